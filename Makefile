@@ -1,0 +1,37 @@
+# make demo   set up, fit the shipped record, sample its posterior, write the report
+# make test   set up, run the tests
+PY = .venv/bin/python
+.DEFAULT_GOAL = help
+.PHONY: help env demo test test-slow check lock clean
+
+help:
+	@sed -n 's/^# \(make .*\)/\1/p' Makefile
+
+env:
+	@sh tools/make_env.sh
+
+demo: env
+	.venv/bin/fitact run data_synth/records/finger_direct.csv --scene data_synth/records/finger_direct.toml --out out/demo --seed 1
+
+test: env
+	$(PY) -m pytest -n auto -m "not slow"
+
+# make test-slow   the statistical tests, of minutes
+test-slow: env
+	$(PY) -m pytest -m slow
+
+# make check   style, types, and the order of the layers
+check: env
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy
+	.venv/bin/lint-imports
+
+# make lock   lock the newest versions of the dependencies
+lock: env
+	.venv/bin/uv pip compile --quiet --upgrade --universal --all-extras --generate-hashes --no-emit-index-url --no-header pyproject.toml -o requirements/all.txt
+	echo uv | .venv/bin/uv pip compile --quiet --upgrade --universal --generate-hashes --no-emit-index-url --no-header - -o requirements/uv.txt
+
+# make clean   remove what the above made
+clean:
+	rm -rf .venv out

@@ -1,0 +1,227 @@
+"""The command line: parses, calls, prints. Heavy imports wait until a command needs them."""
+
+import os
+import platform
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from fitact.errors import InputError
+from fitact.files import replacing, to_json, write_json
+
+if TYPE_CHECKING:
+    from fitact.inference.fit import Fit
+    from fitact.inference.posterior import Posterior
+    from fitact.model.scene import Scene
+
+app = typer.Typer(
+    name="fitact",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    help="""
+Skin and insulator parameters, and the electrostatic force, of an electrovibration display.
+
+Start with a CSV of your oscilloscope whose header reads `time_s,V_V,Vsc_V` (drive and skin voltage):
+
+    fitact run finger.csv
+
+It fits the circuit, samples the posterior and writes a report to open in a browser. Say what you know of
+the panel, the finger and the drive in a scene file (TOML) and add `--scene scene.toml`.
+
+Exit code 0: an answer. 1: an answer that must not be trusted (the files say why). 2: input was refused.
+""",
+)
+
+RecordFile = Annotated[Path, typer.Argument(metavar="RECORD", help="CSV with time_s, V_V, Vsc_V; may be gzipped.")]
+SceneFile = Annotated[
+    Path | None, typer.Option("--scene", metavar="FILE", help="Scene (TOML); absent: the paper's device.")
+]
+Out = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for the results.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Same seed, same draws.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output, and nothing else there.")]
+Fresh = Annotated[bool, typer.Option("--fresh", help="Start the chain anew instead of going on from one in DIR.")]
+
+
+@app.command()
+def run(
+    record: RecordFile, scene: SceneFile = None, out: Out = None, seed: Seed = 0, fresh: Fresh = False, json: Json = False
+) -> None:
+    """Fit, sample and report: everything, into one folder.
+
+    Writes fit.json, summary.json, posterior.nc (opens with ArviZ), chain.h5 (for going on) and report.html.
+    """
+    folder = out or Path(f"{record.name.split('.')[0]}-fitact")
+    posterior = _sampled(record, scene, folder, seed, fresh)
+    page = folder / "report.html"
+    _say("writing the report")
+    posterior.report(page)
+    _show(f"{posterior}\nopen {page}", posterior.summary(), json)
+    _finish(posterior.trusted)
+
+
+@app.command()
+def fit(record: RecordFile, scene: SceneFile = None, out: Out = None, json: Json = False) -> None:
+    """Least squares only: parameters with errors, and the verdict, in seconds."""
+    fitted = _fitted(record, scene)
+    if out is not None:
+        write_json(out / "fit.json", fitted.to_dict())
+    _show(str(fitted), fitted.to_dict(), json)
+    _finish(fitted.trusted)
+
+
+@app.command()
+def sample(
+    record: RecordFile, scene: SceneFile = None, out: Out = None, seed: Seed = 0, fresh: Fresh = False, json: Json = False
+) -> None:
+    """Fit, then sample the posterior until it has converged; as `run`, without the report."""
+    folder = out or Path(f"{record.name.split('.')[0]}-fitact")
+    posterior = _sampled(record, scene, folder, seed, fresh)
+    _show(f"{posterior}\nwrote {folder}; for a report: fitact report {folder}", posterior.summary(), json)
+    _finish(posterior.trusted)
+
+
+@app.command()
+def report(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `run` or `sample` wrote.")],
+    json: Json = False,
+) -> None:
+    """Write the report of a folder of results again."""
+    from fitact.report import read_results, write_report
+
+    tree, summary, fitted = read_results(directory)
+    page = directory / "report.html"
+    write_report(page, tree, summary, fitted)
+    _show(f"open {page}", {"report": str(page)}, json)
+
+
+@app.command()
+def simulate(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene (TOML).")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="CSV to write.")],
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """Simulate a record of a scene: V and Vsc with noise, as CSV that the other commands read."""
+    import numpy as np
+
+    from fitact.model.response import response
+    from fitact.model.scene import Scene
+
+    stated = Scene.load(scene)
+    circuit, drive, measured = stated.make_circuit(), stated.make_drive(), stated.measurement
+    time = np.arange(round(measured.duration * measured.sampling_rate)) / measured.sampling_rate
+    with _double_precision():
+        voltage = np.asarray(drive.value(time))
+        vsc = np.asarray(response(circuit, drive, time, steady_state=stated.drive.steady_state))
+    vsc = vsc + measured.noise_Vsc * np.random.default_rng(seed).standard_normal(time.size)
+    with replacing(out) as temporary:
+        table = np.stack([time, voltage, vsc], axis=1)
+        np.savetxt(temporary, table, fmt="%.12g", delimiter=",", header="time_s,V_V,Vsc_V", comments="")
+    truth = {"Rsc": stated.skin.Rsc, "Csc": stated.skin.Csc, "Ci": stated.device.Ci, "noise_Vsc": measured.noise_Vsc}
+    _show(f"wrote {out}: {time.size} samples", {"file": str(out), "samples": time.size, "seed": seed, "truth": truth}, json)
+
+
+def _double_precision() -> Any:
+    import jax
+
+    return jax.enable_x64(True)
+
+
+def _scene(path: Path | None) -> "Scene | None":
+    from fitact.model.scene import Scene
+
+    return None if path is None else Scene.load(path)
+
+
+def _fitted(record: Path, scene: Path | None) -> "Fit":
+    from fitact.data.formats import read
+
+    stated = _scene(scene)
+    if stated is not None:
+        stated.require_available()
+    measured = read(record, stated)  # refused before the slow imports
+    _use_compilation_cache()
+    from fitact.inference.fit import fit
+
+    _say(f"fitting {record} ({len(measured):,} samples)")
+    return fit(measured, stated)
+
+
+def _sampled(record: Path, scene: Path | None, folder: Path, seed: int, fresh: bool) -> "Posterior":
+    """Fit and sample, and write all but the report."""
+    fitted = _fitted(record, scene)
+    write_json(folder / "fit.json", fitted.to_dict())
+    from fitact.inference.sampling import sample
+
+    chain = folder / "chain.h5"
+    if fresh:
+        chain.unlink(missing_ok=True)
+    posterior = sample(fitted, seed=seed, chain_file=chain)
+    posterior.to_netcdf(folder / "posterior.nc")
+    write_json(folder / "summary.json", posterior.summary())
+    return posterior
+
+
+def _use_compilation_cache() -> None:
+    """Keep what JAX compiles between calls, in the user's cache; a place that cannot be written is passed over."""
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    import jax
+
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = root / "fitact" / f"jax-{jax.__version__}-{platform.node()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def _show(text: str, content: dict[str, Any], as_json: bool) -> None:
+    sys.stdout.write(to_json(content) if as_json else text + "\n")
+    sys.stdout.flush()
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+def _finish(trusted: bool) -> None:
+    if not trusted:
+        _say("fitact: this answer must not be trusted; see the warnings")
+        raise typer.Exit(1)
+
+
+def main() -> None:
+    """Entry point: every error becomes one line and an exit code."""
+    raise SystemExit(_guarded(lambda: app(standalone_mode=False)))
+
+
+def _guarded(command: Callable[[], Any]) -> int:
+    import click
+
+    try:
+        result = command()
+        return result if isinstance(result, int) else 0
+    except InputError as error:
+        _say(f"fitact: {error}")
+        return 2
+    except click.exceptions.ClickException as error:
+        error.show()
+        return 2
+    except (KeyboardInterrupt, click.exceptions.Abort):
+        _say("fitact: interrupted; the same command goes on from the last checkpoint")
+        return 130
+    except BrokenPipeError:
+        return 0
+    except Exception as error:
+        if os.environ.get("FITACT_DEBUG"):
+            raise
+        _say(f"fitact: internal error ({type(error).__name__}: {error}); please report it, with FITACT_DEBUG=1 set")
+        return 3

@@ -1,0 +1,1 @@
+"""What was measured: records, how they are read, and what is refused."""

@@ -1,0 +1,203 @@
+"""Record: one measurement in time, checked on the way in."""
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+from fitact.errors import InputError
+
+MINIMUM_SAMPLES = 20
+CHANNEL_UNITS = {"V": "V", "Vsc": "V", "I": "A"}
+
+_Where = Callable[[int], str]
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """Time and channels of one measurement, SI units.
+
+    Attributes:
+        time: strictly increasing, s.
+        channels: by name: V (drive), Vsc (over the skin), I (trunk current).
+        source: where it came from, for messages.
+        notes: what was assumed or is worth knowing, in sentences.
+    """
+
+    time: Float[np.ndarray, " samples"]
+    channels: Mapping[str, Float[np.ndarray, " samples"]]
+    source: str = "record"
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def from_arrays(
+        cls,
+        time: Float[np.ndarray, " samples"],
+        *,
+        V: Float[np.ndarray, " samples"] | None = None,
+        Vsc: Float[np.ndarray, " samples"] | None = None,
+        I: Float[np.ndarray, " samples"] | None = None,  # noqa: E741  (the field's symbol for current)
+        source: str = "record",
+        notes: tuple[str, ...] = (),
+        where: _Where = lambda row: f"sample {row}",
+    ) -> "Record":
+        """Check arrays (s, V, V, A; equal lengths) and make them a record; `where` names a row in errors.
+
+        Raises:
+            InputError: too few samples, not finite, not increasing, or a channel that holds no signal.
+        """
+        time = np.asarray(time, dtype=float)
+        given = {"V": V, "Vsc": Vsc, "I": I}
+        channels = {name: np.asarray(values, dtype=float) for name, values in given.items() if values is not None}
+        _check_shapes(time, channels, source)
+        for name, values in {"time": time, **channels}.items():
+            _check_finite(values, name, source, where)
+        _check_increasing(time, source, where)
+        for name, values in channels.items():
+            _check_signal(values, name, source)
+        steps = np.diff(time)
+        if not is_uniform(time):
+            notes = (
+                *notes,
+                f"{source}: the time steps are not uniform ({steps.min():.4g} to {steps.max():.4g} s); they are used as they are",
+            )
+        for array in (time, *channels.values()):
+            array.flags.writeable = False
+        return cls(time, channels, source, notes)
+
+    def __getitem__(self, channel: str) -> Float[np.ndarray, " samples"]:
+        try:
+            return self.channels[channel]
+        except KeyError:
+            have = ", ".join(f"{name}_{CHANNEL_UNITS[name]}" for name in self.channels)
+            raise InputError(
+                f"{self.source}: the channel {channel}_{CHANNEL_UNITS[channel]} is missing (found: {have}); record it or name it in the header"
+            ) from None
+
+    def __contains__(self, channel: object) -> bool:
+        return channel in self.channels
+
+    def __len__(self) -> int:
+        return self.time.size
+
+    @property
+    def time_step(self) -> float:
+        """Median step, s."""
+        return float(np.median(np.diff(self.time)))
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the numbers, so that results can name the data they belong to."""
+        digest = hashlib.sha256(np.ascontiguousarray(self.time).tobytes())
+        for name in sorted(self.channels):
+            digest.update(name.encode() + np.ascontiguousarray(self.channels[name]).tobytes())
+        return digest.hexdigest()
+
+    def noise(self, channel: str) -> float:
+        """Standard deviation of the channel's white noise, judged without a model (see `white_noise`)."""
+        return white_noise(self[channel])
+
+    def frequency(self, channel: str = "V") -> float | None:
+        """Fundamental frequency of a channel in Hz; None unless the record shows at least 1.5 periods."""
+        return fundamental(self.time, self[channel])
+
+
+def is_uniform(time: Float[np.ndarray, " samples"], tolerance: float = 1e-2) -> bool:
+    """Whether every sample lies on an even grid, to `tolerance` of a step."""
+    grid = np.linspace(time[0], time[-1], time.size)
+    return bool(np.max(np.abs(time - grid)) <= tolerance * (grid[1] - grid[0]))
+
+
+def white_noise(values: Float[np.ndarray, " samples"]) -> float:
+    """Standard deviation of white noise under a smooth signal, from the median of third differences.
+
+    Edges, being rare, leave the median alone.
+    """
+    third = np.diff(values, 3)
+    return float(np.median(np.abs(third)) / 0.6744897501960817 / math.sqrt(20.0))
+
+
+def rounding_noise(values: Float[np.ndarray, " samples"]) -> float:
+    """Standard deviation that the resolution of the samples alone brings about."""
+    return float(np.diff(np.unique(values)).min() / math.sqrt(12.0))
+
+
+def fundamental(time: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"]) -> float | None:
+    """Frequency (Hz) at which the signal repeats, from its autocorrelation, or None."""
+    count = time.size
+    grid = np.linspace(time[0], time[-1], count)
+    signal = np.interp(grid, time, values)
+    signal = signal - signal.mean()
+    spectrum = np.abs(np.fft.rfft(signal, 2 * count)) ** 2
+    overlap = np.arange(count, 0, -1)
+    correlation = np.fft.irfft(spectrum)[:count] / overlap
+    correlation = correlation / correlation[0]
+    below = np.flatnonzero(correlation < 0.5)
+    last = (2 * count) // 3  # a lag of one period must leave half a period of overlap
+    if below.size == 0 or below[0] >= last - 2:
+        return None
+    window = correlation[below[0] : last]
+    best = float(window.max())
+    if best < 0.8:
+        return None
+    lag = below[0] + int(np.flatnonzero(window >= best - 0.02)[0])
+    while lag + 1 < last and correlation[lag + 1] > correlation[lag]:
+        lag += 1
+    return 1.0 / (_peak(correlation, lag) * (grid[1] - grid[0]))
+
+
+def _peak(curve: Float[np.ndarray, " n"], index: int) -> float:
+    """The place of a maximum near `index`, by a parabola through three points."""
+    left, middle, right = curve[index - 1 : index + 2]
+    bend = left - 2.0 * middle + right
+    return index + (0.5 * (left - right) / bend if bend < 0.0 else 0.0)
+
+
+def _check_shapes(time: np.ndarray, channels: Mapping[str, np.ndarray], source: str) -> None:
+    if not channels:
+        raise InputError(f"{source}: no channel was given; give at least Vsc")
+    for name, values in {"time": time, **channels}.items():
+        if values.ndim != 1 or values.size != time.size:
+            raise InputError(f"{source}: {name} has shape {values.shape}, time {time.shape}; give arrays of one length")
+    if time.size < MINIMUM_SAMPLES:
+        raise InputError(
+            f"{source}: {time.size} samples are too few to fit; record at least {MINIMUM_SAMPLES}, better a whole period"
+        )
+
+
+def _check_finite(values: np.ndarray, name: str, source: str, where: _Where) -> None:
+    bad = np.flatnonzero(~np.isfinite(values))
+    if bad.size:
+        raise InputError(
+            f"{source}, {where(int(bad[0]))}: {name} is {values[bad[0]]} ({bad.size} such values);"
+            " remove those rows or record again"
+        )
+
+
+def _check_increasing(time: np.ndarray, source: str, where: _Where) -> None:
+    bad = np.flatnonzero(np.diff(time) <= 0.0)
+    if bad.size:
+        row = int(bad[0]) + 1
+        kind = "repeats" if time[row] == time[row - 1] else "goes back before"
+        raise InputError(
+            f"{source}, {where(row)}: the time {time[row]:.9g} s {kind} the time before it ({bad.size} such rows);"
+            " sort the rows and drop repeated ones, or check which column is time"
+        )
+
+
+def _check_signal(values: np.ndarray, name: str, source: str) -> None:
+    """Refuse a channel that is constant, or constant but for white noise."""
+    if values.min() == values.max():
+        what = "zero" if values[0] == 0.0 else f"constant at {values[0]:.6g}"
+        raise InputError(f"{source}: {name} is {what} throughout; check the probe and the channel")
+    power = np.abs(np.fft.rfft(values - values.mean())[1:]) ** 2
+    # Fisher's test: the share of the largest of m spectral lines of white noise exceeds x with p < m (1 - x)^(m - 1)
+    share, lines = power.max() / power.sum(), power.size
+    if math.log(lines) + (lines - 1) * math.log1p(-min(share, 1.0 - 1e-16)) > math.log(1e-4):
+        raise InputError(
+            f"{source}: {name} holds nothing but noise around {values.mean():.4g}; check the probe, the channel"
+            " and that the record covers an edge of the drive"
+        )

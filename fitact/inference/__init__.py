@@ -1,0 +1,1 @@
+"""What the data say: least squares, identifiability, and posteriors by emcee."""

@@ -1,0 +1,110 @@
+"""The chain on disk: what sampling needs to go on, in the layout of emcee's HDF5 backend."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any, Self
+
+import emcee
+import h5py
+import numpy as np
+from jaxtyping import Float, Int
+
+from fitact.errors import InputError
+from fitact.files import replacing
+
+
+@dataclasses.dataclass(frozen=True)
+class Chain:
+    """All steps of several ensembles.
+
+    Attributes:
+        names: of the coordinates.
+        fingerprint: what the chain belongs to.
+        points, log_prob: every step of every walker.
+        accepted: moves accepted, per walker.
+        states: where each ensemble stands, its random numbers included.
+    """
+
+    names: tuple[str, ...]
+    fingerprint: str
+    points: Float[np.ndarray, "ensembles steps walkers n"]
+    log_prob: Float[np.ndarray, "ensembles steps walkers"]
+    accepted: Int[np.ndarray, "ensembles walkers"]
+    states: tuple[emcee.State, ...]
+
+    @classmethod
+    def empty(cls, names: tuple[str, ...], fingerprint: str, states: list[emcee.State]) -> Self:
+        """No step taken yet."""
+        walkers, size = states[0].coords.shape
+        points = np.empty((len(states), 0, walkers, size))
+        accepted = np.zeros((len(states), walkers), dtype=int)
+        return cls(names, fingerprint, points, points[..., 0], accepted, tuple(states))
+
+    @property
+    def steps(self) -> int:
+        """Steps taken by each ensemble."""
+        return self.points.shape[1]
+
+    def extended(self, done: list[tuple[np.ndarray, np.ndarray, emcee.State, np.ndarray]]) -> Self:
+        """With more steps of every ensemble: points, log-probabilities, last state, moves accepted."""
+        points, log_prob, states, accepted = zip(*done, strict=True)
+        return dataclasses.replace(
+            self,
+            points=np.concatenate([self.points, np.stack(points)], axis=1),
+            log_prob=np.concatenate([self.log_prob, np.stack(log_prob)], axis=1),
+            accepted=self.accepted + np.stack(accepted).astype(int),
+            states=states,
+        )
+
+    def save(self, path: Path) -> None:
+        """Write the chain; `emcee.backends.HDFBackend(path, name="ensemble_0")` opens an ensemble."""
+        with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+            file.attrs["fingerprint"] = self.fingerprint
+            file.attrs["names"] = list(self.names)
+            for index, state in enumerate(self.states):
+                group = file.create_group(f"ensemble_{index}")
+                walkers, size = state.coords.shape
+                described: dict[str, Any] = {
+                    "version": emcee.__version__,
+                    "nwalkers": walkers,
+                    "ndim": size,
+                    "has_blobs": False,
+                    "iteration": self.steps,
+                }
+                described |= {f"random_state_{i}": part for i, part in enumerate(state.random_state)}
+                group.attrs.update(described)
+                group["chain"] = self.points[index]
+                group["log_prob"] = self.log_prob[index]
+                group["accepted"] = self.accepted[index].astype(float)
+
+    @classmethod
+    def load(cls, path: Path, fingerprint: str) -> Self:
+        """Read a chain that belongs to `fingerprint`.
+
+        Raises:
+            InputError: it belongs to another record, scene, seed or version, or is no chain.
+        """
+        try:
+            with h5py.File(path, "r") as file:
+                if file.attrs["fingerprint"] != fingerprint:
+                    raise InputError(
+                        f"{path}: this chain belongs to another record, scene, seed or version of fitact;"
+                        " remove the file or choose another output folder"
+                    )
+                groups = [file[f"ensemble_{i}"] for i in range(len(file))]
+                states = []
+                for group in groups:
+                    random = tuple(group.attrs[f"random_state_{i}"] for i in range(5))
+                    states.append(
+                        emcee.State(group["chain"][-1], log_prob=group["log_prob"][-1], random_state=random)
+                    )
+                return cls(
+                    tuple(str(name) for name in file.attrs["names"]),
+                    fingerprint,
+                    np.stack([group["chain"][:] for group in groups]),
+                    np.stack([group["log_prob"][:] for group in groups]),
+                    np.stack([group["accepted"][:] for group in groups]).astype(int),
+                    tuple(states),
+                )
+        except (OSError, KeyError) as error:
+            raise InputError(f"{path}: is not a chain of fitact ({error}); remove the file") from error

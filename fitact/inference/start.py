@@ -1,0 +1,172 @@
+"""What a record says before any fit: which drive to use, and the divider and time constant by a linear fit."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from fitact.data.record import Record
+from fitact.errors import InputError
+from fitact.model.drive import Drive, Sampled
+from fitact.model.scene import Scene
+
+
+@dataclasses.dataclass(frozen=True)
+class DriveChoice:
+    """The drive of a fit.
+
+    Attributes:
+        drive: the scene's waveform or the measured one.
+        voltage: it, at the record's times, V.
+        steady_state: or from rest.
+        unknown_charge: whether the charge at the first sample must be left free.
+        shift: the drive starts this much later than the record's t = 0, s.
+        name: "measured" or the waveform's name.
+        notes: what was assumed, in sentences.
+    """
+
+    drive: Drive
+    voltage: Float[np.ndarray, " samples"]
+    steady_state: bool
+    unknown_charge: bool
+    shift: float
+    name: str
+    notes: tuple[str, ...]
+
+
+class LinearStart(NamedTuple):
+    """The divider g = a / b and the time constant b (s), by a linear fit."""
+
+    g: float
+    b: float
+
+
+def choose_drive(record: Record, scene: Scene | None) -> DriveChoice:
+    """The recorded V where there is no scene or it says so, otherwise the scene's waveform.
+
+    A scene that does not name a waveform stands for the nominal square; where the recorded V is not
+    that square, the record is believed.
+    """
+    if scene is None or scene.drive.waveform == "measured":
+        return _measured(record, scene.steady_state() if scene else None, ())
+    drive = scene.make_drive()
+    shift = _align(record, drive, scene.drive.frequency)
+    voltage = np.asarray(drive.value(record.time - shift))
+    notes: tuple[str, ...] = ()
+    if shift != 0.0:
+        notes = (f"the scene's drive was shifted by {shift:.4g} s to lie on the record",)
+    if "V" in record:
+        error = _mismatch(record, voltage)
+        if error > 0.02 and not scene.states_waveform():
+            note = "the scene names no waveform and V_V is not its nominal square: the recorded V_V drives the fit"
+            return _measured(record, scene.steady_state(), (note,))
+        if error > 0.02:
+            notes = (
+                *notes,
+                f"V_V differs from the scene's {scene.drive.waveform} by {100.0 * error:.2g} % rms;"
+                " [drive] waveform = 'measured' would use V_V as recorded",
+            )
+    return DriveChoice(drive, voltage, scene.drive.steady_state, False, shift, scene.drive.waveform, notes)
+
+
+def _measured(record: Record, steady_state: bool | None, notes: tuple[str, ...]) -> DriveChoice:
+    voltage = record["V"]
+    edge = _unresolved_edge(voltage)
+    if edge:
+        notes = (
+            *notes,
+            "V_V jumps within one sample step, so its edges are known only to within a step, and b to a"
+            " correspondingly small error; record faster, or name the waveform in a scene",
+        )
+    if not steady_state:
+        return DriveChoice(Sampled(record.time, voltage), voltage, False, steady_state is None, 0.0, "measured", notes)
+    kept, period = whole_periods(record)
+    if period is None:
+        raise InputError(
+            f"{record.source}: [drive] steady_state = true needs a record of at least 1.5 periods of V_V;"
+            " leave steady_state out to have the charge at the first sample fitted"
+        )
+    return DriveChoice(
+        Sampled(record.time[:kept], voltage[:kept], period), voltage, True, False, 0.0, "measured", notes
+    )
+
+
+def whole_periods(record: Record) -> tuple[int, float | None]:
+    """How many samples make the largest whole number of periods of V, and how long those are (s), or None."""
+    frequency = record.frequency("V" if "V" in record else "Vsc")
+    if frequency is None:
+        return len(record), None
+    span = record.time[-1] - record.time[0] + record.time_step
+    length = np.floor(span * frequency * (1.0 + 1e-3)) / frequency
+    if length <= 0.0:
+        return len(record), None
+    kept = int(np.searchsorted(record.time, record.time[0] + length - 0.5 * record.time_step))
+    return kept, float(length)
+
+
+def linear_start(record: Record, choice: DriveChoice) -> LinearStart:
+    """g and b from  Vsc = g V - (1/b) ∫ Vsc dt + straight line,  the circuit's equation integrated once.
+
+    Raises:
+        InputError: g is not between 0 and 1/2, which this circuit cannot give.
+    """
+    time, vsc, voltage = record.time, record["Vsc"], choice.voltage
+    step = np.diff(time)
+    integral = np.concatenate([[0.0], np.cumsum(0.5 * step * (vsc[1:] + vsc[:-1]))])
+    if choice.name == "square":  # the trapezoid rule misreads the samples beside an ideal edge
+        inside = np.abs(np.diff(voltage, prepend=voltage[0])) < 1e-9 * np.ptp(voltage)
+    else:
+        inside = np.ones(time.size, dtype=bool)
+    span = time[-1] - time[0]
+    design = np.stack([voltage, integral / span, np.ones_like(time), (time - time[0]) / span], axis=1)
+    (g, slope, _, _), *_ = np.linalg.lstsq(design[inside], vsc[inside], rcond=None)
+    if g >= 0.5:
+        raise InputError(
+            f"{record.source}: Vsc is {g:.3g} times V at a step, but this circuit cannot give 1/2 or more;"
+            " check for swapped columns or a wrong unit of V_V or Vsc_V"
+        )
+    if g <= 0.0:
+        raise InputError(
+            f"{record.source}: Vsc steps against V (divider {g:.3g}); check the polarity of the probes"
+            " and that V_V and Vsc_V belong to one recording"
+        )
+    return LinearStart(float(g), float(span / -slope) if slope < 0.0 else float("inf"))
+
+
+def _mismatch(record: Record, voltage: np.ndarray) -> float:
+    """Rms difference between recorded and computed V beyond V's noise, over V's rms; edges' samples apart by one step count."""
+    difference = record["V"] - voltage
+    beyond = max(np.mean(difference**2) - record.noise("V") ** 2, 0.0)
+    return float(np.sqrt(beyond / np.mean(voltage**2)))
+
+
+def _unresolved_edge(voltage: np.ndarray) -> bool:
+    return bool(np.max(np.abs(np.diff(voltage))) > 0.9 * np.ptp(voltage))
+
+
+def _align(record: Record, drive: Drive, frequency: float) -> float:
+    """The shift (s) that lays the drive on the record, 0 unless the record is plainly shifted.
+
+    On V where it was recorded, otherwise on Vsc through its best linear combination of the drive and
+    the drive's integral.
+    """
+    target = record["V"] if "V" in record else record["Vsc"]
+    target = target - target.mean()
+
+    def left(shift: float) -> float:
+        wave = np.asarray(drive.value(record.time - shift))
+        columns = [np.ones_like(wave), wave]
+        if "V" not in record:
+            columns.append(np.cumsum(wave - wave.mean()))
+        design = np.stack(columns, axis=1)
+        remainder = target - design @ np.linalg.lstsq(design, target, rcond=None)[0]
+        return float(remainder @ remainder)
+
+    shifts = np.arange(0.0, 1.0, 1.0 / 128.0) / frequency
+    errors = np.array([left(shift) for shift in shifts])
+    best = int(np.argmin(errors))
+    if errors[0] <= 2.0 * errors[best] or best in (0, 1, shifts.size - 1):
+        return 0.0
+    fine = shifts[best] + np.linspace(-1.0, 1.0, 65) / (128.0 * frequency)
+    return float(fine[np.argmin([left(shift) for shift in fine])])

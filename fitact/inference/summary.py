@@ -1,0 +1,38 @@
+"""Summaries of one quantity: mean, sd and quantiles, from draws or from a Laplace approximation."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+UNITS = {
+    "Rsc": "ohm", "Csc": "F", "Ci": "F", "gain": "1", "delay": "s", "sigma": "V", "offset": "V", "drift": "V", "charge": "V",
+    "g": "1", "b": "s", "force_mean": "N", "force_peak": "N", "force_rms": "N", "friction_mean": "N",
+}  # fmt: skip
+# standard normal quantiles of the summary's probabilities
+_NORMAL = {
+    "q025": -1.959963984540054, "q05": -1.6448536269514722, "q25": -0.6744897501960817, "q50": 0.0,
+    "q75": 0.6744897501960817, "q95": 1.6448536269514722, "q975": 1.959963984540054,
+}  # fmt: skip
+
+Summary = dict[str, float | str]
+
+
+def of_draws(name: str, draws: Float[np.ndarray, "*shape"]) -> Summary:
+    """Summary of draws of the quantity `name`, in its SI unit."""
+    quantiles = np.quantile(draws, [float(f"0.{key[1:]}") for key in _NORMAL])
+    summary: Summary = {"unit": UNITS[name], "mean": float(np.mean(draws)), "sd": float(np.std(draws, ddof=1))}
+    return summary | {key: float(value) for key, value in zip(_NORMAL, quantiles, strict=True)}
+
+
+def log_normal(name: str, median: float, log_sd: float) -> Summary:
+    """Summary of a quantity whose logarithm is normal."""
+    mean = median * math.exp(0.5 * log_sd**2)
+    summary: Summary = {"unit": UNITS[name], "mean": mean, "sd": mean * math.sqrt(math.expm1(log_sd**2))}
+    return summary | {key: median * math.exp(z * log_sd) for key, z in _NORMAL.items()}
+
+
+def normal(name: str, mean: float, sd: float) -> Summary:
+    """Summary of a normal quantity."""
+    summary: Summary = {"unit": UNITS[name], "mean": mean, "sd": sd}
+    return summary | {key: mean + z * sd for key, z in _NORMAL.items()}

@@ -1,0 +1,110 @@
+"""The report: verdict first, then the record, the parameters, the force, and how to repeat it."""
+
+import base64
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import matplotlib as mpl
+import numpy as np
+
+from fitact.errors import InputError
+from fitact.files import replacing
+from fitact.report import plots
+from fitact.units import engineering
+
+_LABELS = {
+    "Rsc": "skin resistance Rsc",
+    "Csc": "skin capacitance Csc",
+    "Ci": "insulator capacitance Ci",
+    "gain": "gain of the channel Vsc",
+    "delay": "delay of Vsc against V",
+    "sigma": "noise of Vsc",
+    "offset": "offset of Vsc",
+    "drift": "drift of Vsc over half the record",
+    "charge": "decaying charge at the first sample",
+    "g": "divider g = Ci / (2 Ci + Csc)",
+    "b": "time constant b = Rsc (2 Ci + Csc)",
+    "force_mean": "electrostatic force, mean",
+    "force_peak": "electrostatic force, peak",
+    "force_rms": "electrostatic force, rms",
+    "friction_mean": "friction, mean",
+}
+
+
+def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any], fitted: dict[str, Any]) -> None:
+    """Write the page from a posterior's DataTree and the contents of summary.json and fit.json."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("fitact.report"), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    with mpl.rc_context(dict(plots.style())):
+        figures = _figures(tree)
+    page = environment.get_template("report.html").render(
+        summary=summary,
+        fitted=fitted,
+        figures=figures,
+        labels=_LABELS,
+        quantity=_quantity,
+        percent=_percent,
+        command=_command(summary),
+        scene=json.dumps(summary["scene"], indent=2, ensure_ascii=False),
+    )
+    with replacing(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+    """What `write_report` needs, from a folder that `fitact sample` or `fitact run` wrote.
+
+    Raises:
+        InputError: a file is missing or damaged.
+    """
+    import xarray as xr
+
+    directory = Path(directory)
+    try:
+        summary, fitted = (json.loads((directory / name).read_text()) for name in ("summary.json", "fit.json"))
+        with xr.open_datatree(directory / "posterior.nc", engine="h5netcdf") as tree:
+            return tree.load(), summary, fitted
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{directory}: holds no complete results ({error}); make them with: fitact sample RECORD --out {directory}"
+        ) from error
+
+
+def _figures(tree: Any) -> dict[str, str]:
+    posterior = {str(name): values.values.ravel() for name, values in tree["posterior"].data_vars.items()}
+    prior = {str(name): values.values.ravel() for name, values in tree["prior"].data_vars.items()}
+    units = {str(name): values.attrs["units"] for name, values in tree["posterior"].data_vars.items()}
+    predicted = tree["posterior_predictive"]["Vsc"]
+    figures = {
+        "record": plots.record_figure(
+            tree["observed_data"]["time"].values,
+            tree["observed_data"]["Vsc"].values,
+            tree["constant_data"]["Vsc_fit"].values,
+            predicted["time"].values,
+            predicted.values.reshape(-1, predicted.sizes["time"]),
+        ),
+        "corner": plots.corner_figure(posterior, prior, units),
+        "force": plots.force_figure(posterior),
+    }
+    # an SVG in an <img> cannot clash with another's ids, and carries its alt text
+    return {name: "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode() for name, svg in figures.items()}
+
+
+def _quantity(summary: dict[str, Any], key: str = "q50", digits: int = 4) -> str:
+    return engineering(summary[key], summary["unit"], digits)
+
+
+def _percent(summary: dict[str, Any]) -> str:
+    """Standard deviation relative to the mean, in per cent."""
+    if not summary["mean"]:
+        return "–"
+    return f"{np.format_float_positional(100.0 * summary['sd'] / abs(summary['mean']), 2, fractional=False, trim='-')} %"
+
+
+def _command(summary: dict[str, Any]) -> str:
+    scene = " --scene SCENE.toml" if summary["scene"] else ""
+    return f"fitact run {summary['record']['source']}{scene} --seed {summary['seed']}"

@@ -1,0 +1,56 @@
+"""Quantities with units, at the border only: inside, every number is a plain float in SI units."""
+
+import functools
+import math
+from typing import Any
+
+from fitact.errors import InputError
+
+_PREFIXES = {-15: "f", -12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
+_SYMBOLS = {"ohm": "Ω", "1": ""}
+
+
+@functools.cache
+def _registry() -> Any:
+    import pint  # 0.4 s, and only needed where text is read
+
+    registry = pint.UnitRegistry()
+    registry.define("@alias ohm = Ohm = OHM = ohms")
+    return registry
+
+
+def parse(value: object, unit: str) -> float:
+    """A quantity such as ``"160 kohm"`` as a float in the SI unit `unit`; a bare number is in `unit` already.
+
+    Raises:
+        InputError: the text is no quantity, or of another dimension.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        raise InputError(f"{value!r} is not a quantity; write a number with a unit, such as '1 {unit}'")
+    if isinstance(value, str):
+        import pint
+
+        try:
+            quantity = _registry().Quantity(value)
+            value = float(quantity.magnitude if quantity.unitless else quantity.to(unit).magnitude)
+        except pint.DimensionalityError as error:
+            raise InputError(f"'{value}' is not in a unit of {unit}; write it as a multiple of {unit}") from error
+        except Exception as error:  # pint raises a dozen kinds, tokenize errors among them
+            raise InputError(f"'{value}' is not a quantity; write a number with a unit, such as '1 {unit}'") from error
+    if not math.isfinite(value):
+        raise InputError(f"{value} is not finite; write a number with a unit, such as '1 {unit}'")
+    return float(value)
+
+
+def scale(text: str, unit: str) -> float:
+    """How many `unit` one `text` is: ``scale("ms", "s") == 1e-3``."""
+    return parse(f"1 {text}", unit)
+
+
+def engineering(value: float, unit: str, digits: int = 4) -> str:
+    """`value` with an SI prefix, for people: ``engineering(1.35e-9, "F") == "1.35 nF"``."""
+    symbol = _SYMBOLS.get(unit, unit)
+    if not math.isfinite(value) or value == 0.0 or not symbol:
+        return f"{value:.{digits}g} {symbol}".rstrip()
+    exponent = max(-15, min(12, 3 * math.floor(math.log10(abs(value)) / 3 + 1e-12)))
+    return f"{value / 10.0**exponent:.{digits}g} {_PREFIXES[exponent]}{symbol}"
