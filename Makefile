@@ -2,7 +2,7 @@
 # make test   set up, run the tests
 PY = .venv/bin/python
 .DEFAULT_GOAL = help
-.PHONY: help env demo test test-slow check lock clean
+.PHONY: help env demo test notebooks check lock clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -14,11 +14,15 @@ demo: env
 	.venv/bin/fitact run data_synth/records/finger_direct.csv --scene data_synth/records/finger_direct.toml --out out/demo --seed 1
 
 test: env
-	$(PY) -m pytest -n auto -m "not slow"
+	$(PY) -m pytest -n auto --dist loadfile
 
-# make test-slow   the statistical tests, of minutes
-test-slow: env
-	$(PY) -m pytest -m slow
+# make notebooks   run the notebooks; executed copies in out/notebooks
+notebooks: env
+	mkdir -p out/notebooks
+	for name in notebooks/*.py; do \
+		.venv/bin/jupytext --quiet --to ipynb --execute --run-path notebooks \
+			--output out/notebooks/$$(basename $$name .py).ipynb $$name || exit 1; \
+	done
 
 # make check   style, types, and the order of the layers
 check: env

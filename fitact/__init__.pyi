@@ -1,14 +1,1 @@
-from .data.formats import read
-from .data.record import Record
-from .errors import InputError
-from .inference.fit import RESULTS, Fit, fit
-from .inference.posterior import Posterior
-from .inference.sampling import sample
-from .model.circuit import FinalCircuit
-from .model.drive import Sampled, Sine, Square, Trapezoid, Triangle
-from .model.force import Contact, electrostatic_force, friction
-from .model.prior import LogNormal, Prior, Uniform
-from .model.response import response
-from .model.scene import Scene
-
 __version__: str

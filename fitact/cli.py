@@ -43,13 +43,20 @@ SceneFile = Annotated[
 ]
 Out = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for the results.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Same seed, same draws.")]
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output, and nothing else there.")]
+Json = Annotated[
+    bool, typer.Option("--json", help="Print the result as JSON on standard output, and nothing else there.")
+]
 Fresh = Annotated[bool, typer.Option("--fresh", help="Start the chain anew instead of going on from one in DIR.")]
 
 
 @app.command()
 def run(
-    record: RecordFile, scene: SceneFile = None, out: Out = None, seed: Seed = 0, fresh: Fresh = False, json: Json = False
+    record: RecordFile,
+    scene: SceneFile = None,
+    out: Out = None,
+    seed: Seed = 0,
+    fresh: Fresh = False,
+    json: Json = False,
 ) -> None:
     """Fit, sample and report: everything, into one folder.
 
@@ -76,7 +83,12 @@ def fit(record: RecordFile, scene: SceneFile = None, out: Out = None, json: Json
 
 @app.command()
 def sample(
-    record: RecordFile, scene: SceneFile = None, out: Out = None, seed: Seed = 0, fresh: Fresh = False, json: Json = False
+    record: RecordFile,
+    scene: SceneFile = None,
+    out: Out = None,
+    seed: Seed = 0,
+    fresh: Fresh = False,
+    json: Json = False,
 ) -> None:
     """Fit, then sample the posterior until it has converged; as `run`, without the report."""
     folder = out or Path(f"{record.name.split('.')[0]}-fitact")
@@ -122,8 +134,17 @@ def simulate(
     with replacing(out) as temporary:
         table = np.stack([time, voltage, vsc], axis=1)
         np.savetxt(temporary, table, fmt="%.12g", delimiter=",", header="time_s,V_V,Vsc_V", comments="")
-    truth = {"Rsc": stated.skin.Rsc, "Csc": stated.skin.Csc, "Ci": stated.device.Ci, "noise_Vsc": measured.noise_Vsc}
-    _show(f"wrote {out}: {time.size} samples", {"file": str(out), "samples": time.size, "seed": seed, "truth": truth}, json)
+    truth = {
+        "Rsc": stated.skin.Rsc,
+        "Csc": stated.skin.Csc,
+        "Ci": stated.device.Ci,
+        "noise_Vsc": measured.noise_Vsc,
+    }
+    _show(
+        f"wrote {out}: {time.size} samples",
+        {"file": str(out), "samples": time.size, "seed": seed, "truth": truth},
+        json,
+    )
 
 
 def _double_precision() -> Any:

@@ -39,7 +39,7 @@ def parse(value: object, unit: str) -> float:
             raise InputError(f"'{value}' is not a quantity; write a number with a unit, such as '1 {unit}'") from error
     if not math.isfinite(value):
         raise InputError(f"{value} is not finite; write a number with a unit, such as '1 {unit}'")
-    return float(value)
+    return float(f"{value:.15g}")  # 200 um is 2e-4 m, not 1.9999999999999998e-4
 
 
 def scale(text: str, unit: str) -> float:

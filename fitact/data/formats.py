@@ -20,7 +20,7 @@ _HEADER = "time_s,V_V,Vsc_V,I_A"
 
 
 class _Column(NamedTuple):
-    index: int
+    place: int
     name: str  # a key of _UNITS
     unit: str | None  # as written, or None
 
@@ -47,7 +47,7 @@ def read(path: str | os.PathLike[str], scene: Scene | None = None) -> Record:
     if not rows:
         raise InputError(f"{name}: there are no rows of numbers under the header")
     table = _numbers(rows, len(_cells(header[1])), name)
-    arrays = {c.name: table[:, c.index] * _scale(c, name, header[0]) for c in columns}
+    arrays = {c.name: table[:, c.place] * _scale(c, name, header[0]) for c in columns}
     notes = (f"{name}: not used: {', '.join(ignored)}",) if ignored else ()
     time = arrays.pop("time")
     record = Record.from_arrays(time, **arrays, source=name, notes=notes, where=lambda row: f"line {rows[row][0]}")
@@ -123,10 +123,11 @@ def _with_units(columns: list[_Column], row: tuple[int, str], name: str) -> list
     cells = [cell.strip("()[]") for cell in _cells(row[1])]
     combined = []
     for column in columns:
-        below = cells[column.index] if column.index < len(cells) else ""
+        below = cells[column.place] if column.place < len(cells) else ""
         if below and column.unit and _scale(column._replace(unit=below), name, row[0]) != _scale(column, name, row[0]):
             raise InputError(
-                f"{name}, line {row[0]}: the unit of {column.name} is {below} here and {column.unit} in the header; keep one"
+                f"{name}, line {row[0]}: the unit of {column.name} is {below} here and {column.unit} in the"
+                " header; keep one"
             )
         combined.append(column._replace(unit=column.unit or below or None))
     return combined
@@ -140,7 +141,8 @@ def _scale(column: _Column, name: str, line: int) -> float:
         return units.scale(column.unit, _UNITS[column.name])
     except InputError:
         raise InputError(
-            f"{name}, line {line}: '{column.unit}' is no unit of {column.name}; write a multiple of {_UNITS[column.name]}"
+            f"{name}, line {line}: '{column.unit}' is no unit of {column.name};"
+            f" write a multiple of {_UNITS[column.name]}"
         ) from None
 
 

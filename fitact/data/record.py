@@ -11,6 +11,8 @@ from jaxtyping import Float
 from fitact.errors import InputError
 
 MINIMUM_SAMPLES = 20
+_NEAR_PEAK = 0.02  # of correlation: the first period's peak may be that much lower than a later one's
+_TOP = 0.002  # of correlation: the part of a peak that is taken for a parabola
 CHANNEL_UNITS = {"V": "V", "Vsc": "V", "I": "A"}
 
 _Where = Callable[[int], str]
@@ -62,7 +64,8 @@ class Record:
         if not is_uniform(time):
             notes = (
                 *notes,
-                f"{source}: the time steps are not uniform ({steps.min():.4g} to {steps.max():.4g} s); they are used as they are",
+                f"{source}: the time steps are not uniform ({steps.min():.4g} to {steps.max():.4g} s);"
+                " they are used as they are",
             )
         for array in (time, *channels.values()):
             array.flags.writeable = False
@@ -74,7 +77,8 @@ class Record:
         except KeyError:
             have = ", ".join(f"{name}_{CHANNEL_UNITS[name]}" for name in self.channels)
             raise InputError(
-                f"{self.source}: the channel {channel}_{CHANNEL_UNITS[channel]} is missing (found: {have}); record it or name it in the header"
+                f"{self.source}: the channel {channel}_{CHANNEL_UNITS[channel]} is missing (found: {have});"
+                " record it or name it in the header"
             ) from None
 
     def __contains__(self, channel: object) -> bool:
@@ -126,15 +130,10 @@ def rounding_noise(values: Float[np.ndarray, " samples"]) -> float:
 
 
 def fundamental(time: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"]) -> float | None:
-    """Frequency (Hz) at which the signal repeats, from its autocorrelation, or None."""
+    """Frequency (Hz) at which the signal repeats, from its correlation with itself, or None."""
     count = time.size
     grid = np.linspace(time[0], time[-1], count)
-    signal = np.interp(grid, time, values)
-    signal = signal - signal.mean()
-    spectrum = np.abs(np.fft.rfft(signal, 2 * count)) ** 2
-    overlap = np.arange(count, 0, -1)
-    correlation = np.fft.irfft(spectrum)[:count] / overlap
-    correlation = correlation / correlation[0]
+    correlation = _self_correlation(np.interp(grid, time, values))
     below = np.flatnonzero(correlation < 0.5)
     last = (2 * count) // 3  # a lag of one period must leave half a period of overlap
     if below.size == 0 or below[0] >= last - 2:
@@ -143,17 +142,39 @@ def fundamental(time: Float[np.ndarray, " samples"], values: Float[np.ndarray, "
     best = float(window.max())
     if best < 0.8:
         return None
-    lag = below[0] + int(np.flatnonzero(window >= best - 0.02)[0])
-    while lag + 1 < last and correlation[lag + 1] > correlation[lag]:
-        lag += 1
-    return 1.0 / (_peak(correlation, lag) * (grid[1] - grid[0]))
+    start, stop = _stretch(window >= best - _NEAR_PEAK, int(np.argmax(window >= best - _NEAR_PEAK)))
+    top = start + int(np.argmax(window[start:stop]))  # of the first period, not of a later one
+    start, stop = _stretch(window >= window[top] - _TOP - 0.3 * (1.0 - window[top]), top)
+    return 1.0 / ((below[0] + _vertex(window, start, stop, top)) * float(grid[1] - grid[0]))
 
 
-def _peak(curve: Float[np.ndarray, " n"], index: int) -> float:
-    """The place of a maximum near `index`, by a parabola through three points."""
-    left, middle, right = curve[index - 1 : index + 2]
-    bend = left - 2.0 * middle + right
-    return index + (0.5 * (left - right) / bend if bend < 0.0 else 0.0)
+def _self_correlation(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Correlation coefficient of x[:n - lag] and x[lag:] for each lag; 1 at a period, however few there are."""
+    x = x - x.mean()
+    count = x.size
+    product = np.fft.irfft(np.abs(np.fft.rfft(x, 2 * count)) ** 2)[:count]
+    overlap = np.arange(count, 0, -1)
+    head, head2 = (np.cumsum(y)[::-1] for y in (x, x**2))  # sums over x[:n - lag]
+    tail, tail2 = (np.cumsum(y[::-1])[::-1] for y in (x, x**2))  # sums over x[lag:]
+    spread = (head2 - head**2 / overlap) * (tail2 - tail**2 / overlap)
+    floor = 1e-12 * head2[0] ** 2  # parts without variation correlate with nothing
+    return np.where(spread > floor, (product - head * tail / overlap) / np.sqrt(np.maximum(spread, floor)), 0.0)
+
+
+def _stretch(inside: np.ndarray, index: int) -> tuple[int, int]:
+    """The run of true values around `index`: its start and the first place after it."""
+    outside = np.flatnonzero(~inside)
+    place = int(np.searchsorted(outside, index))
+    start = int(outside[place - 1]) + 1 if place > 0 else 0
+    return start, int(outside[place]) if place < outside.size else inside.size
+
+
+def _vertex(curve: Float[np.ndarray, " n"], start: int, stop: int, top: int) -> float:
+    """Where the curve between `start` and `stop` peaks, by a parabola."""
+    if stop - start < 5:
+        return float(top)
+    bend, slope, _ = np.polyfit(np.arange(stop - start), curve[start:stop], 2)
+    return float(start + np.clip(-0.5 * slope / bend, 0.0, stop - start) if bend < 0.0 else top)
 
 
 def _check_shapes(time: np.ndarray, channels: Mapping[str, np.ndarray], source: str) -> None:
@@ -164,7 +185,8 @@ def _check_shapes(time: np.ndarray, channels: Mapping[str, np.ndarray], source: 
             raise InputError(f"{source}: {name} has shape {values.shape}, time {time.shape}; give arrays of one length")
     if time.size < MINIMUM_SAMPLES:
         raise InputError(
-            f"{source}: {time.size} samples are too few to fit; record at least {MINIMUM_SAMPLES}, better a whole period"
+            f"{source}: {time.size} samples are too few to fit; record at least {MINIMUM_SAMPLES},"
+            " better a whole period"
         )
 
 
@@ -193,6 +215,9 @@ def _check_signal(values: np.ndarray, name: str, source: str) -> None:
     if values.min() == values.max():
         what = "zero" if values[0] == 0.0 else f"constant at {values[0]:.6g}"
         raise InputError(f"{source}: {name} is {what} throughout; check the probe and the channel")
+    middle = np.median(values)
+    if np.max(np.abs(values - middle)) > 7.0 * np.median(np.abs(values - middle)) / 0.6744897501960817:
+        return  # an edge, however short
     power = np.abs(np.fft.rfft(values - values.mean())[1:]) ** 2
     # Fisher's test: the share of the largest of m spectral lines of white noise exceeds x with p < m (1 - x)^(m - 1)
     share, lines = power.max() / power.sum(), power.size

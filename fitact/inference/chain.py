@@ -95,9 +95,7 @@ class Chain:
                 states = []
                 for group in groups:
                     random = tuple(group.attrs[f"random_state_{i}"] for i in range(5))
-                    states.append(
-                        emcee.State(group["chain"][-1], log_prob=group["log_prob"][-1], random_state=random)
-                    )
+                    states.append(emcee.State(group["chain"][-1], log_prob=group["log_prob"][-1], random_state=random))
                 return cls(
                     tuple(str(name) for name in file.attrs["names"]),
                     fingerprint,

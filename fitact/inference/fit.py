@@ -1,4 +1,4 @@
-"""Least squares with optimistix: parameters, covariance, and whether the answer may be trusted."""
+"""Fit a record: parameters, their covariance, and whether the answer may be trusted."""
 
 import dataclasses
 import math
@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -16,34 +15,17 @@ from fitact.data.record import Record
 from fitact.inference import derived, summary
 from fitact.inference.diagnostics import is_misfit, statistics
 from fitact.inference.identifiability import Identifiability, assess
+from fitact.inference.least_squares import Solved, result_message, result_name, solve
 from fitact.inference.likelihood import LINEAR, Likelihood, natural
 from fitact.inference.start import DriveChoice, LinearStart, choose_drive, linear_start
+from fitact.model.drive import Square
 from fitact.model.prior import Prior
 from fitact.model.scene import Scene
 from fitact.units import engineering
 
-_EVIDENCE = 10.0  # a nuisance is freed when it lowers the Bayesian information criterion by this much
 _DECREMENT = 1e-3  # how far below the optimum, in log-probability, a fit may end
-_IMPLAUSIBLE = 3.0  # prior standard deviations beyond which a parameter is remarked upon
-
-
-class RESULTS(optx.RESULTS):  # type: ignore[misc]
-    """Why a fit ended: optimistix's results, and what else makes an answer untrustworthy."""
-
-    did_not_move = (
-        "The fit never left its start although the record asks for another answer; check the units of the record."
-    )
-    not_at_optimum = "The fit stopped before its optimum; check the units of the record, or give a nearer prior."
-    misfit = (
-        "The model does not describe the record: its residuals are larger than the noise or have structure;"
-        " look at them in the report, and use the drive as measured or a scene that has what is missing."
-    )
-
-
-_BY_NAME = {
-    name: getattr(RESULTS, name)
-    for name in ("successful", "did_not_move", "not_at_optimum", "misfit", "nonfinite", "nonlinear_max_steps_reached", "nonlinear_divergence")
-}  # fmt: skip
+_OFFSET = 0.02  # of Vsc's span: standard deviation of an offset that the record is too short to show
+_IMPLAUSIBLE = 0.005  # share of the prior further out than g or b, below which it is remarked upon
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,7 +73,7 @@ class Fit:
     @property
     def message(self) -> str:
         """The result as a sentence."""
-        return "The fit is at its optimum and leaves only noise." if self.trusted else RESULTS[_BY_NAME[self.result]]
+        return "The fit is at its optimum and leaves only noise." if self.trusted else result_message(self.result)
 
     @property
     def sd(self) -> Float[np.ndarray, " parameters"]:
@@ -109,7 +91,9 @@ class Fit:
         out = {}
         for i, name in enumerate(self.names):
             if name == "delay":
-                out[name] = summary.normal(name, float(values[name]), float(self.sd[i] * self.likelihood.time_step))
+                out[name] = summary.normal(
+                    name, float(values[name]), float(self.sd[i]) * float(self.likelihood.time_step)
+                )
             else:
                 out[name] = summary.log_normal(name, float(values[name]), float(self.sd[i]))
                 out[name]["contraction"] = float(1.0 - self.sd[i] / prior_sd[i])
@@ -156,9 +140,9 @@ class Fit:
         """A table for people: values with errors, correlations, the verdict."""
         rows = [f"{'':14}{'median':>12}{'± 1 sd':>12}{'contraction':>14}"]
         for name, s in (self.parameters() | self.derived()).items():
-            value, relative = float(s["q50"]), 100.0 * float(s["sd"]) / abs(float(s["mean"]))
+            median = engineering(float(s["q50"]), str(s["unit"]))
             contraction = f"{s['contraction']:14.3f}" if "contraction" in s else ""
-            rows.append(f"{name:14}{engineering(value, str(s['unit'])):>12}{relative:10.3g} %{contraction}")
+            rows.append(f"{name:14}{median:>12}{summary.width(s):>12}{contraction}")
         nuisances = {"noise": self.sigma, **self.linear}
         pairs = [(i, j) for i in range(len(self.names)) for j in range(i)]
         rows += [
@@ -190,40 +174,34 @@ def fit(record: Record, scene: Scene | None = None) -> Fit:
         choice = choose_drive(record, scene)
         start = linear_start(record, choice)
         likelihood = _likelihood(record, choice, given.make_prior())
-        solved = _free_by_evidence(likelihood, _on_the_ridge(start, likelihood.prior), record.noise("Vsc"))
+        ridge = _on_the_ridge(start, likelihood.prior)
+        theta = np.append(ridge, 0.0) if likelihood.free_delay else ridge
+        solved = solve(likelihood, theta, record.noise("Vsc"))
         return _judged(solved, record, given, choice, scene is None)
 
 
-class _Solved(eqx.Module):
-    """Where Levenberg-Marquardt ended."""
-
-    likelihood: Likelihood
-    start: Float[Array, " parameters"]
-    theta: Float[Array, " parameters"]
-    sigma: ArrayLike
-    result: Any
-    steps: ArrayLike
-    residuals: Float[Array, " samples"]
-    beta: Float[Array, " 3"]
-    jacobian: Float[Array, "samples parameters"]
-    shapes: Float[Array, "samples 3"]  # of the linear nuisances
-    slope: Float[Array, " samples"]  # of the signal in a further delay
-    gradient: Float[Array, " parameters"]  # of minus the log-posterior
-
-
 def _likelihood(record: Record, choice: DriveChoice, prior: Prior) -> Likelihood:
-    charge = 10.0 * np.ptp(record["Vsc"]) if choice.unknown_charge else 0.0
+    height = float(np.ptp(record["Vsc"]))
+    charge = 10.0 * height if choice.unknown_charge else 0.0
+    # a part of a wave cannot show an offset, so one within an oscilloscope's accuracy is allowed for
+    offset = _OFFSET * height if _frequency(record) is None else 0.0
     return Likelihood(
         time=jnp.asarray(record.time),
         observed=jnp.asarray(record["Vsc"]),
         drive=choice.drive,
         prior=prior,
-        linear_sd=jnp.array([0.0, 0.0, charge]),
+        linear_sd=jnp.array([offset, 0.0, charge]),
         shift=jnp.asarray(choice.shift, dtype=float),
         time_step=jnp.asarray(record.time_step, dtype=float),
+        delay_sd=jnp.asarray(_delay_sd(choice), dtype=float),
         steady_state=choice.steady_state,
-        free_delay=False,
+        free_delay=choice.shift != 0.0,  # then the edges are known to within a step only, which g feels
     )
+
+
+def _delay_sd(choice: DriveChoice) -> float:
+    """Beside an ideal edge the samples leave the delay open within one step, whose middle is the start."""
+    return math.sqrt(1.0 / 12.0) if isinstance(choice.drive, Square) else 5.0
 
 
 def _on_the_ridge(start: LinearStart, prior: Prior) -> Float[np.ndarray, " parameters"]:
@@ -238,86 +216,14 @@ def _on_the_ridge(start: LinearStart, prior: Prior) -> Float[np.ndarray, " param
     point = np.array([math.log(g * b / ci), math.log((1.0 / g - 2.0) * ci), math.log(ci)])
     along, weight = np.array([-1.0, 1.0, 1.0]), sd[:3] ** -2.0
     point = point + along * np.sum(weight * along * (mean[:3] - point)) / np.sum(weight)
-    return np.append(point, mean[3:])
+    return np.append(point, mean[3:])  # a gain starts from its prior
 
 
-def _least_squares(likelihood: Likelihood, start: Array, noise: ArrayLike) -> _Solved:
-    """Two rounds: with the noise as given, then with that of the residuals."""
-    first = _round(likelihood, start, jnp.asarray(noise, dtype=float))
-    second = _round(likelihood, first.theta, first.sigma)
-    return eqx.tree_at(lambda x: (x.start, x.steps), second, (start, first.steps + second.steps))
-
-
-@eqx.filter_jit
-def _round(likelihood: Likelihood, start: Array, sigma: Array) -> _Solved:
-    def residuals(theta: Array, _: None) -> tuple[Array, Array]:
-        return likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)
-
-    solver = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
-    solution = optx.least_squares(residuals, solver, start, max_steps=256, throw=False)
-    theta = solution.value
-    (of_data, of_prior), (jacobian, prior_jacobian) = residuals(theta, None), jax.jacfwd(residuals)(theta, None)
-    remainder, beta, _ = likelihood.linear(theta, sigma)
-    later = jnp.zeros(())
-    return _Solved(
-        likelihood=likelihood,
-        start=start,
-        theta=theta,
-        sigma=jnp.sqrt(jnp.sum(jnp.square(remainder)) / max(remainder.size - start.size, 1)),
-        result=RESULTS.promote(solution.result),
-        steps=solution.stats["num_steps"],
-        residuals=remainder,
-        beta=beta,
-        jacobian=jacobian,
-        shapes=likelihood.shapes(theta),
-        slope=jax.jvp(lambda later: likelihood.signal(theta, later), (later,), (jnp.ones_like(later),))[1],
-        gradient=jacobian.T @ of_data + prior_jacobian.T @ of_prior,
-    )
-
-
-def _free_by_evidence(likelihood: Likelihood, start: Float[np.ndarray, " parameters"], noise: float) -> _Solved:
-    """Fit; then free offset, drift or delay, one at a time, as long as the record asks for one."""
-    solved = _least_squares(likelihood, jnp.asarray(start), noise)
-    for _ in range(3):
-        gains = _evidence(solved)
-        name = max(gains, key=gains.__getitem__, default="")
-        if not name or not gains[name] > _EVIDENCE:
-            break
-        theta = solved.theta
-        if name == "delay":
-            likelihood = eqx.tree_at(lambda x: x.free_delay, likelihood, replace=True)
-            theta = jnp.append(theta, 0.0)
-        else:
-            sd = likelihood.linear_sd.at[LINEAR.index(name)].set(10.0 * jnp.ptp(likelihood.observed))
-            likelihood = eqx.tree_at(lambda x: x.linear_sd, likelihood, sd)
-        solved = eqx.tree_at(lambda x: x.start, _least_squares(likelihood, theta, solved.sigma), theta)
-    return solved
-
-
-def _evidence(solved: _Solved) -> dict[str, float]:
-    """By how much freeing each nuisance would lower the Bayesian information criterion, to first order."""
-    size, linear_sd, shapes = solved.residuals.size, np.asarray(solved.likelihood.linear_sd), np.asarray(solved.shapes)
-    candidates = {name: shapes[:, i] for i, name in enumerate(LINEAR[:2]) if linear_sd[i] == 0.0}
-    if not solved.likelihood.free_delay:
-        candidates["delay"] = np.asarray(solved.slope)
-    known = np.concatenate([np.asarray(solved.jacobian)[:size], shapes * (linear_sd > 0.0)], axis=1)
-    basis, values, _ = np.linalg.svd(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300), full_matrices=False)
-    basis = basis[:, values > 1e-9 * values[0]]
-    residuals = np.asarray(solved.residuals)
-    gains = {}
-    for name, column in candidates.items():
-        column = column - basis @ (basis.T @ column)
-        drop = (column @ residuals) ** 2 / max(column @ column, 1e-300)
-        share = min(drop / (residuals @ residuals), 1.0 - 1e-12)
-        gains[name] = -size * math.log1p(-share) - math.log(size)
-    return gains
-
-
-def _judged(solved: _Solved, record: Record, scene: Scene, choice: DriveChoice, no_scene: bool) -> Fit:
+def _judged(solved: Solved, record: Record, scene: Scene, choice: DriveChoice, no_scene: bool) -> Fit:
     likelihood, theta, sigma = solved.likelihood, np.asarray(solved.theta), float(solved.sigma)
     jacobian = np.asarray(solved.jacobian)
     fisher = jacobian.T @ jacobian
-    prior_sd = np.append(likelihood.prior.log_sd, np.ones(theta.size - len(likelihood.prior.names)))
+    prior_sd = likelihood.prior_sd
     covariance = np.linalg.inv(fisher + np.diag(prior_sd**-2.0))
     derive = derived.for_fit(likelihood, record, choice, scene)
     logs, gradient = _log_derived(derive, theta, sigma)
@@ -329,7 +235,7 @@ def _judged(solved: _Solved, record: Record, scene: Scene, choice: DriveChoice, 
     divider = float(np.exp(logs[derived.NAMES.index("g")]))
     figures = statistics(np.asarray(solved.residuals), theta.size + len(linear), divider, record, choice)
     figures["steps"] = int(solved.steps)
-    identifiability = assess(fisher, likelihood.prior, gradient[derived.NAMES.index("force_mean")])
+    identifiability = assess(fisher, likelihood.prior, prior_sd, gradient[derived.NAMES.index("force_mean")])
     return Fit(
         theta=theta,
         covariance=covariance,
@@ -348,9 +254,9 @@ def _judged(solved: _Solved, record: Record, scene: Scene, choice: DriveChoice, 
     )
 
 
-def _result(solved: _Solved, covariance: Float[np.ndarray, "n n"], figures: dict[str, float]) -> str:
+def _result(solved: Solved, covariance: Float[np.ndarray, "n n"], figures: dict[str, float]) -> str:
     """The first of the things that stand against the answer."""
-    name = next((name for name, item in _BY_NAME.items() if bool(solved.result == item)), "nonfinite")
+    name = result_name(solved.result)
     if name != "successful":
         return name
     gradient = np.asarray(solved.gradient)
@@ -382,18 +288,37 @@ def _warnings(theta: np.ndarray, likelihood: Likelihood, record: Record, no_scen
             "no scene was given: the panel is taken to be the paper's (Ci 1.35 nF ± 5 %), and Rsc, Csc, Ci and the"
             " force scale with that; state your panel's Ci under [device] in a scene file"
         )
-    frequency = record.frequency("V" if "V" in record else "Vsc")
     span = record.time[-1] - record.time[0]
-    if frequency is None:
+    if _frequency(record) is None:
         found.append(
             f"the record ({engineering(span, 's')}) does not show its drive repeating: it is shorter than 1.5 periods"
             " or not periodic, so the answer rests on a part of a wave; record two periods or more"
         )
     prior = likelihood.prior
-    for name, value, mean, sd in zip(prior.names, theta, prior.log_mean, prior.log_sd, strict=False):
-        if abs(value - mean) > _IMPLAUSIBLE * sd:
+    for name, factor, tail in _plausibility(theta, prior):
+        if tail < _IMPLAUSIBLE:
             found.append(
-                f"{name} lies {abs(value - mean) / sd:.1f} prior standard deviations from what was expected;"
-                " check probe attenuation (x10), units, and peak against peak-to-peak"
+                f"{name} is {factor:.3g} times what the prior expects (less than {100.0 * _IMPLAUSIBLE:.2g} % of it"
+                " lies so far out); check the probe's attenuation (x10), the units of time and voltage, and peak"
+                " against peak-to-peak"
             )
     return found
+
+
+def _frequency(record: Record) -> float | None:
+    return record.frequency("V" if "V" in record else "Vsc")
+
+
+def _plausibility(theta: np.ndarray, prior: Prior) -> list[tuple[str, float, float]]:
+    """For g and b, which the record knows: name, ratio to the prior's median, share of the prior further out."""
+    believed = prior.sample(np.random.default_rng(0), 10_000)  # for two tail areas, so any seed will do
+    r, c, i = np.exp(theta[:3])
+    total, expected = 2.0 * i + c, 2.0 * believed["Ci"] + believed["Csc"]
+    pairs = {
+        "the divider g": (i / total, believed["Ci"] / expected),
+        "the time constant b": (r * total, believed["Rsc"] * expected),
+    }
+    return [
+        (name, float(value / np.median(draws)), float(min(np.mean(draws < value), np.mean(draws > value))))
+        for name, (value, draws) in pairs.items()
+    ]

@@ -48,20 +48,22 @@ class Identifiability:
         moves = ", ".join(f"{name} {value:+.2f}" for name, value in self.blind_direction.items())
         return (
             f"{self.verdict}: the record cannot see {self.blind_name} (logs move together: {moves}); along it the"
-            f" prior alone speaks (± {100.0 * math.expm1(self.prior_sd):.2g} %), and {100.0 * self.force_from_prior:.3g} %"
-            f" of the force's variance comes from there. {self.remedy}"
+            f" prior alone speaks (± {100.0 * math.expm1(self.prior_sd):.2g} %), and"
+            f" {100.0 * self.force_from_prior:.3g} % of the force's variance comes from there. {self.remedy}"
         )
 
 
 def assess(
-    fisher: Float[np.ndarray, "parameters parameters"], prior: Prior, force_gradient: Float[np.ndarray, " parameters"]
+    fisher: Float[np.ndarray, "parameters parameters"],
+    prior: Prior,
+    prior_sd: Float[np.ndarray, " parameters"],
+    force_gradient: Float[np.ndarray, " parameters"],
 ) -> Identifiability:
     """Judge a record by the Fisher information of its data in theta.
 
     The first three coordinates are log Rsc, log Csc, log Ci; the others (gain, delay) are nuisances with
-    priors of their own. `force_gradient` is that of the log mean force.
+    priors of their own; `prior_sd` is that of all. `force_gradient` is that of the log mean force.
     """
-    prior_sd = np.append(prior.log_sd, np.ones(fisher.shape[0] - len(prior.names)))
     effective = _marginal(fisher, prior_sd)
     sd = prior_sd[:3]
     values, vectors = np.linalg.eigh(sd[:, None] * effective * sd)

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.scipy.linalg import cho_solve, solve_triangular
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -40,7 +41,8 @@ class Likelihood(eqx.Module):
         linear_sd: prior standard deviations of offset, drift (over half the record) and charge, V; 0 leaves
             one out.
         shift: the drive starts this much later than the record's t = 0, s.
-        time_step: s; also the prior standard deviation of the delay.
+        time_step: s.
+        delay_sd: prior standard deviation of the delay, in time steps.
         steady_state: or from rest.
         free_delay: whether the delay is a parameter.
     """
@@ -52,8 +54,14 @@ class Likelihood(eqx.Module):
     linear_sd: Float[Array, " 3"]
     shift: ArrayLike
     time_step: ArrayLike
+    delay_sd: ArrayLike
     steady_state: bool = eqx.field(static=True)
     free_delay: bool = eqx.field(static=True)
+
+    @property
+    def prior_sd(self) -> np.ndarray:
+        """Standard deviations of theta by the prior."""
+        return np.append(self.prior.log_sd, float(self.delay_sd)) if self.free_delay else self.prior.log_sd
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -74,11 +82,11 @@ class Likelihood(eqx.Module):
         vsc = response(self.circuit(theta), self.drive, self.time - delay, steady_state=self.steady_state)
         return self.gain(theta) * vsc
 
-    def shapes(self, theta: Float[Array, " parameters"]) -> Float[Array, "samples 3"]:
+    def shapes(self, theta: Float[Array, " parameters"]) -> Float[Array, "3 samples"]:
         """The linear nuisances' shapes in time, each of height 1."""
         middle = 0.5 * (self.time[0] + self.time[-1])
         ramp = (self.time - middle) / (self.time[-1] - middle)
-        return jnp.stack([jnp.ones_like(ramp), ramp, self.decay(theta, self.time)], axis=1)
+        return jnp.stack([jnp.ones_like(ramp), ramp, self.decay(theta, self.time)])
 
     def decay(self, theta: Float[Array, " parameters"], time: Float[Array, " times"]) -> Float[Array, " times"]:
         """How an unknown charge at the first sample decays."""
@@ -94,13 +102,12 @@ class Likelihood(eqx.Module):
         deviations, and the Cholesky factor of their posterior precision.
         """
         remainder = self.observed - self.signal(theta)
-        A = self.shapes(theta) * self.linear_sd
+        A = self.linear_sd[:, None] * self.shapes(theta)
         # keep XLA from computing both once per use
         remainder, A = lax.optimization_barrier((remainder, A))
-        factor = jnp.linalg.cholesky(jnp.eye(3) + A.T @ A / sigma**2)
-        half = jnp.linalg.solve(factor, A.T @ remainder / sigma**2)
-        beta = jnp.linalg.solve(factor.T, half)
-        return remainder - A @ beta, beta, factor
+        factor = jnp.linalg.cholesky(jnp.eye(3) + A @ A.T / sigma**2)
+        beta = cho_solve((factor, True), A @ remainder / sigma**2)
+        return remainder - beta @ A, beta, factor
 
     def drawn(
         self, theta: Float[Array, " parameters"], sigma: ArrayLike, deviate: ArrayLike = 0.0
@@ -110,7 +117,7 @@ class Likelihood(eqx.Module):
         With a `deviate` of 0, their posterior mean given theta.
         """
         _, beta, factor = self.linear(theta, sigma)
-        return beta + jnp.linalg.solve(factor.T, jnp.zeros(3) + deviate)
+        return beta + solve_triangular(factor.T, jnp.zeros(3) + deviate)
 
     def residuals(self, theta: Float[Array, " parameters"], sigma: ArrayLike) -> Float[Array, " samples+3"]:
         """Whitened residuals, nuisances' priors included: half their square is -log-likelihood."""
@@ -120,7 +127,7 @@ class Likelihood(eqx.Module):
     def prior_residuals(self, theta: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         """The prior as residuals: normal in theta, with the moments of the stated prior."""
         scale = (theta[: len(self.prior.names)] - self.prior.log_mean) / self.prior.log_sd
-        return jnp.append(scale, theta[-1]) if self.free_delay else scale
+        return jnp.append(scale, theta[-1] / self.delay_sd) if self.free_delay else scale
 
     def log_prob(self, point: Float[Array, " parameters+1"]) -> Float[Array, ""]:
         """Log-posterior of (theta, log sigma), up to a constant; sigma's prior is flat in its logarithm.
@@ -133,12 +140,16 @@ class Likelihood(eqx.Module):
         value = -0.5 * misfit - self.observed.size * log_sigma - jnp.sum(jnp.log(jnp.diagonal(factor)))
         value = value + self.prior.log_density(theta[: len(self.prior.names)])
         if self.free_delay:
-            value = value - 0.5 * theta[-1] ** 2
+            value = value - 0.5 * jnp.square(theta[-1] / self.delay_sd)
         return jnp.where(jnp.isfinite(value), value, -jnp.inf)
 
 
 def in_batches(
-    function: Callable[..., Array], model: eqx.Module, arrays: tuple[np.ndarray, ...], samples: int, batch: int = 32
+    function: Callable[..., Array],
+    model: eqx.Module,
+    arrays: tuple[np.ndarray, ...],
+    samples: int,
+    batch: int = 32,
 ) -> np.ndarray:
     """`function(model, *rows)` over the rows of arrays of one length, a batch at a time.
 
@@ -161,8 +172,9 @@ def _batch(function: Callable[..., Array], model: eqx.Module, rows: tuple[Array,
 
 
 def natural(likelihood: Likelihood, theta: np.ndarray) -> dict[str, np.ndarray]:
-    """Points (..., parameters) in SI units, by name."""
+    """Points (..., parameters) in SI units, by name; the delay is that of Vsc against the drive, in all."""
+    start, step = float(likelihood.shift), float(likelihood.time_step)
     return {
-        name: theta[..., i] * float(likelihood.time_step) if name == "delay" else np.exp(theta[..., i])
+        name: start + theta[..., i] * step if name == "delay" else np.exp(theta[..., i])
         for i, name in enumerate(likelihood.names)
     }

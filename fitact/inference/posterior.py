@@ -139,7 +139,10 @@ class Posterior:
 
     def summary(self) -> dict[str, Any]:
         """What summary.json holds."""
-        fitted, prior_sd = self.fit.to_dict(), dict(zip(self.fit.likelihood.prior.names, self.fit.likelihood.prior.log_sd, strict=True))
+        fitted, prior_sd = (
+            self.fit.to_dict(),
+            dict(zip(self.fit.likelihood.prior.names, self.fit.likelihood.prior.log_sd, strict=True)),
+        )
         parameters = {}
         for name, draws in self.parameters().items():
             parameters[name] = summary.of_draws(name, draws)
@@ -154,10 +157,14 @@ class Posterior:
             "model": fitted["model"],
             "warnings": list(self.warnings),
             "seed": self.seed,
-            "record": {"source": os.path.basename(self.fit.record.source), "samples": len(self.fit.record), "sha256": self.fit.record.fingerprint},
+            "record": self._record(),
             "scene": self.fit.scene.model_dump(mode="json", exclude_unset=True),
-            "versions": {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in _PACKAGES},
-        }  # fmt: skip
+            "versions": _versions(),
+        }
+
+    def _record(self) -> dict[str, Any]:
+        record = self.fit.record
+        return {"source": os.path.basename(record.source), "samples": len(record), "sha256": record.fingerprint}
 
     def __str__(self) -> str:
         rows = [f"{'':14}{'median':>12}{'5 %':>14}{'95 %':>12}"]
@@ -185,9 +192,13 @@ class Posterior:
         believed = self.fit.likelihood.prior.sample(rng, ensembles * count)
         prior = {name: draws.reshape(ensembles, count) for name, draws in believed.items()}
         volts = {"units": "V"}
-        observed = xr.Dataset({"Vsc": ("time", record["Vsc"], volts)}, coords={"time": ("time", record.time, {"units": "s"})})
+        observed = xr.Dataset(
+            {"Vsc": ("time", record["Vsc"], volts)}, coords={"time": ("time", record.time, {"units": "s"})}
+        )
         known = {"V": self.fit.choice.voltage, "Vsc_fit": record["Vsc"] - self.fit.residuals}
-        known_data = xr.Dataset({name: ("time", values, volts) for name, values in known.items()}, coords=observed.coords)
+        known_data = xr.Dataset(
+            {name: ("time", values, volts) for name, values in known.items()}, coords=observed.coords
+        )
         statistics = xr.Dataset({"lp": (("chain", "draw"), self.log_prob)}, coords=dataset(prior).coords)
         return xr.DataTree.from_dict(
             {
@@ -202,12 +213,11 @@ class Posterior:
         )
 
     def _attributes(self) -> dict[str, Any]:
-        fingerprint = self.fit.record.fingerprint
         return {
             "inference_library": "fitact",
             "inference_library_version": importlib.metadata.version("fitact"),
-            "record": os.path.basename(self.fit.record.source),
-            "record_sha256": fingerprint,
+            "record": self._record()["source"],
+            "record_sha256": self.fit.record.fingerprint,
             "scene": self.fit.scene.to_json(),
             "seed": self.seed,
         }
@@ -244,6 +254,10 @@ class Posterior:
         write_report(path, self.to_datatree(), self.summary(), self.fit.to_dict())
 
 
+def _versions() -> dict[str, str]:
+    return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in _PACKAGES}
+
+
 def _derived_of(derive: derived.Derived, point: Array, deviate: Array) -> Array:
     return derive(point[:-1], jnp.exp(point[-1]), deviate)
 
@@ -254,4 +268,4 @@ def _linear_of(likelihood: Likelihood, point: Array, deviate: Array) -> Array:
 
 def _signal_of(likelihood: Likelihood, point: Array, deviate: Array) -> Array:
     theta, beta = point[:-1], _linear_of(likelihood, point, deviate)
-    return likelihood.signal(theta) + (likelihood.shapes(theta) * likelihood.linear_sd) @ beta
+    return likelihood.signal(theta) + (beta * likelihood.linear_sd) @ likelihood.shapes(theta)

@@ -60,7 +60,9 @@ def sample(
     """
     names = (*fit.names, "sigma")
     if walkers % 2 or walkers < 2 * len(names) or ensembles < 2:
-        raise InputError(f"walkers = {walkers}, ensembles = {ensembles}: at least {2 * len(names)}, even; and at least 2")
+        raise InputError(
+            f"walkers = {walkers}, ensembles = {ensembles}: at least {2 * len(names)}, even; and at least 2"
+        )
     path = None if chain_file is None else Path(chain_file)
     with jax.enable_x64(True):
         run = _Run.start(fit, names, seed, walkers, ensembles, path)
@@ -189,7 +191,10 @@ def _vectorised(likelihood: Likelihood, half: int) -> Callable[[np.ndarray], np.
 
 
 def _starts(
-    proposal: _StudentT, log_prob: Callable[[np.ndarray], np.ndarray], walkers: int, random: np.random.RandomState
+    proposal: _StudentT,
+    log_prob: Callable[[np.ndarray], np.ndarray],
+    walkers: int,
+    random: np.random.RandomState,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Over-dispersed draws that the posterior allows, with their log-probabilities."""
     found: list[np.ndarray] = []
@@ -219,7 +224,16 @@ def _fingerprint(fit: Fit, names: tuple[str, ...], seed: int, walkers: int, ense
     """What a chain belongs to; any change of it makes another chain."""
     from fitact import __version__
 
-    settings = [fit.record.fingerprint, fit.scene.to_json(), fit.choice.name, names, fit.theta.tolist(), seed, walkers, ensembles]
+    settings = [
+        fit.record.fingerprint,
+        fit.scene.to_json(),
+        fit.choice.name,
+        names,
+        fit.theta.tolist(),
+        seed,
+        walkers,
+        ensembles,
+    ]
     return hashlib.sha256(json.dumps([__version__, *settings]).encode()).hexdigest()
 
 
@@ -234,7 +248,12 @@ class _Reporter:
             from rich.console import Console
             from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-            columns = (TextColumn("sampling"), BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+            columns = (
+                TextColumn("sampling"),
+                BarColumn(),
+                TextColumn("{task.description}"),
+                TimeElapsedColumn(),
+            )
             self._bar = Progress(*columns, console=Console(stderr=True))
             self._bar.start()
             self._task = self._bar.add_task("starting", total=1.0)

@@ -1,6 +1,7 @@
 """What a record says before any fit: which drive to use, and the divider and time constant by a linear fit."""
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +9,7 @@ from jaxtyping import Float
 
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.model.drive import Drive, Sampled
+from fitact.model.drive import Drive, Sampled, Sine
 from fitact.model.scene import Scene
 
 
@@ -52,6 +53,11 @@ def choose_drive(record: Record, scene: Scene | None) -> DriveChoice:
         return _measured(record, scene.steady_state() if scene else None, ())
     drive = scene.make_drive()
     shift = _align(record, drive, scene.drive.frequency)
+    if shift != 0.0 and "V" not in record and isinstance(drive, Sine):
+        raise InputError(
+            f"{record.source}: does not start where the scene's sine does, and without V_V the phase of the drive"
+            " cannot be told from the circuit's; record V_V, or let t = 0 be its upward zero crossing"
+        )
     voltage = np.asarray(drive.value(record.time - shift))
     notes: tuple[str, ...] = ()
     if shift != 0.0:
@@ -135,7 +141,7 @@ def linear_start(record: Record, choice: DriveChoice) -> LinearStart:
 
 
 def _mismatch(record: Record, voltage: np.ndarray) -> float:
-    """Rms difference between recorded and computed V beyond V's noise, over V's rms; edges' samples apart by one step count."""
+    """Rms difference between recorded and computed V beyond V's noise, over V's rms."""
     difference = record["V"] - voltage
     beyond = max(np.mean(difference**2) - record.noise("V") ** 2, 0.0)
     return float(np.sqrt(beyond / np.mean(voltage**2)))
@@ -160,8 +166,9 @@ def _align(record: Record, drive: Drive, frequency: float) -> float:
         if "V" not in record:
             columns.append(np.cumsum(wave - wave.mean()))
         design = np.stack(columns, axis=1)
-        remainder = target - design @ np.linalg.lstsq(design, target, rcond=None)[0]
-        return float(remainder @ remainder)
+        weights = np.linalg.lstsq(design, target, rcond=None)[0]
+        remainder = target - design @ weights
+        return float(remainder @ remainder) if weights[1] > 0.0 else math.inf  # else half a period off
 
     shifts = np.arange(0.0, 1.0, 1.0 / 128.0) / frequency
     errors = np.array([left(shift) for shift in shifts])

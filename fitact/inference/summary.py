@@ -5,8 +5,11 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from fitact.units import engineering
+
 UNITS = {
-    "Rsc": "ohm", "Csc": "F", "Ci": "F", "gain": "1", "delay": "s", "sigma": "V", "offset": "V", "drift": "V", "charge": "V",
+    "Rsc": "ohm", "Csc": "F", "Ci": "F", "gain": "1", "delay": "s", "sigma": "V",
+    "offset": "V", "drift": "V", "charge": "V",
     "g": "1", "b": "s", "force_mean": "N", "force_peak": "N", "force_rms": "N", "friction_mean": "N",
 }  # fmt: skip
 # standard normal quantiles of the summary's probabilities
@@ -21,7 +24,11 @@ Summary = dict[str, float | str]
 def of_draws(name: str, draws: Float[np.ndarray, "*shape"]) -> Summary:
     """Summary of draws of the quantity `name`, in its SI unit."""
     quantiles = np.quantile(draws, [float(f"0.{key[1:]}") for key in _NORMAL])
-    summary: Summary = {"unit": UNITS[name], "mean": float(np.mean(draws)), "sd": float(np.std(draws, ddof=1))}
+    summary: Summary = {
+        "unit": UNITS[name],
+        "mean": float(np.mean(draws)),
+        "sd": float(np.std(draws, ddof=1)),
+    }
     return summary | {key: float(value) for key, value in zip(_NORMAL, quantiles, strict=True)}
 
 
@@ -36,3 +43,11 @@ def normal(name: str, mean: float, sd: float) -> Summary:
     """Summary of a normal quantity."""
     summary: Summary = {"unit": UNITS[name], "mean": mean, "sd": sd}
     return summary | {key: mean + z * sd for key, z in _NORMAL.items()}
+
+
+def width(summary: Summary) -> str:
+    """Its standard deviation for people: in per cent of the mean, or as it is where that says little."""
+    mean, sd = float(summary["mean"]), float(summary["sd"])
+    if sd > 0.5 * abs(mean):
+        return engineering(sd, str(summary["unit"]), 2)
+    return f"{np.format_float_positional(100.0 * sd / abs(mean), 2, fractional=False, trim='-')} %"

@@ -71,12 +71,12 @@ class FinalCircuit(Circuit):
     @property
     def g(self) -> ArrayLike:
         """The divider a / b = Ci / (2 Ci + Csc), the gain at high frequency; below 1/2."""
-        return self.Ci / (2.0 * self.Ci + self.Csc)  # type: ignore[operator]
+        return self.Ci / (2.0 * self.Ci + self.Csc)
 
     @property
     def b(self) -> ArrayLike:
         """The time constant Rsc (2 Ci + Csc), s."""
-        return self.Rsc * (2.0 * self.Ci + self.Csc)  # type: ignore[operator]
+        return self.Rsc * (2.0 * self.Ci + self.Csc)
 
     def terms(self) -> Terms:
         """One term: the divider g with the time constant b."""

@@ -108,7 +108,13 @@ class Trapezoid(PiecewiseLinear):
         """Rise, high, fall, low."""
         half = 0.5 * jnp.asarray(self.peak_to_peak, dtype=float)
         rise = jnp.asarray(self.rise_time, dtype=float)
-        knots = [0.0 * self.period, rise, self.duty * self.period, self.duty * self.period + rise, self.period]
+        knots = [
+            0.0 * self.period,
+            rise,
+            self.duty * self.period,
+            self.duty * self.period + rise,
+            self.period,
+        ]
         start = self.offset + jnp.stack([-half, half, half, -half])
         end = self.offset + jnp.stack([half, half, -half, -half])
         return Pieces(jnp.stack(knots), start, end)

@@ -29,26 +29,34 @@ class Contact(eqx.Module):
 
     @classmethod
     def from_capacitances(
-        cls, Ci: ArrayLike, Csc: ArrayLike, area: ArrayLike, insulator_thickness: ArrayLike, skin_thickness: ArrayLike
+        cls,
+        Ci: ArrayLike,
+        Csc: ArrayLike,
+        area: ArrayLike,
+        insulator_thickness: ArrayLike,
+        skin_thickness: ArrayLike,
     ) -> "Contact":
         """The contact whose permittivities give the capacitances `Ci` and `Csc` (F) by eq. (3)."""
         unit = EPSILON_0 * jnp.asarray(area)
         return cls(
-            area, insulator_thickness, Ci * insulator_thickness / unit, skin_thickness, Csc * skin_thickness / unit
+            area,
+            insulator_thickness,
+            Ci * insulator_thickness / unit,
+            skin_thickness,
+            Csc * skin_thickness / unit,
         )
 
 
 def plate_capacitance(permittivity: ArrayLike, area: ArrayLike, thickness: ArrayLike) -> ArrayLike:
     """C = eps0 eps_r A / T in F, eq. (3); `area` in m^2, `thickness` in m."""
-    return EPSILON_0 * permittivity * area / thickness  # type: ignore[operator]
+    return EPSILON_0 * permittivity * area / thickness
 
 
 def electrostatic_force(vsc: ArrayLike, contact: Contact) -> Float[Array, "*shape"]:
     """The electrostatic force in N for the skin voltage `vsc` (V), eqs. (1) and (22)."""
-    layers = (
-        contact.insulator_thickness / jnp.asarray(contact.insulator_permittivity)
-        + contact.skin_thickness / jnp.asarray(contact.skin_permittivity)
-    )
+    layers = contact.insulator_thickness / jnp.asarray(
+        contact.insulator_permittivity
+    ) + contact.skin_thickness / jnp.asarray(contact.skin_permittivity)
     gap = jnp.asarray(contact.insulator_thickness) + contact.skin_thickness
     return EPSILON_0 * contact.area * jnp.square(vsc) / (2.0 * layers * gap)
 

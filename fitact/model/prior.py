@@ -48,7 +48,9 @@ class LogNormal(Distribution):
 
     def __check_init__(self) -> None:
         if not (self.median > 0.0 and self.spread > 0.0):
-            raise InputError(f"a log-normal prior needs a median and a spread above zero, not {self.median}, {self.spread}")
+            raise InputError(
+                f"a log-normal prior needs a median and a spread above zero, not {self.median}, {self.spread}"
+            )
 
     @classmethod
     def within_factor(cls, median: float, factor: float) -> "LogNormal":

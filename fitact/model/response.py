@@ -15,15 +15,12 @@ from jaxtyping import Array, Float
 
 from fitact.errors import InputError
 from fitact.model.circuit import Circuit, highpass_gain
-from fitact.model.drive import Drive, PiecewiseLinear, Pieces, Sampled, Sine
-
+from fitact.model.drive import Drive, Pieces, PiecewiseLinear, Sampled, Sine
 
 _SERIES = 0.03  # below, the quotients with expm1 lose digits in their derivatives
 
 
-def response(
-    circuit: Circuit, drive: Drive, time: ArrayLike, *, steady_state: bool = True
-) -> Float[Array, "*shape"]:
+def response(circuit: Circuit, drive: Drive, time: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
     """The skin voltage Vsc(t) in V at `time` (s), exact for the drives of `fitact.model.drive`.
 
     In the steady state, or, with ``steady_state=False``, from rest: no charge anywhere and no drive
@@ -39,9 +36,7 @@ def response(
     return total
 
 
-def highpass(
-    drive: Drive, time: ArrayLike, tau: ArrayLike, *, steady_state: bool = True
-) -> Float[Array, "*shape"]:
+def highpass(drive: Drive, time: ArrayLike, tau: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
     """The response of s tau / (1 + s tau) to `drive` at `time`; arguments as in `response`."""
     time = jnp.asarray(time, dtype=float)
     if isinstance(drive, Sine):
@@ -78,7 +73,9 @@ def _recurrence(decay: Float[Array, " n"], gain: Float[Array, " n"], first: Floa
     decay = jnp.pad(decay, (0, missing), constant_values=1.0).reshape(-1, width)
     gain = jnp.pad(gain, (0, missing)).reshape(-1, width)
 
-    def within(carry: tuple[Array, Array], step: tuple[Array, Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    def within(
+        carry: tuple[Array, Array], step: tuple[Array, Array]
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         carry = carry[0] * step[0], carry[1] * step[0] + step[1]
         return carry, carry
 

@@ -8,7 +8,7 @@ import difflib
 import json
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias
 
 import pydantic
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
@@ -21,17 +21,41 @@ from fitact.model.force import plate_capacitance
 from fitact.model.prior import Distribution, LogNormal, Prior, Uniform
 
 
-def _quantity(unit: str, **bounds: float) -> Any:
+def _quantity(unit: str, **bounds: Any) -> Any:
     """The type of a field in `unit`: SI floats inside, text with units accepted."""
-    return Annotated[float, BeforeValidator(lambda value: units.parse(value, unit)), Field(**bounds)]  # type: ignore[arg-type]
+    return Annotated[float, BeforeValidator(lambda value: units.parse(value, unit)), Field(**bounds)]
 
 
-Ohm = _quantity("ohm", gt=0)
-Farad = _quantity("F", gt=0)
-Meter = _quantity("m", gt=0)
-Second = _quantity("s", gt=0)
-Hertz = _quantity("Hz", gt=0)
-Ratio = _quantity("", gt=0)
+if TYPE_CHECKING:
+    Ohm: TypeAlias = float
+    Farad: TypeAlias = float
+    Meter: TypeAlias = float
+    SquareMeter: TypeAlias = float
+    Second: TypeAlias = float
+    Hertz: TypeAlias = float
+    Ratio: TypeAlias = float
+    Volt: TypeAlias = float
+    AnyVolt: TypeAlias = float
+    AnyOhm: TypeAlias = float
+    NoiseVolt: TypeAlias = float
+    NoiseAmpere: TypeAlias = float
+    Newton: TypeAlias = float
+    Threshold: TypeAlias = float
+else:
+    Ohm = _quantity("ohm", gt=0)
+    Farad = _quantity("F", gt=0)
+    Meter = _quantity("m", gt=0)
+    SquareMeter = _quantity("m^2", gt=0)
+    Second = _quantity("s", gt=0)
+    Hertz = _quantity("Hz", gt=0)
+    Ratio = _quantity("", gt=0)
+    Volt = _quantity("V", gt=0)
+    AnyVolt = _quantity("V")
+    AnyOhm = _quantity("ohm", ge=0)
+    NoiseVolt = _quantity("V", ge=0)
+    NoiseAmpere = _quantity("A", ge=0)
+    Newton = _quantity("N", ge=0)
+    Threshold = _quantity("N", gt=0)
 
 
 class _Section(pydantic.BaseModel):
@@ -44,7 +68,7 @@ class Device(_Section):
     Ci: Farad = 1.35e-9
     insulator_thickness: Meter = 1e-6
     insulator_permittivity: Ratio = 3.9
-    contact_area: _quantity("m^2", gt=0) = 1e-4
+    contact_area: SquareMeter = 1e-4
 
     @model_validator(mode="after")
     def _capacitance_of_the_layer(self) -> Self:
@@ -78,11 +102,11 @@ class DriveSection(_Section):
     """The voltage on the electrode."""
 
     waveform: Literal["sine", "triangle", "square", "trapezoid", "burst", "chirp", "measured"] = "square"
-    peak_to_peak: _quantity("V", gt=0) = 360.0
+    peak_to_peak: Volt = 360.0
     frequency: Hertz = 100.0
     rise_time: Second | None = None
     duty: Annotated[float, Field(gt=0, lt=1)] = 0.5
-    offset: _quantity("V") = 0.0
+    offset: AnyVolt = 0.0
     steady_state: bool = True
 
     @model_validator(mode="after")
@@ -103,13 +127,13 @@ class Measurement(_Section):
     """What is recorded, and through what."""
 
     channels: tuple[Literal["Vsc", "I"], ...] = Field(default=("Vsc",), min_length=1)
-    series_resistor: _quantity("ohm", ge=0) = 0.0
+    series_resistor: AnyOhm = 0.0
     probe_resistance: Ohm | None = None
     probe_capacitance: Farad | None = None
     sampling_rate: Hertz = 200e3
     duration: Second = 20e-3
-    noise_Vsc: _quantity("V", ge=0) = 0.1
-    noise_I: _quantity("A", ge=0) = 20e-9
+    noise_Vsc: NoiseVolt = 0.1
+    noise_I: NoiseAmpere = 20e-9
     gain_relative_sd: Annotated[float, Field(ge=0, lt=1)] = 0.0
 
 
@@ -117,7 +141,7 @@ class Friction(_Section):
     """Eq. (2)."""
 
     coefficient: Annotated[float, Field(gt=0)] = 0.5
-    normal_force: _quantity("N", ge=0) = 0.5
+    normal_force: Newton = 0.5
 
 
 class Belief(_Section):
@@ -132,7 +156,13 @@ class Belief(_Section):
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
         given = self.model_fields_set
-        kinds = ({"low", "high"}, {"factor"}, {"relative_sd"}, {"median", "factor"}, {"median", "relative_sd"})
+        kinds = (
+            {"low", "high"},
+            {"factor"},
+            {"relative_sd"},
+            {"median", "factor"},
+            {"median", "relative_sd"},
+        )
         if given not in kinds:
             raise ValueError("write {median, factor}, {median, relative_sd} or {low, high}")
         if self.low is not None and self.high is not None and not self.low < self.high:
@@ -159,6 +189,14 @@ def _belief(unit: str) -> Any:
     return Annotated[Belief, BeforeValidator(parse)]
 
 
+if TYPE_CHECKING:
+    BeliefOhm: TypeAlias = Belief
+    BeliefFarad: TypeAlias = Belief
+else:
+    BeliefOhm = _belief("ohm")
+    BeliefFarad = _belief("F")
+
+
 class PriorSection(_Section):
     """Beliefs; where one is silent on the median, the device's or the skin's value is it.
 
@@ -166,9 +204,9 @@ class PriorSection(_Section):
     (10 kohm and 5 nF dry, 4.3 kohm and 200 nF wet); the insulator's is a data sheet's 5 %.
     """
 
-    Rsc: _belief("ohm") = Belief(factor=50.0)
-    Csc: _belief("F") = Belief(factor=20.0)
-    Ci: _belief("F") = Belief(relative_sd=0.05)
+    Rsc: BeliefOhm = Belief(factor=50.0)
+    Csc: BeliefFarad = Belief(factor=20.0)
+    Ci: BeliefFarad = Belief(relative_sd=0.05)
 
 
 class ForceSection(_Section):
@@ -180,7 +218,7 @@ class ForceSection(_Section):
 class Perception(_Section):
     """What counts as felt."""
 
-    threshold_force: _quantity("N", gt=0) | None = None
+    threshold_force: Threshold | None = None
     friction_change: Annotated[float, Field(gt=0)] | None = None
 
 
@@ -297,7 +335,8 @@ class Scene(_Section):
             assert d.rise_time is not None  # checked when the section was read
             return Trapezoid(d.peak_to_peak, d.frequency, d.rise_time, d.duty, d.offset)
         raise InputError(
-            f"scene: [drive] waveform = '{d.waveform}' gives no drive to compute; name sine, triangle, square or trapezoid"
+            f"scene: [drive] waveform = '{d.waveform}' gives no drive to compute;"
+            " name sine, triangle, square or trapezoid"
         )
 
     def make_prior(self) -> Prior:

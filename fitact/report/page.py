@@ -8,10 +8,10 @@ from typing import Any
 
 import jinja2
 import matplotlib as mpl
-import numpy as np
 
 from fitact.errors import InputError
 from fitact.files import replacing
+from fitact.inference.summary import width
 from fitact.report import plots
 from fitact.units import engineering
 
@@ -39,7 +39,7 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("fitact.report"), autoescape=True, undefined=jinja2.StrictUndefined
     )
-    with mpl.rc_context(dict(plots.style())):
+    with mpl.rc_context(plots.style()):
         figures = _figures(tree)
     page = environment.get_template("report.html").render(
         summary=summary,
@@ -47,7 +47,7 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
         figures=figures,
         labels=_LABELS,
         quantity=_quantity,
-        percent=_percent,
+        width=width,
         command=_command(summary),
         scene=json.dumps(summary["scene"], indent=2, ensure_ascii=False),
     )
@@ -91,18 +91,13 @@ def _figures(tree: Any) -> dict[str, str]:
         "force": plots.force_figure(posterior),
     }
     # an SVG in an <img> cannot clash with another's ids, and carries its alt text
-    return {name: "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode() for name, svg in figures.items()}
+    return {
+        name: "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode() for name, svg in figures.items()
+    }
 
 
 def _quantity(summary: dict[str, Any], key: str = "q50", digits: int = 4) -> str:
     return engineering(summary[key], summary["unit"], digits)
-
-
-def _percent(summary: dict[str, Any]) -> str:
-    """Standard deviation relative to the mean, in per cent."""
-    if not summary["mean"]:
-        return "–"
-    return f"{np.format_float_positional(100.0 * summary['sd'] / abs(summary['mean']), 2, fractional=False, trim='-')} %"
 
 
 def _command(summary: dict[str, Any]) -> str:

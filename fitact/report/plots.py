@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Mapping
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -10,7 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-_DATA, _MODEL, _PRIOR, _ALERT = "#333333", "#0072B2", "#999999", "#D55E00"  # told apart by the colour-blind, too
+_DATA, _MODEL, _PRIOR, _ALERT = (
+    "#333333",
+    "#0072B2",
+    "#999999",
+    "#D55E00",
+)  # told apart by the colour-blind, too
 _STYLE = {
     "font.size": 11.0,
     "axes.spines.top": False,
@@ -28,9 +34,9 @@ _CORNER_POINTS = 1200
 Draws = Mapping[str, Float[np.ndarray, " draws"]]
 
 
-def style() -> Mapping[str, object]:
+def style() -> Any:
     """Settings that all figures share; use with `matplotlib.rc_context`."""
-    return _STYLE
+    return dict(_STYLE)
 
 
 def record_figure(
@@ -46,7 +52,9 @@ def record_figure(
     above, below = figure.add_subplot(grid[0, :]), figure.add_subplot(grid[1, 0])
     beside = figure.add_subplot(grid[1, 1], sharey=below)
     low, high = np.quantile(predicted, [0.05, 0.95], axis=0)
-    above.fill_between(predicted_time, low, high, color=_MODEL, alpha=0.45, lw=0, label="90 % of predicted records")
+    above.fill_between(
+        predicted_time, low, high, color=_MODEL, alpha=0.45, lw=0, zorder=3, label="90 % of predicted records"
+    )
     above.plot(time, observed, ".", color=_DATA, ms=1.5, label="record", rasterized=True)
     above.set_ylabel("skin voltage Vsc")
     above.legend(loc="upper right", framealpha=0.9, markerscale=5)
@@ -141,9 +149,7 @@ def _ticks(axis: mpl.axis.Axis, limits: tuple[float, float], unit: str, labelled
     places = np.exp(ends[0] + np.array([0.2, 0.5, 0.8]) * (ends[1] - ends[0]))
     axis.set_major_locator(mpl.ticker.FixedLocator([float(f"{place:.2g}") for place in places]))
     axis.set_minor_locator(mpl.ticker.NullLocator())
-    axis.set_major_formatter(
-        EngFormatter(_SYMBOLS.get(unit, unit)) if labelled else mpl.ticker.NullFormatter()
-    )
+    axis.set_major_formatter(EngFormatter(_SYMBOLS.get(unit, unit)) if labelled else mpl.ticker.NullFormatter())
 
 
 def _svg(figure: Figure) -> str:

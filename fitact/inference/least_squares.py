@@ -1,0 +1,161 @@
+"""Levenberg-Marquardt by optimistix, and which nuisances a record asks for."""
+
+import dataclasses
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from fitact.inference.likelihood import LINEAR, Likelihood, in_batches
+
+_EVIDENCE = 10.0  # a nuisance is freed when it lowers the Bayesian information criterion by this much
+
+
+class RESULTS(optx.RESULTS):
+    """Why a fit ended: optimistix's results, and what else makes an answer untrustworthy."""
+
+    did_not_move = (
+        "The fit never left its start although the record asks for another answer; check the units of the record."
+    )
+    not_at_optimum = "The fit stopped before its optimum; check the units of the record, or give a nearer prior."
+    misfit = (
+        "The model does not describe the record: its residuals are larger than the noise or have structure;"
+        " look at them in the report, and use the drive as measured or a scene that has what is missing."
+    )
+
+
+_NAMES = (
+    "successful", "did_not_move", "not_at_optimum", "misfit",
+    "nonfinite", "nonlinear_max_steps_reached", "nonlinear_divergence",
+)  # fmt: skip
+
+
+def result_name(result: Any) -> str:
+    """The name of a member of `RESULTS`; a linear solver's failure counts as "nonfinite"."""
+    return next((name for name in _NAMES if bool(result == getattr(RESULTS, name))), "nonfinite")
+
+
+def result_message(name: str) -> str:
+    """The sentence of a member of `RESULTS`, by its name."""
+    return str(RESULTS[getattr(RESULTS, name)])  # type: ignore[misc]  # equinox's enumerations look up by item
+
+
+class Solved(eqx.Module):
+    """Where Levenberg-Marquardt ended; `start` is where the last fit began."""
+
+    likelihood: Likelihood
+    start: Float[Array, " parameters"]
+    theta: Float[Array, " parameters"]
+    sigma: Float[Array, ""]
+    result: Any
+    steps: Array
+    residuals: Float[Array, " samples"]
+    beta: Float[Array, " 3"]
+    jacobian: Float[Array, "samples parameters"]
+    shapes: Float[Array, "3 samples"]  # of the linear nuisances
+    slope: Float[Array, " samples"]  # of the signal in a further delay
+    gradient: Float[Array, " parameters"]  # of minus the log-posterior
+
+
+def _least_squares(likelihood: Likelihood, start: Array, noise: float | Array) -> Solved:
+    """Two rounds: with the noise as given, then with that of the residuals."""
+    first = _round(likelihood, start, jnp.asarray(noise, dtype=float))
+    second = _round(likelihood, first.theta, first.sigma)
+    return eqx.tree_at(lambda x: (x.start, x.steps), second, (start, first.steps + second.steps))
+
+
+@eqx.filter_jit
+def _round(likelihood: Likelihood, start: Array, sigma: Array) -> Solved:
+    def residuals(theta: Array, _: None) -> tuple[Array, Array]:
+        return likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)
+
+    solver: Any = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
+    solution: Any = optx.least_squares(residuals, solver, start, max_steps=256, throw=False)
+    theta = solution.value
+    (of_data, of_prior), (jacobian, prior_jacobian) = (
+        residuals(theta, None),
+        jax.jacfwd(residuals)(theta, None),
+    )
+    remainder, beta, _ = likelihood.linear(theta, sigma)
+    later = jnp.zeros(())
+    return Solved(
+        likelihood=likelihood,
+        start=start,
+        theta=theta,
+        sigma=jnp.sqrt(jnp.sum(jnp.square(remainder)) / max(remainder.size - start.size, 1)),
+        result=RESULTS.promote(solution.result),
+        steps=solution.stats["num_steps"],
+        residuals=remainder,
+        beta=beta,
+        jacobian=jacobian,
+        shapes=likelihood.shapes(theta),
+        slope=jax.jvp(lambda later: likelihood.signal(theta, later), (later,), (jnp.ones_like(later),))[1],
+        gradient=jacobian.T @ of_data + prior_jacobian.T @ of_prior,
+    )
+
+
+def solve(likelihood: Likelihood, start: Float[np.ndarray, " parameters"], noise: float) -> Solved:
+    """Fit; then free offset, drift or delay, one at a time, as long as the record asks for one."""
+    solved = _least_squares(likelihood, jnp.asarray(start), noise)
+    for _ in range(3):
+        gains = _evidence(solved)
+        name = max(gains, key=gains.__getitem__, default="")
+        if not name or not gains[name] > _EVIDENCE:
+            break
+        theta = solved.theta
+        if name == "delay":
+            shift = likelihood.shift + _nearest_delay(solved)
+            likelihood = dataclasses.replace(likelihood, free_delay=True, shift=shift)
+            theta = jnp.append(theta, 0.0)
+        else:
+            sd = likelihood.linear_sd.at[LINEAR.index(name)].set(10.0 * jnp.ptp(likelihood.observed))
+            likelihood = dataclasses.replace(likelihood, linear_sd=sd)
+        solved = eqx.tree_at(lambda x: x.start, _least_squares(likelihood, theta, solved.sigma), theta)
+    return solved
+
+
+def _nearest_delay(solved: Solved) -> Array:
+    """The middle of the best of a grid of delays within five steps (s): across an ideal edge there is no slope
+    to follow, and between two samples nothing that a gain could not do as well.
+    """
+    likelihood, theta = solved.likelihood, solved.theta
+    delays = np.arange(-40, 41) / 8.0
+    later = jnp.asarray(delays) * likelihood.time_step
+    repeated = jnp.tile(theta, (delays.size, 1))
+    signals = in_batches(Likelihood.signal, likelihood, (np.asarray(repeated), np.asarray(later)), likelihood.time.size)
+    shapes = np.asarray(solved.shapes)[np.asarray(likelihood.linear_sd) > 0.0]
+    left = []
+    for signal in signals:
+        design = np.vstack([signal, shapes]).T
+        remainder = likelihood.observed - design @ np.linalg.lstsq(design, likelihood.observed, rcond=None)[0]
+        left.append(float(remainder @ remainder))
+    good = np.asarray(left) < min(left) * (1.0 + 25.0 / likelihood.observed.size)
+    return jnp.asarray(np.mean(delays[good])) * likelihood.time_step
+
+
+def _evidence(solved: Solved) -> dict[str, float]:
+    """By how much freeing each nuisance would lower the Bayesian information criterion, to first order."""
+    size, linear_sd, shapes = (
+        solved.residuals.size,
+        np.asarray(solved.likelihood.linear_sd),
+        np.asarray(solved.shapes),
+    )
+    candidates = {name: shapes[i] for i, name in enumerate(LINEAR[:2]) if linear_sd[i] == 0.0}
+    if not solved.likelihood.free_delay:
+        candidates["delay"] = np.asarray(solved.slope)
+    known = np.concatenate([np.asarray(solved.jacobian)[:size], (shapes * (linear_sd > 0.0)[:, None]).T], axis=1)
+    basis, values, _ = np.linalg.svd(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300), full_matrices=False)
+    basis = basis[:, values > 1e-9 * values[0]]
+    residuals = np.asarray(solved.residuals)
+    gains = {}
+    for name, column in candidates.items():
+        column = column - basis @ (basis.T @ column)
+        drop = (column @ residuals) ** 2 / max(column @ column, 1e-300)
+        share = min(drop / (residuals @ residuals), 1.0 - 1e-12)
+        gains[name] = -size * math.log1p(-share) - math.log(size)
+    return gains

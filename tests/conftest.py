@@ -1,0 +1,72 @@
+"""Records from routes outside fitact: the shipped one (ngspice), and scipy's state space."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.signal
+
+import fitact
+
+RECORDS = Path(__file__).parents[1] / "data_synth" / "records"
+
+
+@pytest.fixture(scope="session")
+def finger_path() -> Path:
+    return RECORDS / "finger_direct.csv"
+
+
+@pytest.fixture(scope="session")
+def finger_scene_path() -> Path:
+    return RECORDS / "finger_direct.toml"
+
+
+@pytest.fixture(scope="session")
+def finger_truth() -> dict[str, float]:
+    truth = {
+        name: entry["value"]
+        for name, entry in json.loads((RECORDS / "finger_direct.json").read_text())["truth"].items()
+    }
+    total = 2.0 * truth["Ci"] + truth["Csc"]
+    return truth | {"g": truth["Ci"] / total, "b": truth["Rsc"] * total}
+
+
+@pytest.fixture(scope="session")
+def finger_fit(finger_path: Path, finger_scene_path: Path) -> fitact.Fit:
+    scene = fitact.Scene.load(finger_scene_path)
+    return fitact.fit(fitact.read(finger_path, scene), scene)
+
+
+@pytest.fixture(scope="session")
+def finger_posterior(finger_fit: fitact.Fit) -> fitact.Posterior:
+    return fitact.sample(finger_fit, seed=1, progress=False)
+
+
+def skin_voltage(
+    time: np.ndarray, voltage: np.ndarray, Rsc: float, Csc: float, Ci: float, hold: bool = False
+) -> np.ndarray:
+    """Vsc from rest by scipy.signal.lsim, exact for straight lines (or, with hold, steps) between samples."""
+    system = ([Rsc * Ci, 0.0], [Rsc * (2.0 * Ci + Csc), 1.0])
+    return scipy.signal.lsim(system, voltage, time, interp=not hold)[1]
+
+
+def square_record(
+    noise: float = 0.05,
+    offset: float = 0.0,
+    drift: float = 0.0,
+    delay_samples: int = 0,
+    seed: int = 7,
+    Rsc: float = 130e3,
+    Csc: float = 18e-9,
+    Ci: float = 1.35e-9,
+) -> fitact.Record:
+    """Two settled periods of a 360 Vpp square at 100 Hz, 5 us steps, with V sampled exactly at the edges."""
+    per_period, settle, kept = 2000, 12, 2
+    time = np.arange((settle + kept) * per_period) * 5e-6
+    voltage = np.where(np.arange(time.size) % per_period < per_period // 2, 180.0, -180.0)
+    vsc = skin_voltage(time, voltage, Rsc, Csc, Ci, hold=True)
+    last = slice(settle * per_period, None)
+    vsc = np.roll(vsc[last], delay_samples) + noise * np.random.default_rng(seed).standard_normal(kept * per_period)
+    time = time[: kept * per_period]
+    return fitact.Record.from_arrays(time, V=voltage[last], Vsc=vsc + offset + drift * time / time[-1])

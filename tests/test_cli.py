@@ -1,0 +1,230 @@
+"""The command line as a user meets it: another process, its output, its files, its exit code."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+FILES = {"fit.json", "summary.json", "posterior.nc", "chain.h5", "report.html"}
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory) -> dict[str, str]:
+    return os.environ | {"XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache"))}
+
+
+@pytest.fixture
+def fitact_command(environment, tmp_path):
+    def call(*arguments: object) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-c", "from fitact.cli import main; main()", *map(str, arguments)]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=tmp_path)
+        assert "Traceback" not in done.stderr
+        return done
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def results(
+    environment, finger_path, finger_scene_path, tmp_path_factory
+) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    folder = tmp_path_factory.mktemp("run") / "out"
+    command = [
+        sys.executable,
+        "-c",
+        "from fitact.cli import main; main()",
+        "run",
+        finger_path,
+        "--scene",
+        finger_scene_path,
+    ]
+    done = subprocess.run(
+        [*map(str, command), "--out", str(folder), "--seed", "1"],
+        capture_output=True,
+        text=True,
+        env=environment,
+    )
+    return folder, done
+
+
+def test_run_leaves_everything_and_says_what_to_open(results):
+    folder, done = results
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in folder.iterdir()} == FILES  # nothing half-written
+    assert done.stdout.strip().splitlines()[-1] == f"open {folder / 'report.html'}"
+    assert "sampling" in done.stderr
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["identifiability"]["verdict"] == "prior-limited"
+    assert summary["convergence"]["converged"] is True
+
+
+def test_run_again_goes_on_from_the_chain_and_json_stands_alone(
+    results, fitact_command, finger_path, finger_scene_path
+):
+    folder, _ = results
+    before = (folder / "posterior.nc").read_bytes()
+    done = fitact_command("run", finger_path, "--scene", finger_scene_path, "--out", folder, "--seed", 1, "--json")
+    assert done.returncode == 0
+    assert json.loads(done.stdout) == json.loads((folder / "summary.json").read_text())
+    assert "sampling:" not in done.stderr  # it had converged
+    assert (folder / "posterior.nc").read_bytes() == before
+    other = fitact_command("run", finger_path, "--scene", finger_scene_path, "--out", folder, "--seed", 2)
+    assert other.returncode == 2
+    assert "another record, scene, seed" in other.stderr
+    assert (folder / "posterior.nc").read_bytes() == before
+
+
+def test_report_is_made_again_from_the_folder(results, fitact_command, tmp_path):
+    folder, _ = results
+    page = (folder / "report.html").read_text()
+    (folder / "report.html").unlink()
+    done = fitact_command("report", folder)
+    assert done.returncode == 0
+    assert (folder / "report.html").read_text() == page
+    refused = fitact_command("report", tmp_path)
+    assert refused.returncode == 2
+    assert "fitact sample" in refused.stderr
+
+
+def test_fit_json(fitact_command, finger_path):
+    done = fitact_command("fit", finger_path, "--json", "--out", "here")
+    assert done.returncode == 0
+    content = json.loads(done.stdout)
+    assert {"parameters", "derived", "identifiability", "fit", "model", "warnings"} <= set(content)
+    assert any("no scene" in warning for warning in content["warnings"])
+
+
+def test_misfit_is_exit_code_1_with_an_answer(fitact_command, finger_path, tmp_path):
+    header, *rows = finger_path.read_text().splitlines()
+    clipped = [f"{t},{v},{min(max(float(s), -12.0), 12.0)}" for t, v, s in (row.split(",") for row in rows)]
+    (tmp_path / "clipped.csv").write_text("\n".join([header, *clipped]))
+    done = fitact_command("fit", "clipped.csv", "--json", "--out", "clipped")
+    assert done.returncode == 1
+    assert json.loads(done.stdout)["fit"]["misfit"] is True
+    assert json.loads((tmp_path / "clipped" / "fit.json").read_text())["fit"]["result"] == "misfit"
+    assert "must not be trusted" in done.stderr
+
+
+def test_simulate_then_fit_recovers_the_scene(fitact_command, tmp_path):
+    (tmp_path / "scene.toml").write_text(
+        '[skin]\nRsc = "90 kohm"\nCsc = "30 nF"\n[drive]\nwaveform = "trapezoid"\nrise_time = "50 us"\n'
+    )
+    for seed in (3, 3, 4):
+        done = fitact_command("simulate", "scene.toml", "--out", f"{seed}.csv", "--seed", seed, "--json")
+        assert done.returncode == 0
+        assert json.loads(done.stdout)["samples"] == 4000
+    assert (tmp_path / "3.csv").read_text().startswith("time_s,V_V,Vsc_V\n")
+    assert (tmp_path / "3.csv").read_bytes() != (tmp_path / "4.csv").read_bytes()
+    done = fitact_command("fit", "3.csv", "--scene", "scene.toml", "--json")
+    assert done.returncode == 0
+    derived = json.loads(done.stdout)["derived"]
+    for name, truth in {"g": 1.35 / 32.7, "b": 90e3 * 32.7e-9}.items():
+        assert abs(derived[name]["q50"] - truth) < 4.0 * derived[name]["sd"]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("time_s,V_V,Vsc_V\n" + "0,1,x\n" * 30, ["record.csv, line 2, column 3", "x"]),
+        (
+            "time_s,V_V,Vsc_V\n" + "".join(f"{i},1,nan\n" for i in range(30)),
+            ["record.csv, line 2", "Vsc is nan"],
+        ),
+        ("", ["record.csv", "no data"]),
+        ("time_s,V_V\n" + "".join(f"{i},{i % 3}\n" for i in range(30)), ["record.csv", "Vsc_V"]),
+    ],
+)
+def test_refused_input_is_one_sentence_and_exit_code_2(fitact_command, tmp_path, content: str, words: list[str]):
+    (tmp_path / "record.csv").write_text(content)
+    done = fitact_command("run", "record.csv", "--out", "out", "--json")
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert len(done.stderr.strip().splitlines()) == 1
+    for word in words:
+        assert word in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_swapped_columns_and_wrong_units_are_refused(fitact_command, finger_path, tmp_path):
+    header, *rows = finger_path.read_text().splitlines()
+    (tmp_path / "swapped.csv").write_text("\n".join(["time_s,Vsc_V,V_V", *rows]))
+    cells = [row.split(",") for row in rows]
+    (tmp_path / "kv.csv").write_text("\n".join([header, *(f"{t},{float(v) / 1e3!r},{s}" for t, v, s in cells)]))
+    for name in ("swapped.csv", "kv.csv"):
+        done = fitact_command("fit", name)
+        assert done.returncode == 2
+        assert name in done.stderr
+        assert "swapped columns or a wrong unit" in done.stderr
+
+
+def test_directory_missing_file_bad_scene_and_bad_place(fitact_command, finger_path, tmp_path):
+    (tmp_path / "scene.toml").write_text("[devce]\n")
+    (tmp_path / "file").write_text("")
+    for arguments, words in {
+        ("fit", tmp_path): "is a directory",
+        ("fit", "nothing.csv"): "no such file",
+        ("fit", finger_path, "--scene", "scene.toml"): "did you mean 'device'",
+        ("fit", finger_path, "--scene", "nothing.toml"): "no such file",
+        ("fit", finger_path, "--out", "file/below"): "cannot be written",
+        ("run", finger_path, "--seed", "-1"): "seed",
+        ("nonsense",): "nonsense",
+    }.items():
+        done = fitact_command(*arguments)
+        assert done.returncode == 2, done.stderr
+        assert words in done.stderr
+
+
+def test_help_is_a_page_to_start_from(fitact_command):
+    done = fitact_command("--help")
+    assert done.returncode == 0
+    for word in (
+        "fitact run finger.csv",
+        "time_s,V_V,Vsc_V",
+        "--scene",
+        "run",
+        "fit",
+        "sample",
+        "simulate",
+        "report",
+        "Exit code",
+    ):
+        assert word in done.stdout
+    assert fitact_command().stdout.split() == done.stdout.split()
+
+
+def test_an_interrupted_run_goes_on(environment, finger_path, finger_scene_path, results, tmp_path):
+    """SIGINT while it samples: no traceback, exit code not 0, and the same command finishes with the same draws."""
+    import signal
+
+    folder = tmp_path / "out"
+    command = [
+        sys.executable,
+        "-c",
+        "from fitact.cli import main; main()",
+        "run",
+        finger_path,
+        "--scene",
+        finger_scene_path,
+    ]
+    command = [*map(str, command), "--out", str(folder), "--seed", "1"]
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # test runners may pass on an ignored SIGINT
+    )  # fmt: skip
+    assert process.stderr is not None
+    for line in process.stderr:
+        if line.startswith("sampling"):
+            process.send_signal(signal.SIGINT)
+            break
+    _, rest = process.communicate()
+    assert "Traceback" not in rest
+    assert process.returncode in (1, 130)
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0
+    whole = json.loads((results[0] / "summary.json").read_text())["parameters"]
+    again = json.loads((folder / "summary.json").read_text())["parameters"]
+    np.testing.assert_equal(again, whole)

@@ -1,0 +1,220 @@
+import jax
+import numpy as np
+import pytest
+from conftest import square_record
+
+import fitact
+
+SQUARE = fitact.Scene.from_dict({"drive": {"waveform": "square"}})
+
+
+def deviation(fit: fitact.Fit, name: str, truth: float) -> float:
+    """In posterior standard deviations."""
+    s = fit.derived()[name]
+    return (s["q50"] - truth) / s["sd"]
+
+
+def test_shipped_record_with_its_measured_drive(finger_fit: fitact.Fit, finger_truth: dict[str, float]):
+    assert finger_fit.result == "successful"
+    assert finger_fit.choice.name == "measured"
+    for name in ("g", "b"):
+        assert finger_fit.derived()[name]["q50"] == pytest.approx(finger_truth[name], rel=0.01)
+        assert abs(deviation(finger_fit, name, finger_truth[name])) < 3.0
+    for name, s in finger_fit.parameters().items():
+        assert s["q025"] < finger_truth[name] < s["q975"]
+    assert finger_fit.linear["offset"] == pytest.approx(0.08, abs=0.005)
+    assert finger_fit.figures["chi2_reduced"] == pytest.approx(1.0, abs=0.1)
+
+
+def test_verdict_on_vsc_alone(finger_fit: fitact.Fit):
+    verdict = finger_fit.identifiability
+    assert verdict.verdict == "prior-limited"
+    np.testing.assert_allclose(list(verdict.blind_direction.values()), np.array([-1, 1, 1]) / np.sqrt(3.0), atol=1e-4)
+    assert "contact area" in verdict.blind_name
+    assert verdict.eigenvalues[0] < 1e-6
+    assert min(verdict.eigenvalues[1:]) > 0.999
+    assert verdict.force_from_prior > 0.99
+    assert "current" in verdict.remedy
+
+
+def test_shipped_record_with_a_trapezoid_that_lacks_the_overshoot(finger_path, finger_truth):
+    scene = fitact.Scene.from_dict({"drive": {"waveform": "trapezoid", "rise_time": "20 us"}})
+    fit = fitact.fit(fitact.read(finger_path, scene), scene)
+    for name in ("g", "b"):
+        assert fit.derived()[name]["q50"] == pytest.approx(finger_truth[name], rel=0.01)
+
+
+def test_errors_are_those_of_the_linear_theory(finger_fit: fitact.Fit):
+    """scipy's least squares on the same record: a and b, offset, charge free, no prior."""
+    scipy_optimize = pytest.importorskip("scipy.optimize")
+    record = finger_fit.record
+    time, step = record.time - record.time[0], record.time_step
+
+    def vsc(p: np.ndarray) -> np.ndarray:
+        g, b, offset, charge = p
+        keep = np.exp(-step / b)
+        gain = -np.expm1(-step / b) * b / step
+        u = np.empty_like(time)
+        u[0] = 0.0
+        for i, dv in enumerate(np.diff(record["V"])):
+            u[i + 1] = keep * u[i] + gain * dv
+        return g * u + offset + charge * np.exp(-time / b)
+
+    start = [0.05, 4e-3, 0.1, -4.0]
+    found = scipy_optimize.least_squares(
+        lambda p: vsc(p) - record["Vsc"], start, x_scale=[0.05, 4e-3, 0.1, 1.0], xtol=1e-12
+    )
+    sigma = np.sqrt(2.0 * found.cost / (time.size - 4))
+    sd = sigma * np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
+    for i, name in enumerate(("g", "b")):
+        s = finger_fit.derived()[name]
+        assert s["q50"] == pytest.approx(found.x[i], rel=2e-6)
+        assert s["sd"] == pytest.approx(sd[i], rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("made", "freed"),
+    [
+        ({}, set()),
+        ({"offset": 0.2}, {"offset"}),
+        ({"offset": 0.2, "drift": 2.0}, {"offset", "drift"}),
+        ({"delay_samples": 2}, {"delay"}),
+    ],
+)
+def test_nuisances_are_freed_by_evidence_and_leave_g_and_b_unbiased(made: dict[str, float], freed: set[str]):
+    fit = fitact.fit(square_record(**made), SQUARE)
+    assert set(fit.model()["freed"]) == freed
+    assert abs(deviation(fit, "g", 1.35 / 20.7)) < 4.0
+    assert abs(deviation(fit, "b", 130e3 * 20.7e-9)) < 4.0
+    if "delay" in freed:
+        assert fit.parameters()["delay"]["q50"] == pytest.approx(
+            7.5e-6, abs=2.6e-6
+        )  # the edge lies between two samples
+
+
+def test_gain_is_freed_only_with_its_prior():
+    record = square_record()
+    assert "gain" not in fitact.fit(record, SQUARE).names
+    scene = fitact.Scene.from_dict({"drive": {"waveform": "square"}, "measurement": {"gain_relative_sd": 0.02}})
+    fit = fitact.fit(record, scene)
+    assert "gain" in fit.names
+    s = fit.parameters()["gain"]
+    assert s["sd"] == pytest.approx(0.02, rel=0.1)  # confounded with a: the record says nothing
+    assert "gain" in fit.identifiability.remedy
+
+
+def test_ideal_square_in_the_file_is_not_read_as_ramps():
+    """The scene's square is used, V is checked against it; without a scene, the edges are warned of."""
+    record = square_record()
+    assert fitact.fit(record, fitact.Scene()).choice.name == "square"
+    assert any("sample step" in warning for warning in fitact.fit(record).warnings)
+
+
+def test_partial_scene_does_not_replace_a_recorded_drive(finger_path):
+    scene = fitact.Scene.from_dict({"device": {"Ci": "1.4 nF"}})
+    fit = fitact.fit(fitact.read(finger_path), scene)
+    assert fit.choice.name == "measured"
+    assert any("V_V" in warning for warning in fit.warnings)
+
+
+@pytest.mark.parametrize("waveform", ["square", "triangle"])
+def test_record_that_starts_anywhere_without_V(waveform: str, tmp_path):
+    record = square_record()
+    scene = SQUARE
+    if waveform == "triangle":
+        scene = fitact.Scene.from_dict({"drive": {"waveform": "triangle"}})
+        with jax.enable_x64(True):
+            vsc = np.asarray(
+                fitact.response(fitact.FinalCircuit(130e3, 18e-9, 1.35e-9), scene.make_drive(), record.time)
+            )
+        noise = 0.05 * np.random.default_rng(0).normal(size=vsc.size)
+        record = fitact.Record.from_arrays(record.time, Vsc=vsc + noise)
+    shifted = fitact.Record.from_arrays(record.time - 3.71e-3, Vsc=record["Vsc"])
+    fit = fitact.fit(shifted, scene)
+    assert fit.result == "successful"
+    assert abs(deviation(fit, "g", 1.35 / 20.7)) < 4.0
+    assert abs(deviation(fit, "b", 130e3 * 20.7e-9)) < 4.0
+    assert any("shifted" in warning for warning in fit.warnings)
+
+
+def test_sine_of_unknown_phase_without_V_is_refused():
+    scene = fitact.Scene.from_dict({"drive": {"waveform": "sine"}})
+    time = np.arange(2000) * 1e-5
+    record = fitact.Record.from_arrays(time, Vsc=9.0 * np.sin(2.0 * np.pi * 100.0 * time - 2.5))
+    with pytest.raises(fitact.InputError, match="phase"):
+        fitact.fit(record, scene)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda V, Vsc: (Vsc, V), "swapped"),
+        (lambda V, Vsc: (V / 1e3, Vsc), "unit"),
+        (lambda V, Vsc: (V, -Vsc), "polarity"),
+    ],
+)
+def test_what_the_circuit_cannot_give_is_refused(finger_path, change, message: str):
+    record = fitact.read(finger_path)
+    V, Vsc = change(record["V"], record["Vsc"])
+    with pytest.raises(fitact.InputError, match=message):
+        fitact.fit(fitact.Record.from_arrays(record.time, V=V, Vsc=Vsc))
+
+
+def test_implausible_values_are_remarked_upon(finger_path):
+    record = fitact.read(finger_path)
+    in_ms = fitact.Record.from_arrays(record.time * 1e3, V=record["V"], Vsc=record["Vsc"])
+    assert any("time constant b" in warning for warning in fitact.fit(in_ms).warnings)
+    in_mv = fitact.Record.from_arrays(record.time, V=record["V"], Vsc=record["Vsc"] * 1e-3)
+    assert any("divider g" in warning for warning in fitact.fit(in_mv).warnings)
+
+
+def misfits(record: fitact.Record) -> dict[str, fitact.Record]:
+    time, V, Vsc = record.time, record["V"], record["Vsc"]
+    lost = np.r_[0:1500, 1700:4000]  # samples lost without their times
+    return {
+        "clipped": fitact.Record.from_arrays(time, V=V, Vsc=np.clip(Vsc, -12.0, 12.0)),
+        "hum": fitact.Record.from_arrays(time, V=V, Vsc=Vsc + np.sin(2.0 * np.pi * 60.0 * time)),
+        "lost": fitact.Record.from_arrays(time[: lost.size], V=V[lost], Vsc=Vsc[lost]),
+        "saturating": fitact.Record.from_arrays(time, V=V, Vsc=20.0 * np.tanh(Vsc / 20.0)),
+    }
+
+
+@pytest.mark.parametrize("name", ["clipped", "hum", "lost", "saturating"])
+def test_misfit_is_named(finger_path, name: str):
+    fit = fitact.fit(misfits(fitact.read(finger_path))[name])
+    assert fit.result == "misfit"
+    assert not fit.trusted
+    assert "does not describe" in str(fit)
+
+
+def test_short_record_is_answered_with_its_width_and_a_warning(finger_path, finger_truth):
+    record = fitact.read(finger_path)
+    short = slice(0, 400)  # a fifth of a period, with one edge
+    fit = fitact.fit(fitact.Record.from_arrays(record.time[short], V=record["V"][short], Vsc=record["Vsc"][short]))
+    assert any("1.5 periods" in warning for warning in fit.warnings)
+    assert fit.derived()["b"]["sd"] > 3.0 * 1.4e-6  # that of the whole record
+    assert abs(deviation(fit, "b", finger_truth["b"])) < 3.0
+
+
+def test_unidentified_without_an_informative_prior(finger_path):
+    wide = {"factor": 1000.0}
+    scene = fitact.Scene.from_dict({"drive": {"waveform": "measured"}, "prior": {"Rsc": wide, "Csc": wide, "Ci": wide}})
+    assert fitact.fit(fitact.read(finger_path), scene).identifiability.verdict == "unidentified"
+
+
+@pytest.mark.parametrize("x64", [True, False])
+def test_the_users_precision_is_left_alone_and_does_not_matter(finger_fit, x64: bool):
+    before = jax.config.jax_enable_x64
+    try:
+        jax.config.update("jax_enable_x64", x64)
+        fit = fitact.fit(finger_fit.record, finger_fit.scene)
+        assert jax.config.jax_enable_x64 is x64
+    finally:
+        jax.config.update("jax_enable_x64", before)
+    np.testing.assert_array_equal(fit.theta, finger_fit.theta)
+
+
+def test_it_prints_errors_correlations_and_the_verdict(finger_fit: fitact.Fit):
+    text = str(finger_fit)
+    for word in ("Rsc", "Csc", "Ci", "correlations", "prior-limited", "contact area", "chi-square"):
+        assert word in text

@@ -1,0 +1,104 @@
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+import fitact
+
+
+class Page(HTMLParser):
+    """Collects what a test asks for, and checks that tags close."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.images: list[dict[str, str | None]] = []
+        self.addresses: list[str] = []
+        self.words: list[str] = []
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        attributes = dict(attrs)
+        if tag == "img":
+            self.images.append(attributes)
+        self.addresses += [value for name, value in attrs if name in ("src", "href", "srcset", "action") and value]
+        if tag not in ("img", "meta", "link", "br", "hr"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if "style" not in self.open:
+            self.words.append(data)
+
+
+@pytest.fixture(scope="module")
+def path(finger_posterior: fitact.Posterior, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    finger_posterior.report(path)
+    return path
+
+
+def test_page_is_one_self_contained_file(path: Path):
+    text = path.read_text()
+    page = Page(text)
+    assert page.open == []
+    assert all(address.startswith("data:") for address in page.addresses)
+    assert not re.search(r"@import|url\(", text)
+    assert len(page.images) == 3
+    assert all(len(image["alt"] or "") > 40 for image in page.images)
+    assert path.stat().st_size < 5e6
+
+
+def test_page_says_the_verdict_first_and_how_to_repeat_it(path: Path):
+    words = " ".join(" ".join(Page(path.read_text()).words).split())
+    places = [
+        words.index(part)
+        for part in (
+            "Prior-limited",
+            "contact area",
+            "trunk current",
+            "What the model",
+            "Diagnostics",
+            "--seed 1",
+        )
+        if part in words
+    ]
+    assert places == sorted(places)
+    assert len(places) >= 5
+    assert "Do not trust" not in words
+
+
+def test_untrusted_answers_say_so_at_the_top(finger_fit: fitact.Fit, tmp_path):
+    posterior = fitact.sample(finger_fit, walkers=16, max_steps=100, progress=False)
+    posterior.report(tmp_path / "report.html")
+    words = " ".join(Page((tmp_path / "report.html").read_text()).words)
+    assert words.index("Do not trust these numbers") < words.index("What is known")
+
+
+def test_nothing_in_a_record_becomes_markup(finger_posterior: fitact.Posterior, tmp_path):
+    import dataclasses
+
+    record = dataclasses.replace(finger_posterior.fit.record, source="<script>alert(1)</script>.csv")
+    fit = dataclasses.replace(finger_posterior.fit, record=record)
+    dataclasses.replace(finger_posterior, fit=fit).report(tmp_path / "report.html")
+    assert "<script" not in (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="Chromium is not installed (apt-get install chromium)")
+@pytest.mark.parametrize("width", [1280, 500])
+def test_chromium_opens_it_without_complaint(path: Path, width: int, tmp_path):
+    shot = tmp_path / "shot.png"
+    options = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking"
+    options += " --disable-component-update --disable-sync --enable-logging=stderr"
+    done = subprocess.run(
+        ["chromium", *options.split(), f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={width},3000",
+         f"--screenshot={shot}", path.as_uri()],
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert shot.stat().st_size > 50_000
+    assert "CONSOLE" not in done.stderr

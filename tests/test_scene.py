@@ -1,0 +1,149 @@
+import math
+from pathlib import Path
+
+import pytest
+
+import fitact
+
+CONTRACT = """
+[device]
+Ci = "1.35 nF"
+insulator_thickness = "1 um"
+insulator_permittivity = 3.9
+contact_area = "1 cm^2"
+[skin]
+Rsc = "160 kohm"
+Csc = "22 nF"
+thickness = "200 um"
+level = "constant"
+[grounding]
+connection = "direct"
+R_H = "500 ohm"
+grounding_Rsc = "80 kohm"
+grounding_Csc = "44.25 nF"
+Z = "14.5 Mohm"
+[drive]
+waveform = "trapezoid"
+peak_to_peak = "360 V"
+frequency = "100 Hz"
+rise_time = "20 us"
+steady_state = true
+[measurement]
+channels = ["Vsc"]
+series_resistor = "0 ohm"
+probe_resistance = "10 Mohm"
+probe_capacitance = "10 pF"
+sampling_rate = "200 kHz"
+duration = "20 ms"
+noise_Vsc = "0.1 V"
+noise_I = "20 nA"
+gain_relative_sd = 0.0
+[friction]
+coefficient = 0.5
+normal_force = "0.5 N"
+[prior]
+Rsc = {median = "130 kohm", factor = 3}
+Csc = {low = "8.85 nF", high = "44.25 nF"}
+Ci  = {median = "1.35 nF", relative_sd = 0.05}
+[force]
+model = "paper"
+[perception]
+friction_change = 0.1
+[population]
+contact_area = "common"
+[tolerance]
+force = 0.01
+"""
+
+
+def load(tmp_path: Path, text: str) -> fitact.Scene:
+    path = tmp_path / "scene.toml"
+    path.write_text(text)
+    return fitact.Scene.load(path)
+
+
+def test_every_key_of_the_contract_is_read(tmp_path: Path):
+    scene = load(tmp_path, CONTRACT)
+    assert scene.grounding.Z == 14.5e6
+    assert scene.drive.rise_time == 20e-6
+    assert scene.measurement.noise_I == 20e-9
+    assert scene.device.contact_area == 1e-4
+    prior = scene.make_prior()
+    assert isinstance(prior.Csc, fitact.Uniform)
+    assert prior.Rsc == fitact.LogNormal.within_factor(130e3, 3.0)
+
+
+def test_empty_file_is_the_nominal_scene(tmp_path: Path):
+    scene = load(tmp_path, "")
+    assert scene == fitact.Scene()
+    assert (scene.skin.Rsc, scene.skin.Csc, scene.device.Ci) == (160e3, 22e-9, 1.35e-9)
+    assert (scene.drive.peak_to_peak, scene.drive.frequency, scene.drive.waveform) == (360.0, 100.0, "square")
+
+
+def test_default_skin_prior_reaches_published_whole_skin_values():
+    prior = fitact.Scene().make_prior()
+    for Rsc, Csc in [(10e3, 5e-9), (4.3e3, 200e-9), (80e3, 44.25e-9), (200e3, 8.85e-9)]:
+        assert 160e3 / 50 < Rsc < 160e3 * 50
+        assert abs(math.log(Rsc) - prior.Rsc.log_mean) < 2.0 * prior.Rsc.log_sd
+        assert abs(math.log(Csc) - prior.Csc.log_mean) < 2.0 * prior.Csc.log_sd
+
+
+def test_Ci_from_the_layer_only_where_it_is_absent(tmp_path: Path):
+    layer = 'insulator_thickness = "1 um"\ninsulator_permittivity = 3.9\n'
+    assert load(tmp_path, "[device]\n" + layer).device.Ci == pytest.approx(3.4515e-9)
+    assert load(tmp_path, '[device]\nCi = "2 nF"\n' + layer).device.Ci == 2e-9
+    assert load(tmp_path, '[device]\ninsulator_thickness = "2 um"\n').device.Ci == 1.35e-9
+
+
+def test_round_trip(tmp_path: Path):
+    for text in (CONTRACT, "", '[drive]\nwaveform = "measured"\n'):
+        scene = load(tmp_path, text)
+        again = fitact.Scene.from_json(scene.to_json())
+        assert again == scene
+        assert again.to_json() == scene.to_json()
+        assert again.states_waveform() == scene.states_waveform()
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ('[device]\nCj = "1 nF"', ["[device]", "Cj"]),
+        ("[skn]\n", ["skn", "skin"]),
+        ('[drive]\nfrequncy = "1 Hz"', ["frequncy", "frequency"]),
+        ('[device]\nCi = "1 nV"', ["[device] Ci", "1 nV", "F"]),
+        ('[device]\nCi = "much"', ["[device] Ci", "much"]),
+        ('[device]\nCi = "-1 nF"', ["[device] Ci", "greater than 0"]),
+        ("[device]\nCi = nan", ["[device] Ci", "finite"]),
+        ("[device]\nCi = true", ["[device] Ci"]),
+        ('[drive]\nwaveform = "sqare"', ["[drive] waveform", "sqare", "square"]),
+        ('[drive]\nwaveform = "trapezoid"', ["[drive]", "rise_time"]),
+        ('[drive]\nrise_time = "1 us"', ["[drive]", "rise_time"]),
+        ('[drive]\nwaveform = "trapezoid"\nrise_time = "6 ms"', ["[drive]", "shorter"]),
+        ('[drive]\nwaveform = "sine"\nduty = 0.3', ["duty", "sine"]),
+        ("[prior]\nRsc = {factor = 0.5}", ["[prior] Rsc.factor", "1"]),
+        ('[prior]\nRsc = {median = "1 V", factor = 2}', ["[prior] Rsc", "ohm"]),
+        ('[prior]\nRsc = {low = "2 ohm", high = "1 ohm"}', ["[prior] Rsc", "low"]),
+        ("[prior]\nRsc = {median = 3}", ["[prior] Rsc", "factor"]),
+        ("[device", ["TOML"]),
+    ],
+)
+def test_what_is_not_understood_is_refused_by_name(tmp_path: Path, text: str, names: list[str]):
+    with pytest.raises(fitact.InputError) as error:
+        load(tmp_path, text)
+    message = str(error.value)
+    assert "scene.toml" in message
+    assert "\n" not in message
+    for name in names:
+        assert name in message
+
+
+def test_missing_scene_file_is_refused(tmp_path: Path):
+    with pytest.raises(fitact.InputError, match=r"nowhere\.toml.*no such file"):
+        fitact.Scene.load(tmp_path / "nowhere.toml")
+
+
+def test_what_is_not_modelled_yet_is_refused_not_ignored(tmp_path: Path):
+    with pytest.raises(fitact.InputError, match="R_H"):
+        load(tmp_path, '[grounding]\nR_H = "500 ohm"').make_circuit()
+    with pytest.raises(fitact.InputError, match="natural"):
+        load(tmp_path, '[grounding]\nconnection = "natural"').make_circuit()
