@@ -18,11 +18,7 @@ test: env
 
 # make notebooks   run the notebooks; executed copies in out/notebooks
 notebooks: env
-	mkdir -p out/notebooks
-	for name in notebooks/*.py; do \
-		.venv/bin/jupytext --quiet --to ipynb --execute --run-path notebooks \
-			--output out/notebooks/$$(basename $$name .py).ipynb $$name || exit 1; \
-	done
+	$(PY) tools/run_notebooks.py notebooks/*.py
 
 # make check   style, types, and the order of the layers
 check: env

@@ -1,1 +1,40 @@
+from .data.formats import read
+from .data.record import Record
+from .errors import InputError
+from .inference.fit import Fit, fit
+from .inference.least_squares import RESULTS
+from .inference.posterior import Posterior
+from .inference.sampling import sample
+from .model.circuit import FinalCircuit
+from .model.drive import Sampled, Sine, Square, Trapezoid, Triangle
+from .model.force import Contact, electrostatic_force, friction
+from .model.prior import LogNormal, Prior, Uniform
+from .model.response import response
+from .model.scene import Scene
+
+__all__ = [
+    "RESULTS",
+    "Contact",
+    "FinalCircuit",
+    "Fit",
+    "InputError",
+    "LogNormal",
+    "Posterior",
+    "Prior",
+    "Record",
+    "Sampled",
+    "Scene",
+    "Sine",
+    "Square",
+    "Trapezoid",
+    "Triangle",
+    "Uniform",
+    "electrostatic_force",
+    "fit",
+    "friction",
+    "read",
+    "response",
+    "sample",
+]
+
 __version__: str

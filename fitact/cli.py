@@ -225,18 +225,16 @@ def main() -> None:
 
 
 def _guarded(command: Callable[[], Any]) -> int:
-    import click
-
     try:
         result = command()
         return result if isinstance(result, int) else 0
     except InputError as error:
         _say(f"fitact: {error}")
         return 2
-    except click.exceptions.ClickException as error:
-        error.show()
+    except typer.exceptions.TyperException as error:  # a wrong option or argument; it knows how to show itself
+        error.show()  # type: ignore[attr-defined]
         return 2
-    except (KeyboardInterrupt, click.exceptions.Abort):
+    except (KeyboardInterrupt, typer.Abort):
         _say("fitact: interrupted; the same command goes on from the last checkpoint")
         return 130
     except BrokenPipeError:

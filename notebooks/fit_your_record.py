@@ -50,5 +50,6 @@ plt.show()
 # - More of the same data will not help. The current, a known series resistor or a better Ci will.
 
 # %%
-relative = {name: float(np.std(np.log(values))) for name, values in (draws | posterior.derived()).items() if name in ("Rsc", "Csc", "Ci", "g", "b", "force_mean")}
-{name: f"{100 * value:.3g} %" for name, value in relative.items()}
+quantities = draws | posterior.derived()
+for name in ("Rsc", "Csc", "Ci", "force_mean", "g", "b"):
+    print(f"{name:12} ± {100 * np.std(np.log(quantities[name])):.3g} %")

@@ -1,4 +1,5 @@
 import dataclasses
+import signal
 
 import emcee
 import jax
@@ -116,17 +117,18 @@ def test_chain_of_another_record_scene_or_seed_is_refused(finger_fit: fitact.Fit
 
 def test_interrupted_sampling_keeps_what_there_is(finger_fit: fitact.Fit, tmp_path, monkeypatch):
     path = tmp_path / "chain.h5"
-    run, calls = emcee.EnsembleSampler.run_mcmc, []
+    step, calls = emcee.moves.StretchMove.propose, []
 
     def interrupted(self, *args, **kwargs):
         calls.append(1)
-        if len(calls) == 7:  # in the middle of the second round of four ensembles
-            raise KeyboardInterrupt
-        return run(self, *args, **kwargs)
+        if len(calls) == 180:  # of 400 steps a round, three in ten: in the middle of the second
+            signal.raise_signal(signal.SIGINT)
+        return step(self, *args, **kwargs)
 
-    monkeypatch.setattr(emcee.EnsembleSampler, "run_mcmc", interrupted)
+    monkeypatch.setattr(emcee.moves.StretchMove, "propose", interrupted)
     posterior = short(finger_fit, 3, max_steps=300, chain_file=path)
     assert posterior.convergence.interrupted
+    assert posterior.convergence.steps == 100
     assert not posterior.trusted
     monkeypatch.undo()
     np.testing.assert_array_equal(

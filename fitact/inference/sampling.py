@@ -1,11 +1,14 @@
 """Posterior draws with emcee, until converged: independent ensembles, checkpoints, resume."""
 
+import contextlib
 import dataclasses
 import hashlib
 import json
 import os
+import signal
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import emcee
@@ -113,10 +116,13 @@ class _Run:
     def advance(self, steps: int) -> None:
         """Take `steps` with every ensemble, then checkpoint; an interrupted call leaves no trace."""
         done = []
-        for sampler, state in zip(self.samplers, self.chain.states, strict=True):
-            sampler.reset()
-            last = sampler.run_mcmc(state, steps)
-            done.append((sampler.get_chain(), sampler.get_log_prob(), last, sampler.backend.accepted))
+        with _interrupts_between_steps() as check:
+            for sampler, last in zip(self.samplers, self.chain.states, strict=True):
+                sampler.reset()
+                for _ in sampler.sample(last, iterations=steps):
+                    check()
+                state = sampler.get_last_sample()
+                done.append((sampler.get_chain(), sampler.get_log_prob(), state, sampler.backend.accepted))
         self.chain = self.chain.extended(done)
         if self.path is not None:
             self.chain.save(self.path)
@@ -146,6 +152,25 @@ class _Run:
             ensembles=ensembles,
             stuck_walkers=stuck,
         )
+
+
+@contextlib.contextmanager
+def _interrupts_between_steps() -> Iterator[Callable[[], None]]:
+    """Hold Ctrl-C back until the function it gives is called: emcee prints a traceback for any error inside a step."""
+    pending: list[int] = []
+
+    def check() -> None:
+        if pending:
+            raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield check
+        return
+    before = signal.signal(signal.SIGINT, lambda number, _: pending.append(number))
+    try:
+        yield check
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @dataclasses.dataclass(frozen=True)
