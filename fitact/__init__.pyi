@@ -5,7 +5,7 @@ from .inference.fit import Fit, fit
 from .inference.least_squares import RESULTS
 from .inference.posterior import Posterior
 from .inference.sampling import sample
-from .model.circuit import FinalCircuit
+from .model.circuit import DirectGround, FinalCircuit, NaturalGround, Probe
 from .model.drive import Sampled, Sine, Square, Trapezoid, Triangle
 from .model.force import Contact, electrostatic_force, friction
 from .model.prior import LogNormal, Prior, Uniform
@@ -15,12 +15,15 @@ from .model.scene import Scene
 __all__ = [
     "RESULTS",
     "Contact",
+    "DirectGround",
     "FinalCircuit",
     "Fit",
     "InputError",
     "LogNormal",
+    "NaturalGround",
     "Posterior",
     "Prior",
+    "Probe",
     "Record",
     "Sampled",
     "Scene",

@@ -3,11 +3,16 @@
 An RC circuit has simple, real, negative poles, so the transfer function from the drive to the skin
 voltage is, exactly,
 
-    H(s) = dc + sum_k weight_k  s tau_k / (1 + s tau_k).
+    H(s) = sum_k weight_k  s tau_k / (1 + s tau_k),
 
-Everything that depends on time follows from that list (`response.py`). High-pass terms are used
-rather than low-pass ones because the insulator blocks direct current: the dc term vanishes by
-itself instead of by cancellation.
+and so is its admittance, plus a term s C where nothing resistive limits the current. Everything that
+depends on time follows from these lists (`response.py`). High-pass terms rather than low-pass ones:
+the insulator blocks direct current, so no dc term is left that would have to vanish by cancellation.
+
+All circuits here are one loop: the drive, the insulator Ci, perhaps a resistance R0, and parallel
+elements R‖C. Scaled by square roots, its equations have a symmetric matrix whose eigenvalues are the time
+constants, apart from each other even where two elements are equal: the mode that they share then has
+weight zero.
 """
 
 from typing import NamedTuple
@@ -19,11 +24,11 @@ from jaxtyping import Array, Complex
 
 
 class Terms(NamedTuple):
-    """H(s) = dc + sum_k weight[k] s tau[k] / (1 + s tau[k])."""
+    """sum_k weight[k] s tau[k] / (1 + s tau[k]) + rate s."""
 
-    dc: ArrayLike
     weight: tuple[ArrayLike, ...]
     tau: tuple[ArrayLike, ...]  # s
+    rate: ArrayLike | None = None  # s times the weight's unit; None: there is no such term
 
 
 class Circuit(eqx.Module):
@@ -33,13 +38,17 @@ class Circuit(eqx.Module):
         """The high-pass terms of Vsc / V."""
         raise NotImplementedError
 
+    def current_terms(self) -> Terms:
+        """The high-pass terms of I / V, in siemens; `rate` is the term that follows dV/dt, in F."""
+        raise NotImplementedError
+
     def transfer_function(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
         """Vsc / V at the angular frequency `omega` (rad/s, >= 0)."""
-        dc, weights, taus = self.terms()
-        total = jnp.asarray(dc, dtype=complex)
-        for weight, tau in zip(weights, taus, strict=True):
-            total = total + weight * highpass_gain(jnp.asarray(omega) * tau)
-        return total
+        return _at(self.terms(), omega)
+
+    def admittance(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
+        """I / V in siemens at the angular frequency `omega` (rad/s, >= 0)."""
+        return _at(self.current_terms(), omega)
 
 
 def highpass_gain(x: ArrayLike) -> Complex[Array, "*shape"]:
@@ -80,4 +89,169 @@ class FinalCircuit(Circuit):
 
     def terms(self) -> Terms:
         """One term: the divider g with the time constant b."""
-        return Terms(0.0, (self.g,), (self.b,))
+        return Terms((self.g,), (self.b,))
+
+    def current_terms(self) -> Terms:
+        """I = Vsc (1 + s Rsc Csc) / Rsc: one term, and one that follows dV/dt."""
+        # g (1 + s Rsc Csc) / Rsc: the high-pass of b, and what is left of it at high frequency
+        weight = 2.0 * self.g * self.g / self.Rsc  # type: ignore[operator]
+        return Terms((weight,), (self.b,), self.g * self.Csc)
+
+
+class Element(NamedTuple):
+    """A resistance (ohm) with a capacitance (F) in parallel."""
+
+    R: ArrayLike
+    C: ArrayLike
+
+
+class Loop(Circuit):
+    """The drive in series with Ci, perhaps a resistance, and parallel elements; Vsc is over the first."""
+
+    def insulator(self) -> ArrayLike:
+        """Ci, F."""
+        raise NotImplementedError
+
+    def resistance(self) -> ArrayLike | None:
+        """The resistance in the loop, ohm; None where there is none."""
+        raise NotImplementedError
+
+    def elements(self) -> tuple[Element, ...]:
+        """The parallel elements, the touching skin first."""
+        raise NotImplementedError
+
+    def terms(self) -> Terms:
+        """One term for each element, and one more with a resistance in the loop."""
+        return self._modes()[0]
+
+    def current_terms(self) -> Terms:
+        """As `terms`; without a resistance in the loop the current also follows dV/dt."""
+        return self._modes()[1]
+
+    def _modes(self) -> tuple[Terms, Terms]:
+        Ci, R0 = self.insulator(), self.resistance()
+        R, C = (jnp.stack(jnp.broadcast_arrays(*x)) for x in zip(*self.elements(), strict=True))
+        return _modes_without_resistance(Ci, R, C) if R0 is None else _modes_with_resistance(Ci, R0, R, C)
+
+
+def _modes_without_resistance(Ci: ArrayLike, R: Array, C: Array) -> tuple[Terms, Terms]:
+    """With x = v / sqrt(R) over the elements:  T x' + x = Ci sqrt(R) V',  T = diag(R C) + Ci sqrt(R) sqrt(R)^T."""
+    root = jnp.sqrt(R)
+    tau, modes = jnp.linalg.eigh(jnp.diag(R * C) + Ci * jnp.outer(root, root))
+    drive = Ci * (modes.T @ root) / tau
+    vsc = root[0] * modes[0] * drive
+    current = drive**2
+    rate = 1.0 / (1.0 / Ci + jnp.sum(1.0 / C))
+    return Terms(tuple(vsc), tuple(tau)), Terms(tuple(current), tuple(tau), rate)
+
+
+def _modes_with_resistance(Ci: ArrayLike, R0: ArrayLike, R: Array, C: Array) -> tuple[Terms, Terms]:
+    """With x = sqrt(C) v over elements and Ci:  T x' + x = sqrt(Ci) V e_i,  T = sqrt(C) P sqrt(C).
+
+    P holds the resistances that each capacitor's terminals see: its own R, for Ci the whole loop's.
+    """
+    root = jnp.sqrt(jnp.append(C, Ci))
+    seen = jnp.diag(jnp.append(R, R0 + jnp.sum(R))).at[-1, :-1].set(-R).at[:-1, -1].set(-R)
+    tau, modes = jnp.linalg.eigh(jnp.outer(root, root) * seen)
+    vsc = -modes[0] * modes[-1] * root[-1] / root[0]
+    return Terms(tuple(vsc), tuple(tau)), Terms(tuple(Ci * modes[-1] ** 2 / tau), tuple(tau))
+
+
+class Probe(eqx.Module):
+    """What a voltage probe loads the touching skin with: R‖C (ohm, F)."""
+
+    R: ArrayLike
+    C: ArrayLike
+
+    def across(self, skin: Element) -> Element:
+        """The skin with the probe in parallel."""
+        return Element(skin.R * self.R / (skin.R + jnp.asarray(self.R)), skin.C + jnp.asarray(self.C))
+
+
+class DirectGround(Loop):
+    """Direct ground (Fig. 3a): the touching skin, R_H, and the grounding skin in series with Ci, eq. (5).
+
+    With equal skins and R_H this is the paper's simplified circuit (Fig. 7).
+
+    Attributes:
+        Rsc, Csc: the touching skin, ohm and F.
+        Ci: the insulator, F.
+        R_H: the body's inner resistance, ohm; None: left out.
+        grounding_Rsc, grounding_Csc: the grounding skin; None: equal to the touching one.
+        series_resistor: a known resistor in series, ohm; None: none.
+        probe: the load across the touching skin; None: an ideal probe.
+    """
+
+    Rsc: ArrayLike
+    Csc: ArrayLike
+    Ci: ArrayLike
+    R_H: ArrayLike | None = None
+    grounding_Rsc: ArrayLike | None = None
+    grounding_Csc: ArrayLike | None = None
+    series_resistor: ArrayLike | None = None
+    probe: Probe | None = None
+
+    def insulator(self) -> ArrayLike:
+        """Ci, F."""
+        return self.Ci
+
+    def resistance(self) -> ArrayLike | None:
+        """R_H and the series resistor, ohm."""
+        return _in_series(self.R_H, self.series_resistor)
+
+    def elements(self) -> tuple[Element, ...]:
+        """The touching skin (with the probe), and the grounding one."""
+        touching = Element(self.Rsc, self.Csc)
+        grounding = Element(
+            self.Rsc if self.grounding_Rsc is None else self.grounding_Rsc,
+            self.Csc if self.grounding_Csc is None else self.grounding_Csc,
+        )
+        return touching if self.probe is None else self.probe.across(touching), grounding
+
+
+class NaturalGround(Loop):
+    """Natural ground (Fig. 3b): the touching skin and the environment Z in series with Ci, eq. (6).
+
+    Attributes:
+        Rsc, Csc: the touching skin, ohm and F.
+        Ci: the insulator, F.
+        Z: resistance to earth through shoes or chair, ohm.
+        Z_capacitance: in parallel with it, F; None: Z is a plain resistance.
+        series_resistor: a known resistor in series, ohm; None: none.
+        probe: the load across the touching skin; None: an ideal probe.
+    """
+
+    Rsc: ArrayLike
+    Csc: ArrayLike
+    Ci: ArrayLike
+    Z: ArrayLike
+    Z_capacitance: ArrayLike | None = None
+    series_resistor: ArrayLike | None = None
+    probe: Probe | None = None
+
+    def insulator(self) -> ArrayLike:
+        """Ci, F."""
+        return self.Ci
+
+    def resistance(self) -> ArrayLike | None:
+        """Z where it is a plain resistance, and the series resistor, ohm."""
+        return _in_series(self.Z if self.Z_capacitance is None else None, self.series_resistor)
+
+    def elements(self) -> tuple[Element, ...]:
+        """The touching skin (with the probe), and Z where it has a capacitance."""
+        touching = Element(self.Rsc, self.Csc)
+        touching = touching if self.probe is None else self.probe.across(touching)
+        return (touching,) if self.Z_capacitance is None else (touching, Element(self.Z, self.Z_capacitance))
+
+
+def _in_series(*resistances: ArrayLike | None) -> ArrayLike | None:
+    given = [jnp.asarray(r) for r in resistances if r is not None]
+    return sum(given[1:], given[0]) if given else None
+
+
+def _at(terms: Terms, omega: ArrayLike) -> Complex[Array, "*shape"]:
+    omega = jnp.asarray(omega)
+    total = jnp.zeros_like(omega, dtype=complex) if terms.rate is None else 1j * omega * terms.rate
+    for weight, tau in zip(terms.weight, terms.tau, strict=True):
+        total = total + weight * highpass_gain(omega * tau)
+    return total

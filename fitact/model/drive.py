@@ -32,6 +32,10 @@ class Drive(eqx.Module):
         """V at `time` (s), in V."""
         raise NotImplementedError
 
+    def slope(self, time: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
+        """dV/dt at `time` (s), in V/s, from the right; NaN at a jump, that of a start from rest included."""
+        raise NotImplementedError
+
 
 class Periodic(Drive):
     """A drive that repeats with `frequency` (Hz)."""
@@ -76,6 +80,14 @@ class PiecewiseLinear(Periodic):
         piece, since = self.locate(time)
         slope = (end - start) / jnp.diff(knots)
         return start[piece] + slope[piece] * since
+
+    def slope(self, time: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
+        """dV/dt at `time`."""
+        knots, start, end = self.pieces()
+        piece, since = self.locate(time)
+        before = jnp.roll(end, 1)
+        jumps = (since == 0.0) & (start != before)[piece]
+        return _after_rest(jnp.where(jumps, jnp.nan, ((end - start) / jnp.diff(knots))[piece]), start[0], time, steady_state)
 
 
 class Square(PiecewiseLinear):
@@ -146,6 +158,12 @@ class Sine(Periodic):
         phase, _ = self.phase(time)
         return self.offset + 0.5 * jnp.asarray(self.peak_to_peak) * jnp.sin(2.0 * np.pi * phase)
 
+    def slope(self, time: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
+        """dV/dt at `time`."""
+        phase, _ = self.phase(time)
+        steepest = np.pi * jnp.asarray(self.peak_to_peak) * self.frequency
+        return _after_rest(steepest * jnp.cos(2.0 * np.pi * phase), self.offset, time, steady_state)
+
 
 class Sampled(Drive):
     """A measured drive: straight lines between samples, constant before the first and after the last.
@@ -184,3 +202,22 @@ class Sampled(Drive):
         piece, since = self.locate(time)
         fraction = jnp.clip(since / jnp.diff(knots)[piece], 0.0, 1.0)
         return start[piece] + (end - start)[piece] * fraction
+
+    def slope(self, time: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
+        """dV/dt at `time`: that of the line that begins or lies there; 0 outside the samples."""
+        knots, start, end = self.pieces()
+        piece, since = self.locate(time)
+        inside = (since >= 0.0) & (since < jnp.diff(knots)[piece])
+        slope = jnp.where(inside, ((end - start) / jnp.diff(knots))[piece], 0.0)
+        if steady_state:
+            return slope
+        return _after_rest(slope, start[0], jnp.asarray(time, dtype=float) - knots[0], steady_state)
+
+
+def _after_rest(slope: Array, first: ArrayLike, time: ArrayLike, steady_state: bool) -> Array:
+    """From rest: nothing before t = 0, and a jump there unless the drive starts at 0."""
+    if steady_state:
+        return slope
+    time = jnp.asarray(time, dtype=float)
+    slope = jnp.where(time < 0.0, 0.0, slope)
+    return jnp.where((time == 0.0) & (jnp.asarray(first) != 0.0), jnp.nan, slope)

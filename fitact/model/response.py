@@ -6,6 +6,7 @@ L; at a jump u jumps along. Written so that nothing cancels or overflows at eith
 """
 
 import math
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,18 +21,28 @@ from fitact.model.drive import Drive, Pieces, PiecewiseLinear, Sampled, Sine
 _SERIES = 0.03  # below, the quotients with expm1 lose digits in their derivatives
 
 
-def response(circuit: Circuit, drive: Drive, time: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
-    """The skin voltage Vsc(t) in V at `time` (s), exact for the drives of `fitact.model.drive`.
+def response(
+    circuit: Circuit,
+    drive: Drive,
+    time: ArrayLike,
+    *,
+    steady_state: bool = True,
+    channel: Literal["Vsc", "I"] = "Vsc",
+) -> Float[Array, "*shape"]:
+    """The skin voltage Vsc (V) or the trunk current I (A) at `time` (s), exact for the drives of `fitact.model.drive`.
 
     In the steady state, or, with ``steady_state=False``, from rest: no charge anywhere and no drive
     before t = 0 (for a sampled drive, before its first sample). Eqs. (18)-(21) in the time domain.
+    Where nothing resistive limits the current it follows dV/dt, and at an ideal jump it is NaN.
 
     Raises:
         InputError: the steady state of a sampled drive without a period was asked for.
     """
-    dc, weights, taus = circuit.terms()
-    total = dc * drive.value(time)
-    for weight, tau in zip(weights, taus, strict=True):
+    terms = circuit.terms() if channel == "Vsc" else circuit.current_terms()
+    total = jnp.zeros_like(jnp.asarray(time, dtype=float))
+    if terms.rate is not None:
+        total = terms.rate * drive.slope(time, steady_state=steady_state)
+    for weight, tau in zip(terms.weight, terms.tau, strict=True):
         total = total + weight * highpass(drive, time, tau, steady_state=steady_state)
     return total
 
