@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from fitact.errors import InputError
-from fitact.files import replacing, to_json, write_json
+from fitact.files import to_json, write_json
 
 if TYPE_CHECKING:
     from fitact.inference.fit import Fit
@@ -118,39 +118,23 @@ def simulate(
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
-    """Simulate a record of a scene: V and Vsc with noise, as CSV that the other commands read."""
-    import numpy as np
-
-    from fitact.model.response import response
+    """Simulate a record of a scene: V and what it measures (Vsc, I), with noise, as CSV."""
+    from fitact.data.formats import write_csv
+    from fitact.data.simulate import simulate as simulated
     from fitact.model.scene import Scene
 
     stated = Scene.load(scene)
-    circuit, drive, measured = stated.make_circuit(), stated.make_drive(), stated.measurement
-    time = np.arange(round(measured.duration * measured.sampling_rate)) / measured.sampling_rate
-    with _double_precision():
-        voltage = np.asarray(drive.value(time))
-        vsc = np.asarray(response(circuit, drive, time, steady_state=stated.drive.steady_state))
-    vsc = vsc + measured.noise_Vsc * np.random.default_rng(seed).standard_normal(time.size)
-    with replacing(out) as temporary:
-        table = np.stack([time, voltage, vsc], axis=1)
-        np.savetxt(temporary, table, fmt="%.12g", delimiter=",", header="time_s,V_V,Vsc_V", comments="")
-    truth = {
-        "Rsc": stated.skin.Rsc,
-        "Csc": stated.skin.Csc,
-        "Ci": stated.device.Ci,
-        "noise_Vsc": measured.noise_Vsc,
+    record = simulated(stated, seed)
+    write_csv(out, record)
+    truth = {"Rsc": stated.skin.Rsc, "Csc": stated.skin.Csc, "Ci": stated.device.Ci}
+    content = {
+        "file": str(out),
+        "samples": len(record),
+        "channels": list(record.channels),
+        "seed": seed,
+        "truth": truth,
     }
-    _show(
-        f"wrote {out}: {time.size} samples",
-        {"file": str(out), "samples": time.size, "seed": seed, "truth": truth},
-        json,
-    )
-
-
-def _double_precision() -> Any:
-    import jax
-
-    return jax.enable_x64(True)
+    _show(f"wrote {out}: {len(record):,} samples of {', '.join(record.channels)}", content, json)
 
 
 def _scene(path: Path | None) -> "Scene | None":
@@ -164,7 +148,7 @@ def _fitted(record: Path, scene: Path | None) -> "Fit":
 
     stated = _scene(scene)
     if stated is not None:
-        stated.require_available()
+        stated.require_available(fit=True)
     measured = read(record, stated)  # refused before the slow imports
     _use_compilation_cache()
     from fitact.inference.fit import fit

@@ -126,6 +126,20 @@ def test_simulate_then_fit_recovers_the_scene(fitact_command, tmp_path):
         assert abs(derived[name]["q50"] - truth) < 4.0 * derived[name]["sd"]
 
 
+def test_simulated_current_needs_a_finite_one(fitact_command, tmp_path):
+    (tmp_path / "ideal.toml").write_text('[measurement]\nchannels = ["Vsc", "I"]\n')
+    refused = fitact_command("simulate", "ideal.toml", "--out", "ideal.csv")
+    assert refused.returncode == 2
+    assert "rise time" in refused.stderr
+    assert not (tmp_path / "ideal.csv").exists()
+    (tmp_path / "real.toml").write_text('[grounding]\nR_H = "500 ohm"\n[measurement]\nchannels = ["Vsc", "I"]\n')
+    assert fitact_command("simulate", "real.toml", "--out", "real.csv").returncode == 0
+    header, first, *_ = (tmp_path / "real.csv").read_text().splitlines()
+    assert header == "time_s,V_V,Vsc_V,I_A"
+    # just after the edge R_H alone, with what Ci and the skins hold, limits the current: below 360 V / 500 ohm
+    assert 0.7 < float(first.split(",")[3]) < 0.72
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [

@@ -10,29 +10,38 @@ import pytest
 
 import fitact
 
-pytestmark = pytest.mark.skipif(shutil.which("ngspice") is None, reason="ngspice is not installed (apt-get install ngspice)")
+pytestmark = pytest.mark.skipif(
+    shutil.which("ngspice") is None, reason="ngspice is not installed (apt-get install ngspice)"
+)
 
 R, C, CI = 160e3, 22e-9, 1.35e-9
 PROBE = fitact.Probe(10e6, 10e-12)
 PERIOD = 0.01
 
+TOUCHING = ["Ci in skin 1.35n", "R1 skin below 160k", "C1 skin below 22n"]
 # our circuit, and the netlist from the node of the drive ("in") to ground; Vsc is between "skin" and "below"
 CIRCUITS = {
-    "final": (fitact.FinalCircuit(R, C, CI), ["Ci in skin 1.35n", "R1 skin below 160k", "C1 skin below 22n", "R2 below 0 160k", "C2 below 0 22n"]),
+    "final": (fitact.FinalCircuit(R, C, CI), [*TOUCHING, "R2 below 0 160k", "C2 below 0 22n"]),
     "direct ground, R_H, series resistor, probe": (
-        fitact.DirectGround(R, C, CI, R_H=500.0, grounding_Rsc=80e3, grounding_Csc=44.25e-9, series_resistor=100e3, probe=PROBE),
-        ["Rs in a 100k", "Ci a skin 1.35n", "R1 skin below 160k", "C1 skin below 22n", "Rp skin below 10meg", "Cp skin below 10p",
-         "RH below b 500", "R2 b 0 80k", "C2 b 0 44.25n"],
+        fitact.DirectGround(
+            R, C, CI, R_H=500.0, grounding_Rsc=80e3, grounding_Csc=44.25e-9, series_resistor=100e3, probe=PROBE
+        ),
+        [
+            *TOUCHING,
+            "Rp skin below 10meg",
+            "Cp skin below 10p",
+            "RH below a 500",
+            "Rs a b 100k",
+            "R2 b 0 80k",
+            "C2 b 0 44.25n",
+        ],
     ),
-    "natural ground": (
-        fitact.NaturalGround(R, C, CI, Z=14.5e6),
-        ["Ci in skin 1.35n", "R1 skin below 160k", "C1 skin below 22n", "RZ below 0 14.5meg"],
-    ),
+    "natural ground": (fitact.NaturalGround(R, C, CI, Z=14.5e6), [*TOUCHING, "RZ below 0 14.5meg"]),
     "natural ground, Z with capacitance": (
         fitact.NaturalGround(R, C, CI, Z=14.5e6, Z_capacitance=100e-12),
-        ["Ci in skin 1.35n", "R1 skin below 160k", "C1 skin below 22n", "RZ below 0 14.5meg", "CZ below 0 100p"],
+        [*TOUCHING, "RZ below 0 14.5meg", "CZ below 0 100p"],
     ),
-}  # fmt: skip
+}
 EDGE = 20e-6
 DRIVES = {
     "trapezoid": (  # from 0 V, so that it starts without a jump

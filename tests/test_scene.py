@@ -1,6 +1,7 @@
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import fitact
@@ -142,8 +143,23 @@ def test_missing_scene_file_is_refused(tmp_path: Path):
         fitact.Scene.load(tmp_path / "nowhere.toml")
 
 
-def test_what_is_not_modelled_yet_is_refused_not_ignored(tmp_path: Path):
+def test_circuit_is_the_simplest_that_has_what_the_scene_names(tmp_path: Path):
+    assert type(fitact.Scene().make_circuit()) is fitact.FinalCircuit
+    direct = load(tmp_path, '[grounding]\nR_H = "500 ohm"\n[measurement]\nseries_resistor = "100 kohm"').make_circuit()
+    assert isinstance(direct, fitact.DirectGround)
+    assert (direct.R_H, direct.series_resistor, direct.grounding_Rsc, direct.probe) == (500.0, 100e3, None, None)
+    probed = load(tmp_path, '[measurement]\nprobe_capacitance = "10 pF"').make_circuit()
+    assert (math.inf, 10e-12) == (probed.probe.R, probed.probe.C)
+    assert np.isfinite(abs(probed.transfer_function(600.0)))
+    natural = load(tmp_path, '[grounding]\nconnection = "natural"\nZ = "14.5 Mohm"').make_circuit()
+    assert isinstance(natural, fitact.NaturalGround)
+    assert natural.Z == 14.5e6
+
+
+def test_what_is_not_modelled_or_fitted_yet_is_refused_not_ignored(tmp_path: Path):
+    with pytest.raises(fitact.InputError, match="dispersive"):
+        load(tmp_path, '[skin]\nlevel = "dispersive"').make_circuit()
     with pytest.raises(fitact.InputError, match="R_H"):
-        load(tmp_path, '[grounding]\nR_H = "500 ohm"').make_circuit()
-    with pytest.raises(fitact.InputError, match="natural"):
-        load(tmp_path, '[grounding]\nconnection = "natural"').make_circuit()
+        load(tmp_path, '[grounding]\nR_H = "500 ohm"').require_available(fit=True)
+    with pytest.raises(fitact.InputError, match="Z"):
+        load(tmp_path, '[grounding]\nconnection = "natural"')

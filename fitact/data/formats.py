@@ -13,6 +13,7 @@ import numpy as np
 from fitact import units
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.errors import InputError
+from fitact.files import replacing
 from fitact.model.scene import Scene
 
 _UNITS = {"time": "s", **CHANNEL_UNITS}
@@ -171,3 +172,15 @@ def _numbers_one_by_one(rows: Sequence[tuple[int, str]], width: int, name: str) 
                 raise InputError(f"{name}, line {number}, column {column + 1}: {what}; mend or remove the row")
             table[row, column] = float(cell)
     return table
+
+
+def write_csv(path: str | os.PathLike[str], record: Record) -> None:
+    """Write a record as `read` reads it, to 12 digits.
+
+    Raises:
+        InputError: the place cannot be written.
+    """
+    header = ["time_s", *(f"{name}_{CHANNEL_UNITS[name]}" for name in record.channels)]
+    with replacing(path) as temporary:
+        table = np.stack([record.time, *record.channels.values()], axis=1)
+        np.savetxt(temporary, table, fmt="%.12g", delimiter=",", header=",".join(header), comments="")

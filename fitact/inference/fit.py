@@ -169,7 +169,7 @@ def fit(record: Record, scene: Scene | None = None) -> Fit:
         InputError: the record cannot come from this circuit, or the scene asks for what is not available.
     """
     given = scene or Scene()
-    given.require_available()
+    given.require_available(fit=True)
     with jax.enable_x64(True):
         choice = choose_drive(record, scene)
         start = linear_start(record, choice)

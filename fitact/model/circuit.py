@@ -94,7 +94,7 @@ class FinalCircuit(Circuit):
     def current_terms(self) -> Terms:
         """I = Vsc (1 + s Rsc Csc) / Rsc: one term, and one that follows dV/dt."""
         # g (1 + s Rsc Csc) / Rsc: the high-pass of b, and what is left of it at high frequency
-        weight = 2.0 * self.g * self.g / self.Rsc  # type: ignore[operator]
+        weight = 2.0 * self.g * self.g / self.Rsc
         return Terms((weight,), (self.b,), self.g * self.Csc)
 
 
@@ -158,14 +158,14 @@ def _modes_with_resistance(Ci: ArrayLike, R0: ArrayLike, R: Array, C: Array) -> 
 
 
 class Probe(eqx.Module):
-    """What a voltage probe loads the touching skin with: R‖C (ohm, F)."""
+    """What a voltage probe loads the touching skin with: R‖C (ohm, F; R may be infinite)."""
 
     R: ArrayLike
     C: ArrayLike
 
     def across(self, skin: Element) -> Element:
         """The skin with the probe in parallel."""
-        return Element(skin.R * self.R / (skin.R + jnp.asarray(self.R)), skin.C + jnp.asarray(self.C))
+        return Element(1.0 / (1.0 / jnp.asarray(skin.R) + 1.0 / self.R), skin.C + jnp.asarray(self.C))
 
 
 class DirectGround(Loop):

@@ -87,7 +87,9 @@ class PiecewiseLinear(Periodic):
         piece, since = self.locate(time)
         before = jnp.roll(end, 1)
         jumps = (since == 0.0) & (start != before)[piece]
-        return _after_rest(jnp.where(jumps, jnp.nan, ((end - start) / jnp.diff(knots))[piece]), start[0], time, steady_state)
+        return _after_rest(
+            jnp.where(jumps, jnp.nan, ((end - start) / jnp.diff(knots))[piece]), start[0], time, steady_state
+        )
 
 
 class Square(PiecewiseLinear):

@@ -6,6 +6,7 @@ is the paper's nominal device.
 
 import difflib
 import json
+import math
 import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias
@@ -15,7 +16,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from fitact import units
 from fitact.errors import InputError
-from fitact.model.circuit import FinalCircuit
+from fitact.model.circuit import Circuit, DirectGround, FinalCircuit, NaturalGround, Probe
 from fitact.model.drive import Drive, Sine, Square, Trapezoid, Triangle
 from fitact.model.force import plate_capacitance
 from fitact.model.prior import Distribution, LogNormal, Prior, Uniform
@@ -96,6 +97,12 @@ class Grounding(_Section):
     grounding_Rsc: Ohm | None = None
     grounding_Csc: Farad | None = None
     Z: Ohm | None = None
+
+    @model_validator(mode="after")
+    def _Z_of_natural_ground(self) -> Self:
+        if self.connection == "natural" and self.Z is None:
+            raise ValueError("connection = 'natural' needs Z, the resistance to earth, such as '14.5 Mohm'")
+        return self
 
 
 class DriveSection(_Section):
@@ -289,34 +296,53 @@ class Scene(_Section):
         """What the file says of the steady state; None where it is silent."""
         return self.drive.steady_state if "steady_state" in self.drive.model_fields_set else None
 
-    def require_available(self) -> None:
-        """Refuse what this version cannot model, rather than leave it out in silence."""
+    def require_available(self, *, fit: bool = False) -> None:
+        """Refuse what this version cannot model (or, with `fit`, cannot fit), rather than leave it out in silence."""
         unavailable = {
-            "[grounding] connection = 'natural'": self.grounding.connection == "natural",
-            "[grounding] R_H": self.grounding.R_H is not None,
-            "[grounding] grounding_Rsc": self.grounding.grounding_Rsc is not None,
-            "[grounding] grounding_Csc": self.grounding.grounding_Csc is not None,
-            "[grounding] Z": self.grounding.Z is not None,
             f"[skin] level = '{self.skin.level}'": self.skin.level != "constant",
             f"[drive] waveform = '{self.drive.waveform}'": self.drive.waveform in ("burst", "chirp"),
-            "[measurement] channel I": "I" in self.measurement.channels,
-            "[measurement] series_resistor": self.measurement.series_resistor > 0.0,
-            "[measurement] probe_resistance": self.measurement.probe_resistance is not None,
-            "[measurement] probe_capacitance": self.measurement.probe_capacitance is not None,
             "[force] model = 'gap'": self.force.model == "gap",
             "[population] contact_area = 'varies'": self.population.contact_area == "varies",
         }
+        if fit:
+            unavailable |= {
+                "[grounding] connection = 'natural'": self.grounding.connection == "natural",
+                "[grounding] R_H": self.grounding.R_H is not None,
+                "[grounding] grounding_Rsc": self.grounding.grounding_Rsc is not None,
+                "[grounding] grounding_Csc": self.grounding.grounding_Csc is not None,
+                "[measurement] channel I": "I" in self.measurement.channels,
+                "[measurement] series_resistor": self.measurement.series_resistor > 0.0,
+                "[measurement] probe_resistance": self.measurement.probe_resistance is not None,
+                "[measurement] probe_capacitance": self.measurement.probe_capacitance is not None,
+            }
         for what, asked in unavailable.items():
             if asked:
+                can = (
+                    "fits the paper's final circuit (direct ground, equal skins) to Vsc" if fit else "does not model it"
+                )
                 raise InputError(
-                    f"scene: {what} is not available in this version, which models the paper's final circuit"
-                    " (direct ground, equal skins) and Vsc; leave it out of the scene to go on without it"
+                    f"scene: {what} is not available in this version, which {can};"
+                    " leave it out of the scene to go on without it"
                 )
 
-    def make_circuit(self) -> FinalCircuit:
-        """The circuit at the scene's nominal values."""
+    def make_circuit(self) -> Circuit:
+        """The circuit at the scene's nominal values; the paper's final one unless the scene asks for more."""
         self.require_available()
-        return FinalCircuit(Rsc=self.skin.Rsc, Csc=self.skin.Csc, Ci=self.device.Ci)
+        Rsc, Csc, Ci, ground = self.skin.Rsc, self.skin.Csc, self.device.Ci, self.grounding
+        series, probe = self.measurement.series_resistor or None, self._probe()
+        if ground.connection == "natural":
+            assert ground.Z is not None  # checked when the section was read
+            return NaturalGround(Rsc, Csc, Ci, ground.Z, series_resistor=series, probe=probe)
+        extras = (ground.R_H, ground.grounding_Rsc, ground.grounding_Csc, series, probe)
+        if all(extra is None for extra in extras):
+            return FinalCircuit(Rsc, Csc, Ci)
+        return DirectGround(Rsc, Csc, Ci, *extras)
+
+    def _probe(self) -> Probe | None:
+        resistance, capacitance = self.measurement.probe_resistance, self.measurement.probe_capacitance
+        if resistance is None and capacitance is None:
+            return None
+        return Probe(math.inf if resistance is None else resistance, capacitance or 0.0)
 
     def make_drive(self) -> Drive:
         """The scene's drive.

@@ -1,0 +1,33 @@
+"""Simulated records of a scene, for trying things out; data for tests come from `data_synth` instead."""
+
+import jax
+import numpy as np
+
+from fitact.data.record import Record
+from fitact.errors import InputError
+from fitact.model.response import response
+from fitact.model.scene import Scene
+
+
+def simulate(scene: Scene, seed: int = 0) -> Record:
+    """V, and the channels that the scene measures with its noise, at its sampling rate and for its duration.
+
+    Raises:
+        InputError: the scene asks for what is not modelled, or for a current that has impulses.
+    """
+    circuit, drive, measured = scene.make_circuit(), scene.make_drive(), scene.measurement
+    time = np.arange(round(measured.duration * measured.sampling_rate)) / measured.sampling_rate
+    rng = np.random.default_rng(seed)
+    channels = {}
+    with jax.enable_x64(True):
+        channels["V"] = np.asarray(drive.value(time))
+        for channel in measured.channels:
+            clean = np.asarray(response(circuit, drive, time, steady_state=scene.drive.steady_state, channel=channel))
+            noise = measured.noise_Vsc if channel == "Vsc" else measured.noise_I
+            channels[channel] = clean + noise * rng.standard_normal(time.size)
+    if not np.all(np.isfinite(channels.get("I", 0.0))):
+        raise InputError(
+            "scene: the current has an impulse at each ideal jump of the drive; give the drive a rise time"
+            " (waveform = 'trapezoid'), or the scene an R_H or a series_resistor"
+        )
+    return Record.from_arrays(time, V=channels["V"], Vsc=channels.get("Vsc"), I=channels.get("I"), source="simulation")
