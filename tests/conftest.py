@@ -60,10 +60,11 @@ def square_record(
     Rsc: float = 130e3,
     Csc: float = 18e-9,
     Ci: float = 1.35e-9,
+    per_period: int = 2000,
 ) -> fitact.Record:
-    """Two settled periods of a 360 Vpp square at 100 Hz, 5 us steps, with V sampled exactly at the edges."""
-    per_period, settle, kept = 2000, 12, 2
-    time = np.arange((settle + kept) * per_period) * 5e-6
+    """Two settled periods of a 360 Vpp square at 100 Hz, with V sampled exactly at the edges."""
+    settle, kept = 12, 2
+    time = np.arange((settle + kept) * per_period) * (0.01 / per_period)
     voltage = np.where(np.arange(time.size) % per_period < per_period // 2, 180.0, -180.0)
     vsc = skin_voltage(time, voltage, Rsc, Csc, Ci, hold=True)
     last = slice(settle * per_period, None)

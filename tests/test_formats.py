@@ -153,3 +153,13 @@ def test_frequency(wave, periods: float):
 def test_no_frequency_in_a_part_of_a_period():
     time = np.arange(500) * 1e-5
     assert fitact.Record.from_arrays(time, Vsc=np.exp(-time / 1e-3)).frequency("Vsc") is None
+
+
+def test_the_callers_arrays_are_left_alone():
+    time = np.arange(100) * 1e-5
+    vsc = np.sin(time * 1e4)
+    record = fitact.Record.from_arrays(time, Vsc=vsc)
+    vsc[0] = 5.0
+    assert record["Vsc"][0] == 0.0
+    with pytest.raises(ValueError, match="read-only"):
+        record["Vsc"][0] = 1.0

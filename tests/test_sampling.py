@@ -29,7 +29,7 @@ def test_uniform_priors_give_the_inverse_square_law_along_the_blind_direction(bo
             },
         }
     )
-    fit = fitact.fit(square_record(), scene)
+    fit = fitact.fit(square_record(per_period=500), scene)
     assert fit.result == "successful"  # an optimum on the edge of the box is no failure
     # the seed only fixes which 5 % passes: the law holds to a few per cent for every one tried
     posterior = fitact.sample(fit, seed=5, progress=False)

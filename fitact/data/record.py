@@ -51,9 +51,9 @@ class Record:
         Raises:
             InputError: too few samples, not finite, not increasing, or a channel that holds no signal.
         """
-        time = np.asarray(time, dtype=float)
+        time = np.array(time, dtype=float)
         given = {"V": V, "Vsc": Vsc, "I": I}
-        channels = {name: np.asarray(values, dtype=float) for name, values in given.items() if values is not None}
+        channels = {name: np.array(values, dtype=float) for name, values in given.items() if values is not None}
         _check_shapes(time, channels, source)
         for name, values in {"time": time, **channels}.items():
             _check_finite(values, name, source, where)

@@ -11,7 +11,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from fitact.inference.likelihood import LINEAR, Likelihood, in_batches
+from fitact.inference.likelihood import LINEAR, Likelihood
 
 _EVIDENCE = 10.0  # a nuisance is freed when it lowers the Bayesian information criterion by this much
 
@@ -126,16 +126,19 @@ def _nearest_delay(solved: Solved) -> Array:
     likelihood, theta = solved.likelihood, solved.theta
     delays = np.arange(-40, 41) / 8.0
     later = jnp.asarray(delays) * likelihood.time_step
-    repeated = jnp.tile(theta, (delays.size, 1))
-    signals = in_batches(Likelihood.signal, likelihood, (np.asarray(repeated), np.asarray(later)), likelihood.time.size)
     shapes = np.asarray(solved.shapes)[np.asarray(likelihood.linear_sd) > 0.0]
     left = []
-    for signal in signals:
-        design = np.vstack([signal, shapes]).T
+    for shift in later:
+        design = np.vstack([_signal(likelihood, theta, shift), shapes]).T
         remainder = likelihood.observed - design @ np.linalg.lstsq(design, likelihood.observed, rcond=None)[0]
         left.append(float(remainder @ remainder))
     good = np.asarray(left) < min(left) * (1.0 + 25.0 / likelihood.observed.size)
     return jnp.asarray(np.mean(delays[good])) * likelihood.time_step
+
+
+@eqx.filter_jit
+def _signal(likelihood: Likelihood, theta: Array, later: Array) -> Array:
+    return likelihood.signal(theta, later)
 
 
 def _evidence(solved: Solved) -> dict[str, float]:

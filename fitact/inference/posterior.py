@@ -229,7 +229,7 @@ class Posterior:
         ensembles, count = self.points.shape[:2]
         draws = np.linspace(0, count - 1, min(_PREDICTED, count)).astype(int)
         stride = -(-len(self.fit.record) // _PREDICTED_SAMPLES)
-        mean = self._each(_signal_of, self.fit.likelihood, draws)[..., ::stride]
+        mean = self._each(lambda *point: _signal_of(*point)[::stride], self.fit.likelihood, draws)
         sigma = np.exp(self.points[:, draws, -1:])
         noise = np.random.default_rng([self.seed, 3]).standard_normal(mean.shape)
         values = (mean + sigma * noise).astype(np.float32)

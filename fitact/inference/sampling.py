@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import hashlib
+import importlib.metadata
 import json
 import os
 import signal
@@ -80,7 +81,8 @@ def sample(
             if run.chain.steps == 0:
                 raise
             convergence = dataclasses.replace(run.judge(), converged=False, interrupted=True)
-        report.close()
+        finally:
+            report.close()
         return Posterior.from_chain(fit, run.chain, convergence, seed)
 
 
@@ -247,8 +249,6 @@ def _with_divider(points: Float[np.ndarray, "*shape n"], names: tuple[str, ...])
 
 def _fingerprint(fit: Fit, names: tuple[str, ...], seed: int, walkers: int, ensembles: int) -> str:
     """What a chain belongs to; any change of it makes another chain."""
-    from fitact import __version__
-
     settings = [
         fit.record.fingerprint,
         fit.scene.to_json(),
@@ -259,7 +259,7 @@ def _fingerprint(fit: Fit, names: tuple[str, ...], seed: int, walkers: int, ense
         walkers,
         ensembles,
     ]
-    return hashlib.sha256(json.dumps([__version__, *settings]).encode()).hexdigest()
+    return hashlib.sha256(json.dumps([importlib.metadata.version("fitact"), *settings]).encode()).hexdigest()
 
 
 class _Reporter:
