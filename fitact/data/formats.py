@@ -43,12 +43,12 @@ def read(path: str | os.PathLike[str], scene: Scene | None = None) -> Record:
         raise InputError(f"{name}: the file holds no data; expected a header such as {_HEADER} and rows of numbers")
     header, *rows = lines
     columns, ignored = _columns(header[1], name, header[0])
-    if rows and _is_units_row(rows[0][1]):
+    if rows and _is_units_row(rows[0][1], columns):
         columns = _with_units(columns, rows.pop(0), name)
     if not rows:
         raise InputError(f"{name}: there are no rows of numbers under the header")
-    table = _numbers(rows, len(_cells(header[1])), name)
-    arrays = {c.name: table[:, c.place] * _scale(c, name, header[0]) for c in columns}
+    table = _numbers(rows, [c.place for c in columns], len(_cells(header[1])), name)
+    arrays = {c.name: table[:, i] * _scale(c, name, header[0]) for i, c in enumerate(columns)}
     notes = (f"{name}: not used: {', '.join(ignored)}",) if ignored else ()
     time = arrays.pop("time")
     record = Record.from_arrays(time, **arrays, source=name, notes=notes, where=lambda row: f"line {rows[row][0]}")
@@ -107,9 +107,10 @@ def _columns(header: str, name: str, line: int) -> tuple[list[_Column], list[str
     return known, ignored
 
 
-def _is_units_row(line: str) -> bool:
-    """Whether no cell is a number: the row under the header that oscilloscopes fill with units."""
-    return not any(_is_number(cell) for cell in _cells(line))
+def _is_units_row(line: str, columns: list[_Column]) -> bool:
+    """Whether no known column holds a number: the row under the header that oscilloscopes fill with units."""
+    cells = _cells(line)
+    return all(column.place < len(cells) and not _is_number(cells[column.place]) for column in columns)
 
 
 def _is_number(cell: str) -> bool:
@@ -147,29 +148,31 @@ def _scale(column: _Column, name: str, line: int) -> float:
         ) from None
 
 
-def _numbers(rows: Sequence[tuple[int, str]], width: int, name: str) -> np.ndarray:
-    try:
-        table = np.loadtxt(io.StringIO("\n".join(line for _, line in rows)), delimiter=",", ndmin=2, comments=None)
-        if table.shape[1] == width:
-            return table
-    except ValueError:
-        pass
-    return _numbers_one_by_one(rows, width, name)
+def _numbers(rows: Sequence[tuple[int, str]], places: list[int], width: int, name: str) -> np.ndarray:
+    """The columns at `places`, of rows of `width` cells."""
+    if all(line.count(",") == width - 1 for _, line in rows):
+        text = io.StringIO("\n".join(line for _, line in rows))
+        try:
+            return np.loadtxt(text, delimiter=",", ndmin=2, comments=None, usecols=places)
+        except ValueError:
+            pass
+    return _numbers_one_by_one(rows, places, width, name)
 
 
-def _numbers_one_by_one(rows: Sequence[tuple[int, str]], width: int, name: str) -> np.ndarray:
+def _numbers_one_by_one(rows: Sequence[tuple[int, str]], places: list[int], width: int, name: str) -> np.ndarray:
     """The careful way, taken when the fast one failed: finds the offending cell, or copes with quotes."""
-    table = np.empty((len(rows), width))
+    table = np.empty((len(rows), len(places)))
     for row, (number, line) in enumerate(rows):
         cells = _cells(line)
         if len(cells) != width:
             raise InputError(
                 f"{name}, line {number}: {len(cells)} values where the header has {width}; mend or remove the row"
             )
-        for column, cell in enumerate(cells):
+        for column, place in enumerate(places):
+            cell = cells[place]
             if not _is_number(cell):
                 what = f"'{cell[:40]}' is not a number" if cell else "the cell is empty"
-                raise InputError(f"{name}, line {number}, column {column + 1}: {what}; mend or remove the row")
+                raise InputError(f"{name}, line {number}, column {place + 1}: {what}; mend or remove the row")
             table[row, column] = float(cell)
     return table
 

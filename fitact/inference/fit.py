@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from fitact.data.record import Record
 from fitact.inference import derived, summary
 from fitact.inference.diagnostics import is_misfit, statistics
-from fitact.inference.identifiability import Identifiability, assess
+from fitact.inference.identifiability import Identifiability, assess, covariance_root
 from fitact.inference.least_squares import Solved, result_message, result_name, solve
 from fitact.inference.likelihood import LINEAR, Likelihood, natural
 from fitact.inference.start import DriveChoice, LinearStart, choose_drive, linear_start
@@ -34,7 +34,7 @@ class Fit:
 
     Attributes:
         theta: the optimum, in the coordinates `names`.
-        covariance: of theta, in the Laplace approximation.
+        covariance_root: its product with its transpose is `covariance`; keeps digits where that cannot.
         sigma: standard deviation of Vsc's noise, V, from the residuals.
         linear: the offset, drift and charge that were freed, V, at the optimum.
         residuals: record minus fit, V.
@@ -46,7 +46,7 @@ class Fit:
     """
 
     theta: Float[np.ndarray, " parameters"]
-    covariance: Float[np.ndarray, "parameters parameters"]
+    covariance_root: Float[np.ndarray, "parameters parameters"]
     sigma: float
     linear: dict[str, float]
     residuals: Float[np.ndarray, " samples"]
@@ -76,9 +76,14 @@ class Fit:
         return "The fit is at its optimum and leaves only noise." if self.trusted else result_message(self.result)
 
     @property
+    def covariance(self) -> Float[np.ndarray, "parameters parameters"]:
+        """Covariance of theta, in the Laplace approximation."""
+        return self.covariance_root @ self.covariance_root.T
+
+    @property
     def sd(self) -> Float[np.ndarray, " parameters"]:
         """Standard deviations of theta."""
-        return np.sqrt(np.diag(self.covariance))
+        return np.linalg.norm(self.covariance_root, axis=1)
 
     @property
     def correlation(self) -> Float[np.ndarray, "parameters parameters"]:
@@ -102,7 +107,7 @@ class Fit:
     def derived(self) -> dict[str, summary.Summary]:
         """Summaries of divider, time constant, force and friction in the Laplace approximation."""
         values, gradient = _log_derived(self.derive, self.theta, self.sigma)
-        sd = np.sqrt(np.einsum("ki,ij,kj->k", gradient, self.covariance, gradient))
+        sd = np.linalg.norm(gradient @ self.covariance_root, axis=1)
         return {
             name: summary.log_normal(name, math.exp(value), float(s))
             for name, value, s in zip(derived.NAMES, values, sd, strict=True)
@@ -221,10 +226,8 @@ def _on_the_ridge(start: LinearStart, prior: Prior) -> Float[np.ndarray, " param
 
 def _judged(solved: Solved, record: Record, scene: Scene, choice: DriveChoice, no_scene: bool) -> Fit:
     likelihood, theta, sigma = solved.likelihood, np.asarray(solved.theta), float(solved.sigma)
-    jacobian = np.asarray(solved.jacobian)
-    fisher = jacobian.T @ jacobian
-    prior_sd = likelihood.prior_sd
-    covariance = np.linalg.inv(fisher + np.diag(prior_sd**-2.0))
+    jacobian, prior_sd = np.asarray(solved.jacobian), likelihood.prior_sd
+    root = covariance_root(jacobian, prior_sd)
     derive = derived.for_fit(likelihood, record, choice, scene)
     logs, gradient = _log_derived(derive, theta, sigma)
     linear = {
@@ -235,14 +238,14 @@ def _judged(solved: Solved, record: Record, scene: Scene, choice: DriveChoice, n
     divider = float(np.exp(logs[derived.NAMES.index("g")]))
     figures = statistics(np.asarray(solved.residuals), theta.size + len(linear), divider, record, choice)
     figures["steps"] = int(solved.steps)
-    identifiability = assess(fisher, likelihood.prior, prior_sd, gradient[derived.NAMES.index("force_mean")])
+    identifiability = assess(jacobian, likelihood.prior, prior_sd, gradient[derived.NAMES.index("force_mean")])
     return Fit(
         theta=theta,
-        covariance=covariance,
+        covariance_root=root,
         sigma=sigma,
         linear=linear,
         residuals=np.asarray(solved.residuals),
-        result=_result(solved, covariance, figures),
+        result=_result(solved, root, figures),
         figures=figures,
         identifiability=identifiability,
         warnings=(*record.notes, *choice.notes, *_warnings(theta, likelihood, record, no_scene)),
@@ -254,13 +257,12 @@ def _judged(solved: Solved, record: Record, scene: Scene, choice: DriveChoice, n
     )
 
 
-def _result(solved: Solved, covariance: Float[np.ndarray, "n n"], figures: dict[str, float]) -> str:
+def _result(solved: Solved, root: Float[np.ndarray, "n n"], figures: dict[str, float]) -> str:
     """The first of the things that stand against the answer."""
     name = result_name(solved.result)
     if name != "successful":
         return name
-    gradient = np.asarray(solved.gradient)
-    decrement = 0.5 * gradient @ covariance @ gradient
+    decrement = 0.5 * float(np.sum((root.T @ np.asarray(solved.gradient)) ** 2))
     if not decrement < _DECREMENT:
         return "did_not_move" if np.array_equal(solved.theta, solved.start) else "not_at_optimum"
     return "misfit" if is_misfit(figures) else "successful"

@@ -54,45 +54,59 @@ class Identifiability:
 
 
 def assess(
-    fisher: Float[np.ndarray, "parameters parameters"],
+    jacobian: Float[np.ndarray, "samples parameters"],
     prior: Prior,
     prior_sd: Float[np.ndarray, " parameters"],
     force_gradient: Float[np.ndarray, " parameters"],
 ) -> Identifiability:
-    """Judge a record by the Fisher information of its data in theta.
+    """Judge a record by the whitened residuals' `jacobian` in theta.
 
     The first three coordinates are log Rsc, log Csc, log Ci; the others (gain, delay) are nuisances with
     priors of their own; `prior_sd` is that of all. `force_gradient` is that of the log mean force.
     """
-    effective = _marginal(fisher, prior_sd)
     sd = prior_sd[:3]
-    values, vectors = np.linalg.eigh(sd[:, None] * effective * sd)
-    values = np.clip(values, 0.0, None)
+    _, roots, vectors = np.linalg.svd(_marginal(jacobian * prior_sd), full_matrices=False)
+    values = roots[::-1] ** 2
     shares = values / (1.0 + values)
-    blind = sd * vectors[:, 0]
+    blind = sd * vectors[-1]
     blind = blind / np.linalg.norm(blind) * (-1.0 if blind[2] < 0.0 else 1.0)
-    along = 1.0 / math.sqrt(np.sum((blind / sd) ** 2))
+    along = float(np.max(np.abs(blind)) / math.sqrt(np.sum((blind / sd) ** 2)))
     if shares[0] >= _IDENTIFIED:
         verdict = "identified"
     else:
         verdict = "prior-limited" if along <= _WIDE else "unidentified"
-    covariance = np.linalg.inv(fisher + np.diag(prior_sd**-2.0))
-    moved = covariance @ force_gradient
+    root = covariance_root(jacobian, prior_sd)
+    moved = root @ (root.T @ force_gradient)
     return Identifiability(
         verdict=verdict,
         eigenvalues=tuple(float(share) for share in shares),
         blind_direction=dict(zip(NAMES, map(float, blind), strict=True)),
         blind_name=_name(blind),
-        prior_sd=along * float(np.max(np.abs(blind))),
+        prior_sd=along,
         force_from_prior=float(np.sum((moved / prior_sd) ** 2) / (moved @ force_gradient)),
         remedy="" if verdict == "identified" else _remedy(verdict, prior),
     )
 
 
-def _marginal(fisher: np.ndarray, prior_sd: np.ndarray) -> np.ndarray:
-    """Information on the first three parameters once the others are unknown up to their priors."""
-    others = fisher[3:, 3:] + np.diag(prior_sd[3:] ** -2.0)
-    return fisher[:3, :3] - fisher[:3, 3:] @ np.linalg.solve(others, fisher[3:, :3])
+def covariance_root(
+    jacobian: Float[np.ndarray, "samples parameters"], prior_sd: Float[np.ndarray, " parameters"]
+) -> Float[np.ndarray, "parameters parameters"]:
+    """A matrix whose product with its transpose is the Laplace approximation's covariance.
+
+    From the singular values of the Jacobian: their squares span more digits than a number has.
+    """
+    _, roots, vectors = np.linalg.svd(jacobian * prior_sd, full_matrices=False)
+    return prior_sd[:, None] * vectors.T / np.hypot(1.0, roots)
+
+
+def _marginal(scaled: np.ndarray) -> np.ndarray:
+    """The Jacobian (per prior sd) of the first three parameters, less what the others can do within their priors."""
+    count = scaled.shape[1] - 3
+    if count == 0:
+        return scaled
+    others, _ = np.linalg.qr(np.vstack([scaled[:, 3:], np.eye(count)]))
+    first = np.vstack([scaled[:, :3], np.zeros((count, 3))])
+    return first - others @ (others.T @ first)
 
 
 def _name(direction: np.ndarray) -> str:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from fitact.inference.likelihood import LINEAR, Likelihood
 
+_PRECISION = 1e-9  # of Vsc's span: least noise assumed
 _EVIDENCE = 10.0  # a nuisance is freed when it lowers the Bayesian information criterion by this much
 
 
@@ -87,7 +88,11 @@ def _round(likelihood: Likelihood, start: Array, sigma: Array) -> Solved:
         likelihood=likelihood,
         start=start,
         theta=theta,
-        sigma=jnp.sqrt(jnp.sum(jnp.square(remainder)) / max(remainder.size - start.size, 1)),
+        # not below what double precision leaves of a record without noise
+        sigma=jnp.maximum(
+            jnp.sqrt(jnp.sum(jnp.square(remainder)) / max(remainder.size - start.size, 1)),
+            _PRECISION * jnp.ptp(likelihood.observed),
+        ),
         result=RESULTS.promote(solution.result),
         steps=solution.stats["num_steps"],
         residuals=remainder,

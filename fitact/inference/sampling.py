@@ -121,7 +121,7 @@ class _Run:
         with _interrupts_between_steps() as check:
             for sampler, last in zip(self.samplers, self.chain.states, strict=True):
                 sampler.reset()
-                for _ in sampler.sample(last, iterations=steps):
+                for _ in sampler.sample(last, iterations=steps, skip_initial_state_check=True):
                     check()
                 state = sampler.get_last_sample()
                 done.append((sampler.get_chain(), sampler.get_log_prob(), state, sampler.backend.accepted))
@@ -180,16 +180,16 @@ class _StudentT:
     """A multivariate Student-t in the coordinates of the chain."""
 
     center: Float[np.ndarray, " n"]
-    factor: Float[np.ndarray, "n n"]  # Cholesky factor of its scale
+    factor: Float[np.ndarray, "n n"]  # its product with its transpose is the scale
 
     @classmethod
     def around(cls, fit: Fit) -> "_StudentT":
         """The fit's Laplace approximation, with sigma's from its degrees of freedom."""
         size = fit.theta.size + 1
-        scale = np.zeros((size, size))
-        scale[:-1, :-1] = fit.covariance
-        scale[-1, -1] = 0.5 / fit.figures["degrees_of_freedom"]
-        return cls(np.append(fit.theta, np.log(fit.sigma)), np.linalg.cholesky(scale))
+        factor = np.zeros((size, size))
+        factor[:-1, :-1] = fit.covariance_root
+        factor[-1, -1] = np.sqrt(0.5 / fit.figures["degrees_of_freedom"])
+        return cls(np.append(fit.theta, np.log(fit.sigma)), factor)
 
     def draw(self, random: np.random.RandomState, count: int, widen: float = 1.0) -> Float[np.ndarray, "count n"]:
         normal = random.standard_normal((count, self.center.size)) @ self.factor.T

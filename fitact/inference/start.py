@@ -12,6 +12,8 @@ from fitact.errors import InputError
 from fitact.model.drive import Drive, Sampled, Sine
 from fitact.model.scene import Scene
 
+_CONTRADICTION = 0.05  # relative difference between the stated and the recorded drive that cannot be an inaccuracy
+
 
 @dataclasses.dataclass(frozen=True)
 class DriveChoice:
@@ -52,6 +54,8 @@ def choose_drive(record: Record, scene: Scene | None) -> DriveChoice:
     if scene is None or scene.drive.waveform == "measured":
         return _measured(record, scene.steady_state() if scene else None, ())
     drive = scene.make_drive()
+    if scene.states_waveform():
+        _check_frequency(record, scene.drive.frequency)
     shift = _align(record, drive, scene.drive.frequency)
     if shift != 0.0 and "V" not in record and isinstance(drive, Sine):
         raise InputError(
@@ -64,6 +68,8 @@ def choose_drive(record: Record, scene: Scene | None) -> DriveChoice:
         notes = (f"the scene's drive was shifted by {shift:.4g} s to lie on the record",)
     if "V" in record:
         error = _mismatch(record, voltage)
+        if scene.states_waveform():
+            _check_amplitude(record, voltage)
         if error > 0.02 and not scene.states_waveform():
             note = "the scene names no waveform and V_V is not its nominal square: the recorded V_V drives the fit"
             return _measured(record, scene.steady_state(), (note,))
@@ -104,7 +110,7 @@ def whole_periods(record: Record) -> tuple[int, float | None]:
     if frequency is None:
         return len(record), None
     span = record.time[-1] - record.time[0] + record.time_step
-    length = np.floor(span * frequency * (1.0 + 1e-3)) / frequency
+    length = np.floor(span * frequency + min(1e-3 * span * frequency, 2.0 * record.time_step * frequency)) / frequency
     if length <= 0.0:
         return len(record), None
     kept = int(np.searchsorted(record.time, record.time[0] + length - 0.5 * record.time_step))
@@ -140,6 +146,25 @@ def linear_start(record: Record, choice: DriveChoice) -> LinearStart:
     return LinearStart(float(g), float(span / -slope) if slope < 0.0 else float("inf"))
 
 
+def _check_frequency(record: Record, stated: float) -> None:
+    found = record.frequency("V" if "V" in record else "Vsc")
+    if found is not None and abs(found / stated - 1.0) > _CONTRADICTION:
+        raise InputError(
+            f"{record.source}: repeats at {found:.5g} Hz, but the scene's [drive] frequency is {stated:.5g} Hz;"
+            " mend the scene, or check the unit of time"
+        )
+
+
+def _check_amplitude(record: Record, voltage: np.ndarray) -> None:
+    wave = voltage - voltage.mean()
+    ratio = float(wave @ record["V"] / (wave @ wave))
+    if abs(ratio - 1.0) > _CONTRADICTION:
+        raise InputError(
+            f"{record.source}: V_V is {ratio:.3g} times the scene's [drive]; mend peak_to_peak (from trough to crest,"
+            " not the peak) or the other keys there, or use the recorded drive: waveform = 'measured'"
+        )
+
+
 def _mismatch(record: Record, voltage: np.ndarray) -> float:
     """Rms difference between recorded and computed V beyond V's noise, over V's rms."""
     difference = record["V"] - voltage
@@ -173,7 +198,10 @@ def _align(record: Record, drive: Drive, frequency: float) -> float:
     shifts = np.arange(0.0, 1.0, 1.0 / 128.0) / frequency
     errors = np.array([left(shift) for shift in shifts])
     best = int(np.argmin(errors))
-    if errors[0] <= 2.0 * errors[best] or best in (0, 1, shifts.size - 1):
+    fine = shifts[best] + np.linspace(-1.0, 1.0, 129) / (128.0 * frequency)
+    left_fine = np.array([left(shift) for shift in fine])
+    if errors[0] <= 2.0 * left_fine.min():
         return 0.0
-    fine = shifts[best] + np.linspace(-1.0, 1.0, 65) / (128.0 * frequency)
-    return float(fine[np.argmin([left(shift) for shift in fine])])
+    # the middle of what fits equally well: an ideal edge may lie anywhere between two samples
+    shift = float(np.mean(fine[left_fine <= left_fine.min() * (1.0 + 25.0 / target.size)]))
+    return shift - 1.0 / frequency if shift > 0.5 / frequency else shift
