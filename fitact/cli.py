@@ -42,7 +42,7 @@ SceneFile = Annotated[
     Path | None, typer.Option("--scene", metavar="FILE", help="Scene (TOML); absent: the paper's device.")
 ]
 Out = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for the results.")]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="Same seed, same draws.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Same seed, same draws.")]
 Json = Annotated[
     bool, typer.Option("--json", help="Print the result as JSON on standard output, and nothing else there.")
 ]
@@ -62,7 +62,7 @@ def run(
 
     Writes fit.json, summary.json, posterior.nc (opens with ArviZ), chain.h5 (for going on) and report.html.
     """
-    folder = out or Path(f"{record.name.split('.')[0]}-fitact")
+    folder = out or _folder(record)
     posterior = _sampled(record, scene, folder, seed, fresh)
     page = folder / "report.html"
     _say("writing the report")
@@ -91,7 +91,7 @@ def sample(
     json: Json = False,
 ) -> None:
     """Fit, then sample the posterior until it has converged; as `run`, without the report."""
-    folder = out or Path(f"{record.name.split('.')[0]}-fitact")
+    folder = out or _folder(record)
     posterior = _sampled(record, scene, folder, seed, fresh)
     _show(f"{posterior}\nwrote {folder}; for a report: fitact report {folder}", posterior.summary(), json)
     _finish(posterior.trusted)
@@ -108,7 +108,9 @@ def report(
     tree, summary, fitted = read_results(directory)
     page = directory / "report.html"
     write_report(page, tree, summary, fitted)
-    _show(f"open {page}", {"report": str(page)}, json)
+    trusted = bool(summary["convergence"]["converged"]) and summary["fit"]["result"] == "successful"
+    _show(f"open {page}", {"report": str(page), "trusted": trusted}, json)
+    _finish(trusted)
 
 
 @app.command()
@@ -137,6 +139,10 @@ def simulate(
     _show(f"wrote {out}: {len(record):,} samples of {', '.join(record.channels)}", content, json)
 
 
+def _folder(record: Path) -> Path:
+    return Path(f"{record.name.removesuffix('.gz').removesuffix('.csv')}-fitact")
+
+
 def _scene(path: Path | None) -> "Scene | None":
     from fitact.model.scene import Scene
 
@@ -158,15 +164,15 @@ def _fitted(record: Path, scene: Path | None) -> "Fit":
 
 
 def _sampled(record: Path, scene: Path | None, folder: Path, seed: int, fresh: bool) -> "Posterior":
-    """Fit and sample, and write all but the report."""
+    """Fit and sample, and write all but the report, once the chain is known to belong there."""
     fitted = _fitted(record, scene)
-    write_json(folder / "fit.json", fitted.to_dict())
     from fitact.inference.sampling import sample
 
     chain = folder / "chain.h5"
     if fresh:
         chain.unlink(missing_ok=True)
     posterior = sample(fitted, seed=seed, chain_file=chain)
+    write_json(folder / "fit.json", fitted.to_dict())
     posterior.to_netcdf(folder / "posterior.nc")
     write_json(folder / "summary.json", posterior.summary())
     return posterior
@@ -178,11 +184,11 @@ def _use_compilation_cache() -> None:
         return
     import jax
 
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = root / "fitact" / f"jax-{jax.__version__}-{platform.node()}"
     try:
+        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        folder = root / "fitact" / f"jax-{jax.__version__}-{platform.node()}"
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
+    except (OSError, RuntimeError):  # no home, or one that cannot be written
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)

@@ -66,7 +66,7 @@ def test_run_again_goes_on_from_the_chain_and_json_stands_alone(
     results, fitact_command, finger_path, finger_scene_path
 ):
     folder, _ = results
-    before = (folder / "posterior.nc").read_bytes()
+    before, fit_before = (folder / "posterior.nc").read_bytes(), (folder / "fit.json").read_bytes()
     done = fitact_command("run", finger_path, "--scene", finger_scene_path, "--out", folder, "--seed", 1, "--json")
     assert done.returncode == 0
     assert json.loads(done.stdout) == json.loads((folder / "summary.json").read_text())
@@ -76,6 +76,7 @@ def test_run_again_goes_on_from_the_chain_and_json_stands_alone(
     assert other.returncode == 2
     assert "another record, scene, seed" in other.stderr
     assert (folder / "posterior.nc").read_bytes() == before
+    assert (folder / "fit.json").read_bytes() == fit_before
 
 
 def test_report_is_made_again_from_the_folder(results, fitact_command, tmp_path):

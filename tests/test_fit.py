@@ -1,7 +1,7 @@
 import jax
 import numpy as np
 import pytest
-from conftest import square_record
+from conftest import skin_voltage, square_record
 
 import fitact
 
@@ -218,3 +218,70 @@ def test_it_prints_errors_correlations_and_the_verdict(finger_fit: fitact.Fit):
     text = str(finger_fit)
     for word in ("Rsc", "Csc", "Ci", "correlations", "prior-limited", "contact area", "chi-square"):
         assert word in text
+
+
+def trapezoid_record(step: float, edge: float = 20e-6, noise: float = 0.05) -> fitact.Record:
+    """A 100 Hz trapezoid, computed by scipy on a fine grid and sampled every `step`."""
+    fine = np.arange(140_001) * 1e-6
+    phase = (fine + 3.3e-6) % 0.01
+    voltage = np.interp(phase, [0.0, edge, 5e-3, 5e-3 + edge, 0.01], [-180.0, 180.0, 180.0, -180.0, -180.0])
+    vsc = skin_voltage(fine, voltage, 130e3, 18e-9, 1.35e-9)
+    kept = slice(120_000, 140_000, round(step / 1e-6))
+    noise_Vsc = noise * np.random.default_rng(1).standard_normal(fine[kept].size)
+    return fitact.Record.from_arrays(fine[kept] - 0.12, V=voltage[kept], Vsc=vsc[kept] + noise_Vsc)
+
+
+@pytest.mark.parametrize("step", [5e-6, 50e-6, 100e-6])
+def test_edges_faster_than_the_samples_widen_g(step: float):
+    """Straight lines through a jump put its edge in the middle of a step, wherever it was."""
+    fit = fitact.fit(trapezoid_record(step))
+    assert abs(deviation(fit, "g", 1.35 / 20.7)) < 4.0
+    assert abs(deviation(fit, "b", 130e3 * 20.7e-9)) < 4.0
+
+
+@pytest.mark.parametrize("samples", [10, 20])
+def test_coarse_samples_of_a_smooth_drive_are_not_trusted(samples: int):
+    time = np.arange(5 * samples) * 0.01 / samples
+    omega = 2.0 * np.pi * 100.0
+    gain = 1j * omega * 130e3 * 1.35e-9 / (1.0 + 1j * omega * 130e3 * 20.7e-9)
+    vsc = 180.0 * np.imag(gain * np.exp(1j * omega * time)) + 0.05 * np.random.default_rng(0).standard_normal(time.size)
+    fit = fitact.fit(fitact.Record.from_arrays(time, V=180.0 * np.sin(omega * time), Vsc=vsc))
+    assert not fit.trusted
+    assert any("too coarsely" in warning for warning in fit.warnings)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-8, 1e-6, 1e-4])
+def test_a_record_without_noise_is_not_called_identified(noise: float):
+    fit = fitact.fit(square_record(noise=noise), SQUARE)
+    assert fit.identifiability.verdict == "prior-limited"
+    assert fit.identifiability.eigenvalues[0] < 1e-3
+    assert np.all(np.isfinite(fit.sd))
+    assert fit.sd[0] == pytest.approx(0.05, rel=0.01)
+
+
+def test_coarse_converter(finger_path):
+    """8 bits over 40 V: the noise is smaller than a step."""
+    record, step = square_record(noise=0.01), 40.0 / 256.0
+    rounded = np.round(record["Vsc"] / step) * step
+    fit = fitact.fit(fitact.Record.from_arrays(record.time, V=record["V"], Vsc=rounded), SQUARE)
+    assert fit.result == "successful"
+    assert abs(deviation(fit, "b", 130e3 * 20.7e-9)) < 6.0  # rounding errors are not independent
+
+
+@pytest.mark.parametrize(
+    ("drive", "words"), [({"peak_to_peak": 180.0}, "2 times"), ({"frequency": 50.0}, "repeats at 100 Hz")]
+)
+def test_scene_that_contradicts_the_recorded_drive_is_refused(drive: dict[str, float], words: str):
+    scene = fitact.Scene.from_dict({"drive": {"waveform": "square"} | drive})
+    with pytest.raises(fitact.InputError, match=words):
+        fitact.fit(square_record(), scene)
+
+
+@pytest.mark.parametrize("shift", [50e-6, -50e-6, 2e-3, -4.99e-3])
+def test_any_shift_is_found(shift: float):
+    record = square_record()
+    shifted = fitact.Record.from_arrays(record.time + shift, V=record["V"], Vsc=record["Vsc"])
+    fit = fitact.fit(shifted, SQUARE)
+    assert fit.result == "successful"
+    assert abs(deviation(fit, "g", 1.35 / 20.7)) < 2.5
+    assert abs(deviation(fit, "b", 130e3 * 20.7e-9)) < 4.0

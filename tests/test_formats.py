@@ -35,7 +35,7 @@ def test_values_are_read_as_written(finger_path: Path, rows: Rows):
 
 def test_order_comments_gzip_and_extra_columns(tmp_path: Path, finger_path: Path, rows: Rows):
     path = tmp_path / "record.csv.gz"
-    lines = ["# a comment", "Vsc_V, note ,Time_s,V_V", "", *(f"{c},7,{a},{b}" for a, b, c in rows[1:]), ""]
+    lines = ["# a comment", "Vsc_V, note ,Time_s,V_V,", "", *(f"{c},ok,{a},{b}," for a, b, c in rows[1:]), ""]
     path.write_bytes(gzip.compress("\r\n".join(lines).encode("utf-8-sig")))
     record = fitact.read(path)
     assert record.fingerprint == fitact.read(finger_path).fingerprint

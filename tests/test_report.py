@@ -62,14 +62,11 @@ def test_page_says_the_verdict_first_and_how_to_repeat_it(path: Path):
             "Prior-limited",
             "contact area",
             "trunk current",
-            "What the model",
             "Diagnostics",
             "--seed 1",
         )
-        if part in words
     ]
     assert places == sorted(places)
-    assert len(places) >= 5
     assert "Do not trust" not in words
 
 

@@ -16,7 +16,7 @@ BOXES = {
 
 
 @pytest.mark.parametrize("box", BOXES)
-def test_uniform_priors_give_the_inverse_square_law_along_the_blind_direction(box: str):
+def test_uniform_priors_give_the_inverse_square_law_along_the_blind_direction(box: str, tmp_path):
     """p(Rsc) ~ 1/Rsc^2 between its limits: with q the share of 1/Rsc passed, Rsc = 1 / (1/low - q (1/low - 1/high))."""
     low, high = BOXES[box]
     scene = fitact.Scene.from_dict(
@@ -29,15 +29,18 @@ def test_uniform_priors_give_the_inverse_square_law_along_the_blind_direction(bo
             },
         }
     )
-    fit = fitact.fit(square_record(per_period=500), scene)
+    fit = fitact.fit(square_record(per_period=200), scene)
     assert fit.result == "successful"  # an optimum on the edge of the box is no failure
-    # the seed only fixes which 5 % passes: the law holds to a few per cent for every one tried
-    posterior = fitact.sample(fit, seed=5, progress=False)
-    assert posterior.convergence.converged
+    # some 50,000 effective draws put the 95 % quantile's standard error at 1.4 %, so nearly every seed passes
+    path = tmp_path / "chain.h5"
+    convergence = fitact.sample(fit, seed=5, walkers=256, chain_file=path, progress=False).convergence
+    assert convergence.converged
+    backends = [emcee.backends.HDFBackend(path, name=f"ensemble_{i}", read_only=True) for i in range(4)]
+    Rsc = np.exp([backend.get_chain(discard=convergence.burn)[..., 0] for backend in backends])
     a, b = (1.0 / getattr(scene.prior.Rsc, end) for end in ("low", "high"))
     share = np.array([0.05, 0.5, 0.95])
     expected = 1.0 / (a - share * (a - b))
-    np.testing.assert_allclose(np.quantile(posterior.parameters()["Rsc"], share), expected, rtol=0.05)
+    np.testing.assert_allclose(np.quantile(Rsc, share), expected, rtol=0.05)
 
 
 def test_log_normal_prior_along_the_blind_direction(finger_posterior: fitact.Posterior, finger_fit: fitact.Fit):

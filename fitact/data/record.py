@@ -11,6 +11,7 @@ from jaxtyping import Float
 from fitact.errors import InputError
 
 MINIMUM_SAMPLES = 20
+_LEVELS = 12  # distinct values from which a channel counts as rounded by a converter
 _NEAR_PEAK = 0.02  # of correlation: the first period's peak may be that much lower than a later one's
 _TOP = 0.002  # of correlation: the part of a peak that is taken for a parabola
 CHANNEL_UNITS = {"V": "V", "Vsc": "V", "I": "A"}
@@ -101,8 +102,8 @@ class Record:
         return digest.hexdigest()
 
     def noise(self, channel: str) -> float:
-        """Standard deviation of the channel's white noise, judged without a model (see `white_noise`)."""
-        return white_noise(self[channel])
+        """Standard deviation of the channel's noise, judged without a model: white noise and rounding."""
+        return math.hypot(white_noise(self[channel]), rounding_noise(self[channel]))
 
     def frequency(self, channel: str = "V") -> float | None:
         """Fundamental frequency of a channel in Hz; None unless the record shows at least 1.5 periods."""
@@ -125,8 +126,14 @@ def white_noise(values: Float[np.ndarray, " samples"]) -> float:
 
 
 def rounding_noise(values: Float[np.ndarray, " samples"]) -> float:
-    """Standard deviation that the resolution of the samples alone brings about."""
-    return float(np.diff(np.unique(values)).min() / math.sqrt(12.0))
+    """Standard deviation that the resolution of the samples alone brings about, where white noise does not hide it.
+
+    A few levels only are an ideal wave's, not a converter's.
+    """
+    levels = np.unique(values)
+    step = float(np.diff(levels).min())
+    coarse = levels.size >= _LEVELS and white_noise(values) < step
+    return step / math.sqrt(12.0) if coarse else 0.0
 
 
 def fundamental(time: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"]) -> float | None:

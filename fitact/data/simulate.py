@@ -3,10 +3,12 @@
 import jax
 import numpy as np
 
-from fitact.data.record import Record
+from fitact.data.record import MINIMUM_SAMPLES, Record
 from fitact.errors import InputError
 from fitact.model.response import response
 from fitact.model.scene import Scene
+
+_MOST_SAMPLES = 100_000_000
 
 
 def simulate(scene: Scene, seed: int = 0) -> Record:
@@ -16,7 +18,13 @@ def simulate(scene: Scene, seed: int = 0) -> Record:
         InputError: the scene asks for what is not modelled, or for a current that has impulses.
     """
     circuit, drive, measured = scene.make_circuit(), scene.make_drive(), scene.measurement
-    time = np.arange(round(measured.duration * measured.sampling_rate)) / measured.sampling_rate
+    count = round(measured.duration * measured.sampling_rate)
+    if not MINIMUM_SAMPLES <= count <= _MOST_SAMPLES:
+        raise InputError(
+            f"scene: [measurement] duration times sampling_rate is {count:,} samples; choose them to give"
+            f" {MINIMUM_SAMPLES} to {_MOST_SAMPLES:,}"
+        )
+    time = np.arange(count) / measured.sampling_rate
     rng = np.random.default_rng(seed)
     channels = {}
     with jax.enable_x64(True):

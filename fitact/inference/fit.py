@@ -13,13 +13,13 @@ from jaxtyping import Array, Float
 
 from fitact.data.record import Record
 from fitact.inference import derived, summary
-from fitact.inference.diagnostics import is_misfit, statistics
+from fitact.inference.diagnostics import is_coarse, is_misfit, statistics
 from fitact.inference.identifiability import Identifiability, assess, covariance_root
 from fitact.inference.least_squares import Solved, result_message, result_name, solve
 from fitact.inference.likelihood import LINEAR, Likelihood, natural
-from fitact.inference.start import DriveChoice, LinearStart, choose_drive, linear_start
+from fitact.inference.start import DriveChoice, LinearStart, choose_drive, has_unresolved_edge, linear_start
 from fitact.model.drive import Square
-from fitact.model.prior import Prior
+from fitact.model.prior import LogNormal, Prior
 from fitact.model.scene import Scene
 from fitact.units import engineering
 
@@ -178,7 +178,8 @@ def fit(record: Record, scene: Scene | None = None) -> Fit:
     with jax.enable_x64(True):
         choice = choose_drive(record, scene)
         start = linear_start(record, choice)
-        likelihood = _likelihood(record, choice, given.make_prior())
+        prior = _with_edge_time(given.make_prior(), record, choice, start)
+        likelihood = _likelihood(record, choice, prior)
         ridge = _on_the_ridge(start, likelihood.prior)
         theta = np.append(ridge, 0.0) if likelihood.free_delay else ridge
         solved = solve(likelihood, theta, record.noise("Vsc"))
@@ -202,6 +203,15 @@ def _likelihood(record: Record, choice: DriveChoice, prior: Prior) -> Likelihood
         steady_state=choice.steady_state,
         free_delay=choice.shift != 0.0,  # then the edges are known to within a step only, which g feels
     )
+
+
+def _with_edge_time(prior: Prior, record: Record, choice: DriveChoice, start: LinearStart) -> Prior:
+    """Where a measured drive jumps within a step, its edge's time is uncertain within it, which acts as a gain."""
+    if choice.name != "measured" or not has_unresolved_edge(choice.voltage) or not math.isfinite(start.b):
+        return prior
+    spread = record.time_step / math.sqrt(12.0) / start.b
+    known = 0.0 if prior.gain is None else prior.gain.spread
+    return dataclasses.replace(prior, gain=LogNormal(1.0, math.hypot(spread, known)))
 
 
 def _delay_sd(choice: DriveChoice) -> float:
@@ -248,7 +258,7 @@ def _judged(solved: Solved, record: Record, scene: Scene, choice: DriveChoice, n
         result=_result(solved, root, figures),
         figures=figures,
         identifiability=identifiability,
-        warnings=(*record.notes, *choice.notes, *_warnings(theta, likelihood, record, no_scene)),
+        warnings=(*record.notes, *choice.notes, *_warnings(theta, likelihood, record, figures, no_scene)),
         likelihood=likelihood,
         derive=derive,
         record=record,
@@ -283,7 +293,9 @@ def _log_derived(derive: derived.Derived, theta: np.ndarray, sigma: float) -> tu
         return np.asarray(values), np.asarray(gradient)
 
 
-def _warnings(theta: np.ndarray, likelihood: Likelihood, record: Record, no_scene: bool) -> list[str]:
+def _warnings(
+    theta: np.ndarray, likelihood: Likelihood, record: Record, figures: dict[str, float], no_scene: bool
+) -> list[str]:
     found = []
     if no_scene:
         found.append(
@@ -295,6 +307,12 @@ def _warnings(theta: np.ndarray, likelihood: Likelihood, record: Record, no_scen
         found.append(
             f"the record ({engineering(span, 's')}) does not show its drive repeating: it is shorter than 1.5 periods"
             " or not periodic, so the answer rests on a part of a wave; record two periods or more"
+        )
+    if is_coarse(figures):
+        found.append(
+            "V_V is sampled too coarsely for straight lines between its samples (they err by"
+            f" {engineering(figures['interpolation_error'], 'V')} in Vsc); record faster, or name the"
+            " waveform in a scene"
         )
     prior = likelihood.prior
     for name, factor, tail in _plausibility(theta, prior):

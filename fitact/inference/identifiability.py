@@ -124,5 +124,5 @@ def _remedy(verdict: str, prior: Prior) -> str:
     if verdict == "unidentified":
         remedy = "No prior covers that direction: state one for Ci, from the panel's data sheet. " + remedy
     if prior.gain is not None:
-        remedy += " The free gain is confounded with Rsc Ci: calibrate the probe."
+        remedy += " The free gain is confounded with Rsc Ci: calibrate the probe, and resolve the drive's edges."
     return remedy

@@ -84,12 +84,11 @@ def choose_drive(record: Record, scene: Scene | None) -> DriveChoice:
 
 def _measured(record: Record, steady_state: bool | None, notes: tuple[str, ...]) -> DriveChoice:
     voltage = record["V"]
-    edge = _unresolved_edge(voltage)
-    if edge:
+    if has_unresolved_edge(voltage):
         notes = (
             *notes,
-            "V_V jumps within one sample step, so its edges are known only to within a step, and b to a"
-            " correspondingly small error; record faster, or name the waveform in a scene",
+            "V_V jumps within one sample step, so the time of its edges, and with it g, is known only to within a"
+            " step (freed as a gain); record faster, or name the waveform in a scene",
         )
     if not steady_state:
         return DriveChoice(Sampled(record.time, voltage), voltage, False, steady_state is None, 0.0, "measured", notes)
@@ -172,8 +171,9 @@ def _mismatch(record: Record, voltage: np.ndarray) -> float:
     return float(np.sqrt(beyond / np.mean(voltage**2)))
 
 
-def _unresolved_edge(voltage: np.ndarray) -> bool:
-    return bool(np.max(np.abs(np.diff(voltage))) > 0.9 * np.ptp(voltage))
+def has_unresolved_edge(voltage: Float[np.ndarray, " samples"]) -> bool:
+    """Whether a drive jumps by most of its height between two samples."""
+    return bool(np.max(np.abs(np.diff(voltage))) > 0.6 * np.ptp(voltage))
 
 
 def _align(record: Record, drive: Drive, frequency: float) -> float:

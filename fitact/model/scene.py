@@ -60,7 +60,7 @@ else:
 
 
 class _Section(pydantic.BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Device(_Section):
@@ -155,8 +155,8 @@ class Belief(_Section):
     """A prior for one parameter: a log-normal (median with factor or relative_sd), or uniform (low, high)."""
 
     median: float | None = Field(default=None, gt=0)
-    factor: float | None = Field(default=None, gt=1)
-    relative_sd: float | None = Field(default=None, gt=0)
+    factor: float | None = Field(default=None, gt=1, le=1e6)
+    relative_sd: float | None = Field(default=None, gt=0, le=10)
     low: float | None = Field(default=None, gt=0)
     high: float | None = Field(default=None, gt=0)
 

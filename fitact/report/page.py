@@ -3,6 +3,7 @@
 import base64
 import json
 import os
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -67,8 +68,10 @@ def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]
     try:
         summary, fitted = (json.loads((directory / name).read_text()) for name in ("summary.json", "fit.json"))
         with xr.open_datatree(directory / "posterior.nc", engine="h5netcdf") as tree:
+            if not {"identifiability", "convergence", "fit", "model", "record"} <= set(summary):
+                raise ValueError("summary.json is not fitact's")
             return tree.load(), summary, fitted
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError) as error:
         raise InputError(
             f"{directory}: holds no complete results ({error}); make them with: fitact sample RECORD --out {directory}"
         ) from error
@@ -102,4 +105,4 @@ def _quantity(summary: dict[str, Any], key: str = "q50", digits: int = 4) -> str
 
 def _command(summary: dict[str, Any]) -> str:
     scene = " --scene SCENE.toml" if summary["scene"] else ""
-    return f"fitact run {summary['record']['source']}{scene} --seed {summary['seed']}"
+    return f"fitact run {shlex.quote(summary['record']['source'])}{scene} --seed {summary['seed']}"
