@@ -285,3 +285,22 @@ def test_any_shift_is_found(shift: float):
     assert fit.result == "successful"
     assert abs(deviation(fit, "g", 1.35 / 20.7)) < 2.5
     assert abs(deviation(fit, "b", 130e3 * 20.7e-9)) < 4.0
+
+
+def test_from_rest_with_what_was_recorded_before_the_trigger():
+    """scipy starts at rest; the record begins half a period before the drive does."""
+    time = np.arange(-1000, 4000) * 5e-6
+    voltage = np.where(time < 0.0, 0.0, np.where((time % 0.01) < 5e-3 - 1e-9, 180.0, -180.0))
+    vsc = skin_voltage(time - time[0], voltage, 130e3, 18e-9, 1.35e-9, hold=True)
+    vsc = vsc + 0.05 * np.random.default_rng(0).standard_normal(time.size)
+    scene = fitact.Scene.from_dict({"drive": {"waveform": "square", "steady_state": False}})
+    fit = fitact.fit(fitact.Record.from_arrays(time, V=voltage, Vsc=vsc), scene)
+    assert fit.result == "successful"
+    assert fit.choice.shift == 0.0
+    assert not any("differs" in warning for warning in fit.warnings)
+    assert abs(deviation(fit, "g", 1.35 / 20.7)) < 4.0
+
+
+def test_huge_offset_is_not_trusted(finger_path):
+    record = fitact.read(finger_path)
+    assert not fitact.fit(fitact.Record.from_arrays(record.time, V=record["V"], Vsc=record["Vsc"] + 1e6)).trusted

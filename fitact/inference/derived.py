@@ -98,4 +98,4 @@ def _grid(record: Record, choice: DriveChoice) -> tuple[np.ndarray, np.ndarray]:
     cells = np.gradient(record.time)
     if period is None:  # the trapezoid rule; over whole periods the ends meet
         cells[[0, -1]] *= 0.5
-    return record.time[:kept], cells[:kept]
+    return record.time[:kept] - choice.shift, cells[:kept]

@@ -12,6 +12,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.data.record import Record
+from fitact.errors import InputError
 from fitact.inference import derived, summary
 from fitact.inference.diagnostics import is_coarse, is_misfit, statistics
 from fitact.inference.identifiability import Identifiability, assess, covariance_root
@@ -177,13 +178,19 @@ def fit(record: Record, scene: Scene | None = None) -> Fit:
     given.require_available(fit=True)
     with jax.enable_x64(True):
         choice = choose_drive(record, scene)
-        start = linear_start(record, choice)
-        prior = _with_edge_time(given.make_prior(), record, choice, start)
-        likelihood = _likelihood(record, choice, prior)
+        prior = given.make_prior()
+        largest = 0.5 if prior.gain is None else 0.5 * math.exp(3.0 * prior.gain.spread)
+        start = linear_start(record, choice, largest)
+        likelihood = _likelihood(record, choice, _with_edge_time(prior, record, choice, start))
         ridge = _on_the_ridge(start, likelihood.prior)
         theta = np.append(ridge, 0.0) if likelihood.free_delay else ridge
-        solved = solve(likelihood, theta, record.noise("Vsc"))
-        return _judged(solved, record, given, choice, scene is None)
+        try:
+            solved = solve(likelihood, theta, record.noise("Vsc"))
+            return _judged(solved, record, given, choice, scene is None)
+        except np.linalg.LinAlgError as error:
+            raise InputError(
+                f"{record.source}: Vsc and V cannot be computed with ({error}); check for a huge offset or a wrong unit"
+            ) from error
 
 
 def _likelihood(record: Record, choice: DriveChoice, prior: Prior) -> Likelihood:

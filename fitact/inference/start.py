@@ -56,13 +56,13 @@ def choose_drive(record: Record, scene: Scene | None) -> DriveChoice:
     drive = scene.make_drive()
     if scene.states_waveform():
         _check_frequency(record, scene.drive.frequency)
-    shift = _align(record, drive, scene.drive.frequency)
+    shift = _align(record, drive, scene.drive.frequency, scene.drive.steady_state)
     if shift != 0.0 and "V" not in record and isinstance(drive, Sine):
         raise InputError(
             f"{record.source}: does not start where the scene's sine does, and without V_V the phase of the drive"
             " cannot be told from the circuit's; record V_V, or let t = 0 be its upward zero crossing"
         )
-    voltage = np.asarray(drive.value(record.time - shift))
+    voltage = _voltage(drive, record.time - shift, scene.drive.steady_state)
     notes: tuple[str, ...] = ()
     if shift != 0.0:
         notes = (f"the scene's drive was shifted by {shift:.4g} s to lie on the record",)
@@ -116,11 +116,11 @@ def whole_periods(record: Record) -> tuple[int, float | None]:
     return kept, float(length)
 
 
-def linear_start(record: Record, choice: DriveChoice) -> LinearStart:
-    """g and b from  Vsc = g V - (1/b) ∫ Vsc dt + straight line,  the circuit's equation integrated once.
+def linear_start(record: Record, choice: DriveChoice, largest: float = 0.5) -> LinearStart:
+    """g (below `largest`) and b from  Vsc = g V - (1/b) ∫ Vsc dt + line,  the circuit's equation integrated once.
 
     Raises:
-        InputError: g is not between 0 and 1/2, which this circuit cannot give.
+        InputError: g is not between 0 and `largest` (1/2, or a little more with a free gain), so not this circuit's.
     """
     time, vsc, voltage = record.time, record["Vsc"], choice.voltage
     step = np.diff(time)
@@ -132,7 +132,7 @@ def linear_start(record: Record, choice: DriveChoice) -> LinearStart:
     span = time[-1] - time[0]
     design = np.stack([voltage, integral / span, np.ones_like(time), (time - time[0]) / span], axis=1)
     (g, slope, _, _), *_ = np.linalg.lstsq(design[inside], vsc[inside], rcond=None)
-    if g >= 0.5:
+    if g >= largest:
         raise InputError(
             f"{record.source}: Vsc is {g:.3g} times V at a step, but this circuit cannot give 1/2 or more;"
             " check for swapped columns or a wrong unit of V_V or Vsc_V"
@@ -176,7 +176,13 @@ def has_unresolved_edge(voltage: Float[np.ndarray, " samples"]) -> bool:
     return bool(np.max(np.abs(np.diff(voltage))) > 0.6 * np.ptp(voltage))
 
 
-def _align(record: Record, drive: Drive, frequency: float) -> float:
+def _voltage(drive: Drive, time: np.ndarray, steady_state: bool) -> np.ndarray:
+    """The drive at `time`; from rest there is none before t = 0."""
+    voltage = np.asarray(drive.value(time))
+    return voltage if steady_state else np.where(time < 0.0, 0.0, voltage)
+
+
+def _align(record: Record, drive: Drive, frequency: float, steady_state: bool) -> float:
     """The shift (s) that lays the drive on the record, 0 unless the record is plainly shifted.
 
     On V where it was recorded, otherwise on Vsc through its best linear combination of the drive and
@@ -186,7 +192,7 @@ def _align(record: Record, drive: Drive, frequency: float) -> float:
     target = target - target.mean()
 
     def left(shift: float) -> float:
-        wave = np.asarray(drive.value(record.time - shift))
+        wave = _voltage(drive, record.time - shift, steady_state)
         columns = [np.ones_like(wave), wave]
         if "V" not in record:
             columns.append(np.cumsum(wave - wave.mean()))
