@@ -105,9 +105,9 @@ def report(
     """Write the report of a folder of results again."""
     from fitact.report import read_results, write_report
 
-    tree, summary, fitted = read_results(directory)
+    tree, summary = read_results(directory)
     page = directory / "report.html"
-    write_report(page, tree, summary, fitted)
+    write_report(page, tree, summary)
     trusted = bool(summary["convergence"]["converged"]) and summary["fit"]["result"] == "successful"
     _show(f"open {page}", {"report": str(page), "trusted": trusted}, json)
     _finish(trusted)

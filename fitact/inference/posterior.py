@@ -251,7 +251,7 @@ class Posterior:
         """Write the report, one self-contained HTML page."""
         from fitact.report import write_report
 
-        write_report(path, self.to_datatree(), self.summary(), self.fit.to_dict())
+        write_report(path, self.to_datatree(), self.summary())
 
 
 def _versions() -> dict[str, str]:

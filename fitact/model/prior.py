@@ -149,11 +149,6 @@ class Prior(eqx.Module):
         """Standard deviations of the log-parameters."""
         return np.array([self[name].log_sd for name in self.names])
 
-    @property
-    def bounded(self) -> bool:
-        """Whether some parameter has a box, on whose edge an optimum may lie."""
-        return any(isinstance(self[name], Uniform) for name in self.names)
-
     def log_density(self, u: Float[Array, " parameters"]) -> Float[Array, ""]:
         """Log-density of the log-parameters."""
         return sum((self[name].log_density(u[i]) for i, name in enumerate(self.names)), jnp.zeros(()))

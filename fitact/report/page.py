@@ -35,8 +35,8 @@ _LABELS = {
 }
 
 
-def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any], fitted: dict[str, Any]) -> None:
-    """Write the page from a posterior's DataTree and the contents of summary.json and fit.json."""
+def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any]) -> None:
+    """Write the page from a posterior's DataTree and the content of summary.json."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("fitact.report"), autoescape=True, undefined=jinja2.StrictUndefined
     )
@@ -44,7 +44,6 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
         figures = _figures(tree)
     page = environment.get_template("report.html").render(
         summary=summary,
-        fitted=fitted,
         figures=figures,
         labels=_LABELS,
         quantity=_quantity,
@@ -56,7 +55,7 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
         temporary.write_text(page, encoding="utf-8")
 
 
-def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]]:
     """What `write_report` needs, from a folder that `fitact sample` or `fitact run` wrote.
 
     Raises:
@@ -66,11 +65,11 @@ def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]
 
     directory = Path(directory)
     try:
-        summary, fitted = (json.loads((directory / name).read_text()) for name in ("summary.json", "fit.json"))
+        summary = json.loads((directory / "summary.json").read_text())
         with xr.open_datatree(directory / "posterior.nc", engine="h5netcdf") as tree:
             if not {"identifiability", "convergence", "fit", "model", "record"} <= set(summary):
                 raise ValueError("summary.json is not fitact's")
-            return tree.load(), summary, fitted
+            return tree.load(), summary
     except (OSError, ValueError, TypeError) as error:
         raise InputError(
             f"{directory}: holds no complete results ({error}); make them with: fitact sample RECORD --out {directory}"
