@@ -105,9 +105,9 @@ class Record:
         """Standard deviation of the channel's noise, judged without a model: white noise and rounding."""
         return math.hypot(white_noise(self[channel]), rounding_noise(self[channel]))
 
-    def frequency(self, channel: str = "V") -> float | None:
-        """Fundamental frequency of a channel in Hz; None unless the record shows at least 1.5 periods."""
-        return fundamental(self.time, self[channel])
+    def frequency(self, channel: str | None = None) -> float | None:
+        """Fundamental frequency in Hz of a channel (of V, else Vsc); None unless the record shows 1.5 periods."""
+        return fundamental(self.time, self[channel or ("V" if "V" in self else "Vsc")])
 
 
 def is_uniform(time: Float[np.ndarray, " samples"], tolerance: float = 1e-2) -> bool:

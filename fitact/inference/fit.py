@@ -197,7 +197,7 @@ def _likelihood(record: Record, choice: DriveChoice, prior: Prior) -> Likelihood
     height = float(np.ptp(record["Vsc"]))
     charge = 10.0 * height if choice.unknown_charge else 0.0
     # a part of a wave cannot show an offset, so one within an oscilloscope's accuracy is allowed for
-    offset = _OFFSET * height if _frequency(record) is None else 0.0
+    offset = _OFFSET * height if record.frequency() is None else 0.0
     return Likelihood(
         time=jnp.asarray(record.time),
         observed=jnp.asarray(record["Vsc"]),
@@ -255,7 +255,7 @@ def _judged(solved: Solved, record: Record, scene: Scene, choice: DriveChoice, n
     divider = float(np.exp(logs[derived.NAMES.index("g")]))
     figures = statistics(np.asarray(solved.residuals), theta.size + len(linear), divider, record, choice)
     figures["steps"] = int(solved.steps)
-    identifiability = assess(jacobian, likelihood.prior, prior_sd, gradient[derived.NAMES.index("force_mean")])
+    identifiability = assess(jacobian, root, likelihood.prior, prior_sd, gradient[derived.NAMES.index("force_mean")])
     return Fit(
         theta=theta,
         covariance_root=root,
@@ -310,7 +310,7 @@ def _warnings(
             " force scale with that; state your panel's Ci under [device] in a scene file"
         )
     span = record.time[-1] - record.time[0]
-    if _frequency(record) is None:
+    if record.frequency() is None:
         found.append(
             f"the record ({engineering(span, 's')}) does not show its drive repeating: it is shorter than 1.5 periods"
             " or not periodic, so the answer rests on a part of a wave; record two periods or more"
@@ -330,10 +330,6 @@ def _warnings(
                 " against peak-to-peak"
             )
     return found
-
-
-def _frequency(record: Record) -> float | None:
-    return record.frequency("V" if "V" in record else "Vsc")
 
 
 def _plausibility(theta: np.ndarray, prior: Prior) -> list[tuple[str, float, float]]:

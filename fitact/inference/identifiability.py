@@ -55,11 +55,12 @@ class Identifiability:
 
 def assess(
     jacobian: Float[np.ndarray, "samples parameters"],
+    root: Float[np.ndarray, "parameters parameters"],
     prior: Prior,
     prior_sd: Float[np.ndarray, " parameters"],
     force_gradient: Float[np.ndarray, " parameters"],
 ) -> Identifiability:
-    """Judge a record by the whitened residuals' `jacobian` in theta.
+    """Judge a record by the whitened residuals' `jacobian` in theta, and its `covariance_root`.
 
     The first three coordinates are log Rsc, log Csc, log Ci; the others (gain, delay) are nuisances with
     priors of their own; `prior_sd` is that of all. `force_gradient` is that of the log mean force.
@@ -75,7 +76,6 @@ def assess(
         verdict = "identified"
     else:
         verdict = "prior-limited" if along <= _WIDE else "unidentified"
-    root = covariance_root(jacobian, prior_sd)
     moved = root @ (root.T @ force_gradient)
     return Identifiability(
         verdict=verdict,

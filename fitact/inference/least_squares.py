@@ -120,7 +120,7 @@ def solve(likelihood: Likelihood, start: Float[np.ndarray, " parameters"], noise
         else:
             sd = likelihood.linear_sd.at[LINEAR.index(name)].set(10.0 * jnp.ptp(likelihood.observed))
             likelihood = dataclasses.replace(likelihood, linear_sd=sd)
-        solved = eqx.tree_at(lambda x: x.start, _least_squares(likelihood, theta, solved.sigma), theta)
+        solved = _least_squares(likelihood, theta, solved.sigma)
     return solved
 
 

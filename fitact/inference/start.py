@@ -105,7 +105,7 @@ def _measured(record: Record, steady_state: bool | None, notes: tuple[str, ...])
 
 def whole_periods(record: Record) -> tuple[int, float | None]:
     """How many samples make the largest whole number of periods of V, and how long those are (s), or None."""
-    frequency = record.frequency("V" if "V" in record else "Vsc")
+    frequency = record.frequency()
     if frequency is None:
         return len(record), None
     span = record.time[-1] - record.time[0] + record.time_step
@@ -146,7 +146,7 @@ def linear_start(record: Record, choice: DriveChoice, largest: float = 0.5) -> L
 
 
 def _check_frequency(record: Record, stated: float) -> None:
-    found = record.frequency("V" if "V" in record else "Vsc")
+    found = record.frequency()
     if found is not None and abs(found / stated - 1.0) > _CONTRADICTION:
         raise InputError(
             f"{record.source}: repeats at {found:.5g} Hz, but the scene's [drive] frequency is {stated:.5g} Hz;"

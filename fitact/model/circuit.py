@@ -201,12 +201,11 @@ class DirectGround(Loop):
 
     def elements(self) -> tuple[Element, ...]:
         """The touching skin (with the probe), and the grounding one."""
-        touching = Element(self.Rsc, self.Csc)
         grounding = Element(
             self.Rsc if self.grounding_Rsc is None else self.grounding_Rsc,
             self.Csc if self.grounding_Csc is None else self.grounding_Csc,
         )
-        return touching if self.probe is None else self.probe.across(touching), grounding
+        return _loaded(Element(self.Rsc, self.Csc), self.probe), grounding
 
 
 class NaturalGround(Loop):
@@ -239,9 +238,12 @@ class NaturalGround(Loop):
 
     def elements(self) -> tuple[Element, ...]:
         """The touching skin (with the probe), and Z where it has a capacitance."""
-        touching = Element(self.Rsc, self.Csc)
-        touching = touching if self.probe is None else self.probe.across(touching)
+        touching = _loaded(Element(self.Rsc, self.Csc), self.probe)
         return (touching,) if self.Z_capacitance is None else (touching, Element(self.Z, self.Z_capacitance))
+
+
+def _loaded(skin: Element, probe: Probe | None) -> Element:
+    return skin if probe is None else probe.across(skin)
 
 
 def _in_series(*resistances: ArrayLike | None) -> ArrayLike | None:
