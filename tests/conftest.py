@@ -61,9 +61,10 @@ def square_record(
     Csc: float = 18e-9,
     Ci: float = 1.35e-9,
     per_period: int = 2000,
+    periods: int = 2,
 ) -> fitact.Record:
-    """Two settled periods of a 360 Vpp square at 100 Hz, with V sampled exactly at the edges."""
-    settle, kept = 12, 2
+    """Settled periods of a 360 Vpp square at 100 Hz, with V sampled exactly at the edges."""
+    settle, kept = 12, periods
     time = np.arange((settle + kept) * per_period) * (0.01 / per_period)
     voltage = np.where(np.arange(time.size) % per_period < per_period // 2, 180.0, -180.0)
     vsc = skin_voltage(time, voltage, Rsc, Csc, Ci, hold=True)

@@ -7,7 +7,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.data.record import Record
-from fitact.inference.likelihood import Likelihood
+from fitact.inference.likelihood import CHARGE, Likelihood
 from fitact.inference.start import DriveChoice, whole_periods
 from fitact.model.drive import Periodic, PiecewiseLinear
 from fitact.model.force import Contact, electrostatic_force, friction, summarize
@@ -47,12 +47,12 @@ class Derived(eqx.Module):
     ) -> Float[Array, " times"]:
         """Electrostatic force in time, N, eq. (22); the permittivities follow Ci and Csc through eq. (3).
 
-        `deviate` holds three standard normal numbers that draw the charge from its posterior; 0: its mean.
+        `deviate` holds seven standard normal numbers that draw the charge from its posterior; 0: its mean.
         """
         model, circuit = self.likelihood, self.likelihood.circuit(theta)
         vsc = response(circuit, model.drive, self.time, steady_state=model.steady_state)
         beta = model.drawn(theta, sigma, deviate)
-        vsc = vsc + beta[2] * model.linear_sd[2] * model.decay(theta, self.time) / model.gain(theta)
+        vsc = vsc + beta[CHARGE] * model.linear_sd[CHARGE] * model.decay(theta, self.time) / model.gain(theta)
         contact = Contact.from_capacitances(
             circuit.Ci, circuit.Csc, self.area, self.insulator_thickness, self.skin_thickness
         )

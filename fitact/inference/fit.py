@@ -13,11 +13,11 @@ from jaxtyping import Array, Float
 
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.inference import derived, summary
+from fitact.inference import compressed, derived, summary
 from fitact.inference.diagnostics import is_coarse, is_misfit, statistics
 from fitact.inference.identifiability import Identifiability, assess, covariance_root
 from fitact.inference.least_squares import Solved, result_message, result_name, solve
-from fitact.inference.likelihood import LINEAR, Likelihood, natural
+from fitact.inference.likelihood import CHARGE, LINEAR, Likelihood, natural
 from fitact.inference.start import DriveChoice, LinearStart, choose_drive, has_unresolved_edge, linear_start
 from fitact.model.drive import Square
 from fitact.model.prior import LogNormal, Prior
@@ -43,6 +43,8 @@ class Fit:
         figures: chi2_reduced, rms_residual, noise_expected, runs_z, steps and the like.
         identifiability: what the record can and cannot tell.
         warnings: sentences.
+        compression_error: of the compressed log-likelihood near the optimum; None: the samples are summed.
+        full_because: why they are, as a clause.
         likelihood, derive, record, scene, choice: what was fitted, to what.
     """
 
@@ -55,6 +57,8 @@ class Fit:
     figures: dict[str, float]
     identifiability: Identifiability
     warnings: tuple[str, ...]
+    compression_error: float | None
+    full_because: str
     likelihood: Likelihood
     derive: derived.Derived
     record: Record
@@ -123,8 +127,9 @@ class Fit:
             "drive": self.choice.name,
             "steady_state": self.choice.steady_state,
             "freed": [*self.linear, *self.names[3:]],
-            "likelihood": "full",
-            "compression_error": None,
+            "likelihood": "full" if self.compression_error is None else "compressed",
+            "compression_error": self.compression_error,
+            "full_because": self.full_because,
         }
 
     def to_dict(self) -> dict[str, Any]:
@@ -163,13 +168,19 @@ class Fit:
     __str__ = summary
 
 
-def fit(record: Record, scene: Scene | None = None) -> Fit:
+def fit(record: Record, scene: Scene | None = None, *, tolerance: float = compressed.TOLERANCE) -> Fit:
     """Fit the final circuit to a record by Levenberg-Marquardt in log-parameters, the prior as residuals.
 
     The drive is the recorded V where there is no scene or its waveform is "measured", else the scene's.
     The start comes from the record; offset, drift and a delay between the channels are freed where the
-    record asks for them, a gain only with the scene's prior. Runs in double precision whatever JAX is set
-    to, and leaves that setting alone.
+    record asks for them, a gain only with the scene's prior; hum of the mains likewise. Runs in double precision
+    whatever JAX is set to, and leaves that setting alone.
+
+    Args:
+        record: with Vsc, and V unless the scene has the drive.
+        scene: the device, and what is believed of it.
+        tolerance: error of the log-likelihood that compressing the record may cause; 0: sum over the samples
+            each time. Where compression does not hold, `Fit.full_because` says why.
 
     Raises:
         InputError: the record cannot come from this circuit, or the scene asks for what is not available.
@@ -184,13 +195,35 @@ def fit(record: Record, scene: Scene | None = None) -> Fit:
         likelihood = _likelihood(record, choice, _with_edge_time(prior, record, choice, start))
         ridge = _on_the_ridge(start, likelihood.prior)
         theta = np.append(ridge, 0.0) if likelihood.free_delay else ridge
+        freeable = ("offset", "drift", "delay", *_hum(record))
         try:
-            solved = solve(likelihood, theta, record.noise("Vsc"))
-            return _judged(solved, record, given, choice, scene is None)
+            projected, reason = compressed.project(likelihood, start, tolerance)
+            solved = solve(projected, theta, record.noise("Vsc"), freeable)
+            certified = _certified(solved, reason, tolerance)
+            if certified.error is None and solved.likelihood.compression is not None:
+                solved = solve(likelihood, theta, record.noise("Vsc"), freeable)
+                certified = _certified(solved, certified.reason, tolerance)
+            return _judged(solved, certified, record, given, choice, scene is None)
         except np.linalg.LinAlgError as error:
             raise InputError(
                 f"{record.source}: Vsc and V cannot be computed with ({error}); check for a huge offset or a wrong unit"
             ) from error
+
+
+def _certified(solved: Solved, reason: str, tolerance: float) -> compressed.Certified:
+    root = covariance_root(np.asarray(solved.jacobian), solved.likelihood.prior_sd)
+    return compressed.certify(solved.likelihood, reason, np.asarray(solved.theta), root, float(solved.sigma), tolerance)
+
+
+def _hum(record: Record) -> list[str]:
+    """The mains hums that the record can tell from its drive's harmonics."""
+    span, frequency = float(record.time[-1] - record.time[0]), record.frequency()
+    spacing = frequency or 1.0 / span
+    return [
+        f"hum_{hum:.0f}Hz"
+        for hum in (50.0, 60.0)
+        if abs(hum - spacing * round(hum / spacing)) * span > 0.5 and hum * record.time_step < 0.5
+    ]
 
 
 def _likelihood(record: Record, choice: DriveChoice, prior: Prior) -> Likelihood:
@@ -203,11 +236,13 @@ def _likelihood(record: Record, choice: DriveChoice, prior: Prior) -> Likelihood
         observed=jnp.asarray(record["Vsc"]),
         drive=choice.drive,
         prior=prior,
-        linear_sd=jnp.array([offset, 0.0, charge]),
+        linear_sd=jnp.zeros(len(LINEAR)).at[0].set(offset).at[CHARGE].set(charge),
         shift=jnp.asarray(choice.shift, dtype=float),
         time_step=jnp.asarray(record.time_step, dtype=float),
         delay_sd=jnp.asarray(_delay_sd(choice), dtype=float),
+        compression=None,
         steady_state=choice.steady_state,
+        columns=tuple(range(len(LINEAR))),
         free_delay=choice.shift != 0.0,  # then the edges are known to within a step only, which g feels
     )
 
@@ -241,19 +276,28 @@ def _on_the_ridge(start: LinearStart, prior: Prior) -> Float[np.ndarray, " param
     return np.append(point, mean[3:])  # a gain starts from its prior
 
 
-def _judged(solved: Solved, record: Record, scene: Scene, choice: DriveChoice, no_scene: bool) -> Fit:
-    likelihood, theta, sigma = solved.likelihood, np.asarray(solved.theta), float(solved.sigma)
+def _judged(
+    solved: Solved,
+    certified: compressed.Certified,
+    record: Record,
+    scene: Scene,
+    choice: DriveChoice,
+    no_scene: bool,
+) -> Fit:
+    likelihood, theta, sigma = certified.likelihood, np.asarray(solved.theta), float(solved.sigma)
     jacobian, prior_sd = np.asarray(solved.jacobian), likelihood.prior_sd
     root = covariance_root(jacobian, prior_sd)
     derive = derived.for_fit(likelihood, record, choice, scene)
     logs, gradient = _log_derived(derive, theta, sigma)
+    residuals, beta = (
+        np.asarray(x) for x in _over_samples(dataclasses.replace(likelihood, compression=None), theta, sigma)
+    )
     linear = {
-        name: float(beta * sd)
-        for name, beta, sd in zip(LINEAR, solved.beta, likelihood.linear_sd, strict=True)
-        if sd > 0.0
+        LINEAR[column]: float(value * likelihood.linear_sd[column])
+        for column, value in zip(likelihood.columns, beta, strict=True)
     }
     divider = float(np.exp(logs[derived.NAMES.index("g")]))
-    figures = statistics(np.asarray(solved.residuals), theta.size + len(linear), divider, record, choice)
+    figures = statistics(residuals, theta.size + len(linear), divider, record, choice)
     figures["steps"] = int(solved.steps)
     identifiability = assess(jacobian, root, likelihood.prior, prior_sd, gradient[derived.NAMES.index("force_mean")])
     return Fit(
@@ -261,17 +305,25 @@ def _judged(solved: Solved, record: Record, scene: Scene, choice: DriveChoice, n
         covariance_root=root,
         sigma=sigma,
         linear=linear,
-        residuals=np.asarray(solved.residuals),
+        residuals=residuals,
         result=_result(solved, root, figures),
         figures=figures,
         identifiability=identifiability,
         warnings=(*record.notes, *choice.notes, *_warnings(theta, likelihood, record, figures, no_scene)),
+        compression_error=certified.error,
+        full_because=certified.reason,
         likelihood=likelihood,
         derive=derive,
         record=record,
         scene=scene,
         choice=choice,
     )
+
+
+@eqx.filter_jit
+def _over_samples(likelihood: Likelihood, theta: Array, sigma: ArrayLike) -> tuple[Array, Array]:
+    """What is left of the record, and the linear nuisances in prior standard deviations."""
+    return likelihood.linear(theta, sigma)[:2]
 
 
 def _result(solved: Solved, root: Float[np.ndarray, "n n"], figures: dict[str, float]) -> str:

@@ -11,9 +11,15 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from fitact.inference.likelihood import LINEAR, Likelihood
+from fitact.inference.likelihood import Likelihood
 
 _PRECISION = 1e-9  # of Vsc's span: least noise assumed
+NUISANCES = {  # by name, the columns of `LINEAR` that the record may ask for; beside these, a delay
+    "offset": (0,),
+    "drift": (1,),
+    "hum_50Hz": (2, 3),
+    "hum_60Hz": (4, 5),
+}
 _EVIDENCE = 10.0  # a nuisance is freed when it lowers the Bayesian information criterion by this much
 
 
@@ -47,7 +53,7 @@ def result_message(name: str) -> str:
 
 
 class Solved(eqx.Module):
-    """Where Levenberg-Marquardt ended; `start` is where the last fit began."""
+    """Where Levenberg-Marquardt ended; `start` is where the last fit began. Rows: samples, or their coordinates."""
 
     likelihood: Likelihood
     start: Float[Array, " parameters"]
@@ -55,11 +61,10 @@ class Solved(eqx.Module):
     sigma: Float[Array, ""]
     result: Any
     steps: Array
-    residuals: Float[Array, " samples"]
-    beta: Float[Array, " 3"]
-    jacobian: Float[Array, "samples parameters"]
-    shapes: Float[Array, "3 samples"]  # of the linear nuisances
-    slope: Float[Array, " samples"]  # of the signal in a further delay
+    remainder: Float[Array, " rows"]  # of the record, V
+    jacobian: Float[Array, "rows parameters"]
+    shapes: Float[Array, "columns rows"]  # of the linear nuisances
+    slope: Float[Array, " rows"]  # of the signal in a further delay
     gradient: Float[Array, " parameters"]  # of minus the log-posterior
 
 
@@ -82,56 +87,59 @@ def _round(likelihood: Likelihood, start: Array, sigma: Array) -> Solved:
         residuals(theta, None),
         jax.jacfwd(residuals)(theta, None),
     )
-    remainder, beta, _ = likelihood.linear(theta, sigma)
-    later = jnp.zeros(())
+    remainder, _, _ = likelihood.linear(theta, sigma)
     return Solved(
         likelihood=likelihood,
         start=start,
         theta=theta,
         # not below what double precision leaves of a record without noise
         sigma=jnp.maximum(
-            jnp.sqrt(jnp.sum(jnp.square(remainder)) / max(remainder.size - start.size, 1)),
+            jnp.sqrt(jnp.sum(jnp.square(remainder)) / jnp.maximum(likelihood.count - start.size, 1)),
             _PRECISION * jnp.ptp(likelihood.observed),
         ),
         result=RESULTS.promote(solution.result),
         steps=solution.stats["num_steps"],
-        residuals=remainder,
-        beta=beta,
+        remainder=remainder,
         jacobian=jacobian,
-        shapes=likelihood.shapes(theta),
-        slope=jax.jvp(lambda later: likelihood.signal(theta, later), (later,), (jnp.ones_like(later),))[1],
+        shapes=likelihood.before_linear(theta)[1],
+        slope=likelihood.slope(theta),
         gradient=jacobian.T @ of_data + prior_jacobian.T @ of_prior,
     )
 
 
-def solve(likelihood: Likelihood, start: Float[np.ndarray, " parameters"], noise: float) -> Solved:
-    """Fit; then free offset, drift or delay, one at a time, as long as the record asks for one."""
+def solve(
+    likelihood: Likelihood, start: Float[np.ndarray, " parameters"], noise: float, freeable: tuple[str, ...]
+) -> Solved:
+    """Fit; then free nuisances (of `NUISANCES`), one at a time, as long as the record asks for one.
+
+    With a delay, the samples are summed: the response table holds none.
+    """
     solved = _least_squares(likelihood, jnp.asarray(start), noise)
-    for _ in range(3):
-        gains = _evidence(solved)
+    for _ in freeable:
+        gains = _evidence(solved, freeable)
         name = max(gains, key=gains.__getitem__, default="")
         if not name or not gains[name] > _EVIDENCE:
             break
         theta = solved.theta
         if name == "delay":
-            shift = likelihood.shift + _nearest_delay(solved)
+            likelihood = dataclasses.replace(likelihood, compression=None)
+            shift = likelihood.shift + _nearest_delay(likelihood, theta)
             likelihood = dataclasses.replace(likelihood, free_delay=True, shift=shift)
             theta = jnp.append(theta, 0.0)
         else:
-            sd = likelihood.linear_sd.at[LINEAR.index(name)].set(10.0 * jnp.ptp(likelihood.observed))
+            sd = likelihood.linear_sd.at[np.array(NUISANCES[name])].set(10.0 * jnp.ptp(likelihood.observed))
             likelihood = dataclasses.replace(likelihood, linear_sd=sd)
         solved = _least_squares(likelihood, theta, solved.sigma)
     return solved
 
 
-def _nearest_delay(solved: Solved) -> Array:
+def _nearest_delay(likelihood: Likelihood, theta: Array) -> Array:
     """The middle of the best of a grid of delays within five steps (s): across an ideal edge there is no slope
     to follow, and between two samples nothing that a gain could not do as well.
     """
-    likelihood, theta = solved.likelihood, solved.theta
     delays = np.arange(-40, 41) / 8.0
     later = jnp.asarray(delays) * likelihood.time_step
-    shapes = np.asarray(solved.shapes)[np.asarray(likelihood.linear_sd) > 0.0]
+    shapes = np.asarray(likelihood.shapes(theta))[np.asarray(likelihood.linear_sd) > 0.0]
     left = []
     for shift in later:
         design = np.vstack([_signal(likelihood, theta, shift), shapes]).T
@@ -146,24 +154,24 @@ def _signal(likelihood: Likelihood, theta: Array, later: Array) -> Array:
     return likelihood.signal(theta, later)
 
 
-def _evidence(solved: Solved) -> dict[str, float]:
+def _evidence(solved: Solved, freeable: tuple[str, ...]) -> dict[str, float]:
     """By how much freeing each nuisance would lower the Bayesian information criterion, to first order."""
-    size, linear_sd, shapes = (
-        solved.residuals.size,
-        np.asarray(solved.likelihood.linear_sd),
-        np.asarray(solved.shapes),
-    )
-    candidates = {name: shapes[i] for i, name in enumerate(LINEAR[:2]) if linear_sd[i] == 0.0}
-    if not solved.likelihood.free_delay:
-        candidates["delay"] = np.asarray(solved.slope)
-    known = np.concatenate([np.asarray(solved.jacobian)[:size], (shapes * (linear_sd > 0.0)[:, None]).T], axis=1)
+    likelihood, shapes, remainder = solved.likelihood, np.asarray(solved.shapes), np.asarray(solved.remainder)
+    count, free = float(likelihood.count), np.asarray(likelihood.linear_sd) > 0.0
+    candidates = {
+        name: shapes[list(places)] for name, places in NUISANCES.items() if name in freeable and not free[places[0]]
+    }
+    if "delay" in freeable and not likelihood.free_delay:
+        candidates["delay"] = np.asarray(solved.slope)[None]
+    known = np.concatenate([np.asarray(solved.jacobian)[: remainder.size], shapes[free].T], axis=1)
     basis, values, _ = np.linalg.svd(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300), full_matrices=False)
     basis = basis[:, values > 1e-9 * values[0]]
-    residuals = np.asarray(solved.residuals)
     gains = {}
-    for name, column in candidates.items():
-        column = column - basis @ (basis.T @ column)
-        drop = (column @ residuals) ** 2 / max(column @ column, 1e-300)
-        share = min(drop / (residuals @ residuals), 1.0 - 1e-12)
-        gains[name] = -size * math.log1p(-share) - math.log(size)
+    for name, columns in candidates.items():
+        left = columns.T - basis @ (basis.T @ columns.T)
+        modes, sizes, _ = np.linalg.svd(left, full_matrices=False)
+        modes = modes[:, sizes > 1e-9 * max(float(np.linalg.norm(columns)), 1e-300)]
+        drop = float(np.sum((modes.T @ remainder) ** 2))
+        share = min(drop / float(remainder @ remainder), 1.0 - 1e-12)
+        gains[name] = -count * math.log1p(-share) - len(columns) * math.log(count)
     return gains

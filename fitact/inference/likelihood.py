@@ -1,9 +1,12 @@
 """The log-probability of a record: Gaussian noise, with the linear nuisances integrated out.
 
 The record is  Vsc = gain * response(t - delay) + A beta + noise.  The columns of A are an offset, a
-drift and, for a measured drive, the decays of the unknown charge at the first sample. Their
+drift, mains hum and, for a measured drive, the decay of the unknown charge at the first sample. Their
 coefficients have wide normal priors and are integrated out exactly, so the chain holds only the
 parameters that matter: the logarithms of Rsc, Csc, Ci (and gain), the delay, and log sigma.
+
+All this asks of the samples is lengths and angles, so it reads the same in the coordinates of a
+`fitact.data.compress.Compression`, where there is one, as over the samples themselves.
 """
 
 from collections.abc import Callable
@@ -17,14 +20,16 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from fitact.model.circuit import FinalCircuit
+from fitact.data.compress import SLOW, Compression, slow_shapes
+from fitact.model.circuit import FinalCircuit, Terms
 from fitact.model.drive import Drive
 from fitact.model.prior import Prior
 from fitact.model.response import response
 
-_BATCH_SAMPLES = 4_000_000  # evaluated at a time, which bounds memory
+_BATCH_ROWS = 4_000_000  # samples or coordinates evaluated at a time, which bounds memory
 
-LINEAR = ("offset", "drift", "charge")
+LINEAR = (*SLOW, "charge")
+CHARGE = LINEAR.index("charge")
 
 
 class Likelihood(eqx.Module):
@@ -38,25 +43,29 @@ class Likelihood(eqx.Module):
         observed: Vsc, V.
         drive: what drives the circuit.
         prior: of the circuit's parameters.
-        linear_sd: prior standard deviations of offset, drift (over half the record) and charge, V; 0 leaves
-            one out.
+        linear_sd: prior standard deviations of the `LINEAR` nuisances, V (drift: over half the record); 0
+            leaves one out.
         shift: the drive starts this much later than the record's t = 0, s.
         time_step: s.
         delay_sd: prior standard deviation of the delay, in time steps.
         steady_state: or from rest.
+        compression: the record's projection; None: the samples are summed.
         free_delay: whether the delay is a parameter.
+        columns: which of `LINEAR` are looked at; the others' linear_sd is 0.
     """
 
     time: Float[Array, " samples"]
     observed: Float[Array, " samples"]
     drive: Drive
     prior: Prior
-    linear_sd: Float[Array, " 3"]
+    linear_sd: Float[Array, " 7"]
     shift: ArrayLike
     time_step: ArrayLike
     delay_sd: ArrayLike
+    compression: Compression | None
     steady_state: bool = eqx.field(static=True)
     free_delay: bool = eqx.field(static=True)
+    columns: tuple[int, ...] = eqx.field(static=True)
 
     @property
     def prior_sd(self) -> np.ndarray:
@@ -82,44 +91,79 @@ class Likelihood(eqx.Module):
         vsc = response(self.circuit(theta), self.drive, self.time - delay, steady_state=self.steady_state)
         return self.gain(theta) * vsc
 
-    def shapes(self, theta: Float[Array, " parameters"]) -> Float[Array, "3 samples"]:
+    def shapes(self, theta: Float[Array, " parameters"]) -> Float[Array, "7 samples"]:
         """The linear nuisances' shapes in time, each of height 1."""
-        middle = 0.5 * (self.time[0] + self.time[-1])
-        ramp = (self.time - middle) / (self.time[-1] - middle)
-        return jnp.stack([jnp.ones_like(ramp), ramp, self.decay(theta, self.time)])
+        middle, half = 0.5 * (self.time[0] + self.time[-1]), 0.5 * (self.time[-1] - self.time[0])
+        return jnp.concatenate([slow_shapes(self.time, middle, half), self.decay(theta, self.time)[None]])
 
     def decay(self, theta: Float[Array, " parameters"], time: Float[Array, " times"]) -> Float[Array, " times"]:
         """How an unknown charge at the first sample decays."""
         (tau,) = self.circuit(theta).terms().tau
         return jnp.exp(-(time - self.time[0]) / tau)
 
+    @property
+    def count(self) -> ArrayLike:
+        """How many samples there are."""
+        return self.time.size if self.compression is None else self.compression.samples
+
+    @property
+    def rows(self) -> int:
+        """How many numbers an evaluation runs over."""
+        return self.time.size if self.compression is None else self.compression.observed.size
+
+    @property
+    def _places(self) -> np.ndarray:
+        return np.array(self.columns, dtype=int)
+
+    def before_linear(
+        self, theta: Float[Array, " parameters"]
+    ) -> tuple[Float[Array, " rows"], Float[Array, "columns rows"]]:
+        """The record less the signal (V), and the shapes of the `columns`, over samples or coordinates."""
+        if self.compression is None:
+            remainder, shapes = self.observed - self.signal(theta), self.shapes(theta)
+        else:
+            terms = self.circuit(theta).terms()
+            remainder = self.compression.observed - self.gain(theta) * self.compression.response(terms)
+            shapes = jnp.concatenate([self.compression.slow, self.compression.decays(terms.tau[0])[None]])
+        return remainder, shapes[self._places]
+
+    def slope(self, theta: Float[Array, " parameters"]) -> Float[Array, " rows"]:
+        """How a further delay changes the signal, V/s: over two time steps, so that ideal edges count."""
+        if self.compression is None:
+            step = self.time_step
+            return (self.signal(theta, step) - self.signal(theta, -step)) / (2.0 * step)
+        weight, tau, _ = self.circuit(theta).terms()  # u' = V' - u / tau
+        falling = Terms(tuple(w / t for w, t in zip(weight, tau, strict=True)), tau)
+        return self.gain(theta) * (self.compression.response(falling) - sum(weight) * self.compression.slope)
+
     def linear(
         self, theta: Float[Array, " parameters"], sigma: ArrayLike
-    ) -> tuple[Float[Array, " samples"], Float[Array, " 3"], Float[Array, "3 3"]]:
+    ) -> tuple[Float[Array, " rows"], Float[Array, " columns"], Float[Array, "columns columns"]]:
         """What theta leaves of the record, and the nuisances' posterior given theta.
 
         Gives the remainder (V) after the best nuisances, their coefficients in prior standard
         deviations, and the Cholesky factor of their posterior precision.
         """
-        remainder = self.observed - self.signal(theta)
-        A = self.linear_sd[:, None] * self.shapes(theta)
+        remainder, shapes = self.before_linear(theta)
+        A = self.linear_sd[self._places, None] * shapes
         # keep XLA from computing both once per use
         remainder, A = lax.optimization_barrier((remainder, A))
-        factor = jnp.linalg.cholesky(jnp.eye(3) + A @ A.T / sigma**2)
+        factor = jnp.linalg.cholesky(jnp.eye(len(A)) + A @ A.T / sigma**2)
         beta = cho_solve((factor, True), A @ remainder / sigma**2)
         return remainder - beta @ A, beta, factor
 
     def drawn(
         self, theta: Float[Array, " parameters"], sigma: ArrayLike, deviate: ArrayLike = 0.0
-    ) -> Float[Array, " 3"]:
-        """The nuisances' coefficients, in prior standard deviations, as three standard normal numbers draw them.
+    ) -> Float[Array, " 7"]:
+        """The nuisances' coefficients, in prior standard deviations, as seven standard normal numbers draw them.
 
         With a `deviate` of 0, their posterior mean given theta.
         """
         _, beta, factor = self.linear(theta, sigma)
-        return beta + solve_triangular(factor.T, jnp.zeros(3) + deviate)
+        deviate = jnp.broadcast_to(deviate, len(LINEAR))[self._places]
+        return jnp.zeros(len(LINEAR)).at[self._places].set(beta + solve_triangular(factor.T, deviate))
 
-    def residuals(self, theta: Float[Array, " parameters"], sigma: ArrayLike) -> Float[Array, " samples+3"]:
+    def residuals(self, theta: Float[Array, " parameters"], sigma: ArrayLike) -> Float[Array, " rows+columns"]:
         """Whitened residuals, nuisances' priors included: half their square is -log-likelihood."""
         remainder, beta, _ = self.linear(theta, sigma)
         return jnp.concatenate([remainder / sigma, beta])
@@ -137,7 +181,7 @@ class Likelihood(eqx.Module):
         theta, log_sigma = point[:-1], point[-1]
         remainder, beta, factor = self.linear(theta, jnp.exp(log_sigma))
         misfit = jnp.sum(jnp.square(remainder)) * jnp.exp(-2.0 * log_sigma) + jnp.sum(jnp.square(beta))
-        value = -0.5 * misfit - self.observed.size * log_sigma - jnp.sum(jnp.log(jnp.diagonal(factor)))
+        value = -0.5 * misfit - self.count * log_sigma - jnp.sum(jnp.log(jnp.diagonal(factor)))
         value = value + self.prior.log_density(theta[: len(self.prior.names)])
         if self.free_delay:
             value = value - 0.5 * jnp.square(theta[-1] / self.delay_sd)
@@ -148,16 +192,16 @@ def in_batches(
     function: Callable[..., Array],
     model: eqx.Module,
     arrays: tuple[np.ndarray, ...],
-    samples: int,
+    rows: int,
     batch: int = 32,
 ) -> np.ndarray:
     """`function(model, *rows)` over the rows of arrays of one length, a batch at a time.
 
-    Batches have one size, so that they compile once, and shrink where `samples`, the length of the record,
-    is large, which bounds memory. Call it in double precision.
+    Batches have one size, so that they compile once, and shrink where `rows`, the numbers that one
+    evaluation runs over, are many, which bounds memory. Call it in double precision.
     """
     count = len(arrays[0])
-    batch = max(1, min(batch, count, _BATCH_SAMPLES // samples))
+    batch = max(1, min(batch, count, _BATCH_ROWS // rows))
     padded = [np.concatenate([a, np.repeat(a[-1:], -count % batch, axis=0)]) for a in arrays]
     parts = [
         np.asarray(_batch(function, model, tuple(jnp.asarray(a[i : i + batch]) for a in padded)))

@@ -19,9 +19,10 @@ from arviz_stats.base import array_stats
 from jaxtyping import Float
 
 from fitact.errors import InputError
+from fitact.inference import compressed
 from fitact.inference.chain import Chain
 from fitact.inference.fit import Fit
-from fitact.inference.likelihood import Likelihood, in_batches
+from fitact.inference.likelihood import Likelihood
 from fitact.inference.posterior import Convergence, Posterior
 
 _DEGREES = 8.0  # of freedom of the t proposal: tails above any posterior's seen here
@@ -211,10 +212,7 @@ class _StudentT:
 def _vectorised(likelihood: Likelihood, half: int) -> Callable[[np.ndarray], np.ndarray]:
     """Log-probabilities of many points; `half` an ensemble is what a stretch move asks for."""
 
-    def log_prob(points: np.ndarray) -> np.ndarray:
-        return in_batches(Likelihood.log_prob, likelihood, (points,), likelihood.time.size, half)
-
-    return log_prob
+    return lambda points: compressed.log_prob(likelihood, points, half)
 
 
 def _starts(
@@ -253,6 +251,7 @@ def _fingerprint(fit: Fit, names: tuple[str, ...], seed: int, walkers: int, ense
         fit.record.fingerprint,
         fit.scene.to_json(),
         fit.choice.name,
+        fit.compression_error is None,
         names,
         fit.theta.tolist(),
         seed,

@@ -10,6 +10,7 @@ from fitact.units import engineering
 UNITS = {
     "Rsc": "ohm", "Csc": "F", "Ci": "F", "gain": "1", "delay": "s", "sigma": "V",
     "offset": "V", "drift": "V", "charge": "V",
+    "hum_50Hz_cos": "V", "hum_50Hz_sin": "V", "hum_60Hz_cos": "V", "hum_60Hz_sin": "V",
     "g": "1", "b": "s", "force_mean": "N", "force_peak": "N", "force_rms": "N", "friction_mean": "N",
 }  # fmt: skip
 # standard normal quantiles of the summary's probabilities

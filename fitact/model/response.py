@@ -70,10 +70,10 @@ def knot_values(pieces: Pieces, tau: ArrayLike, first: ArrayLike) -> Float[Array
     decay = jnp.exp(-length / tau)
     gain = (pieces.end - pieces.start)[:-1] * phi(length / tau) + (pieces.start[1:] - pieces.end[:-1])
     first = jnp.asarray(first, dtype=gain.dtype)
-    return jnp.concatenate([first[None], _recurrence(decay, gain, first)])
+    return jnp.concatenate([first[None], recurrence(decay, gain, first)])
 
 
-def _recurrence(decay: Float[Array, " n"], gain: Float[Array, " n"], first: Float[Array, ""]) -> Float[Array, " n"]:
+def recurrence(decay: Float[Array, " n"], gain: Float[Array, " n"], first: Float[Array, ""]) -> Float[Array, " n"]:
     """u[k] = decay[k] u[k - 1] + gain[k], from u[-1] = first.
 
     In about sqrt(n) blocks side by side, then from block to block: two short loops over short vectors,

@@ -1,0 +1,331 @@
+"""A record's projection on the response table: after one pass, a likelihood costs the same for any length.
+
+Under white Gaussian noise a likelihood needs from the record only its inner products with what the model
+can put together: the responses u(t; tau) to the drive of one time constant, the decays of an unknown
+charge, and a few slow shapes. Over a range of time constants all u(.; tau) lie, to rounding, in the span of
+some twenty functions, whatever the drive: they are convolutions of dV/dt with e^{-t/tau}, and those
+exponentials do. The pass adds up the inner products of these functions, the shapes and the record. Their
+root then holds coordinates in which the difference between record and model has the length it has over
+all samples, and as functions of log tau the coordinates are Chebyshev series.
+"""
+
+import math
+from collections.abc import Iterator
+from fractions import Fraction
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from fitact.data.record import is_uniform
+from fitact.model.circuit import Terms
+from fitact.model.drive import Drive, Periodic, Sampled
+from fitact.model.response import highpass, phi, recurrence
+
+SLOW = ("offset", "drift", "hum_50Hz_cos", "hum_50Hz_sin", "hum_60Hz_cos", "hum_60Hz_sin")
+
+_NODES = 41  # odd, so that the middle of the table is a node
+_REACH = math.log(9.0)  # half width of the table in log tau
+_RANK = 1e-13  # singular values of the exponentials, relative, that are left out
+_EXACT = 1e-9  # of a step: how evenly samples must lie to be folded
+_CHUNK = 8_192  # samples at a time, which bounds memory
+
+
+class Compression(eqx.Module):
+    """A record in the coordinates of its response table.
+
+    A vector of `rows` coordinates stands for one value a sample; lengths and angles are those over all samples.
+
+    Attributes:
+        center, reach: the table holds log tau within `reach` of `center` (tau in s).
+        signal: Chebyshev coefficients in log tau of the response to the drive (V), rows below its rank being 0.
+        decay: those of the decay of an unknown charge from 1 V.
+        slow: the shapes of `SLOW`, of height 1.
+        slope: dV/dt, V/s, over two samples, so that a jump shows on both sides of it.
+        observed: the record, V.
+        samples: how many there are.
+    """
+
+    center: Float[Array, ""]
+    reach: Float[Array, ""]
+    signal: Float[Array, "rank terms"]
+    decay: Float[Array, "rows terms"]
+    slow: Float[Array, "shapes rows"]
+    slope: Float[Array, " rows"]
+    observed: Float[Array, " rows"]
+    samples: Float[Array, ""]
+
+    def holds(self, log_tau: Float[Array, "*shape"]) -> Array:
+        """Whether the table reaches there."""
+        return jnp.abs(log_tau - self.center) <= self.reach
+
+    def response(self, terms: Terms) -> Float[Array, " rows"]:
+        """The response of a circuit, as `fitact.response` gives it in time; V."""
+        total = sum(
+            weight * (self.signal @ self._series(tau)) for weight, tau in zip(terms.weight, terms.tau, strict=True)
+        )
+        return jnp.pad(total, (0, self.observed.size - self.signal.shape[0]))
+
+    def decays(self, tau: Array) -> Float[Array, " rows"]:
+        """e^{-(t - t0) / tau} from the first sample on."""
+        return self.decay @ self._series(tau)
+
+    def _series(self, tau: Array) -> Float[Array, " terms"]:
+        """Chebyshev polynomials at log tau."""
+        x = (jnp.log(tau) - self.center) / self.reach
+        terms = self.signal.shape[1]
+
+        def step(last: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
+            return (last[1], 2.0 * x * last[1] - last[0]), last[0]
+
+        # a loop compiles sooner, but runs slower where the terms are few
+        return lax.scan(step, (jnp.ones_like(x), x), None, length=terms, unroll=terms <= _NODES // 2)[1]
+
+    def narrowed(self, center: float, reach: float, precision: float, charge: float) -> "Compression":
+        """The same for log tau within `reach` of `center` only, with fewer terms and rows.
+
+        Left-out terms change no response to the drive, and no decay of a `charge` (V), by more than `precision`
+        (V, root of the sum of squares); with no charge its decay is left out altogether.
+        """
+        x, to_series = _chebyshev(_NODES)
+        at = jax.vmap(self._series)(jnp.exp(center + reach * x))  # nodes of the narrow table, in the wide one
+        signal = np.asarray(self.signal @ at.T) @ to_series.T
+        decay = np.asarray(self.decay @ at.T) @ to_series.T
+        sizes = np.linalg.norm(signal, axis=0) + charge * np.linalg.norm(decay, axis=0)
+        left = np.cumsum(sizes[::-1])[::-1]  # what leaving out this term and all later ones would cost
+        terms = max(2, int(np.count_nonzero(left > precision)))
+        signal = np.pad(signal[:, :terms], ((0, self.observed.size - signal.shape[0]), (0, 0)))
+        others = [decay[:, :terms]] if charge > 0.0 else []
+        columns = [signal, *others, self.slow.T, self.slope[:, None], self.observed[:, None]]
+        _, rows = np.linalg.qr(np.hstack(columns))
+        return Compression(
+            center=jnp.asarray(center),
+            reach=jnp.asarray(reach),
+            signal=jnp.asarray(rows[:terms, :terms]),
+            decay=jnp.asarray(rows[:, terms : 2 * terms] if charge > 0.0 else np.zeros((len(rows), terms))),
+            slow=jnp.asarray(rows[:, -2 - len(SLOW) : -2].T),
+            slope=jnp.asarray(rows[:, -2]),
+            observed=jnp.asarray(rows[:, -1]),
+            samples=self.samples,
+        )
+
+
+def compress(
+    drive: Drive,
+    time: Float[np.ndarray, " samples"],
+    observed: Float[np.ndarray, " samples"],
+    *,
+    steady_state: bool,
+    tau: float,
+    gain: float,
+) -> Compression:
+    """Project a record on the responses to `drive` of time constants within a factor 9 of `tau` (s).
+
+    One pass over the arrays, a chunk at a time (so they may be `numpy.memmap`); where a steady drive repeats on
+    the record's own sampling grid, its periods are folded first, exactly. Call it in double precision.
+
+    Args:
+        drive: as in `fitact.response`; a `Sampled` one has the record's own times.
+        time: s.
+        observed: Vsc, V.
+        steady_state: as in `fitact.response`.
+        tau, gain: of a response near the record (gain in V/V), which is taken off before and added after, so
+            that the record's noise keeps its digits.
+    """
+    table = _Table.around(tau, gain, time)
+    if isinstance(drive, Sampled):
+        parts = _along_samples(table, drive, time, observed)
+    else:
+        period = _samples_a_period(drive, time) if steady_state else None
+        if period is None:
+            parts = _plainly(table, drive, time, observed, steady_state)
+        else:
+            parts = _folded(table, drive, time, observed, period)
+    return _assemble(table, sum(parts, np.zeros(())), isinstance(drive, Sampled), time.size)
+
+
+class _Table(eqx.Module):
+    """What the pass needs of the table: its nodes, and the few combinations of them that matter."""
+
+    center: Array
+    nodes: Float[Array, " nodes"]  # s
+    mix: Float[Array, "nodes rank"]
+    series: np.ndarray  # coefficients (rank, terms) that give back any response from those combinations
+    gain: Array
+    middle: Array  # of the record, s
+    half: Array  # its length, s
+    steps: Array  # in it
+
+    @classmethod
+    def around(cls, tau: float, gain: float, time: np.ndarray) -> "_Table":
+        x, to_series = _chebyshev(_NODES)
+        relative = np.exp(_REACH * x)
+        ages = np.concatenate([[0.0], np.geomspace(1e-3 * relative.min(), 40.0 * relative.max(), 400)])
+        _, sizes, modes = np.linalg.svd(np.exp(-ages[:, None] / relative), full_matrices=False)
+        rank = int(np.count_nonzero(sizes > _RANK * sizes[0]))
+        return cls(
+            center=jnp.asarray(math.log(tau)),
+            nodes=jnp.asarray(tau * relative),
+            mix=jnp.asarray(modes[:rank].T / sizes[:rank]),
+            series=(sizes[:rank, None] * modes[:rank]) @ to_series.T,
+            gain=jnp.asarray(gain),
+            middle=jnp.asarray(0.5 * (time[0] + time[-1])),
+            half=jnp.asarray(0.5 * (time[-1] - time[0])),
+            steps=jnp.asarray(float(time.size - 1)),
+        )
+
+
+def slow_shapes(time: Float[Array, " n"], middle: Array, half: Array) -> Float[Array, "6 n"]:
+    """The shapes of `SLOW` in time: 1, a line from -1 to 1 over the record, and hum."""
+    since = time - middle
+    turns = 2.0 * np.pi * since
+    waves = [wave(frequency * turns) for frequency in (50.0, 60.0) for wave in (jnp.cos, jnp.sin)]
+    return jnp.stack([jnp.ones_like(since), since / half, *waves])
+
+
+def _chunks(time: np.ndarray, observed: np.ndarray, length: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Times, record and weights of `length` samples at a time; the last chunk is filled up with weight 0."""
+    for first in range(0, time.size, length):
+        t, y = np.asarray(time[first : first + length]), np.asarray(observed[first : first + length])
+        missing = length - t.size
+        weight = np.pad(np.ones(t.size), (0, missing))
+        yield np.pad(t, (0, missing), mode="edge"), np.pad(y, (0, missing)), weight
+
+
+def _chunk_length(samples: int) -> int:
+    return min(_CHUNK, 1 << (samples - 1).bit_length())
+
+
+def _plainly(
+    table: _Table, drive: Drive, time: np.ndarray, observed: np.ndarray, steady_state: bool
+) -> Iterator[np.ndarray]:
+    for t, y, weight in _chunks(time, observed, _chunk_length(time.size)):
+        yield np.asarray(_at_times(table, drive, t, y, weight, None, steady_state))
+
+
+@eqx.filter_jit
+def _at_times(
+    table: _Table, drive: Drive, time: Array, observed: Array, weight: Array, slow: Array | None, steady_state: bool
+) -> Array:
+    """Inner products where the response to the drive can be computed at any time."""
+    u = jax.vmap(lambda tau: highpass(drive, time, tau, steady_state=steady_state))(table.nodes)
+    step = 2.0 * table.half / table.steps
+
+    def voltage(time: Array) -> Array:
+        return jnp.where(steady_state | (time >= 0.0), drive.value(time), 0.0)
+
+    slope = (voltage(time + step) - voltage(time - step)) / (2.0 * step)
+    slow = slow_shapes(time, table.middle, table.half) if slow is None else slow
+    return _inner(table, u, None, slow, slope, observed, weight)
+
+
+def _inner(
+    table: _Table, u: Array, decays: Array | None, slow: Array, slope: Array, observed: Array, weight: Array
+) -> Array:
+    parts = [table.mix.T @ u] + ([] if decays is None else [table.mix.T @ decays])
+    rest = observed - table.gain * u[_NODES // 2]
+    rows = jnp.concatenate([*parts, slow, slope[None], rest[None]])
+    return (rows * weight) @ rows.T
+
+
+def _folded(table: _Table, drive: Drive, time: np.ndarray, observed: np.ndarray, period: int) -> Iterator[np.ndarray]:
+    """With the periods laid over each other: the response is computed for one, the rest are sums."""
+    periods = max(1, min(_CHUNK, 1 << (time.size - 1).bit_length()) // period)
+    reference = np.asarray(observed[:period])
+    count = np.zeros(period)
+    sums = np.zeros((len(SLOW) + 1, period))
+    squares = np.zeros((len(SLOW) + 1, len(SLOW) + 1))
+    for t, y, weight in _chunks(time, observed, periods * period):
+        z = _over_periods(table, t, y, weight, reference)
+        count += weight.reshape(periods, period).sum(axis=0)
+        sums += np.asarray(z[0])
+        squares += np.asarray(z[1])
+    slow, mean = sums[:-1] / count, sums[-1] / count + reference
+    total = np.array(_at_times(table, drive, np.asarray(time[:period]), mean, count, slow, True))
+    # what the samples of one phase scatter about their mean
+    kept = [*range(-len(SLOW) - 2, -2), -1]
+    total[np.ix_(kept, kept)] += squares - (sums / count) @ sums.T
+    yield total
+
+
+@jax.jit
+def _over_periods(table: _Table, time: Array, observed: Array, weight: Array, reference: Array) -> tuple[Array, Array]:
+    difference = (observed.reshape(-1, reference.size) - reference).reshape(-1)
+    z = jnp.concatenate([slow_shapes(time, table.middle, table.half), difference[None]])
+    weighted = z * weight
+    return weighted.reshape(z.shape[0], -1, reference.size).sum(axis=1), weighted @ z.T
+
+
+def _samples_a_period(drive: Drive, time: np.ndarray) -> int | None:
+    """After how many samples drive and sampling grid meet again, if the record is long enough to gain by it."""
+    if not isinstance(drive, Periodic) or not is_uniform(time, _EXACT):
+        return None
+    step = (time[-1] - time[0]) / (time.size - 1)
+    cycles = Fraction(step * float(drive.frequency)).limit_denominator(max(1, time.size // 2))
+    error = abs(step * float(drive.frequency) - cycles) * time.size
+    return cycles.denominator if cycles > 0 and error < _EXACT * step * float(drive.frequency) else None
+
+
+def _along_samples(table: _Table, drive: Sampled, time: np.ndarray, observed: np.ndarray) -> Iterator[np.ndarray]:
+    """Along a measured drive, from sample to sample."""
+    length = _chunk_length(time.size)
+    last = jnp.zeros(_NODES), jnp.asarray(time[0]), jnp.zeros(())
+    voltages = _chunks(time, drive.samples, length)
+    for (t, y, weight), (_, v, _) in zip(_chunks(time, observed, length), voltages, strict=True):
+        total, last = _from_sample_to_sample(table, t, v, y, weight, last, time[0])
+        yield np.asarray(total)
+
+
+@eqx.filter_jit
+def _from_sample_to_sample(
+    table: _Table,
+    time: Array,
+    voltage: Array,
+    observed: Array,
+    weight: Array,
+    last: tuple[Array, Array, Array],
+    first: Array,
+) -> tuple[Array, tuple[Array, Array, Array]]:
+    """Inner products along a chunk, and the response, time and drive at its end."""
+    u, since, before = last
+    step, rise = jnp.diff(time, prepend=since), jnp.diff(voltage, prepend=before)
+    x = step / table.nodes[:, None]
+    u = jax.vmap(recurrence)(jnp.exp(-x), rise * phi(x), u)
+    decays = jnp.exp((first - time) / table.nodes[:, None])
+    times, voltages = jnp.append(since, time), jnp.append(before, voltage)
+    span = jnp.append(times[2:] - times[:-2], step[-1])
+    slope = jnp.append(voltages[2:] - voltages[:-2], 0.0) / jnp.where(span > 0.0, span, 1.0)
+    slow = slow_shapes(time, table.middle, table.half)
+    return _inner(table, u, decays, slow, slope, observed, weight), (u[:, -1], time[-1], voltage[-1])
+
+
+def _assemble(table: _Table, total: np.ndarray, decays: bool, samples: int) -> Compression:
+    """Coordinates in which inner products are those that were added up."""
+    size, rank = len(total), table.series.shape[0]
+    scale = np.sqrt(np.diagonal(total))
+    scale[scale == 0.0] = 1.0
+    values, vectors = np.linalg.eigh(total / np.outer(scale, scale))
+    _, rows = np.linalg.qr(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * scale)
+    signal = rows[:, :rank] @ table.series
+    middle = signal @ np.cos(0.5 * np.pi * np.arange(_NODES))  # Chebyshev polynomials at 0
+    return Compression(
+        center=table.center,
+        reach=jnp.asarray(_REACH),
+        signal=jnp.asarray(signal[:rank]),
+        decay=jnp.asarray(rows[:, rank : 2 * rank] @ table.series if decays else np.zeros((size, _NODES))),
+        slow=jnp.asarray(rows[:, -2 - len(SLOW) : -2].T),
+        slope=jnp.asarray(rows[:, -2]),
+        observed=jnp.asarray(rows[:, -1] + float(table.gain) * middle),
+        samples=jnp.asarray(float(samples)),
+    )
+
+
+def _chebyshev(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The nodes in [-1, 1], and the matrix from values there to a series' coefficients (terms, nodes)."""
+    angle = np.pi * (np.arange(count) + 0.5) / count
+    matrix = 2.0 / count * np.cos(np.arange(count)[:, None] * angle)
+    matrix[0] *= 0.5
+    return np.cos(angle), matrix
