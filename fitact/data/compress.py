@@ -27,10 +27,11 @@ from fitact.model.response import highpass, phi, recurrence
 
 SLOW = ("offset", "drift", "hum_50Hz_cos", "hum_50Hz_sin", "hum_60Hz_cos", "hum_60Hz_sin")
 
-_NODES = 41  # odd, so that the middle of the table is a node
+NODES = 41  # odd, so that the middle of the table is a node
 _REACH = math.log(9.0)  # half width of the table in log tau
 _RANK = 1e-13  # singular values of the exponentials, relative, that are left out
 _EXACT = 1e-9  # of a step: how evenly samples must lie to be folded
+_BLOCK = 64  # samples in a block of the recurrence
 _CHUNK = 8_192  # samples at a time, which bounds memory
 
 
@@ -58,9 +59,9 @@ class Compression(eqx.Module):
     observed: Float[Array, " rows"]
     samples: Float[Array, ""]
 
-    def holds(self, log_tau: Float[Array, "*shape"]) -> Array:
-        """Whether the table reaches there."""
-        return jnp.abs(log_tau - self.center) <= self.reach
+    def holds(self, tau: Array) -> Array:
+        """Whether the table reaches the time constant (s)."""
+        return jnp.abs(jnp.log(tau) - self.center) <= self.reach
 
     def response(self, terms: Terms) -> Float[Array, " rows"]:
         """The response of a circuit, as `fitact.response` gives it in time; V."""
@@ -82,7 +83,7 @@ class Compression(eqx.Module):
             return (last[1], 2.0 * x * last[1] - last[0]), last[0]
 
         # a loop compiles sooner, but runs slower where the terms are few
-        return lax.scan(step, (jnp.ones_like(x), x), None, length=terms, unroll=terms <= _NODES // 2)[1]
+        return lax.scan(step, (jnp.ones_like(x), x), None, length=terms, unroll=terms <= NODES // 2)[1]
 
     def narrowed(self, center: float, reach: float, precision: float, charge: float) -> "Compression":
         """The same for log tau within `reach` of `center` only, with fewer terms and rows.
@@ -90,7 +91,7 @@ class Compression(eqx.Module):
         Left-out terms change no response to the drive, and no decay of a `charge` (V), by more than `precision`
         (V, root of the sum of squares); with no charge its decay is left out altogether.
         """
-        x, to_series = _chebyshev(_NODES)
+        x, to_series = _chebyshev(NODES)
         at = jax.vmap(self._series)(jnp.exp(center + reach * x))  # nodes of the narrow table, in the wide one
         signal = np.asarray(self.signal @ at.T) @ to_series.T
         decay = np.asarray(self.decay @ at.T) @ to_series.T
@@ -157,11 +158,11 @@ class _Table(eqx.Module):
     gain: Array
     middle: Array  # of the record, s
     half: Array  # its length, s
-    steps: Array  # in it
+    step: Array  # between samples, on average, s
 
     @classmethod
     def around(cls, tau: float, gain: float, time: np.ndarray) -> "_Table":
-        x, to_series = _chebyshev(_NODES)
+        x, to_series = _chebyshev(NODES)
         relative = np.exp(_REACH * x)
         ages = np.concatenate([[0.0], np.geomspace(1e-3 * relative.min(), 40.0 * relative.max(), 400)])
         _, sizes, modes = np.linalg.svd(np.exp(-ages[:, None] / relative), full_matrices=False)
@@ -174,7 +175,7 @@ class _Table(eqx.Module):
             gain=jnp.asarray(gain),
             middle=jnp.asarray(0.5 * (time[0] + time[-1])),
             half=jnp.asarray(0.5 * (time[-1] - time[0])),
-            steps=jnp.asarray(float(time.size - 1)),
+            step=jnp.asarray((time[-1] - time[0]) / (time.size - 1)),
         )
 
 
@@ -212,12 +213,11 @@ def _at_times(
 ) -> Array:
     """Inner products where the response to the drive can be computed at any time."""
     u = jax.vmap(lambda tau: highpass(drive, time, tau, steady_state=steady_state))(table.nodes)
-    step = 2.0 * table.half / table.steps
 
     def voltage(time: Array) -> Array:
         return jnp.where(steady_state | (time >= 0.0), drive.value(time), 0.0)
 
-    slope = (voltage(time + step) - voltage(time - step)) / (2.0 * step)
+    slope = (voltage(time + table.step) - voltage(time - table.step)) / (2.0 * table.step)
     slow = slow_shapes(time, table.middle, table.half) if slow is None else slow
     return _inner(table, u, None, slow, slope, observed, weight)
 
@@ -226,7 +226,7 @@ def _inner(
     table: _Table, u: Array, decays: Array | None, slow: Array, slope: Array, observed: Array, weight: Array
 ) -> Array:
     parts = [table.mix.T @ u] + ([] if decays is None else [table.mix.T @ decays])
-    rest = observed - table.gain * u[_NODES // 2]
+    rest = observed - table.gain * u[NODES // 2]
     rows = jnp.concatenate([*parts, slow, slope[None], rest[None]])
     return (rows * weight) @ rows.T
 
@@ -251,7 +251,7 @@ def _folded(table: _Table, drive: Drive, time: np.ndarray, observed: np.ndarray,
     yield total
 
 
-@jax.jit
+@eqx.filter_jit
 def _over_periods(table: _Table, time: Array, observed: Array, weight: Array, reference: Array) -> tuple[Array, Array]:
     difference = (observed.reshape(-1, reference.size) - reference).reshape(-1)
     z = jnp.concatenate([slow_shapes(time, table.middle, table.half), difference[None]])
@@ -271,11 +271,14 @@ def _samples_a_period(drive: Drive, time: np.ndarray) -> int | None:
 
 def _along_samples(table: _Table, drive: Sampled, time: np.ndarray, observed: np.ndarray) -> Iterator[np.ndarray]:
     """Along a measured drive, from sample to sample."""
-    length = _chunk_length(time.size)
-    last = jnp.zeros(_NODES), jnp.asarray(time[0]), jnp.zeros(())
+    length, step, first = _chunk_length(time.size), float(table.step), float(drive.samples[0])
+    x = step / table.nodes if is_uniform(time, _EXACT) and step < float(jnp.min(table.nodes)) else None
+    last = jnp.zeros(NODES), jnp.asarray(time[0]), jnp.zeros(())  # the first sample is a jump from 0
+    if x is not None:
+        last = first * jnp.exp(x), jnp.asarray(time[0] - step), jnp.asarray(first)
     voltages = _chunks(time, drive.samples, length)
     for (t, y, weight), (_, v, _) in zip(_chunks(time, observed, length), voltages, strict=True):
-        total, last = _from_sample_to_sample(table, t, v, y, weight, last, time[0])
+        total, last = _from_sample_to_sample(table, t, v, y, weight, last, time[0], x)
         yield np.asarray(total)
 
 
@@ -288,18 +291,41 @@ def _from_sample_to_sample(
     weight: Array,
     last: tuple[Array, Array, Array],
     first: Array,
+    x: Array | None,
 ) -> tuple[Array, tuple[Array, Array, Array]]:
-    """Inner products along a chunk, and the response, time and drive at its end."""
+    """Inner products along a chunk, and the response, time and drive at its end; `x`: even steps over the nodes."""
     u, since, before = last
     step, rise = jnp.diff(time, prepend=since), jnp.diff(voltage, prepend=before)
-    x = step / table.nodes[:, None]
-    u = jax.vmap(recurrence)(jnp.exp(-x), rise * phi(x), u)
+    if x is None:
+        ages = step / table.nodes[:, None]
+        u = jax.vmap(recurrence)(jnp.exp(-ages), rise * phi(ages), u)
+    else:
+        u = _evenly(rise, u, x)
     decays = jnp.exp((first - time) / table.nodes[:, None])
     times, voltages = jnp.append(since, time), jnp.append(before, voltage)
     span = jnp.append(times[2:] - times[:-2], step[-1])
     slope = jnp.append(voltages[2:] - voltages[:-2], 0.0) / jnp.where(span > 0.0, span, 1.0)
     slow = slow_shapes(time, table.middle, table.half)
     return _inner(table, u, decays, slow, slope, observed, weight), (u[:, -1], time[-1], voltage[-1])
+
+
+def _evenly(rise: Float[Array, " n"], u: Float[Array, " nodes"], x: Float[Array, " nodes"]) -> Float[Array, "nodes n"]:
+    """u[k] = e^{-x} u[k - 1] + phi(x) rise[k]: `recurrence` for one step size, in blocks."""
+    width = math.gcd(rise.size, _BLOCK)
+    decay, gain = jnp.exp(-x)[:, None], phi(x)[:, None]
+    blocks = rise.reshape(-1, width)
+
+    def within(u: Array, rise: Array) -> tuple[Array, Array]:
+        u = decay * u + rise
+        return u, u
+
+    def across(u: Array, end: Array) -> tuple[Array, Array]:
+        return jnp.exp(-width * x) * u + end, u
+
+    _, alone = lax.scan(within, jnp.zeros((x.size, len(blocks))), blocks.T)
+    _, starts = lax.scan(across, u / gain[:, 0], alone[-1].T)
+    left = jnp.exp(-x[:, None] * jnp.arange(1, width + 1))
+    return gain * (alone.transpose(1, 2, 0) + starts.T[:, :, None] * left[:, None]).reshape(x.size, -1)
 
 
 def _assemble(table: _Table, total: np.ndarray, decays: bool, samples: int) -> Compression:
@@ -310,12 +336,12 @@ def _assemble(table: _Table, total: np.ndarray, decays: bool, samples: int) -> C
     values, vectors = np.linalg.eigh(total / np.outer(scale, scale))
     _, rows = np.linalg.qr(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * scale)
     signal = rows[:, :rank] @ table.series
-    middle = signal @ np.cos(0.5 * np.pi * np.arange(_NODES))  # Chebyshev polynomials at 0
+    middle = signal @ np.cos(0.5 * np.pi * np.arange(NODES))  # Chebyshev polynomials at 0
     return Compression(
         center=table.center,
         reach=jnp.asarray(_REACH),
         signal=jnp.asarray(signal[:rank]),
-        decay=jnp.asarray(rows[:, rank : 2 * rank] @ table.series if decays else np.zeros((size, _NODES))),
+        decay=jnp.asarray(rows[:, rank : 2 * rank] @ table.series if decays else np.zeros((size, NODES))),
         slow=jnp.asarray(rows[:, -2 - len(SLOW) : -2].T),
         slope=jnp.asarray(rows[:, -2]),
         observed=jnp.asarray(rows[:, -1] + float(table.gain) * middle),

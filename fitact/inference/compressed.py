@@ -2,13 +2,14 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from fitact.data.compress import Compression, compress
-from fitact.inference.likelihood import CHARGE, LINEAR, Likelihood, in_batches
+from fitact.inference.likelihood import CHARGE, LINEAR, Batched, Likelihood
 from fitact.inference.start import LinearStart
 from fitact.model.drive import Sampled
 
@@ -76,7 +77,7 @@ def certify(
     full = dataclasses.replace(wide, compression=None, columns=columns)
     if wide.compression is None:
         return Certified(full, None, reason or "a delay is free")
-    if not bool(wide.compression.holds(_log_b(theta))):
+    if not wide.compression.holds(np.exp(_log_b(theta))):
         return Certified(full, None, "the fit left the table's range")
     charge = float(np.ptp(wide.observed)) if CHARGE in columns else 0.0
     precision = 0.1 * tolerance * sigma / float(wide.gain(theta) * wide.circuit(theta).g)
@@ -108,24 +109,30 @@ def _believed(wide: Likelihood, theta: np.ndarray) -> Float[np.ndarray, "n param
     """Points of the prior that the table reaches, the optimum where there are too few."""
     assert wide.compression is not None
     draws = np.log(np.array(list(wide.prior.sample(np.random.default_rng(0), 1000).values())).T)
-    draws = draws[np.asarray(wide.compression.holds(_log_b(draws)))]
+    draws = draws[np.asarray(wide.compression.holds(np.exp(_log_b(draws))))]
     return np.vstack([draws, np.tile(theta, (_POINTS, 1))])[:_POINTS]
 
 
 def _at(likelihood: Likelihood, theta: Float[np.ndarray, "n parameters"], sigma: float) -> np.ndarray:
     """Log-posteriors at points of one sigma."""
     points = np.column_stack([theta, np.full(len(theta), math.log(sigma))])
-    return in_batches(Likelihood.log_prob, likelihood, (points,), likelihood.rows)
+    return Batched(Likelihood.log_prob, likelihood, likelihood.rows)(points)
 
 
-def log_prob(likelihood: Likelihood, points: Float[np.ndarray, "n coordinates"], batch: int) -> np.ndarray:
-    """Log-posteriors of (theta, log sigma); where the compression does not reach, the samples are summed."""
-    values = in_batches(Likelihood.log_prob, likelihood, (points,), likelihood.rows, batch)
-    if likelihood.compression is not None:
-        beyond = ~np.asarray(likelihood.compression.holds(_log_b(points)))
-        if np.any(beyond):
-            full = dataclasses.replace(likelihood, compression=None)
-            values[beyond] = in_batches(Likelihood.log_prob, full, (points[beyond],), full.rows, batch=1)
+def log_prob(likelihood: Likelihood, batch: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Log-posteriors of points (theta, log sigma); where the compression does not reach, the samples are summed."""
+    tabulated = Batched(Likelihood.log_prob, likelihood, likelihood.rows, batch)
+    full = dataclasses.replace(likelihood, compression=None)
+    summed = Batched(Likelihood.log_prob, full, full.rows, batch=1)
+
+    def values(points: Float[np.ndarray, "n coordinates"]) -> np.ndarray:
+        found = tabulated(points)
+        beyond = np.isnan(found)
+        if beyond.any():
+            found = np.array(found)
+            found[beyond] = summed(points[beyond])
+        return found
+
     return values
 
 

@@ -9,7 +9,9 @@ All this asks of the samples is lengths and angles, so it reads the same in the 
 `fitact.data.compress.Compression`, where there is one, as over the samples themselves.
 """
 
+import functools
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -176,7 +178,7 @@ class Likelihood(eqx.Module):
     def log_prob(self, point: Float[Array, " parameters+1"]) -> Float[Array, ""]:
         """Log-posterior of (theta, log sigma), up to a constant; sigma's prior is flat in its logarithm.
 
-        Anything that is not finite counts as impossible.
+        Anything that is not finite counts as impossible; NaN where the compression does not reach.
         """
         theta, log_sigma = point[:-1], point[-1]
         remainder, beta, factor = self.linear(theta, jnp.exp(log_sigma))
@@ -185,34 +187,60 @@ class Likelihood(eqx.Module):
         value = value + self.prior.log_density(theta[: len(self.prior.names)])
         if self.free_delay:
             value = value - 0.5 * jnp.square(theta[-1] / self.delay_sd)
-        return jnp.where(jnp.isfinite(value), value, -jnp.inf)
+        value = jnp.where(jnp.isfinite(value), value, -jnp.inf)
+        if self.compression is None:
+            return value
+        tau = self.circuit(theta).terms().tau[0]
+        return jnp.where(self.compression.holds(tau) | ~jnp.isfinite(jnp.log(tau)), value, jnp.nan)
 
 
-def in_batches(
-    function: Callable[..., Array],
-    model: eqx.Module,
-    arrays: tuple[np.ndarray, ...],
-    rows: int,
-    batch: int = 32,
-) -> np.ndarray:
+class Batched:
     """`function(model, *rows)` over the rows of arrays of one length, a batch at a time.
 
-    Batches have one size, so that they compile once, and shrink where `rows`, the numbers that one
-    evaluation runs over, are many, which bounds memory. Call it in double precision.
+    Batches have one size, so that they compile once, and shrink where `rows`, the numbers that one evaluation
+    runs over, are many, which bounds memory. What jit needs of the model is sorted out here once, since a call
+    may take less time than that. Call it in double precision.
     """
-    count = len(arrays[0])
-    batch = max(1, min(batch, count, _BATCH_ROWS // rows))
-    padded = [np.concatenate([a, np.repeat(a[-1:], -count % batch, axis=0)]) for a in arrays]
-    parts = [
-        np.asarray(_batch(function, model, tuple(jnp.asarray(a[i : i + batch]) for a in padded)))
-        for i in range(0, count, batch)
-    ]
-    return np.concatenate(parts)[:count]
+
+    def __init__(self, function: Callable[..., Array], model: eqx.Module, rows: int, batch: int = 32) -> None:
+        dynamic, static = eqx.partition(model, eqx.is_array)
+        self._dynamic, treedef = jax.tree.flatten(dynamic)
+        self._static = _Static(function, static, treedef)
+        self._batch = max(1, min(batch, _BATCH_ROWS // rows))
+
+    def __call__(self, *arrays: np.ndarray) -> np.ndarray:
+        count = len(arrays[0])
+        batch = min(self._batch, count)
+        missing = -count % batch
+        if missing:
+            arrays = tuple(np.concatenate([a, np.repeat(a[-1:], missing, axis=0)]) for a in arrays)
+        parts = [
+            np.asarray(_evaluate(self._static, self._dynamic, tuple(a[i : i + batch] for a in arrays)))
+            for i in range(0, count, batch)
+        ]
+        return (parts[0] if len(parts) == 1 else np.concatenate(parts))[:count]
 
 
-@eqx.filter_jit
-def _batch(function: Callable[..., Array], model: eqx.Module, rows: tuple[Array, ...]) -> Array:
-    return jax.vmap(lambda *row: function(model, *row))(*rows)
+class _Static:
+    """A function, and a model but for its arrays; equal where their compiled forms are."""
+
+    def __init__(self, function: Callable[..., Array], model: eqx.Module, arrays: Any) -> None:
+        self.function, self.model, self.arrays = function, model, arrays
+        leaves, treedef = jax.tree.flatten(model)
+        self._key = (function, arrays, tuple(leaves), treedef)
+        self._hash = hash(self._key)
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, _Static) and self._key == other._key)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _evaluate(static: _Static, dynamic: list[Array], rows: tuple[Array, ...]) -> Array:
+    model = eqx.combine(jax.tree.unflatten(static.arrays, dynamic), static.model)
+    return jax.vmap(lambda *row: static.function(model, *row))(*rows)
 
 
 def natural(likelihood: Likelihood, theta: np.ndarray) -> dict[str, np.ndarray]:

@@ -18,7 +18,7 @@ from fitact.files import replacing
 from fitact.inference import derived, summary
 from fitact.inference.chain import Chain
 from fitact.inference.fit import Fit
-from fitact.inference.likelihood import LINEAR, Likelihood, in_batches, natural
+from fitact.inference.likelihood import LINEAR, Batched, Likelihood, natural
 from fitact.units import engineering
 
 _DRAWS = 2500  # kept per ensemble, spread over its walkers and steps
@@ -117,7 +117,7 @@ class Posterior:
         points, deviates = self.points[:, draws], self._deviates[:, draws]
         flat = points.reshape(-1, points.shape[-1]), deviates.reshape(-1, len(LINEAR))
         with jax.enable_x64(True):
-            values = in_batches(function, model, flat, len(self.fit.record))
+            values = Batched(function, model, len(self.fit.record))(*flat)
         return values.reshape(*points.shape[:2], -1)
 
     @property

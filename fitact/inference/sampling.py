@@ -22,7 +22,6 @@ from fitact.errors import InputError
 from fitact.inference import compressed
 from fitact.inference.chain import Chain
 from fitact.inference.fit import Fit
-from fitact.inference.likelihood import Likelihood
 from fitact.inference.posterior import Convergence, Posterior
 
 _DEGREES = 8.0  # of freedom of the t proposal: tails above any posterior's seen here
@@ -101,7 +100,7 @@ class _Run:
     ) -> "_Run":
         """From the chain file where there is one, else from the Laplace approximation."""
         proposal = _StudentT.around(fit)
-        log_prob = _vectorised(fit.likelihood, walkers // 2)
+        log_prob = compressed.log_prob(fit.likelihood, walkers // 2)  # as many as a stretch move asks for
         moves = [(emcee.moves.MHMove(proposal.move), 0.7), (emcee.moves.StretchMove(), 0.3)]
         samplers = [
             emcee.EnsembleSampler(walkers, len(names), log_prob, moves=moves, vectorize=True) for _ in range(ensembles)
@@ -207,12 +206,6 @@ class _StudentT:
         """emcee's proposal function: new points, and log q(old) - log q(new)."""
         proposed = self.draw(random, len(points))
         return proposed, self.log_density(points) - self.log_density(proposed)
-
-
-def _vectorised(likelihood: Likelihood, half: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Log-probabilities of many points; `half` an ensemble is what a stretch move asks for."""
-
-    return lambda points: compressed.log_prob(likelihood, points, half)
 
 
 def _starts(

@@ -12,6 +12,7 @@ from fitact.errors import InputError
 from fitact.model.drive import Drive, Sampled, Sine
 from fitact.model.scene import Scene
 
+_ALIGNED = 20_000  # samples on which a drive is laid
 _CONTRADICTION = 0.05  # relative difference between the stated and the recorded drive that cannot be an inaccuracy
 
 
@@ -188,11 +189,12 @@ def _align(record: Record, drive: Drive, frequency: float, steady_state: bool) -
     On V where it was recorded, otherwise on Vsc through its best linear combination of the drive and
     the drive's integral.
     """
-    target = record["V"] if "V" in record else record["Vsc"]
+    few = slice(0, max(_ALIGNED, math.ceil(3.0 / frequency / record.time_step)))  # of a long record, its beginning
+    time, target = record.time[few], record["V" if "V" in record else "Vsc"][few]
     target = target - target.mean()
 
     def left(shift: float) -> float:
-        wave = _voltage(drive, record.time - shift, steady_state)
+        wave = _voltage(drive, time - shift, steady_state)
         columns = [np.ones_like(wave), wave]
         if "V" not in record:
             columns.append(np.cumsum(wave - wave.mean()))

@@ -1,0 +1,168 @@
+"""The compressed log-likelihood against NumPy over the samples, side by side in one run.
+
+    python benchmarks/likelihood.py [--json]
+
+Prints ratios: how many times faster a log-probability of 1,000 walkers is, each, than one evaluation over
+the samples in plain NumPy (and in NumPy that keeps what does not change); what an evaluation costs at 1e7
+samples against 1e4; and what building the compression costs against one `np.dot` for each column of its
+basis, for a settled square (whose periods are folded) and for a measured drive. Medians of interleaved
+repeats.
+"""
+
+import argparse
+import json
+import math
+import statistics
+import time
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import fitact
+from fitact.data import compress as compression
+from fitact.inference.compressed import log_prob
+
+TRUTH = np.log([160e3, 22e-9, 1.35e-9, 0.1])  # and sigma, V
+SQUARE = fitact.Scene.from_dict({"drive": {"waveform": "square"}})
+RATE, FREQUENCY, WALKERS = 250e3, 100.0, 1000
+
+
+def record(samples: int) -> fitact.Record:
+    """A settled square wave in white noise."""
+    t = np.arange(samples) / RATE
+    sign, since = folded(t)
+    noise = math.exp(TRUTH[3]) * np.random.default_rng(1).standard_normal(samples)
+    return fitact.Record.from_arrays(t, V=180.0 * sign, Vsc=skin_voltage(TRUTH, sign, since) + noise)
+
+
+def folded(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The sign of the square, and the time since its last edge."""
+    index = np.arange(t.size) % int(RATE / FREQUENCY)
+    half = int(RATE / FREQUENCY) // 2
+    return np.where(index < half, 1.0, -1.0), (index % half) / RATE
+
+
+def skin_voltage(point: np.ndarray, sign: np.ndarray, since: np.ndarray) -> np.ndarray:
+    """The closed form of eq. (20) for a settled square."""
+    R, C, Ci = np.exp(point[:3])
+    g, b = Ci / (2.0 * Ci + C), R * (2.0 * Ci + C)
+    return sign * 360.0 * g / (1.0 + math.exp(-0.5 / FREQUENCY / b)) * np.exp(-since / b)
+
+
+def plain(point: np.ndarray, t: np.ndarray, y: np.ndarray) -> float:
+    """A log-likelihood as one would write it first (`mod` puts a few samples on the wrong side of an edge)."""
+    period = 1.0 / FREQUENCY
+    phase = np.mod(t, period)
+    sign = np.where(phase < 0.5 * period, 1.0, -1.0)
+    residual = y - skin_voltage(point, sign, np.mod(phase, 0.5 * period))
+    sigma = math.exp(point[3])
+    return float(-0.5 * np.sum((residual / sigma) ** 2) - t.size * math.log(sigma))
+
+
+def good(point: np.ndarray, sign: np.ndarray, since: np.ndarray, y: np.ndarray) -> float:
+    """The same, with what does not change computed beforehand."""
+    residual = y - skin_voltage(point, sign, since)
+    return -0.5 * float(residual @ residual) * math.exp(-2.0 * point[3]) - y.size * point[3]
+
+
+def medians(jobs: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+    """Median seconds of each, run in turn."""
+    taken: dict[str, list[float]] = {name: [] for name in jobs}
+    for job in jobs.values():
+        job()
+    for _ in range(repeats):
+        for name, job in jobs.items():
+            start = time.perf_counter()
+            job()
+            taken[name].append(time.perf_counter() - start)
+    return {name: statistics.median(times) for name, times in taken.items()}
+
+
+def compressed(fit: fitact.Fit, points: np.ndarray) -> Callable[[], np.ndarray]:
+    """Log-probabilities of all points, NumPy in and out."""
+    assert fit.model()["likelihood"] == "compressed", fit.full_because
+    function = log_prob(fit.likelihood, len(points))
+    return lambda: function(points)
+
+
+def evaluation(samples: int, points: np.ndarray) -> dict[str, float]:
+    """Ratios of one evaluation over the samples to one of many compressed ones; and whether they agree."""
+    data = record(samples)
+    t, y = data.time, data["Vsc"]
+    sign, since = folded(t)
+    fit = fitact.fit(data, SQUARE)
+    fast = compressed(fit, points)
+    ours, theirs = fast()[:2], [good(point, sign, since, y) for point in points[:2]]
+    priors = [float(fit.likelihood.prior.log_density(jnp.asarray(point[:3]))) for point in points[:2]]
+    difference = (ours[1] - ours[0]) - (theirs[1] - theirs[0] + priors[1] - priors[0])
+    assert abs(difference) < 0.01, f"the compressed log-probability is off by {difference}"
+    jobs = {
+        "compressed": fast,
+        "plain": lambda: plain(points[0], t, y),
+        "good": lambda: good(points[0], sign, since, y),
+    }
+    seconds = medians(jobs, 30 if samples < 1_000_000 else 9)
+    each = seconds["compressed"] / len(points)
+    return {
+        f"compressed_vs_numpy_{samples}": seconds["plain"] / each,
+        f"compressed_vs_good_numpy_{samples}": seconds["good"] / each,
+    }
+
+
+def growth(points: np.ndarray) -> float:
+    """Cost of an evaluation at 1e7 samples over that at 1e4."""
+    jobs = {str(samples): compressed(fitact.fit(record(samples), SQUARE), points) for samples in (10_000, 10_000_000)}
+    seconds = medians(jobs, 100)
+    return seconds["10000000"] / seconds["10000"]
+
+
+def building(samples: int) -> dict[str, float]:
+    """Cost of a compression over that of one `np.dot` for each basis column, read from memory."""
+    data = record(samples)
+    t, y = data.time, data["Vsc"]
+    drives = {
+        "square": (fitact.Square(360.0, FREQUENCY), True),
+        "unfolded_square": (fitact.Square(360.0, 101.37), True),
+        "measured": (fitact.Sampled(t, data["V"]), False),
+    }
+    columns = np.random.default_rng(2).standard_normal((4, samples))  # as many as memory holds with ease
+    jobs: dict[str, Callable[[], object]] = {
+        name: lambda drive=drive, steady=steady: compression.compress(
+            drive, t, y, steady_state=steady, tau=4e-3, gain=0.05
+        )
+        for name, (drive, steady) in drives.items()
+    }
+    jobs["dot"] = lambda: [np.dot(column, y) for column in columns]
+    seconds = medians(jobs, 5)
+    dot = seconds["dot"] / len(columns)
+    kinds = {"square": 1, "unfolded_square": 1, "measured": 2}  # responses; and the decays of an unknown charge
+    return {f"build_{name}_vs_dots": seconds[name] / (dot * kind * compression.NODES) for name, kind in kinds.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Ratios of the compressed log-likelihood to the full sum.")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--quick", action="store_true", help="leave out the longest records")
+    given = parser.parse_args()
+    with jax.enable_x64(True):
+        fit = fitact.fit(record(5000), SQUARE)
+        root = np.zeros((4, 4))
+        root[:3, :3], root[3, 3] = fit.covariance_root, math.sqrt(0.5 / 5000)
+        deviates = np.random.default_rng(3).standard_normal((WALKERS, 4))
+        points = np.append(fit.theta, math.log(fit.sigma)) + deviates @ root.T
+        ratios = evaluation(5000, points)
+        ratios |= evaluation(1_000_000, points)
+        ratios |= building(1_000_000 if given.quick else 10_000_000)
+        if not given.quick:
+            ratios["cost_10000000_vs_10000"] = growth(points)
+    if given.json:
+        print(json.dumps(ratios))
+        return
+    for name, value in ratios.items():
+        print(f"{name:36}{value:12.3g}")
+
+
+if __name__ == "__main__":
+    main()

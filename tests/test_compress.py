@@ -1,0 +1,161 @@
+"""The compressed likelihood against sums over the samples that are computed without it."""
+
+import dataclasses
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import skin_voltage, square_record
+
+import fitact
+from fitact.data.compress import SLOW, compress
+from fitact.inference import compressed
+from fitact.inference.likelihood import Likelihood
+from fitact.model.circuit import Terms
+
+TAU = 4e-3
+SQUARE = fitact.Scene.from_dict({"drive": {"waveform": "square"}})
+
+
+@pytest.fixture(autouse=True)
+def _double_precision():
+    with jax.enable_x64(True):
+        yield
+
+
+def unit_response(time: np.ndarray, voltage: np.ndarray, tau: float, hold: bool = False) -> np.ndarray:
+    """scipy's response of s tau / (1 + s tau), from rest: a finger of tiny Ci."""
+    return skin_voltage(time, voltage, Rsc=tau / (2e-15 + 1e-9), Csc=1e-9, Ci=1e-15, hold=hold) * (1e-9 + 2e-15) / 1e-15
+
+
+def products(columns: np.ndarray) -> np.ndarray:
+    return columns @ columns.T
+
+
+def check(compression, u: np.ndarray, decay: np.ndarray | None, slow: np.ndarray, y: np.ndarray, tau: float) -> None:
+    """Every inner product of the model's functions and the record, against the sums over samples."""
+    theirs = [u, *slow, y] if decay is None else [u, *slow, y, decay]
+    ours = [compression.response(Terms((1.0,), (tau,))), *compression.slow, compression.observed]
+    if decay is not None:
+        ours.append(compression.decays(jnp.asarray(tau)))
+    expected = products(np.stack(theirs))
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(products(np.stack(ours)) / scale, expected / scale, atol=3e-11)
+
+
+def slow(time: np.ndarray) -> np.ndarray:
+    since = time - 0.5 * (time[0] + time[-1])
+    angles = [2.0 * np.pi * f * since for f in (50.0, 60.0)]
+    waves = [wave(angle) for angle in angles for wave in (np.cos, np.sin)]
+    return np.stack([np.ones_like(time), since / since[-1], *waves])
+
+
+@pytest.mark.parametrize("factor", [0.12, 0.5, 1.0, 1.7, 8.5])
+@pytest.mark.parametrize("kind", ["even", "uneven", "with a gap"])
+def test_measured_drive(kind: str, factor: float):
+    rng = np.random.default_rng(3)
+    grid = np.arange(20001) * 2e-6
+    kept = {
+        "even": np.arange(20001),
+        "uneven": np.unique(np.concatenate([[0, 20000], rng.integers(0, 20001, 9000)])),
+        "with a gap": np.r_[0:7000, 9000:20001],
+    }[kind]
+    time, voltage = grid[kept], np.cumsum(rng.standard_normal(kept.size))
+    y = rng.standard_normal(kept.size)
+    tau = factor * TAU
+    # the same broken line on the even grid that scipy needs
+    u = unit_response(grid, np.interp(grid, time, voltage), tau)[kept]
+    compression = compress(fitact.Sampled(time, voltage), time, y, steady_state=False, tau=TAU, gain=0.05)
+    check(compression, u, np.exp(-(time - time[0]) / tau), slow(time), y, tau)
+
+
+@pytest.mark.parametrize("frequency", [100.0, 300.0, 101.37])
+def test_settled_square(frequency: float):
+    """Periods of 2000 samples, three of them in 2000, and none that fits the sampling grid."""
+    time = np.arange(30000) * 5e-6
+    drive = fitact.Square(360.0, frequency)
+    half = 0.5 / frequency
+    cycles = np.round(time * frequency * 1e9) / 1e9
+    since = np.where(cycles % 1.0 < 0.5, cycles % 1.0, cycles % 1.0 - 0.5) / frequency
+    sign = np.where(cycles % 1.0 < 0.5, 1.0, -1.0)
+    y = np.random.default_rng(4).standard_normal(time.size)
+    compression = compress(drive, time, y, steady_state=True, tau=TAU, gain=0.05)
+    for tau in (0.2 * TAU, TAU, 3.0 * TAU):
+        u = sign * 360.0 / (1.0 + np.exp(-half / tau)) * np.exp(-since / tau)
+        check(compression, u, None, slow(time), y, tau)
+
+
+def test_square_from_rest():
+    time = np.arange(3000) * 1e-5
+    voltage = np.where(np.arange(3000) % 1000 < 500, 180.0, -180.0)
+    y = np.random.default_rng(5).standard_normal(time.size)
+    compression = compress(fitact.Square(360.0, 100.0), time, y, steady_state=False, tau=TAU, gain=0.05)
+    check(compression, unit_response(time, voltage, TAU, hold=True), None, slow(time), y, TAU)
+
+
+@pytest.mark.parametrize("scene", [None, SQUARE], ids=["measured drive", "folded square"])
+def test_fit_and_log_probabilities_are_those_of_the_samples(scene):
+    record = square_record(offset=0.1, periods=4)
+    ours, full = (fitact.fit(record, scene, tolerance=tolerance) for tolerance in (1e-3, 0.0))
+    assert ours.model()["likelihood"] == "compressed"
+    assert full.model()["likelihood"] == "full"
+    assert full.full_because == "it was asked for"
+    assert ours.compression_error < 1e-3
+    np.testing.assert_allclose(ours.theta, full.theta, atol=1e-4 * full.sd.min())
+    np.testing.assert_allclose(ours.sd, full.sd, rtol=1e-6)
+    assert ours.linear.keys() == full.linear.keys()
+    # points further out than those of the certificate
+    deviates = np.random.default_rng(6).standard_normal((20, full.theta.size))
+    points = np.column_stack([full.theta + 3.0 * deviates @ full.covariance_root.T, np.full(20, np.log(full.sigma))])
+    a, b = (compressed.log_prob(fit.likelihood, 32)(points) for fit in (ours, full))
+    np.testing.assert_allclose(a, b, atol=2e-3)
+    assert np.ptp(b) > 10.0
+
+
+def test_cost_does_not_grow_with_the_record():
+    rows = [fitact.fit(square_record(periods=n), SQUARE).likelihood.rows for n in (1, 40)]
+    assert rows[1] <= rows[0] + 2  # a longer record is known better, and asks for a term or two more
+    assert rows[1] < 40
+
+
+def test_points_beyond_the_table_are_summed_over_the_samples():
+    fit = fitact.fit(square_record(), SQUARE)
+    far = np.append(fit.theta, np.log(fit.sigma)) + np.array([0.7, 0.0, 0.0, 0.0])
+    near = np.append(fit.theta, np.log(fit.sigma))
+    full = dataclasses.replace(fit.likelihood, compression=None)
+    expected = [float(Likelihood.log_prob(full, jnp.asarray(point))) for point in (far, near)]
+    np.testing.assert_allclose(compressed.log_prob(fit.likelihood, 2)(np.stack([far, near])), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("made", "tolerance", "reason"),
+    [
+        ({"per_period": 200}, 1e-3, "shorter than 512 samples"),
+        ({"delay_samples": 2}, 1e-3, "delay"),
+        ({}, 1e-13, "off by .* near the optimum"),
+    ],
+)
+def test_samples_are_summed_where_compression_does_not_hold(made: dict[str, int], tolerance: float, reason: str):
+    fit = fitact.fit(square_record(**made), SQUARE, tolerance=tolerance)
+    assert fit.model()["likelihood"] == "full"
+    assert fit.compression_error is None
+
+    assert re.search(reason, fit.full_because)
+    assert fit.trusted
+
+
+def test_arrays_on_disk_are_read_a_chunk_at_a_time(tmp_path):
+    """Records larger than memory: the arrays may be memory maps."""
+    rng = np.random.default_rng(8)
+    time, voltage, y = np.arange(50_000) * 5e-6, rng.standard_normal(50_000), rng.standard_normal(50_000)
+    maps = []
+    for name, values in {"time": time, "y": y}.items():
+        np.save(tmp_path / f"{name}.npy", values)
+        maps.append(np.load(tmp_path / f"{name}.npy", mmap_mode="r"))
+    drive = fitact.Sampled(time, voltage)
+    ours = compress(drive, *maps, steady_state=False, tau=TAU, gain=0.05)
+    expected = compress(drive, time, y, steady_state=False, tau=TAU, gain=0.05)
+    np.testing.assert_array_equal(ours.observed, expected.observed)
+    assert len(SLOW) == len(ours.slow)
