@@ -19,8 +19,9 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Complex
+from jaxtyping import Array, Complex, Float
 
 
 class Terms(NamedTuple):
@@ -44,11 +45,23 @@ class Circuit(eqx.Module):
 
     def transfer_function(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
         """Vsc / V at the angular frequency `omega` (rad/s, >= 0)."""
-        return _at(self.terms(), omega)
+        return gain_at(self.terms(), omega)
 
     def admittance(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
         """I / V in siemens at the angular frequency `omega` (rad/s, >= 0)."""
-        return _at(self.current_terms(), omega)
+        return gain_at(self.current_terms(), omega)
+
+    def amplitude(self, omega: ArrayLike) -> Float[Array, "*shape"]:
+        """|Vsc / V| at the angular frequency `omega` (rad/s, >= 0), eq. (25)."""
+        gain = self.transfer_function(omega)
+        some = gain != 0.0
+        return jnp.where(some, jnp.abs(jnp.where(some, gain, 1.0)), 0.0)
+
+    def phase(self, omega: ArrayLike) -> Float[Array, "*shape"]:
+        """How far Vsc leads V at the angular frequency `omega` (rad/s, >= 0), rad; pi/2 at its zero, eq. (26)."""
+        gain = self.transfer_function(omega)
+        some = gain != 0.0
+        return jnp.where(some, jnp.angle(jnp.where(some, gain, 1j)), 0.5 * np.pi)
 
 
 def highpass_gain(x: ArrayLike) -> Complex[Array, "*shape"]:
@@ -86,6 +99,17 @@ class FinalCircuit(Circuit):
     def b(self) -> ArrayLike:
         """The time constant Rsc (2 Ci + Csc), s."""
         return self.Rsc * (2.0 * self.Ci + self.Csc)
+
+    def amplitude(self, omega: ArrayLike) -> Float[Array, "*shape"]:
+        """|Vsc / V|, eq. (25): g w b / sqrt(1 + (w b)^2)."""
+        x = jnp.asarray(omega) * self.b
+        below = x <= 1.0
+        small, inverse = jnp.where(below, x, 1.0), 1.0 / jnp.where(below, 1.0, x)
+        return self.g * jnp.where(below, small / jnp.sqrt(1.0 + small**2), 1.0 / jnp.sqrt(1.0 + inverse**2))
+
+    def phase(self, omega: ArrayLike) -> Float[Array, "*shape"]:
+        """arctan(1 / (w b)) in rad, eq. (26)."""
+        return jnp.arctan2(1.0, jnp.asarray(omega) * self.b)
 
     def terms(self) -> Terms:
         """One term: the divider g with the time constant b."""
@@ -251,7 +275,8 @@ def _in_series(*resistances: ArrayLike | None) -> ArrayLike | None:
     return sum(given[1:], given[0]) if given else None
 
 
-def _at(terms: Terms, omega: ArrayLike) -> Complex[Array, "*shape"]:
+def gain_at(terms: Terms, omega: ArrayLike) -> Complex[Array, "*shape"]:
+    """The sum of `terms` at s = j omega (rad/s, >= 0)."""
     omega = jnp.asarray(omega)
     total = jnp.zeros_like(omega, dtype=complex) if terms.rate is None else 1j * omega * terms.rate
     for weight, tau in zip(terms.weight, terms.tau, strict=True):
