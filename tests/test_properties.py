@@ -4,6 +4,8 @@ The examples are drawn from a fixed seed, so a run in CI can be repeated: what i
 whole region of values shares, and a law that fails on a fluke is found by raising `max_examples` by hand.
 """
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import mpmath
@@ -66,19 +68,17 @@ def test_response_is_linear_in_the_drive(
 
 @given(SKINS)
 def test_steady_state_has_no_mean(values: tuple[float, float, float]):
-    """Rsc times the charge through the skin: over a period none is left. Gauss points on each straight piece."""
+    """No charge passes the insulator for good. Gauss points on each straight piece, denser at its start."""
     knots = np.array([0.0, 0.1, 0.3, 0.4, 1.0]) * PERIOD
-    b = values[0] * (2.0 * values[2] + values[1])
     nodes, weights = np.polynomial.legendre.leggauss(12)
     mean, size = 0.0, 0.0
-    for low, high in zip(knots[:-1], knots[1:], strict=True):
+    for low, high in itertools.pairwise(knots):
         # cells that double in width from the start, where the response decays with b
         edges = low + (high - low) * np.append(0.0, np.logspace(-30.0, 0.0, 31, base=2.0))
         half = 0.5 * np.diff(edges)[:, None]
         vsc = np.asarray(trapezoid_response(jnp.array(values), edges[:-1, None] + half * (1.0 + nodes)))
         mean += np.sum(half * weights * vsc)
         size = max(size, np.abs(vsc).max())
-    assert b > 0.0
     assert abs(mean) / PERIOD < 1e-12 * size
 
 
