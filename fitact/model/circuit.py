@@ -20,6 +20,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
@@ -53,15 +54,20 @@ class Circuit(eqx.Module):
 
     def amplitude(self, omega: ArrayLike) -> Float[Array, "*shape"]:
         """|Vsc / V| at the angular frequency `omega` (rad/s, >= 0), eq. (25)."""
-        gain = self.transfer_function(omega)
-        some = gain != 0.0
-        return jnp.where(some, jnp.abs(jnp.where(some, gain, 1.0)), 0.0)
+        gain, size = _scaled(self.transfer_function(omega))
+        return size * jnp.sqrt(gain.real**2 + gain.imag**2)
 
     def phase(self, omega: ArrayLike) -> Float[Array, "*shape"]:
         """How far Vsc leads V at the angular frequency `omega` (rad/s, >= 0), rad; pi/2 at its zero, eq. (26)."""
-        gain = self.transfer_function(omega)
-        some = gain != 0.0
-        return jnp.where(some, jnp.angle(jnp.where(some, gain, 1j)), 0.5 * np.pi)
+        gain, size = _scaled(self.transfer_function(omega))
+        return jnp.where(size > 0.0, jnp.arctan2(gain.imag, gain.real), 0.5 * np.pi)
+
+
+def _scaled(gain: Array) -> tuple[Array, Array]:
+    """A complex number as one near 1 (1 for 0) times its size: the squares of its parts neither vanish nor overflow."""
+    size = lax.stop_gradient(jnp.maximum(jnp.abs(gain.real), jnp.abs(gain.imag)))
+    some = size > 0.0
+    return jnp.where(some, gain / jnp.where(some, size, 1.0), 1.0), size
 
 
 def highpass_gain(x: ArrayLike) -> Complex[Array, "*shape"]:
