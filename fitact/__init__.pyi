@@ -7,17 +7,22 @@ from .inference.posterior import Posterior
 from .inference.sampling import sample
 from .model.circuit import DirectGround, FinalCircuit, NaturalGround, Probe
 from .model.drive import Sampled, Sine, Square, Trapezoid, Triangle
+from .model.equivalents import quality_factor, series_equivalent
 from .model.force import Contact, electrostatic_force, friction
+from .model.harmonic import harmonic_error, harmonic_response
 from .model.prior import LogNormal, Prior, Uniform
 from .model.response import response
 from .model.scene import Scene
+from .model.skin import Dispersive, Fractional, WithSkin
 
 __all__ = [
     "RESULTS",
     "Contact",
     "DirectGround",
+    "Dispersive",
     "FinalCircuit",
     "Fit",
+    "Fractional",
     "InputError",
     "LogNormal",
     "NaturalGround",
@@ -32,12 +37,17 @@ __all__ = [
     "Trapezoid",
     "Triangle",
     "Uniform",
+    "WithSkin",
     "electrostatic_force",
     "fit",
     "friction",
+    "harmonic_error",
+    "harmonic_response",
+    "quality_factor",
     "read",
     "response",
     "sample",
+    "series_equivalent",
 ]
 
 __version__: str

@@ -31,6 +31,19 @@ def test_transfer_function_and_gradient_are_finite_at_the_ends(omega: float):
     assert np.isfinite(slope)
 
 
+@pytest.mark.parametrize("omega", [0.0, 1e-300, 1e-12, 1.0, 1e3, 1e12, 1e300])
+def test_amplitude_and_phase_have_finite_gradients(omega: float):
+    for make in (fitact.FinalCircuit, lambda *values: fitact.NaturalGround(*values, Z=14.5e6)):
+        for name in ("amplitude", "phase"):
+            with jax.enable_x64(True):
+                values = jnp.array([160e3, 22e-9, 1.35e-9])
+                value, slope = jax.value_and_grad(lambda v, make=make, name=name: getattr(make(*v), name)(omega))(
+                    values
+                )
+            assert np.isfinite(value)
+            assert np.all(np.isfinite(slope))
+
+
 R, C, CI = 160e3, 22e-9, 1.35e-9
 OTHER = {"grounding_Rsc": 80e3, "grounding_Csc": 44.25e-9}
 PROBE = fitact.Probe(10e6, 10e-12)
@@ -81,10 +94,12 @@ def test_loops_are_their_impedances(name: str):
     current = 1.0 / (1.0 / (1j * omega * CI) + touching(omega) + rest(omega))
     with jax.enable_x64(True):
         ours, admittance = np.asarray(circuit.transfer_function(omega)), np.asarray(circuit.admittance(omega))
+        amplitude, phase = np.asarray(circuit.amplitude(omega)), np.asarray(circuit.phase(omega))
     expected = touching(omega) * current
     # with a resistance in the loop Vsc falls off at high frequency, where terms cancel down to rounding
     np.testing.assert_allclose(ours, expected, rtol=1e-12, atol=1e-14 * np.abs(expected).max())
     np.testing.assert_allclose(admittance, current, rtol=1e-11)
+    np.testing.assert_allclose(amplitude * np.exp(1j * phase), ours, rtol=1e-12, atol=1e-14 * amplitude.max())
 
 
 def test_equal_skins_are_the_limit_of_unequal_ones_and_differentiable():

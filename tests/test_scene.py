@@ -157,11 +157,20 @@ def test_circuit_is_the_simplest_that_has_what_the_scene_names(tmp_path: Path):
     natural = load(tmp_path, '[grounding]\nconnection = "natural"\nZ = "14.5 Mohm"').make_circuit()
     assert isinstance(natural, fitact.NaturalGround)
     assert natural.Z == 14.5e6
+    dispersive = load(tmp_path, '[skin]\nlevel = "dispersive"\n[grounding]\nR_H = "500 ohm"').make_circuit()
+    assert isinstance(dispersive.skin, fitact.Dispersive)
+    assert dispersive.circuit.R_H == 500.0
+    assert load(tmp_path, '[skin]\nlevel = "fractional"').make_circuit().skin.alpha == 0.8
+    assert load(tmp_path, '[skin]\nlevel = "fractional"\nalpha = 0.7').make_circuit().skin.alpha == 0.7
+    with pytest.raises(fitact.InputError, match=r"alpha.*fractional"):
+        load(tmp_path, "[skin]\nalpha = 0.7")
 
 
 def test_what_is_not_modelled_or_fitted_yet_is_refused_not_ignored(tmp_path: Path):
     with pytest.raises(fitact.InputError, match="dispersive"):
-        load(tmp_path, '[skin]\nlevel = "dispersive"').make_circuit()
+        load(tmp_path, '[skin]\nlevel = "dispersive"').require_available(fit=True)
+    with pytest.raises(fitact.InputError, match=r"dispersive.*steady_state"):
+        load(tmp_path, '[skin]\nlevel = "dispersive"\n[drive]\nsteady_state = false').make_circuit()
     with pytest.raises(fitact.InputError, match="R_H"):
         load(tmp_path, '[grounding]\nR_H = "500 ohm"').require_available(fit=True)
     with pytest.raises(fitact.InputError, match="Z"):

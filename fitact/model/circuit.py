@@ -19,8 +19,10 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Complex
+from jaxtyping import Array, Complex, Float
 
 
 class Terms(NamedTuple):
@@ -44,11 +46,28 @@ class Circuit(eqx.Module):
 
     def transfer_function(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
         """Vsc / V at the angular frequency `omega` (rad/s, >= 0)."""
-        return _at(self.terms(), omega)
+        return gain_at(self.terms(), omega)
 
     def admittance(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
         """I / V in siemens at the angular frequency `omega` (rad/s, >= 0)."""
-        return _at(self.current_terms(), omega)
+        return gain_at(self.current_terms(), omega)
+
+    def amplitude(self, omega: ArrayLike) -> Float[Array, "*shape"]:
+        """|Vsc / V| at the angular frequency `omega` (rad/s, >= 0), eq. (25)."""
+        gain, size = _scaled(self.transfer_function(omega))
+        return size * jnp.sqrt(gain.real**2 + gain.imag**2)
+
+    def phase(self, omega: ArrayLike) -> Float[Array, "*shape"]:
+        """How far Vsc leads V at the angular frequency `omega` (rad/s, >= 0), rad; pi/2 at its zero, eq. (26)."""
+        gain, size = _scaled(self.transfer_function(omega))
+        return jnp.where(size > 0.0, jnp.arctan2(gain.imag, gain.real), 0.5 * np.pi)
+
+
+def _scaled(gain: Array) -> tuple[Array, Array]:
+    """A complex number as one near 1 (1 for 0) times its size: the squares of its parts neither vanish nor overflow."""
+    size = lax.stop_gradient(jnp.maximum(jnp.abs(gain.real), jnp.abs(gain.imag)))
+    some = size > 0.0
+    return jnp.where(some, gain / jnp.where(some, size, 1.0), 1.0), size
 
 
 def highpass_gain(x: ArrayLike) -> Complex[Array, "*shape"]:
@@ -86,6 +105,17 @@ class FinalCircuit(Circuit):
     def b(self) -> ArrayLike:
         """The time constant Rsc (2 Ci + Csc), s."""
         return self.Rsc * (2.0 * self.Ci + self.Csc)
+
+    def amplitude(self, omega: ArrayLike) -> Float[Array, "*shape"]:
+        """|Vsc / V|, eq. (25): g w b / sqrt(1 + (w b)^2)."""
+        x = jnp.asarray(omega) * self.b
+        below = x <= 1.0
+        small, inverse = jnp.where(below, x, 1.0), 1.0 / jnp.where(below, 1.0, x)
+        return self.g * jnp.where(below, small / jnp.sqrt(1.0 + small**2), 1.0 / jnp.sqrt(1.0 + inverse**2))
+
+    def phase(self, omega: ArrayLike) -> Float[Array, "*shape"]:
+        """arctan(1 / (w b)) in rad, eq. (26)."""
+        return jnp.arctan2(1.0, jnp.asarray(omega) * self.b)
 
     def terms(self) -> Terms:
         """One term: the divider g with the time constant b."""
@@ -251,7 +281,8 @@ def _in_series(*resistances: ArrayLike | None) -> ArrayLike | None:
     return sum(given[1:], given[0]) if given else None
 
 
-def _at(terms: Terms, omega: ArrayLike) -> Complex[Array, "*shape"]:
+def gain_at(terms: Terms, omega: ArrayLike) -> Complex[Array, "*shape"]:
+    """The sum of `terms` at s = j omega (rad/s, >= 0)."""
     omega = jnp.asarray(omega)
     total = jnp.zeros_like(omega, dtype=complex) if terms.rate is None else 1j * omega * terms.rate
     for weight, tau in zip(terms.weight, terms.tau, strict=True):

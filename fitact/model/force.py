@@ -52,6 +52,11 @@ def plate_capacitance(permittivity: ArrayLike, area: ArrayLike, thickness: Array
     return EPSILON_0 * permittivity * area / thickness
 
 
+def plate_resistance(resistivity: ArrayLike, area: ArrayLike, thickness: ArrayLike) -> ArrayLike:
+    """R = rho T / A in ohm, eq. (4); `resistivity` in ohm m, `area` in m^2, `thickness` in m."""
+    return resistivity * thickness / area
+
+
 def electrostatic_force(vsc: ArrayLike, contact: Contact) -> Float[Array, "*shape"]:
     """The electrostatic force in N for the skin voltage `vsc` (V), eqs. (1) and (22)."""
     layers = contact.insulator_thickness / jnp.asarray(

@@ -15,8 +15,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.errors import InputError
-from fitact.model.circuit import Circuit, highpass_gain
+from fitact.model.circuit import Circuit, gain_at, highpass_gain
 from fitact.model.drive import Drive, Pieces, PiecewiseLinear, Sampled, Sine
+from fitact.model.harmonic import fourier, frequency, fundamental, gain, harmonic_response, harmonic_sum
+from fitact.model.skin import WithSkin
 
 _SERIES = 0.03  # below, the quotients with expm1 lose digits in their derivatives
 
@@ -35,9 +37,15 @@ def response(
     before t = 0 (for a sampled drive, before its first sample). Eqs. (18)-(21) in the time domain.
     Where nothing resistive limits the current it follows dV/dt, and at an ideal jump it is NaN.
 
+    A skin that depends on the frequency has its steady state harmonic by harmonic as far as it changes, and
+    above by time constants: exact for `Dispersive`; for `Fractional` within the error it states.
+
     Raises:
-        InputError: the steady state of a sampled drive without a period was asked for.
+        InputError: the steady state of a sampled drive without a period was asked for, or with a skin that
+            depends on the frequency anything but the steady state of a periodic drive.
     """
+    if isinstance(circuit, WithSkin):
+        return _with_skin(circuit, drive, time, steady_state, channel)
     terms = circuit.terms() if channel == "Vsc" else circuit.current_terms()
     total = jnp.zeros_like(jnp.asarray(time, dtype=float))
     if terms.rate is not None:
@@ -45,6 +53,34 @@ def response(
     for weight, tau in zip(terms.weight, terms.tau, strict=True):
         total = total + weight * highpass(drive, time, tau, steady_state=steady_state)
     return total
+
+
+def _with_skin(
+    circuit: WithSkin, drive: Drive, time: ArrayLike, steady_state: bool, channel: Literal["Vsc", "I"]
+) -> Float[Array, "*shape"]:
+    """The terms that stand for the circuit at high frequency, and the harmonics of what they miss below."""
+    if not steady_state:
+        raise InputError(
+            f"a {type(circuit.skin).__name__.lower()} skin is computed in the steady state only;"
+            " ask for steady_state=True, or take the constant skin level"
+        )
+    omega = fundamental(drive)
+    if isinstance(drive, Sine):
+        return harmonic_response(circuit, drive, time, 1, channel=channel)
+    count = circuit.skin.count(frequency(drive))
+    terms = circuit.skin.above(circuit, omega * count, channel)
+    time = jnp.asarray(time, dtype=float)
+
+    def add(total: Array, term: tuple[Array, Array]) -> tuple[Array, None]:
+        return total + term[0] * highpass(drive, time, term[1]), None
+
+    each = jnp.stack(jnp.broadcast_arrays(*terms.weight)), jnp.stack(jnp.broadcast_arrays(*terms.tau))
+    total, _ = lax.scan(add, jnp.zeros_like(time), each)
+    if terms.rate is not None:
+        total = total + terms.rate * drive.slope(time)
+    harmonics = omega * jnp.arange(1, count + 1)
+    missed = gain(circuit, harmonics, channel) - gain_at(terms, harmonics)
+    return total + harmonic_sum(fourier(drive, count) * missed, drive, time)
 
 
 def highpass(drive: Drive, time: ArrayLike, tau: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:

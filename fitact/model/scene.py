@@ -20,6 +20,7 @@ from fitact.model.circuit import Circuit, DirectGround, FinalCircuit, NaturalGro
 from fitact.model.drive import Drive, Sine, Square, Trapezoid, Triangle
 from fitact.model.force import plate_capacitance
 from fitact.model.prior import Distribution, LogNormal, Prior, Uniform
+from fitact.model.skin import Dispersive, Fractional, WithSkin
 
 
 def _quantity(unit: str, **bounds: Any) -> Any:
@@ -81,12 +82,19 @@ class Device(_Section):
 
 
 class Skin(_Section):
-    """One skin layer."""
+    """One skin layer; `alpha` is the exponent of a fractional one (see `fitact.Fractional`)."""
 
     Rsc: Ohm = 160e3
     Csc: Farad = 22e-9
     thickness: Meter = 200e-6
     level: Literal["constant", "dispersive", "fractional"] = "constant"
+    alpha: Annotated[float, Field(gt=0, le=1)] = 0.8
+
+    @model_validator(mode="after")
+    def _alpha_of_a_fractional_skin(self) -> Self:
+        if "alpha" in self.model_fields_set and self.level != "fractional":
+            raise ValueError(f"alpha belongs to level = 'fractional', not to '{self.level}'")
+        return self
 
 
 class Grounding(_Section):
@@ -299,13 +307,16 @@ class Scene(_Section):
     def require_available(self, *, fit: bool = False) -> None:
         """Refuse what this version cannot model (or, with `fit`, cannot fit), rather than leave it out in silence."""
         unavailable = {
-            f"[skin] level = '{self.skin.level}'": self.skin.level != "constant",
+            f"[skin] level = '{self.skin.level}' with [drive] steady_state = false": (
+                self.skin.level != "constant" and not self.drive.steady_state
+            ),
             f"[drive] waveform = '{self.drive.waveform}'": self.drive.waveform in ("burst", "chirp"),
             "[force] model = 'gap'": self.force.model == "gap",
             "[population] contact_area = 'varies'": self.population.contact_area == "varies",
         }
         if fit:
             unavailable |= {
+                f"[skin] level = '{self.skin.level}'": self.skin.level != "constant",
                 "[grounding] connection = 'natural'": self.grounding.connection == "natural",
                 "[grounding] R_H": self.grounding.R_H is not None,
                 "[grounding] grounding_Rsc": self.grounding.grounding_Rsc is not None,
@@ -327,6 +338,12 @@ class Scene(_Section):
 
     def make_circuit(self) -> Circuit:
         """The circuit at the scene's nominal values; the paper's final one unless the scene asks for more."""
+        circuit = self._circuit_of_constant_skins()
+        if self.skin.level == "constant":
+            return circuit
+        return WithSkin(circuit, Dispersive() if self.skin.level == "dispersive" else Fractional(self.skin.alpha))
+
+    def _circuit_of_constant_skins(self) -> FinalCircuit | DirectGround | NaturalGround:
         self.require_available()
         Rsc, Csc, Ci, ground = self.skin.Rsc, self.skin.Csc, self.device.Ci, self.grounding
         series, probe = self.measurement.series_resistor or None, self._probe()

@@ -1,0 +1,141 @@
+"""The harmonic level: the steady state as a sum over the harmonics of a periodic drive.
+
+Cheap where few harmonics matter, and the only level for a skin without time constants. The Fourier
+coefficients come in closed form from the drive's straight pieces: with c_k = 1/T int V e^{-jkwt} dt,
+a jump J at t adds J e^{-jkwt} / (jkwT), and a straight piece its rise times the mean of e^{-jkwt} over it.
+"""
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Complex, Float
+
+from fitact.errors import InputError
+from fitact.model.circuit import Circuit
+from fitact.model.drive import Drive, Periodic, PiecewiseLinear, Sampled, Sine
+
+_TAIL = 64  # an error is summed up to this many times the harmonics kept,
+_LEAST = 4096  # and to this harmonic at least
+
+
+def harmonic_response(
+    circuit: Circuit,
+    drive: Drive,
+    time: ArrayLike,
+    harmonics: int,
+    *,
+    channel: Literal["Vsc", "I"] = "Vsc",
+) -> Float[Array, "*shape"]:
+    """The steady state of Vsc (V) or I (A) at `time` (s) from the first `harmonics` of a periodic drive, eq. (20).
+
+    `harmonic_error` says what is left out. At a jump of the drive the sum tends to the mean of both sides
+    and overshoots beside it (Gibbs), however many harmonics are taken.
+
+    Raises:
+        InputError: the drive has no period.
+    """
+    omega = fundamental(drive) * jnp.arange(1, harmonics + 1)
+    return harmonic_sum(fourier(drive, harmonics) * gain(circuit, omega, channel), drive, time)
+
+
+def harmonic_error(
+    circuit: Circuit, drive: Drive, harmonics: int, *, channel: Literal["Vsc", "I"] = "Vsc"
+) -> Float[Array, ""]:
+    """What `harmonic_response` leaves out: its root mean square over that of the whole response.
+
+    By Parseval: the harmonics left out are summed up to 64 times those kept (4096 at least), and what lies
+    beyond is taken as a geometric series of octaves from the last two.
+
+    Raises:
+        InputError: the drive has no period.
+    """
+    last = max(_TAIL * harmonics, _LEAST)
+    amplitude = fourier(drive, last) * gain(circuit, fundamental(drive) * jnp.arange(1, last + 1), channel)
+    power = amplitude.real**2 + amplitude.imag**2
+    octave, before = jnp.sum(power[last // 2 :]), jnp.sum(power[last // 4 : last // 2])
+    # a bounded response to jumps, the slowest there is, loses half of its power from octave to octave
+    ratio = jnp.minimum(octave / jnp.where(before > 0.0, before, 1.0), 0.5)
+    left_out = jnp.sum(power[harmonics:]) + octave * ratio / (1.0 - ratio)
+    share = left_out / (jnp.sum(power[:harmonics]) + left_out)
+    return jnp.where(share > 0.0, jnp.sqrt(jnp.where(share > 0.0, share, 1.0)), 0.0)
+
+
+def gain(circuit: Circuit, omega: ArrayLike, channel: Literal["Vsc", "I"]) -> Complex[Array, "*shape"]:
+    """Vsc / V, or I / V in siemens, at `omega` (rad/s)."""
+    return circuit.transfer_function(omega) if channel == "Vsc" else circuit.admittance(omega)
+
+
+def harmonic_sum(amplitude: Complex[Array, " harmonics"], drive: Drive, time: ArrayLike) -> Float[Array, "*shape"]:
+    """2 Re sum_k amplitude[k - 1] e^{jkwt}, one harmonic at a time: the memory does not grow with them."""
+    cycles = _cycles(drive, jnp.asarray(time, dtype=float))
+
+    @jax.checkpoint
+    def add(total: Array, step: tuple[Array, Array]) -> tuple[Array, None]:
+        k, c = step
+        angle = 2.0 * np.pi * jnp.mod(k * cycles, 1.0)
+        return total + 2.0 * (c.real * jnp.cos(angle) - c.imag * jnp.sin(angle)), None
+
+    order = jnp.arange(1, amplitude.size + 1, dtype=cycles.dtype)
+    return lax.scan(add, jnp.zeros_like(cycles), (order, amplitude))[0]
+
+
+def fourier(drive: Drive, harmonics: int) -> Complex[Array, " harmonics"]:
+    """c_k (V) for k = 1 to `harmonics`: the drive is its mean plus 2 Re sum_k c_k e^{jkwt}.
+
+    Raises:
+        InputError: the drive has no period.
+    """
+    order = jnp.arange(1, harmonics + 1, dtype=float)
+    if isinstance(drive, Sine):
+        return jnp.where(order == 1.0, -0.25j * jnp.asarray(drive.peak_to_peak), 0.0)
+    fundamental(drive)
+    assert isinstance(drive, PiecewiseLinear | Sampled)
+    knots, start, end = drive.pieces()
+    period = knots[-1] - knots[0]
+    at, middle = (knots[:-1] - knots[0]) / period, (0.5 * (knots[1:] + knots[:-1]) - knots[0]) / period
+    jump, rise, length = start - jnp.roll(end, 1), end - start, jnp.diff(knots) / period
+
+    def one(k: Array) -> Array:
+        change = jnp.sum(jump * _turn(k * at)) + jnp.sum(rise * jnp.sinc(k * length) * _turn(k * middle))
+        return change / (2j * np.pi * k)
+
+    return lax.map(one, order)
+
+
+def fundamental(drive: Drive) -> Array:
+    """The angular frequency w of the drive's period, rad/s.
+
+    Raises:
+        InputError: the drive has no period.
+    """
+    return 2.0 * np.pi * jnp.asarray(frequency(drive), dtype=float)
+
+
+def frequency(drive: Drive) -> ArrayLike:
+    """How often the drive repeats, Hz.
+
+    Raises:
+        InputError: the drive has no period.
+    """
+    if isinstance(drive, Periodic):
+        return drive.frequency
+    if isinstance(drive, Sampled) and drive.period is not None:
+        return 1.0 / drive.period
+    raise InputError("only a periodic drive has harmonics; give a sampled one its period: Sampled(..., period=T)")
+
+
+def _cycles(drive: Drive, time: Array) -> Array:
+    """Cycles since the last start of a period, in [0, 1): their product with k keeps its digits."""
+    if isinstance(drive, Sampled):
+        return jnp.mod((time - drive.time[0]) / drive.period, 1.0)
+    assert isinstance(drive, Periodic)
+    return drive.phase(time)[0]
+
+
+def _turn(cycles: Array) -> Array:
+    angle = 2.0 * np.pi * jnp.mod(cycles, 1.0)
+    return lax.complex(jnp.cos(angle), -jnp.sin(angle))
