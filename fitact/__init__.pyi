@@ -6,7 +6,7 @@ from .inference.least_squares import RESULTS
 from .inference.posterior import Posterior
 from .inference.sampling import sample
 from .model.circuit import DirectGround, FinalCircuit, NaturalGround, Probe
-from .model.drive import Sampled, Sine, Square, Trapezoid, Triangle
+from .model.drive import Burst, Polyline, Sampled, Sine, Square, Trapezoid, Triangle
 from .model.force import Contact, electrostatic_force, friction
 from .model.prior import LogNormal, Prior, Uniform
 from .model.response import response
@@ -14,6 +14,7 @@ from .model.scene import Scene
 
 __all__ = [
     "RESULTS",
+    "Burst",
     "Contact",
     "DirectGround",
     "FinalCircuit",
@@ -21,6 +22,7 @@ __all__ = [
     "InputError",
     "LogNormal",
     "NaturalGround",
+    "Polyline",
     "Posterior",
     "Prior",
     "Probe",
