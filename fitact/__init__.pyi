@@ -5,6 +5,7 @@ from .inference.fit import Fit, fit
 from .inference.least_squares import RESULTS
 from .inference.posterior import Posterior
 from .inference.sampling import sample
+from .model.chirp import Chirp
 from .model.circuit import DirectGround, FinalCircuit, NaturalGround, Probe
 from .model.drive import Burst, Polyline, Sampled, Sine, Square, Trapezoid, Triangle
 from .model.force import Contact, electrostatic_force, friction
@@ -15,6 +16,7 @@ from .model.scene import Scene
 __all__ = [
     "RESULTS",
     "Burst",
+    "Chirp",
     "Contact",
     "DirectGround",
     "FinalCircuit",

@@ -10,6 +10,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Literal
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -17,8 +19,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.errors import InputError
+from fitact.model.chirp import Chirp
 from fitact.model.circuit import Circuit, highpass_gain
 from fitact.model.drive import Burst, Drive, Line, Pieces, PiecewiseLinear, Sampled, Sine
+from fitact.model.polynomial import evaluate, particular
 
 _SERIES = 0.03  # below, the quotients with expm1 lose digits in their derivatives
 
@@ -63,13 +67,12 @@ def highpass(drive: Drive, time: ArrayLike, tau: ArrayLike, *, steady_state: boo
     """The response of s tau / (1 + s tau) to `drive` at `time`; arguments as in `response`."""
     time = jnp.asarray(time, dtype=float)
     wave = drive.wave if isinstance(drive, Burst) else drive
-    if not isinstance(wave, Sine | PiecewiseLinear | Line):
+    if not isinstance(wave, Sine | PiecewiseLinear | Line | Chirp):
         raise TypeError(f"no exact response to a {type(wave).__name__}")
-    endless = wave is drive and not (isinstance(wave, Line) and wave.period is None)
-    if steady_state and not endless:
-        name = type(drive).__name__
-        cure = "; or give its period: {name}(..., period=T)" if isinstance(drive, Line) else ""
-        raise InputError(f"a {name} has no steady state: give steady_state=False{cure.format(name=name)}")
+    if steady_state:
+        _require_steady_state(drive)
+    if isinstance(wave, Chirp):
+        return _chirp(wave, time, jnp.asarray(tau, dtype=float))
     if isinstance(wave, Line) and wave.period is None:
         pieces = wave.pieces()
         u = _along(wave, time, tau, knot_values(pieces, tau, pieces.start[0]))
@@ -86,6 +89,16 @@ def highpass(drive: Drive, time: ArrayLike, tau: ArrayLike, *, steady_state: boo
     # the wave minus the same begun again at the end: of the two only the transients do not cancel
     after = difference * jnp.expm1(-drive.duration / tau) * jnp.exp(-since / tau)
     return jnp.where(drive.is_over(time), after, u)
+
+
+def _require_steady_state(drive: Drive) -> None:
+    name = type(drive).__name__
+    if isinstance(drive, Burst | Chirp):
+        raise InputError(f"a {name} has no steady state: give steady_state=False")
+    if isinstance(drive, Line) and drive.period is None:
+        raise InputError(
+            f"a {name} has no steady state unless its period is given: {name}(..., period=T), or steady_state=False"
+        )
 
 
 def _remains(
@@ -121,6 +134,7 @@ def knot_values(pieces: Pieces, tau: ArrayLike, first: ArrayLike) -> Float[Array
     return jnp.concatenate([first[None], _recurrence(decay, gain, first)])
 
 
+@jax.jit
 def _recurrence(decay: Float[Array, " n"], gain: Float[Array, " n"], first: Float[Array, ""]) -> Float[Array, " n"]:
     """u[k] = decay[k] u[k - 1] + gain[k], from u[-1] = first.
 
@@ -173,6 +187,22 @@ def _sine(drive: Sine, tau: ArrayLike, time: Array) -> Array:
     gain = 0.5 * jnp.asarray(drive.peak_to_peak) * highpass_gain(2.0 * np.pi * jnp.asarray(drive.frequency) * tau)
     angle = 2.0 * np.pi * drive.cycle(time)[0]
     return gain.real * jnp.sin(angle) + gain.imag * jnp.cos(angle)
+
+
+@eqx.filter_jit  # loops are compiled anew at every call outside jit
+def _chirp(drive: Chirp, time: Array, tau: Array) -> Array:
+    """From rest: u at the pieces' starts, then along each as its polynomial and what decays."""
+    z = drive.duration / tau / drive.pieces
+    series, v = drive.series(), drive.sweep(drive.duration / drive.pieces * jnp.arange(drive.pieces + 1))
+    p, p_end = particular(series, z)
+    rounding = jnp.diff(v) - jnp.sum(series, axis=0)  # what would add up over many pieces
+    decay = jnp.broadcast_to(jnp.exp(-z), p_end.shape)
+    u = jnp.append(v[0], _recurrence(decay, p_end - jnp.exp(-z) * p[0] + rounding, v[0]))
+    piece, s = drive.locate(time)
+    during = evaluate(p, piece, s) + (u[piece] - p[0][piece]) * jnp.exp(-z * s)
+    since = jnp.maximum(time - drive.duration, 0.0)
+    after = (u[-1] - v[-1]) * jnp.exp(-since / tau)
+    return jnp.where(time >= 0.0, jnp.where(drive.is_over(time), after, during), 0.0)
 
 
 def _from_rest(settled: Array, difference: ArrayLike, since: Array, tau: ArrayLike) -> Array:
