@@ -9,6 +9,7 @@ from jax.test_util import check_grads
 
 import fitact
 from fitact import units
+from fitact.model.response import highpass
 
 VALUES = {"Rsc": 160e3, "Csc": 22e-9, "Ci": 1.35e-9}
 CIRCUIT = fitact.FinalCircuit(**VALUES)
@@ -128,6 +129,111 @@ def test_burst_has_no_steady_state_and_whole_cycles():
             fitact.Burst(wave, cycles)
     with pytest.raises(fitact.InputError, match="no cycles"):
         fitact.Burst(fitact.Sampled(TIME, TIME), 1)
+
+
+SWEEPS = {
+    "up": fitact.Chirp(360.0, 20.0, 500.0, 0.1, offset=20.0, phase=0.7),
+    "down": fitact.Chirp(360.0, 500.0, 20.0, 0.1, "logarithmic", phase=-2.0),
+    "hardly": fitact.Chirp(360.0, 1.0, 1.1, 0.05, "logarithmic"),
+    "not at all": fitact.Chirp(360.0, 100.0, 100.0, 0.03, "logarithmic", offset=20.0),
+    "six decades": fitact.Chirp(360.0, 1e-3, 1e3, 0.05, "logarithmic", phase=1.0),
+    "many cycles": fitact.Chirp(360.0, 10.0, 1000.0, 1.0),
+}
+
+
+def swept(chirp: fitact.Chirp, time: np.ndarray) -> np.ndarray:
+    """The textbook's formulas."""
+    f0, f1, T = chirp.start_frequency, chirp.end_frequency, chirp.duration
+    if chirp.spacing == "linear":
+        cycles = f0 * time + (f1 - f0) * time**2 / (2.0 * T)
+    elif f0 == f1:
+        cycles = f0 * time
+    else:
+        cycles = f0 * T / np.log(f1 / f0) * np.expm1(np.log(f1 / f0) * time / T)
+    return chirp.offset + 180.0 * np.sin(2.0 * np.pi * cycles + chirp.phase)
+
+
+@pytest.mark.parametrize("name", SWEEPS)
+def test_chirp_against_gauss_legendre(name: str):
+    """u(t) = V(t) - integral of V(s) e^{-(t - s) / tau} / tau, by 40 nodes on each eighth of a cycle."""
+    chirp = SWEEPS[name]
+    f_max, T = max(chirp.start_frequency, chirp.end_frequency), chirp.duration
+    times = np.append(T * np.array([0.0, 0.013, 0.31, 0.77, 0.99]), [1.0001 * T, 1.2 * T])
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    np.testing.assert_allclose(chirp.value(times[:5]), swept(chirp, times[:5]), atol=1e-9)
+    np.testing.assert_array_equal(chirp.value(np.array([-1e-9, T, 2.0 * T])), 0.0)
+    for tau in (1e-5, 6e-4, 4e-3, 1.0, 1e4):
+        expected = []
+        for t in times:
+            end = min(t, T)
+            begin = max(0.0, end - 45.0 * tau)
+            edges = np.linspace(begin, end, 2 + int(8.0 * f_max * (end - begin) + (end - begin) / tau))
+            half = 0.5 * np.diff(edges)[:, None]
+            s = edges[:-1, None] + half * (1.0 + nodes)
+            past = np.sum(swept(chirp, s) * np.exp(-(t - s) / tau) * weights * half) / tau
+            expected.append((swept(chirp, t) if t < T else 0.0) - past)
+        ours = highpass(chirp, times, tau, steady_state=False)
+        np.testing.assert_allclose(ours, expected, atol=1e-12 * 180.0 * max(1.0, f_max * T / 100.0))
+
+
+def test_chirp_in_single_precision():
+    circuit, time = fitact.FinalCircuit(**VALUES), np.linspace(-0.01, 0.12, 500)
+    exact = np.asarray(fitact.response(circuit, SWEEPS["up"], time, steady_state=False))
+    with jax.enable_x64(False):
+        single = np.asarray(fitact.response(circuit, SWEEPS["up"], time, steady_state=False))
+    assert single.dtype == np.float32
+    np.testing.assert_allclose(single, exact, atol=5e-5 * np.abs(exact).max())  # 26 cycles round the phase
+
+
+def test_chirp_differentiates_in_circuit_amplitude_and_frequencies():
+    time = np.array([1.3e-3, 41e-3, 77e-3, 113e-3])
+
+    def vsc(logs: jax.Array, peak_to_peak: jax.Array, x: jax.Array) -> jax.Array:
+        # small relative changes: 26 cycles make large ones of the phase
+        changed = peak_to_peak, 20.0 * jnp.exp(0.01 * x[0]), 0.1 * jnp.exp(0.01 * x[1])
+        chirp = eqx.tree_at(lambda c: (c.peak_to_peak, c.start_frequency, c.duration), SWEEPS["up"], changed)
+        return fitact.response(fitact.FinalCircuit(*jnp.exp(logs)), chirp, time, steady_state=False)
+
+    at = jnp.log(jnp.array([160e3, 22e-9, 1.35e-9])), jnp.array(1.0), jnp.zeros(2)
+    check_grads(jax.jit(vsc), at, order=1, modes=("fwd", "rev"), rtol=1e-6)
+
+
+@pytest.mark.parametrize("make", ["sine", "square", "triangle", "trapezoid", "burst", "chirp"])
+def test_jit_and_vmap_over_amplitude_and_frequency(make: str):
+    """The whole drive is mapped over, as a tree of numbers."""
+    drives = [
+        {
+            "sine": lambda V, f: fitact.Sine(V, f, phase=1.0),
+            "square": lambda V, f: fitact.Square(V, f, phase=1.0),
+            "triangle": lambda V, f: fitact.Triangle(V, f),
+            "trapezoid": lambda V, f: fitact.Trapezoid(V, f, 1e-3),
+            "burst": lambda V, f: fitact.Burst(fitact.Square(V, f), 2),
+            "chirp": lambda V, f: eqx.tree_at(lambda c: (c.peak_to_peak, c.end_frequency), SWEEPS["up"], (V, 4.0 * f)),
+        }[make](V, f)
+        for V, f in ((360.0, 100.0), (20.0, 73.0))
+    ]
+    time = TIME[::50] + 1e-6
+
+    def vsc(drive: fitact.Square) -> jax.Array:
+        return fitact.response(CIRCUIT, drive, time, steady_state=False)
+
+    together = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(y) for y in x]), *drives)
+    one_by_one = np.stack([vsc(drive) for drive in drives])
+    np.testing.assert_allclose(jax.jit(jax.vmap(vsc))(together), one_by_one, rtol=1e-12, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [({"spacing": "log"}, "logarithmic"), ({"start_frequency": 0.0}, "positive"), ({"duration": -1.0}, "positive")],
+)
+def test_impossible_chirp_is_refused(change: dict[str, object], words: str):
+    given = {"peak_to_peak": 1.0, "start_frequency": 1.0, "end_frequency": 2.0, "duration": 1.0} | change
+    with pytest.raises(fitact.InputError, match=words):
+        fitact.Chirp(**given)
+    with pytest.raises(fitact.InputError, match="outside jit"):
+        jax.jit(lambda f: fitact.Chirp(1.0, f, 2.0, 1.0))(1.0)
+    with pytest.raises(fitact.InputError, match="steady_state=False"):
+        fitact.response(CIRCUIT, SWEEPS["up"], TIME)
 
 
 CORNERS = np.array([0.0, 1e-3, 1e-3, 4e-3, 4e-3, 7e-3]), np.array([0.0, 100.0, -50.0, -50.0, 80.0, 30.0])

@@ -166,6 +166,11 @@ class DriveSection(_Section):
             object.__setattr__(self, "steady_state", False)  # the model is frozen from here on
         return self
 
+    @property
+    def slowest(self) -> float:
+        """The lowest frequency in it, Hz."""
+        return min(self.start_frequency or self.frequency, self.end_frequency or self.frequency)
+
     def make(self) -> Drive:
         """The drive.
 
