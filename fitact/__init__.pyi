@@ -5,8 +5,9 @@ from .inference.fit import Fit, fit
 from .inference.least_squares import RESULTS
 from .inference.posterior import Posterior
 from .inference.sampling import sample
+from .model.chirp import Chirp
 from .model.circuit import DirectGround, FinalCircuit, NaturalGround, Probe
-from .model.drive import Sampled, Sine, Square, Trapezoid, Triangle
+from .model.drive import Burst, Polyline, Sampled, Sine, Square, Trapezoid, Triangle
 from .model.equivalents import quality_factor, series_equivalent
 from .model.force import Contact, electrostatic_force, friction
 from .model.harmonic import harmonic_error, harmonic_response
@@ -17,6 +18,8 @@ from .model.skin import Dispersive, Fractional, WithSkin
 
 __all__ = [
     "RESULTS",
+    "Burst",
+    "Chirp",
     "Contact",
     "DirectGround",
     "Dispersive",
@@ -26,6 +29,7 @@ __all__ = [
     "InputError",
     "LogNormal",
     "NaturalGround",
+    "Polyline",
     "Posterior",
     "Prior",
     "Probe",

@@ -317,3 +317,28 @@ def test_from_rest_with_what_was_recorded_before_the_trigger():
 def test_huge_offset_is_not_trusted(finger_path):
     record = fitact.read(finger_path)
     assert not fitact.fit(fitact.Record.from_arrays(record.time, V=record["V"], Vsc=record["Vsc"] + 1e6)).trusted
+
+
+SWEEP = {"waveform": "chirp", "start_frequency": 20.0, "end_frequency": 500.0, "sweep_time": 0.05}
+
+
+@pytest.mark.parametrize(
+    ("drive", "shift"), [({"waveform": "burst"}, 0.0), (SWEEP, 1.37e-3)], ids=["burst", "shifted chirp"]
+)
+def test_burst_and_chirp_against_scipy(drive: dict[str, object], shift: float):
+    """scipy on a fine grid of steps (burst) or straight lines (chirp), sampled; perhaps the trigger came earlier."""
+    fine = np.arange(70_000) * 1e-6
+    cycles = 20.0 * fine + 480.0 / (2.0 * 0.05) * fine**2
+    if drive is SWEEP:
+        voltage = np.where(fine < 0.05, 180.0 * np.sin(2.0 * np.pi * cycles), 0.0)
+    else:
+        index = np.arange(fine.size)
+        voltage = np.where(index < 50_000, np.where(index % 10_000 < 5_000, 180.0, -180.0), 0.0)
+    vsc = skin_voltage(fine, voltage, 130e3, 18e-9, 1.35e-9, hold=drive is not SWEEP)[::20]
+    vsc = vsc + 0.1 * np.random.default_rng(3).standard_normal(vsc.size)
+    record = fitact.Record.from_arrays(fine[::20] + shift, V=voltage[::20], Vsc=vsc)
+    fit = fitact.fit(record, fitact.Scene.from_dict({"drive": drive}))
+    assert fit.result == "successful"
+    assert fit.choice.shift == pytest.approx(shift, abs=20e-6)
+    assert abs(deviation(fit, "g", 1.35 / 20.7)) < 4.0
+    assert abs(deviation(fit, "b", 130e3 * 20.7e-9)) < 4.0

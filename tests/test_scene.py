@@ -1,10 +1,12 @@
 import math
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 import fitact
+from fitact.data.simulate import simulate
 
 CONTRACT = """
 [device]
@@ -56,6 +58,23 @@ contact_area = "common"
 force = 0.01
 """
 
+BURST = """
+[drive]
+waveform = "burst"
+shape = "sine"
+cycles = 3
+phase = "90 deg"
+offset = "5 V"
+"""
+CHIRP = """
+[drive]
+waveform = "chirp"
+start_frequency = "10 Hz"
+end_frequency = "1 kHz"
+sweep_time = "0.5 s"
+spacing = "logarithmic"
+"""
+
 
 def load(tmp_path: Path, text: str) -> fitact.Scene:
     path = tmp_path / "scene.toml"
@@ -97,7 +116,7 @@ def test_Ci_from_the_layer_only_where_it_is_absent(tmp_path: Path):
 
 
 def test_round_trip(tmp_path: Path):
-    for text in (CONTRACT, "", '[drive]\nwaveform = "measured"\n'):
+    for text in (CONTRACT, "", '[drive]\nwaveform = "measured"\n', BURST, CHIRP):
         scene = load(tmp_path, text)
         again = fitact.Scene.from_json(scene.to_json())
         assert again == scene
@@ -121,6 +140,15 @@ def test_round_trip(tmp_path: Path):
         ('[drive]\nrise_time = "1 us"', ["[drive]", "rise_time"]),
         ('[drive]\nwaveform = "trapezoid"\nrise_time = "6 ms"', ["[drive]", "shorter"]),
         ('[drive]\nwaveform = "sine"\nduty = 0.3', ["duty", "sine"]),
+        ('[drive]\nphase = "1 m"', ["[drive] phase", "rad"]),
+        ('[drive]\nwaveform = "measured"\nphase = 1', ["phase", "measured"]),
+        ("[drive]\ncycles = 3", ["cycles", "burst", "square"]),
+        ('[drive]\nwaveform = "burst"\ncycles = 0', ["[drive] cycles", "1"]),
+        ('[drive]\nwaveform = "burst"\ncycles = 2.5', ["[drive] cycles", "integer"]),
+        ('[drive]\nwaveform = "burst"\nshape = "sine"\nduty = 0.3', ["duty", "square"]),
+        ('[drive]\nwaveform = "burst"\nsteady_state = true', ["burst", "steady_state"]),
+        ('[drive]\nwaveform = "chirp"\nstart_frequency = "1 Hz"', ["end_frequency"]),
+        ('[drive]\nwaveform = "chirp"\nfrequency = "1 Hz"', ["frequency", "chirp"]),
         ("[prior]\nRsc = {factor = 0.5}", ["[prior] Rsc.factor", "1"]),
         ('[prior]\nRsc = {median = "1 V", factor = 2}', ["[prior] Rsc", "ohm"]),
         ('[prior]\nRsc = {low = "2 ohm", high = "1 ohm"}', ["[prior] Rsc", "low"]),
@@ -175,3 +203,34 @@ def test_what_is_not_modelled_or_fitted_yet_is_refused_not_ignored(tmp_path: Pat
         load(tmp_path, '[grounding]\nR_H = "500 ohm"').require_available(fit=True)
     with pytest.raises(fitact.InputError, match="Z"):
         load(tmp_path, '[grounding]\nconnection = "natural"')
+
+
+def test_burst_and_chirp_start_from_rest(tmp_path: Path):
+    burst, chirp = load(tmp_path, BURST), load(tmp_path, CHIRP)
+    assert not burst.drive.steady_state
+    assert not chirp.drive.steady_state
+    drive = burst.make_drive()
+    assert isinstance(drive, fitact.Burst)
+    assert drive.wave == fitact.Sine(360.0, 100.0, 5.0, pytest.approx(math.pi / 2.0, rel=1e-14))
+    assert drive.cycles == 3
+    default = load(tmp_path, '[drive]\nwaveform = "burst"\nduty = 0.3').make_drive()
+    assert default == fitact.Burst(fitact.Square(360.0, 100.0, 0.3), 5)
+    assert chirp.make_drive() == fitact.Chirp(360.0, 10.0, 1000.0, 0.5, "logarithmic")
+
+
+@pytest.mark.parametrize("waveform", ["sine", "triangle", "square", "trapezoid"])
+def test_phase_of_a_wave(tmp_path: Path, waveform: str):
+    rise = 'rise_time = "1 ms"\n' if waveform == "trapezoid" else ""
+    scene = load(tmp_path, f'[drive]\nwaveform = "{waveform}"\n{rise}phase = "90 deg"')
+    unshifted = load(tmp_path, f'[drive]\nwaveform = "{waveform}"\n{rise}')
+    with jax.enable_x64(True):
+        time = np.arange(17) * 1.1e-3
+        ahead = unshifted.make_drive().value(time + 2.5e-3)
+        np.testing.assert_allclose(scene.make_drive().value(time), ahead, atol=1e-9)
+
+
+@pytest.mark.parametrize("text", [BURST, CHIRP])
+def test_burst_and_chirp_are_simulated(tmp_path: Path, text: str):
+    record = simulate(load(tmp_path, text + '[measurement]\nduration = "50 ms"'), seed=1)
+    assert np.ptp(record["V"]) > 300.0
+    assert 5.0 < np.ptp(record["Vsc"]) < 50.0

@@ -86,7 +86,7 @@ def for_fit(likelihood: Likelihood, record: Record, choice: DriveChoice, scene: 
 def _grid(record: Record, choice: DriveChoice) -> tuple[np.ndarray, np.ndarray]:
     drive = choice.drive
     if isinstance(drive, PiecewiseLinear) and choice.steady_state:
-        knots = np.asarray(drive.pieces().knots)
+        knots = np.asarray(drive.pieces().knots) - float(drive.lead)
         nodes, weights = np.polynomial.legendre.leggauss(_NODES)
         length = np.diff(knots)[:, None]
         inside = knots[:-1, None] + 0.5 * length * (nodes + 1.0)

@@ -18,8 +18,14 @@ from fitact.inference.diagnostics import is_coarse, is_misfit, statistics
 from fitact.inference.identifiability import Identifiability, assess, covariance_root
 from fitact.inference.least_squares import Solved, result_message, result_name, solve
 from fitact.inference.likelihood import CHARGE, LINEAR, Likelihood, natural
-from fitact.inference.start import DriveChoice, LinearStart, choose_drive, has_unresolved_edge, linear_start
-from fitact.model.drive import Square
+from fitact.inference.start import (
+    DriveChoice,
+    LinearStart,
+    choose_drive,
+    has_ideal_edges,
+    has_unresolved_edge,
+    linear_start,
+)
 from fitact.model.prior import LogNormal, Prior
 from fitact.model.scene import Scene
 from fitact.units import engineering
@@ -258,7 +264,7 @@ def _with_edge_time(prior: Prior, record: Record, choice: DriveChoice, start: Li
 
 def _delay_sd(choice: DriveChoice) -> float:
     """Beside an ideal edge the samples leave the delay open within one step, whose middle is the start."""
-    return math.sqrt(1.0 / 12.0) if isinstance(choice.drive, Square) else 5.0
+    return math.sqrt(1.0 / 12.0) if has_ideal_edges(choice.drive) else 5.0
 
 
 def _on_the_ridge(start: LinearStart, prior: Prior) -> Float[np.ndarray, " parameters"]:

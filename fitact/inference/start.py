@@ -9,7 +9,8 @@ from jaxtyping import Float
 
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.model.drive import Drive, Sampled, Sine
+from fitact.model.chirp import Chirp
+from fitact.model.drive import Burst, Drive, Sampled, Sine, Square
 from fitact.model.scene import Scene
 
 _ALIGNED = 20_000  # samples on which a drive is laid
@@ -55,9 +56,9 @@ def choose_drive(record: Record, scene: Scene | None) -> DriveChoice:
     if scene is None or scene.drive.waveform == "measured":
         return _measured(record, scene.steady_state() if scene else None, ())
     drive = scene.make_drive()
-    if scene.states_waveform():
+    if scene.states_waveform() and not isinstance(drive, Chirp):
         _check_frequency(record, scene.drive.frequency)
-    shift = _align(record, drive, scene.drive.frequency, scene.drive.steady_state)
+    shift = _align(record, drive, scene.drive.slowest, scene.drive.steady_state)
     if shift != 0.0 and "V" not in record and isinstance(drive, Sine):
         raise InputError(
             f"{record.source}: does not start where the scene's sine does, and without V_V the phase of the drive"
@@ -126,7 +127,7 @@ def linear_start(record: Record, choice: DriveChoice, largest: float = 0.5) -> L
     time, vsc, voltage = record.time, record["Vsc"], choice.voltage
     step = np.diff(time)
     integral = np.concatenate([[0.0], np.cumsum(0.5 * step * (vsc[1:] + vsc[:-1]))])
-    if choice.name == "square":  # the trapezoid rule misreads the samples beside an ideal edge
+    if has_ideal_edges(choice.drive):  # the trapezoid rule misreads the samples beside an ideal edge
         inside = np.abs(np.diff(voltage, prepend=voltage[0])) < 1e-9 * np.ptp(voltage)
     else:
         inside = np.ones(time.size, dtype=bool)
@@ -175,6 +176,11 @@ def _mismatch(record: Record, voltage: np.ndarray) -> float:
 def has_unresolved_edge(voltage: Float[np.ndarray, " samples"]) -> bool:
     """Whether a drive jumps by most of its height between two samples."""
     return bool(np.max(np.abs(np.diff(voltage))) > 0.6 * np.ptp(voltage))
+
+
+def has_ideal_edges(drive: Drive) -> bool:
+    """Whether it is a square wave, or a burst of one."""
+    return isinstance(drive.wave if isinstance(drive, Burst) else drive, Square)
 
 
 def _voltage(drive: Drive, time: np.ndarray, steady_state: bool) -> np.ndarray:

@@ -1,20 +1,30 @@
 """Drives: the voltage applied to the electrode, as exact straight pieces or as a sine.
 
 A periodic drive starts with its rise at t = 0: an edge of finite length begins there, `duty` runs
-from the start of the rise to the start of the fall, and sine and triangle cross zero upwards. At a
-jump the value is the limit from the right. From rest, a drive is zero before t = 0.
+from the start of the rise to the start of the fall, and sine and triangle cross zero upwards. A
+`phase` lets it run ahead of that. At a jump the value is the limit from the right. From rest, a drive
+is zero before t = 0 (one given by points: before the first), and may jump there.
 """
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from fitact.errors import InputError
+
 _SNAP = 8  # ulps of t f within which a time counts as lying on a breakpoint
+_SNAP_PHASE = 32  # ulps of the phase: one that was read from text has 15 digits
+_NO_JUMP = 64  # ulps of a drive's height that are rounding, not a jump
+
+
+def _floats(values: ArrayLike) -> Array:
+    return jnp.asarray(values, dtype=float)
 
 
 class Pieces(NamedTuple):
@@ -24,9 +34,19 @@ class Pieces(NamedTuple):
     start: Float[Array, " pieces"]  # V
     end: Float[Array, " pieces"]  # V
 
+    def slopes(self) -> Float[Array, " pieces"]:
+        """V/s; 0 for a piece of no length, which is a jump."""
+        length = jnp.diff(self.knots)
+        return jnp.where(length > 0.0, (self.end - self.start) / jnp.where(length > 0.0, length, 1.0), 0.0)
+
 
 class Drive(eqx.Module):
     """What every drive offers: its value in time."""
+
+    @property
+    def begin(self) -> ArrayLike:
+        """When it begins, from rest (s)."""
+        return 0.0
 
     def value(self, time: ArrayLike) -> Float[Array, "*shape"]:
         """V at `time` (s), in V."""
@@ -38,25 +58,38 @@ class Drive(eqx.Module):
 
 
 class Periodic(Drive):
-    """A drive that repeats with `frequency` (Hz)."""
+    """A drive that repeats with `frequency` (Hz) and runs ahead by `phase` (rad)."""
 
     frequency: eqx.AbstractVar[ArrayLike]
+    if TYPE_CHECKING:  # a field here would come before the waves' own
+
+        @property
+        def phase(self) -> ArrayLike: ...
+    else:
+        phase: eqx.AbstractVar[ArrayLike]
 
     @property
     def period(self) -> Array:
         """s."""
         return 1.0 / jnp.asarray(self.frequency, dtype=float)
 
-    def phase(self, time: ArrayLike) -> tuple[Array, Array]:
+    @property
+    def lead(self) -> Array:
+        """The phase as a time, s."""
+        return self.phase / (2.0 * np.pi) * self.period
+
+    def cycle(self, time: ArrayLike) -> tuple[Array, Array]:
         """Cycles since the last start of a period, in [0, 1), and the rounding error to allow for in it.
 
         `time * frequency` is only good to a few ulp, which puts samples meant for an edge on its wrong
         side; such a sample is moved onto the edge.
         """
-        cycles = jnp.asarray(time, dtype=float) * self.frequency
-        slack = lax.stop_gradient(_SNAP * jnp.finfo(cycles.dtype).eps * jnp.abs(cycles))
-        phase = cycles - lax.stop_gradient(jnp.floor(cycles + slack))
-        return jnp.maximum(phase, 0.0), slack
+        elapsed = jnp.asarray(time, dtype=float) * self.frequency
+        ahead = self.phase / (2.0 * np.pi)
+        ulps = _SNAP * jnp.abs(elapsed) + _SNAP_PHASE * jnp.abs(ahead)
+        slack = lax.stop_gradient(jnp.finfo(elapsed.dtype).eps * ulps)
+        cycles = elapsed + ahead
+        return jnp.maximum(cycles - lax.stop_gradient(jnp.floor(cycles + slack)), 0.0), slack
 
 
 class PiecewiseLinear(Periodic):
@@ -69,27 +102,25 @@ class PiecewiseLinear(Periodic):
     def locate(self, time: ArrayLike) -> tuple[Array, Array]:
         """The piece that `time` falls in, and the time since that piece began (s)."""
         knots = self.pieces().knots
-        phase, slack = self.phase(time)
+        cycle, slack = self.cycle(time)
         starts = knots[1:-1] / knots[-1]
-        piece = jnp.sum(phase[..., None] + slack[..., None] >= starts, axis=-1)
-        return piece, jnp.maximum(phase * knots[-1] - knots[piece], 0.0)
+        piece = jnp.sum(cycle[..., None] + slack[..., None] >= starts, axis=-1)
+        return piece, jnp.maximum(cycle * knots[-1] - knots[piece], 0.0)
 
     def value(self, time: ArrayLike) -> Float[Array, "*shape"]:
         """V at `time`."""
-        knots, start, end = self.pieces()
+        pieces = self.pieces()
         piece, since = self.locate(time)
-        slope = (end - start) / jnp.diff(knots)
-        return start[piece] + slope[piece] * since
+        return pieces.start[piece] + pieces.slopes()[piece] * since
 
     def slope(self, time: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
         """dV/dt at `time`."""
-        knots, start, end = self.pieces()
+        pieces = self.pieces()
         piece, since = self.locate(time)
-        before = jnp.roll(end, 1)
-        jumps = (since == 0.0) & (start != before)[piece]
-        return _after_rest(
-            jnp.where(jumps, jnp.nan, ((end - start) / jnp.diff(knots))[piece]), start[0], time, steady_state
-        )
+        at_start = since <= self.cycle(time)[1] * self.period
+        jumps = at_start & (pieces.start != jnp.roll(pieces.end, 1))[piece]
+        slope = jnp.where(jumps, jnp.nan, pieces.slopes()[piece])
+        return slope if steady_state else _after_rest(self, slope, time, jnp.max(jnp.abs(pieces.start)))
 
 
 class Square(PiecewiseLinear):
@@ -99,6 +130,7 @@ class Square(PiecewiseLinear):
     frequency: ArrayLike
     duty: ArrayLike = 0.5
     offset: ArrayLike = 0.0
+    phase: ArrayLike = 0.0
 
     def pieces(self) -> Pieces:
         """High, then low."""
@@ -110,13 +142,14 @@ class Square(PiecewiseLinear):
 
 
 class Trapezoid(PiecewiseLinear):
-    """Square wave whose edges both take `rise_time` (s); the rise begins at t = 0."""
+    """Square wave whose edges both take `rise_time` (s); the rise begins at t = 0 (with phase 0)."""
 
     peak_to_peak: ArrayLike
     frequency: ArrayLike
     rise_time: ArrayLike
     duty: ArrayLike = 0.5
     offset: ArrayLike = 0.0
+    phase: ArrayLike = 0.0
 
     def pieces(self) -> Pieces:
         """Rise, high, fall, low."""
@@ -135,11 +168,12 @@ class Trapezoid(PiecewiseLinear):
 
 
 class Triangle(PiecewiseLinear):
-    """Symmetric triangle wave; crosses its `offset` upwards at t = 0."""
+    """Symmetric triangle wave; crosses its `offset` upwards at t = 0 (with phase 0)."""
 
     peak_to_peak: ArrayLike
     frequency: ArrayLike
     offset: ArrayLike = 0.0
+    phase: ArrayLike = 0.0
 
     def pieces(self) -> Pieces:
         """Up to the crest, down to the trough, up to the start."""
@@ -149,25 +183,89 @@ class Triangle(PiecewiseLinear):
 
 
 class Sine(Periodic):
-    """Sine wave; crosses its `offset` upwards at t = 0."""
+    """Sine wave; crosses its `offset` upwards at t = 0 (with phase 0)."""
 
     peak_to_peak: ArrayLike
     frequency: ArrayLike
     offset: ArrayLike = 0.0
+    phase: ArrayLike = 0.0
 
     def value(self, time: ArrayLike) -> Float[Array, "*shape"]:
         """V at `time`."""
-        phase, _ = self.phase(time)
-        return self.offset + 0.5 * jnp.asarray(self.peak_to_peak) * jnp.sin(2.0 * np.pi * phase)
+        cycle, _ = self.cycle(time)
+        return self.offset + 0.5 * jnp.asarray(self.peak_to_peak) * jnp.sin(2.0 * np.pi * cycle)
 
     def slope(self, time: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
         """dV/dt at `time`."""
-        phase, _ = self.phase(time)
-        steepest = np.pi * jnp.asarray(self.peak_to_peak) * self.frequency
-        return _after_rest(steepest * jnp.cos(2.0 * np.pi * phase), self.offset, time, steady_state)
+        cycle, _ = self.cycle(time)
+        slope = np.pi * jnp.asarray(self.peak_to_peak) * self.frequency * jnp.cos(2.0 * np.pi * cycle)
+        return slope if steady_state else _after_rest(self, slope, time, jnp.abs(jnp.asarray(self.peak_to_peak)))
 
 
-class Sampled(Drive):
+class Line(Drive):
+    """A drive through points, joined by straight lines; constant before the first and after the last.
+
+    With a period it repeats, running on from the last point to the first one of the next period. Two
+    points at one time are a jump.
+    """
+
+    if TYPE_CHECKING:
+
+        @property
+        def period(self) -> ArrayLike | None: ...
+    else:
+        period: eqx.AbstractVar[ArrayLike | None]
+
+    def points(self) -> tuple[Float[Array, " points"], Float[Array, " points"]]:
+        """Their times (s) and voltages (V)."""
+        raise NotImplementedError
+
+    @property
+    def begin(self) -> ArrayLike:
+        """The first point (s)."""
+        return self.points()[0][0]
+
+    def pieces(self) -> Pieces:
+        """The lines between the points, and the one that closes the period, or the endless one after the last."""
+        knots, values = self.points()
+        if self.period is None:
+            return Pieces(jnp.append(knots, jnp.inf), values, jnp.append(values[1:], values[-1]))
+        close = jnp.maximum(knots[0] + self.period, knots[-1])
+        return Pieces(jnp.append(knots, close), values, jnp.append(values[1:], values[0]))
+
+    def locate(self, time: ArrayLike) -> tuple[Array, Array]:
+        """The piece that `time` falls in, and the time since that piece began (s; negative before the first)."""
+        knots = self.pieces().knots
+        time = jnp.asarray(time, dtype=float)
+        slack = self._slack(time)
+        if self.period is not None:
+            time = time - self.period * lax.stop_gradient(jnp.floor((time + slack - knots[0]) / self.period))
+        piece = jnp.clip(jnp.searchsorted(knots, time + slack, side="right") - 1, 0, knots.size - 2)
+        since = time - knots[piece]
+        return piece, jnp.where(since < -slack, since, jnp.maximum(since, 0.0))
+
+    def _slack(self, time: Array) -> Array:
+        """The rounding error to allow for in a time (s)."""
+        return lax.stop_gradient(_SNAP * jnp.finfo(time.dtype).eps * jnp.maximum(jnp.abs(time), jnp.abs(self.begin)))
+
+    def value(self, time: ArrayLike) -> Float[Array, "*shape"]:
+        """V at `time`, by linear interpolation."""
+        pieces = self.pieces()
+        piece, since = self.locate(time)
+        return pieces.start[piece] + pieces.slopes()[piece] * jnp.maximum(since, 0.0)
+
+    def slope(self, time: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
+        """dV/dt at `time`: that of the line that begins or lies there; 0 outside the points, NaN at a jump."""
+        pieces = self.pieces()
+        piece, since = self.locate(time)
+        slope = jnp.where(since >= 0.0, pieces.slopes()[piece], 0.0)
+        jump = jnp.where(jnp.diff(pieces.knots) > 0.0, 0.0, pieces.end - pieces.start)
+        at_start = (since >= 0.0) & (since <= self._slack(jnp.asarray(time, dtype=float)))
+        slope = jnp.where(at_start & (jnp.roll(jump, 1) != 0.0)[piece], jnp.nan, slope)
+        return slope if steady_state else _after_rest(self, slope, time, jnp.max(jnp.abs(self.points()[1])))
+
+
+class Sampled(Line):
     """A measured drive: straight lines between samples, constant before the first and after the last.
 
     Attributes:
@@ -181,45 +279,89 @@ class Sampled(Drive):
     samples: Float[Array, " samples"] = eqx.field(converter=jnp.asarray)
     period: ArrayLike | None = None
 
-    def pieces(self) -> Pieces:
-        """The lines between the samples, and, for a period, the one that closes it."""
-        knots, values = self.time, self.samples
-        if self.period is not None:
-            knots = jnp.append(knots, knots[0] + self.period)
-            values = jnp.append(values, values[0])
-        return Pieces(knots, values[:-1], values[1:])
+    def points(self) -> tuple[Float[Array, " samples"], Float[Array, " samples"]]:
+        """The samples."""
+        return self.time, self.samples
 
-    def locate(self, time: ArrayLike) -> tuple[Array, Array]:
-        """The piece that `time` falls in, and the time since that piece began (s)."""
-        knots = self.pieces().knots
-        time = jnp.asarray(time, dtype=float)
-        if self.period is not None:
-            time = time - self.period * lax.stop_gradient(jnp.floor((time - knots[0]) / self.period))
-        piece = jnp.clip(jnp.searchsorted(knots, time, side="right") - 1, 0, knots.size - 2)
-        return piece, time - knots[piece]
+
+class Polyline(Line):
+    """Any piecewise linear drive, by its corners; two at one time are a jump.
+
+    Attributes:
+        time: of the corners, not decreasing, s.
+        voltage: V.
+        period: s; where given, the line repeats and a steady state exists, else it is constant outside.
+
+    Raises:
+        InputError: the corners do not pair up, go back in time, or reach beyond the period.
+    """
+
+    time: Float[Array, " corners"] = eqx.field(converter=_floats)
+    voltage: Float[Array, " corners"] = eqx.field(converter=_floats)
+    period: ArrayLike | None = None
+
+    def __check_init__(self) -> None:
+        if self.time.ndim != 1 or self.time.shape != self.voltage.shape or self.time.size == 0:
+            raise InputError(
+                f"Polyline: time has shape {self.time.shape}, voltage {self.voltage.shape};"
+                " give one of each for a corner"
+            )
+        if isinstance(self.time, Tracer) or isinstance(self.period, Tracer):
+            return
+        if np.any(np.diff(self.time) < 0.0):
+            raise InputError("Polyline: its times go back; sort the corners (two at one time are a jump)")
+        if self.period is not None and np.ptp(self.time) > self.period * (1.0 + 1e-6):
+            raise InputError("Polyline: its corners reach beyond one period; give those of one period")
+
+    def points(self) -> tuple[Float[Array, " corners"], Float[Array, " corners"]]:
+        """The corners."""
+        return self.time, self.voltage
+
+
+class Burst(Drive):
+    """A periodic `wave` for a whole number of `cycles` from t = 0; zero before and after.
+
+    Raises:
+        InputError: `wave` is not periodic, or `cycles` is not a whole number of at least 1.
+    """
+
+    wave: Periodic
+    cycles: int = eqx.field(static=True)
+
+    def __check_init__(self) -> None:
+        if not isinstance(self.wave, Periodic):
+            raise InputError(f"Burst: a {type(self.wave).__name__} has no cycles; give a sine, triangle, square, ...")
+        if isinstance(self.cycles, bool) or not isinstance(self.cycles, int) or self.cycles < 1:
+            raise InputError(f"Burst: cycles = {self.cycles!r}; give a whole number of at least 1")
+
+    @property
+    def duration(self) -> Array:
+        """s."""
+        return self.cycles * self.wave.period
+
+    def is_over(self, time: ArrayLike) -> Array:
+        """Whether the burst has ended; a time on its end to within rounding counts as the end."""
+        elapsed = jnp.asarray(time, dtype=float) * self.wave.frequency
+        return elapsed * (1.0 + _SNAP * jnp.finfo(elapsed.dtype).eps) >= self.cycles
 
     def value(self, time: ArrayLike) -> Float[Array, "*shape"]:
-        """V at `time`, by linear interpolation."""
-        knots, start, end = self.pieces()
-        piece, since = self.locate(time)
-        fraction = jnp.clip(since / jnp.diff(knots)[piece], 0.0, 1.0)
-        return start[piece] + (end - start)[piece] * fraction
+        """V at `time`."""
+        time = jnp.asarray(time, dtype=float)
+        return jnp.where((time >= 0.0) & ~self.is_over(time), self.wave.value(time), 0.0)
 
     def slope(self, time: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
-        """dV/dt at `time`: that of the line that begins or lies there; 0 outside the samples."""
-        knots, start, end = self.pieces()
-        piece, since = self.locate(time)
-        inside = (since >= 0.0) & (since < jnp.diff(knots)[piece])
-        slope = jnp.where(inside, ((end - start) / jnp.diff(knots))[piece], 0.0)
-        if steady_state:
-            return slope
-        return _after_rest(slope, start[0], jnp.asarray(time, dtype=float) - knots[0], steady_state)
+        """dV/dt at `time`."""
+        time = jnp.asarray(time, dtype=float)
+        inside = self.wave.slope(time, steady_state=False)
+        # it ends as it began: with a jump or without
+        at_end = self.is_over(time) & (time <= self.duration * (1.0 + _SNAP * jnp.finfo(time.dtype).eps))
+        after = jnp.where(at_end & jnp.isnan(self.wave.slope(0.0, steady_state=False)), jnp.nan, 0.0)
+        return jnp.where(self.is_over(time), after, inside)
 
 
-def _after_rest(slope: Array, first: ArrayLike, time: ArrayLike, steady_state: bool) -> Array:
-    """From rest: nothing before t = 0, and a jump there unless the drive starts at 0."""
-    if steady_state:
-        return slope
+def _after_rest(drive: Drive, slope: Array, time: ArrayLike, height: ArrayLike) -> Array:
+    """From rest: nothing before the drive begins, and a jump there unless it begins at 0."""
     time = jnp.asarray(time, dtype=float)
-    slope = jnp.where(time < 0.0, 0.0, slope)
-    return jnp.where((time == 0.0) & (jnp.asarray(first) != 0.0), jnp.nan, slope)
+    slope = jnp.where(time < drive.begin, 0.0, slope)
+    jumps = jnp.abs(drive.value(drive.begin)) > _NO_JUMP * jnp.finfo(slope.dtype).eps * jnp.asarray(height)
+    return jnp.where((time == drive.begin) & jumps, jnp.nan, slope)

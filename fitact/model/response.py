@@ -6,8 +6,12 @@ L; at a jump u jumps along. Written so that nothing cancels or overflows at eith
 """
 
 import math
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -15,9 +19,11 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.errors import InputError
+from fitact.model.chirp import Chirp
 from fitact.model.circuit import Circuit, gain_at, highpass_gain
-from fitact.model.drive import Drive, Pieces, PiecewiseLinear, Sampled, Sine
+from fitact.model.drive import Burst, Drive, Line, Pieces, PiecewiseLinear, Sampled, Sine
 from fitact.model.harmonic import fourier, frequency, fundamental, gain, harmonic_response, harmonic_sum
+from fitact.model.polynomial import evaluate, particular
 from fitact.model.skin import WithSkin
 
 _SERIES = 0.03  # below, the quotients with expm1 lose digits in their derivatives
@@ -30,19 +36,25 @@ def response(
     *,
     steady_state: bool = True,
     channel: Literal["Vsc", "I"] = "Vsc",
+    initial: ArrayLike | Sequence[ArrayLike] | None = None,
 ) -> Float[Array, "*shape"]:
     """The skin voltage Vsc (V) or the trunk current I (A) at `time` (s), exact for the drives of `fitact.model.drive`.
 
     In the steady state, or, with ``steady_state=False``, from rest: no charge anywhere and no drive
-    before t = 0 (for a sampled drive, before its first sample). Eqs. (18)-(21) in the time domain.
-    Where nothing resistive limits the current it follows dV/dt, and at an ideal jump it is NaN.
+    before t = 0, or before the first point of a drive given by points (where that of a `Sampled` one is
+    held, since a measured drive was there before). Eqs. (18)-(21) in the time domain. Where nothing
+    resistive limits the current it follows dV/dt, and at an ideal jump it is NaN.
+
+    `initial` stands for a charge that was there when the drive began: one amplitude for each time constant
+    of the circuit, in the order of ``circuit.terms().tau`` and the channel's unit, that decays with it.
 
     A skin that depends on the frequency has its steady state harmonic by harmonic as far as it changes, and
     above by time constants: exact for `Dispersive`; for `Fractional` within the error it states.
 
     Raises:
-        InputError: the steady state of a sampled drive without a period was asked for, or with a skin that
-            depends on the frequency anything but the steady state of a periodic drive.
+        InputError: the steady state was asked for of a drive that has none, or together with `initial`, or
+            `initial` has not one value for each time constant; or, with a skin that depends on the frequency,
+            anything but the steady state of a periodic drive.
     """
     if isinstance(circuit, WithSkin):
         return _with_skin(circuit, drive, time, steady_state, channel)
@@ -52,7 +64,11 @@ def response(
         total = terms.rate * drive.slope(time, steady_state=steady_state)
     for weight, tau in zip(terms.weight, terms.tau, strict=True):
         total = total + weight * highpass(drive, time, tau, steady_state=steady_state)
-    return total
+    if initial is None:
+        return total
+    if steady_state:
+        raise InputError("an initial charge has decayed in the steady state: give steady_state=False with initial")
+    return total + _remains(drive, time, terms.tau, initial)
 
 
 def _with_skin(
@@ -86,18 +102,63 @@ def _with_skin(
 def highpass(drive: Drive, time: ArrayLike, tau: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
     """The response of s tau / (1 + s tau) to `drive` at `time`; arguments as in `response`."""
     time = jnp.asarray(time, dtype=float)
+    wave = drive.wave if isinstance(drive, Burst) else drive
+    if not isinstance(wave, Sine | PiecewiseLinear | Line | Chirp):
+        raise TypeError(f"no exact response to a {type(wave).__name__}")
+    if steady_state:
+        _require_steady_state(drive)
+    if isinstance(wave, Chirp):
+        return _chirp(wave, time, jnp.asarray(tau, dtype=float))
+    if isinstance(wave, Line) and wave.period is None:
+        pieces = wave.pieces()
+        u = _along(wave, time, tau, knot_values(pieces, tau, pieces.start[0]))
+        return u if isinstance(wave, Sampled) else jnp.where(time >= wave.begin, u, 0.0)
+    settled = _steady(wave, tau)
+    if steady_state:
+        return settled(time)
+    begin = jnp.asarray(wave.begin, dtype=float)
+    difference = wave.value(begin) - settled(begin)
+    u = _from_rest(settled(time), difference, time - begin, tau)
+    if not isinstance(drive, Burst):
+        return u
+    since = jnp.maximum(time - drive.duration, 0.0)
+    # the wave minus the same begun again at the end: of the two only the transients do not cancel
+    after = difference * jnp.expm1(-drive.duration / tau) * jnp.exp(-since / tau)
+    return jnp.where(drive.is_over(time), after, u)
+
+
+def _require_steady_state(drive: Drive) -> None:
+    name = type(drive).__name__
+    if isinstance(drive, Burst | Chirp):
+        raise InputError(f"a {name} has no steady state: give steady_state=False")
+    if isinstance(drive, Line) and drive.period is None:
+        raise InputError(
+            f"a {name} has no steady state unless its period is given: {name}(..., period=T), or steady_state=False"
+        )
+
+
+def _remains(
+    drive: Drive, time: ArrayLike, taus: Sequence[ArrayLike], initial: ArrayLike | Sequence[ArrayLike]
+) -> Array:
+    """What is left at `time` of a charge that was there when the drive began."""
+    amplitudes = jnp.atleast_1d(jnp.asarray(initial, dtype=float))
+    if amplitudes.shape != (len(taus),):
+        raise InputError(
+            f"initial has shape {amplitudes.shape}, but the circuit has {len(taus)} time constants;"
+            " give one value for each"
+        )
+    since = jnp.asarray(time, dtype=float) - drive.begin
+    left = sum(v * jnp.exp(-jnp.maximum(since, 0.0) / tau) for v, tau in zip(amplitudes, taus, strict=True))
+    return jnp.asarray(left if isinstance(drive, Sampled) else jnp.where(since >= 0.0, left, 0.0))
+
+
+def _steady(drive: Sine | PiecewiseLinear | Line, tau: ArrayLike) -> Callable[[Array], Array]:
+    """u(t) in the steady state."""
     if isinstance(drive, Sine):
-        return _sine(drive, time, tau, steady_state)
-    if isinstance(drive, Sampled) and (not steady_state or drive.period is None):
-        if steady_state:
-            raise InputError("a sampled drive has no steady state unless its period is given: Sampled(..., period=T)")
-        return _along(drive, time, tau, knot_values(drive.pieces(), tau, drive.samples[0]))
-    if not isinstance(drive, PiecewiseLinear | Sampled):
-        raise TypeError(f"no exact response to a {type(drive).__name__}")
+        return partial(_sine, drive, tau)
     pieces = drive.pieces()
-    settled = _settled(pieces, tau)
-    u = _along(drive, time, tau, knot_values(pieces, tau, settled))
-    return u if steady_state else _from_rest(u, pieces.start[0] - settled, time, tau)
+    u = knot_values(pieces, tau, _settled(pieces, tau))
+    return lambda time: _along(drive, time, tau, u)
 
 
 def knot_values(pieces: Pieces, tau: ArrayLike, first: ArrayLike) -> Float[Array, " pieces"]:
@@ -109,6 +170,7 @@ def knot_values(pieces: Pieces, tau: ArrayLike, first: ArrayLike) -> Float[Array
     return jnp.concatenate([first[None], recurrence(decay, gain, first)])
 
 
+@jax.jit
 def recurrence(decay: Float[Array, " n"], gain: Float[Array, " n"], first: Float[Array, ""]) -> Float[Array, " n"]:
     """u[k] = decay[k] u[k - 1] + gain[k], from u[-1] = first.
 
@@ -135,13 +197,11 @@ def recurrence(decay: Float[Array, " n"], gain: Float[Array, " n"], first: Float
     return (decays * starts + gains).T.reshape(-1)[: decay.size - missing]
 
 
-def _along(drive: PiecewiseLinear | Sampled, time: Array, tau: ArrayLike, u: Array) -> Array:
+def _along(drive: PiecewiseLinear | Line, time: Array, tau: ArrayLike, u: Array) -> Array:
     """u(t) from its values at the starts of the pieces."""
-    knots, start, end = drive.pieces()
     piece, since = drive.locate(time)
-    slope = (end - start) / jnp.diff(knots)
     since = jnp.maximum(since, 0.0)
-    return u[piece] * jnp.exp(-since / tau) + slope[piece] * since * phi(since / tau)
+    return u[piece] * jnp.exp(-since / tau) + drive.pieces().slopes()[piece] * since * phi(since / tau)
 
 
 def _settled(pieces: Pieces, tau: ArrayLike) -> Array:
@@ -159,17 +219,32 @@ def _settled(pieces: Pieces, tau: ArrayLike) -> Array:
     return -jnp.sum(jump * jnp.expm1(-left) + (end - start) * ramp_weight) / jnp.expm1(-(knots[-1] - knots[0]) / tau)
 
 
-def _sine(drive: Sine, time: Array, tau: ArrayLike, steady_state: bool) -> Array:
+def _sine(drive: Sine, tau: ArrayLike, time: Array) -> Array:
     gain = 0.5 * jnp.asarray(drive.peak_to_peak) * highpass_gain(2.0 * np.pi * jnp.asarray(drive.frequency) * tau)
-    angle = 2.0 * np.pi * drive.phase(time)[0]
-    u = gain.real * jnp.sin(angle) + gain.imag * jnp.cos(angle)
-    return u if steady_state else _from_rest(u, drive.offset - gain.imag, time, tau)
+    angle = 2.0 * np.pi * drive.cycle(time)[0]
+    return gain.real * jnp.sin(angle) + gain.imag * jnp.cos(angle)
 
 
-def _from_rest(settled: Array, difference: ArrayLike, time: Array, tau: ArrayLike) -> Array:
-    """The steady state plus the transient that starts with `difference`; nothing before t = 0."""
-    later = jnp.maximum(time, 0.0)
-    return jnp.where(time >= 0.0, settled + difference * jnp.exp(-later / tau), 0.0)
+@eqx.filter_jit  # loops are compiled anew at every call outside jit
+def _chirp(drive: Chirp, time: Array, tau: Array) -> Array:
+    """From rest: u at the pieces' starts, then along each as its polynomial and what decays."""
+    z = drive.duration / tau / drive.pieces
+    series, v = drive.series(), drive.sweep(drive.duration / drive.pieces * jnp.arange(drive.pieces + 1))
+    p, p_end = particular(series, z)
+    rounding = jnp.diff(v) - jnp.sum(series, axis=0)  # what would add up over many pieces
+    decay = jnp.broadcast_to(jnp.exp(-z), p_end.shape)
+    u = jnp.append(v[0], recurrence(decay, p_end - jnp.exp(-z) * p[0] + rounding, v[0]))
+    piece, s = drive.locate(time)
+    during = evaluate(p, piece, s) + (u[piece] - p[0][piece]) * jnp.exp(-z * s)
+    since = jnp.maximum(time - drive.duration, 0.0)
+    after = (u[-1] - v[-1]) * jnp.exp(-since / tau)
+    return jnp.where(time >= 0.0, jnp.where(drive.is_over(time), after, during), 0.0)
+
+
+def _from_rest(settled: Array, difference: ArrayLike, since: Array, tau: ArrayLike) -> Array:
+    """The steady state plus the transient that starts with `difference`; nothing before."""
+    later = jnp.maximum(since, 0.0)
+    return jnp.where(since >= 0.0, settled + difference * jnp.exp(-later / tau), 0.0)
 
 
 def phi(x: ArrayLike) -> Array:

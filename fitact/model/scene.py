@@ -16,8 +16,9 @@ from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from fitact import units
 from fitact.errors import InputError
+from fitact.model.chirp import Chirp
 from fitact.model.circuit import Circuit, DirectGround, FinalCircuit, NaturalGround, Probe
-from fitact.model.drive import Drive, Sine, Square, Trapezoid, Triangle
+from fitact.model.drive import Burst, Drive, Periodic, Sine, Square, Trapezoid, Triangle
 from fitact.model.force import plate_capacitance
 from fitact.model.prior import Distribution, LogNormal, Prior, Uniform
 from fitact.model.skin import Dispersive, Fractional, WithSkin
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     Hertz: TypeAlias = float
     Ratio: TypeAlias = float
     Volt: TypeAlias = float
+    Angle: TypeAlias = float
     AnyVolt: TypeAlias = float
     AnyOhm: TypeAlias = float
     NoiseVolt: TypeAlias = float
@@ -52,6 +54,7 @@ else:
     Hertz = _quantity("Hz", gt=0)
     Ratio = _quantity("", gt=0)
     Volt = _quantity("V", gt=0)
+    Angle = _quantity("rad")
     AnyVolt = _quantity("V")
     AnyOhm = _quantity("ohm", ge=0)
     NoiseVolt = _quantity("V", ge=0)
@@ -113,6 +116,20 @@ class Grounding(_Section):
         return self
 
 
+_WAVES = ("sine", "triangle", "square", "trapezoid")
+_WAVEFORMS_OF = {  # the keys of [drive] that only some waveforms have
+    "frequency": (*_WAVES, "burst", "measured"),
+    "duty": ("square", "trapezoid", "burst"),
+    "phase": (*_WAVES, "burst", "chirp"),
+    "shape": ("burst",),
+    "cycles": ("burst",),
+    "start_frequency": ("chirp",),
+    "end_frequency": ("chirp",),
+    "sweep_time": ("chirp",),
+    "spacing": ("chirp",),
+}
+
+
 class DriveSection(_Section):
     """The voltage on the electrode."""
 
@@ -122,6 +139,13 @@ class DriveSection(_Section):
     rise_time: Second | None = None
     duty: Annotated[float, Field(gt=0, lt=1)] = 0.5
     offset: AnyVolt = 0.0
+    phase: Angle = 0.0
+    shape: Literal["square", "sine", "triangle"] = "square"
+    cycles: Annotated[int, Field(ge=1)] = 5
+    start_frequency: Hertz | None = None
+    end_frequency: Hertz | None = None
+    sweep_time: Second | None = None
+    spacing: Literal["linear", "logarithmic"] = "linear"
     steady_state: bool = True
 
     @model_validator(mode="after")
@@ -131,11 +155,59 @@ class DriveSection(_Section):
                 "rise_time belongs to waveform = 'trapezoid', which needs it"
                 f" (here: waveform = '{self.waveform}', rise_time {'absent' if self.rise_time is None else 'given'})"
             )
-        if "duty" in self.model_fields_set and self.waveform not in ("square", "trapezoid"):
-            raise ValueError(f"duty belongs to the waveforms square and trapezoid, not to '{self.waveform}'")
+        for key, waveforms in _WAVEFORMS_OF.items():
+            if key in self.model_fields_set and self.waveform not in waveforms:
+                raise ValueError(f"{key} belongs to the waveforms {', '.join(waveforms)}, not to '{self.waveform}'")
+        if "duty" in self.model_fields_set and self.waveform == "burst" and self.shape != "square":
+            raise ValueError(f"duty belongs to a burst of shape = 'square', not '{self.shape}'")
+        if self.waveform == "chirp" and None in (self.start_frequency, self.end_frequency, self.sweep_time):
+            raise ValueError("waveform = 'chirp' needs start_frequency, end_frequency and sweep_time")
         if self.rise_time is not None and self.rise_time >= min(self.duty, 1.0 - self.duty) / self.frequency:
             raise ValueError("rise_time must be shorter than the high and the low part of the period")
         return self
+
+    @model_validator(mode="after")
+    def _from_rest(self) -> Self:
+        if self.waveform in ("burst", "chirp"):
+            if "steady_state" in self.model_fields_set and self.steady_state:
+                raise ValueError(f"a {self.waveform} has no steady state; leave steady_state out, or make it false")
+            object.__setattr__(self, "steady_state", False)  # the model is frozen from here on
+        return self
+
+    @property
+    def slowest(self) -> float:
+        """The lowest frequency in it, Hz."""
+        return min(self.start_frequency or self.frequency, self.end_frequency or self.frequency)
+
+    def make(self) -> Drive:
+        """The drive.
+
+        Raises:
+            InputError: the waveform is 'measured', so only a record has it.
+        """
+        if self.waveform == "chirp":
+            start, end, duration = self.start_frequency, self.end_frequency, self.sweep_time
+            assert None not in (start, end, duration)  # checked when the section was read
+            return Chirp(self.peak_to_peak, start, end, duration, self.spacing, self.offset, self.phase)
+        if self.waveform == "burst":
+            return Burst(self._wave(self.shape), self.cycles)
+        return self._wave(self.waveform)
+
+    def _wave(self, shape: str) -> Periodic:
+        height, offset, phase = (self.peak_to_peak, self.frequency), self.offset, self.phase
+        if shape == "sine":
+            return Sine(*height, offset, phase)
+        if shape == "triangle":
+            return Triangle(*height, offset, phase)
+        if shape == "square":
+            return Square(*height, self.duty, offset, phase)
+        if shape == "trapezoid":
+            assert self.rise_time is not None  # checked when it was read
+            return Trapezoid(*height, self.rise_time, self.duty, offset, phase)
+        raise InputError(
+            f"scene: [drive] waveform = '{shape}' gives no drive to compute; name sine, triangle, square, trapezoid,"
+            " burst or chirp"
+        )
 
 
 class Measurement(_Section):
@@ -310,7 +382,6 @@ class Scene(_Section):
             f"[skin] level = '{self.skin.level}' with [drive] steady_state = false": (
                 self.skin.level != "constant" and not self.drive.steady_state
             ),
-            f"[drive] waveform = '{self.drive.waveform}'": self.drive.waveform in ("burst", "chirp"),
             "[force] model = 'gap'": self.force.model == "gap",
             "[population] contact_area = 'varies'": self.population.contact_area == "varies",
         }
@@ -367,20 +438,7 @@ class Scene(_Section):
         Raises:
             InputError: the waveform is 'measured', so only a record has it.
         """
-        d = self.drive
-        if d.waveform == "sine":
-            return Sine(d.peak_to_peak, d.frequency, d.offset)
-        if d.waveform == "triangle":
-            return Triangle(d.peak_to_peak, d.frequency, d.offset)
-        if d.waveform == "square":
-            return Square(d.peak_to_peak, d.frequency, d.duty, d.offset)
-        if d.waveform == "trapezoid":
-            assert d.rise_time is not None  # checked when the section was read
-            return Trapezoid(d.peak_to_peak, d.frequency, d.rise_time, d.duty, d.offset)
-        raise InputError(
-            f"scene: [drive] waveform = '{d.waveform}' gives no drive to compute;"
-            " name sine, triangle, square or trapezoid"
-        )
+        return self.drive.make()
 
     def make_prior(self) -> Prior:
         """The prior of the parameters that the scene frees."""
