@@ -175,23 +175,27 @@ class Likelihood(eqx.Module):
         scale = (theta[: len(self.prior.names)] - self.prior.log_mean) / self.prior.log_sd
         return jnp.append(scale, theta[-1] / self.delay_sd) if self.free_delay else scale
 
-    def log_prob(self, point: Float[Array, " parameters+1"]) -> Float[Array, ""]:
-        """Log-posterior of (theta, log sigma), up to a constant; sigma's prior is flat in its logarithm.
-
-        Anything that is not finite counts as impossible; NaN where the compression does not reach.
-        """
+    def log_likelihood(self, point: Float[Array, " parameters+1"]) -> Float[Array, ""]:
+        """Log-likelihood of (theta, log sigma), up to a constant; NaN where the compression does not reach."""
         theta, log_sigma = point[:-1], point[-1]
         remainder, beta, factor = self.linear(theta, jnp.exp(log_sigma))
         misfit = jnp.sum(jnp.square(remainder)) * jnp.exp(-2.0 * log_sigma) + jnp.sum(jnp.square(beta))
         value = -0.5 * misfit - self.count * log_sigma - jnp.sum(jnp.log(jnp.diagonal(factor)))
-        value = value + self.prior.log_density(theta[: len(self.prior.names)])
-        if self.free_delay:
-            value = value - 0.5 * jnp.square(theta[-1] / self.delay_sd)
-        value = jnp.where(jnp.isfinite(value), value, -jnp.inf)
         if self.compression is None:
             return value
-        tau = self.circuit(theta).terms().tau[0]
-        return jnp.where(self.compression.holds(tau) | ~jnp.isfinite(jnp.log(tau)), value, jnp.nan)
+        return jnp.where(self.compression.holds(self.circuit(theta).terms().tau[0]), value, jnp.nan)
+
+    def log_prob(self, point: Float[Array, " parameters+1"]) -> Float[Array, ""]:
+        """Log-posterior of (theta, log sigma), up to a constant; sigma's prior is flat in its logarithm.
+
+        Anything that is not finite counts as impossible, but it is NaN where the compression does not reach.
+        """
+        theta = point[:-1]
+        value = self.log_likelihood(point) + self.prior.log_density(theta[: len(self.prior.names)])
+        if self.free_delay:
+            value = value - 0.5 * jnp.square(theta[-1] / self.delay_sd)
+        beyond = jnp.isnan(value) & jnp.all(jnp.isfinite(point)) & (self.compression is not None)
+        return jnp.where(jnp.isfinite(value) | beyond, value, -jnp.inf)
 
 
 class Batched:
