@@ -7,10 +7,11 @@ from .inference.posterior import Posterior
 from .inference.sampling import sample
 from .model.circuit import DirectGround, FinalCircuit, NaturalGround, Probe
 from .model.drive import Sampled, Sine, Square, Trapezoid, Triangle
-from .model.force import Contact, electrostatic_force, friction
+from .model.force import Contact, electrostatic_force, friction, mean_force, peak_force
 from .model.prior import LogNormal, Prior, Uniform
 from .model.response import response
 from .model.scene import Scene
+from .model.steady import body_current, mean_square, peak
 
 __all__ = [
     "RESULTS",
@@ -32,9 +33,14 @@ __all__ = [
     "Trapezoid",
     "Triangle",
     "Uniform",
+    "body_current",
     "electrostatic_force",
     "fit",
     "friction",
+    "mean_force",
+    "mean_square",
+    "peak",
+    "peak_force",
     "read",
     "response",
     "sample",

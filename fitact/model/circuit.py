@@ -20,7 +20,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Complex
+from jaxtyping import Array, Complex, Float
 
 
 class Terms(NamedTuple):
@@ -62,6 +62,15 @@ def highpass_gain(x: ArrayLike) -> Complex[Array, "*shape"]:
     return jnp.where(below, low * small + 1j * low, high + 1j * high * inverse)
 
 
+def highpass_amplitude(x: ArrayLike) -> Float[Array, "*shape"]:
+    """|j x / (1 + j x)| for x >= 0, in forms whose derivatives do not cancel."""
+    x = jnp.asarray(x)
+    below = x <= 1.0
+    small = jnp.where(below, x, 1.0)
+    inverse = 1.0 / jnp.where(below, 1.0, x)
+    return jnp.where(below, small / jnp.sqrt(1.0 + small**2), 1.0 / jnp.sqrt(1.0 + inverse**2))
+
+
 class FinalCircuit(Circuit):
     """The paper's final circuit (Fig. 11): two equal skin layers Rsc‖Csc in series with Ci.
 
@@ -79,8 +88,8 @@ class FinalCircuit(Circuit):
 
     @property
     def g(self) -> ArrayLike:
-        """The divider a / b = Ci / (2 Ci + Csc), the gain at high frequency; below 1/2."""
-        return self.Ci / (2.0 * self.Ci + self.Csc)
+        """The divider a / b = Ci / (2 Ci + Csc), the gain at high frequency; at most 1/2."""
+        return 1.0 / (2.0 + self.Csc / self.Ci)  # in this form the logarithms' derivatives do not cancel
 
     @property
     def b(self) -> ArrayLike:
@@ -90,6 +99,14 @@ class FinalCircuit(Circuit):
     def terms(self) -> Terms:
         """One term: the divider g with the time constant b."""
         return Terms((self.g,), (self.b,))
+
+    def amplitude(self, omega: ArrayLike) -> Float[Array, "*shape"]:
+        """|Vsc / V| at the angular frequency `omega` (rad/s, >= 0), eq. (25)."""
+        return self.g * highpass_amplitude(omega * self.b)
+
+    def phase(self, omega: ArrayLike) -> Float[Array, "*shape"]:
+        """The angle (rad) by which Vsc leads V at the angular frequency `omega` (rad/s, >= 0), eq. (26)."""
+        return jnp.arctan2(1.0, omega * self.b)
 
     def current_terms(self) -> Terms:
         """I = Vsc (1 + s Rsc Csc) / Rsc: one term, and one that follows dV/dt."""
