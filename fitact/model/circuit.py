@@ -22,6 +22,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
+_LEAST = 1e-12  # of Ci: a skin without capacitance counts as having so much, which keeps its time constant from 0
+
 
 class Terms(NamedTuple):
     """sum_k weight[k] s tau[k] / (1 + s tau[k]) + rate s."""
@@ -148,17 +150,20 @@ class Loop(Circuit):
     def _modes(self) -> tuple[Terms, Terms]:
         Ci, R0 = self.insulator(), self.resistance()
         R, C = (jnp.stack(jnp.broadcast_arrays(*x)) for x in zip(*self.elements(), strict=True))
+        C = jnp.maximum(C, _LEAST * Ci)
         return _modes_without_resistance(Ci, R, C) if R0 is None else _modes_with_resistance(Ci, R0, R, C)
 
 
 def _modes_without_resistance(Ci: ArrayLike, R: Array, C: Array) -> tuple[Terms, Terms]:
     """With x = v / sqrt(R) over the elements:  T x' + x = Ci sqrt(R) V',  T = diag(R C) + Ci sqrt(R) sqrt(R)^T."""
     root = jnp.sqrt(R)
-    tau, modes = jnp.linalg.eigh(jnp.diag(R * C) + Ci * jnp.outer(root, root))
+    tau, modes = _modes_of(jnp.vstack([jnp.diag(jnp.sqrt(R * C)), jnp.sqrt(Ci) * root]))
     drive = Ci * (modes.T @ root) / tau
     vsc = root[0] * modes[0] * drive
     current = drive**2
-    rate = 1.0 / (1.0 / Ci + jnp.sum(1.0 / C))
+    rate = Ci
+    for each in C:
+        rate = rate * (each / (rate + each))
     return Terms(tuple(vsc), tuple(tau)), Terms(tuple(current), tuple(tau), rate)
 
 
@@ -168,10 +173,18 @@ def _modes_with_resistance(Ci: ArrayLike, R0: ArrayLike, R: Array, C: Array) -> 
     P holds the resistances that each capacitor's terminals see: its own R, for Ci the whole loop's.
     """
     root = jnp.sqrt(jnp.append(C, Ci))
-    seen = jnp.diag(jnp.append(R, R0 + jnp.sum(R))).at[-1, :-1].set(-R).at[:-1, -1].set(-R)
-    tau, modes = jnp.linalg.eigh(jnp.outer(root, root) * seen)
+    # each row is one resistance's current, times its square root
+    through = jnp.vstack([jnp.diag(root[:-1]), jnp.zeros_like(C)])
+    current = jnp.append(jnp.full_like(R, -1.0), 1.0)[:, None] * root[-1]
+    tau, modes = _modes_of(jnp.sqrt(jnp.append(R, R0))[:, None] * jnp.hstack([through, current]))
     vsc = -modes[0] * modes[-1] * root[-1] / root[0]
     return Terms(tuple(vsc), tuple(tau)), Terms(tuple(Ci * modes[-1] ** 2 / tau), tuple(tau))
+
+
+def _modes_of(factor: Array) -> tuple[Array, Array]:
+    """Eigenvalues and eigenvectors of factor^T factor: from the factor, small eigenvalues keep twice the digits."""
+    _, sigma, modes = jnp.linalg.svd(factor, full_matrices=False)
+    return sigma * sigma, modes.T
 
 
 class Probe(eqx.Module):

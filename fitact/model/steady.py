@@ -72,8 +72,8 @@ def peak(circuit: Circuit, drive: Drive, channel: Literal["Vsc", "I"] = "Vsc") -
         amplitude = circuit.amplitude(omega) if channel == "Vsc" and isinstance(circuit, FinalCircuit) else abs(gain)
         return abs(0.5 * jnp.asarray(drive.peak_to_peak)) * amplitude
     terms = circuit.terms() if channel == "Vsc" else circuit.current_terms()
-    if isinstance(drive, Triangle) and len(terms.tau) == 1 and terms.rate is None:
-        return abs(terms.weight[0] * 0.5 * jnp.asarray(drive.peak_to_peak) * _crest(0.25 * drive.period / terms.tau[0]))
+    if isinstance(drive, Square | Triangle) and len(terms.tau) == 1 and terms.rate is None:
+        return abs(terms.weight[0] * jnp.asarray(drive.peak_to_peak)) * _highest(drive, drive.period / terms.tau[0])
     largest = jnp.max(jnp.abs(_extremes(terms, _period(drive))))
     return largest if terms.rate is None else jnp.where(_impulses(drive, terms.rate), jnp.inf, largest)
 
@@ -143,11 +143,22 @@ def _triangle(amplitude: Array, y: Array) -> Array:
     )
 
 
-def _crest(y: Array) -> Array:
-    """tanh(y) / y: the highest response to a triangle of amplitude 1; y = T / (4 tau)."""
-    few, many = jnp.where(y < 1.0, y, 0.0), jnp.where(y < 1.0, 1.0, y)
-    fraction = coth_fraction(few * few)
-    return jnp.where(y < 1.0, fraction / (fraction + few * few), jnp.tanh(many) / many)
+def _highest(drive: Square | Triangle, x: Array) -> Array:
+    """The highest |u| of one time constant for a peak-to-peak of 1; x = T / tau.
+
+    Of a triangle's crest the terms of first order cancel, and of a square's two edges the higher one may be
+    higher by less than rounding: neither the derivative's digits nor its edge come out of the pieces.
+    """
+    if isinstance(drive, Triangle):
+        y = 0.25 * x
+        few, many = jnp.where(y < 1.0, y, 0.0), jnp.where(y < 1.0, 1.0, y)
+        fraction = coth_fraction(few * few)
+        return 0.5 * jnp.where(y < 1.0, fraction / (fraction + few * few), jnp.tanh(many) / many)
+    duty = jnp.asarray(drive.duty, dtype=float)
+    longer = jnp.maximum(duty, 1.0 - duty)
+    few, many = jnp.where(x < 1.0, x, 0.0), jnp.where(x < 1.0, 1.0, x)
+    slow = longer * phi(longer * few) / phi(few)
+    return jnp.where(x < 1.0, slow, jnp.expm1(-longer * many) / jnp.expm1(-many))
 
 
 def _trapezoid(drive: Trapezoid, tau: ArrayLike, general: Array) -> Array:
@@ -204,7 +215,10 @@ def _impulses(drive: Drive, rate: ArrayLike) -> Array:
 
 
 def _extremes(terms: Terms, pieces: Pieces) -> Array:
-    """The response at both ends of every piece and at the extremes in between."""
+    """The response at both ends of every piece and at the extremes in between.
+
+    Of the latter the first derivatives are right, not the second: where an extreme lies is held fixed.
+    """
     length, rise = jnp.diff(pieces.knots), pieces.end - pieces.start
     tau = jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, terms.tau)))
     u = jnp.stack([steady_knots(pieces, t) for t in terms.tau])
@@ -215,11 +229,14 @@ def _extremes(terms: Terms, pieces: Pieces) -> Array:
             total = total + weight * (first * jnp.exp(-since / t) + rise * (since / length) * phi(since / t))
         return total
 
-    # the derivative is a sum of exponentials; at an extreme its own dependence on the parameters drops out
+    # the derivative is a sum of exponentials; to first order, a shift of an extreme does not change it
     weight = jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, terms.weight)))
     fall = weight[:, None] * (rise / length - u / tau[:, None])
     inside = _zeros(*lax.stop_gradient((fall, 1.0 / tau, length)))
-    return jnp.stack([at(jnp.zeros_like(length)), at(length), *map(at, inside)])
+    after, before = at(jnp.zeros_like(length)), at(length)
+    if len(terms.tau) == 1:  # a level only decays; to rounding its end may equal its start, but not in the derivative
+        before = jnp.where(rise == 0.0, 0.0, before)
+    return jnp.stack([after, before, *map(at, inside)])
 
 
 def _zeros(factor: Array, rate: Array, length: Array) -> list[Array]:
