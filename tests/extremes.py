@@ -31,7 +31,7 @@ TOLERANCE = {np.float64: 1e-12, np.float32: 1e-5}
 GRADIENT_TOLERANCE = 1e-9
 # a crest reached at t = (3/4) / f, when T / tau exceeds tolerance / eps: rounding of t decides how far behind it
 EDGES = {"triangle": (4, 12)}
-NOISE = mpf(10) ** -150  # of a difference quotient, relative to the value
+NOISE = mpf(10) ** -150  # what a difference quotient can tell from 0, relative to the peak
 nan = mpf("nan")
 
 
@@ -183,6 +183,7 @@ def truth(name: str, row: np.ndarray, gradients: bool) -> dict[str, Truth]:
     duty, x = mpf(float(kind(DUTY))), 1 / (f * b)
     mean, peak, wave = highpass(name, point, duty, x)
     mean_b, peak_b, wave_b = mpf(0), mpf(0), [mpf(0)] * PHASES
+    left = wave
     if gradients:
         h = mpf(10) ** -40
         up, down = (highpass(name, point, duty, x * factor) for factor in (1 - h, 1 + h))  # b is 1 / x
@@ -191,13 +192,14 @@ def truth(name: str, row: np.ndarray, gradients: bool) -> dict[str, Truth]:
         if abs(peak_b) < NOISE * peak:
             peak_b = mpf(0)
         wave_b = [d if abs(d) > NOISE * peak else mpf(0) for d in wave_b]
+        left = [u if abs(u) > NOISE * peak else mpf(0) for u in wave]
     skipped = EDGES.get(name, ()) if x * float(np.finfo(kind).eps) > TOLERANCE[kind] else ()
     return forces(point, kind, g, r, (mean, mean_b), (peak, peak_b)) | {
         "waveform": Truth(
             [nan if k in skipped else V0 * g * u for k, u in enumerate(wave)],
             [
                 [nan] * 3 if k in skipped else chain(u, V0 * g * u, V0 * g * d, r)
-                for k, (u, d) in enumerate(zip(wave, wave_b, strict=True))
+                for k, (u, d) in enumerate(zip(left, wave_b, strict=True))
             ],
             V0 * g * peak,
         )

@@ -118,7 +118,8 @@ def _settled(pieces: Pieces, tau: ArrayLike) -> Array:
     u0 (1 - e^{-T/tau}) is the sum over a period of (increment) x (decay until its end). Where T/tau is
     large that is how it is computed. Where it is small all decays are close to 1: the increments of a
     period add up to nothing, so decay - 1 may stand for decay, and the quotient keeps its digits.
-    Fractions of the period, which do not depend on tau, keep those of its derivative.
+    Fractions of the period, which do not depend on tau, keep those of its derivative; so does 1 - exp where
+    that is no loss, since the derivative of expm1 is computed as expm1 + 1.
     """
     knots, start, end = pieces
     period = knots[-1] - knots[0]
@@ -130,7 +131,7 @@ def _settled(pieces: Pieces, tau: ArrayLike) -> Array:
     lam = share * few
     ratio = left * phi(left * few) / phi(few)  # (1 - e^{-left x}) / (1 - e^{-x})
     slow = -jnp.sum(jump * ratio + rise * (ratio * phi(lam) + share * psi(lam) / phi(few)))
-    fast = jnp.sum((jump + rise * phi(share * many)) * jnp.exp(-left * many)) / -jnp.expm1(-many)
+    fast = jnp.sum((jump + rise * phi(share * many)) * jnp.exp(-left * many)) / (1.0 - jnp.exp(-many))
     return jnp.where(x < 1.0, slow, fast)
 
 
@@ -169,14 +170,14 @@ def log_slope(x: ArrayLike) -> Array:
     """The derivative of log phi(x), for x >= 0: from -1/2 towards -1/x."""
     x = jnp.asarray(x, dtype=float)
     large = jnp.where(x < 2.0, 2.0, x)
-    return jnp.where(x < 2.0, bend(x) - 0.5, jnp.exp(-large) / -jnp.expm1(-large) - 1.0 / large)
+    return jnp.where(x < 2.0, bend(x) - 0.5, jnp.exp(-large) / (1.0 - jnp.exp(-large)) - 1.0 / large)
 
 
 def bend(x: ArrayLike) -> Array:
     """1 / (e^x - 1) - 1/x + 1/2 for x >= 0: from x/12 towards 1/2."""
     x = jnp.asarray(x, dtype=float)
     small, large = jnp.where(x < 2.0, x, 0.0), jnp.where(x < 2.0, 2.0, x)
-    direct = jnp.exp(-large) / -jnp.expm1(-large) - 1.0 / large + 0.5
+    direct = jnp.exp(-large) / (1.0 - jnp.exp(-large)) - 1.0 / large + 0.5
     return jnp.where(x < 2.0, 0.25 * small / coth_fraction(0.25 * small * small), direct)
 
 

@@ -158,7 +158,7 @@ def _highest(drive: Square | Triangle, x: Array) -> Array:
     longer = jnp.maximum(duty, 1.0 - duty)
     few, many = jnp.where(x < 1.0, x, 0.0), jnp.where(x < 1.0, 1.0, x)
     slow = longer * phi(longer * few) / phi(few)
-    return jnp.where(x < 1.0, slow, jnp.expm1(-longer * many) / jnp.expm1(-many))
+    return jnp.where(x < 1.0, slow, (1.0 - jnp.exp(-longer * many)) / (1.0 - jnp.exp(-many)))
 
 
 def _trapezoid(drive: Trapezoid, tau: ArrayLike, general: Array) -> Array:
