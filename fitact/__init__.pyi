@@ -9,12 +9,13 @@ from .model.chirp import Chirp
 from .model.circuit import DirectGround, FinalCircuit, NaturalGround, Probe
 from .model.drive import Burst, Polyline, Sampled, Sine, Square, Trapezoid, Triangle
 from .model.equivalents import quality_factor, series_equivalent
-from .model.force import Contact, electrostatic_force, friction
+from .model.force import Contact, electrostatic_force, friction, mean_force, peak_force
 from .model.harmonic import harmonic_error, harmonic_response
 from .model.prior import LogNormal, Prior, Uniform
 from .model.response import response
 from .model.scene import Scene
 from .model.skin import Dispersive, Fractional, WithSkin
+from .model.steady import body_current, mean_square, peak
 
 __all__ = [
     "RESULTS",
@@ -42,11 +43,16 @@ __all__ = [
     "Triangle",
     "Uniform",
     "WithSkin",
+    "body_current",
     "electrostatic_force",
     "fit",
     "friction",
     "harmonic_error",
     "harmonic_response",
+    "mean_force",
+    "mean_square",
+    "peak",
+    "peak_force",
     "quality_factor",
     "read",
     "response",

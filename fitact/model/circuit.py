@@ -24,6 +24,8 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
+_LEAST = 1e-12  # of Ci: a skin without capacitance counts as having so much, which keeps its time constant from 0
+
 
 class Terms(NamedTuple):
     """sum_k weight[k] s tau[k] / (1 + s tau[k]) + rate s."""
@@ -81,6 +83,15 @@ def highpass_gain(x: ArrayLike) -> Complex[Array, "*shape"]:
     return jnp.where(below, low * small + 1j * low, high + 1j * high * inverse)
 
 
+def highpass_amplitude(x: ArrayLike) -> Float[Array, "*shape"]:
+    """|j x / (1 + j x)| for x >= 0, in forms whose derivatives do not cancel."""
+    x = jnp.asarray(x)
+    below = x <= 1.0
+    small = jnp.where(below, x, 1.0)
+    inverse = 1.0 / jnp.where(below, 1.0, x)
+    return jnp.where(below, small / jnp.sqrt(1.0 + small**2), 1.0 / jnp.sqrt(1.0 + inverse**2))
+
+
 class FinalCircuit(Circuit):
     """The paper's final circuit (Fig. 11): two equal skin layers Rsc‖Csc in series with Ci.
 
@@ -98,28 +109,25 @@ class FinalCircuit(Circuit):
 
     @property
     def g(self) -> ArrayLike:
-        """The divider a / b = Ci / (2 Ci + Csc), the gain at high frequency; below 1/2."""
-        return self.Ci / (2.0 * self.Ci + self.Csc)
+        """The divider a / b = Ci / (2 Ci + Csc), the gain at high frequency; at most 1/2."""
+        return 1.0 / (2.0 + self.Csc / self.Ci)  # in this form the logarithms' derivatives do not cancel
 
     @property
     def b(self) -> ArrayLike:
         """The time constant Rsc (2 Ci + Csc), s."""
         return self.Rsc * (2.0 * self.Ci + self.Csc)
 
-    def amplitude(self, omega: ArrayLike) -> Float[Array, "*shape"]:
-        """|Vsc / V|, eq. (25): g w b / sqrt(1 + (w b)^2)."""
-        x = jnp.asarray(omega) * self.b
-        below = x <= 1.0
-        small, inverse = jnp.where(below, x, 1.0), 1.0 / jnp.where(below, 1.0, x)
-        return self.g * jnp.where(below, small / jnp.sqrt(1.0 + small**2), 1.0 / jnp.sqrt(1.0 + inverse**2))
-
-    def phase(self, omega: ArrayLike) -> Float[Array, "*shape"]:
-        """arctan(1 / (w b)) in rad, eq. (26)."""
-        return jnp.arctan2(1.0, jnp.asarray(omega) * self.b)
-
     def terms(self) -> Terms:
         """One term: the divider g with the time constant b."""
         return Terms((self.g,), (self.b,))
+
+    def amplitude(self, omega: ArrayLike) -> Float[Array, "*shape"]:
+        """|Vsc / V| at the angular frequency `omega` (rad/s, >= 0), eq. (25)."""
+        return self.g * highpass_amplitude(jnp.asarray(omega) * self.b)
+
+    def phase(self, omega: ArrayLike) -> Float[Array, "*shape"]:
+        """The angle (rad) by which Vsc leads V at the angular frequency `omega` (rad/s, >= 0), eq. (26)."""
+        return jnp.arctan2(1.0, jnp.asarray(omega) * self.b)
 
     def current_terms(self) -> Terms:
         """I = Vsc (1 + s Rsc Csc) / Rsc: one term, and one that follows dV/dt."""
@@ -161,17 +169,20 @@ class Loop(Circuit):
     def _modes(self) -> tuple[Terms, Terms]:
         Ci, R0 = self.insulator(), self.resistance()
         R, C = (jnp.stack(jnp.broadcast_arrays(*x)) for x in zip(*self.elements(), strict=True))
+        C = jnp.maximum(C, _LEAST * Ci)
         return _modes_without_resistance(Ci, R, C) if R0 is None else _modes_with_resistance(Ci, R0, R, C)
 
 
 def _modes_without_resistance(Ci: ArrayLike, R: Array, C: Array) -> tuple[Terms, Terms]:
     """With x = v / sqrt(R) over the elements:  T x' + x = Ci sqrt(R) V',  T = diag(R C) + Ci sqrt(R) sqrt(R)^T."""
     root = jnp.sqrt(R)
-    tau, modes = jnp.linalg.eigh(jnp.diag(R * C) + Ci * jnp.outer(root, root))
+    tau, modes = _modes_of(jnp.vstack([jnp.diag(jnp.sqrt(R * C)), jnp.sqrt(Ci) * root]))
     drive = Ci * (modes.T @ root) / tau
     vsc = root[0] * modes[0] * drive
     current = drive**2
-    rate = 1.0 / (1.0 / Ci + jnp.sum(1.0 / C))
+    rate = Ci
+    for each in C:
+        rate = rate * (each / (rate + each))
     return Terms(tuple(vsc), tuple(tau)), Terms(tuple(current), tuple(tau), rate)
 
 
@@ -181,10 +192,18 @@ def _modes_with_resistance(Ci: ArrayLike, R0: ArrayLike, R: Array, C: Array) -> 
     P holds the resistances that each capacitor's terminals see: its own R, for Ci the whole loop's.
     """
     root = jnp.sqrt(jnp.append(C, Ci))
-    seen = jnp.diag(jnp.append(R, R0 + jnp.sum(R))).at[-1, :-1].set(-R).at[:-1, -1].set(-R)
-    tau, modes = jnp.linalg.eigh(jnp.outer(root, root) * seen)
+    # each row is one resistance's current, times its square root
+    through = jnp.vstack([jnp.diag(root[:-1]), jnp.zeros_like(C)])
+    current = jnp.append(jnp.full_like(R, -1.0), 1.0)[:, None] * root[-1]
+    tau, modes = _modes_of(jnp.sqrt(jnp.append(R, R0))[:, None] * jnp.hstack([through, current]))
     vsc = -modes[0] * modes[-1] * root[-1] / root[0]
     return Terms(tuple(vsc), tuple(tau)), Terms(tuple(Ci * modes[-1] ** 2 / tau), tuple(tau))
+
+
+def _modes_of(factor: Array) -> tuple[Array, Array]:
+    """Eigenvalues and eigenvectors of factor^T factor: from the factor, small eigenvalues keep twice the digits."""
+    _, sigma, modes = jnp.linalg.svd(factor, full_matrices=False)
+    return sigma * sigma, modes.T
 
 
 class Probe(eqx.Module):

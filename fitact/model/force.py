@@ -7,6 +7,10 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from fitact.model.circuit import Circuit
+from fitact.model.drive import Drive
+from fitact.model.steady import mean_square, peak
+
 EPSILON_0 = 8.85e-12  # F/m, the paper's value
 
 
@@ -59,11 +63,34 @@ def plate_resistance(resistivity: ArrayLike, area: ArrayLike, thickness: ArrayLi
 
 def electrostatic_force(vsc: ArrayLike, contact: Contact) -> Float[Array, "*shape"]:
     """The electrostatic force in N for the skin voltage `vsc` (V), eqs. (1) and (22)."""
-    layers = contact.insulator_thickness / jnp.asarray(
-        contact.insulator_permittivity
-    ) + contact.skin_thickness / jnp.asarray(contact.skin_permittivity)
+    vsc = jnp.asarray(vsc)
+    return force_constant(contact) * vsc * vsc
+
+
+def force_constant(contact: Contact) -> Array:
+    """The electrostatic force per Vsc^2 in N/V^2, eqs. (1) and (22); 0 where a permittivity is 0."""
+    insulator, skin = jnp.asarray(contact.insulator_permittivity), jnp.asarray(contact.skin_permittivity)
     gap = jnp.asarray(contact.insulator_thickness) + contact.skin_thickness
-    return EPSILON_0 * contact.area * jnp.square(vsc) / (2.0 * layers * gap)
+    layers = contact.insulator_thickness * skin + contact.skin_thickness * insulator
+    return EPSILON_0 * contact.area / (2.0 * gap) * (insulator * (skin / layers))
+
+
+def mean_force(circuit: Circuit, drive: Drive, contact: Contact) -> Float[Array, ""]:
+    """The electrostatic force in N, averaged over a period of the steady state: exact, eqs. (1) and (22).
+
+    Raises:
+        InputError: the drive does not repeat.
+    """
+    return force_constant(contact) * mean_square(circuit, drive)
+
+
+def peak_force(circuit: Circuit, drive: Drive, contact: Contact) -> Float[Array, ""]:
+    """The largest electrostatic force in N over a period of the steady state: exact, eqs. (1) and (22).
+
+    Raises:
+        InputError: the drive does not repeat.
+    """
+    return electrostatic_force(peak(circuit, drive), contact)
 
 
 def friction(force: ArrayLike, coefficient: ArrayLike, normal_force: ArrayLike) -> Float[Array, "*shape"]:

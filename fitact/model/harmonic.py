@@ -16,7 +16,7 @@ from jaxtyping import Array, Complex, Float
 
 from fitact.errors import InputError
 from fitact.model.circuit import Circuit
-from fitact.model.drive import Drive, Periodic, PiecewiseLinear, Sampled, Sine
+from fitact.model.drive import Drive, Line, Periodic, PiecewiseLinear, Sine
 
 _TAIL = 64  # an error is summed up to this many times the harmonics kept,
 _LEAST = 4096  # and to this harmonic at least
@@ -93,7 +93,7 @@ def fourier(drive: Drive, harmonics: int) -> Complex[Array, " harmonics"]:
     if isinstance(drive, Sine):
         return jnp.where(order == 1.0, -0.25j * jnp.asarray(drive.peak_to_peak), 0.0)
     fundamental(drive)
-    assert isinstance(drive, PiecewiseLinear | Sampled)
+    assert isinstance(drive, PiecewiseLinear | Line)
     knots, start, end = drive.pieces()
     period = knots[-1] - knots[0]
     at, middle = (knots[:-1] - knots[0]) / period, (0.5 * (knots[1:] + knots[:-1]) - knots[0]) / period
@@ -123,17 +123,17 @@ def frequency(drive: Drive) -> ArrayLike:
     """
     if isinstance(drive, Periodic):
         return drive.frequency
-    if isinstance(drive, Sampled) and drive.period is not None:
+    if isinstance(drive, Line) and drive.period is not None:
         return 1.0 / drive.period
     raise InputError("only a periodic drive has harmonics; give a sampled one its period: Sampled(..., period=T)")
 
 
 def _cycles(drive: Drive, time: Array) -> Array:
     """Cycles since the last start of a period, in [0, 1): their product with k keeps its digits."""
-    if isinstance(drive, Sampled):
-        return jnp.mod((time - drive.time[0]) / drive.period, 1.0)
+    if isinstance(drive, Line):
+        return jnp.mod((time - drive.begin) / drive.period, 1.0)
     assert isinstance(drive, Periodic)
-    return drive.phase(time)[0]
+    return drive.cycle(time)[0]
 
 
 def _turn(cycles: Array) -> Array:

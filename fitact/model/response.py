@@ -26,8 +26,6 @@ from fitact.model.harmonic import fourier, frequency, fundamental, gain, harmoni
 from fitact.model.polynomial import evaluate, particular
 from fitact.model.skin import WithSkin
 
-_SERIES = 0.03  # below, the quotients with expm1 lose digits in their derivatives
-
 
 def response(
     circuit: Circuit,
@@ -204,19 +202,32 @@ def _along(drive: PiecewiseLinear | Line, time: Array, tau: ArrayLike, u: Array)
     return u[piece] * jnp.exp(-since / tau) + drive.pieces().slopes()[piece] * since * phi(since / tau)
 
 
+def steady_knots(pieces: Pieces, tau: ArrayLike) -> Float[Array, " pieces"]:
+    """u just after the start of each piece, in the steady state."""
+    return knot_values(pieces, tau, _settled(pieces, tau))
+
+
 def _settled(pieces: Pieces, tau: ArrayLike) -> Array:
     """u just after the start of a period, in the steady state.
 
-    u0 (1 - e^{-T/tau}) is the sum over a period of (increment) x (decay until its end). The
-    increments of a period add up to nothing, so decay - 1 may stand for decay: every weight is then
-    negative and small with T/tau, and the quotient keeps its digits.
+    u0 (1 - e^{-T/tau}) is the sum over a period of (increment) x (decay until its end). Where T/tau is
+    large that is how it is computed. Where it is small all decays are close to 1: the increments of a
+    period add up to nothing, so decay - 1 may stand for decay, and the quotient keeps its digits.
+    Fractions of the period, which do not depend on tau, keep those of its derivative; so does 1 - exp where
+    that is no loss, since the derivative of expm1 is computed as expm1 + 1.
     """
     knots, start, end = pieces
-    length = jnp.diff(knots)
-    left = (knots[-1] - knots[1:]) / tau  # from the end of each piece to the end of the period
-    jump = jnp.append(start[1:], start[0]) - end
-    ramp_weight = jnp.expm1(-left) * phi(length / tau) - (length / tau) * psi(length / tau)
-    return -jnp.sum(jump * jnp.expm1(-left) + (end - start) * ramp_weight) / jnp.expm1(-(knots[-1] - knots[0]) / tau)
+    period = knots[-1] - knots[0]
+    left, share = (knots[-1] - knots[1:]) / period, jnp.diff(knots) / period
+    jump, rise = jnp.append(start[1:], start[0]) - end, end - start
+    x = period / tau
+    few, many = jnp.where(x < 1.0, x, 1.0), jnp.where(x < 1.0, 1.0, x)
+
+    lam = share * few
+    ratio = left * phi(left * few) / phi(few)  # (1 - e^{-left x}) / (1 - e^{-x})
+    slow = -jnp.sum(jump * ratio + rise * (ratio * phi(lam) + share * psi(lam) / phi(few)))
+    fast = jnp.sum((jump + rise * phi(share * many)) * jnp.exp(-left * many)) / (1.0 - jnp.exp(-many))
+    return jnp.where(x < 1.0, slow, fast)
 
 
 def _sine(drive: Sine, tau: ArrayLike, time: Array) -> Array:
@@ -247,24 +258,43 @@ def _from_rest(settled: Array, difference: ArrayLike, since: Array, tau: ArrayLi
     return jnp.where(since >= 0.0, settled + difference * jnp.exp(-later / tau), 0.0)
 
 
+@jax.custom_jvp
 def phi(x: ArrayLike) -> Array:
-    """(1 - e^{-x}) / x for x >= 0, with its derivative."""
+    """(1 - e^{-x}) / x for x >= 0."""
     x = jnp.asarray(x, dtype=float)
-    large = jnp.where(x < _SERIES, 1.0, x)
-    return jnp.where(x < _SERIES, _exponential_series(x, 1), -jnp.expm1(-large) / large)
+    return jnp.where(x == 0.0, 1.0, -jnp.expm1(-x) / jnp.where(x == 0.0, 1.0, x))
+
+
+@phi.defjvp
+def _phi_jvp(primals: tuple[ArrayLike], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (x,), (dx,) = primals, tangents
+    return phi(x), phi(x) * log_slope(x) * dx
 
 
 def psi(x: ArrayLike) -> Array:
-    """(1 - phi(x)) / x = (e^{-x} - 1 + x) / x^2 for x >= 0, with its derivative."""
+    """(1 - phi(x)) / x = (e^{-x} - 1 + x) / x^2 for x >= 0."""
+    return phi(x) * (0.5 + bend(x))
+
+
+def log_slope(x: ArrayLike) -> Array:
+    """The derivative of log phi(x), for x >= 0: from -1/2 towards -1/x."""
     x = jnp.asarray(x, dtype=float)
-    large = jnp.where(x < _SERIES, 1.0, x)
-    return jnp.where(x < _SERIES, 0.5 * _exponential_series(x, 2), (1.0 + jnp.expm1(-large) / large) / large)
+    large = jnp.where(x < 2.0, 2.0, x)
+    return jnp.where(x < 2.0, bend(x) - 0.5, jnp.exp(-large) / (1.0 - jnp.exp(-large)) - 1.0 / large)
 
 
-def _exponential_series(x: Array, first: int) -> Array:
-    """first! sum_n (-x)^n / (n + first)!, to double precision (and its gradient's) below `_SERIES`."""
-    x = jnp.where(x < _SERIES, x, 0.0)
-    total = jnp.ones_like(x)
-    for n in reversed(range(8)):
-        total = 1.0 - x * (1.0 / (n + 1 + first)) * total
+def bend(x: ArrayLike) -> Array:
+    """1 / (e^x - 1) - 1/x + 1/2 for x >= 0: from x/12 towards 1/2."""
+    x = jnp.asarray(x, dtype=float)
+    small, large = jnp.where(x < 2.0, x, 0.0), jnp.where(x < 2.0, 2.0, x)
+    direct = jnp.exp(-large) / (1.0 - jnp.exp(-large)) - 1.0 / large + 0.5
+    return jnp.where(x < 2.0, 0.25 * small / coth_fraction(0.25 * small * small), direct)
+
+
+def coth_fraction(z: ArrayLike) -> Array:
+    """3 + z / (5 + z / (7 + ...)) to double precision for 0 <= z <= 1; w coth w = 1 + w^2 / coth_fraction(w^2)."""
+    z = jnp.asarray(z, dtype=float)
+    total = jnp.full_like(z, 21.0)
+    for odd in range(19, 1, -2):
+        total = odd + z / total
     return total

@@ -1,0 +1,267 @@
+"""What a steady state amounts to over a period, exactly: mean squares, peaks, and the current in the body.
+
+With u the response of one high-pass term s tau / (1 + s tau) and S(tau) its mean square, two terms have
+
+    mean(u_j u_k) = (tau_k S(tau_j) + tau_j S(tau_k)) / (tau_j + tau_k),   mean(u V') = S(tau) / tau,
+
+so S serves every circuit. Written so that neither it nor its derivative cancels at either end of tau.
+"""
+
+import itertools
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from fitact.errors import InputError
+from fitact.model.circuit import Circuit, FinalCircuit, Terms, highpass_amplitude
+from fitact.model.drive import Drive, Line, Periodic, Pieces, PiecewiseLinear, Sine, Square, Trapezoid, Triangle
+from fitact.model.response import bend, coth_fraction, log_slope, phi, psi, steady_knots
+
+_HALVINGS = 160  # of a bracket that begins at 0: to the last bit of an extreme far closer to 0 than to the end
+
+
+class BodyCurrent(NamedTuple):
+    """The trunk current over a period of the steady state, A."""
+
+    rms: Array
+    peak: Array
+
+
+def mean_square(circuit: Circuit, drive: Drive, channel: Literal["Vsc", "I"] = "Vsc") -> Float[Array, ""]:
+    """The mean square over a period of Vsc (V^2) or of the trunk current I (A^2), in the steady state.
+
+    Exact. Where the current follows dV/dt and the drive jumps it is infinite.
+
+    Raises:
+        InputError: the drive does not repeat.
+    """
+    terms = circuit.terms() if channel == "Vsc" else circuit.current_terms()
+    pairs = list(zip(terms.weight, terms.tau, strict=True))
+    each = [weight * highpass_mean_square(drive, tau) for weight, tau in pairs]
+    total = jnp.asarray(0.0)
+    for j, (weight, tau) in enumerate(pairs):
+        total = total + weight * each[j]
+        for k, (other, other_tau) in enumerate(pairs[:j]):
+            both = tau + other_tau
+            total = total + 2.0 * (other * (other_tau / both) * each[j] + weight * (tau / both) * each[k])
+    if terms.rate is None:
+        return total
+    for part, (_, tau) in zip(each, pairs, strict=True):
+        total = total + 2.0 * terms.rate * part / tau
+    return jnp.where(_impulses(drive, terms.rate), jnp.inf, total + terms.rate**2 * _slope_mean_square(drive))
+
+
+def peak(circuit: Circuit, drive: Drive, channel: Literal["Vsc", "I"] = "Vsc") -> Float[Array, ""]:
+    """The largest |Vsc| (V) or |I| (A) over a period of the steady state, both sides of every jump included.
+
+    Exact: one time constant has its extremes at the ends of the straight pieces; of several, those in
+    between are bracketed and halved to the last bit. Where the current follows dV/dt and the drive jumps
+    it is infinite.
+
+    Raises:
+        InputError: the drive does not repeat.
+    """
+    if isinstance(drive, Sine):
+        omega = 2.0 * np.pi * jnp.asarray(drive.frequency)
+        gain = circuit.admittance(omega) if channel == "I" else circuit.transfer_function(omega)
+        amplitude = circuit.amplitude(omega) if channel == "Vsc" and isinstance(circuit, FinalCircuit) else abs(gain)
+        return abs(0.5 * jnp.asarray(drive.peak_to_peak)) * amplitude
+    terms = circuit.terms() if channel == "Vsc" else circuit.current_terms()
+    if isinstance(drive, Square | Triangle) and len(terms.tau) == 1 and terms.rate is None:
+        return abs(terms.weight[0] * jnp.asarray(drive.peak_to_peak)) * _highest(drive, drive.period / terms.tau[0])
+    largest = jnp.max(jnp.abs(_extremes(terms, _period(drive))))
+    return largest if terms.rate is None else jnp.where(_impulses(drive, terms.rate), jnp.inf, largest)
+
+
+def body_current(circuit: Circuit, drive: Drive) -> BodyCurrent:
+    """What flows through the body in the steady state: rms and peak of the trunk current in A, edges included.
+
+    The figure for electrical safety. At an ideal jump both are infinite where nothing resistive limits
+    the current: give the drive a rise time, or the circuit an R_H or a series resistor.
+
+    Raises:
+        InputError: the drive does not repeat.
+    """
+    return BodyCurrent(jnp.sqrt(mean_square(circuit, drive, "I")), peak(circuit, drive, "I"))
+
+
+def highpass_mean_square(drive: Drive, tau: ArrayLike) -> Array:
+    """S(tau), the mean square over a period of the response of s tau / (1 + s tau) to `drive`, V^2."""
+    if isinstance(drive, Sine):
+        omega = 2.0 * np.pi * jnp.asarray(drive.frequency)
+        return 0.5 * jnp.square(0.5 * jnp.asarray(drive.peak_to_peak) * highpass_amplitude(omega * tau))
+    if isinstance(drive, Square):
+        return jnp.square(jnp.asarray(drive.peak_to_peak)) * _rectangle(drive.duty, drive.period / tau)
+    if isinstance(drive, Triangle):
+        return _triangle(0.5 * jnp.asarray(drive.peak_to_peak), 0.25 * drive.period / tau)
+    general = _straight_pieces(_period(drive), tau)
+    return _trapezoid(drive, tau, general) if isinstance(drive, Trapezoid) else general
+
+
+def _period(drive: Drive) -> Pieces:
+    if isinstance(drive, PiecewiseLinear) or (isinstance(drive, Line) and drive.period is not None):
+        return drive.pieces()
+    if isinstance(drive, Periodic):
+        raise TypeError(f"no exact response to a {type(drive).__name__}")
+    raise InputError(
+        f"a {type(drive).__name__} drive without a period has no steady state to average over;"
+        " take a periodic drive, or Sampled(..., period=T)"
+    )
+
+
+@jax.custom_jvp
+def _rectangle(duty: ArrayLike, x: ArrayLike) -> Array:
+    """S of a rectangular wave of peak-to-peak 1 that is high for `duty` of its period; x = T / tau."""
+    duty = jnp.asarray(duty, dtype=float)
+    return duty * phi(duty * x) * ((1.0 - duty) * phi((1.0 - duty) * x) / phi(x))
+
+
+@_rectangle.defjvp
+def _rectangle_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    (d, x), (d_duty, dx) = primals, tangents
+    q = 1.0 - jnp.asarray(d, dtype=float)
+    value = _rectangle(d, x)
+    few, many = jnp.where(x < 2.0, x, 0.0), jnp.where(x < 2.0, 2.0, x)
+    slow = d * bend(d * few) + q * bend(q * few) - bend(few)  # what is left once -d/2 - q/2 + 1/2 has gone
+    fast = d * log_slope(d * many) + q * log_slope(q * many) - log_slope(many)
+    by_x = jnp.where(x < 2.0, slow, fast)
+    by_duty = jnp.exp(-d * x) / (d * phi(d * x)) - jnp.exp(-q * x) / (q * phi(q * x))
+    return value, value * by_x * dx + value * by_duty * d_duty
+
+
+def _triangle(amplitude: Array, y: Array) -> Array:
+    """(1 - tanh(y) / y) / y^2 times the amplitude squared; y = T / (4 tau)."""
+    few, many = jnp.where(y < 1.0, y, 0.0), jnp.where(y < 1.0, 1.0, y)
+    slow = 1.0 / (coth_fraction(few * few) + few * few)
+    return jnp.where(
+        y < 1.0, amplitude * amplitude * slow, jnp.square(amplitude / many) * (1.0 - jnp.tanh(many) / many)
+    )
+
+
+def _highest(drive: Square | Triangle, x: Array) -> Array:
+    """The highest |u| of one time constant for a peak-to-peak of 1; x = T / tau.
+
+    Of a triangle's crest the terms of first order cancel, and of a square's two edges the higher one may be
+    higher by less than rounding: neither the derivative's digits nor its edge come out of the pieces.
+    """
+    if isinstance(drive, Triangle):
+        y = 0.25 * x
+        few, many = jnp.where(y < 1.0, y, 0.0), jnp.where(y < 1.0, 1.0, y)
+        fraction = coth_fraction(few * few)
+        return 0.5 * jnp.where(y < 1.0, fraction / (fraction + few * few), jnp.tanh(many) / many)
+    duty = jnp.asarray(drive.duty, dtype=float)
+    longer = jnp.maximum(duty, 1.0 - duty)
+    few, many = jnp.where(x < 1.0, x, 0.0), jnp.where(x < 1.0, 1.0, x)
+    slow = longer * phi(longer * few) / phi(few)
+    return jnp.where(x < 1.0, slow, (1.0 - jnp.exp(-longer * many)) / (1.0 - jnp.exp(-many)))
+
+
+def _trapezoid(drive: Trapezoid, tau: ArrayLike, general: Array) -> Array:
+    """S of a trapezoid, with `general` where the rise is longer than tau.
+
+    A trapezoid is a rectangular wave averaged over the rise. That multiplies S by (sinh(z/2) / (z/2))^2,
+    z = rise / tau, except that the product of edges with themselves falls short.
+    """
+    x, rise = drive.period / tau, jnp.asarray(drive.rise_time) / drive.period
+    z = jnp.where(rise * x < 1.0, rise * x, 0.0)
+    widened = _even_series(z * z, 2) * _rectangle(drive.duty, x)
+    shortfall = rise * _even_series(z * z, 3) / 3.0
+    square = jnp.square(jnp.asarray(drive.peak_to_peak))
+    return jnp.where(rise * x < 1.0, square * (widened - shortfall), general)
+
+
+def _even_series(z: Array, first: int) -> Array:
+    """first! sum_n z^n / (2 n + first)! for 0 <= z <= 1."""
+    total = jnp.ones_like(z)
+    for n in reversed(range(8)):
+        total = 1.0 + z * total / ((2 * n + first + 1) * (2 * n + first + 2))
+    return total
+
+
+def _straight_pieces(pieces: Pieces, tau: ArrayLike) -> Array:
+    """S of any period of straight pieces."""
+    length, rise = jnp.diff(pieces.knots), pieces.end - pieces.start
+    u, lam = steady_knots(pieces, tau), length / tau
+    third = phi(lam) * (_bend_over(lam) + 0.5 * psi(lam))  # of a rise from u = 0: (psi - phi^2 / 2) / lam
+    inside = u * u * phi(2.0 * lam) + u * rise * jnp.square(phi(lam)) + rise * rise * third
+    return jnp.sum(length / (pieces.knots[-1] - pieces.knots[0]) * inside)
+
+
+def _bend_over(x: Array) -> Array:
+    """bend(x) / x, finite at 0."""
+    few, many = jnp.where(x < 2.0, x, 0.0), jnp.where(x < 2.0, 2.0, x)
+    return jnp.where(x < 2.0, 0.25 / coth_fraction(0.25 * few * few), bend(many) / many)
+
+
+def _slope_mean_square(drive: Drive) -> Array:
+    """The mean square of dV/dt between jumps, V^2/s^2."""
+    if isinstance(drive, Sine):
+        return 0.5 * jnp.square(np.pi * jnp.asarray(drive.peak_to_peak) * drive.frequency)
+    knots, start, end = _period(drive)
+    return jnp.sum(jnp.square(end - start) / jnp.diff(knots)) / (knots[-1] - knots[0])
+
+
+def _impulses(drive: Drive, rate: ArrayLike) -> Array:
+    """Whether a current that follows dV/dt meets a jump."""
+    if isinstance(drive, Sine):
+        return jnp.asarray(False)
+    _, start, end = _period(drive)
+    return jnp.any(rate * (start - jnp.roll(end, 1)) != 0.0)
+
+
+def _extremes(terms: Terms, pieces: Pieces) -> Array:
+    """The response at both ends of every piece and at the extremes in between.
+
+    Of the latter the first derivatives are right, not the second: where an extreme lies is held fixed.
+    """
+    length, rise = jnp.diff(pieces.knots), pieces.end - pieces.start
+    tau = jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, terms.tau)))
+    u = jnp.stack([steady_knots(pieces, t) for t in terms.tau])
+
+    def at(since: Array) -> Array:
+        total = 0.0 if terms.rate is None else terms.rate * (rise / length)
+        for weight, t, first in zip(terms.weight, terms.tau, u, strict=True):
+            total = total + weight * (first * jnp.exp(-since / t) + rise * (since / length) * phi(since / t))
+        return total
+
+    # the derivative is a sum of exponentials; to first order, a shift of an extreme does not change it
+    weight = jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, terms.weight)))
+    fall = weight[:, None] * (rise / length - u / tau[:, None])
+    inside = _zeros(*lax.stop_gradient((fall, 1.0 / tau, length)))
+    after, before = at(jnp.zeros_like(length)), at(length)
+    if len(terms.tau) == 1:  # a level only decays; to rounding its end may equal its start, but not in the derivative
+        before = jnp.where(rise == 0.0, 0.0, before)
+    return jnp.stack([after, before, *map(at, inside)])
+
+
+def _zeros(factor: Array, rate: Array, length: Array) -> list[Array]:
+    """Where sum_k factor[k] e^{-rate[k] s} changes sign in 0 < s < length: one s fewer than terms (or an end).
+
+    n exponentials have at most n - 1 zeros: times e^{rate[0] s} and differentiated they are n - 1
+    exponentials, and between two zeros of these the sum times e^{rate[0] s} is monotone.
+    """
+    if len(rate) == 1:
+        return []
+    turns = _zeros(factor[1:] * (rate[0] - rate[1:])[:, None], rate[1:], length)
+    slowest = jnp.min(rate)
+
+    def positive(s: Array) -> Array:
+        return jnp.sum(factor * jnp.exp(-(rate - slowest)[:, None] * s), axis=0) > 0.0
+
+    def halve(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = bracket
+        middle = 0.5 * (low + high)
+        same = positive(middle) == rising
+        return jnp.where(same, middle, low), jnp.where(same, high, middle)
+
+    found = []
+    ends = [jnp.zeros_like(length), *turns, length]
+    for low, high in itertools.pairwise(ends):
+        rising = positive(low)
+        found.append(lax.fori_loop(0, _HALVINGS, halve, (low, high))[0])
+    return found

@@ -1,0 +1,66 @@
+"""The whole box of parameters: accuracy against mpmath, and nothing that is not finite."""
+
+import extremes
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fitact
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+@pytest.mark.parametrize("name", ["transfer", *extremes.DRIVES])
+def test_accuracy(name: str, kind: type):
+    for _, quantity, what, worst in extremes.sweep(kind, (name,)):
+        allowed = extremes.TOLERANCE[kind] if what == "value" else extremes.GRADIENT_TOLERANCE
+        assert worst.error <= allowed, (quantity, what, worst)
+        assert worst.compared >= 1200, (quantity, what, worst)
+
+
+@pytest.mark.parametrize("name", ["transfer", *extremes.DRIVES])
+def test_single_precision_gradients_are_finite(name: str):
+    with jax.enable_x64(False):
+        _, slopes = extremes.ours(name, extremes.rows_for(np.float32), True)
+    for quantity, slope in slopes.items():
+        assert np.all(np.isfinite(slope)), quantity
+
+
+def loops(point: jax.Array) -> dict[str, fitact.DirectGround | fitact.NaturalGround]:
+    Rsc, Csc, Ci, _, other_R, other_C, R0 = point
+    return {
+        "unequal skins": fitact.DirectGround(Rsc, Csc, Ci, grounding_Rsc=other_R, grounding_Csc=other_C),
+        "R_H": fitact.DirectGround(Rsc, Csc, Ci, R_H=R0, grounding_Rsc=other_R, grounding_Csc=other_C),
+        "natural": fitact.NaturalGround(Rsc, Csc, Ci, Z=R0),
+    }
+
+
+@pytest.mark.parametrize("name", ["unequal skins", "R_H", "natural"])
+def test_other_circuits(name: str):
+    """Finite everywhere; |H| against its impedances, where time constants may lie 24 decades apart."""
+    rows = extremes.points()
+    others = 10.0 ** np.random.default_rng(5).uniform([0.0, -18.0, 0.0], [12.0, -3.0, 12.0], (len(rows), 3))
+    rows = np.column_stack([rows, others])
+
+    def figures(logs: jax.Array, point: jax.Array) -> jax.Array:
+        point = point * jnp.exp(logs)
+        circuit, f = loops(point)[name], point[3]
+        drive = fitact.Trapezoid(360.0, f, 0.01 / f)
+        gain = jnp.abs(circuit.transfer_function(2.0 * np.pi * f))
+        current = fitact.body_current(circuit, drive)
+        return jnp.stack([gain, fitact.mean_square(circuit, drive), fitact.peak(circuit, drive), *current])
+
+    with jax.enable_x64(True):
+        values = np.asarray(jax.jit(jax.vmap(figures, (None, 0)))(jnp.zeros(7), rows))
+        slopes = np.asarray(jax.jit(jax.vmap(jax.jacrev(figures), (None, 0)))(jnp.zeros(7), rows))
+    assert np.all(np.isfinite(values))
+    assert np.all(np.isfinite(slopes))
+
+    Rsc, Csc, Ci, f, other_R, other_C, R0 = rows.T
+    omega = 2.0 * np.pi * f
+    skin = Rsc / (1.0 + 1j * omega * Rsc * Csc)
+    grounding = other_R / (1.0 + 1j * omega * other_R * other_C)
+    rest = {"unequal skins": grounding, "R_H": grounding + R0, "natural": R0}[name]
+    expected = np.abs(skin / (skin + rest + 1.0 / (1j * omega * Ci)))
+    assert np.max(np.abs(values[:, 0] - expected)) < 1e-5
+    assert np.quantile(np.abs(values[:, 0] / expected - 1.0), 0.85) < 1e-11
