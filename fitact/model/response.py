@@ -19,6 +19,8 @@ from fitact.errors import InputError
 from fitact.model.circuit import Circuit, highpass_gain
 from fitact.model.drive import Drive, Pieces, PiecewiseLinear, Sampled, Sine
 
+_FEW = 8  # pieces told apart by comparison rather than looked up
+
 
 def response(
     circuit: Circuit,
@@ -104,7 +106,18 @@ def _along(drive: PiecewiseLinear | Sampled, time: Array, tau: ArrayLike, u: Arr
     piece, since = drive.locate(time)
     slope = (end - start) / jnp.diff(knots)
     since = jnp.maximum(since, 0.0)
-    return u[piece] * jnp.exp(-since / tau) + slope[piece] * since * phi(since / tau)
+    level, steepness = _of_piece(u, piece), _of_piece(slope, piece)
+    return level * jnp.exp(-since / tau) + steepness * since * phi(since / tau)
+
+
+def _of_piece(values: Array, piece: Array) -> Array:
+    """values[piece]; of a few values by comparison, which XLA fuses with the rest and a gather it does not."""
+    if values.size > _FEW:
+        return values[piece]
+    found = values[0]
+    for k in range(1, values.size):
+        found = jnp.where(piece >= k, values[k], found)
+    return jnp.broadcast_to(found, piece.shape)
 
 
 def steady_knots(pieces: Pieces, tau: ArrayLike) -> Float[Array, " pieces"]:
