@@ -2,7 +2,7 @@
 # make test   set up, run the tests
 PY = .venv/bin/python
 .DEFAULT_GOAL = help
-.PHONY: help env demo test notebooks check lock clean
+.PHONY: help env demo test notebooks extremes check lock clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -19,6 +19,10 @@ test: env
 # make notebooks   run the notebooks; executed copies in out/notebooks
 notebooks: env
 	$(PY) tools/run_notebooks.py notebooks/*.py
+
+# make extremes   the worst point of every quantity over the whole range of parameters, against mpmath
+extremes: env
+	$(PY) tests/extremes.py
 
 # make check   style, types, and the order of the layers
 check: env

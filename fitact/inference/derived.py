@@ -9,8 +9,9 @@ from jaxtyping import Array, Float
 from fitact.data.record import Record
 from fitact.inference.likelihood import CHARGE, Likelihood
 from fitact.inference.start import DriveChoice, whole_periods
+from fitact.model.circuit import FinalCircuit
 from fitact.model.drive import Periodic, PiecewiseLinear
-from fitact.model.force import Contact, electrostatic_force, friction, summarize
+from fitact.model.force import Contact, electrostatic_force, friction, mean_force, peak_force, summarize
 from fitact.model.response import response
 from fitact.model.scene import Scene
 
@@ -53,10 +54,13 @@ class Derived(eqx.Module):
         vsc = response(circuit, model.drive, self.time, steady_state=model.steady_state)
         beta = model.drawn(theta, sigma, deviate)
         vsc = vsc + beta[CHARGE] * model.linear_sd[CHARGE] * model.decay(theta, self.time) / model.gain(theta)
-        contact = Contact.from_capacitances(
+        return electrostatic_force(vsc, self.contact(circuit))
+
+    def contact(self, circuit: FinalCircuit) -> Contact:
+        """The contact whose permittivities follow from the circuit's capacitances, eq. (3)."""
+        return Contact.from_capacitances(
             circuit.Ci, circuit.Csc, self.area, self.insulator_thickness, self.skin_thickness
         )
-        return electrostatic_force(vsc, contact)
 
     def __call__(
         self, theta: Float[Array, " parameters"], sigma: ArrayLike, deviate: ArrayLike = 0.0
@@ -64,6 +68,9 @@ class Derived(eqx.Module):
         """All of `NAMES`, in SI units."""
         circuit = self.likelihood.circuit(theta)
         force = summarize(self.force(theta, sigma, deviate), self.weight)
+        if self.likelihood.steady_state and isinstance(self.likelihood.drive, Periodic):  # rms alone needs quadrature
+            contact, drive = self.contact(circuit), self.likelihood.drive
+            force = force._replace(mean=mean_force(circuit, drive, contact), peak=peak_force(circuit, drive, contact))
         felt = friction(force.mean, self.coefficient, self.normal_force)
         return jnp.stack([circuit.g, circuit.b, force.mean, force.peak, force.rms, felt])
 

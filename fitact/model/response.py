@@ -26,6 +26,8 @@ from fitact.model.harmonic import fourier, frequency, fundamental, gain, harmoni
 from fitact.model.polynomial import evaluate, particular
 from fitact.model.skin import WithSkin
 
+_FEW = 8  # pieces told apart by comparison rather than looked up
+
 
 def response(
     circuit: Circuit,
@@ -199,7 +201,18 @@ def _along(drive: PiecewiseLinear | Line, time: Array, tau: ArrayLike, u: Array)
     """u(t) from its values at the starts of the pieces."""
     piece, since = drive.locate(time)
     since = jnp.maximum(since, 0.0)
-    return u[piece] * jnp.exp(-since / tau) + drive.pieces().slopes()[piece] * since * phi(since / tau)
+    level, steepness = _of_piece(u, piece), _of_piece(drive.pieces().slopes(), piece)
+    return level * jnp.exp(-since / tau) + steepness * since * phi(since / tau)
+
+
+def _of_piece(values: Array, piece: Array) -> Array:
+    """values[piece]; of a few values by comparison, which XLA fuses with the rest and a gather it does not."""
+    if values.size > _FEW:
+        return values[piece]
+    found = values[0]
+    for k in range(1, values.size):
+        found = jnp.where(piece >= k, values[k], found)
+    return jnp.broadcast_to(found, piece.shape)
 
 
 def steady_knots(pieces: Pieces, tau: ArrayLike) -> Float[Array, " pieces"]:

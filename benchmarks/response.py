@@ -1,0 +1,88 @@
+"""What the exact response costs, side by side with scipy.signal.lsim and with one bare NumPy exp per sample.
+
+    python benchmarks/response.py [--json]
+
+One from-rest period of a triangle, 5,000 samples; lsim's first-order hold is exact for it. Rounds are interleaved.
+"""
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable
+
+import jax
+import numpy as np
+import scipy.signal
+
+import fitact
+
+SAMPLES, ROUNDS = 5000, 40
+R, C, CI = 160e3, 22e-9, 1.35e-9
+B = R * (2.0 * CI + C)
+
+
+def seconds(function: Callable[[], object], calls: int) -> float:
+    start = time.perf_counter()
+    for _ in range(calls):
+        function()
+    return (time.perf_counter() - start) / calls
+
+
+def contenders() -> dict[str, tuple[Callable[[], object], int]]:
+    """Name: (what is timed, calls a round). Accuracy is checked first."""
+    circuit, drive = fitact.FinalCircuit(R, C, CI), fitact.Triangle(360.0, 100.0)
+    t = np.arange(SAMPLES) * (0.01 / SAMPLES)
+    voltage = np.asarray(drive.value(t))
+    on_device = jax.device_put(t)
+    rest = jax.jit(lambda c, t: fitact.response(c, drive, t, steady_state=False))
+    steady = jax.jit(lambda c, t: fitact.response(c, drive, t))
+
+    bare, nothing = jax.jit(lambda t: jax.numpy.exp(-t / B)), jax.jit(lambda t: t + 1.0)
+
+    def lsim() -> np.ndarray:
+        return scipy.signal.lsim(([R * CI, 0.0], [B, 1.0]), voltage, t, interp=True)[1]
+
+    np.testing.assert_allclose(rest(circuit, on_device), lsim(), atol=1e-10)
+    return {
+        "exact": (lambda: rest(circuit, on_device).block_until_ready(), 50),
+        "steady": (lambda: steady(circuit, on_device).block_until_ready(), 50),
+        "jit call": (lambda: nothing(on_device).block_until_ready(), 50),
+        "exp in JAX": (lambda: bare(on_device).block_until_ready(), 50),
+        "numpy exp": (lambda: np.exp(-t / B), 50),
+        "lsim": (lsim, 1),
+    }
+
+
+def measured() -> dict[str, float]:
+    """Median seconds of each."""
+    with jax.enable_x64(True):
+        each = contenders()
+        for function, _ in each.values():
+            function()
+        rounds = [{name: seconds(*pair) for name, pair in each.items()} for _ in range(ROUNDS)]
+    return {name: statistics.median(one[name] for one in rounds) for name in each}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", action="store_true")
+    times = measured()
+    ratios = {
+        "exact_vs_lsim": times["lsim"] / times["exact"],
+        "exact_vs_numpy_exp": times["exact"] / times["numpy exp"],
+        "steady_vs_numpy_exp": times["steady"] / times["numpy exp"],
+        "jit_call_vs_numpy_exp": times["jit call"] / times["numpy exp"],
+        "jax_exp_vs_numpy_exp": times["exp in JAX"] / times["numpy exp"],
+    }
+    if parser.parse_args().json:
+        print(json.dumps(ratios))
+        return
+    for name, value in times.items():
+        print(f"{name:12}{value * 1e6:10.1f} us")
+    for name, value in ratios.items():
+        print(f"{name:22}{value:10.2f}")
+
+
+if __name__ == "__main__":
+    main()
