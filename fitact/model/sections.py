@@ -1,0 +1,312 @@
+"""The sections of a scene file: keys, units, defaults and what they refuse. Inside, every number is SI."""
+
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias
+
+import pydantic
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
+
+from fitact import units
+from fitact.errors import InputError
+from fitact.model.chirp import Chirp
+from fitact.model.drive import Burst, Drive, Periodic, Sine, Square, Trapezoid, Triangle
+from fitact.model.force import plate_capacitance
+from fitact.model.prior import Distribution, LogNormal, Uniform
+
+
+def _quantity(unit: str, **bounds: Any) -> Any:
+    """The type of a field in `unit`: SI floats inside, text with units accepted."""
+    return Annotated[float, BeforeValidator(lambda value: units.parse(value, unit)), Field(**bounds)]
+
+
+if TYPE_CHECKING:
+    Ohm: TypeAlias = float
+    Farad: TypeAlias = float
+    Meter: TypeAlias = float
+    SquareMeter: TypeAlias = float
+    Second: TypeAlias = float
+    Hertz: TypeAlias = float
+    Ratio: TypeAlias = float
+    Volt: TypeAlias = float
+    Angle: TypeAlias = float
+    AnyVolt: TypeAlias = float
+    AnyOhm: TypeAlias = float
+    NoiseVolt: TypeAlias = float
+    NoiseAmpere: TypeAlias = float
+    Newton: TypeAlias = float
+    Threshold: TypeAlias = float
+else:
+    Ohm = _quantity("ohm", gt=0)
+    Farad = _quantity("F", gt=0)
+    Meter = _quantity("m", gt=0)
+    SquareMeter = _quantity("m^2", gt=0)
+    Second = _quantity("s", gt=0)
+    Hertz = _quantity("Hz", gt=0)
+    Ratio = _quantity("", gt=0)
+    Volt = _quantity("V", gt=0)
+    Angle = _quantity("rad")
+    AnyVolt = _quantity("V")
+    AnyOhm = _quantity("ohm", ge=0)
+    NoiseVolt = _quantity("V", ge=0)
+    NoiseAmpere = _quantity("A", ge=0)
+    Newton = _quantity("N", ge=0)
+    Threshold = _quantity("N", gt=0)
+
+
+class Section(pydantic.BaseModel):
+    """What all sections are: frozen, and without keys they do not know."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Device(Section):
+    """The panel."""
+
+    Ci: Farad = 1.35e-9
+    insulator_thickness: Meter = 1e-6
+    insulator_permittivity: Ratio = 3.9
+    contact_area: SquareMeter = 1e-4
+
+    @model_validator(mode="after")
+    def _capacitance_of_the_layer(self) -> Self:
+        given = self.model_fields_set
+        if "Ci" not in given and {"insulator_thickness", "insulator_permittivity"} <= given:
+            Ci = plate_capacitance(self.insulator_permittivity, self.contact_area, self.insulator_thickness)
+            object.__setattr__(self, "Ci", Ci)  # eq. (3); the model is frozen from here on
+        return self
+
+
+class Skin(Section):
+    """One skin layer; `alpha` is the exponent of a fractional one (see `fitact.Fractional`)."""
+
+    Rsc: Ohm = 160e3
+    Csc: Farad = 22e-9
+    thickness: Meter = 200e-6
+    level: Literal["constant", "dispersive", "fractional"] = "constant"
+    alpha: Annotated[float, Field(gt=0, le=1)] = 0.8
+
+    @model_validator(mode="after")
+    def _alpha_of_a_fractional_skin(self) -> Self:
+        if "alpha" in self.model_fields_set and self.level != "fractional":
+            raise ValueError(f"alpha belongs to level = 'fractional', not to '{self.level}'")
+        return self
+
+
+class Grounding(Section):
+    """How the body is connected to the device's ground."""
+
+    connection: Literal["direct", "natural"] = "direct"
+    R_H: Ohm | None = None
+    grounding_Rsc: Ohm | None = None
+    grounding_Csc: Farad | None = None
+    Z: Ohm | None = None
+
+    @model_validator(mode="after")
+    def _Z_of_natural_ground(self) -> Self:
+        if self.connection == "natural" and self.Z is None:
+            raise ValueError("connection = 'natural' needs Z, the resistance to earth, such as '14.5 Mohm'")
+        return self
+
+
+_WAVES = ("sine", "triangle", "square", "trapezoid")
+_WAVEFORMS_OF = {  # the keys of [drive] that only some waveforms have
+    "frequency": (*_WAVES, "burst", "measured"),
+    "duty": ("square", "trapezoid", "burst"),
+    "phase": (*_WAVES, "burst", "chirp"),
+    "shape": ("burst",),
+    "cycles": ("burst",),
+    "start_frequency": ("chirp",),
+    "end_frequency": ("chirp",),
+    "sweep_time": ("chirp",),
+    "spacing": ("chirp",),
+}
+
+
+class DriveSection(Section):
+    """The voltage on the electrode."""
+
+    waveform: Literal["sine", "triangle", "square", "trapezoid", "burst", "chirp", "measured"] = "square"
+    peak_to_peak: Volt = 360.0
+    frequency: Hertz = 100.0
+    rise_time: Second | None = None
+    duty: Annotated[float, Field(gt=0, lt=1)] = 0.5
+    offset: AnyVolt = 0.0
+    phase: Angle = 0.0
+    shape: Literal["square", "sine", "triangle"] = "square"
+    cycles: Annotated[int, Field(ge=1)] = 5
+    start_frequency: Hertz | None = None
+    end_frequency: Hertz | None = None
+    sweep_time: Second | None = None
+    spacing: Literal["linear", "logarithmic"] = "linear"
+    steady_state: bool = True
+
+    @model_validator(mode="after")
+    def _keys_of_the_waveform(self) -> Self:
+        if (self.waveform == "trapezoid") != (self.rise_time is not None):
+            raise ValueError(
+                "rise_time belongs to waveform = 'trapezoid', which needs it"
+                f" (here: waveform = '{self.waveform}', rise_time {'absent' if self.rise_time is None else 'given'})"
+            )
+        for key, waveforms in _WAVEFORMS_OF.items():
+            if key in self.model_fields_set and self.waveform not in waveforms:
+                raise ValueError(f"{key} belongs to the waveforms {', '.join(waveforms)}, not to '{self.waveform}'")
+        if "duty" in self.model_fields_set and self.waveform == "burst" and self.shape != "square":
+            raise ValueError(f"duty belongs to a burst of shape = 'square', not '{self.shape}'")
+        if self.waveform == "chirp" and None in (self.start_frequency, self.end_frequency, self.sweep_time):
+            raise ValueError("waveform = 'chirp' needs start_frequency, end_frequency and sweep_time")
+        if self.rise_time is not None and self.rise_time >= min(self.duty, 1.0 - self.duty) / self.frequency:
+            raise ValueError("rise_time must be shorter than the high and the low part of the period")
+        return self
+
+    @model_validator(mode="after")
+    def _from_rest(self) -> Self:
+        if self.waveform in ("burst", "chirp"):
+            if "steady_state" in self.model_fields_set and self.steady_state:
+                raise ValueError(f"a {self.waveform} has no steady state; leave steady_state out, or make it false")
+            object.__setattr__(self, "steady_state", False)  # the model is frozen from here on
+        return self
+
+    @property
+    def slowest(self) -> float:
+        """The lowest frequency in it, Hz."""
+        return min(self.start_frequency or self.frequency, self.end_frequency or self.frequency)
+
+    def make(self) -> Drive:
+        """The drive.
+
+        Raises:
+            InputError: the waveform is 'measured', so only a record has it.
+        """
+        if self.waveform == "chirp":
+            start, end, duration = self.start_frequency, self.end_frequency, self.sweep_time
+            assert None not in (start, end, duration)  # checked when the section was read
+            return Chirp(self.peak_to_peak, start, end, duration, self.spacing, self.offset, self.phase)
+        if self.waveform == "burst":
+            return Burst(self._wave(self.shape), self.cycles)
+        return self._wave(self.waveform)
+
+    def _wave(self, shape: str) -> Periodic:
+        height, offset, phase = (self.peak_to_peak, self.frequency), self.offset, self.phase
+        if shape == "sine":
+            return Sine(*height, offset, phase)
+        if shape == "triangle":
+            return Triangle(*height, offset, phase)
+        if shape == "square":
+            return Square(*height, self.duty, offset, phase)
+        if shape == "trapezoid":
+            assert self.rise_time is not None  # checked when it was read
+            return Trapezoid(*height, self.rise_time, self.duty, offset, phase)
+        raise InputError(
+            f"scene: [drive] waveform = '{shape}' gives no drive to compute; name sine, triangle, square, trapezoid,"
+            " burst or chirp"
+        )
+
+
+class Measurement(Section):
+    """What is recorded, and through what."""
+
+    channels: tuple[Literal["Vsc", "I"], ...] = Field(default=("Vsc",), min_length=1)
+    series_resistor: AnyOhm = 0.0
+    probe_resistance: Ohm | None = None
+    probe_capacitance: Farad | None = None
+    sampling_rate: Hertz = 200e3
+    duration: Second = 20e-3
+    noise_Vsc: NoiseVolt = 0.1
+    noise_I: NoiseAmpere = 20e-9
+    gain_relative_sd: Annotated[float, Field(ge=0, lt=1)] = 0.0
+
+
+class Friction(Section):
+    """Eq. (2)."""
+
+    coefficient: Annotated[float, Field(gt=0)] = 0.5
+    normal_force: Newton = 0.5
+
+
+class Belief(Section):
+    """A prior for one parameter: a log-normal (median with factor or relative_sd), or uniform (low, high)."""
+
+    median: float | None = Field(default=None, gt=0)
+    factor: float | None = Field(default=None, gt=1, le=1e6)
+    relative_sd: float | None = Field(default=None, gt=0, le=10)
+    low: float | None = Field(default=None, gt=0)
+    high: float | None = Field(default=None, gt=0)
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        given = self.model_fields_set
+        kinds = (
+            {"low", "high"},
+            {"factor"},
+            {"relative_sd"},
+            {"median", "factor"},
+            {"median", "relative_sd"},
+        )
+        if given not in kinds:
+            raise ValueError("write {median, factor}, {median, relative_sd} or {low, high}")
+        if self.low is not None and self.high is not None and not self.low < self.high:
+            raise ValueError(f"low = {self.low:g} must be below high = {self.high:g}")
+        return self
+
+    def distribution(self, median: float) -> Distribution:
+        """The distribution; `median` where none is given."""
+        if self.low is not None and self.high is not None:
+            return Uniform(self.low, self.high)
+        median = self.median or median
+        if self.factor is not None:
+            return LogNormal.within_factor(median, self.factor)
+        assert self.relative_sd is not None  # _one_kind leaves nothing else
+        return LogNormal.with_relative_sd(median, self.relative_sd)
+
+
+def _belief(unit: str) -> Any:
+    def parse(value: object) -> object:
+        if not isinstance(value, dict):
+            return value
+        return {k: units.parse(v, unit) if k in ("median", "low", "high") else v for k, v in value.items()}
+
+    return Annotated[Belief, BeforeValidator(parse)]
+
+
+if TYPE_CHECKING:
+    BeliefOhm: TypeAlias = Belief
+    BeliefFarad: TypeAlias = Belief
+else:
+    BeliefOhm = _belief("ohm")
+    BeliefFarad = _belief("F")
+
+
+class PriorSection(Section):
+    """Beliefs; where one is silent on the median, the device's or the skin's value is it.
+
+    The skin's defaults reach, within their 95 %, from the paper's values to published whole-skin ones
+    (10 kohm and 5 nF dry, 4.3 kohm and 200 nF wet); the insulator's is a data sheet's 5 %.
+    """
+
+    Rsc: BeliefOhm = Belief(factor=50.0)
+    Csc: BeliefFarad = Belief(factor=20.0)
+    Ci: BeliefFarad = Belief(relative_sd=0.05)
+
+
+class ForceSection(Section):
+    """Which voltage makes the force."""
+
+    model: Literal["paper", "gap"] = "paper"
+
+
+class Perception(Section):
+    """What counts as felt."""
+
+    threshold_force: Threshold | None = None
+    friction_change: Annotated[float, Field(gt=0)] | None = None
+
+
+class PopulationSection(Section):
+    """What fingers on one panel share."""
+
+    contact_area: Literal["common", "varies"] = "common"
+
+
+class Tolerance(Section):
+    """The relative error the user accepts."""
+
+    force: Annotated[float, Field(gt=0, lt=1)] = 0.01
