@@ -46,6 +46,12 @@ Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Same se
 Json = Annotated[
     bool, typer.Option("--json", help="Print the result as JSON on standard output, and nothing else there.")
 ]
+Tolerance = Annotated[
+    float,
+    typer.Option(
+        "--tolerance", min=0.0, help="Error that compressing the record may cause in its log-likelihood; 0: none."
+    ),
+]
 Fresh = Annotated[bool, typer.Option("--fresh", help="Start the chain anew instead of going on from one in DIR.")]
 
 
@@ -55,6 +61,7 @@ def run(
     scene: SceneFile = None,
     out: Out = None,
     seed: Seed = 0,
+    tolerance: Tolerance = 1e-3,
     fresh: Fresh = False,
     json: Json = False,
 ) -> None:
@@ -63,7 +70,7 @@ def run(
     Writes fit.json, summary.json, posterior.nc (opens with ArviZ), chain.h5 (for going on) and report.html.
     """
     folder = out or _folder(record)
-    posterior = _sampled(record, scene, folder, seed, fresh)
+    posterior = _sampled(record, scene, folder, seed, tolerance, fresh)
     page = folder / "report.html"
     _say("writing the report")
     posterior.report(page)
@@ -72,9 +79,15 @@ def run(
 
 
 @app.command()
-def fit(record: RecordFile, scene: SceneFile = None, out: Out = None, json: Json = False) -> None:
+def fit(
+    record: RecordFile,
+    scene: SceneFile = None,
+    out: Out = None,
+    tolerance: Tolerance = 1e-3,
+    json: Json = False,
+) -> None:
     """Least squares only: parameters with errors, and the verdict, in seconds."""
-    fitted = _fitted(record, scene)
+    fitted = _fitted(record, scene, tolerance)
     if out is not None:
         write_json(out / "fit.json", fitted.to_dict())
     _show(str(fitted), fitted.to_dict(), json)
@@ -87,12 +100,13 @@ def sample(
     scene: SceneFile = None,
     out: Out = None,
     seed: Seed = 0,
+    tolerance: Tolerance = 1e-3,
     fresh: Fresh = False,
     json: Json = False,
 ) -> None:
     """Fit, then sample the posterior until it has converged; as `run`, without the report."""
     folder = out or _folder(record)
-    posterior = _sampled(record, scene, folder, seed, fresh)
+    posterior = _sampled(record, scene, folder, seed, tolerance, fresh)
     _show(f"{posterior}\nwrote {folder}; for a report: fitact report {folder}", posterior.summary(), json)
     _finish(posterior.trusted)
 
@@ -149,7 +163,7 @@ def _scene(path: Path | None) -> "Scene | None":
     return None if path is None else Scene.load(path)
 
 
-def _fitted(record: Path, scene: Path | None) -> "Fit":
+def _fitted(record: Path, scene: Path | None, tolerance: float) -> "Fit":
     from fitact.data.formats import read
 
     stated = _scene(scene)
@@ -160,12 +174,12 @@ def _fitted(record: Path, scene: Path | None) -> "Fit":
     from fitact.inference.fit import fit
 
     _say(f"fitting {record} ({len(measured):,} samples)")
-    return fit(measured, stated)
+    return fit(measured, stated, tolerance=tolerance)
 
 
-def _sampled(record: Path, scene: Path | None, folder: Path, seed: int, fresh: bool) -> "Posterior":
+def _sampled(record: Path, scene: Path | None, folder: Path, seed: int, tolerance: float, fresh: bool) -> "Posterior":
     """Fit and sample, and write all but the report, once the chain is known to belong there."""
-    fitted = _fitted(record, scene)
+    fitted = _fitted(record, scene, tolerance)
     from fitact.inference.sampling import sample
 
     chain = folder / "chain.h5"

@@ -14,10 +14,11 @@ from jaxtyping import Array, Float
 from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.inference import compressed, derived, summary
-from fitact.inference.diagnostics import is_coarse, is_misfit, statistics
+from fitact.inference.diagnostics import is_misfit, statistics
 from fitact.inference.identifiability import Identifiability, assess, covariance_root
 from fitact.inference.least_squares import Solved, result_message, result_name, solve
 from fitact.inference.likelihood import CHARGE, LINEAR, Likelihood, natural
+from fitact.inference.remarks import remarks
 from fitact.inference.start import (
     DriveChoice,
     LinearStart,
@@ -32,7 +33,6 @@ from fitact.units import engineering
 
 _DECREMENT = 1e-3  # how far below the optimum, in log-probability, a fit may end
 _OFFSET = 0.02  # of Vsc's span: standard deviation of an offset that the record is too short to show
-_IMPLAUSIBLE = 0.005  # share of the prior further out than g or b, below which it is remarked upon
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,6 +138,11 @@ class Fit:
             "full_because": self.full_because,
         }
 
+    def _likelihood(self) -> str:
+        if self.compression_error is None:
+            return f"summed over the samples each time, since {self.full_because}"
+        return f"compressed to {self.likelihood.rows} numbers, off by {self.compression_error:.1g} at most"
+
     def to_dict(self) -> dict[str, Any]:
         """What `fitact fit --json` prints and fit.json holds."""
         fitted = {"result": self.result, "message": self.message, "misfit": self.result == "misfit"}
@@ -167,6 +172,7 @@ class Fit:
             "correlations of the logs: "
             + ", ".join(f"{self.names[j]}-{self.names[i]} {self.correlation[i, j]:+.3f}" for i, j in pairs),
             f"reduced chi-square {self.figures['chi2_reduced']:.3f}. {self.message}",
+            f"log-likelihood: {self._likelihood()}.",
             str(self.identifiability),
         ]
         return "\n".join([*rows, *(f"warning: {warning}" for warning in self.warnings)])
@@ -315,7 +321,7 @@ def _judged(
         result=_result(solved, root, figures),
         figures=figures,
         identifiability=identifiability,
-        warnings=(*record.notes, *choice.notes, *_warnings(theta, likelihood, record, figures, no_scene)),
+        warnings=(*record.notes, *choice.notes, *remarks(theta, likelihood.prior, record, figures, no_scene)),
         compression_error=certified.error,
         full_because=certified.reason,
         likelihood=likelihood,
@@ -356,50 +362,3 @@ def _log_derived(derive: derived.Derived, theta: np.ndarray, sigma: float) -> tu
     with jax.enable_x64(True):
         values, gradient = _log_derived_jit(derive, jnp.asarray(theta), jnp.asarray(sigma))
         return np.asarray(values), np.asarray(gradient)
-
-
-def _warnings(
-    theta: np.ndarray, likelihood: Likelihood, record: Record, figures: dict[str, float], no_scene: bool
-) -> list[str]:
-    found = []
-    if no_scene:
-        found.append(
-            "no scene was given: the panel is taken to be the paper's (Ci 1.35 nF ± 5 %), and Rsc, Csc, Ci and the"
-            " force scale with that; state your panel's Ci under [device] in a scene file"
-        )
-    span = record.time[-1] - record.time[0]
-    if record.frequency() is None:
-        found.append(
-            f"the record ({engineering(span, 's')}) does not show its drive repeating: it is shorter than 1.5 periods"
-            " or not periodic, so the answer rests on a part of a wave; record two periods or more"
-        )
-    if is_coarse(figures):
-        found.append(
-            "V_V is sampled too coarsely for straight lines between its samples (they err by"
-            f" {engineering(figures['interpolation_error'], 'V')} in Vsc); record faster, or name the"
-            " waveform in a scene"
-        )
-    prior = likelihood.prior
-    for name, factor, tail in _plausibility(theta, prior):
-        if tail < _IMPLAUSIBLE:
-            found.append(
-                f"{name} is {factor:.3g} times what the prior expects (less than {100.0 * _IMPLAUSIBLE:.2g} % of it"
-                " lies so far out); check the probe's attenuation (x10), the units of time and voltage, and peak"
-                " against peak-to-peak"
-            )
-    return found
-
-
-def _plausibility(theta: np.ndarray, prior: Prior) -> list[tuple[str, float, float]]:
-    """For g and b, which the record knows: name, ratio to the prior's median, share of the prior further out."""
-    believed = prior.sample(np.random.default_rng(0), 10_000)  # for two tail areas, so any seed will do
-    r, c, i = np.exp(theta[:3])
-    total, expected = 2.0 * i + c, 2.0 * believed["Ci"] + believed["Csc"]
-    pairs = {
-        "the divider g": (i / total, believed["Ci"] / expected),
-        "the time constant b": (r * total, believed["Rsc"] * expected),
-    }
-    return [
-        (name, float(value / np.median(draws)), float(min(np.mean(draws < value), np.mean(draws > value))))
-        for name, (value, draws) in pairs.items()
-    ]

@@ -104,7 +104,8 @@ class PiecewiseLinear(Periodic):
         knots = self.pieces().knots
         cycle, slack = self.cycle(time)
         starts = knots[1:-1] / knots[-1]
-        piece = jnp.sum(cycle[..., None] + slack[..., None] >= starts, axis=-1)
+        # one comparison after the other fuses with what follows; a sum over an axis does not
+        piece = sum((cycle + slack >= start).astype(int) for start in starts)
         return piece, jnp.maximum(cycle * knots[-1] - knots[piece], 0.0)
 
     def value(self, time: ArrayLike) -> Float[Array, "*shape"]:

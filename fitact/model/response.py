@@ -20,8 +20,8 @@ from jaxtyping import Array, Float
 
 from fitact.errors import InputError
 from fitact.model.chirp import Chirp
-from fitact.model.circuit import Circuit, gain_at, highpass_gain
-from fitact.model.drive import Burst, Drive, Line, Pieces, PiecewiseLinear, Sampled, Sine
+from fitact.model.circuit import Circuit, gain_at, highpass_amplitude
+from fitact.model.drive import Burst, Drive, Line, Pieces, PiecewiseLinear, Sampled, Sine, Square
 from fitact.model.harmonic import fourier, frequency, fundamental, gain, harmonic_response, harmonic_sum
 from fitact.model.polynomial import evaluate, particular
 from fitact.model.skin import WithSkin
@@ -201,8 +201,10 @@ def _along(drive: PiecewiseLinear | Line, time: Array, tau: ArrayLike, u: Array)
     """u(t) from its values at the starts of the pieces."""
     piece, since = drive.locate(time)
     since = jnp.maximum(since, 0.0)
-    level, steepness = _of_piece(u, piece), _of_piece(drive.pieces().slopes(), piece)
-    return level * jnp.exp(-since / tau) + steepness * since * phi(since / tau)
+    left = _of_piece(u, piece) * jnp.exp(-since / tau)
+    if isinstance(drive, Square):
+        return left
+    return left + _of_piece(drive.pieces().slopes(), piece) * since * phi(since / tau)
 
 
 def _of_piece(values: Array, piece: Array) -> Array:
@@ -244,9 +246,9 @@ def _settled(pieces: Pieces, tau: ArrayLike) -> Array:
 
 
 def _sine(drive: Sine, tau: ArrayLike, time: Array) -> Array:
-    gain = 0.5 * jnp.asarray(drive.peak_to_peak) * highpass_gain(2.0 * np.pi * jnp.asarray(drive.frequency) * tau)
-    angle = 2.0 * np.pi * drive.cycle(time)[0]
-    return gain.real * jnp.sin(angle) + gain.imag * jnp.cos(angle)
+    x = 2.0 * np.pi * jnp.asarray(drive.frequency) * tau
+    height = 0.5 * jnp.asarray(drive.peak_to_peak) * highpass_amplitude(x)
+    return height * jnp.sin(2.0 * np.pi * drive.cycle(time)[0] + jnp.arctan2(1.0, x))
 
 
 @eqx.filter_jit  # loops are compiled anew at every call outside jit
