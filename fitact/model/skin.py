@@ -99,8 +99,7 @@ class Fractional(Skin):
     jump Vsc is what those highest frequencies make of it (at alpha = 1, within 5e-7 of the peak).
 
     Attributes:
-        alpha: 0 < alpha <= 1; about 0.8 for human stratum corneum (Kontturi and Murtomaki,
-            Pharm. Res. 11, 1355, 1994).
+        alpha: 0 < alpha <= 1. The default is no measurement: take your skin's own.
         harmonics: how many harmonics a response takes one by one.
     """
 
