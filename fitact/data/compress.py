@@ -20,7 +20,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from fitact.data.record import is_uniform
 from fitact.model.circuit import Terms
 from fitact.model.drive import Drive, Periodic, Sampled
 from fitact.model.response import highpass, phi, recurrence
@@ -32,6 +31,7 @@ _REACH = math.log(9.0)  # half width of the table in log tau
 _RANK = 1e-13  # singular values of the exponentials, relative, that are left out
 _EXACT = 1e-9  # of a step: how evenly samples must lie to be folded
 _BLOCK = 64  # samples in a block of the recurrence
+_LONGEST = 65_536  # samples until a drive repeats on the sampling grid, for folding
 _CHUNK = 8_192  # samples at a time, which bounds memory
 
 
@@ -233,7 +233,7 @@ def _inner(
 
 def _folded(table: _Table, drive: Drive, time: np.ndarray, observed: np.ndarray, period: int) -> Iterator[np.ndarray]:
     """With the periods laid over each other: the response is computed for one, the rest are sums."""
-    periods = max(1, min(_CHUNK, 1 << (time.size - 1).bit_length()) // period)
+    periods = max(1, _chunk_length(time.size) // period)
     reference = np.asarray(observed[:period])
     count = np.zeros(period)
     sums = np.zeros((len(SLOW) + 1, period))
@@ -261,18 +261,30 @@ def _over_periods(table: _Table, time: Array, observed: Array, weight: Array, re
 
 def _samples_a_period(drive: Drive, time: np.ndarray) -> int | None:
     """After how many samples drive and sampling grid meet again, if the record is long enough to gain by it."""
-    if not isinstance(drive, Periodic) or not is_uniform(time, _EXACT):
+    if not isinstance(drive, Periodic) or not _is_even(time):
         return None
+    advance = (time[-1] - time[0]) / (time.size - 1) * float(drive.frequency)  # cycles a sample
+    cycles = Fraction(advance).limit_denominator(max(1, min(time.size // 2, _LONGEST)))
+    rounding = 4.0 * np.finfo(float).eps * time.size
+    error = abs(advance - cycles) * time.size / advance  # by the end of the record, in samples
+    return cycles.denominator if cycles > 0 and error < _EXACT + rounding else None
+
+
+def _is_even(time: np.ndarray) -> bool:
+    """Whether the samples lie on a grid but for rounding, looked at a chunk at a time."""
     step = (time[-1] - time[0]) / (time.size - 1)
-    cycles = Fraction(step * float(drive.frequency)).limit_denominator(max(1, time.size // 2))
-    error = abs(step * float(drive.frequency) - cycles) * time.size
-    return cycles.denominator if cycles > 0 and error < _EXACT * step * float(drive.frequency) else None
+    slack = _EXACT * step + 4.0 * np.finfo(float).eps * max(abs(time[0]), abs(time[-1]))
+    starts = range(0, time.size, _LONGEST)
+    return all(
+        np.all(np.abs(time[i : i + _LONGEST] - (time[0] + step * np.arange(i, min(i + _LONGEST, time.size)))) <= slack)
+        for i in starts
+    )
 
 
 def _along_samples(table: _Table, drive: Sampled, time: np.ndarray, observed: np.ndarray) -> Iterator[np.ndarray]:
     """Along a measured drive, from sample to sample."""
     length, step, first = _chunk_length(time.size), float(table.step), float(drive.samples[0])
-    x = step / table.nodes if is_uniform(time, _EXACT) and step < float(jnp.min(table.nodes)) else None
+    x = step / table.nodes if _is_even(time) and step < float(jnp.min(table.nodes)) else None
     last = jnp.zeros(NODES), jnp.asarray(time[0]), jnp.zeros(())  # the first sample is a jump from 0
     if x is not None:
         last = first * jnp.exp(x), jnp.asarray(time[0] - step), jnp.asarray(first)
