@@ -30,7 +30,7 @@ DIGITS = 220
 TOLERANCE = {np.float64: 1e-12, np.float32: 1e-5}
 GRADIENT_TOLERANCE = 1e-9
 # a crest reached at t = (3/4) / f, when T / tau exceeds tolerance / eps: rounding of t decides how far behind it
-EDGES = {"triangle": (4, 12)}
+EDGES = {"triangle": (12,)}
 NOISE = mpf(10) ** -150  # what a difference quotient can tell from 0, relative to the peak
 nan = mpf("nan")
 

@@ -134,3 +134,12 @@ def test_knee_of_the_paper():
     with jax.enable_x64(True):
         knee = 1.0 / (2.0 * np.pi * fitact.FinalCircuit(160e3, 22e-9, 1.35e-9).b)
     assert knee == pytest.approx(40.27, abs=0.01)
+
+
+@pytest.mark.parametrize("logs", [(-421.5, 599.1, -1070.7), (12.0, -1000.0, -20.0), (12.0, -20.0, 700.0)])
+def test_divider_is_differentiable_where_a_fit_may_stray(logs: tuple[float, float, float]):
+    """One capacitance under- or overflows, and their quotient with it; the divider itself is 0 or 1/2."""
+    with jax.enable_x64(True):
+        value, slope = jax.value_and_grad(lambda x: fitact.FinalCircuit(*jnp.exp(x)).g)(jnp.array(logs))
+    assert float(value) == pytest.approx(0.0 if logs[1] > logs[2] else 0.5)
+    assert np.all(np.isfinite(slope))

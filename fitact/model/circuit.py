@@ -110,7 +110,12 @@ class FinalCircuit(Circuit):
     @property
     def g(self) -> ArrayLike:
         """The divider a / b = Ci / (2 Ci + Csc), the gain at high frequency; at most 1/2."""
-        return 1.0 / (2.0 + self.Csc / self.Ci)  # in this form the logarithms' derivatives do not cancel
+        Csc, Ci = jnp.asarray(self.Csc, dtype=float), jnp.asarray(self.Ci, dtype=float)
+        # the smaller over the larger: log-derivatives neither cancel nor, where one overflows, end in NaN
+        below = Csc <= Ci
+        skin = jnp.where(below, Csc, 0.0) / jnp.where(below, Ci, 1.0)
+        insulator = jnp.where(below, 0.0, Ci) / jnp.where(below, 1.0, Csc)
+        return jnp.where(below, 1.0 / (2.0 + skin), insulator / (1.0 + 2.0 * insulator))
 
     @property
     def b(self) -> ArrayLike:
