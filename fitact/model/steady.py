@@ -50,7 +50,7 @@ def mean_square(circuit: Circuit, drive: Drive, channel: Literal["Vsc", "I"] = "
             both = tau + other_tau
             total = total + 2.0 * (other * (other_tau / both) * each[j] + weight * (tau / both) * each[k])
     if terms.rate is None:
-        return total
+        return jnp.maximum(total, 0.0)  # terms of Vsc may cancel down to rounding
     for part, (_, tau) in zip(each, pairs, strict=True):
         total = total + 2.0 * terms.rate * part / tau
     return jnp.where(_impulses(drive, terms.rate), jnp.inf, total + terms.rate**2 * _slope_mean_square(drive))
