@@ -10,7 +10,7 @@ import pytest
 from conftest import skin_voltage, square_record
 
 import fitact
-from fitact.data.compress import SLOW, compress
+from fitact.data.compress import compress
 from fitact.inference import compressed
 from fitact.inference.likelihood import Likelihood
 from fitact.model.circuit import Terms
@@ -146,16 +146,42 @@ def test_samples_are_summed_where_compression_does_not_hold(made: dict[str, int]
     assert fit.trusted
 
 
-def test_arrays_on_disk_are_read_a_chunk_at_a_time(tmp_path):
+class OnDisk:
+    """An array of which no more than a chunk is ever asked for."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values, self.size = values, values.size
+
+    def __getitem__(self, place):
+        found = self.values[place]
+        assert np.size(found) <= 65_536
+        return found
+
+
+@pytest.mark.parametrize("kind", ["measured", "folded", "not folded", "chirp"])
+def test_no_more_than_a_chunk_is_read_at_a_time(kind: str):
     """Records larger than memory: the arrays may be memory maps."""
-    rng = np.random.default_rng(8)
-    time, voltage, y = np.arange(50_000) * 5e-6, rng.standard_normal(50_000), rng.standard_normal(50_000)
-    maps = []
-    for name, values in {"time": time, "y": y}.items():
-        np.save(tmp_path / f"{name}.npy", values)
-        maps.append(np.load(tmp_path / f"{name}.npy", mmap_mode="r"))
-    drive = fitact.Sampled(time, voltage)
-    ours = compress(drive, *maps, steady_state=False, tau=TAU, gain=0.05)
-    expected = compress(drive, time, y, steady_state=False, tau=TAU, gain=0.05)
-    np.testing.assert_array_equal(ours.observed, expected.observed)
-    assert len(SLOW) == len(ours.slow)
+    count = 150_000
+    time, y = np.arange(count) * 5e-6, np.random.default_rng(8).standard_normal(count)
+    drive = {
+        "measured": lambda: fitact.Sampled(time, np.sin(2e3 * time)),
+        "folded": lambda: fitact.Square(360.0, 100.0),
+        "not folded": lambda: fitact.Square(360.0, 97.00013),
+        "chirp": lambda: fitact.Chirp(360.0, 20.0, 200.0, 0.75),
+    }[kind]()
+    steady = "folded" in kind
+    compression = compress(drive, OnDisk(time), OnDisk(y), steady_state=steady, tau=TAU, gain=0.05)
+    assert float(compression.observed @ compression.observed) == pytest.approx(y @ y, rel=1e-12)
+
+
+@pytest.mark.parametrize("tolerance", [-1.0, float("nan"), float("inf")])
+def test_a_tolerance_that_is_none_is_refused(tolerance: float):
+    with pytest.raises(fitact.InputError, match="tolerance"):
+        fitact.fit(square_record(), SQUARE, tolerance=tolerance)
+
+
+def test_force_of_a_long_record_is_that_of_a_short_one():
+    """Above 20,000 samples only its last periods are computed, after the charge has decayed."""
+    short, long = (fitact.fit(square_record(periods=n, noise=1e-3)).derived() for n in (9, 30))
+    for name in ("force_mean", "force_peak", "force_rms"):
+        assert long[name]["q50"] == pytest.approx(short[name]["q50"], rel=2e-4)

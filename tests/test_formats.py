@@ -163,3 +163,15 @@ def test_the_callers_arrays_are_left_alone():
     assert record["Vsc"][0] == 0.0
     with pytest.raises(ValueError, match="read-only"):
         record["Vsc"][0] = 1.0
+
+
+@pytest.mark.parametrize("spacing", ["linear", "logarithmic"])
+def test_a_sweep_is_no_noise(spacing: str):
+    """Its spectrum has no line, but it is smooth."""
+    time = np.arange(20_000) / 20e3
+    phase = {
+        "linear": 100.0 * time + 0.5 * 900.0 * time**2,
+        "logarithmic": 100.0 * (10.0**time - 1.0) / np.log(10.0),
+    }[spacing]
+    sweep = 180.0 * np.sin(2.0 * np.pi * phase)
+    assert len(fitact.Record.from_arrays(time, V=sweep, Vsc=0.05 * sweep)) == time.size

@@ -237,3 +237,21 @@ def test_relaxation_functions_against_mpmath(x: float):
                 assert float(value) == pytest.approx(truth, rel=1e-13)
             else:
                 assert float(value) == pytest.approx(0.0, abs=1e-290)
+
+
+@pytest.mark.parametrize(
+    "circuit",
+    [fitact.FinalCircuit(R, C, CI), fitact.DirectGround(R, C, CI, R_H=500.0)],
+    ids=["final", "R_H"],
+)
+@pytest.mark.parametrize("kind", ["polyline", "trapezoid"])
+def test_pieces_without_length_are_jumps(circuit, kind: str):
+    drive = {
+        "polyline": fitact.Polyline(
+            np.array([0.0, 0.005, 0.005, 0.01, 0.01]), np.array([180.0, 180.0, -180.0, -180.0, 180.0]), period=0.01
+        ),
+        "trapezoid": fitact.Trapezoid(360.0, 100.0, 0.0),
+    }[kind]
+    square = fitact.Square(360.0, 100.0)
+    assert float(fitact.peak(circuit, drive)) == pytest.approx(float(fitact.peak(circuit, square)), rel=1e-12)
+    np.testing.assert_allclose(fitact.body_current(circuit, drive), fitact.body_current(circuit, square), rtol=1e-9)

@@ -20,6 +20,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from fitact.model.chirp import Chirp
 from fitact.model.circuit import Terms
 from fitact.model.drive import Drive, Periodic, Sampled
 from fitact.model.response import highpass, phi, recurrence
@@ -196,14 +197,15 @@ def _chunks(time: np.ndarray, observed: np.ndarray, length: int) -> Iterator[tup
         yield np.pad(t, (0, missing), mode="edge"), np.pad(y, (0, missing)), weight
 
 
-def _chunk_length(samples: int) -> int:
-    return min(_CHUNK, 1 << (samples - 1).bit_length())
+def _chunk_length(samples: int, longest: int = _CHUNK) -> int:
+    return min(longest, 1 << (samples - 1).bit_length())
 
 
 def _plainly(
     table: _Table, drive: Drive, time: np.ndarray, observed: np.ndarray, steady_state: bool
 ) -> Iterator[np.ndarray]:
-    for t, y, weight in _chunks(time, observed, _chunk_length(time.size)):
+    length = _chunk_length(time.size, _LONGEST if isinstance(drive, Chirp) else _CHUNK)
+    for t, y, weight in _chunks(time, observed, length):
         yield np.asarray(_at_times(table, drive, t, y, weight, None, steady_state))
 
 
@@ -212,7 +214,12 @@ def _at_times(
     table: _Table, drive: Drive, time: Array, observed: Array, weight: Array, slow: Array | None, steady_state: bool
 ) -> Array:
     """Inner products where the response to the drive can be computed at any time."""
-    u = jax.vmap(lambda tau: highpass(drive, time, tau, steady_state=steady_state))(table.nodes)
+
+    def one(tau: Array) -> Array:
+        return highpass(drive, time, tau, steady_state=steady_state)
+
+    # a chirp's many pieces are worked out for each: one after the other, not all side by side
+    u = lax.map(one, table.nodes) if isinstance(drive, Chirp) else jax.vmap(one)(table.nodes)
 
     def voltage(time: Array) -> Array:
         return jnp.where(steady_state | (time >= 0.0), drive.value(time), 0.0)

@@ -178,7 +178,7 @@ def _numbers_one_by_one(rows: Sequence[tuple[int, str]], places: list[int], widt
 
 
 def write_csv(path: str | os.PathLike[str], record: Record) -> None:
-    """Write a record as `read` reads it, to 12 digits.
+    """Write a record as `read` reads it, to 12 digits; times to the last bit, which tells on which side of an edge.
 
     Raises:
         InputError: the place cannot be written.
@@ -186,4 +186,5 @@ def write_csv(path: str | os.PathLike[str], record: Record) -> None:
     header = ["time_s", *(f"{name}_{CHANNEL_UNITS[name]}" for name in record.channels)]
     with replacing(path) as temporary:
         table = np.stack([record.time, *record.channels.values()], axis=1)
-        np.savetxt(temporary, table, fmt="%.12g", delimiter=",", header=",".join(header), comments="")
+        digits = ["%.17g", *["%.12g"] * len(record.channels)]
+        np.savetxt(temporary, table, fmt=digits, delimiter=",", header=",".join(header), comments="")

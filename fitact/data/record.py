@@ -11,6 +11,7 @@ from jaxtyping import Float
 from fitact.errors import InputError
 
 MINIMUM_SAMPLES = 20
+_SMOOTH = 0.3  # of a signal's sd: its noise, when it is more than noise
 _LEVELS = 12  # distinct values from which a channel counts as rounded by a converter
 _NEAR_PEAK = 0.02  # of correlation: the first period's peak may be that much lower than a later one's
 _TOP = 0.002  # of correlation: the part of a peak that is taken for a parabola
@@ -225,6 +226,8 @@ def _check_signal(values: np.ndarray, name: str, source: str) -> None:
     middle = np.median(values)
     if np.max(np.abs(values - middle)) > 7.0 * np.median(np.abs(values - middle)) / 0.6744897501960817:
         return  # an edge, however short
+    if white_noise(values) < _SMOOTH * np.std(values):
+        return  # a smooth signal, though a sweep has no spectral line
     power = np.abs(np.fft.rfft(values - values.mean())[1:]) ** 2
     # Fisher's test: the share of the largest of m spectral lines of white noise exceeds x with p < m (1 - x)^(m - 1)
     share, lines = power.max() / power.sum(), power.size

@@ -88,7 +88,7 @@ class Chain:
             with h5py.File(path, "r") as file:
                 if file.attrs["fingerprint"] != fingerprint:
                     raise InputError(
-                        f"{path}: this chain belongs to another record, scene, seed or version of fitact;"
+                        f"{path}: this chain belongs to another record, scene, seed, tolerance or version of fitact;"
                         " remove the file or choose another output folder"
                     )
                 groups = [file[f"ensemble_{i}"] for i in range(len(file))]

@@ -52,7 +52,7 @@ def project(likelihood: Likelihood, start: LinearStart, tolerance: float) -> tup
 
 
 def _reason_against(likelihood: Likelihood, start: LinearStart, tolerance: float) -> str:
-    if tolerance <= 0.0:
+    if tolerance == 0.0:
         return "it was asked for"
     if likelihood.time.size < _SHORT:
         return f"the record is shorter than {_SHORT} samples"
@@ -89,10 +89,12 @@ def certify(
         _at(model, points, sigma) for model in (full, near, dataclasses.replace(wide, columns=columns))
     )
     error = float(np.max(np.abs(compressed - exact)[: _POINTS + 1]))
+    if np.isnan(error):
+        return Certified(full, None, "the record leaves its time constant more open than the table is wide")
     if not error <= tolerance:
         return Certified(full, None, f"the compressed log-likelihood was off by {error:.2g} near the optimum")
-    excess = float(np.max(np.abs(tabulated - exact) - _FAR * np.abs(exact[0] - exact)))
-    if not excess <= tolerance:
+    excess = float(np.nanmax(np.abs(tabulated - exact) - _FAR * np.abs(exact[0] - exact)))
+    if excess > tolerance:
         return Certified(full, None, f"the compressed log-likelihood was off by {excess:.2g} within the prior")
     return Certified(near, error, "")
 

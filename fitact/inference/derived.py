@@ -1,5 +1,7 @@
 """What follows from the parameters: divider, time constant, force and friction, at any theta."""
 
+import math
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -10,13 +12,16 @@ from fitact.data.record import Record
 from fitact.inference.likelihood import CHARGE, Likelihood
 from fitact.inference.start import DriveChoice, whole_periods
 from fitact.model.circuit import FinalCircuit
-from fitact.model.drive import Periodic, PiecewiseLinear
+from fitact.model.drive import Drive, Periodic, PiecewiseLinear, Sampled
 from fitact.model.force import Contact, electrostatic_force, friction, mean_force, peak_force, summarize
 from fitact.model.response import response
 from fitact.model.scene import Scene
 
 NAMES = ("g", "b", "force_mean", "force_peak", "force_rms", "friction_mean")
 
+_LONG = 20_000  # samples, above which the force is that of the last periods,
+_WINDOW = 4_000  # of at most so many samples where that holds a period,
+_LEAD = 20.0  # after so many time constants
 _NODES = 64  # Gauss-Legendre nodes along each straight piece of a drive
 
 
@@ -24,10 +29,13 @@ class Derived(eqx.Module):
     """Derived quantities as functions of theta; built by `for_fit`.
 
     Means are over one period of a scene's drive in the steady state, else over the largest whole number of
-    periods that the record holds (the whole record where it holds none).
+    periods that the record holds (the whole record where it holds none); of a long record with a measured
+    drive, over its last whole periods, of some thousand samples.
 
     Attributes:
         likelihood: names theta's coordinates.
+        drive: what makes the force: the likelihood's, or the last part of a long measured one, which begins so
+            early that its unknown charge is gone when the force is evaluated.
         time: when the force is evaluated, s.
         weight: the share of time each stands for; a weight of 0 counts for the peak only.
         area, insulator_thickness, skin_thickness: m^2, m, m.
@@ -35,6 +43,7 @@ class Derived(eqx.Module):
     """
 
     likelihood: Likelihood
+    drive: Drive
     time: Float[Array, " times"]
     weight: Float[Array, " times"]
     area: ArrayLike
@@ -42,6 +51,8 @@ class Derived(eqx.Module):
     skin_thickness: ArrayLike
     coefficient: ArrayLike
     normal_force: ArrayLike
+    steady_state: bool = eqx.field(static=True)
+    charge: bool = eqx.field(static=True)  # whether the record's unknown one matters
 
     def force(
         self, theta: Float[Array, " parameters"], sigma: ArrayLike, deviate: ArrayLike = 0.0
@@ -51,9 +62,10 @@ class Derived(eqx.Module):
         `deviate` holds seven standard normal numbers that draw the charge from its posterior; 0: its mean.
         """
         model, circuit = self.likelihood, self.likelihood.circuit(theta)
-        vsc = response(circuit, model.drive, self.time, steady_state=model.steady_state)
-        beta = model.drawn(theta, sigma, deviate)
-        vsc = vsc + beta[CHARGE] * model.linear_sd[CHARGE] * model.decay(theta, self.time) / model.gain(theta)
+        vsc = response(circuit, self.drive, self.time, steady_state=self.steady_state)
+        if self.charge:
+            beta = model.drawn(theta, sigma, deviate)
+            vsc = vsc + beta[CHARGE] * model.linear_sd[CHARGE] * model.decay(theta, self.time) / model.gain(theta)
         return electrostatic_force(vsc, self.contact(circuit))
 
     def contact(self, circuit: FinalCircuit) -> Contact:
@@ -68,18 +80,20 @@ class Derived(eqx.Module):
         """All of `NAMES`, in SI units."""
         circuit = self.likelihood.circuit(theta)
         force = summarize(self.force(theta, sigma, deviate), self.weight)
-        if self.likelihood.steady_state and isinstance(self.likelihood.drive, Periodic):  # rms alone needs quadrature
-            contact, drive = self.contact(circuit), self.likelihood.drive
-            force = force._replace(mean=mean_force(circuit, drive, contact), peak=peak_force(circuit, drive, contact))
+        if self.steady_state and isinstance(self.drive, Periodic):  # rms alone needs quadrature
+            exact = circuit, self.drive, self.contact(circuit)
+            force = force._replace(mean=mean_force(*exact), peak=peak_force(*exact))
         felt = friction(force.mean, self.coefficient, self.normal_force)
         return jnp.stack([circuit.g, circuit.b, force.mean, force.peak, force.rms, felt])
 
 
-def for_fit(likelihood: Likelihood, record: Record, choice: DriveChoice, scene: Scene) -> Derived:
-    """The derived quantities of a fit's parameters."""
-    time, weight = _grid(record, choice)
+def for_fit(likelihood: Likelihood, record: Record, choice: DriveChoice, scene: Scene, b: float) -> Derived:
+    """The derived quantities of a fit's parameters; `b` (s) is the time constant that it found."""
+    last = _last_periods(record, choice, b)
+    drive, (time, weight) = (choice.drive, _grid(record, choice)) if last is None else last
     return Derived(
         likelihood,
+        drive,
         jnp.asarray(time),
         jnp.asarray(weight / weight.sum()),
         scene.device.contact_area,
@@ -87,7 +101,22 @@ def for_fit(likelihood: Likelihood, record: Record, choice: DriveChoice, scene: 
         scene.skin.thickness,
         scene.friction.coefficient,
         scene.friction.normal_force,
+        steady_state=choice.steady_state and last is None,
+        charge=choice.unknown_charge and last is None,
     )
+
+
+def _last_periods(record: Record, choice: DriveChoice, b: float) -> tuple[Drive, tuple[np.ndarray, np.ndarray]] | None:
+    """The end of a long measured drive, and times and weights of its last whole periods; None: take it all."""
+    frequency, time = record.frequency(), record.time
+    if not isinstance(choice.drive, Sampled) or frequency is None or time.size <= _LONG:
+        return None
+    periods = max(1, math.floor(_WINDOW * record.time_step * frequency))
+    begin = int(np.searchsorted(time, time[-1] - periods / frequency + 0.5 * record.time_step))
+    lead = int(np.searchsorted(time, time[begin] - _LEAD * b))
+    if lead == 0:
+        return None
+    return Sampled(time[lead:], record["V"][lead:]), (time[begin:], np.gradient(time)[begin:])
 
 
 def _grid(record: Record, choice: DriveChoice) -> tuple[np.ndarray, np.ndarray]:

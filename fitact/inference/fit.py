@@ -43,7 +43,7 @@ class Fit:
         theta: the optimum, in the coordinates `names`.
         covariance_root: its product with its transpose is `covariance`; keeps digits where that cannot.
         sigma: standard deviation of Vsc's noise, V, from the residuals.
-        linear: the offset, drift and charge that were freed, V, at the optimum.
+        linear: the offset, drift, hum and charge that were freed, V, at the optimum.
         residuals: record minus fit, V.
         result: name of a member of `RESULTS`; `message` is its sentence.
         figures: chi2_reduced, rms_residual, noise_expected, runs_z, steps and the like.
@@ -184,9 +184,9 @@ def fit(record: Record, scene: Scene | None = None, *, tolerance: float = compre
     """Fit the final circuit to a record by Levenberg-Marquardt in log-parameters, the prior as residuals.
 
     The drive is the recorded V where there is no scene or its waveform is "measured", else the scene's.
-    The start comes from the record; offset, drift and a delay between the channels are freed where the
-    record asks for them, a gain only with the scene's prior; hum of the mains likewise. Runs in double precision
-    whatever JAX is set to, and leaves that setting alone.
+    The start comes from the record; offset, drift, hum of the mains and a delay between the channels are freed
+    where the record asks for them, a gain only with the scene's prior. Runs in double precision whatever JAX is
+    set to, and leaves that setting alone.
 
     Args:
         record: with Vsc, and V unless the scene has the drive.
@@ -195,10 +195,13 @@ def fit(record: Record, scene: Scene | None = None, *, tolerance: float = compre
             each time. Where compression does not hold, `Fit.full_because` says why.
 
     Raises:
-        InputError: the record cannot come from this circuit, or the scene asks for what is not available.
+        InputError: the record cannot come from this circuit, the scene asks for what is not available, or the
+            tolerance is no number of 0 or more.
     """
     given = scene or Scene()
     given.require_available(fit=True)
+    if not 0.0 <= tolerance < math.inf:
+        raise InputError(f"tolerance = {tolerance}: give an error of the log-likelihood, 0.001 or so, or 0 for none")
     with jax.enable_x64(True):
         choice = choose_drive(record, scene)
         prior = given.make_prior()
@@ -207,7 +210,7 @@ def fit(record: Record, scene: Scene | None = None, *, tolerance: float = compre
         likelihood = _likelihood(record, choice, _with_edge_time(prior, record, choice, start))
         ridge = _on_the_ridge(start, likelihood.prior)
         theta = np.append(ridge, 0.0) if likelihood.free_delay else ridge
-        freeable = ("offset", "drift", "delay", *_hum(record))
+        freeable = ("offset", "drift", "delay", *_hum(record, choice))
         try:
             projected, reason = compressed.project(likelihood, start, tolerance)
             solved = solve(projected, theta, record.noise("Vsc"), freeable)
@@ -227,22 +230,23 @@ def _certified(solved: Solved, reason: str, tolerance: float) -> compressed.Cert
     return compressed.certify(solved.likelihood, reason, np.asarray(solved.theta), root, float(solved.sigma), tolerance)
 
 
-def _hum(record: Record) -> list[str]:
-    """The mains hums that the record can tell from its drive's harmonics."""
+def _hum(record: Record, choice: DriveChoice) -> list[str]:
+    """The mains hums that the record can tell from its drive's harmonics, or from a part of a wave."""
     span, frequency = float(record.time[-1] - record.time[0]), record.frequency()
-    spacing = frequency or 1.0 / span
-    return [
-        f"hum_{hum:.0f}Hz"
-        for hum in (50.0, 60.0)
-        if abs(hum - spacing * round(hum / spacing)) * span > 0.5 and hum * record.time_step < 0.5
-    ]
+
+    def apart(hum: float) -> bool:
+        if frequency is None:
+            return not choice.periodic and hum * span > 2.0
+        return abs(hum - frequency * round(hum / frequency)) * span > 0.5
+
+    return [f"hum_{hum:.0f}Hz" for hum in (50.0, 60.0) if apart(hum) and hum * record.time_step < 0.5]
 
 
 def _likelihood(record: Record, choice: DriveChoice, prior: Prior) -> Likelihood:
     height = float(np.ptp(record["Vsc"]))
     charge = 10.0 * height if choice.unknown_charge else 0.0
     # a part of a wave cannot show an offset, so one within an oscilloscope's accuracy is allowed for
-    offset = _OFFSET * height if record.frequency() is None else 0.0
+    offset = _OFFSET * height if record.frequency() is None and choice.periodic else 0.0
     return Likelihood(
         time=jnp.asarray(record.time),
         observed=jnp.asarray(record["Vsc"]),
@@ -299,7 +303,7 @@ def _judged(
     likelihood, theta, sigma = certified.likelihood, np.asarray(solved.theta), float(solved.sigma)
     jacobian, prior_sd = np.asarray(solved.jacobian), likelihood.prior_sd
     root = covariance_root(jacobian, prior_sd)
-    derive = derived.for_fit(likelihood, record, choice, scene)
+    derive = derived.for_fit(likelihood, record, choice, scene, float(likelihood.circuit(theta).b))
     logs, gradient = _log_derived(derive, theta, sigma)
     residuals, beta = (
         np.asarray(x) for x in _over_samples(dataclasses.replace(likelihood, compression=None), theta, sigma)
@@ -321,7 +325,7 @@ def _judged(
         result=_result(solved, root, figures),
         figures=figures,
         identifiability=identifiability,
-        warnings=(*record.notes, *choice.notes, *remarks(theta, likelihood.prior, record, figures, no_scene)),
+        warnings=(*record.notes, *choice.notes, *remarks(theta, likelihood.prior, record, choice, figures, no_scene)),
         compression_error=certified.error,
         full_because=certified.reason,
         likelihood=likelihood,

@@ -105,19 +105,21 @@ class Posterior:
 
     @functools.cached_property
     def _derived(self) -> np.ndarray:
-        return self._each(_derived_of, self.fit.derive)
+        return self._each(_derived_of, self.fit.derive, rows=len(self.fit.record))
 
     @functools.cached_property
     def _linear(self) -> np.ndarray:
         """Draws of the linear nuisances, in prior standard deviations."""
-        return self._each(_linear_of, self.fit.likelihood)
+        return self._each(_linear_of, self.fit.likelihood, rows=self.fit.likelihood.rows)
 
-    def _each(self, function: Callable[..., Array], model: eqx.Module, draws: Any = slice(None)) -> np.ndarray:
-        """`function` of the chosen draws."""
+    def _each(
+        self, function: Callable[..., Array], model: eqx.Module, rows: int, draws: Any = slice(None)
+    ) -> np.ndarray:
+        """`function` of the chosen draws; `rows`: numbers that one runs over."""
         points, deviates = self.points[:, draws], self._deviates[:, draws]
         flat = points.reshape(-1, points.shape[-1]), deviates.reshape(-1, len(LINEAR))
         with jax.enable_x64(True):
-            values = Batched(function, model, len(self.fit.record))(*flat)
+            values = Batched(function, model, rows)(*flat)
         return values.reshape(*points.shape[:2], -1)
 
     @property
@@ -229,7 +231,7 @@ class Posterior:
         ensembles, count = self.points.shape[:2]
         draws = np.linspace(0, count - 1, min(_PREDICTED, count)).astype(int)
         stride = -(-len(self.fit.record) // _PREDICTED_SAMPLES)
-        mean = self._each(lambda *point: _signal_of(*point)[::stride], self.fit.likelihood, draws)
+        mean = self._each(lambda *point: _signal_of(*point)[::stride], self.fit.likelihood, len(self.fit.record), draws)
         sigma = np.exp(self.points[:, draws, -1:])
         noise = np.random.default_rng([self.seed, 3]).standard_normal(mean.shape)
         values = (mean + sigma * noise).astype(np.float32)

@@ -5,6 +5,7 @@ from jaxtyping import Float
 
 from fitact.data.record import Record
 from fitact.inference.diagnostics import is_coarse
+from fitact.inference.start import DriveChoice
 from fitact.model.prior import Prior
 from fitact.units import engineering
 
@@ -12,7 +13,12 @@ _IMPLAUSIBLE = 0.005  # share of the prior further out than g or b, below which 
 
 
 def remarks(
-    theta: Float[np.ndarray, " parameters"], prior: Prior, record: Record, figures: dict[str, float], no_scene: bool
+    theta: Float[np.ndarray, " parameters"],
+    prior: Prior,
+    record: Record,
+    choice: DriveChoice,
+    figures: dict[str, float],
+    no_scene: bool,
 ) -> list[str]:
     """Sentences; `figures` are those of `fitact.inference.diagnostics`."""
     found = []
@@ -22,7 +28,7 @@ def remarks(
             " force scale with that; state your panel's Ci under [device] in a scene file"
         )
     span = record.time[-1] - record.time[0]
-    if record.frequency() is None:
+    if record.frequency() is None and choice.periodic:
         found.append(
             f"the record ({engineering(span, 's')}) does not show its drive repeating: it is shorter than 1.5 periods"
             " or not periodic, so the answer rests on a part of a wave; record two periods or more"

@@ -244,7 +244,7 @@ def _fingerprint(fit: Fit, names: tuple[str, ...], seed: int, walkers: int, ense
         fit.record.fingerprint,
         fit.scene.to_json(),
         fit.choice.name,
-        fit.compression_error is None,
+        fit.likelihood.rows,
         names,
         fit.theta.tolist(),
         seed,

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.model.chirp import Chirp
-from fitact.model.drive import Burst, Drive, Sampled, Sine, Square
+from fitact.model.drive import Burst, Drive, Periodic, Sampled, Sine, Square
 from fitact.model.scene import Scene
 
 _ALIGNED = 20_000  # samples on which a drive is laid
@@ -38,6 +38,11 @@ class DriveChoice:
     shift: float
     name: str
     notes: tuple[str, ...]
+
+    @property
+    def periodic(self) -> bool:
+        """Whether it is expected to repeat: a burst or a chirp of a scene is not."""
+        return isinstance(self.drive, Periodic | Sampled)
 
 
 class LinearStart(NamedTuple):

@@ -20,6 +20,7 @@ from fitact.model.drive import Drive
 
 _DEGREE = 16  # (pi / 4)^17 / 17! = 5e-17 of the height is left out
 _RATES = 9  # of the series of the frequency: (1 / 8)^9 / 9! = 2e-14 of it, over an eighth of a cycle
+_MOST_PIECES = 8_000_000  # what memory holds
 _PIECES = 8  # a cycle, and an e-fold of the frequency
 _ROUNDING = 64  # ulps of a cycle that are no jump
 
@@ -65,6 +66,11 @@ class Chirp(Drive):
             raise InputError(f"Chirp: spacing = '{self.spacing}'; give 'linear' or 'logarithmic'")
         first, last, duration = (float(value) for value in given)
         self.pieces = math.ceil(_PIECES * max(max(first, last) * duration, abs(math.log(last / first)), 1.0))
+        if self.pieces > _MOST_PIECES:
+            raise InputError(
+                f"Chirp: {self.pieces // _PIECES:,} cycles of its highest frequency are more than"
+                f" {_MOST_PIECES // _PIECES:,}; make it shorter, or its frequencies lower"
+            )
 
     def is_over(self, time: ArrayLike) -> Array:
         """Whether the sweep has ended; a time on its end to within rounding counts as the end."""

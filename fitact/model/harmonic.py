@@ -125,7 +125,9 @@ def frequency(drive: Drive) -> ArrayLike:
         return drive.frequency
     if isinstance(drive, Line) and drive.period is not None:
         return 1.0 / drive.period
-    raise InputError("only a periodic drive has harmonics; give a sampled one its period: Sampled(..., period=T)")
+    raise InputError(
+        f"a {type(drive).__name__} drive does not repeat, so it has no harmonics; give one of points its period"
+    )
 
 
 def _cycles(drive: Drive, time: Array) -> Array:

@@ -133,7 +133,7 @@ class Scene(Section):
         series, probe = self.measurement.series_resistor or None, self._probe()
         if ground.connection == "natural":
             assert ground.Z is not None  # checked when the section was read
-            return NaturalGround(Rsc, Csc, Ci, ground.Z, series_resistor=series, probe=probe)
+            return NaturalGround(Rsc, Csc, Ci, ground.Z, ground.Z_capacitance, series_resistor=series, probe=probe)
         extras = (ground.R_H, ground.grounding_Rsc, ground.grounding_Csc, series, probe)
         if all(extra is None for extra in extras):
             return FinalCircuit(Rsc, Csc, Ci)

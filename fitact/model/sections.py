@@ -99,6 +99,7 @@ class Grounding(Section):
     grounding_Rsc: Ohm | None = None
     grounding_Csc: Farad | None = None
     Z: Ohm | None = None
+    Z_capacitance: Farad | None = None
 
     @model_validator(mode="after")
     def _Z_of_natural_ground(self) -> Self:

@@ -202,16 +202,17 @@ def _slope_mean_square(drive: Drive) -> Array:
     """The mean square of dV/dt between jumps, V^2/s^2."""
     if isinstance(drive, Sine):
         return 0.5 * jnp.square(np.pi * jnp.asarray(drive.peak_to_peak) * drive.frequency)
-    knots, start, end = _period(drive)
-    return jnp.sum(jnp.square(end - start) / jnp.diff(knots)) / (knots[-1] - knots[0])
+    pieces = _period(drive)
+    return jnp.sum(jnp.square(pieces.slopes()) * jnp.diff(pieces.knots)) / (pieces.knots[-1] - pieces.knots[0])
 
 
 def _impulses(drive: Drive, rate: ArrayLike) -> Array:
     """Whether a current that follows dV/dt meets a jump."""
     if isinstance(drive, Sine):
         return jnp.asarray(False)
-    _, start, end = _period(drive)
-    return jnp.any(rate * (start - jnp.roll(end, 1)) != 0.0)
+    knots, start, end = _period(drive)
+    within = (jnp.diff(knots) == 0.0) & (end != start)
+    return jnp.any(rate * (start - jnp.roll(end, 1)) != 0.0) | (jnp.any(within) & (jnp.asarray(rate) != 0.0))
 
 
 def _extremes(terms: Terms, pieces: Pieces) -> Array:
@@ -219,19 +220,19 @@ def _extremes(terms: Terms, pieces: Pieces) -> Array:
 
     Of the latter the first derivatives are right, not the second: where an extreme lies is held fixed.
     """
-    length, rise = jnp.diff(pieces.knots), pieces.end - pieces.start
+    length, rise, slopes = jnp.diff(pieces.knots), pieces.end - pieces.start, pieces.slopes()
     tau = jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, terms.tau)))
     u = jnp.stack([steady_knots(pieces, t) for t in terms.tau])
 
     def at(since: Array) -> Array:
-        total = 0.0 if terms.rate is None else terms.rate * (rise / length)
+        total = 0.0 if terms.rate is None else terms.rate * slopes
         for weight, t, first in zip(terms.weight, terms.tau, u, strict=True):
-            total = total + weight * (first * jnp.exp(-since / t) + rise * (since / length) * phi(since / t))
+            total = total + weight * (first * jnp.exp(-since / t) + slopes * since * phi(since / t))
         return total
 
     # the derivative is a sum of exponentials; to first order, a shift of an extreme does not change it
     weight = jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, terms.weight)))
-    fall = weight[:, None] * (rise / length - u / tau[:, None])
+    fall = weight[:, None] * (slopes - u / tau[:, None])
     inside = _zeros(*lax.stop_gradient((fall, 1.0 / tau, length)))
     after, before = at(jnp.zeros_like(length)), at(length)
     if len(terms.tau) == 1:  # a level only decays; to rounding its end may equal its start, but not in the derivative
