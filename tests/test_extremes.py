@@ -38,7 +38,7 @@ def loops(point: jax.Array) -> dict[str, fitact.DirectGround | fitact.NaturalGro
 @pytest.mark.parametrize("name", ["unequal skins", "R_H", "natural"])
 def test_other_circuits(name: str):
     """Finite everywhere; |H| against its impedances, where time constants may lie 24 decades apart."""
-    rows = extremes.points()
+    rows = extremes.points()[::3]
     others = 10.0 ** np.random.default_rng(5).uniform([0.0, -18.0, 0.0], [12.0, -3.0, 12.0], (len(rows), 3))
     rows = np.column_stack([rows, others])
 

@@ -116,12 +116,12 @@ def _believed(wide: Likelihood, theta: np.ndarray) -> Float[np.ndarray, "n param
 def _at(likelihood: Likelihood, theta: Float[np.ndarray, "n parameters"], sigma: float) -> np.ndarray:
     """Log-likelihoods at points of one sigma."""
     points = np.column_stack([theta, np.full(len(theta), math.log(sigma))])
-    return Batched(Likelihood.log_likelihood, likelihood, likelihood.rows)(points)
+    return Batched(Likelihood.log_likelihood, likelihood.without_samples(), likelihood.rows)(points)
 
 
 def log_prob(likelihood: Likelihood, batch: int) -> Callable[[np.ndarray], np.ndarray]:
     """Log-posteriors of points (theta, log sigma); where the compression does not reach, the samples are summed."""
-    tabulated = Batched(Likelihood.log_prob, likelihood, likelihood.rows, batch)
+    tabulated = Batched(Likelihood.log_prob, likelihood.without_samples(), likelihood.rows, batch)
     full = dataclasses.replace(likelihood, compression=None)
     summed = Batched(Likelihood.log_prob, full, full.rows, batch=1)
 

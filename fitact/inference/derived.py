@@ -92,7 +92,7 @@ def for_fit(likelihood: Likelihood, record: Record, choice: DriveChoice, scene: 
     last = _last_periods(record, choice, b)
     drive, (time, weight) = (choice.drive, _grid(record, choice)) if last is None else last
     return Derived(
-        likelihood,
+        likelihood.without_samples(),
         drive,
         jnp.asarray(time),
         jnp.asarray(weight / weight.sum()),

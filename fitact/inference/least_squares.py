@@ -70,9 +70,10 @@ class Solved(eqx.Module):
 
 def _least_squares(likelihood: Likelihood, start: Array, noise: float | Array) -> Solved:
     """Two rounds: with the noise as given, then with that of the residuals."""
-    first = _round(likelihood, start, jnp.asarray(noise, dtype=float))
-    second = _round(likelihood, first.theta, first.sigma)
-    return eqx.tree_at(lambda x: (x.start, x.steps), second, (start, first.steps + second.steps))
+    needed = likelihood.without_samples()
+    first = _round(needed, start, jnp.asarray(noise, dtype=float))
+    second = _round(needed, first.theta, first.sigma)
+    return dataclasses.replace(second, likelihood=likelihood, start=start, steps=first.steps + second.steps)
 
 
 @eqx.filter_jit

@@ -9,6 +9,7 @@ All this asks of the samples is lengths and angles, so it reads the same in the 
 `fitact.data.compress.Compression`, where there is one, as over the samples themselves.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -24,7 +25,7 @@ from jaxtyping import Array, Float
 
 from fitact.data.compress import SLOW, Compression, slow_shapes
 from fitact.model.circuit import FinalCircuit, Terms
-from fitact.model.drive import Drive
+from fitact.model.drive import Drive, Sampled
 from fitact.model.prior import Prior
 from fitact.model.response import response
 
@@ -107,6 +108,19 @@ class Likelihood(eqx.Module):
     def count(self) -> ArrayLike:
         """How many samples there are."""
         return self.time.size if self.compression is None else self.compression.samples
+
+    def without_samples(self) -> "Likelihood":
+        """With no more of the samples than their ends, where a compression stands for them.
+
+        What is compiled for it serves records of any length.
+        """
+        if self.compression is None:
+            return self
+        drive = self.drive
+        if isinstance(drive, Sampled):
+            drive = dataclasses.replace(drive, time=drive.time[:2], samples=drive.samples[:2])
+        extremes = jnp.stack([jnp.min(self.observed), jnp.max(self.observed)])
+        return dataclasses.replace(self, time=self.time[:2], observed=extremes, drive=drive)
 
     @property
     def rows(self) -> int:
