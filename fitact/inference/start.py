@@ -4,8 +4,10 @@ import dataclasses
 import math
 from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
 from fitact.data.record import Record
 from fitact.errors import InputError
@@ -190,8 +192,13 @@ def has_ideal_edges(drive: Drive) -> bool:
 
 def _voltage(drive: Drive, time: np.ndarray, steady_state: bool) -> np.ndarray:
     """The drive at `time`; from rest there is none before t = 0."""
-    voltage = np.asarray(drive.value(time))
+    voltage = np.asarray(_value(drive, time))
     return voltage if steady_state else np.where(time < 0.0, 0.0, voltage)
+
+
+@eqx.filter_jit
+def _value(drive: Drive, time: ArrayLike) -> Array:
+    return drive.value(time)
 
 
 def _align(record: Record, drive: Drive, frequency: float, steady_state: bool) -> float:
