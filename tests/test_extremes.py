@@ -12,10 +12,10 @@ import fitact
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
 @pytest.mark.parametrize("name", ["transfer", *extremes.DRIVES])
 def test_accuracy(name: str, kind: type):
-    for _, quantity, what, worst in extremes.sweep(kind, (name,)):
-        allowed = extremes.TOLERANCE[kind] if what == "value" else extremes.GRADIENT_TOLERANCE
-        assert worst.error <= allowed, (quantity, what, worst)
-        assert worst.compared >= 1200, (quantity, what, worst)
+    """On every fourth point; `make extremes`, which CI runs, takes them all."""
+    for _, quantity, what, worst in extremes.sweep(kind, (name,), every=4):
+        assert worst.error <= extremes.allowed(kind, what), (quantity, what, worst)
+        assert worst.compared >= extremes.ENOUGH // 4, (quantity, what, worst)
 
 
 @pytest.mark.parametrize("name", ["transfer", *extremes.DRIVES])
@@ -37,22 +37,23 @@ def loops(point: jax.Array) -> dict[str, fitact.DirectGround | fitact.NaturalGro
 
 @pytest.mark.parametrize("name", ["unequal skins", "R_H", "natural"])
 def test_other_circuits(name: str):
-    """Finite everywhere; |H| against its impedances, where time constants may lie 24 decades apart."""
+    """All finite, although time constants may lie 24 decades apart; |H| against numpy's complex impedances."""
     rows = extremes.points()[::3]
     others = 10.0 ** np.random.default_rng(5).uniform([0.0, -18.0, 0.0], [12.0, -3.0, 12.0], (len(rows), 3))
     rows = np.column_stack([rows, others])
 
-    def figures(logs: jax.Array, point: jax.Array) -> jax.Array:
+    def figures(logs: jax.Array, point: jax.Array) -> tuple[jax.Array, jax.Array]:
         point = point * jnp.exp(logs)
         circuit, f = loops(point)[name], point[3]
         drive = fitact.Trapezoid(360.0, f, 0.01 / f)
         gain = jnp.abs(circuit.transfer_function(2.0 * np.pi * f))
         current = fitact.body_current(circuit, drive)
-        return jnp.stack([gain, fitact.mean_square(circuit, drive), fitact.peak(circuit, drive), *current])
+        found = jnp.stack([gain, fitact.mean_square(circuit, drive), fitact.peak(circuit, drive), *current])
+        return found, found  # compiled once for both
 
     with jax.enable_x64(True):
-        values = np.asarray(jax.jit(jax.vmap(figures, (None, 0)))(jnp.zeros(7), rows))
-        slopes = np.asarray(jax.jit(jax.vmap(jax.jacrev(figures), (None, 0)))(jnp.zeros(7), rows))
+        both = jax.jit(jax.vmap(jax.jacrev(figures, has_aux=True), (None, 0)))(jnp.zeros(7), rows)
+    slopes, values = (np.asarray(x) for x in both)
     assert np.all(np.isfinite(values))
     assert np.all(np.isfinite(slopes))
 
@@ -62,5 +63,4 @@ def test_other_circuits(name: str):
     grounding = other_R / (1.0 + 1j * omega * other_R * other_C)
     rest = {"unequal skins": grounding, "R_H": grounding + R0, "natural": R0}[name]
     expected = np.abs(skin / (skin + rest + 1.0 / (1j * omega * Ci)))
-    assert np.max(np.abs(values[:, 0] - expected)) < 1e-5
-    assert np.quantile(np.abs(values[:, 0] / expected - 1.0), 0.85) < 1e-11
+    np.testing.assert_allclose(values[:, 0], expected, rtol=1e-12)

