@@ -2,7 +2,7 @@
 # make test   set up, run the tests
 PY = .venv/bin/python
 .DEFAULT_GOAL = help
-.PHONY: help env demo test notebooks extremes check lock clean
+.PHONY: help env demo test test-slow notebooks extremes check lock clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -14,7 +14,11 @@ demo: env
 	.venv/bin/fitact run data_synth/records/finger_direct.csv --scene data_synth/records/finger_direct.toml --out out/demo --seed 1
 
 test: env
-	$(PY) -m pytest -n auto --dist loadfile
+	$(PY) -m pytest -n auto --dist loadfile -m "not slow"
+
+# make test-slow   the tests that `make test` leaves out for their time
+test-slow: env
+	$(PY) -m pytest -n auto -m slow
 
 # make notebooks   run the notebooks; executed copies in out/notebooks
 notebooks: env

@@ -18,6 +18,7 @@ def test_accuracy(name: str, kind: type):
         assert worst.compared >= extremes.ENOUGH // 4, (quantity, what, worst)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["transfer", *extremes.DRIVES])
 def test_single_precision_gradients_are_finite(name: str):
     with jax.enable_x64(False):
@@ -35,6 +36,7 @@ def loops(point: jax.Array) -> dict[str, fitact.DirectGround | fitact.NaturalGro
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["unequal skins", "R_H", "natural"])
 def test_other_circuits(name: str):
     """All finite, although time constants may lie 24 decades apart; |H| against numpy's complex impedances."""

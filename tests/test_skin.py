@@ -201,6 +201,7 @@ def test_differentiable_under_jit_and_vmap(skin: fitact.Dispersive | fitact.Frac
     np.testing.assert_allclose(both, np.stack([vsc(row, 360.0) for row in rows]), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_exponent_is_differentiable_up_to_one():
     @jax.jit
     def vsc(alpha: jax.Array) -> jax.Array:

@@ -205,6 +205,7 @@ def test_second_derivatives(x: float):
     check_grads(lambda x: jnp.stack([phi(x), psi(x), _rectangle(0.2, x)]), (x,), order=2, rtol=1e-4, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_differentiable_with_several_time_constants():
     def figures(logs: jax.Array) -> jax.Array:
         Rsc, Csc, Ci, R_H, grounding_Rsc = jnp.exp(logs)
