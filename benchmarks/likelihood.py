@@ -12,13 +12,12 @@ repeats.
 import argparse
 import json
 import math
-import statistics
-import time
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from timing import medians
 
 import fitact
 from fitact.data import compress as compression
@@ -65,19 +64,6 @@ def good(point: np.ndarray, sign: np.ndarray, since: np.ndarray, y: np.ndarray) 
     """The same, with what does not change computed beforehand."""
     residual = y - skin_voltage(point, sign, since)
     return -0.5 * float(residual @ residual) * math.exp(-2.0 * point[3]) - y.size * point[3]
-
-
-def medians(jobs: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
-    """Median seconds of each, run in turn."""
-    taken: dict[str, list[float]] = {name: [] for name in jobs}
-    for job in jobs.values():
-        job()
-    for _ in range(repeats):
-        for name, job in jobs.items():
-            start = time.perf_counter()
-            job()
-            taken[name].append(time.perf_counter() - start)
-    return {name: statistics.median(times) for name, times in taken.items()}
 
 
 def compressed(fit: fitact.Fit, points: np.ndarray) -> Callable[[], np.ndarray]:

@@ -7,13 +7,12 @@ One from-rest period of a triangle, 5,000 samples; lsim's first-order hold is ex
 
 import argparse
 import json
-import statistics
-import time
 from collections.abc import Callable
 
 import jax
 import numpy as np
 import scipy.signal
+from timing import medians
 
 import fitact
 
@@ -22,15 +21,8 @@ R, C, CI = 160e3, 22e-9, 1.35e-9
 B = R * (2.0 * CI + C)
 
 
-def seconds(function: Callable[[], object], calls: int) -> float:
-    start = time.perf_counter()
-    for _ in range(calls):
-        function()
-    return (time.perf_counter() - start) / calls
-
-
-def contenders() -> dict[str, tuple[Callable[[], object], int]]:
-    """Name: (what is timed, calls a round). Accuracy is checked first."""
+def contenders() -> dict[str, Callable[[], object]]:
+    """What is timed, by name. Accuracy is checked first."""
     circuit, drive = fitact.FinalCircuit(R, C, CI), fitact.Triangle(360.0, 100.0)
     t = np.arange(SAMPLES) * (0.01 / SAMPLES)
     voltage = np.asarray(drive.value(t))
@@ -45,23 +37,20 @@ def contenders() -> dict[str, tuple[Callable[[], object], int]]:
 
     np.testing.assert_allclose(rest(circuit, on_device), lsim(), atol=1e-10)
     return {
-        "exact": (lambda: rest(circuit, on_device).block_until_ready(), 50),
-        "steady": (lambda: steady(circuit, on_device).block_until_ready(), 50),
-        "jit call": (lambda: nothing(on_device).block_until_ready(), 50),
-        "exp in JAX": (lambda: bare(on_device).block_until_ready(), 50),
-        "numpy exp": (lambda: np.exp(-t / B), 50),
-        "lsim": (lsim, 1),
+        "exact": lambda: rest(circuit, on_device).block_until_ready(),
+        "steady": lambda: steady(circuit, on_device).block_until_ready(),
+        "jit call": lambda: nothing(on_device).block_until_ready(),
+        "exp in JAX": lambda: bare(on_device).block_until_ready(),
+        "numpy exp": lambda: np.exp(-t / B),
+        "lsim": lsim,
     }
 
 
 def measured() -> dict[str, float]:
     """Median seconds of each."""
     with jax.enable_x64(True):
-        each = contenders()
-        for function, _ in each.values():
-            function()
-        rounds = [{name: seconds(*pair) for name, pair in each.items()} for _ in range(ROUNDS)]
-    return {name: statistics.median(one[name] for one in rounds) for name in each}
+        jobs = contenders()
+        return medians(jobs, ROUNDS, {name: 50 for name in jobs if name != "lsim"})
 
 
 def main() -> None:

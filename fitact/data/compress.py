@@ -20,12 +20,17 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from fitact.data.record import is_uniform
 from fitact.model.chirp import Chirp
 from fitact.model.circuit import Terms
 from fitact.model.drive import Drive, Periodic, Sampled
 from fitact.model.response import highpass, phi, recurrence
 
 SLOW = ("offset", "drift", "hum_50Hz_cos", "hum_50Hz_sin", "hum_60Hz_cos", "hum_60Hz_sin")
+
+# the last of the functions whose inner products are added up
+_SLOW = slice(-2 - len(SLOW), -2)
+_SLOPE, _OBSERVED = -2, -1
 
 NODES = 41  # odd, so that the middle of the table is a node
 _REACH = math.log(9.0)  # half width of the table in log tau
@@ -108,9 +113,9 @@ class Compression(eqx.Module):
             reach=jnp.asarray(reach),
             signal=jnp.asarray(rows[:terms, :terms]),
             decay=jnp.asarray(rows[:, terms : 2 * terms] if charge > 0.0 else np.zeros((len(rows), terms))),
-            slow=jnp.asarray(rows[:, -2 - len(SLOW) : -2].T),
-            slope=jnp.asarray(rows[:, -2]),
-            observed=jnp.asarray(rows[:, -1]),
+            slow=jnp.asarray(rows[:, _SLOW].T),
+            slope=jnp.asarray(rows[:, _SLOPE]),
+            observed=jnp.asarray(rows[:, _OBSERVED]),
             samples=self.samples,
         )
 
@@ -253,7 +258,7 @@ def _folded(table: _Table, drive: Drive, time: np.ndarray, observed: np.ndarray,
     slow, mean = sums[:-1] / count, sums[-1] / count + reference
     total = np.array(_at_times(table, drive, np.asarray(time[:period]), mean, count, slow, True))
     # what the samples of one phase scatter about their mean
-    kept = [*range(-len(SLOW) - 2, -2), -1]
+    kept = np.r_[_SLOW, _OBSERVED]
     total[np.ix_(kept, kept)] += squares - (sums / count) @ sums.T
     yield total
 
@@ -278,14 +283,10 @@ def _samples_a_period(drive: Drive, time: np.ndarray) -> int | None:
 
 
 def _is_even(time: np.ndarray) -> bool:
-    """Whether the samples lie on a grid but for rounding, looked at a chunk at a time."""
+    """Whether the samples lie on a grid but for rounding."""
     step = (time[-1] - time[0]) / (time.size - 1)
-    slack = _EXACT * step + 4.0 * np.finfo(float).eps * max(abs(time[0]), abs(time[-1]))
-    starts = range(0, time.size, _LONGEST)
-    return all(
-        np.all(np.abs(time[i : i + _LONGEST] - (time[0] + step * np.arange(i, min(i + _LONGEST, time.size)))) <= slack)
-        for i in starts
-    )
+    rounding = 4.0 * np.finfo(float).eps * max(abs(time[0]), abs(time[-1]))
+    return is_uniform(time, _EXACT + rounding / step)
 
 
 def _along_samples(table: _Table, drive: Sampled, time: np.ndarray, observed: np.ndarray) -> Iterator[np.ndarray]:
@@ -361,9 +362,9 @@ def _assemble(table: _Table, total: np.ndarray, decays: bool, samples: int) -> C
         reach=jnp.asarray(_REACH),
         signal=jnp.asarray(signal[:rank]),
         decay=jnp.asarray(rows[:, rank : 2 * rank] @ table.series if decays else np.zeros((size, NODES))),
-        slow=jnp.asarray(rows[:, -2 - len(SLOW) : -2].T),
-        slope=jnp.asarray(rows[:, -2]),
-        observed=jnp.asarray(rows[:, -1] + float(table.gain) * middle),
+        slow=jnp.asarray(rows[:, _SLOW].T),
+        slope=jnp.asarray(rows[:, _SLOPE]),
+        observed=jnp.asarray(rows[:, _OBSERVED] + float(table.gain) * middle),
         samples=jnp.asarray(float(samples)),
     )
 

@@ -1,6 +1,7 @@
 """Record: one measurement in time, checked on the way in."""
 
 import dataclasses
+import functools
 import hashlib
 import math
 from collections.abc import Callable, Mapping
@@ -11,6 +12,7 @@ from jaxtyping import Float
 from fitact.errors import InputError
 
 MINIMUM_SAMPLES = 20
+_PART = 65_536  # samples
 _SMOOTH = 0.3  # of a signal's sd: its noise, when it is more than noise
 _LEVELS = 12  # distinct values from which a channel counts as rounded by a converter
 _NEAR_PEAK = 0.02  # of correlation: the first period's peak may be that much lower than a later one's
@@ -89,12 +91,12 @@ class Record:
     def __len__(self) -> int:
         return self.time.size
 
-    @property
+    @functools.cached_property
     def time_step(self) -> float:
         """Median step, s."""
         return float(np.median(np.diff(self.time)))
 
-    @property
+    @functools.cached_property
     def fingerprint(self) -> str:
         """SHA-256 of the numbers, so that results can name the data they belong to."""
         digest = hashlib.sha256(np.ascontiguousarray(self.time).tobytes())
@@ -104,17 +106,38 @@ class Record:
 
     def noise(self, channel: str) -> float:
         """Standard deviation of the channel's noise, judged without a model: white noise and rounding."""
-        return math.hypot(white_noise(self[channel]), rounding_noise(self[channel]))
+        if channel not in self._noises:
+            self._noises[channel] = math.hypot(white_noise(self[channel]), rounding_noise(self[channel]))
+        return self._noises[channel]
 
     def frequency(self, channel: str | None = None) -> float | None:
         """Fundamental frequency in Hz of a channel (of V, else Vsc); None unless the record shows 1.5 periods."""
-        return fundamental(self.time, self[channel or ("V" if "V" in self else "Vsc")])
+        channel = channel or ("V" if "V" in self else "Vsc")
+        if channel not in self._frequencies:
+            self._frequencies[channel] = fundamental(self.time, self[channel])
+        return self._frequencies[channel]
+
+    @functools.cached_property
+    def _noises(self) -> dict[str, float]:
+        """Those asked for so far, each of which takes a pass over the record."""
+        return {}
+
+    @functools.cached_property
+    def _frequencies(self) -> dict[str, float | None]:
+        """Those asked for so far, each of which takes a transform of the record."""
+        return {}
 
 
 def is_uniform(time: Float[np.ndarray, " samples"], tolerance: float = 1e-2) -> bool:
-    """Whether every sample lies on an even grid, to `tolerance` of a step."""
-    grid = np.linspace(time[0], time[-1], time.size)
-    return bool(np.max(np.abs(time - grid)) <= tolerance * (grid[1] - grid[0]))
+    """Whether every sample lies on an even grid, to `tolerance` of a step; looked at a part at a time."""
+    step = (time[-1] - time[0]) / (time.size - 1)
+
+    def near(first: int) -> bool:
+        part = time[first : first + _PART]
+        grid = time[0] + step * np.arange(first, first + part.size)
+        return bool(np.all(np.abs(part - grid) <= tolerance * step))
+
+    return all(near(first) for first in range(0, time.size, _PART))
 
 
 def white_noise(values: Float[np.ndarray, " samples"]) -> float:

@@ -210,13 +210,13 @@ def fit(record: Record, scene: Scene | None = None, *, tolerance: float = compre
         likelihood = _likelihood(record, choice, _with_edge_time(prior, record, choice, start))
         ridge = _on_the_ridge(start, likelihood.prior)
         theta = np.append(ridge, 0.0) if likelihood.free_delay else ridge
-        freeable = ("offset", "drift", "delay", *_hum(record, choice))
+        noise, freeable = record.noise("Vsc"), ("offset", "drift", "delay", *_hum(record, choice))
         try:
             projected, reason = compressed.project(likelihood, start, tolerance)
-            solved = solve(projected, theta, record.noise("Vsc"), freeable)
+            solved = solve(projected, theta, noise, freeable)
             certified = _certified(solved, reason, tolerance)
             if certified.error is None and solved.likelihood.compression is not None:
-                solved = solve(likelihood, theta, record.noise("Vsc"), freeable)
+                solved = solve(likelihood, theta, noise, freeable)
                 certified = _certified(solved, certified.reason, tolerance)
             return _judged(solved, certified, record, given, choice, scene is None)
         except np.linalg.LinAlgError as error:

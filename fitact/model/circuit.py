@@ -15,7 +15,7 @@ constants, apart from each other even where two elements are equal: the mode tha
 weight zero.
 """
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,6 +25,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
 _LEAST = 1e-12  # of Ci: a skin without capacitance counts as having so much, which keeps its time constant from 0
+
+
+Channel: TypeAlias = Literal["Vsc", "I"]
 
 
 class Terms(NamedTuple):
@@ -54,6 +57,14 @@ class Circuit(eqx.Module):
         """I / V in siemens at the angular frequency `omega` (rad/s, >= 0)."""
         return gain_at(self.current_terms(), omega)
 
+    def terms_of(self, channel: Channel) -> Terms:
+        """The high-pass terms of a channel over V."""
+        return self.terms() if channel == "Vsc" else self.current_terms()
+
+    def gain_of(self, channel: Channel, omega: ArrayLike) -> Complex[Array, "*shape"]:
+        """A channel over V at the angular frequency `omega` (rad/s, >= 0)."""
+        return self.transfer_function(omega) if channel == "Vsc" else self.admittance(omega)
+
     def amplitude(self, omega: ArrayLike) -> Float[Array, "*shape"]:
         """|Vsc / V| at the angular frequency `omega` (rad/s, >= 0), eq. (25)."""
         gain, size = _scaled(self.transfer_function(omega))
@@ -74,10 +85,7 @@ def _scaled(gain: Array) -> tuple[Array, Array]:
 
 def highpass_gain(x: ArrayLike) -> Complex[Array, "*shape"]:
     """j x / (1 + j x) for x >= 0, without overflow at either end."""
-    x = jnp.asarray(x)
-    below = x <= 1.0
-    small = jnp.where(below, x, 1.0)
-    inverse = 1.0 / jnp.where(below, 1.0, x)
+    below, small, inverse = _ends(x)
     low = small / (1.0 + small**2)  # (x^2 + j x) / (1 + x^2)
     high = 1.0 / (1.0 + inverse**2)
     return jnp.where(below, low * small + 1j * low, high + 1j * high * inverse)
@@ -85,11 +93,15 @@ def highpass_gain(x: ArrayLike) -> Complex[Array, "*shape"]:
 
 def highpass_amplitude(x: ArrayLike) -> Float[Array, "*shape"]:
     """|j x / (1 + j x)| for x >= 0, in forms whose derivatives do not cancel."""
+    below, small, inverse = _ends(x)
+    return jnp.where(below, small / jnp.sqrt(1.0 + small**2), 1.0 / jnp.sqrt(1.0 + inverse**2))
+
+
+def _ends(x: ArrayLike) -> tuple[Array, Array, Array]:
+    """Whether x <= 1, x where it is, and 1/x where it is not; 1 elsewhere, which keeps gradients finite."""
     x = jnp.asarray(x)
     below = x <= 1.0
-    small = jnp.where(below, x, 1.0)
-    inverse = 1.0 / jnp.where(below, 1.0, x)
-    return jnp.where(below, small / jnp.sqrt(1.0 + small**2), 1.0 / jnp.sqrt(1.0 + inverse**2))
+    return below, jnp.where(below, x, 1.0), 1.0 / jnp.where(below, 1.0, x)
 
 
 class FinalCircuit(Circuit):

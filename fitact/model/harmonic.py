@@ -5,8 +5,6 @@ coefficients come in closed form from the drive's straight pieces: with c_k = 1/
 a jump J at t adds J e^{-jkwt} / (jkwT), and a straight piece its rise times the mean of e^{-jkwt} over it.
 """
 
-from typing import Literal
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
 from fitact.errors import InputError
-from fitact.model.circuit import Circuit
+from fitact.model.circuit import Channel, Circuit
 from fitact.model.drive import Drive, Line, Periodic, PiecewiseLinear, Sine
 
 _TAIL = 64  # an error is summed up to this many times the harmonics kept,
@@ -28,7 +26,7 @@ def harmonic_response(
     time: ArrayLike,
     harmonics: int,
     *,
-    channel: Literal["Vsc", "I"] = "Vsc",
+    channel: Channel = "Vsc",
 ) -> Float[Array, "*shape"]:
     """The steady state of Vsc (V) or I (A) at `time` (s) from the first `harmonics` of a periodic drive, eq. (20).
 
@@ -39,12 +37,10 @@ def harmonic_response(
         InputError: the drive has no period.
     """
     omega = fundamental(drive) * jnp.arange(1, harmonics + 1)
-    return harmonic_sum(fourier(drive, harmonics) * gain(circuit, omega, channel), drive, time)
+    return harmonic_sum(fourier(drive, harmonics) * circuit.gain_of(channel, omega), drive, time)
 
 
-def harmonic_error(
-    circuit: Circuit, drive: Drive, harmonics: int, *, channel: Literal["Vsc", "I"] = "Vsc"
-) -> Float[Array, ""]:
+def harmonic_error(circuit: Circuit, drive: Drive, harmonics: int, *, channel: Channel = "Vsc") -> Float[Array, ""]:
     """What `harmonic_response` leaves out: its root mean square over that of the whole response.
 
     By Parseval: the harmonics left out are summed up to 64 times those kept (4096 at least), and what lies
@@ -54,7 +50,7 @@ def harmonic_error(
         InputError: the drive has no period.
     """
     last = max(_TAIL * harmonics, _LEAST)
-    amplitude = fourier(drive, last) * gain(circuit, fundamental(drive) * jnp.arange(1, last + 1), channel)
+    amplitude = fourier(drive, last) * circuit.gain_of(channel, fundamental(drive) * jnp.arange(1, last + 1))
     power = amplitude.real**2 + amplitude.imag**2
     octave, before = jnp.sum(power[last // 2 :]), jnp.sum(power[last // 4 : last // 2])
     # a bounded response to jumps, the slowest there is, loses half of its power from octave to octave
@@ -62,11 +58,6 @@ def harmonic_error(
     left_out = jnp.sum(power[harmonics:]) + octave * ratio / (1.0 - ratio)
     share = left_out / (jnp.sum(power[:harmonics]) + left_out)
     return jnp.where(share > 0.0, jnp.sqrt(jnp.where(share > 0.0, share, 1.0)), 0.0)
-
-
-def gain(circuit: Circuit, omega: ArrayLike, channel: Literal["Vsc", "I"]) -> Complex[Array, "*shape"]:
-    """Vsc / V, or I / V in siemens, at `omega` (rad/s)."""
-    return circuit.transfer_function(omega) if channel == "Vsc" else circuit.admittance(omega)
 
 
 def harmonic_sum(amplitude: Complex[Array, " harmonics"], drive: Drive, time: ArrayLike) -> Float[Array, "*shape"]:

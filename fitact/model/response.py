@@ -8,7 +8,6 @@ L; at a jump u jumps along. Written so that nothing cancels or overflows at eith
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -20,9 +19,9 @@ from jaxtyping import Array, Float
 
 from fitact.errors import InputError
 from fitact.model.chirp import Chirp
-from fitact.model.circuit import Circuit, gain_at, highpass_amplitude
+from fitact.model.circuit import Channel, Circuit, gain_at, highpass_amplitude
 from fitact.model.drive import Burst, Drive, Line, Pieces, PiecewiseLinear, Sampled, Sine, Square
-from fitact.model.harmonic import fourier, frequency, fundamental, gain, harmonic_response, harmonic_sum
+from fitact.model.harmonic import fourier, frequency, fundamental, harmonic_response, harmonic_sum
 from fitact.model.polynomial import evaluate, particular
 from fitact.model.skin import WithSkin
 
@@ -35,7 +34,7 @@ def response(
     time: ArrayLike,
     *,
     steady_state: bool = True,
-    channel: Literal["Vsc", "I"] = "Vsc",
+    channel: Channel = "Vsc",
     initial: ArrayLike | Sequence[ArrayLike] | None = None,
 ) -> Float[Array, "*shape"]:
     """The skin voltage Vsc (V) or the trunk current I (A) at `time` (s), exact for the drives of `fitact.model.drive`.
@@ -58,7 +57,7 @@ def response(
     """
     if isinstance(circuit, WithSkin):
         return _with_skin(circuit, drive, time, steady_state, channel)
-    terms = circuit.terms() if channel == "Vsc" else circuit.current_terms()
+    terms = circuit.terms_of(channel)
     total = jnp.zeros_like(jnp.asarray(time, dtype=float))
     if terms.rate is not None:
         total = terms.rate * drive.slope(time, steady_state=steady_state)
@@ -72,7 +71,7 @@ def response(
 
 
 def _with_skin(
-    circuit: WithSkin, drive: Drive, time: ArrayLike, steady_state: bool, channel: Literal["Vsc", "I"]
+    circuit: WithSkin, drive: Drive, time: ArrayLike, steady_state: bool, channel: Channel
 ) -> Float[Array, "*shape"]:
     """The terms that stand for the circuit at high frequency, and the harmonics of what they miss below."""
     if not steady_state:
@@ -95,7 +94,7 @@ def _with_skin(
     if terms.rate is not None:
         total = total + terms.rate * drive.slope(time)
     harmonics = omega * jnp.arange(1, count + 1)
-    missed = gain(circuit, harmonics, channel) - gain_at(terms, harmonics)
+    missed = circuit.gain_of(channel, harmonics) - gain_at(terms, harmonics)
     return total + harmonic_sum(fourier(drive, count) * missed, drive, time)
 
 
@@ -156,8 +155,7 @@ def _steady(drive: Sine | PiecewiseLinear | Line, tau: ArrayLike) -> Callable[[A
     """u(t) in the steady state."""
     if isinstance(drive, Sine):
         return partial(_sine, drive, tau)
-    pieces = drive.pieces()
-    u = knot_values(pieces, tau, _settled(pieces, tau))
+    u = steady_knots(drive.pieces(), tau)
     return lambda time: _along(drive, time, tau, u)
 
 

@@ -8,7 +8,6 @@ harmonic by harmonic.
 
 import dataclasses
 import functools
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -18,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Complex
 
 from fitact.errors import InputError
-from fitact.model.circuit import Circuit, DirectGround, Element, FinalCircuit, NaturalGround, Terms
+from fitact.model.circuit import Channel, Circuit, DirectGround, Element, FinalCircuit, NaturalGround, Terms
 
 # section 3.1 of the paper, where Rsc, Csc are those at 100 Hz
 _FREQUENCY = np.array([10.0, 100.0, 1000.0])  # Hz
@@ -40,7 +39,7 @@ class Skin(eqx.Module):
         """How many harmonics of `frequency` (Hz) are taken one by one, before `above` stands for the rest."""
         raise NotImplementedError
 
-    def above(self, circuit: "WithSkin", omega: ArrayLike, channel: Literal["Vsc", "I"]) -> Terms:
+    def above(self, circuit: "WithSkin", omega: ArrayLike, channel: Channel) -> Terms:
         """High-pass terms that stand for `circuit` at the angular frequency `omega` (rad/s) and above."""
         raise NotImplementedError
 
@@ -81,10 +80,9 @@ class Dispersive(Skin):
                 " state how many there are at most: Dispersive(harmonics=...)"
             ) from None
 
-    def above(self, circuit: "WithSkin", omega: ArrayLike, channel: Literal["Vsc", "I"]) -> Terms:
+    def above(self, circuit: "WithSkin", omega: ArrayLike, channel: Channel) -> Terms:
         """Exact: above 1000 Hz the skin is constant."""
-        constant = circuit.at(_FREQUENCY[-1])
-        return constant.terms() if channel == "Vsc" else constant.current_terms()
+        return circuit.at(_FREQUENCY[-1]).terms_of(channel)
 
 
 class Fractional(Skin):
@@ -117,12 +115,12 @@ class Fractional(Skin):
         """`harmonics`."""
         return self.harmonics
 
-    def above(self, circuit: "WithSkin", omega: ArrayLike, channel: Literal["Vsc", "I"]) -> Terms:
+    def above(self, circuit: "WithSkin", omega: ArrayLike, channel: Channel) -> Terms:
         """Time constants spread evenly over the decades above `omega`, with weights fitted by least squares."""
         limited = channel == "Vsc" or circuit.circuit.current_terms().rate is None
         omega = jnp.asarray(omega, dtype=float)
         tau, x, weights = _spread(limited, omega.dtype == jnp.float64)
-        gain = (circuit.transfer_function if channel == "Vsc" else circuit.admittance)(omega * x)
+        gain = circuit.gain_of(channel, omega * x)
         gain = gain if limited else gain / x
         weight = jnp.dot(weights, jnp.concatenate([gain.real, gain.imag]), precision="highest")
         # an unlimited current still grows at the end of the fit: at a jump it has no value

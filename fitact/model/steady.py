@@ -8,7 +8,7 @@ so S serves every circuit. Written so that neither it nor its derivative cancels
 """
 
 import itertools
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.errors import InputError
-from fitact.model.circuit import Circuit, FinalCircuit, Terms, highpass_amplitude
+from fitact.model.circuit import Channel, Circuit, Terms, highpass_amplitude
 from fitact.model.drive import Drive, Line, Periodic, Pieces, PiecewiseLinear, Sine, Square, Trapezoid, Triangle
 from fitact.model.response import bend, coth_fraction, log_slope, phi, psi, steady_knots
 
@@ -32,7 +32,7 @@ class BodyCurrent(NamedTuple):
     peak: Array
 
 
-def mean_square(circuit: Circuit, drive: Drive, channel: Literal["Vsc", "I"] = "Vsc") -> Float[Array, ""]:
+def mean_square(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Float[Array, ""]:
     """The mean square over a period of Vsc (V^2) or of the trunk current I (A^2), in the steady state.
 
     Exact. Where the current follows dV/dt and the drive jumps it is infinite.
@@ -40,7 +40,7 @@ def mean_square(circuit: Circuit, drive: Drive, channel: Literal["Vsc", "I"] = "
     Raises:
         InputError: the drive does not repeat.
     """
-    terms = circuit.terms() if channel == "Vsc" else circuit.current_terms()
+    terms = circuit.terms_of(channel)
     pairs = list(zip(terms.weight, terms.tau, strict=True))
     each = [weight * highpass_mean_square(drive, tau) for weight, tau in pairs]
     total = jnp.asarray(0.0)
@@ -56,7 +56,7 @@ def mean_square(circuit: Circuit, drive: Drive, channel: Literal["Vsc", "I"] = "
     return jnp.where(_impulses(drive, terms.rate), jnp.inf, total + terms.rate**2 * _slope_mean_square(drive))
 
 
-def peak(circuit: Circuit, drive: Drive, channel: Literal["Vsc", "I"] = "Vsc") -> Float[Array, ""]:
+def peak(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Float[Array, ""]:
     """The largest |Vsc| (V) or |I| (A) over a period of the steady state, both sides of every jump included.
 
     Exact: one time constant has its extremes at the ends of the straight pieces; of several, those in
@@ -68,10 +68,9 @@ def peak(circuit: Circuit, drive: Drive, channel: Literal["Vsc", "I"] = "Vsc") -
     """
     if isinstance(drive, Sine):
         omega = 2.0 * np.pi * jnp.asarray(drive.frequency)
-        gain = circuit.admittance(omega) if channel == "I" else circuit.transfer_function(omega)
-        amplitude = circuit.amplitude(omega) if channel == "Vsc" and isinstance(circuit, FinalCircuit) else abs(gain)
+        amplitude = circuit.amplitude(omega) if channel == "Vsc" else abs(circuit.admittance(omega))
         return abs(0.5 * jnp.asarray(drive.peak_to_peak)) * amplitude
-    terms = circuit.terms() if channel == "Vsc" else circuit.current_terms()
+    terms = circuit.terms_of(channel)
     if isinstance(drive, Square | Triangle) and len(terms.tau) == 1 and terms.rate is None:
         return abs(terms.weight[0] * jnp.asarray(drive.peak_to_peak)) * _highest(drive, drive.period / terms.tau[0])
     largest = jnp.max(jnp.abs(_extremes(terms, _period(drive))))
