@@ -97,6 +97,25 @@ class Fit:
         return np.linalg.norm(self.covariance_root, axis=1)
 
     @property
+    def point_names(self) -> tuple[str, ...]:
+        """Coordinates of the posterior: those of theta, and sigma, in logarithms but for the delay."""
+        return (*self.names, "sigma")
+
+    @property
+    def point(self) -> Float[np.ndarray, " coordinates"]:
+        """The optimum in the coordinates of the posterior."""
+        return np.append(self.theta, math.log(self.sigma))
+
+    @property
+    def point_root(self) -> Float[np.ndarray, "coordinates coordinates"]:
+        """As `covariance_root`, in the coordinates of the posterior; sigma's from its degrees of freedom."""
+        size = self.theta.size + 1
+        root = np.zeros((size, size))
+        root[:-1, :-1] = self.covariance_root
+        root[-1, -1] = math.sqrt(0.5 / self.figures["degrees_of_freedom"])
+        return root
+
+    @property
     def correlation(self) -> Float[np.ndarray, "parameters parameters"]:
         """Correlations of theta."""
         return self.covariance / np.outer(self.sd, self.sd)

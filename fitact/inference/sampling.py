@@ -62,7 +62,7 @@ def sample(
     Raises:
         InputError: the chain file belongs to another record, scene or seed; or the prior forbids every start.
     """
-    names = (*fit.names, "sigma")
+    names = fit.point_names
     if walkers % 2 or walkers < 2 * len(names) or ensembles < 2:
         raise InputError(
             f"walkers = {walkers}, ensembles = {ensembles}: at least {2 * len(names)}, even; and at least 2"
@@ -184,12 +184,8 @@ class _StudentT:
 
     @classmethod
     def around(cls, fit: Fit) -> "_StudentT":
-        """The fit's Laplace approximation, with sigma's from its degrees of freedom."""
-        size = fit.theta.size + 1
-        factor = np.zeros((size, size))
-        factor[:-1, :-1] = fit.covariance_root
-        factor[-1, -1] = np.sqrt(0.5 / fit.figures["degrees_of_freedom"])
-        return cls(np.append(fit.theta, np.log(fit.sigma)), factor)
+        """The fit's Laplace approximation."""
+        return cls(fit.point, fit.point_root)
 
     def draw(self, random: np.random.RandomState, count: int, widen: float = 1.0) -> Float[np.ndarray, "count n"]:
         normal = random.standard_normal((count, self.center.size)) @ self.factor.T
