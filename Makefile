@@ -2,7 +2,7 @@
 # make test   set up, run the tests
 PY = .venv/bin/python
 .DEFAULT_GOAL = help
-.PHONY: help env demo test test-slow notebooks extremes check lock clean
+.PHONY: help env demo test test-slow notebooks extremes calibration calibration-quick check lock clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -27,6 +27,14 @@ notebooks: env
 # make extremes   the worst point of every quantity over the whole range of parameters, against mpmath
 extremes: env
 	$(PY) tests/extremes.py
+
+# make calibration   1,000 simulated records through fit and sampler: are the posteriors right? (goes on where it ended)
+calibration: env
+	$(PY) tests/calibration.py --records 1000 --out out/calibration
+
+# make calibration-quick   the same with the first 100 of them
+calibration-quick: env
+	$(PY) tests/calibration.py --records 100 --out out/calibration
 
 # make check   style, types, and the order of the layers
 check: env

@@ -2,16 +2,17 @@ from .data.formats import read
 from .data.record import Record
 from .errors import InputError
 from .inference.fit import Fit, fit
-from .inference.least_squares import RESULTS
 from .inference.posterior import Posterior
 from .inference.sampling import sample
+from .inference.solver import RESULTS
 from .model.chirp import Chirp
 from .model.circuit import DirectGround, FinalCircuit, NaturalGround, Probe
+from .model.distribution import LogNormal, LogUniform, TruncatedLogNormal, Uniform
 from .model.drive import Burst, Polyline, Sampled, Sine, Square, Trapezoid, Triangle
 from .model.equivalents import quality_factor, series_equivalent
 from .model.force import Contact, electrostatic_force, friction, mean_force, peak_force
 from .model.harmonic import harmonic_error, harmonic_response
-from .model.prior import LogNormal, Prior, Uniform
+from .model.prior import Prior
 from .model.response import response
 from .model.scene import Scene
 from .model.skin import Dispersive, Fractional, WithSkin
@@ -29,6 +30,7 @@ __all__ = [
     "Fractional",
     "InputError",
     "LogNormal",
+    "LogUniform",
     "NaturalGround",
     "Polyline",
     "Posterior",
@@ -41,6 +43,7 @@ __all__ = [
     "Square",
     "Trapezoid",
     "Triangle",
+    "TruncatedLogNormal",
     "Uniform",
     "WithSkin",
     "body_current",

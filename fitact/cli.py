@@ -5,7 +5,7 @@ import platform
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -15,7 +15,6 @@ from fitact.files import to_json, write_json
 if TYPE_CHECKING:
     from fitact.inference.fit import Fit
     from fitact.inference.posterior import Posterior
-    from fitact.model.scene import Scene
 
 app = typer.Typer(
     name="fitact",
@@ -37,9 +36,17 @@ Exit code 0: an answer. 1: an answer that must not be trusted (the files say why
 """,
 )
 
-RecordFile = Annotated[Path, typer.Argument(metavar="RECORD", help="CSV with time_s, V_V, Vsc_V; may be gzipped.")]
-SceneFile = Annotated[
-    Path | None, typer.Option("--scene", metavar="FILE", help="Scene (TOML); absent: the paper's device.")
+RecordFiles = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="RECORD...", help="CSV with time_s, V_V, Vsc_V, I_A; may be gzipped. Several: fitted jointly."
+    ),
+]
+SceneFiles = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--scene", metavar="FILE", help="Scene (TOML); absent: the paper's device. Once for all records, or once each."
+    ),
 ]
 Out = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for the results.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Same seed, same draws.")]
@@ -52,14 +59,24 @@ Tolerance = Annotated[
         "--tolerance", min=0.0, help="Error that compressing the record may cause in its log-likelihood; 0: none."
     ),
 ]
+Level = Annotated[
+    Literal["emcee", "psis", "laplace"],
+    typer.Option(
+        "--level",
+        help="How uncertainty is found: sampled until converged; by importance weights (certified or refused); or by"
+        " the fit's normal approximation (fast; says what it is off by).",
+    ),
+]
+Results = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `run` or `sample` wrote.")]
 Fresh = Annotated[bool, typer.Option("--fresh", help="Start the chain anew instead of going on from one in DIR.")]
 
 
 @app.command()
 def run(
-    record: RecordFile,
-    scene: SceneFile = None,
+    records: RecordFiles,
+    scene: SceneFiles = None,
     out: Out = None,
+    level: Level = "emcee",
     seed: Seed = 0,
     tolerance: Tolerance = 1e-3,
     fresh: Fresh = False,
@@ -69,8 +86,8 @@ def run(
 
     Writes fit.json, summary.json, posterior.nc (opens with ArviZ), chain.h5 (for going on) and report.html.
     """
-    folder = out or _folder(record)
-    posterior = _sampled(record, scene, folder, seed, tolerance, fresh)
+    folder = out or _folder(records[0])
+    posterior = _sampled(records, scene, folder, level, seed, tolerance, fresh)
     page = folder / "report.html"
     _say("writing the report")
     posterior.report(page)
@@ -80,49 +97,73 @@ def run(
 
 @app.command()
 def fit(
-    record: RecordFile,
-    scene: SceneFile = None,
+    records: RecordFiles,
+    scene: SceneFiles = None,
     out: Out = None,
     tolerance: Tolerance = 1e-3,
+    starts: Annotated[
+        int, typer.Option("--starts", min=1, help="Starts: the record's own, and draws of the prior.")
+    ] = 1,
+    intervals: Annotated[
+        bool, typer.Option("--intervals", help="Add 95 % profile-likelihood intervals, with and without the prior.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Least squares only: parameters with errors, and the verdict, in seconds."""
-    fitted = _fitted(record, scene, tolerance)
+    fitted = _fitted(records, scene, tolerance, starts)
+    text, content = str(fitted), fitted.to_dict()
+    if intervals:
+        from fitact.inference.profile import table
+
+        both = fitted.intervals(), fitted.intervals(prior=False)
+        text = f"{text}\n{table(*both)}"
+        content["intervals"] = {
+            name: {"with_prior": of.to_dict(), "without_prior": both[1][name].to_dict()} for name, of in both[0].items()
+        }
     if out is not None:
-        write_json(out / "fit.json", fitted.to_dict())
-    _show(str(fitted), fitted.to_dict(), json)
+        write_json(out / "fit.json", content)
+    _show(text, content, json)
     _finish(fitted.trusted)
 
 
 @app.command()
 def sample(
-    record: RecordFile,
-    scene: SceneFile = None,
+    records: RecordFiles,
+    scene: SceneFiles = None,
     out: Out = None,
+    level: Level = "emcee",
     seed: Seed = 0,
     tolerance: Tolerance = 1e-3,
     fresh: Fresh = False,
     json: Json = False,
 ) -> None:
     """Fit, then sample the posterior until it has converged; as `run`, without the report."""
-    folder = out or _folder(record)
-    posterior = _sampled(record, scene, folder, seed, tolerance, fresh)
+    folder = out or _folder(records[0])
+    posterior = _sampled(records, scene, folder, level, seed, tolerance, fresh)
     _show(f"{posterior}\nwrote {folder}; for a report: fitact report {folder}", posterior.summary(), json)
     _finish(posterior.trusted)
 
 
 @app.command()
-def report(
-    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `run` or `sample` wrote.")],
-    json: Json = False,
-) -> None:
+def summary(directory: Results, json: Json = False) -> None:
+    """Print the table of a folder of results again."""
+    from fitact.inference.summary import load, table, trusted
+
+    content = load(directory)
+    _show(table(content), content, json)
+    _finish(trusted(content))
+
+
+@app.command()
+def report(directory: Results, json: Json = False) -> None:
     """Write the report of a folder of results again."""
+    from fitact.inference.summary import trusted as is_trusted
     from fitact.report import read_results, write_report
 
-    tree, summary = read_results(directory)
+    tree, content = read_results(directory)
     page = directory / "report.html"
-    write_report(page, tree, summary)
-    trusted = bool(summary["convergence"]["converged"]) and summary["fit"]["result"] == "successful"
+    write_report(page, tree, content)
+    trusted = is_trusted(content)
     _show(f"open {page}", {"report": str(page), "trusted": trusted}, json)
     _finish(trusted)
 
@@ -153,39 +194,69 @@ def simulate(
     _show(f"wrote {out}: {len(record):,} samples of {', '.join(record.channels)}", content, json)
 
 
+@app.command()
+def prior(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene (TOML).")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="Figure to write: .html, .svg or .png.")
+    ] = None,
+    draws: Annotated[int, typer.Option("--draws", min=100, max=100_000, help="Fingers to draw.")] = 2000,
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """What a scene's prior means for Vsc and force, before any data."""
+    from fitact.model.scene import Scene
+
+    stated = Scene.load(scene)
+    _use_compilation_cache()
+    from fitact.inference.prior_predictive import prior_predictive
+
+    predicted = prior_predictive(stated, draws, seed)
+    if out is not None:
+        from fitact.report.prior import write_prior
+
+        write_prior(out, predicted)
+    _show(str(predicted), predicted.to_dict(), json)
+
+
 def _folder(record: Path) -> Path:
     return Path(f"{record.name.removesuffix('.gz').removesuffix('.csv')}-fitact")
 
 
-def _scene(path: Path | None) -> "Scene | None":
+def _fitted(records: list[Path], scenes: list[Path] | None, tolerance: float, starts: int = 1) -> "Fit":
+    from fitact.data.formats import read
     from fitact.model.scene import Scene
 
-    return None if path is None else Scene.load(path)
-
-
-def _fitted(record: Path, scene: Path | None, tolerance: float) -> "Fit":
-    from fitact.data.formats import read
-
-    stated = _scene(scene)
-    if stated is not None:
-        stated.require_available(fit=True)
-    measured = read(record, stated)  # refused before the slow imports
+    stated = [Scene.load(path) for path in scenes or []]
+    for scene in stated:
+        scene.require_available(fit=True)
+    of_each = stated if len(stated) == len(records) else [stated[0] if stated else None] * len(records)
+    measured = [read(*pair) for pair in zip(records, of_each, strict=True)]  # refused before the slow imports
     _use_compilation_cache()
     from fitact.inference.fit import fit
 
-    _say(f"fitting {record} ({len(measured):,} samples)")
-    return fit(measured, stated, tolerance=tolerance)
+    for path, record in zip(records, measured, strict=True):
+        _say(f"fitting {path} ({len(record):,} samples)")
+    return fit(measured, stated if len(stated) > 1 else of_each[0], starts=starts, tolerance=tolerance)
 
 
-def _sampled(record: Path, scene: Path | None, folder: Path, seed: int, tolerance: float, fresh: bool) -> "Posterior":
+def _sampled(
+    records: list[Path],
+    scene: list[Path] | None,
+    folder: Path,
+    level: Level,
+    seed: int,
+    tolerance: float,
+    fresh: bool,
+) -> "Posterior":
     """Fit and sample, and write all but the report, once the chain is known to belong there."""
-    fitted = _fitted(record, scene, tolerance)
+    fitted = _fitted(records, scene, tolerance)
     from fitact.inference.sampling import sample
 
     chain = folder / "chain.h5"
     if fresh:
         chain.unlink(missing_ok=True)
-    posterior = sample(fitted, seed=seed, chain_file=chain)
+    posterior = sample(fitted, level=level, seed=seed, chain_file=chain)
     write_json(folder / "fit.json", fitted.to_dict())
     posterior.to_netcdf(folder / "posterior.nc")
     write_json(folder / "summary.json", posterior.summary())
@@ -205,7 +276,7 @@ def _use_compilation_cache() -> None:
     except (OSError, RuntimeError):  # no home, or one that cannot be written
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # the many small ones take a second
 
 
 def _show(text: str, content: dict[str, Any], as_json: bool) -> None:

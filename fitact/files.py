@@ -18,7 +18,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         InputError: the place cannot be written.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.tmp")  # one name, so that what a kill leaves is overwritten
+    temporary = _temporary(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
@@ -26,8 +26,17 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from error
     finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
+        clean(path)
+
+
+def clean(path: str | os.PathLike[str]) -> None:
+    """Remove what a killed program left of `replacing(path)`."""
+    with contextlib.suppress(OSError):
+        _temporary(Path(path)).unlink()
+
+
+def _temporary(path: Path) -> Path:
+    return path.with_name(f".{path.name}.tmp")  # one name, so that what a kill leaves is overwritten
 
 
 def to_json(content: Any) -> str:

@@ -32,9 +32,10 @@ def parse(value: object, unit: str) -> float:
 
         try:
             quantity = _registry().Quantity(value)
-            value = float(quantity.magnitude if quantity.unitless else quantity.to(unit).magnitude)
+            value = float(quantity.to("" if quantity.unitless else unit).magnitude)  # "10 %" is 0.1
         except pint.DimensionalityError as error:
-            raise InputError(f"'{value}' is not in a unit of {unit}; write it as a multiple of {unit}") from error
+            remedy = f"in a unit of {unit}; write it as a multiple of {unit}" if unit else "a plain number; write one"
+            raise InputError(f"'{value}' is not {remedy}") from error
         except Exception as error:  # pint raises a dozen kinds, tokenize errors among them
             raise InputError(f"'{value}' is not a quantity; write a number with a unit, such as '1 {unit}'") from error
     if not math.isfinite(value):

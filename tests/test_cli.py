@@ -1,6 +1,7 @@
 """The command line as a user meets it: another process, its output, its files, its exit code."""
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -91,6 +92,36 @@ def test_report_is_made_again_from_the_folder(results, fitact_command, tmp_path)
     assert "fitact sample" in refused.stderr
 
 
+def test_summary_is_printed_again_with_the_runs_exit_code(results, fitact_command, tmp_path):
+    folder, done = results
+    again = fitact_command("summary", folder)
+    assert again.returncode == 0
+    assert done.stdout == again.stdout + f"open {folder / 'report.html'}\n"
+    content = json.loads(fitact_command("summary", folder, "--json").stdout)
+    assert content == json.loads((folder / "summary.json").read_text())
+    content["convergence"]["converged"] = False
+    (tmp_path / "summary.json").write_text(json.dumps(content))
+    assert fitact_command("summary", tmp_path).returncode == 1
+    (tmp_path / "summary.json").write_text("{}")
+    refused = fitact_command("summary", tmp_path)
+    assert refused.returncode == 2
+    assert "fitact sample" in refused.stderr
+
+
+def test_other_levels_of_uncertainty(fitact_command, finger_path, finger_scene_path, tmp_path):
+    command = ("sample", finger_path, "--scene", finger_scene_path, "--json", "--out", "out", "--level")
+    for level in ("psis", "laplace"):
+        done = fitact_command(*command, level)
+        assert done.returncode == 0, done.stderr
+        convergence = json.loads(done.stdout)["convergence"]
+        assert convergence["level"] == level
+        assert convergence["k_hat"] < 0.7
+        assert convergence["seconds"] > 0.0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES - {"chain.h5", "report.html"}
+    assert fitact_command("report", "out").returncode == 0
+    assert fitact_command(*command, "exact").returncode == 2
+
+
 def test_fit_json(fitact_command, finger_path):
     done = fitact_command("fit", finger_path, "--json", "--out", "here")
     assert done.returncode == 0
@@ -101,12 +132,12 @@ def test_fit_json(fitact_command, finger_path):
 
 def test_misfit_is_exit_code_1_with_an_answer(fitact_command, finger_path, tmp_path):
     header, *rows = finger_path.read_text().splitlines()
-    clipped = [f"{t},{v},{min(max(float(s), -12.0), 12.0)}" for t, v, s in (row.split(",") for row in rows)]
-    (tmp_path / "clipped.csv").write_text("\n".join([header, *clipped]))
-    done = fitact_command("fit", "clipped.csv", "--json", "--out", "clipped")
+    bent = [f"{t},{v},{20.0 * math.tanh(float(s) / 20.0)}" for t, v, s in (row.split(",") for row in rows)]
+    (tmp_path / "saturating.csv").write_text("\n".join([header, *bent]))
+    done = fitact_command("fit", "saturating.csv", "--json", "--out", "saturating")
     assert done.returncode == 1
     assert json.loads(done.stdout)["fit"]["misfit"] is True
-    assert json.loads((tmp_path / "clipped" / "fit.json").read_text())["fit"]["result"] == "misfit"
+    assert json.loads((tmp_path / "saturating" / "fit.json").read_text())["fit"]["result"] == "misfit"
     assert "must not be trusted" in done.stderr
 
 
@@ -125,6 +156,18 @@ def test_simulate_then_fit_recovers_the_scene(fitact_command, tmp_path):
     derived = json.loads(done.stdout)["derived"]
     for name, truth in {"g": 1.35 / 32.7, "b": 90e3 * 32.7e-9}.items():
         assert abs(derived[name]["q50"] - truth) < 4.0 * derived[name]["sd"]
+
+
+def test_prior_is_shown_before_any_data(fitact_command, tmp_path):
+    (tmp_path / "scene.toml").write_text('[prior]\nRsc = {median = "130 kohm", factor = 3}\n')
+    done = fitact_command("prior", "scene.toml", "--draws", 500, "--seed", 1, "--out", "prior.html", "--json")
+    assert done.returncode == 0, done.stderr
+    content = json.loads(done.stdout)
+    assert content["draws"] == 500
+    assert {"Rsc", "Csc", "Ci"} == set(content["parameters"])
+    assert 90e3 < content["parameters"]["Rsc"]["q50"] < 180e3
+    assert content["derived"]["force_mean"]["unit"] == "N"
+    assert "<svg" in (tmp_path / "prior.html").read_text()
 
 
 def test_simulated_current_needs_a_finite_one(fitact_command, tmp_path):

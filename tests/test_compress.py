@@ -1,6 +1,5 @@
 """The compressed likelihood against sums over the samples that are computed without it."""
 
-import dataclasses
 import re
 
 import jax
@@ -67,7 +66,7 @@ def test_measured_drive(kind: str, factor: float):
     tau = factor * TAU
     # the same broken line on the even grid that scipy needs
     u = unit_response(grid, np.interp(grid, time, voltage), tau)[kept]
-    compression = compress(fitact.Sampled(time, voltage), time, y, steady_state=False, tau=TAU, gain=0.05)
+    compression = compress(fitact.Sampled(time, voltage), time, y, steady_state=False, near=Terms((0.05,), (TAU,)))
     check(compression, u, np.exp(-(time - time[0]) / tau), slow(time), y, tau)
 
 
@@ -81,7 +80,7 @@ def test_settled_square(frequency: float):
     since = np.where(cycles % 1.0 < 0.5, cycles % 1.0, cycles % 1.0 - 0.5) / frequency
     sign = np.where(cycles % 1.0 < 0.5, 1.0, -1.0)
     y = np.random.default_rng(4).standard_normal(time.size)
-    compression = compress(drive, time, y, steady_state=True, tau=TAU, gain=0.05)
+    compression = compress(drive, time, y, steady_state=True, near=Terms((0.05,), (TAU,)))
     for tau in (0.2 * TAU, TAU, 3.0 * TAU):
         u = sign * 360.0 / (1.0 + np.exp(-half / tau)) * np.exp(-since / tau)
         check(compression, u, None, slow(time), y, tau)
@@ -91,7 +90,7 @@ def test_square_from_rest():
     time = np.arange(3000) * 1e-5
     voltage = np.where(np.arange(3000) % 1000 < 500, 180.0, -180.0)
     y = np.random.default_rng(5).standard_normal(time.size)
-    compression = compress(fitact.Square(360.0, 100.0), time, y, steady_state=False, tau=TAU, gain=0.05)
+    compression = compress(fitact.Square(360.0, 100.0), time, y, steady_state=False, near=Terms((0.05,), (TAU,)))
     check(compression, unit_response(time, voltage, TAU, hold=True), None, slow(time), y, TAU)
 
 
@@ -124,7 +123,7 @@ def test_points_beyond_the_table_are_summed_over_the_samples():
     fit = fitact.fit(square_record(), SQUARE)
     far = np.append(fit.theta, np.log(fit.sigma)) + np.array([0.7, 0.0, 0.0, 0.0])
     near = np.append(fit.theta, np.log(fit.sigma))
-    full = dataclasses.replace(fit.likelihood, compression=None)
+    full = fit.likelihood.summed()
     expected = [float(Likelihood.log_prob(full, jnp.asarray(point))) for point in (far, near)]
     np.testing.assert_allclose(compressed.log_prob(fit.likelihood, 2)(np.stack([far, near])), expected, rtol=1e-9)
 
@@ -170,7 +169,7 @@ def test_no_more_than_a_chunk_is_read_at_a_time(kind: str):
         "chirp": lambda: fitact.Chirp(360.0, 20.0, 200.0, 0.75),
     }[kind]()
     steady = "folded" in kind
-    compression = compress(drive, OnDisk(time), OnDisk(y), steady_state=steady, tau=TAU, gain=0.05)
+    compression = compress(drive, OnDisk(time), OnDisk(y), steady_state=steady, near=Terms((0.05,), (TAU,)))
     assert float(compression.observed @ compression.observed) == pytest.approx(y @ y, rel=1e-12)
 
 

@@ -81,7 +81,8 @@ def test_nothing_in_a_record_becomes_markup(finger_posterior: fitact.Posterior, 
     import dataclasses
 
     record = dataclasses.replace(finger_posterior.fit.record, source="<script>alert(1)</script>.csv")
-    fit = dataclasses.replace(finger_posterior.fit, record=record)
+    trace = dataclasses.replace(finger_posterior.fit.traces[0], record=record)
+    fit = dataclasses.replace(finger_posterior.fit, traces=(trace,))
     dataclasses.replace(finger_posterior, fit=fit).report(tmp_path / "report.html")
     assert "<script" not in (tmp_path / "report.html").read_text()
 

@@ -201,6 +201,7 @@ def test_differentiable_in_every_parameter(name: str):
 
 
 @pytest.mark.parametrize("x", [1e-3, 1.0, 3.0, 50.0])
+@pytest.mark.slow
 def test_second_derivatives(x: float):
     check_grads(lambda x: jnp.stack([phi(x), psi(x), _rectangle(0.2, x)]), (x,), order=2, rtol=1e-4, atol=1e-7)
 

@@ -12,6 +12,7 @@ all samples, and as functions of log tau the coordinates are Chebyshev series.
 import math
 from collections.abc import Iterator
 from fractions import Fraction
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -29,8 +30,8 @@ from fitact.model.response import highpass, phi, recurrence
 SLOW = ("offset", "drift", "hum_50Hz_cos", "hum_50Hz_sin", "hum_60Hz_cos", "hum_60Hz_sin")
 
 # the last of the functions whose inner products are added up
-_SLOW = slice(-2 - len(SLOW), -2)
-_SLOPE, _OBSERVED = -2, -1
+_SLOW = slice(-3 - len(SLOW), -3)
+_RATE, _SLOPE, _OBSERVED = -3, -2, -1
 
 NODES = 41  # odd, so that the middle of the table is a node
 _REACH = math.log(9.0)  # half width of the table in log tau
@@ -51,8 +52,9 @@ class Compression(eqx.Module):
         signal: Chebyshev coefficients in log tau of the response to the drive (V), rows below its rank being 0.
         decay: those of the decay of an unknown charge from 1 V.
         slow: the shapes of `SLOW`, of height 1.
+        rate: dV/dt, V/s, where the channel follows it, else 0.
         slope: dV/dt, V/s, over two samples, so that a jump shows on both sides of it.
-        observed: the record, V.
+        observed: the record, V or A.
         samples: how many there are.
     """
 
@@ -61,6 +63,7 @@ class Compression(eqx.Module):
     signal: Float[Array, "rank terms"]
     decay: Float[Array, "rows terms"]
     slow: Float[Array, "shapes rows"]
+    rate: Float[Array, " rows"]
     slope: Float[Array, " rows"]
     observed: Float[Array, " rows"]
     samples: Float[Array, ""]
@@ -70,11 +73,12 @@ class Compression(eqx.Module):
         return jnp.abs(jnp.log(tau) - self.center) <= self.reach
 
     def response(self, terms: Terms) -> Float[Array, " rows"]:
-        """The response of a circuit, as `fitact.response` gives it in time; V."""
+        """The response of a circuit, as `fitact.response` gives it in time."""
         total = sum(
             weight * (self.signal @ self._series(tau)) for weight, tau in zip(terms.weight, terms.tau, strict=True)
         )
-        return jnp.pad(total, (0, self.observed.size - self.signal.shape[0]))
+        total = jnp.pad(total, (0, self.observed.size - self.signal.shape[0]))
+        return total if terms.rate is None else total + terms.rate * self.rate
 
     def decays(self, tau: Array) -> Float[Array, " rows"]:
         """e^{-(t - t0) / tau} from the first sample on."""
@@ -98,7 +102,9 @@ class Compression(eqx.Module):
         (V, root of the sum of squares); with no charge its decay is left out altogether.
         """
         x, to_series = _chebyshev(NODES)
-        at = jax.vmap(self._series)(jnp.exp(center + reach * x))  # nodes of the narrow table, in the wide one
+        # nodes of the narrow table, in the wide one; by NumPy, since JAX would compile its loop for every record
+        inside = (center + reach * x - float(self.center)) / float(self.reach)
+        at = np.polynomial.chebyshev.chebvander(inside, self.signal.shape[1] - 1)
         signal = np.asarray(self.signal @ at.T) @ to_series.T
         decay = np.asarray(self.decay @ at.T) @ to_series.T
         sizes = np.linalg.norm(signal, axis=0) + charge * np.linalg.norm(decay, axis=0)
@@ -106,7 +112,7 @@ class Compression(eqx.Module):
         terms = max(2, int(np.count_nonzero(left > precision)))
         signal = np.pad(signal[:, :terms], ((0, self.observed.size - signal.shape[0]), (0, 0)))
         others = [decay[:, :terms]] if charge > 0.0 else []
-        columns = [signal, *others, self.slow.T, self.slope[:, None], self.observed[:, None]]
+        columns = [signal, *others, self.slow.T, *(x[:, None] for x in (self.rate, self.slope, self.observed))]
         _, rows = np.linalg.qr(np.hstack(columns))
         return Compression(
             center=jnp.asarray(center),
@@ -114,6 +120,7 @@ class Compression(eqx.Module):
             signal=jnp.asarray(rows[:terms, :terms]),
             decay=jnp.asarray(rows[:, terms : 2 * terms] if charge > 0.0 else np.zeros((len(rows), terms))),
             slow=jnp.asarray(rows[:, _SLOW].T),
+            rate=jnp.asarray(rows[:, _RATE]),
             slope=jnp.asarray(rows[:, _SLOPE]),
             observed=jnp.asarray(rows[:, _OBSERVED]),
             samples=self.samples,
@@ -126,10 +133,11 @@ def compress(
     observed: Float[np.ndarray, " samples"],
     *,
     steady_state: bool,
-    tau: float,
-    gain: float,
+    near: Terms,
+    weight: Float[np.ndarray, " samples"] | None = None,
+    rate: Float[np.ndarray, " samples"] | None = None,
 ) -> Compression:
-    """Project a record on the responses to `drive` of time constants within a factor 9 of `tau` (s).
+    """Project a record on the responses to `drive` of time constants within a factor 9 of that of `near`.
 
     One pass over the arrays, a chunk at a time (so they may be `numpy.memmap`); where a steady drive repeats on
     the record's own sampling grid, its periods are folded first, exactly. Call it in double precision.
@@ -137,21 +145,25 @@ def compress(
     Args:
         drive: as in `fitact.response`; a `Sampled` one has the record's own times.
         time: s.
-        observed: Vsc, V.
+        observed: Vsc or I, V or A.
         steady_state: as in `fitact.response`.
-        tau, gain: of a response near the record (gain in V/V), which is taken off before and added after, so
-            that the record's noise keeps its digits.
+        near: one term whose response is near the record; it is taken off before and added after, so that the
+            record's noise keeps its digits.
+        weight: of the samples: what multiplies their differences from a model; 0 leaves one out. None: 1.
+        rate: dV/dt, V/s, for a channel that follows it.
     """
-    table = _Table.around(tau, gain, time)
+    table = _Table.around(near, time)
+    samples = _Samples(time, observed, weight, rate)
     if isinstance(drive, Sampled):
-        parts = _along_samples(table, drive, time, observed)
+        parts = _along_samples(table, drive, samples)
     else:
         period = _samples_a_period(drive, time) if steady_state else None
         if period is None:
-            parts = _plainly(table, drive, time, observed, steady_state)
+            parts = _plainly(table, drive, samples, steady_state)
         else:
-            parts = _folded(table, drive, time, observed, period)
-    return _assemble(table, sum(parts, np.zeros(())), isinstance(drive, Sampled), time.size)
+            parts = _folded(table, drive, samples, period)
+    count = time.size if weight is None else int(np.count_nonzero(weight))
+    return _assemble(table, sum(parts, np.zeros(())), isinstance(drive, Sampled), count)
 
 
 class _Table(eqx.Module):
@@ -161,13 +173,14 @@ class _Table(eqx.Module):
     nodes: Float[Array, " nodes"]  # s
     mix: Float[Array, "nodes rank"]
     series: np.ndarray  # coefficients (rank, terms) that give back any response from those combinations
-    gain: Array
+    near: Terms
     middle: Array  # of the record, s
     half: Array  # its length, s
     step: Array  # between samples, on average, s
 
     @classmethod
-    def around(cls, tau: float, gain: float, time: np.ndarray) -> "_Table":
+    def around(cls, near: Terms, time: np.ndarray) -> "_Table":
+        (tau,) = map(float, near.tau)
         x, to_series = _chebyshev(NODES)
         relative = np.exp(_REACH * x)
         ages = np.concatenate([[0.0], np.geomspace(1e-3 * relative.min(), 40.0 * relative.max(), 400)])
@@ -178,7 +191,7 @@ class _Table(eqx.Module):
             nodes=jnp.asarray(tau * relative),
             mix=jnp.asarray(modes[:rank].T / sizes[:rank]),
             series=(sizes[:rank, None] * modes[:rank]) @ to_series.T,
-            gain=jnp.asarray(gain),
+            near=jax.tree.map(jnp.asarray, near),
             middle=jnp.asarray(0.5 * (time[0] + time[-1])),
             half=jnp.asarray(0.5 * (time[-1] - time[0])),
             step=jnp.asarray((time[-1] - time[0]) / (time.size - 1)),
@@ -193,30 +206,47 @@ def slow_shapes(time: Float[Array, " n"], middle: Array, half: Array) -> Float[A
     return jnp.stack([jnp.ones_like(since), since / half, *waves])
 
 
-def _chunks(time: np.ndarray, observed: np.ndarray, length: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Times, record and weights of `length` samples at a time; the last chunk is filled up with weight 0."""
+class _Samples(NamedTuple):
+    """Arrays over the samples, which may be on disk."""
+
+    time: np.ndarray
+    observed: np.ndarray
+    weight: np.ndarray | None
+    rate: np.ndarray | None
+
+
+def _chunks(samples: _Samples, length: int) -> Iterator[tuple[np.ndarray, ...]]:
+    """Times, record, squared weights and dV/dt of `length` samples at a time; the last are filled up with weight 0."""
+    time, observed, weight, rate = samples
     for first in range(0, time.size, length):
-        t, y = np.asarray(time[first : first + length]), np.asarray(observed[first : first + length])
-        missing = length - t.size
-        weight = np.pad(np.ones(t.size), (0, missing))
-        yield np.pad(t, (0, missing), mode="edge"), np.pad(y, (0, missing)), weight
+        part = slice(first, first + length)
+        t = np.asarray(time[part])
+        missing = (0, length - t.size)
+        w = np.ones(t.size) if weight is None else np.asarray(weight[part]) ** 2
+        slope = np.zeros(t.size) if rate is None else np.asarray(rate[part])
+        yield np.pad(t, missing, mode="edge"), *(np.pad(x, missing) for x in (np.asarray(observed[part]), w, slope))
 
 
 def _chunk_length(samples: int, longest: int = _CHUNK) -> int:
     return min(longest, 1 << (samples - 1).bit_length())
 
 
-def _plainly(
-    table: _Table, drive: Drive, time: np.ndarray, observed: np.ndarray, steady_state: bool
-) -> Iterator[np.ndarray]:
-    length = _chunk_length(time.size, _LONGEST if isinstance(drive, Chirp) else _CHUNK)
-    for t, y, weight in _chunks(time, observed, length):
-        yield np.asarray(_at_times(table, drive, t, y, weight, None, steady_state))
+def _plainly(table: _Table, drive: Drive, samples: _Samples, steady_state: bool) -> Iterator[np.ndarray]:
+    length = _chunk_length(samples.time.size, _LONGEST if isinstance(drive, Chirp) else _CHUNK)
+    for t, y, weight, rate in _chunks(samples, length):
+        yield np.asarray(_at_times(table, drive, t, y, weight, rate, None, steady_state))
 
 
 @eqx.filter_jit
 def _at_times(
-    table: _Table, drive: Drive, time: Array, observed: Array, weight: Array, slow: Array | None, steady_state: bool
+    table: _Table,
+    drive: Drive,
+    time: Array,
+    observed: Array,
+    weight: Array,
+    rate: Array,
+    slow: Array | None,
+    steady_state: bool,
 ) -> Array:
     """Inner products where the response to the drive can be computed at any time."""
 
@@ -231,35 +261,46 @@ def _at_times(
 
     slope = (voltage(time + table.step) - voltage(time - table.step)) / (2.0 * table.step)
     slow = slow_shapes(time, table.middle, table.half) if slow is None else slow
-    return _inner(table, u, None, slow, slope, observed, weight)
+    return _inner(table, u, None, slow, slope, observed, weight, rate)
 
 
 def _inner(
-    table: _Table, u: Array, decays: Array | None, slow: Array, slope: Array, observed: Array, weight: Array
+    table: _Table,
+    u: Array,
+    decays: Array | None,
+    slow: Array,
+    slope: Array,
+    observed: Array,
+    weight: Array,
+    rate: Array,
 ) -> Array:
     parts = [table.mix.T @ u] + ([] if decays is None else [table.mix.T @ decays])
-    rest = observed - table.gain * u[NODES // 2]
-    rows = jnp.concatenate([*parts, slow, slope[None], rest[None]])
+    rest = observed - table.near.weight[0] * u[NODES // 2]
+    if table.near.rate is not None:
+        rest = rest - table.near.rate * rate
+    rows = jnp.concatenate([*parts, slow, rate[None], slope[None], rest[None]])
     return (rows * weight) @ rows.T
 
 
-def _folded(table: _Table, drive: Drive, time: np.ndarray, observed: np.ndarray, period: int) -> Iterator[np.ndarray]:
+def _folded(table: _Table, drive: Drive, samples: _Samples, period: int) -> Iterator[np.ndarray]:
     """With the periods laid over each other: the response is computed for one, the rest are sums."""
-    periods = max(1, _chunk_length(time.size) // period)
-    reference = np.asarray(observed[:period])
+    periods = max(1, _chunk_length(samples.time.size) // period)
+    reference = np.asarray(samples.observed[:period])
     count = np.zeros(period)
     sums = np.zeros((len(SLOW) + 1, period))
     squares = np.zeros((len(SLOW) + 1, len(SLOW) + 1))
-    for t, y, weight in _chunks(time, observed, periods * period):
+    for t, y, weight, _ in _chunks(samples, periods * period):
         z = _over_periods(table, t, y, weight, reference)
         count += weight.reshape(periods, period).sum(axis=0)
         sums += np.asarray(z[0])
         squares += np.asarray(z[1])
-    slow, mean = sums[:-1] / count, sums[-1] / count + reference
-    total = np.array(_at_times(table, drive, np.asarray(time[:period]), mean, count, slow, True))
+    means = sums / np.where(count > 0.0, count, 1.0)
+    rate = np.zeros(period) if samples.rate is None else np.asarray(samples.rate[:period])
+    time, mean = np.asarray(samples.time[:period]), means[-1] + reference
+    total = np.array(_at_times(table, drive, time, mean, count, rate, means[:-1], True))
     # what the samples of one phase scatter about their mean
     kept = np.r_[_SLOW, _OBSERVED]
-    total[np.ix_(kept, kept)] += squares - (sums / count) @ sums.T
+    total[np.ix_(kept, kept)] += squares - means @ sums.T
     yield total
 
 
@@ -289,16 +330,17 @@ def _is_even(time: np.ndarray) -> bool:
     return is_uniform(time, _EXACT + rounding / step)
 
 
-def _along_samples(table: _Table, drive: Sampled, time: np.ndarray, observed: np.ndarray) -> Iterator[np.ndarray]:
+def _along_samples(table: _Table, drive: Sampled, samples: _Samples) -> Iterator[np.ndarray]:
     """Along a measured drive, from sample to sample."""
+    time = samples.time
     length, step, first = _chunk_length(time.size), float(table.step), float(drive.samples[0])
     x = step / table.nodes if _is_even(time) and step < float(jnp.min(table.nodes)) else None
     last = jnp.zeros(NODES), jnp.asarray(time[0]), jnp.zeros(())  # the first sample is a jump from 0
     if x is not None:
         last = first * jnp.exp(x), jnp.asarray(time[0] - step), jnp.asarray(first)
-    voltages = _chunks(time, drive.samples, length)
-    for (t, y, weight), (_, v, _) in zip(_chunks(time, observed, length), voltages, strict=True):
-        total, last = _from_sample_to_sample(table, t, v, y, weight, last, time[0], x)
+    voltages = _chunks(_Samples(time, drive.samples, None, None), length)
+    for (t, y, weight, rate), (_, v, _, _) in zip(_chunks(samples, length), voltages, strict=True):
+        total, last = _from_sample_to_sample(table, t, v, y, weight, rate, last, time[0], x)
         yield np.asarray(total)
 
 
@@ -309,6 +351,7 @@ def _from_sample_to_sample(
     voltage: Array,
     observed: Array,
     weight: Array,
+    rate: Array,
     last: tuple[Array, Array, Array],
     first: Array,
     x: Array | None,
@@ -326,7 +369,7 @@ def _from_sample_to_sample(
     span = jnp.append(times[2:] - times[:-2], step[-1])
     slope = jnp.append(voltages[2:] - voltages[:-2], 0.0) / jnp.where(span > 0.0, span, 1.0)
     slow = slow_shapes(time, table.middle, table.half)
-    return _inner(table, u, decays, slow, slope, observed, weight), (u[:, -1], time[-1], voltage[-1])
+    return _inner(table, u, decays, slow, slope, observed, weight, rate), (u[:, -1], time[-1], voltage[-1])
 
 
 def _evenly(rise: Float[Array, " n"], u: Float[Array, " nodes"], x: Float[Array, " nodes"]) -> Float[Array, "nodes n"]:
@@ -357,14 +400,16 @@ def _assemble(table: _Table, total: np.ndarray, decays: bool, samples: int) -> C
     _, rows = np.linalg.qr(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * scale)
     signal = rows[:, :rank] @ table.series
     middle = signal @ np.cos(0.5 * np.pi * np.arange(NODES))  # Chebyshev polynomials at 0
+    following = 0.0 if table.near.rate is None else float(table.near.rate) * rows[:, _RATE]
     return Compression(
         center=table.center,
         reach=jnp.asarray(_REACH),
         signal=jnp.asarray(signal[:rank]),
         decay=jnp.asarray(rows[:, rank : 2 * rank] @ table.series if decays else np.zeros((size, NODES))),
         slow=jnp.asarray(rows[:, _SLOW].T),
+        rate=jnp.asarray(rows[:, _RATE]),
         slope=jnp.asarray(rows[:, _SLOPE]),
-        observed=jnp.asarray(rows[:, _OBSERVED] + float(table.gain) * middle),
+        observed=jnp.asarray(rows[:, _OBSERVED] + float(table.near.weight[0]) * middle + following),
         samples=jnp.asarray(float(samples)),
     )
 

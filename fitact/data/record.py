@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from jaxtyping import Float
 
+from fitact.data.clipping import clipped
 from fitact.errors import InputError
 
 MINIMUM_SAMPLES = 20
@@ -107,7 +108,8 @@ class Record:
     def noise(self, channel: str) -> float:
         """Standard deviation of the channel's noise, judged without a model: white noise and rounding."""
         if channel not in self._noises:
-            self._noises[channel] = math.hypot(white_noise(self[channel]), rounding_noise(self[channel]))
+            values = self[channel] if channel == "V" else self[channel][~clipped(self[channel])]
+            self._noises[channel] = math.hypot(white_noise(values), rounding_noise(values))
         return self._noises[channel]
 
     def frequency(self, channel: str | None = None) -> float | None:

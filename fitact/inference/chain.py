@@ -13,7 +13,7 @@ from fitact.errors import InputError
 from fitact.files import replacing
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class Chain:
     """All steps of several ensembles.
 
@@ -23,6 +23,7 @@ class Chain:
         points, log_prob: every step of every walker.
         accepted: moves accepted, per walker.
         states: where each ensemble stands, its random numbers included.
+        seconds: that sampling has taken.
     """
 
     names: tuple[str, ...]
@@ -31,6 +32,7 @@ class Chain:
     log_prob: Float[np.ndarray, "ensembles steps walkers"]
     accepted: Int[np.ndarray, "ensembles walkers"]
     states: tuple[emcee.State, ...]
+    seconds: float = 0.0
 
     @classmethod
     def empty(cls, names: tuple[str, ...], fingerprint: str, states: list[emcee.State]) -> Self:
@@ -45,22 +47,20 @@ class Chain:
         """Steps taken by each ensemble."""
         return self.points.shape[1]
 
-    def extended(self, done: list[tuple[np.ndarray, np.ndarray, emcee.State, np.ndarray]]) -> Self:
-        """With more steps of every ensemble: points, log-probabilities, last state, moves accepted."""
+    def extend(self, done: list[tuple[np.ndarray, np.ndarray, emcee.State, np.ndarray]]) -> None:
+        """Add steps of every ensemble: points, log-probabilities, last state, moves accepted."""
         points, log_prob, states, accepted = zip(*done, strict=True)
-        return dataclasses.replace(
-            self,
-            points=np.concatenate([self.points, np.stack(points)], axis=1),
-            log_prob=np.concatenate([self.log_prob, np.stack(log_prob)], axis=1),
-            accepted=self.accepted + np.stack(accepted).astype(int),
-            states=states,
-        )
+        self.points = _appended(self.points, np.stack(points))
+        self.log_prob = _appended(self.log_prob, np.stack(log_prob))
+        self.accepted = self.accepted + np.stack(accepted).astype(int)
+        self.states = states
 
     def save(self, path: Path) -> None:
         """Write the chain; `emcee.backends.HDFBackend(path, name="ensemble_0")` opens an ensemble."""
         with replacing(path) as temporary, h5py.File(temporary, "w") as file:
             file.attrs["fingerprint"] = self.fingerprint
             file.attrs["names"] = list(self.names)
+            file.attrs["seconds"] = self.seconds
             for index, state in enumerate(self.states):
                 group = file.create_group(f"ensemble_{index}")
                 walkers, size = state.coords.shape
@@ -103,6 +103,17 @@ class Chain:
                     np.stack([group["log_prob"][:] for group in groups]),
                     np.stack([group["accepted"][:] for group in groups]).astype(int),
                     tuple(states),
+                    float(file.attrs["seconds"]),
                 )
         except (OSError, KeyError) as error:
             raise InputError(f"{path}: is not a chain of fitact ({error}); remove the file") from error
+
+
+def _appended(steps: Float[np.ndarray, "ensembles steps ..."], more: np.ndarray) -> np.ndarray:
+    """Both, along the steps; a view into room kept for steps to come, so that few calls copy the chain."""
+    count, room = steps.shape[1] + more.shape[1], steps.base
+    if room is None or room.shape[0] != steps.shape[0] or room.shape[1] < count:
+        room = np.empty((steps.shape[0], 2 * count, *steps.shape[2:]))
+        room[:, : steps.shape[1]] = steps
+    room[:, steps.shape[1] : count] = more
+    return room[:, :count]

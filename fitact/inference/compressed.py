@@ -1,16 +1,18 @@
-"""When a record's compression may stand for its samples: built before the fit, certified after it."""
+"""When traces' compressions may stand for their samples: built before the fit, certified after it."""
 
 import dataclasses
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from fitact.data.compress import Compression, compress
-from fitact.inference.likelihood import CHARGE, LINEAR, Batched, Likelihood
-from fitact.inference.start import LinearStart
+from fitact.data.compress import SLOW, compress
+from fitact.inference.likelihood import Batched, Likelihood
+from fitact.inference.trace import Trace
+from fitact.model.circuit import Terms
 from fitact.model.drive import Sampled
 
 TOLERANCE = 1e-3  # in log-likelihood
@@ -19,84 +21,107 @@ _POINTS = 8  # of each kind at which the full sum is taken
 _FAR = 1e-6  # of a point's distance below the optimum, in log-likelihood: error allowed there
 _REACH = 20.0  # standard deviations of log b that the table for sampling holds
 _LEAST_REACH = 0.05  # in log b
+FEW_ROWS = 200  # numbers that an evaluation runs over, up to which the call costs more than they do
 
 
 class Certified(NamedTuple):
     """A likelihood to sample from.
 
     Attributes:
-        likelihood: with its compression, or without.
-        error: largest error of the compressed log-likelihood near the optimum; None: the samples are summed.
-        reason: why they are, as a clause.
+        likelihood: with the compressions that hold.
+        error: largest error of the compressed log-likelihood near the optimum; None: some samples are summed.
+        reasons: why those of each trace are, as a clause; "" where they are not.
     """
 
     likelihood: Likelihood
     error: float | None
-    reason: str
+    reasons: tuple[str, ...]
 
 
-def project(likelihood: Likelihood, start: LinearStart, tolerance: float) -> tuple[Likelihood, str]:
-    """The likelihood with the record's compression, or as it is and the reason why."""
-    reason = _reason_against(likelihood, start, tolerance)
-    if reason:
-        return likelihood, reason
+def project(trace: Trace, near: Terms | None, tolerance: float) -> tuple[Trace, str]:
+    """The trace with its record's compression, or as it is and the reason why.
+
+    `near`: terms that nearly made it; None: it does not show them.
+    """
+    reason = _reason_against(trace, near, tolerance)
+    if reason or near is None:
+        return trace, reason
+    arrays = (None if x is None else np.asarray(x) for x in (trace.weight, trace.rate))
     compression = compress(
-        likelihood.drive,
-        np.asarray(likelihood.time),
-        np.asarray(likelihood.observed),
-        steady_state=likelihood.steady_state,
-        tau=start.b,
-        gain=start.g,
+        trace.drive,
+        np.asarray(trace.time),
+        np.asarray(trace.observed),
+        steady_state=trace.steady_state,
+        near=near,
+        **dict(zip(("weight", "rate"), arrays, strict=True)),
     )
-    return dataclasses.replace(likelihood, compression=compression), ""
+    return dataclasses.replace(trace, compression=compression), ""
 
 
-def _reason_against(likelihood: Likelihood, start: LinearStart, tolerance: float) -> str:
+def _reason_against(trace: Trace, near: Terms | None, tolerance: float) -> str:
     if tolerance == 0.0:
         return "it was asked for"
-    if likelihood.time.size < _SHORT:
+    if trace.noise == "student":
+        return "noise with outliers is more than lengths and angles"
+    if trace.whitening is not None:
+        return "the noise is coloured"
+    if trace.time.size < _SHORT:
         return f"the record is shorter than {_SHORT} samples"
-    if likelihood.free_delay:
+    if trace.free_delay:
         return "a delay is free"
-    if isinstance(likelihood.drive, Sampled) and likelihood.steady_state:
+    if isinstance(trace.drive, Sampled) and trace.steady_state:
         return "the steady state of a measured drive is not tabulated"
-    if not math.isfinite(start.b):
+    if near is None:
         return "the record does not show its time constant"
+    if len(near.tau) > 1:
+        return "the circuit has several time constants"
     return ""
 
 
 def certify(
-    wide: Likelihood, reason: str, theta: np.ndarray, root: np.ndarray, sigma: float, tolerance: float
+    wide: Likelihood,
+    reasons: tuple[str, ...],
+    theta: np.ndarray,
+    root: np.ndarray,
+    sigma: Float[np.ndarray, " traces"],
+    tolerance: float,
 ) -> Certified:
     """The likelihood for sampling around the optimum `theta`, checked against the full sum.
 
-    `root` is the root of theta's covariance. The compressed log-likelihood must agree to `tolerance` near the
-    optimum, and at points of the prior to a part in a million of how far they lie below it.
+    `root` is the root of theta's covariance. Each trace's compressed log-likelihood must agree to `tolerance` over
+    their number near the optimum, and at points of the prior to a part in a million of how far they lie below it.
     """
-    columns = tuple(i for i in range(len(LINEAR)) if float(wide.linear_sd[i]) > 0.0)
-    full = dataclasses.replace(wide, compression=None, columns=columns)
-    if wide.compression is None:
-        return Certified(full, None, reason or "a delay is free")
-    if not wide.compression.holds(np.exp(_log_b(theta))):
-        return Certified(full, None, "the fit left the table's range")
-    charge = float(np.ptp(wide.observed)) if CHARGE in columns else 0.0
-    precision = 0.1 * tolerance * sigma / float(wide.gain(theta) * wide.circuit(theta).g)
-    near = dataclasses.replace(
-        wide, columns=columns, compression=_narrowed(wide.compression, theta, root, precision, charge)
+    asked = tuple(tuple(np.flatnonzero(np.asarray(trace.linear_sd)).tolist()) for trace in wide.traces)
+    wide = dataclasses.replace(
+        wide, traces=tuple(dataclasses.replace(t, columns=c) for t, c in zip(wide.traces, asked, strict=True))
     )
+    if all(trace.compression is None for trace in wide.traces):
+        return Certified(wide, None, tuple(r or "a delay is free" for r in reasons))
+    spread = _spread_of_log_b(wide, theta, root)
+    near = tuple(_narrowed(trace, wide, i, theta, spread, sigma[i], tolerance) for i, trace in enumerate(wide.traces))
     points = np.vstack([_near(theta, root), _believed(wide, theta)])
-    exact, compressed, tabulated = (
-        _at(model, points, sigma) for model in (full, near, dataclasses.replace(wide, columns=columns))
-    )
+    narrow = dataclasses.replace(wide, traces=near)
+    exact, compressed, tabulated = (_at(model, points, sigma) for model in (wide.summed(), narrow, wide))
+    found = [
+        reason or ("a delay is free" if trace.compression is None else _against(*parts, tolerance / len(near)))
+        for reason, trace, parts in zip(
+            reasons, near, zip(exact.T, compressed.T, tabulated.T, strict=True), strict=True
+        )
+    ]
+    error = None if any(found) else float(np.sum(np.max(np.abs(compressed - exact)[: _POINTS + 1], axis=0)))
+    kept = tuple(trace.summed() if reason else trace for trace, reason in zip(near, found, strict=True))
+    return Certified(dataclasses.replace(wide, traces=kept), error, tuple(found))
+
+
+def _against(exact: np.ndarray, compressed: np.ndarray, tabulated: np.ndarray, tolerance: float) -> str:
+    """What speaks against the compression of a trace, by its log-likelihoods at points near and far; "" if nothing."""
     error = float(np.max(np.abs(compressed - exact)[: _POINTS + 1]))
     if np.isnan(error):
-        return Certified(full, None, "the record leaves its time constant more open than the table is wide")
+        return "the record leaves its time constant more open than the table is wide"
     if not error <= tolerance:
-        return Certified(full, None, f"the compressed log-likelihood was off by {error:.2g} near the optimum")
+        return f"the compressed log-likelihood was off by {error:.2g} near the optimum"
     excess = float(np.nanmax(np.abs(tabulated - exact) - _FAR * np.abs(exact[0] - exact)))
-    if excess > tolerance:
-        return Certified(full, None, f"the compressed log-likelihood was off by {excess:.2g} within the prior")
-    return Certified(near, error, "")
+    return f"the compressed log-likelihood was off by {excess:.2g} within the prior" if excess > tolerance else ""
 
 
 def _near(theta: np.ndarray, root: np.ndarray) -> Float[np.ndarray, "n parameters"]:
@@ -106,23 +131,30 @@ def _near(theta: np.ndarray, root: np.ndarray) -> Float[np.ndarray, "n parameter
 
 
 def _believed(wide: Likelihood, theta: np.ndarray) -> Float[np.ndarray, "n parameters"]:
-    """Points of the prior that the table reaches, the optimum where there are too few."""
-    assert wide.compression is not None
-    draws = np.log(np.array(list(wide.prior.sample(np.random.default_rng(0), 1000).values())).T)
-    draws = draws[np.asarray(wide.compression.holds(np.exp(_log_b(draws))))]
+    """Points of the prior that the tables reach, the optimum where there are too few."""
+    draws = np.tile(theta, (1000, 1))
+    draws[:, : len(wide.prior.names)] = np.log(list(wide.prior.sample(np.random.default_rng(0), 1000).values())).T
+    slowest = jax.vmap(_log_b, (None, 0))(wide, jnp.asarray(draws))
+    held = [trace.compression.holds(jnp.exp(slowest)) for trace in wide.traces if trace.compression is not None]
+    draws = draws[np.all(held, axis=0)]
     return np.vstack([draws, np.tile(theta, (_POINTS, 1))])[:_POINTS]
 
 
-def _at(likelihood: Likelihood, theta: Float[np.ndarray, "n parameters"], sigma: float) -> np.ndarray:
-    """Log-likelihoods at points of one sigma."""
-    points = np.column_stack([theta, np.full(len(theta), math.log(sigma))])
-    return Batched(Likelihood.log_likelihood, likelihood.without_samples(), likelihood.rows)(points)
+def _at(likelihood: Likelihood, theta: Float[np.ndarray, "n parameters"], sigma: np.ndarray) -> np.ndarray:
+    """Log-likelihoods of each trace at points of one sigma, (n, traces)."""
+    points = np.column_stack([theta, np.tile(np.log(sigma), (len(theta), 1))])
+    return Batched(Likelihood.log_likelihoods, likelihood.without_samples(), likelihood.rows)(points)
 
 
-def log_prob(likelihood: Likelihood, batch: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Log-posteriors of points (theta, log sigma); where the compression does not reach, the samples are summed."""
+def log_prob(likelihood: Likelihood, walkers: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Log-posteriors of points (theta, log sigma); where the compression does not reach, the samples are summed.
+
+    Fastest for all `walkers` of an ensemble at once, or half of them.
+    """
+    # halves are filled up where they cost no more, so that one size is compiled
+    batch = walkers if likelihood.rows <= FEW_ROWS else walkers // 2
     tabulated = Batched(Likelihood.log_prob, likelihood.without_samples(), likelihood.rows, batch)
-    full = dataclasses.replace(likelihood, compression=None)
+    full = likelihood.summed()
     summed = Batched(Likelihood.log_prob, full, full.rows, batch=1)
 
     def values(points: Float[np.ndarray, "n coordinates"]) -> np.ndarray:
@@ -136,16 +168,29 @@ def log_prob(likelihood: Likelihood, batch: int) -> Callable[[np.ndarray], np.nd
     return values
 
 
-def _narrowed(wide: Compression, theta: np.ndarray, root: np.ndarray, precision: float, charge: float) -> Compression:
-    """The part of the table that the posterior can want; `charge` (V): size of an unknown one, 0 if none."""
-    center, parts = float(_log_b(theta)), np.exp(theta[1:3]) * [1.0, 2.0]
-    spread = float(np.linalg.norm(root[0] + parts @ root[1:3] / np.sum(parts)))
+def _narrowed(
+    trace: Trace, wide: Likelihood, index: int, theta: np.ndarray, spread: float, sigma: float, tolerance: float
+) -> Trace:
+    """With the part of the table that the posterior can want, where there is a table that reaches the optimum."""
+    table, center = trace.compression, float(_log_b(wide, jnp.asarray(theta)))
+    if table is None or not table.holds(np.exp(center)):
+        return trace
+    seen = wide.seen(jnp.asarray(theta), index)
+    largest = float(jnp.sum(jnp.abs(jnp.stack(seen.circuit.terms_of(trace.channel).weight))) * seen.gain)
+    charge = float(np.ptp(trace.observed)) / largest if max(trace.columns, default=0) >= len(SLOW) else 0.0
     reach = max(_REACH * spread, _LEAST_REACH)
-    low, high = (float(wide.center + side * wide.reach) for side in (-1.0, 1.0))
+    low, high = (float(table.center + side * table.reach) for side in (-1.0, 1.0))
     low, high = max(center - reach, low), min(center + reach, high)
-    return wide.narrowed(0.5 * (low + high), 0.5 * (high - low), precision, charge=charge)
+    narrow = table.narrowed(0.5 * (low + high), 0.5 * (high - low), 0.1 * tolerance * sigma / largest, charge=charge)
+    return dataclasses.replace(trace, compression=narrow)
 
 
-def _log_b(theta: Float[np.ndarray, "*shape parameters"]) -> Float[np.ndarray, "*shape"]:
-    """Logarithm of the time constant, s."""
-    return theta[..., 0] + np.logaddexp(np.log(2.0) + theta[..., 2], theta[..., 1])
+def _spread_of_log_b(likelihood: Likelihood, theta: np.ndarray, root: np.ndarray) -> float:
+    """Standard deviation of the logarithm of the slowest time constant."""
+    slope = jax.grad(_log_b, argnums=1)(likelihood, jnp.asarray(theta))
+    return float(np.linalg.norm(np.asarray(slope) @ root))
+
+
+def _log_b(likelihood: Likelihood, theta: Array) -> Array:
+    """Logarithm of the slowest time constant, s."""
+    return jnp.log(likelihood.circuit(theta).b)

@@ -3,15 +3,17 @@
 import math
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.data.record import Record
-from fitact.inference.likelihood import CHARGE, Likelihood
+from fitact.inference.likelihood import Likelihood
 from fitact.inference.start import DriveChoice, whole_periods
-from fitact.model.circuit import FinalCircuit
+from fitact.inference.trace import CHARGES, LINEAR
+from fitact.model.circuit import RC
 from fitact.model.drive import Drive, Periodic, PiecewiseLinear, Sampled
 from fitact.model.force import Contact, electrostatic_force, friction, mean_force, peak_force, summarize
 from fitact.model.response import response
@@ -26,7 +28,7 @@ _NODES = 64  # Gauss-Legendre nodes along each straight piece of a drive
 
 
 class Derived(eqx.Module):
-    """Derived quantities as functions of theta; built by `for_fit`.
+    """Derived quantities as functions of theta and the traces' noise; built by `for_fit`.
 
     Means are over one period of a scene's drive in the steady state, else over the largest whole number of
     periods that the record holds (the whole record where it holds none); of a long record with a measured
@@ -34,6 +36,7 @@ class Derived(eqx.Module):
 
     Attributes:
         likelihood: names theta's coordinates.
+        index: of the trace whose record's force this is.
         drive: what makes the force: the likelihood's, or the last part of a long measured one, which begins so
             early that its unknown charge is gone when the force is evaluated.
         time: when the force is evaluated, s.
@@ -53,29 +56,41 @@ class Derived(eqx.Module):
     normal_force: ArrayLike
     steady_state: bool = eqx.field(static=True)
     charge: bool = eqx.field(static=True)  # whether the record's unknown one matters
+    index: int = eqx.field(static=True)
 
     def force(
-        self, theta: Float[Array, " parameters"], sigma: ArrayLike, deviate: ArrayLike = 0.0
+        self, theta: Float[Array, " parameters"], sigma: Float[Array, " traces"], deviate: ArrayLike = 0.0
     ) -> Float[Array, " times"]:
         """Electrostatic force in time, N, eq. (22); the permittivities follow Ci and Csc through eq. (3).
 
-        `deviate` holds seven standard normal numbers that draw the charge from its posterior; 0: its mean.
+        `deviate` holds standard normal numbers (traces, `LINEAR`) that draw the charges from their posterior; 0:
+        their mean.
         """
-        model, circuit = self.likelihood, self.likelihood.circuit(theta)
+        circuit = self.likelihood.circuit(theta)
         vsc = response(circuit, self.drive, self.time, steady_state=self.steady_state)
         if self.charge:
-            beta = model.drawn(theta, sigma, deviate)
-            vsc = vsc + beta[CHARGE] * model.linear_sd[CHARGE] * model.decay(theta, self.time) / model.gain(theta)
+            vsc = vsc + self._charges(theta, sigma, deviate)
         return electrostatic_force(vsc, self.contact(circuit))
 
-    def contact(self, circuit: FinalCircuit) -> Contact:
+    def _charges(self, theta: Array, sigma: Array, deviate: ArrayLike) -> Float[Array, " times"]:
+        """What unknown charges at the record's first sample add to Vsc."""
+        trace, seen = self.likelihood.traces[self.index], self.likelihood.seen(theta, self.index)
+        each = jnp.broadcast_to(deviate, (len(self.likelihood.traces), len(LINEAR)))[self.index]
+        sizes = (trace.drawn(seen, sigma[self.index], each) * trace.linear_sd)[-len(CHARGES) :]
+        # a charge shows in each channel as the response to a drive does
+        there, here = (seen.circuit.terms_of(channel).weight for channel in ("Vsc", trace.channel))
+        ratios = jnp.stack([v / jnp.where(w == 0.0, 1.0, w) for v, w in zip(there, here, strict=True)])
+        ratios = jnp.pad(ratios, (0, len(CHARGES) - ratios.size))
+        return (sizes * ratios) @ trace.decays(seen.circuit, self.time) / seen.gain
+
+    def contact(self, circuit: RC) -> Contact:
         """The contact whose permittivities follow from the circuit's capacitances, eq. (3)."""
         return Contact.from_capacitances(
             circuit.Ci, circuit.Csc, self.area, self.insulator_thickness, self.skin_thickness
         )
 
     def __call__(
-        self, theta: Float[Array, " parameters"], sigma: ArrayLike, deviate: ArrayLike = 0.0
+        self, theta: Float[Array, " parameters"], sigma: Float[Array, " traces"], deviate: ArrayLike = 0.0
     ) -> Float[Array, " derived"]:
         """All of `NAMES`, in SI units."""
         circuit = self.likelihood.circuit(theta)
@@ -86,9 +101,28 @@ class Derived(eqx.Module):
         felt = friction(force.mean, self.coefficient, self.normal_force)
         return jnp.stack([circuit.g, circuit.b, force.mean, force.peak, force.rms, felt])
 
+    def logs(
+        self, theta: Float[np.ndarray, " parameters"], sigma: Float[np.ndarray, " traces"]
+    ) -> tuple[Float[np.ndarray, " derived"], Float[np.ndarray, "derived parameters"]]:
+        """Logarithms of all of `NAMES`, and their gradients in theta."""
+        with jax.enable_x64(True):
+            values, gradient = _logs(self, jnp.asarray(theta), jnp.asarray(sigma))
+            return np.asarray(values), np.asarray(gradient)
 
-def for_fit(likelihood: Likelihood, record: Record, choice: DriveChoice, scene: Scene, b: float) -> Derived:
-    """The derived quantities of a fit's parameters; `b` (s) is the time constant that it found."""
+
+@eqx.filter_jit
+def _logs(derive: Derived, theta: Array, sigma: Array) -> tuple[Array, Array]:
+    def logs(theta: Array) -> Array:
+        return jnp.log(derive(theta, sigma))
+
+    return logs(theta), jax.jacfwd(logs)(theta)
+
+
+def for_fit(likelihood: Likelihood, record: Record, choice: DriveChoice, scene: Scene, b: float, index: int) -> Derived:
+    """The derived quantities of a fit's parameters, for the drive of one record.
+
+    `b` (s) is the slowest time constant that was found, `index` that of the record's first trace.
+    """
     last = _last_periods(record, choice, b)
     drive, (time, weight) = (choice.drive, _grid(record, choice)) if last is None else last
     return Derived(
@@ -103,6 +137,7 @@ def for_fit(likelihood: Likelihood, record: Record, choice: DriveChoice, scene: 
         scene.friction.normal_force,
         steady_state=choice.steady_state and last is None,
         charge=choice.unknown_charge and last is None,
+        index=index,
     )
 
 

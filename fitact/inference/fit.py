@@ -1,38 +1,35 @@
-"""Fit a record: parameters, their covariance, and whether the answer may be trusted."""
+"""Fit records: parameters, their covariance, and whether the answer may be trusted."""
 
 import dataclasses
 import math
+import os
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.inference import compressed, derived, summary
-from fitact.inference.diagnostics import is_misfit, statistics
-from fitact.inference.identifiability import Identifiability, assess, covariance_root
-from fitact.inference.least_squares import Solved, result_message, result_name, solve
-from fitact.inference.likelihood import CHARGE, LINEAR, Likelihood, natural
-from fitact.inference.remarks import remarks
-from fitact.inference.start import (
-    DriveChoice,
-    LinearStart,
-    choose_drive,
-    has_ideal_edges,
-    has_unresolved_edge,
-    linear_start,
-)
-from fitact.model.prior import LogNormal, Prior
+from fitact.inference import compressed, derived, remarks, summary
+from fitact.inference.diagnostics import together
+from fitact.inference.expected import covariance_root
+from fitact.inference.identifiability import Identifiability, assess
+from fitact.inference.least_squares import Solved, solve
+from fitact.inference.likelihood import Likelihood
+from fitact.inference.problem import Problem, pose
+from fitact.inference.profile import DERIVED, Interval, intervals
+from fitact.inference.solver import Optima, result_message
+from fitact.inference.start import DriveChoice
+from fitact.inference.starts import begin, better, explore
+from fitact.inference.trace_fit import TraceFit, compare
+from fitact.inference.verdict import misfits, verdict
 from fitact.model.scene import Scene
 from fitact.units import engineering
 
-_DECREMENT = 1e-3  # how far below the optimum, in log-probability, a fit may end
-_OFFSET = 0.02  # of Vsc's span: standard deviation of an offset that the record is too short to show
+_SKIN = ("Rsc", "Csc", "Ci")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,34 +39,62 @@ class Fit:
     Attributes:
         theta: the optimum, in the coordinates `names`.
         covariance_root: its product with its transpose is `covariance`; keeps digits where that cannot.
-        sigma: standard deviation of Vsc's noise, V, from the residuals.
-        linear: the offset, drift, hum and charge that were freed, V, at the optimum.
-        residuals: record minus fit, V.
+        traces: the channels fitted, by record.
         result: name of a member of `RESULTS`; `message` is its sentence.
-        figures: chi2_reduced, rms_residual, noise_expected, runs_z, steps and the like.
-        identifiability: what the record can and cannot tell.
+        figures: of all traces together: chi2_reduced, steps and the like.
+        identifiability: what the records can and cannot tell.
         warnings: sentences.
-        compression_error: of the compressed log-likelihood near the optimum; None: the samples are summed.
-        full_because: why they are, as a clause.
-        likelihood, derive, record, scene, choice: what was fitted, to what.
+        compression_error: of the compressed log-likelihood near the optimum; None: samples are summed.
+        likelihood, derive, scene: what was fitted, what follows from it, the first record's scene.
     """
 
     theta: Float[np.ndarray, " parameters"]
     covariance_root: Float[np.ndarray, "parameters parameters"]
-    sigma: float
-    linear: dict[str, float]
-    residuals: Float[np.ndarray, " samples"]
+    traces: tuple[TraceFit, ...]
     result: str
     figures: dict[str, float]
     identifiability: Identifiability
     warnings: tuple[str, ...]
     compression_error: float | None
-    full_because: str
     likelihood: Likelihood
     derive: derived.Derived
-    record: Record
     scene: Scene
-    choice: DriveChoice
+
+    @property
+    def record(self) -> Record:
+        """The record, or the first of several."""
+        return self.traces[0].record
+
+    @property
+    def records(self) -> tuple[Record, ...]:
+        """All of them."""
+        return tuple({id(trace.record): trace.record for trace in self.traces}.values())
+
+    @property
+    def choice(self) -> DriveChoice:
+        """The drive of `record`."""
+        return self.traces[0].choice
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the first trace's noise, V or A, from the residuals."""
+        return self.traces[0].sigma
+
+    @property
+    def residuals(self) -> Float[np.ndarray, " samples"]:
+        """Record minus fit of the first trace, V or A."""
+        return self.traces[0].residuals
+
+    @property
+    def linear(self) -> dict[str, float]:
+        """What entered linearly and was freed, V or A, at the optimum."""
+        return {name: value for trace in self.traces for name, value in trace.linear.items()}
+
+    @property
+    def full_because(self) -> str:
+        """Why samples are summed, as a clause; "" where none are."""
+        reasons = {f"{trace.label}: " * bool(trace.label) + trace.full_because: trace for trace in self.traces}
+        return "; ".join(reason for reason, trace in reasons.items() if trace.full_because)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -98,21 +123,21 @@ class Fit:
 
     @property
     def point_names(self) -> tuple[str, ...]:
-        """Coordinates of the posterior: those of theta, and sigma, in logarithms but for the delay."""
-        return (*self.names, "sigma")
+        """Coordinates of the posterior: those of theta, and each trace's sigma; logarithms but for delays."""
+        return (*self.names, *self.likelihood.sigma_names)
 
     @property
     def point(self) -> Float[np.ndarray, " coordinates"]:
         """The optimum in the coordinates of the posterior."""
-        return np.append(self.theta, math.log(self.sigma))
+        return np.append(self.theta, np.log([trace.sigma for trace in self.traces]))
 
     @property
     def point_root(self) -> Float[np.ndarray, "coordinates coordinates"]:
         """As `covariance_root`, in the coordinates of the posterior; sigma's from its degrees of freedom."""
-        size = self.theta.size + 1
-        root = np.zeros((size, size))
-        root[:-1, :-1] = self.covariance_root
-        root[-1, -1] = math.sqrt(0.5 / self.figures["degrees_of_freedom"])
+        freedom = np.array([trace.figures["degrees_of_freedom"] for trace in self.traces])
+        size = self.theta.size
+        root = np.diag(np.append(np.zeros(size), np.sqrt(0.5 / freedom)))
+        root[:size, :size] = self.covariance_root
         return root
 
     @property
@@ -122,36 +147,69 @@ class Fit:
 
     def parameters(self) -> dict[str, summary.Summary]:
         """Summaries of the parameters in the Laplace approximation, with their contraction."""
-        values, prior_sd = natural(self.likelihood, self.theta), self.likelihood.prior.log_sd
+        values, prior_sd = self.likelihood.natural(self.theta), self.likelihood.prior.log_sd
+        steps = {trace.named("delay"): float(trace.time_step) for trace in self.likelihood.traces}
+        believed = self.likelihood.believed
         out = {}
         for i, name in enumerate(self.names):
-            if name == "delay":
-                out[name] = summary.normal(
-                    name, float(values[name]), float(self.sd[i]) * float(self.likelihood.time_step)
-                )
+            if name in steps:
+                out[name] = summary.normal(name, float(values[name]), float(self.sd[i]) * steps[name])
             else:
                 out[name] = summary.log_normal(name, float(values[name]), float(self.sd[i]))
-                out[name]["contraction"] = float(1.0 - self.sd[i] / prior_sd[i])
+                if believed or name.startswith("gain"):
+                    out[name]["contraction"] = float(1.0 - self.sd[i] / prior_sd[i])
         return out
 
     def derived(self) -> dict[str, summary.Summary]:
         """Summaries of divider, time constant, force and friction in the Laplace approximation."""
-        values, gradient = _log_derived(self.derive, self.theta, self.sigma)
+        values, gradient = self.derive.logs(self.theta, self._sigmas)
         sd = np.linalg.norm(gradient @ self.covariance_root, axis=1)
         return {
             name: summary.log_normal(name, math.exp(value), float(s))
             for name, value, s in zip(derived.NAMES, values, sd, strict=True)
         }
 
+    def profile(self, name: str, level: float = 0.95, *, prior: bool = True) -> Interval:
+        """The profile-likelihood interval of one parameter, or of g, b or force_mean.
+
+        `prior`: whether the circuit's prior speaks in it (that of the posterior), or the records alone. The noise is
+        held at its estimate. A side that the records leave open, to a factor of a million, is 0 or infinite.
+
+        Raises:
+            InputError: there is no quantity of that name, or the level is not between 0 and 1.
+        """
+        return self._intervals((name,), level, prior)[name]
+
+    def intervals(self, level: float = 0.95, *, prior: bool = True) -> dict[str, Interval]:
+        """As `profile`, of all parameters, and of g, b and force_mean.
+
+        Raises:
+            InputError: the level is not between 0 and 1.
+        """
+        return self._intervals((*self.names, *DERIVED), level, prior)
+
+    def _intervals(self, names: tuple[str, ...], level: float, prior: bool) -> dict[str, Interval]:
+        _, gradient = self.derive.logs(self.theta, self._sigmas)
+        places = [derived.NAMES.index(name) for name in DERIVED]
+        sd = np.append(self.sd, np.linalg.norm(gradient[places] @ self.covariance_root, axis=1))
+        expected = dict(zip((*self.names, *DERIVED), sd.tolist(), strict=True))
+        return intervals(self.likelihood, self.derive, self.theta, self._sigmas, expected, names, level, prior)
+
+    @property
+    def _sigmas(self) -> Float[np.ndarray, " traces"]:
+        return np.array([trace.sigma for trace in self.traces])
+
     def model(self) -> dict[str, Any]:
         """What was fitted, by name."""
+        circuit = type(self.likelihood.template).__name__
         return {
-            "circuit": "final",
+            "circuit": {"FinalCircuit": "final", "DirectGround": "direct", "NaturalGround": "natural"}[circuit],
             "skin": "constant",
             "response": "exact",
             "drive": self.choice.name,
             "steady_state": self.choice.steady_state,
-            "freed": [*self.linear, *self.names[3:]],
+            "channels": [trace.channel for trace in self.traces],
+            "freed": [*self.linear, *(name for name in self.names if name not in _SKIN)],
             "likelihood": "full" if self.compression_error is None else "compressed",
             "compression_error": self.compression_error,
             "full_because": self.full_because,
@@ -165,17 +223,25 @@ class Fit:
     def to_dict(self) -> dict[str, Any]:
         """What `fitact fit --json` prints and fit.json holds."""
         fitted = {"result": self.result, "message": self.message, "misfit": self.result == "misfit"}
-        nuisances = {"sigma": self.sigma, **self.linear}
+        traces = [
+            {"channel": t.channel, "record": os.path.basename(t.record.source), "label": t.label, **t.figures}
+            for t in self.traces
+        ]
         return {
             "parameters": self.parameters(),
             "derived": self.derived(),
-            "nuisances": {name: {"unit": "V", "value": value} for name, value in nuisances.items()},
+            "nuisances": {
+                name: {"unit": summary.unit(name), "value": value} for name, value in self._nuisances().items()
+            },
             "correlation": {"names": list(self.names), "matrix": self.correlation.tolist()},
             "identifiability": self.identifiability.to_dict(),
-            "fit": fitted | self.figures,
+            "fit": fitted | self.figures | {"traces": traces},
             "model": self.model(),
             "warnings": list(self.warnings),
         }
+
+    def _nuisances(self) -> dict[str, float]:
+        return dict(zip(self.likelihood.sigma_names, self._sigmas.tolist(), strict=True)) | self.linear
 
     def summary(self) -> str:
         """A table for people: values with errors, correlations, the verdict."""
@@ -184,10 +250,12 @@ class Fit:
             median = engineering(float(s["q50"]), str(s["unit"]))
             contraction = f"{s['contraction']:14.3f}" if "contraction" in s else ""
             rows.append(f"{name:14}{median:>12}{summary.width(s):>12}{contraction}")
-        nuisances = {"noise": self.sigma, **self.linear}
         pairs = [(i, j) for i in range(len(self.names)) for j in range(i)]
         rows += [
-            "nuisances: " + ", ".join(f"{name} {engineering(value, 'V')}" for name, value in nuisances.items()),
+            "nuisances: "
+            + ", ".join(
+                f"{name} {engineering(value, summary.unit(name))}" for name, value in self._nuisances().items()
+            ),
             "correlations of the logs: "
             + ", ".join(f"{self.names[j]}-{self.names[i]} {self.correlation[i, j]:+.3f}" for i, j in pairs),
             f"reduced chi-square {self.figures['chi2_reduced']:.3f}. {self.message}",
@@ -199,189 +267,128 @@ class Fit:
     __str__ = summary
 
 
-def fit(record: Record, scene: Scene | None = None, *, tolerance: float = compressed.TOLERANCE) -> Fit:
-    """Fit the final circuit to a record by Levenberg-Marquardt in log-parameters, the prior as residuals.
+def fit(
+    record: Record | Sequence[Record],
+    scene: Scene | Sequence[Scene] | None = None,
+    *,
+    prior: bool = True,
+    start: Mapping[str, float] | None = None,
+    starts: int = 1,
+    tolerance: float = compressed.TOLERANCE,
+) -> Fit:
+    """Fit one circuit to a record, or to several jointly, by Levenberg-Marquardt in log-parameters with their prior.
 
-    The drive is the recorded V where there is no scene or its waveform is "measured", else the scene's.
-    The start comes from the record; offset, drift, hum of the mains and a delay between the channels are freed
-    where the record asks for them, a gain only with the scene's prior. Runs in double precision whatever JAX is
-    set to, and leaves that setting alone.
+    The circuit, the prior and the device are the (first) scene's. Each record has the drive of its scene: the
+    recorded V where there is no scene or its waveform is "measured", else the scene's. Each of the scene's
+    channels has its own noise; offset, drift, hum of the mains and (Vsc) a delay are freed where it asks for them,
+    a gain only with the scene's prior. The start comes from the records. Runs in double precision whatever JAX
+    is set to, and leaves that setting alone.
 
     Args:
-        record: with Vsc, and V unless the scene has the drive.
-        scene: the device, and what is believed of it.
-        tolerance: error of the log-likelihood that compressing the record may cause; 0: sum over the samples
+        record: with the scene's channels, and V unless the scene has the drive.
+        scene: the device, and what is believed of it; one for all records, or one for each.
+        prior: False leaves the circuit's out, for least squares alone; gains and delays keep theirs.
+        start: values (SI) to start from in place of the records' own.
+        starts: how many; those after the first are draws of the prior, and tell whether there are other optima.
+        tolerance: error of the log-likelihood that compressing the records may cause; 0: sum over the samples
             each time. Where compression does not hold, `Fit.full_because` says why.
 
     Raises:
-        InputError: the record cannot come from this circuit, the scene asks for what is not available, or the
-            tolerance is no number of 0 or more.
+        InputError: a record cannot come from this circuit, the scene asks for what is not available, a start is
+            none of its parameters, or the tolerance is no number of 0 or more.
     """
-    given = scene or Scene()
-    given.require_available(fit=True)
     if not 0.0 <= tolerance < math.inf:
         raise InputError(f"tolerance = {tolerance}: give an error of the log-likelihood, 0.001 or so, or 0 for none")
+    if starts < 1:
+        raise InputError(f"starts = {starts}: give 1 or more")
+    records = (record,) if isinstance(record, Record) else tuple(record)
+    scenes = (scene,) * len(records) if scene is None or isinstance(scene, Scene) else tuple(scene)
+    if not records or len(scenes) != len(records):
+        raise InputError(f"{len(records)} records and {len(scenes)} scenes: give one scene for all, or one for each")
+    if len({each.fingerprint for each in records}) < len(records):
+        raise InputError(
+            f"{records[0].source}: one record was given twice, which would count its samples twice; drop one"
+        )
+    for each in scenes:
+        (each or Scene()).require_available(fit=True)
     with jax.enable_x64(True):
-        choice = choose_drive(record, scene)
-        prior = given.make_prior()
-        largest = 0.5 if prior.gain is None else 0.5 * math.exp(3.0 * prior.gain.spread)
-        start = linear_start(record, choice, largest)
-        likelihood = _likelihood(record, choice, _with_edge_time(prior, record, choice, start))
-        ridge = _on_the_ridge(start, likelihood.prior)
-        theta = np.append(ridge, 0.0) if likelihood.free_delay else ridge
-        noise, freeable = record.noise("Vsc"), ("offset", "drift", "delay", *_hum(record, choice))
         try:
-            projected, reason = compressed.project(likelihood, start, tolerance)
-            solved = solve(projected, theta, noise, freeable)
-            certified = _certified(solved, reason, tolerance)
-            if certified.error is None and solved.likelihood.compression is not None:
-                solved = solve(likelihood, theta, noise, freeable)
-                certified = _certified(solved, certified.reason, tolerance)
-            return _judged(solved, certified, record, given, choice, scene is None)
+            problem = pose(records, scenes, prior)
+            solved, certified = _solved(problem, tolerance, start)
+            optima = explore(solved, starts) if starts > 1 else None
+            lower = None if optima is None else better(optima, solved)
+            if lower is not None:
+                solved, certified = _solved(problem, tolerance, lower)
+            return _judged(problem, solved, certified, optima, scenes[0])
         except np.linalg.LinAlgError as error:
             raise InputError(
-                f"{record.source}: Vsc and V cannot be computed with ({error}); check for a huge offset or a wrong unit"
+                f"{records[0].source}: the channels cannot be computed with ({error}); check for a huge offset or a"
+                " wrong unit"
             ) from error
 
 
-def _certified(solved: Solved, reason: str, tolerance: float) -> compressed.Certified:
-    root = covariance_root(np.asarray(solved.jacobian), solved.likelihood.prior_sd)
-    return compressed.certify(solved.likelihood, reason, np.asarray(solved.theta), root, float(solved.sigma), tolerance)
-
-
-def _hum(record: Record, choice: DriveChoice) -> list[str]:
-    """The mains hums that the record can tell from its drive's harmonics, or from a part of a wave."""
-    span, frequency = float(record.time[-1] - record.time[0]), record.frequency()
-
-    def apart(hum: float) -> bool:
-        if frequency is None:
-            return not choice.periodic and hum * span > 2.0
-        return abs(hum - frequency * round(hum / frequency)) * span > 0.5
-
-    return [f"hum_{hum:.0f}Hz" for hum in (50.0, 60.0) if apart(hum) and hum * record.time_step < 0.5]
-
-
-def _likelihood(record: Record, choice: DriveChoice, prior: Prior) -> Likelihood:
-    height = float(np.ptp(record["Vsc"]))
-    charge = 10.0 * height if choice.unknown_charge else 0.0
-    # a part of a wave cannot show an offset, so one within an oscilloscope's accuracy is allowed for
-    offset = _OFFSET * height if record.frequency() is None and choice.periodic else 0.0
-    return Likelihood(
-        time=jnp.asarray(record.time),
-        observed=jnp.asarray(record["Vsc"]),
-        drive=choice.drive,
-        prior=prior,
-        linear_sd=jnp.zeros(len(LINEAR)).at[0].set(offset).at[CHARGE].set(charge),
-        shift=jnp.asarray(choice.shift, dtype=float),
-        time_step=jnp.asarray(record.time_step, dtype=float),
-        delay_sd=jnp.asarray(_delay_sd(choice), dtype=float),
-        compression=None,
-        steady_state=choice.steady_state,
-        columns=tuple(range(len(LINEAR))),
-        free_delay=choice.shift != 0.0,  # then the edges are known to within a step only, which g feels
-    )
-
-
-def _with_edge_time(prior: Prior, record: Record, choice: DriveChoice, start: LinearStart) -> Prior:
-    """Where a measured drive jumps within a step, its edge's time is uncertain within it, which acts as a gain."""
-    if choice.name != "measured" or not has_unresolved_edge(choice.voltage) or not math.isfinite(start.b):
-        return prior
-    spread = record.time_step / math.sqrt(12.0) / start.b
-    known = 0.0 if prior.gain is None else prior.gain.spread
-    return dataclasses.replace(prior, gain=LogNormal(1.0, math.hypot(spread, known)))
-
-
-def _delay_sd(choice: DriveChoice) -> float:
-    """Beside an ideal edge the samples leave the delay open within one step, whose middle is the start."""
-    return math.sqrt(1.0 / 12.0) if has_ideal_edges(choice.drive) else 5.0
-
-
-def _on_the_ridge(start: LinearStart, prior: Prior) -> Float[np.ndarray, " parameters"]:
-    """The most probable point, by the prior, among those with the start's g and b.
-
-    They are the line (log Rsc, log Csc, log Ci) = point + t (-1, 1, 1).
-    """
-    mean, sd = prior.log_mean, prior.log_sd
-    g = np.clip(start.g, 1e-9, 0.4999)
-    b = start.b if np.isfinite(start.b) else math.exp(mean[0] + mean[1])
-    ci = math.exp(mean[2])
-    point = np.array([math.log(g * b / ci), math.log((1.0 / g - 2.0) * ci), math.log(ci)])
-    along, weight = np.array([-1.0, 1.0, 1.0]), sd[:3] ** -2.0
-    point = point + along * np.sum(weight * along * (mean[:3] - point)) / np.sum(weight)
-    return np.append(point, mean[3:])  # a gain starts from its prior
+def _solved(
+    problem: Problem, tolerance: float, start: Mapping[str, float] | None
+) -> tuple[Solved, compressed.Certified]:
+    """The fit, with compressions where they hold; again where they turn out not to."""
+    (likelihood, reasons), theta_0 = problem.compressed(tolerance), begin(problem, start)
+    noise = np.array([source.noise for source in problem.sources])
+    freeable = tuple(source.freeable for source in problem.sources)
+    while True:
+        solved = solve(likelihood, theta_0, noise, freeable)
+        root = covariance_root(np.concatenate(solved.jacobian), solved.likelihood.prior_root)
+        theta, sigma = np.asarray(solved.theta), np.asarray(solved.sigma)
+        certified = compressed.certify(solved.likelihood, reasons, theta, root, sigma, tolerance)
+        failed = [
+            i
+            for i, (trace, reason) in enumerate(zip(solved.likelihood.traces, certified.reasons, strict=True))
+            if reason and trace.compression is not None
+        ]
+        if not failed:
+            return solved, certified
+        for i in failed:
+            likelihood = likelihood.with_trace(i, likelihood.traces[i].summed())
+        reasons = certified.reasons
 
 
 def _judged(
+    problem: Problem,
     solved: Solved,
     certified: compressed.Certified,
-    record: Record,
-    scene: Scene,
-    choice: DriveChoice,
-    no_scene: bool,
+    optima: Optima | None,
+    scene: Scene | None,
 ) -> Fit:
-    likelihood, theta, sigma = certified.likelihood, np.asarray(solved.theta), float(solved.sigma)
-    jacobian, prior_sd = np.asarray(solved.jacobian), likelihood.prior_sd
-    root = covariance_root(jacobian, prior_sd)
-    derive = derived.for_fit(likelihood, record, choice, scene, float(likelihood.circuit(theta).b))
-    logs, gradient = _log_derived(derive, theta, sigma)
-    residuals, beta = (
-        np.asarray(x) for x in _over_samples(dataclasses.replace(likelihood, compression=None), theta, sigma)
+    likelihood, theta, sigma = certified.likelihood, np.asarray(solved.theta), np.asarray(solved.sigma)
+    jacobian, prior_root = np.concatenate(solved.jacobian), likelihood.prior_root
+    root = covariance_root(jacobian, prior_root)
+    source, given = problem.sources[0], scene or Scene()
+    circuit = likelihood.circuit(jnp.asarray(theta))
+    derive = derived.for_fit(likelihood, source.record, source.choice, given, float(circuit.b), 0)
+    _, gradient = derive.logs(theta, sigma)
+    traces = tuple(
+        TraceFit.of(likelihood, i, theta, float(sigma[i]), source, certified.reasons[i])
+        for i, source in enumerate(problem.sources)
     )
-    linear = {
-        LINEAR[column]: float(value * likelihood.linear_sd[column])
-        for column, value in zip(likelihood.columns, beta, strict=True)
-    }
-    divider = float(np.exp(logs[derived.NAMES.index("g")]))
-    figures = statistics(residuals, theta.size + len(linear), divider, record, choice)
-    figures["steps"] = int(solved.steps)
-    identifiability = assess(jacobian, root, likelihood.prior, prior_sd, gradient[derived.NAMES.index("force_mean")])
+    figures = together([trace.figures for trace in traces]) | {"steps": int(solved.steps)} | compare(theta.size, traces)
+    if optima is not None:
+        figures |= {"optima": len(optima.reached), "starts_failed": optima.failed}
+    force = gradient[derived.NAMES.index("force_mean")]
+    on_traces = [
+        note
+        for source, trace in zip(problem.sources, traces, strict=True)
+        for note in (*source.notes, *remarks.on_trace(source.record, source.choice, trace.channel, trace.figures))
+    ]
+    on_all = remarks.on_parameters(likelihood, theta, scene is None)
     return Fit(
         theta=theta,
         covariance_root=root,
-        sigma=sigma,
-        linear=linear,
-        residuals=residuals,
-        result=_result(solved, root, figures),
+        traces=traces,
+        result=verdict(solved, root, traces, problem.sources, optima),
         figures=figures,
-        identifiability=identifiability,
-        warnings=(*record.notes, *choice.notes, *remarks(theta, likelihood.prior, record, choice, figures, no_scene)),
+        identifiability=assess(likelihood.names, root, prior_root, force, problem.experiment(likelihood, theta, sigma)),
+        warnings=tuple(dict.fromkeys([*on_traces, *misfits(traces), *on_all])),
         compression_error=certified.error,
-        full_because=certified.reason,
         likelihood=likelihood,
         derive=derive,
-        record=record,
-        scene=scene,
-        choice=choice,
+        scene=given,
     )
-
-
-@eqx.filter_jit
-def _over_samples(likelihood: Likelihood, theta: Array, sigma: ArrayLike) -> tuple[Array, Array]:
-    """What is left of the record, and the linear nuisances in prior standard deviations."""
-    return likelihood.linear(theta, sigma)[:2]
-
-
-def _result(solved: Solved, root: Float[np.ndarray, "n n"], figures: dict[str, float]) -> str:
-    """The first of the things that stand against the answer."""
-    name = result_name(solved.result)
-    if name != "successful":
-        return name
-    decrement = 0.5 * float(np.sum((root.T @ np.asarray(solved.gradient)) ** 2))
-    if not decrement < _DECREMENT:
-        return "did_not_move" if np.array_equal(solved.theta, solved.start) else "not_at_optimum"
-    return "misfit" if is_misfit(figures) else "successful"
-
-
-@eqx.filter_jit
-def _log_derived_jit(derive: derived.Derived, theta: Array, sigma: ArrayLike) -> tuple[Array, Array]:
-    def logs(theta: Array) -> Array:
-        return jnp.log(derive(theta, sigma))
-
-    return logs(theta), jax.jacfwd(logs)(theta)
-
-
-def _log_derived(derive: derived.Derived, theta: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray]:
-    """Logarithms of the derived quantities, and their gradients in theta."""
-    with jax.enable_x64(True):
-        values, gradient = _log_derived_jit(derive, jnp.asarray(theta), jnp.asarray(sigma))
-        return np.asarray(values), np.asarray(gradient)

@@ -1,18 +1,19 @@
-"""What a record can and cannot tell: the Fisher information against the prior, and a verdict in words."""
+"""What a record can and cannot tell: the Fisher information against the prior, a verdict in words, and a remedy."""
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from fitact.model.prior import Prior
+from fitact.inference.expected import Experiment, Remedy, remedies
+from fitact.inference.structure import Structure, blind_directions, gain_names, name_direction
 
-NAMES = ("Rsc", "Csc", "Ci")
 _IDENTIFIED = 0.9  # smallest prior-whitened eigenvalue from which the data speak in every direction
+_MOVES = 0.1  # a component of a unit vector from which it counts as part of a direction
 _WIDE = math.log(10.0) / 1.959963984540054  # a prior whose 95 % spans more than a factor of 10 either way says little
-_CONTACT_AREA = np.array([-1.0, 1.0, 1.0]) / math.sqrt(3.0)  # R ~ 1/A, C ~ A, in logs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,104 +26,116 @@ class Identifiability:
             the data, 0 from the prior alone.
         blind_direction: the direction the data see least, a unit vector in the log-parameters.
         blind_name: what that direction is, in words.
+        structural: whether no record of these channels could tell it; if not, it is this record that does not.
         prior_sd: standard deviation, by the prior, of the parameter that moves most along it, in its logarithm.
         force_from_prior: share of the variance of the mean force that comes from the prior.
+        force_sd: standard deviation of the mean force, in its logarithm.
+        force_contraction: 1 - that over the prior's.
         remedy: what to measure next.
+        remedies: that in figures, best first; none where all is identified.
+        channels: what was recorded beside V.
     """
 
     verdict: str
     eigenvalues: tuple[float, ...]
     blind_direction: dict[str, float]
     blind_name: str
+    structural: bool
     prior_sd: float
     force_from_prior: float
+    force_sd: float
+    force_contraction: float
     remedy: str
+    remedies: tuple[Remedy, ...]
+    channels: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """As in fit.json and summary.json."""
         return dataclasses.asdict(self)
 
     def __str__(self) -> str:
+        names = list(self.blind_direction)
         if self.verdict == "identified":
-            return "identified: the record determines Rsc, Csc and Ci."
+            return f"identified: the record determines {', '.join(names[:-1])} and {names[-1]}."
+        if self.structural:
+            channels = " and ".join(self.channels) if len(self.channels) > 1 else f"{self.channels[0]} alone"
+            found = f"no record of {channels} can tell {self.blind_name}"
+        else:
+            found = f"this record is too short, too noisy or of too few frequencies to tell {self.blind_name}"
         moves = ", ".join(f"{name} {value:+.2f}" for name, value in self.blind_direction.items())
         return (
-            f"{self.verdict}: the record cannot see {self.blind_name} (logs move together: {moves}); along it the"
-            f" prior alone speaks (± {100.0 * math.expm1(self.prior_sd):.2g} %), and"
-            f" {100.0 * self.force_from_prior:.3g} % of the force's variance comes from there. {self.remedy}"
+            f"{self.verdict}: {found} (logs move together: {moves}); along it the prior speaks"
+            f" (± {100.0 * math.expm1(self.prior_sd):.2g} %), and {100.0 * self.force_from_prior:.3g} % of the force's"
+            f" variance comes from the prior. {self.remedy}"
         )
 
 
 def assess(
-    jacobian: Float[np.ndarray, "samples parameters"],
+    names: Sequence[str],
     root: Float[np.ndarray, "parameters parameters"],
-    prior: Prior,
-    prior_sd: Float[np.ndarray, " parameters"],
+    prior_root: Float[np.ndarray, "parameters parameters"],
     force_gradient: Float[np.ndarray, " parameters"],
+    experiment: Experiment,
 ) -> Identifiability:
-    """Judge a record by the whitened residuals' `jacobian` in theta, and its `covariance_root`.
+    """Judge a fit by roots of theta's covariance (`covariance_root`) and of the prior's.
 
-    The first three coordinates are log Rsc, log Csc, log Ci; the others (gain, delay) are nuisances with
-    priors of their own; `prior_sd` is that of all. `force_gradient` is that of the log mean force.
+    `names` are theta's coordinates; those free in `experiment` that are no gains are judged, the others are
+    nuisances with priors of their own. `force_gradient` is that of the log mean force in theta.
     """
-    sd = prior_sd[:3]
-    _, roots, vectors = np.linalg.svd(_marginal(jacobian * prior_sd), full_matrices=False)
-    values = roots[::-1] ** 2
-    shares = values / (1.0 + values)
-    blind = sd * vectors[-1]
-    blind = blind / np.linalg.norm(blind) * (-1.0 if blind[2] < 0.0 else 1.0)
-    along = float(np.max(np.abs(blind)) / math.sqrt(np.sum((blind / sd) ** 2)))
+    force_sd = float(np.linalg.norm(root.T @ force_gradient))
+    free = [name for name in experiment.free if name not in gain_names(experiment.channels)]
+    rows = [list(names).index(name) for name in free]
+    believed = np.linalg.cholesky((prior_root @ prior_root.T)[np.ix_(rows, rows)])
+    # of the prior's spread in each direction, what is left
+    directions, left, _ = np.linalg.svd(np.linalg.solve(believed, root[rows]))
+    shares = np.clip(1.0 - left**2, 0.0, 1.0)
+    blind = believed @ directions[:, 0]
+    blind *= (-1.0 if "Ci" in free and blind[free.index("Ci")] < 0.0 else 1.0) / np.linalg.norm(blind)
+    direction = dict(zip(free, map(float, blind), strict=True))
+    along = float(np.max(np.abs(blind)) / np.linalg.norm(np.linalg.solve(believed, blind)))
+    verdict = "prior-limited" if along <= _WIDE else "unidentified"
+    structural, remedy, offered = False, "", tuple[Remedy, ...]()
     if shares[0] >= _IDENTIFIED:
         verdict = "identified"
     else:
-        verdict = "prior-limited" if along <= _WIDE else "unidentified"
-    moved = root @ (root.T @ force_gradient)
+        structure = blind_directions(experiment.circuit, experiment.free, experiment.channels)
+        structural, offered = structure.hides(direction), remedies(experiment)
+        remedy = _remedy(verdict, force_sd, offered, structure)
     return Identifiability(
         verdict=verdict,
-        eigenvalues=tuple(float(share) for share in shares),
-        blind_direction=dict(zip(NAMES, map(float, blind), strict=True)),
-        blind_name=_name(blind),
+        eigenvalues=tuple(map(float, shares)),
+        blind_direction=direction,
+        blind_name=name_direction(direction),
+        structural=structural,
         prior_sd=along,
-        force_from_prior=float(np.sum((moved / prior_sd) ** 2) / (moved @ force_gradient)),
-        remedy="" if verdict == "identified" else _remedy(verdict, prior),
+        force_from_prior=_from_prior(root, prior_root, force_gradient),
+        force_sd=force_sd,
+        force_contraction=1.0 - force_sd / float(np.linalg.norm(prior_root.T @ force_gradient)),
+        remedy=remedy,
+        remedies=offered,
+        channels=experiment.channels,
     )
 
 
-def covariance_root(
-    jacobian: Float[np.ndarray, "samples parameters"], prior_sd: Float[np.ndarray, " parameters"]
-) -> Float[np.ndarray, "parameters parameters"]:
-    """A matrix whose product with its transpose is the Laplace approximation's covariance.
-
-    From the singular values of the Jacobian: their squares span more digits than a number has.
-    """
-    _, roots, vectors = np.linalg.svd(jacobian * prior_sd, full_matrices=False)
-    return prior_sd[:, None] * vectors.T / np.hypot(1.0, roots)
+def _from_prior(root: np.ndarray, prior_root: np.ndarray, gradient: np.ndarray) -> float:
+    """The share of a quantity's variance that comes from the prior, by its gradient."""
+    moved = np.linalg.solve(prior_root, root @ (root.T @ gradient))
+    return float(moved @ moved / np.sum((root.T @ gradient) ** 2))
 
 
-def _marginal(scaled: np.ndarray) -> np.ndarray:
-    """The Jacobian (per prior sd) of the first three parameters, less what the others can do within their priors."""
-    count = scaled.shape[1] - 3
-    if count == 0:
-        return scaled
-    others, _ = np.linalg.qr(np.vstack([scaled[:, 3:], np.eye(count)]))
-    first = np.vstack([scaled[:, :3], np.zeros((count, 3))])
-    return first - others @ (others.T @ first)
-
-
-def _name(direction: np.ndarray) -> str:
-    if direction @ _CONTACT_AREA > 0.99:
-        return "the contact area, which scales 1/Rsc, Csc and Ci alike"
-    moves = ", ".join(f"{name} {value:+.2f}" for name, value in zip(NAMES, direction, strict=True))
-    return f"the combination ({moves})"
-
-
-def _remedy(verdict: str, prior: Prior) -> str:
+def _remedy(verdict: str, force_sd: float, offered: tuple[Remedy, ...], structure: Structure) -> str:
+    figures = [f"± {_percent(remedy.force_sd)} with {remedy.name}" for remedy in offered]
     remedy = (
-        "To end it, record the trunk current I as well, or put a known resistor (about 100 kohm) in series;"
-        " or measure Ci of the panel better, since its prior sets the scale. More of the same data will not help."
+        f"The mean force is known to ± {_percent(force_sd)}; to be expected is {', '.join(figures[:-1])},"
+        f" and {figures[-1]}."
     )
     if verdict == "unidentified":
-        remedy = "No prior covers that direction: state one for Ci, from the panel's data sheet. " + remedy
-    if prior.gain is not None:
-        remedy += " The free gain is confounded with Rsc Ci: calibrate the probe, and resolve the drive's edges."
+        remedy = f"No prior covers that direction: state one for Ci, from the panel's data sheet. {remedy}"
+    gains = structure.directions[:, [name in gain_names(structure.channels) for name in structure.names]]
+    if np.any(np.abs(gains) > _MOVES):
+        remedy += " The free gain is confounded with the circuit: calibrate the probe, and resolve the drive's edges."
     return remedy
+
+
+def _percent(sd: float) -> str:
+    return f"{100.0 * sd:.2g} %"

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt by optimistix, and which nuisances a record asks for."""
+"""The fit of one or several traces, and which nuisances they ask for."""
 
 import dataclasses
 import math
@@ -8,13 +8,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
+from jax import lax
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.inference.likelihood import Likelihood
+from fitact.inference.noise import first_order, student_curvature, student_weight
+from fitact.inference.solver import minimise
+from fitact.inference.trace import Seen, Trace
 
-_PRECISION = 1e-9  # of Vsc's span: least noise assumed
-NUISANCES = {  # by name, the columns of `LINEAR` that the record may ask for; beside these, a delay
+_SETTLED = 0.01  # relative change of the noise, below which no further round changes what follows
+_ROUNDS = 6
+_SCALE_STEPS = 40  # of Student's scale, each of which gains a quarter of a digit
+NUISANCES = {  # by name, the columns of `LINEAR` that a trace may ask for; beside these, a delay
     "offset": (0,),
     "drift": (1,),
     "hum_50Hz": (2, 3),
@@ -23,156 +29,224 @@ NUISANCES = {  # by name, the columns of `LINEAR` that the record may ask for; b
 _EVIDENCE = 10.0  # a nuisance is freed when it lowers the Bayesian information criterion by this much
 
 
-class RESULTS(optx.RESULTS):
-    """Why a fit ended: optimistix's results, and what else makes an answer untrustworthy."""
-
-    did_not_move = (
-        "The fit never left its start although the record asks for another answer; check the units of the record."
-    )
-    not_at_optimum = "The fit stopped before its optimum; check the units of the record, or give a nearer prior."
-    misfit = (
-        "The model does not describe the record: its residuals are larger than the noise or have structure;"
-        " look at them in the report, and use the drive as measured or a scene that has what is missing."
-    )
-
-
-_NAMES = (
-    "successful", "did_not_move", "not_at_optimum", "misfit",
-    "nonfinite", "nonlinear_max_steps_reached", "nonlinear_divergence",
-)  # fmt: skip
-
-
-def result_name(result: Any) -> str:
-    """The name of a member of `RESULTS`; a linear solver's failure counts as "nonfinite"."""
-    return next((name for name in _NAMES if bool(result == getattr(RESULTS, name))), "nonfinite")
-
-
-def result_message(name: str) -> str:
-    """The sentence of a member of `RESULTS`, by its name."""
-    return str(RESULTS[getattr(RESULTS, name)])  # type: ignore[misc]  # equinox's enumerations look up by item
-
-
 class Solved(eqx.Module):
-    """Where Levenberg-Marquardt ended; `start` is where the last fit began. Rows: samples, or their coordinates."""
+    """Where a fit ended; by trace: rows are its samples, or their coordinates.
+
+    Attributes:
+        likelihood: what was fitted.
+        theta, sigma: the optimum, and each trace's noise by what is left of it.
+        result: a member of `RESULTS`.
+        steps: trial steps taken, in all.
+        jacobian: of the whitened residuals in theta.
+        remainder, shapes, slope: of each trace: what is left of it, the shapes of its linear nuisances, and what a
+            further delay would change. Under Student's t these, and the Jacobian, are reweighted.
+    """
 
     likelihood: Likelihood
-    start: Float[Array, " parameters"]
     theta: Float[Array, " parameters"]
-    sigma: Float[Array, ""]
+    sigma: Float[Array, " traces"]
     result: Any
     steps: Array
-    remainder: Float[Array, " rows"]  # of the record, V
-    jacobian: Float[Array, "rows parameters"]
-    shapes: Float[Array, "columns rows"]  # of the linear nuisances
-    slope: Float[Array, " rows"]  # of the signal in a further delay
-    gradient: Float[Array, " parameters"]  # of minus the log-posterior
+    jacobian: tuple[Float[Array, "rows parameters"], ...]
+    remainder: tuple[Float[Array, " rows"], ...]
+    shapes: tuple[Float[Array, "columns rows"], ...]
+    slope: tuple[Float[Array, " rows"], ...]
 
 
-def _least_squares(likelihood: Likelihood, start: Array, noise: float | Array) -> Solved:
-    """Two rounds: with the noise as given, then with that of the residuals."""
-    needed = likelihood.without_samples()
-    first = _round(needed, start, jnp.asarray(noise, dtype=float))
-    second = _round(needed, first.theta, first.sigma)
-    return dataclasses.replace(second, likelihood=likelihood, start=start, steps=first.steps + second.steps)
+def _least_squares(likelihood: Likelihood, start: Array, noise: Array) -> Solved:
+    """In rounds: with the noise as given, then with that of the residuals, until it has settled."""
+    needed, steps = likelihood.without_samples(), jnp.zeros((), dtype=int)
+    theta, sigma = start, noise
+    for _ in range(_ROUNDS):
+        solved = _round(needed, theta, sigma)
+        change = float(jnp.max(jnp.abs(solved.sigma / sigma - 1.0)))
+        theta, sigma, steps = solved.theta, solved.sigma, steps + solved.steps
+        if not change > _SETTLED:
+            break
+    return dataclasses.replace(solved, likelihood=likelihood, steps=steps)
 
 
 @eqx.filter_jit
 def _round(likelihood: Likelihood, start: Array, sigma: Array) -> Solved:
-    def residuals(theta: Array, _: None) -> tuple[Array, Array]:
-        return likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)
-
-    solver: Any = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
-    solution: Any = optx.least_squares(residuals, solver, start, max_steps=256, throw=False)
-    theta = solution.value
-    (of_data, of_prior), (jacobian, prior_jacobian) = (
-        residuals(theta, None),
-        jax.jacfwd(residuals)(theta, None),
-    )
-    remainder, _, _ = likelihood.linear(theta, sigma)
+    found = minimise(lambda theta: (likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)), start)
+    theta, parts = found.theta, list(likelihood.each(found.theta))
+    sizes = [trace.rows + len(trace.columns) for trace, _ in parts]
+    of_traces = jnp.split(found.jacobian, np.cumsum(sizes))[:-1]
+    remainder = tuple(trace.linear(seen, s)[0] for (trace, seen), s in zip(parts, sigma, strict=True))
+    root = [_root_weight(trace, left / s) for (trace, _), left, s in zip(parts, remainder, sigma, strict=True)]
+    if any(trace.noise == "student" for trace, _ in parts):
+        of_traces = _informing(likelihood, theta, sigma, remainder)
+    used = theta.size / likelihood.count  # of a trace's samples, by the parameters
     return Solved(
         likelihood=likelihood,
-        start=start,
         theta=theta,
-        # not below what double precision leaves of a record without noise
-        sigma=jnp.maximum(
-            jnp.sqrt(jnp.sum(jnp.square(remainder)) / jnp.maximum(likelihood.count - start.size, 1)),
-            _PRECISION * jnp.ptp(likelihood.observed),
-        ),
-        result=RESULTS.promote(solution.result),
-        steps=solution.stats["num_steps"],
-        remainder=remainder,
-        jacobian=jacobian,
-        shapes=likelihood.before_linear(theta)[1],
-        slope=likelihood.slope(theta),
-        gradient=jacobian.T @ of_data + prior_jacobian.T @ of_prior,
+        sigma=jnp.stack([_noise(trace, left, used) for trace, left in zip(likelihood.traces, remainder, strict=True)]),
+        result=found.result,
+        steps=found.steps,
+        jacobian=tuple(of_traces),
+        remainder=tuple(w * left for w, left in zip(root, remainder, strict=True)),
+        shapes=tuple(w * trace.before_linear(seen)[1] for w, (trace, seen) in zip(root, parts, strict=True)),
+        slope=tuple(w * trace.slope(seen) for w, (trace, seen) in zip(root, parts, strict=True)),
     )
+
+
+def _root_weight(trace: Trace, z: Array) -> ArrayLike:
+    """Of the samples, in reweighted least squares."""
+    return jnp.sqrt(student_weight(z)) if trace.noise == "student" else 1.0
+
+
+def _informing(
+    likelihood: Likelihood, theta: Array, sigma: Array, remainder: tuple[Array, ...]
+) -> list[Float[Array, "rows parameters"]]:
+    """The Jacobian whose square is the curvature of -log-likelihood: that of Student's residuals is steeper."""
+
+    def whitened(theta: Array) -> list[Array]:
+        parts = zip(likelihood.each(theta), sigma, strict=True)
+        found = ((trace.linear(seen, s), s) for (trace, seen), s in parts)
+        return [jnp.concatenate([left / s, beta]) for (left, beta, _), s in found]
+
+    scaled = []
+    for trace, jacobian, left, s in zip(likelihood.traces, jax.jacfwd(whitened)(theta), remainder, sigma, strict=True):
+        if trace.noise == "student":
+            z = left / s
+            weight = student_weight(z)
+            weight = weight * trace.mean(student_curvature(z)) / trace.mean(weight)
+            jacobian = jacobian * jnp.pad(jnp.sqrt(weight), (0, len(trace.columns)), constant_values=1.0)[:, None]
+        scaled.append(jacobian)
+    return scaled
+
+
+def _noise(trace: Trace, remainder: Array, used: Array) -> Array:
+    """Its standard deviation, or Student's scale, not below the least that is believed."""
+    counted = jnp.maximum(trace.count * (1.0 - used), 1)
+    sigma = jnp.sqrt(jnp.sum(jnp.square(remainder)) / counted)
+    sigma = jnp.maximum(sigma, trace.least_noise)
+    if trace.noise != "student":
+        return sigma
+
+    def reweighted(_: int, sigma: Array) -> Array:
+        squares = student_weight(remainder / sigma) * jnp.square(remainder)
+        return jnp.maximum(jnp.sqrt(jnp.sum(squares) / counted), trace.least_noise)
+
+    return lax.fori_loop(0, _SCALE_STEPS, reweighted, sigma)
 
 
 def solve(
-    likelihood: Likelihood, start: Float[np.ndarray, " parameters"], noise: float, freeable: tuple[str, ...]
+    likelihood: Likelihood,
+    start: Float[np.ndarray, " parameters"],
+    noise: Float[np.ndarray, " traces"],
+    freeable: tuple[tuple[str, ...], ...],
 ) -> Solved:
-    """Fit; then free nuisances (of `NUISANCES`), one at a time, as long as the record asks for one.
+    """Fit; then free nuisances (each trace's of `NUISANCES`, or its delay), one at a time, as long as one is asked for.
 
-    With a delay, the samples are summed: the response table holds none.
+    With a delay, a trace's samples are summed: the response table holds none.
     """
-    solved = _least_squares(likelihood, jnp.asarray(start), noise)
-    for _ in freeable:
+    solved = _coloured(likelihood, jnp.asarray(start), jnp.asarray(noise, dtype=float))
+    for _ in range(sum(map(len, freeable))):
         gains = _evidence(solved, freeable)
-        name = max(gains, key=gains.__getitem__, default="")
-        if not name or not gains[name] > _EVIDENCE:
+        which, name = max(gains, key=gains.__getitem__, default=(0, ""))
+        if not name or not gains[which, name] > _EVIDENCE:
             break
-        theta = solved.theta
-        if name == "delay":
-            likelihood = dataclasses.replace(likelihood, compression=None)
-            shift = likelihood.shift + _nearest_delay(likelihood, theta)
-            likelihood = dataclasses.replace(likelihood, free_delay=True, shift=shift)
-            theta = jnp.append(theta, 0.0)
-        else:
-            sd = likelihood.linear_sd.at[np.array(NUISANCES[name])].set(10.0 * jnp.ptp(likelihood.observed))
-            likelihood = dataclasses.replace(likelihood, linear_sd=sd)
-        solved = _least_squares(likelihood, theta, solved.sigma)
+        likelihood, theta = _freed(solved, which, name)
+        solved = _coloured(likelihood, theta, solved.sigma)
     return solved
 
 
-def _nearest_delay(likelihood: Likelihood, theta: Array) -> Array:
-    """The middle of the best of a grid of delays within five steps (s): across an ideal edge there is no slope
-    to follow, and between two samples nothing that a gain could not do as well.
+def _coloured(likelihood: Likelihood, start: Array, noise: Array) -> Solved:
+    """Fit; where a trace's noise is AR(1), again with the coefficient that the residuals show.
+
+    It is then held: its error and the parameters' are uncorrelated in the limit of many samples (the information
+    is block-diagonal), so that not knowing it exactly widens no parameter.
     """
-    delays = np.arange(-40, 41) / 8.0
-    later = jnp.asarray(delays) * likelihood.time_step
-    shapes = np.asarray(likelihood.shapes(theta))[np.asarray(likelihood.linear_sd) > 0.0]
-    left = []
-    for shift in later:
-        design = np.vstack([_signal(likelihood, theta, shift), shapes]).T
-        remainder = likelihood.observed - design @ np.linalg.lstsq(design, likelihood.observed, rcond=None)[0]
-        left.append(float(remainder @ remainder))
-    good = np.asarray(left) < min(left) * (1.0 + 25.0 / likelihood.observed.size)
-    return jnp.asarray(np.mean(delays[good])) * likelihood.time_step
+    solved = _least_squares(likelihood, start, noise)
+    for i, trace in enumerate(likelihood.traces):
+        if trace.noise == "ar1":
+            white = dataclasses.replace(trace, whitening=None)
+            left = np.asarray(_remainder(white, likelihood.seen(solved.theta, i), solved.sigma[i]))
+            counted = np.ones(left.size, bool) if trace.weight is None else np.asarray(trace.weight) > 0.0
+            whitening = first_order(left, counted).whitening(counted)
+            likelihood = likelihood.with_trace(i, dataclasses.replace(trace, whitening=whitening))
+    if likelihood is solved.likelihood:
+        return solved
+    return _least_squares(likelihood, solved.theta, solved.sigma)
 
 
 @eqx.filter_jit
-def _signal(likelihood: Likelihood, theta: Array, later: Array) -> Array:
-    return likelihood.signal(theta, later)
+def _remainder(trace: Trace, seen: Seen, sigma: Array) -> Array:
+    return trace.linear(seen, sigma)[0]
 
 
-def _evidence(solved: Solved, freeable: tuple[str, ...]) -> dict[str, float]:
+def _freed(solved: Solved, which: int, name: str) -> tuple[Likelihood, Array]:
+    """The likelihood with a nuisance of the trace `which` freed, and where to go on from."""
+    likelihood, theta = solved.likelihood, solved.theta
+    trace = likelihood.traces[which]
+    if name == "delay":
+        # delays come last in theta, in the order of the traces
+        place = len(likelihood.prior.names) + sum(other.free_delay for other in likelihood.traces[:which])
+        shift = trace.shift + _nearest_delay(trace, likelihood.seen(theta, which))
+        trace = dataclasses.replace(trace.summed(), free_delay=True, shift=shift)
+        theta = jnp.insert(theta, place, 0.0)
+    else:
+        sd = trace.linear_sd.at[np.array(NUISANCES[name])].set(10.0 * jnp.ptp(trace.observed))
+        trace = dataclasses.replace(trace, linear_sd=sd)
+    return likelihood.with_trace(which, trace), theta
+
+
+def _nearest_delay(trace: Trace, seen: Seen) -> Array:
+    """The middle of the best of a grid of delays within five steps (s): across an ideal edge there is no slope
+    to follow, and between two samples nothing that a gain could not do as well.
+    """
+    trace = trace.summed()
+    delays = np.arange(-40, 41) / 8.0
+    later = jnp.asarray(delays) * trace.time_step
+    shapes = np.asarray(trace.shapes(seen))[np.asarray(trace.linear_sd) > 0.0]
+    weight = np.ones(trace.time.size) if trace.weight is None else np.asarray(trace.weight)
+    left = []
+    for shift in later:
+        design = (np.vstack([_signal(trace, seen, shift), shapes]) * weight).T
+        observed = np.asarray(trace.observed) * weight
+        remainder = observed - design @ np.linalg.lstsq(design, observed, rcond=None)[0]
+        left.append(float(remainder @ remainder))
+    good = np.asarray(left) < min(left) * (1.0 + 25.0 / trace.observed.size)
+    return jnp.asarray(np.mean(delays[good])) * trace.time_step
+
+
+@eqx.filter_jit
+def _signal(trace: Trace, seen: Seen, later: Array) -> Array:
+    return trace.signal(seen, later)
+
+
+def _evidence(solved: Solved, freeable: tuple[tuple[str, ...], ...]) -> dict[tuple[int, str], float]:
     """By how much freeing each nuisance would lower the Bayesian information criterion, to first order."""
-    likelihood, shapes, remainder = solved.likelihood, np.asarray(solved.shapes), np.asarray(solved.remainder)
-    count, free = float(likelihood.count), np.asarray(likelihood.linear_sd) > 0.0
-    candidates = {
-        name: shapes[list(places)] for name, places in NUISANCES.items() if name in freeable and not free[places[0]]
-    }
-    if "delay" in freeable and not likelihood.free_delay:
-        candidates["delay"] = np.asarray(solved.slope)[None]
-    known = np.concatenate([np.asarray(solved.jacobian)[: remainder.size], shapes[free].T], axis=1)
+    likelihood, sigma = solved.likelihood, np.asarray(solved.sigma)
+    remainders = [np.asarray(x) / s for x, s in zip(solved.remainder, sigma, strict=True)]
+    starts = np.cumsum([0, *(x.size for x in remainders)])
+    columns = [np.concatenate([np.asarray(j)[: x.size] for j, x in zip(solved.jacobian, remainders, strict=True)])]
+
+    def alone(which: int, shapes: np.ndarray) -> np.ndarray:
+        """Columns of one trace, which are nothing in the others."""
+        around = (starts[which], starts[-1] - starts[which + 1])
+        return np.pad(np.atleast_2d(shapes) / sigma[which], ((0, 0), around)).T
+
+    candidates = {}
+    for i, trace in enumerate(likelihood.traces):
+        shapes, free = np.asarray(solved.shapes[i]), np.asarray(trace.linear_sd) > 0.0
+        columns.append(alone(i, shapes[free[list(trace.columns)]]))
+        for name in freeable[i]:
+            if name == "delay" and not trace.free_delay:
+                candidates[i, name] = alone(i, np.asarray(solved.slope[i]))
+            elif name != "delay" and not free[NUISANCES[name][0]]:
+                candidates[i, name] = alone(i, shapes[list(NUISANCES[name])])
+    known = np.concatenate(columns, axis=1)
     basis, values, _ = np.linalg.svd(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300), full_matrices=False)
     basis = basis[:, values > 1e-9 * values[0]]
+    remainder = np.concatenate(remainders)
     gains = {}
-    for name, columns in candidates.items():
-        left = columns.T - basis @ (basis.T @ columns.T)
+    for (i, name), added in candidates.items():
+        left = added - basis @ (basis.T @ added)
         modes, sizes, _ = np.linalg.svd(left, full_matrices=False)
-        modes = modes[:, sizes > 1e-9 * max(float(np.linalg.norm(columns)), 1e-300)]
-        drop = float(np.sum((modes.T @ remainder) ** 2))
-        share = min(drop / float(remainder @ remainder), 1.0 - 1e-12)
-        gains[name] = -count * math.log1p(-share) - len(columns) * math.log(count)
+        modes = modes[:, sizes > 1e-9 * max(float(np.linalg.norm(added)), 1e-300)]
+        drop, count = float(np.sum((modes.T @ remainder) ** 2)), float(likelihood.traces[i].count)
+        share = min(drop / float(remainders[i] @ remainders[i]), 1.0 - 1e-12)
+        gains[i, name] = -count * math.log1p(-share) - added.shape[1] * math.log(count)
     return gains

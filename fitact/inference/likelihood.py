@@ -1,223 +1,192 @@
-"""The log-probability of a record: Gaussian noise, with the linear nuisances integrated out.
+"""The log-probability of one or several records: a circuit, and the traces that it made.
 
-The record is  Vsc = gain * response(t - delay) + A beta + noise.  The columns of A are an offset, a
-drift, mains hum and, for a measured drive, the decay of the unknown charge at the first sample. Their
-coefficients have wide normal priors and are integrated out exactly, so the chain holds only the
-parameters that matter: the logarithms of Rsc, Csc, Ci (and gain), the delay, and log sigma.
-
-All this asks of the samples is lengths and angles, so it reads the same in the coordinates of a
-`fitact.data.compress.Compression`, where there is one, as over the samples themselves.
+The chain holds only the parameters that matter: the logarithms of the circuit's free parameters and of the
+channels' gains, the delays, and the logarithm of each trace's noise. What enters the traces linearly is
+integrated out (`fitact.inference.trace`).
 """
 
 import dataclasses
 import functools
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jax.scipy.linalg import cho_solve, solve_triangular
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from fitact.data.compress import SLOW, Compression, slow_shapes
-from fitact.model.circuit import FinalCircuit, Terms
-from fitact.model.drive import Drive, Sampled
+from fitact.inference.trace import Seen, Trace
+from fitact.model.circuit import RC
+from fitact.model.distribution import Distribution
 from fitact.model.prior import Prior
-from fitact.model.response import response
 
+OPEN = math.log(1e6)  # in a logarithm: what leaves more open than this leaves it open
 _BATCH_ROWS = 4_000_000  # samples or coordinates evaluated at a time, which bounds memory
-
-LINEAR = (*SLOW, "charge")
-CHARGE = LINEAR.index("charge")
 
 
 class Likelihood(eqx.Module):
-    """Record, drive and prior, as a function of the parameters.
+    """Traces, a circuit and the prior, as a function of the parameters.
 
-    A point theta holds, in the order of `names`, logarithms of positive parameters, and the delay in
-    units of `time_step`. Built by `fitact.inference.fit`.
+    A point theta holds, in the order of `names`, logarithms of positive parameters, and each free delay in units
+    of its trace's `time_step`. Built by `fitact.inference.fit`.
 
     Attributes:
-        time: s.
-        observed: Vsc, V.
-        drive: what drives the circuit.
-        prior: of the circuit's parameters.
-        linear_sd: prior standard deviations of the `LINEAR` nuisances, V (drift: over half the record); 0
-            leaves one out.
-        shift: the drive starts this much later than the record's t = 0, s.
-        time_step: s.
-        delay_sd: prior standard deviation of the delay, in time steps.
-        steady_state: or from rest.
-        compression: the record's projection; None: the samples are summed.
-        free_delay: whether the delay is a parameter.
-        columns: which of `LINEAR` are looked at; the others' linear_sd is 0.
+        traces: channels of records.
+        template: the circuit; what the prior does not name keeps its value there.
+        prior: of the circuit's free parameters and of free gains.
+        sigma_prior: of each trace's noise; None: flat in its logarithm.
+        tied: parameters that are a ratio times another: name, the other's, ratio.
+        believed: whether the prior of the circuit counts, beside those of gains and delays.
     """
 
-    time: Float[Array, " samples"]
-    observed: Float[Array, " samples"]
-    drive: Drive
+    traces: tuple[Trace, ...]
+    template: RC
     prior: Prior
-    linear_sd: Float[Array, " 7"]
-    shift: ArrayLike
-    time_step: ArrayLike
-    delay_sd: ArrayLike
-    compression: Compression | None
-    steady_state: bool = eqx.field(static=True)
-    free_delay: bool = eqx.field(static=True)
-    columns: tuple[int, ...] = eqx.field(static=True)
-
-    @property
-    def prior_sd(self) -> np.ndarray:
-        """Standard deviations of theta by the prior."""
-        return np.append(self.prior.log_sd, float(self.delay_sd)) if self.free_delay else self.prior.log_sd
+    sigma_prior: tuple[Distribution | None, ...]
+    tied: tuple[tuple[str, str, float], ...] = eqx.field(static=True, default=())
+    believed: bool = eqx.field(static=True, default=True)
 
     @property
     def names(self) -> tuple[str, ...]:
         """The coordinates of theta."""
-        return (*self.prior.names, "delay") if self.free_delay else self.prior.names
-
-    def circuit(self, theta: Float[Array, " parameters"]) -> FinalCircuit:
-        """The circuit at theta."""
-        return FinalCircuit(*jnp.exp(theta[:3]))
-
-    def gain(self, theta: Float[Array, " parameters"]) -> ArrayLike:
-        """Gain of the channel Vsc."""
-        return 1.0 if self.prior.gain is None else jnp.exp(theta[3])
-
-    def signal(self, theta: Float[Array, " parameters"], later: ArrayLike = 0.0) -> Float[Array, " samples"]:
-        """Vsc as recorded (V), but for linear nuisances and noise; `later` (s) delays it further."""
-        delay = self.shift + later + (theta[-1] * self.time_step if self.free_delay else 0.0)
-        vsc = response(self.circuit(theta), self.drive, self.time - delay, steady_state=self.steady_state)
-        return self.gain(theta) * vsc
-
-    def shapes(self, theta: Float[Array, " parameters"]) -> Float[Array, "7 samples"]:
-        """The linear nuisances' shapes in time, each of height 1."""
-        middle, half = 0.5 * (self.time[0] + self.time[-1]), 0.5 * (self.time[-1] - self.time[0])
-        return jnp.concatenate([slow_shapes(self.time, middle, half), self.decay(theta, self.time)[None]])
-
-    def decay(self, theta: Float[Array, " parameters"], time: Float[Array, " times"]) -> Float[Array, " times"]:
-        """How an unknown charge at the first sample decays."""
-        (tau,) = self.circuit(theta).terms().tau
-        return jnp.exp(-(time - self.time[0]) / tau)
+        return (*self.prior.names, *(trace.named("delay") for trace in self.traces if trace.free_delay))
 
     @property
-    def count(self) -> ArrayLike:
-        """How many samples there are."""
-        return self.time.size if self.compression is None else self.compression.samples
+    def sigma_names(self) -> tuple[str, ...]:
+        """The coordinates of a posterior's point after theta."""
+        return tuple(trace.named("sigma") for trace in self.traces)
 
-    def without_samples(self) -> "Likelihood":
-        """With no more of the samples than their ends, where a compression stands for them.
+    @property
+    def prior_root(self) -> Float[np.ndarray, "parameters parameters"]:
+        """A root of theta's covariance by the prior; of a circuit without one, `OPEN` in each direction."""
+        delays = [float(trace.delay_sd) for trace in self.traces if trace.free_delay]
+        size, root = len(self.prior.names), np.diag(np.append(self.prior.log_sd, delays))
+        root[:size, :size] = np.linalg.cholesky(self.prior.covariance)
+        return root if self.believed else np.where(self._of_circuit[:, None], OPEN * np.eye(len(root)), root)
 
-        What is compiled for it serves records of any length.
-        """
-        if self.compression is None:
-            return self
-        drive = self.drive
-        if isinstance(drive, Sampled):
-            drive = dataclasses.replace(drive, time=drive.time[:2], samples=drive.samples[:2])
-        extremes = jnp.stack([jnp.min(self.observed), jnp.max(self.observed)])
-        return dataclasses.replace(self, time=self.time[:2], observed=extremes, drive=drive)
+    @property
+    def _of_circuit(self) -> Bool[np.ndarray, " parameters"]:
+        """Which coordinates of theta are the circuit's."""
+        fields = {field.name for field in dataclasses.fields(self.template)}
+        return np.array([name in fields for name in self.names])
 
     @property
     def rows(self) -> int:
         """How many numbers an evaluation runs over."""
-        return self.time.size if self.compression is None else self.compression.observed.size
+        return sum(trace.rows for trace in self.traces)
 
     @property
-    def _places(self) -> np.ndarray:
-        return np.array(self.columns, dtype=int)
+    def count(self) -> ArrayLike:
+        """How many samples count."""
+        return sum(trace.count for trace in self.traces)
 
-    def before_linear(
-        self, theta: Float[Array, " parameters"]
-    ) -> tuple[Float[Array, " rows"], Float[Array, "columns rows"]]:
-        """The record less the signal (V), and the shapes of the `columns`, over samples or coordinates."""
-        if self.compression is None:
-            remainder, shapes = self.observed - self.signal(theta), self.shapes(theta)
-        else:
-            terms = self.circuit(theta).terms()
-            remainder = self.compression.observed - self.gain(theta) * self.compression.response(terms)
-            shapes = jnp.concatenate([self.compression.slow, self.compression.decays(terms.tau[0])[None]])
-        return remainder, shapes[self._places]
+    def summed(self) -> "Likelihood":
+        """Without compression."""
+        return dataclasses.replace(self, traces=tuple(trace.summed() for trace in self.traces))
 
-    def slope(self, theta: Float[Array, " parameters"]) -> Float[Array, " rows"]:
-        """How a further delay changes the signal, V/s: over two time steps, so that ideal edges count."""
-        if self.compression is None:
-            step = self.time_step
-            return (self.signal(theta, step) - self.signal(theta, -step)) / (2.0 * step)
-        weight, tau, _ = self.circuit(theta).terms()  # u' = V' - u / tau
-        falling = Terms(tuple(w / t for w, t in zip(weight, tau, strict=True)), tau)
-        return self.gain(theta) * (self.compression.response(falling) - sum(weight) * self.compression.slope)
+    def without_samples(self) -> "Likelihood":
+        """With no more of the samples than their ends, where a compression stands for them."""
+        return dataclasses.replace(self, traces=tuple(trace.without_samples() for trace in self.traces))
 
-    def linear(
-        self, theta: Float[Array, " parameters"], sigma: ArrayLike
-    ) -> tuple[Float[Array, " rows"], Float[Array, " columns"], Float[Array, "columns columns"]]:
-        """What theta leaves of the record, and the nuisances' posterior given theta.
+    def with_trace(self, index: int, trace: Trace) -> "Likelihood":
+        """With another trace in that place."""
+        traces = (*self.traces[:index], trace, *self.traces[index + 1 :])
+        return dataclasses.replace(self, traces=traces)
 
-        Gives the remainder (V) after the best nuisances, their coefficients in prior standard
-        deviations, and the Cholesky factor of their posterior precision.
-        """
-        remainder, shapes = self.before_linear(theta)
-        A = self.linear_sd[self._places, None] * shapes
-        # keep XLA from computing both once per use
-        remainder, A = lax.optimization_barrier((remainder, A))
-        factor = jnp.linalg.cholesky(jnp.eye(len(A)) + A @ A.T / sigma**2)
-        beta = cho_solve((factor, True), A @ remainder / sigma**2)
-        return remainder - beta @ A, beta, factor
+    def circuit(self, theta: Float[Array, " parameters"]) -> RC:
+        """The circuit at theta."""
+        fields = {field.name for field in dataclasses.fields(self.template)}
+        values = {name: jnp.exp(theta[i]) for i, name in enumerate(self.prior.names) if name in fields}
+        for name, other, ratio in self.tied:
+            values[name] = ratio * values.get(other, getattr(self.template, other))
+        return dataclasses.replace(self.template, **values)
 
-    def drawn(
-        self, theta: Float[Array, " parameters"], sigma: ArrayLike, deviate: ArrayLike = 0.0
-    ) -> Float[Array, " 7"]:
-        """The nuisances' coefficients, in prior standard deviations, as seven standard normal numbers draw them.
+    def seen(self, theta: Float[Array, " parameters"], index: int = 0) -> Seen:
+        """What the trace of that index needs of theta."""
+        return self._seen(self.circuit(theta), theta, self.traces[index])
 
-        With a `deviate` of 0, their posterior mean given theta.
-        """
-        _, beta, factor = self.linear(theta, sigma)
-        deviate = jnp.broadcast_to(deviate, len(LINEAR))[self._places]
-        return jnp.zeros(len(LINEAR)).at[self._places].set(beta + solve_triangular(factor.T, deviate))
+    def _seen(self, circuit: RC, theta: Array, trace: Trace) -> Seen:
+        gain, delay, names = trace.named("gain"), trace.named("delay"), self.names
+        return Seen(
+            circuit,
+            jnp.exp(theta[names.index(gain)]) if gain in names else 1.0,
+            theta[names.index(delay)] * trace.time_step if trace.free_delay else 0.0,
+        )
 
-    def residuals(self, theta: Float[Array, " parameters"], sigma: ArrayLike) -> Float[Array, " rows+columns"]:
-        """Whitened residuals, nuisances' priors included: half their square is -log-likelihood."""
-        remainder, beta, _ = self.linear(theta, sigma)
-        return jnp.concatenate([remainder / sigma, beta])
+    def each(self, theta: Float[Array, " parameters"]) -> Iterator[tuple[Trace, Seen]]:
+        """The traces, and what they need of theta."""
+        circuit = self.circuit(theta)
+        return ((trace, self._seen(circuit, theta, trace)) for trace in self.traces)
+
+    def residuals(
+        self, theta: Float[Array, " parameters"], sigma: Float[Array, " traces"]
+    ) -> tuple[Float[Array, " rows"], ...]:
+        """Whitened residuals of each trace, nuisances' priors included: half their square is -log-likelihood."""
+        return tuple(trace.residuals(seen, s) for (trace, seen), s in zip(self.each(theta), sigma, strict=True))
 
     def prior_residuals(self, theta: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
-        """The prior as residuals: normal in theta, with the moments of the stated prior."""
-        scale = (theta[: len(self.prior.names)] - self.prior.log_mean) / self.prior.log_sd
-        return jnp.append(scale, theta[-1] / self.delay_sd) if self.free_delay else scale
+        """The prior as residuals: normal in theta, with the moments of the stated prior; 0 for what has none."""
+        size = len(self.prior.names)
+        delays = [trace.delay_sd for trace in self.traces if trace.free_delay]
+        scaled = self.prior.residuals(theta[:size])
+        found = jnp.concatenate([scaled, theta[size:] / jnp.asarray(delays)]) if delays else scaled
+        return found if self.believed else jnp.where(self._of_circuit, 0.0, found)
 
-    def log_likelihood(self, point: Float[Array, " parameters+1"]) -> Float[Array, ""]:
-        """Log-likelihood of (theta, log sigma), up to a constant; NaN where the compression does not reach."""
-        theta, log_sigma = point[:-1], point[-1]
-        remainder, beta, factor = self.linear(theta, jnp.exp(log_sigma))
-        misfit = jnp.sum(jnp.square(remainder)) * jnp.exp(-2.0 * log_sigma) + jnp.sum(jnp.square(beta))
-        value = -0.5 * misfit - self.count * log_sigma - jnp.sum(jnp.log(jnp.diagonal(factor)))
-        if self.compression is None:
-            return value
-        return jnp.where(self.compression.holds(self.circuit(theta).terms().tau[0]), value, jnp.nan)
+    def split(self, point: Float[Array, " coordinates"]) -> tuple[Float[Array, " parameters"], Float[Array, " traces"]]:
+        """Theta and the logarithms of the noise."""
+        return point[: -len(self.traces)], point[-len(self.traces) :]
 
-    def log_prob(self, point: Float[Array, " parameters+1"]) -> Float[Array, ""]:
-        """Log-posterior of (theta, log sigma), up to a constant; sigma's prior is flat in its logarithm.
+    def log_likelihoods(self, point: Float[Array, " coordinates"]) -> Float[Array, " traces"]:
+        """Log-likelihood of each trace at (theta, log sigma), up to a constant; NaN where its compression ends."""
+        theta, log_sigma = self.split(point)
+        parts = zip(self.each(theta), log_sigma, strict=True)
+        return jnp.stack([trace.log_likelihood(seen, log) for (trace, seen), log in parts])
 
-        Anything that is not finite counts as impossible, but it is NaN where the compression does not reach.
+    def log_likelihood(self, point: Float[Array, " coordinates"]) -> Float[Array, ""]:
+        """Log-likelihood of (theta, log sigma), up to a constant; NaN where a compression does not reach."""
+        return jnp.sum(self.log_likelihoods(point))
+
+    def log_prior(self, point: Float[Array, " coordinates"]) -> Float[Array, ""]:
+        """Log-density of the prior, up to a constant: a noise is flat in its logarithm unless it has one."""
+        theta, log_sigma = self.split(point)
+        size = len(self.prior.names)
+        value = self.prior.log_density(theta[:size])
+        delays = [trace.delay_sd for trace in self.traces if trace.free_delay]
+        for delay, sd in zip(theta[size:], delays, strict=True):
+            value = value - 0.5 * jnp.square(delay / sd)
+        for prior, log in zip(self.sigma_prior, log_sigma, strict=True):
+            value = value if prior is None else value + prior.log_density(log)
+        return value
+
+    def log_prob(self, point: Float[Array, " coordinates"]) -> Float[Array, ""]:
+        """Log-posterior of (theta, log sigma), up to a constant.
+
+        Anything that is not finite counts as impossible, but it is NaN where a compression does not reach.
         """
-        theta = point[:-1]
-        value = self.log_likelihood(point) + self.prior.log_density(theta[: len(self.prior.names)])
-        if self.free_delay:
-            value = value - 0.5 * jnp.square(theta[-1] / self.delay_sd)
-        beyond = jnp.isnan(value) & jnp.all(jnp.isfinite(point)) & (self.compression is not None)
+        believed, value = self.log_prior(point), self.log_likelihood(point)
+        compressed = any(trace.compression is not None for trace in self.traces)
+        beyond = jnp.isnan(value) & jnp.all(jnp.isfinite(point)) & jnp.isfinite(believed) & compressed
+        value = value + believed
         return jnp.where(jnp.isfinite(value) | beyond, value, -jnp.inf)
+
+    def natural(self, theta: Float[np.ndarray, "*shape parameters"]) -> dict[str, Float[np.ndarray, "*shape"]]:
+        """Points in SI units, by name; a delay is that of the channel against the drive, in all."""
+        found = {name: np.exp(theta[..., i]) for i, name in enumerate(self.prior.names)}
+        delayed = [trace for trace in self.traces if trace.free_delay]
+        for i, trace in enumerate(delayed, len(found)):
+            found[trace.named("delay")] = float(trace.shift) + theta[..., i] * float(trace.time_step)
+        return found
 
 
 class Batched:
     """`function(model, *rows)` over the rows of arrays of one length, a batch at a time.
 
-    Batches have one size, so that they compile once, and shrink where `rows`, the numbers that one evaluation
-    runs over, are many, which bounds memory. What jit needs of the model is sorted out here once, since a call
-    may take less time than that. Call it in double precision.
+    Batches have one size, filled up where rows are missing, so that they compile once; it shrinks where `rows`,
+    the numbers that one evaluation runs over, are many, which bounds memory. What jit needs of the model is sorted
+    out here once, since a call may take less time than that. Call it in double precision.
     """
 
     def __init__(self, function: Callable[..., Array], model: eqx.Module, rows: int, batch: int = 32) -> None:
@@ -228,7 +197,7 @@ class Batched:
 
     def __call__(self, *arrays: np.ndarray) -> np.ndarray:
         count = len(arrays[0])
-        batch = min(self._batch, count)
+        batch = self._batch
         missing = -count % batch
         if missing:
             arrays = tuple(np.concatenate([a, np.repeat(a[-1:], missing, axis=0)]) for a in arrays)
@@ -259,12 +228,3 @@ class _Static:
 def _evaluate(static: _Static, dynamic: list[Array], rows: tuple[Array, ...]) -> Array:
     model = eqx.combine(jax.tree.unflatten(static.arrays, dynamic), static.model)
     return jax.vmap(lambda *row: static.function(model, *row))(*rows)
-
-
-def natural(likelihood: Likelihood, theta: np.ndarray) -> dict[str, np.ndarray]:
-    """Points (..., parameters) in SI units, by name; the delay is that of Vsc against the drive, in all."""
-    start, step = float(likelihood.shift), float(likelihood.time_step)
-    return {
-        name: start + theta[..., i] * step if name == "delay" else np.exp(theta[..., i])
-        for i, name in enumerate(likelihood.names)
-    }

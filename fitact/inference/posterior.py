@@ -14,42 +14,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitact.data.record import CHANNEL_UNITS
 from fitact.files import replacing
 from fitact.inference import derived, summary
 from fitact.inference.chain import Chain
+from fitact.inference.convergence import Convergence
 from fitact.inference.fit import Fit
-from fitact.inference.likelihood import LINEAR, Batched, Likelihood, natural
-from fitact.units import engineering
+from fitact.inference.likelihood import Batched, Likelihood
+from fitact.inference.trace import LINEAR
+from fitact.inference.trace_fit import TraceFit
 
 _DRAWS = 2500  # kept per ensemble, spread over its walkers and steps
+_CHAINS = 4  # that independent draws are dealt out to
 _PREDICTED = 50  # records predicted per ensemble
 _PREDICTED_SAMPLES = 4000  # at most that many of the record's samples are predicted
 _PACKAGES = ("fitact", "jax", "equinox", "optimistix", "emcee", "numpy", "xarray")
-
-
-@dataclasses.dataclass(frozen=True)
-class Convergence:
-    """How far a chain can be trusted; see `fitact.sample`."""
-
-    converged: bool = False
-    tau_max: float = float("nan")
-    ess_min: float = 0.0
-    rhat_max: float = float("nan")
-    acceptance: float = float("nan")
-    burn: int = 0
-    steps: int = 0
-    walkers: int = 0
-    ensembles: int = 0
-    stuck_walkers: int = 0
-    interrupted: bool = False
-
-    def __str__(self) -> str:
-        verdict = "converged" if self.converged else "interrupted" if self.interrupted else "NOT converged"
-        return (
-            f"{verdict}: {self.ensembles} ensembles of {self.walkers} walkers, {self.steps} steps ({self.burn} of them"
-            f" burn-in), autocorrelation time {self.tau_max:.2f}, effective draws {self.ess_min:,.0f},"
-            f" split-R-hat {self.rhat_max:.4f}, accepted {100.0 * self.acceptance:.0f} %"
-        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,11 +59,28 @@ class Posterior:
         points = chain.points[:, chosen].reshape(convergence.ensembles, -1, size)
         return cls(fit, points, chain.log_prob[:, chosen].reshape(points.shape[:2]), convergence, seed)
 
+    @classmethod
+    def from_draws(
+        cls,
+        fit: Fit,
+        points: Float[np.ndarray, "draws n"],
+        log_prob: Float[np.ndarray, " draws"],
+        convergence: Convergence,
+        seed: int,
+    ) -> Self:
+        """Independent draws, dealt out to as many chains as `sample` has ensembles."""
+        points = points.reshape(_CHAINS, -1, points.shape[1])
+        return cls(fit, points, log_prob.reshape(points.shape[:2]), convergence, seed)
+
     def parameters(self) -> dict[str, Float[np.ndarray, "ensembles draws"]]:
         """Draws of what the fit left free, the nuisances included, in SI units."""
-        draws = natural(self.fit.likelihood, self.points[..., :-1]) | {"sigma": np.exp(self.points[..., -1])}
-        linear = self._linear * np.asarray(self.fit.likelihood.linear_sd)
-        return draws | {name: linear[..., i] for i, name in enumerate(LINEAR) if name in self.fit.linear}
+        likelihood, size = self.fit.likelihood, self.fit.theta.size
+        draws = likelihood.natural(self.points[..., :size])
+        draws |= {name: np.exp(self.points[..., size + i]) for i, name in enumerate(likelihood.sigma_names)}
+        for trace, drawn in zip(likelihood.traces, np.moveaxis(self._linear, -2, 0), strict=True):
+            for column in trace.columns:
+                draws[trace.named(LINEAR[column])] = drawn[..., column] * float(trace.linear_sd[column])
+        return draws
 
     def force(self) -> dict[str, Float[np.ndarray, "ensembles draws"]]:
         """Per draw: mean, peak and rms of the electrostatic force by eq. (22), and mean friction by eq. (2), N.
@@ -100,8 +96,9 @@ class Posterior:
 
     @functools.cached_property
     def _deviates(self) -> np.ndarray:
-        """Standard normal numbers that draw the linear nuisances."""
-        return np.random.default_rng([self.seed, 1]).standard_normal((*self.points.shape[:2], len(LINEAR)))
+        """Standard normal numbers that draw the linear nuisances of each trace."""
+        shape = (*self.points.shape[:2], len(self.fit.traces), len(LINEAR))
+        return np.random.default_rng([self.seed, 1]).standard_normal(shape)
 
     @functools.cached_property
     def _derived(self) -> np.ndarray:
@@ -109,7 +106,7 @@ class Posterior:
 
     @functools.cached_property
     def _linear(self) -> np.ndarray:
-        """Draws of the linear nuisances, in prior standard deviations."""
+        """Draws of the linear nuisances of each trace, in prior standard deviations."""
         return self._each(_linear_of, self.fit.likelihood, rows=self.fit.likelihood.rows)
 
     def _each(
@@ -117,10 +114,10 @@ class Posterior:
     ) -> np.ndarray:
         """`function` of the chosen draws; `rows`: numbers that one runs over."""
         points, deviates = self.points[:, draws], self._deviates[:, draws]
-        flat = points.reshape(-1, points.shape[-1]), deviates.reshape(-1, len(LINEAR))
+        flat = points.reshape(-1, points.shape[-1]), deviates.reshape(-1, *deviates.shape[2:])
         with jax.enable_x64(True):
             values = Batched(function, model, rows)(*flat)
-        return values.reshape(*points.shape[:2], -1)
+        return values.reshape(*points.shape[:2], *values.shape[1:])
 
     @property
     def trusted(self) -> bool:
@@ -133,10 +130,8 @@ class Posterior:
         found = list(self.fit.warnings)
         if not self.fit.trusted:
             found.append(self.fit.message)
-        if self.convergence.interrupted:
-            found.append("sampling was interrupted before it had converged; run the same command again to go on")
-        elif not self.convergence.converged:
-            found.append(f"the chain has not converged; allow more steps ({self.convergence})")
+        if self.convergence.warning:
+            found.append(self.convergence.warning)
         return tuple(found)
 
     def summary(self) -> dict[str, Any]:
@@ -153,8 +148,8 @@ class Posterior:
         return {
             "parameters": parameters,
             "derived": {name: summary.of_draws(name, draws) for name, draws in self.derived().items()},
-            "identifiability": fitted["identifiability"],
-            "convergence": dataclasses.asdict(self.convergence),
+            "identifiability": fitted["identifiability"] | {"sentence": str(self.fit.identifiability)},
+            "convergence": dataclasses.asdict(self.convergence) | {"sentence": str(self.convergence)},
             "fit": fitted["fit"],
             "model": fitted["model"],
             "warnings": list(self.warnings),
@@ -165,17 +160,16 @@ class Posterior:
         }
 
     def _record(self) -> dict[str, Any]:
-        record = self.fit.record
-        return {"source": os.path.basename(record.source), "samples": len(record), "sha256": record.fingerprint}
+        records = self.fit.records
+        return {
+            "source": os.path.basename(records[0].source),
+            "samples": sum(map(len, records)),
+            "sha256": records[0].fingerprint,
+            "sources": [{"source": os.path.basename(r.source), "sha256": r.fingerprint} for r in records],
+        }
 
     def __str__(self) -> str:
-        rows = [f"{'':14}{'median':>12}{'5 %':>14}{'95 %':>12}"]
-        for name, draws in (self.parameters() | self.derived()).items():
-            s = summary.of_draws(name, draws)
-            median, low, high = (engineering(float(s[q]), str(s["unit"])) for q in ("q50", "q05", "q95"))
-            rows.append(f"{name:14}{median:>12}{low:>14}{high:>12}")
-        rows += [str(self.convergence), str(self.fit.identifiability)]
-        return "\n".join([*rows, *(f"warning: {warning}" for warning in self.warnings)])
+        return summary.table(self.summary())
 
     def to_datatree(self) -> Any:
         """An `xarray.DataTree` in ArviZ's groups; chain: the independent ensembles."""
@@ -183,33 +177,36 @@ class Posterior:
 
         def dataset(draws: dict[str, np.ndarray]) -> xr.Dataset:
             variables = {
-                name: xr.DataArray(values, dims=("chain", "draw"), attrs={"units": summary.UNITS[name]})
+                name: xr.DataArray(values, dims=("chain", "draw"), attrs={"units": summary.unit(name)})
                 for name, values in draws.items()
             }
             counts = next(iter(draws.values())).shape
             return xr.Dataset(variables, coords={"chain": np.arange(counts[0]), "draw": np.arange(counts[1])})
 
-        record, rng = self.fit.record, np.random.default_rng([self.seed, 2])
+        rng = np.random.default_rng([self.seed, 2])
         ensembles, count = self.points.shape[:2]
         believed = self.fit.likelihood.prior.sample(rng, ensembles * count)
         prior = {name: draws.reshape(ensembles, count) for name, draws in believed.items()}
-        volts = {"units": "V"}
-        observed = xr.Dataset(
-            {"Vsc": ("time", record["Vsc"], volts)}, coords={"time": ("time", record.time, {"units": "s"})}
-        )
-        known = {"V": self.fit.choice.voltage, "Vsc_fit": record["Vsc"] - self.fit.residuals}
-        known_data = xr.Dataset(
-            {name: ("time", values, volts) for name, values in known.items()}, coords=observed.coords
-        )
+        observed, known = xr.Dataset(), xr.Dataset()
+        for trace in self.fit.traces:
+            time, name = _axis(trace), _name(trace)
+            unit = {"units": CHANNEL_UNITS[trace.channel]}
+            at = {time: (time, trace.record.time, {"units": "s"})}
+            values = trace.record[trace.channel]
+            observed = observed.merge(xr.Dataset({name: (time, values, unit)}, coords=at))
+            kept = np.isfinite(self._spread(trace))
+            fitted = {f"{name}_fit": (time, np.where(kept, values - trace.residuals, np.nan), unit)}
+            drive = {_name(trace, "V"): (time, trace.choice.voltage, {"units": "V"})}
+            known = known.merge(xr.Dataset(fitted | drive, coords=at))
         statistics = xr.Dataset({"lp": (("chain", "draw"), self.log_prob)}, coords=dataset(prior).coords)
         return xr.DataTree.from_dict(
             {
                 "/": xr.Dataset(attrs=self._attributes()),
                 "posterior": dataset(self.parameters() | self.derived()),
                 "sample_stats": statistics,
-                "posterior_predictive": self._predicted(),
+                "posterior_predictive": self._predicted,
                 "observed_data": observed,
-                "constant_data": known_data,
+                "constant_data": known,
                 "prior": dataset(prior),
             }
         )
@@ -217,6 +214,7 @@ class Posterior:
     def _attributes(self) -> dict[str, Any]:
         return {
             "inference_library": "fitact",
+            "level": self.convergence.level,
             "inference_library_version": importlib.metadata.version("fitact"),
             "record": self._record()["source"],
             "record_sha256": self.fit.record.fingerprint,
@@ -224,22 +222,34 @@ class Posterior:
             "seed": self.seed,
         }
 
+    @functools.cached_property
     def _predicted(self) -> Any:
         """Records as the posterior predicts them, noise included, on the record's times (thinned where long)."""
         import xarray as xr
 
         ensembles, count = self.points.shape[:2]
         draws = np.linspace(0, count - 1, min(_PREDICTED, count)).astype(int)
-        stride = -(-len(self.fit.record) // _PREDICTED_SAMPLES)
-        mean = self._each(lambda *point: _signal_of(*point)[::stride], self.fit.likelihood, len(self.fit.record), draws)
-        sigma = np.exp(self.points[:, draws, -1:])
-        noise = np.random.default_rng([self.seed, 3]).standard_normal(mean.shape)
-        values = (mean + sigma * noise).astype(np.float32)
-        time = self.fit.record.time[::stride]
-        return xr.Dataset(
-            {"Vsc": (("chain", "draw", "time"), values, {"units": "V"})},
-            coords={"chain": np.arange(ensembles), "draw": draws, "time": ("time", time, {"units": "s"})},
-        )
+        rng = np.random.default_rng([self.seed, 3])
+        found = xr.Dataset(coords={"chain": np.arange(ensembles), "draw": draws})
+        for i, trace in enumerate(self.fit.traces):
+            stride = -(-len(trace.record) // _PREDICTED_SAMPLES)
+            signal = functools.partial(_signal_of, i, stride)
+            mean = self._each(signal, self.fit.likelihood, len(trace.record), draws)
+            sigma = np.exp(self.points[:, draws, self.fit.theta.size + i, None])
+            noisy = mean + sigma * self._spread(trace)[::stride] * rng.standard_normal(mean.shape)
+            time = _axis(trace)
+            unit = {"units": CHANNEL_UNITS[trace.channel]}
+            found[_name(trace)] = ("chain", "draw", time), noisy.astype(np.float32), unit
+            found = found.assign_coords({time: (time, trace.record.time[::stride], {"units": "s"})})
+        return found
+
+    @staticmethod
+    def _spread(trace: TraceFit) -> Float[np.ndarray, " samples"]:
+        """Standard deviation of each sample's noise over the trace's; NaN where one was left out."""
+        if trace.weight is None:
+            return np.ones(len(trace.record))
+        kept = trace.weight > 0.0
+        return np.where(kept, 1.0 / np.where(kept, trace.weight, 1.0), np.nan)
 
     def to_netcdf(self, path: str | os.PathLike[str]) -> None:
         """Write `to_datatree()` as NetCDF (ArviZ's `from_netcdf` opens it)."""
@@ -260,14 +270,30 @@ def _versions() -> dict[str, str]:
     return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in _PACKAGES}
 
 
+def _axis(trace: TraceFit) -> str:
+    """The name of a trace's time axis."""
+    number = trace.label.rpartition("_")[2]
+    return f"time_{number}" if number.isdigit() else "time"
+
+
+def _name(trace: TraceFit, channel: str = "") -> str:
+    """The name of a trace, or of another channel of its record."""
+    return (channel or trace.channel) + _axis(trace).removeprefix("time")
+
+
 def _derived_of(derive: derived.Derived, point: Array, deviate: Array) -> Array:
-    return derive(point[:-1], jnp.exp(point[-1]), deviate)
+    theta, log_sigma = derive.likelihood.split(point)
+    return derive(theta, jnp.exp(log_sigma), deviate)
 
 
 def _linear_of(likelihood: Likelihood, point: Array, deviate: Array) -> Array:
-    return likelihood.drawn(point[:-1], jnp.exp(point[-1]), deviate)
+    theta, log_sigma = likelihood.split(point)
+    parts = zip(likelihood.each(theta), jnp.exp(log_sigma), deviate, strict=True)
+    return jnp.stack([trace.drawn(seen, sigma, each) for (trace, seen), sigma, each in parts])
 
 
-def _signal_of(likelihood: Likelihood, point: Array, deviate: Array) -> Array:
-    theta, beta = point[:-1], _linear_of(likelihood, point, deviate)
-    return likelihood.signal(theta) + (beta * likelihood.linear_sd) @ likelihood.shapes(theta)
+def _signal_of(index: int, stride: int, likelihood: Likelihood, point: Array, deviate: Array) -> Array:
+    theta, log_sigma = likelihood.split(point)
+    trace, seen = likelihood.traces[index], likelihood.seen(theta, index)
+    beta = trace.drawn(seen, jnp.exp(log_sigma[index]), deviate[index])
+    return (trace.signal(seen) + (beta * trace.linear_sd) @ trace.shapes(seen))[::stride]

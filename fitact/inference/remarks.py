@@ -1,32 +1,24 @@
 """What a user should know about an answer although nothing stands against it, in sentences."""
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from fitact.data.record import Record
 from fitact.inference.diagnostics import is_coarse
+from fitact.inference.likelihood import Likelihood
 from fitact.inference.start import DriveChoice
-from fitact.model.prior import Prior
 from fitact.units import engineering
 
+_DRAWS = 10_000
 _IMPLAUSIBLE = 0.005  # share of the prior further out than g or b, below which it is remarked upon
 
 
-def remarks(
-    theta: Float[np.ndarray, " parameters"],
-    prior: Prior,
-    record: Record,
-    choice: DriveChoice,
-    figures: dict[str, float],
-    no_scene: bool,
-) -> list[str]:
-    """Sentences; `figures` are those of `fitact.inference.diagnostics`."""
+def on_trace(record: Record, choice: DriveChoice, channel: str, figures: dict[str, float]) -> list[str]:
+    """Of one trace; `figures` are those of `fitact.inference.diagnostics`."""
     found = []
-    if no_scene:
-        found.append(
-            "no scene was given: the panel is taken to be the paper's (Ci 1.35 nF ± 5 %), and Rsc, Csc, Ci and the"
-            " force scale with that; state your panel's Ci under [device] in a scene file"
-        )
     span = record.time[-1] - record.time[0]
     if record.frequency() is None and choice.periodic:
         found.append(
@@ -39,7 +31,29 @@ def remarks(
             f" {engineering(figures['interpolation_error'], 'V')} in Vsc); record faster, or name the"
             " waveform in a scene"
         )
-    for name, factor, tail in _plausibility(theta, prior):
+    if figures["rounding_noise"] > 0.0:
+        found.append(
+            f"{channel} is rounded to steps wider than its noise, so its errors are not independent and those stated"
+            " may be off by half; record with a finer range"
+        )
+    if figures["outliers"]:
+        found.append(
+            f"{figures['outliers']:.0f} samples of {channel} lie further from the fit than normal noise would bring"
+            f" them, the first at {engineering(figures['first_outlier'], 's')}; [measurement] noise_model = 'student'"
+            " lets outliers count less"
+        )
+    return found
+
+
+def on_parameters(likelihood: Likelihood, theta: Float[np.ndarray, " parameters"], no_scene: bool) -> list[str]:
+    """Of the answer, against what was believed."""
+    found = []
+    if no_scene:
+        found.append(
+            "no scene was given: the panel is taken to be the paper's (Ci 1.35 nF ± 5 %), and Rsc, Csc, Ci and the"
+            " force scale with that; state your panel's Ci under [device] in a scene file"
+        )
+    for name, factor, tail in _plausibility(likelihood, theta):
         if tail < _IMPLAUSIBLE:
             found.append(
                 f"{name} is {factor:.3g} times what the prior expects (less than {100.0 * _IMPLAUSIBLE:.2g} % of it"
@@ -49,16 +63,20 @@ def remarks(
     return found
 
 
-def _plausibility(theta: np.ndarray, prior: Prior) -> list[tuple[str, float, float]]:
+def _plausibility(likelihood: Likelihood, theta: np.ndarray) -> list[tuple[str, float, float]]:
     """For g and b, which the record knows: name, ratio to the prior's median, share of the prior further out."""
-    believed = prior.sample(np.random.default_rng(0), 10_000)  # for two tail areas, so any seed will do
-    r, c, i = np.exp(theta[:3])
-    total, expected = 2.0 * i + c, 2.0 * believed["Ci"] + believed["Csc"]
-    pairs = {
-        "the divider g": (i / total, believed["Ci"] / expected),
-        "the time constant b": (r * total, believed["Rsc"] * expected),
-    }
+    believed = np.tile(theta, (_DRAWS, 1))
+    draws = likelihood.prior.sample(np.random.default_rng(0), _DRAWS)  # for two tail areas, so any seed will do
+    believed[:, : len(draws)] = np.log(list(draws.values())).T
+    g, b = (np.asarray(x) for x in _divider(likelihood, jnp.asarray(np.vstack([theta, believed]))))
     return [
-        (name, float(value / np.median(draws)), float(min(np.mean(draws < value), np.mean(draws > value))))
-        for name, (value, draws) in pairs.items()
+        (name, float(x[0] / np.median(x[1:])), float(min(np.mean(x[1:] < x[0]), np.mean(x[1:] > x[0]))))
+        for name, x in (("the divider g", g), ("the time constant b", b))
+        if np.ptp(x) > 0.0
     ]
+
+
+@eqx.filter_jit
+def _divider(likelihood: Likelihood, theta: Float[Array, "n parameters"]) -> tuple[Array, Array]:
+    circuits = jax.vmap(likelihood.circuit)(theta)
+    return jax.vmap(lambda circuit: circuit.g)(circuits), jax.vmap(lambda circuit: circuit.b)(circuits)

@@ -1,4 +1,4 @@
-"""Posterior draws with emcee, until converged: independent ensembles, checkpoints, resume."""
+"""Posterior draws at a level of uncertainty; by emcee until converged: independent ensembles, checkpoints, resume."""
 
 import contextlib
 import dataclasses
@@ -7,117 +7,177 @@ import importlib.metadata
 import json
 import os
 import signal
-import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Literal, get_args
 
 import emcee
 import jax
 import numpy as np
-from arviz_stats.base import array_stats
-from jaxtyping import Float
 
 from fitact.errors import InputError
-from fitact.inference import compressed
+from fitact.files import clean
+from fitact.inference import compressed, importance
 from fitact.inference.chain import Chain
+from fitact.inference.convergence import Convergence, judge_chain
 from fitact.inference.fit import Fit
-from fitact.inference.posterior import Convergence, Posterior
+from fitact.inference.posterior import Posterior
+from fitact.inference.progress import Reporter
+from fitact.inference.proposal import LogProb, Proposal
 
-_DEGREES = 8.0  # of freedom of the t proposal: tails above any posterior's seen here
+Level = Literal["emcee", "psis", "laplace"]
+
 _OVERDISPERSION = 1.5  # of the walkers' start, so that ensembles that agree have had to find each other
-_LENGTHS = 50.0  # autocorrelation times each ensemble must be long
-_RHAT = 1.01
-_CHUNK = 100  # steps between checkpoints
+_LOOK = 100  # steps; the chain is judged at multiples of it,
+_GROWTH = 1.1  # ever further apart, so that judging never outweighs sampling
+_ROUND = (1.0, 4.0)  # seconds that the ensembles take turns for
+_CHECKPOINT = 2.0  # seconds between checkpoints, at least,
+_SHARE = 20.0  # and so many times what writing one takes
+_FOLLOWED = 4  # walkers per ensemble whose derived quantities are looked at
 
 
 def sample(
     fit: Fit,
     *,
+    level: Level = "emcee",
     seed: int = 0,
-    walkers: int = 64,
+    walkers: int | None = None,
     ensembles: int = 4,
     max_steps: int = 20_000,
     chain_file: str | os.PathLike[str] | None = None,
     progress: bool = True,
 ) -> Posterior:
-    """Sample the posterior around `fit` with emcee until it has converged.
+    """Draw from the posterior around `fit`, and judge the draws.
 
-    Coordinates are the log-parameters of the fit and log sigma. Seven moves in ten propose from a Student-t
-    over the fit's Laplace approximation, three are stretch moves, which keep the mixture safe where the shape
-    is not Gaussian. Converged: each ensemble is longer than 50 autocorrelation times, and split-R-hat over the
-    ensembles is below 1.01, in every parameter and in g and b.
+    Coordinates are the log-parameters of the fit and log sigma. The levels, fastest first:
+
+    - "laplace": independent draws from the fit's normal approximation. Importance weights say what it is off by;
+      refused above a tenth of a standard deviation.
+    - "psis": draws from a Student-t over the fit, importance-weighted (Pareto-smoothed), resampled systematically
+      to equal weights. Refused where Pareto's k-hat is above 0.7.
+    - "emcee": sampled until converged. Seven moves in ten propose from that Student-t, three are stretch moves,
+      which keep the mixture safe where the shape is another. Converged: each ensemble is longer than 50
+      autocorrelation times, split-R-hat over the ensembles is below 1.01, in every coordinate and in g, b and the
+      mean force, and no walker is stuck.
+
+    Along what a bounded prior limits, the density itself is tabulated and takes the Student-t's place.
 
     Args:
         fit: from `fitact.fit`.
-        seed: the same seed gives the same chain, whether or not it was interrupted.
-        walkers: per ensemble; even, at least twice the parameters.
+        level: of uncertainty; those below concern "emcee" alone.
+        seed: the same seed gives the same draws, whether or not sampling was interrupted.
+        walkers: per ensemble; even, at least twice the parameters. None: 128, or 64 where samples are summed.
         ensembles: independent ones, at least two.
         max_steps: per ensemble, after which the answer is marked as not converged.
         chain_file: where to keep the chain (HDF5, emcee's layout); if it exists, sampling goes on from it.
         progress: report on standard error.
 
-    Ctrl-C ends sampling after the last checkpoint, with what there is, marked as not converged.
+    Ctrl-C ends sampling with what there is, marked as not converged.
 
     Raises:
-        InputError: the chain file belongs to another record, scene or seed; or the prior forbids every start.
+        InputError: the chain file belongs to another record, scene or seed; the fit was made without its prior, or
+            the prior forbids every start.
     """
-    names = fit.point_names
-    if walkers % 2 or walkers < 2 * len(names) or ensembles < 2:
-        raise InputError(
-            f"walkers = {walkers}, ensembles = {ensembles}: at least {2 * len(names)}, even; and at least 2"
-        )
-    path = None if chain_file is None else Path(chain_file)
+    if level not in get_args(Level):
+        raise InputError(f"level = {level!r}: choose one of {', '.join(get_args(Level))}")
+    if not fit.likelihood.believed:
+        raise InputError("a fit with prior=False has no posterior to draw from; fit with the prior, then sample")
+    size = len(fit.point_names)
+    if walkers is None:  # a few numbers cost less than a step of emcee's, whose own time hardly grows with walkers
+        walkers = max(128 if fit.likelihood.rows <= compressed.FEW_ROWS else 64, 2 * size)
+    if walkers % 2 or walkers < 2 * size or ensembles < 2:
+        raise InputError(f"walkers = {walkers}, ensembles = {ensembles}: at least {2 * size}, even; and at least 2")
+    began = time.perf_counter()
     with jax.enable_x64(True):
-        run = _Run.start(fit, names, seed, walkers, ensembles, path)
-        report = _Reporter(progress)
-        convergence = run.judge()
-        try:
-            while not convergence.converged and run.chain.steps < max_steps:
-                run.advance(min(_CHUNK, max_steps - run.chain.steps))
-                convergence = run.judge()
-                report(convergence)
-        except KeyboardInterrupt:
-            if run.chain.steps == 0:
-                raise
-            convergence = dataclasses.replace(run.judge(), converged=False, interrupted=True)
-        finally:
-            report.close()
+        log_prob = _finite(compressed.log_prob(fit.likelihood, walkers))
+        if level != "emcee":
+            posterior = importance.draw(fit, level, log_prob, seed)
+            judged = dataclasses.replace(posterior.convergence, seconds=time.perf_counter() - began)
+            return dataclasses.replace(posterior, convergence=judged)
+        run = _Run.start(fit, log_prob, seed, walkers, ensembles, None if chain_file is None else Path(chain_file))
+        convergence = run.until_converged(max_steps, Reporter(progress))
         return Posterior.from_chain(fit, run.chain, convergence, seed)
+
+
+def moves(proposal: Proposal) -> list[tuple[emcee.moves.Move, float]]:
+    """What emcee's walkers do, and how often."""
+    return [(emcee.moves.MHMove(proposal.move), 0.7), (emcee.moves.StretchMove(), 0.3)]
+
+
+def _finite(log_prob: LogProb) -> LogProb:
+    """What is not finite is impossible: emcee would end at NaN, and a walker stick at +inf."""
+
+    def values(points: np.ndarray) -> np.ndarray:
+        found = log_prob(points)
+        return np.where(np.isfinite(found), found, -np.inf)
+
+    return values
 
 
 @dataclasses.dataclass
 class _Run:
     """The ensembles of one posterior."""
 
+    fit: Fit
     chain: Chain
     samplers: list[emcee.EnsembleSampler]
     path: Path | None
+    began: float = dataclasses.field(default_factory=time.perf_counter)
+    pace: int = 1  # steps that the ensembles take in turn
+    saved: float = 0.0  # when
+    writing: float = 0.0  # seconds that it took
+    derived: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
     @classmethod
-    def start(
-        cls, fit: Fit, names: tuple[str, ...], seed: int, walkers: int, ensembles: int, path: Path | None
-    ) -> "_Run":
-        """From the chain file where there is one, else from the Laplace approximation."""
-        proposal = _StudentT.around(fit)
-        log_prob = compressed.log_prob(fit.likelihood, walkers // 2)  # as many as a stretch move asks for
-        moves = [(emcee.moves.MHMove(proposal.move), 0.7), (emcee.moves.StretchMove(), 0.3)]
+    def start(cls, fit: Fit, log_prob: LogProb, seed: int, walkers: int, ensembles: int, path: Path | None) -> "_Run":
+        """From the chain file where there is one, else from around the fit."""
+        began = time.perf_counter()
+        names = fit.point_names
+        proposal = Proposal.around(fit.point, fit.point_root, log_prob)
         samplers = [
-            emcee.EnsembleSampler(walkers, len(names), log_prob, moves=moves, vectorize=True) for _ in range(ensembles)
+            emcee.EnsembleSampler(walkers, len(names), log_prob, moves=moves(proposal), vectorize=True)
+            for _ in range(ensembles)
         ]
         fingerprint = _fingerprint(fit, names, seed, walkers, ensembles)
+        if path is not None:
+            clean(path)
         if path is not None and path.exists():
-            return cls(Chain.load(path, fingerprint), samplers, path)
+            return cls(fit, Chain.load(path, fingerprint), samplers, path, began)
         states = []
         for child in np.random.SeedSequence(seed).spawn(ensembles):
             random = np.random.RandomState(child.generate_state(8))
-            points, values = _starts(proposal, log_prob, walkers, random)
+            points, values = _starts(proposal.widened(_OVERDISPERSION), log_prob, walkers, random)
             states.append(emcee.State(points, log_prob=values, random_state=random.get_state()))
-        return cls(Chain.empty(names, fingerprint, states), samplers, path)
+        return cls(fit, Chain.empty(names, fingerprint, states), samplers, path, began)
+
+    def until_converged(self, max_steps: int, report: Reporter) -> Convergence:
+        """Sample, judge and save in turn."""
+        convergence = self.judge() if self._is_look() or self.chain.steps >= max_steps else Convergence()
+        try:
+            while not convergence.converged and self.chain.steps < max_steps:
+                goal = min(_next_look(self.chain.steps), max_steps)
+                while self.chain.steps < goal:
+                    self.advance(min(self.pace, goal - self.chain.steps))
+                    report(self.chain.steps, convergence)
+                convergence = self.judge()
+                report(self.chain.steps, convergence)
+        except KeyboardInterrupt:
+            if self.chain.steps == 0:
+                raise
+            convergence = dataclasses.replace(self.judge(), converged=False, interrupted=True)
+        finally:
+            report.close()
+            self.save()
+        return convergence
+
+    def _is_look(self) -> bool:
+        return self.chain.steps == _next_look(self.chain.steps - 1)
 
     def advance(self, steps: int) -> None:
-        """Take `steps` with every ensemble, then checkpoint; an interrupted call leaves no trace."""
-        done = []
+        """Take `steps` with every ensemble; an interrupted call leaves no trace."""
+        began, done = time.perf_counter(), []
         with _interrupts_between_steps() as check:
             for sampler, last in zip(self.samplers, self.chain.states, strict=True):
                 sampler.reset()
@@ -125,35 +185,50 @@ class _Run:
                     check()
                 state = sampler.get_last_sample()
                 done.append((sampler.get_chain(), sampler.get_log_prob(), state, sampler.backend.accepted))
-        self.chain = self.chain.extended(done)
-        if self.path is not None:
+        self.chain.extend(done)
+        took = time.perf_counter() - began
+        if took < _ROUND[0]:
+            self.pace = min(2 * self.pace, _LOOK)
+        elif took > _ROUND[1]:
+            self.pace = max(self.pace // 2, 1)
+        if time.perf_counter() - self.saved > max(_CHECKPOINT, _SHARE * self.writing):
+            self.save()
+
+    def save(self) -> None:
+        """Checkpoint, where there is a file for it."""
+        now = time.perf_counter()
+        self.chain.seconds, self.began = self.chain.seconds + now - self.began, now
+        if self.path is not None and self.chain.steps:
             self.chain.save(self.path)
+            self.saved = time.perf_counter()
+            self.writing = self.saved - now
 
     def judge(self) -> Convergence:
-        """Autocorrelation times, effective size and split-R-hat of the chain so far."""
-        points, steps = self.chain.points, self.chain.steps
-        ensembles, _, walkers, _ = points.shape
-        if steps < _CHUNK:
-            return Convergence(steps=steps, walkers=walkers, ensembles=ensembles)
-        seen = _with_divider(points, self.chain.names)
-        tau = np.array([emcee.autocorr.integrated_time(x[steps // 5 :], tol=0, quiet=True) for x in seen])
-        tau_max = float(np.max(np.where(np.isfinite(tau), tau, steps)))
-        burn = int(min(np.ceil(5.0 * tau_max), steps // 2))
-        kept = seen[:, burn:].reshape(ensembles, -1, seen.shape[-1])
-        rhat = [float(array_stats.rhat(kept[..., i], chain_axis=0, draw_axis=1)) for i in range(kept.shape[-1])]
-        stuck = int(np.sum(self.chain.accepted == 0))
-        return Convergence(
-            converged=bool(steps - burn > _LENGTHS * tau_max and max(rhat) < _RHAT and stuck == 0),
-            tau_max=tau_max,
-            ess_min=ensembles * (steps - burn) * walkers / tau_max,
-            rhat_max=max(rhat),
-            acceptance=float(np.mean(self.chain.accepted) / steps),
-            burn=burn,
-            steps=steps,
-            walkers=walkers,
-            ensembles=ensembles,
-            stuck_walkers=stuck,
-        )
+        """How far the chain can be trusted so far."""
+        chain = self.chain
+        self._follow()
+        judged = judge_chain(chain.names, chain.points, chain.accepted, self.derived)
+        return dataclasses.replace(judged, seconds=chain.seconds + time.perf_counter() - self.began)
+
+    def _follow(self) -> None:
+        """Derived quantities of some walkers, for the steps that lack them."""
+        known = next(iter(self.derived.values())).shape[1] if self.derived else 0
+        fresh = self.chain.points[:, known:, :_FOLLOWED]
+        if not fresh.size:
+            return
+        ensembles, steps, followed, size = fresh.shape
+        found = importance.followed(self.fit, fresh.reshape(ensembles, -1, size), seed=known)
+        for name, values in found.items():
+            values = values.reshape(ensembles, steps, followed)
+            self.derived[name] = np.concatenate([self.derived[name], values], axis=1) if known else values
+
+
+def _next_look(steps: int) -> int:
+    """When to judge next: depends on the steps alone, so that a resumed chain ends where an undisturbed one does."""
+    look = _LOOK
+    while look <= steps:
+        look = int(np.ceil(_GROWTH * look / _LOOK)) * _LOOK
+    return look
 
 
 @contextlib.contextmanager
@@ -175,46 +250,14 @@ def _interrupts_between_steps() -> Iterator[Callable[[], None]]:
         signal.signal(signal.SIGINT, before)
 
 
-@dataclasses.dataclass(frozen=True)
-class _StudentT:
-    """A multivariate Student-t in the coordinates of the chain."""
-
-    center: Float[np.ndarray, " n"]
-    factor: Float[np.ndarray, "n n"]  # its product with its transpose is the scale
-
-    @classmethod
-    def around(cls, fit: Fit) -> "_StudentT":
-        """The fit's Laplace approximation."""
-        return cls(fit.point, fit.point_root)
-
-    def draw(self, random: np.random.RandomState, count: int, widen: float = 1.0) -> Float[np.ndarray, "count n"]:
-        normal = random.standard_normal((count, self.center.size)) @ self.factor.T
-        return self.center + widen * normal * np.sqrt(_DEGREES / random.chisquare(_DEGREES, (count, 1)))
-
-    def log_density(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, " count"]:
-        """Up to a constant."""
-        white = np.linalg.solve(self.factor, (points - self.center).T)
-        return -0.5 * (_DEGREES + self.center.size) * np.log1p(np.sum(white**2, axis=0) / _DEGREES)
-
-    def move(
-        self, points: Float[np.ndarray, "count n"], random: np.random.RandomState
-    ) -> tuple[Float[np.ndarray, "count n"], Float[np.ndarray, " count"]]:
-        """emcee's proposal function: new points, and log q(old) - log q(new)."""
-        proposed = self.draw(random, len(points))
-        return proposed, self.log_density(points) - self.log_density(proposed)
-
-
 def _starts(
-    proposal: _StudentT,
-    log_prob: Callable[[np.ndarray], np.ndarray],
-    walkers: int,
-    random: np.random.RandomState,
+    proposal: Proposal, log_prob: LogProb, walkers: int, random: np.random.RandomState
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Over-dispersed draws that the posterior allows, with their log-probabilities."""
+    """Draws that the posterior allows, with their log-probabilities."""
     found: list[np.ndarray] = []
     values: list[np.ndarray] = []
     for _ in range(100):
-        points = proposal.draw(random, walkers, _OVERDISPERSION)
+        points = proposal.draw(random, walkers)
         value = log_prob(points)
         possible = np.isfinite(value)
         found.append(points[possible])
@@ -227,19 +270,12 @@ def _starts(
     )
 
 
-def _with_divider(points: Float[np.ndarray, "*shape n"], names: tuple[str, ...]) -> Float[np.ndarray, "*shape m"]:
-    """The coordinates, and the logarithms of g and b, which the data see best."""
-    r, c, i = (points[..., names.index(name)] for name in ("Rsc", "Csc", "Ci"))
-    total = np.logaddexp(np.log(2.0) + i, c)
-    return np.concatenate([points, (i - total)[..., None], (r + total)[..., None]], axis=-1)
-
-
 def _fingerprint(fit: Fit, names: tuple[str, ...], seed: int, walkers: int, ensembles: int) -> str:
     """What a chain belongs to; any change of it makes another chain."""
     settings = [
-        fit.record.fingerprint,
+        [record.fingerprint for record in fit.records],
         fit.scene.to_json(),
-        fit.choice.name,
+        [trace.choice.name for trace in fit.traces],
         fit.likelihood.rows,
         names,
         fit.theta.tolist(),
@@ -248,40 +284,3 @@ def _fingerprint(fit: Fit, names: tuple[str, ...], seed: int, walkers: int, ense
         ensembles,
     ]
     return hashlib.sha256(json.dumps([importlib.metadata.version("fitact"), *settings]).encode()).hexdigest()
-
-
-class _Reporter:
-    """Progress on standard error: a bar where it is a terminal, else a line now and then."""
-
-    def __init__(self, on: bool) -> None:
-        self._bar = None
-        self._on = on
-        self._lines = 0
-        if on and sys.stderr.isatty():
-            from rich.console import Console
-            from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-            columns = (
-                TextColumn("sampling"),
-                BarColumn(),
-                TextColumn("{task.description}"),
-                TimeElapsedColumn(),
-            )
-            self._bar = Progress(*columns, console=Console(stderr=True))
-            self._bar.start()
-            self._task = self._bar.add_task("starting", total=1.0)
-
-    def __call__(self, c: Convergence) -> None:
-        if not self._on:
-            return
-        share = min((c.steps - c.burn) / (_LENGTHS * c.tau_max), 1.0) if c.tau_max else 0.0
-        text = f"{c.steps} steps, tau {c.tau_max:.1f}, R-hat {c.rhat_max:.4f}"
-        if self._bar is not None:
-            self._bar.update(self._task, completed=share, description=text)
-        elif self._lines in (0, 1, 2, 5, 10) or self._lines % 20 == 0 or c.converged:
-            print(f"sampling: {text}", file=sys.stderr)
-        self._lines += 1
-
-    def close(self) -> None:
-        if self._bar is not None:
-            self._bar.stop()

@@ -5,6 +5,7 @@ import math
 from typing import NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
@@ -13,10 +14,14 @@ from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.model.chirp import Chirp
 from fitact.model.drive import Burst, Drive, Periodic, Sampled, Sine, Square
+from fitact.model.response import highpass
 from fitact.model.scene import Scene
+from fitact.model.sections import DriveSection
 
 _ALIGNED = 20_000  # samples on which a drive is laid
 _CONTRADICTION = 0.05  # relative difference between the stated and the recorded drive that cannot be an inaccuracy
+
+_REPEATS = 6e-5  # relative error of the frequency that a record of two periods shows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,19 +67,29 @@ def choose_drive(record: Record, scene: Scene | None) -> DriveChoice:
     """
     if scene is None or scene.drive.waveform == "measured":
         return _measured(record, scene.steady_state() if scene else None, ())
-    drive = scene.make_drive()
+    drive, slowest = scene.make_drive(), scene.drive.slowest
+    notes: tuple[str, ...] = ()
     if scene.states_waveform() and not isinstance(drive, Chirp):
         _check_frequency(record, scene.drive.frequency)
-    shift = _align(record, drive, scene.drive.slowest, scene.drive.steady_state)
+    if scene.states_waveform() and isinstance(drive, Periodic) and _is_off(record, scene.drive):
+        slowest = record.frequency() or slowest
+        drive = scene.drive.model_copy(update={"frequency": slowest}).make()
+        notes = (
+            f"the record repeats at {slowest:.6g} Hz, not at the scene's {scene.drive.frequency:.6g} Hz, and its own"
+            " frequency is used",
+        )
+    shift = _align(record, drive, slowest, scene.drive.steady_state)
     if shift != 0.0 and "V" not in record and isinstance(drive, Sine):
         raise InputError(
             f"{record.source}: does not start where the scene's sine does, and without V_V the phase of the drive"
             " cannot be told from the circuit's; record V_V, or let t = 0 be its upward zero crossing"
         )
     voltage = _voltage(drive, record.time - shift, scene.drive.steady_state)
-    notes: tuple[str, ...] = ()
     if shift != 0.0:
-        notes = (f"the scene's drive was shifted by {shift:.4g} s to lie on the record",)
+        notes = (
+            *notes,
+            f"the scene's drive was shifted by {shift:.4g} s to lie on the record",
+        )
     if "V" in record:
         error = _mismatch(record, voltage)
         if scene.states_waveform():
@@ -163,6 +178,19 @@ def _check_frequency(record: Record, stated: float) -> None:
         )
 
 
+def _is_off(record: Record, stated: DriveSection) -> bool:
+    """Whether the record's frequency differs from the stated one by more than it is known to.
+
+    A thousandth biases b by several standard errors: generator and recorder have clocks of their own.
+    """
+    found = record.frequency()
+    if found is None or not stated.steady_state:  # from rest, what came before and the transient shift where it repeats
+        return False
+    # an edge between two samples may lie anywhere there
+    edge = 0.0 if stated.waveform in ("sine", "triangle") else 0.5 * record.time_step * stated.frequency
+    return abs(found / stated.frequency - 1.0) > _REPEATS + edge
+
+
 def _check_amplitude(record: Record, voltage: np.ndarray) -> None:
     wave = voltage - voltage.mean()
     ratio = float(wave @ record["V"] / (wave @ wave))
@@ -201,6 +229,26 @@ def _value(drive: Drive, time: ArrayLike) -> Array:
     return drive.value(time)
 
 
+def slope_of(choice: DriveChoice, time: np.ndarray) -> Float[np.ndarray, " samples"]:
+    """dV/dt of the drive at the record's times, V/s."""
+    return np.asarray(_slope(choice.drive, time - choice.shift, choice.steady_state))
+
+
+def unit_response(choice: DriveChoice, time: np.ndarray, tau: float) -> Float[np.ndarray, " samples"]:
+    """The drive's response of one time constant (s) at the record's times, V."""
+    return np.asarray(_highpass(choice.drive, time - choice.shift, tau, choice.steady_state))
+
+
+@eqx.filter_jit
+def _slope(drive: Drive, time: ArrayLike, steady_state: bool) -> Array:
+    return drive.slope(time, steady_state=steady_state)
+
+
+@eqx.filter_jit
+def _highpass(drive: Drive, time: ArrayLike, tau: ArrayLike, steady_state: bool) -> Array:
+    return highpass(drive, time, jnp.asarray(tau), steady_state=steady_state)
+
+
 def _align(record: Record, drive: Drive, frequency: float, steady_state: bool) -> float:
     """The shift (s) that lays the drive on the record, 0 unless the record is plainly shifted.
 
@@ -208,6 +256,8 @@ def _align(record: Record, drive: Drive, frequency: float, steady_state: bool) -
     the drive's integral.
     """
     few = slice(0, max(_ALIGNED, math.ceil(3.0 / frequency / record.time_step)))  # of a long record, its beginning
+    if "V" not in record and "Vsc" not in record:
+        raise InputError(f"{record.source}: I alone does not show where the drive begins; record V_V as well")
     time, target = record.time[few], record["V" if "V" in record else "Vsc"][few]
     target = target - target.mean()
 

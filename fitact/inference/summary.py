@@ -1,18 +1,28 @@
-"""Summaries of one quantity: mean, sd and quantiles, from draws or from a Laplace approximation."""
+"""Summaries of one quantity: mean, sd and quantiles, from draws or from a Laplace approximation; and of them all."""
 
+import json
 import math
+import os
+import re
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from fitact.errors import InputError
 from fitact.units import engineering
 
-UNITS = {
-    "Rsc": "ohm", "Csc": "F", "Ci": "F", "gain": "1", "delay": "s", "sigma": "V",
+_UNITS = {
+    "Rsc": "ohm", "Csc": "F", "Ci": "F", "R_H": "ohm", "grounding_Rsc": "ohm", "grounding_Csc": "F",
+    "Z": "ohm", "Z_capacitance": "F", "series_resistor": "ohm", "gain": "1", "delay": "s", "sigma": "V",
+    "Vsc_peak_to_peak": "V",
     "offset": "V", "drift": "V", "charge": "V",
     "hum_50Hz_cos": "V", "hum_50Hz_sin": "V", "hum_60Hz_cos": "V", "hum_60Hz_sin": "V",
     "g": "1", "b": "s", "force_mean": "N", "force_peak": "N", "force_rms": "N", "friction_mean": "N",
 }  # fmt: skip
+_OPEN = 1e6  # times the mean: a standard deviation that says nothing
+_SECTIONS = {"parameters", "derived", "identifiability", "convergence", "fit", "model", "warnings", "record"}
 # standard normal quantiles of the summary's probabilities
 _NORMAL = {
     "q025": -1.959963984540054, "q05": -1.6448536269514722, "q25": -0.6744897501960817, "q50": 0.0,
@@ -22,11 +32,18 @@ _NORMAL = {
 Summary = dict[str, float | str]
 
 
+def unit(name: str) -> str:
+    """The SI unit of a quantity; a nuisance's name may end in its trace's label, as "sigma_I_2"."""
+    bare = name if name in _UNITS else re.sub(r"_\d+$", "", name)
+    found = _UNITS[bare.removesuffix("_I")]
+    return "A" if bare.endswith("_I") and found == "V" else found
+
+
 def of_draws(name: str, draws: Float[np.ndarray, "*shape"]) -> Summary:
     """Summary of draws of the quantity `name`, in its SI unit."""
     quantiles = np.quantile(draws, [float(f"0.{key[1:]}") for key in _NORMAL])
     summary: Summary = {
-        "unit": UNITS[name],
+        "unit": unit(name),
         "mean": float(np.mean(draws)),
         "sd": float(np.std(draws, ddof=1)),
     }
@@ -36,19 +53,53 @@ def of_draws(name: str, draws: Float[np.ndarray, "*shape"]) -> Summary:
 def log_normal(name: str, median: float, log_sd: float) -> Summary:
     """Summary of a quantity whose logarithm is normal."""
     mean = median * math.exp(0.5 * log_sd**2)
-    summary: Summary = {"unit": UNITS[name], "mean": mean, "sd": mean * math.sqrt(math.expm1(log_sd**2))}
+    summary: Summary = {"unit": unit(name), "mean": mean, "sd": mean * math.sqrt(math.expm1(log_sd**2))}
     return summary | {key: median * math.exp(z * log_sd) for key, z in _NORMAL.items()}
 
 
 def normal(name: str, mean: float, sd: float) -> Summary:
     """Summary of a normal quantity."""
-    summary: Summary = {"unit": UNITS[name], "mean": mean, "sd": sd}
+    summary: Summary = {"unit": unit(name), "mean": mean, "sd": sd}
     return summary | {key: mean + z * sd for key, z in _NORMAL.items()}
 
 
 def width(summary: Summary) -> str:
     """Its standard deviation for people: in per cent of the mean, or as it is where that says little."""
     mean, sd = float(summary["mean"]), float(summary["sd"])
+    if sd > _OPEN * abs(mean):
+        return "open"
     if sd > 0.5 * abs(mean):
         return engineering(sd, str(summary["unit"]), 2)
     return f"{np.format_float_positional(100.0 * sd / abs(mean), 2, fractional=False, trim='-')} %"
+
+
+def load(directory: str | os.PathLike[str]) -> dict[str, Any]:
+    """What summary.json holds, in a folder that `fitact sample` or `fitact run` wrote.
+
+    Raises:
+        InputError: there is none, or it is not fitact's.
+    """
+    try:
+        content = json.loads((Path(directory) / "summary.json").read_text(encoding="utf-8"))
+        if not (isinstance(content, dict) and set(content) >= _SECTIONS):
+            raise ValueError("summary.json is not fitact's")
+        return content
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{directory}: holds no complete results ({error}); make them with: fitact sample RECORD --out {directory}"
+        ) from error
+
+
+def table(content: dict[str, Any]) -> str:
+    """What summary.json holds, for people."""
+    rows = [f"{'':14}{'median':>12}{'5 %':>14}{'95 %':>12}"]
+    for name, s in (content["parameters"] | content["derived"]).items():
+        median, low, high = (engineering(float(s[q]), str(s["unit"])) for q in ("q50", "q05", "q95"))
+        rows.append(f"{name:14}{median:>12}{low:>14}{high:>12}")
+    rows += [content[section]["sentence"] for section in ("convergence", "identifiability")]
+    return "\n".join([*rows, *(f"warning: {warning}" for warning in content["warnings"])])
+
+
+def trusted(content: dict[str, Any]) -> bool:
+    """Whether nothing stands against the answer that summary.json holds."""
+    return bool(content["convergence"]["converged"]) and content["fit"]["result"] == "successful"

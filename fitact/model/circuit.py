@@ -41,6 +41,16 @@ class Terms(NamedTuple):
 class Circuit(eqx.Module):
     """What every circuit offers: its high-pass terms, and from them the transfer function."""
 
+    @property
+    def g(self) -> ArrayLike:
+        """The capacitive divider: Vsc over a jump of V that no resistance delays."""
+        raise NotImplementedError
+
+    @property
+    def b(self) -> ArrayLike:
+        """The slowest time constant, s."""
+        raise NotImplementedError
+
     def terms(self) -> Terms:
         """The high-pass terms of Vsc / V."""
         raise NotImplementedError
@@ -174,6 +184,17 @@ class Loop(Circuit):
     def elements(self) -> tuple[Element, ...]:
         """The parallel elements, the touching skin first."""
         raise NotImplementedError
+
+    @property
+    def g(self) -> ArrayLike:
+        """The capacitive divider: Vsc over a jump of V that no resistance delays."""
+        ratios = [self.insulator() / C for _, C in self.elements()]
+        return ratios[0] / (1.0 + sum(ratios))
+
+    @property
+    def b(self) -> ArrayLike:
+        """The slowest time constant, s."""
+        return self.terms().tau[0]
 
     def transfer_function(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
         """Vsc / V at the angular frequency `omega` (rad/s, >= 0), from the impedances, which keep all digits."""
@@ -325,6 +346,9 @@ class NaturalGround(Loop):
         """The touching skin (with the probe), and Z where it has a capacitance."""
         touching = _loaded(Element(self.Rsc, self.Csc), self.probe)
         return (touching,) if self.Z_capacitance is None else (touching, Element(self.Z, self.Z_capacitance))
+
+
+RC: TypeAlias = FinalCircuit | DirectGround | NaturalGround  # those with constant skins, which can be fitted
 
 
 def _loaded(skin: Element, probe: Probe | None) -> Element:

@@ -8,15 +8,19 @@ import difflib
 import json
 import math
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
 
 import pydantic
+from jax.typing import ArrayLike
+from pydantic import model_validator
 
 from fitact.errors import InputError
-from fitact.model.circuit import Circuit, DirectGround, FinalCircuit, NaturalGround, Probe
+from fitact.model.beliefs import PriorSection
+from fitact.model.circuit import RC, Circuit, DirectGround, FinalCircuit, NaturalGround, Probe
 from fitact.model.drive import Drive
-from fitact.model.prior import LogNormal, Prior
+from fitact.model.prior import Prior
 from fitact.model.sections import (
     Device,
     DriveSection,
@@ -26,12 +30,15 @@ from fitact.model.sections import (
     Measurement,
     Perception,
     PopulationSection,
-    PriorSection,
     Section,
     Skin,
     Tolerance,
 )
 from fitact.model.skin import Dispersive, Fractional, WithSkin
+from fitact.model.tables import Layer
+
+_DIRECT = ("R_H", "grounding_Rsc", "grounding_Csc")  # what only one way of grounding has
+_NATURAL = ("Z", "Z_capacitance")
 
 
 class Scene(Section):
@@ -99,45 +106,44 @@ class Scene(Section):
             "[population] contact_area = 'varies'": self.population.contact_area == "varies",
         }
         if fit:
-            unavailable |= {
-                f"[skin] level = '{self.skin.level}'": self.skin.level != "constant",
-                "[grounding] connection = 'natural'": self.grounding.connection == "natural",
-                "[grounding] R_H": self.grounding.R_H is not None,
-                "[grounding] grounding_Rsc": self.grounding.grounding_Rsc is not None,
-                "[grounding] grounding_Csc": self.grounding.grounding_Csc is not None,
-                "[measurement] channel I": "I" in self.measurement.channels,
-                "[measurement] series_resistor": self.measurement.series_resistor > 0.0,
-                "[measurement] probe_resistance": self.measurement.probe_resistance is not None,
-                "[measurement] probe_capacitance": self.measurement.probe_capacitance is not None,
-            }
+            unavailable[f"[skin] level = '{self.skin.level}'"] = self.skin.level != "constant"
         for what, asked in unavailable.items():
             if asked:
-                can = (
-                    "fits the paper's final circuit (direct ground, equal skins) to Vsc" if fit else "does not model it"
-                )
+                can = "fits skins of constant R and C" if fit else "does not model it"
                 raise InputError(
                     f"scene: {what} is not available in this version, which {can};"
                     " leave it out of the scene to go on without it"
                 )
 
-    def make_circuit(self) -> Circuit:
-        """The circuit at the scene's nominal values; the paper's final one unless the scene asks for more."""
-        circuit = self._circuit_of_constant_skins()
+    def nominal(self) -> dict[str, float | None]:
+        """The scene's own values of all that can have a prior, SI; None: it has none."""
+        ground, measured = self.grounding, self.measurement
+        grounding = {name: getattr(ground, name) for name in (*_DIRECT, *_NATURAL)}
+        series = {"series_resistor": measured.series_resistor or None}
+        noise = {"sigma": measured.noise_Vsc or None, "sigma_I": measured.noise_I or None}
+        return {"Rsc": self.skin.Rsc, "Csc": self.skin.Csc, "Ci": self.device.Ci, **grounding, **series, **noise}
+
+    def make_circuit(self, values: Mapping[str, ArrayLike] | None = None) -> Circuit:
+        """The circuit at the scene's nominal values, or at others by name (ohm, F).
+
+        It is the paper's final one unless the scene, or `values`, asks for more.
+        """
+        circuit = self.make_rc_circuit(values)
         if self.skin.level == "constant":
             return circuit
         return WithSkin(circuit, Dispersive() if self.skin.level == "dispersive" else Fractional(self.skin.alpha))
 
-    def _circuit_of_constant_skins(self) -> FinalCircuit | DirectGround | NaturalGround:
+    def make_rc_circuit(self, values: Mapping[str, ArrayLike] | None = None) -> RC:
+        """As `make_circuit`, with the skins constant."""
         self.require_available()
-        Rsc, Csc, Ci, ground = self.skin.Rsc, self.skin.Csc, self.device.Ci, self.grounding
-        series, probe = self.measurement.series_resistor or None, self._probe()
-        if ground.connection == "natural":
-            assert ground.Z is not None  # checked when the section was read
-            return NaturalGround(Rsc, Csc, Ci, ground.Z, ground.Z_capacitance, series_resistor=series, probe=probe)
-        extras = (ground.R_H, ground.grounding_Rsc, ground.grounding_Csc, series, probe)
+        of: dict[str, Any] = self.nominal() | dict(values or {})
+        skin, series, probe = (of["Rsc"], of["Csc"], of["Ci"]), of["series_resistor"], self._probe()
+        if self.grounding.connection == "natural":
+            return NaturalGround(*skin, of["Z"], of["Z_capacitance"], series_resistor=series, probe=probe)
+        extras = (*(of[name] for name in _DIRECT), series, probe)
         if all(extra is None for extra in extras):
-            return FinalCircuit(Rsc, Csc, Ci)
-        return DirectGround(Rsc, Csc, Ci, *extras)
+            return FinalCircuit(*skin)
+        return DirectGround(*skin, *extras)
 
     def _probe(self) -> Probe | None:
         resistance, capacitance = self.measurement.probe_resistance, self.measurement.probe_capacitance
@@ -154,14 +160,46 @@ class Scene(Section):
         return self.drive.make()
 
     def make_prior(self) -> Prior:
-        """The prior of the parameters that the scene frees."""
-        sd = self.measurement.gain_relative_sd
-        return Prior(
-            Rsc=self.prior.Rsc.distribution(self.skin.Rsc),
-            Csc=self.prior.Csc.distribution(self.skin.Csc),
-            Ci=self.prior.Ci.distribution(self.device.Ci),
-            gain=LogNormal.with_relative_sd(1.0, sd) if sd > 0.0 else None,
-        )
+        """The prior of the parameters that the scene frees, but for gains."""
+        layer = Layer(self.device.contact_area, self.skin.thickness, self.drive.slowest)
+        nominal = self.nominal()
+        marginals = {
+            name: belief.distribution(name, nominal[name], layer)
+            for name, belief in self.prior.beliefs().items()
+            if belief.free
+        }
+        return Prior.of(self.prior.correlations(), self.prior.ordered(), **marginals)
+
+    def fixed(self) -> dict[str, float]:
+        """Parameters that the scene holds, and their values, SI.
+
+        Raises:
+            InputError: one is held at a value that the scene does not have.
+        """
+        nominal, found = self.nominal(), {}
+        for name, belief in self.prior.beliefs().items():
+            if belief.fixed is None:
+                continue
+            value = nominal[name] if belief.fixed is True else belief.fixed
+            if value is None:
+                raise InputError(f"[prior] {name} is fixed, but the scene has no {name}; write fixed = its value")
+            found[name] = float(value)
+        return found
+
+    @model_validator(mode="after")
+    def _prior_of_what_there_is(self) -> Self:
+        absent = dict.fromkeys(_DIRECT, "[grounding] connection = 'direct'")
+        if self.grounding.connection == "direct":
+            absent = dict.fromkeys(_NATURAL, "[grounding] connection = 'natural'")
+        for name, channel in {"sigma": "Vsc", "sigma_I": "I"}.items():
+            if channel not in self.measurement.channels:
+                absent[name] = f"'{channel}' among [measurement] channels"
+        for name in self.prior.beliefs():
+            if name in absent:
+                raise InputError(f"[prior] {name} needs {absent[name]}; leave it out of [prior] otherwise")
+        self.make_prior()
+        self.fixed()
+        return self
 
 
 def _reason(error: OSError | UnicodeDecodeError) -> str:
@@ -182,6 +220,8 @@ def _sentence(error: Any) -> str:
         hint = f"did you mean '{near[0]}'?" if near else f"known here: {', '.join(known)}"
         return f"{place} is not a key of a scene; {hint}"
     message = str(error["msg"]).removeprefix("Value error, ")
+    if message.startswith("["):  # it names its place itself
+        return message
     value = error["input"]
     shown = f" = {value!r}" if isinstance(value, str | int | float | bool) else ""
     return f"{place}{shown}: {message[0].lower()}{message[1:]}"

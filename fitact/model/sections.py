@@ -10,7 +10,6 @@ from fitact.errors import InputError
 from fitact.model.chirp import Chirp
 from fitact.model.drive import Burst, Drive, Periodic, Sine, Square, Trapezoid, Triangle
 from fitact.model.force import plate_capacitance
-from fitact.model.prior import Distribution, LogNormal, Uniform
 
 
 def _quantity(unit: str, **bounds: Any) -> Any:
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
     AnyOhm: TypeAlias = float
     NoiseVolt: TypeAlias = float
     NoiseAmpere: TypeAlias = float
+    AnySecond: TypeAlias = float
     Newton: TypeAlias = float
     Threshold: TypeAlias = float
 else:
@@ -48,6 +48,7 @@ else:
     AnyOhm = _quantity("ohm", ge=0)
     NoiseVolt = _quantity("V", ge=0)
     NoiseAmpere = _quantity("A", ge=0)
+    AnySecond = _quantity("s")
     Newton = _quantity("N", ge=0)
     Threshold = _quantity("N", gt=0)
 
@@ -214,6 +215,20 @@ class Measurement(Section):
     noise_Vsc: NoiseVolt = 0.1
     noise_I: NoiseAmpere = 20e-9
     gain_relative_sd: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    gain_I_relative_sd: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    noise_model: Literal["white", "student", "ar1", "spectrum"] = "white"
+    quiet: tuple[AnySecond, AnySecond] | None = None
+
+    @model_validator(mode="after")
+    def _quiet_for_a_spectrum(self) -> Self:
+        if (self.noise_model == "spectrum") != (self.quiet is not None):
+            raise ValueError(
+                '[measurement] noise_model = \'spectrum\' and quiet = ["0 ms", "5 ms"], the stretch in which the drive'
+                " rests, go together; give both or neither"
+            )
+        if self.quiet is not None and not self.quiet[0] < self.quiet[1]:
+            raise ValueError("[measurement] quiet ends before it begins; write the earlier time first")
+        return self
 
 
 class Friction(Section):
@@ -221,71 +236,6 @@ class Friction(Section):
 
     coefficient: Annotated[float, Field(gt=0)] = 0.5
     normal_force: Newton = 0.5
-
-
-class Belief(Section):
-    """A prior for one parameter: a log-normal (median with factor or relative_sd), or uniform (low, high)."""
-
-    median: float | None = Field(default=None, gt=0)
-    factor: float | None = Field(default=None, gt=1, le=1e6)
-    relative_sd: float | None = Field(default=None, gt=0, le=10)
-    low: float | None = Field(default=None, gt=0)
-    high: float | None = Field(default=None, gt=0)
-
-    @model_validator(mode="after")
-    def _one_kind(self) -> Self:
-        given = self.model_fields_set
-        kinds = (
-            {"low", "high"},
-            {"factor"},
-            {"relative_sd"},
-            {"median", "factor"},
-            {"median", "relative_sd"},
-        )
-        if given not in kinds:
-            raise ValueError("write {median, factor}, {median, relative_sd} or {low, high}")
-        if self.low is not None and self.high is not None and not self.low < self.high:
-            raise ValueError(f"low = {self.low:g} must be below high = {self.high:g}")
-        return self
-
-    def distribution(self, median: float) -> Distribution:
-        """The distribution; `median` where none is given."""
-        if self.low is not None and self.high is not None:
-            return Uniform(self.low, self.high)
-        median = self.median or median
-        if self.factor is not None:
-            return LogNormal.within_factor(median, self.factor)
-        assert self.relative_sd is not None  # _one_kind leaves nothing else
-        return LogNormal.with_relative_sd(median, self.relative_sd)
-
-
-def _belief(unit: str) -> Any:
-    def parse(value: object) -> object:
-        if not isinstance(value, dict):
-            return value
-        return {k: units.parse(v, unit) if k in ("median", "low", "high") else v for k, v in value.items()}
-
-    return Annotated[Belief, BeforeValidator(parse)]
-
-
-if TYPE_CHECKING:
-    BeliefOhm: TypeAlias = Belief
-    BeliefFarad: TypeAlias = Belief
-else:
-    BeliefOhm = _belief("ohm")
-    BeliefFarad = _belief("F")
-
-
-class PriorSection(Section):
-    """Beliefs; where one is silent on the median, the device's or the skin's value is it.
-
-    The skin's defaults reach, within their 95 %, from the paper's values to published whole-skin ones
-    (10 kohm and 5 nF dry, 4.3 kohm and 200 nF wet); the insulator's is a data sheet's 5 %.
-    """
-
-    Rsc: BeliefOhm = Belief(factor=50.0)
-    Csc: BeliefFarad = Belief(factor=20.0)
-    Ci: BeliefFarad = Belief(relative_sd=0.05)
 
 
 class ForceSection(Section):

@@ -2,7 +2,9 @@
 
 import base64
 import json
+import math
 import os
+import re
 import shlex
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ import matplotlib as mpl
 
 from fitact.errors import InputError
 from fitact.files import replacing
-from fitact.inference.summary import width
+from fitact.inference.summary import load, width
 from fitact.report import plots
 from fitact.units import engineering
 
@@ -20,22 +22,38 @@ _LABELS = {
     "Rsc": "skin resistance Rsc",
     "Csc": "skin capacitance Csc",
     "Ci": "insulator capacitance Ci",
-    "gain": "gain of the channel Vsc",
-    "delay": "delay of Vsc against V",
-    "sigma": "noise of Vsc",
-    "offset": "offset of Vsc",
-    "drift": "drift of Vsc over half the record",
-    "hum_50Hz_cos": "hum at 50 Hz, cosine",
-    "hum_50Hz_sin": "hum at 50 Hz, sine",
-    "hum_60Hz_cos": "hum at 60 Hz, cosine",
-    "hum_60Hz_sin": "hum at 60 Hz, sine",
-    "charge": "decaying charge at the first sample",
+    "R_H": "body resistance R_H",
+    "grounding_Rsc": "grounding skin's resistance",
+    "grounding_Csc": "grounding skin's capacitance",
+    "Z": "resistance to earth Z",
+    "Z_capacitance": "capacitance to earth",
+    "series_resistor": "series resistor",
+    "gain": "gain of {}",
+    "delay": "delay of {} against V",
+    "sigma": "noise of {}",
+    "offset": "offset of {}",
+    "drift": "drift of {} over half the record",
+    "hum_50Hz_cos": "hum of {} at 50 Hz, cosine",
+    "hum_50Hz_sin": "hum of {} at 50 Hz, sine",
+    "hum_60Hz_cos": "hum of {} at 60 Hz, cosine",
+    "hum_60Hz_sin": "hum of {} at 60 Hz, sine",
+    "charge": "decaying charge in {} at the first sample",
+    "charge_2": "second decaying charge in {} at the first sample",
+    "charge_3": "third decaying charge in {} at the first sample",
     "g": "divider g = Ci / (2 Ci + Csc)",
     "b": "time constant b = Rsc (2 Ci + Csc)",
     "force_mean": "electrostatic force, mean",
     "force_peak": "electrostatic force, peak",
     "force_rms": "electrostatic force, rms",
     "friction_mean": "friction, mean",
+}
+
+
+_CHANNELS = {"Vsc": "skin voltage Vsc", "I": "trunk current I"}
+_CIRCUITS = {
+    "final": "the paper's final circuit",
+    "direct": "direct ground with more than the paper's final circuit",
+    "natural": "natural ground",
 }
 
 
@@ -49,7 +67,10 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
     page = environment.get_template("report.html").render(
         summary=summary,
         figures=figures,
-        labels=_LABELS,
+        label=_label,
+        channels=_CHANNELS,
+        circuits=_CIRCUITS,
+        engineering=engineering,
         quantity=_quantity,
         width=width,
         command=_command(summary),
@@ -67,13 +88,10 @@ def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]
     """
     import xarray as xr
 
-    directory = Path(directory)
+    content = load(directory)
     try:
-        summary = json.loads((directory / "summary.json").read_text())
-        with xr.open_datatree(directory / "posterior.nc", engine="h5netcdf") as tree:
-            if not {"identifiability", "convergence", "fit", "model", "record"} <= set(summary):
-                raise ValueError("summary.json is not fitact's")
-            return tree.load(), summary
+        with xr.open_datatree(Path(directory) / "posterior.nc", engine="h5netcdf") as tree:
+            return tree.load(), content
     except (OSError, ValueError, TypeError) as error:
         raise InputError(
             f"{directory}: holds no complete results ({error}); make them with: fitact sample RECORD --out {directory}"
@@ -84,18 +102,19 @@ def _figures(tree: Any) -> dict[str, str]:
     posterior = {str(name): values.values.ravel() for name, values in tree["posterior"].data_vars.items()}
     prior = {str(name): values.values.ravel() for name, values in tree["prior"].data_vars.items()}
     units = {str(name): values.attrs["units"] for name, values in tree["posterior"].data_vars.items()}
-    predicted = tree["posterior_predictive"]["Vsc"]
-    figures = {
-        "record": plots.record_figure(
-            tree["observed_data"]["time"].values,
-            tree["observed_data"]["Vsc"].values,
-            tree["constant_data"]["Vsc_fit"].values,
-            predicted["time"].values,
-            predicted.values.reshape(-1, predicted.sizes["time"]),
-        ),
-        "corner": plots.corner_figure(posterior, prior, units),
-        "force": plots.force_figure(posterior),
-    }
+    figures = {"corner": plots.corner_figure(posterior, prior, units), "force": plots.force_figure(posterior)}
+    for number, (name, observed) in enumerate(tree["observed_data"].data_vars.items()):
+        (axis,) = observed.dims
+        predicted = tree["posterior_predictive"][name]
+        figures[f"trace_{number}"] = plots.record_figure(
+            observed[axis].values,
+            observed.values,
+            tree["constant_data"][f"{name}_fit"].values,
+            predicted[axis].values,
+            predicted.values.reshape(-1, predicted.sizes[axis]),
+            _CHANNELS[str(name).partition("_")[0]],
+            observed.attrs["units"],
+        )
     # an SVG in an <img> cannot clash with another's ids, and carries its alt text
     return {
         name: "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode() for name, svg in figures.items()
@@ -103,9 +122,21 @@ def _figures(tree: Any) -> dict[str, str]:
 
 
 def _quantity(summary: dict[str, Any], key: str = "q50", digits: int = 4) -> str:
-    return engineering(summary[key], summary["unit"], digits)
+    """A number of a summary, with at least as many digits as tell its quantiles apart."""
+    spread = summary["sd"] / abs(summary["mean"]) if summary["mean"] else 1.0
+    needed = 1 + math.ceil(-math.log10(spread)) if 0.0 < spread < 1.0 else digits
+    return engineering(summary[key], summary["unit"], min(max(digits, needed), 8))
+
+
+def _label(name: str) -> str:
+    """A quantity's name for people; a nuisance's ends in its trace's label, as "sigma_I_2"."""
+    bare = name if name in _LABELS else re.sub(r"_\d+$", "", name)
+    number = name[len(bare) + 1 :]
+    label = _LABELS[bare.removesuffix("_I")].format("I" if bare.endswith("_I") else "Vsc")
+    return label + (f", record {number}" if number else "")
 
 
 def _command(summary: dict[str, Any]) -> str:
     scene = " --scene SCENE.toml" if summary["scene"] else ""
-    return f"fitact run {shlex.quote(summary['record']['source'])}{scene} --seed {summary['seed']}"
+    records = " ".join(shlex.quote(each["source"]) for each in summary["record"]["sources"])
+    return f"fitact run {records}{scene} --seed {summary['seed']}"

@@ -1,6 +1,7 @@
 """The report's figures, as SVG text that stands alone."""
 
 import io
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -45,8 +46,11 @@ def record_figure(
     fitted: Float[np.ndarray, " samples"],
     predicted_time: Float[np.ndarray, " predicted"],
     predicted: Float[np.ndarray, "draws predicted"],
+    channel: str,
+    unit: str,
 ) -> str:
-    """Record, predictive band, residuals in time and their distribution."""
+    """A channel's record, predictive band, residuals in time and their distribution, where it was fitted."""
+    time, observed, fitted = (x[np.isfinite(fitted)] for x in (time, observed, fitted))
     figure = Figure(figsize=(9.0, 5.6), layout="constrained")
     grid = figure.add_gridspec(2, 2, height_ratios=[2.2, 1.0], width_ratios=[5.0, 1.0])
     above, below = figure.add_subplot(grid[0, :]), figure.add_subplot(grid[1, 0])
@@ -56,7 +60,8 @@ def record_figure(
         predicted_time, low, high, color=_MODEL, alpha=0.45, lw=0, zorder=3, label="90 % of predicted records"
     )
     above.plot(time, observed, ".", color=_DATA, ms=1.5, label="record", rasterized=True)
-    above.set_ylabel("skin voltage Vsc")
+    above.set_ylabel(channel)
+    above.set_ylim(*_without_spikes(observed))
     above.legend(loc="upper right", framealpha=0.9, markerscale=5)
     residuals = observed - fitted
     below.plot(time, residuals, ".", color=_ALERT, ms=1.5, rasterized=True)
@@ -66,10 +71,20 @@ def record_figure(
     beside.tick_params(labelleft=False, labelbottom=False)
     for axes in (above, below):
         axes.xaxis.set_major_formatter(EngFormatter("s"))
-        axes.yaxis.set_major_formatter(EngFormatter("V"))
+        axes.yaxis.set_major_formatter(EngFormatter(unit))
         axes.set_xlim(time[0], time[-1])
     below.set_xlabel("time")
     return _svg(figure)
+
+
+def _without_spikes(values: np.ndarray) -> tuple[float, float]:
+    """Limits that show a channel, but not the few samples of a current at edges that would flatten all others."""
+    low, high = np.quantile(values, [0.02, 0.98])
+    whole = float(values.min()), float(values.max())
+    if whole[1] - whole[0] > 20.0 * (high - low):
+        whole = float(low), float(high)
+    margin = 0.06 * (whole[1] - whole[0])
+    return whole[0] - margin, whole[1] + margin
 
 
 def corner_figure(posterior: Draws, prior: Draws, units: Mapping[str, str]) -> str:
@@ -147,7 +162,8 @@ def _limits(posterior: np.ndarray, prior: np.ndarray) -> tuple[float, float]:
 def _ticks(axis: mpl.axis.Axis, limits: tuple[float, float], unit: str, labelled: bool) -> None:
     ends = np.log(limits)
     places = np.exp(ends[0] + np.array([0.2, 0.5, 0.8]) * (ends[1] - ends[0]))
-    axis.set_major_locator(mpl.ticker.FixedLocator([float(f"{place:.2g}") for place in places]))
+    digits = max(2, 1 + math.ceil(-math.log10(ends[1] - ends[0])))  # that tell them apart
+    axis.set_major_locator(mpl.ticker.FixedLocator([float(f"{place:.{digits}g}") for place in places]))
     axis.set_minor_locator(mpl.ticker.NullLocator())
     axis.set_major_formatter(EngFormatter(_SYMBOLS.get(unit, unit)) if labelled else mpl.ticker.NullFormatter())
 

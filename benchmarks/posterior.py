@@ -1,0 +1,191 @@
+"""Effective draws of mean force per second: `fitact.sample` against the samplers one would otherwise write.
+
+    pip install "fitact[bench]"; python benchmarks/posterior.py [--quick] [--json]
+
+One posterior for all: a settled 100 Hz square, 0.1 V of noise that is sampled too, normal priors of 0.29, 0.29 and
+0.05 on log Rsc, Csc and Ci. fitact's figure is that of the call a user makes, `fitact.sample(fit)`, its judging of
+convergence included, once compiled. Its peers are timed in turn with it, a median of rounds, after burn-in or
+adaptation and compilation; what each draws must have the standard deviations of log Rsc and force that importance
+sampling finds, to 2 %, or to three standard errors where so few draws tell no more (`--quick`: a tenth of the steps).
+
+- `ess_vs_plain_N`: times emcee on a plain NumPy time-domain log-probability, 32 walkers;
+- `ess_vs_good_N`: on a well-written one (closed form of one period against all). At 1,000,000 samples the time of
+  its steps is measured, and its autocorrelation time is that at 5,000: stretch moves are affine-invariant, and both
+  posteriors are close to normal;
+- `ess_vs_lmfit_N`: times lmfit.emcee on the well-written one;
+- `ess_vs_numpyro_N`: times numpyro's NUTS on the samples, default adaptation;
+- `ess_vs_blackjax_N`: times blackjax's NUTS on the samples, whitened by the Laplace approximation;
+- `run_vs_lmfit_script`: time of a whole `fitact run` over that of lmfit_script.py (fit, lmfit.emcee to the same
+  effective size of the force, corner plot), both as processes; `cold_run_vs_lmfit_script`: of a user's first run,
+  which compiles. `whole_vs_good_5000`: effective draws of the warm process per second, from its start to its end, over
+  those of the well-written emcee, which has nothing to read, to burn in or to report.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from pathlib import Path
+
+import jax
+import numpy as np
+from likelihood import record
+from peers import (
+    WALKERS,
+    Blackjax,
+    Ensemble,
+    Lmfit,
+    Numpyro,
+    Peer,
+    good_log_prob,
+    importance_sds,
+    mean_force,
+    plain_log_prob,
+    raw_log_density,
+)
+
+import fitact
+from fitact.data.formats import write_csv
+
+SCENE = """[drive]
+waveform = "square"
+[prior]
+Rsc = {median = "160 kohm", relative_sd = 0.3}
+Csc = {median = "22 nF", relative_sd = 0.3}
+Ci = {median = "1.35 nF", relative_sd = 0.05}
+"""
+ROUNDS = 5
+STEPS = 5000  # a round
+
+
+class Product:
+    """`fitact.sample`, with another seed each time."""
+
+    def __init__(self, fit: fitact.Fit) -> None:
+        self._fit, self._posteriors = fit, [fitact.sample(fit, progress=False)]
+
+    def draw(self) -> float:
+        """Effective draws of the force per second."""
+        began = time.perf_counter()
+        posterior = fitact.sample(self._fit, seed=len(self._posteriors), progress=False)
+        took = time.perf_counter() - began
+        assert posterior.trusted, posterior.warnings
+        self._posteriors.append(posterior)
+        return posterior.convergence.ess["force_mean"] / took
+
+    @property
+    def draws(self) -> np.ndarray:
+        return np.concatenate([posterior.points.reshape(-1, 4) for posterior in self._posteriors])
+
+
+def check(name: str, draws: np.ndarray, effective: float, expected: np.ndarray) -> None:
+    """That what was drawn is the posterior."""
+    found = np.array([draws[..., 0].std(), mean_force(draws).std()])
+    error = float(np.max(np.abs(found / expected - 1.0)))
+    allowed = max(0.02, 3.0 / np.sqrt(2.0 * effective))
+    print(f"{name}: effective {effective:,.0f}, sds within {100.0 * error:.1f} %", file=sys.stderr)
+    assert error < allowed, f"{name} samples another posterior: its standard deviations are off by {error:.3f}"
+
+
+def rates(data: fitact.Record, quick: bool) -> tuple[dict[str, float], dict[str, float]]:
+    """Effective draws of everyone per second; and of the peers, a step."""
+    fit = fitact.fit(data, fitact.Scene.from_dict(tomllib.loads(SCENE)))
+    steps = STEPS // 10 if quick else STEPS
+    starts = fit.point + np.random.default_rng(4).standard_normal((WALKERS, 4)) @ fit.point_root.T
+    plain, good, raw = plain_log_prob(data), good_log_prob(data), raw_log_density(data)
+    ours = Product(fit)
+    peers: dict[str, Peer] = {
+        "plain": Ensemble(plain, starts, steps),
+        "good": Ensemble(good, starts, steps),
+        "lmfit": Lmfit(good, starts, steps),
+        "numpyro": Numpyro(raw, fit.point, steps),
+        "blackjax": Blackjax(raw, fit.point, fit.point_root, steps),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in peers}
+    own: list[float] = []
+    for _ in range(ROUNDS):
+        own += [ours.draw() for _ in range(4)]
+        for name, peer in peers.items():
+            seconds[name].append(peer.draw())
+    expected = importance_sds(good, fit.point, fit.point_root)
+    check("fitact", ours.draws, float(len(ours.draws)), expected)
+    each = {name: peer.effective() for name, peer in peers.items()}
+    for name, peer in peers.items():
+        check(name, peer.draws, each[name] * ROUNDS * steps, expected)
+    found = {name: each[name] / statistics.median(seconds[name]) for name in peers}
+    low, middle, high = np.quantile(own, [0.1, 0.5, 0.9])
+    print(f"fitact: {middle:,.0f} a second, {low:,.0f} to {high:,.0f} (10 to 90 %)", file=sys.stderr)
+    return {"fitact": float(middle)} | found, each
+
+
+def long_record(effective: float) -> float:
+    """The ratio to the well-written emcee, `effective` draws a step, at 1,000,000 samples."""
+    data = record(1_000_000)
+    fit = fitact.fit(data, fitact.Scene.from_dict(tomllib.loads(SCENE)))
+    starts = fit.point + np.random.default_rng(4).standard_normal((WALKERS, 4)) @ fit.point_root.T
+    ours, good = Product(fit), Ensemble(good_log_prob(data), starts, 10)
+    pairs = [(ours.draw(), good.draw()) for _ in range(ROUNDS)]
+    own, step = (statistics.median(values) for values in zip(*pairs, strict=True))
+    return own * step / effective
+
+
+def processes(data: fitact.Record, each: float, quick: bool) -> tuple[dict[str, float], float]:
+    """Times of `fitact run` over that of lmfit's script; and its effective draws per second.
+
+    `each`: effective draws of a step of lmfit's. With `quick`, a tenth of its steps are run, and the others counted.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "scene.toml").write_text(SCENE)
+        write_csv(folder / "record.csv", data)
+        fitact_run = [str(Path(sys.executable).with_name("fitact")), "run", "record.csv", "--scene", "scene.toml"]
+        cold, *warm = (_timed(folder, *fitact_run, "--out", str(i)) for i in range(4))
+        content = json.loads((folder / "0" / "summary.json").read_text())
+        effective, run = content["convergence"]["ess"]["force_mean"], statistics.median(warm)
+        steps = round(effective / each)
+        script = [sys.executable, str(Path(__file__).with_name("lmfit_script.py")), "record.csv"]
+        if quick:
+            start, tenth = (_timed(folder, *script, str(count), "corner.png") for count in (100, steps // 10))
+            lmfit = start + (tenth - start) * (steps - 100) / (steps // 10 - 100)
+        else:
+            lmfit = _timed(folder, *script, str(steps), "corner.png")
+        print(f"fitact run: {run:.1f} s, first {cold:.1f} s; lmfit's script: {lmfit:.0f} s", file=sys.stderr)
+        return {"run_vs_lmfit_script": run / lmfit, "cold_run_vs_lmfit_script": cold / lmfit}, effective / run
+
+
+def _timed(folder: Path, *command: str) -> float:
+    """Seconds of a process, with caches of its own."""
+    kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    kept["XDG_CACHE_HOME"] = str(folder / "cache")
+    began = time.perf_counter()
+    subprocess.run(command, cwd=folder, env=kept, check=True, capture_output=True)
+    return time.perf_counter() - began
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Effective draws per second against other samplers.")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--quick", action="store_true", help="a tenth of the peers' steps")
+    given = parser.parse_args()
+    data = record(5000)
+    with jax.enable_x64(True):
+        found, each = rates(data, given.quick)
+        ratios = {f"ess_vs_{name}_5000": found["fitact"] / rate for name, rate in found.items() if name != "fitact"}
+        ratios["ess_vs_good_1000000"] = long_record(each["good"])
+    print("a second: " + ", ".join(f"{name} {rate:,.0f}" for name, rate in found.items()), file=sys.stderr)
+    whole, rate = processes(data, each["lmfit"], given.quick)
+    ratios |= whole | {"whole_vs_good_5000": rate / found["good"]}
+    if given.json:
+        print(json.dumps(ratios))
+        return
+    for name, value in ratios.items():
+        print(f"{name:30}{value:12.4g}")
+
+
+if __name__ == "__main__":
+    main()

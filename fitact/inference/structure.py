@@ -1,0 +1,201 @@
+"""What no record can tell: combinations of parameters that leave what the channels show as it is.
+
+Found from the model. A record without noise, of every frequency, shows each channel's gain over V as a function
+of frequency, and no more; a direction in the log-parameters along which none of these gains changes is seen by
+no record. The first derivatives of the gains' logarithms know it: it is their null space.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Complex, Float
+
+from fitact.errors import InputError
+from fitact.model.circuit import Channel, Circuit
+
+_POINTS = 8  # at random, beside the circuit as given, which may be special: two equal skins
+_SPREAD = np.log(10.0)  # how far they lie from it, in logs
+_FREQUENCIES = 128
+_BEYOND = 100.0  # the frequencies reach so many times beyond the circuit's own, at both ends
+_NULL = 1e-11  # singular values below count as rounding: it leaves 1e-15, and what is real is above 1e-5,
+_GAP = 1e-3  # if they lie so far below the others; without that gap nothing is called structural
+_SAME = 1e-6  # sine of the angle between directions that count as one
+_LIKE = 0.1  # that between a direction that data leave open and the structural one it stands for
+
+
+@dataclasses.dataclass(frozen=True)
+class Structure:
+    """The directions that no record of these channels can see.
+
+    Attributes:
+        names: the free parameters.
+        channels: what is recorded beside V.
+        directions: unit vectors in the log-parameters, at the circuit's own values.
+        constant: whether they are the same for all values; if not, the ridges of equal answers curve.
+    """
+
+    names: tuple[str, ...]
+    channels: tuple[Channel, ...]
+    directions: Float[np.ndarray, "dimension parameters"]
+    constant: bool
+
+    @property
+    def dimension(self) -> int:
+        """How many independent combinations cannot be told."""
+        return len(self.directions)
+
+    def hides(self, direction: dict[str, float]) -> bool:
+        """Whether a direction in some of the log-parameters is one of those, whatever the others do along it."""
+        part = self.directions[:, [self.names.index(name) for name in direction]]
+        return self.dimension > 0 and _distance(part, np.array([list(direction.values())])) < _LIKE
+
+    def __str__(self) -> str:
+        channels = " and ".join(self.channels)
+        if self.dimension == 0:
+            return f"A record of {channels} can tell {', '.join(self.names)}."
+        what = "; ".join(name_direction(dict(zip(self.names, row, strict=True))) for row in self.directions)
+        here = "" if self.constant else " (the direction at these values; elsewhere it differs)"
+        return f"No record of {channels}{' alone' * (len(self.channels) == 1)} can tell {what}{here}."
+
+
+def blind_directions(circuit: Circuit, free: Sequence[str], channels: Sequence[Channel]) -> Structure:
+    """The directions in the logarithms of `free` that no record of `channels` can see.
+
+    `free` names fields of the circuit, "gain" (of the channel Vsc) and "gain_I"; all else is known. A direction
+    counts if it is blind at the circuit's values and at others around it, each up to a factor of 10 away.
+
+    Raises:
+        InputError: a name in `free` is no parameter of the circuit.
+    """
+    free, channels = tuple(free), tuple(channels)
+    nominal = log_values(circuit, free, channels)
+    away = np.random.default_rng(0).uniform(-_SPREAD, _SPREAD, (_POINTS, len(free)))  # any points would do
+    points = nominal + np.vstack([np.zeros(len(free)), away])
+    with jax.enable_x64(True):
+        sensitivities = _sensitivities(jax.tree.map(jnp.asarray, circuit), free, channels, points)
+    found = [_null_space(sensitivity) for sensitivity in sensitivities]
+    dimension = min(len(directions) for directions in found)
+    generic = [directions for directions in found if len(directions) == dimension]
+    constant = dimension == 0 or all(_distance(generic[0], other) < _SAME for other in generic)
+    directions = _readable(generic[0])
+    if "Ci" in free:
+        directions[directions[:, free.index("Ci")] < -_SAME] *= -1.0
+    return Structure(free, channels, directions, constant)
+
+
+def gain_names(channels: Sequence[Channel]) -> dict[str, Channel]:
+    """The channels by the names that their gains have where they are free."""
+    names: dict[str, Channel] = {"gain": "Vsc", "gain_I": "I"}
+    return {name: channel for name, channel in names.items() if channel in channels}
+
+
+def log_values(circuit: Circuit, free: Sequence[str], channels: Sequence[Channel]) -> Float[np.ndarray, " parameters"]:
+    """Logarithms of the parameters `free`; a gain is 1.
+
+    Raises:
+        InputError: a name in `free` is no parameter of the circuit above zero, and no gain of these channels.
+    """
+    gains = dict.fromkeys(gain_names(channels), 1.0)
+    fields = {field.name: getattr(circuit, field.name) for field in dataclasses.fields(circuit)}
+    known = gains | {name: float(value) for name, value in fields.items() if name != "probe" and value is not None}
+    for name in free:
+        if not known.get(name, 0.0) > 0.0:
+            raise InputError(
+                f"free: {name!r} has no value above zero in this {type(circuit).__name__}; give it one, or free some"
+                f" of {', '.join(known)}"
+            )
+    return np.log([known[name] for name in free])
+
+
+def with_parameters(
+    circuit: Circuit, free: Sequence[str], channels: Sequence[Channel], theta: Float[Array, " parameters"]
+) -> tuple[Circuit, list[ArrayLike]]:
+    """The circuit and the gain of each channel where the parameters `free` have the logarithms `theta`."""
+    values = dict(zip(free, jnp.exp(theta), strict=True))
+    named = gain_names(channels)
+    gains = {named[name]: values.pop(name) for name in free if name in named}
+    return dataclasses.replace(circuit, **values), [gains.get(channel, 1.0) for channel in channels]
+
+
+def name_direction(direction: dict[str, float]) -> str:
+    """What a direction in the log-parameters is, in words."""
+    area = {name: _area_power(name) for name in direction if not name.startswith("gain")}
+    along = sum(power * direction[name] for name, power in area.items())
+    if abs(along) > 0.99 * np.sqrt(len(area)) * np.linalg.norm(list(direction.values())):
+        scaled = [name if power > 0.0 else f"1/{name}" for name, power in area.items()]
+        return f"the contact area, which scales {', '.join(scaled[:-1])} and {scaled[-1]} alike"
+    moves = ", ".join(f"{name} {value:+.2g}" for name, value in direction.items() if abs(value) > 1e-3)
+    return f"the combination ({moves})"
+
+
+def _area_power(name: str) -> float:
+    """With which power of the contact area a circuit's parameter goes: R ~ 1/A, C ~ A."""
+    return 1.0 if name == "Ci" or name.endswith(("Csc", "capacitance")) else -1.0
+
+
+def _sensitivities(
+    circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], points: Float[np.ndarray, "n parameters"]
+) -> Float[np.ndarray, "n rows parameters"]:
+    """Derivatives of the logarithms of the channels' gains, at frequencies all around the circuit's own."""
+    tau = np.asarray(_time_constants(circuit, free, channels, jnp.asarray(points)))
+    omega = np.geomspace(1.0 / (_BEYOND * tau.max(axis=1)), _BEYOND / tau.min(axis=1), _FREQUENCIES, axis=1)
+    slope = np.asarray(_log_gain_slopes(circuit, free, channels, jnp.asarray(points), jnp.asarray(omega)))
+    return np.concatenate([slope.real, slope.imag], axis=1)
+
+
+@eqx.filter_jit
+def _time_constants(circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], points: Array) -> Array:
+    return jax.vmap(lambda theta: jnp.stack(with_parameters(circuit, free, channels, theta)[0].terms().tau))(points)
+
+
+@eqx.filter_jit
+def _log_gain_slopes(
+    circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], points: Array, omega: Array
+) -> Complex[Array, "n rows parameters"]:
+    def gain(theta: Array, omega: Array) -> tuple[Array, Array]:
+        there, gains = with_parameters(circuit, free, channels, theta)
+        value = jnp.concatenate([g * there.gain_of(channel, omega) for g, channel in zip(gains, channels, strict=True)])
+        return value, value
+
+    slope, value = jax.vmap(jax.jacfwd(gain, has_aux=True))(points, omega)
+    return slope / value[..., None]
+
+
+def _null_space(sensitivity: Float[np.ndarray, "rows parameters"]) -> Float[np.ndarray, "dimension parameters"]:
+    """An orthonormal basis of the directions without effect.
+
+    The frequencies reach all corners of the circuit, so that even the smallest resistance has its effect at some;
+    what is left of the parameters' different sizes, the scaling to columns of one length takes out.
+    """
+    scale = np.linalg.norm(sensitivity, axis=0)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    _, sizes, directions = np.linalg.svd(sensitivity / scale, full_matrices=False)
+    null = sizes < _NULL * sizes[0]
+    if not null.any() or sizes[null].max() > _GAP * sizes[~null].min():
+        return np.zeros((0, scale.size))
+    return np.linalg.qr((directions[null] / scale).T)[0].T
+
+
+def _distance(directions: Float[np.ndarray, "n parameters"], others: Float[np.ndarray, "m parameters"]) -> float:
+    """Sine of the largest angle by which `others` stand out of the space of `directions`."""
+    inside = others @ np.linalg.pinv(directions, rcond=_SAME) @ directions
+    return float(np.linalg.norm((others - inside) / np.linalg.norm(others, axis=1, keepdims=True), 2))
+
+
+def _readable(basis: Float[np.ndarray, "dimension parameters"]) -> Float[np.ndarray, "dimension parameters"]:
+    """Unit vectors of the same space that move few parameters each, the circuit's own first: a reduced echelon form."""
+    rows = basis.copy()
+    for i in range(len(rows)):
+        left = np.max(np.abs(rows[i:]), axis=0)
+        pivot = np.flatnonzero(left > 0.5 * left.max())[-1]  # of those that move much, the last
+        best = i + int(np.argmax(np.abs(rows[i:, pivot])))
+        rows[[i, best]] = rows[[best, i]]
+        rows[i] /= rows[i, pivot]
+        others = np.arange(len(rows)) != i
+        rows[others] -= np.outer(rows[others, pivot], rows[i])
+    return rows[::-1] / np.linalg.norm(rows[::-1], axis=1, keepdims=True)

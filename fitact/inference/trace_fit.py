@@ -1,0 +1,123 @@
+"""One channel of one record, fitted: its residuals, nuisances and figures of merit."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitact.data.record import Record
+from fitact.inference.criteria import criteria, gaussian_log_likelihood, student_log_likelihood
+from fitact.inference.diagnostics import outliers, statistics
+from fitact.inference.likelihood import Likelihood
+from fitact.inference.noise import student_weight
+from fitact.inference.problem import Source
+from fitact.inference.start import DriveChoice
+from fitact.inference.trace import LINEAR, Seen, Trace
+
+_EVEN = 0.7  # weight below which a sample's noise is mostly that of the drive's slope
+
+
+@dataclasses.dataclass(frozen=True)
+class TraceFit:
+    """One channel of one record, fitted.
+
+    Attributes:
+        label: "" or what tells it from the other traces, as "I_2".
+        channel: "Vsc" or "I".
+        record, choice: where it comes from, and its drive.
+        sigma: standard deviation of its noise, V or A, from the residuals.
+        linear: the offset, drift, hum and charge that were freed, V or A, at the optimum.
+        residuals: record minus fit, V or A.
+        weight: of the samples; 0 where one was left out. None: all are 1.
+        log_likelihood: of its samples, all constants included.
+        figures: chi2_reduced, rms_residual, noise_expected, runs_z and the like.
+        full_because: why its samples are summed, as a clause; "" where they are not.
+    """
+
+    label: str
+    channel: str
+    record: Record
+    choice: DriveChoice
+    sigma: float
+    linear: dict[str, float]
+    residuals: Float[np.ndarray, " samples"]
+    weight: Float[np.ndarray, " samples"] | None
+    log_likelihood: float
+    figures: dict[str, float]
+    full_because: str
+
+    @classmethod
+    def of(
+        cls, likelihood: Likelihood, index: int, theta: np.ndarray, sigma: float, source: Source, reason: str
+    ) -> "TraceFit":
+        """The trace of that index at the optimum `theta` with the noise `sigma`."""
+        trace, seen = likelihood.traces[index].summed(), likelihood.seen(jnp.asarray(theta), index)
+        left, beta = (np.asarray(x) for x in _over_samples(trace, seen, sigma))
+        weight = None if trace.weight is None else np.asarray(trace.weight)
+        linear = {
+            trace.named(LINEAR[column]): float(value * trace.linear_sd[column])
+            for column, value in zip(trace.columns, beta, strict=True)
+        }
+        kept, counted = _equal_noise(trace, left, sigma)
+        used = theta.size * kept.size / float(likelihood.count) + len(linear)
+        gain = abs(sum(float(w) for w in seen.circuit.terms_of(trace.channel).weight))
+        noise = sigma if trace.noise == "ar1" else source.noise  # coloured, only the residuals show it
+        time = source.record.time[counted]
+        figures = statistics(kept, time, noise, used, gain, source.record, trace.channel, source.choice)
+        if weight is not None and np.mean((weight > 0.0) & (weight < _EVEN)) > 0.01:
+            figures |= {"spectrum_p": 1.0, "line_p": 1.0}  # the noise that dV/dt brings in is not white
+        figures |= outliers(left if weight is None else left * weight, source.record.time, source.noise)
+        return cls(
+            label=trace.label,
+            channel=trace.channel,
+            record=source.record,
+            choice=source.choice,
+            sigma=sigma,
+            linear=linear,
+            residuals=left,
+            weight=weight,
+            log_likelihood=_log_likelihood(trace, left, sigma),
+            figures=figures,
+            full_because=reason,
+        )
+
+
+def _equal_noise(trace: Trace, left: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals that should be independent and equally noisy, and which samples they belong to."""
+    values = np.asarray(trace.weighted(jnp.asarray(left)))
+    if trace.noise == "student":
+        values = values * np.sqrt(np.asarray(student_weight(values / sigma)))
+    counted = np.ones(left.size, bool) if trace.weight is None else np.asarray(trace.weight) > 0.0
+    if trace.whitening is not None:
+        counted = np.asarray(trace.whitening.kept) > 0.0
+    return values[counted], counted
+
+
+def _log_likelihood(trace: Trace, left: np.ndarray, sigma: float) -> float:
+    """At the noise that makes it largest; under Student's t, at `sigma`."""
+    weight = np.ones(left.size) if trace.weight is None else np.asarray(trace.weight)
+    if trace.whitening is None:
+        if trace.noise == "student":
+            return student_log_likelihood(left, weight, sigma)
+        return gaussian_log_likelihood(left, weight)
+    kept = np.asarray(trace.whitening.kept) > 0.0
+    innovations = np.asarray(trace.weighted(jnp.asarray(left)))[kept] / float(trace.whitening.taps[0])
+    return gaussian_log_likelihood(innovations, None) + float(np.sum(np.log(weight[kept])))
+
+
+@eqx.filter_jit
+def _over_samples(trace: Trace, seen: Seen, sigma: float) -> tuple[Array, Array]:
+    """What is left of the samples, and the linear nuisances in prior standard deviations."""
+    _, beta, _ = trace.linear(seen, sigma)
+    remainder, shapes = dataclasses.replace(trace, weight=None, whitening=None).before_linear(seen)
+    return remainder - beta @ (trace.linear_sd[np.array(trace.columns, dtype=int), None] * shapes), beta
+
+
+def compare(parameters: int, traces: Sequence[TraceFit]) -> dict[str, float]:
+    """Information criteria of a fit with so many `parameters` beside each trace's linear nuisances and noise."""
+    counted = parameters + sum(1 + len(trace.linear) for trace in traces)
+    samples = sum(int(trace.figures["samples"]) for trace in traces)
+    return criteria(sum(trace.log_likelihood for trace in traces), counted, samples)

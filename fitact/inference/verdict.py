@@ -1,0 +1,66 @@
+"""Whether a fit may be trusted, and what stands against it if not."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from fitact.inference.diagnostics import is_misfit
+from fitact.inference.least_squares import Solved
+from fitact.inference.likelihood import Likelihood
+from fitact.inference.problem import Source
+from fitact.inference.solver import Optima, result_name
+from fitact.inference.trace_fit import TraceFit
+
+_ALONG = 6.0  # standard deviations along what is known least, within which a bounded prior must leave room
+
+
+def verdict(
+    solved: Solved,
+    root: Float[np.ndarray, "parameters parameters"],
+    traces: Sequence[TraceFit],
+    sources: Sequence[Source],
+    optima: Optima | None,
+) -> str:
+    """The name of the first of the `RESULTS` that stands against the fit; "successful" if none does.
+
+    `root` is that of theta's covariance.
+    """
+    found = result_name(solved.result)
+    if found != "successful":
+        return found
+    if is_out_of_bounds(solved.likelihood, np.asarray(solved.theta), np.asarray(solved.sigma), root):
+        return "on_bound"
+    if optima is not None and result_name(optima.result) == "several_optima":
+        return "several_optima"
+    doubtful = any(is_misfit(trace.figures) for trace in traces) or any(source.drowned for source in sources)
+    return "misfit" if doubtful else "successful"
+
+
+def is_out_of_bounds(
+    likelihood: Likelihood,
+    theta: Float[np.ndarray, " parameters"],
+    sigma: Float[np.ndarray, " traces"],
+    root: Float[np.ndarray, "parameters parameters"],
+) -> bool:
+    """Whether the records put the parameters where a bounded or ordered prior forbids them.
+
+    Least squares take a prior by its mean and covariance. Along what the records do not see it may end beyond an
+    edge, which the sampler mends; so what must be allowed is a point of that line.
+    """
+    axes, sizes, _ = np.linalg.svd(root)
+    along = np.linspace(-_ALONG, _ALONG, 241)[:, None] * (axes[:, 0] * sizes[0])
+    points = np.hstack([theta + along, np.tile(np.log(sigma), (len(along), 1))])
+    return not bool(jnp.any(jnp.isfinite(jax.vmap(likelihood.log_prior)(jnp.asarray(points)))))
+
+
+def misfits(traces: Sequence[TraceFit]) -> list[str]:
+    """Which of several traces the model does not describe, in sentences."""
+    return [
+        f"{trace.record.source}: {trace.channel} is not described by the model that all records share (reduced"
+        f" chi-square {trace.figures['chi2_reduced']:.3g}); fit it alone to see whether it belongs to this finger"
+        for trace in traces
+        if len(traces) > 1 and is_misfit(trace.figures)
+    ]

@@ -1,0 +1,295 @@
+"""Priors for one positive parameter x, as densities of u = log x.
+
+Everything is fitted and sampled in log-parameters, so each density includes the Jacobian of the change. Each
+distribution also gives its normal scores z = Phi^-1(F(u)), which correlate it with others and draw from it.
+"""
+
+import abc
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import ndtr, ndtri
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from fitact.errors import InputError
+
+_Z95 = 1.959963984540054  # half-width, in standard deviations, of a central 95 % interval
+_LEAST = 1e-3  # share of a log-normal that its bounds must leave
+_TINY = 1e-300  # keeps the scores of what rounds to an edge finite
+
+
+class Distribution(eqx.Module):
+    """A prior for one positive parameter."""
+
+    @property
+    @abc.abstractmethod
+    def log_mean(self) -> float:
+        """Mean of log x."""
+
+    @property
+    @abc.abstractmethod
+    def log_sd(self) -> float:
+        """Standard deviation of log x."""
+
+    @abc.abstractmethod
+    def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
+        """Log-density of u = log x, Jacobian included; -inf where x is impossible."""
+
+    @abc.abstractmethod
+    def score(self, u: ArrayLike) -> Float[Array, "*shape"]:
+        """The standard normal number with as much probability below it as u has."""
+
+    @abc.abstractmethod
+    def at_score(self, z: ArrayLike) -> Float[Array, "*shape"]:
+        """The inverse of `score`: log x."""
+
+    def sample(self, rng: np.random.Generator, size: int) -> Float[np.ndarray, " size"]:
+        """Draws of x."""
+        with jax.enable_x64(True):
+            return np.exp(np.asarray(self.at_score(rng.standard_normal(size))))
+
+
+class LogNormal(Distribution):
+    """log x is normal with the standard deviation `spread` around log `median`."""
+
+    median: float
+    spread: float
+
+    def __check_init__(self) -> None:
+        if not (self.median > 0.0 and self.spread > 0.0):
+            raise InputError(
+                f"a log-normal prior needs a median and a spread above zero, not {self.median}, {self.spread}"
+            )
+
+    @classmethod
+    def within_factor(cls, median: float, factor: float) -> "LogNormal":
+        """95 % of the probability lies within `factor` (> 1) of the median, either way."""
+        if not factor > 1.0:
+            raise InputError(f"factor = {factor:g} must be above 1: 95 % of the prior lies within that factor")
+        return cls(median, math.log(factor) / _Z95)
+
+    @classmethod
+    def with_relative_sd(cls, median: float, relative_sd: float) -> "LogNormal":
+        """The standard deviation of x is `relative_sd` (> 0) times its mean."""
+        if not relative_sd > 0.0:
+            raise InputError(f"relative_sd = {relative_sd:g} must be above 0")
+        return cls(median, math.sqrt(math.log1p(relative_sd**2)))
+
+    @property
+    def log_mean(self) -> float:
+        """Mean of log x."""
+        return math.log(self.median)
+
+    @property
+    def log_sd(self) -> float:
+        """Standard deviation of log x."""
+        return self.spread
+
+    def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
+        """Normal in u."""
+        return -0.5 * self.score(u) ** 2 - math.log(self.spread * math.sqrt(2.0 * math.pi))
+
+    def score(self, u: ArrayLike) -> Float[Array, "*shape"]:
+        """(u - log median) / spread."""
+        return (jnp.asarray(u) - self.log_mean) / self.spread
+
+    def at_score(self, z: ArrayLike) -> Float[Array, "*shape"]:
+        """The inverse of `score`: log x."""
+        return self.log_mean + self.spread * jnp.asarray(z)
+
+
+class Bounded(Distribution):
+    """A prior that is zero outside `low` < x < `high`."""
+
+    low: eqx.AbstractVar[float]
+    high: eqx.AbstractVar[float]
+
+    @abc.abstractmethod
+    def share(self, u: ArrayLike) -> Float[Array, "*shape"]:
+        """The probability below u = log x inside the bounds."""
+
+    @abc.abstractmethod
+    def at_share(self, p: ArrayLike) -> Float[Array, "*shape"]:
+        """The inverse of `share`: log x."""
+
+    def inside(self, u: ArrayLike) -> Array:
+        """Whether u = log x lies within the bounds."""
+        u = jnp.asarray(u)
+        low = -math.inf if self.low == 0.0 else math.log(self.low)
+        return (u >= low) & (u <= math.log(self.high))
+
+    def score(self, u: ArrayLike) -> Float[Array, "*shape"]:
+        """The standard normal number with as much probability below it as u has."""
+        u = jnp.where(self.inside(u), u, self.log_mean)  # any value inside: outside, the density says it all
+        share = self.share(u)
+        return ndtri(jnp.clip(share, _TINY, 1.0 - jnp.finfo(share.dtype).epsneg))
+
+    def at_score(self, z: ArrayLike) -> Float[Array, "*shape"]:
+        """The inverse of `score`: log x."""
+        return self.at_share(ndtr(jnp.asarray(z, dtype=float)))
+
+
+class Uniform(Bounded):
+    """x is uniform between `low` and `high`, both above zero."""
+
+    low: float
+    high: float
+
+    def __check_init__(self) -> None:
+        _check_limits("uniform", self.low, self.high)
+
+    @classmethod
+    def with_tolerance(cls, nominal: float, tolerance: float) -> "Uniform":
+        """Uniform within ± `tolerance` (relative, 0 to 1) of `nominal`: what a data sheet's limits say.
+
+        Limits without a distribution are rectangular (JCGM 100:2008, 4.3.7).
+        """
+        if not 0.0 < tolerance < 1.0:
+            raise InputError(f"tolerance = {tolerance:g} must lie between 0 and 1, such as 0.1 or '10 %'")
+        return cls(nominal * (1.0 - tolerance), nominal * (1.0 + tolerance))
+
+    @property
+    def log_mean(self) -> float:
+        """Mean of log x."""
+        return (self.high * math.log(self.high) - self.low * math.log(self.low)) / (self.high - self.low) - 1.0
+
+    @property
+    def log_sd(self) -> float:
+        """Standard deviation of log x: sqrt(1 - q L^2 / (1 - q)^2) with L = log(high / low), q = low / high."""
+        q = self.low / self.high
+        return math.sqrt(max(1.0 - q * math.log(q) ** 2 / (1.0 - q) ** 2, 0.0))
+
+    def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
+        """e^u / (high - low) inside."""
+        return jnp.where(self.inside(u), jnp.asarray(u) - math.log(self.high - self.low), -jnp.inf)
+
+    def share(self, u: ArrayLike) -> Float[Array, "*shape"]:
+        """(x - low) / (high - low)."""
+        return self.low * jnp.expm1(jnp.asarray(u) - math.log(self.low)) / (self.high - self.low)
+
+    def at_share(self, p: ArrayLike) -> Float[Array, "*shape"]:
+        """The inverse of `share`: log x."""
+        return math.log(self.low) + jnp.log1p(jnp.asarray(p) * (self.high - self.low) / self.low)
+
+
+class LogUniform(Bounded):
+    """log x is uniform between log `low` and log `high`: each decade counts the same."""
+
+    low: float
+    high: float
+
+    def __check_init__(self) -> None:
+        _check_limits("log-uniform", self.low, self.high)
+
+    @property
+    def _length(self) -> float:
+        return math.log(self.high / self.low)
+
+    @property
+    def log_mean(self) -> float:
+        """Mean of log x."""
+        return math.log(self.low) + 0.5 * self._length
+
+    @property
+    def log_sd(self) -> float:
+        """Standard deviation of log x."""
+        return self._length / math.sqrt(12.0)
+
+    def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
+        """1 / log(high / low) inside."""
+        return jnp.where(self.inside(u), -math.log(self._length), -jnp.inf)
+
+    def share(self, u: ArrayLike) -> Float[Array, "*shape"]:
+        """log(x / low) / log(high / low)."""
+        return (jnp.asarray(u) - math.log(self.low)) / self._length
+
+    def at_share(self, p: ArrayLike) -> Float[Array, "*shape"]:
+        """The inverse of `share`: log x."""
+        return math.log(self.low) + self._length * jnp.asarray(p)
+
+
+class TruncatedLogNormal(Bounded):
+    """A log-normal cut off outside `low` < x < `high` (0 and inf: no bound); `median` and `spread` are those before it.
+
+    Raises:
+        InputError: the bounds leave less than a thousandth of it.
+    """
+
+    median: float
+    spread: float
+    low: float
+    high: float
+
+    def __check_init__(self) -> None:
+        if not 0.0 <= self.low < self.high:
+            raise InputError(f"bounds of a prior need 0 <= low < high, not low = {self.low:g}, high = {self.high:g}")
+        if self._mass < _LEAST:
+            raise InputError(
+                f"the bounds low = {self.low:g}, high = {self.high:g} leave almost nothing of a prior with median"
+                f" {self.median:g}; bring the median within them"
+            )
+
+    @property
+    def _whole(self) -> LogNormal:
+        return LogNormal(self.median, self.spread)
+
+    @property
+    def _limits(self) -> tuple[float, float]:
+        """The bounds in standard deviations before the cut."""
+        low, high = ((math.log(x) if x > 0.0 else -math.inf) - math.log(self.median) for x in (self.low, self.high))
+        return low / self.spread, high / self.spread
+
+    @property
+    def _below(self) -> float:
+        return _normal_cdf(self._limits[0])
+
+    @property
+    def _mass(self) -> float:
+        return _normal_cdf(self._limits[1]) - self._below
+
+    @property
+    def log_mean(self) -> float:
+        """Mean of log x."""
+        return self._moments[0]
+
+    @property
+    def log_sd(self) -> float:
+        """Standard deviation of log x."""
+        return self._moments[1]
+
+    @property
+    def _moments(self) -> tuple[float, float]:
+        """By quadrature: the closed form cancels where the bounds are close."""
+        low, high = np.clip(self._limits, -10.0, 10.0)  # all but 1e-23 of it
+        nodes, weights = np.polynomial.legendre.leggauss(128)
+        z = low + 0.5 * (high - low) * (nodes + 1.0)
+        weights = weights * np.exp(-0.5 * (z**2 - np.min(z**2)))
+        weights = weights / weights.sum()
+        mean = float(weights @ z)
+        return math.log(self.median) + self.spread * mean, self.spread * math.sqrt(weights @ (z - mean) ** 2)
+
+    def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
+        """Normal in u, over the mass that the bounds leave."""
+        return jnp.where(self.inside(u), self._whole.log_density(u) - math.log(self._mass), -jnp.inf)
+
+    def share(self, u: ArrayLike) -> Float[Array, "*shape"]:
+        """The probability below u = log x inside the bounds."""
+        return (ndtr(self._whole.score(u)) - self._below) / self._mass
+
+    def at_share(self, p: ArrayLike) -> Float[Array, "*shape"]:
+        """The inverse of `share`: log x."""
+        z = ndtri(self._below + jnp.asarray(p) * self._mass)
+        return self._whole.at_score(jnp.clip(z, *self._limits))
+
+
+def _check_limits(kind: str, low: float, high: float) -> None:
+    if not 0.0 < low < high < math.inf:
+        raise InputError(f"a {kind} prior needs 0 < low < high, not low = {low:g}, high = {high:g}")
+
+
+def _normal_cdf(z: float) -> float:
+    return 0.5 * math.erfc(-z / math.sqrt(2.0))

@@ -1,0 +1,74 @@
+"""The prior as a picture: what it means for the skin voltage and the force."""
+
+import html
+import io
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from fitact.errors import InputError
+from fitact.files import replacing
+from fitact.inference.prior_predictive import PriorPredictive
+from fitact.report.plots import style
+
+_FORMATS = (".html", ".svg", ".png")
+_COLOR, _LINE = "#0072B2", "#333333"
+
+
+def write_prior(path: Path, predicted: PriorPredictive) -> None:
+    """Draw a prior's voltage and force at `path`: SVG or PNG by its ending, or HTML with the table.
+
+    Raises:
+        InputError: another ending, or a place that cannot be written.
+    """
+    if path.suffix not in _FORMATS:
+        raise InputError(f"{path}: the figure is written as {', '.join(_FORMATS)}; choose one of these endings")
+    with mpl.rc_context(style()), replacing(path) as temporary:
+        figure = _figure(predicted)
+        if path.suffix == ".html":
+            temporary.write_text(_page(figure, predicted), encoding="utf-8")
+        else:
+            metadata = {"Date": None} if path.suffix == ".svg" else {}
+            figure.savefig(temporary, format=path.suffix[1:], dpi=150, metadata=metadata)
+
+
+def _figure(predicted: PriorPredictive) -> Figure:
+    figure = Figure(figsize=(9.0, 6.0), layout="constrained")
+    grid = figure.add_gridspec(2, 2, height_ratios=[1.4, 1.0])
+    above = figure.add_subplot(grid[0, :])
+    for outer, alpha in ((0.05, 0.25), (0.25, 0.35)):
+        low, high = np.quantile(predicted.Vsc, [outer, 1.0 - outer], axis=0)
+        label = f"{100.0 * (1.0 - 2.0 * outer):.0f} % of fingers"
+        above.fill_between(predicted.time, low, high, color=_COLOR, alpha=alpha, lw=0, label=label)
+    above.plot(predicted.time, np.median(predicted.Vsc, axis=0), color=_LINE, lw=1.2, label="median")
+    above.xaxis.set_major_formatter(EngFormatter("s"))
+    above.yaxis.set_major_formatter(EngFormatter("V"))
+    above.set_xlim(predicted.time[0], predicted.time[-1])
+    above.set_xlabel("time")
+    above.set_ylabel("skin voltage Vsc")
+    above.legend(loc="upper right", framealpha=0.9)
+    for column, (name, title) in enumerate({"force_mean": "mean force", "force_peak": "peak force"}.items()):
+        force = predicted.derived[name]
+        low, high = np.quantile(force, [0.002, 0.998])
+        below = figure.add_subplot(grid[1, column])
+        below.hist(force, bins=np.geomspace(0.98 * low, 1.02 * high, 50).tolist(), color=_COLOR, alpha=0.75)
+        below.axvline(float(np.median(force)), color=_LINE)
+        below.set_xscale("log")
+        below.xaxis.set_major_formatter(EngFormatter("N"))
+        below.set_yticks([])
+        below.set_xlabel(title)
+    return figure
+
+
+def _page(figure: Figure, predicted: PriorPredictive) -> str:
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    svg = buffer.getvalue()
+    return (
+        '<!doctype html><html lang="en"><meta charset="utf-8"><title>fitact: the prior</title>'
+        f"<h1>What the prior means, before any data</h1>{svg[svg.index('<svg') :]}"
+        f"<pre>{html.escape(predicted.summary())}</pre></html>\n"
+    )
