@@ -43,10 +43,7 @@ def brute_force(fit: fitact.Fit, level: float) -> tuple[float, float]:
     return low, high
 
 
-_NARROW = pytest.mark.xfail(reason="0.2 % of the half width too narrow on this record; the cause is not found yet")
-
-
-@pytest.mark.parametrize("level", [0.5, pytest.param(0.95, marks=_NARROW)])
+@pytest.mark.parametrize("level", [0.5, 0.95])
 def test_interval_of_b_against_a_brute_force_profile(noisy: fitact.Fit, level: float):
     low, high = brute_force(noisy, level)
     found = noisy.profile("b", level, prior=False)

@@ -151,21 +151,22 @@ def ends(
     weight = 1.0 / (_TIGHT * expected)
     points = np.tile(theta, (lanes.size, 1))
     points, middle, least = map(np.asarray, _pinned(model, lanes, np.zeros(lanes.size), 0.0 * weight, points))
-    near, far = np.zeros((2, lanes.size)), np.full((2, lanes.size), np.inf)  # how far out, and the deviance's root
-    goal, found = z * expected, np.full(lanes.size, np.nan)
+    # the goals last found too near and too far, of which a quantity falls a little short, and the deviance's root there
+    near, far = np.zeros((2, lanes.size)), np.full((2, lanes.size), np.inf)
+    goal, found, within = z * expected, np.full(lanes.size, np.nan), np.zeros(lanes.size)
     for _ in range(_ROUNDS):
         there, value, deviance = map(np.asarray, _pinned(model, lanes, middle + side * goal, weight, points))
         out, root = side * (value - middle), np.sqrt(np.maximum(deviance - least, 0.0))
         short = root < z  # false where it is not finite
-        near = np.where(short, [out, root], near)
-        far = np.where(short, far, [np.where(np.isfinite(root), out, goal), root])
+        near, far = np.where(short, [goal, root], near), np.where(short, far, [goal, root])
+        within = np.where(short, out, within)
         points = np.where(np.isfinite(there) & short[:, None], there, points)
         done = np.isnan(found) & (np.abs(root - z) < _CLOSE * z)
         found = np.where(done, out, np.where(np.isnan(found) & short & (goal >= OPEN), np.inf, found))
         if not np.isnan(found).any():
             break
         goal = np.where(np.isnan(found), _next(near, far, z), goal)
-    found = np.where(np.isnan(found), near[0], found)  # what was certainly within
+    found = np.where(np.isnan(found), within, found)
     return (middle + side * found).reshape(-1, 2)
 
 
