@@ -108,6 +108,7 @@ def test_summary_is_printed_again_with_the_runs_exit_code(results, fitact_comman
     assert "fitact sample" in refused.stderr
 
 
+@pytest.mark.slow
 def test_other_levels_of_uncertainty(fitact_command, finger_path, finger_scene_path, tmp_path):
     command = ("sample", finger_path, "--scene", finger_scene_path, "--json", "--out", "out", "--level")
     for level in ("psis", "laplace"):

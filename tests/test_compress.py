@@ -179,6 +179,7 @@ def test_a_tolerance_that_is_none_is_refused(tolerance: float):
         fitact.fit(square_record(), SQUARE, tolerance=tolerance)
 
 
+@pytest.mark.slow
 def test_force_of_a_long_record_is_that_of_a_short_one():
     """Above 20,000 samples only its last periods are computed, after the charge has decayed."""
     short, long = (fitact.fit(square_record(periods=n, noise=1e-3)).derived() for n in (9, 30))

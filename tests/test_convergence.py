@@ -32,6 +32,7 @@ PROPOSALS = {
 
 
 @pytest.mark.parametrize("move", range(2))
+@pytest.mark.slow
 def test_every_move_reproduces_a_normals_variance(move: int):
     """To 1 %: the effective draws put 3.5 standard errors there, sqrt(2 / (3 n)) each."""
     offered = moves(PROPOSALS["student"][0])[move][0]

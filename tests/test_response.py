@@ -176,6 +176,7 @@ def test_chirp_against_gauss_legendre(name: str):
         np.testing.assert_allclose(ours, expected, atol=1e-12 * 180.0 * max(1.0, f_max * T / 100.0))
 
 
+@pytest.mark.slow
 def test_chirp_in_single_precision():
     circuit, time = fitact.FinalCircuit(**VALUES), np.linspace(-0.01, 0.12, 500)
     exact = np.asarray(fitact.response(circuit, SWEEPS["up"], time, steady_state=False))
@@ -185,6 +186,7 @@ def test_chirp_in_single_precision():
     np.testing.assert_allclose(single, exact, atol=5e-5 * np.abs(exact).max())  # 26 cycles round the phase
 
 
+@pytest.mark.slow
 def test_chirp_differentiates_in_circuit_amplitude_and_frequencies():
     time = np.array([1.3e-3, 41e-3, 77e-3, 113e-3])
 

@@ -186,6 +186,7 @@ def test_more_harmonics_change_no_more_than_the_stated_error():
 
 
 @pytest.mark.parametrize("skin", [fitact.Dispersive(), fitact.Fractional(0.8, harmonics=8)])
+@pytest.mark.slow
 def test_differentiable_under_jit_and_vmap(skin: fitact.Dispersive | fitact.Fractional):
 
     @jax.jit

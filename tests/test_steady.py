@@ -182,6 +182,7 @@ def test_what_does_not_repeat_is_refused():
 
 
 @pytest.mark.parametrize("name", ["sine", "square", "triangle", "trapezoid", "sampled"])
+@pytest.mark.slow
 def test_differentiable_in_every_parameter(name: str):
     def force(logs: jax.Array, peak_to_peak: jax.Array, frequency: jax.Array, shape: jax.Array) -> jax.Array:
         drive = {
