@@ -18,7 +18,7 @@ BOXES = {
     "Ci binds": WIDE | {"Rsc": ("1 kohm", "10 Mohm"), "Ci": ("1.2 nF", "1.5 nF")},
     "Rsc and Csc bind": WIDE | {"Rsc": ("100 kohm", "10 Mohm"), "Csc": ("8.85 nF", "44.25 nF")},
 }
-QUICK = {("Rsc binds", "compressed"), ("Csc binds", "full")}
+QUICK = {("Rsc binds", "compressed")}
 SHARES = np.array([0.05, 0.5, 0.95])
 TOLERANCES = {"compressed": compressed.TOLERANCE, "full": 0.0}
 CASES = [

@@ -124,8 +124,14 @@ def solved(name: str) -> tuple[Problem, solver.Minimum]:
         return problem, both(jnp.asarray(problem.starts), jnp.asarray(problem.x), jnp.asarray(problem.y))
 
 
+# of each grade of difficulty; the others run in make test-slow
+QUICK = {"Misra1a", "Chwirut2", "Lanczos3", "Gauss1", "MGH09", "Thurber", "BoxBOD"}
+
+
 @pytest.mark.parametrize("start", [0, 1])
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in MODELS]
+)
 def test_certified_values(name: str, start: int):
     problem, ends = solved(name)
     assert solver.result_name(jax.tree.map(lambda leaf: leaf[start], ends.result)) == "successful"

@@ -43,7 +43,7 @@ def brute_force(fit: fitact.Fit, level: float) -> tuple[float, float]:
     return low, high
 
 
-@pytest.mark.parametrize("level", [0.5, 0.95])
+@pytest.mark.parametrize("level", [pytest.param(0.5, marks=pytest.mark.slow), 0.95])
 def test_interval_of_b_against_a_brute_force_profile(noisy: fitact.Fit, level: float):
     low, high = brute_force(noisy, level)
     found = noisy.profile("b", level, prior=False)
