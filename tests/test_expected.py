@@ -174,3 +174,11 @@ def test_remedies_best_first():
 def test_no_remedy_that_was_taken():
     done = dataclasses.replace(BOTH, circuit=RESISTOR, free=("Rsc", "Csc"), prior_root=np.diag(PRIOR_SD[:2]))
     assert [remedy.name for remedy in remedies(done)] == ["four times the record"]
+
+
+def test_remedies_at_a_circuit_whose_current_overflows():
+    """A fit that failed may end there; what can be computed is still told."""
+    far = dataclasses.replace(NOMINAL, circuit=fitact.FinalCircuit(Rsc=1e-200, Csc=1e-8, Ci=1e-10))
+    with np.errstate(all="ignore"):
+        found = [remedy.name for remedy in remedies(far)]
+    assert "the trunk current I recorded to ± 40 nA" not in found

@@ -9,6 +9,7 @@ import pytest
 
 import fitact
 from fitact.files import to_json
+from fitact.inference.summary import log_normal, width
 
 
 @pytest.fixture(scope="module")
@@ -130,3 +131,10 @@ def test_every_public_name_is_there():
         assert getattr(fitact, name) is not None
     with pytest.raises(AttributeError):
         fitact.nonsense  # noqa: B018
+
+
+def test_a_spread_beyond_numbers_is_open():
+    s = log_normal("b", 1.0, 40.0)
+    assert s["q50"] == 1.0
+    assert s["sd"] == np.inf
+    assert width(s) == "open"

@@ -4,6 +4,7 @@ From the Fisher information of the channels' noise and the prior, in the Laplace
 Nothing else is taken to be unknown: no offset, drift, delay or charge at the start.
 """
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping
@@ -131,9 +132,15 @@ def covariance_root(
 
 
 def remedies(experiment: Experiment) -> tuple[Remedy, ...]:
-    """What might be done to know the mean force better, best first."""
-    expected = [(name, expected_sd(changed)) for name, changed in _changes(experiment)]
-    found = [Remedy(name, e.force_sd, e.sd) for name, e in expected]
+    """What might be done to know the mean force better, best first; of that, what can be computed there.
+
+    A fit that failed may have ended at a circuit whose current no double holds.
+    """
+    found = []
+    for name, changed in _changes(experiment):
+        with contextlib.suppress(np.linalg.LinAlgError):
+            expected = expected_sd(changed)
+            found.append(Remedy(name, expected.force_sd, expected.sd))
     return tuple(sorted(found, key=lambda remedy: remedy.force_sd))
 
 

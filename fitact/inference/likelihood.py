@@ -24,6 +24,7 @@ from fitact.model.distribution import Distribution
 from fitact.model.prior import Prior
 
 OPEN = math.log(1e6)  # in a logarithm: what leaves more open than this leaves it open
+_HUGE = 70.0  # in a logarithm: beyond 1e30 or below 1e-30 SI units is no finger, and products overflow
 _BATCH_ROWS = 4_000_000  # samples or coordinates evaluated at a time, which bounds memory
 
 
@@ -97,7 +98,8 @@ class Likelihood(eqx.Module):
         return dataclasses.replace(self, traces=traces)
 
     def circuit(self, theta: Float[Array, " parameters"]) -> RC:
-        """The circuit at theta."""
+        """The circuit at theta; NaN where no double could hold what follows from it, so that no step leads there."""
+        theta = jnp.where(jnp.abs(theta) < _HUGE, theta, jnp.nan)
         fields = {field.name for field in dataclasses.fields(self.template)}
         values = {name: jnp.exp(theta[i]) for i, name in enumerate(self.prior.names) if name in fields}
         for name, other, ratio in self.tied:

@@ -355,8 +355,12 @@ def _best_of_prior(likelihood: Likelihood, theta: np.ndarray) -> Float[np.ndarra
     points = np.tile(theta, (_DRAWS, 1))
     draws = likelihood.prior.sample(np.random.default_rng(0), _DRAWS)  # a start, so any seed will do
     points[1:, : len(draws)] = np.log(list(draws.values())).T[1:]
-    left = Batched(_left, likelihood, likelihood.rows)(points)
-    return points[int(np.argmin(left))]
+    return points[int(np.argmin(left(likelihood, points)))]
+
+
+def left(likelihood: Likelihood, points: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, " n"]:
+    """What points leave of the traces, whatever their noise: for comparing one with another."""
+    return Batched(_left, likelihood, likelihood.rows)(points)
 
 
 def _left(likelihood: Likelihood, theta: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, ""]:

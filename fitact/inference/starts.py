@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from fitact.errors import InputError
 from fitact.inference.least_squares import Solved, solve
 from fitact.inference.likelihood import Likelihood
-from fitact.inference.problem import Problem
+from fitact.inference.problem import Problem, left
 from fitact.inference.solver import Optima, minimise_many
 
 _DRAWS = 100  # of the prior for each start, of which a table may hold few
@@ -20,6 +20,9 @@ _APART = 0.5  # standard errors from the lowest optimum, from which the one foun
 
 def begin(problem: Problem, start: Mapping[str, float] | None) -> Float[np.ndarray, " parameters"]:
     """The data's start, or what summing the samples makes of another (SI), since a table holds little but the data's.
+
+    From far off it may make nothing of it, where the circuit gives no signal: an end that leaves more than the
+    data's own start is no optimum, and that start is taken.
 
     Raises:
         InputError: one is no parameter of the fit, or not above zero.
@@ -32,7 +35,9 @@ def begin(problem: Problem, start: Mapping[str, float] | None) -> Float[np.ndarr
             raise InputError(f"start {name} = {value}: give values above zero, in SI units, of {', '.join(names)}")
         theta[names.index(name)] = math.log(value)
     noise = np.array([source.noise for source in problem.sources])
-    return np.asarray(solve(problem.likelihood, theta, noise, ((),) * noise.size).theta)
+    end = np.asarray(solve(problem.likelihood, theta, noise, ((),) * noise.size).theta)
+    left_of_end, left_of_start = left(problem.likelihood, np.stack([end, problem.start]))
+    return end if left_of_end < left_of_start else problem.start
 
 
 def explore(solved: Solved, count: int) -> Optima:

@@ -51,10 +51,12 @@ def of_draws(name: str, draws: Float[np.ndarray, "*shape"]) -> Summary:
 
 
 def log_normal(name: str, median: float, log_sd: float) -> Summary:
-    """Summary of a quantity whose logarithm is normal."""
-    mean = median * math.exp(0.5 * log_sd**2)
-    summary: Summary = {"unit": unit(name), "mean": mean, "sd": mean * math.sqrt(math.expm1(log_sd**2))}
-    return summary | {key: median * math.exp(z * log_sd) for key, z in _NORMAL.items()}
+    """Summary of a quantity whose logarithm is normal; infinite where a number of that size overflows."""
+    with np.errstate(over="ignore"):
+        mean = median * np.exp(0.5 * log_sd**2)
+        quantiles = median * np.exp(log_sd * np.array(list(_NORMAL.values())))
+        summary: Summary = {"unit": unit(name), "mean": float(mean), "sd": float(mean * np.sqrt(np.expm1(log_sd**2)))}
+    return summary | dict(zip(_NORMAL, quantiles.tolist(), strict=True))
 
 
 def normal(name: str, mean: float, sd: float) -> Summary:
@@ -66,7 +68,7 @@ def normal(name: str, mean: float, sd: float) -> Summary:
 def width(summary: Summary) -> str:
     """Its standard deviation for people: in per cent of the mean, or as it is where that says little."""
     mean, sd = float(summary["mean"]), float(summary["sd"])
-    if sd > _OPEN * abs(mean):
+    if not sd <= _OPEN * abs(mean) or math.isinf(sd):
         return "open"
     if sd > 0.5 * abs(mean):
         return engineering(sd, str(summary["unit"]), 2)
