@@ -2,12 +2,22 @@
 
 import functools
 import math
+import re
 from typing import Any
 
 from fitact.errors import InputError
 
 _PREFIXES = {-15: "f", -12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
 _SYMBOLS = {"ohm": "Ω", "1": ""}
+
+_UNITS = {
+    "Rsc": "ohm", "Csc": "F", "Ci": "F", "R_H": "ohm", "grounding_Rsc": "ohm", "grounding_Csc": "F",
+    "Z": "ohm", "Z_capacitance": "F", "series_resistor": "ohm", "gain": "1", "delay": "s", "sigma": "V",
+    "Vsc_peak_to_peak": "V",
+    "offset": "V", "drift": "V", "charge": "V",
+    "hum_50Hz_cos": "V", "hum_50Hz_sin": "V", "hum_60Hz_cos": "V", "hum_60Hz_sin": "V",
+    "g": "1", "b": "s", "force_mean": "N", "force_peak": "N", "force_rms": "N", "friction_mean": "N",
+}  # fmt: skip
 
 
 @functools.cache
@@ -55,3 +65,10 @@ def engineering(value: float, unit: str, digits: int = 4) -> str:
         return f"{value:.{digits}g} {symbol}".rstrip()
     exponent = max(-15, min(12, 3 * math.floor(math.log10(abs(value)) / 3 + 1e-12)))
     return f"{value / 10.0**exponent:.{digits}g} {_PREFIXES[exponent]}{symbol}"
+
+
+def unit_of(name: str) -> str:
+    """The SI unit of a quantity; a nuisance's name may end in its trace's label, as "sigma_I_2"."""
+    bare = name if name in _UNITS else re.sub(r"_\d+$", "", name)
+    found = _UNITS[bare.removesuffix("_I")]
+    return "A" if bare.endswith("_I") and found == "V" else found

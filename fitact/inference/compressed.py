@@ -46,14 +46,14 @@ def project(trace: Trace, near: Terms | None, tolerance: float) -> tuple[Trace, 
     reason = _reason_against(trace, near, tolerance)
     if reason or near is None:
         return trace, reason
-    arrays = (None if x is None else np.asarray(x) for x in (trace.weight, trace.rate))
     compression = compress(
         trace.drive,
         np.asarray(trace.time),
         np.asarray(trace.observed),
         steady_state=trace.steady_state,
         near=near,
-        **dict(zip(("weight", "rate"), arrays, strict=True)),
+        weight=None if trace.weight is None else np.asarray(trace.weight),
+        rate=None if trace.rate is None else np.asarray(trace.rate),
     )
     return dataclasses.replace(trace, compression=compression), ""
 
@@ -132,8 +132,7 @@ def _near(theta: np.ndarray, root: np.ndarray) -> Float[np.ndarray, "n parameter
 
 def _believed(wide: Likelihood, theta: np.ndarray) -> Float[np.ndarray, "n parameters"]:
     """Points of the prior that the tables reach, the optimum where there are too few."""
-    draws = np.tile(theta, (1000, 1))
-    draws[:, : len(wide.prior.names)] = np.log(list(wide.prior.sample(np.random.default_rng(0), 1000).values())).T
+    draws = wide.draws(theta, 1000)
     slowest = jax.vmap(_log_b, (None, 0))(wide, jnp.asarray(draws))
     held = [trace.compression.holds(jnp.exp(slowest)) for trace in wide.traces if trace.compression is not None]
     draws = draws[np.all(held, axis=0)]

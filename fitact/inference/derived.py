@@ -28,7 +28,7 @@ _NODES = 64  # Gauss-Legendre nodes along each straight piece of a drive
 
 
 class Derived(eqx.Module):
-    """Derived quantities as functions of theta and the traces' noise; built by `for_fit`.
+    """Derived quantities of the first record, as functions of theta and the traces' noise; built by `for_fit`.
 
     Means are over one period of a scene's drive in the steady state, else over the largest whole number of
     periods that the record holds (the whole record where it holds none); of a long record with a measured
@@ -36,7 +36,6 @@ class Derived(eqx.Module):
 
     Attributes:
         likelihood: names theta's coordinates.
-        index: of the trace whose record's force this is.
         drive: what makes the force: the likelihood's, or the last part of a long measured one, which begins so
             early that its unknown charge is gone when the force is evaluated.
         time: when the force is evaluated, s.
@@ -56,7 +55,6 @@ class Derived(eqx.Module):
     normal_force: ArrayLike
     steady_state: bool = eqx.field(static=True)
     charge: bool = eqx.field(static=True)  # whether the record's unknown one matters
-    index: int = eqx.field(static=True)
 
     def force(
         self, theta: Float[Array, " parameters"], sigma: Float[Array, " traces"], deviate: ArrayLike = 0.0
@@ -74,9 +72,9 @@ class Derived(eqx.Module):
 
     def _charges(self, theta: Array, sigma: Array, deviate: ArrayLike) -> Float[Array, " times"]:
         """What unknown charges at the record's first sample add to Vsc."""
-        trace, seen = self.likelihood.traces[self.index], self.likelihood.seen(theta, self.index)
-        each = jnp.broadcast_to(deviate, (len(self.likelihood.traces), len(LINEAR)))[self.index]
-        sizes = (trace.drawn(seen, sigma[self.index], each) * trace.linear_sd)[-len(CHARGES) :]
+        trace, seen = self.likelihood.traces[0], self.likelihood.seen(theta)
+        first = jnp.broadcast_to(deviate, (len(self.likelihood.traces), len(LINEAR)))[0]
+        sizes = (trace.drawn(seen, sigma[0], first) * trace.linear_sd)[-len(CHARGES) :]
         # a charge shows in each channel as the response to a drive does
         there, here = (seen.circuit.terms_of(channel).weight for channel in ("Vsc", trace.channel))
         ratios = jnp.stack([v / jnp.where(w == 0.0, 1.0, w) for v, w in zip(there, here, strict=True)])
@@ -118,11 +116,8 @@ def _logs(derive: Derived, theta: Array, sigma: Array) -> tuple[Array, Array]:
     return logs(theta), jax.jacfwd(logs)(theta)
 
 
-def for_fit(likelihood: Likelihood, record: Record, choice: DriveChoice, scene: Scene, b: float, index: int) -> Derived:
-    """The derived quantities of a fit's parameters, for the drive of one record.
-
-    `b` (s) is the slowest time constant that was found, `index` that of the record's first trace.
-    """
+def for_fit(likelihood: Likelihood, record: Record, choice: DriveChoice, scene: Scene, b: float) -> Derived:
+    """Of a fit; `record` and `choice` are its first, `b` (s) the slowest time constant that was found."""
     last = _last_periods(record, choice, b)
     drive, (time, weight) = (choice.drive, _grid(record, choice)) if last is None else last
     return Derived(
@@ -137,7 +132,6 @@ def for_fit(likelihood: Likelihood, record: Record, choice: DriveChoice, scene: 
         scene.friction.normal_force,
         steady_state=choice.steady_state and last is None,
         charge=choice.unknown_charge and last is None,
-        index=index,
     )
 
 

@@ -27,7 +27,7 @@ from fitact.inference.starts import begin, better, explore
 from fitact.inference.trace_fit import TraceFit, compare
 from fitact.inference.verdict import misfits, verdict
 from fitact.model.scene import Scene
-from fitact.units import engineering
+from fitact.units import engineering, unit_of
 
 _SKIN = ("Rsc", "Csc", "Ci")
 
@@ -220,22 +220,24 @@ class Fit:
             return f"summed over the samples each time, since {self.full_because}"
         return f"compressed to {self.likelihood.rows} numbers, off by {self.compression_error:.1g} at most"
 
-    def to_dict(self) -> dict[str, Any]:
-        """What `fitact fit --json` prints and fit.json holds."""
-        fitted = {"result": self.result, "message": self.message, "misfit": self.result == "misfit"}
+    def judgement(self) -> dict[str, Any]:
+        """The result, and the figures of merit of all traces and of each."""
         traces = [
             {"channel": t.channel, "record": os.path.basename(t.record.source), "label": t.label, **t.figures}
             for t in self.traces
         ]
+        found = {"result": self.result, "message": self.message, "misfit": self.result == "misfit"}
+        return found | self.figures | {"traces": traces}
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `fitact fit --json` prints and fit.json holds."""
         return {
             "parameters": self.parameters(),
             "derived": self.derived(),
-            "nuisances": {
-                name: {"unit": summary.unit(name), "value": value} for name, value in self._nuisances().items()
-            },
+            "nuisances": {name: {"unit": unit_of(name), "value": value} for name, value in self._nuisances().items()},
             "correlation": {"names": list(self.names), "matrix": self.correlation.tolist()},
             "identifiability": self.identifiability.to_dict(),
-            "fit": fitted | self.figures | {"traces": traces},
+            "fit": self.judgement(),
             "model": self.model(),
             "warnings": list(self.warnings),
         }
@@ -253,9 +255,7 @@ class Fit:
         pairs = [(i, j) for i in range(len(self.names)) for j in range(i)]
         rows += [
             "nuisances: "
-            + ", ".join(
-                f"{name} {engineering(value, summary.unit(name))}" for name, value in self._nuisances().items()
-            ),
+            + ", ".join(f"{name} {engineering(value, unit_of(name))}" for name, value in self._nuisances().items()),
             "correlations of the logs: "
             + ", ".join(f"{self.names[j]}-{self.names[i]} {self.correlation[i, j]:+.3f}" for i, j in pairs),
             f"reduced chi-square {self.figures['chi2_reduced']:.3f}. {self.message}",
@@ -363,7 +363,7 @@ def _judged(
     root = covariance_root(jacobian, prior_root)
     source, given = problem.sources[0], scene or Scene()
     circuit = likelihood.circuit(jnp.asarray(theta))
-    derive = derived.for_fit(likelihood, source.record, source.choice, given, float(circuit.b), 0)
+    derive = derived.for_fit(likelihood, source.record, source.choice, given, float(circuit.b))
     _, gradient = derive.logs(theta, sigma)
     traces = tuple(
         TraceFit.of(likelihood, i, theta, float(sigma[i]), source, certified.reasons[i])

@@ -163,7 +163,7 @@ def _coloured(likelihood: Likelihood, start: Array, noise: Array) -> Solved:
         if trace.noise == "ar1":
             white = dataclasses.replace(trace, whitening=None)
             left = np.asarray(_remainder(white, likelihood.seen(solved.theta, i), solved.sigma[i]))
-            counted = np.ones(left.size, bool) if trace.weight is None else np.asarray(trace.weight) > 0.0
+            counted = trace.weights > 0.0
             whitening = first_order(left, counted).whitening(counted)
             likelihood = likelihood.with_trace(i, dataclasses.replace(trace, whitening=whitening))
     if likelihood is solved.likelihood:
@@ -200,11 +200,10 @@ def _nearest_delay(trace: Trace, seen: Seen) -> Array:
     delays = np.arange(-40, 41) / 8.0
     later = jnp.asarray(delays) * trace.time_step
     shapes = np.asarray(trace.shapes(seen))[np.asarray(trace.linear_sd) > 0.0]
-    weight = np.ones(trace.time.size) if trace.weight is None else np.asarray(trace.weight)
     left = []
     for shift in later:
-        design = (np.vstack([_signal(trace, seen, shift), shapes]) * weight).T
-        observed = np.asarray(trace.observed) * weight
+        design = (np.vstack([_signal(trace, seen, shift), shapes]) * trace.weights).T
+        observed = np.asarray(trace.observed) * trace.weights
         remainder = observed - design @ np.linalg.lstsq(design, observed, rcond=None)[0]
         left.append(float(remainder @ remainder))
     good = np.asarray(left) < min(left) * (1.0 + 25.0 / trace.observed.size)

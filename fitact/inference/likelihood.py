@@ -174,6 +174,13 @@ class Likelihood(eqx.Module):
         value = value + believed
         return jnp.where(jnp.isfinite(value) | beyond, value, -jnp.inf)
 
+    def draws(self, theta: Float[np.ndarray, " parameters"], count: int) -> Float[np.ndarray, "count parameters"]:
+        """Points of the prior, always the same; of a delay, which has none of the circuit's, that of `theta`."""
+        points = np.tile(theta, (count, 1))
+        drawn = self.prior.sample(np.random.default_rng(0), count)
+        points[:, : len(drawn)] = np.log(list(drawn.values())).T
+        return points
+
     def natural(self, theta: Float[np.ndarray, "*shape parameters"]) -> dict[str, Float[np.ndarray, "*shape"]]:
         """Points in SI units, by name; a delay is that of the channel against the drive, in all."""
         found = {name: np.exp(theta[..., i]) for i, name in enumerate(self.prior.names)}

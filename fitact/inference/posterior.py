@@ -1,5 +1,6 @@
 """Posterior: draws, summaries, force and friction, and the file that other programs open."""
 
+import copy
 import dataclasses
 import functools
 import importlib.metadata
@@ -23,6 +24,7 @@ from fitact.inference.fit import Fit
 from fitact.inference.likelihood import Batched, Likelihood
 from fitact.inference.trace import LINEAR
 from fitact.inference.trace_fit import TraceFit
+from fitact.units import unit_of
 
 _DRAWS = 2500  # kept per ensemble, spread over its walkers and steps
 _CHAINS = 4  # that independent draws are dealt out to
@@ -136,10 +138,11 @@ class Posterior:
 
     def summary(self) -> dict[str, Any]:
         """What summary.json holds."""
-        fitted, prior_sd = (
-            self.fit.to_dict(),
-            dict(zip(self.fit.likelihood.prior.names, self.fit.likelihood.prior.log_sd, strict=True)),
-        )
+        return copy.deepcopy(self._summary)
+
+    @functools.cached_property
+    def _summary(self) -> dict[str, Any]:
+        prior_sd = dict(zip(self.fit.likelihood.prior.names, self.fit.likelihood.prior.log_sd, strict=True))
         parameters = {}
         for name, draws in self.parameters().items():
             parameters[name] = summary.of_draws(name, draws)
@@ -148,10 +151,10 @@ class Posterior:
         return {
             "parameters": parameters,
             "derived": {name: summary.of_draws(name, draws) for name, draws in self.derived().items()},
-            "identifiability": fitted["identifiability"] | {"sentence": str(self.fit.identifiability)},
+            "identifiability": self.fit.identifiability.to_dict() | {"sentence": str(self.fit.identifiability)},
             "convergence": dataclasses.asdict(self.convergence) | {"sentence": str(self.convergence)},
-            "fit": fitted["fit"],
-            "model": fitted["model"],
+            "fit": self.fit.judgement(),
+            "model": self.fit.model(),
             "warnings": list(self.warnings),
             "seed": self.seed,
             "record": self._record(),
@@ -169,7 +172,7 @@ class Posterior:
         }
 
     def __str__(self) -> str:
-        return summary.table(self.summary())
+        return summary.table(self._summary)
 
     def to_datatree(self) -> Any:
         """An `xarray.DataTree` in ArviZ's groups; chain: the independent ensembles."""
@@ -177,7 +180,7 @@ class Posterior:
 
         def dataset(draws: dict[str, np.ndarray]) -> xr.Dataset:
             variables = {
-                name: xr.DataArray(values, dims=("chain", "draw"), attrs={"units": summary.unit(name)})
+                name: xr.DataArray(values, dims=("chain", "draw"), attrs={"units": unit_of(name)})
                 for name, values in draws.items()
             }
             counts = next(iter(draws.values())).shape

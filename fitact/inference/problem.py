@@ -352,9 +352,7 @@ def _on_the_ridge(start: LinearStart, mean: np.ndarray, sd: np.ndarray) -> Float
 
 def _best_of_prior(likelihood: Likelihood, theta: np.ndarray) -> Float[np.ndarray, " parameters"]:
     """The draw of the prior that leaves least of the traces, whatever their noise."""
-    points = np.tile(theta, (_DRAWS, 1))
-    draws = likelihood.prior.sample(np.random.default_rng(0), _DRAWS)  # a start, so any seed will do
-    points[1:, : len(draws)] = np.log(list(draws.values())).T[1:]
+    points = np.vstack([theta, likelihood.draws(theta, _DRAWS - 1)])
     return points[int(np.argmin(left(likelihood, points)))]
 
 

@@ -21,8 +21,7 @@ from fitact.errors import InputError
 from fitact.inference.derived import NAMES, Derived
 from fitact.inference.likelihood import OPEN, Likelihood
 from fitact.inference.solver import minimise
-from fitact.inference.summary import unit
-from fitact.units import engineering
+from fitact.units import engineering, unit_of
 
 DERIVED = ("g", "b", "force_mean")
 _TIGHT = 0.05  # of the expected error: that of the pseudo-datum
@@ -185,7 +184,7 @@ def table(with_prior: Mapping[str, Interval], without: Mapping[str, Interval]) -
 
     def shown(name: str, interval: Interval) -> str:
         ends = [
-            "open" if interval.open in (side, "both") else engineering(end, unit(name))
+            "open" if interval.open in (side, "both") else engineering(end, unit_of(name))
             for side, end in (("low", interval.low), ("high", interval.high))
         ]
         return f"{ends[0]} to {ends[1]}"

@@ -65,10 +65,8 @@ def on_parameters(likelihood: Likelihood, theta: Float[np.ndarray, " parameters"
 
 def _plausibility(likelihood: Likelihood, theta: np.ndarray) -> list[tuple[str, float, float]]:
     """For g and b, which the record knows: name, ratio to the prior's median, share of the prior further out."""
-    believed = np.tile(theta, (_DRAWS, 1))
-    draws = likelihood.prior.sample(np.random.default_rng(0), _DRAWS)  # for two tail areas, so any seed will do
-    believed[:, : len(draws)] = np.log(list(draws.values())).T
-    g, b = (np.asarray(x) for x in _divider(likelihood, jnp.asarray(np.vstack([theta, believed]))))
+    points = np.vstack([theta, likelihood.draws(theta, _DRAWS)])
+    g, b = (np.asarray(x) for x in _divider(likelihood, jnp.asarray(points)))
     return [
         (name, float(x[0] / np.median(x[1:])), float(min(np.mean(x[1:] < x[0]), np.mean(x[1:] > x[0]))))
         for name, x in (("the divider g", g), ("the time constant b", b))

@@ -46,9 +46,7 @@ def explore(solved: Solved, count: int) -> Optima:
     Where the record is compressed, it shows its time constant, and only draws within the table's reach are taken.
     """
     likelihood = solved.likelihood.without_samples()
-    draws = np.tile(np.asarray(solved.theta), (_DRAWS * count, 1))
-    drawn = likelihood.prior.sample(np.random.default_rng(0), len(draws))  # starts, so any seed will do
-    draws[:, : len(drawn)] = np.log(list(drawn.values())).T
+    draws = likelihood.draws(np.asarray(solved.theta), _DRAWS * count)
     slowest = jax.vmap(lambda theta: likelihood.circuit(theta).b)(jnp.asarray(draws))
     tables = [trace.compression for trace in likelihood.traces if trace.compression is not None]
     held = np.all([np.ones(len(draws), bool), *(table.holds(slowest) for table in tables)], axis=0)

@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import re
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.errors import InputError
-from fitact.units import engineering
+from fitact.units import engineering, unit_of
 
-_UNITS = {
-    "Rsc": "ohm", "Csc": "F", "Ci": "F", "R_H": "ohm", "grounding_Rsc": "ohm", "grounding_Csc": "F",
-    "Z": "ohm", "Z_capacitance": "F", "series_resistor": "ohm", "gain": "1", "delay": "s", "sigma": "V",
-    "Vsc_peak_to_peak": "V",
-    "offset": "V", "drift": "V", "charge": "V",
-    "hum_50Hz_cos": "V", "hum_50Hz_sin": "V", "hum_60Hz_cos": "V", "hum_60Hz_sin": "V",
-    "g": "1", "b": "s", "force_mean": "N", "force_peak": "N", "force_rms": "N", "friction_mean": "N",
-}  # fmt: skip
 _OPEN = 1e6  # times the mean: a standard deviation that says nothing
 _SECTIONS = {"parameters", "derived", "identifiability", "convergence", "fit", "model", "warnings", "record"}
 # standard normal quantiles of the summary's probabilities
@@ -32,18 +23,11 @@ _NORMAL = {
 Summary = dict[str, float | str]
 
 
-def unit(name: str) -> str:
-    """The SI unit of a quantity; a nuisance's name may end in its trace's label, as "sigma_I_2"."""
-    bare = name if name in _UNITS else re.sub(r"_\d+$", "", name)
-    found = _UNITS[bare.removesuffix("_I")]
-    return "A" if bare.endswith("_I") and found == "V" else found
-
-
 def of_draws(name: str, draws: Float[np.ndarray, "*shape"]) -> Summary:
     """Summary of draws of the quantity `name`, in its SI unit."""
     quantiles = np.quantile(draws, [float(f"0.{key[1:]}") for key in _NORMAL])
     summary: Summary = {
-        "unit": unit(name),
+        "unit": unit_of(name),
         "mean": float(np.mean(draws)),
         "sd": float(np.std(draws, ddof=1)),
     }
@@ -55,13 +39,17 @@ def log_normal(name: str, median: float, log_sd: float) -> Summary:
     with np.errstate(over="ignore"):
         mean = median * np.exp(0.5 * log_sd**2)
         quantiles = median * np.exp(log_sd * np.array(list(_NORMAL.values())))
-        summary: Summary = {"unit": unit(name), "mean": float(mean), "sd": float(mean * np.sqrt(np.expm1(log_sd**2)))}
+        summary: Summary = {
+            "unit": unit_of(name),
+            "mean": float(mean),
+            "sd": float(mean * np.sqrt(np.expm1(log_sd**2))),
+        }
     return summary | dict(zip(_NORMAL, quantiles.tolist(), strict=True))
 
 
 def normal(name: str, mean: float, sd: float) -> Summary:
     """Summary of a normal quantity."""
-    summary: Summary = {"unit": unit(name), "mean": mean, "sd": sd}
+    summary: Summary = {"unit": unit_of(name), "mean": mean, "sd": sd}
     return summary | {key: mean + z * sd for key, z in _NORMAL.items()}
 
 

@@ -110,6 +110,11 @@ class Trace(eqx.Module):
         """How many numbers an evaluation runs over."""
         return self.time.size if self.compression is None else self.compression.observed.size
 
+    @property
+    def weights(self) -> Float[np.ndarray, " samples"]:
+        """Of each sample."""
+        return np.ones(self.time.size) if self.weight is None else np.asarray(self.weight)
+
     def without_samples(self) -> "Trace":
         """With no more of the samples than their ends, where a compression stands for them.
 

@@ -90,22 +90,19 @@ def _equal_noise(trace: Trace, left: np.ndarray, sigma: float) -> tuple[np.ndarr
     values = np.asarray(trace.weighted(jnp.asarray(left)))
     if trace.noise == "student":
         values = values * np.sqrt(np.asarray(student_weight(values / sigma)))
-    counted = np.ones(left.size, bool) if trace.weight is None else np.asarray(trace.weight) > 0.0
-    if trace.whitening is not None:
-        counted = np.asarray(trace.whitening.kept) > 0.0
+    counted = trace.weights > 0.0 if trace.whitening is None else np.asarray(trace.whitening.kept) > 0.0
     return values[counted], counted
 
 
 def _log_likelihood(trace: Trace, left: np.ndarray, sigma: float) -> float:
     """At the noise that makes it largest; under Student's t, at `sigma`."""
-    weight = np.ones(left.size) if trace.weight is None else np.asarray(trace.weight)
     if trace.whitening is None:
         if trace.noise == "student":
-            return student_log_likelihood(left, weight, sigma)
-        return gaussian_log_likelihood(left, weight)
+            return student_log_likelihood(left, trace.weights, sigma)
+        return gaussian_log_likelihood(left, trace.weights)
     kept = np.asarray(trace.whitening.kept) > 0.0
     innovations = np.asarray(trace.weighted(jnp.asarray(left)))[kept] / float(trace.whitening.taps[0])
-    return gaussian_log_likelihood(innovations, None) + float(np.sum(np.log(weight[kept])))
+    return gaussian_log_likelihood(innovations, None) + float(np.sum(np.log(trace.weights[kept])))
 
 
 @eqx.filter_jit

@@ -162,8 +162,10 @@ class PriorSection(Section):
         place = f"[prior] {name}: {key} = '{other}'"
         if other == name or other not in beliefs:
             raise ValueError(f"{place} is no other parameter with a prior; name one of {', '.join(beliefs)}")
-        if _unit(name) != _unit(other):
-            raise ValueError(f"{place} compares {_unit(name)} with {_unit(other)}; name one of its own unit")
+        if units.unit_of(name) != units.unit_of(other):
+            raise ValueError(
+                f"{place} compares {units.unit_of(name)} with {units.unit_of(other)}; name one of its own unit"
+            )
         if key == "tied" and beliefs[other].tied is not None:
             raise ValueError(f"{place} is tied itself; name what {other} is tied to")
 
@@ -213,9 +215,3 @@ class PriorSection(Section):
 
 
 BELIEFS = tuple(name for name in PriorSection.model_fields if name != "correlation")
-
-
-def _unit(name: str) -> str:
-    if name.startswith("sigma"):
-        return "A" if name == "sigma_I" else "V"
-    return "F" if name in ("Csc", "Ci", "grounding_Csc", "Z_capacitance") else "ohm"
