@@ -17,6 +17,7 @@ _PART = 65_536  # samples
 _SMOOTH = 0.3  # of a signal's sd: its noise, when it is more than noise
 _LEVELS = 12  # distinct values from which a channel counts as rounded by a converter
 _NEAR_PEAK = 0.02  # of correlation: the first period's peak may be that much lower than a later one's
+_NEAR_LAG = 4  # samples, within which twice a period is known once one is
 _TOP = 0.002  # of correlation: the part of a peak that is taken for a parabola
 CHANNEL_UNITS = {"V": "V", "Vsc": "V", "I": "A"}
 
@@ -177,8 +178,13 @@ def fundamental(time: Float[np.ndarray, " samples"], values: Float[np.ndarray, "
         return None
     start, stop = _stretch(window >= best - _NEAR_PEAK, int(np.argmax(window >= best - _NEAR_PEAK)))
     top = start + int(np.argmax(window[start:stop]))  # of the first period, not of a later one
-    start, stop = _stretch(window >= window[top] - _TOP - 0.3 * (1.0 - window[top]), top)
-    return 1.0 / ((below[0] + _vertex(window, start, stop, top)) * float(grid[1] - grid[0]))
+    lag, periods = below[0] + _peak(window, top), 1
+    reach = min(_NEAR_LAG, int(lag) // 4)
+    while 2.0 * lag < last - reach:  # twice as many periods show one twice as well
+        near = round(2.0 * lag) - below[0] - reach
+        top = near + int(np.argmax(window[near : near + 2 * reach + 1]))
+        lag, periods = below[0] + _peak(window, top), 2 * periods
+    return periods / (lag * float(grid[1] - grid[0]))
 
 
 def _self_correlation(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -200,6 +206,12 @@ def _stretch(inside: np.ndarray, index: int) -> tuple[int, int]:
     place = int(np.searchsorted(outside, index))
     start = int(outside[place - 1]) + 1 if place > 0 else 0
     return start, int(outside[place]) if place < outside.size else inside.size
+
+
+def _peak(curve: Float[np.ndarray, " n"], top: int) -> float:
+    """Where the curve peaks around its largest value, at `top`."""
+    start, stop = _stretch(curve >= curve[top] - _TOP - 0.3 * (1.0 - curve[top]), top)
+    return _vertex(curve, start, stop, top)
 
 
 def _vertex(curve: Float[np.ndarray, " n"], start: int, stop: int, top: int) -> float:

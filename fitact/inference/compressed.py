@@ -16,6 +16,7 @@ from fitact.model.circuit import Terms
 from fitact.model.drive import Sampled
 
 TOLERANCE = 1e-3  # in log-likelihood
+_OFF_TIME = "a delay or a clock is free"
 _SHORT = 512  # samples, below which nothing is gained
 _POINTS = 8  # of each kind at which the full sum is taken
 _FAR = 1e-6  # of a point's distance below the optimum, in log-likelihood: error allowed there
@@ -67,8 +68,8 @@ def _reason_against(trace: Trace, near: Terms | None, tolerance: float) -> str:
         return "the noise is coloured"
     if trace.time.size < _SHORT:
         return f"the record is shorter than {_SHORT} samples"
-    if trace.free_delay:
-        return "a delay is free"
+    if trace.timing:
+        return _OFF_TIME
     if isinstance(trace.drive, Sampled) and trace.steady_state:
         return "the steady state of a measured drive is not tabulated"
     if near is None:
@@ -96,14 +97,14 @@ def certify(
         wide, traces=tuple(dataclasses.replace(t, columns=c) for t, c in zip(wide.traces, asked, strict=True))
     )
     if all(trace.compression is None for trace in wide.traces):
-        return Certified(wide, None, tuple(r or "a delay is free" for r in reasons))
+        return Certified(wide, None, tuple(r or _OFF_TIME for r in reasons))
     spread = _spread_of_log_b(wide, theta, root)
     near = tuple(_narrowed(trace, wide, i, theta, spread, sigma[i], tolerance) for i, trace in enumerate(wide.traces))
     points = np.vstack([_near(theta, root), _believed(wide, theta)])
     narrow = dataclasses.replace(wide, traces=near)
     exact, compressed, tabulated = (_at(model, points, sigma) for model in (wide.summed(), narrow, wide))
     found = [
-        reason or ("a delay is free" if trace.compression is None else _against(*parts, tolerance / len(near)))
+        reason or (_OFF_TIME if trace.compression is None else _against(*parts, tolerance / len(near)))
         for reason, trace, parts in zip(
             reasons, near, zip(exact.T, compressed.T, tabulated.T, strict=True), strict=True
         )

@@ -98,7 +98,7 @@ class Fit:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Coordinates of theta: logarithms, and the delay in time steps."""
+        """Coordinates of theta: logarithms, and delays and clocks in steps."""
         return self.likelihood.names
 
     @property
@@ -123,7 +123,7 @@ class Fit:
 
     @property
     def point_names(self) -> tuple[str, ...]:
-        """Coordinates of the posterior: those of theta, and each trace's sigma; logarithms but for delays."""
+        """Coordinates of the posterior: those of theta, and the logarithm of each trace's sigma."""
         return (*self.names, *self.likelihood.sigma_names)
 
     @property
@@ -148,12 +148,11 @@ class Fit:
     def parameters(self) -> dict[str, summary.Summary]:
         """Summaries of the parameters in the Laplace approximation, with their contraction."""
         values, prior_sd = self.likelihood.natural(self.theta), self.likelihood.prior.log_sd
-        steps = {trace.named("delay"): float(trace.time_step) for trace in self.likelihood.traces}
-        believed = self.likelihood.believed
+        timing, believed = self.likelihood.timing, self.likelihood.believed
         out = {}
         for i, name in enumerate(self.names):
-            if name in steps:
-                out[name] = summary.normal(name, float(values[name]), float(self.sd[i]) * steps[name])
+            if name in timing:
+                out[name] = summary.normal(name, float(values[name]), float(self.sd[i]) * timing[name][1])
             else:
                 out[name] = summary.log_normal(name, float(values[name]), float(self.sd[i]))
                 if believed or name.startswith("gain"):
@@ -280,14 +279,14 @@ def fit(
 
     The circuit, the prior and the device are the (first) scene's. Each record has the drive of its scene: the
     recorded V where there is no scene or its waveform is "measured", else the scene's. Each of the scene's
-    channels has its own noise; offset, drift, hum of the mains and (Vsc) a delay are freed where it asks for them,
-    a gain only with the scene's prior. The start comes from the records. Runs in double precision whatever JAX
-    is set to, and leaves that setting alone.
+    channels has its own noise; offset, drift, hum of the mains and (Vsc) a delay and a clock are freed where it asks
+    for them, a gain only with the scene's prior. The start comes from the records. Runs in double precision whatever
+    JAX is set to, and leaves that setting alone.
 
     Args:
         record: with the scene's channels, and V unless the scene has the drive.
         scene: the device, and what is believed of it; one for all records, or one for each.
-        prior: False leaves the circuit's out, for least squares alone; gains and delays keep theirs.
+        prior: False leaves the circuit's out, for least squares alone; gains, delays and clocks keep theirs.
         start: values (SI) to start from in place of the records' own.
         starts: how many; those after the first are draws of the prior, and tell whether there are other optima.
         tolerance: error of the log-likelihood that compressing the records may cause; 0: sum over the samples

@@ -15,12 +15,13 @@ from jaxtyping import Array, Float
 from fitact.inference.likelihood import Likelihood
 from fitact.inference.noise import first_order, student_curvature, student_weight
 from fitact.inference.solver import minimise
-from fitact.inference.trace import Seen, Trace
+from fitact.inference.timing import clock_drop, opened
+from fitact.inference.trace import TIMING, Seen, Trace
 
 _SETTLED = 0.01  # relative change of the noise, below which no further round changes what follows
 _ROUNDS = 6
 _SCALE_STEPS = 40  # of Student's scale, each of which gains a quarter of a digit
-NUISANCES = {  # by name, the columns of `LINEAR` that a trace may ask for; beside these, a delay
+NUISANCES = {  # by name, the columns of `LINEAR` that a trace may ask for; beside these, its `TIMING`
     "offset": (0,),
     "drift": (1,),
     "hum_50Hz": (2, 3),
@@ -137,10 +138,7 @@ def solve(
     noise: Float[np.ndarray, " traces"],
     freeable: tuple[tuple[str, ...], ...],
 ) -> Solved:
-    """Fit; then free nuisances (each trace's of `NUISANCES`, or its delay), one at a time, as long as one is asked for.
-
-    With a delay, a trace's samples are summed: the response table holds none.
-    """
+    """Fit; then free nuisances (of each trace, `NUISANCES` and `TIMING`), one at a time, while one is asked for."""
     solved = _coloured(likelihood, jnp.asarray(start), jnp.asarray(noise, dtype=float))
     for _ in range(sum(map(len, freeable))):
         gains = _evidence(solved, freeable)
@@ -180,39 +178,14 @@ def _freed(solved: Solved, which: int, name: str) -> tuple[Likelihood, Array]:
     """The likelihood with a nuisance of the trace `which` freed, and where to go on from."""
     likelihood, theta = solved.likelihood, solved.theta
     trace = likelihood.traces[which]
-    if name == "delay":
-        # delays come last in theta, in the order of the traces
-        place = len(likelihood.prior.names) + sum(other.free_delay for other in likelihood.traces[:which])
-        shift = trace.shift + _nearest_delay(trace, likelihood.seen(theta, which))
-        trace = dataclasses.replace(trace.summed(), free_delay=True, shift=shift)
-        theta = jnp.insert(theta, place, 0.0)
+    if name in TIMING:
+        trace = opened(trace, likelihood.seen(theta, which), name)
+        new, before = likelihood.with_trace(which, trace).names, likelihood.names
+        theta = jnp.array([theta[before.index(n)] if n in before else 0.0 for n in new])
     else:
         sd = trace.linear_sd.at[np.array(NUISANCES[name])].set(10.0 * jnp.ptp(trace.observed))
         trace = dataclasses.replace(trace, linear_sd=sd)
     return likelihood.with_trace(which, trace), theta
-
-
-def _nearest_delay(trace: Trace, seen: Seen) -> Array:
-    """The middle of the best of a grid of delays within five steps (s): across an ideal edge there is no slope
-    to follow, and between two samples nothing that a gain could not do as well.
-    """
-    trace = trace.summed()
-    delays = np.arange(-40, 41) / 8.0
-    later = jnp.asarray(delays) * trace.time_step
-    shapes = np.asarray(trace.shapes(seen))[np.asarray(trace.linear_sd) > 0.0]
-    left = []
-    for shift in later:
-        design = (np.vstack([_signal(trace, seen, shift), shapes]) * trace.weights).T
-        observed = np.asarray(trace.observed) * trace.weights
-        remainder = observed - design @ np.linalg.lstsq(design, observed, rcond=None)[0]
-        left.append(float(remainder @ remainder))
-    good = np.asarray(left) < min(left) * (1.0 + 25.0 / trace.observed.size)
-    return jnp.asarray(np.mean(delays[good])) * trace.time_step
-
-
-@eqx.filter_jit
-def _signal(trace: Trace, seen: Seen, later: Array) -> Array:
-    return trace.signal(seen, later)
 
 
 def _evidence(solved: Solved, freeable: tuple[tuple[str, ...], ...]) -> dict[tuple[int, str], float]:
@@ -232,20 +205,28 @@ def _evidence(solved: Solved, freeable: tuple[tuple[str, ...], ...]) -> dict[tup
         shapes, free = np.asarray(solved.shapes[i]), np.asarray(trace.linear_sd) > 0.0
         columns.append(alone(i, shapes[free[list(trace.columns)]]))
         for name in freeable[i]:
-            if name == "delay" and not trace.free_delay:
+            if name == "delay" and name not in trace.timing:
                 candidates[i, name] = alone(i, np.asarray(solved.slope[i]))
-            elif name != "delay" and not free[NUISANCES[name][0]]:
+            elif name in NUISANCES and not free[NUISANCES[name][0]]:
                 candidates[i, name] = alone(i, shapes[list(NUISANCES[name])])
     known = np.concatenate(columns, axis=1)
     basis, values, _ = np.linalg.svd(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300), full_matrices=False)
     basis = basis[:, values > 1e-9 * values[0]]
     remainder = np.concatenate(remainders)
-    gains = {}
+    gains = {
+        (i, "clock"): _gain(clock_drop(trace, likelihood.seen(solved.theta, i), sigma[i]), float(trace.count), 1)
+        for i, trace in enumerate(likelihood.traces)
+        if "clock" in freeable[i] and "clock" not in trace.timing
+    }
     for (i, name), added in candidates.items():
         left = added - basis @ (basis.T @ added)
         modes, sizes, _ = np.linalg.svd(left, full_matrices=False)
         modes = modes[:, sizes > 1e-9 * max(float(np.linalg.norm(added)), 1e-300)]
-        drop, count = float(np.sum((modes.T @ remainder) ** 2)), float(likelihood.traces[i].count)
-        share = min(drop / float(remainders[i] @ remainders[i]), 1.0 - 1e-12)
-        gains[i, name] = -count * math.log1p(-share) - added.shape[1] * math.log(count)
+        share = float(np.sum((modes.T @ remainder) ** 2)) / float(remainders[i] @ remainders[i])
+        gains[i, name] = _gain(share, float(likelihood.traces[i].count), added.shape[1])
     return gains
+
+
+def _gain(share: float, count: float, added: int) -> float:
+    """By how much the Bayesian information criterion falls with a share of `count` samples' sum of squares."""
+    return -count * math.log1p(-min(share, 1.0 - 1e-12)) - added * math.log(count)

@@ -18,7 +18,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from fitact.inference.trace import Seen, Trace
+from fitact.inference.trace import TIMING, Seen, Trace
 from fitact.model.circuit import RC
 from fitact.model.distribution import Distribution
 from fitact.model.prior import Prior
@@ -31,8 +31,8 @@ _BATCH_ROWS = 4_000_000  # samples or coordinates evaluated at a time, which bou
 class Likelihood(eqx.Module):
     """Traces, a circuit and the prior, as a function of the parameters.
 
-    A point theta holds, in the order of `names`, logarithms of positive parameters, and each free delay in units
-    of its trace's `time_step`. Built by `fitact.inference.fit`.
+    A point theta holds, in the order of `names`, logarithms of positive parameters, and each trace's free delay and
+    clock in its `timing_unit`. Built by `fitact.inference.fit`.
 
     Attributes:
         traces: channels of records.
@@ -53,7 +53,29 @@ class Likelihood(eqx.Module):
     @property
     def names(self) -> tuple[str, ...]:
         """The coordinates of theta."""
-        return (*self.prior.names, *(trace.named("delay") for trace in self.traces if trace.free_delay))
+        return (*self.prior.names, *(trace.named(name) for trace, name in self._timing))
+
+    @property
+    def _timing(self) -> list[tuple[Trace, str]]:
+        """Free delays and clocks: the trace, and which."""
+        return [(trace, name) for trace in self.traces for name in trace.timing]
+
+    @property
+    def timing_sd(self) -> list[ArrayLike]:
+        """Their standard deviations by the prior."""
+        return [trace.timing_sd[TIMING.index(name)] for trace, name in self._timing]
+
+    @property
+    def timing(self) -> dict[str, tuple[float, float]]:
+        """By name, what they are (s, or a share of 1) where their coordinate is 0, and what 1 of that adds."""
+        with jax.enable_x64(True):
+            return {
+                trace.named(name): (
+                    float(trace.shift if name == "delay" else trace.clock),
+                    float(trace.timing_unit(name)),
+                )
+                for trace, name in self._timing
+            }
 
     @property
     def sigma_names(self) -> tuple[str, ...]:
@@ -63,8 +85,9 @@ class Likelihood(eqx.Module):
     @property
     def prior_root(self) -> Float[np.ndarray, "parameters parameters"]:
         """A root of theta's covariance by the prior; of a circuit without one, `OPEN` in each direction."""
-        delays = [float(trace.delay_sd) for trace in self.traces if trace.free_delay]
-        size, root = len(self.prior.names), np.diag(np.append(self.prior.log_sd, delays))
+        with jax.enable_x64(True):
+            sd = np.append(self.prior.log_sd, np.array(self.timing_sd))
+        size, root = len(self.prior.names), np.diag(sd)
         root[:size, :size] = np.linalg.cholesky(self.prior.covariance)
         return root if self.believed else np.where(self._of_circuit[:, None], OPEN * np.eye(len(root)), root)
 
@@ -111,12 +134,9 @@ class Likelihood(eqx.Module):
         return self._seen(self.circuit(theta), theta, self.traces[index])
 
     def _seen(self, circuit: RC, theta: Array, trace: Trace) -> Seen:
-        gain, delay, names = trace.named("gain"), trace.named("delay"), self.names
-        return Seen(
-            circuit,
-            jnp.exp(theta[names.index(gain)]) if gain in names else 1.0,
-            theta[names.index(delay)] * trace.time_step if trace.free_delay else 0.0,
-        )
+        gain, names = trace.named("gain"), self.names
+        timing = {name: theta[names.index(trace.named(name))] * trace.timing_unit(name) for name in trace.timing}
+        return Seen(circuit, jnp.exp(theta[names.index(gain)]) if gain in names else 1.0, **timing)
 
     def each(self, theta: Float[Array, " parameters"]) -> Iterator[tuple[Trace, Seen]]:
         """The traces, and what they need of theta."""
@@ -132,9 +152,8 @@ class Likelihood(eqx.Module):
     def prior_residuals(self, theta: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         """The prior as residuals: normal in theta, with the moments of the stated prior; 0 for what has none."""
         size = len(self.prior.names)
-        delays = [trace.delay_sd for trace in self.traces if trace.free_delay]
         scaled = self.prior.residuals(theta[:size])
-        found = jnp.concatenate([scaled, theta[size:] / jnp.asarray(delays)]) if delays else scaled
+        found = jnp.concatenate([scaled, theta[size:] / jnp.asarray(self.timing_sd)]) if self._timing else scaled
         return found if self.believed else jnp.where(self._of_circuit, 0.0, found)
 
     def split(self, point: Float[Array, " coordinates"]) -> tuple[Float[Array, " parameters"], Float[Array, " traces"]]:
@@ -156,9 +175,8 @@ class Likelihood(eqx.Module):
         theta, log_sigma = self.split(point)
         size = len(self.prior.names)
         value = self.prior.log_density(theta[:size])
-        delays = [trace.delay_sd for trace in self.traces if trace.free_delay]
-        for delay, sd in zip(theta[size:], delays, strict=True):
-            value = value - 0.5 * jnp.square(delay / sd)
+        for off, sd in zip(theta[size:], self.timing_sd, strict=True):
+            value = value - 0.5 * jnp.square(off / sd)
         for prior, log in zip(self.sigma_prior, log_sigma, strict=True):
             value = value if prior is None else value + prior.log_density(log)
         return value
@@ -175,18 +193,17 @@ class Likelihood(eqx.Module):
         return jnp.where(jnp.isfinite(value) | beyond, value, -jnp.inf)
 
     def draws(self, theta: Float[np.ndarray, " parameters"], count: int) -> Float[np.ndarray, "count parameters"]:
-        """Points of the prior, always the same; of a delay, which has none of the circuit's, that of `theta`."""
+        """Points of the prior, always the same; delays and clocks are those of `theta`."""
         points = np.tile(theta, (count, 1))
         drawn = self.prior.sample(np.random.default_rng(0), count)
         points[:, : len(drawn)] = np.log(list(drawn.values())).T
         return points
 
     def natural(self, theta: Float[np.ndarray, "*shape parameters"]) -> dict[str, Float[np.ndarray, "*shape"]]:
-        """Points in SI units, by name; a delay is that of the channel against the drive, in all."""
+        """Points in SI units, by name; delays and clocks are those of the channel against the drive, in all."""
         found = {name: np.exp(theta[..., i]) for i, name in enumerate(self.prior.names)}
-        delayed = [trace for trace in self.traces if trace.free_delay]
-        for i, trace in enumerate(delayed, len(found)):
-            found[trace.named("delay")] = float(trace.shift) + theta[..., i] * float(trace.time_step)
+        for i, (name, (base, unit)) in enumerate(self.timing.items(), len(found)):
+            found[name] = base + theta[..., i] * unit
         return found
 
 

@@ -35,6 +35,7 @@ _OFFSET = 0.02  # of a channel's span: standard deviation of an offset that the 
 _CHARGE = 10.0  # spans: that of an unknown charge
 _HELD = 1e-6  # standard deviation, in its logarithm, of a parameter that is held
 _PRECISION = 1e-9  # of a channel's span: least noise assumed
+_CLOCK = 5.0  # steps at a record's ends: that of the drive's clock, since its frequency is known to one or two
 _DRAWS = 256  # of the prior, to start from the best of
 
 
@@ -165,6 +166,8 @@ def _open(
     seen: Comparable | None = None
     if channel == "Vsc":
         gain, freeable = _log_sd(given.measurement.gain_relative_sd), (*freeable, "delay")
+        if choice.periodic and choice.steady_state and choice.name != "measured":
+            freeable = (*freeable, "clock")
         if _jumps(template, record):
             start = linear_start(record, choice, _largest(template) * math.exp(3.0 * gain))
             gain = math.hypot(gain, _edge_time(record, choice, start))
@@ -243,7 +246,8 @@ def _trace(record: Record, choice: DriveChoice, channel: Channel, label: str, te
         linear_sd=jnp.zeros(len(LINEAR)).at[0].set(offset).at[charges].set(_CHARGE * height),
         shift=jnp.asarray(choice.shift, dtype=float),
         time_step=jnp.asarray(record.time_step, dtype=float),
-        delay_sd=jnp.asarray(_delay_sd(choice), dtype=float),
+        clock=jnp.zeros(()),
+        timing_sd=jnp.array([_delay_sd(choice), _CLOCK]),
         compression=None,
         label=label,
         channel=channel,
@@ -251,7 +255,7 @@ def _trace(record: Record, choice: DriveChoice, channel: Channel, label: str, te
         noise=noise,
         columns=tuple(range(len(LINEAR))),
         # a shifted drive's edges are known to within a step only, which g feels; I's samples there are left out
-        free_delay=choice.shift != 0.0 and channel == "Vsc",
+        timing=("delay",) if choice.shift != 0.0 and channel == "Vsc" else (),
     )
 
 

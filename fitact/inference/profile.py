@@ -31,7 +31,7 @@ _WIDER, _ROUNDS, _STEPS = 4.0, 30, 200
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """Where a quantity may lie, in its SI unit; a side is 0 or infinite (a delay's: infinite) where it is open.
+    """Where a quantity may lie, in its SI unit; an open side is 0 or infinite (a delay's or a clock's: infinite).
 
     Attributes:
         low, high: its ends.
@@ -116,7 +116,7 @@ def intervals(
     for name in names:
         if name not in sd:
             raise InputError(f"there is no interval of {name}; choose from {', '.join(sd)}")
-    steps = {trace.named("delay"): (float(trace.time_step), float(trace.shift)) for trace in likelihood.traces}
+    timing = likelihood.timing
     likelihood = dataclasses.replace(likelihood.without_samples(), believed=prior and likelihood.believed)
     found = {}
     with jax.enable_x64(True):
@@ -127,7 +127,7 @@ def intervals(
             model, places = Pinned(likelihood, jnp.asarray(sigma), of), [known.index(name) for name in chosen]
             sides = ends(model, theta, np.array([sd[name] for name in known]), places, level)
             for name, side in zip(chosen, sides, strict=True):
-                low, high = side * steps[name][0] + steps[name][1] if name in steps else np.exp(side)
+                low, high = timing[name][0] + side * timing[name][1] if name in timing else np.exp(side)
                 found[name] = Interval(float(low), float(high), level, likelihood.believed)
     return found
 

@@ -20,8 +20,7 @@ from fitact.model.sections import DriveSection
 
 _ALIGNED = 20_000  # samples on which a drive is laid
 _CONTRADICTION = 0.05  # relative difference between the stated and the recorded drive that cannot be an inaccuracy
-
-_REPEATS = 6e-5  # relative error of the frequency that a record of two periods shows
+_SMOOTH_STEPS, _EDGE_STEPS = 0.5, 2.0  # error, over a whole record, of the frequency at which it repeats
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,16 +178,17 @@ def _check_frequency(record: Record, stated: float) -> None:
 
 
 def _is_off(record: Record, stated: DriveSection) -> bool:
-    """Whether the record's frequency differs from the stated one by more than it is known to.
+    """Whether the record's frequency differs from the stated one by more than it is seen without a model.
 
-    A thousandth biases b by several standard errors: generator and recorder have clocks of their own.
+    A thousandth biases b by several standard errors: generator and recorder have clocks of their own. What is less
+    than this the fit finds, as a trace's clock.
     """
     found = record.frequency()
     if found is None or not stated.steady_state:  # from rest, what came before and the transient shift where it repeats
         return False
     # an edge between two samples may lie anywhere there
-    edge = 0.0 if stated.waveform in ("sine", "triangle") else 0.5 * record.time_step * stated.frequency
-    return abs(found / stated.frequency - 1.0) > _REPEATS + edge
+    steps = _SMOOTH_STEPS if stated.waveform in ("sine", "triangle") else _EDGE_STEPS
+    return abs(found / stated.frequency - 1.0) > steps * record.time_step / float(record.time[-1] - record.time[0])
 
 
 def _check_amplitude(record: Record, voltage: np.ndarray) -> None:

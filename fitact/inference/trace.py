@@ -1,8 +1,8 @@
 """One channel of one record, against a circuit: noise, with the linear nuisances integrated out.
 
-The trace is  gain * response(t - delay) + A beta + noise.  The columns of A are an offset, a drift, mains
-hum and, for a measured drive, the decays of the unknown charges at the first sample. Their coefficients have
-wide normal priors and are integrated out exactly.
+The trace is  gain * response(t - delay) + A beta + noise,  where t runs by the drive's clock.
+The columns of A are an offset, a drift, mains hum and, for a measured drive, the decays of the unknown charges at
+the first sample. Their coefficients have wide normal priors and are integrated out exactly.
 
 Of Gaussian noise all this asks of the samples is lengths and angles, so it reads the same in the coordinates of a
 `fitact.data.compress.Compression`, where there is one, as over the samples themselves.
@@ -26,6 +26,7 @@ from fitact.model.response import highpass
 
 CHARGES = ("charge", "charge_2", "charge_3")  # one for each time constant, the slowest first
 LINEAR = (*SLOW, *CHARGES)
+TIMING = ("delay", "clock")
 _REWEIGHTED = 12  # steps from the Gaussian's linear nuisances to those under Student's t; each gains half a digit
 
 
@@ -36,11 +37,13 @@ class Seen(eqx.Module):
         circuit: at the parameters.
         gain: of the channel.
         delay: beyond the trace's `shift`, s.
+        clock: by what share the drive is faster than stated, by the recorder's clock; beyond the trace's own.
     """
 
     circuit: RC
     gain: ArrayLike = 1.0
     delay: ArrayLike = 0.0
+    clock: ArrayLike = 0.0
 
 
 class Trace(eqx.Module):
@@ -58,13 +61,14 @@ class Trace(eqx.Module):
         linear_sd: prior standard deviations of the `LINEAR` nuisances, in the channel's unit (drift: over half the
             record); 0 leaves one out.
         shift: the drive starts this much later than the record's t = 0, s.
+        clock: by what share it is faster than stated.
         time_step: s.
-        delay_sd: prior standard deviation of the delay, in time steps.
+        timing_sd: prior standard deviations of `TIMING`, in time steps; a clock's are those in half a record.
         compression: the record's projection; None: the samples are summed.
         label: "" or what tells it from the other traces, as "I_2".
         channel: "Vsc" or "I".
         steady_state: or from rest.
-        free_delay: whether the delay is a parameter.
+        timing: which of `TIMING` are parameters, in that order.
         noise: its model.
         columns: which of `LINEAR` are looked at; the others' linear_sd is 0.
     """
@@ -78,19 +82,24 @@ class Trace(eqx.Module):
     drive: Drive
     linear_sd: Float[Array, " 9"]
     shift: ArrayLike
+    clock: ArrayLike
     time_step: ArrayLike
-    delay_sd: ArrayLike
+    timing_sd: Float[Array, "2"]
     compression: Compression | None
     label: str = eqx.field(static=True)
     channel: Channel = eqx.field(static=True)
     steady_state: bool = eqx.field(static=True)
-    free_delay: bool = eqx.field(static=True)
+    timing: tuple[str, ...] = eqx.field(static=True)
     noise: NoiseModel = eqx.field(static=True)
     columns: tuple[int, ...] = eqx.field(static=True)
 
     def named(self, name: str) -> str:
         """A nuisance's name, with the trace's label where there are several traces."""
         return f"{name}_{self.label}" if self.label else name
+
+    def timing_unit(self, name: str) -> ArrayLike:
+        """What 1 of a coordinate of `TIMING` is: s, or a share of 1."""
+        return self.time_step if name == "delay" else 2.0 * self.time_step / (self.time[-1] - self.time[0])
 
     def summed(self) -> "Trace":
         """Without compression."""
@@ -131,6 +140,8 @@ class Trace(eqx.Module):
     def signal(self, seen: Seen, later: ArrayLike = 0.0) -> Float[Array, " samples"]:
         """The channel as recorded, but for linear nuisances and noise; `later` (s) delays it further."""
         time, terms = self.time - (self.shift + seen.delay + later), seen.circuit.terms_of(self.channel)
+        if "clock" in self.timing:
+            time = time * (1.0 + self.clock + seen.clock)
         total = jnp.zeros_like(time)
         for weight, tau in zip(terms.weight, terms.tau, strict=True):
             total = total + weight * highpass(self.drive, time, tau, steady_state=self.steady_state)

@@ -30,6 +30,7 @@ _LABELS = {
     "series_resistor": "series resistor",
     "gain": "gain of {}",
     "delay": "delay of {} against V",
+    "clock": "drive's frequency over the stated one, less 1",
     "sigma": "noise of {}",
     "offset": "offset of {}",
     "drift": "drift of {} over half the record",
