@@ -165,12 +165,25 @@ def test_a_measured_spectrum_widens_what_white_noise_would_make_too_narrow(chann
         noise = 1e-3 * np.ptp(record[channel]) * pink(np.random.default_rng(seed), len(record))
         made.append(fitact.Record.from_arrays(record.time, V=record["V"], **{channel: record[channel] + noise}))
     fits = [fitact.fit(each, quiet) for each in made]
+    assert not any("more than noise" in warning for fit in fits for warning in fit.warnings)
     assert np.all(np.sqrt(np.mean(deviations(fits) ** 2, axis=0)) < 1.7)
     assert np.sqrt(np.mean(deviations([fitact.fit(each, plain) for each in made[:4]]) ** 2)) > 2.0
     posterior = fitact.sample(fits[0], seed=1, progress=False)
     assert posterior.trusted
     for name, draws in posterior.derived().items():
         assert draws.std() == pytest.approx(fits[0].derived()[name]["sd"], rel=0.1)
+
+
+@pytest.mark.slow
+def test_a_decay_in_the_quiet_stretch_is_noticed():
+    record = burst_record()
+    noise = 0.05 * pink(np.random.default_rng(7), len(record))
+    fit = fitact.fit(
+        with_vsc(record, record["Vsc"] + noise),
+        scene("measured", noise_model="spectrum", quiet=["30.5 ms", "50 ms"]),
+    )
+    assert any("quiet holds more than noise" in warning for warning in fit.warnings)
+    assert fit.figures["rms_residual"] < 0.1 < fit.sigma
 
 
 @pytest.mark.slow
