@@ -19,6 +19,7 @@ from fitact.inference.expected import covariance_root
 from fitact.inference.identifiability import Identifiability, assess
 from fitact.inference.least_squares import Solved, solve
 from fitact.inference.likelihood import Likelihood
+from fitact.inference.noise import scale_information
 from fitact.inference.problem import Problem, pose
 from fitact.inference.profile import DERIVED, Interval, intervals
 from fitact.inference.solver import Optima, result_message
@@ -133,10 +134,11 @@ class Fit:
 
     @property
     def point_root(self) -> Float[np.ndarray, "coordinates coordinates"]:
-        """As `covariance_root`, in the coordinates of the posterior; sigma's from its degrees of freedom."""
+        """As `covariance_root`, in the coordinates of the posterior; sigma's by its Fisher information."""
         freedom = np.array([trace.figures["degrees_of_freedom"] for trace in self.traces])
+        information = freedom * [scale_information(trace.noise) for trace in self.likelihood.traces]
         size = self.theta.size
-        root = np.diag(np.append(np.zeros(size), np.sqrt(0.5 / freedom)))
+        root = np.diag(np.append(np.zeros(size), information**-0.5))
         root[:size, :size] = self.covariance_root
         return root
 

@@ -17,6 +17,8 @@ NoiseModel: TypeAlias = Literal["white", "student", "ar1", "spectrum"]
 FREEDOM = 4.0  # of Student's t: Lange, Little, Taylor, J. Am. Stat. Assoc. 84 (1989) 881
 _MOST_LAGS = 40
 _QUIET = 200  # samples from which a spectrum can be told
+_STILL = 0.1  # of the span of the drive: how far it may move where it rests, for its own noise
+_AROUND = 4  # lengths of a record: a circle on which noise is drawn, of which it must not see the other side
 _SERIES = 1e-6  # u, below which log(1 + u) / u is 1 - u / 2 in double precision
 
 
@@ -38,6 +40,11 @@ def student_curvature(z: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     return (FREEDOM + 1.0) * (FREEDOM - jnp.square(z)) / jnp.square(FREEDOM + jnp.square(z))
 
 
+def scale_information(model: NoiseModel) -> float:
+    """Fisher's information on log `sigma` in one sample."""
+    return 2.0 * FREEDOM / (FREEDOM + 3.0) if model == "student" else 2.0
+
+
 class Whitening(eqx.Module):
     """A filter that leaves white noise as strong as what it was given.
 
@@ -57,6 +64,21 @@ class Whitening(eqx.Module):
         return self.kept * sum(parts[1:], parts[0])
 
 
+def draw_noise(
+    rng: np.random.Generator, model: NoiseModel, whitening: Whitening | None, shape: tuple[int, ...], stride: int = 1
+) -> Float[np.ndarray, "*draws samples"]:
+    """Noise of a `sigma` of 1, of every `stride`-th sample of a record."""
+    if model == "student":
+        return rng.standard_t(FREEDOM, shape)
+    if whitening is None:
+        return rng.standard_normal(shape)
+    around = _AROUND * shape[-1]
+    power = np.abs(np.fft.fft(np.asarray(whitening.taps), around * stride)) ** -2.0
+    power = power.reshape(stride, around).mean(axis=0)  # of the samples between those drawn, the spectrum is folded
+    lines = np.fft.fft(rng.standard_normal((*shape[:-1], around))) * np.sqrt(power)
+    return np.fft.ifft(lines).real[..., : shape[-1]]
+
+
 class Autoregression(NamedTuple):
     """x_t = sum_k coefficients_k x_(t-k) + innovation.
 
@@ -74,7 +96,9 @@ class Autoregression(NamedTuple):
         for lag in range(1, self.coefficients.size + 1):
             kept[lag:] &= counted[:-lag]
         kept[: self.coefficients.size] = False
-        taps = np.append(1.0, -self.coefficients) / self.share
+        # filled up with zeros, so that most orders share what is compiled for another
+        fill = 2 ** math.ceil(math.log2(max(self.coefficients.size, 1))) - self.coefficients.size
+        taps = np.concatenate([[1.0], -self.coefficients, np.zeros(fill)]) / self.share
         return Whitening(jnp.asarray(taps), jnp.asarray(kept, dtype=float))
 
 
@@ -116,8 +140,8 @@ def quiet_noise(record: Record, channel: str, quiet: tuple[float, float]) -> tup
     place = f"{record.source}: [measurement] quiet = {quiet[0]:.4g} s to {quiet[1]:.4g} s"
     if count < _QUIET:
         raise InputError(f"{place} holds {count} samples of the record; choose a stretch of {_QUIET} or more")
-    if "V" in record and np.ptp(record["V"][inside]) > 0.5 * np.ptp(record["V"]):
-        raise InputError(f"{place} holds an edge of V_V; choose a stretch in which the drive rests")
+    if "V" in record and np.ptp(record["V"][inside]) > _STILL * np.ptp(record["V"]):
+        raise InputError(f"{place}: V_V moves there; choose a stretch in which the drive rests")
     values = record[channel][inside]
     values = values - values.mean()
     if longest_run(values == values[0]) == count:

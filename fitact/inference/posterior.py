@@ -22,6 +22,7 @@ from fitact.inference.chain import Chain
 from fitact.inference.convergence import Convergence
 from fitact.inference.fit import Fit
 from fitact.inference.likelihood import Batched, Likelihood
+from fitact.inference.noise import draw_noise
 from fitact.inference.trace import LINEAR
 from fitact.inference.trace_fit import TraceFit
 from fitact.units import unit_of
@@ -234,12 +235,13 @@ class Posterior:
         draws = np.linspace(0, count - 1, min(_PREDICTED, count)).astype(int)
         rng = np.random.default_rng([self.seed, 3])
         found = xr.Dataset(coords={"chain": np.arange(ensembles), "draw": draws})
-        for i, trace in enumerate(self.fit.traces):
+        for i, (trace, model) in enumerate(zip(self.fit.traces, self.fit.likelihood.traces, strict=True)):
             stride = -(-len(trace.record) // _PREDICTED_SAMPLES)
             signal = functools.partial(_signal_of, i, stride)
             mean = self._each(signal, self.fit.likelihood, len(trace.record), draws)
             sigma = np.exp(self.points[:, draws, self.fit.theta.size + i, None])
-            noisy = mean + sigma * self._spread(trace)[::stride] * rng.standard_normal(mean.shape)
+            noise = draw_noise(rng, model.noise, model.whitening, mean.shape, stride)
+            noisy = mean + sigma * self._spread(trace)[::stride] * noise
             time = _axis(trace)
             unit = {"units": CHANNEL_UNITS[trace.channel]}
             found[_name(trace)] = ("chain", "draw", time), noisy.astype(np.float32), unit

@@ -6,13 +6,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitact.data.record import Record
+from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.inference.diagnostics import is_coarse
 from fitact.inference.likelihood import Likelihood
 from fitact.inference.start import DriveChoice
 from fitact.units import engineering
 
 _DRAWS = 10_000
+_RESTLESS = 3.0  # times what a fit leaves: noise of the quiet stretch that must hold more than noise
 _IMPLAUSIBLE = 0.005  # share of the prior further out than g or b, below which it is remarked upon
 
 
@@ -35,6 +36,12 @@ def on_trace(record: Record, choice: DriveChoice, channel: str, figures: dict[st
         found.append(
             f"{channel} is rounded to steps wider than its noise, so its errors are not independent and those stated"
             " may be off by half; record with a finer range"
+        )
+    if figures.get("quiet_noise", 0.0) > _RESTLESS * figures["rms_residual"]:
+        there, left = (engineering(figures[name], CHANNEL_UNITS[channel]) for name in ("quiet_noise", "rms_residual"))
+        found.append(
+            f"[measurement] quiet holds more than noise: {channel} varies by {there} in it, and the fit leaves {left},"
+            " so the errors stated are too wide; choose a stretch before the drive starts"
         )
     if figures["outliers"]:
         found.append(

@@ -69,7 +69,12 @@ class TraceFit:
         figures = statistics(kept, time, noise, used, gain, source.record, trace.channel, source.choice)
         if weight is not None and np.mean((weight > 0.0) & (weight < _EVEN)) > 0.01:
             figures |= {"spectrum_p": 1.0, "line_p": 1.0}  # the noise that dV/dt brings in is not white
-        figures |= outliers(left if weight is None else left * weight, source.record.time, source.noise)
+        weighted = left if weight is None else left * weight
+        if trace.whitening is not None:  # as a user sees them, before the filter
+            figures["rms_residual"] = float(np.sqrt(np.mean(weighted[counted] ** 2)))
+        if trace.noise == "spectrum":
+            figures["quiet_noise"] = source.noise
+        figures |= outliers(weighted, source.record.time, source.noise)
         return cls(
             label=trace.label,
             channel=trace.channel,
