@@ -1,6 +1,8 @@
 # make demo   set up, fit the shipped record, sample its posterior, write the report
 # make test   set up, run the tests
 PY = .venv/bin/python
+# what one process of the tests compiles serves the others, and the next run
+COMPILED = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/out/jax JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
 .DEFAULT_GOAL = help
 .PHONY: help env demo test test-slow notebooks extremes calibration calibration-quick check lock clean
 
@@ -14,11 +16,11 @@ demo: env
 	.venv/bin/fitact run data_synth/records/finger_direct.csv --scene data_synth/records/finger_direct.toml --out out/demo --seed 1
 
 test: env
-	$(PY) -m pytest -n auto --dist loadfile -m "not slow"
+	$(COMPILED) $(PY) -m pytest -n auto --dist loadfile -m "not slow"
 
 # make test-slow   the tests that `make test` leaves out for their time
 test-slow: env
-	$(PY) -m pytest -n auto -m slow
+	$(COMPILED) $(PY) -m pytest -n auto -m slow
 
 # make notebooks   run the notebooks; executed copies in out/notebooks
 notebooks: env
