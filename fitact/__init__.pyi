@@ -12,6 +12,7 @@ from .model.drive import Burst, Polyline, Sampled, Sine, Square, Trapezoid, Tria
 from .model.equivalents import quality_factor, series_equivalent
 from .model.force import Contact, electrostatic_force, friction, mean_force, peak_force
 from .model.harmonic import harmonic_error, harmonic_response
+from .model.multitone import Multitone
 from .model.prior import Prior
 from .model.response import response
 from .model.scene import Scene
@@ -31,6 +32,7 @@ __all__ = [
     "InputError",
     "LogNormal",
     "LogUniform",
+    "Multitone",
     "NaturalGround",
     "Polyline",
     "Posterior",

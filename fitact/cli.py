@@ -219,6 +219,18 @@ def prior(
     _show(str(predicted), predicted.to_dict(), json)
 
 
+@app.command()
+def scene(
+    file: Annotated[str, typer.Argument(metavar="[SCENE]", help="Scene (TOML), or the name of a shipped one.")] = "",
+    json: Json = False,
+) -> None:
+    """Print a scene with every key, its unit and, as comments, the defaults; without one: a template to fill in."""
+    from fitact.model.scene import Scene
+
+    stated = Scene.load(file) if file else Scene()
+    _show(str(stated).rstrip(), stated.model_dump(mode="json"), json)
+
+
 def _folder(record: Path) -> Path:
     return Path(f"{record.name.removesuffix('.gz').removesuffix('.csv')}-fitact")
 

@@ -159,6 +159,21 @@ def test_simulate_then_fit_recovers_the_scene(fitact_command, tmp_path):
         assert abs(derived[name]["q50"] - truth) < 4.0 * derived[name]["sd"]
 
 
+def test_scene_is_printed_as_a_file(fitact_command, tmp_path):
+    done = fitact_command("scene", "phone")
+    assert done.returncode == 0
+    (tmp_path / "scene.toml").write_text(done.stdout)
+    assert fitact_command("scene", "scene.toml").stdout == done.stdout
+    assert 'Z_capacitance = "9.4 pF"\n' in done.stdout
+    template = fitact_command("scene").stdout
+    assert '# Rsc = "160 kohm"\n' in template
+    assert json.loads(fitact_command("scene", "phone", "--json").stdout)["grounding"]["Z_capacitance"] == 9.4e-12
+    (tmp_path / "scene.toml").write_text('[drive]\nwaveform = "sine"\nduty = 0.3')
+    refused = fitact_command("scene", "scene.toml")
+    assert refused.returncode == 2
+    assert refused.stderr.startswith("fitact: scene.toml, line 3: [drive]")
+
+
 def test_prior_is_shown_before_any_data(fitact_command, tmp_path):
     (tmp_path / "scene.toml").write_text('[prior]\nRsc = {median = "130 kohm", factor = 3}\n')
     done = fitact_command("prior", "scene.toml", "--draws", 500, "--seed", 1, "--out", "prior.html", "--json")
