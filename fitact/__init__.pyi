@@ -18,6 +18,7 @@ from .model.response import response
 from .model.scene import Scene
 from .model.skin import Dispersive, Fractional, WithSkin
 from .model.steady import body_current, mean_square, peak
+from .tradeoff import Tradeoff, measure_tradeoff
 
 __all__ = [
     "RESULTS",
@@ -43,6 +44,7 @@ __all__ = [
     "Scene",
     "Sine",
     "Square",
+    "Tradeoff",
     "Trapezoid",
     "Triangle",
     "TruncatedLogNormal",
@@ -56,6 +58,7 @@ __all__ = [
     "harmonic_response",
     "mean_force",
     "mean_square",
+    "measure_tradeoff",
     "peak",
     "peak_force",
     "quality_factor",
