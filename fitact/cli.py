@@ -241,7 +241,11 @@ def tradeoff(
     measured = None if record is None else read(record, stated)
     from fitact.tradeoff import measure_tradeoff
 
-    found = measure_tradeoff(measured, stated)
+    try:
+        found = measure_tradeoff(measured, stated)
+    except KeyboardInterrupt:
+        _say("fitact: interrupted; nothing was written")
+        raise typer.Exit(130) from None
     if out is not None:
         from fitact.report.tradeoff import write_tradeoff
 

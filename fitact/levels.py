@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitact.inference.fit import Fit
-from fitact.inference.importance import followed
 from fitact.inference.likelihood import Batched, Likelihood
 from fitact.inference.posterior import Posterior
 from fitact.inference.sampling import Level, sample
@@ -32,7 +31,6 @@ _ROUNDS = 9
 _FEW, _LONG = 3, 0.05  # rounds that are enough for calls that take longer than so many seconds
 _ROUND = 5e-3  # seconds that a job takes in a round, at least
 _RUNS = 3  # of each level of uncertainty, after one that compiles
-_APART = 2  # draws whose force is looked at, which costs more than drawing them
 _QUANTILES = (0.05, 0.5, 0.95)
 _SCATTER = 2.11  # sqrt(0.05 0.95) over the normal density there: the sd of a 5 % quantile, times sqrt(draws)
 _LARGEST = 2.5  # such sd: what the largest of ten differences is hardly ever above
@@ -281,7 +279,7 @@ def uncertainties(full: Fit, compressed: Fit, say: Callable[[str], None]) -> Unc
     draws = {name: _pooled(posteriors) for name, posteriors in runs.items()}
     reference = draws["emcee, full"]
     found = [_of_runs(name, runs[name], off_by(draws[name], reference)) for name in jobs]
-    fewest = min(sum(min(p.convergence.ess_min, p.log_prob.size) / _APART for p in ps) for ps in runs.values())
+    fewest = min(sum(min(p.convergence.ess_min, p.log_prob.size) for p in ps) for ps in runs.values())
     return Uncertainties(
         found,
         _LARGEST * _SCATTER * math.sqrt(2.0 / fewest),
@@ -290,14 +288,13 @@ def uncertainties(full: Fit, compressed: Fit, say: Callable[[str], None]) -> Unc
 
 
 def _pooled(posteriors: Sequence[Posterior]) -> dict[str, Float[np.ndarray, " draws"]]:
-    """Logarithms of Rsc, where it is free, and of the mean force, of every other draw, which are nearly independent."""
+    """Logarithms of Rsc, where it is free, and of the mean force."""
     found: dict[str, list[np.ndarray]] = {}
     for posterior in posteriors:
-        names, points = posterior.fit.point_names, posterior.points[:, ::_APART]
+        names, points = posterior.fit.point_names, posterior.points
         if "Rsc" in names:
             found.setdefault("Rsc", []).append(points[..., names.index("Rsc")])
-        force = followed(posterior.fit, points, posterior.seed)["force_mean"]
-        found.setdefault("force_mean", []).append(np.log(force))
+        found.setdefault("force_mean", []).append(np.log(posterior.force()["force_mean"]))
     return {name: np.concatenate([np.ravel(part) for part in parts]) for name, parts in found.items()}
 
 

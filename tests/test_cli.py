@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -172,6 +173,31 @@ def test_scene_is_printed_as_a_file(fitact_command, tmp_path):
     refused = fitact_command("scene", "scene.toml")
     assert refused.returncode == 2
     assert refused.stderr.startswith("fitact: scene.toml, line 3: [drive]")
+
+
+@pytest.mark.slow
+def test_tradeoff_is_written_or_ends_without_a_trace(fitact_command, environment, finger_path, tmp_path):
+    command = [sys.executable, "-u", "-c", "from fitact.cli import main; main()", "tradeoff", str(finger_path)]
+    running = subprocess.Popen(
+        [*command, "--out", "cut"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+        env=environment,
+    )
+    while "round 1" not in running.stderr.readline():
+        pass
+    running.send_signal(signal.SIGINT)
+    out, err = running.communicate(timeout=60)
+    assert (running.returncode, out, err) == (130, "", "fitact: interrupted; nothing was written\n")
+    assert not (tmp_path / "cut").exists()
+    done = fitact_command("tradeoff", finger_path, "--out", "whole", "--json")
+    assert done.returncode == 0
+    content = json.loads(done.stdout)
+    assert json.loads((tmp_path / "whole" / "tradeoff.json").read_text()) == content
+    assert {level["kind"] for level in content["levels"]} == {"response", "likelihood", "uncertainty"}
+    assert (tmp_path / "whole" / "tradeoff.svg").read_text().startswith("<?xml")
 
 
 def test_prior_is_shown_before_any_data(fitact_command, tmp_path):
