@@ -12,11 +12,13 @@ from .model.drive import Burst, Polyline, Sampled, Sine, Square, Trapezoid, Tria
 from .model.equivalents import quality_factor, series_equivalent
 from .model.force import Contact, electrostatic_force, friction, mean_force, peak_force
 from .model.harmonic import harmonic_error, harmonic_response
+from .model.multitone import Multitone
 from .model.prior import Prior
 from .model.response import response
 from .model.scene import Scene
 from .model.skin import Dispersive, Fractional, WithSkin
 from .model.steady import body_current, mean_square, peak
+from .tradeoff import Tradeoff, measure_tradeoff
 
 __all__ = [
     "RESULTS",
@@ -31,6 +33,7 @@ __all__ = [
     "InputError",
     "LogNormal",
     "LogUniform",
+    "Multitone",
     "NaturalGround",
     "Polyline",
     "Posterior",
@@ -41,6 +44,7 @@ __all__ = [
     "Scene",
     "Sine",
     "Square",
+    "Tradeoff",
     "Trapezoid",
     "Triangle",
     "TruncatedLogNormal",
@@ -54,6 +58,7 @@ __all__ = [
     "harmonic_response",
     "mean_force",
     "mean_square",
+    "measure_tradeoff",
     "peak",
     "peak_force",
     "quality_factor",

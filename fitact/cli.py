@@ -219,6 +219,54 @@ def prior(
     _show(str(predicted), predicted.to_dict(), json)
 
 
+@app.command()
+def tradeoff(
+    record: Annotated[
+        Path | None, typer.Argument(metavar="[RECORD]", help="CSV with V and Vsc; absent: simulated from the scene.")
+    ] = None,
+    scene: Annotated[
+        Path | None, typer.Option("--scene", metavar="FILE", help="Scene (TOML); absent: the paper's device.")
+    ] = None,
+    out: Out = None,
+    json: Json = False,
+) -> None:
+    """Measure what each level of response, likelihood and uncertainty costs and is off by, on this machine.
+
+    Takes a minute or two. With --out writes tradeoff.json and tradeoff.svg.
+    """
+    from fitact.data.formats import read
+    from fitact.model.scene import Scene
+
+    stated = None if scene is None else Scene.load(scene)
+    measured = None if record is None else read(record, stated)
+    from fitact.tradeoff import measure_tradeoff
+
+    try:
+        found = measure_tradeoff(measured, stated)
+    except KeyboardInterrupt:
+        _say("fitact: interrupted; nothing was written")
+        raise typer.Exit(130) from None
+    if out is not None:
+        from fitact.report.tradeoff import write_tradeoff
+
+        write_json(out / "tradeoff.json", found.to_dict())
+        write_tradeoff(out / "tradeoff.svg", found)
+    _show(str(found), found.to_dict(), json)
+    _finish(found.trusted)
+
+
+@app.command()
+def scene(
+    file: Annotated[str, typer.Argument(metavar="[SCENE]", help="Scene (TOML), or the name of a shipped one.")] = "",
+    json: Json = False,
+) -> None:
+    """Print a scene with every key, its unit and, as comments, the defaults; without one: a template to fill in."""
+    from fitact.model.scene import Scene
+
+    stated = Scene.load(file) if file else Scene()
+    _show(str(stated).rstrip(), stated.model_dump(mode="json"), json)
+
+
 def _folder(record: Path) -> Path:
     return Path(f"{record.name.removesuffix('.gz').removesuffix('.csv')}-fitact")
 

@@ -58,6 +58,15 @@ def scale(text: str, unit: str) -> float:
     return parse(f"1 {text}", unit)
 
 
+def written(value: float, unit: str) -> str:
+    """`value` as text that `parse` reads back to its last digit: ``written(1.35e-9, "F") == "1.35 nF"``."""
+    exponent = 0
+    if value and unit and "^" not in unit:  # there a prefix would be raised to a power
+        exponent = max(-15, min(12, 3 * math.floor(math.log10(abs(value)) / 3 + 1e-12)))
+    prefix = _PREFIXES[exponent].replace("µ", "u")
+    return f"{value / 10.0**exponent:.15g} {prefix}{unit}".rstrip()
+
+
 def engineering(value: float, unit: str, digits: int = 4) -> str:
     """`value` with an SI prefix, for people: ``engineering(1.35e-9, "F") == "1.35 nF"``."""
     symbol = _SYMBOLS.get(unit, unit)

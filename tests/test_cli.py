@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -157,6 +158,46 @@ def test_simulate_then_fit_recovers_the_scene(fitact_command, tmp_path):
     derived = json.loads(done.stdout)["derived"]
     for name, truth in {"g": 1.35 / 32.7, "b": 90e3 * 32.7e-9}.items():
         assert abs(derived[name]["q50"] - truth) < 4.0 * derived[name]["sd"]
+
+
+def test_scene_is_printed_as_a_file(fitact_command, tmp_path):
+    done = fitact_command("scene", "phone")
+    assert done.returncode == 0
+    (tmp_path / "scene.toml").write_text(done.stdout)
+    assert fitact_command("scene", "scene.toml").stdout == done.stdout
+    assert 'Z_capacitance = "9.4 pF"\n' in done.stdout
+    template = fitact_command("scene").stdout
+    assert '# Rsc = "160 kohm"\n' in template
+    assert json.loads(fitact_command("scene", "phone", "--json").stdout)["grounding"]["Z_capacitance"] == 9.4e-12
+    (tmp_path / "scene.toml").write_text('[drive]\nwaveform = "sine"\nduty = 0.3')
+    refused = fitact_command("scene", "scene.toml")
+    assert refused.returncode == 2
+    assert refused.stderr.startswith("fitact: scene.toml, line 3: [drive]")
+
+
+@pytest.mark.slow
+def test_tradeoff_is_written_or_ends_without_a_trace(fitact_command, environment, finger_path, tmp_path):
+    command = [sys.executable, "-u", "-c", "from fitact.cli import main; main()", "tradeoff", str(finger_path)]
+    running = subprocess.Popen(
+        [*command, "--out", "cut"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+        env=environment,
+    )
+    while "round 1" not in running.stderr.readline():
+        pass
+    running.send_signal(signal.SIGINT)
+    out, err = running.communicate(timeout=60)
+    assert (running.returncode, out, err) == (130, "", "fitact: interrupted; nothing was written\n")
+    assert not (tmp_path / "cut").exists()
+    done = fitact_command("tradeoff", finger_path, "--out", "whole", "--json")
+    assert done.returncode == 0
+    content = json.loads(done.stdout)
+    assert json.loads((tmp_path / "whole" / "tradeoff.json").read_text()) == content
+    assert {level["kind"] for level in content["levels"]} == {"response", "likelihood", "uncertainty"}
+    assert (tmp_path / "whole" / "tradeoff.svg").read_text().startswith("<?xml")
 
 
 def test_prior_is_shown_before_any_data(fitact_command, tmp_path):

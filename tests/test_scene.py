@@ -1,12 +1,19 @@
+import functools
 import math
+import re
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import fitact
+from fitact import units
 from fitact.data.simulate import simulate
+from fitact.model.scene_file import shipped, value_text
+from fitact.model.sections import unit_of
 
 CONTRACT = """
 [device]
@@ -73,6 +80,14 @@ start_frequency = "10 Hz"
 end_frequency = "1 kHz"
 sweep_time = "0.5 s"
 spacing = "logarithmic"
+"""
+TONES = """
+[drive]
+waveform = "multitone"
+frequencies = ["100 Hz", "250 Hz", "1 kHz"]
+amplitudes = ["36 V", 40, "5 V"]
+phases = ["0 deg", "45 deg", 1.0]
+offset = "-3 V"
 """
 NATURAL = '[grounding]\nconnection = "natural"\nZ = "14.5 Mohm"\n'
 BELIEFS = """
@@ -189,12 +204,50 @@ def test_Ci_from_the_layer_only_where_it_is_absent(tmp_path: Path):
 
 
 def test_round_trip(tmp_path: Path):
-    for text in (CONTRACT, BELIEFS, "", '[drive]\nwaveform = "measured"\n', BURST, CHIRP):
+    for text in (CONTRACT, BELIEFS, "", '[drive]\nwaveform = "measured"\n', BURST, CHIRP, TONES, *shipped().values()):
         scene = load(tmp_path, text)
+        printed = load(tmp_path, str(scene))
+        assert printed == scene
+        assert str(printed) == str(scene)
+        assert printed.to_json() == scene.to_json()  # what was not given is not given there
         again = fitact.Scene.from_json(scene.to_json())
         assert again == scene
         assert again.to_json() == scene.to_json()
         assert again.states_waveform() == scene.states_waveform()
+
+
+@given(st.floats(1e-15, 1e15), st.sampled_from(["ohm", "F", "V", "m", "m^2", "Hz", "s", "rad", ""]))
+def test_quantities_are_written_to_their_last_digit(value: float, unit: str):
+    value = units.parse(value, unit)
+    assert units.parse(units.written(value, unit), unit) == value
+
+
+def test_quantities_are_written_as_people_do():
+    written = [units.written(*quantity) for quantity in ((160e3, "ohm"), (1.35e-9, "F"), (1e-6, "m"), (1e-4, "m^2"))]
+    assert written == ["160 kohm", "1.35 nF", "1 um", "0.0001 m^2"]
+
+
+@pytest.mark.parametrize("text", [f"{wrong}\n{rest}" for wrong, rest in [("[device]", "Ci = -1"), ("", "[skn]")]])
+def test_errors_name_the_line(tmp_path: Path, text: str):
+    for before in range(3):
+        with pytest.raises(fitact.InputError, match=f"scene.toml, line {before + 2}: "):
+            load(tmp_path, "# a comment with Ci = 1\n" * before + text)
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ('[drive]\nwaveform = "sine"\nfrequency = 5\nduty = 0.3', 4),  # what is wrong with the section as a whole
+        ('[skin]\nlevel = "constant"\n[device]\nlevel = 1', 4),  # the same key in another section
+        ('[prior]\nCi = {fixed = true}\nRsc = {factor = 3, hihg = "1 Mohm"}', 3),
+        ("drive.frequency = 1\ndrive.duty = 3", 2),
+        ("[prior]\nRsc = {factor = 3}\n[prior.correlation]\nRsc-Csc = -1.6", 4),
+        ('[grounding]\nconnection = "direct"\n\n[prior]\n# Z = 1\nZ = {factor = 2}', 6),
+    ],
+)
+def test_line_of_what_is_wrong(tmp_path: Path, text: str, line: int):
+    with pytest.raises(fitact.InputError, match=f"scene.toml, line {line}: "):
+        load(tmp_path, text)
 
 
 @pytest.mark.parametrize(
@@ -208,7 +261,7 @@ def test_round_trip(tmp_path: Path):
         ('[device]\nCi = "-1 nF"', ["[device] Ci", "greater than 0"]),
         ("[device]\nCi = nan", ["[device] Ci", "finite"]),
         ("[device]\nCi = true", ["[device] Ci"]),
-        ('[drive]\nwaveform = "sqare"', ["[drive] waveform", "sqare", "square"]),
+        ('[drive]\nwaveform = "sqare"', ["[drive] waveform", "sqare", "did you mean 'square'"]),
         ('[drive]\nwaveform = "trapezoid"', ["[drive]", "rise_time"]),
         ('[drive]\nrise_time = "1 us"', ["[drive]", "rise_time"]),
         ('[drive]\nwaveform = "trapezoid"\nrise_time = "6 ms"', ["[drive]", "shorter"]),
@@ -220,6 +273,17 @@ def test_round_trip(tmp_path: Path):
         ('[drive]\nwaveform = "burst"\ncycles = 2.5', ["[drive] cycles", "integer"]),
         ('[drive]\nwaveform = "burst"\nshape = "sine"\nduty = 0.3', ["duty", "square"]),
         ('[drive]\nwaveform = "burst"\nsteady_state = true', ["burst", "steady_state"]),
+        (TONES + "peak_to_peak = 3", ["peak_to_peak", "multitone"]),
+        (TONES + 'frequency = "1 Hz"', ["frequency", "multitone"]),
+        ('[drive]\nwaveform = "multitone"\nfrequencies = ["1 Hz"]', ["frequencies and amplitudes"]),
+        (TONES.replace('"5 V"', '"5 V", "6 V"'), ["amplitudes has 4 values for 3"]),
+        (TONES.replace("250 Hz", "1 kHz"), ["frequencies must differ"]),
+        (TONES.replace("250 Hz", "250.1 Hz"), ["multiples", "0.1 Hz"]),
+        (TONES.replace("36 V", "-36 V"), ["[drive] amplitudes", "greater than 0"]),
+        ("[device]\ninsulator_permittivity = 0.9", ["insulator_permittivity", "1"]),
+        ("[prior]\nZ_capacitance = {factr = 3}", ["Z_capacitance.factr", "did you mean 'factor'"]),
+        ("device = 3", ["[device]", "table"]),
+        ('[measurement]\nchannels = ["Vsk"]', ["[measurement] channels", "did you mean 'Vsc'"]),
         ('[drive]\nwaveform = "chirp"\nstart_frequency = "1 Hz"', ["end_frequency"]),
         ('[drive]\nwaveform = "chirp"\nfrequency = "1 Hz"', ["frequency", "chirp"]),
         ("[prior]\nRsc = {factor = 0.5}", ["[prior] Rsc.factor", "1"]),
@@ -331,3 +395,77 @@ def test_burst_and_chirp_are_simulated(tmp_path: Path, text: str):
     record = simulate(load(tmp_path, text + '[measurement]\nduration = "50 ms"'), seed=1)
     assert np.ptp(record["V"]) > 300.0
     assert 5.0 < np.ptp(record["Vsc"]) < 50.0
+
+
+def test_tones_of_a_scene(tmp_path: Path):
+    scene = load(tmp_path, TONES)
+    drive = scene.make_drive()
+    assert (drive.frequency, drive.orders) == (50.0, (2, 5, 20))
+    assert (drive.amplitudes, drive.offset) == ((36.0, 40.0, 5.0), -3.0)
+    assert drive.phases == pytest.approx((0.0, math.pi / 4.0, 1.0))
+    assert scene.drive.slowest == 50.0
+
+
+SHIPPED = ("burst", "fast-edge", "gabriel-dry", "gabriel-wet", "multitone", "natural-ground", "paper", "phone")
+
+
+def test_all_shipped_scenes_are_known():
+    assert tuple(sorted(shipped())) == SHIPPED
+    described = (Path(__file__).parents[1] / "docs" / "scene.md").read_text()
+    assert all(f"`{name}`" in described for name in SHIPPED)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_scenes_are_simulated_and_respond(name: str):
+    scene = fitact.Scene.load(name)
+    scene.require_available(fit=True)
+    record = simulate(scene, seed=1)
+    with jax.enable_x64(True):
+        clean = fitact.response(
+            scene.make_circuit(), scene.make_drive(), record.time, steady_state=scene.drive.steady_state
+        )
+    noise = record["Vsc"] - np.asarray(clean)
+    assert np.std(noise) == pytest.approx(scene.measurement.noise_Vsc, rel=0.1)
+    assert np.ptp(clean) > 50.0 * scene.measurement.noise_Vsc
+
+
+def test_phone_is_a_capacitive_divider():
+    """Far above 1/b of the skin, all of the loop is capacitance: stray, panel, finger in series."""
+    phone = fitact.Scene.load("phone")
+    whole = 1.0 / (1.0 / 1.35e-9 + 1.0 / 22e-9 + 1.0 / 9.4e-12)
+    with jax.enable_x64(True):
+        assert float(phone.make_circuit().amplitude(1e6)) == pytest.approx(whole / 22e-9, rel=1e-3)
+
+
+def test_a_file_goes_before_a_shipped_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    assert fitact.Scene.load("phone").grounding.connection == "natural"
+    (tmp_path / "phone").write_text('[skin]\nRsc = "1 kohm"')
+    assert fitact.Scene.load("phone").skin.Rsc == 1e3
+    with pytest.raises(fitact.InputError, match="or the shipped scene 'paper'"):
+        fitact.Scene.load("papper")
+
+
+@functools.cache
+def documented() -> dict[tuple[str, str], list[str]]:
+    """The rows of docs/scene.md: (section, key) -> default, unit, meaning, source."""
+    rows, section = {}, ""
+    for line in (Path(__file__).parents[1] / "docs" / "scene.md").read_text().splitlines():
+        if header := re.fullmatch(r"## \[(\w+)\]", line):
+            section = header[1]
+        elif line.startswith("| `") and section:
+            key, *cells = (cell.strip() for cell in line.strip("|").split(" | "))
+            rows[section, key.strip("`")] = cells
+    return rows
+
+
+@pytest.mark.parametrize("name", list(fitact.Scene.model_fields))
+def test_every_key_is_documented_with_its_default_and_unit(name: str):
+    section = getattr(fitact.Scene(), name)
+    fields = type(section).model_fields
+    assert [key for of, key in documented() if of == name] == list(fields)
+    for key, field in fields.items():
+        default, unit, *_ = documented()[name, key]
+        value = getattr(section, key)
+        assert default == ("absent" if value is None else f"`{value_text(value, unit_of(field))}`")
+        assert unit == (unit_of(field) or "")

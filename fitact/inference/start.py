@@ -69,12 +69,12 @@ def choose_drive(record: Record, scene: Scene | None) -> DriveChoice:
     drive, slowest = scene.make_drive(), scene.drive.slowest
     notes: tuple[str, ...] = ()
     if scene.states_waveform() and not isinstance(drive, Chirp):
-        _check_frequency(record, scene.drive.frequency)
+        _check_frequency(record, slowest)
     if scene.states_waveform() and isinstance(drive, Periodic) and _is_off(record, scene.drive):
-        slowest = record.frequency() or slowest
-        drive = scene.drive.model_copy(update={"frequency": slowest}).make()
+        stated, slowest = slowest, record.frequency() or slowest
+        drive = dataclasses.replace(drive, frequency=slowest)
         notes = (
-            f"the record repeats at {slowest:.6g} Hz, not at the scene's {scene.drive.frequency:.6g} Hz, and its own"
+            f"the record repeats at {slowest:.6g} Hz, not at the scene's {stated:.6g} Hz, and its own"
             " frequency is used",
         )
     shift = _align(record, drive, slowest, scene.drive.steady_state)
@@ -187,8 +187,8 @@ def _is_off(record: Record, stated: DriveSection) -> bool:
     if found is None or not stated.steady_state:  # from rest, what came before and the transient shift where it repeats
         return False
     # an edge between two samples may lie anywhere there
-    steps = _SMOOTH_STEPS if stated.waveform in ("sine", "triangle") else _EDGE_STEPS
-    return abs(found / stated.frequency - 1.0) > steps * record.time_step / float(record.time[-1] - record.time[0])
+    steps = _SMOOTH_STEPS if stated.waveform in ("sine", "triangle", "multitone") else _EDGE_STEPS
+    return abs(found / stated.slowest - 1.0) > steps * record.time_step / float(record.time[-1] - record.time[0])
 
 
 def _check_amplitude(record: Record, voltage: np.ndarray) -> None:

@@ -9,7 +9,7 @@ from fitact import units
 from fitact.errors import InputError
 from fitact.model.distribution import Distribution, LogNormal, LogUniform, TruncatedLogNormal, Uniform
 from fitact.model.prior import Prior
-from fitact.model.sections import Section
+from fitact.model.sections import Section, Unit
 from fitact.model.tables import Layer, Table, published
 
 _FORMS: tuple[tuple[set[str], set[str]], ...] = (  # keys that a form needs, and keys that it can take
@@ -22,6 +22,7 @@ _FORMS: tuple[tuple[set[str], set[str]], ...] = (  # keys that a form needs, and
     ({"tied"}, {"ratio"}),
 )
 _ORDER = {"above", "below"}
+QUANTITIES = ("median", "low", "high", "nominal", "fixed")  # keys in the unit of the parameter
 _SKIN = ("Rsc", "Csc", "grounding_Rsc", "grounding_Csc")  # what the tables have
 
 
@@ -100,14 +101,14 @@ def _given(name: str, key: str, stated: float | None, nominal: float | None) -> 
 
 
 def _belief(unit: str) -> Any:
-    of = {"median": unit, "low": unit, "high": unit, "nominal": unit, "fixed": unit, "tolerance": "", "ratio": ""}
+    of = dict.fromkeys(QUANTITIES, unit) | {"tolerance": "", "ratio": ""}
 
     def parse(value: object) -> object:
         if not isinstance(value, dict):
             return value
         return {k: units.parse(v, of[k]) if k in of and not isinstance(v, bool) else v for k, v in value.items()}
 
-    return Annotated[Belief, BeforeValidator(parse)]
+    return Annotated[Belief, Unit(unit), BeforeValidator(parse)]
 
 
 if TYPE_CHECKING:

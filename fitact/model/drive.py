@@ -121,7 +121,7 @@ class PiecewiseLinear(Periodic):
         at_start = since <= self.cycle(time)[1] * self.period
         jumps = at_start & (pieces.start != jnp.roll(pieces.end, 1))[piece]
         slope = jnp.where(jumps, jnp.nan, pieces.slopes()[piece])
-        return slope if steady_state else _after_rest(self, slope, time, jnp.max(jnp.abs(pieces.start)))
+        return slope if steady_state else after_rest(self, slope, time, jnp.max(jnp.abs(pieces.start)))
 
 
 class Square(PiecewiseLinear):
@@ -200,7 +200,7 @@ class Sine(Periodic):
         """dV/dt at `time`."""
         cycle, _ = self.cycle(time)
         slope = np.pi * jnp.asarray(self.peak_to_peak) * self.frequency * jnp.cos(2.0 * np.pi * cycle)
-        return slope if steady_state else _after_rest(self, slope, time, jnp.abs(jnp.asarray(self.peak_to_peak)))
+        return slope if steady_state else after_rest(self, slope, time, jnp.abs(jnp.asarray(self.peak_to_peak)))
 
 
 class Line(Drive):
@@ -263,7 +263,7 @@ class Line(Drive):
         jump = jnp.where(jnp.diff(pieces.knots) > 0.0, 0.0, pieces.end - pieces.start)
         at_start = (since >= 0.0) & (since <= self._slack(jnp.asarray(time, dtype=float)))
         slope = jnp.where(at_start & (jnp.roll(jump, 1) != 0.0)[piece], jnp.nan, slope)
-        return slope if steady_state else _after_rest(self, slope, time, jnp.max(jnp.abs(self.points()[1])))
+        return slope if steady_state else after_rest(self, slope, time, jnp.max(jnp.abs(self.points()[1])))
 
 
 class Sampled(Line):
@@ -360,8 +360,8 @@ class Burst(Drive):
         return jnp.where(self.is_over(time), after, inside)
 
 
-def _after_rest(drive: Drive, slope: Array, time: ArrayLike, height: ArrayLike) -> Array:
-    """From rest: nothing before the drive begins, and a jump there unless it begins at 0."""
+def after_rest(drive: Drive, slope: Array, time: ArrayLike, height: ArrayLike) -> Array:
+    """A slope from rest: 0 before the drive begins, and NaN there unless it begins at 0."""
     time = jnp.asarray(time, dtype=float)
     slope = jnp.where(time < drive.begin, 0.0, slope)
     jumps = jnp.abs(drive.value(drive.begin)) > _NO_JUMP * jnp.finfo(slope.dtype).eps * jnp.asarray(height)

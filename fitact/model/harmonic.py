@@ -15,6 +15,7 @@ from jaxtyping import Array, Complex, Float
 from fitact.errors import InputError
 from fitact.model.circuit import Channel, Circuit
 from fitact.model.drive import Drive, Line, Periodic, PiecewiseLinear, Sine
+from fitact.model.multitone import Multitone
 
 _TAIL = 64  # an error is summed up to this many times the harmonics kept,
 _LEAST = 4096  # and to this harmonic at least
@@ -83,6 +84,10 @@ def fourier(drive: Drive, harmonics: int) -> Complex[Array, " harmonics"]:
     order = jnp.arange(1, harmonics + 1, dtype=float)
     if isinstance(drive, Sine):
         return jnp.where(order == 1.0, -0.25j * jnp.asarray(drive.peak_to_peak), 0.0)
+    if isinstance(drive, Multitone):
+        kept = np.flatnonzero(np.asarray(drive.orders) <= harmonics)
+        places = np.asarray(drive.orders)[kept] - 1
+        return jnp.zeros(harmonics, dtype=complex).at[places].set(-0.5j * drive.phasors()[kept])
     fundamental(drive)
     assert isinstance(drive, PiecewiseLinear | Line)
     knots, start, end = drive.pieces()

@@ -22,6 +22,7 @@ from fitact.model.chirp import Chirp
 from fitact.model.circuit import Channel, Circuit, gain_at, highpass_amplitude
 from fitact.model.drive import Burst, Drive, Line, Pieces, PiecewiseLinear, Sampled, Sine, Square
 from fitact.model.harmonic import fourier, frequency, fundamental, harmonic_response, harmonic_sum
+from fitact.model.multitone import Multitone
 from fitact.model.polynomial import evaluate, particular
 from fitact.model.skin import WithSkin
 
@@ -80,8 +81,9 @@ def _with_skin(
             " ask for steady_state=True, or take the constant skin level"
         )
     omega = fundamental(drive)
-    if isinstance(drive, Sine):
-        return harmonic_response(circuit, drive, time, 1, channel=channel)
+    if isinstance(drive, Sine | Multitone):
+        highest = max(drive.orders) if isinstance(drive, Multitone) else 1
+        return harmonic_response(circuit, drive, time, highest, channel=channel)
     count = circuit.skin.count(frequency(drive))
     terms = circuit.skin.above(circuit, omega * count, channel)
     time = jnp.asarray(time, dtype=float)
@@ -102,7 +104,7 @@ def highpass(drive: Drive, time: ArrayLike, tau: ArrayLike, *, steady_state: boo
     """The response of s tau / (1 + s tau) to `drive` at `time`; arguments as in `response`."""
     time = jnp.asarray(time, dtype=float)
     wave = drive.wave if isinstance(drive, Burst) else drive
-    if not isinstance(wave, Sine | PiecewiseLinear | Line | Chirp):
+    if not isinstance(wave, Sine | Multitone | PiecewiseLinear | Line | Chirp):
         raise TypeError(f"no exact response to a {type(wave).__name__}")
     if steady_state:
         _require_steady_state(drive)
@@ -151,10 +153,12 @@ def _remains(
     return jnp.asarray(left if isinstance(drive, Sampled) else jnp.where(since >= 0.0, left, 0.0))
 
 
-def _steady(drive: Sine | PiecewiseLinear | Line, tau: ArrayLike) -> Callable[[Array], Array]:
+def _steady(drive: Sine | Multitone | PiecewiseLinear | Line, tau: ArrayLike) -> Callable[[Array], Array]:
     """u(t) in the steady state."""
     if isinstance(drive, Sine):
         return partial(_sine, drive, tau)
+    if isinstance(drive, Multitone):
+        return lambda time: sum((_sine(tone, tau, time) for tone in drive.tones()), jnp.zeros(()))
     u = steady_knots(drive.pieces(), tau)
     return lambda time: _along(drive, time, tau, u)
 

@@ -7,6 +7,7 @@ is the paper's nominal device.
 import difflib
 import json
 import math
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,6 +18,7 @@ from jax.typing import ArrayLike
 from pydantic import model_validator
 
 from fitact.errors import InputError
+from fitact.model import scene_file
 from fitact.model.beliefs import PriorSection
 from fitact.model.circuit import RC, Circuit, DirectGround, FinalCircuit, NaturalGround, Probe
 from fitact.model.drive import Drive
@@ -33,6 +35,7 @@ from fitact.model.sections import (
     Section,
     Skin,
     Tolerance,
+    section_of,
 )
 from fitact.model.skin import Dispersive, Fractional, WithSkin
 from fitact.model.tables import Layer
@@ -58,18 +61,22 @@ class Scene(Section):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a scene file (TOML).
+        """Read a scene file (TOML), or a shipped scene by its name, such as "paper" (docs/scene.md lists them).
 
         Raises:
-            InputError: naming the file, the section, the key and the remedy.
+            InputError: naming the file, the line, the section, the key and the remedy.
         """
+        text = scene_file.read(path)
         try:
-            content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{path}: the scene cannot be read ({_reason(error)}); give a TOML file") from error
+            content = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
             raise InputError(f"{path}: not valid TOML: {error}") from error
-        return cls.from_dict(content, source=str(path))
+        try:
+            return cls.model_validate(content)
+        except pydantic.ValidationError as error:
+            sentence = _sentence(error.errors()[0])
+            line = scene_file.line_of(text, sentence)
+            raise InputError(f"{path}{f', line {line}' if line else ''}: {sentence}") from None
 
     @classmethod
     def from_dict(cls, content: dict[str, Any], source: str = "scene") -> Self:
@@ -79,9 +86,14 @@ class Scene(Section):
         except pydantic.ValidationError as error:
             raise InputError(f"{source}: {_sentence(error.errors()[0])}") from None
 
+    def __str__(self) -> str:
+        """The scene as a file: every key, with its unit; what was not given, as a comment. Loads to an equal scene."""
+        return scene_file.to_toml(self)
+
     def to_json(self) -> str:
         """What was given, in SI units; `from_json` reads it back."""
-        return json.dumps(self.model_dump(mode="json", exclude_unset=True), sort_keys=True)
+        given = self.model_dump(mode="json", exclude_unset=True)
+        return json.dumps({name: section for name, section in given.items() if section}, sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> Self:
@@ -202,26 +214,28 @@ class Scene(Section):
         return self
 
 
-def _reason(error: OSError | UnicodeDecodeError) -> str:
-    return (error.strerror or str(error)).lower() if isinstance(error, OSError) else "not UTF-8 text"
-
-
 def _sentence(error: Any) -> str:
     """A pydantic error as one sentence with the place and the remedy."""
     where = [str(part) for part in error["loc"] if part not in ("function-before", "constrained-float")]
     place = f"[{where[0]}] {'.'.join(where[1:])}".strip() if where else "the scene"
     if error["type"] == "extra_forbidden":
-        model: Any = Scene
+        model: type[Section] = Scene
         for name in where[:-1]:
-            field = model.model_fields.get(name) if hasattr(model, "model_fields") else None
-            model = field.annotation if field is not None else None
-        known = list(model.model_fields) if hasattr(model, "model_fields") else []
-        near = difflib.get_close_matches(where[-1], known, n=1)
-        hint = f"did you mean '{near[0]}'?" if near else f"known here: {', '.join(known)}"
-        return f"{place} is not a key of a scene; {hint}"
+            model = section_of(model.model_fields[name])
+        return f"{place} is not a key of a scene; {_nearest(where[-1], list(model.model_fields))}"
     message = str(error["msg"]).removeprefix("Value error, ")
+    if error["type"] == "model_type":
+        message = "not a table; write its keys in one"
+    if error["type"] == "literal_error":
+        known = re.findall("'([^']+)'", error["ctx"]["expected"])
+        message = f"not a choice; {_nearest(str(error['input']), known)}"
     if message.startswith("["):  # it names its place itself
         return message
     value = error["input"]
     shown = f" = {value!r}" if isinstance(value, str | int | float | bool) else ""
     return f"{place}{shown}: {message[0].lower()}{message[1:]}"
+
+
+def _nearest(word: str, known: list[str]) -> str:
+    near = difflib.get_close_matches(word, known, n=1)
+    return (f"did you mean '{near[0]}'? " if near else "") + f"known: {', '.join(known)}"

@@ -1,20 +1,52 @@
 """The sections of a scene file: keys, units, defaults and what they refuse. Inside, every number is SI."""
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias
+import dataclasses
+import math
+from collections.abc import Iterator
+from fractions import Fraction
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias, get_args
 
 import pydantic
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
+from pydantic.fields import FieldInfo
 
 from fitact import units
 from fitact.errors import InputError
 from fitact.model.chirp import Chirp
 from fitact.model.drive import Burst, Drive, Periodic, Sine, Square, Trapezoid, Triangle
 from fitact.model.force import plate_capacitance
+from fitact.model.multitone import HIGHEST, Multitone
+
+
+@dataclasses.dataclass(frozen=True)
+class Unit:
+    """The SI unit of a field, among its annotations; "" for a ratio."""
+
+    name: str
+
+
+def unit_of(field: FieldInfo) -> str | None:
+    """The SI unit of a section's field; None: it is no quantity."""
+    return next((found.name for found in _annotations(field) if isinstance(found, Unit)), None)
+
+
+def section_of(field: FieldInfo) -> type["Section"]:
+    """The section that a field holds."""
+    return next(found for found in _annotations(field) if isinstance(found, type) and issubclass(found, Section))
+
+
+def _annotations(field: FieldInfo) -> Iterator[Any]:
+    def within(annotations: tuple[Any, ...]) -> Iterator[Any]:
+        for annotation in annotations:
+            yield annotation
+            yield from within(get_args(annotation))
+
+    return within((*field.metadata, field.annotation))
 
 
 def _quantity(unit: str, **bounds: Any) -> Any:
     """The type of a field in `unit`: SI floats inside, text with units accepted."""
-    return Annotated[float, BeforeValidator(lambda value: units.parse(value, unit)), Field(**bounds)]
+    return Annotated[float, Unit(unit), BeforeValidator(lambda value: units.parse(value, unit)), Field(**bounds)]
 
 
 if TYPE_CHECKING:
@@ -24,7 +56,7 @@ if TYPE_CHECKING:
     SquareMeter: TypeAlias = float
     Second: TypeAlias = float
     Hertz: TypeAlias = float
-    Ratio: TypeAlias = float
+    Permittivity: TypeAlias = float
     Volt: TypeAlias = float
     Angle: TypeAlias = float
     AnyVolt: TypeAlias = float
@@ -41,7 +73,7 @@ else:
     SquareMeter = _quantity("m^2", gt=0)
     Second = _quantity("s", gt=0)
     Hertz = _quantity("Hz", gt=0)
-    Ratio = _quantity("", gt=0)
+    Permittivity = _quantity("", ge=1)
     Volt = _quantity("V", gt=0)
     Angle = _quantity("rad")
     AnyVolt = _quantity("V")
@@ -64,7 +96,7 @@ class Device(Section):
 
     Ci: Farad = 1.35e-9
     insulator_thickness: Meter = 1e-6
-    insulator_permittivity: Ratio = 3.9
+    insulator_permittivity: Permittivity = 3.9
     contact_area: SquareMeter = 1e-4
 
     @model_validator(mode="after")
@@ -111,6 +143,7 @@ class Grounding(Section):
 
 _WAVES = ("sine", "triangle", "square", "trapezoid")
 _WAVEFORMS_OF = {  # the keys of [drive] that only some waveforms have
+    "peak_to_peak": (*_WAVES, "burst", "chirp", "measured"),
     "frequency": (*_WAVES, "burst", "measured"),
     "duty": ("square", "trapezoid", "burst"),
     "phase": (*_WAVES, "burst", "chirp"),
@@ -120,13 +153,16 @@ _WAVEFORMS_OF = {  # the keys of [drive] that only some waveforms have
     "end_frequency": ("chirp",),
     "sweep_time": ("chirp",),
     "spacing": ("chirp",),
+    "frequencies": ("multitone",),
+    "amplitudes": ("multitone",),
+    "phases": ("multitone",),
 }
 
 
 class DriveSection(Section):
     """The voltage on the electrode."""
 
-    waveform: Literal["sine", "triangle", "square", "trapezoid", "burst", "chirp", "measured"] = "square"
+    waveform: Literal["sine", "triangle", "square", "trapezoid", "burst", "chirp", "multitone", "measured"] = "square"
     peak_to_peak: Volt = 360.0
     frequency: Hertz = 100.0
     rise_time: Second | None = None
@@ -139,6 +175,9 @@ class DriveSection(Section):
     end_frequency: Hertz | None = None
     sweep_time: Second | None = None
     spacing: Literal["linear", "logarithmic"] = "linear"
+    frequencies: tuple[Hertz, ...] | None = Field(default=None, min_length=1)
+    amplitudes: tuple[Volt, ...] | None = None
+    phases: tuple[Angle, ...] | None = None
     steady_state: bool = True
 
     @model_validator(mode="after")
@@ -167,9 +206,31 @@ class DriveSection(Section):
             object.__setattr__(self, "steady_state", False)  # the model is frozen from here on
         return self
 
+    @model_validator(mode="after")
+    def _tones(self) -> Self:
+        if self.waveform != "multitone":
+            return self
+        if self.frequencies is None or self.amplitudes is None:
+            raise ValueError("waveform = 'multitone' needs frequencies and amplitudes, a list of each")
+        for key in ("amplitudes", "phases"):
+            given = getattr(self, key)
+            if given is not None and len(given) != len(self.frequencies):
+                raise ValueError(f"{key} has {len(given)} values for {len(self.frequencies)} frequencies")
+        if len(set(self.frequencies)) < len(self.frequencies):
+            raise ValueError("frequencies must differ; add the amplitudes of one tone up")
+        if max(self.frequencies) / self.slowest > HIGHEST:
+            raise ValueError(
+                f"frequencies must be multiples, up to {HIGHEST}, of one frequency (these: of {self.slowest:.6g} Hz)"
+            )
+        return self
+
     @property
     def slowest(self) -> float:
-        """The lowest frequency in it, Hz."""
+        """The lowest frequency in it, Hz; of several tones that at which they repeat."""
+        if self.frequencies is not None:
+            tones = [Fraction(repr(tone)) for tone in self.frequencies]
+            whole = math.lcm(*(tone.denominator for tone in tones))
+            return math.gcd(*(int(tone * whole) for tone in tones)) / whole
         return min(self.start_frequency or self.frequency, self.end_frequency or self.frequency)
 
     def make(self) -> Drive:
@@ -184,6 +245,11 @@ class DriveSection(Section):
             return Chirp(self.peak_to_peak, start, end, duration, self.spacing, self.offset, self.phase)
         if self.waveform == "burst":
             return Burst(self._wave(self.shape), self.cycles)
+        if self.waveform == "multitone":
+            assert self.frequencies is not None  # checked when the section was read
+            assert self.amplitudes is not None
+            orders = tuple(round(tone / self.slowest) for tone in self.frequencies)
+            return Multitone(self.slowest, orders, self.amplitudes, self.phases or (), self.offset)
         return self._wave(self.waveform)
 
     def _wave(self, shape: str) -> Periodic:
@@ -199,7 +265,7 @@ class DriveSection(Section):
             return Trapezoid(*height, self.rise_time, self.duty, offset, phase)
         raise InputError(
             f"scene: [drive] waveform = '{shape}' gives no drive to compute; name sine, triangle, square, trapezoid,"
-            " burst or chirp"
+            " burst, chirp or multitone"
         )
 
 

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from fitact.errors import InputError
 from fitact.model.circuit import Channel, Circuit, Terms, highpass_amplitude
 from fitact.model.drive import Drive, Line, Periodic, Pieces, PiecewiseLinear, Sine, Square, Trapezoid, Triangle
+from fitact.model.multitone import Multitone, largest_sum
 from fitact.model.response import bend, coth_fraction, log_slope, phi, psi, steady_knots
 
 _HALVINGS = 160  # of a bracket that begins at 0: to the last bit of an extreme far closer to 0 than to the end
@@ -60,8 +61,8 @@ def peak(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Float[Arra
     """The largest |Vsc| (V) or |I| (A) over a period of the steady state, both sides of every jump included.
 
     Exact: one time constant has its extremes at the ends of the straight pieces; of several, those in
-    between are bracketed and halved to the last bit. Where the current follows dV/dt and the drive jumps
-    it is infinite.
+    between are bracketed and halved to the last bit, and a multi-tone's are found by Newton's method. Where
+    the current follows dV/dt and the drive jumps it is infinite.
 
     Raises:
         InputError: the drive does not repeat.
@@ -70,6 +71,9 @@ def peak(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Float[Arra
         omega = 2.0 * np.pi * jnp.asarray(drive.frequency)
         amplitude = circuit.amplitude(omega) if channel == "Vsc" else abs(circuit.admittance(omega))
         return abs(0.5 * jnp.asarray(drive.peak_to_peak)) * amplitude
+    if isinstance(drive, Multitone):
+        omega = 2.0 * np.pi * jnp.asarray(drive.frequency) * jnp.asarray(drive.orders)
+        return largest_sum(drive.phasors() * circuit.gain_of(channel, omega), drive.orders)
     terms = circuit.terms_of(channel)
     if isinstance(drive, Square | Triangle) and len(terms.tau) == 1 and terms.rate is None:
         return abs(terms.weight[0] * jnp.asarray(drive.peak_to_peak)) * _highest(drive, drive.period / terms.tau[0])
@@ -94,6 +98,8 @@ def highpass_mean_square(drive: Drive, tau: ArrayLike) -> Array:
     if isinstance(drive, Sine):
         omega = 2.0 * np.pi * jnp.asarray(drive.frequency)
         return 0.5 * jnp.square(0.5 * jnp.asarray(drive.peak_to_peak) * highpass_amplitude(omega * tau))
+    if isinstance(drive, Multitone):
+        return sum((highpass_mean_square(tone, tau) for tone in drive.tones()), jnp.zeros(()))
     if isinstance(drive, Square):
         return jnp.square(jnp.asarray(drive.peak_to_peak)) * _rectangle(drive.duty, drive.period / tau)
     if isinstance(drive, Triangle):
@@ -201,13 +207,15 @@ def _slope_mean_square(drive: Drive) -> Array:
     """The mean square of dV/dt between jumps, V^2/s^2."""
     if isinstance(drive, Sine):
         return 0.5 * jnp.square(np.pi * jnp.asarray(drive.peak_to_peak) * drive.frequency)
+    if isinstance(drive, Multitone):
+        return sum(map(_slope_mean_square, drive.tones()), jnp.zeros(()))
     pieces = _period(drive)
     return jnp.sum(jnp.square(pieces.slopes()) * jnp.diff(pieces.knots)) / (pieces.knots[-1] - pieces.knots[0])
 
 
 def _impulses(drive: Drive, rate: ArrayLike) -> Array:
     """Whether a current that follows dV/dt meets a jump."""
-    if isinstance(drive, Sine):
+    if isinstance(drive, Sine | Multitone):
         return jnp.asarray(False)
     knots, start, end = _period(drive)
     within = (jnp.diff(knots) == 0.0) & (end != start)

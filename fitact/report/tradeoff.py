@@ -1,0 +1,129 @@
+"""Speed against accuracy as a picture: error over cost, one panel a kind, the Pareto front joined."""
+
+import itertools
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, NullLocator
+from matplotlib.transforms import Bbox
+
+from fitact.files import replacing
+from fitact.report.plots import style
+from fitact.tradeoff import Kind, Level, Tradeoff
+
+_TITLES: dict[Kind, tuple[str, str, str]] = {
+    "response": ("response", "one evaluation", "error of Vsc, relative rms"),
+    "likelihood": ("likelihood", "one evaluation, of many at once", "error of the log-likelihood"),
+    "uncertainty": ("uncertainty", "one effective draw", "error, posterior standard deviations"),
+}
+_FRONT, _DOMINATED = "#0072B2", "#D55E00"
+_BELOW = 30.0  # times below the least error is where an error of 0 is drawn
+_SIDES = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1)]
+
+
+def write_tradeoff(path: Path, tradeoff: Tradeoff) -> None:
+    """Draw at `path`: SVG or PNG by its ending.
+
+    Raises:
+        InputError: the place cannot be written.
+    """
+    metadata = {"Date": None} if path.suffix == ".svg" else {}
+    with mpl.rc_context(style() | {"axes.grid": False}), replacing(path) as temporary:
+        draw(tradeoff).savefig(temporary, format=path.suffix[1:], dpi=150, metadata=metadata)
+
+
+def draw(tradeoff: Tradeoff) -> Figure:
+    """The picture."""
+    figure = Figure(figsize=(13.0, 4.8), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    panels = dict(zip(_TITLES, figure.subplots(1, len(_TITLES)), strict=True))
+    for kind, axes in panels.items():
+        _draw(axes, kind, tradeoff)
+    canvas.draw()  # so that it is known where everything is
+    figure.set_layout_engine("none")  # and stays there
+    for kind, axes in panels.items():
+        _name(axes, tradeoff.of(kind), canvas)
+    return figure
+
+
+def _heights(levels: tuple[Level, ...]) -> dict[str, float]:
+    """Where errors are drawn: as they are, and 0 below the least of the others."""
+    zero = min((level.error for level in levels if level.error > 0.0), default=1.0) / _BELOW
+    return {level.name: level.error or zero for level in levels}
+
+
+def _draw(axes: Axes, kind: Kind, tradeoff: Tradeoff) -> None:
+    levels, front = tradeoff.of(kind), tradeoff.front(kind)
+    height = _heights(levels)
+    title, cost, error = _TITLES[kind]
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.plot([x.seconds for x in front], [height[x.name] for x in front], "o-", color=_FRONT, ms=7, lw=1.2)
+    dominated = [x for x in levels if x.dominated_by]
+    axes.plot(
+        [x.seconds for x in dominated], [height[x.name] for x in dominated], "o", color=_DOMINATED, ms=7, mfc="none"
+    )
+    zero = min(height.values())
+    axes.axhline(zero, color="#333333", lw=0.8, ls=":")
+    if kind == "uncertainty":
+        axes.axhspan(zero / _BELOW, tradeoff.resolution, color="#999999", alpha=0.2, lw=0)
+    axes.set_ylim(zero / 6.0, 10.0 * max(height.values()))
+    low, high = min(x.seconds for x in levels), max(x.seconds for x in levels)
+    margin = (high / low) ** 0.25 * 1.5
+    axes.set_xlim(low / margin, high * margin)
+    axes.xaxis.set_major_formatter(EngFormatter("s", places=0, sep=""))
+    axes.yaxis.set_major_locator(LogLocator(numticks=8))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0e}" if value > 2.0 * zero else ""))
+    axes.annotate(
+        "0",
+        (0.0, zero),
+        xycoords=("axes fraction", "data"),
+        xytext=(-6, 0),
+        textcoords="offset points",
+        ha="right",
+        va="center",
+    )
+    axes.set_title(title)
+    axes.set_xlabel(f"time of {cost}")
+    axes.set_ylabel(error)
+
+
+def _along(places: dict[str, np.ndarray], levels: tuple[Level, ...]) -> list[np.ndarray]:
+    """Points along the line of the front."""
+    front = sorted((x for x in levels if not x.dominated_by), key=lambda x: x.seconds)
+    pairs = itertools.pairwise(places[x.name] for x in front)
+    return [end + share * (start - end) for start, end in pairs for share in np.linspace(0.0, 1.0, 40)]
+
+
+def _name(axes: Axes, levels: tuple[Level, ...], canvas: FigureCanvasAgg) -> None:
+    """The levels' names, each on the nearest side of its point where it hides nothing."""
+    height = _heights(levels)
+    places = {x.name: axes.transData.transform((x.seconds, height[x.name])) for x in levels}
+    taken = [Bbox.from_extents(x - 8, y - 8, x + 8, y + 8) for x, y in [*places.values(), *_along(places, levels)]]
+    inside = axes.get_window_extent()
+    for level in levels:
+        color = _DOMINATED if level.dominated_by else _FRONT
+        for distance, (right, up) in itertools.product((9, 18, 30, 44), _SIDES):
+            text = axes.annotate(
+                level.name,
+                (level.seconds, height[level.name]),
+                xytext=(distance * right, distance * up),
+                textcoords="offset points",
+                ha={-1: "right", 0: "center", 1: "left"}[right],
+                va={-1: "top", 0: "center", 1: "bottom"}[up],
+                color=color,
+                fontsize=9,
+            )
+            box = text.get_window_extent(canvas.get_renderer())
+            free = not any(box.overlaps(other) for other in taken)
+            if free and inside.contains(box.x0, box.y0) and inside.contains(box.x1, box.y1):
+                break
+            text.remove()
+        else:
+            axes.add_artist(text)
+        taken.append(box)
