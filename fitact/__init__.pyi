@@ -12,6 +12,7 @@ from .model.drive import Burst, Polyline, Sampled, Sine, Square, Trapezoid, Tria
 from .model.equivalents import quality_factor, series_equivalent
 from .model.force import Contact, electrostatic_force, friction, mean_force, peak_force
 from .model.harmonic import harmonic_error, harmonic_response
+from .model.plan import Plan, plan
 from .model.prior import Prior
 from .model.response import response
 from .model.scene import Scene
@@ -32,6 +33,7 @@ __all__ = [
     "LogNormal",
     "LogUniform",
     "NaturalGround",
+    "Plan",
     "Polyline",
     "Posterior",
     "Prior",
@@ -56,6 +58,7 @@ __all__ = [
     "mean_square",
     "peak",
     "peak_force",
+    "plan",
     "quality_factor",
     "read",
     "response",
