@@ -219,6 +219,31 @@ def prior(
     _show(str(predicted), predicted.to_dict(), json)
 
 
+@app.command()
+def plan(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene (TOML).")],
+    out: Out = None,
+    json: Json = False,
+) -> None:
+    """What a scene requires of its model: what may be left out, what that changes, and what it saves.
+
+    Into DIR it writes plan.json and plan.svg.
+    """
+    from fitact.model.scene import Scene
+
+    stated = Scene.load(scene)
+    _use_compilation_cache()
+    from fitact.model.plan import plan as planned
+
+    found = planned(stated)
+    if out is not None:
+        from fitact.report.plan import write_plan
+
+        write_json(out / "plan.json", found.to_dict())
+        write_plan(out / "plan.svg", found)
+    _show(str(found), found.to_dict(), json)
+
+
 def _folder(record: Path) -> Path:
     return Path(f"{record.name.removesuffix('.gz').removesuffix('.csv')}-fitact")
 

@@ -127,13 +127,13 @@ class Plan:
 
     def summary(self) -> str:
         """A table for people: errors of every omission, at the nominal values and at 95 % of the prior."""
-        rows = [f"{'left out':17}" + "".join(f"{title:>22}" for title in _TITLES) + f"{'speedup':>9}  decision"]
+        rows = [f"{'omission':17}" + "".join(f"{title:>22}" for title in _TITLES) + f"{'speedup':>9}  decision"]
         for omission in self.omissions:
             decision = f"{'kept' if omission.kept else 'left out'}: {omission.because}"
             rows.append(_row(omission.name, omission.nominal, omission.q95, omission.speedup) + f"  {decision}")
         rows += [
-            _row("all left out", self.nominal, self.q95, self.speedup),
-            "relative errors at the nominal values (in brackets: 95 % of the prior lie below)",
+            _row("planned model", self.nominal, self.q95, self.speedup),
+            "Relative errors at the nominal values; in brackets, what 95 % of the prior stay below.",
             self.sentence,
         ]
         return "\n".join([*rows, *(f"warning: {warning}" for warning in self.warnings)])
@@ -204,11 +204,11 @@ def _cheapest(
 
 def _values(scene: Scene) -> dict[str, Float[np.ndarray, " draws"]]:
     """The circuit's parameters: the scene's nominal ones, then draws spread evenly over its prior."""
-    prior, size = scene.make_prior(), ROWS - 1
+    prior = scene.make_prior()
     stated = {name: value for name, value in scene.nominal().items() if value is not None}
     believed = {
-        name: np.exp(np.append(m.log_mean, np.log(draws)))
-        for (name, draws), m in zip(prior.spread(size).items(), prior.marginals, strict=True)
+        name: np.append(np.exp(marginal.log_mean), draws)
+        for (name, draws), marginal in zip(prior.spread(ROWS - 1).items(), prior.marginals, strict=True)
     }
     believed |= {name: np.full(ROWS, value) for name, value in scene.fixed().items()}
     believed |= {name: ratio * believed[other] for name, (other, ratio) in scene.prior.tied().items()}

@@ -3,6 +3,7 @@
 import graphlib
 import itertools
 import math
+import statistics
 from collections.abc import Callable, Mapping
 
 import equinox as eqx
@@ -10,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
-from jax.scipy.special import ndtri
 from jaxtyping import Array, Float
 
 from fitact.errors import InputError
@@ -179,8 +179,7 @@ class Prior(eqx.Module):
         def scores() -> np.ndarray:
             number = next(count) * size + np.arange(1, size + 1)
             share = (0.5 + number * ratio ** -axes[:, None].astype(float)) % 1.0
-            with jax.enable_x64(True):
-                return np.asarray(ndtri(share))
+            return np.vectorize(statistics.NormalDist().inv_cdf, otypes=[float])(share)
 
         return self._in_given_order(scores, size)
 

@@ -87,6 +87,7 @@ class Waves:
 
     Attributes:
         drive, steady_state: what drives them all, and whether for ever or from rest.
+        pieces: one period of the drive, where it is straight.
         weight, tau: of the high-pass terms; s.
         knots: each term's steady state at the starts of the drive's pieces, V.
         harmonics: amplitude that the terms miss, V.
@@ -94,6 +95,7 @@ class Waves:
 
     drive: Drive
     steady_state: bool
+    pieces: Pieces | None
     weight: Float[np.ndarray, "circuits terms"]
     tau: Float[np.ndarray, "circuits terms"]
     knots: Float[np.ndarray, "circuits terms pieces"]
@@ -110,11 +112,12 @@ class Waves:
             filled = jax.tree.map(lambda x: _filled_up(x, precision), complete)
             weight, tau, harmonics = _terms(filled, skin, drive, precision)
             wave = drive.wave if isinstance(drive, Burst) else drive
+            pieces = _pieces(wave) if isinstance(wave, PiecewiseLinear) else None
             knots = np.zeros((*tau.shape, 0), dtype=precision)
-            if isinstance(wave, PiecewiseLinear):
-                knots = np.asarray(_knots(jax.tree.map(precision, _pieces(wave)), tau))
+            if pieces is not None:
+                knots = np.asarray(_knots(jax.tree.map(precision, pieces), tau))
         rows = (x[:count] for x in (weight.astype(precision), tau.astype(precision), knots, harmonics))
-        return cls(drive, scene.drive.steady_state, *rows)
+        return cls(drive, scene.drive.steady_state, pieces, *rows)
 
     def at(self, cycle: np.ndarray, elapsed: np.ndarray) -> Rows:
         """Vsc at nodes common to all circuits, or at each circuit's own."""
@@ -137,7 +140,7 @@ class Waves:
         wave: Any = self.drive.wave if isinstance(self.drive, Burst) else self.drive
         begin = np.full((1, 1), _lead(wave), dtype=cycle.dtype)
         tau, since = self.tau[..., None], elapsed[:, None, :]
-        difference = _value(wave, float(begin[0, 0])) - self._settled(begin)
+        difference = self._start(wave) - self._settled(begin)
         u = self._settled(cycle) + difference * np.exp(-since / tau)
         if not isinstance(self.drive, Burst):
             return u
@@ -145,15 +148,22 @@ class Waves:
         after = difference * np.expm1(-end / tau) * np.exp(-np.maximum(since - end, 0.0) / tau)
         return np.where(since > end, after, u)
 
+    def _start(self, wave: Any) -> float:
+        """V at t = 0, from the right."""
+        if self.pieces is None:
+            return float(wave.offset + 0.5 * wave.peak_to_peak * np.sin(wave.phase))
+        piece, since, slope = _along(self.pieces, np.array(_lead(wave)))
+        return float(self.pieces.start[piece] + slope * since)
+
     def _settled(self, cycle: np.ndarray) -> np.ndarray:
         """Each term's response in the steady state."""
         wave: Any = self.drive.wave if isinstance(self.drive, Burst) else self.drive
         tau, cycle = self.tau[..., None], cycle[:, None, :]
-        if isinstance(wave, Sine):
+        if self.pieces is None:
             omega = 2.0 * np.pi * wave.frequency
             x = omega * tau
             return 0.5 * wave.peak_to_peak * (x / np.hypot(1.0, x)) * np.sin(omega * cycle + np.arctan2(1.0, x))
-        piece, since, slope = _along(wave, cycle)
+        piece, since, slope = _along(self.pieces, cycle)
         left = np.expm1(-since / tau)
         return np.take_along_axis(self.knots, piece, axis=2) * (1.0 + left) - slope.astype(tau.dtype) * tau * left
 
@@ -253,38 +263,31 @@ def _pieces(wave: PiecewiseLinear) -> Pieces:
     return Pieces(*filled)
 
 
-def _along(wave: PiecewiseLinear, cycle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _along(pieces: Pieces, cycle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The piece that each time lies in, the time since it began, and its slope."""
-    knots, start, end = _pieces(wave)
-    last = int(np.searchsorted(knots, knots[-1])) - 1  # of any length
-    piece = np.clip(np.searchsorted(knots.astype(cycle.dtype), cycle, side="right") - 1, 0, last)
-    length = np.diff(knots)
-    slope = (end - start) / np.where(length > 0.0, length, 1.0)
-    return piece, np.maximum(cycle - knots.astype(cycle.dtype)[piece], 0.0), slope[piece]
-
-
-def _value(wave: Any, cycle: float) -> float:
-    """V at a time in the period."""
-    if isinstance(wave, Sine):
-        return float(wave.offset + 0.5 * wave.peak_to_peak * np.sin(2.0 * np.pi * wave.frequency * cycle))
-    piece, since, slope = _along(wave, np.array(cycle))
-    return float(_pieces(wave).start[piece] + slope * since)
+    knots, length = pieces.knots.astype(cycle.dtype), np.diff(pieces.knots)
+    last = int(np.flatnonzero(length)[-1])
+    piece = np.clip(np.searchsorted(knots, cycle, side="right") - 1, 0, last)
+    slope = (pieces.end - pieces.start) / np.where(length > 0.0, length, 1.0)
+    return piece, np.maximum(cycle - knots[piece], 0.0), slope[piece]
 
 
 def _complete(circuit: RC) -> DirectGround | NaturalGround:
     """The circuit with every part that its kind may have, an absent one too small to matter."""
     if isinstance(circuit, FinalCircuit):
         circuit = DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci)
-    resistance = circuit.resistance()
-    series = _ABSENT if resistance is None else resistance
-    probe = circuit.probe or Probe(math.inf, 0.0)
-    if isinstance(circuit, NaturalGround):
-        Z, capacitance = circuit.Z, circuit.Z_capacitance
-        if capacitance is None:  # a plain resistance is in `series` already
-            Z, capacitance = _ABSENT, 0.0
-        return NaturalGround(circuit.Rsc, circuit.Csc, circuit.Ci, Z, capacitance, series, probe)
-    grounding = circuit.elements()[1]
-    return DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci, series, *grounding, None, probe)
+    skin, probe = (circuit.Rsc, circuit.Csc, circuit.Ci), circuit.probe or Probe(math.inf, 0.0)
+    if isinstance(circuit, DirectGround):
+        R = circuit.Rsc if circuit.grounding_Rsc is None else circuit.grounding_Rsc
+        C = circuit.Csc if circuit.grounding_Csc is None else circuit.grounding_Csc
+        return DirectGround(*skin, _sum(circuit.R_H, circuit.series_resistor), R, C, None, probe)
+    if circuit.Z_capacitance is None:
+        return NaturalGround(*skin, _ABSENT, 0.0, _sum(circuit.Z, circuit.series_resistor), probe)
+    return NaturalGround(*skin, circuit.Z, circuit.Z_capacitance, _sum(circuit.series_resistor), probe)
+
+
+def _sum(*resistances: Any) -> Any:
+    return sum((resistance for resistance in resistances if resistance is not None), start=_ABSENT)
 
 
 def _filled_up(values: Any, precision: Any) -> np.ndarray:
