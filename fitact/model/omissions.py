@@ -1,10 +1,12 @@
 """What a scene names that may be left out of its model, what is then left of the scene, and what its model costs."""
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
-from fitact.model.circuit import FinalCircuit
-from fitact.model.drive import Sine
+from jax.typing import ArrayLike
+
+from fitact.model.circuit import RC, DirectGround, FinalCircuit
 from fitact.model.scene import Scene
 from fitact.model.skin import Fractional, WithSkin
 
@@ -91,19 +93,33 @@ def _changes(scene: Scene, name: str) -> dict[tuple[str, str], Any]:
     return _KEYS[name]
 
 
-def cost(scene: Scene) -> float:
+def cost(scene: Scene, values: Mapping[str, ArrayLike] | None = None) -> float:
     """What a sample of Vsc costs, in exponentials, where many circuits are computed side by side.
 
     Each time is looked up in the drive once; each time constant and each harmonic adds its share. The shares were
     measured once, so that a plan does not depend on what else a machine does; `benchmarks/plan.py` repeats it.
+    `values` are of parameters that the scene has by its prior alone.
     """
-    circuit, inner, drive, stated = scene.make_circuit(), scene.make_rc_circuit(), scene.make_drive(), scene.drive
-    terms = 1 if isinstance(inner, FinalCircuit) else len(inner.elements()) + (inner.resistance() is not None)
-    harmonics = 0
+    circuit, stated = scene.make_circuit(values), scene.drive
+    terms, harmonics = _time_constants(scene.make_rc_circuit(values)), 0
     if isinstance(circuit, WithSkin):
-        harmonics = 1 if isinstance(drive, Sine) else circuit.skin.count(stated.frequency)
-        terms = 0 if isinstance(drive, Sine) else _FRACTIONAL_TERMS if isinstance(circuit.skin, Fractional) else terms
+        if stated.waveform == "sine":
+            terms, harmonics = 0, 1
+        else:
+            harmonics = circuit.skin.count(stated.frequency)
+            terms = _FRACTIONAL_TERMS if isinstance(circuit.skin, Fractional) else terms
     of_term = _TERM[stated.shape if stated.waveform == "burst" else stated.waveform]
     if not stated.steady_state and stated.waveform != "chirp":
         of_term += _BURST if stated.waveform == "burst" else _TRANSIENT
     return _LOCATE + terms * of_term + _HARMONIC * harmonics
+
+
+def _time_constants(circuit: RC) -> int:
+    """How many a circuit has: one for each capacitor, but for Ci where nothing resistive is in series with it."""
+    if isinstance(circuit, FinalCircuit):
+        return 1
+    if isinstance(circuit, DirectGround):
+        return 2 + (circuit.R_H is not None or circuit.series_resistor is not None)
+    if circuit.Z_capacitance is not None:
+        return 2 + (circuit.series_resistor is not None)
+    return 1 + (circuit.Z is not None or circuit.series_resistor is not None)

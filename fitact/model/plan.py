@@ -170,20 +170,20 @@ def plan(scene: Scene) -> Plan:
     reference = Reference(Window.of(scene), full)
     names = omissions.named(scene)
     reasons = {name: omissions.required(scene, name) for name in names}
-    whole, tolerance = omissions.cost(scene), scene.tolerance.force
+    whole, tolerance = omissions.cost(scene, nominal), scene.tolerance.force
     best = _cheapest(scene, nominal, reference, tuple(name for name in names if not reasons[name]), tolerance)
     rows = []
     for name in names:
         reduced = omissions.without(scene, (name,), prior=False)
         at_nominal, q95 = _errors(reference.compare(Waves.of(reduced, _left(values, (name,)))))
-        speedup = whole / omissions.cost(reduced)
+        speedup = whole / omissions.cost(reduced, _left(nominal, (name,)))
         because = reasons[name] or _because(name in best, at_nominal.force, tolerance, speedup)
         rows.append(Omission(name, at_nominal, q95, speedup, name not in best, because))
     single = _errors(reference.compare(Waves.of(scene, values, np.float32)))
     rows.append(Omission("float64", *single, omissions.SINGLE_SPEEDUP, True, "fits and sampling need its derivatives"))
     reduced = omissions.without(scene, best, prior=False)
     joint = _errors(reference.compare(Waves.of(reduced, _left(values, best))))
-    speedup = whole / omissions.cost(reduced)
+    speedup = whole / omissions.cost(reduced, _left(nominal, best))
     return Plan(scene, omissions.without(scene, best), tuple(rows), *joint, speedup)
 
 
@@ -193,7 +193,7 @@ def _cheapest(
     """The combination of least cost that keeps the tolerance; of several the one that leaves out, then errs, least."""
     combinations = [c for size in range(len(names) + 1) for c in itertools.combinations(names, size)]
     scenes = {c: omissions.without(scene, c, prior=False) for c in combinations}
-    rank = {c: (omissions.cost(reduced), len(c)) for c, reduced in scenes.items()}
+    rank = {c: (omissions.cost(reduced, _left(nominal, c)), len(c)) for c, reduced in scenes.items()}
     for _, group in itertools.groupby(sorted(combinations, key=lambda c: rank[c]), key=lambda c: rank[c]):
         force = {c: _errors(reference.compare(Waves.of(scenes[c], _left(nominal, c))))[0].force for c in group}
         found = min(force, key=lambda c: force[c])
