@@ -35,7 +35,8 @@ _DECADES, _ORDER = 8, 8  # of a piece, and the order of the rule in each
 _PERIODS = 12  # from rest: periods that stand for all, in geometric progression
 _CHIRP_TIMES = 2048
 _SNAP = 1e-9  # of a period: corners so close are one
-_REFINED = 17  # times between the neighbours of a peak, twice
+_HIGHEST = 4  # stretches among which the peak is looked for
+_REFINED, _REFINEMENTS = 17, 3  # times between the neighbours of a peak, and how often
 
 Rows: TypeAlias = Float[np.ndarray, "circuits times"]
 
@@ -46,7 +47,7 @@ class Window(NamedTuple):
     cycle: Float[np.ndarray, " times"]  # s since the drive's last start of a period
     elapsed: Float[np.ndarray, " times"]  # s since t = 0
     weight: Float[np.ndarray, " times"]  # the share of the window that each stands for
-    segment: Float[np.ndarray, " times"]  # number of the stretch without a corner that it lies in
+    stretches: int = 1  # without a corner, each of as many times as another
 
     @classmethod
     def of(cls, scene: Scene) -> "Window":
@@ -54,7 +55,7 @@ class Window(NamedTuple):
         drive, duration = scene.make_drive(), scene.measurement.duration
         if isinstance(drive, Chirp):
             times = duration * (np.arange(_CHIRP_TIMES) + 0.5) / _CHIRP_TIMES
-            return cls(times, times, np.full(times.size, 1.0 / times.size), np.zeros(times.size))
+            return cls(times, times, np.full(times.size, 1.0 / times.size))
         wave: Any = drive.wave if isinstance(drive, Burst) else drive
         period, lead = 1.0 / wave.frequency, _lead(wave)
         cuts = _corners(wave)
@@ -76,9 +77,8 @@ class Window(NamedTuple):
         )
         cycle = low + length * share
         weight = stands * length * share_weight
-        segment = np.broadcast_to(np.arange(len(stretches))[:, None], cycle.shape)
         elapsed = first * period + cycle - lead
-        return cls(cycle.ravel(), elapsed.ravel(), (weight / weight.sum()).ravel(), segment.ravel())
+        return cls(cycle.ravel(), elapsed.ravel(), (weight / weight.sum()).ravel(), len(stretches))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,22 +200,22 @@ class Reference:
 
 
 def _peak(window: Window, waves: Waves, vsc: Rows) -> Float[np.ndarray, " circuits"]:
-    """The largest |Vsc|, between the nodes too."""
-    highest = np.abs(vsc).argmax(axis=1)
-    found = np.abs(vsc).max(axis=1)
+    """The largest |Vsc|, between the nodes too: the highest stretches are looked at more closely."""
     if isinstance(waves.drive, Chirp):  # smooth, and compiled for its nodes
-        return found
-    beside = np.clip(highest[:, None] + np.array([-1, 1]), 0, len(window.cycle) - 1)
-    beside = np.where(window.segment[beside] == window.segment[highest][:, None], beside, highest[:, None])
-    low, high = window.cycle[beside].T
-    offset = (window.elapsed - window.cycle)[highest][:, None]
-    for _ in range(2):
-        cycle = np.linspace(low, high, _REFINED, axis=1)
-        refined = np.abs(waves.at(cycle, cycle + offset))
-        best = refined.argmax(axis=1)
-        found = np.maximum(found, refined.max(axis=1))
-        low, high = (np.take_along_axis(cycle, np.clip(best + i, 0, _REFINED - 1)[:, None], 1)[:, 0] for i in (-1, 1))
-    return found
+        return np.abs(vsc).max(axis=1)
+    height = np.abs(vsc).reshape(len(vsc), window.stretches, -1)
+    node = height.argmax(axis=2)
+    highest = np.argsort(-height.max(axis=2), axis=1)[:, :_HIGHEST]
+    first, last = highest * height.shape[2], (highest + 1) * height.shape[2] - 1
+    at = first + np.take_along_axis(node, highest, axis=1)
+    low, high = window.cycle[np.maximum(at - 1, first)], window.cycle[np.minimum(at + 1, last)]
+    offset = (window.elapsed - window.cycle)[at][..., None]
+    for _ in range(_REFINEMENTS):
+        cycle = np.linspace(low, high, _REFINED, axis=2)
+        refined = np.abs(waves.at(*(x.reshape(len(vsc), -1) for x in (cycle, cycle + offset)))).reshape(cycle.shape)
+        best = refined.argmax(axis=2)[..., None]
+        low, high = (np.take_along_axis(cycle, np.clip(best + i, 0, _REFINED - 1), 2)[..., 0] for i in (-1, 1))
+    return np.maximum(height.max(axis=(1, 2)), refined.max(axis=(1, 2)))
 
 
 @functools.cache
