@@ -17,13 +17,13 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from timing import medians
+from timing import minima
 
 import fitact
 from fitact.model import omissions
 from fitact.model.waves import Reference, Waves, Window
 
-CIRCUITS, SAMPLES, ROUNDS = 64, 4000, 15
+CIRCUITS, SAMPLES, ROUNDS = 64, 4000, 200
 SAME = 1.1  # times closer than this count as equal
 
 GROUNDINGS = {
@@ -82,7 +82,7 @@ def table() -> dict[str, tuple[float, float]]:
     scenes["dispersive, square"] = Scene.from_dict({"skin": {"level": "dispersive"}})
     jobs = {name: job(scene) for name, scene in scenes.items()}
     jobs |= {f"{name}, float32": job(scenes[name], np.float32) for name in ("final, square", "R_H, square")}
-    times = {name: 1e9 * seconds / CIRCUITS / SAMPLES for name, seconds in medians(jobs, ROUNDS).items()}
+    times = {name: 1e9 * seconds / CIRCUITS / SAMPLES for name, seconds in minima(jobs, ROUNDS).items()}
     costs = {name: omissions.cost(scene) for name, scene in scenes.items()}
     costs |= {
         name: costs[name.removesuffix(", float32")] / omissions.SINGLE_SPEEDUP for name in times if name not in costs
@@ -139,7 +139,7 @@ def hindsight(count: int) -> tuple[np.ndarray, np.ndarray]:
         seconds.append(time.perf_counter() - begin)
     choices = [admissible(scene) for scene in scenes]
     kinds = {kind(each): each for each in itertools.chain(*choices)}
-    taken = medians({name: job(each) for name, each in kinds.items()}, ROUNDS)
+    taken = minima({name: job(each) for name, each in kinds.items()}, ROUNDS)
     ratios = [
         taken[kind(plan.scene)] / min(taken[kind(each)] for each in of) for plan, of in zip(plans, choices, strict=True)
     ]
