@@ -13,6 +13,7 @@ from .model.equivalents import quality_factor, series_equivalent
 from .model.force import Contact, electrostatic_force, friction, mean_force, peak_force
 from .model.harmonic import harmonic_error, harmonic_response
 from .model.multitone import Multitone
+from .model.plan import Plan, plan
 from .model.prior import Prior
 from .model.response import response
 from .model.scene import Scene
@@ -35,6 +36,7 @@ __all__ = [
     "LogUniform",
     "Multitone",
     "NaturalGround",
+    "Plan",
     "Polyline",
     "Posterior",
     "Prior",
@@ -61,6 +63,7 @@ __all__ = [
     "measure_tradeoff",
     "peak",
     "peak_force",
+    "plan",
     "quality_factor",
     "read",
     "response",

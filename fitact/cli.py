@@ -13,7 +13,7 @@ from fitact.errors import InputError
 from fitact.files import to_json, write_json
 
 if TYPE_CHECKING:
-    from fitact.inference.fit import Fit
+    from fitact.inference.planned import PlannedFit
     from fitact.inference.posterior import Posterior
 
 app = typer.Typer(
@@ -67,6 +67,12 @@ Level = Annotated[
         " the fit's normal approximation (fast; says what it is off by).",
     ),
 ]
+Model = Annotated[
+    Literal["planned", "full"],
+    typer.Option(
+        "--model", help="What the scene's tolerance requires (see `plan`), or everything that the scene names."
+    ),
+]
 Results = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `run` or `sample` wrote.")]
 Fresh = Annotated[bool, typer.Option("--fresh", help="Start the chain anew instead of going on from one in DIR.")]
 
@@ -77,6 +83,7 @@ def run(
     scene: SceneFiles = None,
     out: Out = None,
     level: Level = "emcee",
+    model: Model = "planned",
     seed: Seed = 0,
     tolerance: Tolerance = 1e-3,
     fresh: Fresh = False,
@@ -87,11 +94,13 @@ def run(
     Writes fit.json, summary.json, posterior.nc (opens with ArviZ), chain.h5 (for going on) and report.html.
     """
     folder = out or _folder(records[0])
-    posterior = _sampled(records, scene, folder, level, seed, tolerance, fresh)
+    posterior, content = _sampled(records, scene, folder, level, model, seed, tolerance, fresh)
     page = folder / "report.html"
     _say("writing the report")
-    posterior.report(page)
-    _show(f"{posterior}\nopen {page}", posterior.summary(), json)
+    from fitact.report import write_report
+
+    write_report(page, posterior.to_datatree(), content)
+    _show(f"{posterior}\nopen {page}", content, json)
     _finish(posterior.trusted)
 
 
@@ -100,6 +109,7 @@ def fit(
     records: RecordFiles,
     scene: SceneFiles = None,
     out: Out = None,
+    model: Model = "planned",
     tolerance: Tolerance = 1e-3,
     starts: Annotated[
         int, typer.Option("--starts", min=1, help="Starts: the record's own, and draws of the prior.")
@@ -110,8 +120,9 @@ def fit(
     json: Json = False,
 ) -> None:
     """Least squares only: parameters with errors, and the verdict, in seconds."""
-    fitted = _fitted(records, scene, tolerance, starts)
-    text, content = str(fitted), fitted.to_dict()
+    planned = _fitted(records, scene, model, tolerance, starts)
+    fitted = planned.fit
+    text, content = f"{fitted}\n{planned.sentence}", fitted.to_dict() | {"plan": planned.to_dict()}
     if intervals:
         from fitact.inference.profile import table
 
@@ -132,6 +143,7 @@ def sample(
     scene: SceneFiles = None,
     out: Out = None,
     level: Level = "emcee",
+    model: Model = "planned",
     seed: Seed = 0,
     tolerance: Tolerance = 1e-3,
     fresh: Fresh = False,
@@ -139,8 +151,8 @@ def sample(
 ) -> None:
     """Fit, then sample the posterior until it has converged; as `run`, without the report."""
     folder = out or _folder(records[0])
-    posterior = _sampled(records, scene, folder, level, seed, tolerance, fresh)
-    _show(f"{posterior}\nwrote {folder}; for a report: fitact report {folder}", posterior.summary(), json)
+    posterior, content = _sampled(records, scene, folder, level, model, seed, tolerance, fresh)
+    _show(f"{posterior}\nwrote {folder}; for a report: fitact report {folder}", content, json)
     _finish(posterior.trusted)
 
 
@@ -267,25 +279,52 @@ def scene(
     _show(str(stated).rstrip(), stated.model_dump(mode="json"), json)
 
 
+@app.command()
+def plan(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene (TOML).")],
+    out: Out = None,
+    json: Json = False,
+) -> None:
+    """What a scene requires of its model: what may be left out, what that changes, and what it saves.
+
+    Into DIR it writes plan.json and plan.svg.
+    """
+    from fitact.model.scene import Scene
+
+    stated = Scene.load(scene)
+    _use_compilation_cache()
+    from fitact.model.plan import plan as planned
+
+    found = planned(stated)
+    if out is not None:
+        from fitact.report.plan import write_plan
+
+        write_json(out / "plan.json", found.to_dict())
+        write_plan(out / "plan.svg", found)
+    _show(str(found), found.to_dict(), json)
+
+
 def _folder(record: Path) -> Path:
     return Path(f"{record.name.removesuffix('.gz').removesuffix('.csv')}-fitact")
 
 
-def _fitted(records: list[Path], scenes: list[Path] | None, tolerance: float, starts: int = 1) -> "Fit":
+def _fitted(
+    records: list[Path], scenes: list[Path] | None, model: Model, tolerance: float, starts: int = 1
+) -> "PlannedFit":
     from fitact.data.formats import read
     from fitact.model.scene import Scene
 
     stated = [Scene.load(path) for path in scenes or []]
     for scene in stated:
-        scene.require_available(fit=True)
+        scene.require_available(fit=model == "full")
     of_each = stated if len(stated) == len(records) else [stated[0] if stated else None] * len(records)
     measured = [read(*pair) for pair in zip(records, of_each, strict=True)]  # refused before the slow imports
     _use_compilation_cache()
-    from fitact.inference.fit import fit
+    from fitact.inference.planned import fit_planned
 
     for path, record in zip(records, measured, strict=True):
         _say(f"fitting {path} ({len(record):,} samples)")
-    return fit(measured, stated if len(stated) > 1 else of_each[0], starts=starts, tolerance=tolerance)
+    return fit_planned(measured, stated, model, starts=starts, tolerance=tolerance)
 
 
 def _sampled(
@@ -293,22 +332,25 @@ def _sampled(
     scene: list[Path] | None,
     folder: Path,
     level: Level,
+    model: Model,
     seed: int,
     tolerance: float,
     fresh: bool,
-) -> "Posterior":
+) -> "tuple[Posterior, dict[str, Any]]":
     """Fit and sample, and write all but the report, once the chain is known to belong there."""
-    fitted = _fitted(records, scene, tolerance)
+    planned = _fitted(records, scene, model, tolerance)
+    _say(planned.sentence)
     from fitact.inference.sampling import sample
 
     chain = folder / "chain.h5"
     if fresh:
         chain.unlink(missing_ok=True)
-    posterior = sample(fitted, level=level, seed=seed, chain_file=chain)
-    write_json(folder / "fit.json", fitted.to_dict())
+    posterior = sample(planned.fit, level=level, seed=seed, chain_file=chain)
+    write_json(folder / "fit.json", planned.fit.to_dict() | {"plan": planned.to_dict()})
     posterior.to_netcdf(folder / "posterior.nc")
-    write_json(folder / "summary.json", posterior.summary())
-    return posterior
+    content = posterior.summary() | {"plan": planned.to_dict()}
+    write_json(folder / "summary.json", content)
+    return posterior, content
 
 
 def _use_compilation_cache() -> None:

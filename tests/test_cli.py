@@ -212,6 +212,35 @@ def test_prior_is_shown_before_any_data(fitact_command, tmp_path):
     assert "<svg" in (tmp_path / "prior.html").read_text()
 
 
+def test_plan_is_a_table_json_and_a_picture(fitact_command, tmp_path):
+    (tmp_path / "scene.toml").write_text('[grounding]\nR_H = "500 ohm"\n')
+    done = fitact_command("plan", "scene.toml", "--out", "plan", "--json")
+    assert done.returncode == 0, done.stderr
+    content = json.loads(done.stdout)
+    assert {each["name"]: each["kept"] for each in content["omissions"]} == {"R_H": False, "float64": True}
+    assert content["model"]["circuit"] == "final"
+    assert json.loads((tmp_path / "plan" / "plan.json").read_text()) == content
+    assert "<svg" in (tmp_path / "plan" / "plan.svg").read_text()
+    assert "Left out: R_H; that changes the peak of Vsc by 0.14 %" in fitact_command("plan", "scene.toml").stdout
+    (tmp_path / "measured.toml").write_text('[drive]\nwaveform = "measured"\n')
+    assert fitact_command("plan", "measured.toml").returncode == 2
+
+
+@pytest.mark.slow
+def test_run_reports_what_was_left_out(fitact_command, tmp_path):
+    (tmp_path / "scene.toml").write_text('[grounding]\nR_H = "500 ohm"\n')
+    assert fitact_command("simulate", "scene.toml", "--out", "record.csv").returncode == 0
+    done = fitact_command("run", "record.csv", "--scene", "scene.toml", "--level", "psis", "--out", "out", "--json")
+    assert done.returncode == 0, done.stderr
+    content = json.loads(done.stdout)
+    assert content["model"]["circuit"] == "final"
+    assert content["plan"]["used"] == "planned"
+    assert content["plan"]["sentence"] in (tmp_path / "out" / "report.html").read_text()
+    assert json.loads((tmp_path / "out" / "fit.json").read_text())["plan"] == content["plan"]
+    done = fitact_command("fit", "record.csv", "--scene", "scene.toml", "--model", "full", "--json")
+    assert json.loads(done.stdout)["model"]["circuit"] == "direct"
+
+
 def test_simulated_current_needs_a_finite_one(fitact_command, tmp_path):
     (tmp_path / "ideal.toml").write_text('[measurement]\nchannels = ["Vsc", "I"]\n')
     refused = fitact_command("simulate", "ideal.toml", "--out", "ideal.csv")

@@ -320,7 +320,7 @@ class NaturalGround(Loop):
     Attributes:
         Rsc, Csc: the touching skin, ohm and F.
         Ci: the insulator, F.
-        Z: resistance to earth through shoes or chair, ohm.
+        Z: resistance to earth through shoes or chair, ohm; None: the body is at earth.
         Z_capacitance: in parallel with it, F; None: Z is a plain resistance.
         series_resistor: a known resistor in series, ohm; None: none.
         probe: the load across the touching skin; None: an ideal probe.
@@ -329,7 +329,7 @@ class NaturalGround(Loop):
     Rsc: ArrayLike
     Csc: ArrayLike
     Ci: ArrayLike
-    Z: ArrayLike
+    Z: ArrayLike | None
     Z_capacitance: ArrayLike | None = None
     series_resistor: ArrayLike | None = None
     probe: Probe | None = None

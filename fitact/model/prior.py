@@ -1,8 +1,10 @@
 """What is believed of the parameters together before the data, in their logarithms."""
 
 import graphlib
+import itertools
 import math
-from collections.abc import Mapping
+import statistics
+from collections.abc import Callable, Mapping
 
 import equinox as eqx
 import jax
@@ -15,6 +17,7 @@ from fitact.errors import InputError
 from fitact.model.distribution import Distribution
 
 _NODES, _TERMS = 96, 24  # of the quadrature and the series behind covariances
+_FIXED_POINT = 64  # steps towards a ratio, which converge by a factor of 2 or more each
 _TRIES = 1000  # rounds of draws, of which an order may leave one in as many
 
 
@@ -157,18 +160,46 @@ class Prior(eqx.Module):
         Raises:
             InputError: the marginals leave next to nothing in the order asked for.
         """
-        drawn = self._unordered(rng, size)
+        return self._in_given_order(lambda: rng.standard_normal((len(self.names), size)), size)
+
+    def spread(self, size: int) -> dict[str, Float[np.ndarray, " size"]]:
+        """As `sample`, but spread evenly over the prior, and always the same.
+
+        The Kronecker sequence of the generalised golden ratio (M. Roberts, 2018), as normal scores.
+
+        Raises:
+            InputError: the marginals leave next to nothing in the order asked for.
+        """
+        axes = np.arange(1, len(self.names) + 1)
+        ratio = 2.0
+        for _ in range(_FIXED_POINT):
+            ratio = (1.0 + ratio) ** (1.0 / (axes.size + 1))
+        count = itertools.count()
+
+        def scores() -> np.ndarray:
+            number = next(count) * size + np.arange(1, size + 1)
+            share = (0.5 + number * ratio ** -axes[:, None].astype(float)) % 1.0
+            return np.vectorize(statistics.NormalDist().inv_cdf, otypes=[float])(share)
+
+        return self._in_given_order(scores, size)
+
+    def _in_given_order(
+        self, scores: Callable[[], Float[np.ndarray, "parameters size"]], size: int
+    ) -> dict[str, Float[np.ndarray, " size"]]:
+        """The first `size` of the parameters at `scores()` that are in the order asked for."""
+        drawn = self._at_scores(scores())
         kept = {name: values[self._in_order(drawn)] for name, values in drawn.items()}
         for _ in range(_TRIES):
             if all(values.size >= size for values in kept.values()):
                 return {name: values[:size] for name, values in kept.items()}
-            drawn = self._unordered(rng, size)
+            drawn = self._at_scores(scores())
             kept = {name: np.append(kept[name], values[self._in_order(drawn)]) for name, values in drawn.items()}
         stated = ", ".join(f"{lower} < {higher}" for lower, higher in self.ordered)
         raise InputError(f"the priors leave next to nothing in the order {stated}; widen them, or leave it out")
 
-    def _unordered(self, rng: np.random.Generator, size: int) -> dict[str, Float[np.ndarray, " size"]]:
-        z = np.linalg.cholesky(self.correlation) @ rng.standard_normal((len(self.names), size))
+    def _at_scores(self, scores: Float[np.ndarray, "parameters size"]) -> dict[str, Float[np.ndarray, " size"]]:
+        """The parameters at independent normal scores."""
+        z = np.linalg.cholesky(self.correlation) @ scores
         with jax.enable_x64(True):
             return {
                 name: np.exp(np.asarray(marginal.at_score(row)))

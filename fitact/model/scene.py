@@ -131,6 +131,7 @@ class Scene(Section):
         """The scene's own values of all that can have a prior, SI; None: it has none."""
         ground, measured = self.grounding, self.measurement
         grounding = {name: getattr(ground, name) for name in (*_DIRECT, *_NATURAL)}
+        grounding["Z"] = ground.Z or None  # 0: the body is at earth
         series = {"series_resistor": measured.series_resistor or None}
         noise = {"sigma": measured.noise_Vsc or None, "sigma_I": measured.noise_I or None}
         return {"Rsc": self.skin.Rsc, "Csc": self.skin.Csc, "Ci": self.device.Ci, **grounding, **series, **noise}

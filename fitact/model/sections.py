@@ -131,11 +131,13 @@ class Grounding(Section):
     R_H: Ohm | None = None
     grounding_Rsc: Ohm | None = None
     grounding_Csc: Farad | None = None
-    Z: Ohm | None = None
+    Z: AnyOhm | None = None
     Z_capacitance: Farad | None = None
 
     @model_validator(mode="after")
     def _Z_of_natural_ground(self) -> Self:
+        if self.Z == 0.0 and self.Z_capacitance is not None:
+            raise ValueError("Z = 0 shorts Z_capacitance; leave one of them out")
         if self.connection == "natural" and self.Z is None:
             raise ValueError("connection = 'natural' needs Z, the resistance to earth, such as '14.5 Mohm'")
         return self

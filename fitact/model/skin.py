@@ -119,7 +119,7 @@ class Fractional(Skin):
         """Time constants spread evenly over the decades above `omega`, with weights fitted by least squares."""
         limited = channel == "Vsc" or circuit.circuit.current_terms().rate is None
         omega = jnp.asarray(omega, dtype=float)
-        tau, x, weights = _spread(limited, omega.dtype == jnp.float64)
+        tau, x, weights = spread(limited, omega.dtype == jnp.float64)
         gain = circuit.gain_of(channel, omega * x)
         gain = gain if limited else gain / x
         weight = jnp.dot(weights, jnp.concatenate([gain.real, gain.imag]), precision="highest")
@@ -128,7 +128,7 @@ class Fractional(Skin):
 
 
 @functools.cache
-def _spread(limited: bool, double: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def spread(limited: bool, double: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Time constants, frequencies (over omega) and the least-squares map from the gain there to the weights.
 
     A gain that is limited is fitted as it is, one that grows with the frequency in proportion to it. What

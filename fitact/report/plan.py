@@ -1,0 +1,48 @@
+"""The plan as a picture: what each omission changes, beside the tolerance."""
+
+import os
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+
+from fitact.files import replacing
+from fitact.model.plan import Plan
+from fitact.report.plots import style
+
+_KEPT, _LEFT_OUT, _LIMIT = "#999999", "#0072B2", "#D55E00"
+_LEAST = 1e-8  # an error drawn on a logarithmic axis
+
+
+def write_plan(path: str | os.PathLike[str], plan: Plan) -> None:
+    """Draw a plan's errors of the force as SVG at `path`.
+
+    Raises:
+        InputError: the place cannot be written.
+    """
+    with mpl.rc_context(style()), replacing(Path(path)) as temporary:
+        _figure(plan).savefig(temporary, format="svg", metadata={"Date": None})
+
+
+def _figure(plan: Plan) -> Figure:
+    bars = [(o.name, o.nominal.force, o.q95.force, o.kept, o.speedup) for o in plan.omissions]
+    if plan.left_out:
+        bars.append(("planned model", plan.nominal.force, plan.q95.force, False, plan.speedup))
+    names, nominal, q95, kept, speedup = zip(*reversed(bars), strict=True)
+    place, shown = np.arange(len(bars)), np.maximum(nominal, _LEAST)
+    figure = Figure(figsize=(9.0, 1.6 + 0.45 * len(bars)), layout="constrained")
+    axes = figure.add_subplot()
+    axes.barh(place, shown, left=0.0, color=[_KEPT if each else _LEFT_OUT for each in kept], height=0.6)
+    axes.plot(np.maximum(q95, _LEAST), place, "|", color="#333333", ms=14, mew=2, label="95 % of the prior")
+    axes.axvline(plan.full.tolerance.force, color=_LIMIT, label="tolerance")
+    for at, error, faster in zip(place, np.maximum(nominal, q95), speedup, strict=True):
+        axes.annotate(f"{faster:.3g}×", (max(error, _LEAST), at), (8, 0), textcoords="offset points", va="center")
+    axes.set_xscale("log")
+    axes.set_xlim(0.3 * min(shown), 5.0 * max(*nominal, *q95, plan.full.tolerance.force))
+    axes.set_yticks(place, names)
+    axes.grid(axis="y", visible=False)
+    axes.set_xlabel("relative error of the force, mean or peak, and how many times faster the model is")
+    handles = [mpl.patches.Patch(color=_LEFT_OUT, label="left out"), mpl.patches.Patch(color=_KEPT, label="kept")]
+    figure.legend(handles=[*handles, *axes.get_legend_handles_labels()[0]], loc="outside upper center", ncols=4)
+    return figure
