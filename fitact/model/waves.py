@@ -1,9 +1,8 @@
 """Vsc of many circuits under one drive, for comparing models with each other.
 
-All circuits of a kind share one compiled program: what a circuit lacks is filled in with a value too small to
-matter. The rest is NumPy, where nothing is compiled: every response is a sum of exponentials along the straight
-pieces of its drive, and a window is a set of nodes, graded towards the corners, where a small resistance makes its
-difference.
+All circuits share one compiled program: what a circuit lacks is filled in with a value too small to matter. The rest
+is NumPy, where nothing is compiled: every response is a sum of exponentials along the straight pieces of its drive, and
+a window is a set of nodes, graded towards the corners, where a small resistance makes its difference.
 """
 
 import dataclasses
@@ -111,6 +110,7 @@ class Waves:
             complete = _complete(scene.make_rc_circuit(dict(values)))
             filled = jax.tree.map(lambda x: _filled_up(x, precision), complete)
             weight, tau, harmonics = _terms(filled, skin, drive, precision)
+            tau = np.maximum(tau, np.finfo(np.float32).tiny)  # single precision may lose that of an absent part
             wave = drive.wave if isinstance(drive, Burst) else drive
             pieces = _pieces(wave) if isinstance(wave, PiecewiseLinear) else None
             knots = np.zeros((*tau.shape, 0), dtype=precision)
@@ -301,7 +301,7 @@ def _terms(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Weights, time constants, and amplitudes of the harmonics that they miss."""
     if skin is None:
-        weight, tau = (np.asarray(x) for x in _constant(circuit))
+        weight, tau = _constant_terms(circuit)
         return weight, tau, np.zeros((ROWS, 0), dtype=complex)
     assert isinstance(drive, Periodic)
     frequency = float(drive.frequency)
@@ -316,7 +316,7 @@ def _terms(
         weight = np.concatenate([above.real, above.imag], axis=1) @ fitted.T
         tau = np.broadcast_to(tau / omega[-1], weight.shape)
     else:  # above 1000 Hz it is constant
-        weight, tau = (np.asarray(x) for x in _constant(WithSkin(circuit, skin).at(1000.0)))
+        weight, tau = _constant_terms(WithSkin(circuit, skin).at(1000.0))
     x = 1j * omega * tau[..., None]
     return weight, tau, amplitude * (gain - np.einsum("rk,rkh->rh", weight, x / (1.0 + x)))
 
@@ -352,8 +352,17 @@ def _skin_at(skin: Skin, element: Element, frequency: Array) -> Element:
     return skin.at(element, frequency)
 
 
+def _constant_terms(circuit: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Of constant skins. Z stands in the loop where a grounding skin does, so one program serves both."""
+    if isinstance(circuit, NaturalGround):
+        loop = circuit.series_resistor, circuit.Z, circuit.Z_capacitance
+        circuit = DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci, *loop, None, circuit.probe)
+    weight, tau = _constant(circuit)
+    return np.asarray(weight), np.asarray(tau)
+
+
 @jax.jit
-def _constant(circuit: DirectGround | NaturalGround) -> tuple[Array, Array]:
+def _constant(circuit: DirectGround) -> tuple[Array, Array]:
     terms = jax.vmap(lambda one: one.terms())(circuit)
     return jnp.stack(terms.weight, axis=1), jnp.stack(terms.tau, axis=1)
 
