@@ -373,3 +373,30 @@ def test_draws_are_spread_evenly_over_the_prior():
     # independent draws leave 0.03, a lattice 0.02 in two dimensions
     assert scipy.stats.qmc.discrepancy(np.column_stack(shares), method="L2-star") < 0.01
     np.testing.assert_array_equal(prior.spread(500)["Csc"], drawn["Csc"])
+
+
+def test_a_multitone_by_phasors():
+    """R_H left out, tone by tone; peaks on a fine grid."""
+    tones, amplitudes, phases = (
+        np.array([100.0, 300.0, 700.0]),
+        np.array([100.0, 60.0, 40.0]),
+        np.array([0.2, 1.0, -0.5]),
+    )
+    drive = {
+        "waveform": "multitone",
+        "frequencies": list(tones),
+        "amplitudes": list(amplitudes),
+        "phases": list(phases),
+    }
+    scene = fitact.Scene.from_dict({"drive": drive, "grounding": {"R_H": 5e3}, "tolerance": {"force": 0.5}})
+    found = {omission.name: omission for omission in fitact.plan(scene).omissions}["R_H"].nominal
+    s = 2j * np.pi * tones
+    skin = 1.0 / (1.0 / 160e3 + s * 22e-9)
+    waves = []
+    for R_H in (5e3, 0.0):
+        phasors = amplitudes * np.exp(1j * phases) * skin / (2.0 * skin + R_H + 1.0 / (s * 1.35e-9))
+        waves.append(np.imag(phasors @ np.exp(s[:, None] * np.linspace(0.0, 0.01, 200_001)[:-1])))
+    full, without = waves
+    assert found.Vsc_rms == pytest.approx(np.sqrt(np.mean((without - full) ** 2) / np.mean(full**2)), rel=1e-6)
+    assert found.Vsc_peak == pytest.approx(abs(np.abs(without).max() / np.abs(full).max() - 1.0), rel=1e-3)
+    assert found.force_mean == pytest.approx(abs(np.mean(without**2) / np.mean(full**2) - 1.0), rel=1e-6)

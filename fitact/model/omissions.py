@@ -27,8 +27,8 @@ _RESISTANCES = ("R_H", "series resistor")  # what limits the current at an edge
 # Nanoseconds a sample, of many circuits side by side in one compiled program: one exponential takes about one.
 # Measured by benchmarks/plan.py; docs/plan.md has the table.
 _LOCATE = 1.0
-_TERM = {"square": 1.0, "trapezoid": 2.0, "triangle": 2.0, "sine": 5.0, "chirp": 15.0}
-_TRANSIENT, _BURST = 0.5, 2.5  # more for each term, from rest
+_TERM = {"square": 1.0, "trapezoid": 2.0, "triangle": 2.0, "sine": 4.0, "chirp": 15.0}
+_TRANSIENT, _BURST = 0.5, 1.0  # more for each term, from rest
 _HARMONIC = 10.0
 _FRACTIONAL_TERMS = 81
 SINGLE_SPEEDUP = 1.6  # of float32, where many circuits are computed side by side
@@ -101,20 +101,23 @@ def cost(scene: Scene, values: Mapping[str, ArrayLike] | None = None) -> float:
     `values` are of parameters that the scene has by its prior alone.
     """
     circuit, stated = scene.make_circuit(values), scene.drive
-    terms, harmonics = _time_constants(scene.make_rc_circuit(values)), 0
+    terms, harmonics, tones = time_constants(scene.make_rc_circuit(values)), 0, len(stated.frequencies or (1,))
     if isinstance(circuit, WithSkin):
-        if stated.waveform == "sine":
-            terms, harmonics = 0, 1
+        if stated.waveform in ("sine", "multitone"):
+            terms, harmonics = 0, tones
         else:
             harmonics = circuit.skin.count(stated.frequency)
             terms = _FRACTIONAL_TERMS if isinstance(circuit.skin, Fractional) else terms
-    of_term = _TERM[stated.shape if stated.waveform == "burst" else stated.waveform]
+    if stated.waveform == "multitone":
+        of_term = tones * _TERM["sine"]
+    else:
+        of_term = _TERM[stated.shape if stated.waveform == "burst" else stated.waveform]
     if not stated.steady_state and stated.waveform != "chirp":
         of_term += _BURST if stated.waveform == "burst" else _TRANSIENT
     return _LOCATE + terms * of_term + _HARMONIC * harmonics
 
 
-def _time_constants(circuit: RC) -> int:
+def time_constants(circuit: RC) -> int:
     """How many a circuit has: one for each capacitor, but for Ci where nothing resistive is in series with it."""
     if isinstance(circuit, FinalCircuit):
         return 1

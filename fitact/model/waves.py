@@ -1,9 +1,8 @@
 """Vsc of many circuits under one drive, for comparing models with each other.
 
-All circuits of a kind share one compiled program: what a circuit lacks is filled in with a value too small to
-matter. The rest is NumPy, where nothing is compiled: every response is a sum of exponentials along the straight
-pieces of its drive, and a window is a set of nodes, graded towards the corners, where a small resistance makes its
-difference.
+All circuits share one compiled program: what a circuit lacks is filled in with a value too small to matter. The rest
+is NumPy, where nothing is compiled: every response is a sum of exponentials along the straight pieces of its drive, and
+a window is a set of nodes, graded towards the corners, where a small resistance makes its difference.
 """
 
 import dataclasses
@@ -24,6 +23,7 @@ from fitact.model.chirp import Chirp
 from fitact.model.circuit import RC, DirectGround, Element, FinalCircuit, NaturalGround, Probe
 from fitact.model.drive import Burst, Drive, Periodic, Pieces, PiecewiseLinear, Sine
 from fitact.model.harmonic import fourier
+from fitact.model.multitone import Multitone
 from fitact.model.response import highpass, steady_knots
 from fitact.model.scene import Scene
 from fitact.model.skin import Fractional, Skin, WithSkin, spread
@@ -111,6 +111,7 @@ class Waves:
             complete = _complete(scene.make_rc_circuit(dict(values)))
             filled = jax.tree.map(lambda x: _filled_up(x, precision), complete)
             weight, tau, harmonics = _terms(filled, skin, drive, precision)
+            tau = np.maximum(tau, np.finfo(np.float32).tiny)  # single precision may lose that of an absent part
             wave = drive.wave if isinstance(drive, Burst) else drive
             pieces = _pieces(wave) if isinstance(wave, PiecewiseLinear) else None
             knots = np.zeros((*tau.shape, 0), dtype=precision)
@@ -151,7 +152,8 @@ class Waves:
     def _start(self, wave: Any) -> float:
         """V at t = 0, from the right."""
         if self.pieces is None:
-            return float(wave.offset + 0.5 * wave.peak_to_peak * np.sin(wave.phase))
+            with jax.enable_x64(True):
+                return float(wave.value(0.0))
         piece, since, slope = _along(self.pieces, np.array(_lead(wave)))
         return float(self.pieces.start[piece] + slope * since)
 
@@ -160,9 +162,11 @@ class Waves:
         wave: Any = self.drive.wave if isinstance(self.drive, Burst) else self.drive
         tau, cycle = self.tau[..., None], cycle[:, None, :]
         if self.pieces is None:
-            omega = 2.0 * np.pi * wave.frequency
-            x = omega * tau
-            return 0.5 * wave.peak_to_peak * (x / np.hypot(1.0, x)) * np.sin(omega * cycle + np.arctan2(1.0, x))
+            omega, u = 2.0 * np.pi * wave.frequency, np.zeros((1, 1, 1), dtype=tau.dtype)
+            for order, height, phase in _tones(wave):
+                x = order * omega * tau
+                u = u + height * (x / np.hypot(1.0, x)) * np.sin(order * omega * cycle + (phase + np.arctan2(1.0, x)))
+            return u
         piece, since, slope = _along(self.pieces, cycle)
         left = np.expm1(-since / tau)
         return np.take_along_axis(self.knots, piece, axis=2) * (1.0 + left) - slope.astype(tau.dtype) * tau * left
@@ -245,9 +249,19 @@ def _lead(wave: Any) -> float:
     return float(wave.phase / (2.0 * np.pi) % 1.0 / wave.frequency)
 
 
-def _corners(wave: Periodic) -> np.ndarray:
+def _tones(wave: Any) -> list[tuple[int, float, float]]:
+    """Of a smooth drive: order, amplitude (V), and phase beside the whole's (rad)."""
     if isinstance(wave, Sine):
-        return np.linspace(0.0, 1.0, 5) / float(wave.frequency)
+        return [(1, 0.5 * float(wave.peak_to_peak), 0.0)]
+    phases = wave.phases or (0.0,) * len(wave.orders)
+    return [
+        (n, float(height), float(phase)) for n, height, phase in zip(wave.orders, wave.amplitudes, phases, strict=True)
+    ]
+
+
+def _corners(wave: Periodic) -> np.ndarray:
+    if isinstance(wave, Sine | Multitone):
+        return np.linspace(0.0, 1.0, 4 * max(order for order, _, _ in _tones(wave)) + 1) / float(wave.frequency)
     assert isinstance(wave, PiecewiseLinear)
     return np.unique(_pieces(wave).knots)
 
@@ -301,14 +315,15 @@ def _terms(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Weights, time constants, and amplitudes of the harmonics that they miss."""
     if skin is None:
-        weight, tau = (np.asarray(x) for x in _constant(circuit))
+        weight, tau = _constant_terms(circuit)
         return weight, tau, np.zeros((ROWS, 0), dtype=complex)
     assert isinstance(drive, Periodic)
     frequency = float(drive.frequency)
-    count = 1 if isinstance(drive, Sine) else max(1, skin.count(frequency))
+    smooth = isinstance(drive, Sine | Multitone)
+    count = max(order for order, _, _ in _tones(drive)) if smooth else max(1, skin.count(frequency))
     omega = 2.0 * np.pi * frequency * np.arange(1, count + 1)
     gain, amplitude = _gain(circuit, skin, omega), np.asarray(_fourier(jax.tree.map(np.asarray, drive), count))
-    if isinstance(drive, Sine):
+    if smooth:
         return np.zeros((ROWS, 0)), np.zeros((ROWS, 0)), amplitude * gain
     if isinstance(skin, Fractional):
         tau, x, fitted = spread(True, precision is np.float64)
@@ -316,7 +331,7 @@ def _terms(
         weight = np.concatenate([above.real, above.imag], axis=1) @ fitted.T
         tau = np.broadcast_to(tau / omega[-1], weight.shape)
     else:  # above 1000 Hz it is constant
-        weight, tau = (np.asarray(x) for x in _constant(WithSkin(circuit, skin).at(1000.0)))
+        weight, tau = _constant_terms(WithSkin(circuit, skin).at(1000.0))
     x = 1j * omega * tau[..., None]
     return weight, tau, amplitude * (gain - np.einsum("rk,rkh->rh", weight, x / (1.0 + x)))
 
@@ -352,8 +367,17 @@ def _skin_at(skin: Skin, element: Element, frequency: Array) -> Element:
     return skin.at(element, frequency)
 
 
+def _constant_terms(circuit: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Of constant skins. Z stands in the loop where a grounding skin does, so one program serves both."""
+    if isinstance(circuit, NaturalGround):
+        loop = circuit.series_resistor, circuit.Z, circuit.Z_capacitance
+        circuit = DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci, *loop, None, circuit.probe)
+    weight, tau = _constant(circuit)
+    return np.asarray(weight), np.asarray(tau)
+
+
 @jax.jit
-def _constant(circuit: DirectGround | NaturalGround) -> tuple[Array, Array]:
+def _constant(circuit: DirectGround) -> tuple[Array, Array]:
     terms = jax.vmap(lambda one: one.terms())(circuit)
     return jnp.stack(terms.weight, axis=1), jnp.stack(terms.tau, axis=1)
 
