@@ -74,7 +74,7 @@ def record_figure(
         axes.yaxis.set_major_formatter(EngFormatter(unit))
         axes.set_xlim(time[0], time[-1])
     below.set_xlabel("time")
-    return _svg(figure)
+    return svg(figure)
 
 
 def _without_spikes(values: np.ndarray) -> tuple[float, float]:
@@ -116,7 +116,7 @@ def corner_figure(posterior: Draws, prior: Draws, units: Mapping[str, str]) -> s
                 here.set_ylabel(y)
     handles = [mpl.lines.Line2D([], [], color=c, lw=6, alpha=0.7) for c in (_MODEL, _PRIOR)]
     figure.legend(handles, ["posterior", "prior"], loc="upper right", fontsize=13)
-    return _svg(figure)
+    return svg(figure)
 
 
 def force_figure(force: Draws) -> str:
@@ -132,7 +132,7 @@ def force_figure(force: Draws) -> str:
         axes.xaxis.set_major_locator(MaxNLocator(4))
         axes.set_yticks([])
         axes.set_xlabel(title)
-    return _svg(figure)
+    return svg(figure)
 
 
 def _histograms(axes: Axes, posterior: np.ndarray, prior: np.ndarray, limits: tuple[float, float]) -> None:
@@ -168,7 +168,8 @@ def _ticks(axis: mpl.axis.Axis, limits: tuple[float, float], unit: str, labelled
     axis.set_major_formatter(EngFormatter(_SYMBOLS.get(unit, unit)) if labelled else mpl.ticker.NullFormatter())
 
 
-def _svg(figure: Figure) -> str:
+def svg(figure: Figure) -> str:
+    """A figure as an element of a page."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", dpi=150, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()

@@ -1,7 +1,6 @@
 """The prior as a picture: what it means for the skin voltage and the force."""
 
 import html
-import io
 from pathlib import Path
 
 import matplotlib as mpl
@@ -12,7 +11,7 @@ from matplotlib.ticker import EngFormatter
 from fitact.errors import InputError
 from fitact.files import replacing
 from fitact.inference.prior_predictive import PriorPredictive
-from fitact.report.plots import style
+from fitact.report.plots import style, svg
 
 _FORMATS = (".html", ".svg", ".png")
 _COLOR, _LINE = "#0072B2", "#333333"
@@ -64,11 +63,8 @@ def _figure(predicted: PriorPredictive) -> Figure:
 
 
 def _page(figure: Figure, predicted: PriorPredictive) -> str:
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
-    svg = buffer.getvalue()
     return (
         '<!doctype html><html lang="en"><meta charset="utf-8"><title>fitact: the prior</title>'
-        f"<h1>What the prior means, before any data</h1>{svg[svg.index('<svg') :]}"
+        f"<h1>What the prior means, before any data</h1>{svg(figure)}"
         f"<pre>{html.escape(predicted.summary())}</pre></html>\n"
     )
