@@ -325,6 +325,7 @@ def test_help_is_a_page_to_start_from(fitact_command):
     assert fitact_command().stdout.split() == done.stdout.split()
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on(environment, finger_path, finger_scene_path, results, tmp_path):
     """SIGINT while it samples: no traceback, exit code not 0, and the same command finishes with the same draws."""
     import signal

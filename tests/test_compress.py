@@ -94,7 +94,9 @@ def test_square_from_rest():
     check(compression, unit_response(time, voltage, TAU, hold=True), None, slow(time), y, TAU)
 
 
-@pytest.mark.parametrize("scene", [None, SQUARE], ids=["measured drive", "folded square"])
+@pytest.mark.parametrize(
+    "scene", [pytest.param(None, marks=pytest.mark.slow), SQUARE], ids=["measured drive", "folded square"]
+)
 def test_fit_and_log_probabilities_are_those_of_the_samples(scene):
     record = square_record(offset=0.1, periods=4)
     ours, full = (fitact.fit(record, scene, tolerance=tolerance) for tolerance in (1e-3, 0.0))
@@ -113,6 +115,7 @@ def test_fit_and_log_probabilities_are_those_of_the_samples(scene):
     assert np.ptp(b) > 10.0
 
 
+@pytest.mark.slow
 def test_cost_does_not_grow_with_the_record():
     rows = [fitact.fit(square_record(periods=n), SQUARE).likelihood.rows for n in (1, 40)]
     assert rows[1] <= rows[0] + 2  # a longer record is known better, and asks for a term or two more

@@ -37,6 +37,7 @@ def test_verdict_on_vsc_alone(finger_fit: fitact.Fit):
     assert "current" in verdict.remedy
 
 
+@pytest.mark.slow
 def test_shipped_record_with_a_trapezoid_that_lacks_the_overshoot(finger_path, finger_truth):
     scene = fitact.Scene.from_dict({"drive": {"waveform": "trapezoid", "rise_time": "20 us"}})
     fit = fitact.fit(fitact.read(finger_path, scene), scene)
@@ -131,7 +132,7 @@ def test_partial_scene_does_not_replace_a_recorded_drive(finger_path):
     assert any("V_V" in warning for warning in fit.warnings)
 
 
-@pytest.mark.parametrize("waveform", ["square", "triangle"])
+@pytest.mark.parametrize("waveform", ["square", pytest.param("triangle", marks=pytest.mark.slow)])
 def test_record_that_starts_anywhere_without_V(waveform: str, tmp_path):
     record = square_record()
     scene = SQUARE
@@ -191,7 +192,7 @@ def misfits(record: fitact.Record) -> dict[str, fitact.Record]:
     }
 
 
-@pytest.mark.parametrize("name", ["lost", "saturating"])
+@pytest.mark.parametrize("name", ["lost", pytest.param("saturating", marks=pytest.mark.slow)])
 def test_misfit_is_named(finger_path, name: str):
     fit = fitact.fit(misfits(fitact.read(finger_path))[name])
     assert fit.result == "misfit"
@@ -243,7 +244,9 @@ def trapezoid_record(step: float, edge: float = 20e-6, noise: float = 0.05) -> f
     return fitact.Record.from_arrays(fine[kept] - 0.12, V=voltage[kept], Vsc=vsc[kept] + noise_Vsc)
 
 
-@pytest.mark.parametrize("step", [5e-6, 50e-6, 100e-6])
+@pytest.mark.parametrize(
+    "step", [pytest.param(5e-6, marks=pytest.mark.slow), pytest.param(50e-6, marks=pytest.mark.slow), 100e-6]
+)
 def test_edges_faster_than_the_samples_widen_g(step: float):
     """Straight lines through a jump put its edge in the middle of a step, wherever it was."""
     fit = fitact.fit(trapezoid_record(step))
@@ -251,7 +254,7 @@ def test_edges_faster_than_the_samples_widen_g(step: float):
     assert abs(deviation(fit, "b", 130e3 * 20.7e-9)) < 4.0
 
 
-@pytest.mark.parametrize("samples", [10, 20])
+@pytest.mark.parametrize("samples", [pytest.param(10, marks=pytest.mark.slow), 20])
 def test_coarse_samples_of_a_smooth_drive_are_not_trusted(samples: int):
     time = np.arange(5 * samples) * 0.01 / samples
     omega = 2.0 * np.pi * 100.0
@@ -322,7 +325,9 @@ SWEEP = {"waveform": "chirp", "start_frequency": 20.0, "end_frequency": 500.0, "
 
 
 @pytest.mark.parametrize(
-    ("drive", "shift"), [({"waveform": "burst"}, 0.0), (SWEEP, 1.37e-3)], ids=["burst", "shifted chirp"]
+    ("drive", "shift"),
+    [({"waveform": "burst"}, 0.0), pytest.param(SWEEP, 1.37e-3, marks=pytest.mark.slow)],
+    ids=["burst", "shifted chirp"],
 )
 def test_burst_and_chirp_against_scipy(drive: dict[str, object], shift: float):
     """scipy on a fine grid of steps (burst) or straight lines (chirp), sampled; perhaps the trigger came earlier."""

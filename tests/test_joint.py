@@ -97,6 +97,7 @@ EARTH = (14.5e6, 100e-12)
 PROBED = (1.0 / (1.0 / SKIN[0] + 1.0 / 10e6), SKIN[1] + 10e-12)
 
 
+@pytest.mark.slow
 def test_known_series_resistor_identifies_all_three():
     fit = fitact.fit(record([SKIN, SKIN], 100e3), scene(measurement={"series_resistor": 100e3}))
     assert fit.trusted
@@ -143,6 +144,7 @@ def test_the_papers_circuits(elements, R0: float, sections):
     assert_true(fit, **{name: TRUTH.get(name, nominal[name]) for name in fit.names})
 
 
+@pytest.mark.slow
 def test_parameters_tied_to_others():
     ties = {"grounding_Rsc": {"tied": "Rsc", "ratio": 0.5}, "grounding_Csc": {"tied": "Csc", "ratio": 2.0}}
     made = record([SKIN, (0.5 * SKIN[0], 2.0 * SKIN[1])])
@@ -162,6 +164,7 @@ def alone(first: fitact.Record) -> fitact.Fit:
     return fitact.fit(first, scene())
 
 
+@pytest.mark.slow
 def test_a_held_insulator_leaves_nothing_to_the_prior(first: fitact.Record):
     fit = fitact.fit(first, scene(prior={"Ci": {"fixed": True}}))
     assert fit.names == ("Rsc", "Csc")
@@ -171,6 +174,7 @@ def test_a_held_insulator_leaves_nothing_to_the_prior(first: fitact.Record):
     assert fit.parameters()["Rsc"]["sd"] < 0.01 * TRUTH["Rsc"]
 
 
+@pytest.mark.slow
 def test_correlated_beliefs_show_along_the_blind_direction(first: fitact.Record):
     """With g and b known, t along (-1, 1, 1) is normal with the precision d' S^-1 d, S the prior's covariance."""
     sd, r = np.log([3.0, 3.0, 1.5]) / 1.959963984540054, 0.8

@@ -391,7 +391,12 @@ DIFFERENTIABLE = ["sine", "square", "trapezoid", "triangle", "sampled", "polylin
 
 @pytest.mark.parametrize(
     ("name", "steady_state"),
-    [(name, steady) for name in DIFFERENTIABLE for steady in (True, False) if not (steady and name == "burst")],
+    [
+        pytest.param(name, steady, marks=[pytest.mark.slow] * (name in ("trapezoid", "triangle")))  # as polylines are
+        for name in DIFFERENTIABLE
+        for steady in (True, False)
+        if not (steady and name == "burst")
+    ],
 )
 def test_differentiable_in_every_parameter(name: str, steady_state: bool):
     time = np.array([1.3e-3, 4.1e-3, 7.7e-3, 31.3e-3])

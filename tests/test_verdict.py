@@ -24,6 +24,7 @@ def test_bounds_and_orders_that_the_record_contradicts(prior: dict, result: str)
     assert fitact.fit(square_record(), fitact.Scene.from_dict(NOMINAL | {"prior": prior})).result == result
 
 
+@pytest.mark.slow
 def test_records_of_two_fingers_are_not_one():
     one = square_record()
     other = dataclasses.replace(square_record(Rsc=80e3, seed=8), source="other.csv")
