@@ -14,6 +14,11 @@ import pytest
 FILES = {"fit.json", "summary.json", "posterior.nc", "chain.h5", "report.html"}
 
 
+def interruptible() -> None:
+    """Before a program starts: test runners may pass on an ignored SIGINT."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory) -> dict[str, str]:
     return os.environ | {"XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache"))}
@@ -185,6 +190,7 @@ def test_tradeoff_is_written_or_ends_without_a_trace(fitact_command, environment
         text=True,
         cwd=tmp_path,
         env=environment,
+        preexec_fn=interruptible,
     )
     while "round 1" not in running.stderr.readline():
         pass
@@ -328,8 +334,6 @@ def test_help_is_a_page_to_start_from(fitact_command):
 @pytest.mark.slow
 def test_an_interrupted_run_goes_on(environment, finger_path, finger_scene_path, results, tmp_path):
     """SIGINT while it samples: no traceback, exit code not 0, and the same command finishes with the same draws."""
-    import signal
-
     folder = tmp_path / "out"
     command = [
         sys.executable,
@@ -342,9 +346,8 @@ def test_an_interrupted_run_goes_on(environment, finger_path, finger_scene_path,
     ]
     command = [*map(str, command), "--out", str(folder), "--seed", "1"]
     process = subprocess.Popen(
-        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # test runners may pass on an ignored SIGINT
-    )  # fmt: skip
+        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment, preexec_fn=interruptible
+    )
     assert process.stderr is not None
     for line in process.stderr:
         if line.startswith("sampling"):
