@@ -14,9 +14,10 @@ import pytest
 FILES = {"fit.json", "summary.json", "posterior.nc", "chain.h5", "report.html"}
 
 
-def interruptible() -> None:
-    """Before a program starts: test runners may pass on an ignored SIGINT."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+# a program that can be interrupted although test runners may pass on an ignored SIGINT
+INTERRUPTIBLE = (
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from fitact.cli import main; main()"
+)
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +183,7 @@ def test_scene_is_printed_as_a_file(fitact_command, tmp_path):
 
 @pytest.mark.slow
 def test_tradeoff_is_written_or_ends_without_a_trace(fitact_command, environment, finger_path, tmp_path):
-    command = [sys.executable, "-u", "-c", "from fitact.cli import main; main()", "tradeoff", str(finger_path)]
+    command = [sys.executable, "-u", "-c", INTERRUPTIBLE, "tradeoff", str(finger_path)]
     running = subprocess.Popen(
         [*command, "--out", "cut"],
         stdout=subprocess.PIPE,
@@ -190,7 +191,6 @@ def test_tradeoff_is_written_or_ends_without_a_trace(fitact_command, environment
         text=True,
         cwd=tmp_path,
         env=environment,
-        preexec_fn=interruptible,
     )
     while "round 1" not in running.stderr.readline():
         pass
@@ -338,16 +338,14 @@ def test_an_interrupted_run_goes_on(environment, finger_path, finger_scene_path,
     command = [
         sys.executable,
         "-c",
-        "from fitact.cli import main; main()",
+        INTERRUPTIBLE,
         "run",
         finger_path,
         "--scene",
         finger_scene_path,
     ]
     command = [*map(str, command), "--out", str(folder), "--seed", "1"]
-    process = subprocess.Popen(
-        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment, preexec_fn=interruptible
-    )
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
     assert process.stderr is not None
     for line in process.stderr:
         if line.startswith("sampling"):
