@@ -4,7 +4,7 @@ PY = .venv/bin/python
 # what one process of the tests compiles serves the others, and the next run
 COMPILED = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/out/jax JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
 .DEFAULT_GOAL = help
-.PHONY: help env demo test test-slow notebooks extremes calibration calibration-quick check lock clean
+.PHONY: help env demo test test-slow test-slow-quick notebooks extremes calibration calibration-quick check lock clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -21,6 +21,10 @@ test: env
 # make test-slow   the tests that `make test` leaves out for their time
 test-slow: env
 	$(COMPILED) $(PY) -m pytest -n auto -m slow
+
+# make test-slow-quick   the same without those that repeat a case for thoroughness
+test-slow-quick: env
+	$(COMPILED) $(PY) -m pytest -n auto -m "slow and not thorough"
 
 # make notebooks   run the notebooks; executed copies in out/notebooks
 notebooks: env

@@ -151,7 +151,7 @@ def pink(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("channel", ["Vsc", "I"])
+@pytest.mark.parametrize("channel", ["Vsc", pytest.param("I", marks=pytest.mark.thorough)])
 def test_a_measured_spectrum_widens_what_white_noise_would_make_too_narrow(channel: str):
     """The root mean square of 12 errors is 1 ± 0.2."""
     record = burst_record()
