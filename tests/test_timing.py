@@ -36,7 +36,7 @@ def fitted(waveform: str, off: float, periods: int, per_period: int) -> fitact.F
     ],
 )
 def test_a_clock_is_found(waveform: str, off: float, periods: int, per_period: int):
-    """A hundred-thousandth, unnoticed over 50 periods, biases b (sine) or g (square) by 15 standard errors."""
+    """A hundred-thousandth, unnoticed over 50 periods, biases b (sine) or g (square) by 13 standard errors or more."""
     fit = fitted(waveform, off, periods, per_period)
     assert fit.result == "successful"
     clock = fit.parameters()["clock"]
