@@ -10,14 +10,13 @@ repeats.
 """
 
 import argparse
-import json
 import math
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from timing import medians
+from timing import medians, show
 
 import fitact
 from fitact.data import compress as compression
@@ -143,11 +142,7 @@ def main() -> None:
         ratios |= building(1_000_000 if given.quick else 10_000_000)
         if not given.quick:
             ratios["cost_10000000_vs_10000"] = growth(points)
-    if given.json:
-        print(json.dumps(ratios))
-        return
-    for name, value in ratios.items():
-        print(f"{name:36}{value:12.3g}")
+    show(ratios, given.json)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ is compared with the shortest among all combinations of omissions that keep the 
 
 import argparse
 import itertools
-import json
 import math
 import time
 from collections.abc import Callable
@@ -17,7 +16,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from timing import minima
+from timing import minima, show
 
 import fitact
 from fitact.model import omissions
@@ -163,14 +162,11 @@ def main() -> None:
         "cost_in_ns_median": float(np.median(share)),
         "cost_off_by_factor_at_most": float(np.max(np.maximum(share / np.median(share), np.median(share) / share))),
     }
-    if arguments.json:
-        print(json.dumps(ratios))
-        return
-    print(f"{'model':44}{'cost':>8}{'ns a sample':>14}")
-    for name, (cost, ns) in rows.items():
-        print(f"{name:44}{cost:8.1f}{ns:14.1f}")
-    for name, value in ratios.items():
-        print(f"{name:44}{value:10.3g}")
+    if not arguments.json:
+        print(f"{'model':44}{'cost':>8}{'ns a sample':>14}")
+        for name, (cost, ns) in rows.items():
+            print(f"{name:44}{cost:8.1f}{ns:14.1f}")
+    show(ratios, arguments.json)
 
 
 if __name__ == "__main__":

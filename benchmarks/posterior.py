@@ -48,6 +48,7 @@ from peers import (
     plain_log_prob,
     raw_log_density,
 )
+from timing import show
 
 import fitact
 from fitact.data.formats import write_csv
@@ -180,11 +181,7 @@ def main() -> None:
     print("a second: " + ", ".join(f"{name} {rate:,.0f}" for name, rate in found.items()), file=sys.stderr)
     whole, rate = processes(data, each["lmfit"], given.quick)
     ratios |= whole | {"whole_vs_good_5000": rate / found["good"]}
-    if given.json:
-        print(json.dumps(ratios))
-        return
-    for name, value in ratios.items():
-        print(f"{name:30}{value:12.4g}")
+    show(ratios, given.json)
 
 
 if __name__ == "__main__":

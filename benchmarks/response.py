@@ -6,13 +6,12 @@ One from-rest period of a triangle, 5,000 samples; lsim's first-order hold is ex
 """
 
 import argparse
-import json
 from collections.abc import Callable
 
 import jax
 import numpy as np
 import scipy.signal
-from timing import medians
+from timing import medians, show
 
 import fitact
 
@@ -64,13 +63,11 @@ def main() -> None:
         "jit_call_vs_numpy_exp": times["jit call"] / times["numpy exp"],
         "jax_exp_vs_numpy_exp": times["exp in JAX"] / times["numpy exp"],
     }
-    if parser.parse_args().json:
-        print(json.dumps(ratios))
-        return
-    for name, value in times.items():
-        print(f"{name:12}{value * 1e6:10.1f} us")
-    for name, value in ratios.items():
-        print(f"{name:22}{value:10.2f}")
+    as_json = parser.parse_args().json
+    if not as_json:
+        for name, value in times.items():
+            print(f"{name:12}{value * 1e6:10.1f} us")
+    show(ratios, as_json)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
-"""The stopwatch of the benchmarks."""
+"""The stopwatch of the benchmarks, and how they tell what they found."""
 
+import json
 import statistics
 import time
 from collections.abc import Callable
@@ -29,3 +30,12 @@ def _taken(jobs: dict[str, Callable[[], object]], rounds: int, calls: dict[str, 
                 job()
             taken[name].append((time.perf_counter() - start) / count)
     return taken
+
+
+def show(ratios: dict[str, float], as_json: bool) -> None:
+    """Print named ratios, a line each or as one JSON object."""
+    if as_json:
+        print(json.dumps(ratios))
+        return
+    for name, value in ratios.items():
+        print(f"{name:36}{value:12.4g}")

@@ -81,3 +81,8 @@ def unit_of(name: str) -> str:
     bare = name if name in _UNITS else re.sub(r"_\d+$", "", name)
     found = _UNITS[bare.removesuffix("_I")]
     return "A" if bare.endswith("_I") and found == "V" else found
+
+
+def percent(share: float) -> str:
+    """A share of 1, for people: ``percent(0.0123) == "1.2 %"``."""
+    return f"{100.0 * share:.2g} %"

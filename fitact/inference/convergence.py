@@ -8,6 +8,8 @@ import numpy as np
 from arviz_stats.base import array_stats
 from jaxtyping import Float, Int
 
+from fitact.units import percent
+
 _LENGTHS = 50.0  # autocorrelation times each ensemble must be long
 _RHAT = 1.01
 _RANKED = 4000  # draws per ensemble that are enough to see it
@@ -94,8 +96,8 @@ class Convergence:
         shifted, widened = (max(errors, key=lambda name: abs(errors[name])) for errors in (self.shift, self.widening))
         return (
             f"{verdict}, by importance weights ({weights}) off by {abs(self.shift[shifted]):.2g} sd in the mean"
-            f" ({shifted}) and {100.0 * abs(self.widening[widened]):.2g} % in the sd ({widened}) at most;"
-            f" the prior forbids {100.0 * self.forbidden:.2g} % of its draws"
+            f" ({shifted}) and {percent(abs(self.widening[widened]))} in the sd ({widened}) at most;"
+            f" the prior forbids {percent(self.forbidden)} of its draws"
         )
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 
 from fitact.data.record import Record
 from fitact.inference.start import DriveChoice, slope_of, unit_response
+from fitact.units import percent
 
 _NEAR = 2  # steps from an edge within which samples are left out
 _BLOCK = 64  # samples over which the bend of a smooth drive counts as the same
@@ -53,7 +54,7 @@ def comparable(record: Record, choice: DriveChoice) -> Comparable:
     if attenuation <= _ATTENUATION:
         return Comparable(weight, rate, False, (note,))
     drowned = (
-        f"V_V's noise, differentiated, drowns I and takes {100.0 * attenuation:.2g} % off what follows dV/dt;"
+        f"V_V's noise, differentiated, drowns I and takes {percent(attenuation)} off what follows dV/dt;"
         " name the waveform in the scene, or record V with less noise"
     )
     return Comparable(weight, rate, True, (note, drowned))

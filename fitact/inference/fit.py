@@ -315,12 +315,12 @@ def fit(
     with jax.enable_x64(True):
         try:
             problem = pose(records, scenes, prior)
-            solved, certified = _solved(problem, tolerance, start)
+            solved, certified, root = _solved(problem, tolerance, start)
             optima = explore(solved, starts) if starts > 1 else None
             lower = None if optima is None else better(optima, solved)
             if lower is not None:
-                solved, certified = _solved(problem, tolerance, lower)
-            return _judged(problem, solved, certified, optima, scenes[0])
+                solved, certified, root = _solved(problem, tolerance, lower)
+            return _judged(problem, solved, certified, root, optima, scenes[0])
         except np.linalg.LinAlgError as error:
             raise InputError(
                 f"{records[0].source}: the channels cannot be computed with ({error}); check for a huge offset or a"
@@ -330,8 +330,8 @@ def fit(
 
 def _solved(
     problem: Problem, tolerance: float, start: Mapping[str, float] | None
-) -> tuple[Solved, compressed.Certified]:
-    """The fit, with compressions where they hold; again where they turn out not to."""
+) -> tuple[Solved, compressed.Certified, np.ndarray]:
+    """The fit, with compressions where they hold, and its covariance's root; again where they turn out not to."""
     (likelihood, reasons), theta_0 = problem.compressed(tolerance), begin(problem, start)
     noise = np.array([source.noise for source in problem.sources])
     freeable = tuple(source.freeable for source in problem.sources)
@@ -346,7 +346,7 @@ def _solved(
             if reason and trace.compression is not None
         ]
         if not failed:
-            return solved, certified
+            return solved, certified, root
         for i in failed:
             likelihood = likelihood.with_trace(i, likelihood.traces[i].summed())
         reasons = certified.reasons
@@ -356,12 +356,11 @@ def _judged(
     problem: Problem,
     solved: Solved,
     certified: compressed.Certified,
+    root: Float[np.ndarray, "parameters parameters"],
     optima: Optima | None,
     scene: Scene | None,
 ) -> Fit:
     likelihood, theta, sigma = certified.likelihood, np.asarray(solved.theta), np.asarray(solved.sigma)
-    jacobian, prior_root = np.concatenate(solved.jacobian), likelihood.prior_root
-    root = covariance_root(jacobian, prior_root)
     source, given = problem.sources[0], scene or Scene()
     circuit = likelihood.circuit(jnp.asarray(theta))
     derive = derived.for_fit(likelihood, source.record, source.choice, given, float(circuit.b))
@@ -386,7 +385,9 @@ def _judged(
         traces=traces,
         result=verdict(solved, root, traces, problem.sources, optima),
         figures=figures,
-        identifiability=assess(likelihood.names, root, prior_root, force, problem.experiment(likelihood, theta, sigma)),
+        identifiability=assess(
+            likelihood.names, root, likelihood.prior_root, force, problem.experiment(likelihood, theta, sigma)
+        ),
         warnings=tuple(dict.fromkeys([*on_traces, *misfits(traces), *on_all])),
         compression_error=certified.error,
         likelihood=likelihood,

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from fitact.inference.expected import Experiment, Remedy, remedies
 from fitact.inference.structure import Structure, blind_directions, gain_names, name_direction
+from fitact.units import percent
 
 _IDENTIFIED = 0.9  # smallest prior-whitened eigenvalue from which the data speak in every direction
 _MOVES = 0.1  # a component of a unit vector from which it counts as part of a direction
@@ -65,7 +66,7 @@ class Identifiability:
         moves = ", ".join(f"{name} {value:+.2f}" for name, value in self.blind_direction.items())
         return (
             f"{self.verdict}: {found} (logs move together: {moves}); along it the prior speaks"
-            f" (± {100.0 * math.expm1(self.prior_sd):.2g} %), and {100.0 * self.force_from_prior:.3g} % of the force's"
+            f" (± {percent(math.expm1(self.prior_sd))}), and {100.0 * self.force_from_prior:.3g} % of the force's"
             f" variance comes from the prior. {self.remedy}"
         )
 
@@ -124,9 +125,9 @@ def _from_prior(root: np.ndarray, prior_root: np.ndarray, gradient: np.ndarray) 
 
 
 def _remedy(verdict: str, force_sd: float, offered: tuple[Remedy, ...], structure: Structure) -> str:
-    figures = [f"± {_percent(remedy.force_sd)} with {remedy.name}" for remedy in offered]
+    figures = [f"± {percent(remedy.force_sd)} with {remedy.name}" for remedy in offered]
     remedy = (
-        f"The mean force is known to ± {_percent(force_sd)}; to be expected is {', '.join(figures[:-1])},"
+        f"The mean force is known to ± {percent(force_sd)}; to be expected is {', '.join(figures[:-1])},"
         f" and {figures[-1]}."
     )
     if verdict == "unidentified":
@@ -135,7 +136,3 @@ def _remedy(verdict: str, force_sd: float, offered: tuple[Remedy, ...], structur
     if np.any(np.abs(gains) > _MOVES):
         remedy += " The free gain is confounded with the circuit: calibrate the probe, and resolve the drive's edges."
     return remedy
-
-
-def _percent(sd: float) -> str:
-    return f"{100.0 * sd:.2g} %"

@@ -10,7 +10,7 @@ from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.inference.diagnostics import is_coarse
 from fitact.inference.likelihood import Likelihood
 from fitact.inference.start import DriveChoice
-from fitact.units import engineering
+from fitact.units import engineering, percent
 
 _DRAWS = 10_000
 _RESTLESS = 3.0  # times what a fit leaves: noise of the quiet stretch that must hold more than noise
@@ -63,7 +63,7 @@ def on_parameters(likelihood: Likelihood, theta: Float[np.ndarray, " parameters"
     for name, factor, tail in _plausibility(likelihood, theta):
         if tail < _IMPLAUSIBLE:
             found.append(
-                f"{name} is {factor:.3g} times what the prior expects (less than {100.0 * _IMPLAUSIBLE:.2g} % of it"
+                f"{name} is {factor:.3g} times what the prior expects (less than {percent(_IMPLAUSIBLE)} of it"
                 " lies so far out); check the probe's attenuation (x10), the units of time and voltage, and peak"
                 " against peak-to-peak"
             )

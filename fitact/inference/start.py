@@ -17,6 +17,7 @@ from fitact.model.drive import Burst, Drive, Periodic, Sampled, Sine, Square
 from fitact.model.response import highpass
 from fitact.model.scene import Scene
 from fitact.model.sections import DriveSection
+from fitact.units import percent
 
 _ALIGNED = 20_000  # samples on which a drive is laid
 _CONTRADICTION = 0.05  # relative difference between the stated and the recorded drive that cannot be an inaccuracy
@@ -99,7 +100,7 @@ def choose_drive(record: Record, scene: Scene | None) -> DriveChoice:
         if error > 0.02:
             notes = (
                 *notes,
-                f"V_V differs from the scene's {scene.drive.waveform} by {100.0 * error:.2g} % rms;"
+                f"V_V differs from the scene's {scene.drive.waveform} by {percent(error)} rms;"
                 " [drive] waveform = 'measured' would use V_V as recorded",
             )
     return DriveChoice(drive, voltage, scene.drive.steady_state, False, shift, scene.drive.waveform, notes)

@@ -91,8 +91,9 @@ def clock_drop(trace: Trace, seen: Seen, sigma: float) -> float:
     Its shape is no combination of responses, so the response table does not hold it: from the samples.
     """
     rows, kept, edges = np.asarray(_around(trace.summed(), seen, sigma)), trace.weights > 0.0, _beside_edges(trace)
+    drop = _drop(rows[:, kept])
     # an ideal edge shows a clock where it has passed a sample, and hides it where it has not
-    return max(_drop(rows[:, kept]), _drop(rows[:, kept & ~edges]))
+    return max(drop, _drop(rows[:, kept & ~edges])) if edges.any() else drop
 
 
 def _drop(rows: np.ndarray) -> float:
@@ -113,7 +114,7 @@ def _around(trace: Trace, seen: Seen, sigma: float) -> Float[Array, "n samples"]
         return highpass(trace.drive, time, jnp.exp(log_tau), steady_state=trace.steady_state)
 
     along, bent = jax.vmap(lambda x: jax.jvp(response, (x,), (jnp.ones_like(x),)))(jnp.log(taus))
-    slope = (trace.signal(seen, trace.time_step) - trace.signal(seen, -trace.time_step)) / (2.0 * trace.time_step)
+    slope = trace.change_by_delay(seen)
     shapes = jnp.where(trace.linear_sd[:, None] > 0.0, trace.shapes(seen), 0.0)
     # a free delay changes the slope alone
     delay = slope if "delay" in trace.timing else jnp.zeros_like(slope)

@@ -184,12 +184,15 @@ class Trace(eqx.Module):
         """Over the samples that have a weight."""
         return jnp.mean(values, where=None if self.weight is None else self.weight > 0.0)
 
-    def slope(self, seen: Seen) -> Float[Array, " rows"]:
+    def change_by_delay(self, seen: Seen) -> Float[Array, " samples"]:
         """How a further delay changes the signal, per s: over two time steps, so that ideal edges count."""
+        step = self.time_step
+        return (self.signal(seen, step) - self.signal(seen, -step)) / (2.0 * step)
+
+    def slope(self, seen: Seen) -> Float[Array, " rows"]:
+        """As `change_by_delay`, weighted, over samples or coordinates."""
         if self.compression is None:
-            step = self.time_step
-            change = (self.signal(seen, step) - self.signal(seen, -step)) / (2.0 * step)
-            return self.weighted(change)
+            return self.weighted(self.change_by_delay(seen))
         weight, tau, _ = seen.circuit.terms_of(self.channel)  # u' = V' - u / tau
         falling = Terms(tuple(w / t for w, t in zip(weight, tau, strict=True)), tau)
         return seen.gain * (self.compression.response(falling) - sum(weight) * self.compression.slope)

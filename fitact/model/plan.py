@@ -16,7 +16,7 @@ from fitact.model import omissions
 from fitact.model.circuit import FinalCircuit, NaturalGround
 from fitact.model.scene import Scene
 from fitact.model.waves import ROWS, Comparison, Reference, Waves, Window
-from fitact.units import engineering
+from fitact.units import engineering, percent
 
 _NOT_OF_THE_CIRCUIT = ("sigma", "sigma_I")
 _QUANTILE = 0.95
@@ -97,8 +97,8 @@ class Plan:
         if self.q95.force <= tolerance:
             return ()
         return (
-            f"over the prior the planned model errs by up to {_percent(self.q95.force)} of the force (95 %), more than"
-            f" the tolerance of {_percent(tolerance)}, which it keeps at the nominal values; narrow [prior], or lower"
+            f"over the prior the planned model errs by up to {percent(self.q95.force)} of the force (95 %), more than"
+            f" the tolerance of {percent(tolerance)}, which it keeps at the nominal values; narrow [prior], or lower"
             " [tolerance] force",
         )
 
@@ -144,9 +144,9 @@ class Plan:
         if not self.left_out:
             return "Nothing is left out."
         return (
-            f"Left out: {', '.join(self.left_out)}; that changes the peak of Vsc by {_percent(self.nominal.Vsc_peak)},"
-            f" the mean force by {_percent(self.nominal.force_mean)} and the peak force by"
-            f" {_percent(self.nominal.force_peak)} (tolerance {_percent(self.full.tolerance.force)}), and is"
+            f"Left out: {', '.join(self.left_out)}; that changes the peak of Vsc by {percent(self.nominal.Vsc_peak)},"
+            f" the mean force by {percent(self.nominal.force_mean)} and the peak force by"
+            f" {percent(self.nominal.force_peak)} (tolerance {percent(self.full.tolerance.force)}), and is"
             f" {self.speedup:.2g} times faster."
         )
 
@@ -172,19 +172,20 @@ def plan(scene: Scene) -> Plan:
     reasons = {name: omissions.required(scene, name) for name in names}
     whole, tolerance = omissions.cost(scene, nominal), scene.tolerance.force
     best = _cheapest(scene, nominal, reference, tuple(name for name in names if not reasons[name]), tolerance)
+
+    def judged(left_out: tuple[str, ...]) -> tuple[Errors, Errors, float]:
+        reduced = omissions.without(scene, left_out, prior=False)
+        errors = _errors(reference.compare(Waves.of(reduced, _left(values, left_out))))
+        return *errors, whole / omissions.cost(reduced, _left(nominal, left_out))
+
     rows = []
     for name in names:
-        reduced = omissions.without(scene, (name,), prior=False)
-        at_nominal, q95 = _errors(reference.compare(Waves.of(reduced, _left(values, (name,)))))
-        speedup = whole / omissions.cost(reduced, _left(nominal, (name,)))
+        at_nominal, q95, speedup = judged((name,))
         because = reasons[name] or _because(name in best, at_nominal.force, tolerance, speedup)
         rows.append(Omission(name, at_nominal, q95, speedup, name not in best, because))
     single = _errors(reference.compare(Waves.of(scene, values, np.float32)))
     rows.append(Omission("float64", *single, omissions.SINGLE_SPEEDUP, True, "fits and sampling need its derivatives"))
-    reduced = omissions.without(scene, best, prior=False)
-    joint = _errors(reference.compare(Waves.of(reduced, _left(values, best))))
-    speedup = whole / omissions.cost(reduced, _left(nominal, best))
-    return Plan(scene, omissions.without(scene, best), tuple(rows), *joint, speedup)
+    return Plan(scene, omissions.without(scene, best), tuple(rows), *judged(best))
 
 
 def _cheapest(
@@ -237,7 +238,7 @@ def _because(left_out: bool, error: float, tolerance: float, speedup: float) -> 
     if left_out:
         return "keeps the tolerance"
     if error > tolerance:
-        return f"{_percent(error)} of the force, more than {_percent(tolerance)}"
+        return f"{percent(error)} of the force, more than {percent(tolerance)}"
     return "saves nothing" if speedup == 1.0 else "too much together with the others, or saves nothing then"
 
 
@@ -256,9 +257,5 @@ def _named_errors(nominal: Errors, q95: Errors) -> dict[str, float]:
 
 
 def _row(name: str, nominal: Errors, q95: Errors, speedup: float) -> str:
-    cells = (f"{_percent(a)} ({_percent(b)})" for a, b in zip(nominal, q95, strict=True))
+    cells = (f"{percent(a)} ({percent(b)})" for a, b in zip(nominal, q95, strict=True))
     return f"{name:17}" + "".join(f"{cell:>22}" for cell in cells) + f"{speedup:8.2f}x"
-
-
-def _percent(share: float) -> str:
-    return f"{100.0 * share:.2g} %"
