@@ -30,6 +30,7 @@ from fitact.model.skin import Fractional, Skin, WithSkin, spread
 
 ROWS = 128  # circuits side by side; fewer are filled up, so that each program is compiled once
 _ABSENT = 1e-6  # ohm: with any capacitance here over long before the first node
+_BLOCK = 64  # frequencies in one program
 _PIECES = 4  # of a period; fewer are filled up with ones of no length
 _DECADES, _ORDER = 8, 8  # of a piece, and the order of the rule in each
 _PERIODS = 12  # from rest: periods that stand for all, in geometric progression
@@ -107,7 +108,7 @@ class Waves:
         drive, count = scene.make_drive(), max(np.size(value) for value in values.values())
         with jax.enable_x64(precision is np.float64):
             circuit = scene.make_circuit(dict(values))
-            skin = circuit.skin if isinstance(circuit, WithSkin) else None
+            skin = jax.tree.map(jnp.asarray, circuit.skin) if isinstance(circuit, WithSkin) else None
             complete = _complete(scene.make_rc_circuit(dict(values)))
             filled = jax.tree.map(lambda x: _filled_up(x, precision), complete)
             weight, tau, harmonics = _terms(filled, skin, drive, precision)
@@ -116,7 +117,7 @@ class Waves:
             pieces = _pieces(wave) if isinstance(wave, PiecewiseLinear) else None
             knots = np.zeros((*tau.shape, 0), dtype=precision)
             if pieces is not None:
-                knots = np.asarray(_knots(jax.tree.map(precision, pieces), tau))
+                knots = _knots(jax.tree.map(precision, pieces), tau)
         rows = (x[:count] for x in (weight.astype(precision), tau.astype(precision), knots, harmonics))
         return cls(drive, scene.drive.steady_state, pieces, *rows)
 
@@ -322,7 +323,9 @@ def _terms(
     smooth = isinstance(drive, Sine | Multitone)
     count = max(order for order, _, _ in _tones(drive)) if smooth else max(1, skin.count(frequency))
     omega = 2.0 * np.pi * frequency * np.arange(1, count + 1)
-    gain, amplitude = _gain(circuit, skin, omega), np.asarray(_fourier(jax.tree.map(np.asarray, drive), count))
+    with jax.enable_x64(True):  # the drive's, whatever the precision of what follows
+        amplitude = np.asarray(_fourier(jax.tree.map(np.asarray, drive), _blocks(count) * _BLOCK))[:count]
+    gain = _gain(circuit, skin, omega)
     if smooth:
         return np.zeros((ROWS, 0)), np.zeros((ROWS, 0)), amplitude * gain
     if isinstance(skin, Fractional):
@@ -331,7 +334,7 @@ def _terms(
         weight = np.concatenate([above.real, above.imag], axis=1) @ fitted.T
         tau = np.broadcast_to(tau / omega[-1], weight.shape)
     else:  # above 1000 Hz it is constant
-        weight, tau = _constant_terms(WithSkin(circuit, skin).at(1000.0))
+        weight, tau = _constant_terms(_at(WithSkin(circuit, skin), 1000.0))
     x = 1j * omega * tau[..., None]
     return weight, tau, amplitude * (gain - np.einsum("rk,rkh->rh", weight, x / (1.0 + x)))
 
@@ -345,7 +348,11 @@ def _gain(circuit: DirectGround | NaturalGround, skin: Skin, omega: np.ndarray) 
         return 1.0 / R + s * C
 
     def of_skin(R: ArrayLike, C: ArrayLike) -> np.ndarray:
-        return admittance(_skin_at(skin, Element(*(jnp.asarray(x)[:, None] for x in (R, C))), omega / (2.0 * np.pi)))
+        missing = _blocks(omega.size) * _BLOCK - omega.size
+        blocks = np.pad(omega / (2.0 * np.pi), (0, missing), mode="edge").reshape(-1, _BLOCK)
+        constant = Element(*(jnp.asarray(x)[:, None] for x in (R, C)))
+        parts = [_skin_at(skin, constant, block) for block in blocks]
+        return admittance(Element(*(np.concatenate(x, axis=1)[:, : omega.size] for x in zip(*parts, strict=True))))
 
     assert circuit.probe is not None
     touching = 1.0 / (of_skin(circuit.Rsc, circuit.Csc) + admittance(Element(circuit.probe.R, circuit.probe.C)))
@@ -357,6 +364,11 @@ def _gain(circuit: DirectGround | NaturalGround, skin: Skin, omega: np.ndarray) 
     return touching / (touching + other + rest)
 
 
+def _blocks(count: int) -> int:
+    """In how many blocks frequencies are computed, so that programs are compiled for one size."""
+    return -(-count // _BLOCK)
+
+
 @eqx.filter_jit
 def _fourier(drive: Drive, harmonics: int) -> Complex[Array, " harmonics"]:
     return fourier(drive, harmonics)
@@ -365,6 +377,11 @@ def _fourier(drive: Drive, harmonics: int) -> Complex[Array, " harmonics"]:
 @eqx.filter_jit
 def _skin_at(skin: Skin, element: Element, frequency: Array) -> Element:
     return skin.at(element, frequency)
+
+
+@eqx.filter_jit
+def _at(circuit: WithSkin, frequency: float) -> Any:
+    return circuit.at(frequency)
 
 
 def _constant_terms(circuit: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -382,9 +399,14 @@ def _constant(circuit: DirectGround) -> tuple[Array, Array]:
     return jnp.stack(terms.weight, axis=1), jnp.stack(terms.tau, axis=1)
 
 
+def _knots(pieces: Pieces, tau: Float[np.ndarray, "circuits terms"]) -> Float[np.ndarray, "circuits terms pieces"]:
+    """In columns, so that one program serves any number of terms."""
+    return np.stack([np.asarray(_column_knots(pieces, column)) for column in tau.T], axis=1)
+
+
 @jax.jit
-def _knots(pieces: Pieces, tau: Float[Array, "circuits terms"]) -> Float[Array, "circuits terms pieces"]:
-    return jax.vmap(jax.vmap(functools.partial(steady_knots, pieces)))(tau)
+def _column_knots(pieces: Pieces, tau: Float[Array, " circuits"]) -> Float[Array, "circuits pieces"]:
+    return jax.vmap(functools.partial(steady_knots, pieces))(tau)
 
 
 @eqx.filter_jit
