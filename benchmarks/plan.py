@@ -20,7 +20,8 @@ from timing import minima, show
 
 import fitact
 from fitact.model import omissions
-from fitact.model.waves import Reference, Waves, Window
+from fitact.model.drive import Sampled
+from fitact.model.waves import Reference
 
 CIRCUITS, SAMPLES, ROUNDS = 64, 4000, 200
 SAME = 1.1  # times closer than this count as equal
@@ -44,6 +45,7 @@ DRIVES = {
     "trapezoid from rest": {"waveform": "trapezoid", "rise_time": 20e-6, "steady_state": False},
     "burst": {"waveform": "burst"},
     "chirp": {"waveform": "chirp", "start_frequency": 50, "end_frequency": 500, "sweep_time": 15e-3},
+    "measured": {"waveform": "measured"},
 }
 
 Scene = fitact.Scene
@@ -57,10 +59,15 @@ def kind(scene: Scene) -> tuple:
 
 def job(scene: Scene, dtype: type = np.float64) -> Callable[[], object]:
     """One call of the response of many circuits."""
-    drive, steady = scene.make_drive(), scene.drive.steady_state
+    steady, duration = scene.drive.steady_state, scene.measurement.duration
+    time = duration * np.arange(SAMPLES) / SAMPLES
     with jax.enable_x64(dtype is np.float64):
         circuits = jax.tree.map(lambda x: jnp.full(CIRCUITS, x, dtype=dtype), scene.make_circuit())
-        at = jnp.asarray(scene.measurement.duration * np.arange(SAMPLES) / SAMPLES, dtype=dtype)
+        at = jnp.asarray(time, dtype=dtype)
+        if scene.drive.waveform == "measured":
+            drive = Sampled(time, np.sin(2.0 * np.pi * time / duration), duration)
+        else:
+            drive = scene.make_drive()
         drive = jax.tree.map(lambda x: jnp.asarray(x, dtype=dtype), drive)
         one = jax.jit(jax.vmap(lambda c, t: fitact.response(c, drive, t, steady_state=steady), in_axes=(0, None)))
         one(circuits, at)
@@ -116,12 +123,12 @@ def random_scene(rng: np.random.Generator) -> Scene:
 def admissible(scene: Scene) -> list[Scene]:
     """All reduced scenes that keep the tolerance."""
     values = {"Rsc": scene.skin.Rsc, "Csc": scene.skin.Csc, "Ci": scene.device.Ci}
-    reference = Reference(Window.of(scene), Waves.of(scene, values))
+    reference = Reference(scene, values)
     free = [name for name in omissions.named(scene) if not omissions.required(scene, name)]
     found = []
     for names in itertools.chain.from_iterable(itertools.combinations(free, n) for n in range(len(free) + 1)):
         reduced = omissions.without(scene, names)
-        errors = reference.compare(Waves.of(reduced, values))
+        errors = reference.compare(reduced, values)
         if max(errors.force_mean[0], errors.force_peak[0]) <= scene.tolerance.force:
             found.append(reduced)
     return found

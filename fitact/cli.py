@@ -282,6 +282,9 @@ def scene(
 @app.command()
 def plan(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene (TOML).")],
+    record: Annotated[
+        Path | None, typer.Option("--record", help="Plan for this record: for its V where that drives the fit.")
+    ] = None,
     out: Out = None,
     json: Json = False,
 ) -> None:
@@ -292,10 +295,20 @@ def plan(
     from fitact.model.scene import Scene
 
     stated = Scene.load(scene)
-    _use_compilation_cache()
-    from fitact.model.plan import plan as planned
+    measured = None
+    if record is not None:
+        from fitact.data.formats import read
 
-    found = planned(stated)
+        measured = read(record, stated)
+    _use_compilation_cache()
+    if measured is None:
+        from fitact.model.plan import plan as planned
+
+        found = planned(stated)
+    else:
+        from fitact.inference.planned import plan_for
+
+        found = plan_for(measured, stated)
     if out is not None:
         from fitact.report.plan import write_plan
 

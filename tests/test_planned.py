@@ -3,7 +3,9 @@
 import dataclasses
 import json
 
+import numpy as np
 import pytest
+import scipy.signal
 
 import fitact
 from fitact.data.simulate import simulate
@@ -73,23 +75,61 @@ def test_which_model_is_used(monkeypatch, of_planned: str, of_full: str, used: s
         return Outcome(fitted, of_full if fitted == scene else of_planned)
 
     monkeypatch.setattr(planned, "fit", fit)
-    found = fit_planned([], [scene], "planned")
+    found = fit_planned([simulate(scene)], [scene], "planned")
     assert found.used == used
     assert (found.fit.scene == scene) == (used == "full")
     assert len(found.fit.warnings) == (used == "full")
     assert found.plan.left_out == ("R_H",)
 
 
+def test_a_recorded_drive_is_planned_for_as_it_was_recorded():
+    drive = {"waveform": "trapezoid", "rise_time": "0.5 ms", "peak_to_peak": "200 V", "frequency": "250 Hz"}
+    body = {"grounding": {"R_H": "20 kohm"}}  # acts over 27 us, which samples each microsecond resolve
+    named = fitact.Scene.from_dict(body | {"drive": drive, "measurement": {"sampling_rate": "1 MHz"}})
+    record = simulate(named)
+    stated = fitact.plan(named)
+    (r_h, edges, _) = stated.omissions
+    assert edges.name == "edges"
+    for drive in ({}, {"drive": {"waveform": "measured", "steady_state": True}}):
+        scene = fitact.Scene.from_dict(body | drive)
+        found = planned.plan_for(record, scene).omissions[0]
+        assert found.name == "R_H"
+        # a sum over the samples, which the peak lies beside
+        assert tuple(found.nominal) == pytest.approx(tuple(r_h.nominal), rel=1e-3)
+        assert tuple(found.q95) == pytest.approx(tuple(r_h.q95), rel=1e-3)
+    assert planned.plan_for(record, named).omissions == stated.omissions
+
+
+def test_a_part_of_a_period_is_planned_for_from_its_first_sample():
+    """Against scipy, from no charge: one time constant, and R_H = 0.5 Mohm as a second."""
+    scene = fitact.Scene.from_dict({"grounding": {"R_H": "0.5 Mohm"}})
+    time = np.linspace(0.0, 3e-3, 3001)
+    voltage = 100.0 * np.sin(2.0 * np.pi * 60.0 * time**1.1)
+    record = fitact.Record.from_arrays(time, V=voltage, Vsc=0.05 * voltage)
+    found = planned.plan_for(record, scene).omissions[0]
+    Rsc, Csc, Ci, R_H = 160e3, 22e-9, 1.35e-9, 0.5e6
+
+    def force(resistance: float) -> np.ndarray:
+        # Rsc Ci s / ((1 + Rsc Csc s) (1 + R Ci s) + 2 Rsc Ci s)
+        skin, rest = Rsc * Csc, resistance * Ci
+        system = ([Rsc * Ci, 0.0], np.trim_zeros([skin * rest, skin + rest + 2.0 * Rsc * Ci, 1.0], "f"))
+        return scipy.signal.lsim(system, voltage, time)[1] ** 2
+
+    full, reduced = force(R_H), force(0.0)
+    assert found.nominal.force_peak == pytest.approx(abs(reduced.max() / full.max() - 1.0), rel=1e-4)
+    assert found.nominal.force_mean == pytest.approx(abs(reduced[:-1].sum() / full[:-1].sum() - 1.0), rel=1e-4)
+
+
 def test_where_nothing_is_planned_the_full_model_is_fitted(monkeypatch):
     fitted = []
     monkeypatch.setattr(planned, "fit", lambda records, scene, **options: fitted.append(scene))
     scene = fitact.Scene.from_dict(SCENE)
-    measured = fitact.Scene.from_dict(SCENE | {"drive": {"waveform": "measured"}})
+    measured = fitact.Scene.from_dict({"skin": {"level": "dispersive"}, "drive": {"waveform": "measured"}})
     for scenes, model, reason in [
         ([scene], "full", "asked for"),
         ([], "planned", "without a scene"),
         ([scene, scene], "planned", "several scenes"),
-        ([measured], "planned", "measured drive"),
+        ([measured], "planned", "no plan with a measured drive"),
         ([fitact.Scene()], "planned", "names nothing"),
     ]:
         found = fit_planned([], scenes, model)

@@ -77,6 +77,14 @@ def test_untrusted_answers_say_so_at_the_top(finger_fit: fitact.Fit, tmp_path):
     assert words.index("Do not trust these numbers") < words.index("What is known")
 
 
+def test_a_plan_is_stated(finger_posterior: fitact.Posterior, tmp_path):
+    plan = fitact.plan(fitact.Scene.from_dict({"grounding": {"R_H": "500 ohm"}}))
+    finger_posterior.report(tmp_path / "report.html", plan)
+    words = " ".join(Page((tmp_path / "report.html").read_text()).words)
+    assert "What the model leaves out" in words
+    assert plan.sentence in words
+
+
 def test_nothing_in_a_record_becomes_markup(finger_posterior: fitact.Posterior, tmp_path):
     import dataclasses
 

@@ -7,11 +7,15 @@ from typing import Any, Literal, TypeAlias
 from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.inference.fit import Fit, fit
-from fitact.model.omissions import named
+from fitact.inference.start import choose_drive, whole_periods
+from fitact.model.drive import Sampled
+from fitact.model.omissions import named, without
 from fitact.model.plan import Plan, plan
 from fitact.model.scene import Scene
 
 Model: TypeAlias = Literal["planned", "full"]
+
+_SAMPLES = 20_000  # of a measured drive that a plan looks at
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +43,8 @@ class PlannedFit:
 def fit_planned(records: Sequence[Record], scenes: Sequence[Scene], model: Model, **options: Any) -> PlannedFit:
     """Fit with the planned model of a scene; where that is a misfit and the full one is not, with the full one.
 
-    A scene of a measured drive has no plan, and of several scenes each would have its own: they get the full model.
+    Where the recorded V drives the fit, that is planned for, as it was recorded. Several scenes would each have their
+    own plan: they get the full model.
 
     Args:
         records: as in `fitact.fit`.
@@ -54,8 +59,8 @@ def fit_planned(records: Sequence[Record], scenes: Sequence[Scene], model: Model
     why = _no_plan(scenes, model)
     if why:
         return PlannedFit(fit(records, full, **options), "full", f"The full model is fitted: {why}.")
-    found = plan(scenes[0])
-    fitted = fit(records, found.scene, **options)
+    found = plan_for(records[0], scenes[0])
+    fitted = fit(records, without(scenes[0], found.left_out), **options)
     if found.left_out and fitted.result == "misfit":
         whole = _fitted_in_full(records, scenes[0], options)
         if whole is not None and whole.result != "misfit":
@@ -68,6 +73,15 @@ def fit_planned(records: Sequence[Record], scenes: Sequence[Scene], model: Model
     return PlannedFit(fitted, "planned", found.sentence, found)
 
 
+def plan_for(record: Record, scene: Scene) -> Plan:
+    """The plan for a record: of its V, where that is what drives the fit, else of the scene's drive.
+
+    Raises:
+        InputError: as `fitact.plan`, or the record does not fit the scene's drive.
+    """
+    return plan(scene, _recorded(record, scene))
+
+
 def _no_plan(scenes: Sequence[Scene], model: Model) -> str:
     """Why the full model is fitted from the first, as a clause; "" where there is a plan."""
     if model == "full":
@@ -76,9 +90,19 @@ def _no_plan(scenes: Sequence[Scene], model: Model) -> str:
         return "without a scene it is the paper's final circuit, which has nothing to leave out"
     if len(scenes) > 1:
         return "several scenes have no common plan"
-    if scenes[0].drive.waveform == "measured":
-        return "a measured drive cannot be planned for"
+    if scenes[0].drive.waveform == "measured" and scenes[0].skin.level != "constant":
+        return "a skin that depends on the frequency has no plan with a measured drive"
     return "" if named(scenes[0]) else "the scene names nothing that it could do without"
+
+
+def _recorded(record: Record, scene: Scene) -> Sampled | None:
+    """The beginning of the recorded V, where that drives the fit: whole periods of it where it holds some."""
+    choice = choose_drive(record, scene)
+    if choice.name != "measured":
+        return None
+    begin = Record(record.time[:_SAMPLES], {"V": choice.voltage[:_SAMPLES]}, record.source)
+    kept, period = whole_periods(begin)
+    return Sampled(begin.time[:kept], begin["V"][:kept], period)
 
 
 def _fitted_in_full(records: Sequence[Record], scene: Scene, options: dict[str, Any]) -> Fit | None:

@@ -25,6 +25,7 @@ from fitact.inference.likelihood import Batched, Likelihood
 from fitact.inference.noise import draw_noise
 from fitact.inference.trace import LINEAR
 from fitact.inference.trace_fit import TraceFit
+from fitact.model.plan import Plan
 from fitact.units import unit_of
 
 _DRAWS = 2500  # kept per ensemble, spread over its walkers and steps
@@ -264,11 +265,12 @@ class Posterior:
         with replacing(path) as temporary:
             tree.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
 
-    def report(self, path: str | os.PathLike[str]) -> None:
-        """Write the report, one self-contained HTML page."""
+    def report(self, path: str | os.PathLike[str], plan: Plan | None = None) -> None:
+        """Write the report, one self-contained HTML page; with `plan`, whose scene was fitted, what that left out."""
         from fitact.report import write_report
 
-        write_report(path, self.to_datatree(), self.summary())
+        stated = {} if plan is None else {"plan": {"used": "planned", "sentence": plan.sentence} | plan.to_dict()}
+        write_report(path, self.to_datatree(), self.summary() | stated)
 
 
 def _versions() -> dict[str, str]:

@@ -6,6 +6,7 @@ from typing import Any
 
 from jax.typing import ArrayLike
 
+from fitact.errors import InputError
 from fitact.model.circuit import RC, DirectGround, FinalCircuit
 from fitact.model.scene import Scene
 from fitact.model.skin import Fractional, WithSkin
@@ -27,7 +28,7 @@ _RESISTANCES = ("R_H", "series resistor")  # what limits the current at an edge
 # Nanoseconds a sample, of many circuits side by side in one compiled program: one exponential takes about one.
 # Measured by benchmarks/plan.py; docs/plan.md has the table.
 _LOCATE = 1.0
-_TERM = {"square": 1.0, "trapezoid": 2.0, "triangle": 2.0, "sine": 4.0, "chirp": 15.0}
+_TERM = {"square": 1.0, "trapezoid": 2.0, "triangle": 2.0, "sine": 4.0, "measured": 25.0, "chirp": 15.0}
 _TRANSIENT, _BURST = 0.5, 1.0  # more for each term, from rest
 _HARMONIC = 10.0
 _FRACTIONAL_TERMS = 81
@@ -47,7 +48,7 @@ def named(scene: Scene) -> tuple[str, ...]:
         "probe": scene.measurement.probe_resistance is not None or scene.measurement.probe_capacitance is not None,
         "edges": drive.waveform == "trapezoid",
         "dispersion": scene.skin.level != "constant",
-        "transient": not drive.steady_state and drive.waveform != "chirp",
+        "transient": not drive.steady_state and drive.waveform not in ("chirp", "measured"),
     }
     return tuple(name for name, there in present.items() if there)
 
@@ -69,6 +70,23 @@ def required(scene: Scene, name: str) -> str:
     if name == "transient" and scene.drive.waveform == "burst":
         return "a burst has no steady state"
     return ""
+
+
+def driven(scene: Scene) -> Scene:
+    """The scene driven by what was recorded.
+
+    Raises:
+        InputError: its skin depends on the frequency.
+    """
+    if scene.skin.level != "constant":
+        raise InputError(
+            f"scene: [skin] level = '{scene.skin.level}' has no plan with a measured drive;"
+            " name the waveform in [drive]"
+        )
+    content = json.loads(scene.to_json())
+    stated = content.pop("drive", {})
+    kept = {key: stated[key] for key in ("steady_state",) if key in stated}
+    return Scene.from_dict(content | {"drive": {"waveform": "measured"} | kept})
 
 
 def without(scene: Scene, names: tuple[str, ...], *, prior: bool = True) -> Scene:
@@ -112,7 +130,7 @@ def cost(scene: Scene, values: Mapping[str, ArrayLike] | None = None) -> float:
         of_term = tones * _TERM["sine"]
     else:
         of_term = _TERM[stated.shape if stated.waveform == "burst" else stated.waveform]
-    if not stated.steady_state and stated.waveform != "chirp":
+    if not stated.steady_state and stated.waveform not in ("chirp", "measured"):
         of_term += _BURST if stated.waveform == "burst" else _TRANSIENT
     return _LOCATE + terms * of_term + _HARMONIC * harmonics
 

@@ -14,8 +14,9 @@ from jaxtyping import Float
 
 from fitact.model import omissions
 from fitact.model.circuit import FinalCircuit, NaturalGround
+from fitact.model.drive import Sampled
 from fitact.model.scene import Scene
-from fitact.model.waves import ROWS, Comparison, Reference, Waves, Window
+from fitact.model.waves import ROWS, Comparison, Reference
 from fitact.units import engineering, percent
 
 _NOT_OF_THE_CIRCUIT = ("sigma", "sigma_I")
@@ -153,21 +154,24 @@ class Plan:
     __str__ = summary
 
 
-def plan(scene: Scene) -> Plan:
+def plan(scene: Scene, measured: Sampled | None = None) -> Plan:
     """The cheapest model of a scene that keeps `[tolerance] force`, among all combinations of omissions.
 
     The tolerance bounds the larger of mean and peak force's error at the scene's nominal values; where 95 % of the
     prior do not keep it, the plan warns. Errors are those over one period of the steady state, or over the scene's
-    duration from rest. Costs are those of `fitact.model.omissions.cost`. What saves nothing is kept.
+    duration from rest, or over the samples of `measured`, a drive that takes the place of the scene's. Costs are those
+    of `fitact.model.omissions.cost`. What saves nothing is kept.
 
     Raises:
-        InputError: the scene has no drive of its own (waveform = 'measured'), or asks for what is not available.
+        InputError: the scene has no drive of its own (waveform = 'measured') and `measured` is not given, or asks for
+            what is not available.
     """
     scene.require_available()
+    if measured is not None:
+        scene = omissions.driven(scene)
     values = _values(scene)
     nominal = {name: each[:1] for name, each in values.items()}
-    full = Waves.of(scene, values)
-    reference = Reference(Window.of(scene), full)
+    reference = Reference(scene, values, measured)
     names = omissions.named(scene)
     reasons = {name: omissions.required(scene, name) for name in names}
     whole, tolerance = omissions.cost(scene, nominal), scene.tolerance.force
@@ -175,7 +179,7 @@ def plan(scene: Scene) -> Plan:
 
     def judged(left_out: tuple[str, ...]) -> tuple[Errors, Errors, float]:
         reduced = omissions.without(scene, left_out, prior=False)
-        errors = _errors(reference.compare(Waves.of(reduced, _left(values, left_out))))
+        errors = _errors(reference.compare(reduced, _left(values, left_out)))
         return *errors, whole / omissions.cost(reduced, _left(nominal, left_out))
 
     rows = []
@@ -183,7 +187,7 @@ def plan(scene: Scene) -> Plan:
         at_nominal, q95, speedup = judged((name,))
         because = reasons[name] or _because(name in best, at_nominal.force, tolerance, speedup)
         rows.append(Omission(name, at_nominal, q95, speedup, name not in best, because))
-    single = _errors(reference.compare(Waves.of(scene, values, np.float32)))
+    single = _errors(reference.compare(scene, values, np.float32))
     rows.append(Omission("float64", *single, omissions.SINGLE_SPEEDUP, True, "fits and sampling need its derivatives"))
     return Plan(scene, omissions.without(scene, best), tuple(rows), *judged(best))
 
@@ -196,7 +200,7 @@ def _cheapest(
     scenes = {c: omissions.without(scene, c, prior=False) for c in combinations}
     rank = {c: (omissions.cost(reduced, _left(nominal, c)), len(c)) for c, reduced in scenes.items()}
     for _, group in itertools.groupby(sorted(combinations, key=lambda c: rank[c]), key=lambda c: rank[c]):
-        force = {c: _errors(reference.compare(Waves.of(scenes[c], _left(nominal, c))))[0].force for c in group}
+        force = {c: _errors(reference.compare(scenes[c], _left(nominal, c)))[0].force for c in group}
         found = min(force, key=lambda c: force[c])
         if force[found] <= tolerance:
             return found

@@ -21,10 +21,10 @@ from jaxtyping import Array, Complex, Float
 
 from fitact.model.chirp import Chirp
 from fitact.model.circuit import RC, DirectGround, Element, FinalCircuit, NaturalGround, Probe
-from fitact.model.drive import Burst, Drive, Periodic, Pieces, PiecewiseLinear, Sine
+from fitact.model.drive import Burst, Drive, Periodic, Pieces, PiecewiseLinear, Sampled, Sine
 from fitact.model.harmonic import fourier
 from fitact.model.multitone import Multitone
-from fitact.model.response import highpass, steady_knots
+from fitact.model.response import highpass, knot_values, steady_knots
 from fitact.model.scene import Scene
 from fitact.model.skin import Fractional, Skin, WithSkin, spread
 
@@ -51,8 +51,12 @@ class Window(NamedTuple):
     stretches: int = 1  # without a corner, each of as many times as another
 
     @classmethod
-    def of(cls, scene: Scene) -> "Window":
-        """One period of the steady state; else the scene's duration from rest."""
+    def of(cls, scene: Scene, measured: Sampled | None = None) -> "Window":
+        """One period of the steady state; else the scene's duration from rest; of a measured drive, its samples."""
+        if measured is not None:
+            time, last = (np.asarray(x) for x in (measured.time, measured.time[-1]))
+            step = np.diff(time, append=last if measured.period is None else time[0] + measured.period)
+            return cls(time, time, step / step.sum())
         drive, duration = scene.make_drive(), scene.measurement.duration
         if isinstance(drive, Chirp):
             times = duration * (np.arange(_CHIRP_TIMES) + 0.5) / _CHIRP_TIMES
@@ -103,9 +107,18 @@ class Waves:
     harmonics: Complex[np.ndarray, "circuits harmonics"]
 
     @classmethod
-    def of(cls, scene: Scene, values: Mapping[str, Any], precision: type[np.floating[Any]] = np.float64) -> "Waves":
-        """Those of the scene's circuit at `values` (SI, by name; arrays of at most `ROWS`), in that precision."""
-        drive, count = scene.make_drive(), max(np.size(value) for value in values.values())
+    def of(
+        cls,
+        scene: Scene,
+        values: Mapping[str, Any],
+        precision: type[np.floating[Any]] = np.float64,
+        measured: Sampled | None = None,
+    ) -> "Waves":
+        """Those of the scene's circuit at `values` (SI, by name; arrays of at most `ROWS`), in that precision.
+
+        `measured` is what drives them in place of the scene's drive.
+        """
+        drive, count = measured or scene.make_drive(), max(np.size(value) for value in values.values())
         with jax.enable_x64(precision is np.float64):
             circuit = scene.make_circuit(dict(values))
             skin = jax.tree.map(jnp.asarray, circuit.skin) if isinstance(circuit, WithSkin) else None
@@ -114,17 +127,19 @@ class Waves:
             weight, tau, harmonics = _terms(filled, skin, drive, precision)
             tau = np.maximum(tau, np.finfo(np.float32).tiny)  # single precision may lose that of an absent part
             wave = drive.wave if isinstance(drive, Burst) else drive
-            pieces = _pieces(wave) if isinstance(wave, PiecewiseLinear) else None
+            pieces = _pieces(wave) if isinstance(wave, PiecewiseLinear | Sampled) else None
             knots = np.zeros((*tau.shape, 0), dtype=precision)
             if pieces is not None:
-                knots = _knots(jax.tree.map(precision, pieces), tau)
+                knots = _knots(jax.tree.map(precision, pieces), tau, measured is None or measured.period is not None)
         rows = (x[:count] for x in (weight.astype(precision), tau.astype(precision), knots, harmonics))
         return cls(drive, scene.drive.steady_state, pieces, *rows)
 
     def at(self, cycle: np.ndarray, elapsed: np.ndarray) -> Rows:
         """Vsc at nodes common to all circuits, or at each circuit's own."""
         cycle, elapsed = (np.atleast_2d(x).astype(self.tau.dtype) for x in (cycle, elapsed))
-        if isinstance(self.drive, Chirp):
+        if isinstance(self.drive, Sampled):  # whose samples are the nodes
+            u = self.knots
+        elif isinstance(self.drive, Chirp):
             with jax.enable_x64(self.tau.dtype == np.float64):
                 u = np.asarray(_chirped(self.drive, elapsed[0], _filled_up(self.tau, self.tau.dtype)))[: len(self.tau)]
         elif self.steady_state:
@@ -183,15 +198,22 @@ class Comparison(NamedTuple):
 
 
 class Reference:
-    """The full model's waves over a window, to compare others with."""
+    """The full model's waves over a window, to compare others with.
 
-    def __init__(self, window: Window, full: Waves) -> None:
-        self.window = window
-        self.vsc = full.at(window.cycle, window.elapsed)
-        self.peak = _peak(window, full, self.vsc)
+    `values` of its circuits as in `Waves.of`; `measured`: what drives all of them in place of the scene's drive.
+    """
 
-    def compare(self, waves: Waves) -> Comparison:
-        """How far `waves`, of as many of the circuits from the first on, lie from the full model's."""
+    def __init__(self, scene: Scene, values: Mapping[str, Any], measured: Sampled | None = None) -> None:
+        self.measured, self.window = measured, Window.of(scene, measured)
+        full = Waves.of(scene, values, measured=measured)
+        self.vsc = full.at(self.window.cycle, self.window.elapsed)
+        self.peak = _peak(self.window, full, self.vsc)
+
+    def compare(
+        self, scene: Scene, values: Mapping[str, Any], precision: type[np.floating[Any]] = np.float64
+    ) -> Comparison:
+        """How far those of another scene, of as many of the circuits from the first on, lie from the full model's."""
+        waves = Waves.of(scene, values, precision, self.measured)
         vsc, weight = waves.at(self.window.cycle, self.window.elapsed), self.window.weight
         full = self.vsc[: len(vsc)]
         mean_square = full**2 @ weight
@@ -206,7 +228,7 @@ class Reference:
 
 def _peak(window: Window, waves: Waves, vsc: Rows) -> Float[np.ndarray, " circuits"]:
     """The largest |Vsc|, between the nodes too: the highest stretches are looked at more closely."""
-    if isinstance(waves.drive, Chirp):  # smooth, and compiled for its nodes
+    if isinstance(waves.drive, Chirp | Sampled):  # known at its nodes
         return np.abs(vsc).max(axis=1)
     height = np.abs(vsc).reshape(len(vsc), window.stretches, -1)
     node = height.argmax(axis=2)
@@ -267,11 +289,11 @@ def _corners(wave: Periodic) -> np.ndarray:
     return np.unique(_pieces(wave).knots)
 
 
-def _pieces(wave: PiecewiseLinear) -> Pieces:
+def _pieces(wave: PiecewiseLinear | Sampled) -> Pieces:
     """One period, filled up with pieces of no length."""
     with jax.enable_x64(True):
         knots, start, end = (np.asarray(x) for x in wave.pieces())
-    missing = _PIECES - start.size
+    missing = max(_PIECES - start.size, 0)
     filled = [
         np.append(x, np.full(missing, last)) for x, last in ((knots, knots[-1]), (start, end[-1]), (end, end[-1]))
     ]
@@ -399,14 +421,19 @@ def _constant(circuit: DirectGround) -> tuple[Array, Array]:
     return jnp.stack(terms.weight, axis=1), jnp.stack(terms.tau, axis=1)
 
 
-def _knots(pieces: Pieces, tau: Float[np.ndarray, "circuits terms"]) -> Float[np.ndarray, "circuits terms pieces"]:
+def _knots(
+    pieces: Pieces, tau: Float[np.ndarray, "circuits terms"], settled: bool
+) -> Float[np.ndarray, "circuits terms pieces"]:
     """In columns, so that one program serves any number of terms."""
-    return np.stack([np.asarray(_column_knots(pieces, column)) for column in tau.T], axis=1)
+    return np.stack([np.asarray(_column_knots(pieces, column, settled)) for column in tau.T], axis=1)
 
 
-@jax.jit
-def _column_knots(pieces: Pieces, tau: Float[Array, " circuits"]) -> Float[Array, "circuits pieces"]:
-    return jax.vmap(functools.partial(steady_knots, pieces))(tau)
+@functools.partial(jax.jit, static_argnums=2)
+def _column_knots(pieces: Pieces, tau: Float[Array, " circuits"], settled: bool) -> Float[Array, "circuits pieces"]:
+    """u just after the start of each piece, in the steady state or without charge before the first."""
+    return jax.vmap(lambda one: steady_knots(pieces, one) if settled else knot_values(pieces, one, pieces.start[0]))(
+        tau
+    )
 
 
 @eqx.filter_jit
