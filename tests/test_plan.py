@@ -5,11 +5,13 @@ import json
 import math
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.signal
 import scipy.stats
 from test_ngspice import JUMP, simulate
 
@@ -265,28 +267,39 @@ def test_errors_are_judged_together():
     assert set(planned(**scene, tolerance={"force": 2.5 * alone[0]}).left_out) >= {"R_H", "series resistor"}
 
 
-def test_dispersion_against_a_sum_of_harmonics():
-    """The paper's three frequencies, log-log between them; the rms of the difference and of Vsc by Parseval."""
-    plan = planned(skin={"level": "dispersive"}, drive={"waveform": "trapezoid", "rise_time": "50 us"})
-    k = np.arange(1, 20_001)
-    f = 100.0 * k
-    drive = np.sin(0.5 * np.pi * k) * np.sinc(k * 0.005) / k  # to a factor
+def dispersive_skin(f: np.ndarray) -> np.ndarray:
+    """Impedance of the paper's skin: its three frequencies, log-log between them."""
     knots = np.log([10.0, 100.0, 1000.0])
     where = np.log(np.minimum(f, 1000.0))
     R = np.exp(np.interp(where, knots, np.log([200e3, 160e3, 80e3])))
     C = np.exp(np.interp(where, knots, np.log([44.25e-9, 22e-9, 8.85e-9])))
+    return R / (1.0 + 2j * np.pi * f * R * C)
+
+
+def fractional_skin(f: np.ndarray) -> np.ndarray:
+    """Impedance by Cole's formula."""
+    return 160e3 / (1.0 + (2j * np.pi * f * 160e3 * 22e-9) ** 0.7)
+
+
+@pytest.mark.parametrize(
+    ("skin", "impedance"),
+    [({"level": "dispersive"}, dispersive_skin), ({"level": "fractional", "alpha": 0.7}, fractional_skin)],
+)
+def test_dispersion_against_a_sum_of_harmonics(skin: dict, impedance: Callable[[np.ndarray], np.ndarray]):
+    """The rms of the difference and of Vsc by Parseval."""
+    plan = planned(skin=skin, drive={"waveform": "trapezoid", "rise_time": "50 us"})
+    k = np.arange(1, 20_001)
+    f = 100.0 * k
     s = 2j * np.pi * f
-
-    def gain(R: np.ndarray, C: np.ndarray) -> np.ndarray:
-        skin = R / (1.0 + s * R * C)
-        return skin / (2.0 * skin + 1.0 / (s * 1.35e-9))
-
-    full, constant = (np.abs(drive * x) ** 2 for x in (gain(R, C), gain(np.array(160e3), np.array(22e-9))))
-    difference = np.abs(drive * (gain(R, C) - gain(np.array(160e3), np.array(22e-9)))) ** 2
+    drive = np.sin(0.5 * np.pi * k) * np.sinc(k * 0.005) / k  # to a factor
+    full, constant = (
+        drive * skin / (2.0 * skin + 1.0 / (s * 1.35e-9)) for skin in (impedance(f), 160e3 / (1.0 + s * 160e3 * 22e-9))
+    )
+    full_square, square, difference = (np.sum(np.abs(x) ** 2) for x in (full, constant, full - constant))
     errors = {o.name: o.nominal for o in plan.omissions}["dispersion"]
-    assert errors.Vsc_rms == pytest.approx(math.sqrt(difference.sum() / full.sum()), rel=1e-4)
-    assert errors.force_mean == pytest.approx(abs(constant.sum() / full.sum() - 1.0), rel=1e-4)
-    assert plan.model()["skin"] == "dispersive"
+    assert errors.Vsc_rms == pytest.approx(math.sqrt(difference / full_square), rel=1e-4)
+    assert errors.force_mean == pytest.approx(abs(square / full_square - 1.0), rel=1e-4)
+    assert plan.model()["skin"] == skin["level"]
 
 
 def test_quantiles_are_those_of_the_prior():
@@ -327,11 +340,24 @@ def test_only_what_the_scene_names_is_an_omission():
         planned(drive={"waveform": "measured"})
 
 
-def test_a_chirp_is_planned_too():
+def test_a_chirp_against_scipy():
     chirp = {"waveform": "chirp", "start_frequency": 50, "end_frequency": 500, "sweep_time": "15 ms"}
-    plan = planned(**PAPER, drive=chirp)
-    assert plan.left_out == ("R_H",)
-    assert 0.0 < plan.nominal.force_mean < plan.nominal.Vsc_rms < 0.01
+    scene = {"grounding": {"R_H": "20 kohm"}, "measurement": {"duration": "15 ms"}, "drive": chirp}
+    errors = planned(**scene).omissions[0].nominal
+    t = np.linspace(0.0, 15e-3, 30_001)
+    drive = np.sin(2.0 * np.pi * (50.0 * t + 0.5 * 450.0 / 15e-3 * t**2))
+    Rsc, Csc, Ci = 160e3, 22e-9, 1.35e-9
+
+    def vsc(R: float) -> np.ndarray:
+        # Rsc Ci s / ((1 + Rsc Csc s) (1 + R Ci s) + 2 Rsc Ci s)
+        polynomial = [Rsc * Csc * R * Ci, Rsc * Csc + R * Ci + 2.0 * Rsc * Ci, 1.0]
+        return scipy.signal.lsim(([Rsc * Ci, 0.0], np.trim_zeros(polynomial, "f")), drive, t)[1]
+
+    full, reduced = vsc(20e3), vsc(0.0)
+    mean_square, peak = np.mean(full**2), np.abs(full).max()
+    assert errors.Vsc_rms == pytest.approx(math.sqrt(np.mean((full - reduced) ** 2) / mean_square), rel=1e-3)
+    assert errors.Vsc_peak == pytest.approx(abs(np.abs(reduced).max() / peak - 1.0), rel=1e-3)
+    assert errors.force_mean == pytest.approx(abs(np.mean(reduced**2) / mean_square - 1.0), rel=1e-3)
 
 
 def test_contract_and_picture(tmp_path: Path):

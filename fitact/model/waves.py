@@ -34,7 +34,7 @@ _BLOCK = 64  # frequencies in one program
 _PIECES = 4  # of a period; fewer are filled up with ones of no length
 _DECADES, _ORDER = 8, 8  # of a piece, and the order of the rule in each
 _PERIODS = 12  # from rest: periods that stand for all, in geometric progression
-_CHIRP_TIMES = 2048
+_CHIRP_TIMES = 2048, 32768  # at least and at most, and between them 16 a cycle of the highest frequency
 _SNAP = 1e-9  # of a period: corners so close are one
 _HIGHEST = 4  # stretches among which the peak is looked for
 _REFINED, _REFINEMENTS = 17, 3  # times between the neighbours of a peak, and how often
@@ -59,7 +59,9 @@ class Window(NamedTuple):
             return cls(time, time, step / step.sum())
         drive, duration = scene.make_drive(), scene.measurement.duration
         if isinstance(drive, Chirp):
-            times = duration * (np.arange(_CHIRP_TIMES) + 0.5) / _CHIRP_TIMES
+            least, most = _CHIRP_TIMES
+            count = int(np.clip(2 ** math.ceil(math.log2(2 * drive.pieces)), least, most))
+            times = duration * (np.arange(count) + 0.5) / count
             return cls(times, times, np.full(times.size, 1.0 / times.size))
         wave: Any = drive.wave if isinstance(drive, Burst) else drive
         period, lead = 1.0 / wave.frequency, _lead(wave)
@@ -228,8 +230,8 @@ class Reference:
 
 def _peak(window: Window, waves: Waves, vsc: Rows) -> Float[np.ndarray, " circuits"]:
     """The largest |Vsc|, between the nodes too: the highest stretches are looked at more closely."""
-    if isinstance(waves.drive, Chirp | Sampled):  # known at its nodes
-        return np.abs(vsc).max(axis=1)
+    if isinstance(waves.drive, Chirp | Sampled):  # compiled for its nodes, or not known between them
+        return _parabola(np.abs(vsc)) if isinstance(waves.drive, Chirp) else np.abs(vsc).max(axis=1)
     height = np.abs(vsc).reshape(len(vsc), window.stretches, -1)
     node = height.argmax(axis=2)
     highest = np.argsort(-height.max(axis=2), axis=1)[:, :_HIGHEST]
@@ -243,6 +245,15 @@ def _peak(window: Window, waves: Waves, vsc: Rows) -> Float[np.ndarray, " circui
         best = refined.argmax(axis=2)[..., None]
         low, high = (np.take_along_axis(cycle, np.clip(best + i, 0, _REFINED - 1), 2)[..., 0] for i in (-1, 1))
     return np.maximum(height.max(axis=(1, 2)), refined.max(axis=(1, 2)))
+
+
+def _parabola(height: Rows) -> Float[np.ndarray, " circuits"]:
+    """The top of the parabola through the highest node of each row and its neighbours."""
+    at = np.clip(height.argmax(axis=1), 1, height.shape[1] - 2)
+    before, top, after = (height[np.arange(len(height)), at + i] for i in (-1, 0, 1))
+    bend = before - 2.0 * top + after
+    vertex = top - 0.125 * np.square(after - before) / np.where(bend < 0.0, bend, -np.inf)
+    return np.maximum(vertex, height.max(axis=1))
 
 
 @functools.cache
