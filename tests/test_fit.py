@@ -4,6 +4,7 @@ import pytest
 from conftest import skin_voltage, square_record
 
 import fitact
+from fitact.data.simulate import simulate
 
 SQUARE = fitact.Scene.from_dict({"drive": {"waveform": "square"}})
 
@@ -363,3 +364,20 @@ def test_a_recorder_whose_clock_is_not_the_generators(off: float, with_V: bool):
     assert any("repeats at" in warning for warning in fit.warnings) == (off > 0.0)
     for name, truth in (("g", 1.35 / 20.7), ("b", 130e3 * 20.7e-9)):
         assert abs(deviation(fit, name, truth)) < 4.0
+
+
+def test_another_drive_and_prior_compile_nothing_anew(caplog: pytest.LogCaptureFixture):
+    """What is compiled takes most of a first fit's time, so numbers must not be constants of it."""
+
+    def fitted(frequency: float, rise_time: float, Ci: float) -> fitact.Fit:
+        drive = {"waveform": "trapezoid", "rise_time": rise_time, "frequency": frequency}
+        scene = fitact.Scene.from_dict({"device": {"Ci": Ci}, "drive": drive})
+        return fitact.fit(simulate(scene, seed=1), scene)
+
+    fitted(97.0, 2e-4, 1.35e-9)  # neither frequency meets the sampling grid, on which periods would be folded
+    caplog.clear()
+    with jax.log_compiles():
+        assert fitted(91.0, 3e-4, 2e-9).result == "successful"
+    compiled = [record.getMessage() for record in caplog.records if record.getMessage().startswith("Compiling")]
+    # the drive's value is asked for once in numbers, before there is a fit
+    assert [message.split()[1] for message in compiled if "_value" not in message] == []

@@ -109,7 +109,8 @@ class Compression(eqx.Module):
         decay = np.asarray(self.decay @ at.T) @ to_series.T
         sizes = np.linalg.norm(signal, axis=0) + charge * np.linalg.norm(decay, axis=0)
         left = np.cumsum(sizes[::-1])[::-1]  # what leaving out this term and all later ones would cost
-        terms = max(2, int(np.count_nonzero(left > precision)))
+        # in fours, so that most records of a kind share what is compiled
+        terms = min(4 * max(1, math.ceil(np.count_nonzero(left > precision) / 4)), left.size)
         signal = np.pad(signal[:, :terms], ((0, self.observed.size - signal.shape[0]), (0, 0)))
         others = [decay[:, :terms]] if charge > 0.0 else []
         columns = [signal, *others, self.slow.T, *(x[:, None] for x in (self.rate, self.slope, self.observed))]

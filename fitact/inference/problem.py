@@ -20,6 +20,7 @@ from fitact.inference.noise import Autoregression, NoiseModel, quiet_noise, requ
 from fitact.inference.start import (
     DriveChoice,
     LinearStart,
+    as_arrays,
     choose_drive,
     has_ideal_edges,
     has_unresolved_edge,
@@ -127,8 +128,8 @@ def pose(records: Sequence[Record], scenes: Sequence[Scene | None], believed: bo
     )
     likelihood = Likelihood(
         traces=traces,
-        template=template,
-        prior=prior,
+        template=as_arrays(template),
+        prior=_compiled_once(prior),
         sigma_prior=tuple(noise.get("sigma" if trace.channel == "Vsc" else "sigma_I") for trace in traces),
         tied=tuple((name, other, ratio) for name, (other, ratio) in tied.items()),
         believed=believed,
@@ -145,6 +146,14 @@ def _template(scene: Scene, prior: Prior, tied: dict[str, tuple[str, float]]) ->
             raise InputError(f"scene: [prior] {name} is tied to {other}, which the scene does not have; give it there")
         values[name] = ratio * value
     return scene.make_rc_circuit(values)
+
+
+def _compiled_once(prior: Prior) -> Prior:
+    """The prior whose log-normal marginals are no constants of what is compiled, where none are correlated."""
+    if prior.pairs:
+        return prior
+    marginals = (as_arrays(m) if isinstance(m, LogNormal) else m for m in prior.marginals)
+    return dataclasses.replace(prior, marginals=tuple(marginals))
 
 
 def _channels(record: Record, scene: Scene | None) -> tuple[Channel, ...]:

@@ -2,9 +2,10 @@
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -18,6 +19,8 @@ from fitact.model.response import highpass
 from fitact.model.scene import Scene
 from fitact.model.sections import DriveSection
 from fitact.units import percent
+
+_Module = TypeVar("_Module", bound=eqx.Module)
 
 _ALIGNED = 20_000  # samples on which a drive is laid
 _CONTRADICTION = 0.05  # relative difference between the stated and the recorded drive that cannot be an inaccuracy
@@ -103,7 +106,13 @@ def choose_drive(record: Record, scene: Scene | None) -> DriveChoice:
                 f"V_V differs from the scene's {scene.drive.waveform} by {percent(error)} rms;"
                 " [drive] waveform = 'measured' would use V_V as recorded",
             )
-    return DriveChoice(drive, voltage, scene.drive.steady_state, False, shift, scene.drive.waveform, notes)
+    return DriveChoice(as_arrays(drive), voltage, scene.drive.steady_state, False, shift, scene.drive.waveform, notes)
+
+
+def as_arrays(module: _Module) -> _Module:
+    """With its numbers as arrays, so that what is compiled for one serves all others of its kind."""
+    with jax.enable_x64(True):
+        return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, module)
 
 
 def _measured(record: Record, steady_state: bool | None, notes: tuple[str, ...]) -> DriveChoice:
@@ -237,7 +246,8 @@ def slope_of(choice: DriveChoice, time: np.ndarray) -> Float[np.ndarray, " sampl
 
 def unit_response(choice: DriveChoice, time: np.ndarray, tau: float) -> Float[np.ndarray, " samples"]:
     """The drive's response of one time constant (s) at the record's times, V."""
-    return np.asarray(_highpass(choice.drive, time - choice.shift, tau, choice.steady_state))
+    # an array: for a number jit would compile anew
+    return np.asarray(_highpass(choice.drive, time - choice.shift, jnp.asarray(tau), choice.steady_state))
 
 
 @eqx.filter_jit
@@ -246,8 +256,8 @@ def _slope(drive: Drive, time: ArrayLike, steady_state: bool) -> Array:
 
 
 @eqx.filter_jit
-def _highpass(drive: Drive, time: ArrayLike, tau: ArrayLike, steady_state: bool) -> Array:
-    return highpass(drive, time, jnp.asarray(tau), steady_state=steady_state)
+def _highpass(drive: Drive, time: ArrayLike, tau: Array, steady_state: bool) -> Array:
+    return highpass(drive, time, tau, steady_state=steady_state)
 
 
 def _align(record: Record, drive: Drive, frequency: float, steady_state: bool) -> float:

@@ -90,7 +90,8 @@ def clock_drop(trace: Trace, seen: Seen, sigma: float) -> float:
 
     Its shape is no combination of responses, so the response table does not hold it: from the samples.
     """
-    rows, kept, edges = np.asarray(_around(trace.summed(), seen, sigma)), trace.weights > 0.0, _beside_edges(trace)
+    rows = np.asarray(_around(trace.summed(), seen, jnp.asarray(sigma)))
+    kept, edges = trace.weights > 0.0, _beside_edges(trace)
     drop = _drop(rows[:, kept])
     # an ideal edge shows a clock where it has passed a sample, and hides it where it has not
     return max(drop, _drop(rows[:, kept & ~edges])) if edges.any() else drop
@@ -105,7 +106,7 @@ def _drop(rows: np.ndarray) -> float:
 
 
 @eqx.filter_jit
-def _around(trace: Trace, seen: Seen, sigma: float) -> Float[Array, "n samples"]:
+def _around(trace: Trace, seen: Seen, sigma: Array) -> Float[Array, "n samples"]:
     """What a clock changes, what is left of the trace, and all that the circuit and the linear nuisances can change."""
     time = trace.time - (trace.shift + seen.delay)
     taus = jnp.stack(seen.circuit.terms_of(trace.channel).tau)

@@ -6,6 +6,7 @@ distribution also gives its normal scores z = Phi^-1(F(u)), which correlate it w
 
 import abc
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -47,6 +48,10 @@ class Distribution(eqx.Module):
     def at_score(self, z: ArrayLike) -> Float[Array, "*shape"]:
         """The inverse of `score`: log x."""
 
+    def whitened(self, u: ArrayLike) -> Float[Array, "*shape"]:
+        """u less its mean, over its standard deviation."""
+        return (jnp.asarray(u) - self.log_mean) / self.log_sd
+
     def sample(self, rng: np.random.Generator, size: int) -> Float[np.ndarray, " size"]:
         """Draws of x."""
         with jax.enable_x64(True):
@@ -54,10 +59,10 @@ class Distribution(eqx.Module):
 
 
 class LogNormal(Distribution):
-    """log x is normal with the standard deviation `spread` around log `median`."""
+    """log x is normal with the standard deviation `spread` around log `median`, which may be arrays."""
 
-    median: float
-    spread: float
+    median: ArrayLike
+    spread: ArrayLike
 
     def __check_init__(self) -> None:
         if not (self.median > 0.0 and self.spread > 0.0):
@@ -87,19 +92,23 @@ class LogNormal(Distribution):
     @property
     def log_sd(self) -> float:
         """Standard deviation of log x."""
-        return self.spread
+        return float(self.spread)
 
     def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """Normal in u."""
-        return -0.5 * self.score(u) ** 2 - math.log(self.spread * math.sqrt(2.0 * math.pi))
+        return -0.5 * self.score(u) ** 2 - _log(self.spread * math.sqrt(2.0 * math.pi))
 
     def score(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """(u - log median) / spread."""
-        return (jnp.asarray(u) - self.log_mean) / self.spread
+        return (jnp.asarray(u) - _log(self.median)) / self.spread
+
+    def whitened(self, u: ArrayLike) -> Float[Array, "*shape"]:
+        """u less its mean, over its standard deviation: its score."""
+        return self.score(u)
 
     def at_score(self, z: ArrayLike) -> Float[Array, "*shape"]:
         """The inverse of `score`: log x."""
-        return self.log_mean + self.spread * jnp.asarray(z)
+        return _log(self.median) + self.spread * jnp.asarray(z)
 
 
 class Bounded(Distribution):
@@ -284,6 +293,11 @@ class TruncatedLogNormal(Bounded):
         """The inverse of `share`: log x."""
         z = ndtri(self._below + jnp.asarray(p) * self._mass)
         return self._whole.at_score(jnp.clip(z, *self._limits))
+
+
+def _log(x: Any) -> Any:
+    """Of a number, which loses nothing in single precision, or of an array."""
+    return jnp.log(x) if isinstance(x, jax.Array) else math.log(x)
 
 
 def _check_limits(kind: str, low: float, high: float) -> None:

@@ -151,7 +151,7 @@ class Prior(eqx.Module):
     def residuals(self, u: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         """The log-parameters whitened by mean and covariance: the normal prior with its moments, as residuals."""
         if not self.pairs:
-            return (u - self.log_mean) / self.log_sd
+            return jnp.array([marginal.whitened(u[i]) for i, marginal in enumerate(self.marginals)])
         return solve_triangular(np.linalg.cholesky(self.covariance), u - self.log_mean, lower=True)
 
     def sample(self, rng: np.random.Generator, size: int) -> dict[str, Float[np.ndarray, " size"]]:
