@@ -12,7 +12,8 @@ _SYMBOLS = {"ohm": "Ω", "1": ""}
 
 _UNITS = {
     "Rsc": "ohm", "Csc": "F", "Ci": "F", "R_H": "ohm", "grounding_Rsc": "ohm", "grounding_Csc": "F",
-    "Z": "ohm", "Z_capacitance": "F", "series_resistor": "ohm", "gain": "1", "delay": "s", "clock": "1", "sigma": "V",
+    "Z": "ohm", "Z_capacitance": "F", "series_resistor": "ohm", "Rgap": "ohm", "Cgap": "F",
+    "gain": "1", "delay": "s", "clock": "1", "sigma": "V",
     "Vsc_peak_to_peak": "V",
     "offset": "V", "drift": "V", "charge": "V",
     "hum_50Hz_cos": "V", "hum_50Hz_sin": "V", "hum_60Hz_cos": "V", "hum_60Hz_sin": "V",

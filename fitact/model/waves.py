@@ -1,4 +1,4 @@
-"""Vsc of many circuits under one drive, for comparing models with each other.
+"""Vsc of many circuits under one drive, and what makes the force, for comparing models with each other.
 
 All circuits share one compiled program: what a circuit lacks is filled in with a value too small to matter. The rest
 is NumPy, where nothing is compiled: every response is a sum of exponentials along the straight pieces of its drive, and
@@ -20,8 +20,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
 from fitact.model.chirp import Chirp
-from fitact.model.circuit import RC, DirectGround, Element, FinalCircuit, NaturalGround, Probe
+from fitact.model.circuit import RC, Channel, DirectGround, Element, FinalCircuit, NaturalGround, Probe
 from fitact.model.drive import Burst, Drive, Periodic, Pieces, PiecewiseLinear, Sine
+from fitact.model.force import force_constant
 from fitact.model.harmonic import fourier
 from fitact.model.multitone import Multitone
 from fitact.model.response import highpass, steady_knots
@@ -91,6 +92,8 @@ class Waves:
         weight, tau: of the high-pass terms; s.
         knots: each term's steady state at the starts of the drive's pieces, V.
         harmonics: amplitude that the terms miss, V.
+        factor: the force over the square of the voltage that makes it, N/V^2.
+        acting: those voltages; None: these themselves.
     """
 
     drive: Drive
@@ -100,25 +103,40 @@ class Waves:
     tau: Float[np.ndarray, "circuits terms"]
     knots: Float[np.ndarray, "circuits terms pieces"]
     harmonics: Complex[np.ndarray, "circuits harmonics"]
+    factor: Float[np.ndarray, " circuits"]
+    acting: "Waves | None" = None
 
     @classmethod
     def of(cls, scene: Scene, values: Mapping[str, Any], precision: type[np.floating[Any]] = np.float64) -> "Waves":
         """Those of the scene's circuit at `values` (SI, by name; arrays of at most `ROWS`), in that precision."""
+        found = cls._of(scene, values, precision, "Vsc")
+        if scene.force.model == "paper":
+            return found
+        return dataclasses.replace(found, acting=cls._of(scene, values, precision, "Vgap"))
+
+    @classmethod
+    def _of(
+        cls, scene: Scene, values: Mapping[str, Any], precision: type[np.floating[Any]], channel: Channel
+    ) -> "Waves":
         drive, count = scene.make_drive(), max(np.size(value) for value in values.values())
         with jax.enable_x64(precision is np.float64):
             circuit = scene.make_circuit(dict(values))
             skin = circuit.skin if isinstance(circuit, WithSkin) else None
             complete = _complete(scene.make_rc_circuit(dict(values)))
             filled = jax.tree.map(lambda x: _filled_up(x, precision), complete)
-            weight, tau, harmonics = _terms(filled, skin, drive, precision)
+            weight, tau, harmonics = _terms(filled, skin, drive, precision, channel)
             tau = np.maximum(tau, np.finfo(np.float32).tiny)  # single precision may lose that of an absent part
             wave = drive.wave if isinstance(drive, Burst) else drive
             pieces = _pieces(wave) if isinstance(wave, PiecewiseLinear) else None
             knots = np.zeros((*tau.shape, 0), dtype=precision)
             if pieces is not None:
                 knots = np.asarray(_knots(jax.tree.map(precision, pieces), tau))
-        rows = (x[:count] for x in (weight.astype(precision), tau.astype(precision), knots, harmonics))
-        return cls(drive, scene.drive.steady_state, pieces, *rows)
+        weight, tau, knots, harmonics = (
+            x[:count] for x in (weight.astype(precision), tau.astype(precision), knots, harmonics)
+        )
+        return cls(
+            drive, scene.drive.steady_state, pieces, weight, tau, knots, harmonics, _factor(scene, values, count)
+        )
 
     def at(self, cycle: np.ndarray, elapsed: np.ndarray) -> Rows:
         """Vsc at nodes common to all circuits, or at each circuit's own."""
@@ -186,21 +204,34 @@ class Reference:
 
     def __init__(self, window: Window, full: Waves) -> None:
         self.window = window
-        self.vsc = full.at(window.cycle, window.elapsed)
-        self.peak = _peak(window, full, self.vsc)
+        self.vsc = _Heights.of(window, full)
+        self.factor = full.factor
+        self.acting = self.vsc if full.acting is None else _Heights.of(window, full.acting)
 
     def compare(self, waves: Waves) -> Comparison:
         """How far `waves`, of as many of the circuits from the first on, lie from the full model's."""
-        vsc, weight = waves.at(self.window.cycle, self.window.elapsed), self.window.weight
-        full = self.vsc[: len(vsc)]
-        mean_square = full**2 @ weight
-        peak = _peak(self.window, waves, vsc) / self.peak[: len(vsc)]
+        weight, count = self.window.weight, len(waves.tau)
+        vsc, factor = _Heights.of(self.window, waves), waves.factor / self.factor[:count]
+        acting = vsc if waves.acting is None else _Heights.of(self.window, waves.acting)
+        full, acting_full = (_Heights(at[:count], peak[:count]) for at, peak in (self.vsc, self.acting))
         return Comparison(
-            np.sqrt((vsc - full) ** 2 @ weight / mean_square),
-            np.abs(peak - 1.0),
-            np.abs(vsc**2 @ weight / mean_square - 1.0),
-            np.abs(peak**2 - 1.0),
+            np.sqrt((vsc.at - full.at) ** 2 @ weight / (full.at**2 @ weight)),
+            np.abs(vsc.peak / full.peak - 1.0),
+            np.abs(factor * (acting.at**2 @ weight / (acting_full.at**2 @ weight)) - 1.0),
+            np.abs(factor * (acting.peak / acting_full.peak) ** 2 - 1.0),
         )
+
+
+class _Heights(NamedTuple):
+    """Voltages at a window's nodes, and the largest."""
+
+    at: Rows
+    peak: Float[np.ndarray, " circuits"]
+
+    @classmethod
+    def of(cls, window: Window, waves: Waves) -> "_Heights":
+        at = waves.at(window.cycle, window.elapsed)
+        return cls(at, _peak(window, waves, at))
 
 
 def _peak(window: Window, waves: Waves, vsc: Rows) -> Float[np.ndarray, " circuits"]:
@@ -287,21 +318,29 @@ def _along(pieces: Pieces, cycle: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _complete(circuit: RC) -> DirectGround | NaturalGround:
-    """The circuit with every part that its kind may have, an absent one too small to matter."""
+    """The circuit with every part that its kind may have but a gap, an absent one too small to matter."""
     if isinstance(circuit, FinalCircuit):
         circuit = DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci)
     skin, probe = (circuit.Rsc, circuit.Csc, circuit.Ci), circuit.probe or Probe(math.inf, 0.0)
+    gap = {"Rgap": circuit.Rgap, "Cgap": circuit.Cgap}
     if isinstance(circuit, DirectGround):
         R = circuit.Rsc if circuit.grounding_Rsc is None else circuit.grounding_Rsc
         C = circuit.Csc if circuit.grounding_Csc is None else circuit.grounding_Csc
-        return DirectGround(*skin, _sum(circuit.R_H, circuit.series_resistor), R, C, None, probe)
+        return DirectGround(*skin, _sum(circuit.R_H, circuit.series_resistor), R, C, None, probe, **gap)
     if circuit.Z_capacitance is None:
-        return NaturalGround(*skin, _ABSENT, 0.0, _sum(circuit.Z, circuit.series_resistor), probe)
-    return NaturalGround(*skin, circuit.Z, circuit.Z_capacitance, _sum(circuit.series_resistor), probe)
+        return NaturalGround(*skin, _ABSENT, 0.0, _sum(circuit.Z, circuit.series_resistor), probe, **gap)
+    return NaturalGround(*skin, circuit.Z, circuit.Z_capacitance, _sum(circuit.series_resistor), probe, **gap)
 
 
 def _sum(*resistances: Any) -> Any:
     return sum((resistance for resistance in resistances if resistance is not None), start=_ABSENT)
+
+
+def _factor(scene: Scene, values: Mapping[str, Any], count: int) -> Float[np.ndarray, " circuits"]:
+    """Force over the square of the voltage that makes it, in double precision whatever the waves'."""
+    with jax.enable_x64(True):
+        contact = scene.geometry().contact(scene.make_rc_circuit(dict(values)))
+        return np.broadcast_to(np.asarray(force_constant(contact)), count)
 
 
 def _filled_up(values: Any, precision: Any) -> np.ndarray:
@@ -311,33 +350,37 @@ def _filled_up(values: Any, precision: Any) -> np.ndarray:
 
 
 def _terms(
-    circuit: DirectGround | NaturalGround, skin: Skin | None, drive: Drive, precision: type[np.floating[Any]]
+    circuit: DirectGround | NaturalGround,
+    skin: Skin | None,
+    drive: Drive,
+    precision: type[np.floating[Any]],
+    channel: Channel,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Weights, time constants, and amplitudes of the harmonics that they miss."""
     if skin is None:
-        weight, tau = _constant_terms(circuit)
+        weight, tau = _constant_terms(circuit, channel)
         return weight, tau, np.zeros((ROWS, 0), dtype=complex)
     assert isinstance(drive, Periodic)
     frequency = float(drive.frequency)
     smooth = isinstance(drive, Sine | Multitone)
     count = max(order for order, _, _ in _tones(drive)) if smooth else max(1, skin.count(frequency))
     omega = 2.0 * np.pi * frequency * np.arange(1, count + 1)
-    gain, amplitude = _gain(circuit, skin, omega), np.asarray(_fourier(jax.tree.map(np.asarray, drive), count))
+    gain, amplitude = _gain(circuit, skin, omega, channel), np.asarray(_fourier(jax.tree.map(np.asarray, drive), count))
     if smooth:
         return np.zeros((ROWS, 0)), np.zeros((ROWS, 0)), amplitude * gain
     if isinstance(skin, Fractional):
         tau, x, fitted = spread(True, precision is np.float64)
-        above = _gain(circuit, skin, omega[-1] * x)
+        above = _gain(circuit, skin, omega[-1] * x, channel)
         weight = np.concatenate([above.real, above.imag], axis=1) @ fitted.T
         tau = np.broadcast_to(tau / omega[-1], weight.shape)
     else:  # above 1000 Hz it is constant
-        weight, tau = _constant_terms(WithSkin(circuit, skin).at(1000.0))
+        weight, tau = _constant_terms(WithSkin(circuit, skin).at(1000.0), channel)
     x = 1j * omega * tau[..., None]
     return weight, tau, amplitude * (gain - np.einsum("rk,rkh->rh", weight, x / (1.0 + x)))
 
 
-def _gain(circuit: DirectGround | NaturalGround, skin: Skin, omega: np.ndarray) -> np.ndarray:
-    """Vsc / V of circuits whose skins follow a level."""
+def _gain(circuit: DirectGround | NaturalGround, skin: Skin, omega: np.ndarray, channel: Channel) -> np.ndarray:
+    """Vsc / V, or Vgap / V, of circuits whose skins follow a level."""
     s = 1j * omega
 
     def admittance(element: Element) -> np.ndarray:
@@ -353,8 +396,13 @@ def _gain(circuit: DirectGround | NaturalGround, skin: Skin, omega: np.ndarray) 
         other = 1.0 / admittance(Element(circuit.Z, circuit.Z_capacitance))
     else:
         other = 1.0 / of_skin(circuit.grounding_Rsc, circuit.grounding_Csc)
+    gap = (
+        0.0
+        if circuit.Cgap is None
+        else 1.0 / admittance(Element(np.inf if circuit.Rgap is None else circuit.Rgap, circuit.Cgap))
+    )
     rest = np.asarray(circuit.resistance())[:, None] + 1.0 / (s * np.asarray(circuit.Ci)[:, None])
-    return touching / (touching + other + rest)
+    return (touching if channel == "Vsc" else gap) / (touching + other + rest + gap)
 
 
 @eqx.filter_jit
@@ -367,18 +415,19 @@ def _skin_at(skin: Skin, element: Element, frequency: Array) -> Element:
     return skin.at(element, frequency)
 
 
-def _constant_terms(circuit: Any) -> tuple[np.ndarray, np.ndarray]:
+def _constant_terms(circuit: Any, channel: Channel) -> tuple[np.ndarray, np.ndarray]:
     """Of constant skins. Z stands in the loop where a grounding skin does, so one program serves both."""
     if isinstance(circuit, NaturalGround):
         loop = circuit.series_resistor, circuit.Z, circuit.Z_capacitance
-        circuit = DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci, *loop, None, circuit.probe)
-    weight, tau = _constant(circuit)
+        gap = {"Rgap": circuit.Rgap, "Cgap": circuit.Cgap}
+        circuit = DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci, *loop, None, circuit.probe, **gap)
+    weight, tau = _constant(circuit, channel)
     return np.asarray(weight), np.asarray(tau)
 
 
-@jax.jit
-def _constant(circuit: DirectGround) -> tuple[Array, Array]:
-    terms = jax.vmap(lambda one: one.terms())(circuit)
+@functools.partial(jax.jit, static_argnums=1)
+def _constant(circuit: DirectGround, channel: Channel) -> tuple[Array, Array]:
+    terms = jax.vmap(lambda one: one.terms_of(channel))(circuit)
     return jnp.stack(terms.weight, axis=1), jnp.stack(terms.tau, axis=1)
 
 
