@@ -279,7 +279,8 @@ def compare(
     from fitact.data.formats import read
     from fitact.model.scene import Scene
 
-    stated = {str(path): Scene.load(path) for path in scenes}
+    alike = len({path.stem for path in scenes}) < len(scenes)
+    stated = {str(path) if alike else path.stem: Scene.load(path) for path in scenes}
     for each in stated.values():
         each.require_available(fit=True)
     measured = [read(record, next(iter(stated.values()))) for record in records]

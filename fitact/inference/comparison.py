@@ -140,14 +140,14 @@ class Comparison:
     def summary(self) -> str:
         """A table for people."""
         width = max(12, *(len(model.name) for model in self.models))
-        titles = ("log-lik.", "parameters", "AIC", "AICc", "BIC", "elpd", "below the best")
-        rows = [f"{'model':{width}}" + "".join(f"{title:>{14 if i else 12}}" for i, title in enumerate(titles))]
+        titles = ("log-lik.", "parameters", "AIC", "AICc", "BIC", "elpd", " below the best")
+        rows = [f"{'model':{width}}" + "".join(f"{title:>14}" for title in titles)]
         for model in self.models:
             cells = [f"{model.fit.figures[name]:.2f}" for name in _CRITERIA]
             cells[1] = f"{model.fit.figures['parameters_counted']:.0f}"
             below = "" if model is self.models[0] else _by(model, self.models[0])
             shown = [*cells, f"{model.elpd:.2f}", below]
-            rows.append(f"{model.name:{width}}" + "".join(f"{c:>{14 if i else 12}}" for i, c in enumerate(shown)))
+            rows.append(f"{model.name:{width}}" + "".join(f"{cell:>14}" for cell in shown))
         held = self.models[0].held_out
         rows += [
             f"elpd: log predictive density of {held.log_density.size} blocks, in {held.folds} folds left out; below the"

@@ -20,13 +20,14 @@ from fitact.data.record import Record
 from fitact.inference.fit import Fit
 from fitact.inference.least_squares import least_squares
 from fitact.inference.likelihood import Likelihood
-from fitact.inference.noise import FREEDOM, student_weight
+from fitact.inference.noise import FREEDOM, student_curvature, student_weight
 from fitact.inference.solver import result_name
 from fitact.inference.trace import Trace
 
 _BLOCKS = 40  # of a record: enough for a standard error of their sum
 _PERIODS = 20  # whole ones, from which blocks consist of them
 _FOLDS = 10
+_STUDENT_INFORMATION = (FREEDOM + 1.0) / (FREEDOM + 3.0)  # of a sample, on its location in scales
 _STUDENT = math.lgamma(0.5 * (FREEDOM + 1.0)) - math.lgamma(0.5 * FREEDOM) - 0.5 * math.log(FREEDOM * math.pi)
 
 
@@ -134,7 +135,7 @@ class _Near(NamedTuple):
             with np.errstate(divide="ignore"):
                 scale.append(np.where(counts, np.log(trace.weights * first / sigma[i]), -np.inf))
             rows = slope[i][some & counts]
-            precision += _information(student[i]) * rows.T @ rows
+            precision += (_STUDENT_INFORMATION if student[i] else 1.0) * rows.T @ rows
         return cls(z, slope, scale, student, precision)
 
     def log_density(self, chosen: list[np.ndarray]) -> float:
@@ -146,7 +147,9 @@ class _Near(NamedTuple):
             density = _STUDENT - 0.5 * (FREEDOM + 1.0) * np.log1p(z**2 / FREEDOM) if student else _normal(z)
             total += float(np.sum(density + scale[some]))
             score -= slope.T @ (np.asarray(student_weight(z)) * z if student else z)
-            added += _information(student) * slope.T @ slope
+            # an outlier's negative curvature would not leave a maximum for sure
+            curvature = np.maximum(np.asarray(student_curvature(z)), 0.0) if student else np.ones(len(z))
+            added += (curvature[:, None] * slope).T @ slope
         wider = self.precision + added
         _, log_ratio = np.linalg.slogdet(np.linalg.solve(self.precision, wider))
         return total + 0.5 * float(score @ np.linalg.solve(wider, score)) - 0.5 * float(log_ratio)
@@ -154,11 +157,6 @@ class _Near(NamedTuple):
 
 def _normal(z: np.ndarray) -> np.ndarray:
     return -0.5 * z**2 - 0.5 * math.log(2.0 * math.pi)
-
-
-def _information(student: bool) -> float:
-    """Of a sample, on its own location in standard deviations (Student's: scales)."""
-    return (FREEDOM + 1.0) / (FREEDOM + 3.0) if student else 1.0
 
 
 @eqx.filter_jit
