@@ -49,7 +49,7 @@ def verdicts(size: float, records: int) -> Counter:
 def main() -> None:
     """Count, for each size of the gap."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--records", type=int, default=40, help="without a gap; with one, a quarter as many")
+    parser.add_argument("--records", type=int, default=30, help="without a gap; with one, a quarter as many")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     ratios = {}

@@ -15,7 +15,8 @@ from jaxtyping import Float
 from fitact.model import omissions
 from fitact.model.circuit import FinalCircuit, NaturalGround
 from fitact.model.scene import Scene
-from fitact.model.waves import ROWS, Comparison, Reference, Waves, Window
+from fitact.model.wave_terms import ROWS
+from fitact.model.waves import Comparison, Reference, Waves, Window
 from fitact.units import engineering, percent
 
 _NOT_OF_THE_CIRCUIT = ("sigma", "sigma_I")

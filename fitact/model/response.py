@@ -19,9 +19,10 @@ from jaxtyping import Array, Float
 
 from fitact.errors import InputError
 from fitact.model.chirp import Chirp
-from fitact.model.circuit import Channel, Circuit, gain_at, highpass_amplitude
+from fitact.model.circuit import Channel, Circuit, gain_at
 from fitact.model.drive import Burst, Drive, Line, Pieces, PiecewiseLinear, Sampled, Sine, Square
 from fitact.model.harmonic import fourier, frequency, fundamental, harmonic_response, harmonic_sum
+from fitact.model.highpass import highpass_amplitude
 from fitact.model.multitone import Multitone
 from fitact.model.polynomial import evaluate, particular
 from fitact.model.skin import WithSkin

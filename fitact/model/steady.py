@@ -18,8 +18,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.errors import InputError
-from fitact.model.circuit import Channel, Circuit, Terms, highpass_amplitude
+from fitact.model.circuit import Channel, Circuit, Terms
 from fitact.model.drive import Drive, Line, Periodic, Pieces, PiecewiseLinear, Sine, Square, Trapezoid, Triangle
+from fitact.model.highpass import highpass_amplitude
 from fitact.model.multitone import Multitone, largest_sum
 from fitact.model.response import bend, coth_fraction, log_slope, phi, psi, steady_knots
 

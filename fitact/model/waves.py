@@ -1,8 +1,8 @@
 """Vsc of many circuits under one drive, and what makes the force, for comparing models with each other.
 
-All circuits share one compiled program: what a circuit lacks is filled in with a value too small to matter. The rest
-is NumPy, where nothing is compiled: every response is a sum of exponentials along the straight pieces of its drive, and
-a window is a set of nodes, graded towards the corners, where a small resistance makes its difference.
+The time constants come from `fitact.model.wave_terms`. The rest is NumPy, where nothing is compiled: every response is
+a sum of exponentials along the straight pieces of its drive, and a window is a set of nodes, graded towards the
+corners, where a small resistance makes its difference.
 """
 
 import dataclasses
@@ -14,23 +14,19 @@ from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
 from fitact.model.chirp import Chirp
-from fitact.model.circuit import RC, Channel, DirectGround, Element, FinalCircuit, NaturalGround, Probe
+from fitact.model.circuit import Channel
 from fitact.model.drive import Burst, Drive, Periodic, Pieces, PiecewiseLinear, Sine
 from fitact.model.force import force_constant
-from fitact.model.harmonic import fourier
 from fitact.model.multitone import Multitone
 from fitact.model.response import highpass, steady_knots
 from fitact.model.scene import Scene
-from fitact.model.skin import Fractional, Skin, WithSkin, spread
+from fitact.model.skin import WithSkin
+from fitact.model.wave_terms import complete, filled_up, terms, tones
 
-ROWS = 128  # circuits side by side; fewer are filled up, so that each program is compiled once
-_ABSENT = 1e-6  # ohm: with any capacitance here over long before the first node
 _PIECES = 4  # of a period; fewer are filled up with ones of no length
 _DECADES, _ORDER = 8, 8  # of a piece, and the order of the rule in each
 _PERIODS = 12  # from rest: periods that stand for all, in geometric progression
@@ -122,9 +118,9 @@ class Waves:
         with jax.enable_x64(precision is np.float64):
             circuit = scene.make_circuit(dict(values))
             skin = circuit.skin if isinstance(circuit, WithSkin) else None
-            complete = _complete(scene.make_rc_circuit(dict(values)))
-            filled = jax.tree.map(lambda x: _filled_up(x, precision), complete)
-            weight, tau, harmonics = _terms(filled, skin, drive, precision, channel)
+            whole = complete(scene.make_rc_circuit(dict(values)))
+            filled = jax.tree.map(lambda x: filled_up(x, precision), whole)
+            weight, tau, harmonics = terms(filled, skin, drive, precision, channel)
             tau = np.maximum(tau, np.finfo(np.float32).tiny)  # single precision may lose that of an absent part
             wave = drive.wave if isinstance(drive, Burst) else drive
             pieces = _pieces(wave) if isinstance(wave, PiecewiseLinear) else None
@@ -143,7 +139,7 @@ class Waves:
         cycle, elapsed = (np.atleast_2d(x).astype(self.tau.dtype) for x in (cycle, elapsed))
         if isinstance(self.drive, Chirp):
             with jax.enable_x64(self.tau.dtype == np.float64):
-                u = np.asarray(_chirped(self.drive, elapsed[0], _filled_up(self.tau, self.tau.dtype)))[: len(self.tau)]
+                u = np.asarray(_chirped(self.drive, elapsed[0], filled_up(self.tau, self.tau.dtype)))[: len(self.tau)]
         elif self.steady_state:
             u = self._settled(cycle)
         else:
@@ -181,7 +177,7 @@ class Waves:
         tau, cycle = self.tau[..., None], cycle[:, None, :]
         if self.pieces is None:
             omega, u = 2.0 * np.pi * wave.frequency, np.zeros((1, 1, 1), dtype=tau.dtype)
-            for order, height, phase in _tones(wave):
+            for order, height, phase in tones(wave):
                 x = order * omega * tau
                 u = u + height * (x / np.hypot(1.0, x)) * np.sin(order * omega * cycle + (phase + np.arctan2(1.0, x)))
             return u
@@ -280,19 +276,9 @@ def _lead(wave: Any) -> float:
     return float(wave.phase / (2.0 * np.pi) % 1.0 / wave.frequency)
 
 
-def _tones(wave: Any) -> list[tuple[int, float, float]]:
-    """Of a smooth drive: order, amplitude (V), and phase beside the whole's (rad)."""
-    if isinstance(wave, Sine):
-        return [(1, 0.5 * float(wave.peak_to_peak), 0.0)]
-    phases = wave.phases or (0.0,) * len(wave.orders)
-    return [
-        (n, float(height), float(phase)) for n, height, phase in zip(wave.orders, wave.amplitudes, phases, strict=True)
-    ]
-
-
 def _corners(wave: Periodic) -> np.ndarray:
     if isinstance(wave, Sine | Multitone):
-        return np.linspace(0.0, 1.0, 4 * max(order for order, _, _ in _tones(wave)) + 1) / float(wave.frequency)
+        return np.linspace(0.0, 1.0, 4 * max(order for order, _, _ in tones(wave)) + 1) / float(wave.frequency)
     assert isinstance(wave, PiecewiseLinear)
     return np.unique(_pieces(wave).knots)
 
@@ -317,118 +303,11 @@ def _along(pieces: Pieces, cycle: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     return piece, np.maximum(cycle - knots[piece], 0.0), slope[piece]
 
 
-def _complete(circuit: RC) -> DirectGround | NaturalGround:
-    """The circuit with every part that its kind may have but a gap, an absent one too small to matter."""
-    if isinstance(circuit, FinalCircuit):
-        circuit = DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci)
-    skin, probe = (circuit.Rsc, circuit.Csc, circuit.Ci), circuit.probe or Probe(math.inf, 0.0)
-    gap = {"Rgap": circuit.Rgap, "Cgap": circuit.Cgap}
-    if isinstance(circuit, DirectGround):
-        R = circuit.Rsc if circuit.grounding_Rsc is None else circuit.grounding_Rsc
-        C = circuit.Csc if circuit.grounding_Csc is None else circuit.grounding_Csc
-        return DirectGround(*skin, _sum(circuit.R_H, circuit.series_resistor), R, C, None, probe, **gap)
-    if circuit.Z_capacitance is None:
-        return NaturalGround(*skin, _ABSENT, 0.0, _sum(circuit.Z, circuit.series_resistor), probe, **gap)
-    return NaturalGround(*skin, circuit.Z, circuit.Z_capacitance, _sum(circuit.series_resistor), probe, **gap)
-
-
-def _sum(*resistances: Any) -> Any:
-    return sum((resistance for resistance in resistances if resistance is not None), start=_ABSENT)
-
-
 def _factor(scene: Scene, values: Mapping[str, Any], count: int) -> Float[np.ndarray, " circuits"]:
     """Force over the square of the voltage that makes it, in double precision whatever the waves'."""
     with jax.enable_x64(True):
         contact = scene.geometry().contact(scene.make_rc_circuit(dict(values)))
         return np.broadcast_to(np.asarray(force_constant(contact)), count)
-
-
-def _filled_up(values: Any, precision: Any) -> np.ndarray:
-    """As many rows as programs are compiled for, the first standing in for those that are missing."""
-    values = np.atleast_1d(np.asarray(values, dtype=precision))
-    return np.concatenate([values, np.broadcast_to(values[:1], (ROWS - len(values), *values.shape[1:]))])
-
-
-def _terms(
-    circuit: DirectGround | NaturalGround,
-    skin: Skin | None,
-    drive: Drive,
-    precision: type[np.floating[Any]],
-    channel: Channel,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weights, time constants, and amplitudes of the harmonics that they miss."""
-    if skin is None:
-        weight, tau = _constant_terms(circuit, channel)
-        return weight, tau, np.zeros((ROWS, 0), dtype=complex)
-    assert isinstance(drive, Periodic)
-    frequency = float(drive.frequency)
-    smooth = isinstance(drive, Sine | Multitone)
-    count = max(order for order, _, _ in _tones(drive)) if smooth else max(1, skin.count(frequency))
-    omega = 2.0 * np.pi * frequency * np.arange(1, count + 1)
-    gain, amplitude = _gain(circuit, skin, omega, channel), np.asarray(_fourier(jax.tree.map(np.asarray, drive), count))
-    if smooth:
-        return np.zeros((ROWS, 0)), np.zeros((ROWS, 0)), amplitude * gain
-    if isinstance(skin, Fractional):
-        tau, x, fitted = spread(True, precision is np.float64)
-        above = _gain(circuit, skin, omega[-1] * x, channel)
-        weight = np.concatenate([above.real, above.imag], axis=1) @ fitted.T
-        tau = np.broadcast_to(tau / omega[-1], weight.shape)
-    else:  # above 1000 Hz it is constant
-        weight, tau = _constant_terms(WithSkin(circuit, skin).at(1000.0), channel)
-    x = 1j * omega * tau[..., None]
-    return weight, tau, amplitude * (gain - np.einsum("rk,rkh->rh", weight, x / (1.0 + x)))
-
-
-def _gain(circuit: DirectGround | NaturalGround, skin: Skin, omega: np.ndarray, channel: Channel) -> np.ndarray:
-    """Vsc / V, or Vgap / V, of circuits whose skins follow a level."""
-    s = 1j * omega
-
-    def admittance(element: Element) -> np.ndarray:
-        R, C = (np.atleast_2d(np.asarray(x).T).T for x in element)
-        return 1.0 / R + s * C
-
-    def of_skin(R: ArrayLike, C: ArrayLike) -> np.ndarray:
-        return admittance(_skin_at(skin, Element(*(jnp.asarray(x)[:, None] for x in (R, C))), omega / (2.0 * np.pi)))
-
-    assert circuit.probe is not None
-    touching = 1.0 / (of_skin(circuit.Rsc, circuit.Csc) + admittance(Element(circuit.probe.R, circuit.probe.C)))
-    if isinstance(circuit, NaturalGround):
-        other = 1.0 / admittance(Element(circuit.Z, circuit.Z_capacitance))
-    else:
-        other = 1.0 / of_skin(circuit.grounding_Rsc, circuit.grounding_Csc)
-    gap = (
-        0.0
-        if circuit.Cgap is None
-        else 1.0 / admittance(Element(np.inf if circuit.Rgap is None else circuit.Rgap, circuit.Cgap))
-    )
-    rest = np.asarray(circuit.resistance())[:, None] + 1.0 / (s * np.asarray(circuit.Ci)[:, None])
-    return (touching if channel == "Vsc" else gap) / (touching + other + rest + gap)
-
-
-@eqx.filter_jit
-def _fourier(drive: Drive, harmonics: int) -> Complex[Array, " harmonics"]:
-    return fourier(drive, harmonics)
-
-
-@eqx.filter_jit
-def _skin_at(skin: Skin, element: Element, frequency: Array) -> Element:
-    return skin.at(element, frequency)
-
-
-def _constant_terms(circuit: Any, channel: Channel) -> tuple[np.ndarray, np.ndarray]:
-    """Of constant skins. Z stands in the loop where a grounding skin does, so one program serves both."""
-    if isinstance(circuit, NaturalGround):
-        loop = circuit.series_resistor, circuit.Z, circuit.Z_capacitance
-        gap = {"Rgap": circuit.Rgap, "Cgap": circuit.Cgap}
-        circuit = DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci, *loop, None, circuit.probe, **gap)
-    weight, tau = _constant(circuit, channel)
-    return np.asarray(weight), np.asarray(tau)
-
-
-@functools.partial(jax.jit, static_argnums=1)
-def _constant(circuit: DirectGround, channel: Channel) -> tuple[Array, Array]:
-    terms = jax.vmap(lambda one: one.terms_of(channel))(circuit)
-    return jnp.stack(terms.weight, axis=1), jnp.stack(terms.tau, axis=1)
 
 
 @jax.jit
