@@ -123,13 +123,16 @@ NOISY = [1.0 + (-1.0) ** i for i in range(16)]  # the same sum, 4.13 as standard
 def test_verdicts():
     better = ranked(scored("a", FLAT, 0.0), scored("b", [x - 1.0 for x in NOISY], -50.0))
     assert better.preferred == "a"  # by 16 ± 4.1, whatever the criterion says
-    assert better.verdict == "a is preferred: of what was left out it predicts 16.00 ± 4.13 more than b."
+    assert better.verdict == "a is preferred: it predicts what was left out better than b, by an elpd of 16.00 ± 4.13."
     simpler = ranked(scored("a", FLAT, 15.0), scored("b", [x - 0.1 for x in NOISY], 0.0))
     assert simpler.preferred == "b"
-    assert "as well as a (of which a predicts 1.60 ± 4.13 more) and has the lower BIC, by 15" in simpler.verdict
+    assert simpler.verdict == (
+        "b is preferred, for its BIC: a predicts what was left out better by an elpd of only 1.60 ± 4.13, and b has the"
+        " lower BIC, by 15."
+    )
     tied = ranked(scored("a", FLAT, 5.0), scored("b", [x - 0.1 for x in NOISY], 0.0))
     assert tied.preferred is None
-    assert tied.verdict.startswith("b and a cannot be told apart: of what was left out a predicts 1.60 ± 4.13 more")
+    assert tied.verdict.startswith("b and a cannot be told apart: a predicts what was left out better by an elpd of")
     assert all(found.trusted for found in (better, simpler, tied))
 
 

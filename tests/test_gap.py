@@ -11,8 +11,10 @@ from test_ngspice import DRIVES, PERIOD, away_from, computed, simulate
 
 import fitact
 from fitact.inference.structure import blind_directions
+from fitact.inference.trace import CHARGES
 from fitact.model.circuit import gain_at
 from fitact.model.force import AirGap
+from fitact.units import unit_of
 
 R, C, CI = 160e3, 22e-9, 1.35e-9
 AREA, THICKNESS = 1e-4, 2e-6
@@ -159,6 +161,14 @@ def test_what_no_record_can_tell(gap: str, measured: tuple[str, ...], blind: int
         along = dict(zip(found.names, found.directions[0], strict=True))
         assert along["Rsc"] == pytest.approx(0.0, abs=1e-9)
         assert along["Ci"] / along["Cgap"] == pytest.approx(-CI / CGAP)  # 1/Ci + 1/Cgap stays
+
+
+def test_every_unknown_charge_has_a_unit_in_every_channel():
+    """One for each time constant: two skins, the gap, and the resistor's."""
+    circuit = fitact.DirectGround(R, C, CI, series_resistor=100e3, Rgap=RGAP, Cgap=CGAP)
+    assert len(circuit.terms().tau) == len(CHARGES) == 4
+    assert {unit_of(name) for name in CHARGES} == {"V"}
+    assert {unit_of(f"{name}_I") for name in CHARGES} == {unit_of(f"{name}_I_2") for name in CHARGES} == {"A"}
 
 
 SLIDING = {

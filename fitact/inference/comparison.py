@@ -88,26 +88,26 @@ class Comparison:
         first, *others = self._standing
         if not others:
             second = min(self.models[1:], key=lambda model: model.below(first)[0])
-            by = _by(second, first)
-            return f"{first.name} is preferred: of what was left out it predicts {by} more than {second.name}."
-        rival, apart = others[0], _bic(others[0]) - _bic(first)
-        pair = (rival, first) if rival.below(first)[0] >= 0.0 else (first, rival)
-        if self.preferred is None:
             return (
-                f"{first.name} and {rival.name} cannot be told apart: of what was left out {pair[1].name} predicts"
-                f" {_by(*pair)} more, and {first.name} has the lower BIC by {apart:.3g}."
+                f"{first.name} is preferred: it predicts what was left out better than {second.name}, by an elpd of"
+                f" {_by(second, first)}."
             )
-        return (
-            f"{first.name} is preferred: it predicts what was left out as well as {rival.name}"
-            f" (of which {pair[1].name} predicts {_by(*pair)} more) and has the lower BIC, by {apart:.3g}."
+        rival, apart = others[0], _bic(others[0]) - _bic(first)
+        worse, better = (rival, first) if rival.below(first)[0] >= 0.0 else (first, rival)
+        why = (
+            f"{better.name} predicts what was left out better by an elpd of only {_by(worse, better)}, and {first.name}"
+            f" has the lower BIC, by {apart:.3g}."
         )
+        if self.preferred is None:
+            return f"{first.name} and {rival.name} cannot be told apart: {why}"
+        return f"{first.name} is preferred, for its BIC: {why}"
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences."""
         failed = [
             f"{m.name}: {m.held_out.failed} of {m.held_out.folds} fits without a fold did not reach an optimum, so its"
-            " elpd is too low; free less, or state narrower priors"
+            " elpd may be too low; free less, or state narrower priors"
             for m in self.models
             if m.held_out.failed
         ]
