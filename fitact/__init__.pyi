@@ -1,6 +1,7 @@
 from .data.formats import read
 from .data.record import Record
 from .errors import InputError
+from .inference.comparison import Comparison, compare
 from .inference.fit import Fit, fit
 from .inference.posterior import Posterior
 from .inference.sampling import sample
@@ -25,6 +26,7 @@ __all__ = [
     "RESULTS",
     "Burst",
     "Chirp",
+    "Comparison",
     "Contact",
     "DirectGround",
     "Dispersive",
@@ -53,6 +55,7 @@ __all__ = [
     "Uniform",
     "WithSkin",
     "body_current",
+    "compare",
     "electrostatic_force",
     "fit",
     "friction",

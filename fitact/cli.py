@@ -268,6 +268,31 @@ def tradeoff(
 
 
 @app.command()
+def compare(
+    records: RecordFiles,
+    scenes: Annotated[
+        list[Path], typer.Option("--scene", metavar="FILE", help="Scene (TOML) of one model; give two or more.")
+    ],
+    json: Json = False,
+) -> None:
+    """Fit the model of each scene to the same records, in full, and say which the data prefer."""
+    from fitact.data.formats import read
+    from fitact.model.scene import Scene
+
+    alike = len({path.stem for path in scenes}) < len(scenes)
+    stated = {str(path) if alike else path.stem: Scene.load(path) for path in scenes}
+    for each in stated.values():
+        each.require_available(fit=True)
+    measured = [read(record, next(iter(stated.values()))) for record in records]
+    _use_compilation_cache()
+    from fitact.inference.comparison import compare as compared
+
+    found = compared(measured, stated)
+    _show(str(found), found.to_dict(), json)
+    _finish(found.trusted)
+
+
+@app.command()
 def scene(
     file: Annotated[str, typer.Argument(metavar="[SCENE]", help="Scene (TOML), or the name of a shipped one.")] = "",
     json: Json = False,

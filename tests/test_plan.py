@@ -48,6 +48,9 @@ def state_space(scene: fitact.Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray
         capacitances.append(ground.Z_capacitance)
     else:
         series += ground.Z
+    if scene.gap.capacitance:
+        conductances.append(1.0 / (scene.gap.resistance or math.inf))
+        capacitances.append(scene.gap.capacitance)
     G, C = np.diag(conductances), np.diag(capacitances)
     one = np.ones(len(conductances))
     if series == 0.0:  # Ci (V - sum x)' flows through every element
@@ -214,6 +217,24 @@ def test_the_papers_scene_leaves_R_H_out_at_one_per_cent_and_keeps_it_at_a_tenth
     assert strict.left_out == ()
     assert strict.scene.make_circuit().R_H == 500.0
     assert strict.nominal.force == 0.0
+
+
+GAP = {"gap": {"resistance": 2e6, "capacitance": 4e-10}}
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        GAP,
+        {"gap": {"resistance": 1e5, "capacitance": 4e-8}, **PAPER},
+        GAP | NATURAL | {"measurement": {"series_resistor": 1e3}},
+    ],
+)
+def test_what_leaving_out_the_gap_changes(scene: dict):
+    full = fitact.Scene.from_dict(scene)
+    (omission,) = (each for each in fitact.plan(full).omissions if each.name == "gap")
+    expected = true_errors(full, omissions.without(full, ("gap",)))
+    np.testing.assert_allclose(omission.nominal, expected, rtol=2e-3, atol=_GRID)
 
 
 @pytest.mark.skipif(shutil.which("ngspice") is None, reason="ngspice is not installed (apt-get install ngspice)")

@@ -15,7 +15,16 @@ from fitact.inference.start import DriveChoice, whole_periods
 from fitact.inference.trace import CHARGES, LINEAR
 from fitact.model.circuit import RC
 from fitact.model.drive import Drive, Periodic, PiecewiseLinear, Sampled
-from fitact.model.force import Contact, electrostatic_force, friction, mean_force, peak_force, summarize
+from fitact.model.force import (
+    AirGap,
+    Contact,
+    Geometry,
+    electrostatic_force,
+    friction,
+    mean_force,
+    peak_force,
+    summarize,
+)
 from fitact.model.response import response
 from fitact.model.scene import Scene
 
@@ -40,7 +49,7 @@ class Derived(eqx.Module):
             early that its unknown charge is gone when the force is evaluated.
         time: when the force is evaluated, s.
         weight: the share of time each stands for; a weight of 0 counts for the peak only.
-        area, insulator_thickness, skin_thickness: m^2, m, m.
+        geometry: with the circuit, where the force acts.
         coefficient, normal_force: of friction; 1, N.
     """
 
@@ -48,9 +57,7 @@ class Derived(eqx.Module):
     drive: Drive
     time: Float[Array, " times"]
     weight: Float[Array, " times"]
-    area: ArrayLike
-    insulator_thickness: ArrayLike
-    skin_thickness: ArrayLike
+    geometry: Geometry
     coefficient: ArrayLike
     normal_force: ArrayLike
     steady_state: bool = eqx.field(static=True)
@@ -59,33 +66,36 @@ class Derived(eqx.Module):
     def force(
         self, theta: Float[Array, " parameters"], sigma: Float[Array, " traces"], deviate: ArrayLike = 0.0
     ) -> Float[Array, " times"]:
-        """Electrostatic force in time, N, eq. (22); the permittivities follow Ci and Csc through eq. (3).
+        """Electrostatic force in time, N; see `fitact.model.force.Geometry`.
 
         `deviate` holds standard normal numbers (traces, `LINEAR`) that draw the charges from their posterior; 0:
         their mean.
         """
         circuit = self.likelihood.circuit(theta)
-        vsc = response(circuit, self.drive, self.time, steady_state=self.steady_state)
+        contact = self.contact(circuit)
+        voltage = response(circuit, self.drive, self.time, steady_state=self.steady_state, channel=contact.channel)
         if self.charge:
-            vsc = vsc + self._charges(theta, sigma, deviate)
-        return electrostatic_force(vsc, self.contact(circuit))
+            voltage = voltage + self._charges(theta, sigma, deviate)
+        return electrostatic_force(voltage, contact)
 
     def _charges(self, theta: Array, sigma: Array, deviate: ArrayLike) -> Float[Array, " times"]:
-        """What unknown charges at the record's first sample add to Vsc."""
+        """What unknown charges at the record's first sample add to the voltage that makes the force.
+
+        Not what one that stays on a gap adds, which no channel shows.
+        """
         trace, seen = self.likelihood.traces[0], self.likelihood.seen(theta)
         first = jnp.broadcast_to(deviate, (len(self.likelihood.traces), len(LINEAR)))[0]
         sizes = (trace.drawn(seen, sigma[0], first) * trace.linear_sd)[-len(CHARGES) :]
         # a charge shows in each channel as the response to a drive does
-        there, here = (seen.circuit.terms_of(channel).weight for channel in ("Vsc", trace.channel))
-        ratios = jnp.stack([v / jnp.where(w == 0.0, 1.0, w) for v, w in zip(there, here, strict=True)])
+        acting = self.contact(seen.circuit).channel
+        there, here = (seen.circuit.terms_of(channel).weight for channel in (acting, trace.channel))
+        ratios = jnp.stack([v / jnp.where(w == 0.0, 1.0, w) for v, w in zip(there, here, strict=False)])
         ratios = jnp.pad(ratios, (0, len(CHARGES) - ratios.size))
         return (sizes * ratios) @ trace.decays(seen.circuit, self.time) / seen.gain
 
-    def contact(self, circuit: RC) -> Contact:
-        """The contact whose permittivities follow from the circuit's capacitances, eq. (3)."""
-        return Contact.from_capacitances(
-            circuit.Ci, circuit.Csc, self.area, self.insulator_thickness, self.skin_thickness
-        )
+    def contact(self, circuit: RC) -> Contact | AirGap:
+        """Where the circuit's force acts."""
+        return self.geometry.contact(circuit)
 
     def __call__(
         self, theta: Float[Array, " parameters"], sigma: Float[Array, " traces"], deviate: ArrayLike = 0.0
@@ -125,9 +135,7 @@ def for_fit(likelihood: Likelihood, record: Record, choice: DriveChoice, scene: 
         drive,
         jnp.asarray(time),
         jnp.asarray(weight / weight.sum()),
-        scene.device.contact_area,
-        scene.device.insulator_thickness,
-        scene.skin.thickness,
+        scene.geometry(),
         scene.friction.coefficient,
         scene.friction.normal_force,
         steady_state=choice.steady_state and last is None,

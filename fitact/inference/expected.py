@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from fitact.inference.structure import log_values, with_parameters
 from fitact.model.circuit import Channel, Circuit, DirectGround, FinalCircuit, NaturalGround
 from fitact.model.drive import Drive, Periodic, Sampled
-from fitact.model.force import Contact, force_constant
+from fitact.model.force import Geometry, force_constant
 from fitact.model.response import highpass
 from fitact.units import engineering
 
@@ -48,6 +48,7 @@ class Experiment:
         noise: standard deviation of each channel's noise, V and A.
         steady_state: or from rest.
         records: how many such records there are.
+        geometry: what the force needs beside the circuit; of areas and thicknesses nothing but factors depends.
     """
 
     circuit: Circuit
@@ -59,6 +60,7 @@ class Experiment:
     noise: Mapping[str, float]
     steady_state: bool = True
     records: float = 1.0
+    geometry: Geometry = Geometry()  # noqa: RUF009  (a frozen Module)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,13 +101,13 @@ def expected_sd(experiment: Experiment) -> Expected:
     """
     e, theta = experiment, log_values(experiment.circuit, experiment.free, experiment.channels)
     with jax.enable_x64(True):
-        circuit = jax.tree.map(jnp.asarray, e.circuit)  # plain numbers would be compiled in
-        *seen, touching, force_constant_slope = _terms(circuit, e.free, e.channels, jnp.asarray(theta))
+        circuit, geometry = jax.tree.map(jnp.asarray, (e.circuit, e.geometry))  # plain numbers would be compiled in
+        *seen, acting, force_constant_slope = _terms(circuit, e.free, e.channels, jnp.asarray(theta), geometry)
         sampling = _sampling(e)
-        vsc, slope = _response(touching, sampling)
+        voltage, slope = _response(acting, sampling)
         responses = [_response(terms, sampling)[1] for terms in seen]
-    weight = sampling.force * vsc
-    gradient = np.asarray(force_constant_slope) + 2.0 * (weight @ slope) / (weight @ vsc)
+    weight = sampling.force * voltage
+    gradient = np.asarray(force_constant_slope) + 2.0 * (weight @ slope) / (weight @ voltage)
     jacobian = [
         (sampling.away if float(terms.rate) else sampling.data)[:, None] / e.noise[channel] * response
         for channel, (terms, _), response in zip(e.channels, seen, responses, strict=True)
@@ -180,14 +182,22 @@ class _Terms(NamedTuple):
 
 @eqx.filter_jit
 def _terms(
-    circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], theta: Float[Array, " parameters"]
+    circuit: Circuit,
+    free: tuple[str, ...],
+    channels: tuple[Channel, ...],
+    theta: Float[Array, " parameters"],
+    geometry: Geometry,
 ) -> tuple[Any, ...]:
-    """For each channel, and for Vsc itself: terms and their derivatives; and the derivative of log force over Vsc^2."""
+    """For each channel, and the voltage that makes the force: terms and their derivatives; and that of its factor.
+
+    The last is the derivative of the logarithm of force over that voltage squared.
+    """
+    acting: Channel = "Vsc" if geometry.model == "paper" else "Vgap"
 
     def terms(theta: Array) -> list[_Terms]:
         there, gains = with_parameters(circuit, free, channels, theta)
         found = []
-        for gain, channel in [*zip(gains, channels, strict=True), (1.0, "Vsc")]:
+        for gain, channel in [*zip(gains, channels, strict=True), (1.0, acting)]:
             weight, tau, rate = there.terms_of(channel)
             rate = jnp.asarray(0.0 if rate is None else rate)
             found.append(_Terms(gain * jnp.stack(weight), jnp.log(jnp.stack(tau)), gain * rate))
@@ -195,8 +205,7 @@ def _terms(
 
     def log_force(theta: Array) -> Array:
         there: Any = with_parameters(circuit, free, channels, theta)[0]
-        # the permittivities follow the capacitances, eq. (3), so the geometry is but a factor of the force
-        return jnp.log(force_constant(Contact.from_capacitances(there.Ci, there.Csc, 1.0, 1.0, 1.0)))
+        return jnp.log(force_constant(geometry.contact(there)))
 
     return *zip(terms(theta), jax.jacfwd(terms)(theta), strict=True), jax.jacfwd(log_force)(theta)
 

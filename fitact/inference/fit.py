@@ -210,6 +210,7 @@ class Fit:
             "drive": self.choice.name,
             "steady_state": self.choice.steady_state,
             "channels": [trace.channel for trace in self.traces],
+            "force": self.derive.geometry.model,
             "freed": [*self.linear, *(name for name in self.names if name not in _SKIN)],
             "likelihood": "full" if self.compression_error is None else "compressed",
             "compression_error": self.compression_error,
@@ -261,6 +262,7 @@ class Fit:
             + ", ".join(f"{self.names[j]}-{self.names[i]} {self.correlation[i, j]:+.3f}" for i, j in pairs),
             f"reduced chi-square {self.figures['chi2_reduced']:.3f}. {self.message}",
             f"log-likelihood: {self._likelihood()}.",
+            f"force: {summary.BY_FORCE[self.derive.geometry.model]}.",
             str(self.identifiability),
         ]
         return "\n".join([*rows, *(f"warning: {warning}" for warning in self.warnings)])

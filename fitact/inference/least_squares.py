@@ -54,7 +54,7 @@ class Solved(eqx.Module):
     slope: tuple[Float[Array, " rows"], ...]
 
 
-def _least_squares(likelihood: Likelihood, start: Array, noise: Array) -> Solved:
+def least_squares(likelihood: Likelihood, start: Array, noise: Array) -> Solved:
     """In rounds: with the noise as given, then with that of the residuals, until it has settled."""
     needed, steps = likelihood.without_samples(), jnp.zeros((), dtype=int)
     theta, sigma = start, noise
@@ -156,7 +156,7 @@ def _coloured(likelihood: Likelihood, start: Array, noise: Array) -> Solved:
     It is then held: its error and the parameters' are uncorrelated in the limit of many samples (the information
     is block-diagonal), so that not knowing it exactly widens no parameter.
     """
-    solved = _least_squares(likelihood, start, noise)
+    solved = least_squares(likelihood, start, noise)
     for i, trace in enumerate(likelihood.traces):
         if trace.noise == "ar1":
             white = dataclasses.replace(trace, whitening=None)
@@ -166,7 +166,7 @@ def _coloured(likelihood: Likelihood, start: Array, noise: Array) -> Solved:
             likelihood = likelihood.with_trace(i, dataclasses.replace(trace, whitening=whitening))
     if likelihood is solved.likelihood:
         return solved
-    return _least_squares(likelihood, solved.theta, solved.sigma)
+    return least_squares(likelihood, solved.theta, solved.sigma)
 
 
 @eqx.filter_jit

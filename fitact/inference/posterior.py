@@ -87,10 +87,11 @@ class Posterior:
         return draws
 
     def force(self) -> dict[str, Float[np.ndarray, "ensembles draws"]]:
-        """Per draw: mean, peak and rms of the electrostatic force by eq. (22), and mean friction by eq. (2), N.
+        """Per draw: mean, peak and rms of the electrostatic force, and mean friction by eq. (2), N.
 
-        The permittivities follow each draw's Csc and Ci through eq. (3); thicknesses, area and friction are the
-        scene's. Means run over whole periods of the drive.
+        By eq. (22), where the permittivities follow each draw's Csc and Ci through eq. (3); or, with the scene's
+        `[force] model = "gap"`, across the gap. Thicknesses, area and friction are the scene's. Means run over whole
+        periods of the drive.
         """
         return {name: values for name, values in self.derived().items() if name not in ("g", "b")}
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from fitact.inference import summary
 from fitact.model.circuit import FinalCircuit
 from fitact.model.drive import Drive, Periodic, PiecewiseLinear
-from fitact.model.force import Contact, electrostatic_force, mean_force, peak_force
+from fitact.model.force import electrostatic_force, mean_force, peak_force
 from fitact.model.response import response
 from fitact.model.scene import Scene
 from fitact.units import engineering
@@ -110,18 +110,13 @@ def _of_one(
     """Vsc in time, and what it amounts to, of one draw."""
     circuit = scene.make_circuit(values)
     vsc = response(circuit, drive, time, steady_state=repeats)
-    contact = Contact.from_capacitances(
-        values["Ci"],
-        values["Csc"],
-        scene.device.contact_area,
-        scene.device.insulator_thickness,
-        scene.skin.thickness,
-    )
+    contact = scene.geometry().contact(scene.make_rc_circuit(values))
     derived = {"g": circuit.g, "b": circuit.b} if isinstance(circuit, FinalCircuit) else {}
     derived["Vsc_peak_to_peak"] = jnp.ptp(vsc)
     if repeats and scene.skin.level == "constant":
         mean, peak = mean_force(circuit, drive, contact), peak_force(circuit, drive, contact)
     else:
-        force = electrostatic_force(vsc, contact)
+        acting = response(circuit, drive, time, steady_state=repeats, channel=contact.channel)
+        force = electrostatic_force(acting, contact)
         mean, peak = jnp.trapezoid(force, time) / time[-1], jnp.max(force)
     return vsc, derived | {"force_mean": mean, "force_peak": peak}

@@ -99,6 +99,7 @@ class Problem(NamedTuple):
             noise=noise | {trace.channel: float(s) for trace, s in zip(of_first, sigma, strict=False)},
             steady_state=source.choice.steady_state,
             records=float(records),
+            geometry=source.scene.geometry(),
         )
 
 

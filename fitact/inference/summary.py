@@ -21,6 +21,10 @@ _NORMAL = {
 }  # fmt: skip
 
 Summary = dict[str, float | str]
+BY_FORCE = {  # what makes the force, by the name of its model
+    "paper": "by Vsc, eq. (22)",
+    "gap": "by the voltage across the gap, eps0 A Vgap^2 / (2 d^2)",
+}
 
 
 def of_draws(name: str, draws: Float[np.ndarray, "*shape"]) -> Summary:
@@ -86,6 +90,7 @@ def table(content: dict[str, Any]) -> str:
     for name, s in (content["parameters"] | content["derived"]).items():
         median, low, high = (engineering(float(s[q]), str(s["unit"])) for q in ("q50", "q05", "q95"))
         rows.append(f"{name:14}{median:>12}{low:>14}{high:>12}")
+    rows += [f"force: {BY_FORCE[content['model'].get('force', 'paper')]}."]
     rows += [content[section]["sentence"] for section in ("convergence", "identifiability")]
     return "\n".join([*rows, *(f"warning: {warning}" for warning in content["warnings"])])
 

@@ -24,7 +24,7 @@ from fitact.model.circuit import RC, Channel, Terms
 from fitact.model.drive import Drive, Sampled
 from fitact.model.response import highpass
 
-CHARGES = ("charge", "charge_2", "charge_3")  # one for each time constant, the slowest first
+CHARGES = ("charge", "charge_2", "charge_3", "charge_4")  # one for each time constant, the slowest first
 LINEAR = (*SLOW, *CHARGES)
 TIMING = ("delay", "clock")
 _REWEIGHTED = 12  # steps from the Gaussian's linear nuisances to those under Student's t; each gains half a digit
@@ -80,7 +80,7 @@ class Trace(eqx.Module):
     least_noise: ArrayLike
     rate: Float[Array, " samples"] | None
     drive: Drive
-    linear_sd: Float[Array, " 9"]
+    linear_sd: Float[Array, " 10"]
     shift: ArrayLike
     clock: ArrayLike
     time_step: ArrayLike
@@ -149,12 +149,12 @@ class Trace(eqx.Module):
             total = total + terms.rate * self.rate
         return seen.gain * total
 
-    def shapes(self, seen: Seen) -> Float[Array, "9 samples"]:
+    def shapes(self, seen: Seen) -> Float[Array, "10 samples"]:
         """The linear nuisances' shapes in time, each of height 1."""
         middle, half = 0.5 * (self.time[0] + self.time[-1]), 0.5 * (self.time[-1] - self.time[0])
         return jnp.concatenate([slow_shapes(self.time, middle, half), self.decays(seen.circuit, self.time)])
 
-    def decays(self, circuit: RC, time: Float[Array, " times"]) -> Float[Array, "3 times"]:
+    def decays(self, circuit: RC, time: Float[Array, " times"]) -> Float[Array, "4 times"]:
         """How unknown charges at the first sample decay; 0 beyond the circuit's time constants."""
         since, taus = time - self.time[0], circuit.terms().tau
         found = jnp.stack([jnp.exp(-since / tau) for tau in taus])
@@ -229,8 +229,8 @@ class Trace(eqx.Module):
         curvature = jnp.maximum(self.mean(student_curvature(left / sigma)), 0.0)
         return left, beta, jnp.linalg.cholesky(one + curvature * A @ A.T / sigma**2)
 
-    def drawn(self, seen: Seen, sigma: ArrayLike, deviate: ArrayLike = 0.0) -> Float[Array, " 9"]:
-        """The nuisances' coefficients, in prior standard deviations, as nine standard normal numbers draw them.
+    def drawn(self, seen: Seen, sigma: ArrayLike, deviate: ArrayLike = 0.0) -> Float[Array, " 10"]:
+        """The nuisances' coefficients, in prior standard deviations, as ten standard normal numbers draw them.
 
         With a `deviate` of 0, their posterior mean.
         """

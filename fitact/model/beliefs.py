@@ -140,6 +140,8 @@ class PriorSection(Section):
     Z: BeliefOhm | None = None
     Z_capacitance: BeliefFarad | None = None
     series_resistor: BeliefOhm | None = None
+    Rgap: BeliefOhm | None = None
+    Cgap: BeliefFarad | None = None
     sigma: BeliefVolt | None = None
     sigma_I: BeliefAmpere | None = None
     correlation: dict[str, Annotated[float, Field(gt=-1, lt=1)]] = Field(default_factory=dict)

@@ -10,9 +10,9 @@ depends on time follows from these lists (`response.py`). High-pass terms rather
 the insulator blocks direct current, so no dc term is left that would have to vanish by cancellation.
 
 All circuits here are one loop: the drive, the insulator Ci, perhaps a resistance R0, and parallel
-elements R‖C. Scaled by square roots, its equations have a symmetric matrix whose eigenvalues are the time
-constants, apart from each other even where two elements are equal: the mode that they share then has
-weight zero.
+elements R‖C, of which an interface gap may be one. Scaled by square roots, its equations have a symmetric
+matrix whose eigenvalues are the time constants, apart from each other even where two elements are equal:
+the mode that they share then has weight zero.
 """
 
 from typing import Literal, NamedTuple, TypeAlias
@@ -24,10 +24,14 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
+from fitact.errors import InputError
+from fitact.model.highpass import highpass_amplitude, highpass_gain
+
 _LEAST = 1e-12  # of Ci: a skin without capacitance counts as having so much, which keeps its time constant from 0
+_NEVER = 1e15  # of the slowest time constant: that with which an open gap loses its charge
 
 
-Channel: TypeAlias = Literal["Vsc", "I"]
+Channel: TypeAlias = Literal["Vsc", "I", "Vgap"]  # Vgap is not recorded; the force may come from it
 
 
 class Terms(NamedTuple):
@@ -59,6 +63,14 @@ class Circuit(eqx.Module):
         """The high-pass terms of I / V, in siemens; `rate` is the term that follows dV/dt, in F."""
         raise NotImplementedError
 
+    def gap_terms(self) -> Terms:
+        """The high-pass terms of Vgap / V, the voltage across the gap between finger and panel.
+
+        Raises:
+            InputError: there is no gap.
+        """
+        raise InputError(f"this {type(self).__name__} has no gap between finger and panel; give it Cgap for Vgap")
+
     def transfer_function(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
         """Vsc / V at the angular frequency `omega` (rad/s, >= 0)."""
         return gain_at(self.terms(), omega)
@@ -67,13 +79,18 @@ class Circuit(eqx.Module):
         """I / V in siemens at the angular frequency `omega` (rad/s, >= 0)."""
         return gain_at(self.current_terms(), omega)
 
+    def gap_transfer_function(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
+        """Vgap / V at the angular frequency `omega` (rad/s, >= 0); raises as `gap_terms`."""
+        return gain_at(self.gap_terms(), omega)
+
     def terms_of(self, channel: Channel) -> Terms:
         """The high-pass terms of a channel over V."""
-        return self.terms() if channel == "Vsc" else self.current_terms()
+        return {"Vsc": self.terms, "I": self.current_terms, "Vgap": self.gap_terms}[channel]()
 
     def gain_of(self, channel: Channel, omega: ArrayLike) -> Complex[Array, "*shape"]:
         """A channel over V at the angular frequency `omega` (rad/s, >= 0)."""
-        return self.transfer_function(omega) if channel == "Vsc" else self.admittance(omega)
+        of = {"Vsc": self.transfer_function, "I": self.admittance, "Vgap": self.gap_transfer_function}
+        return of[channel](omega)
 
     def amplitude(self, omega: ArrayLike) -> Float[Array, "*shape"]:
         """|Vsc / V| at the angular frequency `omega` (rad/s, >= 0), eq. (25)."""
@@ -91,27 +108,6 @@ def _scaled(gain: Array) -> tuple[Array, Array]:
     size = lax.stop_gradient(jnp.maximum(jnp.abs(gain.real), jnp.abs(gain.imag)))
     some = size > 0.0
     return jnp.where(some, gain / jnp.where(some, size, 1.0), 1.0), size
-
-
-def highpass_gain(x: ArrayLike) -> Complex[Array, "*shape"]:
-    """j x / (1 + j x) for x >= 0, without overflow at either end."""
-    below, small, inverse = _ends(x)
-    low = small / (1.0 + small**2)  # (x^2 + j x) / (1 + x^2)
-    high = 1.0 / (1.0 + inverse**2)
-    return jnp.where(below, low * small + 1j * low, high + 1j * high * inverse)
-
-
-def highpass_amplitude(x: ArrayLike) -> Float[Array, "*shape"]:
-    """|j x / (1 + j x)| for x >= 0, in forms whose derivatives do not cancel."""
-    below, small, inverse = _ends(x)
-    return jnp.where(below, small / jnp.sqrt(1.0 + small**2), 1.0 / jnp.sqrt(1.0 + inverse**2))
-
-
-def _ends(x: ArrayLike) -> tuple[Array, Array, Array]:
-    """Whether x <= 1, x where it is, and 1/x where it is not; 1 elsewhere, which keeps gradients finite."""
-    x = jnp.asarray(x)
-    below = x <= 1.0
-    return below, jnp.where(below, x, 1.0), 1.0 / jnp.where(below, 1.0, x)
 
 
 class FinalCircuit(Circuit):
@@ -170,20 +166,52 @@ class Element(NamedTuple):
     C: ArrayLike
 
 
+class _Modes(NamedTuple):
+    """What the elements' voltages and the current weigh of each time constant, and the current's rate (F)."""
+
+    tau: Array
+    voltages: Float[Array, "elements modes"]
+    current: Array
+    rate: ArrayLike | None = None
+
+
 class Loop(Circuit):
-    """The drive in series with Ci, perhaps a resistance, and parallel elements; Vsc is over the first."""
+    """The drive in series with Ci, perhaps a gap and a resistance, and parallel elements; Vsc is over the first.
+
+    Attributes:
+        Rsc, Csc: the touching skin, ohm and F.
+        Ci: the insulator, F.
+        Rgap: of the interface gap between finger and panel, ohm, which sliding raises; None: it does not conduct.
+        Cgap: in parallel with it, F; None: there is no gap. Source: Shultz, Peshkin, Colgate, Haptics Symposium 2018.
+    """
+
+    Rsc: ArrayLike
+    Csc: ArrayLike
+    Ci: ArrayLike
+    Rgap: ArrayLike | None = eqx.field(default=None, kw_only=True)
+    Cgap: ArrayLike | None = eqx.field(default=None, kw_only=True)
+
+    def __check_init__(self) -> None:
+        if self.Rgap is not None and self.Cgap is None:
+            raise InputError("a gap of Rgap needs its Cgap; give both, or Cgap alone")
 
     def insulator(self) -> ArrayLike:
-        """Ci, F."""
-        raise NotImplementedError
+        """Ci in series with a gap that does not conduct, F."""
+        return self.Ci if self.Cgap is None or self.Rgap is not None else self._share() * self.Cgap
 
     def resistance(self) -> ArrayLike | None:
         """The resistance in the loop, ohm; None where there is none."""
         raise NotImplementedError
 
-    def elements(self) -> tuple[Element, ...]:
-        """The parallel elements, the touching skin first."""
+    def body(self) -> tuple[Element, ...]:
+        """The parallel elements of skins and body, the touching skin first."""
         raise NotImplementedError
+
+    def elements(self) -> tuple[Element, ...]:
+        """Those of the body, and last a gap that conducts."""
+        if self.Rgap is None or self.Cgap is None:
+            return self.body()
+        return (*self.body(), Element(self.Rgap, self.Cgap))
 
     @property
     def g(self) -> ArrayLike:
@@ -205,6 +233,13 @@ class Loop(Circuit):
         """I / V in siemens at the angular frequency `omega` (rad/s, >= 0), from the impedances."""
         return 1j * jnp.asarray(omega) * self.insulator() / (1.0 + sum(self._over_insulator(omega)))
 
+    def gap_transfer_function(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
+        """Vgap / V at the angular frequency `omega` (rad/s, >= 0), from the impedances; raises as `gap_terms`."""
+        self._require_gap()
+        around = self._over_insulator(omega)
+        gap = self._share() if self.Rgap is None else around[len(self.elements()) - 1]
+        return gap / (1.0 + sum(around))
+
     def _over_insulator(self, omega: ArrayLike) -> list[Array]:
         """The impedances around the loop, the touching skin's first, over the insulator's: no real part is negative."""
         charging = jnp.asarray(omega) * self.insulator()
@@ -217,33 +252,51 @@ class Loop(Circuit):
 
     def terms(self) -> Terms:
         """One term for each element, and one more with a resistance in the loop."""
-        return self._modes()[0]
+        modes = self._modes()
+        return Terms(tuple(modes.voltages[0]), tuple(modes.tau))
 
     def current_terms(self) -> Terms:
         """As `terms`; without a resistance in the loop the current also follows dV/dt."""
-        return self._modes()[1]
+        modes = self._modes()
+        return Terms(tuple(modes.current), tuple(modes.tau), modes.rate)
 
-    def _modes(self) -> tuple[Terms, Terms]:
+    def gap_terms(self) -> Terms:
+        """As `terms`; a gap that does not conduct has one more, so slow that it keeps the charge it had."""
+        self._require_gap()
+        tau, voltages, current, _ = self._modes()
+        if self.Rgap is not None:
+            return Terms(tuple(voltages[-1]), tuple(tau))
+        R0, share = self.resistance(), self._share()
+        others = jnp.sum(voltages, axis=0) + (0.0 if R0 is None else R0 * current)
+        return Terms((*(-share * others), share), (*tau, _NEVER * tau[0]))
+
+    def _require_gap(self) -> None:
+        if self.Cgap is None:
+            super().gap_terms()
+
+    def _share(self) -> ArrayLike:
+        """Of the voltage over Ci and a gap that does not conduct, the gap's."""
+        return self.Ci / (self.Ci + jnp.asarray(self.Cgap))
+
+    def _modes(self) -> _Modes:
         Ci, R0 = self.insulator(), self.resistance()
         R, C = (jnp.stack(jnp.broadcast_arrays(*x)) for x in zip(*self.elements(), strict=True))
         C = jnp.maximum(C, _LEAST * Ci)
         return _modes_without_resistance(Ci, R, C) if R0 is None else _modes_with_resistance(Ci, R0, R, C)
 
 
-def _modes_without_resistance(Ci: ArrayLike, R: Array, C: Array) -> tuple[Terms, Terms]:
+def _modes_without_resistance(Ci: ArrayLike, R: Array, C: Array) -> _Modes:
     """With x = v / sqrt(R) over the elements:  T x' + x = Ci sqrt(R) V',  T = diag(R C) + Ci sqrt(R) sqrt(R)^T."""
     root = jnp.sqrt(R)
     tau, modes = _modes_of(jnp.vstack([jnp.diag(jnp.sqrt(R * C)), jnp.sqrt(Ci) * root]))
     drive = Ci * (modes.T @ root) / tau
-    vsc = root[0] * modes[0] * drive
-    current = drive**2
     rate = Ci
     for each in C:
         rate = rate * (each / (rate + each))
-    return Terms(tuple(vsc), tuple(tau)), Terms(tuple(current), tuple(tau), rate)
+    return _Modes(tau, root[:, None] * modes * drive, drive**2, rate)
 
 
-def _modes_with_resistance(Ci: ArrayLike, R0: ArrayLike, R: Array, C: Array) -> tuple[Terms, Terms]:
+def _modes_with_resistance(Ci: ArrayLike, R0: ArrayLike, R: Array, C: Array) -> _Modes:
     """With x = sqrt(C) v over elements and Ci:  T x' + x = sqrt(Ci) V e_i,  T = sqrt(C) P sqrt(C).
 
     P holds the resistances that each capacitor's terminals see: its own R, for Ci the whole loop's.
@@ -253,8 +306,8 @@ def _modes_with_resistance(Ci: ArrayLike, R0: ArrayLike, R: Array, C: Array) -> 
     through = jnp.vstack([jnp.diag(root[:-1]), jnp.zeros_like(C)])
     current = jnp.append(jnp.full_like(R, -1.0), 1.0)[:, None] * root[-1]
     tau, modes = _modes_of(jnp.sqrt(jnp.append(R, R0))[:, None] * jnp.hstack([through, current]))
-    vsc = -modes[0] * modes[-1] * root[-1] / root[0]
-    return Terms(tuple(vsc), tuple(tau)), Terms(tuple(Ci * modes[-1] ** 2 / tau), tuple(tau))
+    voltages = -modes[:-1] * modes[-1] * (root[-1] / root[:-1, None])
+    return _Modes(tau, voltages, Ci * modes[-1] ** 2 / tau)
 
 
 def _modes_of(factor: Array) -> tuple[Array, Array]:
@@ -286,26 +339,20 @@ class DirectGround(Loop):
         grounding_Rsc, grounding_Csc: the grounding skin; None: equal to the touching one.
         series_resistor: a known resistor in series, ohm; None: none.
         probe: the load across the touching skin; None: an ideal probe.
+        Rgap, Cgap: the interface gap, ohm and F, by name; None: none (see `Loop`).
     """
 
-    Rsc: ArrayLike
-    Csc: ArrayLike
-    Ci: ArrayLike
     R_H: ArrayLike | None = None
     grounding_Rsc: ArrayLike | None = None
     grounding_Csc: ArrayLike | None = None
     series_resistor: ArrayLike | None = None
     probe: Probe | None = None
 
-    def insulator(self) -> ArrayLike:
-        """Ci, F."""
-        return self.Ci
-
     def resistance(self) -> ArrayLike | None:
         """R_H and the series resistor, ohm."""
         return _in_series(self.R_H, self.series_resistor)
 
-    def elements(self) -> tuple[Element, ...]:
+    def body(self) -> tuple[Element, ...]:
         """The touching skin (with the probe), and the grounding one."""
         grounding = Element(
             self.Rsc if self.grounding_Rsc is None else self.grounding_Rsc,
@@ -324,25 +371,19 @@ class NaturalGround(Loop):
         Z_capacitance: in parallel with it, F; None: Z is a plain resistance.
         series_resistor: a known resistor in series, ohm; None: none.
         probe: the load across the touching skin; None: an ideal probe.
+        Rgap, Cgap: the interface gap, ohm and F, by name; None: none (see `Loop`).
     """
 
-    Rsc: ArrayLike
-    Csc: ArrayLike
-    Ci: ArrayLike
     Z: ArrayLike | None
     Z_capacitance: ArrayLike | None = None
     series_resistor: ArrayLike | None = None
     probe: Probe | None = None
 
-    def insulator(self) -> ArrayLike:
-        """Ci, F."""
-        return self.Ci
-
     def resistance(self) -> ArrayLike | None:
         """Z where it is a plain resistance, and the series resistor, ohm."""
         return _in_series(self.Z if self.Z_capacitance is None else None, self.series_resistor)
 
-    def elements(self) -> tuple[Element, ...]:
+    def body(self) -> tuple[Element, ...]:
         """The touching skin (with the probe), and Z where it has a capacitance."""
         touching = _loaded(Element(self.Rsc, self.Csc), self.probe)
         return (touching,) if self.Z_capacitance is None else (touching, Element(self.Z, self.Z_capacitance))

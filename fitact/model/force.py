@@ -1,21 +1,24 @@
 """The electrostatic force on the finger and the friction that is felt."""
 
-from typing import NamedTuple
+from typing import ClassVar, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from fitact.model.circuit import Circuit
+from fitact.errors import InputError
+from fitact.model.circuit import RC, Channel, Circuit
 from fitact.model.drive import Drive
 from fitact.model.steady import mean_square, peak
 
 EPSILON_0 = 8.85e-12  # F/m, the paper's value
 
+ForceModel: TypeAlias = Literal["paper", "gap"]
+
 
 class Contact(eqx.Module):
-    """The plate capacitor that finger and panel form; SI units.
+    """The plate capacitor that finger and panel form, on which Vsc acts; SI units.
 
     Attributes:
         area: contact area A, m^2.
@@ -30,6 +33,7 @@ class Contact(eqx.Module):
     insulator_permittivity: ArrayLike
     skin_thickness: ArrayLike
     skin_permittivity: ArrayLike
+    channel: ClassVar[Channel] = "Vsc"
 
     @classmethod
     def from_capacitances(
@@ -51,6 +55,51 @@ class Contact(eqx.Module):
         )
 
 
+class AirGap(eqx.Module):
+    """The air between finger and panel, on whose faces the voltage across it acts; SI units.
+
+    Source: Shultz, Peshkin, Colgate, IEEE Trans. Haptics 11 (2018) 279; Ayyildiz et al., PNAS 115 (2018) 12668.
+
+    Attributes:
+        area: m^2.
+        thickness: m.
+    """
+
+    area: ArrayLike
+    thickness: ArrayLike
+    channel: ClassVar[Channel] = "Vgap"
+
+
+class Geometry(eqx.Module):
+    """What the force needs beside the circuit; SI units.
+
+    Attributes:
+        area, insulator_thickness, skin_thickness: m^2, m, m.
+        gap_thickness: m; None: that of air of the circuit's Cgap, eps0 A / Cgap.
+        model: "paper": by Vsc, eq. (22); "gap": by the voltage across the gap.
+    """
+
+    area: ArrayLike = 1.0
+    insulator_thickness: ArrayLike = 1.0
+    skin_thickness: ArrayLike = 1.0
+    gap_thickness: ArrayLike | None = None
+    model: ForceModel = eqx.field(static=True, default="paper")
+
+    def contact(self, circuit: RC) -> "Contact | AirGap":
+        """Where the force acts; permittivities, and an unstated gap, follow the circuit's capacitances, eq. (3).
+
+        Raises:
+            InputError: the model is "gap" and the circuit has none.
+        """
+        if self.model == "paper":
+            layers = self.insulator_thickness, self.skin_thickness
+            return Contact.from_capacitances(circuit.Ci, circuit.Csc, self.area, *layers)
+        Cgap = getattr(circuit, "Cgap", None)
+        if Cgap is None:
+            raise InputError("the force across a gap needs a circuit with one; give it Cgap, or take the paper's force")
+        return AirGap(self.area, EPSILON_0 * self.area / Cgap if self.gap_thickness is None else self.gap_thickness)
+
+
 def plate_capacitance(permittivity: ArrayLike, area: ArrayLike, thickness: ArrayLike) -> ArrayLike:
     """C = eps0 eps_r A / T in F, eq. (3); `area` in m^2, `thickness` in m."""
     return EPSILON_0 * permittivity * area / thickness
@@ -61,36 +110,42 @@ def plate_resistance(resistivity: ArrayLike, area: ArrayLike, thickness: ArrayLi
     return resistivity * thickness / area
 
 
-def electrostatic_force(vsc: ArrayLike, contact: Contact) -> Float[Array, "*shape"]:
-    """The electrostatic force in N for the skin voltage `vsc` (V), eqs. (1) and (22)."""
-    vsc = jnp.asarray(vsc)
-    return force_constant(contact) * vsc * vsc
+def electrostatic_force(voltage: ArrayLike, contact: Contact | AirGap) -> Float[Array, "*shape"]:
+    """The electrostatic force in N for the `voltage` (V): Vsc on a contact, eqs. (1) and (22), Vgap across a gap."""
+    voltage = jnp.asarray(voltage)
+    return force_constant(contact) * voltage * voltage
 
 
-def force_constant(contact: Contact) -> Array:
-    """The electrostatic force per Vsc^2 in N/V^2, eqs. (1) and (22); 0 where a permittivity is 0."""
+def force_constant(contact: Contact | AirGap) -> Array:
+    """The electrostatic force per square of the voltage, N/V^2; 0 where a permittivity is 0.
+
+    Of a contact eqs. (1) and (22); of a gap eps0 A / (2 d^2).
+    """
+    if isinstance(contact, AirGap):
+        thickness = jnp.asarray(contact.thickness)
+        return EPSILON_0 * contact.area / 2.0 / thickness / thickness
     insulator, skin = jnp.asarray(contact.insulator_permittivity), jnp.asarray(contact.skin_permittivity)
     gap = jnp.asarray(contact.insulator_thickness) + contact.skin_thickness
     layers = contact.insulator_thickness * skin + contact.skin_thickness * insulator
     return EPSILON_0 * contact.area / (2.0 * gap) * (insulator * (skin / layers))
 
 
-def mean_force(circuit: Circuit, drive: Drive, contact: Contact) -> Float[Array, ""]:
+def mean_force(circuit: Circuit, drive: Drive, contact: Contact | AirGap) -> Float[Array, ""]:
     """The electrostatic force in N, averaged over a period of the steady state: exact, eqs. (1) and (22).
 
     Raises:
-        InputError: the drive does not repeat.
+        InputError: the drive does not repeat, or `contact` is a gap and the circuit has none.
     """
-    return force_constant(contact) * mean_square(circuit, drive)
+    return force_constant(contact) * mean_square(circuit, drive, contact.channel)
 
 
-def peak_force(circuit: Circuit, drive: Drive, contact: Contact) -> Float[Array, ""]:
+def peak_force(circuit: Circuit, drive: Drive, contact: Contact | AirGap) -> Float[Array, ""]:
     """The largest electrostatic force in N over a period of the steady state: exact, eqs. (1) and (22).
 
     Raises:
-        InputError: the drive does not repeat.
+        InputError: the drive does not repeat, or `contact` is a gap and the circuit has none.
     """
-    return electrostatic_force(peak(circuit, drive), contact)
+    return electrostatic_force(peak(circuit, drive, contact.channel), contact)
 
 
 def friction(force: ArrayLike, coefficient: ArrayLike, normal_force: ArrayLike) -> Float[Array, "*shape"]:

@@ -7,7 +7,7 @@ from typing import Any
 from jax.typing import ArrayLike
 
 from fitact.errors import InputError
-from fitact.model.circuit import RC, DirectGround, FinalCircuit
+from fitact.model.circuit import RC, FinalCircuit
 from fitact.model.scene import Scene
 from fitact.model.skin import Fractional, WithSkin
 
@@ -18,11 +18,13 @@ _KEYS: dict[str, dict[tuple[str, str], Any]] = {
     "Z": {("grounding", "Z"): 0.0, ("grounding", "Z_capacitance"): None},
     "Z capacitance": {("grounding", "Z_capacitance"): None},
     "series resistor": {("measurement", "series_resistor"): None},
+    "gap": {**{("gap", key): None for key in ("resistance", "capacitance", "thickness")}, ("force", "model"): None},
     "probe": {("measurement", "probe_resistance"): None, ("measurement", "probe_capacitance"): None},
     "edges": {("drive", "waveform"): "square", ("drive", "rise_time"): None},
     "dispersion": {("skin", "level"): None, ("skin", "alpha"): None},
     "transient": {("drive", "steady_state"): True},
 }
+_PARAMETERS = {"resistance": "Rgap", "capacitance": "Cgap"}  # those that are not named as their key
 _RESISTANCES = ("R_H", "series resistor")  # what limits the current at an edge
 
 # Nanoseconds a sample, of many circuits side by side in one compiled program: one exponential takes about one.
@@ -45,6 +47,7 @@ def named(scene: Scene) -> tuple[str, ...]:
         "Z": ground.connection == "natural" and "Z" in has,
         "Z capacitance": "Z_capacitance" in has,
         "series resistor": "series_resistor" in has,
+        "gap": "Cgap" in has,
         "probe": scene.measurement.probe_resistance is not None or scene.measurement.probe_capacitance is not None,
         "edges": drive.waveform == "trapezoid",
         "dispersion": scene.skin.level != "constant",
@@ -55,7 +58,8 @@ def named(scene: Scene) -> tuple[str, ...]:
 
 def parameters(name: str) -> set[str]:
     """The circuit's parameters that go with an omission."""
-    return {key for section, key in _KEYS[name] if section == "grounding" or key == "series_resistor"}
+    keys = {key for section, key in _KEYS[name] if section in ("grounding", "gap") or key == "series_resistor"}
+    return {_PARAMETERS.get(key, key) for key in keys if key != "thickness"}
 
 
 def required(scene: Scene, name: str) -> str:
@@ -67,6 +71,8 @@ def required(scene: Scene, name: str) -> str:
         return "another parameter is tied to it"
     if name in _RESISTANCES and "I" in scene.measurement.channels:
         return "the current that is recorded has no value at an edge without it"
+    if name == "gap" and scene.force.model == "gap":
+        return "the force acts across it"
     if name == "transient" and scene.drive.waveform == "burst":
         return "a burst has no steady state"
     return ""
@@ -139,8 +145,4 @@ def time_constants(circuit: RC) -> int:
     """How many a circuit has: one for each capacitor, but for Ci where nothing resistive is in series with it."""
     if isinstance(circuit, FinalCircuit):
         return 1
-    if isinstance(circuit, DirectGround):
-        return 2 + (circuit.R_H is not None or circuit.series_resistor is not None)
-    if circuit.Z_capacitance is not None:
-        return 2 + (circuit.series_resistor is not None)
-    return 1 + (circuit.Z is not None or circuit.series_resistor is not None)
+    return len(circuit.elements()) + (circuit.resistance() is not None)

@@ -16,7 +16,8 @@ from fitact.model import omissions
 from fitact.model.circuit import FinalCircuit, NaturalGround
 from fitact.model.drive import Sampled
 from fitact.model.scene import Scene
-from fitact.model.waves import ROWS, Comparison, Reference
+from fitact.model.wave_terms import ROWS
+from fitact.model.waves import Comparison, Reference
 from fitact.units import engineering, percent
 
 _NOT_OF_THE_CIRCUIT = ("sigma", "sigma_I")

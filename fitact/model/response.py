@@ -19,9 +19,10 @@ from jaxtyping import Array, Float
 
 from fitact.errors import InputError
 from fitact.model.chirp import Chirp
-from fitact.model.circuit import Channel, Circuit, gain_at, highpass_amplitude
+from fitact.model.circuit import Channel, Circuit, gain_at
 from fitact.model.drive import Burst, Drive, Line, Pieces, PiecewiseLinear, Sampled, Sine, Square
 from fitact.model.harmonic import fourier, frequency, fundamental, harmonic_response, harmonic_sum
+from fitact.model.highpass import highpass_amplitude
 from fitact.model.multitone import Multitone
 from fitact.model.polynomial import evaluate, particular
 from fitact.model.skin import WithSkin
@@ -38,12 +39,13 @@ def response(
     channel: Channel = "Vsc",
     initial: ArrayLike | Sequence[ArrayLike] | None = None,
 ) -> Float[Array, "*shape"]:
-    """The skin voltage Vsc (V) or the trunk current I (A) at `time` (s), exact for the drives of `fitact.model.drive`.
+    """The skin voltage Vsc (V), the trunk current I (A) or the gap's voltage Vgap (V) at `time` (s), exact.
 
     In the steady state, or, with ``steady_state=False``, from rest: no charge anywhere and no drive
     before t = 0, or before the first point of a drive given by points (where that of a `Sampled` one is
     held, since a measured drive was there before). Eqs. (18)-(21) in the time domain. Where nothing
-    resistive limits the current it follows dV/dt, and at an ideal jump it is NaN.
+    resistive limits the current it follows dV/dt, and at an ideal jump it is NaN. A gap that does not
+    conduct has, in the steady state, none of the drive's mean across it, and from rest its share of it.
 
     `initial` stands for a charge that was there when the drive began: one amplitude for each time constant
     of the circuit, in the order of ``circuit.terms().tau`` and the channel's unit, that decays with it.
@@ -54,7 +56,7 @@ def response(
     Raises:
         InputError: the steady state was asked for of a drive that has none, or together with `initial`, or
             `initial` has not one value for each time constant; or, with a skin that depends on the frequency,
-            anything but the steady state of a periodic drive.
+            anything but the steady state of a periodic drive; or Vgap of a circuit without a gap.
     """
     if isinstance(circuit, WithSkin):
         return _with_skin(circuit, drive, time, steady_state, channel)

@@ -22,12 +22,14 @@ from fitact.model import scene_file
 from fitact.model.beliefs import PriorSection
 from fitact.model.circuit import RC, Circuit, DirectGround, FinalCircuit, NaturalGround, Probe
 from fitact.model.drive import Drive
+from fitact.model.force import Geometry, plate_capacitance
 from fitact.model.prior import Prior
 from fitact.model.sections import (
     Device,
     DriveSection,
     ForceSection,
     Friction,
+    Gap,
     Grounding,
     Measurement,
     Perception,
@@ -50,6 +52,7 @@ class Scene(Section):
     device: Device = Device()
     skin: Skin = Skin()
     grounding: Grounding = Grounding()
+    gap: Gap = Gap()
     drive: DriveSection = DriveSection()
     measurement: Measurement = Measurement()
     friction: Friction = Friction()
@@ -114,7 +117,6 @@ class Scene(Section):
             f"[skin] level = '{self.skin.level}' with [drive] steady_state = false": (
                 self.skin.level != "constant" and not self.drive.steady_state
             ),
-            "[force] model = 'gap'": self.force.model == "gap",
             "[population] contact_area = 'varies'": self.population.contact_area == "varies",
         }
         if fit:
@@ -134,7 +136,27 @@ class Scene(Section):
         grounding["Z"] = ground.Z or None  # 0: the body is at earth
         series = {"series_resistor": measured.series_resistor or None}
         noise = {"sigma": measured.noise_Vsc or None, "sigma_I": measured.noise_I or None}
-        return {"Rsc": self.skin.Rsc, "Csc": self.skin.Csc, "Ci": self.device.Ci, **grounding, **series, **noise}
+        gap = {"Rgap": self.gap.resistance, "Cgap": self._gap_capacitance()}
+        skin = {"Rsc": self.skin.Rsc, "Csc": self.skin.Csc, "Ci": self.device.Ci}
+        return {**skin, **grounding, **series, **gap, **noise}
+
+    def _gap_capacitance(self) -> float | None:
+        """As stated, or of air of the stated thickness, eq. (3)."""
+        thickness = self.gap.thickness
+        if self.gap.capacitance is not None or thickness is None:
+            return self.gap.capacitance
+        return float(plate_capacitance(1.0, self.device.contact_area, thickness))
+
+    def geometry(self) -> Geometry:
+        """What the force needs beside the circuit; a gap's thickness follows Cgap unless both are stated."""
+        both = self.gap.capacitance is not None and self.gap.thickness is not None
+        return Geometry(
+            self.device.contact_area,
+            self.device.insulator_thickness,
+            self.skin.thickness,
+            self.gap.thickness if both else None,
+            self.force.model,
+        )
 
     def make_circuit(self, values: Mapping[str, ArrayLike] | None = None) -> Circuit:
         """The circuit at the scene's nominal values, or at others by name (ohm, F).
@@ -150,13 +172,14 @@ class Scene(Section):
         """As `make_circuit`, with the skins constant."""
         self.require_available()
         of: dict[str, Any] = self.nominal() | dict(values or {})
-        skin, series, probe = (of["Rsc"], of["Csc"], of["Ci"]), of["series_resistor"], self._probe()
+        skin, names = (of["Rsc"], of["Csc"], of["Ci"]), ("series_resistor", "Rgap", "Cgap")
+        common = {name: of[name] for name in names} | {"probe": self._probe()}
         if self.grounding.connection == "natural":
-            return NaturalGround(*skin, of["Z"], of["Z_capacitance"], series_resistor=series, probe=probe)
-        extras = (*(of[name] for name in _DIRECT), series, probe)
-        if all(extra is None for extra in extras):
+            return NaturalGround(*skin, of["Z"], of["Z_capacitance"], **common)
+        extras = common | {name: of[name] for name in _DIRECT}
+        if all(extra is None for extra in extras.values()):
             return FinalCircuit(*skin)
-        return DirectGround(*skin, *extras)
+        return DirectGround(*skin, **extras)
 
     def _probe(self) -> Probe | None:
         resistance, capacitance = self.measurement.probe_resistance, self.measurement.probe_capacitance
@@ -210,9 +233,21 @@ class Scene(Section):
         for name in self.prior.beliefs():
             if name in absent:
                 raise InputError(f"[prior] {name} needs {absent[name]}; leave it out of [prior] otherwise")
+        self._check_gap()
         self.make_prior()
         self.fixed()
         return self
+
+    def _check_gap(self) -> None:
+        has = {name for name, value in self.nominal().items() if value is not None} | set(self.prior.beliefs())
+        if "Rgap" in has and "Cgap" not in has:
+            raise InputError(
+                "[gap] resistance needs what lies in parallel with it; give capacitance, or the thickness of air, too"
+            )
+        if self.force.model == "gap" and "Cgap" not in has:
+            raise InputError(
+                "[force] model = 'gap' needs a gap; give [gap] thickness or capacitance, or take model = 'paper'"
+            )
 
 
 def _sentence(error: Any) -> str:

@@ -143,6 +143,14 @@ class Grounding(Section):
         return self
 
 
+class Gap(Section):
+    """Between the finger and the panel, which sliding opens; without any key there is none."""
+
+    resistance: Ohm | None = None
+    capacitance: Farad | None = None
+    thickness: Meter | None = None
+
+
 _WAVES = ("sine", "triangle", "square", "trapezoid")
 _WAVEFORMS_OF = {  # the keys of [drive] that only some waveforms have
     "peak_to_peak": (*_WAVES, "burst", "chirp", "measured"),

@@ -117,7 +117,7 @@ class Fractional(Skin):
 
     def above(self, circuit: "WithSkin", omega: ArrayLike, channel: Channel) -> Terms:
         """Time constants spread evenly over the decades above `omega`, with weights fitted by least squares."""
-        limited = channel == "Vsc" or circuit.circuit.current_terms().rate is None
+        limited = channel != "I" or circuit.circuit.current_terms().rate is None
         omega = jnp.asarray(omega, dtype=float)
         tau, x, weights = spread(limited, omega.dtype == jnp.float64)
         gain = circuit.gain_of(channel, omega * x)
@@ -187,6 +187,10 @@ class WithSkin(Circuit):
     def admittance(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
         """I / V in siemens at the angular frequency `omega` (rad/s, >= 0)."""
         return jnp.vectorize(lambda w: self.at(w / (2.0 * np.pi)).admittance(w))(_floating(omega))
+
+    def gap_transfer_function(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
+        """Vgap / V at the angular frequency `omega` (rad/s, >= 0); raises where there is no gap."""
+        return jnp.vectorize(lambda w: self.at(w / (2.0 * np.pi)).gap_transfer_function(w))(_floating(omega))
 
 
 def _floating(omega: ArrayLike) -> Array:

@@ -18,8 +18,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.errors import InputError
-from fitact.model.circuit import Channel, Circuit, Terms, highpass_amplitude
+from fitact.model.circuit import Channel, Circuit, Terms
 from fitact.model.drive import Drive, Line, Periodic, Pieces, PiecewiseLinear, Sine, Square, Trapezoid, Triangle
+from fitact.model.highpass import highpass_amplitude
 from fitact.model.multitone import Multitone, largest_sum
 from fitact.model.response import bend, coth_fraction, log_slope, phi, psi, steady_knots
 
@@ -34,7 +35,7 @@ class BodyCurrent(NamedTuple):
 
 
 def mean_square(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Float[Array, ""]:
-    """The mean square over a period of Vsc (V^2) or of the trunk current I (A^2), in the steady state.
+    """The mean square over a period of Vsc or Vgap (V^2) or of the trunk current I (A^2), in the steady state.
 
     Exact. Where the current follows dV/dt and the drive jumps it is infinite.
 
@@ -58,7 +59,7 @@ def mean_square(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Flo
 
 
 def peak(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Float[Array, ""]:
-    """The largest |Vsc| (V) or |I| (A) over a period of the steady state, both sides of every jump included.
+    """The largest |Vsc| or |Vgap| (V) or |I| (A) over a period of the steady state, both sides of every jump included.
 
     Exact: one time constant has its extremes at the ends of the straight pieces; of several, those in
     between are bracketed and halved to the last bit, and a multi-tone's are found by Newton's method. Where
@@ -69,7 +70,7 @@ def peak(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Float[Arra
     """
     if isinstance(drive, Sine):
         omega = 2.0 * np.pi * jnp.asarray(drive.frequency)
-        amplitude = circuit.amplitude(omega) if channel == "Vsc" else abs(circuit.admittance(omega))
+        amplitude = circuit.amplitude(omega) if channel == "Vsc" else abs(circuit.gain_of(channel, omega))
         return abs(0.5 * jnp.asarray(drive.peak_to_peak)) * amplitude
     if isinstance(drive, Multitone):
         omega = 2.0 * np.pi * jnp.asarray(drive.frequency) * jnp.asarray(drive.orders)

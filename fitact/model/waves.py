@@ -1,8 +1,8 @@
-"""Vsc of many circuits under one drive, for comparing models with each other.
+"""Vsc of many circuits under one drive, and what makes the force, for comparing models with each other.
 
-All circuits share one compiled program: what a circuit lacks is filled in with a value too small to matter. The rest
-is NumPy, where nothing is compiled: every response is a sum of exponentials along the straight pieces of its drive, and
-a window is a set of nodes, graded towards the corners, where a small resistance makes its difference.
+The time constants come from `fitact.model.wave_terms`. The rest is NumPy, where nothing is compiled: every response is
+a sum of exponentials along the straight pieces of its drive, and a window is a set of nodes, graded towards the
+corners, where a small resistance makes its difference.
 """
 
 import dataclasses
@@ -16,21 +16,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
 from fitact.model.chirp import Chirp
-from fitact.model.circuit import RC, DirectGround, Element, FinalCircuit, NaturalGround, Probe
+from fitact.model.circuit import Channel
 from fitact.model.drive import Burst, Drive, Periodic, Pieces, PiecewiseLinear, Sampled, Sine
-from fitact.model.harmonic import fourier
+from fitact.model.force import force_constant
 from fitact.model.multitone import Multitone
 from fitact.model.response import highpass, knot_values, steady_knots
 from fitact.model.scene import Scene
-from fitact.model.skin import Fractional, Skin, WithSkin, spread
+from fitact.model.skin import WithSkin
+from fitact.model.wave_terms import complete, filled_up, terms, tones
 
-ROWS = 128  # circuits side by side; fewer are filled up, so that each program is compiled once
-_ABSENT = 1e-6  # ohm: with any capacitance here over long before the first node
-_BLOCK = 64  # frequencies in one program
 _PIECES = 4  # of a period; fewer are filled up with ones of no length
 _DECADES, _ORDER = 8, 8  # of a piece, and the order of the rule in each
 _PERIODS = 12  # from rest: periods that stand for all, in geometric progression
@@ -98,6 +95,8 @@ class Waves:
         weight, tau: of the high-pass terms; s.
         knots: each term's steady state at the starts of the drive's pieces, V.
         harmonics: amplitude that the terms miss, V.
+        factor: the force over the square of the voltage that makes it, N/V^2.
+        acting: those voltages; None: these themselves.
     """
 
     drive: Drive
@@ -107,6 +106,8 @@ class Waves:
     tau: Float[np.ndarray, "circuits terms"]
     knots: Float[np.ndarray, "circuits terms pieces"]
     harmonics: Complex[np.ndarray, "circuits harmonics"]
+    factor: Float[np.ndarray, " circuits"]
+    acting: "Waves | None" = None
 
     @classmethod
     def of(
@@ -120,21 +121,41 @@ class Waves:
 
         `measured` is what drives them in place of the scene's drive.
         """
-        drive, count = measured or scene.make_drive(), max(np.size(value) for value in values.values())
+        drive = measured or scene.make_drive()
+        found = cls._of(scene, drive, values, precision, "Vsc")
+        if scene.force.model == "paper":
+            return found
+        return dataclasses.replace(found, acting=cls._of(scene, drive, values, precision, "Vgap"))
+
+    @classmethod
+    def _of(
+        cls,
+        scene: Scene,
+        drive: Drive,
+        values: Mapping[str, Any],
+        precision: type[np.floating[Any]],
+        channel: Channel,
+    ) -> "Waves":
+        count = max(np.size(value) for value in values.values())
         with jax.enable_x64(precision is np.float64):
             circuit = scene.make_circuit(dict(values))
             skin = jax.tree.map(jnp.asarray, circuit.skin) if isinstance(circuit, WithSkin) else None
-            complete = _complete(scene.make_rc_circuit(dict(values)))
-            filled = jax.tree.map(lambda x: _filled_up(x, precision), complete)
-            weight, tau, harmonics = _terms(filled, skin, drive, precision)
+            whole = complete(scene.make_rc_circuit(dict(values)))
+            filled = jax.tree.map(lambda x: filled_up(x, precision), whole)
+            weight, tau, harmonics = terms(filled, skin, drive, precision, channel)
             tau = np.maximum(tau, np.finfo(np.float32).tiny)  # single precision may lose that of an absent part
             wave = drive.wave if isinstance(drive, Burst) else drive
             pieces = _pieces(wave) if isinstance(wave, PiecewiseLinear | Sampled) else None
             knots = np.zeros((*tau.shape, 0), dtype=precision)
             if pieces is not None:
-                knots = _knots(jax.tree.map(precision, pieces), tau, measured is None or measured.period is not None)
-        rows = (x[:count] for x in (weight.astype(precision), tau.astype(precision), knots, harmonics))
-        return cls(drive, scene.drive.steady_state, pieces, *rows)
+                settled = not isinstance(drive, Sampled) or drive.period is not None
+                knots = _knots(jax.tree.map(precision, pieces), tau, settled)
+        weight, tau, knots, harmonics = (
+            x[:count] for x in (weight.astype(precision), tau.astype(precision), knots, harmonics)
+        )
+        return cls(
+            drive, scene.drive.steady_state, pieces, weight, tau, knots, harmonics, _factor(scene, values, count)
+        )
 
     def at(self, cycle: np.ndarray, elapsed: np.ndarray) -> Rows:
         """Vsc at nodes common to all circuits, or at each circuit's own."""
@@ -143,7 +164,7 @@ class Waves:
             u = self.knots
         elif isinstance(self.drive, Chirp):
             with jax.enable_x64(self.tau.dtype == np.float64):
-                u = np.asarray(_chirped(self.drive, elapsed[0], _filled_up(self.tau, self.tau.dtype)))[: len(self.tau)]
+                u = np.asarray(_chirped(self.drive, elapsed[0], filled_up(self.tau, self.tau.dtype)))[: len(self.tau)]
         elif self.steady_state:
             u = self._settled(cycle)
         else:
@@ -181,7 +202,7 @@ class Waves:
         tau, cycle = self.tau[..., None], cycle[:, None, :]
         if self.pieces is None:
             omega, u = 2.0 * np.pi * wave.frequency, np.zeros((1, 1, 1), dtype=tau.dtype)
-            for order, height, phase in _tones(wave):
+            for order, height, phase in tones(wave):
                 x = order * omega * tau
                 u = u + height * (x / np.hypot(1.0, x)) * np.sin(order * omega * cycle + (phase + np.arctan2(1.0, x)))
             return u
@@ -208,24 +229,37 @@ class Reference:
     def __init__(self, scene: Scene, values: Mapping[str, Any], measured: Sampled | None = None) -> None:
         self.measured, self.window = measured, Window.of(scene, measured)
         full = Waves.of(scene, values, measured=measured)
-        self.vsc = full.at(self.window.cycle, self.window.elapsed)
-        self.peak = _peak(self.window, full, self.vsc)
+        self.vsc = _Heights.of(self.window, full)
+        self.factor = full.factor
+        self.acting = self.vsc if full.acting is None else _Heights.of(self.window, full.acting)
 
     def compare(
         self, scene: Scene, values: Mapping[str, Any], precision: type[np.floating[Any]] = np.float64
     ) -> Comparison:
         """How far those of another scene, of as many of the circuits from the first on, lie from the full model's."""
         waves = Waves.of(scene, values, precision, self.measured)
-        vsc, weight = waves.at(self.window.cycle, self.window.elapsed), self.window.weight
-        full = self.vsc[: len(vsc)]
-        mean_square = full**2 @ weight
-        peak = _peak(self.window, waves, vsc) / self.peak[: len(vsc)]
+        weight, count = self.window.weight, len(waves.tau)
+        vsc, factor = _Heights.of(self.window, waves), waves.factor / self.factor[:count]
+        acting = vsc if waves.acting is None else _Heights.of(self.window, waves.acting)
+        full, acting_full = (_Heights(at[:count], peak[:count]) for at, peak in (self.vsc, self.acting))
         return Comparison(
-            np.sqrt((vsc - full) ** 2 @ weight / mean_square),
-            np.abs(peak - 1.0),
-            np.abs(vsc**2 @ weight / mean_square - 1.0),
-            np.abs(peak**2 - 1.0),
+            np.sqrt((vsc.at - full.at) ** 2 @ weight / (full.at**2 @ weight)),
+            np.abs(vsc.peak / full.peak - 1.0),
+            np.abs(factor * (acting.at**2 @ weight / (acting_full.at**2 @ weight)) - 1.0),
+            np.abs(factor * (acting.peak / acting_full.peak) ** 2 - 1.0),
         )
+
+
+class _Heights(NamedTuple):
+    """Voltages at a window's nodes, and the largest."""
+
+    at: Rows
+    peak: Float[np.ndarray, " circuits"]
+
+    @classmethod
+    def of(cls, window: Window, waves: Waves) -> "_Heights":
+        at = waves.at(window.cycle, window.elapsed)
+        return cls(at, _peak(window, waves, at))
 
 
 def _peak(window: Window, waves: Waves, vsc: Rows) -> Float[np.ndarray, " circuits"]:
@@ -283,19 +317,9 @@ def _lead(wave: Any) -> float:
     return float(wave.phase / (2.0 * np.pi) % 1.0 / wave.frequency)
 
 
-def _tones(wave: Any) -> list[tuple[int, float, float]]:
-    """Of a smooth drive: order, amplitude (V), and phase beside the whole's (rad)."""
-    if isinstance(wave, Sine):
-        return [(1, 0.5 * float(wave.peak_to_peak), 0.0)]
-    phases = wave.phases or (0.0,) * len(wave.orders)
-    return [
-        (n, float(height), float(phase)) for n, height, phase in zip(wave.orders, wave.amplitudes, phases, strict=True)
-    ]
-
-
 def _corners(wave: Periodic) -> np.ndarray:
     if isinstance(wave, Sine | Multitone):
-        return np.linspace(0.0, 1.0, 4 * max(order for order, _, _ in _tones(wave)) + 1) / float(wave.frequency)
+        return np.linspace(0.0, 1.0, 4 * max(order for order, _, _ in tones(wave)) + 1) / float(wave.frequency)
     assert isinstance(wave, PiecewiseLinear)
     return np.unique(_pieces(wave).knots)
 
@@ -320,116 +344,11 @@ def _along(pieces: Pieces, cycle: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     return piece, np.maximum(cycle - knots[piece], 0.0), slope[piece]
 
 
-def _complete(circuit: RC) -> DirectGround | NaturalGround:
-    """The circuit with every part that its kind may have, an absent one too small to matter."""
-    if isinstance(circuit, FinalCircuit):
-        circuit = DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci)
-    skin, probe = (circuit.Rsc, circuit.Csc, circuit.Ci), circuit.probe or Probe(math.inf, 0.0)
-    if isinstance(circuit, DirectGround):
-        R = circuit.Rsc if circuit.grounding_Rsc is None else circuit.grounding_Rsc
-        C = circuit.Csc if circuit.grounding_Csc is None else circuit.grounding_Csc
-        return DirectGround(*skin, _sum(circuit.R_H, circuit.series_resistor), R, C, None, probe)
-    if circuit.Z_capacitance is None:
-        return NaturalGround(*skin, _ABSENT, 0.0, _sum(circuit.Z, circuit.series_resistor), probe)
-    return NaturalGround(*skin, circuit.Z, circuit.Z_capacitance, _sum(circuit.series_resistor), probe)
-
-
-def _sum(*resistances: Any) -> Any:
-    return sum((resistance for resistance in resistances if resistance is not None), start=_ABSENT)
-
-
-def _filled_up(values: Any, precision: Any) -> np.ndarray:
-    """As many rows as programs are compiled for, the first standing in for those that are missing."""
-    values = np.atleast_1d(np.asarray(values, dtype=precision))
-    return np.concatenate([values, np.broadcast_to(values[:1], (ROWS - len(values), *values.shape[1:]))])
-
-
-def _terms(
-    circuit: DirectGround | NaturalGround, skin: Skin | None, drive: Drive, precision: type[np.floating[Any]]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weights, time constants, and amplitudes of the harmonics that they miss."""
-    if skin is None:
-        weight, tau = _constant_terms(circuit)
-        return weight, tau, np.zeros((ROWS, 0), dtype=complex)
-    assert isinstance(drive, Periodic)
-    frequency = float(drive.frequency)
-    smooth = isinstance(drive, Sine | Multitone)
-    count = max(order for order, _, _ in _tones(drive)) if smooth else max(1, skin.count(frequency))
-    omega = 2.0 * np.pi * frequency * np.arange(1, count + 1)
-    with jax.enable_x64(True):  # the drive's, whatever the precision of what follows
-        amplitude = np.asarray(_fourier(jax.tree.map(np.asarray, drive), _blocks(count) * _BLOCK))[:count]
-    gain = _gain(circuit, skin, omega)
-    if smooth:
-        return np.zeros((ROWS, 0)), np.zeros((ROWS, 0)), amplitude * gain
-    if isinstance(skin, Fractional):
-        tau, x, fitted = spread(True, precision is np.float64)
-        above = _gain(circuit, skin, omega[-1] * x)
-        weight = np.concatenate([above.real, above.imag], axis=1) @ fitted.T
-        tau = np.broadcast_to(tau / omega[-1], weight.shape)
-    else:  # above 1000 Hz it is constant
-        weight, tau = _constant_terms(_at(WithSkin(circuit, skin), 1000.0))
-    x = 1j * omega * tau[..., None]
-    return weight, tau, amplitude * (gain - np.einsum("rk,rkh->rh", weight, x / (1.0 + x)))
-
-
-def _gain(circuit: DirectGround | NaturalGround, skin: Skin, omega: np.ndarray) -> np.ndarray:
-    """Vsc / V of circuits whose skins follow a level."""
-    s = 1j * omega
-
-    def admittance(element: Element) -> np.ndarray:
-        R, C = (np.atleast_2d(np.asarray(x).T).T for x in element)
-        return 1.0 / R + s * C
-
-    def of_skin(R: ArrayLike, C: ArrayLike) -> np.ndarray:
-        missing = _blocks(omega.size) * _BLOCK - omega.size
-        blocks = np.pad(omega / (2.0 * np.pi), (0, missing), mode="edge").reshape(-1, _BLOCK)
-        constant = Element(*(jnp.asarray(x)[:, None] for x in (R, C)))
-        parts = [_skin_at(skin, constant, block) for block in blocks]
-        return admittance(Element(*(np.concatenate(x, axis=1)[:, : omega.size] for x in zip(*parts, strict=True))))
-
-    assert circuit.probe is not None
-    touching = 1.0 / (of_skin(circuit.Rsc, circuit.Csc) + admittance(Element(circuit.probe.R, circuit.probe.C)))
-    if isinstance(circuit, NaturalGround):
-        other = 1.0 / admittance(Element(circuit.Z, circuit.Z_capacitance))
-    else:
-        other = 1.0 / of_skin(circuit.grounding_Rsc, circuit.grounding_Csc)
-    rest = np.asarray(circuit.resistance())[:, None] + 1.0 / (s * np.asarray(circuit.Ci)[:, None])
-    return touching / (touching + other + rest)
-
-
-def _blocks(count: int) -> int:
-    """In how many blocks frequencies are computed, so that programs are compiled for one size."""
-    return -(-count // _BLOCK)
-
-
-@eqx.filter_jit
-def _fourier(drive: Drive, harmonics: int) -> Complex[Array, " harmonics"]:
-    return fourier(drive, harmonics)
-
-
-@eqx.filter_jit
-def _skin_at(skin: Skin, element: Element, frequency: Array) -> Element:
-    return skin.at(element, frequency)
-
-
-@eqx.filter_jit
-def _at(circuit: WithSkin, frequency: float) -> Any:
-    return circuit.at(frequency)
-
-
-def _constant_terms(circuit: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Of constant skins. Z stands in the loop where a grounding skin does, so one program serves both."""
-    if isinstance(circuit, NaturalGround):
-        loop = circuit.series_resistor, circuit.Z, circuit.Z_capacitance
-        circuit = DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci, *loop, None, circuit.probe)
-    weight, tau = _constant(circuit)
-    return np.asarray(weight), np.asarray(tau)
-
-
-@jax.jit
-def _constant(circuit: DirectGround) -> tuple[Array, Array]:
-    terms = jax.vmap(lambda one: one.terms())(circuit)
-    return jnp.stack(terms.weight, axis=1), jnp.stack(terms.tau, axis=1)
+def _factor(scene: Scene, values: Mapping[str, Any], count: int) -> Float[np.ndarray, " circuits"]:
+    """Force over the square of the voltage that makes it, in double precision whatever the waves'."""
+    with jax.enable_x64(True):
+        contact = scene.geometry().contact(scene.make_rc_circuit(dict(values)))
+        return np.broadcast_to(np.asarray(force_constant(contact)), count)
 
 
 def _knots(
@@ -442,9 +361,8 @@ def _knots(
 @functools.partial(jax.jit, static_argnums=2)
 def _column_knots(pieces: Pieces, tau: Float[Array, " circuits"], settled: bool) -> Float[Array, "circuits pieces"]:
     """u just after the start of each piece, in the steady state or without charge before the first."""
-    return jax.vmap(lambda one: steady_knots(pieces, one) if settled else knot_values(pieces, one, pieces.start[0]))(
-        tau
-    )
+    begin = functools.partial(knot_values, pieces, first=pieces.start[0])
+    return jax.vmap(functools.partial(steady_knots, pieces) if settled else begin)(tau)
 
 
 @eqx.filter_jit

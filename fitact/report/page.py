@@ -14,7 +14,7 @@ import matplotlib as mpl
 
 from fitact.errors import InputError
 from fitact.files import replacing
-from fitact.inference.summary import load, width
+from fitact.inference.summary import BY_FORCE, load, width
 from fitact.report import plots
 from fitact.units import engineering
 
@@ -28,6 +28,8 @@ _LABELS = {
     "Z": "resistance to earth Z",
     "Z_capacitance": "capacitance to earth",
     "series_resistor": "series resistor",
+    "Rgap": "gap's resistance Rgap",
+    "Cgap": "gap's capacitance Cgap",
     "gain": "gain of {}",
     "delay": "delay of {} against V",
     "clock": "drive's frequency over the stated one, less 1",
@@ -41,6 +43,7 @@ _LABELS = {
     "charge": "decaying charge in {} at the first sample",
     "charge_2": "second decaying charge in {} at the first sample",
     "charge_3": "third decaying charge in {} at the first sample",
+    "charge_4": "fourth decaying charge in {} at the first sample",
     "g": "divider g = Ci / (2 Ci + Csc)",
     "b": "time constant b = Rsc (2 Ci + Csc)",
     "force_mean": "electrostatic force, mean",
@@ -70,6 +73,7 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
         figures=figures,
         label=_label,
         channels=_CHANNELS,
+        force=BY_FORCE[summary["model"].get("force", "paper")],
         circuits=_CIRCUITS,
         engineering=engineering,
         quantity=_quantity,
