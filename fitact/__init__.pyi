@@ -2,6 +2,7 @@ from .data.formats import read
 from .data.record import Record
 from .errors import InputError
 from .inference.fit import Fit, fit
+from .inference.population import Population, population
 from .inference.posterior import Posterior
 from .inference.sampling import sample
 from .inference.solver import RESULTS
@@ -38,6 +39,7 @@ __all__ = [
     "NaturalGround",
     "Plan",
     "Polyline",
+    "Population",
     "Posterior",
     "Prior",
     "Probe",
@@ -64,6 +66,7 @@ __all__ = [
     "peak",
     "peak_force",
     "plan",
+    "population",
     "quality_factor",
     "read",
     "response",

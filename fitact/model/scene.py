@@ -115,7 +115,6 @@ class Scene(Section):
                 self.skin.level != "constant" and not self.drive.steady_state
             ),
             "[force] model = 'gap'": self.force.model == "gap",
-            "[population] contact_area = 'varies'": self.population.contact_area == "varies",
         }
         if fit:
             unavailable[f"[skin] level = '{self.skin.level}'"] = self.skin.level != "constant"
