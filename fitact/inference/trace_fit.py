@@ -55,7 +55,8 @@ class TraceFit:
     ) -> "TraceFit":
         """The trace of that index at the optimum `theta` with the noise `sigma`."""
         trace, seen = likelihood.traces[index].summed(), likelihood.seen(jnp.asarray(theta), index)
-        left, beta = (np.asarray(x) for x in _over_samples(trace, seen, sigma))
+        # the noise as an array: a float would be compiled in, anew for every record
+        left, beta = (np.asarray(x) for x in _over_samples(trace, seen, jnp.asarray(sigma)))
         weight = None if trace.weight is None else np.asarray(trace.weight)
         linear = {
             trace.named(LINEAR[column]): float(value * trace.linear_sd[column])
@@ -111,7 +112,7 @@ def _log_likelihood(trace: Trace, left: np.ndarray, sigma: float) -> float:
 
 
 @eqx.filter_jit
-def _over_samples(trace: Trace, seen: Seen, sigma: float) -> tuple[Array, Array]:
+def _over_samples(trace: Trace, seen: Seen, sigma: Array) -> tuple[Array, Array]:
     """What is left of the samples, and the linear nuisances in prior standard deviations."""
     _, beta, _ = trace.linear(seen, sigma)
     remainder, shapes = dataclasses.replace(trace, weight=None, whitening=None).before_linear(seen)

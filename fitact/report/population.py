@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
 from fitact.files import replacing
 from fitact.inference.population import Population
@@ -61,8 +61,10 @@ def _draw_skin(
         axes.errorbar(x, y, **errors, fmt="o", ms=4, color=_FINGER, label=label)
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.xaxis.set_major_formatter(EngFormatter("Ω"))
-    axes.yaxis.set_major_formatter(EngFormatter("F"))
+    for axis, unit in ((axes.xaxis, "Ω"), (axes.yaxis, "F")):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(EngFormatter(unit))
+        axis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("Rsc")
     axes.set_ylabel("Csc")
     axes.legend(markerscale=2)
