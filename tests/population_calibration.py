@@ -45,7 +45,7 @@ class Simulated(NamedTuple):
     truth: dict[str, float]
 
 
-def simulate(seed: int, number: int, fingers: int = FINGERS) -> Simulated:
+def simulate(seed: int, number: int, fingers: int = FINGERS, noise: float = NOISE) -> Simulated:
     """Population `number`."""
     rng = np.random.default_rng([seed, number])
     score = scipy.stats.norm.ppf(0.975)
@@ -59,7 +59,7 @@ def simulate(seed: int, number: int, fingers: int = FINGERS) -> Simulated:
         fitact.Record.from_arrays(
             np.arange(2 * SAMPLES) / (SAMPLES * FREQUENCY),
             V=np.tile(wave("triangle", rng), 2),
-            Vsc=np.tile(values, 2) + NOISE * rng.standard_normal(2 * SAMPLES),
+            Vsc=np.tile(values, 2) + noise * rng.standard_normal(2 * SAMPLES),
             source=f"finger {finger} of population {number}",
         )
         for finger, values in enumerate(settled[:-1])
