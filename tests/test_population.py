@@ -178,18 +178,17 @@ def nuts(fits: list[fitact.Fit], prior: Prior) -> dict[str, np.ndarray]:
 
     def log_prob(x: dict[str, jax.Array]) -> jax.Array:
         sd, r, logpdf = jnp.exp(x["log_sd"]), jnp.tanh(x["atanh_r"]), jax.scipy.stats.norm.logpdf
-        skin = x["median"] + sd * jnp.stack([x["u"], r * x["u"] + jnp.sqrt(1.0 - r**2) * x["v"]], axis=-1)
-        points = jnp.column_stack([skin, jnp.full(count, x["log_Ci"]), x["log_sigma"]])
+        points = jnp.column_stack([x["skin"], jnp.full(count, x["log_Ci"]), x["log_sigma"]])
         each = jax.vmap(lambda finger, point: eqx.combine(finger, static).log_likelihood(point))(stacked, points)
+        first, second = ((x["skin"] - x["median"]) / sd).T
+        of_fingers = logpdf(first) + logpdf(second, r * first, jnp.sqrt(1.0 - r**2)) - jnp.sum(x["log_sd"])
         law = logpdf(jnp.append(x["median"], x["log_Ci"]), prior.log_mean, prior.log_sd).sum()
         law += jnp.sum(x["log_sd"] - 0.5 * (sd / 0.5) ** 2) + 2.0 * jnp.log1p(-(r**2))
-        return jnp.sum(each) + logpdf(x["u"]).sum() + logpdf(x["v"]).sum() + law
+        return jnp.sum(each) + jnp.sum(of_fingers) + law
 
-    skins = np.array([fit.theta[:2] for fit in fits])
-    sd = skins.std(axis=0) + 0.1
-    u, v = ((skins - skins.mean(axis=0)) / sd).T
-    start = {"median": skins.mean(axis=0), "log_sd": np.log(sd), "atanh_r": 0.0, "log_Ci": prior.log_mean[2]}
-    start |= {"u": u, "v": v, "log_sigma": np.log([fit.sigma for fit in fits])}
+    skin = np.array([fit.theta[:2] for fit in fits])
+    start = {"median": skin.mean(axis=0), "log_sd": np.log(skin.std(axis=0) + 0.1), "log_Ci": prior.log_mean[2]}
+    start |= {"skin": skin, "atanh_r": 0.0, "log_sigma": np.log([fit.sigma for fit in fits])}
     start = jax.tree.map(jnp.asarray, start)
     keys = jax.random.split(jax.random.key(0), NUTS_CHAINS)
 
