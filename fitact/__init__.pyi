@@ -3,6 +3,7 @@ from .data.record import Record
 from .errors import InputError
 from .inference.comparison import Comparison, compare
 from .inference.fit import Fit, fit
+from .inference.population import Population, population
 from .inference.posterior import Posterior
 from .inference.sampling import sample
 from .inference.solver import RESULTS
@@ -40,6 +41,7 @@ __all__ = [
     "NaturalGround",
     "Plan",
     "Polyline",
+    "Population",
     "Posterior",
     "Prior",
     "Probe",
@@ -67,6 +69,7 @@ __all__ = [
     "peak",
     "peak_force",
     "plan",
+    "population",
     "quality_factor",
     "read",
     "response",

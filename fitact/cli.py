@@ -293,6 +293,38 @@ def compare(
 
 
 @app.command()
+def population(
+    records: Annotated[list[Path], typer.Argument(metavar="RECORD...", help="One CSV of each finger, on one panel.")],
+    scene: Annotated[
+        Path | None, typer.Option("--scene", metavar="FILE", help="Scene (TOML) of all; absent: the paper's device.")
+    ] = None,
+    out: Out = None,
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """From one finger to people: how fingers differ, what force the next one will feel, and why.
+
+    Into DIR it writes population.json and population.svg.
+    """
+    from fitact.data.formats import read
+    from fitact.model.scene import Scene
+
+    stated = None if scene is None else Scene.load(scene)
+    measured = [read(path, stated) for path in records]
+    _use_compilation_cache()
+    from fitact.inference.population import population as find_population
+
+    found = find_population(measured, stated, seed=seed)
+    if out is not None:
+        from fitact.report.population import write_population
+
+        write_json(out / "population.json", found.to_dict())
+        write_population(out / "population.svg", found)
+    _show(str(found), found.to_dict(), json)
+    _finish(found.trusted)
+
+
+@app.command()
 def scene(
     file: Annotated[str, typer.Argument(metavar="[SCENE]", help="Scene (TOML), or the name of a shipped one.")] = "",
     json: Json = False,

@@ -19,6 +19,7 @@ import argparse
 import concurrent.futures
 import dataclasses
 import hashlib
+import inspect
 import json
 import multiprocessing
 import os
@@ -26,7 +27,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -194,9 +195,11 @@ def drawn(posterior: fitact.Posterior, rng: np.random.Generator) -> dict[str, np
     return draws
 
 
-def collect(path: Path, records: int, seed: int, workers: int) -> list[dict[str, Any]]:
-    """Rows of records 0 to `records`, those that the file lacks computed and added to it."""
-    header = {"seed": seed, "sources": sources()}
+def collect(
+    path: Path, records: int, seed: int, workers: int, task: Callable[[int, int], dict[str, Any]] = ranks
+) -> list[dict[str, Any]]:
+    """`task`'s rows of records 0 to `records`, those that the file lacks computed and added to it."""
+    header = {"seed": seed, "sources": sources(inspect.getfile(task))}
     lines = path.read_text().splitlines(keepends=True) if path.exists() else []
     whole = [json.loads(line) for line in lines if line.endswith("\n")]  # a killed run may leave a part of a line
     if whole and whole[0] != header:
@@ -208,7 +211,7 @@ def collect(path: Path, records: int, seed: int, workers: int) -> list[dict[str,
         temporary.write_text("".join(json.dumps(row) + "\n" for row in [header, *rows.values()]))
     began = time.monotonic()
     with path.open("a") as file:
-        for done, row in enumerate(computed(missing, seed, workers, path.parent / "compiled"), 1):
+        for done, row in enumerate(computed(missing, seed, workers, path.parent / "compiled", task), 1):
             rows[row["record"]] = row
             file.write(json.dumps(row) + "\n")
             file.flush()
@@ -218,12 +221,14 @@ def collect(path: Path, records: int, seed: int, workers: int) -> list[dict[str,
     return [rows[number] for number in range(records)]
 
 
-def computed(numbers: list[int], seed: int, workers: int, compiled: Path) -> Iterator[dict[str, Any]]:
+def computed(
+    numbers: list[int], seed: int, workers: int, compiled: Path, task: Callable[[int, int], dict[str, Any]]
+) -> Iterator[dict[str, Any]]:
     """Rows of the records, as they come."""
     each = RECYCLED * workers
     for first in range(0, len(numbers), each):
         with pool(workers, compiled) as executor:
-            futures = [executor.submit(ranks, number, seed) for number in numbers[first : first + each]]
+            futures = [executor.submit(task, number, seed) for number in numbers[first : first + each]]
             try:
                 yield from (future.result() for future in concurrent.futures.as_completed(futures))
             except BaseException:  # Ctrl-C too
@@ -231,10 +236,10 @@ def computed(numbers: list[int], seed: int, workers: int, compiled: Path) -> Ite
                 raise
 
 
-def sources() -> str:
-    """SHA-256 of all code that the ranks come from."""
+def sources(script: str) -> str:
+    """SHA-256 of all code that the rows come from."""
     files = sorted(Path(fitact.__file__).parent.rglob("*.py"))
-    return hashlib.sha256(b"".join(file.read_bytes() for file in [*files, Path(__file__)])).hexdigest()
+    return hashlib.sha256(b"".join(file.read_bytes() for file in [*files, Path(script)])).hexdigest()
 
 
 def pool(workers: int, compiled: Path) -> concurrent.futures.ProcessPoolExecutor:

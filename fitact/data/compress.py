@@ -9,6 +9,7 @@ root then holds coordinates in which the difference between record and model has
 all samples, and as functions of log tau the coordinates are Chebyshev series.
 """
 
+import functools
 import math
 from collections.abc import Iterator
 from fractions import Fraction
@@ -182,21 +183,28 @@ class _Table(eqx.Module):
     @classmethod
     def around(cls, near: Terms, time: np.ndarray) -> "_Table":
         (tau,) = map(float, near.tau)
-        x, to_series = _chebyshev(NODES)
-        relative = np.exp(_REACH * x)
-        ages = np.concatenate([[0.0], np.geomspace(1e-3 * relative.min(), 40.0 * relative.max(), 400)])
-        _, sizes, modes = np.linalg.svd(np.exp(-ages[:, None] / relative), full_matrices=False)
-        rank = int(np.count_nonzero(sizes > _RANK * sizes[0]))
+        relative, mix, series = _basis()
         return cls(
             center=jnp.asarray(math.log(tau)),
             nodes=jnp.asarray(tau * relative),
-            mix=jnp.asarray(modes[:rank].T / sizes[:rank]),
-            series=(sizes[:rank, None] * modes[:rank]) @ to_series.T,
+            mix=jnp.asarray(mix),
+            series=series,
             near=jax.tree.map(jnp.asarray, near),
             middle=jnp.asarray(0.5 * (time[0] + time[-1])),
             half=jnp.asarray(0.5 * (time[-1] - time[0])),
             step=jnp.asarray((time[-1] - time[0]) / (time.size - 1)),
         )
+
+
+@functools.cache
+def _basis() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nodes of any table over its middle, their combinations that matter, and the series that give back a response."""
+    x, to_series = _chebyshev(NODES)
+    relative = np.exp(_REACH * x)
+    ages = np.concatenate([[0.0], np.geomspace(1e-3 * relative.min(), 40.0 * relative.max(), 400)])
+    _, sizes, modes = np.linalg.svd(np.exp(-ages[:, None] / relative), full_matrices=False)
+    rank = int(np.count_nonzero(sizes > _RANK * sizes[0]))
+    return relative, modes[:rank].T / sizes[:rank], (sizes[:rank, None] * modes[:rank]) @ to_series.T
 
 
 def slow_shapes(time: Float[Array, " n"], middle: Array, half: Array) -> Float[Array, "6 n"]:

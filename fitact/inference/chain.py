@@ -47,6 +47,12 @@ class Chain:
         """Steps taken by each ensemble."""
         return self.points.shape[1]
 
+    def thinned(self, burn: int, most: int) -> slice:
+        """Steps after the burn-in, evenly apart up to the last, at which an ensemble has some `most` points."""
+        kept = self.steps - burn
+        apart = max(1, -(-kept * self.points.shape[2] // most))
+        return slice(burn + (kept - 1) % apart, None, apart)
+
     def extend(self, done: list[tuple[np.ndarray, np.ndarray, emcee.State, np.ndarray]]) -> None:
         """Add steps of every ensemble: points, log-probabilities, last state, moves accepted."""
         points, log_prob, states, accepted = zip(*done, strict=True)

@@ -56,9 +56,7 @@ class Posterior:
     @classmethod
     def from_chain(cls, fit: Fit, chain: Chain, convergence: Convergence, seed: int) -> Self:
         """Leave out the burn-in and thin."""
-        kept = chain.steps - convergence.burn
-        step = max(1, -(-kept * convergence.walkers // _DRAWS))
-        chosen = slice(convergence.burn + (kept - 1) % step, None, step)
+        chosen = chain.thinned(convergence.burn, _DRAWS)
         size = chain.points.shape[-1]
         points = chain.points[:, chosen].reshape(convergence.ensembles, -1, size)
         return cls(fit, points, chain.log_prob[:, chosen].reshape(points.shape[:2]), convergence, seed)

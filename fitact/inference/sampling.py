@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import importlib.metadata
 import json
@@ -11,11 +12,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import emcee
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from fitact.errors import InputError
 from fitact.files import clean
@@ -91,14 +93,48 @@ def sample(
         raise InputError(f"walkers = {walkers}, ensembles = {ensembles}: at least {2 * size}, even; and at least 2")
     began = time.perf_counter()
     with jax.enable_x64(True):
-        log_prob = _finite(compressed.log_prob(fit.likelihood, walkers))
+        log_prob = finite(compressed.log_prob(fit.likelihood, walkers))
         if level != "emcee":
             posterior = importance.draw(fit, level, log_prob, seed)
             judged = dataclasses.replace(posterior.convergence, seconds=time.perf_counter() - began)
             return dataclasses.replace(posterior, convergence=judged)
-        run = _Run.start(fit, log_prob, seed, walkers, ensembles, None if chain_file is None else Path(chain_file))
-        convergence = run.until_converged(max_steps, Reporter(progress))
-        return Posterior.from_chain(fit, run.chain, convergence, seed)
+        target = Target(
+            fit.point_names,
+            log_prob,
+            Proposal.around(fit.point, fit.point_root, log_prob),
+            functools.partial(importance.followed, fit),
+            _fingerprint(fit, seed, walkers, ensembles),
+        )
+        path = None if chain_file is None else Path(chain_file)
+        chain, convergence = run(target, seed, walkers, ensembles, max_steps, path, progress)
+        return Posterior.from_chain(fit, chain, convergence, seed)
+
+
+class Target(NamedTuple):
+    """What ensembles sample.
+
+    Attributes:
+        names: of the coordinates.
+        log_prob: of points, finite or -inf.
+        proposal: near to it.
+        follow: quantities to be judged beside the coordinates, of points (ensembles, draws, n), with a seed.
+        fingerprint: what a chain belongs to; "" where none is kept.
+    """
+
+    names: tuple[str, ...]
+    log_prob: LogProb
+    proposal: Proposal
+    follow: Callable[[Float[np.ndarray, "ensembles draws n"], int], dict[str, np.ndarray]]
+    fingerprint: str = ""
+
+
+def run(
+    target: Target, seed: int, walkers: int, ensembles: int, max_steps: int, path: Path | None, progress: bool
+) -> tuple[Chain, Convergence]:
+    """Sample until converged; arguments as in `sample`. Call it in double precision."""
+    sampled = _Run.start(target, seed, walkers, ensembles, path)
+    convergence = sampled.until_converged(max_steps, Reporter(progress))
+    return sampled.chain, convergence
 
 
 def moves(proposal: Proposal) -> list[tuple[emcee.moves.Move, float]]:
@@ -106,7 +142,7 @@ def moves(proposal: Proposal) -> list[tuple[emcee.moves.Move, float]]:
     return [(emcee.moves.MHMove(proposal.move), 0.7), (emcee.moves.StretchMove(), 0.3)]
 
 
-def _finite(log_prob: LogProb) -> LogProb:
+def finite(log_prob: LogProb) -> LogProb:
     """What is not finite is impossible: emcee would end at NaN, and a walker stick at +inf."""
 
     def values(points: np.ndarray) -> np.ndarray:
@@ -120,7 +156,7 @@ def _finite(log_prob: LogProb) -> LogProb:
 class _Run:
     """The ensembles of one posterior."""
 
-    fit: Fit
+    target: Target
     chain: Chain
     samplers: list[emcee.EnsembleSampler]
     path: Path | None
@@ -131,26 +167,24 @@ class _Run:
     derived: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
     @classmethod
-    def start(cls, fit: Fit, log_prob: LogProb, seed: int, walkers: int, ensembles: int, path: Path | None) -> "_Run":
-        """From the chain file where there is one, else from around the fit."""
+    def start(cls, target: Target, seed: int, walkers: int, ensembles: int, path: Path | None) -> "_Run":
+        """From the chain file where there is one, else from a wider proposal."""
         began = time.perf_counter()
-        names = fit.point_names
-        proposal = Proposal.around(fit.point, fit.point_root, log_prob)
+        names, log_prob, proposal = target.names, target.log_prob, target.proposal
         samplers = [
             emcee.EnsembleSampler(walkers, len(names), log_prob, moves=moves(proposal), vectorize=True)
             for _ in range(ensembles)
         ]
-        fingerprint = _fingerprint(fit, names, seed, walkers, ensembles)
         if path is not None:
             clean(path)
         if path is not None and path.exists():
-            return cls(fit, Chain.load(path, fingerprint), samplers, path, began)
+            return cls(target, Chain.load(path, target.fingerprint), samplers, path, began)
         states = []
         for child in np.random.SeedSequence(seed).spawn(ensembles):
             random = np.random.RandomState(child.generate_state(8))
             points, values = _starts(proposal.widened(_OVERDISPERSION), log_prob, walkers, random)
             states.append(emcee.State(points, log_prob=values, random_state=random.get_state()))
-        return cls(fit, Chain.empty(names, fingerprint, states), samplers, path, began)
+        return cls(target, Chain.empty(names, target.fingerprint, states), samplers, path, began)
 
     def until_converged(self, max_steps: int, report: Reporter) -> Convergence:
         """Sample, judge and save in turn."""
@@ -217,7 +251,7 @@ class _Run:
         if not fresh.size:
             return
         ensembles, steps, followed, size = fresh.shape
-        found = importance.followed(self.fit, fresh.reshape(ensembles, -1, size), seed=known)
+        found = self.target.follow(fresh.reshape(ensembles, -1, size), known)
         for name, values in found.items():
             values = values.reshape(ensembles, steps, followed)
             self.derived[name] = np.concatenate([self.derived[name], values], axis=1) if known else values
@@ -270,14 +304,14 @@ def _starts(
     )
 
 
-def _fingerprint(fit: Fit, names: tuple[str, ...], seed: int, walkers: int, ensembles: int) -> str:
+def _fingerprint(fit: Fit, seed: int, walkers: int, ensembles: int) -> str:
     """What a chain belongs to; any change of it makes another chain."""
     settings = [
         [record.fingerprint for record in fit.records],
         fit.scene.to_json(),
         [trace.choice.name for trace in fit.traces],
         fit.likelihood.rows,
-        names,
+        fit.point_names,
         fit.theta.tolist(),
         seed,
         walkers,

@@ -55,6 +55,7 @@ class TraceFit:
     ) -> "TraceFit":
         """The trace of that index at the optimum `theta` with the noise `sigma`."""
         trace, seen = likelihood.traces[index].summed(), likelihood.seen(jnp.asarray(theta), index)
+        # the noise as an array: a float would be compiled in, anew for every record
         left, beta = (np.asarray(x) for x in _over_samples(trace, seen, jnp.asarray(sigma)))
         weight = None if trace.weight is None else np.asarray(trace.weight)
         linear = {

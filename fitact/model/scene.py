@@ -117,7 +117,6 @@ class Scene(Section):
             f"[skin] level = '{self.skin.level}' with [drive] steady_state = false": (
                 self.skin.level != "constant" and not self.drive.steady_state
             ),
-            "[population] contact_area = 'varies'": self.population.contact_area == "varies",
         }
         if fit:
             unavailable[f"[skin] level = '{self.skin.level}'"] = self.skin.level != "constant"

@@ -1,0 +1,251 @@
+"""The likelihood of each of several fingers as a function of what they share, all that is its own integrated out.
+
+Given log Ci, a finger's likelihood is nearly normal in log Rsc, log Csc and its nuisances, also where Vsc alone
+leaves the three together open: its mean then slides along that line with log Ci. Draws of a Student-t over that
+normal slide with it, so the weight of each draw is a smooth function of log Ci alone. It is tabulated once; any
+population is then an average of its density over the weighted draws.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitact.errors import InputError
+from fitact.inference import compressed
+from fitact.inference.fit import Fit
+from fitact.inference.likelihood import Likelihood
+from fitact.inference.proposal import Proposal
+from fitact.model.distribution import Distribution, LogNormal
+from fitact.model.prior import Prior
+
+SKIN = ("Rsc", "Csc")
+SHARED = "Ci"
+_FLAT = 1e3  # standard deviation, in a logarithm, of a prior that says nothing
+REACH = 8.0  # standard deviations of log Ci that the tables hold
+_AREA = 1.0  # of an area's logarithm: the widest that the tables allow for
+_BATCH = 128  # points evaluated at a time
+_IMPOSSIBLE = -1e6  # log-weight of a draw that some nuisance's prior forbids
+
+
+class Law(NamedTuple):
+    """How fingers of a population are distributed.
+
+    Attributes:
+        median: of log Rsc and log Csc, at the panel's Ci: their means.
+        log_sd: of Rsc and Csc.
+        correlation: of their logarithms.
+        log_Ci: of the panel, for the median finger's area.
+        area: standard deviation of the logarithm of a finger's area; None: they are the same.
+    """
+
+    median: Float[Array, "2"]
+    log_sd: Float[Array, "2"]
+    correlation: Float[Array, ""]
+    log_Ci: Float[Array, ""]
+    area: Float[Array, ""] | None = None
+
+    def log_density(self, skin: Float[Array, "*shape 2"]) -> Float[Array, "*shape"]:
+        """Of log Rsc and log Csc, at the median area, up to a constant."""
+        first, second = jnp.moveaxis((skin - self.median) / self.log_sd, -1, 0)
+        rest = 1.0 - jnp.square(self.correlation)
+        squares = jnp.square(first) + jnp.square(second - self.correlation * first) / rest
+        return -0.5 * squares - jnp.sum(jnp.log(self.log_sd)) - 0.5 * jnp.log(rest)
+
+
+@dataclasses.dataclass(frozen=True)
+class Conditional:
+    """A finger's likelihood around its optimum, normal in its own coordinates given log Ci.
+
+    Attributes:
+        source: of the record.
+        likelihood: with priors of the nuisances alone.
+        names: the coordinates of a point; its own are all but Ci.
+        center: log Ci of the optimum.
+        place: its own coordinates there.
+        slope: how these move with log Ci.
+        root: of their covariance, given log Ci.
+        precision: of log Ci, from the record alone.
+        pull: precision times how far the record wants log Ci from `center`.
+    """
+
+    source: str
+    likelihood: Likelihood
+    names: tuple[str, ...]
+    center: float
+    place: Float[np.ndarray, " own"]
+    slope: Float[np.ndarray, " own"]
+    root: Float[np.ndarray, "own own"]
+    precision: float
+    pull: float
+
+    @classmethod
+    def around(cls, fit: Fit) -> Self:
+        """From the whitened residuals at the fit and their Jacobian; a noise's by its Fisher information."""
+        likelihood = _without_skin_prior(fit.likelihood)
+        names, size = fit.point_names, fit.theta.size
+        shared = fit.names.index(SHARED)
+        theta, log_sigma = np.split(fit.point, [size])
+        residuals, jacobian = _linearised(likelihood.without_samples(), theta, np.exp(log_sigma))
+        own = [i for i in range(size) if i != shared]
+        # R of (own, Ci, residuals): what Ci's column holds below the own ones' is what the record alone says of it
+        R = np.asarray(np.linalg.qr(np.column_stack([jacobian[:, [*own, shared]], residuals]), mode="r"))
+        n = len(own)
+        root = np.linalg.inv(R[:n, :n])
+        noise = np.diag(fit.point_root)[size:]
+        whole = np.diag(np.append(np.zeros(n), noise))
+        whole[:n, :n] = root
+        return cls(
+            source=fit.record.source,
+            likelihood=likelihood,
+            names=names,
+            center=float(theta[shared]),
+            place=np.append(theta[own] - root @ R[:n, n + 1], log_sigma),
+            slope=np.append(-root @ R[:n, n], np.zeros(noise.size)),
+            root=whole,
+            precision=float(R[n, n] ** 2),
+            pull=float(-R[n, n] * R[n, n + 1]),
+        )
+
+    def at(self, log_Ci: float, white: Float[np.ndarray, "draws own"]) -> Float[np.ndarray, "draws coordinates"]:
+        """Points that standard normal numbers are at that log Ci."""
+        own = self.place + self.slope * (log_Ci - self.center) + white @ self.root.T
+        return np.insert(own, self.names.index(SHARED), log_Ci, axis=1)
+
+
+def _without_skin_prior(likelihood: Likelihood) -> Likelihood:
+    flat = {name: LogNormal(math.exp(likelihood.prior[name].log_mean), _FLAT) for name in (*SKIN, SHARED)}
+    marginals = dict(zip(likelihood.prior.names, likelihood.prior.marginals, strict=True)) | flat
+    return dataclasses.replace(likelihood, prior=Prior.of(**marginals))
+
+
+@eqx.filter_jit
+def _linearised_in(likelihood: Likelihood, theta: Array, sigma: Array) -> tuple[Array, Array]:
+    def residuals(theta: Array) -> Array:
+        return jnp.concatenate([*likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)])
+
+    return residuals(theta), jax.jacfwd(residuals)(theta)
+
+
+def _linearised(likelihood: Likelihood, theta: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    residuals, jacobian = _linearised_in(likelihood, jnp.asarray(theta), jnp.asarray(sigma))
+    return np.asarray(residuals), np.asarray(jacobian)
+
+
+class Fingers(eqx.Module):
+    """Weighted draws of several fingers, as tables in log Ci.
+
+    Attributes:
+        skin: log Rsc and log Csc of each draw at `center`.
+        slope: how they move with log Ci.
+        center, reach: of the tables in log Ci.
+        weight: Chebyshev coefficients of the log-weights.
+        precision: of log Ci, by each record alone.
+        pull: precision times how far the record wants log Ci from `center`.
+        deviate: standard normal numbers that draw the fingers' areas.
+    """
+
+    skin: Float[Array, "fingers draws 2"]
+    slope: Float[Array, "fingers 1 2"]
+    center: Float[Array, "fingers 1"]
+    reach: Float[Array, "fingers 1"]
+    weight: Float[Array, "fingers draws terms"]
+    precision: Float[Array, "fingers 1"]
+    pull: Float[Array, "fingers 1"]
+    deviate: Float[Array, "fingers draws"]
+
+    @classmethod
+    def tabulated(
+        cls,
+        conditionals: Sequence[Conditional],
+        prior: Distribution,
+        *,
+        area_varies: bool,
+        draws: int,
+        terms: int,
+        seed: Sequence[int],
+    ) -> Self:
+        """Tables of `terms`, wherever the records and the panel's `prior` allow log Ci to be."""
+        tables = []
+        center, reach = _weighed(conditionals, prior.log_mean, prior.log_sd)
+        for each, child in zip(conditionals, np.random.SeedSequence(seed).spawn(len(conditionals)), strict=True):
+            if area_varies:
+                center, reach = _weighed([each], prior.log_mean, math.hypot(prior.log_sd, _AREA))
+            student = Proposal(np.zeros(each.place.size + area_varies), np.eye(each.place.size + area_varies))
+            tables.append(_table(each, center, reach, student, draws, terms, np.random.default_rng(child)))
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *tables)
+
+    def log_weights(self, law: Law) -> tuple[Float[Array, "fingers draws"], Float[Array, "fingers draws 2"]]:
+        """Log-weights of the draws, -inf beyond the tables, and their log Rsc and log Csc at the median area."""
+        log_Ci, value = jnp.broadcast_to(law.log_Ci, self.deviate.shape), jnp.zeros(())
+        if law.area is not None:
+            # given the law, log Ci of a finger is normal, but for what the tables correct
+            precision = self.precision + law.area**-2
+            middle = self.center + (self.pull + (law.log_Ci - self.center) * law.area**-2) / precision
+            log_Ci = middle + self.deviate / jnp.sqrt(precision)
+            value = -0.5 * jnp.square((log_Ci - law.log_Ci) / law.area) - jnp.log(law.area) - 0.5 * jnp.log(precision)
+        area = log_Ci - law.log_Ci
+        at = (log_Ci - self.center) / self.reach
+        value = value + jnp.where(jnp.abs(at) <= 1.0, _series(self.weight, at), -jnp.inf)
+        own = self.skin + self.slope * (log_Ci - self.center)[..., None]
+        skin = own + jnp.array([1.0, -1.0]) * area[..., None]
+        return value + law.log_density(skin), skin
+
+    def log_likelihood(self, law: Law) -> Float[Array, " fingers"]:
+        """Of each finger under a law, up to a constant; -inf beyond the tables."""
+        return jax.nn.logsumexp(self.log_weights(law)[0], axis=1)
+
+
+def _series(weight: Float[Array, "fingers draws terms"], at: Float[Array, "fingers draws"]) -> Array:
+    """Chebyshev series, by Clenshaw's recurrence."""
+    later, latest = jnp.zeros_like(at), jnp.zeros_like(at)
+    for k in range(weight.shape[-1] - 1, 0, -1):
+        latest, later = 2.0 * at * latest - later + weight[..., k], latest
+    return at * latest - later + weight[..., 0]
+
+
+def _weighed(conditionals: Sequence[Conditional], mean: float, sd: float) -> tuple[float, float]:
+    """Where log Ci may lie by records and a normal prior, and how far from there."""
+    precision = sd**-2 + sum(each.precision for each in conditionals)
+    pull = sum(each.pull + each.precision * (each.center - mean) for each in conditionals)
+    return mean + pull / precision, REACH / math.sqrt(precision)
+
+
+def _table(
+    finger: Conditional,
+    center: float,
+    reach: float,
+    student: Proposal,
+    draws: int,
+    terms: int,
+    random: np.random.Generator,
+) -> Fingers:
+    """Of one finger, for log Ci within `reach` of `center`; a deviate beyond its own coordinates draws its area."""
+    own = finger.place.size
+    deviates = student.draw(random, draws)
+    nodes = np.cos(np.pi * (np.arange(terms) + 0.5) / terms)
+    points = np.stack([finger.at(center + reach * x, deviates[:, :own]) for x in nodes])
+    values = compressed.log_prob(finger.likelihood, _BATCH)(points.reshape(-1, points.shape[-1]))
+    values = values.reshape(terms, draws) - student.log_density(deviates)
+    possible = np.isfinite(values).all(axis=0)
+    if not possible.any():
+        raise InputError(f"{finger.source}: the record leaves Rsc and Csc too open for a population; leave it out")
+    values = np.where(possible, values - np.max(values[:, possible]), _IMPOSSIBLE)
+    skin = [finger.names.index(name) for name in SKIN]
+    off = center - finger.center
+    return Fingers(
+        skin=jnp.asarray(finger.at(center, deviates[:, :own])[:, skin]),
+        slope=jnp.asarray(np.insert(finger.slope, finger.names.index(SHARED), 1.0)[None, skin]),
+        center=jnp.array([center]),
+        reach=jnp.array([reach]),
+        weight=jnp.asarray(np.polynomial.chebyshev.chebfit(nodes, values, terms - 1).T),
+        precision=jnp.array([finger.precision]),
+        pull=jnp.array([finger.pull - finger.precision * off]),
+        deviate=jnp.asarray(deviates[:, -1] if deviates.shape[1] > own else np.zeros(draws)),
+    )

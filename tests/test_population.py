@@ -1,0 +1,267 @@
+"""Populations: against scipy's densities and quadrature, laws in closed form, NUTS, and ngspice's eight fingers."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.special
+import scipy.stats
+from arviz_stats.base import array_stats
+from population_calibration import FREQUENCY, simulate, steady, wave
+
+import fitact
+from fitact.inference.fingers import Conditional, Fingers, Law
+from fitact.inference.hierarchy import Hierarchy
+from fitact.inference.new_finger import FACTORS, NAMES, Spread, variance_shares
+from fitact.model.prior import Prior
+
+NUTS_CHAINS, NUTS_STEPS = 4, 3000
+FINGERS = Path(__file__).parents[1] / "data_synth" / "records" / "fingers"
+SCALES = {"Rsc": (11.8, 0.4), "Csc": (-17.7, 0.5), "Ci": (-20.4, 0.1)}  # of logarithms: mean, standard deviation
+PRIOR = Prior.of(**{name: fitact.LogNormal(float(np.exp(mean)), sd) for name, (mean, sd) in SCALES.items()})
+
+
+def known(skins: np.ndarray, log_Ci: np.ndarray, precision: float) -> Fingers:
+    """Fingers whose Rsc and Csc are known, and whose Ci is normal with that precision."""
+    count, one, reach = len(skins), np.ones((len(skins), 1)), 0.5
+    deviate = np.random.default_rng(0).standard_normal((count, 4))
+    # -precision x^2 / 2 with x = reach t and t^2 = (T_0 + T_2) / 2, over the deviates' density
+    series = -0.25 * precision * reach**2 * np.array([1.0, 0.0, 1.0]) + np.zeros((count, 4, 1))
+    series[..., 0] += 0.5 * deviate**2
+    skin = np.repeat(skins[:, None], 4, axis=1)
+    parts = (skin, np.zeros((count, 1, 2)), log_Ci[:, None], reach * one, series, precision * one, 0.0 * one, deviate)
+    return Fingers(*map(jnp.asarray, parts))
+
+
+@pytest.mark.parametrize("varies", [False, True])
+def test_log_posterior_of_known_fingers_is_scipys(varies: bool):
+    """Of Rsc and Csc, and of Ci too where each finger's area scales all three."""
+    rng = np.random.default_rng(1)
+    with jax.enable_x64(True):
+        skins = rng.normal([11.8, -17.7], 0.3, (5, 2))
+        log_Ci = -20.4 + (0.2 * rng.standard_normal(5) if varies else np.zeros(5))
+        hierarchy = Hierarchy(known(skins, log_Ci, 1e10 if varies else 0.0), PRIOR, varies)
+
+        def natural(point: jax.Array) -> jax.Array:
+            law = hierarchy.law(point)
+            return jnp.array([*law.median, law.log_Ci, *law.log_sd, law.correlation, *([law.area] if varies else [])])
+
+        def expected(values: np.ndarray) -> float:
+            """The stated densities."""
+            mean, sd, r, area = values[:3], values[3:5], values[5], values[6:].sum()
+            covariance = area**2 * np.outer([-1.0, 1.0, 1.0], [-1.0, 1.0, 1.0])
+            covariance[:2, :2] += np.outer(sd, sd) * [[1.0, r], [r, 1.0]]
+            seen = slice(3 if varies else 2)
+            of_fingers = scipy.stats.multivariate_normal(mean[seen], covariance[seen, seen])
+            return (
+                np.sum(of_fingers.logpdf(np.column_stack([skins, log_Ci])[:, seen]))
+                + np.sum(scipy.stats.norm(*np.transpose(list(SCALES.values()))).logpdf(mean))
+                + np.sum(scipy.stats.halfnorm(scale=0.5).logpdf([*values[3:5], *values[6:]]))
+                + scipy.stats.beta(2.0, 2.0, loc=-1.0, scale=2.0).logpdf(r)
+            )
+
+        far = np.array([2.0, 2.0, 0.1, 0.3, 0.3, 0.5, 0.3])[: 6 + varies]
+        points = hierarchy.start() + far * rng.standard_normal((6, 6 + varies))
+        each = jax.jit(jax.vmap(lambda x: (hierarchy.log_prob(x), natural(x), jax.jacfwd(natural)(x))))
+        found, at, jacobian = map(np.asarray, each(points))
+    volume = np.linalg.slogdet(jacobian)[1]
+    difference = found - volume - [expected(values) for values in at]
+    assert np.ptp(found) > 3.0
+    np.testing.assert_allclose(difference, difference[0], atol=2e-3 if varies else 1e-9)
+
+
+def test_integral_over_a_finger_is_that_of_quadrature():
+    """A finger from scipy's state space, so noisy that it is known no better than fingers differ; noise integrated."""
+    noise = 8.0
+    simulated = simulate(5, 0, fingers=1, noise=noise)
+    record, scene = simulated.records[0], simulated.scene
+    fit = fitact.fit(record, scene)
+    assert fit.names == ("Rsc", "Csc", "Ci")
+    assert not fit.linear
+    log_Ci = np.log(simulated.truth["Ci"]) + np.array([-0.1, 0.1, 0.1, 0.1])
+    spreads = np.array([[0.1, 0.1], [0.1, 0.3], [0.3, 0.2], [0.05, 0.05]])
+    correlations = np.array([0.0, 0.5, -0.8, 0.3])
+    medians = fit.theta[:2] + np.array([[0.2, -0.3], [0.0, 0.1], [-0.3, 0.4], [0.1, 0.1]])
+
+    g_0, b_0 = (float(fit.derived()[name]["q50"]) for name in ("g", "b"))
+    g = g_0 * np.exp(np.linspace(-1.0, 0.9, 400))
+    g = g[g < 0.5]
+    b = b_0 * np.exp(np.linspace(-1.5, 1.5, 161))
+    units = [np.tile(steady("triangle", FREQUENCY, wave("triangle", np.random.default_rng()), 1.0, x), 2) for x in b]
+    y, u = record["Vsc"], np.array(units)
+    left = y @ y - 2.0 * g[:, None] * (u @ y) + np.square(g)[:, None] * np.sum(u**2, axis=1)
+    log_likelihood = -0.5 * y.size * np.log(left / np.min(left))
+
+    with jax.enable_x64(True):
+        conditional = Conditional.around(fit)
+        prior = scene.make_prior()["Ci"]
+        tables = Fingers.tabulated([conditional], prior, area_varies=False, draws=20_000, terms=9, seed=[1])
+        law = Law(*map(jnp.asarray, (medians, spreads, correlations, log_Ci)))
+        found = jax.jit(jax.vmap(tables.log_likelihood))(law)[:, 0]
+    expected = []
+    for median, sd, r, c in zip(medians, spreads, correlations, log_Ci, strict=True):
+        skin = np.broadcast_arrays(np.log(g)[:, None] + np.log(b) - c, np.log(1.0 / g - 2.0)[:, None] + c)
+        covariance = np.outer(sd, sd) * np.array([[1.0, r], [r, 1.0]])
+        density = scipy.stats.multivariate_normal(median, covariance).logpdf(np.stack(skin, axis=-1))
+        # d(log Rsc, log Csc) = d(log g, log b) / (1 - 2 g)
+        expected.append(scipy.special.logsumexp(log_likelihood + density - np.log(1.0 - 2.0 * g)[:, None]))
+    assert np.ptp(expected) > 1.0
+    np.testing.assert_allclose(np.diff(found), np.diff(expected), atol=0.05)
+
+
+def test_spread_of_the_next_finger_is_people_and_ignorance():
+    """Of means with a variance of 4, and fingers with one of 9 about them."""
+    rng = np.random.default_rng(2)
+    spread = Spread.of(2.0 * rng.standard_normal((20_000, 1)) + 3.0 * rng.standard_normal((20_000, 8)))
+    assert spread.people == pytest.approx(9.0, rel=0.02)  # four standard errors, sqrt(2 / 140,000) and sqrt(2 / 20,000)
+    assert spread.ignorance == pytest.approx(4.0, rel=0.05)
+
+
+def test_variance_shares_of_correlated_factors_are_those_of_the_closed_form():
+    """y = x . slope of normal x: first (cov(x_i, y))^2 / var(x_i), total slope_i^2 var(x_i | others), over var(y)."""
+    slope = np.array([1.0, -2.0, 0.5])
+    covariance = np.array([[1.0, 0.6, 0.0], [0.6, 0.8, -0.2], [0.0, -0.2, 0.5]])
+
+    class Linear:
+        def each(self, factors: np.ndarray) -> np.ndarray:
+            return np.repeat((factors @ slope)[:, None], len(NAMES), axis=1)
+
+    white = np.random.default_rng(3).standard_normal((4000, 3))
+    white = (white - white.mean(axis=0)) @ np.linalg.inv(np.linalg.cholesky(np.cov(white.T))).T
+    factors = white @ np.linalg.cholesky(covariance).T
+    found = variance_shares(Linear(), factors, ("force_mean",), seed=0)["force_mean"]
+    variance = slope @ covariance @ slope
+    for i, name in enumerate(FACTORS[:3]):
+        first = (covariance[i] @ slope) ** 2 / covariance[i, i] / variance
+        total = slope[i] ** 2 / np.linalg.inv(covariance)[i, i] / variance
+        assert found[name]["first"] == pytest.approx(first, abs=2.0 * found[name]["first_error"])  # 95 % each
+        assert found[name]["total"] == pytest.approx(total, abs=2.0 * found[name]["total_error"])
+        assert found[name]["first_error"] < 0.1
+
+
+def test_what_makes_no_population_is_refused():
+    simulated = simulate(1, 0, fingers=3)
+    first, *others = simulated.records
+    with pytest.raises(fitact.InputError, match="two or more fingers"):
+        fitact.population([first])
+    with pytest.raises(fitact.InputError, match=r"finger 0 .* same record as finger 0"):
+        fitact.population([first, first])
+    held = fitact.Scene.from_dict({"prior": {"Ci": {"fixed": True}}})
+    with pytest.raises(fitact.InputError, match="holds or ties"):
+        fitact.population([first, *others], held)
+    correlated = {"R_H": {"median": "500 ohm", "factor": 2}, "correlation": {"R_H-Csc": 0.5}}
+    with pytest.raises(fitact.InputError, match="with others"):
+        fitact.population([first, *others], fitact.Scene.from_dict({"prior": correlated, "grounding": {"R_H": 500.0}}))
+
+
+def test_refused_records_are_named(tmp_path):
+    simulated = simulate(1, 0, fingers=3)
+    swapped = [dataclasses.replace(r, channels={"V": r["Vsc"], "Vsc": r["V"]}) for r in simulated.records]
+    with pytest.raises(fitact.InputError, match=r"^finger 0.*also refused: finger 2 of population 0$"):
+        fitact.population([swapped[0], simulated.records[1], swapped[2]], simulated.scene)
+
+
+def nuts(fits: list[fitact.Fit], prior: Prior) -> dict[str, np.ndarray]:
+    """Draws of the law by blackjax, with all that is the fingers' own sampled along, not integrated out."""
+    import blackjax
+
+    count = len(fits)
+    arrays, (static, *_) = zip(*(eqx.partition(fit.likelihood.summed(), eqx.is_array) for fit in fits), strict=True)
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *arrays)
+
+    def log_prob(x: dict[str, jax.Array]) -> jax.Array:
+        sd, r, logpdf = jnp.exp(x["log_sd"]), jnp.tanh(x["atanh_r"]), jax.scipy.stats.norm.logpdf
+        points = jnp.column_stack([x["skin"], jnp.full(count, x["log_Ci"]), x["log_sigma"]])
+        each = jax.vmap(lambda finger, point: eqx.combine(finger, static).log_likelihood(point))(stacked, points)
+        first, second = ((x["skin"] - x["median"]) / sd).T
+        of_fingers = logpdf(first) + logpdf(second, r * first, jnp.sqrt(1.0 - r**2)) - jnp.sum(x["log_sd"])
+        law = logpdf(jnp.append(x["median"], x["log_Ci"]), prior.log_mean, prior.log_sd).sum()
+        law += jnp.sum(x["log_sd"] - 0.5 * (sd / 0.5) ** 2) + 2.0 * jnp.log1p(-(r**2))
+        return jnp.sum(each) + jnp.sum(of_fingers) + law
+
+    skin = np.array([fit.theta[:2] for fit in fits])
+    start = {"median": skin.mean(axis=0), "log_sd": np.log(skin.std(axis=0) + 0.1), "log_Ci": prior.log_mean[2]}
+    start |= {"skin": skin, "atanh_r": 0.0, "log_sigma": np.log([fit.sigma for fit in fits])}
+    start = jax.tree.map(jnp.asarray, start)
+    keys = jax.random.split(jax.random.key(0), NUTS_CHAINS)
+
+    def chain(key: jax.Array) -> dict[str, jax.Array]:
+        warm = blackjax.window_adaptation(blackjax.nuts, log_prob, is_mass_matrix_diagonal=False)
+        (state, parameters), _ = warm.run(key, start, 1500)
+        step = blackjax.nuts(log_prob, **parameters).step
+
+        def one(state, key):
+            state, _ = step(key, state)
+            return state, state.position
+
+        return jax.lax.scan(one, state, jax.random.split(key, NUTS_STEPS))[1]
+
+    drawn = jax.tree.map(np.asarray, jax.jit(jax.vmap(chain))(keys))
+    found = {"log_Ci": drawn["log_Ci"], "atanh_r": drawn["atanh_r"]}
+    for i, name in enumerate(("Rsc", "Csc")):
+        found |= {f"log_{name}": drawn["median"][..., i], f"log_sd_{name}": drawn["log_sd"][..., i]}
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [3, 6])
+def test_law_is_that_of_nuts_over_all_parameters(count: int):
+    """Of fingers known no better than they differ; within four standard errors of means, and 5 % in width."""
+    simulated = simulate(5, 1, fingers=count, noise=4.0)
+    found = fitact.population(simulated.records, simulated.scene, seed=1, progress=False)
+    assert found.trusted
+    draws = found.parameters()
+    seen = {f"log_{name}": np.log(draws[name]) for name in ("Rsc", "Csc", "Ci")}
+    seen |= {f"log_sd_{name}": np.log(draws[f"log_sd_{name}"]) for name in ("Rsc", "Csc")}
+    seen |= {"atanh_r": np.arctanh(draws["correlation"])}
+    with jax.enable_x64(True):
+        expected = nuts(list(found.fits), found.hierarchy.prior)
+    for name, reference in expected.items():
+        assert array_stats.rhat(reference, chain_axis=0, draw_axis=1) < 1.01, name
+        effective = float(array_stats.ess(reference, chain_axis=0, draw_axis=1))
+        error = np.std(reference) * np.sqrt(1.0 / effective + 1.0 / found.convergence.ess_min)
+        shift, wider = np.mean(seen[name]) - np.mean(reference), np.std(seen[name]) / np.std(reference) - 1.0
+        off = shift / np.std(reference)
+        print(f"{count} fingers, {name}: off by {off:+.3f} sd, {wider:+.1%} wider, {effective:,.0f} effective draws")
+        assert abs(shift) < 4.0 * error + found.off * np.std(reference), name
+        assert wider == pytest.approx(0.0, abs=0.05), name
+
+
+@pytest.fixture(scope="module")
+def eight(tmp_path_factory) -> dict:
+    """What the command prints for ngspice's eight fingers, with V, Vsc and I."""
+    folder = tmp_path_factory.mktemp("population")
+    scene = folder / "scene.toml"
+    scene.write_text(
+        '[device]\nCi = "1.35 nF"\n[drive]\nwaveform = "trapezoid"\nrise_time = "50 us"\n'
+        '[measurement]\nchannels = ["Vsc", "I"]\n[prior]\nCi = {relative_sd = 0.1}\n'
+    )
+    command = [sys.executable, "-c", "from fitact.cli import main; main()", "population"]
+    command += [*map(str, sorted(FINGERS.glob("*.csv.gz"))), "--scene", str(scene), "--seed", "1", "--json"]
+    done = subprocess.run([*command, "--out", str(folder / "out")], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in (folder / "out").iterdir()} == {"population.json", "population.svg"}
+    assert json.loads((folder / "out" / "population.json").read_text()) == json.loads(done.stdout)
+    return json.loads(done.stdout)
+
+
+@pytest.mark.slow
+def test_eight_fingers_and_their_panel(eight):
+    truth = json.loads((FINGERS / "truth.json").read_text())
+    for name in ("Rsc", "Csc"):
+        logs = np.log([finger[name] for finger in truth])
+        law = eight["population"][name]
+        assert law["median"]["q025"] < np.exp(np.mean(logs)) < law["median"]["q975"]
+        assert law["log_sd"]["q025"] < np.std(logs, ddof=1) < law["log_sd"]["q975"]
+    assert eight["population"]["Ci"]["mean"] == pytest.approx(1.42e-9, rel=5e-3)
+    assert eight["population"]["Ci"]["sd"] < 1e-5 * 1.42e-9
+    assert set(eight["variance_shares"]["force_mean"]) == {"Rsc", "Csc", "Ci"}
+    assert set(eight["new_finger"]["force_mean"]["variance"]) == {"people", "ignorance"}
+    assert eight["warnings"] == []
