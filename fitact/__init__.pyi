@@ -1,4 +1,5 @@
 from .data.formats import read
+from .data.inspection import Inspection, inspect
 from .data.record import Record
 from .errors import InputError
 from .inference.fit import Fit, fit
@@ -32,6 +33,7 @@ __all__ = [
     "Fit",
     "Fractional",
     "InputError",
+    "Inspection",
     "LogNormal",
     "LogUniform",
     "Multitone",
@@ -58,6 +60,7 @@ __all__ = [
     "friction",
     "harmonic_error",
     "harmonic_response",
+    "inspect",
     "mean_force",
     "mean_square",
     "measure_tradeoff",

@@ -104,7 +104,7 @@ def _read_scope(path: Path, source: str, pick: Pick) -> Capture:
             np.asarray(channel.volts, dtype=float),
             unit.get(channel.unit.name, ""),
             unit.get(channel.unit.name, channel.unit.name),
-            float(channel.probe_value),
+            float(channel.probe_value) if channel.probe_value != 1.0 else None,  # 1 is also what is not known
         )
         for name, channel in zip(names, wfm.channels, strict=True)
         if name in wanted
@@ -170,6 +170,7 @@ def _read_hdf5(path: Path, source: str, pick: Pick) -> Capture:
 
     contents = _Contents("HDF5")
     with h5py.File(path, "r") as file:
+
         def visit(name: str, item: Any) -> None:
             for key, value in item.attrs.items():
                 contents.add(key, value)
@@ -188,7 +189,9 @@ def _capture(contents: _Contents, source: str, pick: Pick) -> Capture:
     if any(array.dtype.kind == "c" for array in arrays.values()):
         raise InputError(f"{source}: holds complex numbers (IQ data), not voltages in time; export those")
     last = {name: name.rpartition("/")[2] for name in arrays}
-    timed = [name for wanted in ("time", *sorted(layouts.TIME_NAMES)) for name in arrays if last[name].lower() == wanted]
+    timed = [
+        name for wanted in ("time", *sorted(layouts.TIME_NAMES)) for name in arrays if last[name].lower() == wanted
+    ]
     others = [name for name in arrays if not timed or name != timed[0]]
     short = [last[name] for name in others]
     names = others if len(set(short)) < len(short) else short

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from fitact.data.layouts import same_channel
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.errors import InputError
+from fitact.units import engineering
 
 Pick = Callable[[list[str], str], Iterable[str]]  # of the names found, and their place, those that are wanted
 
@@ -77,6 +78,12 @@ def resolve(names: list[str], channels: Mapping[str, str], source: str, place: s
     return known
 
 
+def is_mapped(capture: Capture) -> bool:
+    """Whether the file's own names say which channel is which."""
+    known = [name.lower() for name in CHANNEL_UNITS]
+    return any(trace.name.lower() in known for trace in capture.traces)
+
+
 def to_record(capture: Capture, channels: Mapping[str, str], scale: Mapping[str, float]) -> Record:
     """The record that the stated channels and factors make of a capture.
 
@@ -87,7 +94,9 @@ def to_record(capture: Capture, channels: Mapping[str, str], scale: Mapping[str,
         if channel not in CHANNEL_UNITS:
             raise InputError(f"{capture.source}: '{channel}' is no channel of fitact; scale {', '.join(CHANNEL_UNITS)}")
         if not math.isfinite(factor) or factor == 0.0:
-            raise InputError(f"{capture.source}: the scale {factor} of {channel} is no factor; give a number such as 10")
+            raise InputError(
+                f"{capture.source}: the scale {factor} of {channel} is no factor; give a number such as 10"
+            )
     names = [trace.name for trace in capture.traces]
     known = resolve(names, channels, capture.source, capture.traces[0].place if capture.traces else "")
     unused = sorted(set(scale) - set(known))
@@ -98,13 +107,15 @@ def to_record(capture: Capture, channels: Mapping[str, str], scale: Mapping[str,
         trace = capture.traces[names.index(name)]
         _check_unit(trace, channel, channel in scale, capture.source)
         arrays[channel] = trace.values * scale.get(channel, 1.0)
-        notes += _assumed(trace, channel, scale.get(channel), capture.source)
-    unused = [*(name for name in names if name not in known.values()), *capture.others]
-    if unused:
-        notes.append(f"{capture.source}: not used: {', '.join(unused)}")
-    return Record.from_arrays(
-        capture.time, **arrays, source=capture.source, notes=tuple(notes), where=capture.where
-    )
+        if channels or scale:
+            notes.append(f"{capture.source}: {_assumed(trace, channel, scale.get(channel, 1.0))}")
+    if channels or scale:
+        first = engineering(float(capture.time[0]), "s") if capture.time.size else "nowhere"
+        notes.append(f"{capture.source}: the time is the file's own ({capture.format}), from {first}")
+    unread = [*(name for name in names if name not in known.values()), *capture.others]
+    if unread:
+        notes.append(f"{capture.source}: not used: {', '.join(unread)}")
+    return Record.from_arrays(capture.time, **arrays, source=capture.source, notes=tuple(notes), where=capture.where)
 
 
 def _named(asked: str, names: list[str], source: str) -> str:
@@ -129,16 +140,11 @@ def _check_unit(trace: Trace, channel: str, scaled: bool, source: str) -> None:
         )
 
 
-def _assumed(trace: Trace, channel: str, factor: float | None, source: str) -> list[str]:
-    """In sentences; nothing where the file's own names and SI units say it all."""
-    wanted = CHANNEL_UNITS[channel]
-    said = []
-    if trace.name.lower() != channel.lower() or factor is not None:
-        stated = f"; the file states an attenuation of {trace.attenuation:g}" if trace.attenuation else ""
-        said.append(f"{source}: {channel} is '{trace.name}' times {factor or 1.0:g}{stated}")
-    if not trace.written and trace.name.lower() != channel.lower():
-        said.append(f"{source}: the file states no unit of '{trace.name}'; {wanted} was assumed")
-    return said
+def _assumed(trace: Trace, channel: str, factor: float) -> str:
+    """What stands behind the numbers of a channel, in a sentence."""
+    unit = f"in {trace.written}" if trace.written else f"no unit stated, {CHANNEL_UNITS[channel]} assumed"
+    probe = "no attenuation stated" if trace.attenuation is None else f"attenuation {trace.attenuation:g} as stated"
+    return f"{channel} is '{trace.name}' ({unit}; {probe}) times {factor:g}"
 
 
 def _pairs(known: Mapping[str, str]) -> str:

@@ -62,30 +62,31 @@ class Header:
     place: str
 
 
-def read_header(text: str, source: str) -> Header:
-    """The header of a file that begins with `text`.
+def read_header(text: str, source: str, companion: str = "") -> Header:
+    """The header of a file that begins with `text`; `companion` is one kept in a file of its own, as `key:value` lines.
 
     Raises:
         InputError: there are no numbers, no time, or several segments.
     """
-    sheet = _Sheet.of(text, source)
+    sheet = _Sheet.of(text, companion, source)
     if not sheet.numeric:
         raise InputError(
             f"{source}: there are no rows of numbers; expected a header such as {_EXAMPLE}, and rows of numbers"
         )
-    segments = sheet.quantity(layouts.SEGMENT_KEYS)
-    if segments is not None and segments > 1.0:
-        raise InputError(f"{source}: holds {segments:g} segments; export one of them")
+    segments = sheet.values(layouts.SEGMENT_KEYS)[:1]
+    if segments and (number(segments[0], sheet.decimal_comma) or 1.0) > 1.0:
+        raise InputError(f"{source}: holds {segments[0]} segments; export one of them")
     top = sheet.names or sheet.units or sheet.below[0]
     start, step = sheet.grid()
     columns = sheet.columns()
-    time = sheet.time(columns, step)
+    time = sheet.time(columns)
     index = next((c.place for c in columns if sheet.is_index(c)), None)
     if time is None and step is None:
         found = ", ".join(sheet.names.cells) if sheet.names else "no header"
         raise InputError(
             f"{source}, line {top.number}: no column time_s, nor another of time (found: {found[:200]}); name the"
-            f" columns as in {_EXAMPLE}, or export the time as well"
+            f" columns as in {_EXAMPLE}, or export the time as well (Rohde & Schwarz keep that of NAME.Wfm.csv in"
+            " NAME.csv beside it)"
         )
     named = sheet.names.cells[: sheet.width] if sheet.names else []
     count = sheet.quantity(layouts.COUNT_KEYS)
@@ -97,8 +98,12 @@ def read_header(text: str, source: str) -> Header:
         width=sheet.width,
         time=time,
         index=index,
-        columns=tuple(c for c in columns if c is not time and c.place != index),
-        others=tuple(c for i, c in enumerate(named) if i not in sheet.numeric and layouts.key(c) not in layouts.GRID_KEYS),
+        columns=sheet.completed([c for c in columns if c.place not in (index, time.place if time else None)]),
+        others=tuple(
+            c
+            for i, c in enumerate(named)
+            if i not in sheet.numeric and layouts.key(c.partition("=")[0]) not in layouts.GRID_KEYS
+        ),
         start=start,
         step=step,
         count=int(count) if count is not None and count < 1e12 else None,
@@ -135,7 +140,7 @@ class _Sheet:
     source: str
 
     @classmethod
-    def of(cls, text: str, source: str) -> "_Sheet":
+    def of(cls, text: str, companion: str, source: str) -> "_Sheet":
         lines = [(n, line.strip(" \r\f\v")) for n, line in enumerate(text.split("\n"), start=1)]
         delimiter, decimal_comma = _delimiter([line for _, line in lines if line and not line.startswith("#")])
         rows = [Line(n, cells_of(line, delimiter)) for n, line in lines if line.strip(delimiter + " ")]
@@ -148,12 +153,16 @@ class _Sheet:
         numeric = patterns.most_common(1)[0][0] if patterns else frozenset()
         full = [numeric <= p for p in places]
         first = next((i for i, here in enumerate(full) if here and all(full[i : i + 2])), len(full))
-        while first and places[first - 1] and len("".join(data[first - 1].cells)) == sum(
-            len(data[first - 1].cells[i]) for i in places[first - 1] & numeric
+        while (
+            first
+            and places[first - 1]
+            and len("".join(data[first - 1].cells))
+            == sum(len(data[first - 1].cells[i]) for i in places[first - 1] & numeric)
         ):
             first -= 1  # a row with a time and no values yet
         end = data[first].number if first < len(data) else len(lines)
         comments = [row for row in rows if row.cells[0].startswith("#") and row.number < end]
+        comments += [Line(0, line.split(":")) for line in companion.splitlines()]
         return cls(delimiter, decimal_comma, comments, data[:first], data[first:], numeric, source)
 
     @functools.cached_property
@@ -196,7 +205,7 @@ class _Sheet:
         rows = [row for row in self.above if len(row.cells) > max(self.numeric) and row is not self.units]
         if rows and self._is_names(rows[-1]):
             return rows[-1]
-        if self.comments and not self.units:
+        if self.comments and self.comments[-1].number and not self.units:
             cells = cells_of(self.delimiter.join(self.comments[-1].cells).lstrip("# "), self.delimiter)
             row = Line(self.comments[-1].number, cells)
             if len(cells) == self.width and self._is_names(row):
@@ -237,26 +246,29 @@ class _Sheet:
         return find(layouts.START_KEYS), step if step is not None and 0.0 < step < float("inf") else None
 
     def columns(self) -> list[Column]:
-        """Those of numbers, with names and units from wherever the header has them."""
-        places = sorted(self.numeric)
-        cells = [self.names.cells[i] if self.names else "" for i in places]
-        below = [self.units.cells[i] if self.units else "" for i in places]
-        names = [layouts.name_and_unit(cell)[0] for cell in cells]
-        values = names[1:]
-        if "" in values or len(set(values)) < len(values):
-            names[1:] = self._names_elsewhere(len(values)) or [f"column {place + 1}" for place in places[1:]]
-        units = [self._unit(*pair) for pair in zip(cells, below, strict=True)]
-        elsewhere = self.values(layouts.UNIT_KEYS)
-        probes = [self._quantity(text) for text in self.values(layouts.ATTENUATION_KEYS)]
+        """Those of numbers, with the names and units above them."""
         made = []
-        for i, (place, name, unit) in enumerate(zip(places, names, units, strict=True)):
-            if not unit and i and elsewhere:
-                unit = re.sub(r".*:", "", elsewhere[min(i, len(elsewhere)) - 1])
-            if not unit and not i:
-                unit = next(iter(self.values(layouts.TIME_UNIT_KEYS)), "")
-            probe = probes[i - 1] if 0 < i <= len(probes) else None
-            made.append(Column(place, name, unit.strip("()[] "), probe))
+        for place in sorted(self.numeric):
+            cell, below = (row.cells[place] if row else "" for row in (self.names, self.units))
+            made.append(Column(place, layouts.name_and_unit(cell)[0], self._unit(cell, below)))
         return made
+
+    def completed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
+        """Columns of values, with the names and units that the header states elsewhere."""
+        names = [column.name for column in columns]
+        if "" in names or (len(set(names)) < len(names) and not any(layouts.is_contract(name) for name in names)):
+            names = self._names_elsewhere(len(names)) or [f"column {column.place + 1}" for column in columns]
+        units = [re.sub(r".*:", "", text) for text in self.values(layouts.UNIT_KEYS)] or [""]
+        probes = [self._quantity(text) for text in self.values(layouts.ATTENUATION_KEYS)]
+        return tuple(
+            Column(
+                column.place,
+                names[i],
+                column.unit or units[min(i, len(units) - 1)],
+                probes[i] if i < len(probes) else None,
+            )
+            for i, column in enumerate(columns)
+        )
 
     def _unit(self, cell: str, below: str) -> str:
         """In the name, or in the row of units."""
@@ -281,7 +293,7 @@ class _Sheet:
         below = self.units.cells[column.place] if self.units else ""
         return below.lower() in layouts.INDEX_NAMES or column.name.lower() in layouts.INDEX_NAMES
 
-    def time(self, columns: Sequence[Column], step: float | None) -> Column | None:
+    def time(self, columns: Sequence[Column]) -> Column | None:
         """By name, by unit, or because it stands first beside a header."""
         able = [c for c in columns if not self.is_index(c)]
         for fits in (
@@ -291,13 +303,19 @@ class _Sheet:
         ):
             found = [c for c in able if fits(c)]
             if found:
-                return found[0]
+                return self._timed(found[0])
         beside = not self.names and not self.units and min(self.numeric) > 1 and self.values(layouts.TIME_UNIT_KEYS)
-        return able[0] if beside and len(able) > 1 else None
+        return self._timed(able[0]) if beside and len(able) > 1 else None
+
+    def _timed(self, column: Column) -> Column:
+        """With the unit that the header states elsewhere."""
+        elsewhere = next(iter(self.values(layouts.TIME_UNIT_KEYS)), "")
+        return dataclasses.replace(column, unit=column.unit or elsewhere)
 
 
 def _delimiter(lines: Sequence[str]) -> tuple[str, bool]:
-    """What parts most lines into two numbers or more, and whether their decimals stand after a comma."""
+    """What parts most lines, from the middle on, into two numbers or more, and whether a comma marks the decimals."""
+    lines = lines[len(lines) // 2 :]
     for delimiter in (";", "\t", ",", " "):
         rows = [cells_of(line, delimiter) for line in lines]
         comma = delimiter in ";\t" and any(_DECIMAL_COMMA.fullmatch(cell) for cells in rows for cell in cells)

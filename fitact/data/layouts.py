@@ -7,7 +7,7 @@ MAKERS: tuple[tuple[str, re.Pattern[str]], ...] = tuple(
     (maker, re.compile(mark, re.IGNORECASE | re.MULTILINE))
     for maker, mark in (
         ("fitact", r"^\W*time_\w+[,;\t]|[,;\t]time_\w+"),
-        ("Siglent", r"^Record Length,\s*Analog:|^Model Number,\s*SD[SX]"),
+        ("Siglent", r"^(?:Record Length|Sample Interval),\s*Analog:|^Model Number,\s*SD[SX]"),
         ("Tektronix TDS", r"^Record Length,[^,\n]*,.*,\s*-?[\d.]+"),
         ("Tektronix", r"^Waveform Type,|^Sample Interval,.*\n(?:.*\n)*TIME,"),
         ("LeCroy", r"^LECROY"),
@@ -20,18 +20,25 @@ MAKERS: tuple[tuple[str, re.Pattern[str]], ...] = tuple(
     )
 )
 
-TIME_NAMES = frozenset(
-    "time t x x-axis x_value xvalue seconds second timestamp source zeit temps tiempo tempo tijd czas".split()
-)
-INDEX_NAMES = frozenset("sample samples index sequence nr no n point row".split())
+TIME_NAMES = frozenset((
+    "time", "t", "x", "x-axis", "x_value", "xvalue", "s", "second", "seconds", "timestamp", "source",
+    "zeit", "temps", "tiempo", "tempo", "tijd", "czas",
+))  # fmt: skip
+INDEX_NAMES = frozenset(["sample", "samples", "index", "sequence", "nr", "no", "n", "point", "row"])
 # what stands in a row of units although it is none, or one of another kind
-NOT_UNITS = frozenset(["", "sequence", "value", *"ohm w watt hz khz db dbm pa n % °c unknown none u deg".split()])
+NOT_UNITS = frozenset((
+    "", "sequence", "value", "none", "unknown", "ohm", "w", "watt", "hz", "khz", "db", "dbm", "pa", "n", "%", "°c",
+    "deg", "u",
+))  # fmt: skip
 
 # keys of a header, in small letters without blanks or punctuation
-COUNT_KEYS = ("recordlength", "numberofdatapoints", "segmentsize", "samples")
-STEP_KEYS = ("sampleinterval", "increment", "tinc", "timestep", "dt", "tinterval", "xinc", "xincrement", "wfincrement")
+COUNT_KEYS = ("signalhardwarerecordlength", "recordlength", "numberofdatapoints", "segmentsize", "samples")
+STEP_KEYS = (
+    *("sampleinterval", "increment", "tinc", "timestep", "dt", "tinterval", "xinc", "xincrement", "wfincrement"),
+    *("signalresolution", "resolution"),
+)
 RATE_KEYS = ("samplerate", "samplingrate", "fs", "rate", "samplefrequency", "samplingfrequency")
-START_KEYS = ("start", "t0", "tstart", "xorg", "xorigin", "starttime", "wfstartoffset")
+START_KEYS = (*("start", "t0", "tstart", "xorg", "xorigin", "starttime", "wfstartoffset", "hardwarexstart", "xstart"),)
 GRID_KEYS = frozenset(("", *START_KEYS, *STEP_KEYS))
 NAME_KEYS = ("source", "channeldata", "label")
 UNIT_KEYS = ("verticalunits", "verticalunit")
@@ -89,6 +96,11 @@ def name_and_unit(cell: str) -> tuple[str, str]:
 def same_channel(asked: str, name: str) -> bool:
     """Whether both mean one channel: "CH2", "Channel 2", "Chan 2" and Keysight's "2" do."""
     return _channel(asked) == _channel(name)
+
+
+def is_contract(name: str) -> bool:
+    """Whether a column's name is fitact's own."""
+    return _CONTRACT.fullmatch(name) is not None
 
 
 def _channel(name: str) -> str:

@@ -1,13 +1,14 @@
 """Text files: a header in its maker's words, then rows of numbers, read a block at a time."""
 
 import bisect
+import contextlib
 import gzip
 import io
 import re
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import IO
+from typing import IO, cast
 
 import numpy as np
 
@@ -29,11 +30,11 @@ def read_text(path: Path, source: str, pick: Pick) -> Capture:
         InputError: it cannot be read, has no header or time, or a row is broken; names the line.
     """
     try:
-        with _opened(path, source) as stream:
+        with _opened(path) as stream:
             head = stream.read(_HEAD)
             stream.seek(0)
             text = _decoded(head, source)
-            header = read_header(text if len(head) < _HEAD else text.rpartition("\n")[0], source)
+            header = read_header(text if len(head) < _HEAD else text.rpartition("\n")[0], source, _companion(path))
             wanted = set(pick([column.name for column in header.columns], header.place))
             table = _Table(header, [column for column in header.columns if column.name in wanted], source)
             for block in _blocks(stream, source):
@@ -53,20 +54,31 @@ def _is_utf16(head: bytes) -> bool:
     return head[:2] in (b"\xff\xfe", b"\xfe\xff")
 
 
-def _opened(path: Path, source: str) -> IO[bytes]:
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[IO[bytes]]:
     """The bytes of the text, as UTF-8 or a superset of ASCII, with lines that end in a line feed."""
     with path.open("rb") as file:
         packed = file.read(2) == b"\x1f\x8b"
-    stream: IO[bytes] = gzip.open(path) if packed else path.open("rb")
-    head = stream.read(_HEAD)
-    stream.seek(0)
-    old = b"\r" in head and b"\n" not in head
-    if not (old or _is_utf16(head)):
-        return stream
-    with stream:
-        content = stream.read(_MOST)
-    text = content.decode("utf-16" if _is_utf16(head) else "latin-1", errors="replace")
-    return io.BytesIO((text.replace("\r", "\n") if old else text).encode())
+        file.seek(0)
+        stream = cast(IO[bytes], gzip.GzipFile(fileobj=file) if packed else file)
+        head = stream.read(_HEAD)
+        stream.seek(0)
+        old = b"\r" in head and b"\n" not in head
+        if old or _is_utf16(head):
+            text = stream.read(_MOST).decode("utf-16" if _is_utf16(head) else "latin-1", errors="replace")
+            stream = io.BytesIO((text.replace("\r", "\n") if old else text).encode())
+        yield stream
+
+
+def _companion(path: Path) -> str:
+    """The header that Rohde & Schwarz keep in NAME.csv for the numbers in NAME.Wfm.csv, or nothing."""
+    if not path.name.lower().endswith(".wfm.csv"):
+        return ""
+    header = path.with_name(path.name[: -len(".wfm.csv")] + path.name[-4:])
+    if not header.is_file():
+        return ""
+    with header.open("rb") as file:
+        return file.read(_HEAD).decode("latin-1")
 
 
 def _decoded(head: bytes, source: str) -> str:
@@ -153,7 +165,8 @@ class _Table:
 
     def _careful(self, block: bytes, first: int) -> tuple[np.ndarray, list[int]]:
         """Line by line, to find the offending cell or to pass over lines that hold nothing."""
-        rows, lines = [], []
+        rows: list[list[float]] = []
+        lines: list[int] = []
         delimiter = self._header.delimiter
         for line, text in enumerate(block.decode("utf-8", errors="replace").split("\n"), start=first):
             if not text.strip(delimiter + " ") or text.startswith("#"):
@@ -188,8 +201,8 @@ class _Table:
         header, rows = self._header, self._starts[-1]
         if header.count is not None and rows < header.count - _OFF:
             raise InputError(
-                f"{self._source}: the header announces {header.count:,} rows and {rows:,} are there, so the file was cut;"
-                " export it again"
+                f"{self._source}: the header announces {header.count:,} rows and {rows:,} are there, so the file"
+                " was cut; export it again"
             )
         kept, notes = self._filled(rows)
         columns = [np.concatenate([part[:, i] for part in self._parts])[kept] for i in range(len(self._places))]
@@ -230,7 +243,7 @@ class _Table:
                 raise InputError(
                     f"{self._source}{header.place}: '{header.time.unit}' is no unit of time; write a multiple of s"
                 )
-            stated = header.time.unit or header.time.name.lower() == "time" and header.maker == "fitact"
+            stated = header.time.unit or (header.time.name.lower() == "time" and header.maker == "fitact")
             notes = [] if stated else [f"{self._source}: the file states no unit of time; seconds were assumed"]
             return time * (unit[1] if unit else 1.0), notes
         if header.step is None:
