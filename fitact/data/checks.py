@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.data.clipping import clipped
-from fitact.data.record import OVERFLOW, is_uniform
+from fitact.data.record import OVERFLOW, is_uniform, rounding_noise
 from fitact.units import engineering
 
 _ROUNDED = 1e-6  # of a step: off an even grid by more, time was rounded
@@ -18,7 +18,7 @@ _HUM_SHARE = 0.01  # of the channel's range: hum worth a word
 _DRIFT_SHARE = 0.02  # of the channel's range, over the record
 _CERTAIN = 6.0  # standard errors
 _LARGE = {"V": 5e3, "A": 0.1}  # beyond what drives a touch display
-_DIVIDERS = (2e-3, 0.5)  # Vsc over V: below, a probe's attenuation may be missing; from 1/2 on, no circuit does it
+_DIVIDERS = (2e-2, 0.5)  # Vsc over V: below, a probe's attenuation may be missing; from 1/2 on, no circuit does it
 _MINIMUM = 3  # samples that a check can say anything about
 
 Samples = Float[np.ndarray, " samples"]
@@ -60,6 +60,8 @@ def check_channel(name: str, unit: str, time: Samples, values: Samples, frequenc
             f"{name} is clipped at {railed:,} samples ({values.min():.4g} to {values.max():.4g}): the oscilloscope's"
             " range or the amplifier is exceeded"
         )
+    if rounding_noise(values) > 0.0:
+        found.append(f"{name} is rounded to steps wider than its noise; record with a finer range")
     largest = float(np.max(np.abs(values)))
     if largest > _LARGE.get(unit, math.inf):
         found.append(
@@ -76,7 +78,11 @@ def check_divider(channels: Mapping[str, Samples]) -> list[str]:
     ratio = float(np.ptp(channels["Vsc"]) / np.ptp(channels["V"]))
     if _DIVIDERS[0] <= ratio < _DIVIDERS[1]:
         return []
-    doubt = "a 10x probe read as 1x (--scale Vsc=10)" if ratio < _DIVIDERS[0] else "swapped columns or a wrong unit"
+    doubt = (
+        "a 10x probe read as 1x (--scale Vsc=10), or a wet finger"
+        if ratio < _DIVIDERS[0]
+        else "swapped columns or a wrong unit"
+    )
     return [f"Vsc spans {ratio:.3g} times V, which suggests {doubt}"]
 
 

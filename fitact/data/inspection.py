@@ -22,7 +22,7 @@ _ENOUGH = 2_097_152  # samples from which the frequency of a long record is foun
 
 @dataclasses.dataclass(frozen=True)
 class Channel:
-    """One channel in its SI unit ("" where none is stated), its noise's standard deviation, and how often it is clipped."""
+    """One channel in its SI unit ("" where none is stated), the standard deviation of its noise, samples clipped."""
 
     name: str
     unit: str

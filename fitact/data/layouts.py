@@ -6,10 +6,10 @@ import re
 MAKERS: tuple[tuple[str, re.Pattern[str]], ...] = tuple(
     (maker, re.compile(mark, re.IGNORECASE | re.MULTILINE))
     for maker, mark in (
-        ("fitact", r"^\W*time_\w+[,;\t]|[,;\t]time_\w+"),
+        ("fitact", r"^\W*time_\w+\W|[,;\t ]time_\w+"),
         ("Siglent", r"^(?:Record Length|Sample Interval),\s*Analog:|^Model Number,\s*SD[SX]"),
         ("Tektronix TDS", r"^Record Length,[^,\n]*,.*,\s*-?[\d.]+"),
-        ("Tektronix", r"^Waveform Type,|^Sample Interval,.*\n(?:.*\n)*TIME,"),
+        ("Tektronix", r"^Waveform Type,|^TIME,(?:CH|REF|MATH)\d"),
         ("LeCroy", r"^LECROY"),
         ("Digilent WaveForms", r"^#\s*Digilent"),
         ("Rigol", r"Start,Increment|^\"?Number of Data points|^X,CH\d|^,CH\d|\bt(?:0|Inc) ="),

@@ -17,7 +17,7 @@ from fitact.data.capture import Capture, Pick, Trace
 from fitact.data.header import Column, Header, cells_of, number, read_header
 from fitact.errors import InputError
 
-_HEAD = 131_072  # bytes that hold any header and some rows
+_HEAD = 32_768  # bytes that hold any header and some rows
 _BLOCK = 8_388_608  # bytes parsed at a time
 _MOST = 4_294_967_296  # bytes of text, beyond which it is no record but what a broken gzip unfolds to
 _OFF = 2  # rows by which a header's count may be off
@@ -231,7 +231,7 @@ class _Table:
             where = self._line(inside[0]) if inside else "all rows"
             raise InputError(f"{self._source}, {where}: the cells of the channels are empty; mend or remove the row")
         left = rows - (last + 1 - first)
-        notes = [f"{self._source}: {left:,} rows without values at the ends were passed over"] if left else []
+        notes = [f"{self._source}: rows without values at the ends were passed over ({left:,})"] if left else []
         return slice(first, last + 1), notes
 
     def _timed(self, time: np.ndarray) -> tuple[np.ndarray, list[str]]:
