@@ -147,7 +147,7 @@ KINDS: dict[str, tuple] = {
     ),
     "arrays of different lengths": ("refused", as_npz, "'Vsc' has 3,993 samples and the time 4,000"),
     "rows without values inside": ("refused", line(102, emptied), "line 102: the cells"),
-    "rows without values at the ends": ("warned", line(2, emptied), "rows without values at the ends were passed over (1)"),
+    "rows without values at the ends": ("warned", line(2, emptied), "were passed over (1)"),
     "comments, blank rows, trailing commas": (
         "read", lines(lambda all_: ["# by hand", *(f"{x}," for x in all_), "", ",,,"]), "",
     ),

@@ -8,10 +8,11 @@ import contextlib
 import dataclasses
 import importlib
 import io
+import logging
 import re
 import types
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +117,8 @@ def _read_scope(path: Path, source: str, pick: Pick) -> Capture:
 
 
 def _read_tdms(path: Path, source: str, pick: Pick) -> Capture:
-    with _import("nptdms", "tdms", source).TdmsFile.open(path) as file:
+    nptdms = _import("nptdms", "tdms", source)
+    with _complaints("nptdms") as said, nptdms.TdmsFile.open(path) as file:
         channels = {channel.name: channel for group in file.groups() for channel in group.channels()}
         many = [f"{group.name}/{channel.name}" for group in file.groups() for channel in group.channels()]
         if len(many) > len(channels):  # one name in several groups
@@ -131,6 +133,8 @@ def _read_tdms(path: Path, source: str, pick: Pick) -> Capture:
         if len(times) == len(contents.arrays) and times:
             _check_one_grid(times, list(contents.arrays), source)
             contents.add("time", times[0], "s")
+    if said:  # of a cut file nptdms reads what is left
+        raise InputError(f"{source}: was cut or is broken ({said[0][:120]}); export the record again")
     return _capture(contents, source, pick)
 
 
@@ -243,6 +247,23 @@ def _trace(name: str, values: np.ndarray, written: str) -> Trace:
     unit = layouts.unit(written)
     values = values.astype(float)
     return Trace(column, values * unit[1] if unit else values, unit[0] if unit else "", written)
+
+
+@contextlib.contextmanager
+def _complaints(library: str) -> Iterator[list[str]]:
+    """What a library would log."""
+    said: list[str] = []
+    handler = logging.Handler()
+    handler.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
+    logs = [logging.getLogger(name) for name in logging.root.manager.loggerDict if name.startswith(library)]
+    before = [(log, log.propagate, log.handlers) for log in logs]
+    for log in logs:
+        log.propagate, log.handlers = False, [handler]
+    try:
+        yield said
+    finally:
+        for log, propagate, handlers in before:
+            log.propagate, log.handlers = propagate, handlers
 
 
 def _check_one_grid(times: Sequence[np.ndarray], names: Sequence[str], source: str) -> None:

@@ -152,7 +152,9 @@ class _Sheet:
         patterns = collections.Counter(p for p in places[len(places) // 2 :] if p)
         numeric = patterns.most_common(1)[0][0] if patterns else frozenset()
         full = [numeric <= p for p in places]
-        first = next((i for i, here in enumerate(full) if here and all(full[i : i + 2])), len(full))
+        first = next((i for i, here in enumerate(full) if here and all(full[i : i + 2])), None)
+        if first is None:  # not two in a row
+            first = full.index(True) if numeric else len(full)
         while (
             first
             and places[first - 1]

@@ -13,7 +13,15 @@ from fitact.data.capture import Capture, is_mapped, to_record
 from fitact.data.checks import check_channel, check_divider, check_time
 from fitact.data.clipping import clipped
 from fitact.data.formats import read_capture
-from fitact.data.record import CHANNEL_UNITS, fundamental, grid_notes, rounding_noise, white_noise
+from fitact.data.record import (
+    CHANNEL_UNITS,
+    MINIMUM_SAMPLES,
+    OVERFLOW,
+    fundamental,
+    grid_notes,
+    rounding_noise,
+    white_noise,
+)
 from fitact.errors import InputError
 from fitact.units import engineering
 
@@ -139,17 +147,22 @@ def _looked_at(
 
 
 def _channel(name: str, unit: str, values: Float[np.ndarray, " samples"]) -> Channel:
-    if values.size < 5 or not np.all(np.isfinite(values)) or np.ptp(values) == 0.0:
-        return Channel(name, unit, values, math.nan if values.size < 5 else 0.0, 0)
+    if values.size < MINIMUM_SAMPLES or not _is_signal(values):
+        return Channel(name, unit, values, math.nan, 0)
     railed = clipped(values)
     free = values if railed.all() else values[~railed]
     noise = math.hypot(white_noise(free), rounding_noise(free)) if free.size > 4 and np.ptp(free) else 0.0
     return Channel(name, unit, values, noise, int(np.count_nonzero(railed)))
 
 
+def _is_signal(values: Float[np.ndarray, " samples"]) -> bool:
+    """Whether there is anything to judge: finite numbers that vary."""
+    return bool(np.all(np.abs(values) < OVERFLOW) and np.ptp(values) > 0.0)
+
+
 def _frequency(time: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"]) -> float | None:
     """From a part of a long record, or from each n-th sample of it."""
-    if time.size < 20 or not np.all(np.isfinite(values)) or np.ptp(values) == 0.0:
+    if time.size < MINIMUM_SAMPLES or not _is_signal(values):
         return None
     whole = fundamental(time[:_ENOUGH], values[:_ENOUGH])
     if whole is None and time.size > _ENOUGH:
