@@ -19,7 +19,6 @@ _DRIFT_SHARE = 0.02  # of the channel's range, over the record
 _CERTAIN = 6.0  # standard errors
 _LARGE = {"V": 5e3, "A": 0.1}  # beyond what drives a touch display
 _DIVIDERS = (2e-2, 0.5)  # Vsc over V: below, a probe's attenuation may be missing; from 1/2 on, no circuit does it
-_MINIMUM = 3  # samples that a check can say anything about
 
 Samples = Float[np.ndarray, " samples"]
 
@@ -87,24 +86,24 @@ def check_divider(channels: Mapping[str, Samples]) -> list[str]:
 
 
 def _slow(time: Samples, values: Samples, spread: float, frequency: float | None) -> Iterator[str]:
-    """Hum and drift beside a periodic signal, judged on the means of its periods and on a line of the spectrum."""
+    """Hum and drift beside a periodic signal: by a line of the spectrum, and by the means of the periods."""
     span = float(time[-1] - time[0])
     if frequency is None or not is_uniform(time) or span * frequency < 3.0:
         return
+    for mains in _MAINS:
+        harmonic = abs(mains / frequency - round(mains / frequency)) * frequency * span < 2.0
+        if span * mains < _HUM_PERIODS or harmonic:
+            continue  # too short to tell, or of the signal itself
+        line = _line(time, values, mains)
+        beside = max(abs(_line(time, values, mains + away / span)) for away in (-3.0, 3.0))
+        if abs(line) > max(_HUM_SHARE * spread, 3.0 * beside):
+            yield f"holds {mains:.0f} Hz of {abs(line):.3g}: mains hum; the fit frees it where the data ask for it"
+            values = values - np.real(line * np.exp(2j * np.pi * mains * time))
     step = span / (time.size - 1)
     means, centres = _period_means(values, 1.0 / (frequency * step))
-    if means.size >= _MINIMUM:
-        slope, error = _slope(centres * step, means)
-        if abs(slope * span) > _DRIFT_SHARE * spread and abs(slope) > _CERTAIN * error:
-            yield f"drifts by {slope * span:.3g} over the record; the fit frees a drift where the data ask for one"
-    for mains in _MAINS:
-        ratio = mains / frequency
-        if span * mains < _HUM_PERIODS or abs(ratio - round(ratio)) * frequency * span < 2.0:
-            continue  # too short to tell, or a harmonic of the signal itself
-        size = _amplitude(time, values, mains)
-        beside = max(_amplitude(time, values, mains + side * 2.0 / span) for side in (-1.5, 1.5))
-        if size > _HUM_SHARE * spread and size > 3.0 * beside:
-            yield f"holds {mains:.0f} Hz of {size:.3g}: mains hum; the fit frees it where the data ask for it"
+    slope, error = _slope(centres * step, means)
+    if abs(slope * span) > _DRIFT_SHARE * spread and abs(slope) > _CERTAIN * error:
+        yield f"drifts by {slope * span:.3g} over the record; the fit frees a drift where the data ask for one"
 
 
 def _period_means(values: Samples, samples: float) -> tuple[np.ndarray, np.ndarray]:
@@ -122,8 +121,8 @@ def _slope(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     return slope, math.sqrt(float(rest @ rest) / max(y.size - 2, 1) / float(x @ x))
 
 
-def _amplitude(time: Samples, values: Samples, frequency: float) -> float:
-    """Of one line of the spectrum, under a Hann window."""
+def _line(time: Samples, values: Samples, frequency: float) -> complex:
+    """One line of the spectrum under a Hann window: amplitude and phase."""
     window = np.hanning(values.size)
     wave = np.exp(-2j * np.pi * frequency * time)
-    return float(2.0 * abs(np.sum(window * wave * (values - values.mean()))) / window.sum())
+    return complex(2.0 * np.sum(window * wave * (values - values.mean())) / window.sum())

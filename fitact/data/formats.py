@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,12 +13,14 @@ from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.data.text import is_binary, read_text
 from fitact.errors import InputError
 from fitact.files import replacing
-from fitact.model.scene import Scene
+
+if TYPE_CHECKING:
+    from fitact.model.scene import Scene  # which brings JAX along
 
 
 def read(
     path: str | os.PathLike[str],
-    scene: Scene | None = None,
+    scene: "Scene | None" = None,
     *,
     channels: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
