@@ -45,7 +45,11 @@ RecordFiles = Annotated[
 ]
 Channels = Annotated[
     list[str] | None,
-    typer.Option("--channel", metavar="NAME=COLUMN", help="Which of the file's channels V, Vsc or I is: Vsc=CH2."),
+    typer.Option(
+        "--channel",
+        metavar="NAME=COLUMN",
+        help="Which of the file's channels V, Vsc or I is: Vsc=CH2, V=OTHERFILE:CH1.",
+    ),
 ]
 Scales = Annotated[
     list[str] | None,

@@ -351,6 +351,20 @@ def test_a_wrong_mapping_is_refused(asked: dict, words: str):
         fitact.read(SCOPE / "keysight_scope_0.csv", **asked)
 
 
+def test_channels_from_files_of_their_own(tmp_path: Path):
+    """As LeCroy and Tektronix TDS write them; a file of another capture is refused."""
+    table = np.loadtxt(SCOPE / "keysight_scope_0.csv", delimiter=",", skiprows=2)
+    for name, column in (("C1.csv", 1), ("C2.csv", 2)):
+        np.savetxt(tmp_path / name, table[:, [0, column]], "%.9g", ",", header="Time,Ampl", comments="")
+    np.savetxt(tmp_path / "C3.csv", table[:-1, :2], "%.9g", ",", header="Time,Ampl", comments="")
+    record = fitact.read(tmp_path / "C2.csv", channels={"Vsc": "Ampl", "V": "C1.csv:Ampl"})
+    np.testing.assert_array_equal(record["V"], table[:, 1])
+    np.testing.assert_array_equal(record["Vsc"], table[:, 2])
+    for asked, words in (("C3.csv:Ampl", "not of one capture"), ("C1.csv:B", "C1.csv: there is no column 'B'")):
+        with pytest.raises(fitact.InputError, match=words):
+            fitact.read(tmp_path / "C2.csv", channels={"Vsc": "Ampl", "V": asked})
+
+
 def test_a_current_from_the_voltage_over_a_resistor():
     """1 V over 1 kohm is 1 mA."""
     scene = fitact.Scene(measurement={"channels": ["I"]})

@@ -66,7 +66,7 @@ def resolve(names: list[str], channels: Mapping[str, str], source: str, place: s
     for channel, asked in channels.items():
         if channel not in CHANNEL_UNITS:
             raise InputError(f"{source}: '{channel}' is no channel of fitact; map to {', '.join(CHANNEL_UNITS)}")
-        known[channel] = _named(asked, names, source)
+        known[channel] = named(asked, names, source)
     if len(set(known.values())) < len(known):
         raise InputError(f"{source}: one column is to be two channels ({_pairs(known)}); name another for one of them")
     if not known:
@@ -76,6 +76,20 @@ def resolve(names: list[str], channels: Mapping[str, str], source: str, place: s
             " (in Python: channels={'Vsc': ...})"
         )
     return known
+
+
+def named(asked: str, names: list[str], source: str) -> str:
+    """The name in the file of the channel that is asked for, as "CH2" for "Channel 2".
+
+    Raises:
+        InputError: there is none, or several.
+    """
+    exact = [name for name in names if name.strip().lower() == asked.strip().lower()]
+    alike = exact or [name for name in names if same_channel(asked, name)]
+    if len(alike) != 1:
+        what = f"there are {len(alike)} columns" if alike else "there is no column"
+        raise InputError(f"{source}: {what} '{asked}'; the file has {_listed(names)}")
+    return alike[0]
 
 
 def is_mapped(capture: Capture) -> bool:
@@ -116,15 +130,6 @@ def to_record(capture: Capture, channels: Mapping[str, str], scale: Mapping[str,
     if unread:
         notes.append(f"{capture.source}: not used: {', '.join(unread)}")
     return Record.from_arrays(capture.time, **arrays, source=capture.source, notes=tuple(notes), where=capture.where)
-
-
-def _named(asked: str, names: list[str], source: str) -> str:
-    exact = [name for name in names if name.strip().lower() == asked.strip().lower()]
-    alike = exact or [name for name in names if same_channel(asked, name)]
-    if len(alike) != 1:
-        what = f"there are {len(alike)} columns" if alike else "there is no column"
-        raise InputError(f"{source}: {what} '{asked}'; the file has {_listed(names)}")
-    return alike[0]
 
 
 def _check_unit(trace: Trace, channel: str, scaled: bool, source: str) -> None:

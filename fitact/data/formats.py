@@ -1,5 +1,6 @@
 """Files to records: text and binary files of oscilloscopes and DAQ programs, and fitact's own CSV."""
 
+import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fitact.data.binary import is_known_binary, read_binary
-from fitact.data.capture import Capture, Pick, resolve, to_record
+from fitact.data.capture import Capture, Pick, named, resolve, to_record
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.data.text import is_binary, read_text
 from fitact.errors import InputError
@@ -27,16 +28,19 @@ def read(
 ) -> Record:
     """Read a record: a CSV file with the columns time_s, V_V, Vsc_V and I_A, or a file of an oscilloscope.
 
-    `channels` says which of a file's own names is which, {"Vsc": "CH2"}; names V, Vsc and I need no word. `scale`
-    multiplies, {"Vsc": 10} for a 10x probe that the oscilloscope did not know of. Units in the header are heeded;
-    what had to be assumed is in the record's notes. With a `scene`, the channels that it measures must be there; V
+    `channels` says which of a file's own names is which, {"Vsc": "CH2"}; names V, Vsc and I need no word. Where each
+    channel has a file of its own, {"Vsc": "CH2", "V": "C1.trc:CH1"} fetches V from beside this one. `scale` multiplies,
+    {"Vsc": 10} for a 10x probe that the oscilloscope did not know of. Units in the header are heeded; what had to be
+    assumed is in the record's notes. With a `scene`, the channels that it measures must be there; V
     may be absent only where a scene gives the drive. The layouts are listed in docs/input.md.
 
     Raises:
         InputError: the file cannot be read, or holds what cannot be used; names the line and the remedy.
     """
     source, channels = os.fspath(path), channels or {}
-    capture = read_capture(path, lambda names, place: resolve(names, channels, source, place).values())
+    own = {channel: asked for channel, asked in channels.items() if _elsewhere(path, asked) is None}
+    capture = read_capture(path, lambda names, place: resolve(names, own, source, place).values())
+    capture = with_other_files(capture, path, channels)
     record = to_record(capture, channels, scale or {})
     for channel in scene.measurement.channels if scene else ("Vsc",):
         record[channel]  # refused where missing
@@ -69,6 +73,42 @@ def read_capture(path: str | os.PathLike[str], pick: Pick = lambda names, place:
     if head[:2] == b"\x1f\x8b" or not (is_binary(head) or is_known_binary(head, path.suffix)):
         return read_text(path, source, pick)
     return read_binary(path, source, head, pick)
+
+
+def with_other_files(capture: Capture, path: str | os.PathLike[str], channels: Mapping[str, str]) -> Capture:
+    """The capture, and the columns of other files that `channels` names as FILE:COLUMN.
+
+    Raises:
+        InputError: such a file cannot be read, or its times are others.
+    """
+    traces = list(capture.traces)
+    for asked in channels.values():
+        elsewhere = _elsewhere(path, asked)
+        if elsewhere is None:
+            continue
+        file, column = elsewhere
+        other = _column(file, column)
+        step = (capture.time[-1] - capture.time[0]) / max(capture.time.size - 1, 1)
+        if other.time.size != capture.time.size or np.max(np.abs(other.time - capture.time)) > 0.01 * step:
+            raise InputError(
+                f"{capture.source}: {file} has another length or other times, so it is not of one capture with this"
+                " file; export both anew"
+            )
+        traces.append(dataclasses.replace(other.traces[0], name=asked))
+    return dataclasses.replace(capture, traces=tuple(traces))
+
+
+def _column(file: Path, column: str) -> Capture:
+    return read_capture(file, lambda names, _: [named(column, names, str(file))])
+
+
+def _elsewhere(path: str | os.PathLike[str], asked: str) -> tuple[Path, str] | None:
+    """The file and the column where a channel is asked for as FILE:COLUMN, the file from here or beside `path`."""
+    file, colon, column = asked.rpartition(":")
+    for found in (Path(path).parent / file, Path(file)):
+        if colon and column and found.is_file():
+            return found, column
+    return None
 
 
 def write_csv(path: str | os.PathLike[str], record: Record) -> None:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from fitact.data.capture import Capture, is_mapped, to_record
 from fitact.data.checks import check_channel, check_divider, check_time
 from fitact.data.clipping import clipped
-from fitact.data.formats import read_capture
+from fitact.data.formats import read_capture, with_other_files
 from fitact.data.record import (
     CHANNEL_UNITS,
     MINIMUM_SAMPLES,
@@ -105,7 +105,7 @@ def inspect(
     Raises:
         InputError: the file cannot be read, or what is known as V, Vsc or I could not be fitted.
     """
-    capture = read_capture(path)
+    capture = with_other_files(read_capture(path), path, channels or {})
     if channels or scale or is_mapped(capture):
         record = to_record(capture, channels or {}, scale or {})
         arrays = {name: (record[name], CHANNEL_UNITS[name]) for name in record.channels}
