@@ -307,6 +307,9 @@ def test_named_arrays_that_are_refused(tmp_path: Path):
     scipy.io.savemat(tmp_path / "iq.mat", {"sampleInterval": 4e-7, "IQData": np.exp(1j * TIME)})
     with pytest.raises(fitact.InputError, match="complex"):
         read_capture(tmp_path / "iq.mat")
+    np.savez(tmp_path / "counts.npz", XInc=1e-6, YInc=0.01, Vsc=np.arange(50))
+    with pytest.raises(fitact.InputError, match="a converter's counts"):
+        read_capture(tmp_path / "counts.npz")
     np.savez(tmp_path / "no_time.npz", Vsc=TIME)
     with pytest.raises(fitact.InputError, match="has no time; store an array 'time'"):
         read_capture(tmp_path / "no_time.npz")

@@ -201,6 +201,8 @@ def _capture(contents: _Contents, source: str, pick: Pick) -> Capture:
     names = others if len(set(short)) < len(short) else short
     wanted = set(pick(names, ""))
     chosen = [(name, other) for name, other in zip(names, others, strict=True) if name in wanted]
+    if "yinc" in contents.stated and any(arrays[other].dtype.kind in "iu" for _, other in chosen):
+        raise InputError(f"{source}: holds a converter's counts under its maker's scale (YInc); export volts, or CSV")
     if not chosen:
         raise InputError(f"{source}: holds no array of one axis besides the time; store V, Vsc or I in it")
     if timed:

@@ -12,6 +12,7 @@ from fitact.errors import InputError
 _EXAMPLE = "time_s,V_V,Vsc_V,I_A"
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 _QUANTITY = re.compile(r"(?:analog:)?\s*([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*([a-zµμ]*)", re.IGNORECASE)
+_MOST_ROWS = 1e12  # that a header can mean
 _HERTZ = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
 
 
@@ -80,7 +81,6 @@ def read_header(text: str, source: str, companion: str = "") -> Header:
     start, step = sheet.grid()
     columns = sheet.columns()
     time = sheet.time(columns)
-    index = next((c.place for c in columns if sheet.is_index(c)), None)
     if time is None and step is None:
         found = ", ".join(sheet.names.cells) if sheet.names else "no header"
         raise InputError(
@@ -88,8 +88,7 @@ def read_header(text: str, source: str, companion: str = "") -> Header:
             f" columns as in {_EXAMPLE}, or export the time as well (Rohde & Schwarz keep that of NAME.Wfm.csv in"
             " NAME.csv beside it)"
         )
-    named = sheet.names.cells[: sheet.width] if sheet.names else []
-    count = sheet.quantity(layouts.COUNT_KEYS)
+    index = next((c.place for c in columns if sheet.is_index(c)), None)
     return Header(
         maker=next((maker for maker, mark in layouts.MAKERS if mark.search(text[:4096])), "text"),
         delimiter=sheet.delimiter,
@@ -99,14 +98,10 @@ def read_header(text: str, source: str, companion: str = "") -> Header:
         time=time,
         index=index,
         columns=sheet.completed([c for c in columns if c.place not in (index, time.place if time else None)]),
-        others=tuple(
-            c
-            for i, c in enumerate(named)
-            if i not in sheet.numeric and layouts.key(c.partition("=")[0]) not in layouts.GRID_KEYS
-        ),
+        others=sheet.others(),
         start=start,
         step=step,
-        count=int(count) if count is not None and count < 1e12 else None,
+        count=sheet.count(),
         place=f", line {top.number}",
     )
 
@@ -155,13 +150,8 @@ class _Sheet:
         first = next((i for i, here in enumerate(full) if here and all(full[i : i + 2])), None)
         if first is None:  # not two in a row
             first = full.index(True) if numeric else len(full)
-        while (
-            first
-            and places[first - 1]
-            and len("".join(data[first - 1].cells))
-            == sum(len(data[first - 1].cells[i]) for i in places[first - 1] & numeric)
-        ):
-            first -= 1  # a row with a time and no values yet
+        while first and _is_unfilled(data[first - 1], places[first - 1] & numeric):
+            first -= 1
         end = data[first].number if first < len(data) else len(lines)
         comments = [row for row in rows if row.cells[0].startswith("#") and row.number < end]
         comments += [Line(0, line.split(":")) for line in companion.splitlines()]
@@ -283,6 +273,17 @@ class _Sheet:
             )
         return written or below
 
+    def others(self) -> tuple[str, ...]:
+        """Names of the columns that hold no numbers."""
+        named = self.names.cells[: self.width] if self.names else []
+        words = [layouts.key(cell.partition("=")[0]) for cell in named]
+        return tuple(c for i, c in enumerate(named) if i not in self.numeric and words[i] not in layouts.GRID_KEYS)
+
+    def count(self) -> int | None:
+        """The rows that the header announces."""
+        count = self.quantity(layouts.COUNT_KEYS)
+        return int(count) if count is not None and count < _MOST_ROWS else None
+
     def _names_elsewhere(self, count: int) -> list[str]:
         """As "Source,CH1" or "Vertical Scale,CH1:0.05 CH2:0.10" state them."""
         named = self.values(layouts.NAME_KEYS)
@@ -313,6 +314,11 @@ class _Sheet:
         """With the unit that the header states elsewhere."""
         elsewhere = next(iter(self.values(layouts.TIME_UNIT_KEYS)), "")
         return dataclasses.replace(column, unit=column.unit or elsewhere)
+
+
+def _is_unfilled(row: Line, numbers: frozenset[int]) -> bool:
+    """Whether all that the row holds are numbers, in some columns of numbers: a time without values yet."""
+    return bool(numbers) and all(i in numbers for i, cell in enumerate(row.cells) if cell)
 
 
 def _delimiter(lines: Sequence[str]) -> tuple[str, bool]:
