@@ -29,9 +29,9 @@ Start with a CSV of your oscilloscope whose header reads `time_s,V_V,Vsc_V` (dri
 
     fitact run finger.csv
 
-(For any other file of an oscilloscope, start with `fitact inspect FILE`.)
 It fits the circuit, samples the posterior and writes a report to open in a browser. Say what you know of
-the panel, the finger and the drive in a scene file (TOML) and add `--scene scene.toml`.
+the panel, the finger and the drive in a scene file (TOML) and add `--scene scene.toml`. With any other file of an
+oscilloscope start with `fitact inspect FILE`.
 
 Exit code 0: an answer. 1: an answer that must not be trusted (the files say why). 2: input was refused.
 """,
