@@ -9,6 +9,7 @@ import pytest
 
 import fitact
 from fitact.data.formats import read_capture
+from fitact.data.matlab import read_mat
 
 SCOPE = Path(__file__).parent / "data" / "scope"
 SKIN = {"V": "CH1", "Vsc": "CH2"}
@@ -299,6 +300,25 @@ def test_files_of_named_arrays(tmp_path: Path, name: str):
     np.testing.assert_allclose(record.time, TIME, atol=1e-15)
     np.testing.assert_allclose(record["V"], WAVES["drive"], atol=1e-15)
     np.testing.assert_allclose(record["Vsc"], 10.0 * WAVES["skin"], atol=1e-15)
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_matlab_against_what_scipy_wrote(tmp_path: Path, compressed: bool):
+    import scipy.io
+
+    rng = np.random.default_rng(0)  # any
+    written = {
+        "a": rng.normal(size=(5, 3)), "b": rng.integers(-9, 9, (1, 40)).astype("i2"),
+        "c": np.float32(rng.normal(size=(7, 1))), "d": np.array([[1 + 2j, 3.0]]), "name_of_some_length": np.array([[7.0]]),
+    }  # fmt: skip
+    more = {"unit": "mV", "cell": np.array([1, "x"], dtype=object), "struct": {"x": 1.0}, "none": np.zeros((0, 0))}
+    scipy.io.savemat(tmp_path / "a.mat", written | more, do_compression=compressed)
+    found = dict(read_mat((tmp_path / "a.mat").read_bytes(), 10**6))
+    assert found.pop("unit") == "mV"
+    found.pop("none", None)
+    assert set(found) == set(written)
+    for name, values in written.items():
+        np.testing.assert_array_equal(found[name], values)
 
 
 def test_named_arrays_that_are_refused(tmp_path: Path):

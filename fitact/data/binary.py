@@ -20,6 +20,7 @@ import numpy as np
 
 from fitact.data import layouts
 from fitact.data.capture import Capture, Pick, Trace
+from fitact.data.matlab import read_mat
 from fitact.errors import InputError
 
 _MOST = 4_294_967_296  # bytes of one array, beyond which it is no record but a broken header
@@ -139,12 +140,9 @@ def _read_tdms(path: Path, source: str, pick: Pick) -> Capture:
 
 
 def _read_mat(path: Path, source: str, pick: Pick) -> Capture:
-    import scipy.io
-
     contents = _Contents("MATLAB")
-    for name, value in scipy.io.loadmat(path, squeeze_me=True).items():
-        if not name.startswith("__"):
-            contents.add(name, value)
+    for name, value in read_mat(path.read_bytes(), _MOST):
+        contents.add(name, value)
     return _capture(contents, source, pick)
 
 
