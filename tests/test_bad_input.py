@@ -138,6 +138,9 @@ KINDS: dict[str, tuple] = {
     "columns of other names": ("warned", lambda t: text_of({**t, "other": t["V_V"]}), "not used: other"),
     # the rows
     "text in a cell": ("refused", line(102, lambda x: x.replace(",", ",abc", 1)), "line 102, column 2: 'abc"),
+    "text in all cells of a column": (
+        "refused", lambda t: re.sub(r"(?m)^(\d.*),.*$", r"\1,x", text_of(t)), "line 2, column 3: 'x'",
+    ),
     "empty cell": ("refused", line(102, lambda x: re.sub(",.*,", ",,", x)), "line 102, column 2: the cell is empty"),
     "short row": ("refused", line(102, lambda x: x.rpartition(",")[0]), "line 102: 2 values"),
     "long row": ("refused", line(102, lambda x: x + ",1"), "line 102: 4 values"),

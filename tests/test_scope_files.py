@@ -309,7 +309,7 @@ def test_matlab_against_what_scipy_wrote(tmp_path: Path, compressed: bool):
     rng = np.random.default_rng(0)  # any
     written = {
         "a": rng.normal(size=(5, 3)), "b": rng.integers(-9, 9, (1, 40)).astype("i2"),
-        "c": np.float32(rng.normal(size=(7, 1))), "d": np.array([[1 + 2j, 3.0]]), "name_of_some_length": np.array([[7.0]]),
+        "c": np.float32(rng.normal(size=(7, 1))), "d": np.array([[1 + 2j, 3.0]]), "a_long_name": np.ones((1, 1)),
     }  # fmt: skip
     more = {"unit": "mV", "cell": np.array([1, "x"], dtype=object), "struct": {"x": 1.0}, "none": np.zeros((0, 0))}
     scipy.io.savemat(tmp_path / "a.mat", written | more, do_compression=compressed)

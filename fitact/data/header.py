@@ -74,6 +74,7 @@ def read_header(text: str, source: str, companion: str = "") -> Header:
         raise InputError(
             f"{source}: there are no rows of numbers; expected a header such as {_EXAMPLE}, and rows of numbers"
         )
+    sheet = dataclasses.replace(sheet, numeric=sheet.numeric | sheet.contracted())
     segments = sheet.values(layouts.SEGMENT_KEYS)[:1]
     if segments and (number(segments[0], sheet.decimal_comma) or 1.0) > 1.0:
         raise InputError(f"{source}: holds {segments[0]} segments; export one of them")
@@ -272,6 +273,13 @@ class _Sheet:
                 " keep one of the two"
             )
         return written or below
+
+    def contracted(self) -> frozenset[int]:
+        """Columns under fitact's own names, which must hold numbers whether they do or not."""
+        parts = [layouts.name_and_unit(cell) for cell in (self.names.cells[: self.width] if self.names else [])]
+        return frozenset(
+            i for i, (name, unit) in enumerate(parts) if layouts.is_contract(name) and (not unit or layouts.unit(unit))
+        )
 
     def others(self) -> tuple[str, ...]:
         """Names of the columns that hold no numbers."""
