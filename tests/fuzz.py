@@ -24,6 +24,7 @@ from fitact.data.formats import read_capture
 
 SCOPE = Path(__file__).parent / "data" / "scope"
 SECONDS = 10.0  # for one file
+MEGABYTES = 300.0  # by which one may raise the peak of memory
 TOKENS = (
     b"nan", b"inf", b"-inf", b"1e999", b"-1e-999", b"9.9E+37", b"", b"-", b".", b"e", b"1,5", b"0x1F", b"1_000", b'"',
     b";", b"\t", b"#", b",,,,", b"9" * 400, b"\xe2\x88\x9e", b"\xb5s", b"\xff\xfe", b"\0", b"\r", b"\n\n", b"Start",
@@ -151,8 +152,11 @@ def findings(count: int, seed: int, first: int = 0, keep: Path | None = None) ->
                 path = keep or Path(folder) / name
                 path.write_bytes(content)
                 signal.setitimer(signal.ITIMER_REAL, SECONDS)
+                peak = _peak()
                 try:
                     result = outcome(path)
+                    if _peak() - peak > MEGABYTES:
+                        result = f"FOUND memory: {_peak() - peak:.0f} MB more"
                 except BaseException as error:  # whatever a parser lets through
                     if isinstance(error, KeyboardInterrupt):
                         raise
@@ -164,6 +168,10 @@ def findings(count: int, seed: int, first: int = 0, keep: Path | None = None) ->
         signal.signal(signal.SIGALRM, before)
 
 
+def _peak() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=20_000)
@@ -173,15 +181,14 @@ def main() -> int:
     given = parser.parse_args()
     outcomes: collections.Counter[str] = collections.Counter()
     slowest, before = 0.0, time.perf_counter()
-    base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    base = _peak()
     for number, name, result in findings(given.count, given.seed, given.first, given.keep):
         now = time.perf_counter()
         slowest, before = max(slowest, now - before), now
         outcomes[result.split()[0]] += 1
         if result.startswith("FOUND"):
             print(number, name, result[:300])
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    print(f"{dict(outcomes)}; slowest {slowest:.2f} s; memory {base / 1e3:.0f} to {peak / 1e3:.0f} MB")
+    print(f"{dict(outcomes)}; slowest {slowest:.2f} s; memory {base:.0f} to {_peak():.0f} MB")
     return 1 if outcomes["FOUND"] else 0
 
 

@@ -23,7 +23,8 @@ from fitact.data.capture import Capture, Pick, Trace
 from fitact.data.matlab import read_mat
 from fitact.errors import InputError
 
-_MOST = 4_294_967_296  # bytes of one array, beyond which it is no record but a broken header
+_PACKED = 1032  # times that deflate can shrink what it packs; a header that announces more is broken
+_LEAST = 1_000_000  # bytes that any file may unfold to
 _SCOPE = re.compile(
     rb"\A(?:AG(?:01|03|10)|RG0\d|\xa5\xa5|\xa1\xa5\0\0|\x01\xff\xff\xff|[\x0f\xf0]{2}.:WFM#|.{0,3}LLWFM|<\?xml)"
     rb"|WAVEDESC|:CURVE? #|NR_PT:",
@@ -124,7 +125,7 @@ def _read_tdms(path: Path, source: str, pick: Pick) -> Capture:
         many = [f"{group.name}/{channel.name}" for group in file.groups() for channel in group.channels()]
         if len(many) > len(channels):  # one name in several groups
             channels = {f"{group.name}/{c.name}": c for group in file.groups() for c in group.channels()}
-        _check_size(sum(8 * len(channel) for channel in channels.values()), source)
+        _check_size(sum(8 * len(channel) for channel in channels.values()), path, source)
         contents = _Contents("TDMS")
         times = []
         for name, channel in channels.items():
@@ -141,7 +142,7 @@ def _read_tdms(path: Path, source: str, pick: Pick) -> Capture:
 
 def _read_mat(path: Path, source: str, pick: Pick) -> Capture:
     contents = _Contents("MATLAB")
-    for name, value in read_mat(path.read_bytes(), _MOST):
+    for name, value in read_mat(path.read_bytes(), _most(path)):
         contents.add(name, value)
     return _capture(contents, source, pick)
 
@@ -151,6 +152,7 @@ def _read_npz(path: Path, source: str, pick: Pick) -> Capture:
     with np.load(path, allow_pickle=False) as file:
         if isinstance(file, np.ndarray) or not all(name.endswith(".npy") for name in file.zip.namelist()):
             raise InputError(f"{source}: is a zip archive but not of NumPy; save the record as CSV")
+        _check_size(sum(part.file_size for part in file.zip.infolist()), path, source)
         for name in file.files:
             contents.add(name, file[name])
     return _capture(contents, source, pick)
@@ -162,7 +164,7 @@ def _read_netcdf3(path: Path, source: str, pick: Pick) -> Capture:
     contents = _Contents("NetCDF")
     with scipy.io.netcdf_file(path, mmap=False) as file:
         for name, variable in file.variables.items():
-            _check_size(8 * int(np.prod(variable.shape)), source)
+            _check_size(8 * int(np.prod(variable.shape)), path, source)
             contents.add(name, variable[...].copy(), getattr(variable, "units", ""))
     return _capture(contents, source, pick)
 
@@ -177,7 +179,7 @@ def _read_hdf5(path: Path, source: str, pick: Pick) -> Capture:
             for key, value in item.attrs.items():
                 contents.add(key, value)
             if isinstance(item, h5py.Dataset) and item.dtype.kind in "iufc":
-                _check_size(item.size * 8, source)
+                _check_size(item.size * 8, path, source)
                 contents.add(name, item[...], item.attrs.get("units", item.attrs.get("unit", "")))
 
         visit("", file)
@@ -276,9 +278,14 @@ def _check_one_grid(times: Sequence[np.ndarray], names: Sequence[str], source: s
             )
 
 
-def _check_size(size: int, source: str) -> None:
-    if size > _MOST:
-        raise InputError(f"{source}: announces {size:,} bytes of numbers; the file is broken, or cut the record")
+def _most(path: Path) -> int:
+    """Bytes that the file may unfold to."""
+    return _LEAST + _PACKED * path.stat().st_size
+
+
+def _check_size(size: int, path: Path, source: str) -> None:
+    if size > _most(path):
+        raise InputError(f"{source}: announces {size:,} bytes of numbers, more than it can hold; export it again")
 
 
 def _word(value: Any) -> str:

@@ -90,6 +90,11 @@ def read_header(text: str, source: str, companion: str = "") -> Header:
             " NAME.csv beside it)"
         )
     index = next((c.place for c in columns if sheet.is_index(c)), None)
+    values = sheet.completed([c for c in columns if c.place not in (index, time.place if time else None)])
+    if not values:
+        raise InputError(
+            f"{source}, line {top.number}: there is no column of numbers besides the time; export channels"
+        )
     return Header(
         maker=next((maker for maker, mark in layouts.MAKERS if mark.search(text[:4096])), "text"),
         delimiter=sheet.delimiter,
@@ -98,7 +103,7 @@ def read_header(text: str, source: str, companion: str = "") -> Header:
         width=sheet.width,
         time=time,
         index=index,
-        columns=sheet.completed([c for c in columns if c.place not in (index, time.place if time else None)]),
+        columns=values,
         others=sheet.others(),
         start=start,
         step=step,
@@ -160,7 +165,8 @@ class _Sheet:
 
     @functools.cached_property
     def width(self) -> int:
-        return collections.Counter(len(row.cells) for row in self.below).most_common(1)[0][0]
+        widths = (len(row.cells) for row in self.below if len(row.cells) > max(self.numeric))
+        return collections.Counter(widths).most_common(1)[0][0]
 
     @functools.cached_property
     def stated(self) -> dict[str, list[str]]:

@@ -190,7 +190,10 @@ def fundamental(time: Float[np.ndarray, " samples"], values: Float[np.ndarray, "
     while 2.0 * lag < last - reach:  # twice as many periods show one twice as well
         near = round(2.0 * lag) - below[0] - reach
         top = near + int(np.argmax(window[near : near + 2 * reach + 1]))
-        lag, periods = below[0] + _peak(window, top), 2 * periods
+        further = below[0] + _peak(window, top)
+        if further <= lag:  # repeats at two or three samples, whose peaks run into each other
+            return None
+        lag, periods = further, 2 * periods
     return periods / (lag * float(grid[1] - grid[0]))
 
 
