@@ -176,8 +176,10 @@ def _read_hdf5(path: Path, source: str, pick: Pick) -> Capture:
     with h5py.File(path, "r") as file:
 
         def visit(name: str, item: Any) -> None:
-            for key, value in item.attrs.items():
-                contents.add(key, value)
+            for key in item.attrs:
+                kept = item.attrs.get_id(key)
+                _check_size(kept.dtype.itemsize * int(np.prod(kept.shape)), path, source)
+                contents.add(key, item.attrs[key])
             if isinstance(item, h5py.Dataset) and item.dtype.kind in "iufc":
                 _check_size(item.size * 8, path, source)
                 contents.add(name, item[...], item.attrs.get("units", item.attrs.get("unit", "")))
