@@ -107,6 +107,7 @@ def test_documented_layouts(tmp_path: Path, maker: str):
     [
         ("X,CH1,Start,Increment,\nSequence,Volt,-2e-3,1e-3,\n", "{i},{a},", -2e-3, 1e-3),
         ("CH1(V),t0 = -25s, tInc = 2e-06s,\n", "{a},,,", -25.0, 2e-6),
+        ("#t0 = -25s\n#tInc = 2e-06s\nCH1(V)\n", "{a}\n", -25.0, 2e-6),
     ],
 )
 def test_time_from_start_and_increment(tmp_path: Path, header: str, row: str, start: float, step: float):

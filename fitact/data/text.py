@@ -114,7 +114,8 @@ class _Table:
     def __init__(self, header: Header, columns: Sequence[Column], source: str) -> None:
         self._header, self._columns, self._source = header, columns, source
         known = [header.time.place] if header.time else [header.index] if header.index is not None else []
-        self._places = [*(place for place in known if place is not None), *(column.place for column in columns)]
+        self._has_time = bool(known)  # or a count of samples, in the first place
+        self._places = [*known, *(column.place for column in columns)]
         self._parts: list[np.ndarray] = []
         self._lines: list[Sequence[int]] = []  # their numbers, part by part
         self._starts = [0]  # rows before each part
@@ -178,7 +179,7 @@ class _Table:
                     " mend or remove the row"
                 )
             here = [cells[place] for place in self._places]
-            if here[0] and not any(here[1:]):
+            if self._has_time and here[0] and here[1:] and not any(here[1:]):
                 self._blank.append(self._starts[-1] + len(rows))
                 here[1:] = ["nan"] * len(here[1:])
             rows.append([self._number(cell, line, place) for cell, place in zip(here, self._places, strict=True)])
@@ -206,7 +207,7 @@ class _Table:
             )
         kept, notes = self._filled(rows)
         columns = [np.concatenate([part[:, i] for part in self._parts])[kept] for i in range(len(self._places))]
-        if header.time or header.index is not None:
+        if self._has_time:
             time, *values = columns
         else:
             time, values = np.arange(rows, dtype=float)[kept], columns
