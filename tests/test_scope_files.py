@@ -195,7 +195,7 @@ def test_lecroy_binary_against_its_descriptor():
 
 @pytest.mark.usefixtures("rigolwfm")
 def test_rigol_binary_against_the_csv_of_the_same_capture():
-    """The DS1052E's CSV begins at 0 and four samples later; the DS2072A's holds every tenth sample, one step off."""
+    """The DS1052E's CSV begins at 0 and four samples later; the DS2072A's has a tenth of the times, 25 ns late."""
     text, binary = (read_capture(SCOPE / f"rigol_DS1052E.{end}") for end in ("csv.gz", "wfm"))
     for shown, kept in zip(text.traces, binary.traces, strict=True):
         np.testing.assert_allclose(shown.values[4:], kept.values[:-4], atol=1e-12)
@@ -203,7 +203,9 @@ def test_rigol_binary_against_the_csv_of_the_same_capture():
     text, binary = (read_capture(SCOPE / f"rigol_DS2072A-5.{end}") for end in ("csv", "wfm"))
     np.testing.assert_allclose(binary.time[::10], text.time, atol=1e-12)
     for shown, kept, step in zip(text.traces, binary.traces, (2e-3, 4e-2), strict=True):
-        assert np.median(np.abs(shown.values - kept.values[::10])) <= step
+        off = np.abs(shown.values[3:] - kept.values[5:-25:10]) / step
+        assert np.mean(off < 1.01) > 0.8
+        assert off.max() < 2.51
 
 
 REFUSED = {
