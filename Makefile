@@ -4,7 +4,7 @@ PY = .venv/bin/python
 # what one process of the tests compiles serves the others, and the next run
 COMPILED = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/out/jax JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
 .DEFAULT_GOAL = help
-.PHONY: help env demo test test-slow test-slow-quick notebooks extremes calibration calibration-quick check lock clean
+.PHONY: help env demo test test-slow test-slow-quick notebooks extremes calibration calibration-quick fuzz check lock clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -41,6 +41,10 @@ calibration: env
 # make calibration-quick   the same with the first 100 of them
 calibration-quick: env
 	$(PY) tests/calibration.py --records 100 --out out/calibration
+
+# make fuzz   20,000 broken files: each ends in a record or in one sentence
+fuzz: env
+	$(PY) tests/fuzz.py --count 20000
 
 # make check   style, types, and the order of the layers
 check: env

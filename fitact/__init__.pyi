@@ -1,4 +1,5 @@
 from .data.formats import read
+from .data.inspection import Inspection, inspect
 from .data.record import Record
 from .errors import InputError
 from .inference.comparison import Comparison, compare
@@ -35,6 +36,7 @@ __all__ = [
     "Fit",
     "Fractional",
     "InputError",
+    "Inspection",
     "LogNormal",
     "LogUniform",
     "Multitone",
@@ -63,6 +65,7 @@ __all__ = [
     "friction",
     "harmonic_error",
     "harmonic_response",
+    "inspect",
     "mean_force",
     "mean_square",
     "measure_tradeoff",

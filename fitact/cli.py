@@ -30,7 +30,8 @@ Start with a CSV of your oscilloscope whose header reads `time_s,V_V,Vsc_V` (dri
     fitact run finger.csv
 
 It fits the circuit, samples the posterior and writes a report to open in a browser. Say what you know of
-the panel, the finger and the drive in a scene file (TOML) and add `--scene scene.toml`.
+the panel, the finger and the drive in a scene file (TOML) and add `--scene scene.toml`. With any other file of an
+oscilloscope start with `fitact inspect FILE`.
 
 Exit code 0: an answer. 1: an answer that must not be trusted (the files say why). 2: input was refused.
 """,
@@ -39,8 +40,21 @@ Exit code 0: an answer. 1: an answer that must not be trusted (the files say why
 RecordFiles = Annotated[
     list[Path],
     typer.Argument(
-        metavar="RECORD...", help="CSV with time_s, V_V, Vsc_V, I_A; may be gzipped. Several: fitted jointly."
+        metavar="RECORD...",
+        help="CSV with time_s, V_V, Vsc_V, I_A, or an oscilloscope's file with --channel. Several: fitted jointly.",
     ),
+]
+Channels = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--channel",
+        metavar="NAME=COLUMN",
+        help="Which of the file's channels V, Vsc or I is: Vsc=CH2, V=OTHERFILE:CH1.",
+    ),
+]
+Scales = Annotated[
+    list[str] | None,
+    typer.Option("--scale", metavar="NAME=FACTOR", help="What to multiply V, Vsc or I by, as for a probe: Vsc=10."),
 ]
 SceneFiles = Annotated[
     list[Path] | None,
@@ -73,6 +87,7 @@ Model = Annotated[
         "--model", help="What the scene's tolerance requires (see `plan`), or everything that the scene names."
     ),
 ]
+Mapping = tuple[list[str] | None, list[str] | None]  # --channel and --scale as given
 Results = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `run` or `sample` wrote.")]
 Fresh = Annotated[bool, typer.Option("--fresh", help="Start the chain anew instead of going on from one in DIR.")]
 
@@ -81,6 +96,8 @@ Fresh = Annotated[bool, typer.Option("--fresh", help="Start the chain anew inste
 def run(
     records: RecordFiles,
     scene: SceneFiles = None,
+    channel: Channels = None,
+    scale: Scales = None,
     out: Out = None,
     level: Level = "emcee",
     model: Model = "planned",
@@ -94,7 +111,7 @@ def run(
     Writes fit.json, summary.json, posterior.nc (opens with ArviZ), chain.h5 (for going on) and report.html.
     """
     folder = out or _folder(records[0])
-    posterior, content = _sampled(records, scene, folder, level, model, seed, tolerance, fresh)
+    posterior, content = _sampled(records, scene, (channel, scale), folder, level, model, seed, tolerance, fresh)
     page = folder / "report.html"
     _say("writing the report")
     from fitact.report import write_report
@@ -108,6 +125,8 @@ def run(
 def fit(
     records: RecordFiles,
     scene: SceneFiles = None,
+    channel: Channels = None,
+    scale: Scales = None,
     out: Out = None,
     model: Model = "planned",
     tolerance: Tolerance = 1e-3,
@@ -120,7 +139,7 @@ def fit(
     json: Json = False,
 ) -> None:
     """Least squares only: parameters with errors, and the verdict, in seconds."""
-    planned = _fitted(records, scene, model, tolerance, starts)
+    planned = _fitted(records, scene, (channel, scale), model, tolerance, starts)
     fitted = planned.fit
     text, content = f"{fitted}\n{planned.sentence}", fitted.to_dict() | {"plan": planned.to_dict()}
     if intervals:
@@ -141,6 +160,8 @@ def fit(
 def sample(
     records: RecordFiles,
     scene: SceneFiles = None,
+    channel: Channels = None,
+    scale: Scales = None,
     out: Out = None,
     level: Level = "emcee",
     model: Model = "planned",
@@ -151,7 +172,7 @@ def sample(
 ) -> None:
     """Fit, then sample the posterior until it has converged; as `run`, without the report."""
     folder = out or _folder(records[0])
-    posterior, content = _sampled(records, scene, folder, level, model, seed, tolerance, fresh)
+    posterior, content = _sampled(records, scene, (channel, scale), folder, level, model, seed, tolerance, fresh)
     _show(f"{posterior}\nwrote {folder}; for a report: fitact report {folder}", content, json)
     _finish(posterior.trusted)
 
@@ -239,6 +260,8 @@ def tradeoff(
     scene: Annotated[
         Path | None, typer.Option("--scene", metavar="FILE", help="Scene (TOML); absent: the paper's device.")
     ] = None,
+    channel: Channels = None,
+    scale: Scales = None,
     out: Out = None,
     json: Json = False,
 ) -> None:
@@ -250,7 +273,7 @@ def tradeoff(
     from fitact.model.scene import Scene
 
     stated = None if scene is None else Scene.load(scene)
-    measured = None if record is None else read(record, stated)
+    measured = None if record is None else read(record, stated, **_mapping((channel, scale)))
     from fitact.tradeoff import measure_tradeoff
 
     try:
@@ -325,6 +348,25 @@ def population(
 
 
 @app.command()
+def inspect(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A record, or any file of an oscilloscope.")],
+    channel: Channels = None,
+    scale: Scales = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Drawing to write: .svg or .png.")] = None,
+    json: Json = False,
+) -> None:
+    """Look at a file before fitting it: channels, rate, units, noise, clipping, frequency, and what is doubtful."""
+    from fitact.data.inspection import inspect as inspected
+
+    seen = inspected(file, **_mapping((channel, scale)))
+    if out is not None:
+        from fitact.report.record import write_record
+
+        write_record(out, seen)
+    _show(str(seen), seen.to_dict(), json)
+
+
+@app.command()
 def scene(
     file: Annotated[str, typer.Argument(metavar="[SCENE]", help="Scene (TOML), or the name of a shipped one.")] = "",
     json: Json = False,
@@ -378,8 +420,29 @@ def _folder(record: Path) -> Path:
     return Path(f"{record.name.removesuffix('.gz').removesuffix('.csv')}-fitact")
 
 
+def _mapping(given: Mapping) -> dict[str, Any]:
+    """What --channel and --scale say, as `fitact.read` takes it."""
+    pairs: list[dict[str, str]] = []
+    for option, texts in zip(("--channel Vsc=CH2", "--scale Vsc=10"), given, strict=True):
+        parts = [text.partition("=") for text in texts or []]
+        for name, _, value in parts:
+            if not name or not value:
+                raise InputError(f"'{name}{value}' after {option.split()[0]} lacks a side; write {option}")
+        pairs.append({name.strip(): value.strip() for name, _, value in parts})
+    try:
+        factors = {name: float(value) for name, value in pairs[1].items()}
+    except ValueError as error:
+        raise InputError(f"--scale: {error}; write a number, as --scale Vsc=10") from error
+    return {"channels": pairs[0], "scale": factors}
+
+
 def _fitted(
-    records: list[Path], scenes: list[Path] | None, model: Model, tolerance: float, starts: int = 1
+    records: list[Path],
+    scenes: list[Path] | None,
+    mapping: Mapping,
+    model: Model,
+    tolerance: float,
+    starts: int = 1,
 ) -> "PlannedFit":
     from fitact.data.formats import read
     from fitact.model.scene import Scene
@@ -388,7 +451,8 @@ def _fitted(
     for scene in stated:
         scene.require_available(fit=model == "full")
     of_each = stated if len(stated) == len(records) else [stated[0] if stated else None] * len(records)
-    measured = [read(*pair) for pair in zip(records, of_each, strict=True)]  # refused before the slow imports
+    asked = _mapping(mapping)
+    measured = [read(*pair, **asked) for pair in zip(records, of_each, strict=True)]  # refused before the slow imports
     _use_compilation_cache()
     from fitact.inference.planned import fit_planned
 
@@ -400,6 +464,7 @@ def _fitted(
 def _sampled(
     records: list[Path],
     scene: list[Path] | None,
+    mapping: Mapping,
     folder: Path,
     level: Level,
     model: Model,
@@ -408,7 +473,7 @@ def _sampled(
     fresh: bool,
 ) -> "tuple[Posterior, dict[str, Any]]":
     """Fit and sample, and write all but the report, once the chain is known to belong there."""
-    planned = _fitted(records, scene, model, tolerance)
+    planned = _fitted(records, scene, mapping, model, tolerance)
     _say(planned.sentence)
     from fitact.inference.sampling import sample
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import fitact
+from fitact.data.formats import write_csv
 
 Rows = list[list[str]]
 
@@ -132,6 +133,18 @@ def test_directory_and_missing_file(tmp_path: Path):
         fitact.read(tmp_path)
     with pytest.raises(fitact.InputError, match="no such file"):
         fitact.read(tmp_path / "nothing.csv")
+
+
+def test_what_is_written_is_read_again(tmp_path: Path):
+    """Times to the last bit, values to the 12 digits that are written."""
+    rng = np.random.default_rng(0)  # any
+    time = np.cumsum(rng.uniform(0.9e-5, 1.1e-5, 500)) - 1e-3
+    waves = {"V": 360.0 * np.sin(2e3 * time), "Vsc": 15.0 * np.cos(2e3 * time), "I": 1e-6 * np.cos(2e3 * time)}
+    write_csv(tmp_path / "record.csv", fitact.Record.from_arrays(time, **waves))
+    record = fitact.read(tmp_path / "record.csv")
+    np.testing.assert_array_equal(record.time, time)
+    for name, values in waves.items():
+        np.testing.assert_allclose(record[name], values, rtol=6e-12)
 
 
 def test_noise_and_frequency_are_judged_without_a_model(finger_path: Path, finger_truth: dict[str, float]):

@@ -13,6 +13,7 @@ from fitact.data.clipping import clipped
 from fitact.errors import InputError
 
 MINIMUM_SAMPLES = 20
+OVERFLOW = 9e36  # what oscilloscopes write for a value out of range is 9.9E+37 or more
 _PART = 65_536  # samples
 _SMOOTH = 0.3  # of a signal's sd: its noise, when it is more than noise
 _LEVELS = 12  # distinct values from which a channel counts as rounded by a converter
@@ -63,16 +64,11 @@ class Record:
         _check_shapes(time, channels, source)
         for name, values in {"time": time, **channels}.items():
             _check_finite(values, name, source, where)
+            _check_range(values, name, source, where)
         _check_increasing(time, source, where)
         for name, values in channels.items():
             _check_signal(values, name, source)
-        steps = np.diff(time)
-        if not is_uniform(time):
-            notes = (
-                *notes,
-                f"{source}: the time steps are not uniform ({steps.min():.4g} to {steps.max():.4g} s);"
-                " they are used as they are",
-            )
+        notes = (*notes, *grid_notes(time, source))
         for array in (time, *channels.values()):
             array.flags.writeable = False
         return cls(time, channels, source, notes)
@@ -143,6 +139,17 @@ def is_uniform(time: Float[np.ndarray, " samples"], tolerance: float = 1e-2) -> 
     return all(near(first) for first in range(0, time.size, _PART))
 
 
+def grid_notes(time: Float[np.ndarray, " samples"], source: str) -> tuple[str, ...]:
+    """A sentence where the time steps are not uniform."""
+    if is_uniform(time):
+        return ()
+    steps = np.diff(time)
+    return (
+        f"{source}: the time steps are not uniform ({steps.min():.4g} to {steps.max():.4g} s);"
+        " they are used as they are",
+    )
+
+
 def white_noise(values: Float[np.ndarray, " samples"]) -> float:
     """Standard deviation of white noise under a smooth signal, from the median of third differences.
 
@@ -183,7 +190,10 @@ def fundamental(time: Float[np.ndarray, " samples"], values: Float[np.ndarray, "
     while 2.0 * lag < last - reach:  # twice as many periods show one twice as well
         near = round(2.0 * lag) - below[0] - reach
         top = near + int(np.argmax(window[near : near + 2 * reach + 1]))
-        lag, periods = below[0] + _peak(window, top), 2 * periods
+        further = below[0] + _peak(window, top)
+        if further <= lag:  # repeats at two or three samples, whose peaks run into each other
+            return None
+        lag, periods = further, 2 * periods
     return periods / (lag * float(grid[1] - grid[0]))
 
 
@@ -241,6 +251,15 @@ def _check_finite(values: np.ndarray, name: str, source: str, where: _Where) -> 
         raise InputError(
             f"{source}, {where(int(bad[0]))}: {name} is {values[bad[0]]} ({bad.size} such values);"
             " remove those rows or record again"
+        )
+
+
+def _check_range(values: np.ndarray, name: str, source: str, where: _Where) -> None:
+    bad = np.flatnonzero(np.abs(values) >= OVERFLOW)
+    if bad.size:
+        raise InputError(
+            f"{source}, {where(int(bad[0]))}: {name} is {values[bad[0]]:.4g}, an oscilloscope's code for out of range"
+            f" ({bad.size} such values); record again within range"
         )
 
 

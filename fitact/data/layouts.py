@@ -1,0 +1,108 @@
+"""What the makers of oscilloscopes and DAQ programs write in a header: one table, so that one reader serves all."""
+
+import re
+
+# who wrote a file, by what its first lines show; the first that matches
+MAKERS: tuple[tuple[str, re.Pattern[str]], ...] = tuple(
+    (maker, re.compile(mark, re.IGNORECASE | re.MULTILINE))
+    for maker, mark in (
+        ("fitact", r"^\W*time_\w+\W|[,;\t ]time_\w+"),
+        ("Siglent", r"^(?:Record Length|Sample Interval),\s*Analog:|^Model Number,\s*SD[SX]"),
+        ("Tektronix TDS", r"^Record Length,[^,\n]*,.*,\s*-?[\d.]+"),
+        ("Tektronix", r"^Waveform Type,|^TIME,(?:CH|REF|MATH)\d"),
+        ("LeCroy", r"^LECROY"),
+        ("Digilent WaveForms", r"^#\s*Digilent"),
+        ("Rigol", r"Start,Increment|^\"?Number of Data points|^X,CH\d|^,CH\d|\bt(?:0|Inc) ="),
+        ("Keysight", r"^x-axis,"),
+        ("PicoScope", r"^\W*\((?:[fpnuµμm]?s)\)[,;\t]"),
+        ("Saleae", r"^Time \[s\][,;\t]Channel \d"),
+        ("Rohde & Schwarz", r"^in s[,;\t]"),
+    )
+)
+
+TIME_NAMES = frozenset((
+    "time", "t", "x", "x-axis", "x_value", "xvalue", "s", "second", "seconds", "timestamp", "source",
+    "zeit", "temps", "tiempo", "tempo", "tijd", "czas",
+))  # fmt: skip
+INDEX_NAMES = frozenset(["sample", "samples", "index", "sequence", "nr", "no", "n", "point", "row"])
+# what stands in a row of units although it is none, or one of another kind
+NOT_UNITS = frozenset((
+    "", "sequence", "value", "none", "unknown", "ohm", "w", "watt", "hz", "khz", "db", "dbm", "pa", "n", "%", "°c",
+    "deg", "u",
+))  # fmt: skip
+
+# keys of a header, in small letters without blanks or punctuation
+COUNT_KEYS = ("signalhardwarerecordlength", "recordlength", "numberofdatapoints", "segmentsize", "samples")
+STEP_KEYS = (
+    *("sampleinterval", "increment", "tinc", "timestep", "dt", "tinterval", "xinc", "xincrement", "wfincrement"),
+    *("signalresolution", "resolution"),
+)
+RATE_KEYS = ("samplerate", "samplingrate", "fs", "rate", "samplefrequency", "samplingfrequency")
+START_KEYS = (*("start", "t0", "tstart", "xorg", "xorigin", "starttime", "wfstartoffset", "hardwarexstart", "xstart"),)
+GRID_KEYS = frozenset(("", *START_KEYS, *STEP_KEYS))
+NAME_KEYS = ("multichannelsource", "source", "channeldata", "label")
+UNIT_KEYS = ("verticalunits", "verticalunit")
+TIME_UNIT_KEYS = ("horizontalunits",)
+ATTENUATION_KEYS = ("probeatten", "probeattenuation", "attenuation")
+SEGMENT_KEYS = ("segments",)
+
+_PREFIXES = {
+    "": 1.0, "f": 1e-15, "p": 1e-12, "n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6,
+}  # fmt: skip
+_QUANTITIES = {
+    "s": "s", "S": "s", "sec": "s", "second": "s", "seconds": "s",
+    "V": "V", "v": "V", "volt": "V", "volts": "V",
+    "A": "A", "amp": "A", "amps": "A", "ampere": "A", "amperes": "A",
+}  # fmt: skip
+
+
+def key(text: str) -> str:
+    """A header's key as the tables above spell it: ``key("Number of Data points =") == "numberofdatapoints"``."""
+    return re.sub(r"[^0-9a-zµμ]", "", text.lower())
+
+
+def unit(text: str) -> tuple[str, float] | None:
+    """SI unit (s, V or A) and factor of a unit as makers spell it: ``unit("(ms)") == ("s", 1e-3)``; None: no unit."""
+    bare = text.strip().strip("()[]").strip()
+    for length in (0, 1):
+        prefix, symbol = bare[:length], bare[length:]
+        found = _QUANTITIES.get(symbol) or (_QUANTITIES.get(symbol.lower()) if len(symbol) > 2 else None)
+        if found and prefix in _PREFIXES:
+            return found, _PREFIXES[prefix]
+    return None
+
+
+_NAME_AND_UNIT = (
+    re.compile(r"^(?P<name>.*?)\s*[(\[](?P<unit>[^)\]]*)[)\]]$"),  # Channel 1 (V), Time [s]
+    re.compile(r"^(?P<name>.*?)\s*\bin\s+(?P<unit>\S+)$"),  # C1 in V
+    re.compile(r"^(?P<name>.*\S)\s+/\s+(?P<unit>\S+)$"),  # Time / s
+    re.compile(r"^(?P<name>.*)_(?P<unit>[^_]+)$"),  # time_ms
+)
+_CONTRACT = re.compile(r"^(?P<name>time|V|Vsc|I)(?:_(?P<unit>.+))?$", re.IGNORECASE)
+
+
+def name_and_unit(cell: str) -> tuple[str, str]:
+    """A column's name and its unit as written, "" where none is."""
+    contract = _CONTRACT.match(cell)
+    if contract:
+        return contract["name"], contract["unit"] or ""
+    for pattern in _NAME_AND_UNIT:
+        match = pattern.match(cell)
+        if match and unit(match["unit"]):
+            return match["name"].strip(), match["unit"]
+    return cell, ""
+
+
+def same_channel(asked: str, name: str) -> bool:
+    """Whether both mean one channel: "CH2", "Channel 2", "Chan 2" and Keysight's "2" do."""
+    return _channel(asked) == _channel(name)
+
+
+def is_contract(name: str) -> bool:
+    """Whether a column's name is fitact's own."""
+    return _CONTRACT.fullmatch(name) is not None
+
+
+def _channel(name: str) -> str:
+    bare = re.sub(r"[\s_.-]", "", name.lower())
+    return re.sub(r"^(channel|chan|ch|kanal|canal|ampl|c)(?=[0-9]+$|[a-z]$)", "", bare)

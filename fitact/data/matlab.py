@@ -1,0 +1,94 @@
+"""MATLAB's .mat files of version 5 to 7, as MathWorks document them: arrays of numbers and words at the top level.
+
+SciPy reads more of them, but its compiled reader ends the process at some broken files.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterator
+
+import numpy as np
+
+_HEADER = 128  # bytes
+_MATRIX, _COMPRESSED = 14, 15
+_NUMBERS = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    9: "f8",
+    12: "i8",
+    13: "u8",
+    16: "u1",
+    17: "u2",
+}
+_CHAR, _CLASSES = 4, range(6, 16)  # of arrays: words; double, single and the integers
+_COMPLEX = 0x0800
+
+
+def read_mat(content: bytes, most: int) -> Iterator[tuple[str, np.ndarray]]:
+    """Name and array of each variable of numbers or words; what unfolds to more than `most` bytes is an error.
+
+    Raises:
+        ValueError: the file is broken.
+    """
+    order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
+    if order is None:
+        raise ValueError("no byte order in the header")
+    for kind, data in _elements(content[_HEADER:], order):
+        if kind == _COMPRESSED:
+            unpacked = _unpacked(data, most)
+            kind, data = next(_elements(unpacked, order), (0, b""))
+        if kind == _MATRIX:
+            yield from _matrix(data, order)
+
+
+def _unpacked(data: bytes, most: int) -> bytes:
+    stream = zlib.decompressobj()
+    try:
+        unpacked = stream.decompress(data, most)
+    except zlib.error as error:
+        raise ValueError(f"a compressed part is broken: {error}") from error
+    if not stream.eof:
+        raise ValueError("a compressed part is cut or too large")
+    return unpacked
+
+
+def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
+    """Type and content of each element; a small one keeps its size in the upper half of its type."""
+    at = 0
+    while at + 8 <= len(data):
+        kind, size = struct.unpack_from(order + "II", data, at)
+        start = at + 8
+        if kind >> 16:
+            kind, size, start = kind & 0xFFFF, kind >> 16, at + 4
+        if start + size > len(data):
+            raise ValueError(f"an element of {size:,} bytes reaches beyond the end")
+        yield kind, data[start : start + size]
+        at = start + size
+        if kind != _COMPRESSED:
+            at = -(-at // 8) * 8  # padded
+
+
+def _matrix(data: bytes, order: str) -> Iterator[tuple[str, np.ndarray]]:
+    parts = list(_elements(data, order))
+    if len(parts) < 4 or len(parts[0][1]) < 8:
+        return  # an array of no elements, or an object
+    flags = struct.unpack_from(order + "I", parts[0][1])[0]
+    name = parts[2][1].decode("ascii", errors="replace")
+    values = [
+        np.frombuffer(raw, order + _NUMBERS[kind])
+        for kind, raw in parts[3 : 5 if flags & _COMPLEX else 4]
+        if kind in _NUMBERS and len(raw) % int(_NUMBERS[kind][1]) == 0
+    ]
+    shape = np.frombuffer(parts[1][1], order + "i4").astype(int)
+    if not values or np.prod(shape.astype(float)) != values[0].size:
+        return  # a cell or a structure, whose parts are no numbers
+    if flags & 0xFF == _CHAR:
+        yield name, np.array("".join(map(chr, values[0])))
+    elif flags & 0xFF in _CLASSES:
+        array = values[0] if len(values) == 1 else values[0] + 1j * values[1]
+        yield name, array.reshape(shape, order="F")
