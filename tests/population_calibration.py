@@ -85,7 +85,7 @@ def places(number: int, seed: int) -> dict[str, Any]:
         found = fitact.population(simulated.records, simulated.scene, seed=number, progress=False)
     except fitact.InputError as error:
         return row | {"refused": str(error)}
-    draws = found.parameters() | found.new_fingers()
+    draws = found.new_fingers() | found.parameters()  # Rsc and Csc are the medians
     row |= {"places": {name: float(np.mean(draws[name] < simulated.truth[name])) for name in QUANTITIES}}
     row |= {"trusted": found.trusted, "warnings": list(found.warnings), "integrals_off": found.off}
     return row | {"steps": found.convergence.steps, "seconds": time.perf_counter() - began}

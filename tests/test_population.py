@@ -234,6 +234,17 @@ def test_law_is_that_of_nuts_over_all_parameters(count: int):
         assert wider == pytest.approx(0.0, abs=0.05), name
 
 
+@pytest.mark.slow
+def test_a_misfit_is_named_and_the_population_stays_trusted():
+    simulated = simulate(1, 0, fingers=4)
+    first, *others = simulated.records
+    bent = dataclasses.replace(first, channels={**first.channels, "Vsc": first["Vsc"] + 0.005 * first["Vsc"] ** 2})
+    found = fitact.population([bent, *others], simulated.scene, seed=1, progress=False)
+    assert [fit.result for fit in found.fits] == ["misfit", *["successful"] * 3]
+    assert [warning.partition(":")[0] for warning in found.warnings] == ["finger 0 of population 0"]
+    assert found.trusted
+
+
 @pytest.fixture(scope="module")
 def eight(tmp_path_factory) -> dict:
     """What the command prints for ngspice's eight fingers, with V, Vsc and I."""

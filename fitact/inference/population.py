@@ -28,8 +28,9 @@ from fitact.units import engineering
 _WALKERS, _ENSEMBLES = 128, 4
 _KEPT = 2500  # points per ensemble
 _LAWS, _FINGERS = 1000, 32  # that new fingers are drawn from, and of each
-_DRAWS, _TERMS = 64, 9  # of the fingers' tables,
-_MORE_DRAWS, _MORE_TERMS = 256, 13  # and of those that these are checked against
+_DRAWS = (64, 1024)  # in the fingers' tables, and where so few turn out to be too few
+_LEAST_CHECKED = 256  # other draws that these are checked against
+_TERMS, _MORE_TERMS = 9, 13  # of the tables, and of those that they are checked against
 _CHECKED = 500  # points at which
 _OFF = 0.1  # standard deviations of a mean that the tables may shift it by
 _SHARES = ("force_mean", "force_peak")
@@ -162,14 +163,13 @@ class Population:
             median, low, high = (engineering(float(s[q]), str(s["unit"])) for q in ("q50", "q025", "q975"))
             rows.append(f"{name:26}{median:>12}{low:>14}{high:>12}")
         for name in _SHARES:
-            people = new[name]["variance"]["people"]
-            parts = ", ".join(
-                f"{f} {100 * s['first']:.0f} % ({100 * s['total']:.0f} % in all)"
-                for f, s in content["variance_shares"][name].items()
+            people = 100.0 * new[name]["variance"]["people"]
+            parts = (
+                f"{factor} {100.0 * share['first']:.0f} % ({100.0 * share['total']:.0f} %)"
+                for factor, share in content["variance_shares"][name].items()
             )
-            rows.append(
-                f"the spread of {name} is {100.0 * people:.0f} % people, the rest ignorance; it comes from {parts}"
-            )
+            rows.append(f"variance of {name}: {people:.0f} % people, the rest ignorance; {', '.join(parts)}")
+        rows.append("factors: the share of the variance that goes once each is known (that stays if only it is not)")
         rows.append(str(self.convergence))
         return "\n".join([*rows, *(f"warning: {warning}" for warning in self.warnings)])
 
@@ -205,10 +205,10 @@ def population(
     scene = scene or Scene()
     medians = _prior(scene)
     _require_fingers(records)
-    varies = scene.population.contact_area == "varies"
     fits = _fitted(records, scene)
     with jax.enable_x64(True):
         conditionals = [Conditional.around(each) for each in fits]
+        varies = scene.population.contact_area == "varies"
 
         def hierarchy(draws: int, terms: int, purpose: int) -> Hierarchy:
             tables = Fingers.tabulated(
@@ -216,15 +216,23 @@ def population(
             )
             return Hierarchy(tables, medians, varies)
 
-        sampled = hierarchy(_DRAWS, _TERMS, 2)
-        log_prob = finite(Batched(Hierarchy.log_prob, sampled, sampled.fingers.weight.size, _WALKERS // 2))
-        proposal = Proposal.around(*laplace(sampled), log_prob)
-        target = Target(sampled.names, log_prob, proposal, lambda points, _: _medians(_laws(sampled, points)))
-        chain, convergence = run(target, seed, _WALKERS, _ENSEMBLES, max_steps, None, progress)
-        points = chain.points[:, chain.thinned(convergence.burn, _KEPT)]
-        points = points.reshape(_ENSEMBLES, -1, len(sampled.names))
-        off = _off(sampled, hierarchy(_MORE_DRAWS, _MORE_TERMS, 3), points)
+        for draws in _DRAWS:
+            sampled = hierarchy(draws, _TERMS, 2)
+            points, convergence = _sampled(sampled, seed, max_steps, progress)
+            off = _off(sampled, hierarchy(max(draws, _LEAST_CHECKED), _MORE_TERMS, 3), points)
+            if off <= _OFF or not convergence.converged:
+                break
     return Population(fits, sampled, points, convergence, off, scene, seed)
+
+
+def _sampled(hierarchy: Hierarchy, seed: int, max_steps: int, progress: bool) -> tuple[np.ndarray, Convergence]:
+    """Points (ensembles, draws, coordinates), and how far they can be trusted."""
+    log_prob = finite(Batched(Hierarchy.log_prob, hierarchy, hierarchy.fingers.weight.size, _WALKERS // 2))
+    proposal = Proposal.around(*laplace(hierarchy), log_prob)
+    target = Target(hierarchy.names, log_prob, proposal, lambda points, _: _medians(_laws(hierarchy, points)))
+    chain, convergence = run(target, seed, _WALKERS, _ENSEMBLES, max_steps, None, progress)
+    points = chain.points[:, chain.thinned(convergence.burn, _KEPT)]
+    return points.reshape(_ENSEMBLES, -1, len(hierarchy.names)), convergence
 
 
 def _prior(scene: Scene) -> Prior:
