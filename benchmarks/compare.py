@@ -25,7 +25,7 @@ MEASURED = {
 }
 RGAP, CGAP = 2e6, 443e-12
 WIDE = {"prior": {"Rgap": {"factor": 100}, "Cgap": {"factor": 100}}}
-SIZES = {"no gap": 0.0, "gap of 1 %": 1e-2, "gap of 10 %": 1e-1, "whole gap": 1.0}
+SIZES = {"no gap": 0.0, "gap of 10 %": 1e-1, "whole gap": 1.0}
 
 
 def scene(size: float, **more: dict) -> fitact.Scene:

@@ -143,3 +143,16 @@ def test_divider_is_differentiable_where_a_fit_may_stray(logs: tuple[float, floa
         value, slope = jax.value_and_grad(lambda x: fitact.FinalCircuit(*jnp.exp(x)).g)(jnp.array(logs))
     assert float(value) == pytest.approx(0.0 if logs[1] > logs[2] else 0.5)
     assert np.all(np.isfinite(slope))
+
+
+@pytest.mark.parametrize("Rsc", [1e-18, 1e-3, 160e3])
+def test_derivatives_are_finite_where_two_skins_share_a_time_constant(Rsc: float):
+    """A resistor far larger than two equal skins leaves their time constants apart by less than rounding."""
+
+    def square_of_vsc(values: jax.Array) -> jax.Array:
+        circuit = fitact.DirectGround(*values, series_resistor=100e3)
+        return jnp.sum(jnp.square(fitact.response(circuit, fitact.Square(360.0, 100.0), jnp.linspace(0.0, 0.01, 9))))
+
+    with jax.enable_x64(True):
+        values = jnp.array([Rsc, 18e-9, 1.35e-9])
+        assert np.all(np.isfinite(jax.jacfwd(square_of_vsc)(values)))

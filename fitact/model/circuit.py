@@ -18,6 +18,7 @@ the mode that they share then has weight zero.
 from typing import Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -28,6 +29,7 @@ from fitact.errors import InputError
 from fitact.model.highpass import highpass_amplitude, highpass_gain
 
 _LEAST = 1e-12  # of Ci: a skin without capacitance counts as having so much, which keeps its time constant from 0
+_ROUNDING = 4.0  # times the largest singular value's rounding: others so close to each other are one
 _NEVER = 1e15  # of the slowest time constant: that with which an open gap loses its charge
 
 
@@ -310,10 +312,27 @@ def _modes_with_resistance(Ci: ArrayLike, R0: ArrayLike, R: Array, C: Array) -> 
     return _Modes(tau, voltages, Ci * modes[-1] ** 2 / tau)
 
 
+@jax.custom_jvp
 def _modes_of(factor: Array) -> tuple[Array, Array]:
     """Eigenvalues and eigenvectors of factor^T factor: from the factor, small eigenvalues keep twice the digits."""
     _, sigma, modes = jnp.linalg.svd(factor, full_matrices=False)
     return sigma * sigma, modes.T
+
+
+@_modes_of.defjvp
+def _modes_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """That of the singular value decomposition, but finite where modes are apart by no more than rounding.
+
+    They then have one time constant, and only their sum matters, which their rotation into each other leaves alone.
+    """
+    left, sigma, right = jnp.linalg.svd(primals[0], full_matrices=False)
+    modes, slope = right.T, left.T @ tangents[0] @ right.T
+    apart = sigma - sigma[:, None]
+    distinct = jnp.abs(apart) > _ROUNDING * jnp.finfo(sigma.dtype).eps * sigma[0]
+    turn = jnp.where(distinct, 1.0 / jnp.where(distinct, apart * (sigma + sigma[:, None]), 1.0), 0.0)
+    scaled = sigma[:, None] * slope
+    changes = 2.0 * sigma * jnp.diagonal(slope), modes @ (turn * (scaled + scaled.T))
+    return (sigma * sigma, modes), changes
 
 
 class Probe(eqx.Module):
