@@ -1,0 +1,39 @@
+"""The command line: parses, calls, prints. Heavy imports wait until a command needs them."""
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+import typer
+
+from fitact.cli import one_finger, records, scenes  # noqa: F401  (their commands)
+from fitact.cli.app import app
+from fitact.cli.terminal import say
+from fitact.errors import InputError
+
+
+def main() -> None:
+    """Entry point: every error becomes one line and an exit code."""
+    raise SystemExit(_guarded(lambda: app(standalone_mode=False)))
+
+
+def _guarded(command: Callable[[], Any]) -> int:
+    try:
+        result = command()
+        return result if isinstance(result, int) else 0
+    except InputError as error:
+        say(f"fitact: {error}")
+        return 2
+    except typer.exceptions.TyperException as error:  # a wrong option or argument; it knows how to show itself
+        error.show()  # type: ignore[attr-defined]
+        return 2
+    except (KeyboardInterrupt, typer.Abort):
+        say("fitact: interrupted; the same command goes on from the last checkpoint")
+        return 130
+    except BrokenPipeError:
+        return 0
+    except Exception as error:
+        if os.environ.get("FITACT_DEBUG"):
+            raise
+        say(f"fitact: internal error ({type(error).__name__}: {error}); please report it, with FITACT_DEBUG=1 set")
+        return 3

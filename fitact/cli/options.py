@@ -1,0 +1,78 @@
+"""What several commands ask for."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from fitact.errors import InputError
+
+RecordFiles = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="RECORD...",
+        help="CSV with time_s, V_V, Vsc_V, I_A, or an oscilloscope's file with --channel. Several: fitted jointly.",
+    ),
+]
+Channels = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--channel",
+        metavar="NAME=COLUMN",
+        help="Which of the file's channels V, Vsc or I is: Vsc=CH2, V=OTHERFILE:CH1.",
+    ),
+]
+Scales = Annotated[
+    list[str] | None,
+    typer.Option("--scale", metavar="NAME=FACTOR", help="What to multiply V, Vsc or I by, as for a probe: Vsc=10."),
+]
+SceneFiles = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--scene", metavar="FILE", help="Scene (TOML); absent: the paper's device. Once for all records, or once each."
+    ),
+]
+Out = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for the results.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Same seed, same draws.")]
+Json = Annotated[
+    bool, typer.Option("--json", help="Print the result as JSON on standard output, and nothing else there.")
+]
+Tolerance = Annotated[
+    float,
+    typer.Option(
+        "--tolerance", min=0.0, help="Error that compressing the record may cause in its log-likelihood; 0: none."
+    ),
+]
+Level = Annotated[
+    Literal["emcee", "psis", "laplace"],
+    typer.Option(
+        "--level",
+        help="How uncertainty is found: sampled until converged; by importance weights (certified or refused); or by"
+        " the fit's normal approximation (fast; says what it is off by).",
+    ),
+]
+Model = Annotated[
+    Literal["planned", "full"],
+    typer.Option(
+        "--model", help="What the scene's tolerance requires (see `plan`), or everything that the scene names."
+    ),
+]
+Columns = tuple[list[str] | None, list[str] | None]  # --channel and --scale as given
+Results = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `run` or `sample` wrote.")]
+Fresh = Annotated[bool, typer.Option("--fresh", help="Start the chain anew instead of going on from one in DIR.")]
+
+
+def mapping(given: Columns) -> dict[str, Any]:
+    """What --channel and --scale say, as `fitact.read` takes it."""
+    pairs: list[dict[str, str]] = []
+    for option, texts in zip(("--channel Vsc=CH2", "--scale Vsc=10"), given, strict=True):
+        parts = [text.partition("=") for text in texts or []]
+        for name, _, value in parts:
+            if not name or not value:
+                raise InputError(f"'{name}{value}' after {option.split()[0]} lacks a side; write {option}")
+        pairs.append({name.strip(): value.strip() for name, _, value in parts})
+    try:
+        factors = {name: float(value) for name, value in pairs[1].items()}
+    except ValueError as error:
+        raise InputError(f"--scale: {error}; write a number, as --scale Vsc=10") from error
+    return {"channels": pairs[0], "scale": factors}

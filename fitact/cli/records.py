@@ -1,0 +1,131 @@
+"""Commands on records: what they hold, which model they prefer, what people they come from, what accuracy costs."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fitact.cli.app import app
+from fitact.cli.options import Channels, Json, Out, RecordFiles, Scales, Seed, mapping
+from fitact.cli.terminal import finish, say, show, use_compilation_cache
+from fitact.files import write_json
+
+
+@app.command()
+def inspect(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A record, or any file of an oscilloscope.")],
+    channel: Channels = None,
+    scale: Scales = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Drawing to write: .svg or .png.")] = None,
+    json: Json = False,
+) -> None:
+    """Look at a file before fitting it: channels, rate, units, noise, clipping, frequency, and what is doubtful."""
+    from fitact.data.inspection import inspect as inspected
+
+    seen = inspected(file, **mapping((channel, scale)))
+    if out is not None:
+        from fitact.report.record import write_record
+
+        write_record(out, seen)
+    show(str(seen), seen.to_dict(), json)
+
+
+@app.command()
+def compare(
+    records: RecordFiles,
+    scenes: Annotated[
+        list[Path], typer.Option("--scene", metavar="FILE", help="Scene (TOML) of one model; give two or more.")
+    ],
+    channel: Channels = None,
+    scale: Scales = None,
+    json: Json = False,
+) -> None:
+    """Fit the model of each scene to the same records, in full, and say which the data prefer."""
+    from fitact.data.formats import read
+    from fitact.model.scene import Scene
+
+    alike = len({path.stem for path in scenes}) < len(scenes)
+    stated = {str(path) if alike else path.stem: Scene.load(path) for path in scenes}
+    for each in stated.values():
+        each.require_available(fit=True)
+    first, columns = next(iter(stated.values())), mapping((channel, scale))
+    measured = [read(record, first, **columns) for record in records]
+    use_compilation_cache()
+    from fitact.inference.comparison import compare as compared
+
+    found = compared(measured, stated)
+    show(str(found), found.to_dict(), json)
+    finish(found.trusted)
+
+
+@app.command()
+def population(
+    records: Annotated[list[Path], typer.Argument(metavar="RECORD...", help="One of each finger, on one panel.")],
+    scene: Annotated[
+        Path | None, typer.Option("--scene", metavar="FILE", help="Scene (TOML) of all; absent: the paper's device.")
+    ] = None,
+    channel: Channels = None,
+    scale: Scales = None,
+    out: Out = None,
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """From one finger to people: how fingers differ, what force the next one will feel, and why.
+
+    Into DIR it writes population.json and population.svg.
+    """
+    from fitact.data.formats import read
+    from fitact.model.scene import Scene
+
+    stated = None if scene is None else Scene.load(scene)
+    columns = mapping((channel, scale))
+    measured = [read(path, stated, **columns) for path in records]
+    use_compilation_cache()
+    from fitact.inference.population import population as find_population
+
+    found = find_population(measured, stated, seed=seed)
+    if out is not None:
+        from fitact.report.population import write_population
+
+        write_json(out / "population.json", found.to_dict())
+        write_population(out / "population.svg", found)
+    show(str(found), found.to_dict(), json)
+    finish(found.trusted)
+
+
+@app.command()
+def tradeoff(
+    record: Annotated[
+        Path | None, typer.Argument(metavar="[RECORD]", help="CSV with V and Vsc; absent: simulated from the scene.")
+    ] = None,
+    scene: Annotated[
+        Path | None, typer.Option("--scene", metavar="FILE", help="Scene (TOML); absent: the paper's device.")
+    ] = None,
+    channel: Channels = None,
+    scale: Scales = None,
+    out: Out = None,
+    json: Json = False,
+) -> None:
+    """Measure what each level of response, likelihood and uncertainty costs and is off by, on this machine.
+
+    Takes a minute or two. With --out writes tradeoff.json and tradeoff.svg.
+    """
+    from fitact.data.formats import read
+    from fitact.model.scene import Scene
+
+    stated = None if scene is None else Scene.load(scene)
+    measured = None if record is None else read(record, stated, **mapping((channel, scale)))
+    from fitact.tradeoff import measure_tradeoff
+
+    try:
+        found = measure_tradeoff(measured, stated)
+    except KeyboardInterrupt:
+        say("fitact: interrupted; nothing was written")
+        raise typer.Exit(130) from None
+    if out is not None:
+        from fitact.report.tradeoff import write_tradeoff
+
+        write_json(out / "tradeoff.json", found.to_dict())
+        write_tradeoff(out / "tradeoff.svg", found)
+    show(str(found), found.to_dict(), json)
+    finish(found.trusted)
