@@ -13,7 +13,7 @@ _SYMBOLS = {"ohm": "Ω", "1": ""}
 _UNITS = {
     "Rsc": "ohm", "Csc": "F", "Ci": "F", "R_H": "ohm", "grounding_Rsc": "ohm", "grounding_Csc": "F",
     "Z": "ohm", "Z_capacitance": "F", "series_resistor": "ohm", "gain": "1", "delay": "s", "clock": "1", "sigma": "V",
-    "Vsc_peak_to_peak": "V",
+    "alpha": "1", "Vsc_peak_to_peak": "V",
     "offset": "V", "drift": "V", "charge": "V",
     "hum_50Hz_cos": "V", "hum_50Hz_sin": "V", "hum_60Hz_cos": "V", "hum_60Hz_sin": "V",
     "g": "1", "b": "s", "force_mean": "N", "force_peak": "N", "force_rms": "N", "friction_mean": "N",

@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -20,7 +20,8 @@ from fitact.inference.structure import log_values, with_parameters
 from fitact.model.circuit import Channel, Circuit, DirectGround, FinalCircuit, NaturalGround
 from fitact.model.drive import Drive, Periodic, Sampled
 from fitact.model.force import Contact, force_constant
-from fitact.model.response import highpass
+from fitact.model.response import highpass, response_and_rate
+from fitact.model.skin import WithSkin, limits_current, parameters
 from fitact.units import engineering
 
 NOISE_I = 20e-9  # A, of a current channel where none is stated
@@ -100,15 +101,17 @@ def expected_sd(experiment: Experiment) -> Expected:
     e, theta = experiment, log_values(experiment.circuit, experiment.free, experiment.channels)
     with jax.enable_x64(True):
         circuit = jax.tree.map(jnp.asarray, e.circuit)  # plain numbers would be compiled in
-        *seen, touching, force_constant_slope = _terms(circuit, e.free, e.channels, jnp.asarray(theta))
         sampling = _sampling(e)
-        vsc, slope = _response(touching, sampling)
-        responses = [_response(terms, sampling)[1] for terms in seen]
+        of = _skinned if isinstance(circuit, WithSkin) else _with_constant_skins
+        *seen, (vsc, slope) = of(circuit, e.free, e.channels, jnp.asarray(theta), sampling)
+        force_constant_slope = _force_constant_slope(circuit, e.free, e.channels, jnp.asarray(theta))
     weight = sampling.force * vsc
     gradient = np.asarray(force_constant_slope) + 2.0 * (weight @ slope) / (weight @ vsc)
     jacobian = [
-        (sampling.away if float(terms.rate) else sampling.data)[:, None] / e.noise[channel] * response
-        for channel, (terms, _), response in zip(e.channels, seen, responses, strict=True)
+        (sampling.away if channel == "I" and not limits_current(circuit) else sampling.data)[:, None]
+        / e.noise[channel]
+        * response
+        for channel, (_, response) in zip(e.channels, seen, strict=True)
     ]
     root = covariance_root(np.concatenate(jacobian), e.prior_root)
     force_sd = float(np.linalg.norm(gradient @ root))
@@ -163,6 +166,9 @@ def _changes(e: Experiment) -> Iterator[tuple[str, Experiment]]:
 
 def _with_resistor(circuit: Circuit) -> Circuit | None:
     """The circuit with a known resistor in series; None where it has one."""
+    if isinstance(circuit, WithSkin):
+        resisted: Any = _with_resistor(circuit.circuit)
+        return None if resisted is None else dataclasses.replace(circuit, circuit=resisted)
     if isinstance(circuit, FinalCircuit):
         circuit = DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci)
     if not isinstance(circuit, DirectGround | NaturalGround) or circuit.series_resistor is not None:
@@ -182,7 +188,7 @@ class _Terms(NamedTuple):
 def _terms(
     circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], theta: Float[Array, " parameters"]
 ) -> tuple[Any, ...]:
-    """For each channel, and for Vsc itself: terms and their derivatives; and the derivative of log force over Vsc^2."""
+    """For each channel, and for Vsc itself: terms and their derivatives."""
 
     def terms(theta: Array) -> list[_Terms]:
         there, gains = with_parameters(circuit, free, channels, theta)
@@ -193,12 +199,24 @@ def _terms(
             found.append(_Terms(gain * jnp.stack(weight), jnp.log(jnp.stack(tau)), gain * rate))
         return found
 
-    def log_force(theta: Array) -> Array:
-        there: Any = with_parameters(circuit, free, channels, theta)[0]
-        # the permittivities follow the capacitances, eq. (3), so the geometry is but a factor of the force
-        return jnp.log(force_constant(Contact.from_capacitances(there.Ci, there.Csc, 1.0, 1.0, 1.0)))
+    return tuple(zip(terms(theta), jax.jacfwd(terms)(theta), strict=True))
 
-    return *zip(terms(theta), jax.jacfwd(terms)(theta), strict=True), jax.jacfwd(log_force)(theta)
+
+@eqx.filter_jit
+def _force_constant_slope(
+    circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], theta: Float[Array, " parameters"]
+) -> Float[Array, " parameters"]:
+    """The derivative of log force over Vsc^2."""
+
+    def log_force(theta: Array) -> Array:
+        there: Any = parameters(with_parameters(circuit, free, channels, theta)[0])
+        # the permittivities follow the capacitances, eq. (3), so the geometry is but a factor of the force
+        return jnp.log(force_constant(Contact.from_capacitances(there["Ci"], there["Csc"], 1.0, 1.0, 1.0)))
+
+    return jax.jacfwd(log_force)(theta)
+
+
+_Seen: TypeAlias = tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times parameters"]]
 
 
 class _Sampling(NamedTuple):
@@ -274,9 +292,46 @@ def _highpass(drive: Drive, time: Array, log_tau: Array, steady_state: bool) -> 
     return jax.jvp(response, (log_tau,), (jnp.ones_like(log_tau),))
 
 
-def _response(
-    channel: tuple[_Terms, _Terms], sampling: _Sampling
-) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times parameters"]]:
+def _with_constant_skins(
+    circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], theta: Array, sampling: _Sampling
+) -> list[_Seen]:
+    """What each channel, and Vsc itself, shows, and its derivatives in the log-parameters."""
+    return [_response(terms, sampling) for terms in _terms(circuit, free, channels, theta)]
+
+
+def _skinned(
+    circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], theta: Array, sampling: _Sampling
+) -> list[_Seen]:
+    """As `_with_constant_skins`, of a skin that depends on the frequency."""
+    of = jnp.asarray(sampling.time), jnp.asarray(sampling.slope), sampling.steady_state
+    values, slopes = _shown(circuit, free, channels, theta, sampling.drive, *of)
+    return [(np.asarray(value), np.asarray(slope)) for value, slope in zip(values, slopes, strict=True)]
+
+
+@eqx.filter_jit
+def _shown(
+    circuit: Circuit,
+    free: tuple[str, ...],
+    channels: tuple[Channel, ...],
+    theta: Array,
+    drive: Drive,
+    time: Array,
+    rising: Array,
+    steady_state: bool,
+) -> tuple[list[Array], list[Array]]:
+    def shown(theta: Array) -> tuple[list[Array], list[Array]]:
+        there, gains = with_parameters(circuit, free, channels, theta)
+        found = []
+        for gain, channel in [*zip(gains, channels, strict=True), (1.0, "Vsc")]:
+            value, rate = response_and_rate(there, drive, time, steady_state=steady_state, channel=channel)
+            found.append(gain * (value if rate is None else value + rate * rising))
+        return found, found
+
+    slopes, values = jax.jacfwd(shown, has_aux=True)(theta)
+    return values, slopes
+
+
+def _response(channel: tuple[_Terms, _Terms], sampling: _Sampling) -> _Seen:
     """What a channel shows, and its derivatives in the log-parameters.
 
     Term by term, and the terms' derivatives apart: at once it takes ten times as long to compile.

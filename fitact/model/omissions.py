@@ -54,7 +54,7 @@ def named(scene: Scene) -> tuple[str, ...]:
 
 def parameters(name: str) -> set[str]:
     """The circuit's parameters that go with an omission."""
-    return {key for section, key in _KEYS[name] if section == "grounding" or key == "series_resistor"}
+    return {key for section, key in _KEYS[name] if section == "grounding" or key in ("series_resistor", "alpha")}
 
 
 def required(scene: Scene, name: str) -> str:

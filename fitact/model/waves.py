@@ -107,7 +107,9 @@ class Waves:
         drive, count = scene.make_drive(), max(np.size(value) for value in values.values())
         with jax.enable_x64(precision is np.float64):
             circuit = scene.make_circuit(dict(values))
-            skin = circuit.skin if isinstance(circuit, WithSkin) else None
+            skin = None
+            if isinstance(circuit, WithSkin):  # its exponent may differ from circuit to circuit
+                skin = jax.tree.map(lambda x: _filled_up(x, precision)[:, None], circuit.skin)
             complete = _complete(scene.make_rc_circuit(dict(values)))
             filled = jax.tree.map(lambda x: _filled_up(x, precision), complete)
             weight, tau, harmonics = _terms(filled, skin, drive, precision)
