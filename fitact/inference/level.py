@@ -17,6 +17,7 @@ from fitact.model.scene import Scene
 from fitact.model.skin import TOP, Dispersive, Fractional, WithSkin
 
 _BELOW = 0.3  # of the slowest angular frequency there is: from where the grid is fitted,
+_OFF = 0.9  # of a drive's stated frequency, at least, is that of the record
 _ABOVE = 100.0  # and to so many times the inverse of the time step
 _AT_JUMP = 0.5  # steps from an ideal jump, within which a fractional skin's response has no value of its own
 
@@ -28,7 +29,7 @@ def with_level(circuit: RC, records: Sequence[Record], scenes: Sequence[Scene | 
         return circuit
     slowest = min(_slowest(record, given or Scene()) for record, given in zip(records, scenes, strict=True))
     if scene.skin.level == "dispersive":
-        return WithSkin(circuit, Dispersive(math.ceil(2.0 * math.pi * TOP / (_BELOW * slowest))))
+        return WithSkin(circuit, Dispersive(math.ceil(2.0 * math.pi * TOP / (_OFF * slowest))))
     fastest = _ABOVE / min(record.time_step for record in records)
     alpha = jnp.asarray(scene.fixed().get("alpha", scene.skin.alpha))
     return WithSkin(circuit, Fractional(alpha), Grid.between(_BELOW * slowest, fastest))

@@ -310,6 +310,8 @@ def _start(likelihood: Likelihood, sources: Sequence[Source]) -> Float[np.ndarra
     vsc = next((start for start in starts if isinstance(start, LinearStart)), None)
     current = next((start for start in starts if isinstance(start, CurrentStart)), None)
     theta = np.concatenate([likelihood.prior.log_mean, np.zeros(len(likelihood.names) - len(likelihood.prior.names))])
+    if current is not None and not current.capacitance > 0.0 and isinstance(likelihood.template, WithSkin):
+        current = None  # of one frequency, what a constant skin makes of such a current need be no skin
     if vsc is None and current is None:
         return _best_of_prior(likelihood, theta)
     mean, sd = _believed(likelihood)

@@ -31,6 +31,7 @@ TOP = float(_FREQUENCY[-1])  # Hz, above which a dispersive skin is constant
 
 _PER_DECADE = 6  # time constants by which a fractional skin is followed at high frequency
 _DECADES = 8
+_NO_ELEMENT = 2.0  # exponents from which an impedance that goes as its power of frequency would turn its sign
 
 
 class Skin(eqx.Module):
@@ -112,8 +113,10 @@ class Fractional(Skin):
     def at(self, skin: Element, frequency: ArrayLike) -> Element:
         """R(f) = 1 / Re(1/Z), C(f) = Im(1/Z) / w."""
         x = 2.0 * np.pi * jnp.asarray(frequency, dtype=float) * (jnp.asarray(skin.R) * skin.C)
-        power = jnp.where(x > 0.0, jnp.exp((self.alpha - 1.0) * jnp.log(jnp.where(x > 0.0, x, 1.0))), 1.0)
-        angle = 0.5 * np.pi * (1.0 - jnp.asarray(self.alpha))  # from the missing part of alpha: exactly 0 at 1
+        alpha = jnp.asarray(self.alpha)
+        alpha = jnp.where(alpha < _NO_ELEMENT, alpha, jnp.nan)  # so that no step of a fit leads there
+        power = jnp.where(x > 0.0, jnp.exp((alpha - 1.0) * jnp.log(jnp.where(x > 0.0, x, 1.0))), 1.0)
+        angle = 0.5 * np.pi * (1.0 - alpha)  # from the missing part of alpha: exactly 0 at 1
         return Element(skin.R / (1.0 + x * power * jnp.sin(angle)), skin.C * power * jnp.cos(angle))
 
     def count(self, frequency: ArrayLike) -> int:
