@@ -21,7 +21,7 @@ from fitact.model.circuit import Channel, Circuit, DirectGround, FinalCircuit, N
 from fitact.model.drive import Drive, Periodic, Sampled
 from fitact.model.force import Contact, force_constant
 from fitact.model.response import highpass, response_and_rate
-from fitact.model.skin import WithSkin, limits_current, parameters
+from fitact.model.skin import WithSkin, has_time_constants, limits_current, parameters
 from fitact.units import engineering
 
 NOISE_I = 20e-9  # A, of a current channel where none is stated
@@ -102,7 +102,7 @@ def expected_sd(experiment: Experiment) -> Expected:
     with jax.enable_x64(True):
         circuit = jax.tree.map(jnp.asarray, e.circuit)  # plain numbers would be compiled in
         sampling = _sampling(e)
-        of = _skinned if isinstance(circuit, WithSkin) else _with_constant_skins
+        of = _by_terms if has_time_constants(circuit) else _by_harmonics
         *seen, (vsc, slope) = of(circuit, e.free, e.channels, jnp.asarray(theta), sampling)
         force_constant_slope = _force_constant_slope(circuit, e.free, e.channels, jnp.asarray(theta))
     weight = sampling.force * vsc
@@ -292,17 +292,17 @@ def _highpass(drive: Drive, time: Array, log_tau: Array, steady_state: bool) -> 
     return jax.jvp(response, (log_tau,), (jnp.ones_like(log_tau),))
 
 
-def _with_constant_skins(
+def _by_terms(
     circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], theta: Array, sampling: _Sampling
 ) -> list[_Seen]:
     """What each channel, and Vsc itself, shows, and its derivatives in the log-parameters."""
     return [_response(terms, sampling) for terms in _terms(circuit, free, channels, theta)]
 
 
-def _skinned(
+def _by_harmonics(
     circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], theta: Array, sampling: _Sampling
 ) -> list[_Seen]:
-    """As `_with_constant_skins`, of a skin that depends on the frequency."""
+    """As `_by_terms`, of a skin without time constants."""
     of = jnp.asarray(sampling.time), jnp.asarray(sampling.slope), sampling.steady_state
     values, slopes = _shown(circuit, free, channels, theta, sampling.drive, *of)
     return [(np.asarray(value), np.asarray(slope)) for value, slope in zip(values, slopes, strict=True)]
