@@ -251,7 +251,7 @@ def test_a_measured_drive(steady: bool):
     time = (np.arange(SAMPLES) + 0.5) * STEP
     rng = np.random.default_rng(0)
     on, whole = time.size, time.size * (1 if steady else 256)
-    phase = np.mod(time, PERIOD)
+    phase = np.mod(time - time[0], PERIOD)  # from rest V begins at 0
     wave = np.interp(phase, [0.0, 4 * STEP, PERIOD / 2, PERIOD / 2 + 4 * STEP, PERIOD], [-180, 180, 180, -180, -180])
     voltage = np.concatenate([wave if steady else wave + 180.0, np.zeros(whole - on)])
     # straight lines between samples: the samples' spectrum times that of a triangle, over all its aliases
