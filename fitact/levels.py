@@ -137,7 +137,8 @@ class _Case(NamedTuple):
 
     @classmethod
     def of(cls, fit: Fit) -> "_Case":
-        record, choice, circuit = fit.record, fit.choice, fit.likelihood.circuit(jnp.asarray(fit.theta))
+        record, choice = fit.record, fit.choice
+        circuit: Any = fit.likelihood.circuit(jnp.asarray(fit.theta))  # of constant skins
         drive, time, steady_state = choice.drive, record.time - choice.shift, choice.steady_state
         if isinstance(drive, Sampled):
             kept, period = whole_periods(record)

@@ -126,6 +126,10 @@ def measure_tradeoff(record: Record | None = None, scene: Scene | None = None, *
     stated = scene or Scene()
     if "Vsc" not in stated.measurement.channels:
         raise InputError("scene: [measurement] channels has no Vsc, which the levels are compared on; add it")
+    if stated.skin.level != "constant":
+        raise InputError(
+            f"scene: [skin] level = '{stated.skin.level}': the levels are those of a constant skin; leave it out"
+        )
     stated.require_available(fit=True)
     say = _teller(progress)
     measured = record or simulate(stated)

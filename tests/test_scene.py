@@ -357,8 +357,13 @@ def test_circuit_is_the_simplest_that_has_what_the_scene_names(tmp_path: Path):
 
 
 def test_what_is_not_modelled_or_fitted_yet_is_refused_not_ignored(tmp_path: Path):
+    load(tmp_path, '[skin]\nlevel = "dispersive"').require_available(fit=True)
+    rest = "[drive]\nsteady_state = false"
     with pytest.raises(fitact.InputError, match="dispersive"):
-        load(tmp_path, '[skin]\nlevel = "dispersive"').require_available(fit=True)
+        load(tmp_path, f'[skin]\nlevel = "dispersive"\n{rest}').require_available(fit=True)
+    load(tmp_path, f'[skin]\nlevel = "fractional"\n{rest}').require_available(fit=True)
+    with pytest.raises(fitact.InputError, match="fractional"):
+        load(tmp_path, f'[skin]\nlevel = "fractional"\n{rest}').make_circuit()
     with pytest.raises(fitact.InputError, match=r"dispersive.*steady_state"):
         load(tmp_path, '[skin]\nlevel = "dispersive"\n[drive]\nsteady_state = false').make_circuit()
     load(tmp_path, '[grounding]\nR_H = "500 ohm"').require_available(fit=True)

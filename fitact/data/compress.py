@@ -81,6 +81,11 @@ class Compression(eqx.Module):
         total = jnp.pad(total, (0, self.observed.size - self.signal.shape[0]))
         return total if terms.rate is None else total + terms.rate * self.rate
 
+    def change_by_delay(self, terms: Terms) -> Float[Array, " rows"]:
+        """How a delay changes it, per s: u' = V' - u / tau."""
+        falling = Terms(tuple(w / t for w, t in zip(terms.weight, terms.tau, strict=True)), terms.tau)
+        return self.response(falling) - sum(terms.weight) * self.slope
+
     def decays(self, tau: Array) -> Float[Array, " rows"]:
         """e^{-(t - t0) / tau} from the first sample on."""
         return self.decay @ self._series(tau)

@@ -2,18 +2,20 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitact.data.compress import SLOW, compress
+from fitact.data.compress import SLOW, Compression, compress
+from fitact.data.on_grid import compress_on_grid
 from fitact.inference.likelihood import Batched, Likelihood
 from fitact.inference.trace import Trace
-from fitact.model.circuit import Terms
+from fitact.model.circuit import Circuit
 from fitact.model.drive import Sampled
+from fitact.model.skin import WithSkin
 
 TOLERANCE = 1e-3  # in log-likelihood
 _OFF_TIME = "a delay or a clock is free"
@@ -39,27 +41,30 @@ class Certified(NamedTuple):
     reasons: tuple[str, ...]
 
 
-def project(trace: Trace, near: Terms | None, tolerance: float) -> tuple[Trace, str]:
+def project(trace: Trace, circuit: Circuit, shown: bool, tolerance: float) -> tuple[Trace, str]:
     """The trace with its record's compression, or as it is and the reason why.
 
-    `near`: terms that nearly made it; None: it does not show them.
+    `circuit` nearly made it, and `shown` says whether the record shows it.
     """
-    reason = _reason_against(trace, near, tolerance)
-    if reason or near is None:
+    reason = _reason_against(trace, circuit, shown, tolerance)
+    if reason:
         return trace, reason
-    compression = compress(
-        trace.drive,
-        np.asarray(trace.time),
-        np.asarray(trace.observed),
-        steady_state=trace.steady_state,
-        near=near,
-        weight=None if trace.weight is None else np.asarray(trace.weight),
-        rate=None if trace.rate is None else np.asarray(trace.rate),
-    )
-    return dataclasses.replace(trace, compression=compression), ""
+    arrays = np.asarray(trace.time), np.asarray(trace.observed)
+    how: dict[str, Any] = {
+        "steady_state": trace.steady_state,
+        "weight": None if trace.weight is None else np.asarray(trace.weight),
+        "rate": None if trace.rate is None else np.asarray(trace.rate),
+    }
+    if isinstance(circuit, WithSkin):
+        assert circuit.grid is not None  # there would be a reason against it
+        return dataclasses.replace(
+            trace, compression=compress_on_grid(trace.drive, *arrays, grid=circuit.grid, **how)
+        ), ""
+    near = circuit.terms_of(trace.channel)
+    return dataclasses.replace(trace, compression=compress(trace.drive, *arrays, near=near, **how)), ""
 
 
-def _reason_against(trace: Trace, near: Terms | None, tolerance: float) -> str:
+def _reason_against(trace: Trace, circuit: Circuit, shown: bool, tolerance: float) -> str:
     if tolerance == 0.0:
         return "it was asked for"
     if trace.noise == "student":
@@ -70,11 +75,13 @@ def _reason_against(trace: Trace, near: Terms | None, tolerance: float) -> str:
         return f"the record is shorter than {_SHORT} samples"
     if trace.timing:
         return _OFF_TIME
+    if isinstance(circuit, WithSkin):
+        return "a dispersive skin has no time constants" if circuit.grid is None else ""
     if isinstance(trace.drive, Sampled) and trace.steady_state:
         return "the steady state of a measured drive is not tabulated"
-    if near is None:
+    if not shown:
         return "the record does not show its time constant"
-    if len(near.tau) > 1:
+    if len(circuit.terms_of(trace.channel).tau) > 1:
         return "the circuit has several time constants"
     return ""
 
@@ -173,7 +180,7 @@ def _narrowed(
 ) -> Trace:
     """With the part of the table that the posterior can want, where there is a table that reaches the optimum."""
     table, center = trace.compression, float(_log_b(wide, jnp.asarray(theta)))
-    if table is None or not table.holds(np.exp(center)):
+    if not isinstance(table, Compression) or not table.holds(np.exp(center)):
         return trace
     seen = wide.seen(jnp.asarray(theta), index)
     largest = float(jnp.sum(jnp.abs(jnp.stack(seen.circuit.terms_of(trace.channel).weight))) * seen.gain)

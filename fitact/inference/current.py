@@ -41,9 +41,12 @@ def comparable(record: Record, choice: DriveChoice) -> Comparable:
     """Leave out the samples at edges, and weigh those between them by the noise that dV/dt brings in."""
     noise = record.noise("V") if choice.name == "measured" else 0.0
     kept = ~_at_edges(choice.voltage, noise)
+    if choice.name != "measured":
+        slope = slope_of(choice, record.time)
+        kept &= np.isfinite(slope)  # a record may begin at a jump
     note = f"I: {np.count_nonzero(~kept):,} of {kept.size:,} samples lie at an edge of the drive and are left out"
     if choice.name != "measured":
-        return Comparable(kept.astype(float), np.where(kept, slope_of(choice, record.time), 0.0), False, (note,))
+        return Comparable(kept.astype(float), np.where(kept, slope, 0.0), False, (note,))
     rate = np.gradient(choice.voltage) / np.gradient(record.time)  # over two steps, which halves the noise
     capacitance = abs(float(record["I"][kept] @ rate[kept]) / max(float(rate[kept] @ rate[kept]), 1e-300))
     # a V that stays at one level has no noise there that a derivative could see

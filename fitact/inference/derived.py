@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 
 from fitact.data.record import Record
 from fitact.inference.likelihood import Likelihood
-from fitact.inference.start import DriveChoice, whole_periods
+from fitact.inference.start import DriveChoice, has_ideal_edges, whole_periods
 from fitact.inference.trace import CHARGES, LINEAR
-from fitact.model.circuit import RC
-from fitact.model.drive import Drive, Periodic, PiecewiseLinear, Sampled
+from fitact.model.circuit import Circuit
+from fitact.model.drive import Drive, Periodic, PiecewiseLinear, Sampled, Sine
 from fitact.model.force import (
     AirGap,
     Contact,
@@ -25,14 +25,17 @@ from fitact.model.force import (
     peak_force,
     summarize,
 )
+from fitact.model.multitone import Multitone
 from fitact.model.response import response
 from fitact.model.scene import Scene
+from fitact.model.skin import WithSkin
 
 NAMES = ("g", "b", "force_mean", "force_peak", "force_rms", "friction_mean")
 
 _LONG = 20_000  # samples, above which the force is that of the last periods,
 _WINDOW = 4_000  # of at most so many samples where that holds a period,
 _LEAD = 20.0  # after so many time constants
+_AFTER = 0.5  # steps after an ideal jump, where the peak of a skin that depends on the frequency is taken
 _NODES = 64  # Gauss-Legendre nodes along each straight piece of a drive
 
 
@@ -93,7 +96,7 @@ class Derived(eqx.Module):
         ratios = jnp.pad(ratios, (0, len(CHARGES) - ratios.size))
         return (sizes * ratios) @ trace.decays(seen.circuit, self.time) / seen.gain
 
-    def contact(self, circuit: RC) -> Contact | AirGap:
+    def contact(self, circuit: Circuit) -> Contact | AirGap:
         """Where the circuit's force acts."""
         return self.geometry.contact(circuit)
 
@@ -105,7 +108,9 @@ class Derived(eqx.Module):
         force = summarize(self.force(theta, sigma, deviate), self.weight)
         if self.steady_state and isinstance(self.drive, Periodic):  # rms alone needs quadrature
             exact = circuit, self.drive, self.contact(circuit)
-            force = force._replace(mean=mean_force(*exact), peak=peak_force(*exact))
+            force = force._replace(mean=mean_force(*exact))
+            if not isinstance(circuit, WithSkin) or isinstance(self.drive, Sine | Multitone):
+                force = force._replace(peak=peak_force(*exact))
         felt = friction(force.mean, self.coefficient, self.normal_force)
         return jnp.stack([circuit.g, circuit.b, force.mean, force.peak, force.rms, felt])
 
@@ -128,8 +133,9 @@ def _logs(derive: Derived, theta: Array, sigma: Array) -> tuple[Array, Array]:
 
 def for_fit(likelihood: Likelihood, record: Record, choice: DriveChoice, scene: Scene, b: float) -> Derived:
     """Of a fit; `record` and `choice` are its first, `b` (s) the slowest time constant that was found."""
-    last = _last_periods(record, choice, b)
-    drive, (time, weight) = (choice.drive, _grid(record, choice)) if last is None else last
+    last = None if isinstance(likelihood.template, WithSkin) else _last_periods(record, choice, b)
+    after = _AFTER * record.time_step if isinstance(likelihood.template, WithSkin) else 0.0
+    drive, (time, weight) = (choice.drive, _grid(record, choice, after)) if last is None else last
     return Derived(
         likelihood.without_samples(),
         drive,
@@ -156,7 +162,8 @@ def _last_periods(record: Record, choice: DriveChoice, b: float) -> tuple[Drive,
     return Sampled(time[lead:], record["V"][lead:]), (time[begin:], np.gradient(time)[begin:])
 
 
-def _grid(record: Record, choice: DriveChoice) -> tuple[np.ndarray, np.ndarray]:
+def _grid(record: Record, choice: DriveChoice, after: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times and weights; at ideal jumps so long `after` them (s), since there a fractional skin's Vsc has no value."""
     drive = choice.drive
     if isinstance(drive, PiecewiseLinear) and choice.steady_state:
         knots = np.asarray(drive.pieces().knots) - float(drive.lead)
@@ -164,7 +171,8 @@ def _grid(record: Record, choice: DriveChoice) -> tuple[np.ndarray, np.ndarray]:
         length = np.diff(knots)[:, None]
         inside = knots[:-1, None] + 0.5 * length * (nodes + 1.0)
         # u is monotone along a piece, so peaks sit at the knots
-        return np.append(inside, knots[:-1]), np.append(0.5 * length * weights, np.zeros(length.size))
+        peaks = knots[:-1] + (after if has_ideal_edges(drive) else 0.0)
+        return np.append(inside, peaks), np.append(0.5 * length * weights, np.zeros(length.size))
     if isinstance(drive, Periodic) and choice.steady_state:
         return np.arange(1024) / 1024 * float(drive.period), np.ones(1024)
     kept, period = whole_periods(record)

@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -20,7 +20,8 @@ from fitact.inference.structure import log_values, with_parameters
 from fitact.model.circuit import Channel, Circuit, DirectGround, FinalCircuit, NaturalGround
 from fitact.model.drive import Drive, Periodic, Sampled
 from fitact.model.force import Geometry, force_constant
-from fitact.model.response import highpass
+from fitact.model.response import highpass, response_and_rate
+from fitact.model.skin import WithSkin, has_time_constants, limits_current
 from fitact.units import engineering
 
 NOISE_I = 20e-9  # A, of a current channel where none is stated
@@ -102,15 +103,18 @@ def expected_sd(experiment: Experiment) -> Expected:
     e, theta = experiment, log_values(experiment.circuit, experiment.free, experiment.channels)
     with jax.enable_x64(True):
         circuit, geometry = jax.tree.map(jnp.asarray, (e.circuit, e.geometry))  # plain numbers would be compiled in
-        *seen, acting, force_constant_slope = _terms(circuit, e.free, e.channels, jnp.asarray(theta), geometry)
         sampling = _sampling(e)
-        voltage, slope = _response(acting, sampling)
-        responses = [_response(terms, sampling)[1] for terms in seen]
+        acting: Channel = "Vsc" if e.geometry.model == "paper" else "Vgap"
+        of = _by_terms if has_time_constants(circuit) else _by_harmonics
+        *seen, (voltage, slope) = of(circuit, e.free, (*e.channels, acting), jnp.asarray(theta), sampling)
+        force_constant_slope = _force_constant_slope(circuit, e.free, e.channels, jnp.asarray(theta), geometry)
     weight = sampling.force * voltage
     gradient = np.asarray(force_constant_slope) + 2.0 * (weight @ slope) / (weight @ voltage)
     jacobian = [
-        (sampling.away if float(terms.rate) else sampling.data)[:, None] / e.noise[channel] * response
-        for channel, (terms, _), response in zip(e.channels, seen, responses, strict=True)
+        (sampling.away if channel == "I" and not limits_current(circuit) else sampling.data)[:, None]
+        / e.noise[channel]
+        * response
+        for channel, (_, response) in zip(e.channels, seen, strict=True)
     ]
     root = covariance_root(np.concatenate(jacobian), e.prior_root)
     force_sd = float(np.linalg.norm(gradient @ root))
@@ -165,6 +169,9 @@ def _changes(e: Experiment) -> Iterator[tuple[str, Experiment]]:
 
 def _with_resistor(circuit: Circuit) -> Circuit | None:
     """The circuit with a known resistor in series; None where it has one."""
+    if isinstance(circuit, WithSkin):
+        resisted: Any = _with_resistor(circuit.circuit)
+        return None if resisted is None else dataclasses.replace(circuit, circuit=resisted)
     if isinstance(circuit, FinalCircuit):
         circuit = DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci)
     if not isinstance(circuit, DirectGround | NaturalGround) or circuit.series_resistor is not None:
@@ -182,32 +189,39 @@ class _Terms(NamedTuple):
 
 @eqx.filter_jit
 def _terms(
-    circuit: Circuit,
-    free: tuple[str, ...],
-    channels: tuple[Channel, ...],
-    theta: Float[Array, " parameters"],
-    geometry: Geometry,
+    circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], theta: Float[Array, " parameters"]
 ) -> tuple[Any, ...]:
-    """For each channel, and the voltage that makes the force: terms and their derivatives; and that of its factor.
-
-    The last is the derivative of the logarithm of force over that voltage squared.
-    """
-    acting: Channel = "Vsc" if geometry.model == "paper" else "Vgap"
+    """For each channel, the last being that which makes the force: terms and their derivatives."""
 
     def terms(theta: Array) -> list[_Terms]:
-        there, gains = with_parameters(circuit, free, channels, theta)
+        there, gains = with_parameters(circuit, free, channels[:-1], theta)
         found = []
-        for gain, channel in [*zip(gains, channels, strict=True), (1.0, acting)]:
+        for gain, channel in zip((*gains, 1.0), channels, strict=True):
             weight, tau, rate = there.terms_of(channel)
             rate = jnp.asarray(0.0 if rate is None else rate)
             found.append(_Terms(gain * jnp.stack(weight), jnp.log(jnp.stack(tau)), gain * rate))
         return found
 
-    def log_force(theta: Array) -> Array:
-        there: Any = with_parameters(circuit, free, channels, theta)[0]
-        return jnp.log(force_constant(geometry.contact(there)))
+    return tuple(zip(terms(theta), jax.jacfwd(terms)(theta), strict=True))
 
-    return *zip(terms(theta), jax.jacfwd(terms)(theta), strict=True), jax.jacfwd(log_force)(theta)
+
+@eqx.filter_jit
+def _force_constant_slope(
+    circuit: Circuit,
+    free: tuple[str, ...],
+    channels: tuple[Channel, ...],
+    theta: Float[Array, " parameters"],
+    geometry: Geometry,
+) -> Float[Array, " parameters"]:
+    """The derivative of the logarithm of force over the square of the voltage that makes it."""
+
+    def log_force(theta: Array) -> Array:
+        return jnp.log(force_constant(geometry.contact(with_parameters(circuit, free, channels, theta)[0])))
+
+    return jax.jacfwd(log_force)(theta)
+
+
+_Seen: TypeAlias = tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times parameters"]]
 
 
 class _Sampling(NamedTuple):
@@ -283,9 +297,46 @@ def _highpass(drive: Drive, time: Array, log_tau: Array, steady_state: bool) -> 
     return jax.jvp(response, (log_tau,), (jnp.ones_like(log_tau),))
 
 
-def _response(
-    channel: tuple[_Terms, _Terms], sampling: _Sampling
-) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times parameters"]]:
+def _by_terms(
+    circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], theta: Array, sampling: _Sampling
+) -> list[_Seen]:
+    """What each channel, the last being that which makes the force, shows, and its derivatives in the logarithms."""
+    return [_response(terms, sampling) for terms in _terms(circuit, free, channels, theta)]
+
+
+def _by_harmonics(
+    circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], theta: Array, sampling: _Sampling
+) -> list[_Seen]:
+    """As `_by_terms`, of a skin without time constants."""
+    of = jnp.asarray(sampling.time), jnp.asarray(sampling.slope), sampling.steady_state
+    values, slopes = _shown(circuit, free, channels, theta, sampling.drive, *of)
+    return [(np.asarray(value), np.asarray(slope)) for value, slope in zip(values, slopes, strict=True)]
+
+
+@eqx.filter_jit
+def _shown(
+    circuit: Circuit,
+    free: tuple[str, ...],
+    channels: tuple[Channel, ...],
+    theta: Array,
+    drive: Drive,
+    time: Array,
+    rising: Array,
+    steady_state: bool,
+) -> tuple[list[Array], list[Array]]:
+    def shown(theta: Array) -> tuple[list[Array], list[Array]]:
+        there, gains = with_parameters(circuit, free, channels[:-1], theta)
+        found = []
+        for gain, channel in zip((*gains, 1.0), channels, strict=True):
+            value, rate = response_and_rate(there, drive, time, steady_state=steady_state, channel=channel)
+            found.append(gain * (value if rate is None else value + rate * rising))
+        return found, found
+
+    slopes, values = jax.jacfwd(shown, has_aux=True)(theta)
+    return values, slopes
+
+
+def _response(channel: tuple[_Terms, _Terms], sampling: _Sampling) -> _Seen:
     """What a channel shows, and its derivatives in the log-parameters.
 
     Term by term, and the terms' derivatives apart: at once it takes ten times as long to compile.

@@ -28,9 +28,15 @@ from fitact.inference.starts import begin, better, explore
 from fitact.inference.trace_fit import TraceFit, compare
 from fitact.inference.verdict import misfits, verdict
 from fitact.model.scene import Scene
+from fitact.model.skin import constant
 from fitact.units import engineering, unit_of
 
 _SKIN = ("Rsc", "Csc", "Ci")
+_RESPONSE = {
+    "constant": "exact",
+    "dispersive": "harmonics and time constants",
+    "fractional": "time constants on a grid",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,11 +208,11 @@ class Fit:
 
     def model(self) -> dict[str, Any]:
         """What was fitted, by name."""
-        circuit = type(self.likelihood.template).__name__
+        circuit = type(constant(self.likelihood.template)).__name__
         return {
             "circuit": {"FinalCircuit": "final", "DirectGround": "direct", "NaturalGround": "natural"}[circuit],
-            "skin": "constant",
-            "response": "exact",
+            "skin": self.scene.skin.level,
+            "response": _RESPONSE[self.scene.skin.level],
             "drive": self.choice.name,
             "steady_state": self.choice.steady_state,
             "channels": [trace.channel for trace in self.traces],

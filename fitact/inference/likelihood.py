@@ -19,9 +19,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from fitact.inference.trace import TIMING, Seen, Trace
-from fitact.model.circuit import RC
+from fitact.model.circuit import RC, Circuit
 from fitact.model.distribution import Distribution
 from fitact.model.prior import Prior
+from fitact.model.skin import WithSkin, parameters, with_values
 
 OPEN = math.log(1e6)  # in a logarithm: what leaves more open than this leaves it open
 _HUGE = 70.0  # in a logarithm: beyond 1e30 or below 1e-30 SI units is no finger, and products overflow
@@ -44,7 +45,7 @@ class Likelihood(eqx.Module):
     """
 
     traces: tuple[Trace, ...]
-    template: RC
+    template: RC | WithSkin
     prior: Prior
     sigma_prior: tuple[Distribution | None, ...]
     tied: tuple[tuple[str, str, float], ...] = eqx.field(static=True, default=())
@@ -94,8 +95,7 @@ class Likelihood(eqx.Module):
     @property
     def _of_circuit(self) -> Bool[np.ndarray, " parameters"]:
         """Which coordinates of theta are the circuit's."""
-        fields = {field.name for field in dataclasses.fields(self.template)}
-        return np.array([name in fields for name in self.names])
+        return np.array([name in parameters(self.template) for name in self.names])
 
     @property
     def rows(self) -> int:
@@ -120,20 +120,20 @@ class Likelihood(eqx.Module):
         traces = (*self.traces[:index], trace, *self.traces[index + 1 :])
         return dataclasses.replace(self, traces=traces)
 
-    def circuit(self, theta: Float[Array, " parameters"]) -> RC:
+    def circuit(self, theta: Float[Array, " parameters"]) -> Circuit:
         """The circuit at theta; NaN where no double could hold what follows from it, so that no step leads there."""
         theta = jnp.where(jnp.abs(theta) < _HUGE, theta, jnp.nan)
-        fields = {field.name for field in dataclasses.fields(self.template)}
-        values = {name: jnp.exp(theta[i]) for i, name in enumerate(self.prior.names) if name in fields}
+        known = parameters(self.template)
+        values = {name: jnp.exp(theta[i]) for i, name in enumerate(self.prior.names) if name in known}
         for name, other, ratio in self.tied:
-            values[name] = ratio * values.get(other, getattr(self.template, other))
-        return dataclasses.replace(self.template, **values)
+            values[name] = ratio * values.get(other, known[other])
+        return with_values(self.template, values)
 
     def seen(self, theta: Float[Array, " parameters"], index: int = 0) -> Seen:
         """What the trace of that index needs of theta."""
         return self._seen(self.circuit(theta), theta, self.traces[index])
 
-    def _seen(self, circuit: RC, theta: Array, trace: Trace) -> Seen:
+    def _seen(self, circuit: Circuit, theta: Array, trace: Trace) -> Seen:
         gain, names = trace.named("gain"), self.names
         timing = {name: theta[names.index(trace.named(name))] * trace.timing_unit(name) for name in trace.timing}
         return Seen(circuit, jnp.exp(theta[names.index(gain)]) if gain in names else 1.0, **timing)

@@ -15,6 +15,7 @@ from fitact.errors import InputError
 from fitact.inference import compressed
 from fitact.inference.current import Comparable, CurrentStart, comparable, current_start
 from fitact.inference.expected import Experiment
+from fitact.inference.level import require_followed, with_level, without_jumps
 from fitact.inference.likelihood import Batched, Likelihood
 from fitact.inference.noise import Autoregression, NoiseModel, quiet_noise, require_uniform
 from fitact.inference.start import (
@@ -31,6 +32,7 @@ from fitact.model.circuit import RC, Channel, FinalCircuit, Loop
 from fitact.model.distribution import LogNormal
 from fitact.model.prior import Prior
 from fitact.model.scene import Scene
+from fitact.model.skin import WithSkin, constant, limits_current, parameters
 
 _OFFSET = 0.02  # of a channel's span: standard deviation of an offset that the record is too short to show
 _CHARGE = 10.0  # spans: that of an unknown charge
@@ -73,7 +75,7 @@ class Problem(NamedTuple):
         """With compressed traces where that can hold, and the reasons where it cannot."""
         circuit = self.likelihood.circuit(jnp.asarray(self.start))
         pairs = [
-            compressed.project(trace, circuit.terms_of(trace.channel) if _shows(source.start) else None, tolerance)
+            compressed.project(trace, circuit, _shows(source.start), tolerance)
             for trace, source in zip(self.likelihood.traces, self.sources, strict=True)
         ]
         traces, reasons = zip(*pairs, strict=True)
@@ -84,7 +86,7 @@ class Problem(NamedTuple):
         source, records = self.sources[0], len({id(source.record) for source in self.sources})
         pairs = zip(likelihood.traces, self.sources, strict=True)
         of_first = [trace for trace, other in pairs if other.record is source.record]
-        fields = {field.name for field in dataclasses.fields(likelihood.template)}
+        fields = parameters(likelihood.template)
         gains = ("gain", "gain_I") if records == 1 else ()
         free = tuple(name for name in likelihood.prior.names if name in fields or name in gains)
         rows = [likelihood.prior.names.index(name) for name in free]
@@ -117,7 +119,7 @@ def pose(records: Sequence[Record], scenes: Sequence[Scene | None], believed: bo
     stated, tied = first.make_prior(), first.prior.tied()
     noise = {name: stated[name] for name in ("sigma", "sigma_I") if name in stated.names}
     prior = stated.without(*noise)
-    template = _template(first, prior, tied)
+    template = with_level(_template(first, prior, tied), records, scenes)
     opened = [
         _open(record, scene, channel, number if len(records) > 1 else None, template)
         for number, (record, scene) in enumerate(zip(records, scenes, strict=True), 1)
@@ -139,7 +141,7 @@ def pose(records: Sequence[Record], scenes: Sequence[Scene | None], believed: bo
 
 
 def _template(scene: Scene, prior: Prior, tied: dict[str, tuple[str, float]]) -> RC:
-    """The scene's circuit with all that is held, free or tied in it."""
+    """The scene's circuit with all that is held, free or tied in it, and with constant skins."""
     values = scene.fixed() | {name: math.exp(prior[name].log_mean) for name in prior.names}
     for name, (other, ratio) in tied.items():
         value = values.get(other, scene.nominal()[other])
@@ -165,11 +167,12 @@ def _channels(record: Record, scene: Scene | None) -> tuple[Channel, ...]:
 
 
 def _open(
-    record: Record, scene: Scene | None, channel: Channel, number: int | None, template: RC
+    record: Record, scene: Scene | None, channel: Channel, number: int | None, template: RC | WithSkin
 ) -> tuple[Trace, Source, float]:
     """A trace over its samples, its source, and the standard deviation of a gain's logarithm."""
     given, choice = scene or Scene(), choose_drive(record, scene)
     _require_whole_drive(record, choice)
+    require_followed(template, record, choice)
     label = "_".join(([channel] if channel != "Vsc" else []) + ([str(number)] if number else []))
     notes, freeable = choice.notes, ("offset", "drift", *_hum(record, choice))
     start: LinearStart | CurrentStart | None = None
@@ -183,10 +186,11 @@ def _open(
             gain = math.hypot(gain, _edge_time(record, choice, start))
     else:
         gain = _log_sd(given.measurement.gain_I_relative_sd)
-        if template.current_terms().rate is not None:
+        if not limits_current(template):
             seen = comparable(record, choice)
             start, notes = current_start(record, choice, seen), (*notes, *seen.notes)
     weight, left_out = _weight(record, channel, seen)
+    weight, at_jumps = without_jumps(template, record, choice, weight)
     colour, noise = _noise(record, channel, given)
     trace = dataclasses.replace(
         _trace(record, choice, channel, label, template, given.measurement.noise_model),
@@ -195,7 +199,9 @@ def _open(
         whitening=colour and colour.whitening(np.ones(len(record), bool) if weight is None else weight > 0.0),
     )
     drowned = seen is not None and seen.drowned
-    source = Source(record, given, choice, noise, freeable, start, (*record.notes, *notes, *left_out), drowned)
+    source = Source(
+        record, given, choice, noise, freeable, start, (*record.notes, *notes, *left_out, *at_jumps), drowned
+    )
     return trace, source, gain
 
 
@@ -240,7 +246,9 @@ def _log_sd(relative_sd: float) -> float:
     return LogNormal.with_relative_sd(1.0, relative_sd).spread if relative_sd > 0.0 else 0.0
 
 
-def _trace(record: Record, choice: DriveChoice, channel: Channel, label: str, template: RC, noise: NoiseModel) -> Trace:
+def _trace(
+    record: Record, choice: DriveChoice, channel: Channel, label: str, template: RC | WithSkin, noise: NoiseModel
+) -> Trace:
     height = float(np.ptp(record[channel]))
     charges = len(LINEAR) - len(CHARGES) + np.arange(len(template.terms().tau) if choice.unknown_charge else 0)
     # a part of a wave cannot show an offset, so one within an oscilloscope's accuracy is allowed for
@@ -293,16 +301,17 @@ def _delay_sd(choice: DriveChoice) -> float:
     return math.sqrt(1.0 / 12.0) if has_ideal_edges(choice.drive) else 5.0
 
 
-def _jumps(template: RC, record: Record) -> bool:
+def _jumps(template: RC | WithSkin, record: Record) -> bool:
     """Whether Vsc follows a jump of V, within the record's time step."""
-    if not isinstance(template, Loop) or template.resistance() is None:
+    circuit = constant(template)
+    if not isinstance(circuit, Loop) or circuit.resistance() is None:
         return True
-    return float(template.terms().tau[-1]) < record.time_step
+    return float(circuit.terms().tau[-1]) < record.time_step
 
 
-def _largest(template: RC) -> float:
+def _largest(template: RC | WithSkin) -> float:
     """The largest divider the circuit can have."""
-    return 0.5 if isinstance(template, FinalCircuit) else 1.0
+    return 0.5 if isinstance(constant(template), FinalCircuit) else 1.0
 
 
 def _start(likelihood: Likelihood, sources: Sequence[Source]) -> Float[np.ndarray, " parameters"]:
@@ -311,6 +320,8 @@ def _start(likelihood: Likelihood, sources: Sequence[Source]) -> Float[np.ndarra
     vsc = next((start for start in starts if isinstance(start, LinearStart)), None)
     current = next((start for start in starts if isinstance(start, CurrentStart)), None)
     theta = np.concatenate([likelihood.prior.log_mean, np.zeros(len(likelihood.names) - len(likelihood.prior.names))])
+    if current is not None and not current.capacitance > 0.0 and isinstance(likelihood.template, WithSkin):
+        current = None  # of one frequency, what a constant skin makes of such a current need be no skin
     if vsc is None and current is None:
         return _best_of_prior(likelihood, theta)
     mean, sd = _believed(likelihood)
@@ -340,11 +351,9 @@ def _skin_of(vsc: LinearStart | None, current: CurrentStart | None) -> tuple[flo
 
 def _believed(likelihood: Likelihood) -> tuple[np.ndarray, np.ndarray]:
     """Means and standard deviations of log Rsc, log Csc and log Ci; what is held has next to none."""
-    prior, template = likelihood.prior, likelihood.template
+    prior, known = likelihood.prior, parameters(likelihood.template)
     pairs = [
-        (prior[name].log_mean, prior[name].log_sd)
-        if name in prior.names
-        else (math.log(float(getattr(template, name))), _HELD)
+        (prior[name].log_mean, prior[name].log_sd) if name in prior.names else (math.log(float(known[name])), _HELD)
         for name in ("Rsc", "Csc", "Ci")
     ]
     mean, sd = np.array(pairs).T

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from fitact.data.record import Record
 from fitact.errors import InputError
@@ -226,6 +226,12 @@ def has_unresolved_edge(voltage: Float[np.ndarray, " samples"]) -> bool:
 def has_ideal_edges(drive: Drive) -> bool:
     """Whether it is a square wave, or a burst of one."""
     return isinstance(drive.wave if isinstance(drive, Burst) else drive, Square)
+
+
+def jumps_within(drive: Drive, time: np.ndarray, margin: float) -> Bool[np.ndarray, " samples"]:
+    """Which times lie within a margin (s) of an ideal edge of a square wave."""
+    before, after = (np.asarray(drive.value(jnp.asarray(t))) for t in (time - margin, time + margin))
+    return np.abs(after - before) > 1e-9 * np.ptp(after)
 
 
 def _voltage(drive: Drive, time: np.ndarray, steady_state: bool) -> np.ndarray:

@@ -17,9 +17,11 @@ from jaxtyping import Array, Complex, Float
 
 from fitact.errors import InputError
 from fitact.model.circuit import Channel, Circuit
+from fitact.model.skin import constant, parameters, with_values
 
 _POINTS = 8  # at random, beside the circuit as given, which may be special: two equal skins
 _SPREAD = np.log(10.0)  # how far they lie from it, in logs
+_SPREAD_OF_ALPHA = 0.1  # likewise of a fractional skin's exponent, which 1 bounds
 _FREQUENCIES = 128
 _BEYOND = 100.0  # the frequencies reach so many times beyond the circuit's own, at both ends
 _NULL = 1e-11  # singular values below count as rounding: it leaves 1e-15, and what is real is above 1e-5,
@@ -74,7 +76,8 @@ def blind_directions(circuit: Circuit, free: Sequence[str], channels: Sequence[C
     """
     free, channels = tuple(free), tuple(channels)
     nominal = log_values(circuit, free, channels)
-    away = np.random.default_rng(0).uniform(-_SPREAD, _SPREAD, (_POINTS, len(free)))  # any points would do
+    spread = np.array([_SPREAD_OF_ALPHA if name == "alpha" else _SPREAD for name in free])
+    away = spread * np.random.default_rng(0).uniform(-1.0, 1.0, (_POINTS, len(free)))  # any points would do
     points = nominal + np.vstack([np.zeros(len(free)), away])
     with jax.enable_x64(True):
         sensitivities = _sensitivities(jax.tree.map(jnp.asarray, circuit), free, channels, points)
@@ -101,13 +104,12 @@ def log_values(circuit: Circuit, free: Sequence[str], channels: Sequence[Channel
         InputError: a name in `free` is no parameter of the circuit above zero, and no gain of these channels.
     """
     gains = dict.fromkeys(gain_names(channels), 1.0)
-    fields = {field.name: getattr(circuit, field.name) for field in dataclasses.fields(circuit)}
-    known = gains | {name: float(value) for name, value in fields.items() if name != "probe" and value is not None}
+    known = gains | {name: float(value) for name, value in parameters(circuit).items() if value is not None}
     for name in free:
         if not known.get(name, 0.0) > 0.0:
             raise InputError(
-                f"free: {name!r} has no value above zero in this {type(circuit).__name__}; give it one, or free some"
-                f" of {', '.join(known)}"
+                f"free: {name!r} has no value above zero in this {type(constant(circuit)).__name__}; give it one,"
+                f" or free some of {', '.join(known)}"
             )
     return np.log([known[name] for name in free])
 
@@ -119,12 +121,12 @@ def with_parameters(
     values = dict(zip(free, jnp.exp(theta), strict=True))
     named = gain_names(channels)
     gains = {named[name]: values.pop(name) for name in free if name in named}
-    return dataclasses.replace(circuit, **values), [gains.get(channel, 1.0) for channel in channels]
+    return with_values(circuit, values), [gains.get(channel, 1.0) for channel in channels]
 
 
 def name_direction(direction: dict[str, float]) -> str:
     """What a direction in the log-parameters is, in words."""
-    area = {name: _area_power(name) for name in direction if not name.startswith("gain")}
+    area = {name: _area_power(name) for name in direction if not name.startswith("gain") and name != "alpha"}
     along = sum(power * direction[name] for name, power in area.items())
     if abs(along) > 0.99 * np.sqrt(len(area)) * np.linalg.norm(list(direction.values())):
         scaled = [name if power > 0.0 else f"1/{name}" for name, power in area.items()]
@@ -150,7 +152,10 @@ def _sensitivities(
 
 @eqx.filter_jit
 def _time_constants(circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], points: Array) -> Array:
-    return jax.vmap(lambda theta: jnp.stack(with_parameters(circuit, free, channels, theta)[0].terms().tau))(points)
+    def taus(theta: Array) -> Array:
+        return jnp.stack(constant(with_parameters(circuit, free, channels, theta)[0]).terms().tau)
+
+    return jax.vmap(taus)(points)
 
 
 @eqx.filter_jit

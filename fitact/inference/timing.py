@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitact.inference.noise import student_weight
-from fitact.inference.start import has_ideal_edges
+from fitact.inference.start import has_ideal_edges, jumps_within
 from fitact.inference.trace import TIMING, Seen, Trace
 from fitact.model.response import highpass
+from fitact.model.skin import constant
 
 _STEP = 1 / 8  # of the grids, in units of the coordinates
 _REACH = {"delay": 5.0, "clock": 2.0}
@@ -57,8 +58,7 @@ def _beside_edges(trace: Trace) -> np.ndarray:
     if not has_ideal_edges(trace.drive):
         return np.zeros(trace.time.size, bool)
     time, step = np.asarray(trace.time) - float(trace.shift), _BESIDE * float(trace.time_step)
-    before, after = (np.asarray(trace.drive.value(jnp.asarray(t))) for t in (time - step, time + step))
-    return np.abs(after - before) > 1e-9 * np.ptp(after)
+    return jumps_within(trace.drive, time, step)
 
 
 def _part(trace: Trace, chosen: np.ndarray) -> Trace:
@@ -109,7 +109,7 @@ def _drop(rows: np.ndarray) -> float:
 def _around(trace: Trace, seen: Seen, sigma: Array) -> Float[Array, "n samples"]:
     """What a clock changes, what is left of the trace, and all that the circuit and the linear nuisances can change."""
     time = trace.time - (trace.shift + seen.delay)
-    taus = jnp.stack(seen.circuit.terms_of(trace.channel).tau)
+    taus = jnp.stack(constant(seen.circuit).terms_of(trace.channel).tau)
 
     def response(log_tau: Array) -> Array:
         return highpass(trace.drive, time, jnp.exp(log_tau), steady_state=trace.steady_state)

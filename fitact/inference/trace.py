@@ -9,6 +9,7 @@ Of Gaussian noise all this asks of the samples is lengths and angles, so it read
 """
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,10 +20,12 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.data.compress import SLOW, Compression, slow_shapes
+from fitact.data.on_grid import GridCompression
 from fitact.inference.noise import NoiseModel, Whitening, student_curvature, student_residual, student_weight
-from fitact.model.circuit import RC, Channel, Terms
+from fitact.model.circuit import Channel, Circuit
 from fitact.model.drive import Drive, Sampled
-from fitact.model.response import highpass
+from fitact.model.response import response_and_rate
+from fitact.model.skin import WithSkin
 
 CHARGES = ("charge", "charge_2", "charge_3", "charge_4")  # one for each time constant, the slowest first
 LINEAR = (*SLOW, *CHARGES)
@@ -40,7 +43,7 @@ class Seen(eqx.Module):
         clock: by what share the drive is faster than stated, by the recorder's clock; beyond the trace's own.
     """
 
-    circuit: RC
+    circuit: Circuit
     gain: ArrayLike = 1.0
     delay: ArrayLike = 0.0
     clock: ArrayLike = 0.0
@@ -85,7 +88,7 @@ class Trace(eqx.Module):
     clock: ArrayLike
     time_step: ArrayLike
     timing_sd: Float[Array, "2"]
-    compression: Compression | None
+    compression: Compression | GridCompression | None
     label: str = eqx.field(static=True)
     channel: Channel = eqx.field(static=True)
     steady_state: bool = eqx.field(static=True)
@@ -139,14 +142,13 @@ class Trace(eqx.Module):
 
     def signal(self, seen: Seen, later: ArrayLike = 0.0) -> Float[Array, " samples"]:
         """The channel as recorded, but for linear nuisances and noise; `later` (s) delays it further."""
-        time, terms = self.time - (self.shift + seen.delay + later), seen.circuit.terms_of(self.channel)
+        time = self.time - (self.shift + seen.delay + later)
         if "clock" in self.timing:
             time = time * (1.0 + self.clock + seen.clock)
-        total = jnp.zeros_like(time)
-        for weight, tau in zip(terms.weight, terms.tau, strict=True):
-            total = total + weight * highpass(self.drive, time, tau, steady_state=self.steady_state)
-        if terms.rate is not None and self.rate is not None:
-            total = total + terms.rate * self.rate
+        how: dict[str, Any] = {"steady_state": self.steady_state, "channel": self.channel}
+        total, rate = response_and_rate(seen.circuit, self.drive, time, **how)
+        if rate is not None and self.rate is not None:
+            total = total + rate * self.rate
         return seen.gain * total
 
     def shapes(self, seen: Seen) -> Float[Array, "10 samples"]:
@@ -154,8 +156,10 @@ class Trace(eqx.Module):
         middle, half = 0.5 * (self.time[0] + self.time[-1]), 0.5 * (self.time[-1] - self.time[0])
         return jnp.concatenate([slow_shapes(self.time, middle, half), self.decays(seen.circuit, self.time)])
 
-    def decays(self, circuit: RC, time: Float[Array, " times"]) -> Float[Array, "4 times"]:
-        """How unknown charges at the first sample decay; 0 beyond the circuit's time constants."""
+    def decays(self, circuit: Circuit, time: Float[Array, " times"]) -> Float[Array, "4 times"]:
+        """How unknown charges at the first sample decay; 0 beyond the time constants of constant skins."""
+        if isinstance(circuit, WithSkin):
+            return jnp.zeros((len(CHARGES), time.size))
         since, taus = time - self.time[0], circuit.terms().tau
         found = jnp.stack([jnp.exp(-since / tau) for tau in taus])
         return jnp.pad(found, ((0, len(CHARGES) - len(taus)), (0, 0)))
@@ -193,9 +197,7 @@ class Trace(eqx.Module):
         """As `change_by_delay`, weighted, over samples or coordinates."""
         if self.compression is None:
             return self.weighted(self.change_by_delay(seen))
-        weight, tau, _ = seen.circuit.terms_of(self.channel)  # u' = V' - u / tau
-        falling = Terms(tuple(w / t for w, t in zip(weight, tau, strict=True)), tau)
-        return seen.gain * (self.compression.response(falling) - sum(weight) * self.compression.slope)
+        return seen.gain * self.compression.change_by_delay(seen.circuit.terms_of(self.channel))
 
     def linear(
         self, seen: Seen, sigma: ArrayLike
@@ -255,4 +257,4 @@ class Trace(eqx.Module):
         value = -0.5 * misfit - self.count * log_sigma - jnp.sum(jnp.log(jnp.diagonal(factor)))
         if self.compression is None:
             return value
-        return jnp.where(self.compression.holds(seen.circuit.terms().tau[0]), value, jnp.nan)
+        return jnp.where(self.compression.holds(seen.circuit.b), value, jnp.nan)

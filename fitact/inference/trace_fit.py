@@ -16,6 +16,8 @@ from fitact.inference.noise import student_weight
 from fitact.inference.problem import Source
 from fitact.inference.start import DriveChoice
 from fitact.inference.trace import LINEAR, Seen, Trace
+from fitact.model.circuit import Circuit
+from fitact.model.skin import WithSkin
 
 _EVEN = 0.7  # weight below which a sample's noise is mostly that of the drive's slope
 
@@ -64,7 +66,7 @@ class TraceFit:
         }
         kept, counted = _equal_noise(trace, left, sigma)
         used = theta.size * kept.size / float(likelihood.count) + len(linear)
-        gain = abs(sum(float(w) for w in seen.circuit.terms_of(trace.channel).weight))
+        gain = _gain(seen.circuit, trace)
         noise = sigma if trace.noise == "ar1" else source.noise  # coloured, only the residuals show it
         time = source.record.time[counted]
         figures = statistics(kept, time, noise, used, gain, source.record, trace.channel, source.choice)
@@ -89,6 +91,13 @@ class TraceFit:
             figures=figures,
             full_because=reason,
         )
+
+
+def _gain(circuit: Circuit, trace: Trace) -> float:
+    """What makes the channel's noise of a measured drive's."""
+    if isinstance(circuit, WithSkin):  # it falls with the frequency, and noise is mostly fast
+        return float(jnp.abs(circuit.gain_of(trace.channel, 1.0 / trace.time_step)))
+    return abs(sum(float(w) for w in circuit.terms_of(trace.channel).weight))
 
 
 def _equal_noise(trace: Trace, left: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray]:

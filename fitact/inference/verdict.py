@@ -1,5 +1,6 @@
 """Whether a fit may be trusted, and what stands against it if not."""
 
+import math
 from collections.abc import Sequence
 
 import jax
@@ -14,6 +15,8 @@ from fitact.inference.problem import Source
 from fitact.inference.solver import Optima, result_name
 from fitact.inference.trace_fit import TraceFit
 
+_NOISE = 4.0  # standard deviations by which noise may put an exponent beyond its bound
+_WITHIN = 1e-12
 _ALONG = 6.0  # standard deviations along what is known least, within which a bounded prior must leave room
 
 
@@ -48,12 +51,26 @@ def is_out_of_bounds(
     """Whether the records put the parameters where a bounded or ordered prior forbids them.
 
     Least squares take a prior by its mean and covariance. Along what the records do not see it may end beyond an
-    edge, which the sampler mends; so what must be allowed is a point of that line.
+    edge, which the sampler mends; so what must be allowed is a point of that line. An exponent of 1 is a constant
+    skin, which the records may well have: where their noise alone puts it beyond, the line goes through 1.
     """
     axes, sizes, _ = np.linalg.svd(root)
     along = np.linspace(-_ALONG, _ALONG, 241)[:, None] * (axes[:, 0] * sizes[0])
-    points = np.hstack([theta + along, np.tile(np.log(sigma), (len(along), 1))])
+    points = np.hstack([_with_possible_exponent(likelihood, theta, root) + along, np.tile(np.log(sigma), (241, 1))])
     return not bool(jnp.any(jnp.isfinite(jax.vmap(likelihood.log_prior)(jnp.asarray(points)))))
+
+
+def _with_possible_exponent(likelihood: Likelihood, theta: np.ndarray, root: np.ndarray) -> np.ndarray:
+    """Theta, or the most probable point with a fractional skin's exponent at its bound, where noise explains that."""
+    if "alpha" not in likelihood.prior.names:
+        return theta
+    place, high = likelihood.prior.names.index("alpha"), getattr(likelihood.prior["alpha"], "high", 1.0)
+    excess, spread = theta[place] - math.log(high), np.linalg.norm(root[place])
+    if not 0.0 < excess < _NOISE * spread:
+        return theta
+    moved = theta - root @ root[place] * (excess / spread**2)
+    moved[place] = math.log(high) * (1.0 + _WITHIN) - _WITHIN  # rounding must not leave it beyond
+    return moved
 
 
 def misfits(traces: Sequence[TraceFit]) -> list[str]:

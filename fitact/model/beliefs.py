@@ -66,6 +66,15 @@ class Belief(Section):
         """Whether it is a density, rather than fixed or tied."""
         return self.fixed is None and self.tied is None
 
+    @property
+    def highest(self) -> float:
+        """Above which it allows no value, so far as it says so itself."""
+        if self.tolerance is not None:
+            return (self.nominal or 0.0) * (1.0 + self.tolerance)
+        if self.fixed is not None:
+            return 0.0 if self.fixed is True else self.fixed
+        return math.inf if self.high is None else self.high
+
     def distribution(self, name: str, nominal: float | None, layer: Layer) -> Distribution:
         """The density of the parameter `name`, around its `nominal` value in the scene where it states no other.
 
@@ -112,11 +121,13 @@ def _belief(unit: str) -> Any:
 
 
 if TYPE_CHECKING:
+    BeliefPlain: TypeAlias = Belief
     BeliefOhm: TypeAlias = Belief
     BeliefFarad: TypeAlias = Belief
     BeliefVolt: TypeAlias = Belief
     BeliefAmpere: TypeAlias = Belief
 else:
+    BeliefPlain = _belief("")
     BeliefOhm = _belief("ohm")
     BeliefFarad = _belief("F")
     BeliefVolt = _belief("V")
@@ -142,6 +153,7 @@ class PriorSection(Section):
     series_resistor: BeliefOhm | None = None
     Rgap: BeliefOhm | None = None
     Cgap: BeliefFarad | None = None
+    alpha: BeliefPlain | None = None
     sigma: BeliefVolt | None = None
     sigma_I: BeliefAmpere | None = None
     correlation: dict[str, Annotated[float, Field(gt=-1, lt=1)]] = Field(default_factory=dict)
@@ -152,6 +164,8 @@ class PriorSection(Section):
         for name, belief in beliefs.items():
             if belief.table is not None and name not in _SKIN:
                 raise ValueError(f"[prior] {name}: a table has the skin's parameters only: {', '.join(_SKIN)}")
+            if name == "alpha" and belief.highest > 1.0:
+                raise ValueError("[prior] alpha is an exponent of at most 1; give high = 1 or less beside the rest")
             for key in ("tied", "above", "below"):
                 other = getattr(belief, key)
                 if other is not None:

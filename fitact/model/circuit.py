@@ -39,8 +39,8 @@ Channel: TypeAlias = Literal["Vsc", "I", "Vgap"]  # Vgap is not recorded; the fo
 class Terms(NamedTuple):
     """sum_k weight[k] s tau[k] / (1 + s tau[k]) + rate s."""
 
-    weight: tuple[ArrayLike, ...]
-    tau: tuple[ArrayLike, ...]  # s
+    weight: tuple[ArrayLike, ...] | Array
+    tau: tuple[ArrayLike, ...] | Array  # s
     rate: ArrayLike | None = None  # s times the weight's unit; None: there is no such term
 
 

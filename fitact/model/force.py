@@ -1,6 +1,6 @@
 """The electrostatic force on the finger and the friction that is felt."""
 
-from typing import ClassVar, Literal, NamedTuple, TypeAlias
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,8 +8,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.errors import InputError
-from fitact.model.circuit import RC, Channel, Circuit
+from fitact.model.circuit import Channel, Circuit
 from fitact.model.drive import Drive
+from fitact.model.skin import constant
 from fitact.model.steady import mean_square, peak
 
 EPSILON_0 = 8.85e-12  # F/m, the paper's value
@@ -85,16 +86,17 @@ class Geometry(eqx.Module):
     gap_thickness: ArrayLike | None = None
     model: ForceModel = eqx.field(static=True, default="paper")
 
-    def contact(self, circuit: RC) -> "Contact | AirGap":
+    def contact(self, circuit: Circuit) -> "Contact | AirGap":
         """Where the force acts; permittivities, and an unstated gap, follow the circuit's capacitances, eq. (3).
 
         Raises:
             InputError: the model is "gap" and the circuit has none.
         """
+        inner: Any = constant(circuit)
         if self.model == "paper":
             layers = self.insulator_thickness, self.skin_thickness
-            return Contact.from_capacitances(circuit.Ci, circuit.Csc, self.area, *layers)
-        Cgap = getattr(circuit, "Cgap", None)
+            return Contact.from_capacitances(inner.Ci, inner.Csc, self.area, *layers)
+        Cgap = getattr(inner, "Cgap", None)
         if Cgap is None:
             raise InputError("the force across a gap needs a circuit with one; give it Cgap, or take the paper's force")
         return AirGap(self.area, EPSILON_0 * self.area / Cgap if self.gap_thickness is None else self.gap_thickness)

@@ -58,7 +58,9 @@ def named(scene: Scene) -> tuple[str, ...]:
 
 def parameters(name: str) -> set[str]:
     """The circuit's parameters that go with an omission."""
-    keys = {key for section, key in _KEYS[name] if section in ("grounding", "gap") or key == "series_resistor"}
+    keys = {
+        key for section, key in _KEYS[name] if section in ("grounding", "gap") or key in ("series_resistor", "alpha")
+    }
     return {_PARAMETERS.get(key, key) for key in keys if key != "thickness"}
 
 

@@ -8,6 +8,7 @@ L; at a jump u jumps along. Written so that nothing cancels or overflows at eith
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,17 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from fitact.errors import InputError
 from fitact.model.chirp import Chirp
-from fitact.model.circuit import Channel, Circuit, gain_at
+from fitact.model.circuit import Channel, Circuit, Terms, gain_at
 from fitact.model.drive import Burst, Drive, Line, Pieces, PiecewiseLinear, Sampled, Sine, Square
-from fitact.model.harmonic import fourier, frequency, fundamental, harmonic_response, harmonic_sum
+from fitact.model.harmonic import fourier, frequency, fundamental, harmonic_sum
 from fitact.model.highpass import highpass_amplitude
 from fitact.model.multitone import Multitone
 from fitact.model.polynomial import evaluate, particular
-from fitact.model.skin import WithSkin
+from fitact.model.skin import WithSkin, has_time_constants
 
 _FEW = 8  # pieces told apart by comparison rather than looked up
 
@@ -51,55 +52,88 @@ def response(
     of the circuit, in the order of ``circuit.terms().tau`` and the channel's unit, that decays with it.
 
     A skin that depends on the frequency has its steady state harmonic by harmonic as far as it changes, and
-    above by time constants: exact for `Dispersive`; for `Fractional` within the error it states.
+    above by time constants: exact for `Dispersive`; for `Fractional` within the error it states. One that is
+    followed by a grid of time constants is computed like any other circuit.
 
     Raises:
         InputError: the steady state was asked for of a drive that has none, or together with `initial`, or
             `initial` has not one value for each time constant; or, with a skin that depends on the frequency,
             anything but the steady state of a periodic drive; or Vgap of a circuit without a gap.
     """
-    if isinstance(circuit, WithSkin):
-        return _with_skin(circuit, drive, time, steady_state, channel)
-    terms = circuit.terms_of(channel)
-    total = jnp.zeros_like(jnp.asarray(time, dtype=float))
-    if terms.rate is not None:
-        total = terms.rate * drive.slope(time, steady_state=steady_state)
-    for weight, tau in zip(terms.weight, terms.tau, strict=True):
-        total = total + weight * highpass(drive, time, tau, steady_state=steady_state)
+    total, rate = response_and_rate(circuit, drive, time, steady_state=steady_state, channel=channel)
+    if rate is not None:
+        total = total + rate * drive.slope(time, steady_state=steady_state)
     if initial is None:
         return total
     if steady_state:
         raise InputError("an initial charge has decayed in the steady state: give steady_state=False with initial")
-    return total + _remains(drive, time, terms.tau, initial)
+    return total + _remains(drive, time, circuit.terms_of(channel).tau, initial)
 
 
-def _with_skin(
-    circuit: WithSkin, drive: Drive, time: ArrayLike, steady_state: bool, channel: Channel
-) -> Float[Array, "*shape"]:
-    """The terms that stand for the circuit at high frequency, and the harmonics of what they miss below."""
+def response_and_rate(
+    circuit: Circuit, drive: Drive, time: ArrayLike, *, steady_state: bool = True, channel: Channel = "Vsc"
+) -> tuple[Float[Array, "*shape"], ArrayLike | None]:
+    """As `response` but for what follows dV/dt, and how much does (F); None: nothing."""
+    if has_time_constants(circuit):
+        terms = circuit.terms_of(channel)
+        return respond(terms, drive, time, steady_state=steady_state), terms.rate
+    assert isinstance(circuit, WithSkin)
     if not steady_state:
         raise InputError(
             f"a {type(circuit.skin).__name__.lower()} skin is computed in the steady state only;"
             " ask for steady_state=True, or take the constant skin level"
         )
-    omega = fundamental(drive)
-    if isinstance(drive, Sine | Multitone):
-        highest = max(drive.orders) if isinstance(drive, Multitone) else 1
-        return harmonic_response(circuit, drive, time, highest, channel=channel)
-    count = circuit.skin.count(frequency(drive))
-    terms = circuit.skin.above(circuit, omega * count, channel)
+    found = by_harmonics(circuit, drive, channel)
+    return respond(found.terms, drive, time) + harmonic_sum(found.drive * found.missed, drive, time), found.terms.rate
+
+
+def respond(terms: Terms, drive: Drive, time: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
+    """The response of a circuit's `terms`, but for the one that follows dV/dt; arguments as in `response`."""
     time = jnp.asarray(time, dtype=float)
+    if len(terms.tau) <= _FEW:
+        total = jnp.zeros_like(time)
+        for weight, tau in zip(terms.weight, terms.tau, strict=True):
+            total = total + weight * highpass(drive, time, tau, steady_state=steady_state)
+        return total
 
     def add(total: Array, term: tuple[Array, Array]) -> tuple[Array, None]:
-        return total + term[0] * highpass(drive, time, term[1]), None
+        return total + term[0] * highpass(drive, time, term[1], steady_state=steady_state), None
 
-    each = jnp.stack(jnp.broadcast_arrays(*terms.weight)), jnp.stack(jnp.broadcast_arrays(*terms.tau))
-    total, _ = lax.scan(add, jnp.zeros_like(time), each)
-    if terms.rate is not None:
-        total = total + terms.rate * drive.slope(time)
+    each = (jnp.stack(jnp.broadcast_arrays(*x)) if isinstance(x, tuple) else x for x in (terms.weight, terms.tau))
+    return lax.scan(add, jnp.zeros_like(time), tuple(each))[0]
+
+
+class Harmonics(NamedTuple):
+    """A circuit without time constants in the steady state: terms that stand for high frequencies, and the others.
+
+    Attributes:
+        terms: what they are exact or fitted for lies above the harmonics.
+        drive: V, the harmonics' amplitudes.
+        gain: the circuit's at each.
+        missed: of that, what the terms do not have.
+    """
+
+    terms: Terms
+    drive: Complex[Array, " harmonics"]
+    gain: Complex[Array, " harmonics"]
+    missed: Complex[Array, " harmonics"]
+
+
+def by_harmonics(circuit: WithSkin, drive: Drive, channel: Channel) -> Harmonics:
+    """The harmonics in which the skin changes, and terms for those above.
+
+    Raises:
+        InputError: the drive has no period.
+    """
+    omega, terms = fundamental(drive), Terms((), ())
+    if isinstance(drive, Sine | Multitone):
+        count = max(drive.orders) if isinstance(drive, Multitone) else 1
+    else:
+        count = circuit.skin.count(frequency(drive))
+        terms = circuit.skin.above(circuit, omega * count, channel)
     harmonics = omega * jnp.arange(1, count + 1)
-    missed = circuit.gain_of(channel, harmonics) - gain_at(terms, harmonics)
-    return total + harmonic_sum(fourier(drive, count) * missed, drive, time)
+    gain = circuit.gain_of(channel, harmonics)
+    return Harmonics(terms, fourier(drive, count), gain, gain - gain_at(terms, harmonics))
 
 
 def highpass(drive: Drive, time: ArrayLike, tau: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:

@@ -113,18 +113,16 @@ class Scene(Section):
 
     def require_available(self, *, fit: bool = False) -> None:
         """Refuse what this version cannot model (or, with `fit`, cannot fit), rather than leave it out in silence."""
+        follows = ("constant", "fractional") if fit else ("constant",)  # the skins whose transients are computed
         unavailable = {
             f"[skin] level = '{self.skin.level}' with [drive] steady_state = false": (
-                self.skin.level != "constant" and not self.drive.steady_state
+                self.skin.level not in follows and not self.drive.steady_state
             ),
         }
-        if fit:
-            unavailable[f"[skin] level = '{self.skin.level}'"] = self.skin.level != "constant"
         for what, asked in unavailable.items():
             if asked:
-                can = "fits skins of constant R and C" if fit else "does not model it"
                 raise InputError(
-                    f"scene: {what} is not available in this version, which {can};"
+                    f"scene: {what} is not available in this version, which does not model it;"
                     " leave it out of the scene to go on without it"
                 )
 
@@ -134,6 +132,7 @@ class Scene(Section):
         grounding = {name: getattr(ground, name) for name in (*_DIRECT, *_NATURAL)}
         grounding["Z"] = ground.Z or None  # 0: the body is at earth
         series = {"series_resistor": measured.series_resistor or None}
+        series["alpha"] = self.skin.alpha if self.skin.level == "fractional" else None
         noise = {"sigma": measured.noise_Vsc or None, "sigma_I": measured.noise_I or None}
         gap = {"Rgap": self.gap.resistance, "Cgap": self._gap_capacitance()}
         skin = {"Rsc": self.skin.Rsc, "Csc": self.skin.Csc, "Ci": self.device.Ci}
@@ -162,14 +161,16 @@ class Scene(Section):
 
         It is the paper's final one unless the scene, or `values`, asks for more.
         """
+        self.require_available()
         circuit = self.make_rc_circuit(values)
         if self.skin.level == "constant":
             return circuit
-        return WithSkin(circuit, Dispersive() if self.skin.level == "dispersive" else Fractional(self.skin.alpha))
+        alpha = dict(values or {}).get("alpha", self.skin.alpha)
+        return WithSkin(circuit, Dispersive() if self.skin.level == "dispersive" else Fractional(alpha))
 
     def make_rc_circuit(self, values: Mapping[str, ArrayLike] | None = None) -> RC:
         """As `make_circuit`, with the skins constant."""
-        self.require_available()
+        self.require_available(fit=True)
         of: dict[str, Any] = self.nominal() | dict(values or {})
         skin, names = (of["Rsc"], of["Csc"], of["Ci"]), ("series_resistor", "Rgap", "Cgap")
         common = {name: of[name] for name in names} | {"probe": self._probe()}
@@ -226,6 +227,8 @@ class Scene(Section):
         absent = dict.fromkeys(_DIRECT, "[grounding] connection = 'direct'")
         if self.grounding.connection == "direct":
             absent = dict.fromkeys(_NATURAL, "[grounding] connection = 'natural'")
+        if self.skin.level != "fractional":
+            absent["alpha"] = "[skin] level = 'fractional'"
         for name, channel in {"sigma": "Vsc", "sigma_I": "I"}.items():
             if channel not in self.measurement.channels:
                 absent[name] = f"'{channel}' among [measurement] channels"

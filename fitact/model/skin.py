@@ -3,11 +3,13 @@
 At each frequency any linear skin is a resistance and a capacitance in parallel, so a level is a map from
 the constant Rsc, Csc and the frequency to R(f), C(f). `WithSkin` puts a level into a circuit; a circuit
 without one has the constant level. Such a skin has no finite set of time constants, but a steady state,
-harmonic by harmonic.
+harmonic by harmonic. A fractional one is causal, so a grid of time constants can follow it in any drive.
 """
 
 import dataclasses
 import functools
+from collections.abc import Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,15 +19,19 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Complex
 
 from fitact.errors import InputError
-from fitact.model.circuit import Channel, Circuit, DirectGround, Element, FinalCircuit, NaturalGround, Terms
+from fitact.model.circuit import RC, Channel, Circuit, Element, Loop, Terms
+from fitact.model.relaxation import Grid
 
 # section 3.1 of the paper, where Rsc, Csc are those at 100 Hz
 _FREQUENCY = np.array([10.0, 100.0, 1000.0])  # Hz
 _RESISTANCE = np.array([200.0, 160.0, 80.0]) / 160.0
 _CAPACITANCE = np.array([44.25, 22.0, 8.85]) / 22.0
 
+TOP = float(_FREQUENCY[-1])  # Hz, above which a dispersive skin is constant
+
 _PER_DECADE = 6  # time constants by which a fractional skin is followed at high frequency
 _DECADES = 8
+_NO_ELEMENT = 2.0  # exponents from which an impedance that goes as its power of frequency would turn its sign
 
 
 class Skin(eqx.Module):
@@ -107,8 +113,10 @@ class Fractional(Skin):
     def at(self, skin: Element, frequency: ArrayLike) -> Element:
         """R(f) = 1 / Re(1/Z), C(f) = Im(1/Z) / w."""
         x = 2.0 * np.pi * jnp.asarray(frequency, dtype=float) * (jnp.asarray(skin.R) * skin.C)
-        power = jnp.where(x > 0.0, jnp.exp((self.alpha - 1.0) * jnp.log(jnp.where(x > 0.0, x, 1.0))), 1.0)
-        angle = 0.5 * np.pi * (1.0 - jnp.asarray(self.alpha))  # from the missing part of alpha: exactly 0 at 1
+        alpha = jnp.asarray(self.alpha)
+        alpha = jnp.where(alpha < _NO_ELEMENT, alpha, jnp.nan)  # so that no step of a fit leads there
+        power = jnp.where(x > 0.0, jnp.exp((alpha - 1.0) * jnp.log(jnp.where(x > 0.0, x, 1.0))), 1.0)
+        angle = 0.5 * np.pi * (1.0 - alpha)  # from the missing part of alpha: exactly 0 at 1
         return Element(skin.R / (1.0 + x * power * jnp.sin(angle)), skin.C * power * jnp.cos(angle))
 
     def count(self, frequency: ArrayLike) -> int:
@@ -117,7 +125,7 @@ class Fractional(Skin):
 
     def above(self, circuit: "WithSkin", omega: ArrayLike, channel: Channel) -> Terms:
         """Time constants spread evenly over the decades above `omega`, with weights fitted by least squares."""
-        limited = channel != "I" or circuit.circuit.current_terms().rate is None
+        limited = channel != "I" or limits_current(circuit.circuit)
         omega = jnp.asarray(omega, dtype=float)
         tau, x, weights = spread(limited, omega.dtype == jnp.float64)
         gain = circuit.gain_of(channel, omega * x)
@@ -148,10 +156,22 @@ class WithSkin(Circuit):
     Attributes:
         circuit: final, direct or natural ground, with the constant values that the level refers to.
         skin: `Dispersive` or `Fractional`.
+        grid: time constants to follow a fractional skin by; None: it has harmonics only.
     """
 
-    circuit: FinalCircuit | DirectGround | NaturalGround
+    circuit: RC
     skin: Skin
+    grid: Grid | None = None
+
+    @property
+    def g(self) -> ArrayLike:
+        """The divider that the constant values have."""
+        return self.circuit.g
+
+    @property
+    def b(self) -> ArrayLike:
+        """The slowest time constant that the constant values have, s."""
+        return self.circuit.b
 
     def at(self, frequency: ArrayLike) -> Circuit:
         """The circuit with R(f), C(f) of `frequency` (Hz), which at this frequency is this one."""
@@ -166,19 +186,28 @@ class WithSkin(Circuit):
         return dataclasses.replace(self.circuit, **changed)
 
     def terms(self) -> Terms:
-        """None exist.
+        """Those of the grid.
 
         Raises:
-            InputError: always.
+            InputError: there is none.
         """
+        return self._on_grid("Vsc")
+
+    def current_terms(self) -> Terms:
+        """As `terms`."""
+        return self._on_grid("I")
+
+    def gap_terms(self) -> Terms:
+        """As `terms`."""
+        return self._on_grid("Vgap")
+
+    def _on_grid(self, channel: Channel) -> Terms:
+        if self.grid is not None:
+            return self.grid.terms(channel, limits_current(self.circuit), self.gain_of(channel, self.grid.omega))
         raise InputError(
             f"a {type(self.skin).__name__.lower()} skin has no finite set of time constants; ask for the steady"
             " state of a periodic drive (response) or for harmonics (harmonic_response)"
         )
-
-    def current_terms(self) -> Terms:
-        """As `terms`."""
-        return self.terms()
 
     def transfer_function(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
         """Vsc / V at the angular frequency `omega` (rad/s, >= 0)."""
@@ -191,6 +220,43 @@ class WithSkin(Circuit):
     def gap_transfer_function(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
         """Vgap / V at the angular frequency `omega` (rad/s, >= 0); raises where there is no gap."""
         return jnp.vectorize(lambda w: self.at(w / (2.0 * np.pi)).gap_transfer_function(w))(_floating(omega))
+
+
+def constant(circuit: Circuit) -> Circuit:
+    """The circuit with constant skins that a level refers to; one without a level, as it is."""
+    return circuit.circuit if isinstance(circuit, WithSkin) else circuit
+
+
+def limits_current(circuit: Circuit) -> bool:
+    """Whether a resistance is in series with the insulator; without one the current follows dV/dt."""
+    inner = constant(circuit)
+    return isinstance(inner, Loop) and inner.resistance() is not None
+
+
+def has_time_constants(circuit: Circuit) -> bool:
+    """Whether finitely many stand for it, its own or a grid's."""
+    return not isinstance(circuit, WithSkin) or circuit.grid is not None
+
+
+def parameters(circuit: Circuit) -> dict[str, Any]:
+    """What can be known or unknown of a circuit, by name: its fields, and the exponent of a fractional skin."""
+    inner = constant(circuit)
+    found: dict[str, Any] = {
+        field.name: getattr(inner, field.name) for field in dataclasses.fields(inner) if field.name != "probe"
+    }
+    if isinstance(circuit, WithSkin) and isinstance(circuit.skin, Fractional):
+        found["alpha"] = circuit.skin.alpha
+    return found
+
+
+def with_values(circuit: Circuit, values: Mapping[str, ArrayLike]) -> Circuit:
+    """The circuit with other values of its `parameters`."""
+    if not isinstance(circuit, WithSkin):
+        return dataclasses.replace(circuit, **values)
+    inner, skin = dict(values), circuit.skin
+    if isinstance(skin, Fractional):
+        skin = dataclasses.replace(skin, alpha=inner.pop("alpha", skin.alpha))
+    return dataclasses.replace(circuit, circuit=dataclasses.replace(circuit.circuit, **inner), skin=skin)
 
 
 def _floating(omega: ArrayLike) -> Array:

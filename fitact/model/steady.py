@@ -22,8 +22,10 @@ from fitact.model.circuit import Channel, Circuit, Terms
 from fitact.model.drive import Drive, Line, Periodic, Pieces, PiecewiseLinear, Sine, Square, Trapezoid, Triangle
 from fitact.model.highpass import highpass_amplitude
 from fitact.model.multitone import Multitone, largest_sum
-from fitact.model.response import bend, coth_fraction, log_slope, phi, psi, steady_knots
+from fitact.model.response import bend, by_harmonics, coth_fraction, log_slope, phi, psi, steady_knots
+from fitact.model.skin import WithSkin
 
+_FEW = 8  # terms that are taken one by one
 _HALVINGS = 160  # of a bracket that begins at 0: to the last bit of an extreme far closer to 0 than to the end
 
 
@@ -42,7 +44,18 @@ def mean_square(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Flo
     Raises:
         InputError: the drive does not repeat.
     """
-    terms = circuit.terms_of(channel)
+    if isinstance(circuit, WithSkin) and circuit.grid is None:
+        found = by_harmonics(circuit, drive, channel)
+        # by Parseval: what the terms have of the harmonics gives way to what the circuit has
+        instead = _power(found.drive * found.gain) - _power(found.drive * (found.gain - found.missed))
+        return instead + (_of_terms(found.terms, drive) if found.terms.tau else 0.0)
+    return _of_terms(circuit.terms_of(channel), drive)
+
+
+def _of_terms(terms: Terms, drive: Drive) -> Float[Array, ""]:
+    """The mean square of what the terms put together."""
+    if len(terms.tau) > _FEW:
+        return _of_many(terms, drive)
     pairs = list(zip(terms.weight, terms.tau, strict=True))
     each = [weight * highpass_mean_square(drive, tau) for weight, tau in pairs]
     total = jnp.asarray(0.0)
@@ -55,6 +68,23 @@ def mean_square(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Flo
         return jnp.maximum(total, 0.0)  # terms of Vsc may cancel down to rounding
     for part, (_, tau) in zip(each, pairs, strict=True):
         total = total + 2.0 * terms.rate * part / tau
+    return jnp.where(_impulses(drive, terms.rate), jnp.inf, total + terms.rate**2 * _slope_mean_square(drive))
+
+
+def _power(amplitude: Array) -> Array:
+    """The mean square of 2 Re sum_k amplitude[k - 1] e^{jkwt}."""
+    return 2.0 * jnp.sum(amplitude.real**2 + amplitude.imag**2)
+
+
+def _of_many(terms: Terms, drive: Drive) -> Float[Array, ""]:
+    """As `_of_terms`, side by side."""
+    weight, tau = (jnp.stack(jnp.broadcast_arrays(*x)) for x in (terms.weight, terms.tau))
+    each = jax.vmap(lambda t: highpass_mean_square(drive, t))(tau)
+    both = weight * each
+    total = jnp.sum(2.0 * (weight[:, None] * tau[:, None] / (tau[:, None] + tau)) * both)
+    if terms.rate is None:
+        return jnp.maximum(total, 0.0)
+    total = total + 2.0 * terms.rate * jnp.sum(both / tau)
     return jnp.where(_impulses(drive, terms.rate), jnp.inf, total + terms.rate**2 * _slope_mean_square(drive))
 
 

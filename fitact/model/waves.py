@@ -14,7 +14,6 @@ from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
@@ -139,7 +138,9 @@ class Waves:
         count = max(np.size(value) for value in values.values())
         with jax.enable_x64(precision is np.float64):
             circuit = scene.make_circuit(dict(values))
-            skin = jax.tree.map(jnp.asarray, circuit.skin) if isinstance(circuit, WithSkin) else None
+            skin = None
+            if isinstance(circuit, WithSkin):  # its exponent may differ from circuit to circuit
+                skin = jax.tree.map(lambda x: filled_up(x, precision)[:, None], circuit.skin)
             whole = complete(scene.make_rc_circuit(dict(values)))
             filled = jax.tree.map(lambda x: filled_up(x, precision), whole)
             weight, tau, harmonics = terms(filled, skin, drive, precision, channel)
