@@ -132,7 +132,7 @@ def test_where_nothing_is_planned_the_full_model_is_fitted(monkeypatch):
         ([measured], "planned", "no plan with a measured drive"),
         ([fitact.Scene()], "planned", "names nothing"),
     ]:
-        found = fit_planned([], scenes, model)
+        found = fit_planned([simulate(fitact.Scene())], scenes, model)
         assert found.used == "full"
         assert reason in found.sentence
         assert found.to_dict() == {"used": "full", "sentence": found.sentence}

@@ -56,10 +56,11 @@ def fit_planned(records: Sequence[Record], scenes: Sequence[Scene], model: Model
         InputError: as `fitact.fit` and `fitact.plan`.
     """
     full = tuple(scenes) if len(scenes) > 1 else (scenes[0] if scenes else None)
-    why = _no_plan(scenes, model)
+    recorded = _recorded(records[0], scenes[0]) if model == "planned" and len(scenes) == 1 else None
+    why = _no_plan(scenes, model, recorded is not None)
     if why:
         return PlannedFit(fit(records, full, **options), "full", f"The full model is fitted: {why}.")
-    found = plan_for(records[0], scenes[0])
+    found = plan(scenes[0], recorded)
     fitted = fit(records, without(scenes[0], found.left_out), **options)
     if found.left_out and fitted.result == "misfit":
         whole = _fitted_in_full(records, scenes[0], options)
@@ -82,7 +83,7 @@ def plan_for(record: Record, scene: Scene) -> Plan:
     return plan(scene, _recorded(record, scene))
 
 
-def _no_plan(scenes: Sequence[Scene], model: Model) -> str:
+def _no_plan(scenes: Sequence[Scene], model: Model, recorded: bool) -> str:
     """Why the full model is fitted from the first, as a clause; "" where there is a plan."""
     if model == "full":
         return "it was asked for"
@@ -90,7 +91,7 @@ def _no_plan(scenes: Sequence[Scene], model: Model) -> str:
         return "without a scene it is the paper's final circuit, which has nothing to leave out"
     if len(scenes) > 1:
         return "several scenes have no common plan"
-    if scenes[0].drive.waveform == "measured" and scenes[0].skin.level != "constant":
+    if recorded and scenes[0].skin.level != "constant":
         return "a skin that depends on the frequency has no plan with a measured drive"
     return "" if named(scenes[0]) else "the scene names nothing that it could do without"
 
