@@ -63,6 +63,8 @@ class Outcome:
     [
         ("successful", "successful", "planned"),
         ("misfit", "successful", "full"),
+        ("not_at_optimum", "successful", "full"),
+        ("misfit", "not_at_optimum", "planned"),
         ("misfit", "misfit", "planned"),
         ("misfit", "on_bound", "full"),
         ("on_bound", "successful", "planned"),

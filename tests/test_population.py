@@ -211,7 +211,7 @@ def nuts(fits: list[fitact.Fit], prior: Prior) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [3, 6])
+@pytest.mark.parametrize("count", [3, pytest.param(6, marks=pytest.mark.thorough)])
 def test_law_is_that_of_nuts_over_all_parameters(count: int):
     """Of fingers known no better than they differ; within four standard errors of means, and 5 % in width."""
     simulated = simulate(5, 1, fingers=count, noise=4.0)

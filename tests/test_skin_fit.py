@@ -19,6 +19,7 @@ TRUTH = {"Rsc": R, "Csc": C, "Ci": CI, "alpha": ALPHA}
 STEP, PERIOD, SAMPLES = 5e-6, 0.01, 4000
 RISE, NOISE_V, NOISE_I = 20e-6, 0.05, 20e-9
 TONES, HEIGHTS = (1, 3, 7, 20), (60.0, 50.0, 40.0, 30.0)
+HIGHEST = 2**22  # of the harmonics: fewer miss I beside an ideal jump
 Impedance = Callable[[np.ndarray], np.ndarray]
 
 
@@ -34,7 +35,7 @@ def paper(omega: np.ndarray) -> np.ndarray:
     return 1.0 / (1.0 / resistance + 1j * omega * capacitance)
 
 
-def amplitudes(waveform: str, highest: int = 2**18) -> tuple[np.ndarray, np.ndarray]:
+def amplitudes(waveform: str, highest: int = HIGHEST) -> tuple[np.ndarray, np.ndarray]:
     """Orders and Fourier coefficients of the drive."""
     if waveform == "multitone":
         return np.array(TONES), -0.5j * np.array(HEIGHTS)
@@ -46,7 +47,7 @@ def amplitudes(waveform: str, highest: int = 2**18) -> tuple[np.ndarray, np.ndar
 def channels(waveform: str, impedance: Impedance, time: np.ndarray) -> tuple[np.ndarray, ...]:
     """V, Vsc and I, over samples that lie on the same places of each period; the highest harmonics fade out."""
     k, drive = amplitudes(waveform)
-    omega, fade = 2.0 * np.pi * k / PERIOD, np.cos(0.5 * np.pi * np.clip(2.0 * k / 2**18 - 1.0, 0.0, 1.0)) ** 2
+    omega, fade = 2.0 * np.pi * k / PERIOD, np.cos(0.5 * np.pi * np.clip(2.0 * k / HIGHEST - 1.0, 0.0, 1.0)) ** 2
     current = drive * fade / (1.0 / (1j * omega * CI) + 2.0 * impedance(omega))
     per_period = round(PERIOD / STEP)
 
@@ -192,8 +193,24 @@ def test_summed_samples_give_the_same_fit(trapezoid: fitact.Fit):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seen", [("Vsc",), ("I",), ("Vsc", "I")], ids="+".join)
-@pytest.mark.parametrize("waveform", ["multitone", "trapezoid", "square"])
+@pytest.mark.parametrize(
+    ("waveform", "seen"),
+    [
+        ("multitone", ("I",)),
+        ("square", ("Vsc", "I")),
+        *(
+            pytest.param(waveform, seen, marks=pytest.mark.thorough)
+            for waveform, seen in [
+                ("multitone", ("Vsc",)),
+                ("multitone", ("Vsc", "I")),
+                ("trapezoid", ("I",)),
+                ("trapezoid", ("Vsc", "I")),
+                ("square", ("Vsc",)),
+                ("square", ("I",)),
+            ]
+        ),
+    ],
+)
 def test_recovery(waveform: str, seen: tuple[str, ...]):
     fit = fitact.fit(record(waveform, cole()), scene(waveform, seen=seen))
     assert_recovers(fit, **TRUTH)
@@ -203,7 +220,10 @@ def test_recovery(waveform: str, seen: tuple[str, ...]):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("waveform", "seen"), [("trapezoid", ("Vsc",)), ("multitone", ("Vsc", "I"))])
+@pytest.mark.parametrize(
+    ("waveform", "seen"),
+    [("trapezoid", ("Vsc",)), pytest.param("multitone", ("Vsc", "I"), marks=pytest.mark.thorough)],
+)
 def test_recovery_of_the_papers_dispersion(waveform: str, seen: tuple[str, ...]):
     fit = fitact.fit(record(waveform, paper), scene(waveform, "dispersive", seen=seen))
     assert_recovers(fit, **TRUTH)
@@ -241,11 +261,13 @@ def test_a_constant_skin_has_an_exponent_of_one(seed: int):
 
 @pytest.mark.slow
 def test_a_constant_skin_does_not_describe_a_fractional_one(trapezoid: fitact.Fit):
-    assert fitact.fit(trapezoid.record, scene("trapezoid", "constant")).result == "misfit"
+    fit = fitact.fit(trapezoid.record, scene("trapezoid", "constant"))
+    assert not fit.trusted
+    assert fit.figures["chi2_reduced"] > 100.0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("steady", [True, False], ids=["steady", "from rest"])
+@pytest.mark.parametrize("steady", [True, pytest.param(False, marks=pytest.mark.thorough)], ids=["steady", "from rest"])
 def test_a_measured_drive(steady: bool):
     """From rest: the wave begins after so long a pause that next to nothing is left of what was before."""
     time = (np.arange(SAMPLES) + 0.5) * STEP
@@ -272,7 +294,7 @@ def test_a_measured_drive(steady: bool):
 
 @pytest.mark.slow
 def test_a_plan_that_leaves_dispersion_out_fits_a_constant_skin():
-    held = {"skin": {"level": "fractional", "alpha": 0.999}, "prior": {}, "tolerance": {"force": 0.5}}
+    held = {"skin": {"level": "fractional", "alpha": 0.99995}, "prior": {}, "tolerance": {"force": 0.002}}
     stated = scene("trapezoid", **held)
     found = fit_planned([simulate(stated, seed=1)], [stated], "planned")
     assert "dispersion" in found.plan.left_out

@@ -15,6 +15,7 @@ from fitact.model.scene import Scene
 
 Model: TypeAlias = Literal["planned", "full"]
 
+_FAILED = ("misfit", "not_at_optimum")  # how a fit ends whose model is too simple
 _SAMPLES = 20_000  # of a measured drive that a plan looks at
 
 
@@ -41,7 +42,7 @@ class PlannedFit:
 
 
 def fit_planned(records: Sequence[Record], scenes: Sequence[Scene], model: Model, **options: Any) -> PlannedFit:
-    """Fit with the planned model of a scene; where that is a misfit and the full one is not, with the full one.
+    """Fit with the planned model of a scene; where that does not describe the records and the full one does, with it.
 
     Where the recorded V drives the fit, that is planned for, as it was recorded. Several scenes would each have their
     own plan: they get the full model.
@@ -62,12 +63,12 @@ def fit_planned(records: Sequence[Record], scenes: Sequence[Scene], model: Model
         return PlannedFit(fit(records, full, **options), "full", f"The full model is fitted: {why}.")
     found = plan(scenes[0], recorded)
     fitted = fit(records, without(scenes[0], found.left_out), **options)
-    if found.left_out and fitted.result == "misfit":
+    if found.left_out and fitted.result in _FAILED:
         whole = _fitted_in_full(records, scenes[0], options)
-        if whole is not None and whole.result != "misfit":
+        if whole is not None and whole.result not in _FAILED:
             said = (
-                f"the record contradicts the planned model, which leaves out {', '.join(found.left_out)}: its fit is a"
-                " misfit and that of the full model is not, so the full model is fitted"
+                f"the record contradicts the planned model, which leaves out {', '.join(found.left_out)}: its fit does"
+                " not describe it and that of the full model does, so the full model is fitted"
             )
             whole = dataclasses.replace(whole, warnings=(*whole.warnings, said))
             return PlannedFit(whole, "full", f"{said[0].upper()}{said[1:]}.", found)
