@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 import fitact
+from fitact.model.beliefs import PriorSection
+from fitact.report.page import _label
 
 
 class Page(HTMLParser):
@@ -108,3 +110,8 @@ def test_chromium_opens_it_without_complaint(path: Path, width: int, tmp_path):
     )  # fmt: skip
     assert shot.stat().st_size > 50_000
     assert "CONSOLE" not in done.stderr
+
+
+def test_whatever_can_be_free_has_a_name_for_people():
+    for name in set(PriorSection.model_fields) - {"correlation", "order"}:
+        assert _label(name) != name

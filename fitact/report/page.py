@@ -30,6 +30,7 @@ _LABELS = {
     "series_resistor": "series resistor",
     "Rgap": "gap's resistance Rgap",
     "Cgap": "gap's capacitance Cgap",
+    "alpha": "exponent of the fractional skin",
     "gain": "gain of {}",
     "delay": "delay of {} against V",
     "clock": "drive's frequency over the stated one, less 1",
