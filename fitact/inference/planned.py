@@ -57,8 +57,11 @@ def fit_planned(records: Sequence[Record], scenes: Sequence[Scene], model: Model
         InputError: as `fitact.fit` and `fitact.plan`.
     """
     full = tuple(scenes) if len(scenes) > 1 else (scenes[0] if scenes else None)
-    recorded = _recorded(records[0], scenes[0]) if model == "planned" and len(scenes) == 1 else None
-    why = _no_plan(scenes, model, recorded is not None)
+    why, recorded = _no_plan(scenes, model), None
+    if not why:  # only now is the record worth a look
+        recorded = _recorded(records[0], scenes[0])
+        if recorded is not None and scenes[0].skin.level != "constant":
+            why = "a skin that depends on the frequency has no plan with a measured drive"
     if why:
         return PlannedFit(fit(records, full, **options), "full", f"The full model is fitted: {why}.")
     found = plan(scenes[0], recorded)
@@ -84,7 +87,7 @@ def plan_for(record: Record, scene: Scene) -> Plan:
     return plan(scene, _recorded(record, scene))
 
 
-def _no_plan(scenes: Sequence[Scene], model: Model, recorded: bool) -> str:
+def _no_plan(scenes: Sequence[Scene], model: Model) -> str:
     """Why the full model is fitted from the first, as a clause; "" where there is a plan."""
     if model == "full":
         return "it was asked for"
@@ -92,8 +95,6 @@ def _no_plan(scenes: Sequence[Scene], model: Model, recorded: bool) -> str:
         return "without a scene it is the paper's final circuit, which has nothing to leave out"
     if len(scenes) > 1:
         return "several scenes have no common plan"
-    if recorded and scenes[0].skin.level != "constant":
-        return "a skin that depends on the frequency has no plan with a measured drive"
     return "" if named(scenes[0]) else "the scene names nothing that it could do without"
 
 

@@ -28,7 +28,7 @@ from fitact.inference.start import (
     linear_start,
 )
 from fitact.inference.trace import CHARGES, LINEAR, Trace
-from fitact.model.circuit import RC, Channel, FinalCircuit, Loop
+from fitact.model.circuit import RC, Channel, FinalCircuit
 from fitact.model.distribution import LogNormal
 from fitact.model.prior import Prior
 from fitact.model.scene import Scene
@@ -303,10 +303,7 @@ def _delay_sd(choice: DriveChoice) -> float:
 
 def _jumps(template: RC | WithSkin, record: Record) -> bool:
     """Whether Vsc follows a jump of V, within the record's time step."""
-    circuit = constant(template)
-    if not isinstance(circuit, Loop) or circuit.resistance() is None:
-        return True
-    return float(circuit.terms().tau[-1]) < record.time_step
+    return not limits_current(template) or float(constant(template).terms().tau[-1]) < record.time_step
 
 
 def _largest(template: RC | WithSkin) -> float:
