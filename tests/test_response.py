@@ -323,6 +323,13 @@ def test_sampled_drive_against_scipy(count: int):
     drive = fitact.Sampled(time, voltage)
     expected = skin_voltage(time, voltage, **VALUES)
     np.testing.assert_allclose(fitact.response(CIRCUIT, drive, time, steady_state=False), expected, atol=1e-13)
+    np.testing.assert_allclose(fitact.response(CIRCUIT, drive, drive.time, steady_state=False), expected, atol=1e-13)
+
+
+@pytest.mark.parametrize("part", [250, 333, 998, 999])
+def test_long_sampled_drive_is_followed_in_parts(part: int, monkeypatch):
+    monkeypatch.setattr("fitact.model.response._LONG", part)
+    test_sampled_drive_against_scipy(1000)
 
 
 def test_sampled_drive_on_uneven_times_is_the_same_line():

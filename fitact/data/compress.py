@@ -27,6 +27,7 @@ from fitact.model.chirp import Chirp
 from fitact.model.circuit import Terms
 from fitact.model.drive import Drive, Periodic, Sampled
 from fitact.model.response import highpass, phi, recurrence
+from fitact.progress import watched
 
 SLOW = ("offset", "drift", "hum_50Hz_cos", "hum_50Hz_sin", "hum_60Hz_cos", "hum_60Hz_sin")
 
@@ -170,6 +171,7 @@ def compress(
         else:
             parts = _folded(table, drive, samples, period)
     count = time.size if weight is None else int(np.count_nonzero(weight))
+    parts = watched(parts, "compressing the record", math.ceil(time.size / _chunk_length(time.size)))
     return _assemble(table, sum(parts, np.zeros(())), isinstance(drive, Sampled), count)
 
 

@@ -58,9 +58,8 @@ class Record:
         Raises:
             InputError: too few samples, not finite, not increasing, or a channel that holds no signal.
         """
-        time = np.array(time, dtype=float)
         given = {"V": V, "Vsc": Vsc, "I": I}
-        channels = {name: np.array(values, dtype=float) for name, values in given.items() if values is not None}
+        time, channels = _copy(time), {name: _copy(values) for name, values in given.items() if values is not None}
         _check_shapes(time, channels, source)
         for name, values in {"time": time, **channels}.items():
             _check_finite(values, name, source, where)
@@ -156,7 +155,8 @@ def white_noise(values: Float[np.ndarray, " samples"]) -> float:
     Edges, being rare, leave the median alone.
     """
     third = np.diff(values, 3)
-    return float(np.median(np.abs(third)) / 0.6744897501960817 / math.sqrt(20.0))
+    np.abs(third, out=third)
+    return float(np.median(third, overwrite_input=True) / 0.6744897501960817 / math.sqrt(20.0))
 
 
 def rounding_noise(values: Float[np.ndarray, " samples"]) -> float:
@@ -164,10 +164,13 @@ def rounding_noise(values: Float[np.ndarray, " samples"]) -> float:
 
     A few levels only are an ideal wave's, not a converter's.
     """
-    levels = np.unique(values)
-    step = float(np.diff(levels).min())
-    coarse = levels.size >= _LEVELS and white_noise(values) < step
-    return step / math.sqrt(12.0) if coarse else 0.0
+    noise, step = white_noise(values), math.inf
+    for part in (values[:_PART], values):  # mostly some samples tell
+        levels = np.unique(part)
+        step = float(np.diff(levels).min(initial=math.inf))
+        if step <= noise:
+            return 0.0
+    return step / math.sqrt(12.0) if levels.size >= _LEVELS else 0.0
 
 
 def fundamental(time: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"]) -> float | None:
@@ -201,13 +204,19 @@ def _self_correlation(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Correlation coefficient of x[:n - lag] and x[lag:] for each lag; 1 at a period, however few there are."""
     x = x - x.mean()
     count = x.size
-    product = np.fft.irfft(np.abs(np.fft.rfft(x, 2 * count)) ** 2)[:count]
+    power = np.abs(np.fft.rfft(x, 2 * count))
+    power *= power
+    correlation = np.fft.irfft(power, 2 * count)[:count].copy()  # frees the other half
+    del power
     overlap = np.arange(count, 0, -1)
-    head, head2 = (np.cumsum(y)[::-1] for y in (x, x**2))  # sums over x[:n - lag]
-    tail, tail2 = (np.cumsum(y[::-1])[::-1] for y in (x, x**2))  # sums over x[lag:]
-    spread = (head2 - head**2 / overlap) * (tail2 - tail**2 / overlap)
-    floor = 1e-12 * head2[0] ** 2  # parts without variation correlate with nothing
-    return np.where(spread > floor, (product - head * tail / overlap) / np.sqrt(np.maximum(spread, floor)), 0.0)
+    head, tail = np.cumsum(x)[::-1], np.cumsum(x[::-1])[::-1]  # sums over x[:n - lag] and x[lag:]
+    correlation -= head * tail / overlap
+    spread = np.cumsum(x**2)[::-1]
+    floor = 1e-12 * spread[0] ** 2  # parts without variation correlate with nothing
+    spread = (spread - head**2 / overlap) * (np.cumsum(x[::-1] ** 2)[::-1] - tail**2 / overlap)
+    correlation /= np.sqrt(np.maximum(spread, floor))
+    correlation[spread <= floor] = 0.0
+    return correlation
 
 
 def _stretch(inside: np.ndarray, index: int) -> tuple[int, int]:
@@ -230,6 +239,16 @@ def _vertex(curve: Float[np.ndarray, " n"], start: int, stop: int, top: int) -> 
         return float(top)
     bend, slope, _ = np.polyfit(np.arange(stop - start), curve[start:stop], 2)
     return float(start + np.clip(-0.5 * slope / bend, 0.0, stop - start) if bend < 0.0 else top)
+
+
+def _copy(values: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+    """In double precision, and where JAX can use it without one of its own: from a multiple of 64 bytes on."""
+    values = np.asarray(values, dtype=float)
+    memory = np.empty(values.size + 8)
+    first = -memory.ctypes.data % 64 // 8
+    found = memory[first : first + values.size].reshape(values.shape)
+    found[...] = values
+    return found
 
 
 def _check_shapes(time: np.ndarray, channels: Mapping[str, np.ndarray], source: str) -> None:

@@ -16,6 +16,7 @@ from fitact.data import layouts
 from fitact.data.capture import Capture, Pick, Trace
 from fitact.data.header import Column, Header, cells_of, number, read_header
 from fitact.errors import InputError
+from fitact.progress import watched
 
 _HEAD = 32_768  # bytes that hold any header and some rows
 _BLOCK = 8_388_608  # bytes parsed at a time
@@ -30,14 +31,16 @@ def read_text(path: Path, source: str, pick: Pick) -> Capture:
         InputError: it cannot be read, has no header or time, or a row is broken; names the line.
     """
     try:
-        with _opened(path) as stream:
+        with _opened(path) as (stream, file):
             head = stream.read(_HEAD)
             stream.seek(0)
             text = _decoded(head, source)
             header = read_header(text if len(head) < _HEAD else text.rpartition("\n")[0], source, _companion(path))
             wanted = set(pick([column.name for column in header.columns], header.place))
-            table = _Table(header, [column for column in header.columns if column.name in wanted], source)
-            for block in _blocks(stream, source):
+            size = path.stat().st_size
+            table = _Table(header, [column for column in header.columns if column.name in wanted], source, size)
+            blocks = watched(_blocks(stream, source), f"reading {source}", size, file.tell)
+            for block in blocks:
                 table.add(block)
     except (OSError, EOFError, zlib.error) as error:
         reason = getattr(error, "strerror", None) or str(error)
@@ -55,8 +58,8 @@ def _is_utf16(head: bytes) -> bool:
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[IO[bytes]]:
-    """The bytes of the text, as UTF-8 or a superset of ASCII, with lines that end in a line feed."""
+def _opened(path: Path) -> Iterator[tuple[IO[bytes], IO[bytes]]]:
+    """The bytes of the text, as UTF-8 or a superset of ASCII, with lines that end in a line feed; and the file."""
     with path.open("rb") as file:
         packed = file.read(2) == b"\x1f\x8b"
         file.seek(0)
@@ -67,7 +70,7 @@ def _opened(path: Path) -> Iterator[IO[bytes]]:
         if old or _is_utf16(head):
             text = stream.read(_MOST).decode("utf-16" if _is_utf16(head) else "latin-1", errors="replace")
             stream = io.BytesIO((text.replace("\r", "\n") if old else text).encode())
-        yield stream
+        yield stream, file
 
 
 def _companion(path: Path) -> str:
@@ -111,12 +114,13 @@ def _blocks(stream: IO[bytes], source: str) -> Iterator[bytes]:
 class _Table:
     """The numbers of a file, as they come in."""
 
-    def __init__(self, header: Header, columns: Sequence[Column], source: str) -> None:
+    def __init__(self, header: Header, columns: Sequence[Column], source: str, size: int) -> None:
         self._header, self._columns, self._source = header, columns, source
+        self._size = size  # of the file, bytes
         known = [header.time.place] if header.time else [header.index] if header.index is not None else []
         self._has_time = bool(known)  # or a count of samples, in the first place
         self._places = [*known, *(column.place for column in columns)]
-        self._parts: list[np.ndarray] = []
+        self._numbers = np.empty((len(self._places), 0))  # of each column; longer than there are rows
         self._lines: list[Sequence[int]] = []  # their numbers, part by part
         self._starts = [0]  # rows before each part
         self._blank: list[int] = []  # rows with a time and no values
@@ -124,7 +128,7 @@ class _Table:
 
     def add(self, block: bytes) -> None:
         """Parse some more lines."""
-        first, skipped = self._next, max(0, self._header.first - self._next)
+        length, first, skipped = len(block), self._next, max(0, self._header.first - self._next)
         self._next += block.count(b"\n") + 1
         if skipped:
             parts = block.split(b"\n", skipped)
@@ -139,9 +143,15 @@ class _Table:
         if numbers is None:
             numbers, lines = self._careful(block, first)
         if len(numbers):
-            self._parts.append(numbers)
+            first_row, rows = self._starts[-1], self._starts[-1] + len(numbers)
+            if rows > self._numbers.shape[1]:
+                # memory that is not written to is not taken
+                room = np.empty((len(self._places), max(2 * rows, int(1.1 * len(numbers) * self._size / length))))
+                room[:, :first_row] = self._numbers[:, :first_row]
+                self._numbers = room
+            self._numbers[:, first_row:rows] = numbers.T
             self._lines.append(lines)
-            self._starts.append(self._starts[-1] + len(numbers))
+            self._starts.append(rows)
 
     def _fast(self, block: bytes) -> np.ndarray | None:
         """By numpy's parser; None where a line is not as the others."""
@@ -206,7 +216,7 @@ class _Table:
                 " was cut; export it again"
             )
         kept, notes = self._filled(rows)
-        columns = [np.concatenate([part[:, i] for part in self._parts])[kept] for i in range(len(self._places))]
+        columns = [column[:rows][kept] for column in self._numbers]
         if self._has_time:
             time, *values = columns
         else:

@@ -16,6 +16,7 @@ from fitact.inference.trace import Trace
 from fitact.model.circuit import Circuit
 from fitact.model.drive import Sampled
 from fitact.model.skin import WithSkin
+from fitact.progress import watched
 
 TOLERANCE = 1e-3  # in log-likelihood
 _OFF_TIME = "a delay or a clock is free"
@@ -150,7 +151,9 @@ def _believed(wide: Likelihood, theta: np.ndarray) -> Float[np.ndarray, "n param
 def _at(likelihood: Likelihood, theta: Float[np.ndarray, "n parameters"], sigma: np.ndarray) -> np.ndarray:
     """Log-likelihoods of each trace at points of one sigma, (n, traces)."""
     points = np.column_stack([theta, np.tile(np.log(sigma), (len(theta), 1))])
-    return Batched(Likelihood.log_likelihoods, likelihood.without_samples(), likelihood.rows)(points)
+    evaluate = Batched(Likelihood.log_likelihoods, likelihood.without_samples(), likelihood.rows)
+    batches = [points[i : i + evaluate.batch] for i in range(0, len(points), evaluate.batch)]
+    return np.concatenate([evaluate(batch) for batch in watched(batches, "checking the compression", len(batches))])
 
 
 def log_prob(likelihood: Likelihood, walkers: int) -> Callable[[np.ndarray], np.ndarray]:

@@ -219,11 +219,11 @@ class Batched:
         dynamic, static = eqx.partition(model, eqx.is_array)
         self._dynamic, treedef = jax.tree.flatten(dynamic)
         self._static = _Static(function, static, treedef)
-        self._batch = max(1, min(batch, _BATCH_ROWS // rows))
+        self.batch = max(1, min(batch, _BATCH_ROWS // rows))
 
     def __call__(self, *arrays: np.ndarray) -> np.ndarray:
         count = len(arrays[0])
-        batch = self._batch
+        batch = self.batch
         missing = -count % batch
         if missing:
             arrays = tuple(np.concatenate([a, np.repeat(a[-1:], missing, axis=0)]) for a in arrays)

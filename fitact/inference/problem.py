@@ -26,6 +26,7 @@ from fitact.inference.start import (
     has_ideal_edges,
     has_unresolved_edge,
     linear_start,
+    shared,
 )
 from fitact.inference.trace import CHARGES, LINEAR, Trace
 from fitact.model.circuit import RC, Channel, FinalCircuit
@@ -254,8 +255,8 @@ def _trace(
     # a part of a wave cannot show an offset, so one within an oscilloscope's accuracy is allowed for
     offset = _OFFSET * height if record.frequency() is None and choice.periodic else 0.0
     return Trace(
-        time=jnp.asarray(record.time),
-        observed=jnp.asarray(record[channel]),
+        time=shared(record.time),
+        observed=shared(record[channel]),
         weight=None,
         whitening=None,
         least_noise=jnp.asarray(max(_PRECISION * height, rounding_noise(record[channel]))),

@@ -22,6 +22,7 @@ from fitact.units import percent
 
 _Module = TypeVar("_Module", bound=eqx.Module)
 
+_PART = 1_048_576  # samples at a time
 _ALIGNED = 20_000  # samples on which a drive is laid
 _CONTRADICTION = 0.05  # relative difference between the stated and the recorded drive that cannot be an inaccuracy
 _SMOOTH_STEPS, _EDGE_STEPS = 0.5, 2.0  # error, over a whole record, of the frequency at which it repeats
@@ -115,6 +116,12 @@ def as_arrays(module: _Module) -> _Module:
         return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, module)
 
 
+def shared(values: Float[np.ndarray, " samples"]) -> Float[Array, " samples"]:
+    """A record's samples for JAX, in the memory that they are in."""
+    with jax.enable_x64(True):
+        return jax.device_put(values, may_alias=True)
+
+
 def _measured(record: Record, steady_state: bool | None, notes: tuple[str, ...]) -> DriveChoice:
     voltage = record["V"]
     if has_unresolved_edge(voltage):
@@ -124,7 +131,8 @@ def _measured(record: Record, steady_state: bool | None, notes: tuple[str, ...])
             " step (freed as a gain); record faster, or name the waveform in a scene",
         )
     if not steady_state:
-        return DriveChoice(Sampled(record.time, voltage), voltage, False, steady_state is None, 0.0, "measured", notes)
+        drive = Sampled(shared(record.time), shared(voltage))
+        return DriveChoice(drive, voltage, False, steady_state is None, 0.0, "measured", notes)
     kept, period = whole_periods(record)
     if period is None:
         raise InputError(
@@ -156,15 +164,19 @@ def linear_start(record: Record, choice: DriveChoice, largest: float = 0.5) -> L
         InputError: g is not between 0 and `largest` (1/2, or a little more with a free gain), so not this circuit's.
     """
     time, vsc, voltage = record.time, record["Vsc"], choice.voltage
-    step = np.diff(time)
-    integral = np.concatenate([[0.0], np.cumsum(0.5 * step * (vsc[1:] + vsc[:-1]))])
+    integral = np.concatenate([[0.0], np.cumsum(0.5 * np.diff(time) * (vsc[1:] + vsc[:-1]))])
     if has_ideal_edges(choice.drive):  # the trapezoid rule misreads the samples beside an ideal edge
         inside = np.abs(np.diff(voltage, prepend=voltage[0])) < 1e-9 * np.ptp(voltage)
     else:
         inside = np.ones(time.size, dtype=bool)
     span = time[-1] - time[0]
-    design = np.stack([voltage, integral / span, np.ones_like(time), (time - time[0]) / span], axis=1)
-    (g, slope, _, _), *_ = np.linalg.lstsq(design[inside], vsc[inside], rcond=None)
+    R = np.zeros((0, 5))
+    for first in range(0, time.size, _PART):  # a part at a time, which bounds memory
+        part = slice(first, first + _PART)
+        line = (time[part] - time[0]) / span
+        rows = np.stack([voltage[part], integral[part] / span, np.ones_like(line), line, vsc[part]], axis=1)
+        R = np.asarray(np.linalg.qr(np.vstack([R, rows[inside[part]]]), mode="r"))
+    (g, slope, _, _), *_ = np.linalg.lstsq(R[:, :4], R[:, 4], rcond=None)
     if g >= largest:
         raise InputError(
             f"{record.source}: Vsc is {g:.3g} times V at a step, but this circuit cannot give 1/2 or more;"

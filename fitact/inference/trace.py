@@ -142,7 +142,11 @@ class Trace(eqx.Module):
 
     def signal(self, seen: Seen, later: ArrayLike = 0.0) -> Float[Array, " samples"]:
         """The channel as recorded, but for linear nuisances and noise; `later` (s) delays it further."""
-        time = self.time - (self.shift + seen.delay + later)
+        undelayed = not self.timing and isinstance(later, float) and later == 0.0
+        if undelayed and isinstance(self.drive, Sampled) and self.drive.period is None:
+            time = self.drive.time  # V's samples, which are the trace's: `highpass` knows u there without a search
+        else:
+            time = self.time - (self.shift + seen.delay + later)
         if "clock" in self.timing:
             time = time * (1.0 + self.clock + seen.clock)
         how: dict[str, Any] = {"steady_state": self.steady_state, "channel": self.channel}

@@ -28,6 +28,7 @@ from fitact.model.multitone import Multitone
 from fitact.model.polynomial import evaluate, particular
 from fitact.model.skin import WithSkin, has_time_constants
 
+_LONG = 262_144  # pieces followed at a time
 _FEW = 8  # pieces told apart by comparison rather than looked up
 
 
@@ -148,7 +149,10 @@ def highpass(drive: Drive, time: ArrayLike, tau: ArrayLike, *, steady_state: boo
         return _chirp(wave, time, jnp.asarray(tau, dtype=float))
     if isinstance(wave, Line) and wave.period is None:
         pieces = wave.pieces()
-        u = _along(wave, time, tau, knot_values(pieces, tau, pieces.start[0]))
+        at_knots = knot_values(pieces, tau, pieces.start[0])
+        if isinstance(wave, Sampled) and time is wave.time:  # its own samples need no search
+            return at_knots
+        u = _along(wave, time, tau, at_knots)
         return u if isinstance(wave, Sampled) else jnp.where(time >= wave.begin, u, 0.0)
     settled = _steady(wave, tau)
     if steady_state:
@@ -201,11 +205,23 @@ def _steady(drive: Sine | Multitone | PiecewiseLinear | Line, tau: ArrayLike) ->
 
 def knot_values(pieces: Pieces, tau: ArrayLike, first: ArrayLike) -> Float[Array, " pieces"]:
     """u just after the start of each piece, given u just after the first start."""
-    length = jnp.diff(pieces.knots)[:-1]
-    decay = jnp.exp(-length / tau)
-    gain = (pieces.end - pieces.start)[:-1] * phi(length / tau) + (pieces.start[1:] - pieces.end[:-1])
-    first = jnp.asarray(first, dtype=gain.dtype)
-    return jnp.concatenate([first[None], recurrence(decay, gain, first)])
+    first = jnp.asarray(first, dtype=pieces.start.dtype)
+
+    def along(before: Array, begin: ArrayLike, count: int) -> tuple[Array, Array]:
+        """Over so many pieces, the first of which begins with u `before`; the last one's u, and all."""
+        knots, start = (lax.dynamic_slice_in_dim(x, begin, count + 1) for x in (pieces.knots, pieces.start))
+        end = lax.dynamic_slice_in_dim(pieces.end, begin, count)
+        x = jnp.diff(knots) / tau
+        u = recurrence(jnp.exp(-x), (end - start[:-1]) * phi(x) + (start[1:] - end), before)
+        return u[-1], u
+
+    steps = pieces.start.size - 1
+    if steps <= _LONG:
+        return jnp.concatenate([first[None], along(first, 0, steps)[1]]) if steps else first[None]
+    # a part at a time: what it takes in between would be several times the record
+    many, rest = divmod(steps - 1, _LONG)
+    last, u = lax.scan(lambda before, k: along(before, k * _LONG, _LONG), first, jnp.arange(many))
+    return jnp.concatenate([first[None], u.ravel(), along(last, many * _LONG, rest + 1)[1]])
 
 
 @jax.jit
