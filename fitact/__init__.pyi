@@ -1,6 +1,7 @@
 from .data.formats import read
 from .data.inspection import Inspection, inspect
 from .data.record import Record
+from .data.spectrum import Spectrum, read_spectrum
 from .errors import InputError
 from .inference.comparison import Comparison, compare
 from .inference.fit import Fit, fit
@@ -8,6 +9,7 @@ from .inference.population import Population, population
 from .inference.posterior import Posterior
 from .inference.sampling import sample
 from .inference.solver import RESULTS
+from .inference.spectrum_fit import SpectrumFit, fit_spectrum
 from .model.chirp import Chirp
 from .model.circuit import DirectGround, FinalCircuit, NaturalGround, Probe
 from .model.distribution import LogNormal, LogUniform, TruncatedLogNormal, Uniform
@@ -51,6 +53,8 @@ __all__ = [
     "Sampled",
     "Scene",
     "Sine",
+    "Spectrum",
+    "SpectrumFit",
     "Square",
     "Tradeoff",
     "Trapezoid",
@@ -62,6 +66,7 @@ __all__ = [
     "compare",
     "electrostatic_force",
     "fit",
+    "fit_spectrum",
     "friction",
     "harmonic_error",
     "harmonic_response",
@@ -75,6 +80,7 @@ __all__ = [
     "population",
     "quality_factor",
     "read",
+    "read_spectrum",
     "response",
     "sample",
     "series_equivalent",

@@ -76,7 +76,12 @@ def fit(
     ] = False,
     json: Json = False,
 ) -> None:
-    """Least squares only: parameters with errors, and the verdict, in seconds."""
+    """Least squares only: parameters with errors, and the verdict, in seconds; of an impedance spectrum, too."""
+    from fitact.data.spectrum import is_spectrum
+
+    if len(records) == 1 and is_spectrum(records[0]):
+        _fit_spectrum(records[0], scene, out, json)
+        return
     planned = _fitted(records, scene, (channel, scale), model, tolerance, starts)
     fitted = planned.fit
     text, content = f"{fitted}\n{planned.sentence}", fitted.to_dict() | {"plan": planned.to_dict()}
@@ -91,6 +96,22 @@ def fit(
     if out is not None:
         write_json(out / "fit.json", content)
     show(text, content, json)
+    finish(fitted.trusted)
+
+
+def _fit_spectrum(path: Path, scenes: list[Path] | None, out: Path | None, json: bool) -> None:
+    from fitact.data.spectrum import read_spectrum
+    from fitact.model.scene import Scene
+
+    stated = Scene.load(scenes[0]) if scenes else None
+    spectrum = read_spectrum(path)
+    use_compilation_cache()
+    from fitact.inference.spectrum_fit import fit_spectrum
+
+    fitted = fit_spectrum(spectrum, stated)
+    if out is not None:
+        write_json(out / "fit.json", fitted.to_dict())
+    show(str(fitted), fitted.to_dict(), json)
     finish(fitted.trusted)
 
 

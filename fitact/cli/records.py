@@ -21,7 +21,12 @@ def inspect(
 ) -> None:
     """Look at a file before fitting it: channels, rate, units, noise, clipping, frequency, and what is doubtful."""
     from fitact.data.inspection import inspect as inspected
+    from fitact.data.spectrum import is_spectrum, read_spectrum
 
+    if is_spectrum(file):
+        spectrum = read_spectrum(file)
+        show(str(spectrum), spectrum.to_dict(), json)
+        return
     seen = inspected(file, **mapping((channel, scale)))
     if out is not None:
         from fitact.report.record import write_record

@@ -11,6 +11,7 @@ import numpy as np
 from fitact.data.binary import is_known_binary, read_binary
 from fitact.data.capture import Capture, Pick, named, resolve, to_record
 from fitact.data.record import CHANNEL_UNITS, Record
+from fitact.data.spectrum import is_spectrum
 from fitact.data.text import is_binary, read_text
 from fitact.errors import InputError
 from fitact.files import replacing
@@ -70,6 +71,8 @@ def read_capture(path: str | os.PathLike[str], pick: Pick = lambda names, place:
         raise InputError(f"{source}: cannot be read ({reason.lower()}); check the path and the file") from error
     if not head.strip():
         raise InputError(f"{source}: the file holds no data; expected a header such as time_s,V_V,Vsc_V,I_A")
+    if is_spectrum(path):
+        raise InputError(f"{source}: is an impedance spectrum, without time; give it to: fitact fit (fit_spectrum)")
     if head[:2] == b"\x1f\x8b" or not (is_binary(head) or is_known_binary(head, path.suffix)):
         return read_text(path, source, pick)
     return read_binary(path, source, head, pick)

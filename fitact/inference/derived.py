@@ -10,8 +10,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.data.record import Record
+from fitact.errors import InputError
 from fitact.inference.likelihood import Likelihood
-from fitact.inference.start import DriveChoice, has_ideal_edges, whole_periods
+from fitact.inference.start import DriveChoice, as_arrays, has_ideal_edges, whole_periods
 from fitact.inference.trace import CHARGES, LINEAR
 from fitact.model.circuit import Circuit
 from fitact.model.drive import Drive, Periodic, PiecewiseLinear, Sampled, Sine
@@ -162,21 +163,51 @@ def _last_periods(record: Record, choice: DriveChoice, b: float) -> tuple[Drive,
     return Sampled(time[lead:], record["V"][lead:]), (time[begin:], np.gradient(time)[begin:])
 
 
+def for_scene(likelihood: Likelihood, scene: Scene) -> Derived:
+    """Under the scene's own drive, for a likelihood without records.
+
+    Raises:
+        InputError: the drive has no steady state.
+    """
+    drive = scene.make_drive()
+    if not (isinstance(drive, Periodic) and scene.drive.steady_state):
+        raise InputError(
+            f"scene: without a record the force is that of a periodic drive in its steady state, which a"
+            f" {scene.drive.waveform} from rest has not; name another waveform in [drive]"
+        )
+    time, weight = _of_period(drive, 0.0)
+    return Derived(
+        likelihood,
+        as_arrays(drive),
+        jnp.asarray(time),
+        jnp.asarray(weight / weight.sum()),
+        scene.geometry(),
+        scene.friction.coefficient,
+        scene.friction.normal_force,
+        steady_state=True,
+        charge=False,
+    )
+
+
 def _grid(record: Record, choice: DriveChoice, after: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times and weights; at ideal jumps so long `after` them (s), since there a fractional skin's Vsc has no value."""
-    drive = choice.drive
-    if isinstance(drive, PiecewiseLinear) and choice.steady_state:
-        knots = np.asarray(drive.pieces().knots) - float(drive.lead)
-        nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-        length = np.diff(knots)[:, None]
-        inside = knots[:-1, None] + 0.5 * length * (nodes + 1.0)
-        # u is monotone along a piece, so peaks sit at the knots
-        peaks = knots[:-1] + (after if has_ideal_edges(drive) else 0.0)
-        return np.append(inside, peaks), np.append(0.5 * length * weights, np.zeros(length.size))
-    if isinstance(drive, Periodic) and choice.steady_state:
-        return np.arange(1024) / 1024 * float(drive.period), np.ones(1024)
+    """Times and weights, of a period where the drive has one; `after` as in `_of_period`."""
+    if isinstance(choice.drive, Periodic) and choice.steady_state:
+        return _of_period(choice.drive, after)
     kept, period = whole_periods(record)
     cells = np.gradient(record.time)
     if period is None:  # the trapezoid rule; over whole periods the ends meet
         cells[[0, -1]] *= 0.5
     return record.time[:kept] - choice.shift, cells[:kept]
+
+
+def _of_period(drive: Periodic, after: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times and weights; at ideal jumps so long `after` them (s), since there a fractional skin's Vsc has no value."""
+    if not isinstance(drive, PiecewiseLinear):
+        return np.arange(1024) / 1024 * float(drive.period), np.ones(1024)
+    knots = np.asarray(drive.pieces().knots) - float(drive.lead)
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    length = np.diff(knots)[:, None]
+    inside = knots[:-1, None] + 0.5 * length * (nodes + 1.0)
+    # u is monotone along a piece, so peaks sit at the knots
+    peaks = knots[:-1] + (after if has_ideal_edges(drive) else 0.0)
+    return np.append(inside, peaks), np.append(0.5 * length * weights, np.zeros(length.size))

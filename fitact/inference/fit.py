@@ -17,8 +17,8 @@ from fitact.inference import compressed, derived, remarks, summary
 from fitact.inference.diagnostics import together
 from fitact.inference.expected import covariance_root
 from fitact.inference.identifiability import Identifiability, assess
+from fitact.inference.laplace import Laplace
 from fitact.inference.least_squares import Solved, solve
-from fitact.inference.likelihood import Likelihood
 from fitact.inference.noise import scale_information
 from fitact.inference.problem import Problem, pose
 from fitact.inference.profile import DERIVED, Interval, intervals
@@ -40,31 +40,25 @@ _RESPONSE = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Fit:
+class Fit(Laplace):
     """The best parameters, their Laplace approximation, and a judgement.
 
     Attributes:
-        theta: the optimum, in the coordinates `names`.
-        covariance_root: its product with its transpose is `covariance`; keeps digits where that cannot.
         traces: the channels fitted, by record.
         result: name of a member of `RESULTS`; `message` is its sentence.
         figures: of all traces together: chi2_reduced, steps and the like.
         identifiability: what the records can and cannot tell.
         warnings: sentences.
         compression_error: of the compressed log-likelihood near the optimum; None: samples are summed.
-        likelihood, derive, scene: what was fitted, what follows from it, the first record's scene.
+        scene: the first record's.
     """
 
-    theta: Float[np.ndarray, " parameters"]
-    covariance_root: Float[np.ndarray, "parameters parameters"]
     traces: tuple[TraceFit, ...]
     result: str
     figures: dict[str, float]
     identifiability: Identifiability
     warnings: tuple[str, ...]
     compression_error: float | None
-    likelihood: Likelihood
-    derive: derived.Derived
     scene: Scene
 
     @property
@@ -104,11 +98,6 @@ class Fit:
         return "; ".join(reason for reason, trace in reasons.items() if trace.full_because)
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Coordinates of theta: logarithms, and delays and clocks in steps."""
-        return self.likelihood.names
-
-    @property
     def trusted(self) -> bool:
         """Whether nothing stands against the answer."""
         return self.result == "successful"
@@ -117,16 +106,6 @@ class Fit:
     def message(self) -> str:
         """The result as a sentence."""
         return "The fit is at its optimum and leaves only noise." if self.trusted else result_message(self.result)
-
-    @property
-    def covariance(self) -> Float[np.ndarray, "parameters parameters"]:
-        """Covariance of theta, in the Laplace approximation."""
-        return self.covariance_root @ self.covariance_root.T
-
-    @property
-    def sd(self) -> Float[np.ndarray, " parameters"]:
-        """Standard deviations of theta."""
-        return np.linalg.norm(self.covariance_root, axis=1)
 
     @property
     def point_names(self) -> tuple[str, ...]:
@@ -147,34 +126,6 @@ class Fit:
         root = np.diag(np.append(np.zeros(size), information**-0.5))
         root[:size, :size] = self.covariance_root
         return root
-
-    @property
-    def correlation(self) -> Float[np.ndarray, "parameters parameters"]:
-        """Correlations of theta."""
-        return self.covariance / np.outer(self.sd, self.sd)
-
-    def parameters(self) -> dict[str, summary.Summary]:
-        """Summaries of the parameters in the Laplace approximation, with their contraction."""
-        values, prior_sd = self.likelihood.natural(self.theta), self.likelihood.prior.log_sd
-        timing, believed = self.likelihood.timing, self.likelihood.believed
-        out = {}
-        for i, name in enumerate(self.names):
-            if name in timing:
-                out[name] = summary.normal(name, float(values[name]), float(self.sd[i]) * timing[name][1])
-            else:
-                out[name] = summary.log_normal(name, float(values[name]), float(self.sd[i]))
-                if believed or name.startswith("gain"):
-                    out[name]["contraction"] = float(1.0 - self.sd[i] / prior_sd[i])
-        return out
-
-    def derived(self) -> dict[str, summary.Summary]:
-        """Summaries of divider, time constant, force and friction in the Laplace approximation."""
-        values, gradient = self.derive.logs(self.theta, self._sigmas)
-        sd = np.linalg.norm(gradient @ self.covariance_root, axis=1)
-        return {
-            name: summary.log_normal(name, math.exp(value), float(s))
-            for name, value, s in zip(derived.NAMES, values, sd, strict=True)
-        }
 
     def profile(self, name: str, level: float = 0.95, *, prior: bool = True) -> Interval:
         """The profile-likelihood interval of one parameter, or of g, b or force_mean.

@@ -85,20 +85,9 @@ def assess(
     """
     force_sd = float(np.linalg.norm(root.T @ force_gradient))
     free = [name for name in experiment.free if name not in gain_names(experiment.channels)]
-    rows = [list(names).index(name) for name in free]
-    believed = np.linalg.cholesky((prior_root @ prior_root.T)[np.ix_(rows, rows)])
-    # of the prior's spread in each direction, what is left
-    directions, left, _ = np.linalg.svd(np.linalg.solve(believed, root[rows]))
-    shares = np.clip(1.0 - left**2, 0.0, 1.0)
-    blind = believed @ directions[:, 0]
-    blind *= (-1.0 if "Ci" in free and blind[free.index("Ci")] < 0.0 else 1.0) / np.linalg.norm(blind)
-    direction = dict(zip(free, map(float, blind), strict=True))
-    along = float(np.max(np.abs(blind)) / np.linalg.norm(np.linalg.solve(believed, blind)))
-    verdict = "prior-limited" if along <= _WIDE else "unidentified"
+    verdict, shares, direction, along = seen_directions(names, root, prior_root, free)
     structural, remedy, offered = False, "", tuple[Remedy, ...]()
-    if shares[0] >= _IDENTIFIED:
-        verdict = "identified"
-    else:
+    if verdict != "identified":
         structure = blind_directions(experiment.circuit, experiment.free, experiment.channels)
         structural, offered = structure.hides(direction), remedies(experiment)
         remedy = _remedy(verdict, force_sd, offered, structure)
@@ -109,7 +98,7 @@ def assess(
         blind_name=name_direction(direction),
         structural=structural,
         prior_sd=along,
-        force_from_prior=_from_prior(root, prior_root, force_gradient),
+        force_from_prior=from_prior(root, prior_root, force_gradient),
         force_sd=force_sd,
         force_contraction=1.0 - force_sd / float(np.linalg.norm(prior_root.T @ force_gradient)),
         remedy=remedy,
@@ -118,7 +107,27 @@ def assess(
     )
 
 
-def _from_prior(root: np.ndarray, prior_root: np.ndarray, gradient: np.ndarray) -> float:
+def seen_directions(
+    names: Sequence[str],
+    root: Float[np.ndarray, "parameters parameters"],
+    prior_root: Float[np.ndarray, "parameters parameters"],
+    free: Sequence[str],
+) -> tuple[str, Float[np.ndarray, " free"], dict[str, float], float]:
+    """The verdict, the eigenvalues, the blind direction and `prior_sd` of the parameters `free` among `names`."""
+    rows = [list(names).index(name) for name in free]
+    believed = np.linalg.cholesky((prior_root @ prior_root.T)[np.ix_(rows, rows)])
+    # of the prior's spread in each direction, what is left
+    directions, left, _ = np.linalg.svd(np.linalg.solve(believed, root[rows]))
+    shares = np.clip(1.0 - left**2, 0.0, 1.0)
+    blind = believed @ directions[:, 0]
+    blind *= (-1.0 if "Ci" in free and blind[list(free).index("Ci")] < 0.0 else 1.0) / np.linalg.norm(blind)
+    along = float(np.max(np.abs(blind)) / np.linalg.norm(np.linalg.solve(believed, blind)))
+    verdict = "prior-limited" if along <= _WIDE else "unidentified"
+    verdict = "identified" if shares[0] >= _IDENTIFIED else verdict
+    return verdict, shares, dict(zip(free, map(float, blind), strict=True)), along
+
+
+def from_prior(root: np.ndarray, prior_root: np.ndarray, gradient: np.ndarray) -> float:
     """The share of a quantity's variance that comes from the prior, by its gradient."""
     moved = np.linalg.solve(prior_root, root @ (root.T @ gradient))
     return float(moved @ moved / np.sum((root.T @ gradient) ** 2))

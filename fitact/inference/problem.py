@@ -120,7 +120,7 @@ def pose(records: Sequence[Record], scenes: Sequence[Scene | None], believed: bo
     stated, tied = first.make_prior(), first.prior.tied()
     noise = {name: stated[name] for name in ("sigma", "sigma_I") if name in stated.names}
     prior = stated.without(*noise)
-    template = with_level(_template(first, prior, tied), records, scenes)
+    template = with_level(template_of(first, prior, tied), records, scenes)
     opened = [
         _open(record, scene, channel, number if len(records) > 1 else None, template)
         for number, (record, scene) in enumerate(zip(records, scenes, strict=True), 1)
@@ -133,7 +133,7 @@ def pose(records: Sequence[Record], scenes: Sequence[Scene | None], believed: bo
     likelihood = Likelihood(
         traces=traces,
         template=as_arrays(template),
-        prior=_compiled_once(prior),
+        prior=compiled_once(prior),
         sigma_prior=tuple(noise.get("sigma" if trace.channel == "Vsc" else "sigma_I") for trace in traces),
         tied=tuple((name, other, ratio) for name, (other, ratio) in tied.items()),
         believed=believed,
@@ -141,7 +141,7 @@ def pose(records: Sequence[Record], scenes: Sequence[Scene | None], believed: bo
     return Problem(likelihood, sources, _start(likelihood, sources))
 
 
-def _template(scene: Scene, prior: Prior, tied: dict[str, tuple[str, float]]) -> RC:
+def template_of(scene: Scene, prior: Prior, tied: dict[str, tuple[str, float]]) -> RC:
     """The scene's circuit with all that is held, free or tied in it, and with constant skins."""
     values = scene.fixed() | {name: math.exp(prior[name].log_mean) for name in prior.names}
     for name, (other, ratio) in tied.items():
@@ -152,7 +152,7 @@ def _template(scene: Scene, prior: Prior, tied: dict[str, tuple[str, float]]) ->
     return scene.make_rc_circuit(values)
 
 
-def _compiled_once(prior: Prior) -> Prior:
+def compiled_once(prior: Prior) -> Prior:
     """The prior whose log-normal marginals are no constants of what is compiled, where none are correlated."""
     if prior.pairs:
         return prior

@@ -1,0 +1,233 @@
+"""Impedance spectra: frequency and complex impedance, from the text files of impedance analysers."""
+
+import dataclasses
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from fitact.data.header import cells_of, number
+from fitact.errors import InputError
+from fitact.units import engineering
+
+MINIMUM_POINTS = 5
+_MOST = 67_108_864  # bytes: a spectrum has hundreds of points
+_HEAD = 16_384
+_MOST_UNITS = 2  # lines between the names and the numbers
+_FREQUENCY = re.compile(r"^(definition=.*)?f(req(uency)?)?\b|^freq", re.IGNORECASE)
+_REAL = re.compile(r"^-?(re\s*\(?z|z?\s*_?re(al)?\b|zre|z_re|z')(?!')", re.IGNORECASE)
+_IMAGINARY = re.compile(r"""^-?(im\s*\(?z|z?\s*_?im(ag)?\b|zim|z_im|z''|z")""", re.IGNORECASE)
+_SIZE = re.compile(r"^(\|z\||z\s*_?mod|abs\s*\(?z|z_abs|z_magnitude|magnitude)", re.IGNORECASE)
+_PHASE = re.compile(r"^(-?phase|z\s*_?ph(z|ase)?\b|theta|arg\s*\(?z)", re.IGNORECASE)
+_PREFIX = re.compile(r"[(/_\[\s]([kMGm]?)\s*(?:ohms?|Ω|Ω)", re.IGNORECASE)
+_PREFIXES = {"": 1.0, "k": 1e3, "K": 1e3, "M": 1e6, "G": 1e9, "m": 1e-3}
+_HERTZ = re.compile(r"[(/_\[\s]([kM]?)hz", re.IGNORECASE)
+
+
+@dataclasses.dataclass(frozen=True)
+class Spectrum:
+    """The impedance V / I of finger and panel, from the drive's electrode to ground.
+
+    Attributes:
+        frequency: increasing, Hz.
+        impedance: ohm; that of a capacitance has a negative imaginary part.
+        source: where it came from, for messages.
+        notes: what was assumed, in sentences.
+    """
+
+    frequency: Float[np.ndarray, " points"]
+    impedance: Complex[np.ndarray, " points"]
+    source: str = "spectrum"
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def from_arrays(
+        cls,
+        frequency: Float[np.ndarray, " points"],
+        impedance: Complex[np.ndarray, " points"],
+        source: str = "spectrum",
+        notes: tuple[str, ...] = (),
+    ) -> "Spectrum":
+        """Check arrays (Hz, ohm; equal lengths, any order) and make them a spectrum.
+
+        Raises:
+            InputError: too few points, not finite, a frequency that is not positive or comes twice, or an impedance
+                that no finger on a panel has.
+        """
+        f, z = np.array(frequency, dtype=float), np.array(impedance, dtype=complex)
+        if f.ndim != 1 or f.shape != z.shape:
+            raise InputError(f"{source}: frequency has shape {f.shape}, impedance {z.shape}; give one of each a point")
+        if f.size < MINIMUM_POINTS:
+            raise InputError(f"{source}: {f.size} points are too few to fit; measure {MINIMUM_POINTS} or more")
+        if not (np.isfinite(f).all() and np.isfinite(z).all()):
+            raise InputError(f"{source}: holds values that are not finite; remove those points")
+        order = np.argsort(f)
+        f, z = f[order], z[order]
+        if f[0] <= 0.0:
+            raise InputError(f"{source}: holds the frequency {f[0]:g} Hz; remove points at 0 Hz and below")
+        if np.any(np.diff(f) == 0.0):
+            raise InputError(
+                f"{source}: {f[:-1][np.diff(f) == 0.0][0]:g} Hz comes twice; keep one sweep, or average them"
+            )
+        if np.any(np.abs(z) == 0.0):
+            raise InputError(f"{source}: the impedance is 0 at {f[np.abs(z) == 0.0][0]:g} Hz; remove that point")
+        if np.mean(z.imag > 0.0) > 0.5:
+            raise InputError(
+                f"{source}: the imaginary part is positive, as of a coil; a finger's is negative: name a column that"
+                " holds -Im Z with a leading minus, as -Z_imag_ohm"
+            )
+        for array in (f, z):
+            array.flags.writeable = False
+        return cls(f, z, source, notes)
+
+    def __len__(self) -> int:
+        return self.frequency.size
+
+    def to_dict(self) -> dict[str, Any]:
+        """As `fitact inspect --json` prints it; Hz and ohm."""
+        size = np.abs(self.impedance)
+        return {
+            "source": self.source,
+            "format": "impedance spectrum",
+            "channels": [{"name": "impedance", "unit": "ohm", "min": float(size.min()), "max": float(size.max())}],
+            "points": len(self),
+            "frequency_min": float(self.frequency[0]),
+            "frequency_max": float(self.frequency[-1]),
+            "notes": list(self.notes),
+        }
+
+    def __str__(self) -> str:
+        low, high = (engineering(float(f), "Hz") for f in self.frequency[[0, -1]])
+        small, large = (engineering(float(z), "ohm") for z in np.sort(np.abs(self.impedance))[[0, -1]])
+        return f"{self.source} (impedance spectrum): {len(self)} points, {low} to {high}, |Z| {small} to {large}"
+
+
+class _Columns(NamedTuple):
+    """Where the numbers stand; `second` is that of the imaginary part, or of the phase."""
+
+    frequency: int
+    first: int
+    second: int
+    hertz: float
+    ohm: float
+    sign: float  # of `second`
+    radian: float  # of one unit of the phase; 0: `first` and `second` are real and imaginary part
+
+
+def is_spectrum(path: str | os.PathLike[str]) -> bool:
+    """Whether a file's header names a frequency and an impedance."""
+    try:
+        with Path(path).open("rb") as file:
+            head = _decoded(file.read(_HEAD))
+    except OSError:
+        return False
+    return next(_headers(head.splitlines()), None) is not None
+
+
+def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
+    """Read an impedance spectrum: a CSV file with frequency_Hz, Z_real_ohm and Z_imag_ohm, or an analyser's text.
+
+    Any table whose header names a frequency and an impedance, by parts or by size and phase, is read: those of Gamry
+    (.DTA), BioLogic (.mpt), Autolab, ZPlot (.z), VersaStudio (.par), CH Instruments and others. A leading minus in a
+    column's name, as -Im(Z)/Ohm, is heeded. Three columns without a header are frequency, real and imaginary part.
+
+    Raises:
+        InputError: the file cannot be read, or holds no spectrum; names the line and the remedy.
+    """
+    source = os.fspath(path)
+    try:
+        with Path(path).open("rb") as file:
+            lines = _decoded(file.read(_MOST)).splitlines()
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InputError(f"{source}: cannot be read ({reason.lower()}); check the path and the file") from error
+    place, delimiter, columns = next(_headers(lines), None) or _bare(lines, source)
+    rows = np.array(list(_rows(lines, place, delimiter, columns, source))).reshape(-1, 3)
+    first, second = columns.ohm * rows[:, 1], columns.sign * rows[:, 2]
+    z = first * np.exp(1j * columns.radian * second) if columns.radian else first + 1j * columns.ohm * second
+    return Spectrum.from_arrays(columns.hertz * rows[:, 0], z, source)
+
+
+def _decoded(content: bytes) -> str:
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
+def _headers(lines: list[str]) -> Iterator[tuple[int, str, _Columns]]:
+    """Lines that name the columns: the first line after each, its delimiter, its columns."""
+    for place, line in enumerate(lines):
+        if "req" not in line.lower() and not line.lower().startswith("f"):
+            continue
+        for delimiter in ("\t", ";", ",", " "):
+            columns = _columns(_named(line, delimiter))
+            if columns is not None:
+                yield place + 1, delimiter, columns
+                break
+
+
+def _named(line: str, delimiter: str) -> list[str]:
+    names = re.split(r"\s{2,}", line.strip()) if delimiter == " " else line.split(delimiter)
+    return [name.strip().strip('"#').strip() for name in names]
+
+
+def _columns(names: list[str]) -> _Columns | None:
+    def first(pattern: re.Pattern[str]) -> int | None:
+        return next((place for place, name in enumerate(names) if pattern.search(name)), None)
+
+    frequency, real, imaginary = first(_FREQUENCY), first(_REAL), first(_IMAGINARY)
+    size, phase = first(_SIZE), first(_PHASE)
+    if frequency is None:
+        return None
+    hertz = _HERTZ.search(names[frequency])
+    of_hertz = _PREFIXES[hertz[1]] if hertz else 1.0
+    if real is not None and imaginary is not None:
+        sign = -1.0 if names[imaginary].startswith("-") else 1.0
+        return _Columns(frequency, real, imaginary, of_hertz, _ohm(names[real]), sign, 0.0)
+    if size is None or phase is None:
+        return None
+    sign = -1.0 if names[phase].startswith("-") else 1.0
+    radian = 1.0 if "rad" in names[phase].lower() else np.pi / 180.0
+    return _Columns(frequency, size, phase, of_hertz, _ohm(names[size]), sign, radian)
+
+
+def _ohm(name: str) -> float:
+    found = _PREFIX.search(name)
+    return _PREFIXES[found[1]] if found else 1.0
+
+
+def _bare(lines: list[str], source: str) -> tuple[int, str, _Columns]:
+    """Three columns without names."""
+    first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
+    for delimiter in ("\t", ";", ",", " "):
+        cells = cells_of(first, delimiter)
+        if len(cells) == 3 and all(number(cell, delimiter != ",") is not None for cell in cells):
+            return 0, delimiter, _Columns(0, 1, 2, 1.0, 1.0, 1.0, 0.0)
+    raise InputError(
+        f"{source}: no line names a frequency and an impedance; write a header such as"
+        " frequency_Hz,Z_real_ohm,Z_imag_ohm"
+    )
+
+
+def _rows(
+    lines: list[str], place: int, delimiter: str, columns: _Columns, source: str
+) -> Iterator[tuple[float, float, float]]:
+    """Numbers below the header, as far as they go."""
+    begun, comma = False, delimiter in ("\t", ";")
+    for line, text in enumerate(lines[place:], place + 1):
+        # names apart by blanks stand above numbers apart by anything
+        cells = re.split(r"[\s,;]+", text.strip()) if delimiter == " " else cells_of(text, delimiter)
+        places = columns.frequency, columns.first, columns.second
+        found = [number(cells[i], comma) if i < len(cells) else None for i in places]
+        if None not in found:
+            begun = True
+            yield found[0] or 0.0, found[1] or 0.0, found[2] or 0.0
+        elif begun and (not text.strip() or text.lstrip()[0] not in "0123456789+-."):
+            return  # what follows the table
+        elif begun or line - place > _MOST_UNITS + 1:
+            raise InputError(f"{source}, line {line}: '{text.strip()[:40]}' is no row of numbers; mend or remove it")
