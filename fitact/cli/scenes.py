@@ -113,3 +113,19 @@ def simulate(
         "truth": truth,
     }
     show(f"wrote {out}: {len(record):,} samples of {', '.join(record.channels)}", content, json)
+
+
+@app.command()
+def reproduce(out: Out = Path("reproduction"), json: Json = False) -> None:
+    """Every equation, figure and number of the paper, computed and judged.
+
+    Into DIR it writes reproduction.json and reproduction.html.
+    """
+    use_compilation_cache()
+    from fitact import paper
+    from fitact.report.reproduction import write_reproduction
+
+    claims = paper.reproduce()
+    page = write_reproduction(out or Path(), claims)
+    lines = [f"{claim.verdict:8} {claim.id:24} {claim.claim}" for claim in claims]
+    show("\n".join([*lines, f"open {page}"]), {"claims": [claim.to_dict() for claim in claims]}, json)

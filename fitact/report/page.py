@@ -1,6 +1,5 @@
 """The report: verdict first, then the record, the parameters, the force, and how to repeat it."""
 
-import base64
 import json
 import math
 import os
@@ -64,12 +63,10 @@ _CIRCUITS = {
 
 def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any]) -> None:
     """Write the page from a posterior's DataTree and the content of summary.json."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("fitact.report"), autoescape=True, undefined=jinja2.StrictUndefined
-    )
     with mpl.rc_context(plots.style()):
         figures = _figures(tree)
-    page = environment.get_template("report.html").render(
+    page = render(
+        "report.html",
         summary=summary,
         figures=figures,
         label=_label,
@@ -84,6 +81,14 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
     )
     with replacing(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
+
+
+def render(template: str, **content: Any) -> str:
+    """A page of the folder of templates."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("fitact.report"), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    return environment.get_template(template).render(**content)
 
 
 def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]]:
@@ -121,10 +126,7 @@ def _figures(tree: Any) -> dict[str, str]:
             _CHANNELS[str(name).partition("_")[0]],
             observed.attrs["units"],
         )
-    # an SVG in an <img> cannot clash with another's ids, and carries its alt text
-    return {
-        name: "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode() for name, svg in figures.items()
-    }
+    return {name: plots.source(svg) for name, svg in figures.items()}
 
 
 def _quantity(summary: dict[str, Any], key: str = "q50", digits: int = 4) -> str:

@@ -1,5 +1,6 @@
 """The report's figures, as SVG text that stands alone."""
 
+import base64
 import io
 import math
 from collections.abc import Mapping
@@ -174,3 +175,8 @@ def svg(figure: Figure) -> str:
     figure.savefig(buffer, format="svg", dpi=150, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     return text[text.index("<svg") :]
+
+
+def source(svg: str) -> str:
+    """A figure as the source of an image: it cannot clash with another's ids, and has its alt text."""
+    return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
