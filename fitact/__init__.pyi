@@ -3,6 +3,7 @@ from .data.inspection import Inspection, inspect
 from .data.record import Record
 from .errors import InputError
 from .inference.comparison import Comparison, compare
+from .inference.design import MeasurementDesign, design_measurement
 from .inference.fit import Fit, fit
 from .inference.population import Population, population
 from .inference.posterior import Posterior
@@ -39,6 +40,7 @@ __all__ = [
     "Inspection",
     "LogNormal",
     "LogUniform",
+    "MeasurementDesign",
     "Multitone",
     "NaturalGround",
     "Plan",
@@ -60,6 +62,7 @@ __all__ = [
     "WithSkin",
     "body_current",
     "compare",
+    "design_measurement",
     "electrostatic_force",
     "fit",
     "friction",

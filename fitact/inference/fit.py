@@ -15,7 +15,7 @@ from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.inference import compressed, derived, remarks, summary
 from fitact.inference.diagnostics import together
-from fitact.inference.expected import covariance_root
+from fitact.inference.expected import Experiment, covariance_root
 from fitact.inference.identifiability import Identifiability, assess
 from fitact.inference.least_squares import Solved, solve
 from fitact.inference.likelihood import Likelihood
@@ -53,6 +53,7 @@ class Fit:
         warnings: sentences.
         compression_error: of the compressed log-likelihood near the optimum; None: samples are summed.
         likelihood, derive, scene: what was fitted, what follows from it, the first record's scene.
+        experiment: the measurement that was done, at the optimum.
     """
 
     theta: Float[np.ndarray, " parameters"]
@@ -66,6 +67,7 @@ class Fit:
     likelihood: Likelihood
     derive: derived.Derived
     scene: Scene
+    experiment: Experiment
 
     @property
     def record(self) -> Record:
@@ -387,18 +389,18 @@ def _judged(
         for note in (*source.notes, *remarks.on_trace(source.record, source.choice, trace.channel, trace.figures))
     ]
     on_all = remarks.on_parameters(likelihood, theta, scene is None)
+    experiment = problem.experiment(likelihood, theta, sigma)
     return Fit(
         theta=theta,
         covariance_root=root,
         traces=traces,
         result=verdict(solved, root, traces, problem.sources, optima),
         figures=figures,
-        identifiability=assess(
-            likelihood.names, root, likelihood.prior_root, force, problem.experiment(likelihood, theta, sigma)
-        ),
+        identifiability=assess(likelihood.names, root, likelihood.prior_root, force, experiment),
         warnings=tuple(dict.fromkeys([*on_traces, *misfits(traces), *on_all])),
         compression_error=certified.error,
         likelihood=likelihood,
         derive=derive,
         scene=given,
+        experiment=experiment,
     )
