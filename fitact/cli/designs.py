@@ -8,6 +8,7 @@ import typer
 from fitact.cli.app import app
 from fitact.cli.options import Channels, Json, Out, Scales, mapping
 from fitact.cli.terminal import finish, show, use_compilation_cache
+from fitact.files import write_json
 
 design = typer.Typer(name="design", no_args_is_help=True, help="What to do next: which measurement would tell most.")
 app.add_typer(design)
@@ -42,5 +43,10 @@ def measurement(
     from fitact.inference.design import design_measurement
 
     found = design_measurement(stated, measured)
+    if out is not None:
+        from fitact.report.design import write_design
+
+        write_json(out / "design.json", found.to_dict())
+        write_design(out / "design.svg", found)
     show(str(found), found.to_dict(), json)
     finish(found.trusted)

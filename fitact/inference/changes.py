@@ -25,6 +25,7 @@ _CAN_HAVE_RESISTOR = (FinalCircuit, DirectGround, NaturalGround)
 _RESISTORS = (1e3, 1e8)  # ohm, that one can buy and that the cable's capacitance does not short
 _PANELS = 10.0  # a second panel's capacitance, at most so many times larger or smaller
 _RESOLVED = 100.0  # samples in a period, at least
+_SLOWEST = 1.0  # Hz
 _EDGES = 4.0  # rises in half a period, at least
 _PROBE = 10.0  # times the impedance of the probe that there is
 _MORE = 4  # times the duration or the sampling rate
@@ -118,21 +119,19 @@ def _count(number: int) -> str:
 
 
 def _frequencies(trial: Trial, count: int) -> Trial | None:
-    """So many records in place of one, each with a frequency of its own; none of a record of several frequencies."""
+    """So many records in place of one, each with a frequency of its own, and as many samples as that one."""
     first, *others = trial.experiments
     drive = first.drive
     if others or not (isinstance(drive, Periodic) and first.steady_state and has_time_constants(first.circuit)):
         return None
     step, top = float(np.median(np.diff(first.time))), 1.0
-    low, high = 1.0 / (len(first.time) * step), 1.0 / (_RESOLVED * step)
+    low, high = min(_SLOWEST, float(drive.frequency)), 1.0 / (_RESOLVED * step)
     if isinstance(drive, Multitone):
         top = max(drive.orders)
     if isinstance(drive, Trapezoid):
         high = min(high, float(min(drive.duty, 1.0 - drive.duty) / (_EDGES * drive.rise_time)))
     high /= top
-    if not low < high:
-        return None
-    start = min(max(float(drive.frequency), low), high)
+    start = min(float(drive.frequency), high)
     numbers = [""] + [f"_{number}" for number in range(2, count + 1)]
     settings = (Setting(FREQUENCY + n, FREQUENCY, "Hz", start, low, high, (i,)) for i, n in enumerate(numbers))
     several = f"{_count(count)} such records, " if count > 1 else ""

@@ -29,7 +29,8 @@ _LONG = 8192  # likewise of a long measured drive's beginning, since its every s
 _GOLDEN = 0.6180339887498949
 _PERIOD = 1024  # times in a period, at which the force is averaged
 _EDGE = 10.0  # a step of V so many times the mean one is an edge (a sine's largest is 1.6 times, a triangle's 1),
-_BESIDE = 2  # so many samples to either side of which say nothing of a current that follows dV/dt
+_BESIDE = 2  # so many samples to either side of which say nothing of a current that follows dV/dt,
+_ASIDE = 0.25  # of a step further, lest rounding decide where edges coincide with samples
 
 
 @dataclasses.dataclass(frozen=True)
@@ -258,7 +259,8 @@ def _sampling(e: Experiment) -> _Sampling:
     periodic = e.steady_state and isinstance(drive, Periodic)
     period = float(drive.period) * (np.arange(_PERIOD) + 0.5) / _PERIOD if periodic else np.full(_PERIOD, time[0])
     times = np.append(time[chosen], period)
-    around = time[chosen][:, None] + np.arange(-_BESIDE, 1 + _BESIDE) * float(np.median(np.diff(time)))
+    beside = np.arange(-_BESIDE, 1 + _BESIDE) + _ASIDE
+    around = time[chosen][:, None] + beside * float(np.median(np.diff(time)))
     voltage, slope = (np.asarray(x) for x in _wave(drive, jnp.asarray(around), jnp.asarray(times), e.steady_state))
     step = np.abs(np.diff(voltage, axis=1))
     away = step.max(axis=1) <= _EDGE * step[:used].mean()

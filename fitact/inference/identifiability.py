@@ -101,8 +101,9 @@ def assess(
     if shares[0] >= _IDENTIFIED:
         verdict = "identified"
     else:
+        known = [list(names).index(name) for name in experiment.free]
         structure = blind_directions(experiment.circuit, experiment.free, experiment.channels)
-        structural, offered = structure.hides(direction), remedies(experiment, force_gradient[rows])
+        structural, offered = structure.hides(direction), remedies(experiment, force_gradient[known])
         remedy = _remedy(verdict, force_sd, offered, structure)
     return Identifiability(
         verdict=verdict,

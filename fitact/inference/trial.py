@@ -179,8 +179,8 @@ def _with(e: Experiment, field: str, value: float, in_step: bool) -> Experiment:
     drive: Any = e.drive
     slower = float(drive.frequency) / value
     changed = dataclasses.replace(drive, frequency=value)
-    if not in_step:
-        return dataclasses.replace(e, drive=changed)
+    if not in_step:  # a slower drive needs a longer record for its periods, a faster one no shorter
+        return dataclasses.replace(e, drive=changed, time=max(slower, 1.0) * e.time)
     if isinstance(drive, Trapezoid):
         changed = dataclasses.replace(changed, rise_time=slower * drive.rise_time)
     return dataclasses.replace(e, drive=changed, time=slower * e.time)
