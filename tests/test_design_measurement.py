@@ -6,6 +6,7 @@ import json
 import math
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,21 +35,30 @@ SCENE = fitact.Scene.from_dict(PAPER)
 
 @functools.cache
 def shown(
-    Rsc: float, Csc: float, Ci: float, series: float = 0.0, frequency: float = 100.0, probe: float = 0.0
+    Rsc: float,
+    Csc: float,
+    Ci: float,
+    *,
+    series: float = 0.0,
+    probe: float = 0.0,
+    second: float = 1.0,
+    steps: int = 1250,
+    step: float = 1.0 / RATE,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Vsc and I over one settled half period of the square, its edge first, from scipy's zero-order hold.
 
-    `probe` (ohm) is in parallel with the touching skin. Without a resistance in series I is what flows between edges.
+    `probe` (ohm) is in parallel with the touching skin; the `second` skin has so much of its resistance, or is
+    absent (0). Without a resistance in series I is what flows between edges.
     """
     ms = 1e3  # of time, so that the polynomials' coefficients are alike in size
-    loaded = 1.0 / (1.0 / Rsc + (1.0 / probe if probe else 0.0))
-    first, second, charging = (
-        np.poly1d([ms * float(tau), on]) for tau, on in ((loaded * Csc, 1), (Rsc * Csc, 1), (Ci, 0))
+    loaded, grounding = 1.0 / (1.0 / Rsc + (1.0 / probe if probe else 0.0)), second * float(Rsc)
+    skin, other, charging = (
+        np.poly1d([ms * float(tau), on]) for tau, on in ((loaded * Csc, 1), (grounding * Csc, 1), (Ci, 0))
     )
-    loop = first * second + charging * (second * float(loaded) + first * float(Rsc) + first * second * series)
-    A, B, C, D = scipy.signal.tf2ss((charging * second * float(loaded)).coeffs, loop.coeffs)
-    a, b, *_ = scipy.signal.cont2discrete((A, B, C, D), ms / RATE, method="zoh")
-    steps, one = round(0.5 * RATE / frequency), np.eye(len(a))
+    loop = skin * other + charging * (other * float(loaded) + skin * grounding + skin * other * series)
+    A, B, C, D = scipy.signal.tf2ss((charging * other * float(loaded)).coeffs, loop.coeffs)
+    a, b, *_ = scipy.signal.cont2discrete((A, B, C, D), ms * step, method="zoh")
+    one = np.eye(len(a))
     held = np.linalg.solve(one - a, b) * HALF  # where the state tends to
     half = np.linalg.matrix_power(a, steps)
     left = -np.linalg.solve(one + half, (one - half) @ held) - held  # it ends at minus where it begins
@@ -77,7 +87,7 @@ def derivative(function, h: float = 1e-4) -> np.ndarray:
 GRADIENT = derivative(log_force)
 
 
-def information(channels: str = "Vsc", count: float = COUNT, noise: float = NOISE_VSC, **circuit: float) -> np.ndarray:
+def information(channels: str = "Vsc", count: float = COUNT, noise: float = NOISE_VSC, **circuit: Any) -> np.ndarray:
     """Fisher information of so many samples in Rsc, Csc, Ci."""
 
     def vsc(*values: float) -> np.ndarray:
@@ -188,11 +198,11 @@ PROBED = fitact.Scene.from_dict(PAPER | {"measurement": PAPER["measurement"] | {
         (("lighter probe",), (), lambda: information(probe=1e7)),
         (("no probe load",), (), information),
         (("finer converter",), (), lambda: information(probe=1e6, noise=0.08)),
-        (("frequency",), (500.0,), lambda: information(probe=1e6, frequency=500.0)),
+        (("frequency",), (500.0,), lambda: information(probe=1e6, steps=250)),
         (
             ("two frequencies",),
             (125.0, 1e3),
-            lambda: information(probe=1e6, frequency=125.0) + information(probe=1e6, frequency=1e3),
+            lambda: information(probe=1e6, steps=1000) + information(probe=1e6, steps=125),
         ),
     ],
 )
@@ -262,3 +272,99 @@ def test_command_line(design: fitact.MeasurementDesign, tmp_path: Path, monkeypa
         {"name", "force_sd", "contraction", "effort", "settings"} <= set(option) for option in printed["options"]
     )
     assert "<svg" in (tmp_path / "out" / "design.svg").read_text()
+
+
+NATURAL = {"grounding": {"connection": "natural", "Z": 14.5e6}}
+
+
+def record(
+    vsc: np.ndarray, step: float = 1.0 / RATE, current: np.ndarray | None = None, seed: int = 0
+) -> fitact.Record:
+    """As many samples as the scene's, with noise, from one half period of each channel."""
+    rng, half = np.random.default_rng(seed), len(vsc)
+
+    def whole(values: np.ndarray) -> np.ndarray:
+        return np.tile(np.append(values, -values), COUNT // (2 * half))
+
+    channels = {"V": whole(np.full(half, HALF)), "Vsc": whole(vsc) + NOISE_VSC * rng.standard_normal(COUNT)}
+    if current is not None:
+        channels["I"] = whole(current) + NOISE_I * rng.standard_normal(COUNT)
+    return fitact.Record.from_arrays(np.arange(COUNT) * step, **channels)
+
+
+def scene(**sections: dict[str, Any]) -> fitact.Scene:
+    merged = {name: PAPER.get(name, {}) | sections.get(name, {}) for name in {*PAPER, *sections, "drive"}}
+    return fitact.Scene.from_dict(merged | {"drive": {"waveform": "square"} | merged["drive"]})
+
+
+def logs_of(records: list[fitact.Record], scenes: list[fitact.Scene], seed: int) -> np.ndarray:
+    """Draws of the logarithms of Rsc, Csc, Ci from the posterior of records, fitted jointly and sampled."""
+    fit = fitact.fit(records, scenes)
+    assert fit.trusted
+    drawn = fitact.sample(fit, seed=seed, progress=False).parameters()
+    return np.log([drawn[name].ravel() for name in VALUES])
+
+
+def vsc_alone(seed: int) -> np.ndarray:
+    return logs_of([record(shown(**VALUES)[0], seed=seed)], [scene()], seed)
+
+
+def with_resistor(seed: int) -> np.ndarray:
+    known = scene(measurement={"series_resistor": 166e3})
+    return logs_of([record(shown(**VALUES, series=166e3)[0], seed=seed)], [known], seed)
+
+
+def with_current(seed: int) -> np.ndarray:
+    vsc, current = shown(**VALUES)
+    both = scene(measurement={"channels": ["Vsc", "I"]})
+    return logs_of([record(vsc, current=current, seed=seed)], [both], seed)
+
+
+def at_two_frequencies(seed: int) -> np.ndarray:
+    """Naturally grounded, 10 and 100 Hz."""
+    steps = [10.0 / RATE, 1.0 / RATE]
+    records = [
+        record(shown(**VALUES, series=14.5e6, second=0.0, step=step)[0], step, seed=2 * seed + k)
+        for k, step in enumerate(steps)
+    ]
+    scenes = [scene(**NATURAL, drive={"frequency": 4e-4 / step}) for step in steps]
+    return logs_of(records, scenes, seed)
+
+
+def on_two_panels(seed: int) -> np.ndarray:
+    """The second panel's posterior of the skin is the prior for the first."""
+    own = 10.0 * VALUES["Ci"]
+    other = scene(device={"Ci": own})
+    skin = logs_of([record(shown(VALUES["Rsc"], VALUES["Csc"], own)[0], seed=1000 + seed)], [other], seed)[:2]
+    believed = {
+        name: {"median": math.exp(np.mean(log)), "relative_sd": math.sqrt(math.expm1(np.var(log)))}
+        for name, log in zip(("Rsc", "Csc"), skin, strict=True)
+    }
+    first = scene(prior=believed | {"correlation": {"Rsc-Csc": float(np.corrcoef(skin)[0, 1])}})
+    return logs_of([record(shown(**VALUES)[0], seed=seed)], [first], seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("drawn", "stated", "names", "values"),
+    [
+        (vsc_alone, SCENE, (), ()),
+        (with_resistor, SCENE, ("series resistor",), (166e3,)),
+        (with_current, SCENE, ("current",), ()),
+        (at_two_frequencies, scene(**NATURAL), ("two frequencies",), (10.0, 100.0)),
+        (on_two_panels, SCENE, ("second panel",), (13.5e-9,)),
+    ],
+)
+def test_posteriors_are_as_wide_as_was_to_be_expected(drawn, stated: fitact.Scene, names, values):
+    """To 10 % in the standard deviations of the logarithms and of the force, in the mean of three records."""
+    experiment = stated_experiment(stated)
+    gradient = force_gradient(experiment)
+    found = judge(trial_of(experiment, *names), values, gradient)
+    sd = []
+    for seed in range(3):  # any would do
+        logs = drawn(seed)
+        sd.append([*np.std(logs, axis=1), np.std(gradient @ logs)])
+    np.testing.assert_allclose(np.mean(sd, axis=0), predicted(found), rtol=0.1)
+    before = np.append(PRIOR_SD, np.linalg.norm(gradient * PRIOR_SD))
+    contraction = np.append(list(found.contractions.values()), found.contraction)
+    np.testing.assert_allclose(1.0 - np.mean(sd, axis=0) / before, contraction, atol=0.01)

@@ -6,6 +6,7 @@ from pathlib import Path
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 from fitact.files import replacing
 from fitact.inference.design import Curve, MeasurementDesign
@@ -44,8 +45,6 @@ def _figure(design: MeasurementDesign) -> Figure:
         if first is None:
             first = axes
             axes.set_ylabel("error of the mean force, %")
-            axes.yaxis.set_major_formatter("{x:g}")
-            axes.yaxis.set_minor_formatter("")
         else:
             axes.tick_params(which="both", labelleft=False)
     return figure
@@ -77,4 +76,7 @@ def _along(axes: Axes, curve: Curve, design: MeasurementDesign) -> None:
             axes.plot(option.settings[curve.setting], 100.0 * option.force_sd, "o", color=_CHOSEN)
     axes.set_xscale("log")
     axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("")
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.set_xlabel(_LABELS[curve.setting])
