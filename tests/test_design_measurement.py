@@ -256,6 +256,7 @@ def test_what_cannot_be_asked():
 def test_command_line(design: fitact.MeasurementDesign, tmp_path: Path, monkeypatch, capsys):
     (tmp_path / "scene.toml").write_text(str(SCENE))
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))  # so that this process keeps its own
+    monkeypatch.setattr("fitact.inference.design.design_measurement", lambda scene, records: design)
     monkeypatch.setattr(
         sys,
         "argv",
@@ -266,7 +267,7 @@ def test_command_line(design: fitact.MeasurementDesign, tmp_path: Path, monkeypa
     printed = json.loads(capsys.readouterr().out)
     assert next(iter(printed)) == "now"
     assert printed == json.loads((tmp_path / "out" / "design.json").read_text())
-    assert printed["now"]["force_sd"] == pytest.approx(design.now.force_sd, rel=1e-9)
+    assert printed["now"]["force_sd"] == design.now.force_sd
     assert [option["name"] for option in printed["options"]] == [option.name for option in design.options]
     assert all(
         {"name", "force_sd", "contraction", "effort", "settings"} <= set(option) for option in printed["options"]
@@ -356,7 +357,7 @@ def on_two_panels(seed: int) -> np.ndarray:
     ],
 )
 def test_posteriors_are_as_wide_as_was_to_be_expected(drawn, stated: fitact.Scene, names, values):
-    """To 10 % in the standard deviations of the logarithms and of the force, in the mean of three records."""
+    """To 3 % in the standard deviations of the logarithms and of the force, in the mean of three records."""
     experiment = stated_experiment(stated)
     gradient = force_gradient(experiment)
     found = judge(trial_of(experiment, *names), values, gradient)
@@ -364,7 +365,7 @@ def test_posteriors_are_as_wide_as_was_to_be_expected(drawn, stated: fitact.Scen
     for seed in range(3):  # any would do
         logs = drawn(seed)
         sd.append([*np.std(logs, axis=1), np.std(gradient @ logs)])
-    np.testing.assert_allclose(np.mean(sd, axis=0), predicted(found), rtol=0.1)
+    np.testing.assert_allclose(np.mean(sd, axis=0), predicted(found), rtol=0.03)
     before = np.append(PRIOR_SD, np.linalg.norm(gradient * PRIOR_SD))
     contraction = np.append(list(found.contractions.values()), found.contraction)
-    np.testing.assert_allclose(1.0 - np.mean(sd, axis=0) / before, contraction, atol=0.01)
+    np.testing.assert_allclose(1.0 - np.mean(sd, axis=0) / before, contraction, atol=0.005)

@@ -12,15 +12,16 @@ from jaxtyping import Float
 from fitact.data.record import Record
 from fitact.data.simulate import sample_times
 from fitact.errors import InputError
+from fitact.inference import derived
 from fitact.inference.changes import Change, changes
 from fitact.inference.expected import Experiment, force_gradient, spans
-from fitact.inference.fit import fit
+from fitact.inference.fit import Fit, fit
 from fitact.inference.optimum import Optimum, optimise
 from fitact.inference.trial import Option, Trial, judge
 from fitact.model.circuit import Channel
 from fitact.model.distribution import LogNormal
 from fitact.model.scene import Scene
-from fitact.model.skin import parameters
+from fitact.model.skin import Dispersive, WithSkin, parameters
 from fitact.units import percent
 
 _LEVELS = 256  # of an ordinary oscilloscope's converter, over what a channel reaches
@@ -117,14 +118,13 @@ def design_measurement(scene: Scene, records: Record | Sequence[Record] = ()) ->
     records = (records,) if isinstance(records, Record) else tuple(records)
     if records:
         fitted = fit(records, scene)
-        experiment, steps = fitted.experiment, _steps(records[0], fitted.experiment)
+        experiment, gradient = fitted.experiment, _force_gradient(fitted)
+        steps = _steps(records[0], experiment)
         judgement = fitted.trusted, (() if fitted.trusted else (fitted.message,))
     else:
         experiment, judgement = stated_experiment(scene), (True, ())
+        gradient = force_gradient(experiment)
         steps = {channel: span / _LEVELS for channel, span in spans(experiment).items()}
-    if not experiment.free:
-        raise InputError("scene: [prior] frees no parameter, so there is nothing to learn; give one a prior")
-    gradient = force_gradient(experiment)
     now = dataclasses.replace(judge(Trial((experiment,)), (), gradient), name="now", text="as it stands")
     found, curves = _ranked(Trial((experiment,)), gradient, now, changes(steps))
     believed = float(np.linalg.norm(gradient @ experiment.prior_root))
@@ -142,7 +142,12 @@ def stated_experiment(scene: Scene) -> Experiment:
     values = {name: math.exp(prior[name].log_mean) for name in prior.names if nominal[name] is None}
     values |= scene.fixed()
     values |= {name: ratio * float(nominal[other] or 0.0) for name, (other, ratio) in scene.prior.tied().items()}
+    if not prior.names:
+        raise InputError("scene: [prior] frees no parameter, so there is nothing to learn; give one a prior")
     circuit = scene.make_circuit(values)
+    if isinstance(circuit, WithSkin) and isinstance(circuit.skin, Dispersive):
+        # counted now, since what is compiled has its frequency traced
+        circuit = dataclasses.replace(circuit, skin=Dispersive(circuit.skin.count(scene.drive.slowest)))
     gains = {"gain": measured.gain_relative_sd, "gain_I": measured.gain_I_relative_sd}
     of_channel = {"gain": "Vsc", "gain_I": "I"}
     believed = prior.without(*(name for name in prior.names if name not in parameters(circuit))).including(
@@ -163,6 +168,13 @@ def stated_experiment(scene: Scene) -> Experiment:
         steady_state=scene.drive.steady_state,
         geometry=scene.geometry(),
     )
+
+
+def _force_gradient(fitted: Fit) -> Float[np.ndarray, " parameters"]:
+    """That of the logarithm of a fit's mean force, in the free parameters of its experiment."""
+    _, gradients = fitted.derive.logs(fitted.theta, np.array([trace.sigma for trace in fitted.traces]))
+    rows = [fitted.names.index(name) for name in fitted.experiment.free]
+    return gradients[derived.NAMES.index("force_mean"), rows]
 
 
 def _steps(record: Record, experiment: Experiment) -> dict[Channel, float]:
