@@ -122,7 +122,7 @@ def options(design: fitact.MeasurementDesign) -> dict[str, Option]:
     return {option.name: option for option in design.options}
 
 
-def test_the_paper_s_measurement(design: fitact.MeasurementDesign):
+def test_the_paper_s_measurement(design: fitact.MeasurementDesign, options: dict[str, Option]):
     """4.9 % from Vsc alone, 0.13 % with a known resistor in series, 0.02 % with the current."""
     np.testing.assert_allclose(predicted(design.now), standard_deviations(information()), rtol=1e-3)
     assert design.now.force_sd == pytest.approx(0.0487, abs=5e-5)
@@ -133,6 +133,7 @@ def test_the_paper_s_measurement(design: fitact.MeasurementDesign):
     assert sizes == sorted(sizes)
     assert design.best_for_effort is not None
     assert design.best_for_effort.name == "series resistor"
+    assert options["frequency"].settings == {"frequency": 100.0}  # nothing is gained by another
 
 
 def second_panel(Ci: float) -> np.ndarray:

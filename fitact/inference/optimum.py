@@ -15,6 +15,7 @@ from fitact.model.skin import has_time_constants
 
 _POINTS = {1: 33, 2: 6}  # of the grid along each of so many settings; along more, 4
 _STARTS = 3  # of its lowest points
+_WORTH = 1e-3  # of the error: by so much, at least, it must fall for a setting to be moved
 
 
 class Optimum(NamedTuple):
@@ -47,10 +48,12 @@ def optimise(trial: Trial, gradient: Float[np.ndarray, " parameters"]) -> Optimu
     found = [(coarse[i], points[i]) for i in order]
     if all(has_time_constants(e.circuit) for e in trial.experiments):
         found += [_downhill(trial, gradient, points[i], bounds) for i in order]
-    values = [float(value) for value in min(found)[1]]
+    best, values = min(found)
+    if force_sd(trial, trial.starts, gradient) < (1.0 + _WORTH) * best:
+        values = trial.starts
     if len({setting.field for setting in trial.settings}) == 1:  # of records alike but for it
-        values.sort()
-    return Optimum(tuple(values), grid, coarse.reshape(shape))
+        values = sorted(values)
+    return Optimum(tuple(map(float, values)), grid, coarse.reshape(shape))
 
 
 def force_sd(trial: Trial, values: Sequence[float], gradient: Float[np.ndarray, " parameters"]) -> float:
