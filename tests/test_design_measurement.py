@@ -18,7 +18,7 @@ from fitact.cli import main
 from fitact.inference.changes import changes, remedies
 from fitact.inference.design import stated_experiment
 from fitact.inference.expected import Experiment, force_gradient
-from fitact.inference.optimum import force_sd, log_force_sd_slope
+from fitact.inference.optimum import force_sd, log_force_sd_slope, optimise
 from fitact.inference.trial import Option, Trial, judge
 
 VALUES = {"Rsc": 160e3, "Csc": 22e-9, "Ci": 1.35e-9}
@@ -221,6 +221,26 @@ def test_probes_frequencies_and_converters_as_scipy_has_them(
     covariance, gradient = np.linalg.inv(expected() + np.diag(PRIOR_SD**-2.0)), derivative(log_force)
     sd = np.sqrt([*np.diag(covariance), gradient @ covariance @ gradient])
     np.testing.assert_allclose(predicted(found), sd, rtol=2e-3)
+
+
+def test_what_is_tied_follows():
+    """A grounding skin of half the resistance."""
+    prior = PAPER["prior"] | {"grounding_Rsc": {"tied": "Rsc", "ratio": 0.5}}
+    experiment = stated_experiment(fitact.Scene.from_dict(PAPER | {"prior": prior}))
+    found = judge(Trial((experiment,)), (), force_gradient(experiment))
+    expected = standard_deviations(information(second=0.5))
+    np.testing.assert_allclose(predicted(found)[:3], expected[:3], rtol=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("names", [("frequency", "series resistor"), ("frequency", "current"), ("two frequencies",)])
+def test_no_random_setting_is_better(names: tuple[str, ...]):
+    experiment = stated_experiment(scene(**NATURAL))
+    trial, gradient = trial_of(experiment, *names), force_gradient(experiment)
+    best = force_sd(trial, optimise(trial, gradient).values, gradient)
+    low, high = (np.log([getattr(setting, bound) for setting in trial.settings]) for bound in ("low", "high"))
+    points = np.exp(np.random.default_rng(0).uniform(low, high, (200, len(low))))
+    assert best < 1.001 * min(force_sd(trial, point, gradient) for point in points)
 
 
 def test_remedies_are_the_quick_changes_best_first():

@@ -141,7 +141,8 @@ def stated_experiment(scene: Scene) -> Experiment:
     measured, prior, nominal = scene.measurement, scene.make_prior(), scene.nominal()
     values = {name: math.exp(prior[name].log_mean) for name in prior.names if nominal[name] is None}
     values |= scene.fixed()
-    values |= {name: ratio * float(nominal[other] or 0.0) for name, (other, ratio) in scene.prior.tied().items()}
+    tied = tuple((name, other, ratio) for name, (other, ratio) in scene.prior.tied().items())
+    values |= {name: ratio * float(values.get(other) or nominal[other] or 0.0) for name, other, ratio in tied}
     if not prior.names:
         raise InputError("scene: [prior] frees no parameter, so there is nothing to learn; give one a prior")
     circuit = scene.make_circuit(values)
@@ -167,6 +168,7 @@ def stated_experiment(scene: Scene) -> Experiment:
         noise={"Vsc": measured.noise_Vsc, "I": measured.noise_I},
         steady_state=scene.drive.steady_state,
         geometry=scene.geometry(),
+        tied=tied,
     )
 
 

@@ -7,12 +7,13 @@ Nothing else is taken to be unknown: no offset, drift, delay or charge at the st
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.inference.structure import log_values, with_parameters
@@ -20,7 +21,7 @@ from fitact.model.circuit import Channel, Circuit
 from fitact.model.drive import Drive, Periodic, Sampled
 from fitact.model.force import Geometry, force_constant
 from fitact.model.response import highpass, response_and_rate
-from fitact.model.skin import has_time_constants, limits_current
+from fitact.model.skin import has_time_constants, limits_current, parameters, with_values
 
 FREQUENCY = "frequency"  # the drive's, as the name of a setting
 
@@ -31,6 +32,9 @@ _PERIOD = 1024  # times in a period, at which the force is averaged
 _EDGE = 10.0  # a step of V so many times the mean one is an edge (a sine's largest is 1.6 times, a triangle's 1),
 _BESIDE = 2  # so many samples to either side of which say nothing of a current that follows dV/dt,
 _ASIDE = 0.25  # of a step further, lest rounding decide where edges coincide with samples
+
+
+Tied: TypeAlias = tuple[tuple[str, str, float], ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +53,7 @@ class Experiment:
         records: how many such records there are.
         geometry: what the force needs beside the circuit; of areas and thicknesses nothing but factors depends.
         own: which of `free` it shares with no other experiment on the same finger.
+        tied: (name, other, ratio) of the circuit's fields that follow another one.
     """
 
     circuit: Circuit
@@ -62,6 +67,7 @@ class Experiment:
     records: float = 1.0
     geometry: Geometry = Geometry()  # noqa: RUF009  (a frozen Module)
     own: tuple[str, ...] = ()
+    tied: Tied = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,7 +112,9 @@ def force_gradient(experiment: Experiment) -> Float[np.ndarray, " parameters"]:
         sampling = _sampling(e)
         ((voltage, slope),) = _derivatives(e, e.free, theta, sampling, _ACTING, order=1)
         circuit, geometry = jax.tree.map(jnp.asarray, (e.circuit, e.geometry))  # plain numbers would be compiled in
-        of_constant = np.asarray(_force_constant_slope(circuit, e.free, e.channels, jnp.asarray(theta), geometry))
+        of_constant = np.asarray(
+            _force_constant_slope(circuit, e.tied, e.free, e.channels, jnp.asarray(theta), geometry)
+        )
     weight = sampling.force * voltage
     return of_constant + 2.0 * (weight @ slope) / (weight @ voltage)
 
@@ -166,11 +174,20 @@ def _derivatives(
     circuit = jax.tree.map(jnp.asarray, e.circuit)
     channels: tuple[Channel, ...] = (*e.channels, "Vsc" if e.geometry.model == "paper" else "Vgap")
     if has_time_constants(circuit):
-        terms = _terms(circuit, names, channels, jnp.asarray(theta), order)
+        terms = _terms(circuit, e.tied, names, channels, jnp.asarray(theta), order)
         return [_response([_Terms(*map(np.asarray, part)) for part in of], sampling) for of in terms[which]]
     of = jnp.asarray(sampling.time), jnp.asarray(sampling.slope), sampling.steady_state
-    values, slopes = _shown(circuit, names, channels, jnp.asarray(theta), sampling.drive, *of)
+    values, slopes = _shown(circuit, e.tied, names, channels, jnp.asarray(theta), sampling.drive, *of)
     return [[np.asarray(value), np.asarray(slope)] for value, slope in zip(values, slopes, strict=True)][which]
+
+
+def _there(
+    circuit: Circuit, tied: Tied, names: tuple[str, ...], channels: tuple[Channel, ...], theta: Array
+) -> tuple[Circuit, list[ArrayLike]]:
+    """As `with_parameters`; what is tied follows."""
+    there, gains = with_parameters(circuit, names, channels, theta)
+    known = parameters(there)
+    return with_values(there, {name: ratio * known[other] for name, other, ratio in tied}), gains
 
 
 class _Terms(NamedTuple):
@@ -184,6 +201,7 @@ class _Terms(NamedTuple):
 @eqx.filter_jit
 def _terms(
     circuit: Circuit,
+    tied: Tied,
     names: tuple[str, ...],
     channels: tuple[Channel, ...],
     theta: Float[Array, " names"],
@@ -193,7 +211,7 @@ def _terms(
     fields = tuple(name for name in names if name != FREQUENCY)
 
     def terms(theta: Array) -> list[_Terms]:
-        there, gains = with_parameters(circuit, fields, channels[:-1], theta[: len(fields)])
+        there, gains = _there(circuit, tied, fields, channels[:-1], theta[: len(fields)])
         # at another frequency the same happens in the period as with all time constants so many times longer
         faster = theta[names.index(FREQUENCY)] if FREQUENCY in names else jnp.zeros(())
         found = []
@@ -215,6 +233,7 @@ def _terms(
 @eqx.filter_jit
 def _force_constant_slope(
     circuit: Circuit,
+    tied: Tied,
     free: tuple[str, ...],
     channels: tuple[Channel, ...],
     theta: Float[Array, " parameters"],
@@ -223,7 +242,7 @@ def _force_constant_slope(
     """The derivative of the logarithm of force over the square of the voltage that makes it."""
 
     def log_force(theta: Array) -> Array:
-        return jnp.log(force_constant(geometry.contact(with_parameters(circuit, free, channels, theta)[0])))
+        return jnp.log(force_constant(geometry.contact(_there(circuit, tied, free, channels, theta)[0])))
 
     return jax.jacfwd(log_force)(theta)
 
@@ -312,6 +331,7 @@ def _highpass(drive: Drive, time: Array, log_tau: Array, steady_state: bool, ord
 @eqx.filter_jit
 def _shown(
     circuit: Circuit,
+    tied: Tied,
     free: tuple[str, ...],
     channels: tuple[Channel, ...],
     theta: Array,
@@ -321,7 +341,7 @@ def _shown(
     steady_state: bool,
 ) -> tuple[list[Array], list[Array]]:
     def shown(theta: Array) -> tuple[list[Array], list[Array]]:
-        there, gains = with_parameters(circuit, free, channels[:-1], theta)
+        there, gains = _there(circuit, tied, free, channels[:-1], theta)
         found = []
         for gain, channel in zip((*gains, 1.0), channels, strict=True):
             value, rate = response_and_rate(there, drive, time, steady_state=steady_state, channel=channel)

@@ -103,6 +103,7 @@ class Problem(NamedTuple):
             steady_state=source.choice.steady_state,
             records=float(records),
             geometry=source.scene.geometry(),
+            tied=likelihood.tied,
         )
 
 
