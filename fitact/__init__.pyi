@@ -4,6 +4,7 @@ from .data.record import Record
 from .data.spectrum import Spectrum, read_spectrum
 from .errors import InputError
 from .inference.comparison import Comparison, compare
+from .inference.design import MeasurementDesign, design_measurement
 from .inference.fit import Fit, fit
 from .inference.population import Population, population
 from .inference.posterior import Posterior
@@ -41,6 +42,7 @@ __all__ = [
     "Inspection",
     "LogNormal",
     "LogUniform",
+    "MeasurementDesign",
     "Multitone",
     "NaturalGround",
     "Plan",
@@ -64,6 +66,7 @@ __all__ = [
     "WithSkin",
     "body_current",
     "compare",
+    "design_measurement",
     "electrostatic_force",
     "fit",
     "fit_spectrum",

@@ -8,7 +8,7 @@ import pytest
 import scipy.signal
 
 import fitact
-from fitact.inference.expected import Expected, Experiment, expected_sd, remedies
+from fitact.inference.expected import Expected, Experiment, expected_sd
 
 VALUES = {"Rsc": 160e3, "Csc": 22e-9, "Ci": 1.35e-9}
 PRIOR_SD = np.array([0.3, 0.3, 0.05])
@@ -156,29 +156,3 @@ def test_noise_of_a_measured_drive_tells_nothing():
 def test_the_beginning_of_a_long_measured_drive_stands_for_all():
     long, short = (expected_sd(measured(0.0, periods)).force_sd for periods in (16, 4))
     assert long == pytest.approx(0.5 * short, rel=0.05)
-
-
-def test_remedies_best_first():
-    found = {remedy.name: remedy for remedy in remedies(NOMINAL)}
-    assert list(found) == [
-        "the trunk current I recorded to ± 20 nA",
-        "a known resistor of 100 kΩ in series",
-        "Ci known twice as well",
-        "four times the record",
-    ]
-    assert found["Ci known twice as well"].force_sd == pytest.approx((2.0 / 0.09 + 4.0 / 0.0025) ** -0.5, rel=1e-4)
-    noise = dataclasses.replace(NOMINAL, noise={"Vsc": 0.1, "I": 40e-9})
-    assert "the trunk current I recorded to ± 40 nA" in {remedy.name for remedy in remedies(noise)}
-
-
-def test_no_remedy_that_was_taken():
-    done = dataclasses.replace(BOTH, circuit=RESISTOR, free=("Rsc", "Csc"), prior_root=np.diag(PRIOR_SD[:2]))
-    assert [remedy.name for remedy in remedies(done)] == ["four times the record"]
-
-
-def test_remedies_at_a_circuit_whose_current_overflows():
-    """A fit that failed may end there; what can be computed is still told."""
-    far = dataclasses.replace(NOMINAL, circuit=fitact.FinalCircuit(Rsc=1e-200, Csc=1e-8, Ci=1e-10))
-    with np.errstate(all="ignore"):
-        found = [remedy.name for remedy in remedies(far)]
-    assert "the trunk current I recorded to ± 40 nA" not in found

@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from fitact.data.record import MINIMUM_SAMPLES, Record
 from fitact.errors import InputError
@@ -17,14 +18,7 @@ def simulate(scene: Scene, seed: int = 0) -> Record:
     Raises:
         InputError: the scene asks for what is not modelled, or for a current that has impulses.
     """
-    circuit, drive, measured = scene.make_circuit(), scene.make_drive(), scene.measurement
-    count = round(measured.duration * measured.sampling_rate)
-    if not MINIMUM_SAMPLES <= count <= _MOST_SAMPLES:
-        raise InputError(
-            f"scene: [measurement] duration times sampling_rate is {count:,} samples; choose them to give"
-            f" {MINIMUM_SAMPLES} to {_MOST_SAMPLES:,}"
-        )
-    time = np.arange(count) / measured.sampling_rate
+    circuit, drive, measured, time = scene.make_circuit(), scene.make_drive(), scene.measurement, sample_times(scene)
     rng = np.random.default_rng(seed)
     channels = {}
     with jax.enable_x64(True):
@@ -39,3 +33,19 @@ def simulate(scene: Scene, seed: int = 0) -> Record:
             " (waveform = 'trapezoid'), or the scene an R_H or a series_resistor"
         )
     return Record.from_arrays(time, V=channels["V"], Vsc=channels.get("Vsc"), I=channels.get("I"), source="simulation")
+
+
+def sample_times(scene: Scene) -> Float[np.ndarray, " samples"]:
+    """When the scene's measurement samples, s.
+
+    Raises:
+        InputError: that is too few times to fit, or too many to hold.
+    """
+    measured = scene.measurement
+    count = round(measured.duration * measured.sampling_rate)
+    if not MINIMUM_SAMPLES <= count <= _MOST_SAMPLES:
+        raise InputError(
+            f"scene: [measurement] duration times sampling_rate is {count:,} samples; choose them to give"
+            f" {MINIMUM_SAMPLES} to {_MOST_SAMPLES:,}"
+        )
+    return np.arange(count) / measured.sampling_rate

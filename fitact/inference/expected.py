@@ -4,35 +4,37 @@ From the Fisher information of the channels' noise and the prior, in the Laplace
 Nothing else is taken to be unknown: no offset, drift, delay or charge at the start.
 """
 
-import contextlib
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.inference.structure import log_values, with_parameters
-from fitact.model.circuit import Channel, Circuit, DirectGround, FinalCircuit, NaturalGround
+from fitact.model.circuit import Channel, Circuit
 from fitact.model.drive import Drive, Periodic, Sampled
 from fitact.model.force import Geometry, force_constant
 from fitact.model.response import highpass, response_and_rate
-from fitact.model.skin import WithSkin, has_time_constants, limits_current
-from fitact.units import engineering
+from fitact.model.skin import has_time_constants, limits_current, parameters, with_values
 
-NOISE_I = 20e-9  # A, of a current channel where none is stated
-SERIES_RESISTOR = 100e3  # ohm, the known one that is recommended
+FREQUENCY = "frequency"  # the drive's, as the name of a setting
 
 _SAMPLES = 4096  # of a long record as many stand for all
 _LONG = 8192  # likewise of a long measured drive's beginning, since its every sample costs
 _GOLDEN = 0.6180339887498949
 _PERIOD = 1024  # times in a period, at which the force is averaged
 _EDGE = 10.0  # a step of V so many times the mean one is an edge (a sine's largest is 1.6 times, a triangle's 1),
-_BESIDE = 2  # so many samples to either side of which say nothing of a current that follows dV/dt
+_BESIDE = 2  # so many samples to either side of which say nothing of a current that follows dV/dt,
+_ASIDE = 0.25  # of a step further, lest rounding decide where edges coincide with samples
+
+
+Tied: TypeAlias = tuple[tuple[str, str, float], ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +52,8 @@ class Experiment:
         steady_state: or from rest.
         records: how many such records there are.
         geometry: what the force needs beside the circuit; of areas and thicknesses nothing but factors depends.
+        own: which of `free` it shares with no other experiment on the same finger.
+        tied: (name, other, ratio) of the circuit's fields that follow another one.
     """
 
     circuit: Circuit
@@ -62,6 +66,8 @@ class Experiment:
     steady_state: bool = True
     records: float = 1.0
     geometry: Geometry = Geometry()  # noqa: RUF009  (a frozen Module)
+    own: tuple[str, ...] = ()
+    tied: Tied = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,50 +85,71 @@ class Expected:
     force_contraction: float
 
 
-@dataclasses.dataclass(frozen=True)
-class Remedy:
-    """What might be done about an answer that is not well known, and the errors to expect then.
-
-    Attributes:
-        name: what is done.
-        force_sd: as in `Expected`, of all data together.
-        sd: likewise.
-    """
-
-    name: str
-    force_sd: float
-    sd: dict[str, float]
-
-
 def expected_sd(experiment: Experiment) -> Expected:
     """The errors to expect of an experiment, in the Laplace approximation.
 
     Raises:
         InputError: a name in `free` is no parameter of the circuit, or the drive has no steady state asked for.
     """
-    e, theta = experiment, log_values(experiment.circuit, experiment.free, experiment.channels)
-    with jax.enable_x64(True):
-        circuit, geometry = jax.tree.map(jnp.asarray, (e.circuit, e.geometry))  # plain numbers would be compiled in
-        sampling = _sampling(e)
-        acting: Channel = "Vsc" if e.geometry.model == "paper" else "Vgap"
-        of = _by_terms if has_time_constants(circuit) else _by_harmonics
-        *seen, (voltage, slope) = of(circuit, e.free, (*e.channels, acting), jnp.asarray(theta), sampling)
-        force_constant_slope = _force_constant_slope(circuit, e.free, e.channels, jnp.asarray(theta), geometry)
-    weight = sampling.force * voltage
-    gradient = np.asarray(force_constant_slope) + 2.0 * (weight @ slope) / (weight @ voltage)
-    jacobian = [
-        (sampling.away if channel == "I" and not limits_current(circuit) else sampling.data)[:, None]
-        / e.noise[channel]
-        * response
-        for channel, (_, response) in zip(e.channels, seen, strict=True)
-    ]
-    root = covariance_root(np.concatenate(jacobian), e.prior_root)
+    gradient = force_gradient(experiment)
+    root = covariance_root(jacobian(experiment)[0], experiment.prior_root)
     force_sd = float(np.linalg.norm(gradient @ root))
     return Expected(
-        sd=dict(zip(e.free, np.linalg.norm(root, axis=1).tolist(), strict=True)),
+        sd=dict(zip(experiment.free, np.linalg.norm(root, axis=1).tolist(), strict=True)),
         force_sd=force_sd,
-        force_contraction=1.0 - force_sd / float(np.linalg.norm(gradient @ e.prior_root)),
+        force_contraction=1.0 - force_sd / float(np.linalg.norm(gradient @ experiment.prior_root)),
     )
+
+
+def force_gradient(experiment: Experiment) -> Float[np.ndarray, " parameters"]:
+    """The derivative of the logarithm of the mean force that an experiment makes, in its log-parameters.
+
+    Raises:
+        InputError: as `expected_sd`.
+    """
+    e, theta = experiment, log_values(experiment.circuit, experiment.free, experiment.channels)
+    with jax.enable_x64(True):
+        sampling = _sampling(e)
+        ((voltage, slope),) = _derivatives(e, e.free, theta, sampling, _ACTING, order=1)
+        circuit, geometry = jax.tree.map(jnp.asarray, (e.circuit, e.geometry))  # plain numbers would be compiled in
+        of_constant = np.asarray(
+            _force_constant_slope(circuit, e.tied, e.free, e.channels, jnp.asarray(theta), geometry)
+        )
+    weight = sampling.force * voltage
+    return of_constant + 2.0 * (weight @ slope) / (weight @ voltage)
+
+
+def jacobian(experiment: Experiment, settings: Sequence[str] = ()) -> Float[np.ndarray, "1+settings rows parameters"]:
+    """That of what is recorded over its noise, and behind it its derivatives in the logarithms of `settings`.
+
+    A setting is a field of the circuit, or `FREQUENCY`, in which each sample, and each edge, stays where it is in
+    the period. Settings need a circuit with time constants.
+
+    Raises:
+        InputError: as `expected_sd`.
+    """
+    e, names = experiment, tuple(dict.fromkeys([*experiment.free, *sorted(settings, key=FREQUENCY.__eq__)]))
+    fields = [name for name in names if name != FREQUENCY]
+    theta = np.append(log_values(e.circuit, fields, e.channels), np.zeros(len(names) - len(fields)))
+    with jax.enable_x64(True):
+        sampling = _sampling(e)
+        shown = _derivatives(e, names, theta, sampling, _RECORDED, order=2 if settings else 1)
+    found = []
+    for channel, (_, slope, *curvature) in zip(e.channels, shown, strict=True):
+        counts = sampling.away if channel == "I" and not limits_current(e.circuit) else sampling.data
+        parts = [slope, *(curvature[0][..., names.index(name)] for name in settings)]
+        found.append(np.stack(parts)[..., : len(e.free)] * (counts / e.noise[channel])[:, None])
+    return np.concatenate(found, axis=1)
+
+
+def spans(experiment: Experiment) -> dict[Channel, float]:
+    """What each channel's samples reach over, V and A, but for a current within edges."""
+    e, theta = experiment, log_values(experiment.circuit, experiment.free, experiment.channels)
+    with jax.enable_x64(True):
+        sampling = _sampling(e)
+        shown = _derivatives(e, e.free, theta, sampling, _RECORDED, order=1)
+    kept = sampling.away > 0.0
+    return {channel: float(np.ptp(value[kept])) for channel, (value, *_) in zip(e.channels, shown, strict=True)}
 
 
 def covariance_root(
@@ -137,46 +164,30 @@ def covariance_root(
     return prior_root @ directions.T / np.hypot(1.0, sizes)
 
 
-def remedies(experiment: Experiment) -> tuple[Remedy, ...]:
-    """What might be done to know the mean force better, best first; of that, what can be computed there.
-
-    A fit that failed may have ended at a circuit whose current no double holds.
-    """
-    found = []
-    for name, changed in _changes(experiment):
-        with contextlib.suppress(np.linalg.LinAlgError):
-            expected = expected_sd(changed)
-            found.append(Remedy(name, expected.force_sd, expected.sd))
-    return tuple(sorted(found, key=lambda remedy: remedy.force_sd))
+_RECORDED, _ACTING = slice(None, -1), slice(-1, None)  # of the channels, to which that which makes the force is added
 
 
-def _changes(e: Experiment) -> Iterator[tuple[str, Experiment]]:
-    if "I" not in e.channels:
-        noise = e.noise.get("I", NOISE_I)
-        changed = dataclasses.replace(e, channels=(*e.channels, "I"), noise={**e.noise, "I": noise})
-        yield f"the trunk current I recorded to ± {engineering(noise, 'A')}", changed
-    resisted = _with_resistor(e.circuit)
-    if resisted is not None:
-        yield (
-            f"a known resistor of {engineering(SERIES_RESISTOR, 'ohm')} in series",
-            dataclasses.replace(e, circuit=resisted),
-        )
-    if "Ci" in e.free:
-        halved = np.where([name == "Ci" for name in e.free], 0.5, 1.0)[:, None] * e.prior_root
-        yield "Ci known twice as well", dataclasses.replace(e, prior_root=halved)
-    yield "four times the record", dataclasses.replace(e, records=4.0 * e.records)
+def _derivatives(
+    e: Experiment, names: tuple[str, ...], theta: np.ndarray, sampling: "_Sampling", which: slice, order: int
+) -> list[list[np.ndarray]]:
+    """What each channel shows, and its derivatives in the logarithms of `names` up to `order`."""
+    circuit = jax.tree.map(jnp.asarray, e.circuit)
+    channels: tuple[Channel, ...] = (*e.channels, "Vsc" if e.geometry.model == "paper" else "Vgap")
+    if has_time_constants(circuit):
+        terms = _terms(circuit, e.tied, names, channels, jnp.asarray(theta), order)
+        return [_response([_Terms(*map(np.asarray, part)) for part in of], sampling) for of in terms[which]]
+    of = jnp.asarray(sampling.time), jnp.asarray(sampling.slope), sampling.steady_state
+    values, slopes = _shown(circuit, e.tied, names, channels, jnp.asarray(theta), sampling.drive, *of)
+    return [[np.asarray(value), np.asarray(slope)] for value, slope in zip(values, slopes, strict=True)][which]
 
 
-def _with_resistor(circuit: Circuit) -> Circuit | None:
-    """The circuit with a known resistor in series; None where it has one."""
-    if isinstance(circuit, WithSkin):
-        resisted: Any = _with_resistor(circuit.circuit)
-        return None if resisted is None else dataclasses.replace(circuit, circuit=resisted)
-    if isinstance(circuit, FinalCircuit):
-        circuit = DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci)
-    if not isinstance(circuit, DirectGround | NaturalGround) or circuit.series_resistor is not None:
-        return None
-    return dataclasses.replace(circuit, series_resistor=SERIES_RESISTOR)
+def _there(
+    circuit: Circuit, tied: Tied, names: tuple[str, ...], channels: tuple[Channel, ...], theta: Array
+) -> tuple[Circuit, list[ArrayLike]]:
+    """As `with_parameters`; what is tied follows."""
+    there, gains = with_parameters(circuit, names, channels, theta)
+    known = parameters(there)
+    return with_values(there, {name: ratio * known[other] for name, other, ratio in tied}), gains
 
 
 class _Terms(NamedTuple):
@@ -189,25 +200,40 @@ class _Terms(NamedTuple):
 
 @eqx.filter_jit
 def _terms(
-    circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], theta: Float[Array, " parameters"]
+    circuit: Circuit,
+    tied: Tied,
+    names: tuple[str, ...],
+    channels: tuple[Channel, ...],
+    theta: Float[Array, " names"],
+    order: int,
 ) -> tuple[Any, ...]:
     """For each channel, the last being that which makes the force: terms and their derivatives."""
+    fields = tuple(name for name in names if name != FREQUENCY)
 
     def terms(theta: Array) -> list[_Terms]:
-        there, gains = with_parameters(circuit, free, channels[:-1], theta)
+        there, gains = _there(circuit, tied, fields, channels[:-1], theta[: len(fields)])
+        # at another frequency the same happens in the period as with all time constants so many times longer
+        faster = theta[names.index(FREQUENCY)] if FREQUENCY in names else jnp.zeros(())
         found = []
         for gain, channel in zip((*gains, 1.0), channels, strict=True):
             weight, tau, rate = there.terms_of(channel)
             rate = jnp.asarray(0.0 if rate is None else rate)
-            found.append(_Terms(gain * jnp.stack(weight), jnp.log(jnp.stack(tau)), gain * rate))
+            found.append(
+                _Terms(gain * jnp.stack(weight), jnp.log(jnp.stack(tau)) + faster, gain * rate * jnp.exp(faster))
+            )
         return found
 
-    return tuple(zip(terms(theta), jax.jacfwd(terms)(theta), strict=True))
+    found, derivative = [terms(theta)], terms
+    for _ in range(order):
+        derivative = jax.jacfwd(derivative)
+        found.append(derivative(theta))
+    return tuple(zip(*found, strict=True))
 
 
 @eqx.filter_jit
 def _force_constant_slope(
     circuit: Circuit,
+    tied: Tied,
     free: tuple[str, ...],
     channels: tuple[Channel, ...],
     theta: Float[Array, " parameters"],
@@ -216,12 +242,9 @@ def _force_constant_slope(
     """The derivative of the logarithm of force over the square of the voltage that makes it."""
 
     def log_force(theta: Array) -> Array:
-        return jnp.log(force_constant(geometry.contact(with_parameters(circuit, free, channels, theta)[0])))
+        return jnp.log(force_constant(geometry.contact(_there(circuit, tied, free, channels, theta)[0])))
 
     return jax.jacfwd(log_force)(theta)
-
-
-_Seen: TypeAlias = tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times parameters"]]
 
 
 class _Sampling(NamedTuple):
@@ -255,7 +278,8 @@ def _sampling(e: Experiment) -> _Sampling:
     periodic = e.steady_state and isinstance(drive, Periodic)
     period = float(drive.period) * (np.arange(_PERIOD) + 0.5) / _PERIOD if periodic else np.full(_PERIOD, time[0])
     times = np.append(time[chosen], period)
-    around = time[chosen][:, None] + np.arange(-_BESIDE, 1 + _BESIDE) * float(np.median(np.diff(time)))
+    beside = np.arange(-_BESIDE, 1 + _BESIDE) + _ASIDE
+    around = time[chosen][:, None] + beside * float(np.median(np.diff(time)))
     voltage, slope = (np.asarray(x) for x in _wave(drive, jnp.asarray(around), jnp.asarray(times), e.steady_state))
     step = np.abs(np.diff(voltage, axis=1))
     away = step.max(axis=1) <= _EDGE * step[:used].mean()
@@ -288,34 +312,26 @@ def _wave(drive: Drive, around: Array, time: Array, steady_state: bool) -> tuple
 
 
 @eqx.filter_jit
-def _highpass(drive: Drive, time: Array, log_tau: Array, steady_state: bool) -> tuple[Array, Array]:
-    """The response of one term, and its derivative in log tau."""
+def _highpass(drive: Drive, time: Array, log_tau: Array, steady_state: bool, order: int) -> tuple[Array, ...]:
+    """The response of one term, and its derivatives in log tau up to `order`, 1 or 2."""
+    one = jnp.ones_like(log_tau)
 
     def response(log_tau: Array) -> Array:
         return highpass(drive, time, jnp.exp(log_tau), steady_state=steady_state)
 
-    return jax.jvp(response, (log_tau,), (jnp.ones_like(log_tau),))
+    def first(log_tau: Array) -> tuple[Array, ...]:
+        return jax.jvp(response, (log_tau,), (one,))
 
-
-def _by_terms(
-    circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], theta: Array, sampling: _Sampling
-) -> list[_Seen]:
-    """What each channel, the last being that which makes the force, shows, and its derivatives in the logarithms."""
-    return [_response(terms, sampling) for terms in _terms(circuit, free, channels, theta)]
-
-
-def _by_harmonics(
-    circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], theta: Array, sampling: _Sampling
-) -> list[_Seen]:
-    """As `_by_terms`, of a skin without time constants."""
-    of = jnp.asarray(sampling.time), jnp.asarray(sampling.slope), sampling.steady_state
-    values, slopes = _shown(circuit, free, channels, theta, sampling.drive, *of)
-    return [(np.asarray(value), np.asarray(slope)) for value, slope in zip(values, slopes, strict=True)]
+    if order == 1:
+        return first(log_tau)
+    values, slopes = jax.jvp(first, (log_tau,), (one,))
+    return (*values, slopes[1])
 
 
 @eqx.filter_jit
 def _shown(
     circuit: Circuit,
+    tied: Tied,
     free: tuple[str, ...],
     channels: tuple[Channel, ...],
     theta: Array,
@@ -325,7 +341,7 @@ def _shown(
     steady_state: bool,
 ) -> tuple[list[Array], list[Array]]:
     def shown(theta: Array) -> tuple[list[Array], list[Array]]:
-        there, gains = with_parameters(circuit, free, channels[:-1], theta)
+        there, gains = _there(circuit, tied, free, channels[:-1], theta)
         found = []
         for gain, channel in zip((*gains, 1.0), channels, strict=True):
             value, rate = response_and_rate(there, drive, time, steady_state=steady_state, channel=channel)
@@ -336,18 +352,21 @@ def _shown(
     return values, slopes
 
 
-def _response(channel: tuple[_Terms, _Terms], sampling: _Sampling) -> _Seen:
-    """What a channel shows, and its derivatives in the log-parameters.
+def _response(terms: Sequence[_Terms], sampling: _Sampling) -> list[np.ndarray]:
+    """What a channel shows, by its terms and their derivatives, and its derivatives in the log-parameters.
 
     Term by term, and the terms' derivatives apart: at once it takes ten times as long to compile.
     """
-    terms, slopes = (_Terms(*map(np.asarray, part)) for part in channel)
-    value, slope = sampling.slope * terms.rate, np.outer(sampling.slope, slopes.rate)
-    for k, weight in enumerate(terms.weight):
-        term = _highpass(
-            sampling.drive, jnp.asarray(sampling.time), jnp.asarray(terms.log_tau[k]), sampling.steady_state
-        )
-        u, change = (np.asarray(x) for x in term)
-        value = value + weight * u
-        slope = slope + np.outer(u, slopes.weight[k]) + np.outer(weight * change, slopes.log_tau[k])
-    return value, slope
+    time, found = jnp.asarray(sampling.time), [np.multiply.outer(sampling.slope, of.rate) for of in terms]
+    for k, (weight, log_tau) in enumerate(zip(terms[0].weight, terms[0].log_tau, strict=True)):
+        at = sampling.drive, time, jnp.asarray(log_tau), sampling.steady_state
+        u, du, *ddu = (np.asarray(x) for x in _highpass(*at, len(terms) - 1))
+        w, tau = terms[1].weight[k], terms[1].log_tau[k]
+        found[0] += weight * u
+        found[1] += np.outer(u, w) + np.outer(weight * du, tau)
+        if ddu:
+            both = np.outer(w, tau)
+            mixed = both + both.T + weight * terms[2].log_tau[k]
+            found[2] += np.multiply.outer(u, terms[2].weight[k]) + np.multiply.outer(du, mixed)
+            found[2] += np.multiply.outer(weight * ddu[0], np.outer(tau, tau))
+    return found

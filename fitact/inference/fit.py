@@ -15,7 +15,7 @@ from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.inference import compressed, derived, remarks, summary
 from fitact.inference.diagnostics import together
-from fitact.inference.expected import covariance_root
+from fitact.inference.expected import Experiment, covariance_root
 from fitact.inference.identifiability import Identifiability, assess
 from fitact.inference.laplace import Laplace
 from fitact.inference.least_squares import Solved, solve
@@ -51,6 +51,7 @@ class Fit(Laplace):
         warnings: sentences.
         compression_error: of the compressed log-likelihood near the optimum; None: samples are summed.
         scene: the first record's.
+        experiment: the measurement that was done, at the optimum.
     """
 
     traces: tuple[TraceFit, ...]
@@ -60,6 +61,7 @@ class Fit(Laplace):
     warnings: tuple[str, ...]
     compression_error: float | None
     scene: Scene
+    experiment: Experiment
 
     @property
     def record(self) -> Record:
@@ -338,18 +340,18 @@ def _judged(
         for note in (*source.notes, *remarks.on_trace(source.record, source.choice, trace.channel, trace.figures))
     ]
     on_all = remarks.on_parameters(likelihood, theta, scene is None)
+    experiment = problem.experiment(likelihood, theta, sigma)
     return Fit(
         theta=theta,
         covariance_root=root,
         traces=traces,
         result=verdict(solved, root, traces, problem.sources, optima),
         figures=figures,
-        identifiability=assess(
-            likelihood.names, root, likelihood.prior_root, force, problem.experiment(likelihood, theta, sigma)
-        ),
+        identifiability=assess(likelihood.names, root, likelihood.prior_root, force, experiment),
         warnings=tuple(dict.fromkeys([*on_traces, *misfits(traces), *on_all])),
         compression_error=certified.error,
         likelihood=likelihood,
         derive=derive,
         scene=given,
+        experiment=experiment,
     )

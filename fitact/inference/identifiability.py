@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from fitact.inference.expected import Experiment, Remedy, remedies
+from fitact.inference.changes import remedies
+from fitact.inference.expected import Experiment
 from fitact.inference.structure import Structure, blind_directions, gain_names, name_direction
+from fitact.inference.trial import Option
 from fitact.units import percent
 
 _IDENTIFIED = 0.9  # smallest prior-whitened eigenvalue from which the data speak in every direction
@@ -47,12 +49,12 @@ class Identifiability:
     force_sd: float
     force_contraction: float
     remedy: str
-    remedies: tuple[Remedy, ...]
+    remedies: tuple[Option, ...]
     channels: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """As in fit.json and summary.json."""
-        return dataclasses.asdict(self)
+        return dataclasses.asdict(self) | {"remedies": [remedy.to_dict() for remedy in self.remedies]}
 
     def __str__(self) -> str:
         names = list(self.blind_direction)
@@ -86,10 +88,11 @@ def assess(
     force_sd = float(np.linalg.norm(root.T @ force_gradient))
     free = [name for name in experiment.free if name not in gain_names(experiment.channels)]
     verdict, shares, direction, along = seen_directions(names, root, prior_root, free)
-    structural, remedy, offered = False, "", tuple[Remedy, ...]()
+    structural, remedy, offered = False, "", tuple[Option, ...]()
     if verdict != "identified":
+        known = [list(names).index(name) for name in experiment.free]
         structure = blind_directions(experiment.circuit, experiment.free, experiment.channels)
-        structural, offered = structure.hides(direction), remedies(experiment)
+        structural, offered = structure.hides(direction), remedies(experiment, force_gradient[known])
         remedy = _remedy(verdict, force_sd, offered, structure)
     return Identifiability(
         verdict=verdict,
@@ -133,8 +136,8 @@ def from_prior(root: np.ndarray, prior_root: np.ndarray, gradient: np.ndarray) -
     return float(moved @ moved / np.sum((root.T @ gradient) ** 2))
 
 
-def _remedy(verdict: str, force_sd: float, offered: tuple[Remedy, ...], structure: Structure) -> str:
-    figures = [f"± {percent(remedy.force_sd)} with {remedy.name}" for remedy in offered]
+def _remedy(verdict: str, force_sd: float, offered: tuple[Option, ...], structure: Structure) -> str:
+    figures = [f"± {percent(remedy.force_sd)} with {remedy.text}" for remedy in offered]
     remedy = (
         f"The mean force is known to ± {percent(force_sd)}; to be expected is {', '.join(figures[:-1])},"
         f" and {figures[-1]}."

@@ -91,7 +91,8 @@ class Problem(NamedTuple):
         gains = ("gain", "gain_I") if records == 1 else ()
         free = tuple(name for name in likelihood.prior.names if name in fields or name in gains)
         rows = [likelihood.prior.names.index(name) for name in free]
-        root, noise = likelihood.prior_root, {"I": source.scene.measurement.noise_I}
+        root, measured = likelihood.prior_root, source.scene.measurement
+        noise = {"Vsc": measured.noise_Vsc, "I": measured.noise_I}
         return Experiment(
             circuit=likelihood.circuit(jnp.asarray(theta)),
             free=free,
@@ -103,6 +104,7 @@ class Problem(NamedTuple):
             steady_state=source.choice.steady_state,
             records=float(records),
             geometry=source.scene.geometry(),
+            tied=likelihood.tied,
         )
 
 
