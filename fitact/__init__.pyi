@@ -3,6 +3,7 @@ from .data.inspection import Inspection, inspect
 from .data.record import Record
 from .errors import InputError
 from .inference.comparison import Comparison, compare
+from .inference.drive_design import DriveDesign, design_drive
 from .inference.fit import Fit, fit
 from .inference.population import Population, population
 from .inference.posterior import Posterior
@@ -32,6 +33,7 @@ __all__ = [
     "Contact",
     "DirectGround",
     "Dispersive",
+    "DriveDesign",
     "FinalCircuit",
     "Fit",
     "Fractional",
@@ -60,6 +62,7 @@ __all__ = [
     "WithSkin",
     "body_current",
     "compare",
+    "design_drive",
     "electrostatic_force",
     "fit",
     "friction",
