@@ -133,9 +133,9 @@ def test_a_cycle_is_scipys(name: str, settled):
 
 
 def one_finger(**values: float) -> People:
-    return People(
-        {name: np.array([[x]]) for name, x in ({"Rsc": R, "Csc": C, "Ci": CI} | values).items()}, "one finger"
-    )
+    """So often that one compiled program serves this and `LAWS`."""
+    finger = {"Rsc": R, "Csc": C, "Ci": CI} | values
+    return People({name: np.full((1, 512), x) for name, x in finger.items()}, "one finger")
 
 
 @pytest.fixture(scope="module")
@@ -281,7 +281,7 @@ def test_friction_changes_by_a_share_of_itself():
     few = fitact.design_drive(scene(perception={"friction_change": 2e-4}), one_finger()).options["sine"]
     fe = 2e-4 * 0.5 / (1.0 - 2e-4)
     assert few.assured == pytest.approx(sine_amplitude(F) * math.sqrt(fe / THRESHOLD), rel=1e-9)
-    never = fitact.design_drive(scene(perception={"friction_change": 1.0}), one_finger())
+    never = fitact.design_drive(scene(perception={"friction_change": 1.01}), one_finger())
     assert never.options["sine"].violations == ("too few feel it at any amplitude",)
     assert never.options["sine"].to_dict()["peak_to_peak"]["assured"] == math.inf
     assert "unbounded" in str(never)
@@ -355,3 +355,53 @@ def test_the_command_writes_what_it_prints(tmp_path: Path, capsys: pytest.Captur
     assert content["options"][2]["at_assured"]["current_peak"] is None  # unbounded at an ideal edge
     assert command("design", "drive", "paper") == 2
     assert "[perception] must state" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def eight() -> tuple[fitact.Population, fitact.DriveDesign]:
+    """Of ngspice's fingers."""
+    stated = scene(
+        drive=TRAPEZOID,
+        measurement={"channels": ["Vsc", "I"]},
+        prior={"Ci": {"relative_sd": 0.1}},
+        device={"breakdown_field": "500 V/um"},
+    )
+    people = fitact.population(
+        [fitact.read(path, stated) for path in sorted(FINGERS.glob("*.csv.gz"))], stated, seed=1, progress=False
+    )
+    return people, fitact.design_drive(stated, people, seed=1)
+
+
+@pytest.mark.slow
+def test_people_are_those_of_the_population(eight):
+    """What share of other fingers of the same laws feel a sine, by its closed form."""
+    people, design = eight
+    assert design.people.separated
+    assert design.trusted
+    white = np.random.default_rng(8).standard_normal((512, 400, 3))  # of the same laws
+    Rsc, Csc, Ci = np.moveaxis(np.exp(people.factors(white)), -1, 0)
+    s = 2j * np.pi * F
+    gain = np.abs(s * Rsc * Ci / (1.0 + s * Rsc * (2.0 * Ci + Csc)))
+    needed = np.sqrt(8.0 * THRESHOLD / (per_square(Csc, Ci) * gain**2))
+    option = design.options["sine"]
+    for mine, q in zip(option.people, (0.05, 0.25, 0.5, 0.75, 0.95), strict=True):
+        assert np.mean(needed <= mine) == pytest.approx(q, abs=0.005)
+    off = np.log(np.quantile(needed, 0.95, axis=1, method="hazen") / option.amplitude)
+    assert np.mean(off) == pytest.approx(0.0, abs=0.01)
+    assert np.std(off) < 0.2 * np.std(np.log(option.amplitude))
+
+
+@pytest.mark.slow
+def test_areas_scale_capacitances_up_and_resistance_down(eight):
+    people, _ = eight
+
+    class Area:
+        fits, trusted = people.fits, True
+
+        @staticmethod
+        def factors(white: np.ndarray) -> np.ndarray:
+            return np.concatenate([people.factors(white), np.full((*white.shape[:2], 1), math.log(2.0))], axis=-1)
+
+    plain, double = People.of_population(people), People.of_population(Area)
+    for name, factor in {"Rsc": 0.5, "Csc": 2.0, "Ci": 2.0}.items():
+        np.testing.assert_allclose(double.values[name], factor * plain.values[name], rtol=1e-12)

@@ -75,13 +75,9 @@ class DriveDesign:
     def smallest(self) -> dict[str, str | None]:
         """The waveform that takes least, of those that keep the limits, by amplitude and by power; None: none does."""
         kept = {name: option for name, option in self.options.items() if not option.violations}
-        takes = {
-            "peak_to_peak": {name: option.assured for name, option in kept.items()},
-            "real_power": {name: float(option.at_assured.real_power) for name, option in kept.items()},
-            "apparent_power": {name: float(option.at_assured.apparent_power) for name, option in kept.items()},
+        return {
+            what: min(kept, key=lambda name: kept[name].takes(what)) if kept else None for what in DriveOption.CRITERIA
         }
-        finite = {what: {k: x for k, x in of.items() if math.isfinite(x)} for what, of in takes.items()}
-        return {what: min(of, key=of.__getitem__) if of else None for what, of in finite.items()}
 
     def curve(self, waveform: str) -> dict[str, Float[np.ndarray, " amplitudes"]]:
         """The drive curve: peak-to-peak amplitude (V), and the share who feel it: quantiles over the laws."""
@@ -135,6 +131,7 @@ class DriveDesign:
 
     def summary(self) -> str:
         """A table for people."""
+        smallest = self.smallest()
         here = engineering(self.options[self.own].frequency, "Hz", 3)
         titles = "".join(f"{title:>11}" for title in ("assured", "real", "apparent", "rms", "peak", "insulator"))
         rows = [
@@ -145,8 +142,10 @@ class DriveDesign:
             " by the median finger, current and insulator's voltage at most",
         ]
         rows += [f"{name}: excluded, {each}" for name, option in self.options.items() for each in option.violations]
-        for criterion, smallest in self.smallest().items():
-            rows.append(f"smallest {criterion.replace('_', ' ')}: {smallest or 'no waveform keeps the limits'}")
+        for what, unit in DriveOption.CRITERIA.items():
+            name = smallest[what]
+            least = name and f"{name}, {shown(self.options[name].takes(what), unit)}"
+            rows.append(f"smallest {what.replace('_', ' ')}: {least or 'no waveform keeps the limits'}")
         best = {name: min(options, key=lambda option: option.assured) for name, options in self.by_frequency.items()}
         at = (f"{name} {engineering(o.frequency, 'Hz', 3)} ({shown(o.assured, 'V')})" for name, o in best.items())
         rows += [f"easiest frequency of 10 Hz to 1 kHz, with the same threshold at all: {', '.join(at)}"]

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -42,6 +42,8 @@ class DriveOption:
             and the currents the largest of all fingers.
     """
 
+    CRITERIA: ClassVar[dict[str, str]] = {"peak_to_peak": "V", "real_power": "W", "apparent_power": "VA"}
+
     waveform: str
     frequency: float
     device: Device
@@ -69,6 +71,10 @@ class DriveOption:
     def assured(self) -> float:
         """The peak-to-peak amplitude that meets the share with a probability of `ASSURANCE`, V."""
         return float(quantile(self.amplitude, ASSURANCE))
+
+    def takes(self, what: str) -> float:
+        """The assured amplitude, or a power there, by the names of `CRITERIA` and in their units."""
+        return self.assured if what == "peak_to_peak" else float(getattr(self.at_assured, what))
 
     @property
     def breakdown_voltage(self) -> float | None:

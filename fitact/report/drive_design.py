@@ -52,11 +52,20 @@ def _figure(design: DriveDesign) -> Figure:
     return figure
 
 
+def _own_first(design: DriveDesign) -> list[str]:
+    return sorted(design.options, key=lambda name: name != design.own)
+
+
+def _width(design: DriveDesign, name: str) -> float:
+    """So that another wave on top of the scene's own hides it not."""
+    return 3.0 if name == design.own else 1.3
+
+
 def _draw_curves(axes: Axes, design: DriveDesign) -> None:
-    for name in design.options:
+    for name in _own_first(design):
         curve = design.curve(name)
         title = f"{name}, the scene's" if name == design.own else name
-        axes.plot(curve["peak_to_peak"], curve["q50"], color=_COLORS[name], label=title)
+        axes.plot(curve["peak_to_peak"], curve["q50"], color=_COLORS[name], lw=_width(design, name), label=title)
         axes.fill_between(curve["peak_to_peak"], curve["q05"], curve["q95"], color=_COLORS[name], alpha=0.2, lw=0)
     axes.axhline(design.share, color=_LIMIT, lw=1.0, ls="--")
     axes.set_xscale("log")
@@ -68,7 +77,8 @@ def _draw_curves(axes: Axes, design: DriveDesign) -> None:
 
 
 def _draw_frequencies(axes: Axes, design: DriveDesign) -> None:
-    for name, options in design.by_frequency.items():
+    for name in _own_first(design):
+        options = design.by_frequency[name]
         frequency = [option.frequency for option in options]
         if name == design.own:
             people = np.stack([_drawn(option.people) for option in options])
@@ -77,7 +87,8 @@ def _draw_frequencies(axes: Axes, design: DriveDesign) -> None:
                     frequency, people[:, low], people[:, high], color=_COLORS[name], alpha=0.18, lw=0, label=label
                 )
         median = [float(quantile(option.amplitude, 0.5)) for option in options]
-        axes.plot(frequency, _drawn(median), color=_COLORS[name], label=f"{100.0 * design.share:g} %, {name}")
+        title = f"{100.0 * design.share:g} %, {name}"
+        axes.plot(frequency, _drawn(median), color=_COLORS[name], lw=_width(design, name), label=title)
     axes.set_xscale("log")
     axes.set_yscale("log")
     _log_ticks(axes.xaxis, "Hz")
