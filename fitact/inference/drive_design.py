@@ -4,7 +4,6 @@ Vsc is linear in the drive and the force quadratic, so one response at 1 Vpp giv
 """
 
 import dataclasses
-import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -149,7 +148,7 @@ class DriveDesign:
         best = {name: min(options, key=lambda option: option.assured) for name, options in self.by_frequency.items()}
         at = (f"{name} {engineering(o.frequency, 'Hz', 3)} ({shown(o.assured, 'V')})" for name, o in best.items())
         rows += [f"easiest frequency of 10 Hz to 1 kHz, with the same threshold at all: {', '.join(at)}"]
-        rows += [_thinnest(self.by_thickness)]
+        rows += [f"{self.own}, {_thinnest(self.by_thickness)}"]
         return "\n".join([*rows, *(f"warning: {warning}" for warning in self.warnings)])
 
     __str__ = summary
@@ -213,7 +212,7 @@ def design_drive(
     if people is None:
         people = People.of_prior(scene, seed)
     elif isinstance(people, Population):
-        people = People.of_population(people, seed)
+        people = People.of_population(people, scene, seed)
     bench = _Bench(scene, people, share)
     own, here = scene.drive.waveform, scene.drive.slowest
     names = tuple(name for name in COMPARED if name != "trapezoid" or scene.drive.rise_time is not None)
@@ -245,16 +244,17 @@ class _Bench:
         self, waveform: str, frequency: float, *, thickness: float | None = None, permittivity: float | None = None
     ) -> tuple[DriveOption, Float[np.ndarray, "laws fingers"]]:
         """A drive on an insulator (m, relative; None: the scene's), and the amplitude that each finger needs, V."""
-        changed = {"insulator_thickness": thickness, "insulator_permittivity": permittivity}
         own = self.scene.device
-        device = own.model_copy(update={name: value for name, value in changed.items() if value is not None})
+        thickness = own.insulator_thickness if thickness is None else thickness
+        permittivity = own.insulator_permittivity if permittivity is None else permittivity
         # eq. (3), from whatever Ci the scene or the people have
-        ratio = device.insulator_permittivity / own.insulator_permittivity
-        ratio *= own.insulator_thickness / device.insulator_thickness
+        ratio = permittivity / own.insulator_permittivity * (own.insulator_thickness / thickness)
+        layer = {"insulator_thickness": thickness, "insulator_permittivity": permittivity, "Ci": ratio * own.Ci}
+        device = own.model_copy(update=layer)
         drive = _unit(self.scene.drive).model_copy(update={"waveform": waveform}).make()
         assert isinstance(drive, Periodic)
         drive = eqx.tree_at(lambda wave: wave.frequency, drive, frequency)
-        found = self._cycles(drive, device.insulator_thickness, ratio)
+        found = self._cycles(drive, thickness, ratio)
         needed = _needed(self.scene, found)
         return DriveOption.of(waveform, frequency, device, needed, found, self.share), needed
 
