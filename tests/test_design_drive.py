@@ -132,6 +132,26 @@ def test_a_cycle_is_scipys(name: str, settled):
     assert found.apparent_power == pytest.approx(math.sqrt(mean(seen["V"] ** 2)) * rms, rel=1e-6)
 
 
+def test_peaks_between_corners_are_found():
+    """A triangle's, exactly elsewhere; and of two tones, on a fine grid."""
+    with jax.enable_x64(True):
+        contact = fitact.Contact.from_capacitances(CI, C, AREA, TI, TSC)
+        circuit, triangle = CIRCUITS["direct"][0], fitact.Triangle(360.0, F)
+        found = jax.jit(lambda: cycle(circuit, triangle, contact))()
+        exact = jax.jit(lambda: fitact.body_current(circuit, triangle))()
+        assert found.current_peak == pytest.approx(float(exact.peak), rel=1e-4)
+        tones = fitact.Multitone(F, (1, 7), (100.0, 30.0), (0.3, 1.0), offset=20.0)
+        found = jax.jit(lambda: cycle(circuit, tones, contact))()
+        s = 2j * np.pi * F * np.array([1, 7])
+        whole = sum(R0 / (1.0 + s * R0 * C0) for R0, C0 in CIRCUITS["direct"][1]) + 40e3 + 1.0 / (s * CI)
+        turns = np.exp(1j * (np.outer([1, 7], np.linspace(0.0, 2.0 * np.pi, 50_001)) + np.array([[0.3], [1.0]])))
+        current = np.imag((np.array([100.0, 30.0]) / whole) @ turns)
+        over = 20.0 + np.imag((np.array([100.0, 30.0]) / whole / (s * CI)) @ turns)
+        assert found.current_peak == pytest.approx(np.abs(current).max(), rel=1e-4)
+        assert found.insulator_peak == pytest.approx(np.abs(over).max(), rel=1e-4)
+        assert found.current_rms == pytest.approx(math.sqrt(np.mean(current[:-1] ** 2)), rel=1e-9)
+
+
 def one_finger(**values: float) -> People:
     """So often that one compiled program serves this and `LAWS`."""
     finger = {"Rsc": R, "Csc": C, "Ci": CI} | values
