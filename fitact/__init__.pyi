@@ -5,6 +5,7 @@ from .data.spectrum import Spectrum, read_spectrum
 from .errors import InputError
 from .inference.comparison import Comparison, compare
 from .inference.design import MeasurementDesign, design_measurement
+from .inference.drive_design import DriveDesign, design_drive
 from .inference.fit import Fit, fit
 from .inference.population import Population, population
 from .inference.posterior import Posterior
@@ -35,6 +36,7 @@ __all__ = [
     "Contact",
     "DirectGround",
     "Dispersive",
+    "DriveDesign",
     "FinalCircuit",
     "Fit",
     "Fractional",
@@ -67,6 +69,7 @@ __all__ = [
     "body_current",
     "compare",
     "design_measurement",
+    "design_drive",
     "electrostatic_force",
     "fit",
     "fit_spectrum",

@@ -1,4 +1,4 @@
-"""Commands on what to do next: which measurement would tell most."""
+"""Commands on what to do next: which measurement would tell most, which drive is felt."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,11 +6,15 @@ from typing import Annotated
 import typer
 
 from fitact.cli.app import app
-from fitact.cli.options import Channels, Json, Out, Scales, mapping
+from fitact.cli.options import Channels, Json, Out, Scales, Seed, mapping
 from fitact.cli.terminal import finish, show, use_compilation_cache
 from fitact.files import write_json
 
-design = typer.Typer(name="design", no_args_is_help=True, help="What to do next: which measurement would tell most.")
+design = typer.Typer(
+    name="design",
+    no_args_is_help=True,
+    help="What to do next: which measurement would tell most, which drive enough people feel.",
+)
 app.add_typer(design)
 
 
@@ -48,5 +52,49 @@ def measurement(
 
         write_json(out / "design.json", found.to_dict())
         write_design(out / "design.svg", found)
+    show(str(found), found.to_dict(), json)
+    finish(found.trusted)
+
+
+@design.command()
+def drive(
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Scene (TOML): panel, drive, threshold and limits.")],
+    records: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[RECORD]...", help="One of each finger; absent: the scene's prior stands for people."),
+    ] = None,
+    share: Annotated[float, typer.Option("--share", help="Of people, who are to feel it.")] = 0.95,
+    channel: Channels = None,
+    scale: Scales = None,
+    out: Out = None,
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """The smallest drive that enough people feel: by waveform, frequency and insulator, within stated limits.
+
+    Into DIR it writes drive.json and drive.svg.
+    """
+    from fitact.model.scene import Scene
+
+    stated, asked, measured = Scene.load(scene), mapping((channel, scale)), []
+    if records:
+        from fitact.data.formats import read
+
+        measured = [read(path, stated, **asked) for path in records]
+    use_compilation_cache()
+    from fitact.inference.drive_design import design_drive, require_designable
+
+    require_designable(stated, share)  # before the people are sampled
+    people = None
+    if measured:
+        from fitact.inference.population import population
+
+        people = population(measured, stated, seed=seed)
+    found = design_drive(stated, people, share, seed=seed)
+    if out is not None:
+        from fitact.report.drive_design import write_drive_design
+
+        write_json(out / "drive.json", found.to_dict())
+        write_drive_design(out / "drive.svg", found)
     show(str(found), found.to_dict(), json)
     finish(found.trusted)

@@ -66,6 +66,8 @@ if TYPE_CHECKING:
     AnySecond: TypeAlias = float
     Newton: TypeAlias = float
     Threshold: TypeAlias = float
+    VoltPerMeter: TypeAlias = float
+    Ampere: TypeAlias = float
 else:
     Ohm = _quantity("ohm", gt=0)
     Farad = _quantity("F", gt=0)
@@ -83,6 +85,8 @@ else:
     AnySecond = _quantity("s")
     Newton = _quantity("N", ge=0)
     Threshold = _quantity("N", gt=0)
+    VoltPerMeter = _quantity("V/m", gt=0)
+    Ampere = _quantity("A", gt=0)
 
 
 class Section(pydantic.BaseModel):
@@ -98,6 +102,9 @@ class Device(Section):
     insulator_thickness: Meter = 1e-6
     insulator_permittivity: Permittivity = 3.9
     contact_area: SquareMeter = 1e-4
+    breakdown_field: VoltPerMeter | None = None
+    current_limit_rms: Ampere | None = None
+    current_limit_peak: Ampere | None = None
 
     @model_validator(mode="after")
     def _capacitance_of_the_layer(self) -> Self:

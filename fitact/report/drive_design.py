@@ -1,0 +1,146 @@
+"""A drive's design as a picture: who feels it, at which frequency, on which insulator."""
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, PercentFormatter
+
+from fitact.files import replacing
+from fitact.inference.drive_design import DriveDesign
+from fitact.inference.drive_option import DriveOption, quantile
+from fitact.report.plots import style
+
+_COLORS = {
+    "sine": "#0072B2",
+    "triangle": "#009E73",
+    "square": "#CC79A7",
+    "trapezoid": "#333333",
+    "multitone": "#56B4E9",
+}
+_LIMIT, _CURRENT = "#D55E00", "#E69F00"
+
+
+def write_drive_design(path: str | os.PathLike[str], design: DriveDesign) -> None:
+    """Draw the drive curves and the amplitude that is needed, as SVG at `path`.
+
+    Raises:
+        InputError: the place cannot be written.
+    """
+    with mpl.rc_context(style()), replacing(Path(path)) as temporary:
+        _figure(design).savefig(temporary, format="svg", metadata={"Date": None})
+
+
+def _figure(design: DriveDesign) -> Figure:
+    figure = Figure(figsize=(11.0, 8.0), layout="constrained")
+    (curves, frequencies), (thicknesses, permittivities) = figure.subplots(2, 2)
+    _draw_curves(curves, design)
+    _draw_frequencies(frequencies, design)
+    _draw_insulators(thicknesses, design, design.by_thickness, lambda o: o.device.insulator_thickness)
+    thicknesses.set_xscale("log")
+    thicknesses.set_xlabel("insulator thickness")
+    _log_ticks(thicknesses.xaxis, "m", (1.0,))
+    thicknesses.legend(fontsize=9)
+    _draw_insulators(permittivities, design, design.by_permittivity, lambda o: o.device.insulator_permittivity)
+    permittivities.set_xlabel("insulator's relative permittivity")
+    return figure
+
+
+def _own_first(design: DriveDesign) -> list[str]:
+    return sorted(design.options, key=lambda name: name != design.own)
+
+
+def _width(design: DriveDesign, name: str) -> float:
+    """So that another wave on top of the scene's own hides it not."""
+    return 3.0 if name == design.own else 1.3
+
+
+def _draw_curves(axes: Axes, design: DriveDesign) -> None:
+    for name in _own_first(design):
+        curve = design.curve(name)
+        title = f"{name}, the scene's" if name == design.own else name
+        axes.plot(curve["peak_to_peak"], curve["q50"], color=_COLORS[name], lw=_width(design, name), label=title)
+        axes.fill_between(curve["peak_to_peak"], curve["q05"], curve["q95"], color=_COLORS[name], alpha=0.2, lw=0)
+    axes.axhline(design.share, color=_LIMIT, lw=1.0, ls="--")
+    axes.set_xscale("log")
+    _log_ticks(axes.xaxis, "V")
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+    axes.set_xlabel("peak-to-peak amplitude")
+    axes.set_ylabel("people who feel it" + (" (band: 90 %)" if design.people.separated else ""))
+    axes.legend(fontsize=9)
+
+
+def _draw_frequencies(axes: Axes, design: DriveDesign) -> None:
+    for name in _own_first(design):
+        options = design.by_frequency[name]
+        frequency = [option.frequency for option in options]
+        if name == design.own:
+            people = np.stack([_drawn(option.people) for option in options])
+            for low, high, label in ((0, 4, f"90 % of people, {name}"), (1, 3, f"50 %, {name}")):
+                axes.fill_between(
+                    frequency, people[:, low], people[:, high], color=_COLORS[name], alpha=0.18, lw=0, label=label
+                )
+        median = [float(quantile(option.amplitude, 0.5)) for option in options]
+        title = f"{100.0 * design.share:g} %, {name}"
+        axes.plot(frequency, _drawn(median), color=_COLORS[name], lw=_width(design, name), label=title)
+    axes.set_xscale("log")
+    _log_ticks(axes.xaxis, "Hz")
+    _volts(axes)
+    axes.set_xlabel("frequency of the drive")
+    axes.set_ylabel("peak-to-peak amplitude needed")
+    axes.legend(fontsize=9)
+
+
+def _draw_insulators(
+    axes: Axes, design: DriveDesign, options: Sequence[DriveOption], place: Callable[[DriveOption], float]
+) -> None:
+    at, color = [place(option) for option in options], _COLORS[design.own]
+    low, median, high = (_drawn([float(quantile(o.amplitude, q)) for o in options]) for q in (0.05, 0.5, 0.95))
+    axes.fill_between(at, low, high, color=color, alpha=0.25, lw=0)
+    axes.plot(at, median, ".-", color=color, label=f"{100.0 * design.share:g} % need")
+    for what, limit, shade in (
+        ("the insulator breaks down", [_allowed(o, "insulator_peak", o.breakdown_voltage) for o in options], _LIMIT),
+        ("rms current's limit", [_allowed(o, "current_rms", o.device.current_limit_rms) for o in options], _CURRENT),
+        (
+            "peak current's limit",
+            [_allowed(o, "current_peak", o.device.current_limit_peak) for o in options],
+            "#999999",
+        ),
+    ):
+        if np.any(np.isfinite(limit)):
+            axes.plot(at, limit, color=shade, lw=1.5, ls="--", label=what)
+    _volts(axes)
+    axes.set_ylabel(f"peak-to-peak amplitude, {design.own}")
+
+
+def _allowed(option: DriveOption, what: str, limit: float | None) -> float:
+    """The amplitude at which a limit is met, V: all are linear in it."""
+    reached = float(getattr(option.at_assured, what))
+    return np.nan if limit is None or not np.isfinite(reached) else option.assured * limit / reached
+
+
+def _drawn(amplitude: Sequence[float] | Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """With a gap where it is infinite."""
+    values = np.asarray(amplitude, dtype=float)
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def _volts(axes: Axes) -> None:
+    if not np.isfinite(axes.dataLim.ymin):
+        axes.set_yticks([])
+        axes.text(0.5, 0.5, "too few feel it at any amplitude", transform=axes.transAxes, ha="center")
+        return
+    axes.set_yscale("log")
+    _log_ticks(axes.yaxis, "V")
+
+
+def _log_ticks(axis: Axis, unit: str, subs: tuple[float, ...] = (1.0, 2.0, 5.0)) -> None:
+    axis.set_major_locator(LogLocator(subs=subs))
+    axis.set_major_formatter(EngFormatter(unit))
+    axis.set_minor_formatter(NullFormatter())
