@@ -13,6 +13,7 @@ from data_synth.errors import RecipeError
 from data_synth.recipe import UNITS
 
 Columns = Mapping[str, np.ndarray]
+_UNITS = {"time": "s", **UNITS}
 
 
 def write_record(path: Path, time: np.ndarray, channels: Columns) -> None:
@@ -24,8 +25,7 @@ def write_record(path: Path, time: np.ndarray, channels: Columns) -> None:
     write = _FORMATS.get(format_of(path))
     if write is None:
         raise RecipeError(f"{path}: no format of that name; end it in {', '.join(_FORMATS)}")
-    columns = {"time_s": time} | {f"{name}_{UNITS[name]}": values for name, values in channels.items()}
-    _replacing(path, lambda file: write(file, columns))
+    _replacing(path, lambda file: write(file, {"time": time, **channels}))
 
 
 def format_of(path: Path) -> str:
@@ -41,7 +41,7 @@ def write_json(path: Path, content: Any) -> None:
 
 def _csv(columns: Columns) -> bytes:
     """Times to their last digit, values to nine."""
-    rows = [",".join(columns)]
+    rows = [",".join(f"{name}_{_UNITS[name]}" for name in columns)]
     for time, *values in zip(*(each.tolist() for each in columns.values()), strict=True):
         rows.append(",".join([repr(time), *(f"{value:.9g}" for value in values)]))
     return ("\n".join(rows) + "\n").encode()
@@ -64,6 +64,7 @@ def _h5(file: IO[bytes], columns: Columns) -> None:
     with h5py.File(file, "w") as content:
         for name, values in columns.items():
             content[name] = values
+            content[name].attrs["units"] = _UNITS[name]
 
 
 _FORMATS: dict[str, Callable[[IO[bytes], Columns], Any]] = {

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.integrate
+from scipy.special import expit
 
 from data_synth.drive import Drive
 from data_synth.errors import RecipeError
@@ -49,7 +50,7 @@ class Skin(NamedTuple):
         change = self.system.A @ states[:size] + self.system.B @ np.append(voltage, current)
         if not self.remembers:
             return change
-        wanted = 1.0 / (1.0 + np.exp((self.law["threshold"] - np.abs(v)) / self.law["width"]))
+        wanted = expit((np.abs(v) - self.law["threshold"]) / self.law["width"])
         return np.append(change, (wanted - states[size:]) / self.law["time_constant"])
 
 

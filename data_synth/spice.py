@@ -46,13 +46,14 @@ def spice_response(
         begin -= drive.period * np.ceil(_SETTLED * slowest / drive.period)
     end = float(time.max()) + 2.0 * _JUMP
     step = float(np.median(np.diff(np.unique(time)))) / _STEPS
+    kept = max(float(time.min()) - begin - 2.0 * step, 0.0)
     skin = ",".join(str(node) for node in circuit.skin if node)
     deck = ["* a finger", f"Vdrive 99 0 PWL({_points(drive, begin, end)})", "Vmeter 99 1 0"]
     deck += [f"{each.kind}{n} {each.start} {each.end} {each.value:.15g}" for n, each in enumerate(circuit.branches)]
     deck += _extra(circuit, law)
-    deck += [".options reltol=1e-6 abstol=1e-15 vntol=1e-9 method=gear", ".control"]
+    deck += [".options reltol=1e-6 abstol=1e-15 vntol=1e-9 trtol=1 method=gear", ".control"]
     deck += ["set wr_vecnames", "set wr_singlescale", "set numdgt=12"]
-    deck += [f"tran {step:.12g} {end - begin:.15g} {time.min() - begin:.15g} {step:.12g} uic"]
+    deck += [f"tran {step:.12g} {end - begin:.15g} {kept:.15g} {step:.12g} uic"]
     deck += [f"wrdata out.txt v(1) v({skin}) i(Vmeter)"]
     table = _run([*deck, "quit", ".endc", ".end"])
     # at a jump the value after it is wanted
