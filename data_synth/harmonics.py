@@ -28,8 +28,10 @@ def harmonic_response(
     of harmonics holds what the skin differs from it by.
 
     Raises:
-        RecipeError: the drive does not repeat.
+        RecipeError: the drive does not repeat, or jumps, for which a fractional skin would need far more harmonics.
     """
+    if skin["level"] == "fractional" and drive.jumps:
+        raise RecipeError("[skin] level = 'fractional' takes no drive that jumps here; give it a rise time (trapezoid)")
     if drive.period is None:
         raise RecipeError(
             f"[skin] level = '{skin['level']}' has a steady state only; give it a drive that repeats, not from rest"

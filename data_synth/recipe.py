@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from data_synth.errors import RecipeError
 from data_synth.keys import Choice, Key, Listed, Quantity, Table, Whole, checked, read_toml
+from data_synth.scene import KEYS as SCENE
 from data_synth.scene import Scene, make_scene
 
 UNITS = {"V": "V", "Vsc": "V", "I": "A"}
@@ -79,14 +80,17 @@ def load(path: Path) -> Recipe:
     Raises:
         RecipeError: naming file, section, key and remedy.
     """
-    content = read_toml(path)
-    if not isinstance(content.get("scene"), str):
-        if "scene" in content:
-            raise RecipeError(f"{path}: scene = {content['scene']!r} is not the path of a scene file; write one")
-        content = {"scene": path.name, "truth": {}} | {"of": content}
-    scene_path = path.parent / content["scene"]
-    tables = content.pop("of", None) or read_toml(scene_path)
-    scene = make_scene(tables, content.get("truth", {}), str(scene_path))
+    content, scene_path = read_toml(path), path
+    if "scene" in content:
+        scene_path = path.parent / str(content["scene"])
+        tables = read_toml(scene_path)
+    else:
+        tables, content = content, {}
+    truth = content.get("truth", {})
+    if not isinstance(truth, dict):
+        raise RecipeError(f"{path}: truth is not a table; write [truth.skin] and the like")
+    checked(truth, SCENE, f"{path}, truth")
+    scene = make_scene(tables, truth, str(scene_path))
     rest = {name: part for name, part in content.items() if name not in _TOP}
     parts = checked(rest, KEYS, str(path))
     top = checked({"recipe": {k: content[k] for k in ("seed", "route") if k in content}}, _RECIPE, str(path))["recipe"]

@@ -86,7 +86,6 @@ def make_scene(content: Mapping[str, Any], truth: Mapping[str, Any], place: str)
     Raises:
         RecipeError: an unknown key, a value that is not possible, or keys that need others.
     """
-    checked(truth, KEYS, f"{place}: truth")
     merged = {name: {**content.get(name, {}), **truth.get(name, {})} for name in {**content, **truth}}
     scene = checked(merged, KEYS, place)
     device, drive, skin = scene["device"], scene["drive"], scene["skin"]

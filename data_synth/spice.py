@@ -16,7 +16,9 @@ from data_synth.network import Network, state_space
 _JUMP = 1e-9  # s, that an ideal jump takes here
 _POINTS = 32  # of the source in a step of a drive that is not straight: 512 in a cycle
 _SETTLED = 16.0  # slowest time constants before a steady state: 1e-7 is left
+_STILL = 1e-9  # of the fastest rate: that of a charge which nothing moves
 _STEPS = 4  # of time in one of the record's
+_LONG = 600  # s
 
 
 def found() -> bool:
@@ -42,8 +44,9 @@ def spice_response(
         raise RecipeError("ngspice is not installed; install it (apt-get install ngspice), or take route = 'scipy'")
     begin = min(float(time.min()), 0.0)
     if drive.period:
-        slowest = -1.0 / np.max(np.linalg.eigvalsh(state_space(circuit).A))
-        begin -= drive.period * np.ceil(_SETTLED * slowest / drive.period)
+        rates = -np.linalg.eigvalsh(state_space(circuit).A)
+        slowest = np.min(rates[rates > _STILL * np.max(rates)])
+        begin -= drive.period * np.ceil(_SETTLED / slowest / drive.period)
     end = float(time.max()) + 2.0 * _JUMP
     step = float(np.median(np.diff(np.unique(time)))) / _STEPS
     kept = max(float(time.min()) - begin - 2.0 * step, 0.0)
@@ -55,7 +58,7 @@ def spice_response(
     deck += ["set wr_vecnames", "set wr_singlescale", "set numdgt=12"]
     deck += [f"tran {step:.12g} {end - begin:.15g} {kept:.15g} {step:.12g} uic"]
     deck += [f"wrdata out.txt v(1) v({skin}) i(Vmeter)"]
-    table = _run([*deck, "quit", ".endc", ".end"])
+    table = _run([*deck, "quit", ".endc", ".end"], end - begin)
     # at a jump the value after it is wanted
     wanted = time - begin + (2.0 * _JUMP if drive.jumps else 0.0)
     voltage, Vsc, current = (np.interp(wanted, table[:, 0], table[:, column]) for column in (1, 2, 3))
@@ -92,12 +95,19 @@ def _extra(circuit: Network, law: Mapping[str, Any] | None) -> list[str]:
     return found
 
 
-def _run(deck: list[str]) -> np.ndarray:
+def _run(deck: list[str], end: float) -> np.ndarray:
+    """What the deck writes, which must reach `end` (s)."""
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "deck.cir").write_text("\n".join(deck) + "\n")
-        ran = subprocess.run(["ngspice", "-b", "deck.cir"], cwd=folder, capture_output=True, text=True, timeout=600)
+        try:
+            ran = subprocess.run(
+                ["ngspice", "-b", "deck.cir"], cwd=folder, capture_output=True, text=True, timeout=_LONG
+            )
+        except subprocess.TimeoutExpired:
+            raise RecipeError(f"ngspice took longer than {_LONG} s; record less, or take route = 'scipy'") from None
         out = Path(folder, "out.txt")
-        if not out.exists():
+        table = np.loadtxt(out, skiprows=1) if out.exists() else np.empty((0, 4))
+        if not table.size or table[-1, 0] < end * (1.0 - 1e-9):
             said = (ran.stderr.strip() or ran.stdout.strip() or "no reason given").splitlines()[-1]
             raise RecipeError(f"ngspice did not finish ({said}); take route = 'scipy'")
-        return np.loadtxt(out, skiprows=1)
+        return table

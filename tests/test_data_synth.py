@@ -200,10 +200,15 @@ def test_a_dispersive_skin(frequency: float, values: tuple[float, float]):
     np.testing.assert_allclose(vsc, 180.0 * (gain * np.exp(1j * omega * time)).imag, atol=1e-9)
 
 
+def test_a_fractional_skin_takes_no_jumps():
+    with pytest.raises(RecipeError, match="rise time"):
+        respond(even(), skin={"level": "fractional"})
+
+
 def test_levels_of_frequency_have_no_transient():
     for level in ("fractional", "dispersive"):
         with pytest.raises(RecipeError, match="steady state"):
-            respond(even(), skin={"level": level}, drive={"steady_state": False})
+            respond(even(), skin={"level": level}, drive={"waveform": "sine", "steady_state": False})
 
 
 TRAPEZOID = {"waveform": "trapezoid", "rise_time": "50 us"}
@@ -255,6 +260,7 @@ SPICE: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
             "measurement": {"series_resistor": 1e5, "probe_resistance": 10e6, "probe_capacitance": 10e-12},
         },
     ),
+    "gap that does not conduct": ({}, {"drive": TRAPEZOID, "gap": {"capacitance": "2 nF"}}),
     "burst of sines": ({}, {"drive": {"waveform": "burst", "shape": "sine", "frequency": 200.0, "cycles": 2}}),
     "two layers": ({"model": "two layers", "Rsc_2": 20e3, "Csc_2": 50e-9}, {"drive": TRAPEZOID}),
     "nonlinear": ({"model": "nonlinear", "half_voltage": 10.0}, {"drive": TRAPEZOID}),

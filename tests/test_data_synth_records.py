@@ -104,9 +104,13 @@ def test_lost_samples_take_their_times_along(tmp_path: Path):
 # ------------------------------------------------------------------ recipes
 
 
-def written(folder: Path, text: str, tables: str = '[drive]\nwaveform = "triangle"\n') -> recipe.Recipe:
+TRIANGLE = '[drive]\nwaveform = "triangle"\n[measurement]\nsampling_rate = "20 kHz"\n'
+
+
+def written(folder: Path, text: str, tables: str = TRIANGLE) -> recipe.Recipe:
     (folder / "scene.toml").write_text(tables)
-    (folder / "some.recipe.toml").write_text(f'scene = "scene.toml"\n{text}')
+    named = text if text.startswith("scene") else f'scene = "scene.toml"\n{text}'
+    (folder / "some.recipe.toml").write_text(named)
     return recipe.load(folder / "some.recipe.toml")
 
 
@@ -163,6 +167,8 @@ BAD = {
     ),
     "unknown section": ("[noise]\nVsc = 1", "", "[noise] is not a section"),
     "unknown truth": ("[truth.skin]\nRcs = 3", "", "[skin] Rcs is not a key; did you mean 'Rsc'"),
+    "no truth": ("truth = 3", "", "truth is not a table"),
+    "no scene": ('scene = "other.toml"', "", "other.toml: cannot be read"),
     "unknown key": ("[white]\nVcs = 1", "", "[white] Vcs is not a key; did you mean 'Vsc'"),
     "another dimension": ('[white]\nVsc = "3 ohm"', "", "is no number with a unit of V"),
     "negative": ("[white]\nVsc = -1", "", "must be at least 0"),
