@@ -1,6 +1,7 @@
 """python -m data_synth: records from scenes and recipes."""
 
 import argparse
+import os
 import shlex
 import sys
 from pathlib import Path
@@ -22,6 +23,7 @@ def main() -> int:
         command.add_argument("--out", type=Path, required=True, help="folder for NAME.csv.gz and NAME.json")
     chosen = parser.parse_args()
 
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads would wait for each other
     from data_synth.errors import RecipeError  # what follows takes a second to import
 
     try:

@@ -80,7 +80,8 @@ def _record(recipe: Recipe, scene: Scene, finger: int) -> Synthetic:
         raise RecipeError(f"{recipe.name}: duration times sampling_rate is {count:,} samples; give 2 to 10,000,000")
     time = np.arange(count) / measured["sampling_rate"]
     taken = imperfections.instants(time, parts["clock"], recipe.seed, finger)
-    found = dict(zip(UNITS, respond(scene, parts["skin"], recipe.route, taken), strict=True))
+    area = scene["device"]["contact_area"] / recipe.scene["device"]["contact_area"]
+    found = dict(zip(UNITS, respond(scene, _of_area(parts["skin"], area), recipe.route, taken), strict=True))
     wanted = [name for name in UNITS if name == "V" or name in measured["channels"]]
     if "I" in wanted and not np.all(np.isfinite(found["I"])):
         raise RecipeError(
@@ -91,6 +92,11 @@ def _record(recipe: Recipe, scene: Scene, finger: int) -> Synthetic:
     there = imperfections.kept(count, parts["missing"]["share"], recipe.seed, finger)
     channels = {name: values[there] for name, values in channels.items()}
     return Synthetic(time[there], channels, _truth(recipe, scene, parts))
+
+
+def _of_area(skin: Mapping[str, Any], area: float) -> Mapping[str, Any]:
+    """A second layer, where there is one, of `area` times the median's."""
+    return {**skin, "Rsc_2": skin["Rsc_2"] / area, "Csc_2": skin["Csc_2"] * area} if skin["Rsc_2"] else skin
 
 
 def _with_noise(recipe: Recipe) -> dict[str, dict[str, Any]]:

@@ -40,7 +40,7 @@ KEYS: Table = {
     },
     # in the order in which they act
     "clock": {"jitter": Quantity("s", 0.0, least=True), "trigger_error": Quantity("s", 0.0, -math.inf)},
-    "gain": dict.fromkeys(UNITS, Quantity("", 1.0)),
+    "gain": dict.fromkeys(UNITS, Quantity("", 1.0, -math.inf)),
     "offset": _each(-math.inf),
     "drift": _each(-math.inf),
     "hum": {**_each(), "frequency": Quantity("Hz", 50.0), "harmonics": Listed(Quantity("", least=True), (1.0,))},
@@ -55,7 +55,8 @@ _MODELS = {
     "nonlinear": ("half_voltage",),
     "electroporated": ("threshold", "width", "time_constant", "factor"),
 }
-_TOP = {"scene", "seed", "route", "truth"}
+_TOP = ("scene", "truth", "seed", "route")
+_RECIPE: Table = {"recipe": {"seed": Whole(0), "route": Choice(("scipy", "ngspice"))}}
 
 
 class Recipe(NamedTuple):
@@ -93,13 +94,10 @@ def load(path: Path) -> Recipe:
     scene = make_scene(tables, truth, str(scene_path))
     rest = {name: part for name, part in content.items() if name not in _TOP}
     parts = checked(rest, KEYS, str(path))
-    top = checked({"recipe": {k: content[k] for k in ("seed", "route") if k in content}}, _RECIPE, str(path))["recipe"]
+    top = checked({"recipe": {k: content[k] for k in _RECIPE["recipe"] if k in content}}, _RECIPE, str(path))["recipe"]
     _check(parts, scene, str(path))
     name = path.name.removesuffix(".toml").removesuffix(_SUFFIX)
     return Recipe(name, scene_path.name, scene, parts, tuple(rest), top["seed"], top["route"])
-
-
-_RECIPE: Table = {"recipe": {"seed": Whole(0), "route": Choice(("scipy", "ngspice"))}}
 
 
 def _check(parts: dict[str, dict[str, Any]], scene: Scene, place: str) -> None:

@@ -11,10 +11,9 @@ import scipy.linalg
 from numpy.polynomial import chebyshev
 
 from data_synth.drive import Drive
-from data_synth.errors import RecipeError
 from data_synth.network import StateSpace
 
-_SAME = 1e-9  # of the shortest wanted step: times nearer than that are one
+_SAME = 1e-9  # of a record's step: times nearer than that are one
 _STILL = 1e-12  # singular values below are those of charges that nothing moves
 
 
@@ -96,8 +95,6 @@ def _states(system: StateSpace, grid: np.ndarray, taylor: np.ndarray, charge: np
     whole[:, :size, :size] = system.A * lengths[:, None, None]
     whole[:, :size, size] = system.B[:, 0] * lengths[:, None]
     whole[:, size:, size:] = np.eye(count, k=1)
-    if size == 0 or lengths.size == 0:
-        raise RecipeError("the circuit has no capacitor, or the record no samples; give both")
     step = scipy.linalg.expm(whole)[:, :size]
     pushed = np.einsum("nij,nj->ni", step[which, :, size:], taylor)
     states = np.empty((grid.size, size))

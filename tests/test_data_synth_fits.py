@@ -10,6 +10,8 @@ import pytest
 
 import fitact
 
+pytestmark = pytest.mark.slow
+
 RECORDS = Path(__file__).parents[1] / "data_synth" / "records"
 SIGMAS = 4.0
 FREED = {"hum": "hum_60Hz_cos", "eight_bit": "offset", "late_trigger": "delay"}
@@ -42,22 +44,7 @@ def deviation(summary: dict[str, Any], truth: float) -> float:
     return (float(summary["q50"]) - truth) / float(summary["sd"])
 
 
-slow = functools.partial(pytest.param, marks=pytest.mark.slow)
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "clean",
-        "low_snr",
-        slow("hum"),
-        slow("clipped"),
-        slow("eight_bit"),
-        slow("late_trigger"),
-        slow("burst"),
-        slow("chirp"),
-    ],
-)
+@pytest.mark.parametrize("name", ["clean", "low_snr", "hum", "clipped", "eight_bit", "late_trigger", "burst", "chirp"])
 def test_vsc_alone_gives_g_and_b(name: str):
     """A gain of the probe counts to g, which no record of Vsc alone could tell apart."""
     fit, truth = fitted(name), truths(RECORDS / f"{name}.json")
@@ -78,13 +65,11 @@ def test_little_signal_is_told_as_such():
     assert loud["g"]["sd"] > 0.01 * loud["g"]["q50"]
 
 
-@pytest.mark.slow
 def test_a_late_trigger_is_found():
     recipe = shipped(RECORDS / "late_trigger.json")["recipe"]
     assert abs(deviation(fitted("late_trigger").parameters()["delay"], -recipe["clock"]["trigger_error"])) < SIGMAS
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["natural_ground", "fractional"])
 def test_vsc_and_current_give_everything(name: str):
     fit, truth = fitted(name), truths(RECORDS / f"{name}.json")
@@ -94,14 +79,13 @@ def test_vsc_and_current_give_everything(name: str):
         assert abs(deviation(fit.parameters()[parameter], value)) < SIGMAS, parameter
 
 
-@pytest.mark.parametrize("name", [slow("two_layers"), "nonlinear"])
+@pytest.mark.parametrize("name", ["two_layers", "nonlinear"])
 def test_another_skin_than_the_scene_says_is_noticed(name: str):
     fit = fitted(name)
     assert fit.result == "misfit"
     assert not fit.trusted
 
 
-@pytest.mark.slow
 def test_people_with_areas():
     """Each finger's own values, and medians and spreads of the law that they follow."""
     paths = sorted((RECORDS / "areas").glob("*.json"))
