@@ -1,0 +1,71 @@
+"""python -m data_synth: records from scenes and recipes."""
+
+import argparse
+import os
+import shlex
+import sys
+from pathlib import Path
+
+RECORDS = Path(__file__).parent / "records"
+
+
+def main() -> int:
+    """Exit code 0; 2 with one line on standard error for what is refused."""
+    parser = argparse.ArgumentParser(prog="python -m data_synth", description="Synthetic records, by scipy or ngspice.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    one = commands.add_parser("make", help="the records of recipes, or of scenes as they are")
+    one.add_argument("recipe", nargs="+", type=Path, help="TOML; data_synth/README.md lists the keys of recipes")
+    one.add_argument("--seed", type=int, help="in place of the recipe's")
+    one.add_argument("--route", choices=["scipy", "ngspice"], help="in place of the recipe's")
+    one.add_argument("--format", default="csv.gz", choices=["csv.gz", "csv", "npz", "mat", "h5"])
+    committed = commands.add_parser("committed", help="the records in data_synth/records that have a recipe, again")
+    for command in (one, committed):
+        command.add_argument("--out", type=Path, required=True, help="folder for NAME.csv.gz and NAME.json")
+    chosen = parser.parse_args()
+
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads would wait for each other
+    from data_synth.errors import RecipeError  # what follows takes a second to import
+
+    try:
+        if chosen.command == "committed":
+            for path in sorted(RECORDS.glob("*.recipe.toml")):
+                if _can(path):
+                    _make(path, chosen.out, "csv.gz", None, None)
+            return 0
+        for path in chosen.recipe:
+            _make(path, chosen.out, chosen.format, chosen.seed, chosen.route)
+        return 0
+    except (RecipeError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 2
+
+
+def _can(path: Path) -> bool:
+    """Whether its route is there; says so where it is not."""
+    from data_synth import recipe, spice
+
+    there = recipe.load(path).route != "ngspice" or spice.found()
+    if not there:
+        print(f"{path.name}: left out, since ngspice is not installed", file=sys.stderr)
+    return there
+
+
+def _make(path: Path, out: Path, end: str, seed: int | None, route: str | None) -> None:
+    from data_synth import files, recipe
+    from data_synth.make import make
+
+    found = recipe.load(path)
+    found = found._replace(seed=found.seed if seed is None else seed, route=route or found.route)
+    folder = out if found.parts["population"]["fingers"] is None else out / found.name
+    options = f"--seed {found.seed} --route {found.route} --format {end}"
+    command = f"python -m data_synth make {shlex.quote(path.name)} {options} --out DIR"
+    for name, made in make(found).items():
+        files.write_record(folder / f"{name}.{end}", made.time, made.channels)
+        truth = {"record": f"{name}.{end}", **made.truth}
+        truth["origin"]["command"] = command
+        files.write_json(folder / f"{name}.json", truth)
+        print(folder / f"{name}.{end}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

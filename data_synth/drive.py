@@ -1,0 +1,144 @@
+"""Drives: the voltage as a function of time that is smooth between corners."""
+
+import math
+from collections.abc import Callable, Mapping
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from data_synth.errors import RecipeError
+
+_STRAIGHT, _SMOOTH = 1, 8  # degree of the polynomial that a drive is within a step
+_BESIDE = 1e-7  # of a stretch: what is there is not beyond its end
+_STEPS = 16  # of a cycle at least, for that degree to leave 1e-14 of a sine
+
+Values = Callable[[np.ndarray], np.ndarray]
+
+
+class Drive(NamedTuple):
+    """V(t) between corners.
+
+    value: V at times (s); which side a corner takes is not said.
+    corners: times (s) in an interval at which the drive jumps or bends.
+    degree: of the polynomial that it is, to rounding, over `longest` (s).
+    period: s; None: it does not repeat.
+    jumps: whether a corner is a jump.
+    """
+
+    value: Values
+    corners: Callable[[float, float], np.ndarray]
+    degree: int
+    longest: float
+    period: float | None
+    jumps: bool
+
+
+def make_drive(section: Mapping[str, Any]) -> Drive:
+    """The drive of a scene's section [drive], from rest where that says so.
+
+    Raises:
+        RecipeError: the waveform is measured, so that only a record has it.
+    """
+    waveform = section["waveform"]
+    if waveform == "measured":
+        raise RecipeError("[drive] waveform = 'measured' gives no drive to compute; state one under [truth.drive]")
+    if waveform == "chirp":
+        return _chirp(section)
+    if waveform == "burst":
+        wave = _wave(section, section["shape"])
+        return _between(wave, 0.0, section["cycles"] / section["frequency"])
+    wave = _multitone(section) if waveform == "multitone" else _wave(section, waveform)
+    return wave if section["steady_state"] else _between(wave, 0.0, math.inf)
+
+
+def _wave(section: Mapping[str, Any], shape: str) -> Drive:
+    frequency, offset, height = section["frequency"], section["offset"], 0.5 * section["peak_to_peak"]
+    ahead, duty = section["phase"] / (2.0 * math.pi), section["duty"]
+    if shape == "sine":
+        xs, ys = [], []
+    elif shape == "triangle":
+        xs, ys = [0.0, 0.25, 0.75, 1.0], [0.0, 1.0, -1.0, 0.0]
+    else:
+        rise = (section["rise_time"] or 0.0) * frequency
+        xs, ys = [0.0, rise, duty, duty + rise, 1.0], [-1.0, 1.0, 1.0, -1.0, -1.0]
+
+    def value(time: np.ndarray) -> np.ndarray:
+        cycle = np.mod(time * frequency + ahead, 1.0)
+        if shape == "square":
+            return offset + height * np.where(cycle < duty, 1.0, -1.0)
+        return offset + height * (np.interp(cycle, xs, ys) if xs else np.sin(2.0 * np.pi * cycle))
+
+    def corners(start: float, end: float) -> np.ndarray:
+        cycles = np.arange(math.floor(start * frequency) - 1, math.ceil(end * frequency) + 2)
+        return (np.add.outer(cycles, sorted(set(xs[:-1]))).ravel() - ahead) / frequency
+
+    straight = bool(xs)
+    longest = 1.0 / frequency if straight else 1.0 / (_STEPS * frequency)
+    return Drive(value, corners, _STRAIGHT if straight else _SMOOTH, longest, 1.0 / frequency, shape == "square")
+
+
+def _multitone(section: Mapping[str, Any]) -> Drive:
+    tones, heights = np.array(section["frequencies"]), np.array(section["amplitudes"])
+    phases = np.array(section["phases"] or [0.0] * tones.size)
+    exact = [Fraction(repr(float(tone))) for tone in tones]
+    whole = math.lcm(*(tone.denominator for tone in exact))
+    lowest = math.gcd(*(int(tone * whole) for tone in exact)) / whole
+
+    def value(time: np.ndarray) -> np.ndarray:
+        total = np.full(np.shape(time), float(section["offset"]))
+        for tone, height, phase in zip(tones, heights, phases, strict=True):
+            total = total + height * np.sin(2.0 * np.pi * tone * time + phase)
+        return total
+
+    return Drive(value, _no_corners, _SMOOTH, 1.0 / (_STEPS * tones.max()), 1.0 / lowest, False)
+
+
+def _chirp(section: Mapping[str, Any]) -> Drive:
+    first, last, duration = section["start_frequency"], section["end_frequency"], section["sweep_time"]
+
+    def value(time: np.ndarray) -> np.ndarray:
+        if section["spacing"] == "linear":
+            cycles = first * time + 0.5 * (last - first) * time**2 / duration
+        else:
+            rate = math.log(last / first) / duration
+            cycles = first * (np.expm1(rate * time) / rate if rate else time)
+        wave = np.sin(2.0 * np.pi * cycles + section["phase"])
+        return section["offset"] + 0.5 * section["peak_to_peak"] * wave
+
+    sweep = Drive(value, _no_corners, _SMOOTH, 1.0 / (_STEPS * max(first, last)), None, False)
+    return _between(sweep, 0.0, duration)
+
+
+def _no_corners(start: float, end: float) -> np.ndarray:
+    return np.empty(0)
+
+
+def _between(wave: Drive, begin: float, end: float) -> Drive:
+    """The wave from `begin` to `end` (s), and zero before and after."""
+
+    def value(time: np.ndarray) -> np.ndarray:
+        inside = (time >= begin) & (time < end)
+        return np.where(inside, wave.value(np.where(inside, time, begin)), 0.0)
+
+    def corners(start: float, stop: float) -> np.ndarray:
+        ends = [each for each in (begin, end) if math.isfinite(each)]
+        return np.append(wave.corners(start, stop), ends)
+
+    at_ends = [wave.value(np.array(each)) for each in (begin, end) if math.isfinite(each)]
+    jumps = wave.jumps or max(abs(float(each)) for each in at_ends) > 1e-9 * float(np.ptp(wave.value(_sampled(wave))))
+    return Drive(value, corners, wave.degree, wave.longest, None, jumps)
+
+
+def _sampled(wave: Drive) -> np.ndarray:
+    """Times (s) over which the wave shows its height."""
+    return np.linspace(0.0, wave.period or 64.0 * wave.longest, 64)
+
+
+def at_ends(drive: Drive, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """V at the start and at the end of each stretch between neighbouring times, of which none holds a corner inside."""
+    length = np.diff(corners)
+    if drive.degree > _STRAIGHT:
+        return drive.value(corners[:-1] + _BESIDE * length), drive.value(corners[1:] - _BESIDE * length)
+    early, late = drive.value(corners[:-1] + 0.25 * length), drive.value(corners[1:] - 0.25 * length)
+    return 1.5 * early - 0.5 * late, 1.5 * late - 0.5 * early

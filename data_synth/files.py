@@ -1,0 +1,89 @@
+"""Records and their truth as files, written under another name first."""
+
+import gzip
+import json
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from data_synth.errors import RecipeError
+from data_synth.recipe import UNITS
+
+Columns = Mapping[str, np.ndarray]
+_UNITS = {"time": "s", **UNITS}
+
+
+def write_record(path: Path, time: np.ndarray, channels: Columns) -> None:
+    """Time (s) and channels (V, V, A), in the format of the name's end: .csv, .csv.gz, .npz, .mat or .h5.
+
+    Raises:
+        RecipeError: the name ends otherwise.
+    """
+    write = _FORMATS.get(format_of(path))
+    if write is None:
+        raise RecipeError(f"{path}: no format of that name; end it in {', '.join(_FORMATS)}")
+    _replacing(path, lambda file: write(file, {"time": time, **channels}))
+
+
+def format_of(path: Path) -> str:
+    """The end of the name: csv.gz, csv, npz, mat, h5, or something else."""
+    return next((end for end in _FORMATS if path.name.endswith(f".{end}")), "")
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Indented."""
+    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+    _replacing(path, lambda file: file.write(text.encode()))
+
+
+def _csv(columns: Columns) -> bytes:
+    """Times to their last digit, values to nine."""
+    rows = [",".join(f"{name}_{_UNITS[name]}" for name in columns)]
+    for time, *values in zip(*(each.tolist() for each in columns.values()), strict=True):
+        rows.append(",".join([repr(time), *(f"{value:.9g}" for value in values)]))
+    return ("\n".join(rows) + "\n").encode()
+
+
+def _npz(file: IO[bytes], columns: Columns) -> None:
+    arrays: dict[str, Any] = dict(columns)
+    np.savez_compressed(file, **arrays)
+
+
+def _mat(file: IO[bytes], columns: Columns) -> None:
+    import scipy.io
+
+    scipy.io.savemat(file, dict(columns), oned_as="column")
+
+
+def _h5(file: IO[bytes], columns: Columns) -> None:
+    import h5py
+
+    with h5py.File(file, "w") as content:
+        for name, values in columns.items():
+            content[name] = values
+            content[name].attrs["units"] = _UNITS[name]
+
+
+_FORMATS: dict[str, Callable[[IO[bytes], Columns], Any]] = {
+    "csv.gz": lambda file, columns: file.write(gzip.compress(_csv(columns), mtime=0)),
+    "csv": lambda file, columns: file.write(_csv(columns)),
+    "npz": _npz,
+    "mat": _mat,
+    "h5": _h5,
+}
+FORMATS = tuple(_FORMATS)
+
+
+def _replacing(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
+    """A file that is there whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        with beside.open("w+b") as file:
+            write(file)
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)

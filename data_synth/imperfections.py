@@ -1,0 +1,82 @@
+"""What instruments and surroundings add to a channel, in the order in which they act.
+
+Each kind has random numbers of its own for each channel and finger, so that adding one changes no other.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from data_synth.recipe import UNITS
+
+_STREAMS = ("population", "clock", "hum", "pink", "white", "missing")  # add at the end only
+_CHANNELS = tuple(UNITS)
+
+
+def generator(seed: int, finger: int, kind: str, channel: str = "V") -> np.random.Generator:
+    """The random numbers of one kind of imperfection."""
+    return np.random.default_rng([seed, finger, _STREAMS.index(kind), _CHANNELS.index(channel)])
+
+
+def instants(time: np.ndarray, clock: Mapping[str, Any], seed: int, finger: int) -> np.ndarray:
+    """When samples are taken (s) that the record says were taken at `time`: jitter, normal, and a late trigger."""
+    jitter = clock["jitter"] * generator(seed, finger, "clock").standard_normal(time.size) if clock["jitter"] else 0.0
+    return time + clock["trigger_error"] + jitter
+
+
+def spoil(
+    values: np.ndarray, channel: str, time: np.ndarray, parts: Mapping[str, Mapping[str, Any]], seed: int, finger: int
+) -> np.ndarray:
+    """A channel as it is recorded."""
+    share = (time - time[0]) / (time[-1] - time[0])
+    values = values * parts["gain"][channel] + (parts["offset"][channel] or 0.0)
+    values = values + (parts["drift"][channel] or 0.0) * share
+    if parts["hum"][channel]:
+        phases = generator(seed, finger, "hum").uniform(0.0, 2.0 * np.pi, len(parts["hum"]["harmonics"]))
+        values = values + parts["hum"][channel] * hum(time, parts["hum"], phases)
+    if parts["pink"][channel]:
+        rng, pink = generator(seed, finger, "pink", channel), parts["pink"]
+        step = float(np.median(np.diff(time)))
+        values = values + pink[channel] * coloured(time.size, step, pink["exponent"], pink["corner"], rng)
+    if parts["white"][channel]:
+        values = values + parts["white"][channel] * generator(seed, finger, "white", channel).standard_normal(time.size)
+    if parts["clip"][channel]:
+        values = np.clip(values, -parts["clip"][channel], parts["clip"][channel])
+    if parts["converter"][channel]:
+        values = converted(values, parts["converter"][channel], parts["converter"]["bits"])
+    return values
+
+
+def hum(time: np.ndarray, section: Mapping[str, Any], phases: np.ndarray) -> np.ndarray:
+    """Mains and its harmonics, of amplitudes relative to the whole's; all channels of a record have one phase."""
+    orders = np.arange(1, len(phases) + 1)
+    angle = 2.0 * np.pi * section["frequency"] * np.outer(time, orders) + phases
+    return np.sin(angle) @ np.array(section["harmonics"])
+
+
+def coloured(size: int, step: float, exponent: float, corner: float | None, rng: np.random.Generator) -> np.ndarray:
+    """Normal noise of expected variance 1 whose power falls as frequency^-exponent above `corner` (Hz), flat below.
+
+    Without a corner it is the lowest frequency that a record of `size` samples of `step` s shows. Made on a circle
+    of twice the record, so that its end knows nothing of its beginning, without a mean over the circle.
+    """
+    frequency = np.fft.rfftfreq(2 * size, step)[1:]
+    power = np.maximum(frequency, corner or 1.0 / (size * step)) ** -exponent
+    twice = np.append(np.full(frequency.size - 1, 2.0), 1.0)  # a spectrum's two sides; the highest frequency has one
+    waves = rng.standard_normal(frequency.size) + 1j * rng.standard_normal(frequency.size)
+    waves[-1] = math.sqrt(2.0) * waves[-1].real
+    heights = np.sqrt(0.5 * power / np.sum(twice * power)) * waves
+    return np.fft.irfft(np.append(0.0, heights), 2 * size)[:size] * 2 * size
+
+
+def converted(values: np.ndarray, span: float, bits: int) -> np.ndarray:
+    """To the nearest of 2^bits levels over `span` around 0, the lowest at -span / 2; values beyond get the last one."""
+    step, half = span / 2**bits, 2 ** (bits - 1)
+    return np.clip(np.round(values / step), -half, half - 1) * step
+
+
+def kept(size: int, share: float, seed: int, finger: int) -> np.ndarray:
+    """Which samples are there: each is lost, with its time, with probability `share`."""
+    return generator(seed, finger, "missing").uniform(size=size) >= share

@@ -1,0 +1,146 @@
+"""Tables of keys: what a file may say, in which unit, and what stands where it is silent."""
+
+import difflib
+import functools
+import math
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from data_synth.errors import RecipeError
+
+
+class Quantity(NamedTuple):
+    """A number in an SI unit, "" for a plain one; above `low`, or from it on with `least`."""
+
+    unit: str
+    default: float | None = None
+    low: float = 0.0
+    least: bool = False
+
+
+class Choice(NamedTuple):
+    """One of some words, numbers or truths; the first is the default."""
+
+    options: tuple[Any, ...]
+
+
+class Listed(NamedTuple):
+    """A list, of quantities or of words."""
+
+    of: Quantity | Choice
+    default: tuple[Any, ...] | None = None
+
+
+class Whole(NamedTuple):
+    """A whole number."""
+
+    default: int | None
+    least: int = 0
+
+
+class Unread(NamedTuple):
+    """What says nothing about a record: known, and passed over."""
+
+
+Key = Quantity | Choice | Listed | Whole | Unread
+Table = Mapping[str, Mapping[str, Key]]
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The content of a TOML file.
+
+    Raises:
+        RecipeError: it cannot be read.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise RecipeError(f"{path}: cannot be read as TOML ({reason}); check the path and the file") from error
+
+
+def checked(content: Mapping[str, Any], table: Table, place: str) -> dict[str, dict[str, Any]]:
+    """Sections with every key of `table`, in SI units; `place` names the file.
+
+    Raises:
+        RecipeError: an unknown section or key, or a value that it cannot have.
+    """
+    for section, given in content.items():
+        if section not in table:
+            raise RecipeError(f"{place}: [{section}] is not a section; {_nearest(section, list(table))}")
+        if not isinstance(given, dict):
+            raise RecipeError(f"{place}: [{section}] is not a table; write its keys under [{section}]")
+        for key in given:
+            if key not in table[section]:
+                raise RecipeError(f"{place}: [{section}] {key} is not a key; {_nearest(key, list(table[section]))}")
+    return {
+        section: {
+            name: value(content[section][name], key, f"{place}: [{section}] {name}")
+            if name in content.get(section, {})
+            else default(key)
+            for name, key in keys.items()
+        }
+        for section, keys in table.items()
+    }
+
+
+def default(key: Key) -> Any:
+    """What stands where a file is silent."""
+    if isinstance(key, Choice):
+        return key.options[0]
+    return None if isinstance(key, Unread) else key.default
+
+
+def value(given: Any, key: Key, place: str) -> Any:
+    """One value, checked."""
+    if isinstance(key, Unread):
+        return given
+    if isinstance(key, Listed):
+        if not isinstance(given, list) or not given:
+            raise RecipeError(f"{place} = {given!r} is not a list; write one in brackets")
+        return tuple(value(each, key.of, place) for each in given)
+    if isinstance(key, Choice):
+        if given not in key.options:
+            raise RecipeError(f"{place} = {given!r} is not a choice; write one of {', '.join(map(repr, key.options))}")
+        return given
+    if isinstance(key, Whole):
+        if isinstance(given, bool) or not isinstance(given, int) or given < key.least:
+            raise RecipeError(f"{place} = {given!r}; write a whole number of at least {key.least}")
+        return given
+    found = quantity(given, key.unit, place)
+    if found < key.low or (found == key.low and not key.least):
+        raise RecipeError(f"{place} = {given!r} must be {'at least' if key.least else 'above'} {key.low:g}")
+    return found
+
+
+@functools.cache
+def _registry() -> Any:
+    import pint  # only where text is read
+
+    registry = pint.UnitRegistry()
+    registry.define("@alias ohm = Ohm = OHM = ohms")
+    return registry
+
+
+def quantity(given: Any, unit: str, place: str) -> float:
+    """Text such as "160 kohm", or a bare number in SI, as a float in the SI unit `unit`.
+
+    Raises:
+        RecipeError: it is none, of another dimension, or not finite.
+    """
+    try:
+        if isinstance(given, bool):
+            raise ValueError
+        found = float(_registry().Quantity(given).to(unit).magnitude) if isinstance(given, str) else float(given)
+    except Exception as error:  # pint raises a dozen kinds, tokenize errors among them
+        raise RecipeError(f"{place} = {given!r} is no number with a unit of {unit or '1'}; write one") from error
+    if not math.isfinite(found):
+        raise RecipeError(f"{place} = {given!r} is not finite; write a number")
+    return float(f"{found:.15g}")
+
+
+def _nearest(word: str, known: list[str]) -> str:
+    near = difflib.get_close_matches(word, known, n=1)
+    return (f"did you mean '{near[0]}'? " if near else "") + f"known: {', '.join(known)}"

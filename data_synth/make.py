@@ -1,0 +1,171 @@
+"""Records from recipes, by scipy's route or ngspice's, with the truth about them."""
+
+import math
+import platform
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from data_synth import imperfections
+from data_synth.drive import Drive, make_drive
+from data_synth.errors import RecipeError
+from data_synth.keys import default
+from data_synth.network import Network, network, state_space
+from data_synth.recipe import KEYS, UNITS, Recipe
+from data_synth.scene import KEYS as SCENE
+from data_synth.scene import Scene
+
+_MOST_SAMPLES = 10_000_000
+_VALUES = {  # name -> section of the scene, key, unit
+    "Rsc": ("skin", "Rsc", "ohm"),
+    "Csc": ("skin", "Csc", "F"),
+    "Ci": ("device", "Ci", "F"),
+    "alpha": ("skin", "alpha", "1"),
+    "R_H": ("grounding", "R_H", "ohm"),
+    "grounding_Rsc": ("grounding", "grounding_Rsc", "ohm"),
+    "grounding_Csc": ("grounding", "grounding_Csc", "F"),
+    "Z": ("grounding", "Z", "ohm"),
+    "Z_capacitance": ("grounding", "Z_capacitance", "F"),
+    "series_resistor": ("measurement", "series_resistor", "ohm"),
+    "probe_resistance": ("measurement", "probe_resistance", "ohm"),
+    "probe_capacitance": ("measurement", "probe_capacitance", "F"),
+    "Rgap": ("gap", "resistance", "ohm"),
+    "Cgap": ("gap", "capacitance", "F"),
+}
+
+
+class Synthetic(NamedTuple):
+    """A record (s, V, V, A) and what is true of it."""
+
+    time: np.ndarray
+    channels: dict[str, np.ndarray]
+    truth: dict[str, Any]
+
+
+def make(recipe: Recipe) -> dict[str, Synthetic]:
+    """The recipe's records by name: one, or one of each finger of its population.
+
+    Raises:
+        RecipeError: the scene or the route cannot give what is asked for.
+    """
+    fingers = recipe.parts["population"]["fingers"]
+    if fingers is None:
+        return {recipe.name: _record(recipe, recipe.scene, 0)}
+    scenes = _population(recipe)
+    return {f"finger{n:02}": _record(recipe, scene, n) for n, scene in enumerate(scenes)}
+
+
+def _population(recipe: Recipe) -> list[Scene]:
+    """The scene of each finger: log-normal Rsc and Csc, and an area that scales Ci, Csc and 1 / Rsc."""
+    law, scene = recipe.parts["population"], recipe.scene
+    found = []
+    for finger in range(law["fingers"]):
+        first, second, third = imperfections.generator(recipe.seed, finger, "population").standard_normal(3)
+        r, area = law["correlation"], math.exp(law["log_sd_area"] * third)
+        Rsc = scene["skin"]["Rsc"] * math.exp(law["log_sd_Rsc"] * first) / area
+        Csc = scene["skin"]["Csc"] * area
+        Csc *= math.exp(law["log_sd_Csc"] * (r * first + math.sqrt(1.0 - r**2) * second))
+        own = {"skin": {**scene["skin"], "Rsc": Rsc, "Csc": Csc}}
+        own["device"] = {**scene["device"], "Ci": scene["device"]["Ci"] * area}
+        own["device"]["contact_area"] *= area
+        found.append({**scene, **own})
+    return found
+
+
+def _record(recipe: Recipe, scene: Scene, finger: int) -> Synthetic:
+    measured, parts = scene["measurement"], _with_noise(recipe)
+    count = round(measured["duration"] * measured["sampling_rate"])
+    if not 2 <= count <= _MOST_SAMPLES:
+        raise RecipeError(f"{recipe.name}: duration times sampling_rate is {count:,} samples; give 2 to 10,000,000")
+    time = np.arange(count) / measured["sampling_rate"]
+    taken = imperfections.instants(time, parts["clock"], recipe.seed, finger)
+    area = scene["device"]["contact_area"] / recipe.scene["device"]["contact_area"]
+    found = dict(zip(UNITS, respond(scene, _of_area(parts["skin"], area), recipe.route, taken), strict=True))
+    wanted = [name for name in UNITS if name == "V" or name in measured["channels"]]
+    if "I" in wanted and not np.all(np.isfinite(found["I"])):
+        raise RecipeError(
+            f"{recipe.name}: the current has an impulse at each ideal jump of the drive; give the drive a rise time, or"
+            " the circuit R_H or a series_resistor"
+        )
+    channels = {n: imperfections.spoil(found[n], n, time, parts, recipe.seed, finger) for n in wanted}
+    there = imperfections.kept(count, parts["missing"]["share"], recipe.seed, finger)
+    channels = {name: values[there] for name, values in channels.items()}
+    return Synthetic(time[there], channels, _truth(recipe, scene, parts))
+
+
+def _of_area(skin: Mapping[str, Any], area: float) -> Mapping[str, Any]:
+    """A second layer, where there is one, of `area` times the median's."""
+    return {**skin, "Rsc_2": skin["Rsc_2"] / area, "Csc_2": skin["Csc_2"] * area} if skin["Rsc_2"] else skin
+
+
+def _with_noise(recipe: Recipe) -> dict[str, dict[str, Any]]:
+    """The recipe's sections; where it is silent on white noise, the scene's counts."""
+    measured, white = recipe.scene["measurement"], recipe.parts["white"]
+    stated = {"V": 0.0, "Vsc": measured["noise_Vsc"], "I": measured["noise_I"]}
+    return {**recipe.parts, "white": {n: stated[n] if white[n] is None else white[n] for n in UNITS}}
+
+
+def respond(
+    scene: Scene, skin: Mapping[str, Any], route: str, time: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """V, Vsc (V) and I (A) at `time` (s), without imperfections.
+
+    Raises:
+        RecipeError: the route has no such skin, or ngspice is absent.
+    """
+    second = (skin["Rsc_2"], skin["Csc_2"]) if skin["model"] == "two layers" else None
+    circuit, drive = network(scene, second), make_drive(scene["drive"])
+    law = skin if skin["model"] in ("nonlinear", "electroporated") else None
+    level = scene["skin"]["level"]
+    if route == "ngspice":
+        from data_synth.spice import spice_response
+
+        if level != "constant":
+            raise RecipeError(f"[skin] level = '{level}' is not among ngspice's circuits; take route = 'scipy'")
+        return spice_response(circuit, law, drive, time)
+    return _by_scipy(circuit, law, scene["skin"], drive, time)
+
+
+def _by_scipy(
+    circuit: Network, law: Mapping[str, Any] | None, skin: Mapping[str, Any], drive: Drive, time: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    # each brings a part of scipy along
+    if law is not None:
+        from data_synth.nonlinear import nonlinear_response
+
+        return nonlinear_response(circuit, law, drive, time)
+    if skin["level"] != "constant":
+        from data_synth.harmonics import harmonic_response
+
+        return harmonic_response(circuit, skin, drive, time)
+    from data_synth.response import response
+
+    return response(state_space(circuit), drive, time)
+
+
+def _truth(recipe: Recipe, scene: Scene, parts: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    values = {name: (scene[section][key], unit) for name, (section, key, unit) in _VALUES.items()}
+    if scene["skin"]["level"] != "fractional":
+        del values["alpha"]
+    values |= {f"noise_{name}": (parts["white"][name], UNITS[name]) for name in scene["measurement"]["channels"]}
+    stated = {key: value for key, value in scene["drive"].items() if value != default(SCENE["drive"][key])}
+    added = {name: parts[name] for name in KEYS if name in recipe.given}
+    return {
+        "scene": recipe.scene_file,
+        "truth": {name: {"value": value, "unit": unit} for name, (value, unit) in values.items() if value},
+        "drive": {"waveform": scene["drive"]["waveform"]} | stated,
+        "recipe": {name: {k: v for k, v in part.items() if v is not None} for name, part in added.items()},
+        "origin": {"route": recipe.route, "seed": recipe.seed, "versions": _versions(recipe.route)},
+    }
+
+
+def _versions(route: str) -> dict[str, str]:
+    import scipy
+
+    found = {"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__}
+    if route == "ngspice":
+        from data_synth import spice
+
+        found["ngspice"] = spice.version()
+    return found

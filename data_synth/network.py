@@ -1,0 +1,156 @@
+"""The circuit as a network of resistors and capacitors, and its state space by nodal analysis."""
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+EPS0 = 8.85e-12  # F/m, as the paper takes it
+_EMPTY = 1e-10  # of the largest capacitance: a node with less has none
+
+
+class Branch(NamedTuple):
+    """A resistor (ohm) or capacitor (F) between two nodes; node 0 is ground, node 1 the drive."""
+
+    kind: str  # R or C
+    start: int
+    end: int
+    value: float
+    layer: str = ""  # outer: of the skin that a level, or a voltage, changes
+
+
+class Network(NamedTuple):
+    """Branches, the nodes that Vsc lies between, and of each outer layer of skin the ends, R (ohm) and C (F)."""
+
+    branches: tuple[Branch, ...]
+    skin: tuple[int, int]
+    layers: tuple[tuple[int, int, float, float], ...]
+
+
+class StateSpace(NamedTuple):
+    """x' = A x + B u and y = C x + D u, + E dV/dt; u: V (V), what each outer layer conducts besides (A).
+
+    y: Vsc (V), I (A), the voltage of each outer layer (V).
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+    E: np.ndarray
+
+
+def network(scene: Mapping[str, Mapping[str, Any]], second: tuple[float, float] | None = None) -> Network:
+    """The scene's circuit, from the drive to ground; `second`: R (ohm) and C (F) of a deeper layer in each skin."""
+    skin, measured = scene["skin"], scene["measurement"]
+    touching = [(skin["Rsc"], skin["Csc"], "outer"), *([(*second, "")] if second else [])]
+    before = [(measured["series_resistor"], None, ""), (None, scene["device"]["Ci"], ""), (*_gap(scene), "")]
+    before, after = (list(filter(_is_there, part)) for part in (before, _to_ground(scene, second)))
+    branches = []
+    for node, (R, C, layer) in enumerate([*before, *touching, *after]):
+        start, end = node + 1, node + 2
+        if end == len(before) + len(touching) + len(after) + 1:
+            end = 0
+        branches += [Branch("R", start, end, R, layer)] if R else []
+        branches += [Branch("C", start, end, C, layer)] if C else []
+    first = len(before) + 1
+    last = first + len(touching) if after else 0
+    probe = (("R", measured["probe_resistance"]), ("C", measured["probe_capacitance"]))
+    branches += [Branch(kind, first, last, value) for kind, value in probe if value]
+    outer = [(R, C) for R, C in itertools.pairwise(branches) if R.layer and R.kind == "R"]
+    layers = tuple((R.start, R.end, R.value, C.value) for R, C in outer)
+    return Network(tuple(branches), (first, last), layers)
+
+
+def _is_there(part: tuple[float | None, float | None, str]) -> bool:
+    return bool(part[0] or part[1])
+
+
+def _gap(scene: Mapping[str, Mapping[str, Any]]) -> tuple[float | None, float | None]:
+    gap = scene["gap"]
+    air = EPS0 * scene["device"]["contact_area"] / gap["thickness"] if gap["thickness"] else None
+    return gap["resistance"], gap["capacitance"] or air
+
+
+def _to_ground(scene: Mapping[str, Mapping[str, Any]], second: tuple[float, float] | None) -> Iterator[tuple]:
+    """What lies between the touching skin and ground, in series."""
+    ground, skin = scene["grounding"], scene["skin"]
+    if ground["connection"] == "natural":
+        yield ground["Z"], ground["Z_capacitance"], ""
+        return
+    yield ground["R_H"], None, ""
+    yield ground["grounding_Rsc"] or skin["Rsc"], ground["grounding_Csc"] or skin["Csc"], "outer"
+    if second:
+        yield *second, ""
+
+
+def _incidence(pairs: list[tuple[int, int]], size: int) -> np.ndarray:
+    """A column for each pair: 1 where it starts, -1 where it ends, without the row of ground."""
+    found = np.zeros((size + 1, len(pairs)))
+    for column, (start, end) in enumerate(pairs):
+        found[start, column] += 1.0
+        found[end, column] -= 1.0
+    return found[1:]
+
+
+def _size(circuit: Network) -> int:
+    return max(max(each.start, each.end) for each in circuit.branches)
+
+
+def state_space(circuit: Network) -> StateSpace:
+    """By nodal analysis: capacitances c x' + conductances g x = 0 at every node but the drive's, row and column 0.
+
+    The states are those combinations of the free nodes, plus what the drive puts on them at once, that
+    capacitances hold; nodes without any follow from Kirchhoff's current law.
+    """
+    size = _size(circuit)
+    g, c = np.zeros((size, size)), np.zeros((size, size))
+    for each in circuit.branches:
+        ends = _incidence([(each.start, each.end)], size)
+        if each.kind == "R":
+            g += ends @ ends.T / each.value
+        else:
+            c += ends @ ends.T * each.value
+    # what the outer layers conduct besides leaves their start for their end
+    extra = _incidence([(start, end) for start, end, *_ in circuit.layers], size)
+    values, vectors = np.linalg.eigh(c[1:, 1:])
+    held = values > _EMPTY * values[-1]
+    P, N = vectors[:, held] / np.sqrt(values[held]), vectors[:, ~held]  # P^T c P = 1
+    at_once = P @ (P.T @ c[1:, 0])  # free nodes = z - at_once V
+    source = np.column_stack([g[1:, 0] - g[1:, 1:] @ at_once, extra[1:]])
+    # z = P x + N w, and N w from the nodes without capacitance
+    follow = -N @ np.linalg.solve(N.T @ g[1:, 1:] @ N, N.T) if N.shape[1] else np.zeros((size - 1, size - 1))
+    rest = np.eye(size - 1) + follow @ g[1:, 1:]
+    A, B = -P.T @ g[1:, 1:] @ rest @ P, -P.T @ (g[1:, 1:] @ follow + np.eye(size - 1)) @ source
+    nodes_x, nodes_u = rest @ P, follow @ source
+    nodes_u[:, 0] -= at_once
+    of_skin = _incidence([circuit.skin, *((start, end) for start, end, *_ in circuit.layers)], size)
+    C = np.vstack([of_skin[1:].T @ nodes_x, c[0, 1:] @ nodes_x @ A + g[0, 1:] @ nodes_x])
+    D = np.vstack([of_skin[1:].T @ nodes_u, c[0, 1:] @ nodes_x @ B + g[0, 1:] @ nodes_u])
+    D[:-1, 0] += of_skin[0]
+    D[-1] += np.append(g[0, 0], extra[0])
+    E = np.zeros(len(D))
+    E[-1] = c[0, 1:] @ nodes_u[:, 0] + c[0, 0]
+    E[np.abs(E) < _EMPTY * values[-1]] = 0.0
+    order = [0, len(D) - 1, *range(1, len(D) - 1)]
+    return StateSpace(A, B, C[order], D[order], E[order])
+
+
+def gains(
+    circuit: Network, omega: np.ndarray, admittance: Callable[[Branch, np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vsc / V and I / V (S) at angular frequencies `omega` (rad/s), with the admittance (S) of each branch."""
+    size = _size(circuit)
+    Y = np.zeros((omega.size, size, size), dtype=complex)
+    for each in circuit.branches:
+        ends = _incidence([(each.start, each.end)], size)
+        Y += admittance(each, omega)[:, None, None] * (ends @ ends.T)
+    free = np.linalg.solve(Y[:, 1:, 1:], -Y[:, 1:, :1])[..., 0]
+    nodes = np.concatenate([np.ones((omega.size, 1)), free], axis=1)
+    return nodes @ _incidence([circuit.skin], size)[:, 0], np.einsum("ni,ni->n", Y[:, 0], nodes)
+
+
+def plain_admittance(branch: Branch, omega: np.ndarray) -> np.ndarray:
+    """S, of a resistor or capacitor."""
+    return 1j * omega * branch.value if branch.kind == "C" else np.full(omega.shape, 1.0 / branch.value, dtype=complex)

@@ -1,0 +1,115 @@
+"""Vsc and I in time: matrix exponentials of the state space, with the drive a polynomial over each step.
+
+For straight lines that is a first-order hold, exact; for sines a polynomial of degree 8 through Chebyshev's points
+of a step of at most a 16th of a cycle.
+"""
+
+import math
+
+import numpy as np
+import scipy.linalg
+from numpy.polynomial import chebyshev
+
+from data_synth.drive import Drive
+from data_synth.network import StateSpace
+
+_SAME = 1e-9  # of a record's step: times nearer than that are one
+_STILL = 1e-12  # singular values below are those of charges that nothing moves
+
+
+def response(system: StateSpace, drive: Drive, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """V, Vsc (V) and I (A) at `time` (s, any order): periodic drives in the steady state, others from rest.
+
+    At a jump, values are right limits; I is NaN there where nothing limits it.
+    """
+    grid, place = steps(drive, time)
+    taylor = polynomials(drive, grid)
+    charge = _settled(system, drive, float(grid[0])) if drive.period else np.zeros(len(system.A))
+    states = _states(system, grid, taylor, charge)[:-1]
+    voltage, slope = taylor[:, 0], taylor[:, 1] / np.diff(grid)
+    out = states @ system.C.T + np.outer(voltage, system.D[:, 0])
+    current = out[:, 1] + system.E[1] * slope
+    if drive.jumps and system.E[1] != 0.0:
+        ended = np.sum(taylor / _factorials(drive.degree), axis=1)
+        before = np.append(drive.value(grid[:1] - 1e-6 * drive.longest), ended[:-1])
+        current = np.where(np.abs(voltage - before) > 1e-5 * np.ptp(voltage), np.nan, current)
+    return voltage[place], out[place, 0], current[place]
+
+
+def frequency_response(system: StateSpace, omega: float) -> tuple[complex, complex]:
+    """Vsc / V and I / V (S) at the angular frequency `omega` (rad/s)."""
+    x = np.linalg.solve(1j * omega * np.eye(len(system.A)) - system.A, system.B[:, 0])
+    Vsc, current = system.C[:2] @ x + system.D[:2, 0] + 1j * omega * system.E[:2]
+    return complex(Vsc), complex(current)
+
+
+def steps(drive: Drive, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times (s) that part the record into steps without a corner inside, and where among them `time` is."""
+    start, end = float(time.min()), float(time.max())
+    if drive.period is None:
+        start = min(start, 0.0)
+    apart = np.diff(np.unique(time))
+    end += float(np.median(apart))  # each sample begins a step
+    corners = drive.corners(start, end)
+    corners = corners[(corners > start) & (corners < end)]
+    wanted = np.unique(np.concatenate([time, corners, [start, end]]))
+    keep = np.append(True, np.diff(wanted) > _SAME * np.median(apart))
+    wanted = wanted[keep]
+    parts = np.ceil(np.diff(wanted) / drive.longest * (1.0 - 1e-9)).astype(int)
+    fine = [wanted[:-1]] if np.all(parts <= 1) else _divided(wanted, parts)
+    grid = np.append(np.concatenate(fine), wanted[-1])
+    place = np.searchsorted(grid, time + _SAME * np.median(apart), side="right") - 1
+    return grid, place
+
+
+def _divided(wanted: np.ndarray, parts: np.ndarray) -> list[np.ndarray]:
+    ends = zip(wanted[:-1], wanted[1:], parts, strict=True)
+    return [np.linspace(start, end, count, endpoint=False) for start, end, count in ends]
+
+
+def _factorials(degree: int) -> np.ndarray:
+    return np.array([math.factorial(order) for order in range(degree + 1)], dtype=float)
+
+
+def polynomials(drive: Drive, grid: np.ndarray) -> np.ndarray:
+    """Derivatives of V at the start of each step, in steps: through points inside it, which are on no corner."""
+    count = drive.degree + 1
+    angle = np.pi * (np.arange(count) + 0.5) / count
+    values = drive.value(grid[:-1, None] + 0.5 * (1.0 - np.cos(angle)) * np.diff(grid)[:, None])
+    series = np.cos(np.outer(np.arange(count), angle)) * (2.0 - (np.arange(count) == 0)[:, None]) / count
+    # derivatives of T_m(2 s - 1) at s = 0; points run from s = 0 on, where T_m is (-1)^m
+    ends = [[_at_start(m, order) for m in range(count)] for order in range(count)]
+    return values @ (np.array(ends) @ ((-1.0) ** np.arange(count)[:, None] * series)).T
+
+
+def _at_start(m: int, order: int) -> float:
+    """d^order/ds^order of T_m(2 s - 1) at s = 0."""
+    return 2.0**order * float(chebyshev.chebval(-1.0, chebyshev.chebder(np.eye(m + 1)[m], order)))
+
+
+def _states(system: StateSpace, grid: np.ndarray, taylor: np.ndarray, charge: np.ndarray) -> np.ndarray:
+    """The states at the grid's times, `charge` at the first."""
+    lengths, which = np.unique(np.diff(grid), return_inverse=True)
+    size, count = len(system.A), taylor.shape[1]
+    whole = np.zeros((lengths.size, size + count, size + count))
+    whole[:, :size, :size] = system.A * lengths[:, None, None]
+    whole[:, :size, size] = system.B[:, 0] * lengths[:, None]
+    whole[:, size:, size:] = np.eye(count, k=1)
+    step = scipy.linalg.expm(whole)[:, :size]
+    pushed = np.einsum("nij,nj->ni", step[which, :, size:], taylor)
+    states = np.empty((grid.size, size))
+    states[0] = charge
+    for n, (each, push) in enumerate(zip(which, pushed, strict=True)):
+        states[n + 1] = step[each, :, :size] @ states[n] + push
+    return states
+
+
+def _settled(system: StateSpace, drive: Drive, start: float) -> np.ndarray:
+    """The states at `start` (s) that a period leaves as they were: the fixed point of its map."""
+    assert drive.period is not None
+    grid, _ = steps(drive, np.array([start, start + drive.period]))
+    end = int(np.argmin(np.abs(grid - (start + drive.period))))
+    grid = grid[: end + 1]
+    reached = _states(system, grid, polynomials(drive, grid), np.zeros(len(system.A)))[-1]
+    lost = np.eye(len(system.A)) - scipy.linalg.expm(system.A * drive.period)
+    return np.linalg.lstsq(lost, reached, rcond=_STILL)[0]

@@ -1,0 +1,110 @@
+"""Scene files, as docs/scene.md lists them: the keys that say what a record holds, and the defaults."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from data_synth.errors import RecipeError
+from data_synth.keys import Choice, Listed, Quantity, Table, Unread, Whole, checked
+from data_synth.network import EPS0
+
+Scene = dict[str, dict[str, Any]]
+
+_ANY = -math.inf
+_BELIEFS = """Rsc Csc Ci R_H grounding_Rsc grounding_Csc Z Z_capacitance series_resistor Rgap Cgap alpha sigma sigma_I
+correlation"""
+KEYS: Table = {
+    "device": {
+        "Ci": Quantity("F", 1.35e-9),
+        "insulator_thickness": Quantity("m", 1e-6),
+        "insulator_permittivity": Quantity("", 3.9),
+        "contact_area": Quantity("m^2", 1e-4),
+    },
+    "skin": {
+        "Rsc": Quantity("ohm", 160e3),
+        "Csc": Quantity("F", 22e-9),
+        "thickness": Quantity("m", 200e-6),
+        "level": Choice(("constant", "dispersive", "fractional")),
+        "alpha": Quantity("", 0.8),
+    },
+    "grounding": {
+        "connection": Choice(("direct", "natural")),
+        "R_H": Quantity("ohm"),
+        "grounding_Rsc": Quantity("ohm"),
+        "grounding_Csc": Quantity("F"),
+        "Z": Quantity("ohm", least=True),
+        "Z_capacitance": Quantity("F"),
+    },
+    "gap": {"resistance": Quantity("ohm"), "capacitance": Quantity("F"), "thickness": Quantity("m")},
+    "drive": {
+        "waveform": Choice(("square", "sine", "triangle", "trapezoid", "burst", "chirp", "multitone", "measured")),
+        "peak_to_peak": Quantity("V", 360.0),
+        "frequency": Quantity("Hz", 100.0),
+        "rise_time": Quantity("s"),
+        "duty": Quantity("", 0.5),
+        "offset": Quantity("V", 0.0, _ANY),
+        "phase": Quantity("rad", 0.0, _ANY),
+        "shape": Choice(("square", "sine", "triangle")),
+        "cycles": Whole(5, 1),
+        "start_frequency": Quantity("Hz"),
+        "end_frequency": Quantity("Hz"),
+        "sweep_time": Quantity("s"),
+        "spacing": Choice(("linear", "logarithmic")),
+        "frequencies": Listed(Quantity("Hz")),
+        "amplitudes": Listed(Quantity("V")),
+        "phases": Listed(Quantity("rad", None, _ANY)),
+        "steady_state": Choice((True, False)),
+    },
+    "measurement": {
+        "channels": Listed(Choice(("Vsc", "I")), ("Vsc",)),
+        "series_resistor": Quantity("ohm", 0.0, least=True),
+        "probe_resistance": Quantity("ohm"),
+        "probe_capacitance": Quantity("F"),
+        "sampling_rate": Quantity("Hz", 200e3),
+        "duration": Quantity("s", 20e-3),
+        "noise_Vsc": Quantity("V", 0.1, least=True),
+        "noise_I": Quantity("A", 20e-9, least=True),
+        **dict.fromkeys(("gain_relative_sd", "gain_I_relative_sd", "noise_model", "quiet"), Unread()),
+    },
+    "friction": dict.fromkeys(("coefficient", "normal_force"), Unread()),
+    "prior": dict.fromkeys(_BELIEFS.split(), Unread()),
+    "force": {"model": Unread()},
+    "perception": dict.fromkeys(("threshold_force", "friction_change"), Unread()),
+    "population": {"contact_area": Unread()},
+    "tolerance": {"force": Unread()},
+}
+_NEEDED = {
+    "trapezoid": ("rise_time",),
+    "chirp": ("start_frequency", "end_frequency", "sweep_time"),
+    "multitone": ("frequencies", "amplitudes"),
+}
+
+
+def make_scene(content: Mapping[str, Any], truth: Mapping[str, Any], place: str) -> Scene:
+    """The scene of a file's tables, with what is true in place of what it says; `place` names the file.
+
+    Raises:
+        RecipeError: an unknown key, a value that is not possible, or keys that need others.
+    """
+    merged = {name: {**content.get(name, {}), **truth.get(name, {})} for name in {**content, **truth}}
+    scene = checked(merged, KEYS, place)
+    device, drive, skin = scene["device"], scene["drive"], scene["skin"]
+    given = merged.get("device", {})
+    if "Ci" not in given and {"insulator_thickness", "insulator_permittivity"} <= given.keys():  # eq. (3)
+        permittivity, thickness = device["insulator_permittivity"], device["insulator_thickness"]
+        device["Ci"] = EPS0 * permittivity * device["contact_area"] / thickness
+    for key in _NEEDED.get(drive["waveform"], ()):
+        if drive[key] is None:
+            raise RecipeError(f"{place}: [drive] waveform = '{drive['waveform']}' needs {key}; give it")
+    if drive["frequencies"] and any(len(drive[k] or drive["frequencies"]) != len(drive["frequencies"]) for k in _LISTS):
+        raise RecipeError(f"{place}: [drive] frequencies, amplitudes and phases differ in length; give one of each")
+    if not drive["duty"] < 1.0 or not skin["alpha"] <= 1.0:
+        raise RecipeError(f"{place}: [drive] duty must be below 1, and [skin] alpha at most 1")
+    if scene["grounding"]["connection"] == "natural" and scene["grounding"]["Z"] is None:
+        raise RecipeError(f"{place}: [grounding] connection = 'natural' needs Z, such as '14.5 Mohm'")
+    if scene["gap"]["resistance"] and not (scene["gap"]["capacitance"] or scene["gap"]["thickness"]):
+        raise RecipeError(f"{place}: [gap] resistance needs capacitance, or thickness; give one of them")
+    return scene
+
+
+_LISTS = ("amplitudes", "phases")

@@ -1,0 +1,113 @@
+"""The same circuits by ngspice, which steps through time: a netlist, a source through points, a transient run."""
+
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_synth.drive import Drive, at_ends
+from data_synth.errors import RecipeError
+from data_synth.network import Network, state_space
+
+_JUMP = 1e-9  # s, that an ideal jump takes here
+_POINTS = 32  # of the source in a step of a drive that is not straight: 512 in a cycle
+_SETTLED = 16.0  # slowest time constants before a steady state: 1e-7 is left
+_STILL = 1e-9  # of the fastest rate: that of a charge which nothing moves
+_STEPS = 4  # of time in one of the record's
+_LONG = 600  # s
+
+
+def found() -> bool:
+    """Whether ngspice is installed."""
+    return shutil.which("ngspice") is not None
+
+
+def version() -> str:
+    """Of ngspice, as it says it."""
+    said = subprocess.run(["ngspice", "--version"], capture_output=True, text=True, timeout=60).stdout
+    return next((word for word in said.split() if word.startswith("ngspice-")), "ngspice")
+
+
+def spice_response(
+    circuit: Network, law: Mapping[str, Any] | None, drive: Drive, time: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """V, Vsc (V) and I (A) at `time` (s): periodic drives after many periods, others from rest.
+
+    Raises:
+        RecipeError: ngspice is not installed, failed, or the skin is one that only scipy's route has.
+    """
+    if not found():
+        raise RecipeError("ngspice is not installed; install it (apt-get install ngspice), or take route = 'scipy'")
+    begin = min(float(time.min()), 0.0)
+    if drive.period:
+        rates = -np.linalg.eigvalsh(state_space(circuit).A)
+        slowest = np.min(rates[rates > _STILL * np.max(rates)])
+        begin -= drive.period * np.ceil(_SETTLED / slowest / drive.period)
+    end = float(time.max()) + 2.0 * _JUMP
+    step = float(np.median(np.diff(np.unique(time)))) / _STEPS
+    kept = max(float(time.min()) - begin - 2.0 * step, 0.0)
+    skin = ",".join(str(node) for node in circuit.skin if node)
+    deck = ["* a finger", f"Vdrive 99 0 PWL({_points(drive, begin, end)})", "Vmeter 99 1 0"]
+    deck += [f"{each.kind}{n} {each.start} {each.end} {each.value:.15g}" for n, each in enumerate(circuit.branches)]
+    deck += _extra(circuit, law)
+    deck += [".options reltol=1e-6 abstol=1e-15 vntol=1e-9 trtol=1 method=gear", ".control"]
+    deck += ["set wr_vecnames", "set wr_singlescale", "set numdgt=12"]
+    deck += [f"tran {step:.12g} {end - begin:.15g} {kept:.15g} {step:.12g} uic"]
+    deck += [f"wrdata out.txt v(1) v({skin}) i(Vmeter)"]
+    table = _run([*deck, "quit", ".endc", ".end"], end - begin)
+    # at a jump the value after it is wanted
+    wanted = time - begin + (2.0 * _JUMP if drive.jumps else 0.0)
+    voltage, Vsc, current = (np.interp(wanted, table[:, 0], table[:, column]) for column in (1, 2, 3))
+    return voltage, Vsc, current
+
+
+def _points(drive: Drive, begin: float, end: float) -> str:
+    """Times from `begin` on, and voltages, through which the source goes in straight lines."""
+    corners = drive.corners(begin, end)
+    corners = np.unique([begin, *corners[(corners > begin) & (corners < end)], end + _JUMP])
+    if drive.degree > 1:
+        fine = np.arange(begin, end, drive.longest / _POINTS)
+        corners = np.unique(np.concatenate([corners, fine]))
+        corners = corners[np.append(True, np.diff(corners) > 4.0 * _JUMP)]
+    after, before = at_ends(drive, corners)
+    points = [(0.0, 0.0 if drive.period is None else after[0])]
+    for time, left, right in zip(corners[:-1] - begin, [points[0][1], *before[:-1]], after, strict=True):
+        points += [(time, left)] if time > 0.0 else []
+        points += [(time + _JUMP, right)] if abs(right - left) > 1e-3 else []
+    points.append((corners[-1] - begin, before[-1]))
+    return "\n+ ".join(f"{time:.15g} {voltage:.12g}" for time, voltage in points)
+
+
+def _extra(circuit: Network, law: Mapping[str, Any] | None) -> list[str]:
+    """Sources of what a nonlinear skin conducts besides."""
+    if law is None:
+        return []
+    if law["model"] != "nonlinear":
+        raise RecipeError(f"[skin] model = '{law['model']}' is not among ngspice's circuits; take route = 'scipy'")
+    found = []
+    for n, (start, end, R, _) in enumerate(circuit.layers):
+        v = f"v({start},{end})" if end else f"v({start})"
+        found.append(f"B{n} {start} {end} I={v}*{v}*{v}/{R * law['half_voltage'] ** 2:.15g}")
+    return found
+
+
+def _run(deck: list[str], end: float) -> np.ndarray:
+    """What the deck writes, which must reach `end` (s)."""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "deck.cir").write_text("\n".join(deck) + "\n")
+        try:
+            ran = subprocess.run(
+                ["ngspice", "-b", "deck.cir"], cwd=folder, capture_output=True, text=True, timeout=_LONG
+            )
+        except subprocess.TimeoutExpired:
+            raise RecipeError(f"ngspice took longer than {_LONG} s; record less, or take route = 'scipy'") from None
+        out = Path(folder, "out.txt")
+        table = np.loadtxt(out, skiprows=1) if out.exists() else np.empty((0, 4))
+        if not table.size or table[-1, 0] < end * (1.0 - 1e-9):
+            said = (ran.stderr.strip() or ran.stdout.strip() or "no reason given").splitlines()[-1]
+            raise RecipeError(f"ngspice did not finish ({said}); take route = 'scipy'")
+        return table
