@@ -272,6 +272,8 @@ def test_what_cannot_be_asked():
     held = {"prior": {name: {"fixed": True} for name in VALUES}}
     with pytest.raises(fitact.InputError, match="frees no parameter"):
         fitact.design_measurement(fitact.Scene.from_dict(held))
+    with pytest.raises(fitact.InputError, match="noise_Vsc is 0"):
+        fitact.design_measurement(fitact.Scene.from_dict({"measurement": {"noise_Vsc": 0.0}}))
 
 
 def test_command_line(design: fitact.MeasurementDesign, tmp_path: Path, monkeypatch, capsys):
