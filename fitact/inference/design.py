@@ -122,7 +122,7 @@ def design_measurement(scene: Scene, records: Record | Sequence[Record] = ()) ->
         fitted = fit(records, scene)
         experiment, gradient = fitted.experiment, _force_gradient(fitted)
         steps = _steps(records[0], experiment)
-        judgement = fitted.trusted, (() if fitted.trusted else (fitted.message,))
+        judgement = fitted.trusted, (*([] if fitted.trusted else [fitted.message]), *fitted.warnings)
     else:
         experiment, judgement = stated_experiment(scene), (True, ())
         gradient = force_gradient(experiment)
