@@ -266,12 +266,26 @@ def test_remedies_at_a_circuit_whose_current_overflows():
     assert "current" not in found
 
 
+def test_a_record_s_values_and_noise(finger_fit: fitact.Fit, monkeypatch):
+    """The fit's own; one of the changes is enough here."""
+    monkeypatch.setattr("fitact.inference.design.fit", lambda records, scene: finger_fit)
+    monkeypatch.setattr("fitact.inference.design.changes", lambda steps: changes(steps)[-2:-1])
+    found = fitact.design_measurement(finger_fit.scene, finger_fit.record)
+    known = finger_fit.identifiability
+    assert found.now.force_sd == pytest.approx(known.force_sd, rel=0.01)
+    assert found.now.contraction == pytest.approx(known.force_contraction, rel=0.01)
+    assert list(found.now.sd.values()) == pytest.approx(finger_fit.sd.tolist(), rel=0.02)
+    assert found.trusted
+
+
 def test_what_cannot_be_asked():
     with pytest.raises(fitact.InputError, match="waveform = 'measured'"):
         fitact.design_measurement(fitact.Scene.from_dict({"drive": {"waveform": "measured"}}))
     held = {"prior": {name: {"fixed": True} for name in VALUES}}
     with pytest.raises(fitact.InputError, match="frees no parameter"):
         fitact.design_measurement(fitact.Scene.from_dict(held))
+    with pytest.raises(fitact.InputError, match="noise_Vsc is 0"):
+        fitact.design_measurement(fitact.Scene.from_dict({"measurement": {"noise_Vsc": 0.0}}))
 
 
 def test_command_line(design: fitact.MeasurementDesign, tmp_path: Path, monkeypatch, capsys):

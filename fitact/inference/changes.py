@@ -214,7 +214,7 @@ def _better_Ci(trial: Trial) -> Trial | None:
 def _channel(trial: Trial, channel: Channel, what: str) -> Trial | None:
     if channel in trial.experiments[0].channels:
         return None
-    noise = trial.experiments[0].noise.get(channel, NOISE[channel])
+    noise = trial.experiments[0].noise.get(channel) or NOISE[channel]
 
     def recorded(e: Experiment) -> Experiment:
         return dataclasses.replace(e, channels=(*e.channels, channel), noise={**e.noise, channel: noise})

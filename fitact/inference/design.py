@@ -17,6 +17,7 @@ from fitact.inference.changes import Change, changes
 from fitact.inference.expected import Experiment, force_gradient, spans
 from fitact.inference.fit import Fit, fit
 from fitact.inference.optimum import Optimum, optimise
+from fitact.inference.structure import gain_names
 from fitact.inference.trial import Option, Trial, judge
 from fitact.model.circuit import Channel
 from fitact.model.distribution import LogNormal
@@ -113,19 +114,26 @@ def design_measurement(scene: Scene, records: Record | Sequence[Record] = ()) ->
             is taken to be repeated.
 
     Raises:
-        InputError: the scene frees no parameter, or gives no drive and there is no record; or as `fitact.fit`.
+        InputError: the scene frees no parameter, or gives no noise, or no drive and there is no record; as
+            `fitact.fit`; or the fit ended where nothing can be computed.
     """
     records = (records,) if isinstance(records, Record) else tuple(records)
     if records:
         fitted = fit(records, scene)
         experiment, gradient = fitted.experiment, _force_gradient(fitted)
         steps = _steps(records[0], experiment)
-        judgement = fitted.trusted, (() if fitted.trusted else (fitted.message,))
+        judgement = fitted.trusted, (*([] if fitted.trusted else [fitted.message]), *fitted.warnings)
     else:
         experiment, judgement = stated_experiment(scene), (True, ())
         gradient = force_gradient(experiment)
         steps = {channel: span / _LEVELS for channel, span in spans(experiment).items()}
-    now = dataclasses.replace(judge(Trial((experiment,)), (), gradient), name="now", text="as it stands")
+    try:
+        now = dataclasses.replace(judge(Trial((experiment,)), (), gradient), name="now", text="as it stands")
+    except np.linalg.LinAlgError as error:
+        raise InputError(
+            f"what is recorded cannot be computed with at these values ({error}); check the scene's, or first get a"
+            " fit of the record that is trusted"
+        ) from error
     found, curves = _ranked(Trial((experiment,)), gradient, now, changes(steps))
     believed = float(np.linalg.norm(gradient @ experiment.prior_root))
     return MeasurementDesign(now, found, curves, believed, *judgement)
@@ -135,7 +143,7 @@ def stated_experiment(scene: Scene) -> Experiment:
     """The measurement that a scene states, at its own values.
 
     Raises:
-        InputError: it has no drive, or its sampling is out of bounds.
+        InputError: it has no drive, no noise or nothing free, or its sampling is out of bounds.
     """
     scene.require_available()
     measured, prior, nominal = scene.measurement, scene.make_prior(), scene.nominal()
@@ -143,21 +151,20 @@ def stated_experiment(scene: Scene) -> Experiment:
     values |= scene.fixed()
     tied = tuple((name, other, ratio) for name, (other, ratio) in scene.prior.tied().items())
     values |= {name: ratio * float(values.get(other) or nominal[other] or 0.0) for name, other, ratio in tied}
+    noise = {"Vsc": measured.noise_Vsc, "I": measured.noise_I}
+    silent = [channel for channel in measured.channels if noise[channel] == 0.0]
+    if silent:
+        raise InputError(
+            f"scene: [measurement] noise_{silent[0]} is 0, and without noise every sample tells all; give the noise"
+        )
     if not prior.names:
         raise InputError("scene: [prior] frees no parameter, so there is nothing to learn; give one a prior")
     circuit = scene.make_circuit(values)
     if isinstance(circuit, WithSkin) and isinstance(circuit.skin, Dispersive):
         # counted now, since what is compiled has its frequency traced
         circuit = dataclasses.replace(circuit, skin=Dispersive(circuit.skin.count(scene.drive.slowest)))
-    gains = {"gain": measured.gain_relative_sd, "gain_I": measured.gain_I_relative_sd}
-    of_channel = {"gain": "Vsc", "gain_I": "I"}
-    believed = prior.without(*(name for name in prior.names if name not in parameters(circuit))).including(
-        **{
-            name: LogNormal.with_relative_sd(1.0, sd)
-            for name, sd in gains.items()
-            if sd > 0.0 and of_channel[name] in measured.channels
-        }
-    )
+    believed = prior.without(*(name for name in prior.names if name not in parameters(circuit)))
+    believed = believed.including(**_gains(scene))
     return Experiment(
         circuit=circuit,
         free=believed.names,
@@ -165,11 +172,22 @@ def stated_experiment(scene: Scene) -> Experiment:
         drive=scene.make_drive(),
         time=sample_times(scene),
         channels=measured.channels,
-        noise={"Vsc": measured.noise_Vsc, "I": measured.noise_I},
+        noise=noise,
         steady_state=scene.drive.steady_state,
         geometry=scene.geometry(),
         tied=tied,
     )
+
+
+def _gains(scene: Scene) -> dict[str, LogNormal]:
+    """What the scene believes of the gains of its channels."""
+    measured = scene.measurement
+    stated = {"gain": measured.gain_relative_sd, "gain_I": measured.gain_I_relative_sd}
+    return {
+        name: LogNormal.with_relative_sd(1.0, stated[name])
+        for name in gain_names(measured.channels)
+        if stated[name] > 0.0
+    }
 
 
 def _force_gradient(fitted: Fit) -> Float[np.ndarray, " parameters"]:

@@ -56,8 +56,10 @@ class Trial:
     effort: float = 0.0
 
     def at(self, values: Sequence[float], *, in_step: bool = False) -> tuple[Experiment, ...]:
-        """The experiments with their settings at `values`; `in_step`: samples and edges keep their place in the
-        period, so that what is learnt changes smoothly with the frequency.
+        """The experiments with their settings at `values`.
+
+        `in_step`: samples and edges keep their place in the period, so that what they tell changes smoothly with
+        the frequency.
         """
         found = list(self.experiments)
         for setting, value in zip(self.settings, values, strict=True):
