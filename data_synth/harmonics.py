@@ -24,8 +24,7 @@ def harmonic_response(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """V, Vsc and I at `time` in the steady state, with the outer layers of skin dispersive or fractional.
 
-    A network of constants, which is the skin at the highest of `count` harmonics, is computed in time; the sum
-    of harmonics holds what the skin differs from it by.
+    A network whose skin is that of the highest of `count` harmonics is computed in time, the rest as a sum.
 
     Raises:
         RecipeError: the drive does not repeat, or jumps, for which a fractional skin would need far more harmonics.

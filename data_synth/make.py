@@ -12,7 +12,7 @@ from data_synth.drive import Drive, make_drive
 from data_synth.errors import RecipeError
 from data_synth.keys import default
 from data_synth.network import Network, network, state_space
-from data_synth.recipe import KEYS, UNITS, Recipe
+from data_synth.recipe import AS_IT_IS, KEYS, UNITS, Recipe
 from data_synth.scene import KEYS as SCENE
 from data_synth.scene import Scene
 
@@ -81,7 +81,7 @@ def _record(recipe: Recipe, scene: Scene, finger: int) -> Synthetic:
     time = np.arange(count) / measured["sampling_rate"]
     taken = imperfections.instants(time, parts["clock"], recipe.seed, finger)
     area = scene["device"]["contact_area"] / recipe.scene["device"]["contact_area"]
-    found = dict(zip(UNITS, respond(scene, _of_area(parts["skin"], area), recipe.route, taken), strict=True))
+    found = dict(zip(UNITS, respond(scene, taken, _of_area(parts["skin"], area), recipe.route), strict=True))
     wanted = [name for name in UNITS if name == "V" or name in measured["channels"]]
     if "I" in wanted and not np.all(np.isfinite(found["I"])):
         raise RecipeError(
@@ -107,13 +107,14 @@ def _with_noise(recipe: Recipe) -> dict[str, dict[str, Any]]:
 
 
 def respond(
-    scene: Scene, skin: Mapping[str, Any], route: str, time: np.ndarray
+    scene: Scene, time: np.ndarray, skin: Mapping[str, Any] | None = None, route: str = "scipy"
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """V, Vsc (V) and I (A) at `time` (s), without imperfections.
+    """V, Vsc (V) and I (A) at `time` (s), without imperfections; `skin` is a recipe's section of that name.
 
     Raises:
         RecipeError: the route has no such skin, or ngspice is absent.
     """
+    skin = skin or {"model": AS_IT_IS}
     second = (skin["Rsc_2"], skin["Csc_2"]) if skin["model"] == "two layers" else None
     circuit, drive = network(scene, second), make_drive(scene["drive"])
     law = skin if skin["model"] in ("nonlinear", "electroporated") else None

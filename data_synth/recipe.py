@@ -11,6 +11,7 @@ from data_synth.scene import KEYS as SCENE
 from data_synth.scene import Scene, make_scene
 
 UNITS = {"V": "V", "Vsc": "V", "I": "A"}
+AS_IT_IS = "as the scene says"  # what skin a recipe has that names no other
 _SUFFIX = ".recipe"
 
 
@@ -22,7 +23,7 @@ def _each(low: float = 0.0, default: float | None = None) -> dict[str, Key]:
 KEYS: Table = {
     # what the scene's skin is not
     "skin": {
-        "model": Choice(("as the scene says", "two layers", "nonlinear", "electroporated")),
+        "model": Choice((AS_IT_IS, "two layers", "nonlinear", "electroporated")),
         "Rsc_2": Quantity("ohm"),
         "Csc_2": Quantity("F"),
         "half_voltage": Quantity("V"),

@@ -19,6 +19,7 @@ KEYS: Table = {
         "insulator_thickness": Quantity("m", 1e-6),
         "insulator_permittivity": Quantity("", 3.9),
         "contact_area": Quantity("m^2", 1e-4),
+        **dict.fromkeys(("breakdown_field", "current_limit_rms", "current_limit_peak"), Unread()),
     },
     "skin": {
         "Rsc": Quantity("ohm", 160e3),
@@ -70,7 +71,9 @@ KEYS: Table = {
     "prior": dict.fromkeys(_BELIEFS.split(), Unread()),
     "force": {"model": Unread()},
     "perception": dict.fromkeys(("threshold_force", "friction_change"), Unread()),
-    "population": {"contact_area": Unread()},
+    "population": dict.fromkeys(
+        ("contact_area", "skin_thickness_relative_sd", "insulator_thickness_relative_sd"), Unread()
+    ),
     "tolerance": {"force": Unread()},
 }
 _NEEDED = {

@@ -12,7 +12,7 @@ import scipy.integrate
 import scipy.signal
 
 import fitact
-from data_synth import keys, make, recipe, scene
+from data_synth import keys, make, scene
 from data_synth.errors import RecipeError
 from data_synth.network import network, state_space
 from data_synth.response import frequency_response
@@ -20,7 +20,6 @@ from fitact.data.simulate import simulate
 
 R, C, CI = 160e3, 22e-9, 1.35e-9
 G, B = CI / (2.0 * CI + C), R * (2.0 * CI + C)
-PLAIN = keys.checked({}, recipe.KEYS, "no recipe")
 
 needs_ngspice = pytest.mark.skipif(shutil.which("ngspice") is None, reason="ngspice is not installed")
 
@@ -32,7 +31,7 @@ def scene_of(**tables: dict[str, Any]) -> scene.Scene:
 def respond(
     time: np.ndarray, model: dict[str, Any] | None = None, route: str = "scipy", **tables: dict[str, Any]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return make.respond(scene_of(**tables), PLAIN["skin"] | (model or {}), route, time)
+    return make.respond(scene_of(**tables), time, model, route)
 
 
 def even(count: int = 2000, step: float = 1e-5) -> np.ndarray:
@@ -295,7 +294,7 @@ def test_scenes_have_the_keys_and_defaults_that_fitact_reads():
     theirs = fitact.Scene.model_fields
     assert set(theirs) == set(scene.KEYS)
     for name, section in fitact.Scene():
-        assert set(type(section).model_fields) == set(scene.KEYS[name])
+        assert set(type(section).model_fields) <= set(scene.KEYS[name])
         for key, kind in scene.KEYS[name].items():
             if not isinstance(kind, keys.Unread):
                 assert getattr(section, key) == keys.default(kind), (name, key)

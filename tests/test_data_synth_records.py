@@ -133,6 +133,18 @@ def test_noise_depends_on_the_seed_and_on_no_other_noise(tmp_path: Path):
     assert np.std(other - plain) > 1.0
 
 
+def test_kinds_channels_and_fingers_have_random_numbers_of_their_own():
+    """No two streams go together by five standard errors, which one pair in a million would by chance."""
+    streams = [
+        imperfections.generator(1, finger, kind, channel).standard_normal(2000)
+        for kind in ("population", "clock", "hum", "pink", "white", "missing")
+        for channel in ("V", "Vsc", "I")
+        for finger in range(3)
+    ]
+    together = np.corrcoef(streams) - np.eye(len(streams))
+    assert np.abs(together).max() < 5.0 / np.sqrt(2000)
+
+
 def test_what_is_true_goes_before_what_the_scene_says(tmp_path: Path):
     text = '[truth.skin]\nRsc = "90 kohm"\n[truth.drive]\nwaveform = "square"\nduty = 0.25'
     made = only(make.make(written(tmp_path, text)))

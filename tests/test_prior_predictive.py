@@ -3,9 +3,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import skin_voltage
 
 import fitact
+from data_synth.make import respond
+from data_synth.scene import make_scene
 from fitact.inference.prior_predictive import believed, prior_predictive
 from fitact.report.prior import write_prior
 
@@ -29,13 +30,13 @@ def predicted():
 
 
 def test_each_draw_is_the_circuit_at_its_parameters(predicted):
-    """scipy.signal from rest, until the transient has gone; force by eqs. (3) and (22)."""
+    """Settled by scipy's state space (data_synth); force by eqs. (3) and (22)."""
     Rsc, Csc, Ci = (predicted.parameters[name] for name in ("Rsc", "Csc", "Ci"))
-    time = np.arange(40 * 400) * 2.5e-5
-    voltage = np.where(np.arange(time.size) % 400 < 200, 180.0, -180.0)
-    there = np.abs(predicted.time[:, None] - time[:800]).argmin(axis=0)
-    for i in np.flatnonzero(Rsc * (Csc + 2.0 * Ci) < 0.02)[:5]:
-        settled = skin_voltage(time, voltage, Rsc[i], Csc[i], Ci[i], hold=True)[-800:]
+    time = np.arange(800) * 2.5e-5
+    there = np.abs(predicted.time[:, None] - time).argmin(axis=0)
+    for i in range(5):
+        true = {"skin": {"Rsc": float(Rsc[i]), "Csc": float(Csc[i])}, "device": {"Ci": float(Ci[i])}}
+        settled = respond(make_scene(true, {}, "draw"), time)[1]
         np.testing.assert_allclose(predicted.Vsc[i][there], settled, atol=1e-6)
         derived = {name: draws[i] for name, draws in predicted.derived.items()}
         assert derived["Vsc_peak_to_peak"] == pytest.approx(np.ptp(settled), rel=1e-6)
