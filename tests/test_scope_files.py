@@ -324,6 +324,14 @@ def test_matlab_against_what_scipy_wrote(tmp_path: Path, compressed: bool):
         np.testing.assert_array_equal(found[name], values)
 
 
+def test_arrays_are_named_as_columns_are(tmp_path: Path):
+    np.savez(tmp_path / "named.npz", time_ms=1e3 * TIME, V_V=TIME, Vsc_mV=1e3 * TIME)
+    capture = read_capture(tmp_path / "named.npz")
+    np.testing.assert_allclose(capture.time, TIME, rtol=1e-15)
+    assert {trace.name: trace.unit for trace in capture.traces} == {"V": "V", "Vsc": "V"}
+    np.testing.assert_allclose(capture.traces[1].values, TIME, rtol=1e-15)
+
+
 def test_named_arrays_that_are_refused(tmp_path: Path):
     import scipy.io
 

@@ -194,12 +194,11 @@ def _capture(contents: _Contents, source: str, pick: Pick) -> Capture:
     arrays = contents.arrays
     if any(array.dtype.kind == "c" for array in arrays.values()):
         raise InputError(f"{source}: holds complex numbers (IQ data), not voltages in time; export those")
-    last = {name: name.rpartition("/")[2] for name in arrays}
-    timed = [
-        name for wanted in ("time", *sorted(layouts.TIME_NAMES)) for name in arrays if last[name].lower() == wanted
-    ]
+    last = {name: layouts.name_and_unit(name.rpartition("/")[2]) for name in arrays}
+    times = ("time", *sorted(layouts.TIME_NAMES))
+    timed = [name for wanted in times for name in arrays if last[name][0].lower() == wanted]
     others = [name for name in arrays if not timed or name != timed[0]]
-    short = [last[name] for name in others]
+    short = [last[name][0] for name in others]
     names = others if len(set(short)) < len(short) else short
     wanted = set(pick(names, ""))
     chosen = [(name, other) for name, other in zip(names, others, strict=True) if name in wanted]
@@ -208,7 +207,7 @@ def _capture(contents: _Contents, source: str, pick: Pick) -> Capture:
     if not chosen:
         raise InputError(f"{source}: holds no array of one axis besides the time; store V, Vsc or I in it")
     if timed:
-        time, notes = _seconds(arrays[timed[0]], contents.units[timed[0]], source)
+        time, notes = _seconds(arrays[timed[0]], last[timed[0]][1] or contents.units[timed[0]], source)
     else:
         time, notes = _grid(contents, arrays[chosen[0][1]].size, source)
     for name, other in chosen:
@@ -218,7 +217,7 @@ def _capture(contents: _Contents, source: str, pick: Pick) -> Capture:
                 " one length, or name those wanted with --channel"
             )
     stated = next((_word(contents.stated[key]) for key in layouts.UNIT_KEYS if key in contents.stated), "")
-    traces = [_trace(name, arrays[other], contents.units[other] or stated) for name, other in chosen]
+    traces = [_trace(name, arrays[other], last[other][1] or contents.units[other] or stated) for name, other in chosen]
     unread = tuple(name for name in names if name not in wanted)
     return Capture(source, contents.format, time, tuple(traces), notes=tuple(notes), others=unread)
 
@@ -246,11 +245,9 @@ def _grid(contents: _Contents, count: int, source: str) -> tuple[np.ndarray, lis
 
 
 def _trace(name: str, values: np.ndarray, written: str) -> Trace:
-    column, in_name = layouts.name_and_unit(name)
-    written = in_name or written
     unit = layouts.unit(written)
     values = values.astype(float)
-    return Trace(column, values * unit[1] if unit else values, unit[0] if unit else "", written)
+    return Trace(name, values * unit[1] if unit else values, unit[0] if unit else "", written)
 
 
 @contextlib.contextmanager
