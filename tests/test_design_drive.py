@@ -22,6 +22,7 @@ from fitact.cli.app import app
 from fitact.inference.drive_option import quantile
 from fitact.inference.people import People
 from fitact.model.cycle import cycle
+from fitact.report.drive_design import write_drive_design
 
 EPS0, AREA, TI, TSC = 8.85e-12, 1e-4, 1e-6, 200e-6
 R, C, CI, F, RISE = 160e3, 22e-9, 1.35e-9, 100.0, 50e-6
@@ -130,6 +131,26 @@ def test_a_cycle_is_scipys(name: str, settled):
     assert found.current_rms == pytest.approx(rms, rel=1e-6)
     assert found.current_peak == pytest.approx(max(np.abs(seen["I"]).max(), np.abs(seen["I left"]).max()), rel=1e-6)
     assert found.apparent_power == pytest.approx(math.sqrt(mean(seen["V"] ** 2)) * rms, rel=1e-6)
+
+
+def test_peaks_between_corners_are_found():
+    """A triangle's, exactly elsewhere; and of two tones, on a fine grid."""
+    with jax.enable_x64(True):
+        contact = fitact.Contact.from_capacitances(CI, C, AREA, TI, TSC)
+        circuit, triangle = CIRCUITS["direct"][0], fitact.Triangle(360.0, F)
+        found = jax.jit(lambda: cycle(circuit, triangle, contact))()
+        exact = jax.jit(lambda: fitact.body_current(circuit, triangle))()
+        assert found.current_peak == pytest.approx(float(exact.peak), rel=1e-4)
+        tones = fitact.Multitone(F, (1, 7), (100.0, 30.0), (0.3, 1.0), offset=20.0)
+        found = jax.jit(lambda: cycle(circuit, tones, contact))()
+        s = 2j * np.pi * F * np.array([1, 7])
+        whole = sum(R0 / (1.0 + s * R0 * C0) for R0, C0 in CIRCUITS["direct"][1]) + 40e3 + 1.0 / (s * CI)
+        turns = np.exp(1j * (np.outer([1, 7], np.linspace(0.0, 2.0 * np.pi, 50_001)) + np.array([[0.3], [1.0]])))
+        current = np.imag((np.array([100.0, 30.0]) / whole) @ turns)
+        over = 20.0 + np.imag((np.array([100.0, 30.0]) / whole / (s * CI)) @ turns)
+        assert found.current_peak == pytest.approx(np.abs(current).max(), rel=1e-4)
+        assert found.insulator_peak == pytest.approx(np.abs(over).max(), rel=1e-4)
+        assert found.current_rms == pytest.approx(math.sqrt(np.mean(current[:-1] ** 2)), rel=1e-9)
 
 
 def one_finger(**values: float) -> People:
@@ -276,7 +297,7 @@ def test_quantiles_hold_where_some_never_feel_it():
     )
 
 
-def test_friction_changes_by_a_share_of_itself():
+def test_friction_changes_by_a_share_of_itself(tmp_path: Path):
     """Of a sine mean and amplitude of fe are one: c (fe + fN) = fe; none reaches the mean itself."""
     few = fitact.design_drive(scene(perception={"friction_change": 2e-4}), one_finger()).options["sine"]
     fe = 2e-4 * 0.5 / (1.0 - 2e-4)
@@ -286,6 +307,10 @@ def test_friction_changes_by_a_share_of_itself():
     assert never.options["sine"].to_dict()["peak_to_peak"]["assured"] == math.inf
     assert "unbounded" in str(never)
     assert never.smallest()["peak_to_peak"] == "triangle"  # whose force is more pointed
+    nobody = fitact.design_drive(scene(perception={"friction_change": 5.0}), one_finger())
+    assert nobody.smallest() == {"peak_to_peak": None, "real_power": None, "apparent_power": None}
+    write_drive_design(tmp_path / "nobody.svg", nobody)
+    assert (tmp_path / "nobody.svg").stat().st_size > 0
 
 
 def test_what_breaks_a_limit_is_named_and_not_the_smallest(one):

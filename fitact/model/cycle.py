@@ -13,17 +13,17 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.model.circuit import RC, Terms
-from fitact.model.drive import Periodic, Pieces, PiecewiseLinear, Sine
+from fitact.model.drive import Periodic, PiecewiseLinear, Sine
 from fitact.model.force import AirGap, Contact, electrostatic_force
-from fitact.model.multitone import Multitone, largest_sum
+from fitact.model.multitone import Multitone
 from fitact.model.response import highpass, phi, steady_knots
-from fitact.model.steady import body_current, highpass_mean_square
+from fitact.model.steady import highpass_mean_square, mean_square
 
 HARMONICS = 4  # of the drive's frequency, at which the force is stated
 
 _NODES = 10  # Gauss-Legendre nodes of each part of a straight piece;
 _PARTS = 4.0 ** -np.arange(9.0, -1.0, -1.0)  # parts grow from its start, where transients of any length begin
-_POINTS_OF_A_SINE, _POINTS = 16, 1024  # of a period: the mean of Vsc^4 is exact, with a multi-tone's up to order 250
+_PER_CYCLE = 32  # points of the fastest sine's cycle: the mean of Vsc^4 is exact from 5 on
 
 
 class Cycle(NamedTuple):
@@ -51,10 +51,10 @@ class Cycle(NamedTuple):
 
 def cycle(circuit: RC, drive: Periodic, contact: Contact | AirGap) -> Cycle:
     """All of `Cycle`; the force acts on `contact`, eqs. (1) and (22)."""
-    period, (rms, largest) = Period.of(drive), body_current(circuit, drive)
-    terms = circuit.terms_of(contact.channel)
-    force = electrostatic_force(_sum(terms, period), contact)
+    period, terms = Period.of(drive), circuit.terms_of(contact.channel)
+    force = electrostatic_force(period.response(terms), contact)
     mean = period.weight @ force
+    rms = jnp.sqrt(mean_square(circuit, drive, "I"))
     turns = jnp.exp(-2j * np.pi * jnp.arange(1, HARMONICS + 1)[:, None] * period.cycles)
     return Cycle(
         force_mean=mean,
@@ -64,7 +64,7 @@ def cycle(circuit: RC, drive: Periodic, contact: Contact | AirGap) -> Cycle:
         real_power=real_power(circuit, drive),
         apparent_power=jnp.sqrt(period.weight @ jnp.square(period.voltage)) * rms,
         current_rms=rms,
-        current_peak=largest,
+        current_peak=jnp.where(jnp.isinf(rms), jnp.inf, period.largest(period.response(circuit.current_terms()))),
     )
 
 
@@ -80,26 +80,14 @@ def real_power(circuit: RC, drive: Periodic) -> Float[Array, ""]:
 
 
 def insulator_peak(circuit: RC, drive: Periodic) -> Float[Array, ""]:
-    """The largest |voltage| over the insulator in V, edges included; the drive's mean lies over it entirely.
-
-    Between the ends of straight pieces it is taken at nodes: low by less than 1e-4.
-    """
-    if isinstance(drive, Sine | Multitone):
-        orders: tuple[int, ...] = (1,)
-        if isinstance(drive, Sine):
-            phasors = 0.5 * jnp.asarray(drive.peak_to_peak)[None]
-        else:
-            orders, phasors = drive.orders, drive.phasors()
-        omega = 2.0 * np.pi * jnp.asarray(drive.frequency) * jnp.asarray(orders)
-        gain = circuit.admittance(omega) / (1j * omega * circuit.Ci)
-        return abs(jnp.asarray(drive.offset)) + largest_sum(phasors * gain, orders)
+    """The largest |voltage| over the insulator in V, edges included; the drive's mean lies over it entirely."""
     period, (weight, tau, rate) = Period.of(drive), circuit.current_terms()
     mean = period.weight @ period.voltage
     alternating = period.voltage - mean
     charge = jnp.zeros_like(alternating) if rate is None else rate * alternating
     for each, of in zip(weight, tau, strict=True):  # the integral of a high-pass response is what it leaves out
         charge = charge + each * of * (alternating - period.highpass(of))
-    return jnp.max(jnp.abs(mean + charge / circuit.Ci))
+    return period.largest(mean + charge / circuit.Ci)
 
 
 class Period(eqx.Module):
@@ -111,6 +99,7 @@ class Period(eqx.Module):
         cycles: from the start of the period, in periods.
         weight: the share of the period.
         voltage: of the drive, V.
+        slope: of the drive between its jumps, V/s.
     """
 
     drive: Periodic
@@ -118,43 +107,58 @@ class Period(eqx.Module):
     cycles: Float[Array, " points"]
     weight: Float[Array, " points"]
     voltage: Float[Array, " points"]
+    slope: Float[Array, " points"]
 
     @classmethod
     def of(cls, drive: Periodic) -> "Period":
         """Of a drive."""
         if not isinstance(drive, PiecewiseLinear):
-            count = _POINTS_OF_A_SINE if isinstance(drive, Sine) else _POINTS
+            count = _PER_CYCLE * (max(drive.orders) if isinstance(drive, Multitone) else 1)
             cycles = jnp.arange(count) / count
             since = cycles * drive.period
-            return cls(drive, since[None], cycles, jnp.full(count, 1.0 / count), drive.value(since))
-        knots, start, end = drive.pieces()
+            share = jnp.full(count, 1.0 / count)
+            return cls(drive, since[None], cycles, share, drive.value(since), drive.slope(since))
+        pieces = drive.pieces()
         place, weight = _rule()
-        length = jnp.diff(knots)[:, None]
-        flat = (knots[:-1, None] + length * place) / knots[-1], length * weight / knots[-1]
-        voltage = start[:, None] + (end - start)[:, None] * place
-        return cls(drive, length * place, *(x.reshape(-1) for x in (*flat, voltage)))
+        length = jnp.diff(pieces.knots)[:, None]
+        slope = jnp.broadcast_to(pieces.slopes()[:, None], (length.size, place.size))
+        since, period = length * place, pieces.knots[-1]
+        flat = (pieces.knots[:-1, None] + since) / period, length * weight / period
+        voltage = pieces.start[:, None] + (pieces.end - pieces.start)[:, None] * place
+        return cls(drive, since, *(x.reshape(-1) for x in (*flat, voltage, slope)))
 
     def highpass(self, tau: ArrayLike) -> Float[Array, " points"]:
         """The response of s tau / (1 + s tau), V."""
         if not isinstance(self.drive, PiecewiseLinear):
             return highpass(self.drive, self.since[0], tau)
-        pieces: Pieces = self.drive.pieces()
+        pieces = self.drive.pieces()
         left = steady_knots(pieces, tau)[:, None] * jnp.exp(-self.since / tau)
         return (left + pieces.slopes()[:, None] * self.since * phi(self.since / tau)).reshape(-1)
+
+    def response(self, terms: Terms) -> Float[Array, " points"]:
+        """That of a circuit's terms, in their unit."""
+        total = jnp.zeros_like(self.voltage) if terms.rate is None else terms.rate * self.slope
+        for weight, tau in zip(terms.weight, terms.tau, strict=True):
+            total = total + weight * self.highpass(tau)
+        return total
+
+    def largest(self, values: Float[Array, " points"]) -> Float[Array, ""]:
+        """The largest of |values|: exact at the ends of straight pieces and of a sine, elsewhere low by up to 1e-4."""
+        size = jnp.abs(values)
+        if isinstance(self.drive, Sine):
+            first = jnp.exp(-2j * np.pi * self.cycles)
+            return jnp.abs(self.weight @ values) + 2.0 * jnp.abs((self.weight * first) @ values)
+        if isinstance(self.drive, PiecewiseLinear):
+            return jnp.max(size)
+        top = jnp.argmax(size)  # of the parabola through it and its neighbours
+        before, at, after = size[top - 1], size[top], size[(top + 1) % size.size]
+        bend = before - 2.0 * at + after
+        return at - jnp.where(bend < 0.0, jnp.square(before - after) / (8.0 * jnp.where(bend < 0.0, bend, -1.0)), 0.0)
 
 
 def _rule() -> tuple[np.ndarray, np.ndarray]:
     """Places and weights on a piece of length 1."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     length = np.diff(_PARTS, prepend=0.0)[:, None]
-    places = _PARTS[:, None] - length * 0.5 * (1.0 - nodes)
-    return np.concatenate([[0.0], places.ravel(), [1.0]]), np.concatenate(
-        [[0.0], (0.5 * length * weights).ravel(), [0.0]]
-    )
-
-
-def _sum(terms: Terms, period: Period) -> Float[Array, " points"]:
-    total = jnp.zeros_like(period.voltage)
-    for weight, tau in zip(terms.weight, terms.tau, strict=True):
-        total = total + weight * period.highpass(tau)
-    return total
+    places, inside = _PARTS[:, None] - length * 0.5 * (1.0 - nodes), 0.5 * length * weights
+    return np.concatenate([[0.0], places.ravel(), [1.0]]), np.concatenate([[0.0], inside.ravel(), [0.0]])

@@ -90,9 +90,8 @@ def _draw_frequencies(axes: Axes, design: DriveDesign) -> None:
         title = f"{100.0 * design.share:g} %, {name}"
         axes.plot(frequency, _drawn(median), color=_COLORS[name], lw=_width(design, name), label=title)
     axes.set_xscale("log")
-    axes.set_yscale("log")
     _log_ticks(axes.xaxis, "Hz")
-    _log_ticks(axes.yaxis, "V")
+    _volts(axes)
     axes.set_xlabel("frequency of the drive")
     axes.set_ylabel("peak-to-peak amplitude needed")
     axes.legend(fontsize=9)
@@ -116,9 +115,8 @@ def _draw_insulators(
     ):
         if np.any(np.isfinite(limit)):
             axes.plot(at, limit, color=shade, lw=1.5, ls="--", label=what)
-    axes.set_yscale("log")
-    _log_ticks(axes.yaxis, "V")
-    axes.set_ylabel("peak-to-peak amplitude")
+    _volts(axes)
+    axes.set_ylabel(f"peak-to-peak amplitude, {design.own}")
 
 
 def _allowed(option: DriveOption, what: str, limit: float | None) -> float:
@@ -131,6 +129,15 @@ def _drawn(amplitude: Sequence[float] | Float[np.ndarray, " n"]) -> Float[np.nda
     """With a gap where it is infinite."""
     values = np.asarray(amplitude, dtype=float)
     return np.where(np.isfinite(values), values, np.nan)
+
+
+def _volts(axes: Axes) -> None:
+    if not any(np.isfinite(np.asarray(line.get_ydata(), dtype=float)).any() for line in axes.lines):
+        axes.set_yticks([])
+        axes.text(0.5, 0.5, "too few feel it at any amplitude", transform=axes.transAxes, ha="center")
+        return
+    axes.set_yscale("log")
+    _log_ticks(axes.yaxis, "V")
 
 
 def _log_ticks(axis: Axis, unit: str, subs: tuple[float, ...] = (1.0, 2.0, 5.0)) -> None:
