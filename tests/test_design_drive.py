@@ -20,7 +20,7 @@ import fitact
 from fitact.cli import _guarded
 from fitact.cli.app import app
 from fitact.inference.drive_option import quantile
-from fitact.inference.people import People
+from fitact.inference.drive_people import People
 from fitact.model.cycle import cycle
 from fitact.report.drive_design import write_drive_design
 
