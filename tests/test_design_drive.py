@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import types
 from pathlib import Path
 
 import jax
@@ -20,8 +21,10 @@ import fitact
 from fitact.cli import _guarded
 from fitact.cli.app import app
 from fitact.inference.drive_option import quantile
-from fitact.inference.people import People
+from fitact.inference.drive_people import People
+from fitact.inference.fingers import Law
 from fitact.model.cycle import cycle
+from fitact.report.drive_design import write_drive_design
 
 EPS0, AREA, TI, TSC = 8.85e-12, 1e-4, 1e-6, 200e-6
 R, C, CI, F, RISE = 160e3, 22e-9, 1.35e-9, 100.0, 50e-6
@@ -296,7 +299,7 @@ def test_quantiles_hold_where_some_never_feel_it():
     )
 
 
-def test_friction_changes_by_a_share_of_itself():
+def test_friction_changes_by_a_share_of_itself(tmp_path: Path):
     """Of a sine mean and amplitude of fe are one: c (fe + fN) = fe; none reaches the mean itself."""
     few = fitact.design_drive(scene(perception={"friction_change": 2e-4}), one_finger()).options["sine"]
     fe = 2e-4 * 0.5 / (1.0 - 2e-4)
@@ -306,6 +309,10 @@ def test_friction_changes_by_a_share_of_itself():
     assert never.options["sine"].to_dict()["peak_to_peak"]["assured"] == math.inf
     assert "unbounded" in str(never)
     assert never.smallest()["peak_to_peak"] == "triangle"  # whose force is more pointed
+    nobody = fitact.design_drive(scene(perception={"friction_change": 5.0}), one_finger())
+    assert nobody.smallest() == {"peak_to_peak": None, "real_power": None, "apparent_power": None}
+    write_drive_design(tmp_path / "nobody.svg", nobody)
+    assert (tmp_path / "nobody.svg").stat().st_size > 0
 
 
 def test_what_breaks_a_limit_is_named_and_not_the_smallest(one):
@@ -398,8 +405,13 @@ def test_people_are_those_of_the_population(eight):
     people, design = eight
     assert design.people.separated
     assert design.trusted
-    white = np.random.default_rng(8).standard_normal((512, 4000, 3))  # of the same laws
-    Rsc, Csc, Ci = np.moveaxis(np.exp(people.factors(white)), -1, 0)
+    laws = {name: x.reshape(-1) for name, x in people.parameters().items()}
+    chosen = np.linspace(0, laws["Ci"].size - 1, 512).astype(int)
+    of = {name: x[chosen, None] for name, x in laws.items()}
+    one, other = np.random.default_rng(8).standard_normal((2, 512, 4000))
+    other = of["correlation"] * one + np.sqrt(1.0 - of["correlation"] ** 2) * other
+    Rsc, Csc = of["Rsc"] * np.exp(of["log_sd_Rsc"] * one), of["Csc"] * np.exp(of["log_sd_Csc"] * other)
+    Ci = of["Ci"]
     s = 2j * np.pi * F
     gain = np.abs(s * Rsc * Ci / (1.0 + s * Rsc * (2.0 * Ci + Csc)))
     needed = np.sqrt(8.0 * THRESHOLD / (per_square(Csc, Ci) * gain**2))
@@ -412,24 +424,23 @@ def test_people_are_those_of_the_population(eight):
     assert np.std(off) < 0.2 * np.std(np.log(option.amplitude))
 
 
-@pytest.mark.slow
-def test_areas_scale_capacitances_up_and_resistance_down(eight):
-    people, design = eight
+def test_an_area_scales_capacitances_up_and_the_resistance_down():
+    """Of one law, whose fingers differ in nothing else; what is tied follows."""
+
+    def law(_: np.ndarray) -> Law:
+        return Law(np.log([R, C]), np.zeros(2), 0.0, math.log(CI), 0.3)
+
+    population = types.SimpleNamespace(
+        hierarchy=types.SimpleNamespace(law=law), points=np.zeros((1, 1000, 1)), fits=(), trusted=True
+    )
     tied = scene(prior={"grounding_Rsc": {"tied": "Rsc", "ratio": 3}, "R_H": {"fixed": "500 ohm"}})
-
-    class Area:
-        fits, trusted = people.fits, True
-
-        @staticmethod
-        def factors(white: np.ndarray) -> np.ndarray:
-            return np.concatenate([people.factors(white), np.full((*white.shape[:2], 1), math.log(2.0))], axis=-1)
-
-    plain, double = People.of_population(people, design.scene), People.of_population(Area, tied)
-    for name, factor in {"Rsc": 0.5, "Csc": 2.0, "Ci": 2.0}.items():
-        np.testing.assert_allclose(double.values[name], factor * plain.values[name], rtol=1e-12)
-    assert set(plain.values) == {"Rsc", "Csc", "Ci"}
-    np.testing.assert_array_equal(double.values["grounding_Rsc"], 3.0 * double.values["Rsc"])
-    assert np.all(double.values["R_H"] == 500.0)
+    values = People.of_population(population, tied).values
+    area = values["Ci"] / CI
+    np.testing.assert_allclose(values["Csc"], C * area)
+    np.testing.assert_allclose(values["Rsc"], R / area)
+    assert np.std(np.log(area)) == pytest.approx(0.3, rel=1e-3)
+    np.testing.assert_array_equal(values["grounding_Rsc"], 3.0 * values["Rsc"])
+    assert np.all(values["R_H"] == 500.0)
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from fitact.errors import InputError
 from fitact.inference.drive_option import ASSURANCE, DriveOption, quantile, shown
-from fitact.inference.people import People
+from fitact.inference.drive_people import People
 from fitact.inference.population import Population
 from fitact.model.circuit import RC
 from fitact.model.cycle import Cycle, cycle

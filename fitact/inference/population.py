@@ -94,10 +94,12 @@ class Population:
         with jax.enable_x64(True):
             return NewFinger.under_drive_of(self.fits[0])
 
-    def factors(self, white: Float[np.ndarray, "laws fingers 3"]) -> Float[np.ndarray, "laws fingers factors"]:
-        """Logarithms of Rsc, Csc, Ci and, where it varies, area of new fingers, from standard normal numbers."""
+    @functools.cached_property
+    def _factors(self) -> Float[np.ndarray, "laws fingers factors"]:
+        """Logarithms of Rsc, Csc, Ci and, where it varies, area of new fingers."""
         flat = self.points.reshape(-1, self.points.shape[-1])
-        law = _laws(self.hierarchy, flat[np.linspace(0, len(flat) - 1, len(white)).astype(int), None])
+        law = _laws(self.hierarchy, flat[np.linspace(0, len(flat) - 1, _LAWS).astype(int), None])
+        white = np.random.default_rng([self.seed, 1]).standard_normal((_LAWS, _FINGERS, 3))
         r = law.correlation
         second = r * white[..., 0] + np.sqrt(1.0 - r**2) * white[..., 1]
         skin = law.median + law.log_sd * np.stack([white[..., 0], second], axis=-1)
@@ -105,10 +107,6 @@ class Population:
         if law.area is not None:
             factors.append(law.area * white[..., 2])
         return np.stack(factors, axis=-1)
-
-    @functools.cached_property
-    def _factors(self) -> Float[np.ndarray, "laws fingers factors"]:
-        return self.factors(np.random.default_rng([self.seed, 1]).standard_normal((_LAWS, _FINGERS, 3)))
 
     @functools.cached_property
     def _new(self) -> Float[np.ndarray, "laws fingers names"]:

@@ -44,6 +44,8 @@ def _figure(design: DriveDesign) -> Figure:
     _draw_frequencies(frequencies, design)
     _draw_insulators(thicknesses, design, design.by_thickness, lambda o: o.device.insulator_thickness)
     thicknesses.set_xscale("log")
+    thickness = [option.device.insulator_thickness for option in design.by_thickness]
+    thicknesses.set_xlim(0.8 * thickness[0], 1.25 * thickness[-1])
     thicknesses.set_xlabel("insulator thickness")
     _log_ticks(thicknesses.xaxis, "m", (1.0,))
     thicknesses.legend(fontsize=9)
@@ -90,6 +92,7 @@ def _draw_frequencies(axes: Axes, design: DriveDesign) -> None:
         title = f"{100.0 * design.share:g} %, {name}"
         axes.plot(frequency, _drawn(median), color=_COLORS[name], lw=_width(design, name), label=title)
     axes.set_xscale("log")
+    axes.set_xlim(8.0, 1250.0)
     _log_ticks(axes.xaxis, "Hz")
     _volts(axes)
     axes.set_xlabel("frequency of the drive")
@@ -132,7 +135,7 @@ def _drawn(amplitude: Sequence[float] | Float[np.ndarray, " n"]) -> Float[np.nda
 
 
 def _volts(axes: Axes) -> None:
-    if not np.isfinite(axes.dataLim.ymin):
+    if not any(np.isfinite(np.asarray(line.get_ydata(), dtype=float)).any() for line in axes.lines):
         axes.set_yticks([])
         axes.text(0.5, 0.5, "too few feel it at any amplitude", transform=axes.transAxes, ha="center")
         return

@@ -3,12 +3,13 @@
 import dataclasses
 from typing import Any, Self
 
+import jax
 import numpy as np
 import scipy.special
 import scipy.stats
 from jaxtyping import Float
 
-from fitact.inference.fingers import SHARED, SKIN
+from fitact.inference.fingers import SHARED, SKIN, Law
 from fitact.inference.population import Population
 from fitact.inference.prior_predictive import believed
 from fitact.model.scene import Scene
@@ -49,11 +50,15 @@ class People:
 
         What the scene holds or ties to these follows; all else is the scene's.
         """
-        uniform = scipy.stats.qmc.Sobol(3, rng=np.random.default_rng([seed, 2])).random(_LAWS * _FINGERS)
-        logs = population.factors(scipy.special.ndtri(uniform).reshape(_LAWS, _FINGERS, 3))
-        area = logs[..., 3] if logs.shape[-1] > 3 else 0.0
-        signs = {SKIN[0]: -1.0, SKIN[1]: 1.0, SHARED: 1.0}
-        values = {name: np.exp(logs[..., i] + sign * area) for i, (name, sign) in enumerate(signs.items())}
+        law, white = _laws(population), _standard_normal(seed)
+        r, area = law.correlation, 0.0 if law.area is None else law.area * white[..., 2]
+        second = r * white[..., 0] + np.sqrt(1.0 - r**2) * white[..., 1]
+        skin = law.median + law.log_sd * np.stack([white[..., 0], second], axis=-1)
+        values = {
+            SKIN[0]: np.exp(skin[..., 0] - area),
+            SKIN[1]: np.exp(skin[..., 1] + area),
+            SHARED: np.exp(law.log_Ci + area + np.zeros_like(second)),
+        }
         held = {name: np.full((_LAWS, _FINGERS), value) for name, value in scene.fixed().items()}
         known: dict[str, Any] = {**scene.nominal(), **held, **values}
         tied = {name: ratio * known[other] for name, (other, ratio) in scene.prior.tied().items()}
@@ -75,3 +80,17 @@ class People:
 
 def _of_the_circuit(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: x for name, x in values.items() if name not in _NOT_OF_THE_CIRCUIT}
+
+
+def _laws(population: Population) -> Law:
+    """Draws of it, spread over the chain; each leaf (laws, 1, ...)."""
+    flat = population.points.reshape(-1, population.points.shape[-1])
+    drawn = flat[np.linspace(0, len(flat) - 1, _LAWS).astype(int)]
+    with jax.enable_x64(True):
+        return jax.tree.map(lambda x: np.asarray(x)[:, None], jax.jit(jax.vmap(population.hierarchy.law))(drawn))
+
+
+def _standard_normal(seed: int) -> Float[np.ndarray, "laws fingers 3"]:
+    """Spread evenly within each law and over all."""
+    uniform = scipy.stats.qmc.Sobol(3, rng=np.random.default_rng([seed, 2])).random(_LAWS * _FINGERS)
+    return scipy.special.ndtri(uniform).reshape(_LAWS, _FINGERS, 3)
