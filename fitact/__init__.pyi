@@ -4,7 +4,8 @@ from .data.record import Record
 from .errors import InputError
 from .inference.comparison import Comparison, compare
 from .inference.fit import Fit, fit
-from .inference.population import Population, population
+from .inference.people import Population
+from .inference.population import population
 from .inference.posterior import Posterior
 from .inference.sampling import sample
 from .inference.solver import RESULTS

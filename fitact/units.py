@@ -18,6 +18,7 @@ _UNITS = {
     "offset": "V", "drift": "V", "charge": "V", "charge_2": "V", "charge_3": "V", "charge_4": "V",
     "hum_50Hz_cos": "V", "hum_50Hz_sin": "V", "hum_60Hz_cos": "V", "hum_60Hz_sin": "V",
     "g": "1", "b": "s", "force_mean": "N", "force_peak": "N", "force_rms": "N", "friction_mean": "N",
+    "force_at_f": "N", "force_at_2f": "N", "friction_at_f": "N", "friction_at_2f": "N",
 }  # fmt: skip
 
 

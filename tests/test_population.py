@@ -4,6 +4,7 @@ import dataclasses
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import equinox as eqx
@@ -17,9 +18,11 @@ from arviz_stats.base import array_stats
 from population_calibration import FREQUENCY, simulate, steady, wave
 
 import fitact
-from fitact.inference.fingers import Conditional, Fingers, Law
+from fitact.inference.finger import Finger
+from fitact.inference.fingers import Fingers, Law
 from fitact.inference.hierarchy import Hierarchy
-from fitact.inference.new_finger import FACTORS, NAMES, Spread, variance_shares
+from fitact.inference.new_finger import FACTORS, Spread
+from fitact.inference.sensitivity import Surrogate, shares_of, variance_shares
 from fitact.model.prior import Prior
 
 NUTS_CHAINS, NUTS_STEPS = 4, 3000
@@ -100,9 +103,9 @@ def test_integral_over_a_finger_is_that_of_quadrature():
     log_likelihood = -0.5 * y.size * np.log(left / np.min(left))
 
     with jax.enable_x64(True):
-        conditional = Conditional.around(fit)
+        finger = Finger.of(fit)
         prior = scene.make_prior()["Ci"]
-        tables = Fingers.tabulated([conditional], prior, area_varies=False, draws=20_000, terms=9, seed=[1])
+        tables = Fingers.tabulated([finger], prior, area_varies=False, draws=20_000, terms=9, seed=[1])
         law = Law(*map(jnp.asarray, (medians, spreads, correlations, log_Ci)))
         found = jax.jit(jax.vmap(tables.log_likelihood))(law)[:, 0]
     expected = []
@@ -128,22 +131,58 @@ def test_variance_shares_of_correlated_factors_are_those_of_the_closed_form():
     """y = x . slope of normal x: first (cov(x_i, y))^2 / var(x_i), total slope_i^2 var(x_i | others), over var(y)."""
     slope = np.array([1.0, -2.0, 0.5])
     covariance = np.array([[1.0, 0.6, 0.0], [0.6, 0.8, -0.2], [0.0, -0.2, 0.5]])
-
-    class Linear:
-        def each(self, factors: np.ndarray) -> np.ndarray:
-            return np.repeat((factors @ slope)[:, None], len(NAMES), axis=1)
-
     white = np.random.default_rng(3).standard_normal((4000, 3))
     white = (white - white.mean(axis=0)) @ np.linalg.inv(np.linalg.cholesky(np.cov(white.T))).T
     factors = white @ np.linalg.cholesky(covariance).T
-    found = variance_shares(Linear(), factors, ("force_mean",), seed=0)["force_mean"]
+    found = shares_of(lambda x: (x @ slope)[:, None], FACTORS[:3], factors, ("force_mean",), seed=0)["force_mean"]
     variance = slope @ covariance @ slope
     for i, name in enumerate(FACTORS[:3]):
         first = (covariance[i] @ slope) ** 2 / covariance[i, i] / variance
         total = slope[i] ** 2 / np.linalg.inv(covariance)[i, i] / variance
         assert found[name]["first"] == pytest.approx(first, abs=2.0 * found[name]["first_error"])  # 95 % each
         assert found[name]["total"] == pytest.approx(total, abs=2.0 * found[name]["total_error"])
+        assert found[name]["interaction"] == pytest.approx(0.0, abs=2.0 * found[name]["interaction_error"])
         assert found[name]["first_error"] < 0.1
+
+
+@dataclasses.dataclass
+class Known:
+    """A finger of one quantity; counts how often it is asked."""
+
+    quantity: Callable[[np.ndarray], np.ndarray]
+    factors: tuple[str, ...]
+    names: tuple[str, ...] = ("force_mean",)
+    evaluations: int = 0
+
+    def each(self, factors: np.ndarray) -> np.ndarray:
+        self.evaluations += len(factors)
+        return self.quantity(factors)[:, None]
+
+
+def test_variance_shares_of_a_product_are_those_of_the_closed_form():
+    """y = exp(x . slope), x independent, s = slope sd: first (e^(s_i^2) - 1) over e^(sum s^2) - 1, total likewise."""
+    s = np.array([0.3, 0.5, 0.4])
+    factors = np.random.default_rng(4).standard_normal((4000, 3))
+    factors = (factors - factors.mean(axis=0)) @ np.linalg.inv(np.linalg.cholesky(np.cov(factors.T))).T
+    finger = Known(lambda x: np.exp(x @ s), FACTORS[:3])
+    found = variance_shares(finger, factors, finger.names, seed=0)["force_mean"]
+    assert finger.evaluations <= 4096 * 3 * 5 // 100
+    whole = np.expm1(s @ s)
+    for name, square in zip(FACTORS[:3], s**2, strict=True):
+        first, total = np.expm1(square) / whole, np.expm1(square) * np.exp(s @ s - square) / whole
+        for key, value in {"first": first, "total": total, "interaction": total - first}.items():
+            assert found[name][key] == pytest.approx(value, abs=2.0 * found[name][f"{key}_error"])
+            assert found[name][f"{key}_error"] < 0.12
+
+
+def test_a_surrogate_that_is_off_says_by_how_much():
+    """Of a quantity with a kink, which no polynomial has: the correlation at 100,000 other points."""
+    finger = Known(lambda x: np.exp(np.abs(x[:, 0] - 0.5) + 0.3 * x[:, 1]), FACTORS[:2])
+    surrogate = Surrogate.of(finger, np.random.default_rng(5).standard_normal((4000, 2)), finger.names)
+    points = surrogate.mean + np.random.default_rng(6).standard_normal((100_000, 2)) @ surrogate.root.T
+    r = np.corrcoef(finger.each(points)[:, 0], surrogate.at(points)[:, 0])[0, 1]
+    assert np.sqrt(1.0 - r**2) > 0.05
+    assert surrogate.off[0] == pytest.approx(np.sqrt(1.0 - r**2), rel=0.5)
 
 
 def test_what_makes_no_population_is_refused():
@@ -222,7 +261,7 @@ def test_law_is_that_of_nuts_over_all_parameters(count: int):
     seen |= {f"log_sd_{name}": np.log(draws[f"log_sd_{name}"]) for name in ("Rsc", "Csc")}
     seen |= {"atanh_r": np.arctanh(draws["correlation"])}
     with jax.enable_x64(True):
-        expected = nuts(list(found.fits), found.hierarchy.prior)
+        expected = nuts([fitact.fit(each, simulated.scene) for each in simulated.records], found.hierarchy.prior)
     for name, reference in expected.items():
         assert array_stats.rhat(reference, chain_axis=0, draw_axis=1) < 1.01, name
         effective = float(array_stats.ess(reference, chain_axis=0, draw_axis=1))
@@ -240,7 +279,7 @@ def test_a_misfit_is_named_and_the_population_stays_trusted():
     first, *others = simulated.records
     bent = dataclasses.replace(first, channels={**first.channels, "Vsc": first["Vsc"] + 0.005 * first["Vsc"] ** 2})
     found = fitact.population([bent, *others], simulated.scene, seed=1, progress=False)
-    assert [fit.result for fit in found.fits] == ["misfit", *["successful"] * 3]
+    assert [finger.result for finger in found.fingers] == ["misfit", *["successful"] * 3]
     assert [warning.partition(":")[0] for warning in found.warnings] == ["finger 0 of population 0"]
     assert found.trusted
 
@@ -258,7 +297,12 @@ def eight(tmp_path_factory) -> dict:
     command += [*map(str, sorted(FINGERS.glob("*.csv.gz"))), "--scene", str(scene), "--seed", "1", "--json"]
     done = subprocess.run([*command, "--out", str(folder / "out")], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert {path.name for path in (folder / "out").iterdir()} == {"population.json", "population.svg"}
+    assert {path.name for path in (folder / "out").iterdir()} == {
+        "population.json",
+        "population.nc",
+        "population.svg",
+        "chain.h5",
+    }
     assert json.loads((folder / "out" / "population.json").read_text()) == json.loads(done.stdout)
     return json.loads(done.stdout)
 

@@ -6,7 +6,6 @@ normal slide with it, so the weight of each draw is a smooth function of log Ci 
 population is then an average of its density over the weighted draws.
 """
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from typing import NamedTuple, Self
@@ -18,20 +17,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitact.errors import InputError
-from fitact.inference import compressed
-from fitact.inference.fit import Fit
-from fitact.inference.likelihood import Likelihood
+from fitact.inference.finger import SHARED, SKIN, Finger
+from fitact.inference.likelihood import Batched, Likelihood
 from fitact.inference.proposal import Proposal
-from fitact.model.distribution import Distribution, LogNormal
-from fitact.model.prior import Prior
+from fitact.model.distribution import Distribution
 
-SKIN = ("Rsc", "Csc")
-SHARED = "Ci"
-_FLAT = 1e3  # standard deviation, in a logarithm, of a prior that says nothing
 REACH = 8.0  # standard deviations of log Ci that the tables hold
 _AREA = 1.0  # of an area's logarithm: the widest that the tables allow for
 _BATCH = 128  # points evaluated at a time
-_IMPOSSIBLE = -1e6  # log-weight of a draw that some nuisance's prior forbids
+_IMPOSSIBLE = -1e6  # log-weight of a draw that some nuisance's prior forbids, or a compression does not reach
 
 
 class Law(NamedTuple):
@@ -59,85 +53,6 @@ class Law(NamedTuple):
         return -0.5 * squares - jnp.sum(jnp.log(self.log_sd)) - 0.5 * jnp.log(rest)
 
 
-@dataclasses.dataclass(frozen=True)
-class Conditional:
-    """A finger's likelihood around its optimum, normal in its own coordinates given log Ci.
-
-    Attributes:
-        source: of the record.
-        likelihood: with priors of the nuisances alone.
-        names: the coordinates of a point; its own are all but Ci.
-        center: log Ci of the optimum.
-        place: its own coordinates there.
-        slope: how these move with log Ci.
-        root: of their covariance, given log Ci.
-        precision: of log Ci, from the record alone.
-        pull: precision times how far the record wants log Ci from `center`.
-    """
-
-    source: str
-    likelihood: Likelihood
-    names: tuple[str, ...]
-    center: float
-    place: Float[np.ndarray, " own"]
-    slope: Float[np.ndarray, " own"]
-    root: Float[np.ndarray, "own own"]
-    precision: float
-    pull: float
-
-    @classmethod
-    def around(cls, fit: Fit) -> Self:
-        """From the whitened residuals at the fit and their Jacobian; a noise's by its Fisher information."""
-        likelihood = _without_skin_prior(fit.likelihood)
-        names, size = fit.point_names, fit.theta.size
-        shared = fit.names.index(SHARED)
-        theta, log_sigma = np.split(fit.point, [size])
-        residuals, jacobian = _linearised(likelihood.without_samples(), theta, np.exp(log_sigma))
-        own = [i for i in range(size) if i != shared]
-        # R of (own, Ci, residuals): what Ci's column holds below the own ones' is what the record alone says of it
-        R = np.asarray(np.linalg.qr(np.column_stack([jacobian[:, [*own, shared]], residuals]), mode="r"))
-        n = len(own)
-        root = np.linalg.inv(R[:n, :n])
-        noise = np.diag(fit.point_root)[size:]
-        whole = np.diag(np.append(np.zeros(n), noise))
-        whole[:n, :n] = root
-        return cls(
-            source=fit.record.source,
-            likelihood=likelihood,
-            names=names,
-            center=float(theta[shared]),
-            place=np.append(theta[own] - root @ R[:n, n + 1], log_sigma),
-            slope=np.append(-root @ R[:n, n], np.zeros(noise.size)),
-            root=whole,
-            precision=float(R[n, n] ** 2),
-            pull=float(-R[n, n] * R[n, n + 1]),
-        )
-
-    def at(self, log_Ci: float, white: Float[np.ndarray, "draws own"]) -> Float[np.ndarray, "draws coordinates"]:
-        """Points that standard normal numbers are at that log Ci."""
-        own = self.place + self.slope * (log_Ci - self.center) + white @ self.root.T
-        return np.insert(own, self.names.index(SHARED), log_Ci, axis=1)
-
-
-def _without_skin_prior(likelihood: Likelihood) -> Likelihood:
-    flat = {name: LogNormal(math.exp(likelihood.prior[name].log_mean), _FLAT) for name in (*SKIN, SHARED)}
-    marginals = dict(zip(likelihood.prior.names, likelihood.prior.marginals, strict=True)) | flat
-    return dataclasses.replace(likelihood, prior=Prior.of(**marginals))
-
-
-@eqx.filter_jit
-def _linearised_in(likelihood: Likelihood, theta: Array, sigma: Array) -> tuple[Array, Array]:
-    def residuals(theta: Array) -> Array:
-        return jnp.concatenate([*likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)])
-
-    return residuals(theta), jax.jacfwd(residuals)(theta)
-
-
-def _linearised(likelihood: Likelihood, theta: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    residuals, jacobian = _linearised_in(likelihood, jnp.asarray(theta), jnp.asarray(sigma))
-    return np.asarray(residuals), np.asarray(jacobian)
-
-
 class Fingers(eqx.Module):
     """Weighted draws of several fingers, as tables in log Ci.
 
@@ -163,7 +78,7 @@ class Fingers(eqx.Module):
     @classmethod
     def tabulated(
         cls,
-        conditionals: Sequence[Conditional],
+        fingers: Sequence[Finger],
         prior: Distribution,
         *,
         area_varies: bool,
@@ -173,8 +88,8 @@ class Fingers(eqx.Module):
     ) -> Self:
         """Tables of `terms`, wherever the records and the panel's `prior` allow log Ci to be."""
         tables = []
-        center, reach = _weighed(conditionals, prior.log_mean, prior.log_sd)
-        for each, child in zip(conditionals, np.random.SeedSequence(seed).spawn(len(conditionals)), strict=True):
+        center, reach = _weighed(fingers, prior.log_mean, prior.log_sd)
+        for each, child in zip(fingers, np.random.SeedSequence(seed).spawn(len(fingers)), strict=True):
             if area_varies:
                 center, reach = _weighed([each], prior.log_mean, math.hypot(prior.log_sd, _AREA))
             student = Proposal(np.zeros(each.place.size + area_varies), np.eye(each.place.size + area_varies))
@@ -210,15 +125,15 @@ def _series(weight: Float[Array, "fingers draws terms"], at: Float[Array, "finge
     return at * latest - later + weight[..., 0]
 
 
-def _weighed(conditionals: Sequence[Conditional], mean: float, sd: float) -> tuple[float, float]:
+def _weighed(fingers: Sequence[Finger], mean: float, sd: float) -> tuple[float, float]:
     """Where log Ci may lie by records and a normal prior, and how far from there."""
-    precision = sd**-2 + sum(each.precision for each in conditionals)
-    pull = sum(each.pull + each.precision * (each.center - mean) for each in conditionals)
+    precision = sd**-2 + sum(each.precision for each in fingers)
+    pull = sum(each.pull + each.precision * (each.center - mean) for each in fingers)
     return mean + pull / precision, REACH / math.sqrt(precision)
 
 
 def _table(
-    finger: Conditional,
+    finger: Finger,
     center: float,
     reach: float,
     student: Proposal,
@@ -231,7 +146,8 @@ def _table(
     deviates = student.draw(random, draws)
     nodes = np.cos(np.pi * (np.arange(terms) + 0.5) / terms)
     points = np.stack([finger.at(center + reach * x, deviates[:, :own]) for x in nodes])
-    values = compressed.log_prob(finger.likelihood, _BATCH)(points.reshape(-1, points.shape[-1]))
+    log_prob = Batched(Likelihood.log_prob, finger.likelihood, finger.likelihood.rows, _BATCH)
+    values = log_prob(points.reshape(-1, points.shape[-1]))
     values = values.reshape(terms, draws) - student.log_density(deviates)
     possible = np.isfinite(values).all(axis=0)
     if not possible.any():

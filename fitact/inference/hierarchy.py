@@ -7,6 +7,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Array, Float
 
+from fitact.inference.finger import SHARED, SKIN
 from fitact.inference.fingers import REACH, Fingers, Law
 from fitact.model.prior import Prior
 
@@ -58,6 +59,18 @@ class Hierarchy(eqx.Module):
         to_median = jnp.sum(point[3:5]) + 0.5 * rest  # the coordinates' determinants
         believed = self.prior.log_density(jnp.append(law.median, law.log_Ci))
         return believed + half_normal + to_median + LKJ * rest
+
+    def prior_laws(self, random: np.random.Generator, count: int) -> Law:
+        """Draws of the law before any record is seen, leaves (count, 1)."""
+        drawn = self.prior.sample(random, count)
+        spreads = LOG_SD * np.abs(random.standard_normal((count, 1, 3)))
+        return Law(
+            np.log(np.stack([drawn[name] for name in SKIN], axis=-1))[:, None],
+            spreads[..., :2],
+            2.0 * random.beta(LKJ, LKJ, (count, 1)) - 1.0,  # what makes (1 - r^2)^(LKJ - 1)
+            np.log(drawn[SHARED])[:, None],
+            spreads[..., 2] if self.area_varies else None,
+        )
 
     def start(self) -> Float[np.ndarray, " coordinates"]:
         """The moments of the fingers, as if each were known."""

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
 from fitact.files import replacing
-from fitact.inference.population import Population
+from fitact.inference.people import Population
 from fitact.report.plots import style
 
 _LAW, _FINGER = "#0072B2", "#333333"
@@ -50,8 +50,8 @@ def _draw_skin(
     axes: Axes, population: Population, Rsc: Float[np.ndarray, " fingers"], Csc: Float[np.ndarray, " fingers"]
 ) -> None:
     axes.plot(Rsc, Csc, ".", ms=2, color=_LAW, alpha=0.25, rasterized=True, label="fingers to come")
-    for number, fit in enumerate(population.fits):
-        parameters = fit.parameters()
+    for number, finger in enumerate(population.fingers):
+        parameters = finger.parameters
         (x, y), (dx, dy) = (
             [np.array([parameters[name][key] for key in keys], dtype=float) for name in ("Rsc", "Csc")]
             for keys in (["q50"], ["q025", "q975"])
