@@ -18,6 +18,7 @@ from arviz_stats.base import array_stats
 from population_calibration import FREQUENCY, simulate, steady, wave
 
 import fitact
+from fitact.data.covariates import Covariates, read_covariates
 from fitact.inference.finger import Finger
 from fitact.inference.fingers import Fingers, Law
 from fitact.inference.hierarchy import Hierarchy
@@ -43,35 +44,43 @@ def known(skins: np.ndarray, log_Ci: np.ndarray, precision: float) -> Fingers:
     return Fingers(*map(jnp.asarray, parts))
 
 
-@pytest.mark.parametrize("varies", [False, True])
-def test_log_posterior_of_known_fingers_is_scipys(varies: bool):
-    """Of Rsc and Csc, and of Ci too where each finger's area scales all three."""
+@pytest.mark.parametrize(("varies", "known_of_each"), [(False, 0), (True, 0), (False, 2)])
+def test_log_posterior_of_known_fingers_is_scipys(varies: bool, known_of_each: int):
+    """Of Rsc and Csc; of Ci too where each finger's area scales all three; and with covariates."""
     rng = np.random.default_rng(1)
     with jax.enable_x64(True):
         skins = rng.normal([11.8, -17.7], 0.3, (5, 2))
         log_Ci = -20.4 + (0.2 * rng.standard_normal(5) if varies else np.zeros(5))
-        hierarchy = Hierarchy(known(skins, log_Ci, 1e10 if varies else 0.0), PRIOR, varies)
+        covariates = Covariates.of({f"x{i}": rng.uniform(3.0, 7.0, 5) for i in range(known_of_each)}, 5).standard
+        fingers = known(skins, log_Ci, 1e10 if varies else 0.0)
+        hierarchy = Hierarchy(fingers, PRIOR, varies, jnp.asarray(covariates))
 
         def natural(point: jax.Array) -> jax.Array:
             law = hierarchy.law(point)
-            return jnp.array([*law.median, law.log_Ci, *law.log_sd, law.correlation, *([law.area] if varies else [])])
+            slopes = jnp.ravel(law.slopes) if known_of_each else []
+            area = [law.area] if varies else []
+            return jnp.array([*law.median, law.log_Ci, *law.log_sd, law.correlation, *area, *slopes])
 
         def expected(values: np.ndarray) -> float:
             """The stated densities."""
-            mean, sd, r, area = values[:3], values[3:5], values[5], values[6:].sum()
+            mean, sd, r, area = values[:3], values[3:5], values[5], values[6] if varies else 0.0
+            slopes = values[6 + varies :].reshape(-1, 2)
             covariance = area**2 * np.outer([-1.0, 1.0, 1.0], [-1.0, 1.0, 1.0])
             covariance[:2, :2] += np.outer(sd, sd) * [[1.0, r], [r, 1.0]]
             seen = slice(3 if varies else 2)
             of_fingers = scipy.stats.multivariate_normal(mean[seen], covariance[seen, seen])
+            at_mean = np.column_stack([skins - covariates @ slopes, log_Ci])
+            spreads = [*sd, area] if varies else sd
             return (
-                np.sum(of_fingers.logpdf(np.column_stack([skins, log_Ci])[:, seen]))
+                np.sum(of_fingers.logpdf(at_mean[:, seen]))
                 + np.sum(scipy.stats.norm(*np.transpose(list(SCALES.values()))).logpdf(mean))
-                + np.sum(scipy.stats.halfnorm(scale=0.5).logpdf([*values[3:5], *values[6:]]))
+                + np.sum(scipy.stats.norm(scale=0.5).logpdf(slopes))
+                + np.sum(scipy.stats.halfnorm(scale=0.5).logpdf(spreads))
                 + scipy.stats.beta(2.0, 2.0, loc=-1.0, scale=2.0).logpdf(r)
             )
 
-        far = np.array([2.0, 2.0, 0.1, 0.3, 0.3, 0.5, 0.3])[: 6 + varies]
-        points = hierarchy.start() + far * rng.standard_normal((6, 6 + varies))
+        far = np.array([2.0, 2.0, 0.1, 0.3, 0.3, 0.5, *[0.3] * varies, *[2.0] * (2 * known_of_each)])
+        points = hierarchy.start() + far * rng.standard_normal((6, far.size))
         each = jax.jit(jax.vmap(lambda x: (hierarchy.log_prob(x), natural(x), jax.jacfwd(natural)(x))))
         found, at, jacobian = map(np.asarray, each(points))
     volume = np.linalg.slogdet(jacobian)[1]
@@ -198,6 +207,40 @@ def test_what_makes_no_population_is_refused():
     correlated = {"R_H": {"median": "500 ohm", "factor": 2}, "correlation": {"R_H-Csc": 0.5}}
     with pytest.raises(fitact.InputError, match="with others"):
         fitact.population([first, *others], fitact.Scene.from_dict({"prior": correlated, "grounding": {"R_H": 500.0}}))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("file,moisture\na.csv,1\n", "needs a column 'record'"),
+        ("record,moisture\na.csv,1\n", "no row for b.csv"),
+        ("record,moisture\na.csv,1\nb.csv,dry\n", "moisture of b.csv is 'dry'"),
+        ("record,moisture\na.csv,1\nb.csv,2\na.csv,1\n", "line 4: a.csv has a row already"),
+    ],
+)
+def test_covariates_that_cannot_be_used_are_refused(tmp_path, text: str, said: str):
+    path = tmp_path / "people.csv"
+    path.write_text(text)
+    with pytest.raises(fitact.InputError, match=said):
+        read_covariates(path, [Path("a.csv"), Path("b.csv")])
+
+
+def test_covariates_are_those_of_the_records_in_their_order(tmp_path):
+    path = tmp_path / "people.csv"
+    path.write_text("record,moisture,age\nb.csv,0.5,30\nc.csv,9,9\na.csv,0.1,50\n")
+    found = read_covariates(path, [Path("x/a.csv"), Path("b.csv")])
+    assert found == {"moisture": [0.1, 0.5], "age": [50.0, 30.0]}
+    for values, said in (
+        ({"moisture": [1.0, 2.0]}, "2 values for 3 records"),
+        ({"moisture": [2.0, 2.0, 2.0]}, "same value"),
+        ({"a": [1.0, 2.0, 4.0], "b": [2.0, 4.0, 8.0]}, "one follows from the others"),
+    ):
+        with pytest.raises(fitact.InputError, match=said):
+            Covariates.of(values, 3)
+    known = Covariates.of({"moisture": [1.0, 2.0, 3.0]}, 3)
+    assert known.standardised({"moisture": 3.0}) == pytest.approx(np.sqrt(1.5))
+    with pytest.raises(fitact.InputError, match="not among those of the records"):
+        known.standardised({"age": 3.0})
 
 
 def test_refused_records_are_named(tmp_path):

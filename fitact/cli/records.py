@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from fitact.cli.app import app
-from fitact.cli.options import Channels, Fresh, Json, Out, RecordFiles, Scales, Seed, mapping
+from fitact.cli.options import Channels, Fresh, Json, Out, RecordFiles, Scales, Seed, mapping, numbers
 from fitact.cli.terminal import finish, say, show, use_compilation_cache
 from fitact.files import write_json
 
@@ -86,6 +86,13 @@ def population(
     ] = None,
     channel: Channels = None,
     scale: Scales = None,
+    covariates: Annotated[
+        Path | None,
+        typer.Option("--covariates", metavar="FILE", help="CSV: a column 'record', and one for each covariate."),
+    ] = None,
+    at: Annotated[
+        list[str] | None, typer.Option("--at", metavar="NAME=VALUE", help="A covariate of the next finger.")
+    ] = None,
     out: Out = None,
     seed: Seed = 0,
     fresh: Fresh = False,
@@ -95,16 +102,21 @@ def population(
 
     Into DIR it writes population.json, population.nc (the draws), population.svg, and chain.h5 (for going on).
     """
+    from fitact.data.covariates import read_covariates
     from fitact.model.scene import Scene
 
     stated = None if scene is None else Scene.load(scene)
+    known = {} if covariates is None else read_covariates(covariates, records)
     use_compilation_cache()
     from fitact.inference.population import forget
     from fitact.inference.population import population as find_population
 
     if fresh and out is not None:
         forget(out)
-    found = find_population(_Files(records, stated, mapping((channel, scale))), stated, folder=out, seed=seed)
+    measured = _Files(records, stated, mapping((channel, scale)))
+    found = find_population(
+        measured, stated, covariates=known, at=numbers("--at moisture=0.4", at), folder=out, seed=seed
+    )
     if out is not None:
         from fitact.report.population import write_population
 

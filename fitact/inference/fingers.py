@@ -37,6 +37,7 @@ class Law(NamedTuple):
         correlation: of their logarithms.
         log_Ci: of the panel, for the median finger's area.
         area: standard deviation of the logarithm of a finger's area; None: they are the same.
+        slopes: by how much a standard deviation of each covariate shifts `median`, which is at their mean.
     """
 
     median: Float[Array, "2"]
@@ -44,6 +45,11 @@ class Law(NamedTuple):
     correlation: Float[Array, ""]
     log_Ci: Float[Array, ""]
     area: Float[Array, ""] | None = None
+    slopes: Float[Array, "covariates 2"] | None = None
+
+    def at(self, covariates: Float[Array, "*shape covariates"]) -> Self:
+        """The law of fingers with those (standardised) covariates, its median of shape (*shape, 2)."""
+        return self if self.slopes is None else self._replace(median=self.median + covariates @ self.slopes)
 
     def log_density(self, skin: Float[Array, "*shape 2"]) -> Float[Array, "*shape"]:
         """Of log Rsc and log Csc, at the median area, up to a constant."""

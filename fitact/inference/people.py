@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from fitact.data.covariates import Covariates
 from fitact.files import replacing
 from fitact.inference import summary
 from fitact.inference.convergence import Convergence
@@ -37,6 +38,8 @@ class Population:
         convergence: how far they can be trusted.
         off: by how much, at most, the integrals over the fingers shift any mean, in standard deviations.
         finger: the next one, under the first record's drive.
+        covariates: of the fingers; may be none.
+        at: those of the next finger, in standard deviations from the mean.
         scene: of all records.
         seed: of every random number here.
     """
@@ -47,6 +50,8 @@ class Population:
     convergence: Convergence
     off: float
     finger: NewFinger
+    covariates: Covariates
+    at: Float[np.ndarray, " covariates"]
     scene: Scene
     seed: int
 
@@ -71,10 +76,17 @@ class Population:
         return tuple(found)
 
     def parameters(self) -> dict[str, Float[np.ndarray, "ensembles draws"]]:
-        """Draws of the law: medians of Rsc (ohm) and Csc (F), Ci (F), log-standard deviations, correlation."""
+        """Draws of the law: medians of Rsc (ohm) and Csc (F), Ci (F), log-standard deviations, correlation.
+
+        Where there are covariates, also slopes: by how much log Rsc and log Csc change per unit of each.
+        """
         law = laws(self.hierarchy, self.points)
         found = {f"log_sd_{name}": law.log_sd[..., i] for i, name in enumerate(SKIN)}
         found |= {} if law.area is None else {"log_sd_area": law.area}
+        if law.slopes is not None:
+            per_unit = law.slopes / self.covariates.sd[:, None]
+            for i, name in enumerate(self.covariates.names):
+                found |= {f"slope_{skin}_{name}": per_unit[..., i, j] for j, skin in enumerate(SKIN)}
         return found | {"correlation": law.correlation} | {k: np.exp(x) for k, x in log_medians(law).items()}
 
     def new_fingers(self) -> dict[str, Float[np.ndarray, "laws fingers"]]:
@@ -86,13 +98,13 @@ class Population:
         """Logarithms of what makes the new fingers, in the order of `finger.factors`."""
         flat = self.points.reshape(-1, self.points.shape[-1])
         drawn = laws(self.hierarchy, flat[np.linspace(0, len(flat) - 1, _LAWS).astype(int), None])
-        return draw_factors(drawn, self._thickness_sd, _FINGERS, np.random.default_rng([self.seed, 1]))
+        return draw_factors(drawn.at(self.at), self._thickness_sd, _FINGERS, np.random.default_rng([self.seed, 1]))
 
     @property
     def prior_factors(self) -> Float[np.ndarray, "laws fingers factors"]:
         """As `factors`, of fingers of laws that are believed before any record is seen."""
         random = np.random.default_rng([self.seed, 4])
-        return draw_factors(self.hierarchy.prior_laws(random, _LAWS), self._thickness_sd, _FINGERS, random)
+        return draw_factors(self.hierarchy.prior_laws(random, _LAWS).at(self.at), self._thickness_sd, _FINGERS, random)
 
     @property
     def _thickness_sd(self) -> dict[str, float]:
@@ -128,6 +140,13 @@ class Population:
         law |= {name: summary.of_draws(name, draws[name]) for name in (SHARED, "correlation")}
         if self.hierarchy.area_varies:
             law[AREA] = {"log_sd": summary.of_draws("log_sd", draws["log_sd_area"])}
+        law["covariates"] = {
+            name: {"mean": float(mean), "sd": float(sd), "next_finger": float(mean + at * sd)}
+            | {skin: {"slope": summary.of_draws("slope", draws[f"slope_{skin}_{name}"])} for skin in SKIN}
+            for name, mean, sd, at in zip(
+                self.covariates.names, self.covariates.mean, self.covariates.sd, self.at, strict=True
+            )
+        }
         new: dict[str, dict[str, Any]] = {}
         for name, values in self.new_fingers().items():
             spread = Spread.of(values)
@@ -156,6 +175,11 @@ class Population:
         shown |= {name: content["population"][name] for name in (SHARED, "correlation")}
         if self.hierarchy.area_varies:
             shown["contact area, log_sd"] = content["population"][AREA]["log_sd"]
+        shown |= {
+            f"{skin}, slope in {name}": of[skin]["slope"]
+            for name, of in content["population"]["covariates"].items()
+            for skin in SKIN
+        }
         new = content["new_finger"]
         shown |= {f"next finger, {name}": new[name] for name in NAMES}
         for name, s in shown.items():
@@ -215,4 +239,4 @@ def log_medians(law: Law) -> dict[str, np.ndarray]:
 
 
 def _unit(name: str) -> str:
-    return "1" if name.startswith("log_sd") else unit_of(name)
+    return "1" if name.startswith(("log_sd", "slope")) else unit_of(name)

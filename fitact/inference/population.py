@@ -6,13 +6,15 @@ import json
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from fitact.data.covariates import Covariates
 from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.inference.convergence import Convergence
@@ -42,6 +44,8 @@ def population(
     records: Sequence[Record],
     scene: Scene | None = None,
     *,
+    covariates: Mapping[str, Sequence[float]] | None = None,
+    at: Mapping[str, float] | None = None,
     folder: str | os.PathLike[str] | None = None,
     seed: int = 0,
     max_steps: int = 20_000,
@@ -57,6 +61,9 @@ def population(
     Args:
         records: one of each finger, on one panel; taken one after the other, none is kept.
         scene: of all; its prior of Rsc and Csc is that of their medians.
+        covariates: by name, a number of each finger, such as how moist its skin is; the medians of log Rsc and
+            log Csc change linearly with each, by a normal prior of scale 0.5 per standard deviation of it.
+        at: covariates of the next finger, where they are not the mean of these.
         folder: where to keep the chain; if it holds one of these records, sampling goes on from there.
         seed: the same seed gives the same draws, whether or not sampling was interrupted.
         max_steps: per ensemble, after which the answer is marked as not converged.
@@ -66,10 +73,12 @@ def population(
 
     Raises:
         InputError: there are fewer than two, one is given twice or is refused, the scene's prior does not leave
-            Rsc, Csc and Ci free, or the folder's chain belongs to others.
+            Rsc, Csc and Ci free, a covariate tells nothing, or the folder's chain belongs to others.
     """
     scene = scene or Scene()
     medians = _prior(scene)
+    known = Covariates.of(covariates or {}, len(records))
+    next_at = known.standardised(at or {})
     fingers, new = _fitted(records, scene, progress)
     varies = scene.population.contact_area == "varies"
     with jax.enable_x64(True):
@@ -78,17 +87,17 @@ def population(
             tables = Fingers.tabulated(
                 fingers, medians[SHARED], area_varies=varies, draws=draws, terms=terms, seed=[seed, purpose]
             )
-            return Hierarchy(tables, medians, varies)
+            return Hierarchy(tables, medians, varies, jnp.asarray(known.standard))
 
         for draws, name in _DRAWS.items():
             sampled = hierarchy(draws, _TERMS, 2)
             chain_file = None if folder is None else Path(folder) / name
-            fingerprint = _fingerprint(fingers, scene, seed, draws)
+            fingerprint = _fingerprint(fingers, known, scene, seed, draws)
             points, convergence = _sampled(sampled, fingerprint, seed, max_steps, chain_file, progress)
             off = _off(sampled, hierarchy(max(draws, _LEAST_CHECKED), _MORE_TERMS, 3), points)
             if off <= OFF or not convergence.converged:
                 break
-    return Population(fingers, sampled, points, convergence, off, new, scene, seed)
+    return Population(fingers, sampled, points, convergence, off, new, known, next_at, scene, seed)
 
 
 def forget(folder: str | os.PathLike[str]) -> None:
@@ -173,8 +182,8 @@ def _off(sampled: Hierarchy, finer: Hierarchy, points: Float[np.ndarray, "ensemb
     return float(np.std(found[1] - found[0]))
 
 
-def _fingerprint(fingers: Sequence[Finger], scene: Scene, seed: int, draws: int) -> str:
+def _fingerprint(fingers: Sequence[Finger], known: Covariates, scene: Scene, seed: int, draws: int) -> str:
     """What a chain belongs to; any change of it makes another chain."""
     each = [[finger.fingerprint, finger.center, finger.place.tolist()] for finger in fingers]
-    settings = [importlib.metadata.version("fitact"), each, scene.to_json(), seed, draws]
+    settings = [importlib.metadata.version("fitact"), each, known.standard.tolist(), scene.to_json(), seed, draws]
     return hashlib.sha256(json.dumps(settings).encode()).hexdigest()
