@@ -114,7 +114,7 @@ def test_integral_over_a_finger_is_that_of_quadrature():
     with jax.enable_x64(True):
         finger = Finger.of(fit)
         prior = scene.make_prior()["Ci"]
-        tables = Fingers.tabulated([finger], prior, area_varies=False, draws=20_000, terms=9, seed=[1])
+        tables = Fingers.tabulated([finger], prior, area_varies=False, draws=2**14, terms=9, seed=[1])
         law = Law(*map(jnp.asarray, (medians, spreads, correlations, log_Ci)))
         found = jax.jit(jax.vmap(tables.log_likelihood))(law)[:, 0]
     expected = []

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calibration import PER_PERIOD, wave
+from calibration import AMPLITUDE, PER_PERIOD, wave
 from population_calibration import FREQUENCY, NOISE, simulate, vsc
 
 import fitact
@@ -95,11 +95,46 @@ def test_slopes_of_a_covariate_and_fingers_at_one_are_covered():
     assert np.mean(np.log(new["Rsc"])) == pytest.approx(expected, abs=0.25)  # 0.45 less than at the mean
 
 
-def record(skin: np.ndarray, Ci: float, number: int, rng: np.random.Generator) -> fitact.Record:
-    """Two settled periods of a triangle."""
+@pytest.mark.slow
+@pytest.mark.parametrize("channels", [("I",), pytest.param(("Vsc", "I"), marks=pytest.mark.thorough)])
+def test_areas_are_seen_by_the_current(channels: tuple[str, ...]):
+    """Ten fingers whose areas differ by a factor of two and more: their spread and Ci, each within its 99 %."""
+    rng = np.random.default_rng(12)
+    spread, area_sd, Ci = np.array([0.15, 0.25]), 0.7, 1.35e-9
+    areas = np.exp(area_sd * rng.standard_normal(10))
+    skins = np.exp(np.log([130e3, 20e-9]) + spread * rng.standard_normal((10, 2)))
+    records = [
+        record(skin * [1.0 / area, area], area * Ci, i, rng, current=True)
+        for i, (skin, area) in enumerate(zip(skins, areas, strict=True))
+    ]
+    few = simulate(SEED, 0, fingers=2)
+    scene = few.scene.model_dump(exclude_unset=True) | {
+        "measurement": {"channels": channels},
+        "population": {"contact_area": "varies"},
+    }
+    found = fitact.population(records, fitact.Scene.from_dict(scene), seed=1, progress=False)
+    assert found.trusted
+    draws = found.parameters()
+    known = {"log_sd_area": area_sd, "log_sd_Rsc": spread[0], "log_sd_Csc": spread[1], "Ci": Ci}
+    for name, value in known.items():
+        low, high = np.quantile(draws[name], [0.005, 0.995])
+        assert low < value < high, name
+    low, high = np.quantile(draws["log_sd_area"], [0.025, 0.975])
+    assert high / low < 3.5  # ten fingers of known area: chi-square's 95 % are a factor of 2.7 apart
+
+
+def record(skin: np.ndarray, Ci: float, number: int, rng: np.random.Generator, current: bool = False) -> fitact.Record:
+    """Two settled periods of a triangle; I = Vsc / Rsc + Csc dVsc/dt, with b Vsc' = a V' - Vsc."""
+    settled = vsc(*skin, Ci, rng)
+    channels = {"Vsc": np.tile(settled, 2) + NOISE * rng.standard_normal(2 * PER_PERIOD)}
+    if current:
+        (Rsc, Csc), phase = skin, np.arange(PER_PERIOD) / PER_PERIOD
+        slope = 4.0 * AMPLITUDE * FREQUENCY * np.where((phase < 0.25) | (phase >= 0.75), 1.0, -1.0)
+        flow = settled / Rsc + Csc * (Rsc * Ci * slope - settled) / (Rsc * (2.0 * Ci + Csc))
+        channels["I"] = np.tile(flow, 2) + 1e-6 * rng.standard_normal(2 * PER_PERIOD)
     return fitact.Record.from_arrays(
         np.arange(2 * PER_PERIOD) / (PER_PERIOD * FREQUENCY),
         V=np.tile(wave("triangle", rng), 2),
-        Vsc=np.tile(vsc(*skin, Ci, rng), 2) + NOISE * rng.standard_normal(2 * PER_PERIOD),
+        **channels,
         source=f"finger {number}",
     )

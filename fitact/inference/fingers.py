@@ -14,12 +14,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.special
+import scipy.stats
 from jaxtyping import Array, Float
 
 from fitact.errors import InputError
 from fitact.inference.finger import SHARED, SKIN, Finger
 from fitact.inference.likelihood import Batched, Likelihood
-from fitact.inference.proposal import Proposal
+from fitact.inference.proposal import DEGREES, Proposal
 from fitact.model.distribution import Distribution
 
 REACH = 8.0  # standard deviations of log Ci that the tables hold
@@ -123,6 +125,13 @@ class Fingers(eqx.Module):
         return jax.nn.logsumexp(self.log_weights(law)[0], axis=1)
 
 
+def _spread_out(size: int, draws: int, random: np.random.Generator) -> Float[np.ndarray, "draws size"]:
+    """Draws of a `Proposal` of no mean and unit axes by Sobol's scrambled sequence: fewer hold an integral as well."""
+    uniform = scipy.stats.qmc.Sobol(size + 1, rng=random).random(draws)
+    chi_square = scipy.stats.chi2.ppf(uniform[:, -1:], DEGREES)
+    return scipy.special.ndtri(uniform[:, :-1]) * np.sqrt(DEGREES / chi_square)
+
+
 def _series(weight: Float[Array, "fingers draws terms"], at: Float[Array, "fingers draws"]) -> Array:
     """Chebyshev series, by Clenshaw's recurrence."""
     later, latest = jnp.zeros_like(at), jnp.zeros_like(at)
@@ -149,7 +158,7 @@ def _table(
 ) -> Fingers:
     """Of one finger, for log Ci within `reach` of `center`; a deviate beyond its own coordinates draws its area."""
     own = finger.place.size
-    deviates = student.draw(random, draws)
+    deviates = _spread_out(student.center.size, draws, random)
     nodes = np.cos(np.pi * (np.arange(terms) + 0.5) / terms)
     points = np.stack([finger.at(center + reach * x, deviates[:, :own]) for x in nodes])
     log_prob = Batched(Likelihood.log_prob, finger.likelihood, finger.likelihood.rows, _BATCH)

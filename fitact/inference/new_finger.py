@@ -65,9 +65,8 @@ class NewFinger(eqx.Module):
         """Of what follows: `NAMES`, and where the drive repeats the amplitudes at its frequency and twice that."""
         return NAMES if self.frequency is None else (*NAMES, *HARMONICS)
 
-    def _of(self, factors: Float[Array, " factors"]) -> tuple[derived.Derived, Float[Array, " parameters"]]:
-        """The finger's circuit and geometry. Area scales both capacitances up and the resistance down, and the
-        insulator's thickness its capacitance down, by eqs. (3) and (4)."""
+    def of(self, factors: Float[Array, " factors"]) -> tuple[derived.Derived, Float[Array, " parameters"]]:
+        """Its geometry and circuit; area and thickness scale the latter by eqs. (3) and (4)."""
         by_name = dict(zip(self.factors, factors, strict=True))
         area, skin, insulator = (by_name.get(name, 0.0) for name in FACTORS[3:])
         at = jnp.stack([by_name["Rsc"] - area, by_name["Csc"] + area, by_name["Ci"] + area - insulator])
@@ -82,7 +81,7 @@ class NewFinger(eqx.Module):
 
     def __call__(self, factors: Float[Array, " factors"]) -> Float[Array, " names"]:
         """All of `names`."""
-        derive, theta = self._of(factors)
+        derive, theta = self.of(factors)
         skin = jnp.exp(theta[np.array([derive.likelihood.names.index(name) for name in SKIN])])
         parts = [skin, derive(theta, self.sigma)]
         if self.frequency is not None:
@@ -97,6 +96,23 @@ class NewFinger(eqx.Module):
             flat = factors.reshape(-1, factors.shape[-1])
             found = Batched(NewFinger.__call__, self, self.derive.time.size, _BATCH)(flat)
         return found.reshape(*factors.shape[:-1], len(self.names))
+
+    def force_in_time(
+        self, factors: Float[np.ndarray, "fingers factors"], count: int
+    ) -> tuple[Float[np.ndarray, " count"], Float[np.ndarray, "fingers count"]]:
+        """Times (s) and electrostatic force (N) of many fingers over a period; all the time if none repeats."""
+        with jax.enable_x64(True):
+            first, last = float(jnp.min(self.derive.time)), float(jnp.max(self.derive.time))
+            span = last - first if self.frequency is None else 1.0 / self.frequency
+            time = span * np.arange(count) / count
+            there = dataclasses.replace(self.derive, time=jnp.asarray(last - span + time))
+            force = Batched(_force, dataclasses.replace(self, derive=there), count, _BATCH)(factors)
+        return time, force
+
+
+def _force(finger: NewFinger, factors: Float[Array, " factors"]) -> Float[Array, " times"]:
+    derive, theta = finger.of(factors)
+    return derive.force(theta, finger.sigma)
 
 
 class Spread(NamedTuple):
