@@ -15,14 +15,14 @@ import pytest
 import scipy.special
 import scipy.stats
 from arviz_stats.base import array_stats
-from population_calibration import FREQUENCY, simulate, steady, wave
+from population_calibration import FREQUENCY, simulate, steady, vsc, wave
 
 import fitact
 from fitact.data.covariates import Covariates, read_covariates
 from fitact.inference.finger import Finger
 from fitact.inference.fingers import Fingers, Law
 from fitact.inference.hierarchy import Hierarchy
-from fitact.inference.new_finger import FACTORS, Spread
+from fitact.inference.new_finger import FACTORS, NewFinger, Spread
 from fitact.inference.sensitivity import Surrogate, shares_of, variance_shares
 from fitact.model.prior import Prior
 
@@ -126,6 +126,27 @@ def test_integral_over_a_finger_is_that_of_quadrature():
         expected.append(scipy.special.logsumexp(log_likelihood + density - np.log(1.0 - 2.0 * g)[:, None]))
     assert np.ptp(expected) > 1.0
     np.testing.assert_allclose(np.diff(found), np.diff(expected), atol=0.05)
+
+
+def test_force_of_a_new_finger_is_that_of_scipys_response():
+    """Mean, and amplitudes at f and 2 f, of a finger with its own area and thicknesses: eqs. (2), (3), (4) and (22)."""
+    simulated = simulate(5, 0, fingers=1)
+    finger = NewFinger.under_drive_of(fitact.fit(simulated.records[0], simulated.scene), FACTORS)
+    Rsc, Csc, Ci, area, skin, insulator = 150e3, 18e-9, 1.2e-9, 1.4, 1.2, 0.7
+    found = dict(zip(finger.names, finger.each(np.log([[Rsc, Csc, Ci, area, skin, insulator]]))[0], strict=True))
+    Csc, Ci = area * Csc, area * Ci / insulator
+    voltage = vsc(Rsc / area, Csc, Ci, np.random.default_rng())
+    force = voltage**2 * (Ci * Csc / (Ci + Csc)) / (2.0 * (200e-6 * skin + 1e-6 * insulator))
+    tones = 2.0 * np.abs(np.fft.rfft(force)) / force.size
+    assert found["Rsc"] == pytest.approx(Rsc / area)
+    assert found["Csc"] == pytest.approx(Csc)
+    assert found["force_mean"] == pytest.approx(np.mean(force), rel=1e-4)
+    assert found["force_at_2f"] == pytest.approx(tones[2], rel=1e-4)
+    assert found["friction_at_2f"] == pytest.approx(0.5 * tones[2], rel=1e-4)
+    assert found["force_at_f"] == pytest.approx(0.0, abs=1e-9 * tones[2])
+    time, traced = finger.force_in_time(np.log([[150e3, 18e-9, 1.2e-9, area, skin, insulator]]), force.size)
+    assert time[-1] == pytest.approx((1.0 - 1.0 / force.size) / FREQUENCY)
+    np.testing.assert_allclose(traced[0], force, rtol=1e-9, atol=1e-9 * np.max(force))
 
 
 def test_spread_of_the_next_finger_is_people_and_ignorance():

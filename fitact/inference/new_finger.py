@@ -57,8 +57,9 @@ class NewFinger(eqx.Module):
             frequency = float(derive.drive.frequency)
         elif isinstance(derive.drive, Sampled) and whole_periods(fit.record)[1] is not None:
             frequency = float(fit.record.frequency() or math.nan)
-        sigma = jnp.asarray([trace.sigma for trace in fit.traces])
-        return cls(derive, jnp.asarray(fit.theta), sigma, factors, frequency)
+        with jax.enable_x64(True):
+            sigma = jnp.asarray([trace.sigma for trace in fit.traces])
+            return cls(derive, jnp.asarray(fit.theta), sigma, factors, frequency)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -100,12 +101,13 @@ class NewFinger(eqx.Module):
     def force_in_time(
         self, factors: Float[np.ndarray, "fingers factors"], count: int
     ) -> tuple[Float[np.ndarray, " count"], Float[np.ndarray, "fingers count"]]:
-        """Times (s) and electrostatic force (N) of many fingers over a period; all the time if none repeats."""
+        """Times (s) and force (N) of many fingers over the last period (all of a drive that has none)."""
         with jax.enable_x64(True):
             first, last = float(jnp.min(self.derive.time)), float(jnp.max(self.derive.time))
             span = last - first if self.frequency is None else 1.0 / self.frequency
             time = span * np.arange(count) / count
-            there = dataclasses.replace(self.derive, time=jnp.asarray(last - span + time))
+            start = 0.0 if isinstance(self.derive.drive, Periodic) else last - span
+            there = dataclasses.replace(self.derive, time=jnp.asarray(start + time))
             force = Batched(_force, dataclasses.replace(self, derive=there), count, _BATCH)(factors)
         return time, force
 
