@@ -70,11 +70,11 @@ def mapping(given: Columns) -> dict[str, Any]:
 
 def numbers(example: str, texts: list[str] | None) -> dict[str, float]:
     """Pairs of a name and a number, as the option's `example` has them."""
-    option = example.split()[0]
+    given = pairs(example, texts)
     try:
-        return {name: float(value) for name, value in pairs(example, texts).items()}
+        return {name: float(value) for name, value in given.items()}
     except ValueError as error:
-        raise InputError(f"{option}: {error}; write a number, as {example}") from error
+        raise InputError(f"{example.split()[0]}: {error}; write a number, as {example}") from error
 
 
 def pairs(example: str, texts: list[str] | None) -> dict[str, str]:

@@ -28,7 +28,7 @@ def write_population(path: str | os.PathLike[str], population: Population) -> No
     Raises:
         InputError: the place cannot be written.
     """
-    with mpl.rc_context(style()), replacing(Path(path)) as temporary:
+    with mpl.rc_context(style() | {"legend.fontsize": 9.0}), replacing(Path(path)) as temporary:
         _figure(population).savefig(temporary, format="svg", metadata={"Date": None})
 
 
@@ -82,6 +82,7 @@ def _draw_force(axes: Axes, values: Float[np.ndarray, "laws fingers"]) -> None:
     )
     axes.plot(middle, next_one, color=_LAW, drawstyle="steps-mid", label="next finger: people and ignorance")
     axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(EngFormatter("N"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_ylim(0.0, 1.3 * float(np.max(high)))  # room for the legend
@@ -113,12 +114,12 @@ def _draw_time(axes: Axes, population: Population) -> None:
     axes.yaxis.set_major_formatter(EngFormatter("N"))
     right.yaxis.set_major_formatter(EngFormatter("N"))
     axes.set_xlim(time[0], time[-1])
-    axes.set_ylim(bottom=0.0)
+    axes.set_ylim(0.0, 1.3 * float(np.quantile(force, 0.975, axis=0).max()))  # room for the legend
     axes.set_xlabel("time in the period" if finger.frequency is not None else "time")
     axes.set_ylabel("electrostatic force")
     right.set_ylabel("friction")
     axes.set_title("The next finger in time")
-    axes.legend()
+    axes.legend(ncols=2)
 
 
 def _draw_shares(axes: Axes, population: Population) -> None:
@@ -130,7 +131,7 @@ def _draw_shares(axes: Axes, population: Population) -> None:
     rows = (
         (after, "first", _LAW, 1.0, "goes once it is known"),
         (after, "total", _OTHER, 1.0, "stays if only it is not"),
-        (before, "first", _LAW, 0.35, "the same, before the records"),
+        (before, "first", _LAW, 0.35, "before the records"),
         (before, "total", _OTHER, 0.35, None),
     )
     for row, (shares, key, color, opaque, label) in enumerate(rows):
@@ -149,4 +150,4 @@ def _draw_shares(axes: Axes, population: Population) -> None:
     axes.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
     axes.set_xlabel("share of the variance of the mean force")
     axes.set_title("What makes it differ")
-    axes.legend(loc="lower right")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=len(rows) - 1, handlelength=1.2)
