@@ -41,6 +41,7 @@ def known(skins: np.ndarray, log_Ci: np.ndarray, precision: float) -> Fingers:
     series[..., 0] += 0.5 * deviate**2
     skin = np.repeat(skins[:, None], 4, axis=1)
     parts = (skin, np.zeros((count, 1, 2)), log_Ci[:, None], reach * one, series, precision * one, 0.0 * one, deviate)
+    parts += (0.5 * deviate**2, skins, np.zeros((count, 2, 2)))
     return Fingers(*map(jnp.asarray, parts))
 
 

@@ -2,8 +2,9 @@
 
 Given log Ci, a finger's likelihood is nearly normal in log Rsc, log Csc and its nuisances, also where Vsc alone
 leaves the three together open: its mean then slides along that line with log Ci. Draws of a Student-t over that
-normal slide with it, so the weight of each draw is a smooth function of log Ci alone. It is tabulated once; any
-population is then an average of its density over the weighted draws.
+normal slide with it, so the weight of each draw is a smooth function of log Ci alone, tabulated once. Under any law
+the likelihood is that of the normal, in closed form, times what averages of the law's density over the draws, with
+their exact weights and with the normal's, say that it is off by.
 """
 
 import math
@@ -72,6 +73,8 @@ class Fingers(eqx.Module):
         precision: of log Ci, by each record alone.
         pull: precision times how far the record wants log Ci from `center`.
         deviate: standard normal numbers that draw the fingers' areas.
+        normal: log-weights of the draws under the normal likelihood, at `center`.
+        mean, covariance: of log Rsc and log Csc by that.
     """
 
     skin: Float[Array, "fingers draws 2"]
@@ -82,6 +85,9 @@ class Fingers(eqx.Module):
     precision: Float[Array, "fingers 1"]
     pull: Float[Array, "fingers 1"]
     deviate: Float[Array, "fingers draws"]
+    normal: Float[Array, "fingers draws"]
+    mean: Float[Array, "fingers 2"]
+    covariance: Float[Array, "fingers 2 2"]
 
     @classmethod
     def tabulated(
@@ -104,25 +110,51 @@ class Fingers(eqx.Module):
             tables.append(_table(each, center, reach, student, draws, terms, np.random.default_rng(child)))
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *tables)
 
-    def log_weights(self, law: Law) -> tuple[Float[Array, "fingers draws"], Float[Array, "fingers draws 2"]]:
-        """Log-weights of the draws, -inf beyond the tables, and their log Rsc and log Csc at the median area."""
+    def log_likelihood(self, law: Law) -> Float[Array, " fingers"]:
+        """Of each finger under a law, up to a constant; -inf beyond the tables.
+
+        That of the normal likelihood is known in closed form; the draws say by what factor the exact one differs, which
+        takes most of their noise away where a law is narrower than they are apart.
+        """
         log_Ci, value = jnp.broadcast_to(law.log_Ci, self.deviate.shape), jnp.zeros(())
         if law.area is not None:
             # given the law, log Ci of a finger is normal, but for what the tables correct
-            precision = self.precision + law.area**-2
-            middle = self.center + (self.pull + (law.log_Ci - self.center) * law.area**-2) / precision
-            log_Ci = middle + self.deviate / jnp.sqrt(precision)
+            precision, middle = self._of_areas(law.log_Ci, law.area)
+            log_Ci = self.center + middle + self.deviate / jnp.sqrt(precision)
             value = -0.5 * jnp.square((log_Ci - law.log_Ci) / law.area) - jnp.log(law.area) - 0.5 * jnp.log(precision)
-        area = log_Ci - law.log_Ci
-        at = (log_Ci - self.center) / self.reach
-        value = value + jnp.where(jnp.abs(at) <= 1.0, _series(self.weight, at), -jnp.inf)
-        own = self.skin + self.slope * (log_Ci - self.center)[..., None]
-        skin = own + jnp.array([1.0, -1.0]) * area[..., None]
-        return value + law.log_density(skin), skin
+        off = log_Ci - self.center
+        own = self.skin + self.slope * off[..., None]
+        skin = own + jnp.array([1.0, -1.0]) * (log_Ci - law.log_Ci)[..., None]
+        value, at = value + law.log_density(skin), off / self.reach
+        exact = value + jnp.where(jnp.abs(at) <= 1.0, _series(self.weight, at), -jnp.inf)
+        normal = value + self.normal + self.pull * off - 0.5 * self.precision * jnp.square(off)
+        factor = jax.nn.logsumexp(exact, axis=1) - jax.nn.logsumexp(normal, axis=1)
+        return self._normal_log_likelihood(law) + factor
 
-    def log_likelihood(self, law: Law) -> Float[Array, " fingers"]:
-        """Of each finger under a law, up to a constant; -inf beyond the tables."""
-        return jax.nn.logsumexp(self.log_weights(law)[0], axis=1)
+    def _of_areas(self, log_Ci: Array, area: Array) -> tuple[Float[Array, "fingers 1"], Float[Array, "fingers 1"]]:
+        """Precision of log Ci of each finger, and its mean from `center`, where areas differ by `area`."""
+        precision = self.precision + area**-2
+        return precision, (self.pull + (log_Ci - self.center) * area**-2) / precision
+
+    def _normal_log_likelihood(self, law: Law) -> Float[Array, " fingers"]:
+        """Of the normal likelihood under a law, up to a constant."""
+        off = law.log_Ci - self.center
+        between = jnp.outer(law.log_sd, law.log_sd) * jnp.where(jnp.eye(2) == 1.0, 1.0, law.correlation)
+        covariance, mean = self.covariance + between, self.mean + self.slope[:, 0] * off
+        value = self.pull * off - 0.5 * self.precision * jnp.square(off)
+        if law.area is not None:
+            precision, middle = self._of_areas(law.log_Ci, law.area)
+            area = jnp.array([1.0, -1.0])
+            along = self.slope[:, 0] + area
+            covariance = covariance + along[:, :, None] * along[:, None, :] / precision[..., None]
+            mean = self.mean + self.slope[:, 0] * middle + area * (middle - off)
+            value = 0.5 * precision * jnp.square(middle) - 0.5 * jnp.square(off / law.area)
+            value = value - jnp.log(law.area) - 0.5 * jnp.log(precision)
+        left = mean - law.median.reshape(-1, 2)
+        (xx, xy), (_, yy) = jnp.moveaxis(covariance, 0, -1)
+        determinant = xx * yy - jnp.square(xy)
+        squares = yy * left[:, 0] ** 2 - 2.0 * xy * left[:, 0] * left[:, 1] + xx * left[:, 1] ** 2
+        return value[:, 0] - 0.5 * (squares / determinant + jnp.log(determinant))
 
 
 def _spread_out(size: int, draws: int, random: np.random.Generator) -> Float[np.ndarray, "draws size"]:
@@ -163,15 +195,18 @@ def _table(
     points = np.stack([finger.at(center + reach * x, deviates[:, :own]) for x in nodes])
     log_prob = Batched(Likelihood.log_prob, finger.likelihood, finger.likelihood.rows, _BATCH)
     values = log_prob(points.reshape(-1, points.shape[-1]))
-    values = values.reshape(terms, draws) - student.log_density(deviates)
+    density = student.log_density(deviates)
+    values = values.reshape(terms, draws) - density
     possible = np.isfinite(values).all(axis=0)
     if not possible.any():
         raise InputError(f"{finger.source}: the record leaves Rsc and Csc too open for a population; leave it out")
     values = np.where(possible, values - np.max(values[:, possible]), _IMPOSSIBLE)
     skin = [finger.names.index(name) for name in SKIN]
+    at_center = finger.at(center, np.vstack([np.zeros(own), deviates[:, :own]]))[:, skin]
+    root = np.insert(finger.root, finger.names.index(SHARED), 0.0, axis=0)[skin]
     off = center - finger.center
     return Fingers(
-        skin=jnp.asarray(finger.at(center, deviates[:, :own])[:, skin]),
+        skin=jnp.asarray(at_center[1:]),
         slope=jnp.asarray(np.insert(finger.slope, finger.names.index(SHARED), 1.0)[None, skin]),
         center=jnp.array([center]),
         reach=jnp.array([reach]),
@@ -179,4 +214,7 @@ def _table(
         precision=jnp.array([finger.precision]),
         pull=jnp.array([finger.pull - finger.precision * off]),
         deviate=jnp.asarray(deviates[:, -1] if deviates.shape[1] > own else np.zeros(draws)),
+        normal=jnp.asarray(-0.5 * np.sum(np.square(deviates[:, :own]), axis=1) - density),
+        mean=jnp.asarray(at_center[0]),
+        covariance=jnp.asarray(root @ root.T),
     )
