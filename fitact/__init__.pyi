@@ -7,7 +7,8 @@ from .inference.comparison import Comparison, compare
 from .inference.design import MeasurementDesign, design_measurement
 from .inference.drive_design import DriveDesign, design_drive
 from .inference.fit import Fit, fit
-from .inference.population import Population, population
+from .inference.people import Population
+from .inference.population import population
 from .inference.posterior import Posterior
 from .inference.sampling import sample
 from .inference.solver import RESULTS

@@ -14,10 +14,11 @@ _UNITS = {
     "Rsc": "ohm", "Csc": "F", "Ci": "F", "R_H": "ohm", "grounding_Rsc": "ohm", "grounding_Csc": "F",
     "Z": "ohm", "Z_capacitance": "F", "series_resistor": "ohm", "Rgap": "ohm", "Cgap": "F",
     "gain": "1", "delay": "s", "clock": "1", "sigma": "V",
-    "alpha": "1", "Vsc_peak_to_peak": "V", "log_sd": "1", "correlation": "1",
+    "alpha": "1", "Vsc_peak_to_peak": "V", "log_sd": "1", "slope": "1", "correlation": "1",
     "offset": "V", "drift": "V", "charge": "V", "charge_2": "V", "charge_3": "V", "charge_4": "V",
     "hum_50Hz_cos": "V", "hum_50Hz_sin": "V", "hum_60Hz_cos": "V", "hum_60Hz_sin": "V",
     "g": "1", "b": "s", "force_mean": "N", "force_peak": "N", "force_rms": "N", "friction_mean": "N",
+    "force_at_f": "N", "force_at_2f": "N", "friction_at_f": "N", "friction_at_2f": "N",
 }  # fmt: skip
 
 

@@ -431,7 +431,11 @@ def test_an_area_scales_capacitances_up_and_the_resistance_down():
         return Law(np.log([R, C]), np.zeros(2), 0.0, math.log(CI), 0.3)
 
     population = types.SimpleNamespace(
-        hierarchy=types.SimpleNamespace(law=law), points=np.zeros((1, 1000, 1)), fits=(), trusted=True
+        hierarchy=types.SimpleNamespace(law=law),
+        points=np.zeros((1, 1000, 1)),
+        at=np.zeros(0),
+        fingers=(),
+        trusted=True,
     )
     tied = scene(prior={"grounding_Rsc": {"tied": "Rsc", "ratio": 3}, "R_H": {"fixed": "500 ohm"}})
     values = People.of_population(population, tied).values

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import equinox as eqx
@@ -14,12 +15,15 @@ import pytest
 import scipy.special
 import scipy.stats
 from arviz_stats.base import array_stats
-from population_calibration import FREQUENCY, simulate, steady, wave
+from population_calibration import FREQUENCY, simulate, steady, vsc, wave
 
 import fitact
-from fitact.inference.fingers import Conditional, Fingers, Law
+from fitact.data.covariates import Covariates, read_covariates
+from fitact.inference.finger import Finger
+from fitact.inference.fingers import Fingers, Law
 from fitact.inference.hierarchy import Hierarchy
-from fitact.inference.new_finger import FACTORS, NAMES, Spread, variance_shares
+from fitact.inference.new_finger import FACTORS, NewFinger, Spread
+from fitact.inference.sensitivity import Surrogate, shares_of, variance_shares
 from fitact.model.prior import Prior
 
 NUTS_CHAINS, NUTS_STEPS = 4, 3000
@@ -37,38 +41,47 @@ def known(skins: np.ndarray, log_Ci: np.ndarray, precision: float) -> Fingers:
     series[..., 0] += 0.5 * deviate**2
     skin = np.repeat(skins[:, None], 4, axis=1)
     parts = (skin, np.zeros((count, 1, 2)), log_Ci[:, None], reach * one, series, precision * one, 0.0 * one, deviate)
+    parts += (0.5 * deviate**2, skins, np.zeros((count, 2, 2)))
     return Fingers(*map(jnp.asarray, parts))
 
 
-@pytest.mark.parametrize("varies", [False, True])
-def test_log_posterior_of_known_fingers_is_scipys(varies: bool):
-    """Of Rsc and Csc, and of Ci too where each finger's area scales all three."""
+@pytest.mark.parametrize(("varies", "known_of_each"), [(False, 0), (True, 0), (False, 2)])
+def test_log_posterior_of_known_fingers_is_scipys(varies: bool, known_of_each: int):
+    """Of Rsc and Csc; of Ci too where each finger's area scales all three; and with covariates."""
     rng = np.random.default_rng(1)
     with jax.enable_x64(True):
         skins = rng.normal([11.8, -17.7], 0.3, (5, 2))
         log_Ci = -20.4 + (0.2 * rng.standard_normal(5) if varies else np.zeros(5))
-        hierarchy = Hierarchy(known(skins, log_Ci, 1e10 if varies else 0.0), PRIOR, varies)
+        covariates = Covariates.of({f"x{i}": rng.uniform(3.0, 7.0, 5) for i in range(known_of_each)}, 5).standard
+        fingers = known(skins, log_Ci, 1e10 if varies else 0.0)
+        hierarchy = Hierarchy(fingers, PRIOR, varies, jnp.asarray(covariates))
 
         def natural(point: jax.Array) -> jax.Array:
             law = hierarchy.law(point)
-            return jnp.array([*law.median, law.log_Ci, *law.log_sd, law.correlation, *([law.area] if varies else [])])
+            slopes = jnp.ravel(law.slopes) if known_of_each else []
+            area = [law.area] if varies else []
+            return jnp.array([*law.median, law.log_Ci, *law.log_sd, law.correlation, *area, *slopes])
 
         def expected(values: np.ndarray) -> float:
             """The stated densities."""
-            mean, sd, r, area = values[:3], values[3:5], values[5], values[6:].sum()
+            mean, sd, r, area = values[:3], values[3:5], values[5], values[6] if varies else 0.0
+            slopes = values[6 + varies :].reshape(-1, 2)
             covariance = area**2 * np.outer([-1.0, 1.0, 1.0], [-1.0, 1.0, 1.0])
             covariance[:2, :2] += np.outer(sd, sd) * [[1.0, r], [r, 1.0]]
             seen = slice(3 if varies else 2)
             of_fingers = scipy.stats.multivariate_normal(mean[seen], covariance[seen, seen])
+            at_mean = np.column_stack([skins - covariates @ slopes, log_Ci])
+            spreads = [*sd, area] if varies else sd
             return (
-                np.sum(of_fingers.logpdf(np.column_stack([skins, log_Ci])[:, seen]))
+                np.sum(of_fingers.logpdf(at_mean[:, seen]))
                 + np.sum(scipy.stats.norm(*np.transpose(list(SCALES.values()))).logpdf(mean))
-                + np.sum(scipy.stats.halfnorm(scale=0.5).logpdf([*values[3:5], *values[6:]]))
+                + np.sum(scipy.stats.norm(scale=0.5).logpdf(slopes))
+                + np.sum(scipy.stats.halfnorm(scale=0.5).logpdf(spreads))
                 + scipy.stats.beta(2.0, 2.0, loc=-1.0, scale=2.0).logpdf(r)
             )
 
-        far = np.array([2.0, 2.0, 0.1, 0.3, 0.3, 0.5, 0.3])[: 6 + varies]
-        points = hierarchy.start() + far * rng.standard_normal((6, 6 + varies))
+        far = np.array([2.0, 2.0, 0.1, 0.3, 0.3, 0.5, *[0.3] * varies, *[2.0] * (2 * known_of_each)])
+        points = hierarchy.start() + far * rng.standard_normal((6, far.size))
         each = jax.jit(jax.vmap(lambda x: (hierarchy.log_prob(x), natural(x), jax.jacfwd(natural)(x))))
         found, at, jacobian = map(np.asarray, each(points))
     volume = np.linalg.slogdet(jacobian)[1]
@@ -100,9 +113,9 @@ def test_integral_over_a_finger_is_that_of_quadrature():
     log_likelihood = -0.5 * y.size * np.log(left / np.min(left))
 
     with jax.enable_x64(True):
-        conditional = Conditional.around(fit)
+        finger = Finger.of(fit)
         prior = scene.make_prior()["Ci"]
-        tables = Fingers.tabulated([conditional], prior, area_varies=False, draws=20_000, terms=9, seed=[1])
+        tables = Fingers.tabulated([finger], prior, area_varies=False, draws=2**14, terms=9, seed=[1])
         law = Law(*map(jnp.asarray, (medians, spreads, correlations, log_Ci)))
         found = jax.jit(jax.vmap(tables.log_likelihood))(law)[:, 0]
     expected = []
@@ -114,6 +127,27 @@ def test_integral_over_a_finger_is_that_of_quadrature():
         expected.append(scipy.special.logsumexp(log_likelihood + density - np.log(1.0 - 2.0 * g)[:, None]))
     assert np.ptp(expected) > 1.0
     np.testing.assert_allclose(np.diff(found), np.diff(expected), atol=0.05)
+
+
+def test_force_of_a_new_finger_is_that_of_scipys_response():
+    """Mean, and amplitudes at f and 2 f, of a finger with its own area and thicknesses: eqs. (2), (3), (4) and (22)."""
+    simulated = simulate(5, 0, fingers=1)
+    finger = NewFinger.under_drive_of(fitact.fit(simulated.records[0], simulated.scene), FACTORS)
+    Rsc, Csc, Ci, area, skin, insulator = 150e3, 18e-9, 1.2e-9, 1.4, 1.2, 0.7
+    found = dict(zip(finger.names, finger.each(np.log([[Rsc, Csc, Ci, area, skin, insulator]]))[0], strict=True))
+    Csc, Ci = area * Csc, area * Ci / insulator
+    voltage = vsc(Rsc / area, Csc, Ci, np.random.default_rng())
+    force = voltage**2 * (Ci * Csc / (Ci + Csc)) / (2.0 * (200e-6 * skin + 1e-6 * insulator))
+    tones = 2.0 * np.abs(np.fft.rfft(force)) / force.size
+    assert found["Rsc"] == pytest.approx(Rsc / area)
+    assert found["Csc"] == pytest.approx(Csc)
+    assert found["force_mean"] == pytest.approx(np.mean(force), rel=1e-4)
+    assert found["force_at_2f"] == pytest.approx(tones[2], rel=1e-4)
+    assert found["friction_at_2f"] == pytest.approx(0.5 * tones[2], rel=1e-4)
+    assert found["force_at_f"] == pytest.approx(0.0, abs=1e-9 * tones[2])
+    time, traced = finger.force_in_time(np.log([[150e3, 18e-9, 1.2e-9, area, skin, insulator]]), force.size)
+    assert time[-1] == pytest.approx((1.0 - 1.0 / force.size) / FREQUENCY)
+    np.testing.assert_allclose(traced[0], force, rtol=1e-9, atol=1e-9 * np.max(force))
 
 
 def test_spread_of_the_next_finger_is_people_and_ignorance():
@@ -128,22 +162,58 @@ def test_variance_shares_of_correlated_factors_are_those_of_the_closed_form():
     """y = x . slope of normal x: first (cov(x_i, y))^2 / var(x_i), total slope_i^2 var(x_i | others), over var(y)."""
     slope = np.array([1.0, -2.0, 0.5])
     covariance = np.array([[1.0, 0.6, 0.0], [0.6, 0.8, -0.2], [0.0, -0.2, 0.5]])
-
-    class Linear:
-        def each(self, factors: np.ndarray) -> np.ndarray:
-            return np.repeat((factors @ slope)[:, None], len(NAMES), axis=1)
-
     white = np.random.default_rng(3).standard_normal((4000, 3))
     white = (white - white.mean(axis=0)) @ np.linalg.inv(np.linalg.cholesky(np.cov(white.T))).T
     factors = white @ np.linalg.cholesky(covariance).T
-    found = variance_shares(Linear(), factors, ("force_mean",), seed=0)["force_mean"]
+    found = shares_of(lambda x: (x @ slope)[:, None], FACTORS[:3], factors, ("force_mean",), seed=0)["force_mean"]
     variance = slope @ covariance @ slope
     for i, name in enumerate(FACTORS[:3]):
         first = (covariance[i] @ slope) ** 2 / covariance[i, i] / variance
         total = slope[i] ** 2 / np.linalg.inv(covariance)[i, i] / variance
         assert found[name]["first"] == pytest.approx(first, abs=2.0 * found[name]["first_error"])  # 95 % each
         assert found[name]["total"] == pytest.approx(total, abs=2.0 * found[name]["total_error"])
+        assert found[name]["interaction"] == pytest.approx(0.0, abs=2.0 * found[name]["interaction_error"])
         assert found[name]["first_error"] < 0.1
+
+
+@dataclasses.dataclass
+class Known:
+    """A finger of one quantity; counts how often it is asked."""
+
+    quantity: Callable[[np.ndarray], np.ndarray]
+    factors: tuple[str, ...]
+    names: tuple[str, ...] = ("force_mean",)
+    evaluations: int = 0
+
+    def each(self, factors: np.ndarray) -> np.ndarray:
+        self.evaluations += len(factors)
+        return self.quantity(factors)[:, None]
+
+
+def test_variance_shares_of_a_product_are_those_of_the_closed_form():
+    """y = exp(x . slope), x independent, s = slope sd: first (e^(s_i^2) - 1) over e^(sum s^2) - 1, total likewise."""
+    s = np.array([0.3, 0.5, 0.4])
+    factors = np.random.default_rng(4).standard_normal((4000, 3))
+    factors = (factors - factors.mean(axis=0)) @ np.linalg.inv(np.linalg.cholesky(np.cov(factors.T))).T
+    finger = Known(lambda x: np.exp(x @ s), FACTORS[:3])
+    found = variance_shares(finger, factors, finger.names, seed=0)["force_mean"]
+    assert finger.evaluations <= 4096 * 3 * 5 // 100
+    whole = np.expm1(s @ s)
+    for name, square in zip(FACTORS[:3], s**2, strict=True):
+        first, total = np.expm1(square) / whole, np.expm1(square) * np.exp(s @ s - square) / whole
+        for key, value in {"first": first, "total": total, "interaction": total - first}.items():
+            assert found[name][key] == pytest.approx(value, abs=2.0 * found[name][f"{key}_error"])
+            assert found[name][f"{key}_error"] < 0.12
+
+
+def test_a_surrogate_that_is_off_says_by_how_much():
+    """Of a quantity with a kink, which no polynomial has: the correlation at 100,000 other points."""
+    finger = Known(lambda x: np.exp(np.abs(x[:, 0] - 0.5) + 0.3 * x[:, 1]), FACTORS[:2])
+    surrogate = Surrogate.of(finger, np.random.default_rng(5).standard_normal((4000, 2)), finger.names)
+    points = surrogate.mean + np.random.default_rng(6).standard_normal((100_000, 2)) @ surrogate.root.T
+    r = np.corrcoef(finger.each(points)[:, 0], surrogate.at(points)[:, 0])[0, 1]
+    assert np.sqrt(1.0 - r**2) > 0.05
+    assert surrogate.off[0] == pytest.approx(np.sqrt(1.0 - r**2), rel=0.5)
 
 
 def test_what_makes_no_population_is_refused():
@@ -159,6 +229,40 @@ def test_what_makes_no_population_is_refused():
     correlated = {"R_H": {"median": "500 ohm", "factor": 2}, "correlation": {"R_H-Csc": 0.5}}
     with pytest.raises(fitact.InputError, match="with others"):
         fitact.population([first, *others], fitact.Scene.from_dict({"prior": correlated, "grounding": {"R_H": 500.0}}))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("file,moisture\na.csv,1\n", "needs a column 'record'"),
+        ("record,moisture\na.csv,1\n", "no row for b.csv"),
+        ("record,moisture\na.csv,1\nb.csv,dry\n", "moisture of b.csv is 'dry'"),
+        ("record,moisture\na.csv,1\nb.csv,2\na.csv,1\n", "line 4: a.csv has a row already"),
+    ],
+)
+def test_covariates_that_cannot_be_used_are_refused(tmp_path, text: str, said: str):
+    path = tmp_path / "people.csv"
+    path.write_text(text)
+    with pytest.raises(fitact.InputError, match=said):
+        read_covariates(path, [Path("a.csv"), Path("b.csv")])
+
+
+def test_covariates_are_those_of_the_records_in_their_order(tmp_path):
+    path = tmp_path / "people.csv"
+    path.write_text("record,moisture,age\nb.csv,0.5,30\nc.csv,9,9\na.csv,0.1,50\n")
+    found = read_covariates(path, [Path("x/a.csv"), Path("b.csv")])
+    assert found == {"moisture": [0.1, 0.5], "age": [50.0, 30.0]}
+    for values, said in (
+        ({"moisture": [1.0, 2.0]}, "2 values for 3 records"),
+        ({"moisture": [2.0, 2.0, 2.0]}, "same value"),
+        ({"a": [1.0, 2.0, 4.0], "b": [2.0, 4.0, 8.0]}, "one follows from the others"),
+    ):
+        with pytest.raises(fitact.InputError, match=said):
+            Covariates.of(values, 3)
+    known = Covariates.of({"moisture": [1.0, 2.0, 3.0]}, 3)
+    assert known.standardised({"moisture": 3.0}) == pytest.approx(np.sqrt(1.5))
+    with pytest.raises(fitact.InputError, match="not among those of the records"):
+        known.standardised({"age": 3.0})
 
 
 def test_refused_records_are_named(tmp_path):
@@ -222,7 +326,7 @@ def test_law_is_that_of_nuts_over_all_parameters(count: int):
     seen |= {f"log_sd_{name}": np.log(draws[f"log_sd_{name}"]) for name in ("Rsc", "Csc")}
     seen |= {"atanh_r": np.arctanh(draws["correlation"])}
     with jax.enable_x64(True):
-        expected = nuts(list(found.fits), found.hierarchy.prior)
+        expected = nuts([fitact.fit(each, simulated.scene) for each in simulated.records], found.hierarchy.prior)
     for name, reference in expected.items():
         assert array_stats.rhat(reference, chain_axis=0, draw_axis=1) < 1.01, name
         effective = float(array_stats.ess(reference, chain_axis=0, draw_axis=1))
@@ -240,7 +344,7 @@ def test_a_misfit_is_named_and_the_population_stays_trusted():
     first, *others = simulated.records
     bent = dataclasses.replace(first, channels={**first.channels, "Vsc": first["Vsc"] + 0.005 * first["Vsc"] ** 2})
     found = fitact.population([bent, *others], simulated.scene, seed=1, progress=False)
-    assert [fit.result for fit in found.fits] == ["misfit", *["successful"] * 3]
+    assert [finger.result for finger in found.fingers] == ["misfit", *["successful"] * 3]
     assert [warning.partition(":")[0] for warning in found.warnings] == ["finger 0 of population 0"]
     assert found.trusted
 
@@ -258,7 +362,12 @@ def eight(tmp_path_factory) -> dict:
     command += [*map(str, sorted(FINGERS.glob("*.csv.gz"))), "--scene", str(scene), "--seed", "1", "--json"]
     done = subprocess.run([*command, "--out", str(folder / "out")], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert {path.name for path in (folder / "out").iterdir()} == {"population.json", "population.svg"}
+    assert {path.name for path in (folder / "out").iterdir()} == {
+        "population.json",
+        "population.nc",
+        "population.svg",
+        "chain.h5",
+    }
     assert json.loads((folder / "out" / "population.json").read_text()) == json.loads(done.stdout)
     return json.loads(done.stdout)
 

@@ -64,15 +64,24 @@ Fresh = Annotated[bool, typer.Option("--fresh", help="Start the chain anew inste
 
 def mapping(given: Columns) -> dict[str, Any]:
     """What --channel and --scale say, as `fitact.read` takes it."""
-    pairs: list[dict[str, str]] = []
-    for option, texts in zip(("--channel Vsc=CH2", "--scale Vsc=10"), given, strict=True):
-        parts = [text.partition("=") for text in texts or []]
-        for name, _, value in parts:
-            if not name or not value:
-                raise InputError(f"'{name}{value}' after {option.split()[0]} lacks a side; write {option}")
-        pairs.append({name.strip(): value.strip() for name, _, value in parts})
+    channels, scale = given
+    return {"channels": pairs("--channel Vsc=CH2", channels), "scale": numbers("--scale Vsc=10", scale)}
+
+
+def numbers(example: str, texts: list[str] | None) -> dict[str, float]:
+    """Pairs of a name and a number, as the option's `example` has them."""
+    given = pairs(example, texts)
     try:
-        factors = {name: float(value) for name, value in pairs[1].items()}
+        return {name: float(value) for name, value in given.items()}
     except ValueError as error:
-        raise InputError(f"--scale: {error}; write a number, as --scale Vsc=10") from error
-    return {"channels": pairs[0], "scale": factors}
+        raise InputError(f"{example.split()[0]}: {error}; write a number, as {example}") from error
+
+
+def pairs(example: str, texts: list[str] | None) -> dict[str, str]:
+    """Pairs of a name and a value, as the option's `example` has them."""
+    found = {}
+    for name, _, value in (text.partition("=") for text in texts or []):
+        if not name or not value:
+            raise InputError(f"'{name}{value}' after {example.split()[0]} lacks a side; write {example}")
+        found[name.strip()] = value.strip()
+    return found

@@ -1,14 +1,19 @@
 """Commands on records: what they hold, which model they prefer, what people they come from, what accuracy costs."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from fitact.cli.app import app
-from fitact.cli.options import Channels, Json, Out, RecordFiles, Scales, Seed, mapping
+from fitact.cli.options import Channels, Fresh, Json, Out, RecordFiles, Scales, Seed, mapping, numbers
 from fitact.cli.terminal import finish, say, show, use_compilation_cache
 from fitact.files import write_json
+
+if TYPE_CHECKING:
+    from fitact.data.record import Record
+    from fitact.model.scene import Scene
 
 
 @app.command()
@@ -63,6 +68,21 @@ def compare(
     finish(found.trusted)
 
 
+class _Files(Sequence["Record"]):
+    """Records, each read when it is asked for."""
+
+    def __init__(self, paths: list[Path], scene: "Scene | None", columns: dict[str, Any]) -> None:
+        self._paths, self._scene, self._columns = paths, scene, columns
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    def __getitem__(self, index: Any) -> Any:
+        from fitact.data.formats import read
+
+        return read(self._paths[index], self._scene, **self._columns)
+
+
 @app.command()
 def population(
     records: Annotated[list[Path], typer.Argument(metavar="RECORD...", help="One of each finger, on one panel.")],
@@ -71,28 +91,42 @@ def population(
     ] = None,
     channel: Channels = None,
     scale: Scales = None,
+    covariates: Annotated[
+        Path | None,
+        typer.Option("--covariates", metavar="FILE", help="CSV: a column 'record', and one for each covariate."),
+    ] = None,
+    at: Annotated[
+        list[str] | None, typer.Option("--at", metavar="NAME=VALUE", help="A covariate of the next finger.")
+    ] = None,
     out: Out = None,
     seed: Seed = 0,
+    fresh: Fresh = False,
     json: Json = False,
 ) -> None:
     """From one finger to people: how fingers differ, what force the next one will feel, and why.
 
-    Into DIR it writes population.json and population.svg.
+    Into DIR it writes population.json, population.nc (the draws), population.svg, and chain.h5 (for going on).
     """
-    from fitact.data.formats import read
+    from fitact.data.covariates import read_covariates
     from fitact.model.scene import Scene
 
     stated = None if scene is None else Scene.load(scene)
-    columns = mapping((channel, scale))
-    measured = [read(path, stated, **columns) for path in records]
+    known = {} if covariates is None else read_covariates(covariates, records)
     use_compilation_cache()
+    from fitact.inference.population import forget
     from fitact.inference.population import population as find_population
 
-    found = find_population(measured, stated, seed=seed)
+    if fresh and out is not None:
+        forget(out)
+    measured = _Files(records, stated, mapping((channel, scale)))
+    found = find_population(
+        measured, stated, covariates=known, at=numbers("--at moisture=0.4", at), folder=out, seed=seed
+    )
     if out is not None:
         from fitact.report.population import write_population
 
         write_json(out / "population.json", found.to_dict())
+        found.to_netcdf(out / "population.nc")
         write_population(out / "population.svg", found)
     show(str(found), found.to_dict(), json)
     finish(found.trusted)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from fitact.errors import InputError
 from fitact.inference.drive_option import ASSURANCE, DriveOption, quantile, shown
 from fitact.inference.drive_people import People
-from fitact.inference.population import Population
+from fitact.inference.people import Population
 from fitact.model.circuit import RC
 from fitact.model.cycle import Cycle, cycle
 from fitact.model.drive import Periodic
@@ -121,6 +121,11 @@ class DriveDesign:
             found.append(
                 "the scene's prior stands for people and for ignorance of them alike; give records of fingers to tell"
                 " these apart"
+            )
+        thickness = self.scene.population.thickness_sd
+        if thickness:
+            found.append(
+                f"people are taken to have one thickness, though [population] spreads {' and '.join(thickness)}"
             )
         limits = ("breakdown_field", "current_limit_rms", "current_limit_peak")
         absent = [name for name in limits if getattr(device, name) is None]

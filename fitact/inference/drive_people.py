@@ -3,14 +3,14 @@
 import dataclasses
 from typing import Any, Self
 
-import jax
 import numpy as np
 import scipy.special
 import scipy.stats
 from jaxtyping import Float
 
-from fitact.inference.fingers import SHARED, SKIN, Law
-from fitact.inference.population import Population
+from fitact.inference.finger import SHARED, SKIN
+from fitact.inference.fingers import Law
+from fitact.inference.people import Population, laws
 from fitact.inference.prior_predictive import believed
 from fitact.model.scene import Scene
 
@@ -62,7 +62,7 @@ class People:
         held = {name: np.full((_LAWS, _FINGERS), value) for name, value in scene.fixed().items()}
         known: dict[str, Any] = {**scene.nominal(), **held, **values}
         tied = {name: ratio * known[other] for name, (other, ratio) in scene.prior.tied().items()}
-        source = f"the population of {len(population.fits)} fingers"
+        source = f"the population of {len(population.fingers)} fingers"
         return cls(_of_the_circuit(held | tied | values), source, population.trusted)
 
     @classmethod
@@ -85,9 +85,8 @@ def _of_the_circuit(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def _laws(population: Population) -> Law:
     """Draws of it, spread over the chain; each leaf (laws, 1, ...)."""
     flat = population.points.reshape(-1, population.points.shape[-1])
-    drawn = flat[np.linspace(0, len(flat) - 1, _LAWS).astype(int)]
-    with jax.enable_x64(True):
-        return jax.tree.map(lambda x: np.asarray(x)[:, None], jax.jit(jax.vmap(population.hierarchy.law))(drawn))
+    drawn = flat[np.linspace(0, len(flat) - 1, _LAWS).astype(int), None]
+    return laws(population.hierarchy, drawn).at(population.at)
 
 
 def _standard_normal(seed: int) -> Float[np.ndarray, "laws fingers 3"]:

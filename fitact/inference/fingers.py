@@ -2,11 +2,11 @@
 
 Given log Ci, a finger's likelihood is nearly normal in log Rsc, log Csc and its nuisances, also where Vsc alone
 leaves the three together open: its mean then slides along that line with log Ci. Draws of a Student-t over that
-normal slide with it, so the weight of each draw is a smooth function of log Ci alone. It is tabulated once; any
-population is then an average of its density over the weighted draws.
+normal slide with it, so the weight of each draw is a smooth function of log Ci alone, tabulated once. Under any law
+the likelihood is that of the normal, in closed form, times what averages of the law's density over the draws, with
+their exact weights and with the normal's, say that it is off by.
 """
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from typing import NamedTuple, Self
@@ -15,23 +15,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.special
+import scipy.stats
 from jaxtyping import Array, Float
 
 from fitact.errors import InputError
-from fitact.inference import compressed
-from fitact.inference.fit import Fit
-from fitact.inference.likelihood import Likelihood
-from fitact.inference.proposal import Proposal
-from fitact.model.distribution import Distribution, LogNormal
-from fitact.model.prior import Prior
+from fitact.inference.finger import SHARED, SKIN, Finger
+from fitact.inference.likelihood import Batched, Likelihood
+from fitact.inference.proposal import DEGREES, Proposal
+from fitact.model.distribution import Distribution
 
-SKIN = ("Rsc", "Csc")
-SHARED = "Ci"
-_FLAT = 1e3  # standard deviation, in a logarithm, of a prior that says nothing
 REACH = 8.0  # standard deviations of log Ci that the tables hold
 _AREA = 1.0  # of an area's logarithm: the widest that the tables allow for
 _BATCH = 128  # points evaluated at a time
-_IMPOSSIBLE = -1e6  # log-weight of a draw that some nuisance's prior forbids
+_IMPOSSIBLE = -1e6  # log-weight of a draw that some nuisance's prior forbids, or a compression does not reach
 
 
 class Law(NamedTuple):
@@ -43,6 +40,7 @@ class Law(NamedTuple):
         correlation: of their logarithms.
         log_Ci: of the panel, for the median finger's area.
         area: standard deviation of the logarithm of a finger's area; None: they are the same.
+        slopes: by how much a standard deviation of each covariate shifts `median`, which is at their mean.
     """
 
     median: Float[Array, "2"]
@@ -50,6 +48,11 @@ class Law(NamedTuple):
     correlation: Float[Array, ""]
     log_Ci: Float[Array, ""]
     area: Float[Array, ""] | None = None
+    slopes: Float[Array, "covariates 2"] | None = None
+
+    def at(self, covariates: Float[Array, "*shape covariates"]) -> Self:
+        """The law of fingers with those (standardised) covariates, its median of shape (*shape, 2)."""
+        return self if self.slopes is None else self._replace(median=self.median + covariates @ self.slopes)
 
     def log_density(self, skin: Float[Array, "*shape 2"]) -> Float[Array, "*shape"]:
         """Of log Rsc and log Csc, at the median area, up to a constant."""
@@ -57,85 +60,6 @@ class Law(NamedTuple):
         rest = 1.0 - jnp.square(self.correlation)
         squares = jnp.square(first) + jnp.square(second - self.correlation * first) / rest
         return -0.5 * squares - jnp.sum(jnp.log(self.log_sd)) - 0.5 * jnp.log(rest)
-
-
-@dataclasses.dataclass(frozen=True)
-class Conditional:
-    """A finger's likelihood around its optimum, normal in its own coordinates given log Ci.
-
-    Attributes:
-        source: of the record.
-        likelihood: with priors of the nuisances alone.
-        names: the coordinates of a point; its own are all but Ci.
-        center: log Ci of the optimum.
-        place: its own coordinates there.
-        slope: how these move with log Ci.
-        root: of their covariance, given log Ci.
-        precision: of log Ci, from the record alone.
-        pull: precision times how far the record wants log Ci from `center`.
-    """
-
-    source: str
-    likelihood: Likelihood
-    names: tuple[str, ...]
-    center: float
-    place: Float[np.ndarray, " own"]
-    slope: Float[np.ndarray, " own"]
-    root: Float[np.ndarray, "own own"]
-    precision: float
-    pull: float
-
-    @classmethod
-    def around(cls, fit: Fit) -> Self:
-        """From the whitened residuals at the fit and their Jacobian; a noise's by its Fisher information."""
-        likelihood = _without_skin_prior(fit.likelihood)
-        names, size = fit.point_names, fit.theta.size
-        shared = fit.names.index(SHARED)
-        theta, log_sigma = np.split(fit.point, [size])
-        residuals, jacobian = _linearised(likelihood.without_samples(), theta, np.exp(log_sigma))
-        own = [i for i in range(size) if i != shared]
-        # R of (own, Ci, residuals): what Ci's column holds below the own ones' is what the record alone says of it
-        R = np.asarray(np.linalg.qr(np.column_stack([jacobian[:, [*own, shared]], residuals]), mode="r"))
-        n = len(own)
-        root = np.linalg.inv(R[:n, :n])
-        noise = np.diag(fit.point_root)[size:]
-        whole = np.diag(np.append(np.zeros(n), noise))
-        whole[:n, :n] = root
-        return cls(
-            source=fit.record.source,
-            likelihood=likelihood,
-            names=names,
-            center=float(theta[shared]),
-            place=np.append(theta[own] - root @ R[:n, n + 1], log_sigma),
-            slope=np.append(-root @ R[:n, n], np.zeros(noise.size)),
-            root=whole,
-            precision=float(R[n, n] ** 2),
-            pull=float(-R[n, n] * R[n, n + 1]),
-        )
-
-    def at(self, log_Ci: float, white: Float[np.ndarray, "draws own"]) -> Float[np.ndarray, "draws coordinates"]:
-        """Points that standard normal numbers are at that log Ci."""
-        own = self.place + self.slope * (log_Ci - self.center) + white @ self.root.T
-        return np.insert(own, self.names.index(SHARED), log_Ci, axis=1)
-
-
-def _without_skin_prior(likelihood: Likelihood) -> Likelihood:
-    flat = {name: LogNormal(math.exp(likelihood.prior[name].log_mean), _FLAT) for name in (*SKIN, SHARED)}
-    marginals = dict(zip(likelihood.prior.names, likelihood.prior.marginals, strict=True)) | flat
-    return dataclasses.replace(likelihood, prior=Prior.of(**marginals))
-
-
-@eqx.filter_jit
-def _linearised_in(likelihood: Likelihood, theta: Array, sigma: Array) -> tuple[Array, Array]:
-    def residuals(theta: Array) -> Array:
-        return jnp.concatenate([*likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)])
-
-    return residuals(theta), jax.jacfwd(residuals)(theta)
-
-
-def _linearised(likelihood: Likelihood, theta: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    residuals, jacobian = _linearised_in(likelihood, jnp.asarray(theta), jnp.asarray(sigma))
-    return np.asarray(residuals), np.asarray(jacobian)
 
 
 class Fingers(eqx.Module):
@@ -149,6 +73,8 @@ class Fingers(eqx.Module):
         precision: of log Ci, by each record alone.
         pull: precision times how far the record wants log Ci from `center`.
         deviate: standard normal numbers that draw the fingers' areas.
+        normal: log-weights of the draws under the normal likelihood, at `center`.
+        mean, covariance: of log Rsc and log Csc by that.
     """
 
     skin: Float[Array, "fingers draws 2"]
@@ -159,11 +85,14 @@ class Fingers(eqx.Module):
     precision: Float[Array, "fingers 1"]
     pull: Float[Array, "fingers 1"]
     deviate: Float[Array, "fingers draws"]
+    normal: Float[Array, "fingers draws"]
+    mean: Float[Array, "fingers 2"]
+    covariance: Float[Array, "fingers 2 2"]
 
     @classmethod
     def tabulated(
         cls,
-        conditionals: Sequence[Conditional],
+        fingers: Sequence[Finger],
         prior: Distribution,
         *,
         area_varies: bool,
@@ -173,33 +102,66 @@ class Fingers(eqx.Module):
     ) -> Self:
         """Tables of `terms`, wherever the records and the panel's `prior` allow log Ci to be."""
         tables = []
-        center, reach = _weighed(conditionals, prior.log_mean, prior.log_sd)
-        for each, child in zip(conditionals, np.random.SeedSequence(seed).spawn(len(conditionals)), strict=True):
+        center, reach = _weighed(fingers, prior.log_mean, prior.log_sd)
+        for each, child in zip(fingers, np.random.SeedSequence(seed).spawn(len(fingers)), strict=True):
             if area_varies:
                 center, reach = _weighed([each], prior.log_mean, math.hypot(prior.log_sd, _AREA))
             student = Proposal(np.zeros(each.place.size + area_varies), np.eye(each.place.size + area_varies))
             tables.append(_table(each, center, reach, student, draws, terms, np.random.default_rng(child)))
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *tables)
 
-    def log_weights(self, law: Law) -> tuple[Float[Array, "fingers draws"], Float[Array, "fingers draws 2"]]:
-        """Log-weights of the draws, -inf beyond the tables, and their log Rsc and log Csc at the median area."""
+    def log_likelihood(self, law: Law) -> Float[Array, " fingers"]:
+        """Of each finger under a law, up to a constant; -inf beyond the tables.
+
+        That of the normal likelihood is known in closed form; the draws say by what factor the exact one differs, which
+        takes most of their noise away where a law is narrower than they are apart.
+        """
         log_Ci, value = jnp.broadcast_to(law.log_Ci, self.deviate.shape), jnp.zeros(())
         if law.area is not None:
             # given the law, log Ci of a finger is normal, but for what the tables correct
-            precision = self.precision + law.area**-2
-            middle = self.center + (self.pull + (law.log_Ci - self.center) * law.area**-2) / precision
-            log_Ci = middle + self.deviate / jnp.sqrt(precision)
+            precision, middle = self._of_areas(law.log_Ci, law.area)
+            log_Ci = self.center + middle + self.deviate / jnp.sqrt(precision)
             value = -0.5 * jnp.square((log_Ci - law.log_Ci) / law.area) - jnp.log(law.area) - 0.5 * jnp.log(precision)
-        area = log_Ci - law.log_Ci
-        at = (log_Ci - self.center) / self.reach
-        value = value + jnp.where(jnp.abs(at) <= 1.0, _series(self.weight, at), -jnp.inf)
-        own = self.skin + self.slope * (log_Ci - self.center)[..., None]
-        skin = own + jnp.array([1.0, -1.0]) * area[..., None]
-        return value + law.log_density(skin), skin
+        off = log_Ci - self.center
+        own = self.skin + self.slope * off[..., None]
+        skin = own + jnp.array([1.0, -1.0]) * (log_Ci - law.log_Ci)[..., None]
+        value, at = value + law.log_density(skin), off / self.reach
+        exact = value + jnp.where(jnp.abs(at) <= 1.0, _series(self.weight, at), -jnp.inf)
+        normal = value + self.normal + self.pull * off - 0.5 * self.precision * jnp.square(off)
+        factor = jax.nn.logsumexp(exact, axis=1) - jax.nn.logsumexp(normal, axis=1)
+        return self._normal_log_likelihood(law) + factor
 
-    def log_likelihood(self, law: Law) -> Float[Array, " fingers"]:
-        """Of each finger under a law, up to a constant; -inf beyond the tables."""
-        return jax.nn.logsumexp(self.log_weights(law)[0], axis=1)
+    def _of_areas(self, log_Ci: Array, area: Array) -> tuple[Float[Array, "fingers 1"], Float[Array, "fingers 1"]]:
+        """Precision of log Ci of each finger, and its mean from `center`, where areas differ by `area`."""
+        precision = self.precision + area**-2
+        return precision, (self.pull + (log_Ci - self.center) * area**-2) / precision
+
+    def _normal_log_likelihood(self, law: Law) -> Float[Array, " fingers"]:
+        """Of the normal likelihood under a law, up to a constant."""
+        off = law.log_Ci - self.center
+        between = jnp.outer(law.log_sd, law.log_sd) * jnp.where(jnp.eye(2) == 1.0, 1.0, law.correlation)
+        covariance, mean = self.covariance + between, self.mean + self.slope[:, 0] * off
+        value = self.pull * off - 0.5 * self.precision * jnp.square(off)
+        if law.area is not None:
+            precision, middle = self._of_areas(law.log_Ci, law.area)
+            area = jnp.array([1.0, -1.0])
+            along = self.slope[:, 0] + area
+            covariance = covariance + along[:, :, None] * along[:, None, :] / precision[..., None]
+            mean = self.mean + self.slope[:, 0] * middle + area * (middle - off)
+            value = 0.5 * precision * jnp.square(middle) - 0.5 * jnp.square(off / law.area)
+            value = value - jnp.log(law.area) - 0.5 * jnp.log(precision)
+        left = mean - law.median.reshape(-1, 2)
+        (xx, xy), (_, yy) = jnp.moveaxis(covariance, 0, -1)
+        determinant = xx * yy - jnp.square(xy)
+        squares = yy * left[:, 0] ** 2 - 2.0 * xy * left[:, 0] * left[:, 1] + xx * left[:, 1] ** 2
+        return value[:, 0] - 0.5 * (squares / determinant + jnp.log(determinant))
+
+
+def _spread_out(size: int, draws: int, random: np.random.Generator) -> Float[np.ndarray, "draws size"]:
+    """Draws of a `Proposal` of no mean and unit axes by Sobol's scrambled sequence: fewer hold an integral as well."""
+    uniform = scipy.stats.qmc.Sobol(size + 1, rng=random).random(draws)
+    chi_square = scipy.stats.chi2.ppf(uniform[:, -1:], DEGREES)
+    return scipy.special.ndtri(uniform[:, :-1]) * np.sqrt(DEGREES / chi_square)
 
 
 def _series(weight: Float[Array, "fingers draws terms"], at: Float[Array, "fingers draws"]) -> Array:
@@ -210,15 +172,15 @@ def _series(weight: Float[Array, "fingers draws terms"], at: Float[Array, "finge
     return at * latest - later + weight[..., 0]
 
 
-def _weighed(conditionals: Sequence[Conditional], mean: float, sd: float) -> tuple[float, float]:
+def _weighed(fingers: Sequence[Finger], mean: float, sd: float) -> tuple[float, float]:
     """Where log Ci may lie by records and a normal prior, and how far from there."""
-    precision = sd**-2 + sum(each.precision for each in conditionals)
-    pull = sum(each.pull + each.precision * (each.center - mean) for each in conditionals)
+    precision = sd**-2 + sum(each.precision for each in fingers)
+    pull = sum(each.pull + each.precision * (each.center - mean) for each in fingers)
     return mean + pull / precision, REACH / math.sqrt(precision)
 
 
 def _table(
-    finger: Conditional,
+    finger: Finger,
     center: float,
     reach: float,
     student: Proposal,
@@ -228,19 +190,23 @@ def _table(
 ) -> Fingers:
     """Of one finger, for log Ci within `reach` of `center`; a deviate beyond its own coordinates draws its area."""
     own = finger.place.size
-    deviates = student.draw(random, draws)
+    deviates = _spread_out(student.center.size, draws, random)
     nodes = np.cos(np.pi * (np.arange(terms) + 0.5) / terms)
     points = np.stack([finger.at(center + reach * x, deviates[:, :own]) for x in nodes])
-    values = compressed.log_prob(finger.likelihood, _BATCH)(points.reshape(-1, points.shape[-1]))
-    values = values.reshape(terms, draws) - student.log_density(deviates)
+    log_prob = Batched(Likelihood.log_prob, finger.likelihood, finger.likelihood.rows, _BATCH)
+    values = log_prob(points.reshape(-1, points.shape[-1]))
+    density = student.log_density(deviates)
+    values = values.reshape(terms, draws) - density
     possible = np.isfinite(values).all(axis=0)
     if not possible.any():
         raise InputError(f"{finger.source}: the record leaves Rsc and Csc too open for a population; leave it out")
     values = np.where(possible, values - np.max(values[:, possible]), _IMPOSSIBLE)
     skin = [finger.names.index(name) for name in SKIN]
+    at_center = finger.at(center, np.vstack([np.zeros(own), deviates[:, :own]]))[:, skin]
+    root = np.insert(finger.root, finger.names.index(SHARED), 0.0, axis=0)[skin]
     off = center - finger.center
     return Fingers(
-        skin=jnp.asarray(finger.at(center, deviates[:, :own])[:, skin]),
+        skin=jnp.asarray(at_center[1:]),
         slope=jnp.asarray(np.insert(finger.slope, finger.names.index(SHARED), 1.0)[None, skin]),
         center=jnp.array([center]),
         reach=jnp.array([reach]),
@@ -248,4 +214,7 @@ def _table(
         precision=jnp.array([finger.precision]),
         pull=jnp.array([finger.pull - finger.precision * off]),
         deviate=jnp.asarray(deviates[:, -1] if deviates.shape[1] > own else np.zeros(draws)),
+        normal=jnp.asarray(-0.5 * np.sum(np.square(deviates[:, :own]), axis=1) - density),
+        mean=jnp.asarray(at_center[0]),
+        covariance=jnp.asarray(root @ root.T),
     )

@@ -1,6 +1,7 @@
 """The next finger of a population: its force, and what of the spread is people and what is ignorance."""
 
 import dataclasses
+import math
 from typing import NamedTuple, Self
 
 import equinox as eqx
@@ -10,33 +11,39 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitact.inference import derived
-from fitact.inference.fingers import SHARED, SKIN
+from fitact.inference.finger import SHARED, SKIN
+from fitact.inference.fingers import Law
 from fitact.inference.fit import Fit
 from fitact.inference.likelihood import Batched
 from fitact.inference.start import whole_periods
-from fitact.model.drive import Sampled
+from fitact.model.drive import Periodic, Sampled
 
 AREA = "contact_area"
-FACTORS = (*SKIN, SHARED, AREA)  # Rsc and Csc at the median area, Ci of the panel there, the area over the median
+THICKNESSES = ("skin_thickness", "insulator_thickness")
+FACTORS = (*SKIN, SHARED, AREA, *THICKNESSES)  # Rsc, Csc and Ci at the median area and thickness; the others over it
 NAMES = (*SKIN, *derived.NAMES)
+HARMONICS = ("force_at_f", "force_at_2f", "friction_at_f", "friction_at_2f")
 _BATCH = 512  # fingers evaluated at a time
-_BASE = 4096  # points of Sobol's sequence
 
 
 class NewFinger(eqx.Module):
-    """What follows from the logarithms of a finger's `FACTORS`: all of `NAMES`, SI units.
+    """What follows from the logarithms of a finger's `factors`: all of `names`, SI units.
 
     Attributes:
         derive: of a fit, without its record's charge.
         theta, sigma: of the fit; what is not the finger's stays as it is.
+        factors: which of `FACTORS`, in that order.
+        frequency: of the drive, Hz; None: it does not repeat.
     """
 
     derive: derived.Derived
     theta: Float[Array, " parameters"]
     sigma: Float[Array, " traces"]
+    factors: tuple[str, ...] = eqx.field(static=True)
+    frequency: float | None = eqx.field(static=True)
 
     @classmethod
-    def under_drive_of(cls, fit: Fit) -> Self:
+    def under_drive_of(cls, fit: Fit, factors: tuple[str, ...]) -> Self:
         """A measured drive that repeats is taken to go on doing so."""
         derive = fit.derive
         if derive.charge:
@@ -45,22 +52,69 @@ class NewFinger(eqx.Module):
                 drive = Sampled(fit.record.time[:kept], fit.record["V"][:kept], period)
                 derive = dataclasses.replace(derive, drive=drive, steady_state=True)
             derive = dataclasses.replace(derive, charge=False)
-        return cls(derive, jnp.asarray(fit.theta), jnp.asarray([trace.sigma for trace in fit.traces]))
+        frequency = None
+        if isinstance(derive.drive, Periodic) and derive.steady_state:
+            frequency = float(derive.drive.frequency)
+        elif isinstance(derive.drive, Sampled) and whole_periods(fit.record)[1] is not None:
+            frequency = float(fit.record.frequency() or math.nan)
+        with jax.enable_x64(True):
+            sigma = jnp.asarray([trace.sigma for trace in fit.traces])
+            return cls(derive, jnp.asarray(fit.theta), sigma, factors, frequency)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of what follows: `NAMES`, and where the drive repeats the amplitudes at its frequency and twice that."""
+        return NAMES if self.frequency is None else (*NAMES, *HARMONICS)
+
+    def of(self, factors: Float[Array, " factors"]) -> tuple[derived.Derived, Float[Array, " parameters"]]:
+        """Its geometry and circuit; area and thickness scale the latter by eqs. (3) and (4)."""
+        by_name = dict(zip(self.factors, factors, strict=True))
+        area, skin, insulator = (by_name.get(name, 0.0) for name in FACTORS[3:])
+        at = jnp.stack([by_name["Rsc"] - area, by_name["Csc"] + area, by_name["Ci"] + area - insulator])
+        places = np.array([self.derive.likelihood.names.index(name) for name in (*SKIN, SHARED)])
+        geometry = self.derive.geometry
+        thicker = dataclasses.replace(
+            geometry,
+            skin_thickness=geometry.skin_thickness * jnp.exp(skin),
+            insulator_thickness=geometry.insulator_thickness * jnp.exp(insulator),
+        )
+        return dataclasses.replace(self.derive, geometry=thicker), self.theta.at[places].set(at)
 
     def __call__(self, factors: Float[Array, " factors"]) -> Float[Array, " names"]:
-        """Area scales both capacitances up and the resistance down; without one it is the median's."""
-        area = factors[3] if factors.size > 3 else 0.0
-        skin = factors[:3] + jnp.array([-1.0, 1.0, 1.0]) * area
-        places = np.array([self.derive.likelihood.names.index(name) for name in (*SKIN, SHARED)])
-        theta = self.theta.at[places].set(skin)
-        return jnp.concatenate([jnp.exp(skin[:2]), self.derive(theta, self.sigma)])
+        """All of `names`."""
+        derive, theta = self.of(factors)
+        skin = jnp.exp(theta[np.array([derive.likelihood.names.index(name) for name in SKIN])])
+        parts = [skin, derive(theta, self.sigma)]
+        if self.frequency is not None:
+            turn = jnp.exp(2j * jnp.pi * self.frequency * jnp.outer(jnp.array([1.0, 2.0]), derive.time))
+            tones = 2.0 * jnp.abs(turn @ (derive.weight * derive.force(theta, self.sigma)))
+            parts += [tones, derive.coefficient * tones]
+        return jnp.concatenate(parts)
 
     def each(self, factors: Float[np.ndarray, "*shape factors"]) -> Float[np.ndarray, "*shape names"]:
         """Of many fingers."""
         with jax.enable_x64(True):
             flat = factors.reshape(-1, factors.shape[-1])
             found = Batched(NewFinger.__call__, self, self.derive.time.size, _BATCH)(flat)
-        return found.reshape(*factors.shape[:-1], len(NAMES))
+        return found.reshape(*factors.shape[:-1], len(self.names))
+
+    def force_in_time(
+        self, factors: Float[np.ndarray, "fingers factors"], count: int
+    ) -> tuple[Float[np.ndarray, " count"], Float[np.ndarray, "fingers count"]]:
+        """Times (s) and force (N) of many fingers over the last period (all of a drive that has none)."""
+        with jax.enable_x64(True):
+            first, last = float(jnp.min(self.derive.time)), float(jnp.max(self.derive.time))
+            span = last - first if self.frequency is None else 1.0 / self.frequency
+            time = span * np.arange(count) / count
+            start = 0.0 if isinstance(self.derive.drive, Periodic) else last - span
+            there = dataclasses.replace(self.derive, time=jnp.asarray(start + time))
+            force = Batched(_force, dataclasses.replace(self, derive=there), count, _BATCH)(factors)
+        return time, force
+
+
+def _force(finger: NewFinger, factors: Float[Array, " factors"]) -> Float[Array, " times"]:
+    derive, theta = finger.of(factors)
+    return derive.force(theta, finger.sigma)
 
 
 class Spread(NamedTuple):
@@ -87,38 +141,19 @@ class Spread(NamedTuple):
         return self.people / (self.people + self.ignorance)
 
 
-def variance_shares(
-    finger: NewFinger, factors: Float[np.ndarray, "fingers factors"], names: tuple[str, ...], seed: int
-) -> dict[str, dict[str, dict[str, float]]]:
-    """First-order and total shares of each factor in the variance of quantities `names`, with 95 % errors.
+def draw_factors(
+    law: Law, thickness_sd: dict[str, float], fingers: int, random: np.random.Generator
+) -> Float[np.ndarray, "laws fingers factors"]:
+    """Logarithms of the factors of some fingers of each law (whose leaves are (laws, 1)).
 
-    The factors are taken as normal with the mean and covariance of `factors`. Where they depend on each other, first
-    is Var(E[y | x]) and total E[Var(y | others)] over the variance of y (Kucherenko, Tarantola, Annoni 2012): Sobol's
-    indices, by SALib, of independent normal numbers that build the factors one after the other. That of the first
-    holds what x shares with the others, that of the last what is x's alone (Mara, Tarantola 2012).
+    `thickness_sd`: log-standard deviation of each of `THICKNESSES` that is a factor.
     """
-    import SALib.analyze.sobol
-    import SALib.sample.sobol
-    from scipy.special import ndtri
-
-    size = factors.shape[1]
-    problem = {"num_vars": size, "names": list(FACTORS[:size]), "bounds": [[0.0, 1.0]] * size}
-    shares = SALib.sample.sobol.sample(problem, _BASE, calc_second_order=False, seed=seed)
-    scores = ndtri(np.clip(shares, 1e-12, 1.0 - 1e-12))
-    mean, covariance = factors.mean(axis=0), np.cov(factors.T)
-    keys = ("first", "first_error", "total", "total_error")
-    found = {name: {factor: dict.fromkeys(keys, 0.0) for factor in FACTORS[:size]} for name in names}
-    for turn in range(size):
-        order = np.roll(np.arange(size), -turn)
-        root = np.linalg.cholesky(covariance[np.ix_(order, order)])
-        points = np.empty_like(scores)
-        points[:, order] = mean[order] + scores @ root.T
-        values = finger.each(points)
-        for name in names:
-            y = values[:, NAMES.index(name)]
-            indices = SALib.analyze.sobol.analyze(problem, y / np.std(y), calc_second_order=False, seed=seed)
-            for key, symbol, place in (("first", "S1", 0), ("total", "ST", size - 1)):
-                shown = found[name][FACTORS[order[place]]]
-                shown |= {key: float(indices[symbol][place])}
-                shown |= {f"{key}_error": float(indices[f"{symbol}_conf"][place])}
-    return found
+    white = random.standard_normal((len(law.median), fingers, 3))
+    r = law.correlation
+    second = r * white[..., 0] + np.sqrt(1.0 - r**2) * white[..., 1]
+    skin = law.median + law.log_sd * np.stack([white[..., 0], second], axis=-1)
+    factors = [skin[..., 0], skin[..., 1], np.broadcast_to(law.log_Ci, second.shape)]
+    if law.area is not None:
+        factors.append(law.area * white[..., 2])
+    factors += [sd * random.standard_normal(second.shape) for sd in thickness_sd.values()]
+    return np.stack(factors, axis=-1)

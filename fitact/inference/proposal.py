@@ -15,7 +15,7 @@ from jaxtyping import Float
 LogProb = Callable[[np.ndarray], np.ndarray]
 Random = np.random.RandomState | np.random.Generator
 
-_DEGREES = 8.0  # of freedom: tails above any posterior's seen here
+DEGREES = 8.0  # of freedom: tails above any posterior's seen here
 _SAFE = 0.1  # share drawn from the Student-t even where there are tables, so that no place is out of reach
 _PROBES = np.array([-2.5, -1.0, 0.0, 1.0, 2.5])  # standard deviations along an axis, at which it is compared
 _NORMAL = 0.3  # departure from the normal's log-density there, above which an axis is tabulated
@@ -120,15 +120,13 @@ class Proposal:
 
 
 def _student(random: Random, count: int, size: int) -> Float[np.ndarray, "count size"]:
-    return random.standard_normal((count, size)) * np.sqrt(_DEGREES / random.chisquare(_DEGREES, (count, 1)))
+    return random.standard_normal((count, size)) * np.sqrt(DEGREES / random.chisquare(DEGREES, (count, 1)))
 
 
 def _student_log_density(white: Float[np.ndarray, "count size"]) -> Float[np.ndarray, " count"]:
     size = white.shape[1]
-    scale = (
-        math.lgamma(0.5 * (_DEGREES + size)) - math.lgamma(0.5 * _DEGREES) - 0.5 * size * math.log(math.pi * _DEGREES)
-    )
-    return scale - 0.5 * (_DEGREES + size) * np.log1p(np.sum(white**2, axis=1) / _DEGREES)
+    scale = math.lgamma(0.5 * (DEGREES + size)) - math.lgamma(0.5 * DEGREES) - 0.5 * size * math.log(math.pi * DEGREES)
+    return scale - 0.5 * (DEGREES + size) * np.log1p(np.sum(white**2, axis=1) / DEGREES)
 
 
 def _along(center: Float[np.ndarray, " n"], axis: Float[np.ndarray, " n"], log_prob: LogProb) -> Table | None:

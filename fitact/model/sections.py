@@ -335,9 +335,20 @@ class Perception(Section):
 
 
 class PopulationSection(Section):
-    """What fingers on one panel share."""
+    """What fingers on one panel share, and how the next one's layers differ from the stated ones."""
 
     contact_area: Literal["common", "varies"] = "common"
+    skin_thickness_relative_sd: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    insulator_thickness_relative_sd: Annotated[float, Field(ge=0, lt=1)] = 0.0
+
+    @property
+    def thickness_sd(self) -> dict[str, float]:
+        """Log-standard deviations of the thicknesses that vary."""
+        stated = {
+            "skin_thickness": self.skin_thickness_relative_sd,
+            "insulator_thickness": self.insulator_thickness_relative_sd,
+        }
+        return {name: math.sqrt(math.log1p(sd**2)) for name, sd in stated.items() if sd > 0.0}
 
 
 class Tolerance(Section):

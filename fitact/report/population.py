@@ -1,48 +1,45 @@
-"""A population as a picture: its fingers with its law, and the force of the next one."""
+"""A population as a picture: its fingers with its law, the force of the next one, and what that depends on."""
 
 import os
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, PercentFormatter
 
 from fitact.files import replacing
-from fitact.inference.population import Population
+from fitact.inference.people import Population
 from fitact.report.plots import style
 
-_LAW, _FINGER = "#0072B2", "#333333"
+_LAW, _FINGER, _OTHER = "#0072B2", "#333333", "#D55E00"
 _SHOWN = 4000  # new fingers
+_TIMES = 256  # in a period
+_BANDS = {50: 0.55, 90: 0.3, 95: 0.15}  # per cent of the fingers: how opaque
+_BINS = 50
 
 
 def write_population(path: str | os.PathLike[str], population: Population) -> None:
-    """Draw the fingers, those to come, and the force of these as SVG at `path`.
+    """Draw the fingers, those to come, their force, and what makes it differ, as SVG at `path`.
 
     Raises:
         InputError: the place cannot be written.
     """
-    with mpl.rc_context(style()), replacing(Path(path)) as temporary:
+    with mpl.rc_context(style() | {"legend.fontsize": 9.0}), replacing(Path(path)) as temporary:
         _figure(population).savefig(temporary, format="svg", metadata={"Date": None})
 
 
 def _figure(population: Population) -> Figure:
-    figure = Figure(figsize=(11.0, 4.2), layout="constrained")
-    skin, force = figure.subplots(1, 2)
+    figure = Figure(figsize=(11.0, 8.4), layout="constrained")
+    (skin, force), (time, shares) = figure.subplots(2, 2)
     new = population.new_fingers()
     _draw_skin(skin, population, new["Rsc"].ravel()[:_SHOWN], new["Csc"].ravel()[:_SHOWN])
-    for name, color, label in (("force_mean", _LAW, "mean"), ("force_peak", "#D55E00", "peak")):
-        values = new[name].ravel()
-        low, high = np.quantile(values, [0.002, 0.998])
-        edges = np.geomspace(low, high, 60)
-        force.hist(values, bins=edges.tolist(), color=color, alpha=0.6, label=label)
-    force.set_xscale("log")
-    force.xaxis.set_major_formatter(EngFormatter("N"))
-    force.set_yticks([])
-    force.set_xlabel("electrostatic force of the next finger")
-    force.legend()
+    _draw_force(force, new["force_mean"])
+    _draw_time(time, population)
+    _draw_shares(shares, population)
     return figure
 
 
@@ -50,10 +47,9 @@ def _draw_skin(
     axes: Axes, population: Population, Rsc: Float[np.ndarray, " fingers"], Csc: Float[np.ndarray, " fingers"]
 ) -> None:
     axes.plot(Rsc, Csc, ".", ms=2, color=_LAW, alpha=0.25, rasterized=True, label="fingers to come")
-    for number, fit in enumerate(population.fits):
-        parameters = fit.parameters()
+    for number, finger in enumerate(population.fingers):
         (x, y), (dx, dy) = (
-            [np.array([parameters[name][key] for key in keys], dtype=float) for name in ("Rsc", "Csc")]
+            [np.array([finger.parameters[name][key] for key in keys], dtype=float) for name in ("Rsc", "Csc")]
             for keys in (["q50"], ["q025", "q975"])
         )
         label = "fingers, 95 %" if number == 0 else None
@@ -67,4 +63,91 @@ def _draw_skin(
         axis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("Rsc")
     axes.set_ylabel("Csc")
+    axes.set_title("Fingers")
     axes.legend(markerscale=2)
+
+
+def _draw_force(axes: Axes, values: Float[np.ndarray, "laws fingers"]) -> None:
+    """What the next finger may feel; and for each law that may be the true one, what its fingers feel."""
+    logs = np.log(values)
+    least, largest = np.quantile(logs, [0.002, 0.998]).tolist()
+    edges = np.linspace(least, largest, _BINS + 1)
+    middle = np.exp(0.5 * (edges[1:] + edges[:-1]))
+    next_one = np.histogram(logs, edges, density=True)[0]
+    mean, sd = logs.mean(axis=1)[:, None], logs.std(axis=1, ddof=1)[:, None]
+    of_laws = np.exp(-0.5 * np.square((np.log(middle) - mean) / sd)) / (sd * np.sqrt(2.0 * np.pi))
+    low, high = np.quantile(of_laws, [0.025, 0.975], axis=0)
+    axes.fill_between(
+        middle, low, high, color=_OTHER, alpha=0.3, lw=0, label="people, by 95 % of the laws that may be true"
+    )
+    axes.plot(middle, next_one, color=_LAW, drawstyle="steps-mid", label="next finger: people and ignorance")
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(EngFormatter("N"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_ylim(0.0, 1.3 * float(np.max(high)))  # room for the legend
+    axes.set_yticks([])
+    axes.set_xlabel("mean electrostatic force")
+    axes.set_title("Force across people")
+    axes.legend()
+
+
+def _draw_time(axes: Axes, population: Population) -> None:
+    """Bands of force in time over fingers to come; friction, by eq. (2), on the other side."""
+    finger = population.finger
+    factors = population.factors.reshape(-1, len(finger.factors))
+    time, force = finger.force_in_time(factors[:: max(1, len(factors) // _SHOWN)], _TIMES)
+    for share, opaque in reversed(_BANDS.items()):
+        low, high = np.quantile(force, [0.5 - share / 200.0, 0.5 + share / 200.0], axis=0)
+        axes.fill_between(time, low, high, color=_LAW, alpha=opaque, lw=0, label=f"{share} % of fingers")
+    axes.plot(time, np.median(force, axis=0), color=_FINGER, lw=1.0, label="median")
+    coefficient, normal = (float(x) for x in (finger.derive.coefficient, finger.derive.normal_force))
+
+    def friction(force: Any) -> Any:
+        return coefficient * (np.asarray(force) + normal)
+
+    def force_of(felt: Any) -> Any:
+        return np.asarray(felt) / coefficient - normal
+
+    right = axes.secondary_yaxis("right", functions=(friction, force_of))
+    axes.xaxis.set_major_formatter(EngFormatter("s"))
+    axes.yaxis.set_major_formatter(EngFormatter("N"))
+    right.yaxis.set_major_formatter(EngFormatter("N"))
+    axes.set_xlim(time[0], time[-1])
+    axes.set_ylim(0.0, 1.3 * float(np.quantile(force, 0.975, axis=0).max()))  # room for the legend
+    axes.set_xlabel("time in the period" if finger.frequency is not None else "time")
+    axes.set_ylabel("electrostatic force")
+    right.set_ylabel("friction")
+    axes.set_title("The next finger in time")
+    axes.legend(ncols=2)
+
+
+def _draw_shares(axes: Axes, population: Population) -> None:
+    """Each factor's share of the variance of the mean force, the largest on top; before the records, too."""
+    name = "force_mean"
+    after, before = population.shares[name], population.prior_shares[name]
+    order = sorted(after, key=lambda factor: after[factor]["total"])
+    height = 0.2
+    rows = (
+        (after, "first", _LAW, 1.0, "goes once it is known"),
+        (after, "total", _OTHER, 1.0, "stays if only it is not"),
+        (before, "first", _LAW, 0.35, "before the records"),
+        (before, "total", _OTHER, 0.35, None),
+    )
+    for row, (shares, key, color, opaque, label) in enumerate(rows):
+        axes.barh(
+            np.arange(len(order)) + (1.5 - row) * height,
+            [shares[factor][key] for factor in order],
+            height,
+            xerr=[shares[factor][f"{key}_error"] for factor in order],
+            color=color,
+            alpha=opaque,
+            error_kw={"ecolor": _FINGER, "elinewidth": 1.0},
+            label=label,
+        )
+    axes.set_yticks(np.arange(len(order)), [factor.replace("_", " ") for factor in order])
+    axes.set_xlim(left=0.0)
+    axes.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+    axes.set_xlabel("share of the variance of the mean force")
+    axes.set_title("What makes it differ")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=len(rows) - 1, handlelength=1.2)

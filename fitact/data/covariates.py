@@ -1,0 +1,100 @@
+"""What else is known of the people behind records, such as how moist their skin is."""
+
+import csv
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from jaxtyping import Float
+
+from fitact.errors import InputError
+
+_KEY = "record"  # the column that names the record's file
+
+
+@dataclasses.dataclass(frozen=True)
+class Covariates:
+    """A number or several of each finger.
+
+    Attributes:
+        names: of the covariates.
+        mean, sd: over the fingers.
+        standard: less their mean, over their standard deviation.
+    """
+
+    names: tuple[str, ...]
+    mean: Float[np.ndarray, " covariates"]
+    sd: Float[np.ndarray, " covariates"]
+    standard: Float[np.ndarray, "fingers covariates"]
+
+    @classmethod
+    def of(cls, values: Mapping[str, Sequence[float]], fingers: int) -> Self:
+        """From a number for each finger.
+
+        Raises:
+            InputError: they are not as many, not finite, all the same, or follow from each other.
+        """
+        for name, column in values.items():
+            if len(column) != fingers:
+                raise InputError(f"covariate {name}: {len(column)} values for {fingers} records; give one for each")
+            if not np.all(np.isfinite(column)):
+                raise InputError(f"covariate {name}: a value is not finite; measure it, or leave that finger out")
+            if np.ptp(column) == 0.0:
+                raise InputError(f"covariate {name}: all fingers have the same value, which tells nothing; drop it")
+        table = np.array([values[name] for name in values], dtype=float).reshape(len(values), fingers).T
+        mean, sd = table.mean(axis=0), table.std(axis=0)
+        standard = (table - mean) / sd
+        if np.linalg.matrix_rank(np.column_stack([np.ones(fingers), standard])) <= len(values):
+            raise InputError(
+                f"covariates {', '.join(values)}: one follows from the others over these {fingers} fingers; drop one,"
+                " or measure more fingers"
+            )
+        return cls(tuple(values), mean, sd, standard)
+
+    def standardised(self, at: Mapping[str, float]) -> Float[np.ndarray, " covariates"]:
+        """Values in standard deviations from the mean; 0 where none is given.
+
+        Raises:
+            InputError: a name is none of the covariates.
+        """
+        unknown = [name for name in at if name not in self.names]
+        if unknown:
+            known = ", ".join(self.names) or "none"
+            raise InputError(f"covariate {unknown[0]}: is not among those of the records ({known}); check its name")
+        values = np.array([at.get(name, mean) for name, mean in zip(self.names, self.mean, strict=True)])
+        return (values - self.mean) / self.sd
+
+
+def read_covariates(path: Path, records: Sequence[Path]) -> dict[str, list[float]]:
+    """From a CSV with a column `record` (file names) and a numeric column a covariate, in the order of `records`.
+
+    Raises:
+        InputError: it cannot be read, or lacks a record or a number.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read ({error}); give a CSV with a column 'record'") from error
+    names = [name for name in (rows[0] if rows else {}) if name and name != _KEY]
+    if not rows or _KEY not in rows[0] or not names:
+        raise InputError(f"{path}: needs a column 'record' with file names, and a column for each covariate")
+    of_record: dict[str, dict[str, str]] = {}
+    for line, row in enumerate(rows, 2):
+        key = Path(str(row[_KEY]).strip()).name
+        if key in of_record:
+            raise InputError(f"{path}, line {line}: {key} has a row already; keep one")
+        of_record[key] = row
+    found: dict[str, list[float]] = {name: [] for name in names}
+    for record in records:
+        if record.name not in of_record:
+            raise InputError(f"{path}: has no row for {record.name}; add one, or leave the record out")
+        for name in names:
+            text = of_record[record.name][name]
+            try:
+                found[name].append(float(text))
+            except (TypeError, ValueError):
+                raise InputError(f"{path}: {name} of {record.name} is {text!r}, not a number; write one") from None
+    return found
