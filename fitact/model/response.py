@@ -205,23 +205,25 @@ def _steady(drive: Sine | Multitone | PiecewiseLinear | Line, tau: ArrayLike) ->
 
 def knot_values(pieces: Pieces, tau: ArrayLike, first: ArrayLike) -> Float[Array, " pieces"]:
     """u just after the start of each piece, given u just after the first start."""
-    first = jnp.asarray(first, dtype=pieces.start.dtype)
 
     def along(before: Array, begin: ArrayLike, count: int) -> tuple[Array, Array]:
         """Over so many pieces, the first of which begins with u `before`; the last one's u, and all."""
         knots, start = (lax.dynamic_slice_in_dim(x, begin, count + 1) for x in (pieces.knots, pieces.start))
         end = lax.dynamic_slice_in_dim(pieces.end, begin, count)
         x = jnp.diff(knots) / tau
-        u = recurrence(jnp.exp(-x), (end - start[:-1]) * phi(x) + (start[1:] - end), before)
+        gain = (end - start[:-1]) * phi(x) + (start[1:] - end)
+        u = recurrence(jnp.exp(-x), gain, before.astype(gain.dtype))
         return u[-1], u
 
-    steps = pieces.start.size - 1
+    steps, first = pieces.start.size - 1, jnp.asarray(first)
     if steps <= _LONG:
-        return jnp.concatenate([first[None], along(first, 0, steps)[1]]) if steps else first[None]
+        return jnp.append(first, along(first, 0, steps)[1]) if steps else first[None]
     # a part at a time: what it takes in between would be several times the record
-    many, rest = divmod(steps - 1, _LONG)
-    last, u = lax.scan(lambda before, k: along(before, k * _LONG, _LONG), first, jnp.arange(many))
-    return jnp.concatenate([first[None], u.ravel(), along(last, many * _LONG, rest + 1)[1]])
+    many, rest = divmod(steps - 2, _LONG)
+    begun, u = along(first, 0, 1)
+    last, parts = lax.scan(lambda before, k: along(before, 1 + k * _LONG, _LONG), begun, jnp.arange(many))
+    rest_of_it = along(last, 1 + many * _LONG, rest + 1)[1]
+    return jnp.concatenate([first[None].astype(u.dtype), u, parts.ravel(), rest_of_it])
 
 
 @jax.jit
