@@ -149,6 +149,7 @@ def test_misfit_is_exit_code_1_with_an_answer(fitact_command, finger_path, tmp_p
     assert "must not be trusted" in done.stderr
 
 
+@pytest.mark.slow
 def test_simulate_then_fit_recovers_the_scene(fitact_command, tmp_path):
     (tmp_path / "scene.toml").write_text(
         '[skin]\nRsc = "90 kohm"\nCsc = "30 nF"\n[drive]\nwaveform = "trapezoid"\nrise_time = "50 us"\n'

@@ -95,7 +95,9 @@ def test_square_from_rest():
 
 
 @pytest.mark.parametrize(
-    "scene", [pytest.param(None, marks=pytest.mark.slow), SQUARE], ids=["measured drive", "folded square"]
+    "scene",
+    [pytest.param(each, marks=pytest.mark.slow) for each in (None, SQUARE)],
+    ids=["measured drive", "folded square"],
 )
 def test_fit_and_log_probabilities_are_those_of_the_samples(scene):
     record = square_record(offset=0.1, periods=4)

@@ -86,6 +86,7 @@ def test_another_skin_than_the_scene_says_is_noticed(name: str):
     assert not fit.trusted
 
 
+@pytest.mark.thorough
 def test_people_with_areas():
     """Each finger's own values, and medians and spreads of the law that they follow."""
     paths = sorted((RECORDS / "areas").glob("*.json"))

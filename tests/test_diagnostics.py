@@ -40,7 +40,14 @@ def significance(vsc: np.ndarray) -> float:
     return 2.0 * float(scipy.optimize.least_squares(left, np.log([0.05, 4e-3]), xtol=1e-12, ftol=1e-12).cost)
 
 
-@pytest.mark.parametrize(("R2", "C2"), [(20e3, 5e-9), (5e3, 50e-9), (20e3, 0.5e-6), (15e3, 0.5e-6), (3e3, 0.5e-6)])
+@pytest.mark.parametrize(
+    ("R2", "C2"),
+    [
+        (20e3, 5e-9),
+        (20e3, 0.5e-6),
+        *(pytest.param(*each, marks=pytest.mark.slow) for each in ((5e3, 50e-9), (15e3, 0.5e-6), (3e3, 0.5e-6))),
+    ],
+)
 def test_a_second_skin_layer_is_misfit_wherever_it_shows(R2: float, C2: float):
     time, voltage, vsc = two_layers(R2, C2)
     assert significance(vsc) > 75.0  # what an F test of 32 phases finds at 1e-7 nearly always

@@ -78,7 +78,7 @@ def test_errors_are_those_of_the_linear_theory(finger_fit: fitact.Fit):
     ("made", "freed"),
     [
         ({}, set()),
-        ({"offset": 0.2}, {"offset"}),
+        pytest.param({"offset": 0.2}, {"offset"}, marks=pytest.mark.slow),
         ({"offset": 0.2, "drift": 2.0}, {"offset", "drift"}),
         ({"delay_samples": 2}, {"delay"}),
     ],
@@ -246,7 +246,12 @@ def trapezoid_record(step: float, edge: float = 20e-6, noise: float = 0.05) -> f
 
 
 @pytest.mark.parametrize(
-    "step", [pytest.param(5e-6, marks=pytest.mark.slow), pytest.param(50e-6, marks=pytest.mark.slow), 100e-6]
+    "step",
+    [
+        pytest.param(5e-6, marks=pytest.mark.slow),
+        pytest.param(50e-6, marks=pytest.mark.slow),
+        pytest.param(100e-6, marks=pytest.mark.slow),
+    ],
 )
 def test_edges_faster_than_the_samples_widen_g(step: float):
     """Straight lines through a jump put its edge in the middle of a step, wherever it was."""
@@ -255,7 +260,9 @@ def test_edges_faster_than_the_samples_widen_g(step: float):
     assert abs(deviation(fit, "b", 130e3 * 20.7e-9)) < 4.0
 
 
-@pytest.mark.parametrize("samples", [pytest.param(10, marks=pytest.mark.slow), 20])
+@pytest.mark.parametrize(
+    "samples", [pytest.param(10, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.slow)]
+)
 def test_coarse_samples_of_a_smooth_drive_are_not_trusted(samples: int):
     time = np.arange(5 * samples) * 0.01 / samples
     omega = 2.0 * np.pi * 100.0
@@ -266,7 +273,7 @@ def test_coarse_samples_of_a_smooth_drive_are_not_trusted(samples: int):
     assert any("too coarsely" in warning for warning in fit.warnings)
 
 
-@pytest.mark.parametrize("noise", [0.0, 1e-8, 1e-6, 1e-4])
+@pytest.mark.parametrize("noise", [0.0, *(pytest.param(noise, marks=pytest.mark.slow) for noise in (1e-8, 1e-6, 1e-4))])
 def test_a_record_without_noise_is_not_called_identified(noise: float):
     fit = fitact.fit(square_record(noise=noise), SQUARE)
     assert fit.identifiability.verdict == "prior-limited"
@@ -293,7 +300,9 @@ def test_scene_that_contradicts_the_recorded_drive_is_refused(drive: dict[str, f
         fitact.fit(square_record(), scene)
 
 
-@pytest.mark.parametrize("shift", [50e-6, -50e-6, 2e-3, -4.99e-3])
+@pytest.mark.parametrize(
+    "shift", [50e-6, -4.99e-3, *(pytest.param(shift, marks=pytest.mark.slow) for shift in (-50e-6, 2e-3))]
+)
 def test_any_shift_is_found(shift: float):
     record = square_record()
     shifted = fitact.Record.from_arrays(record.time + shift, V=record["V"], Vsc=record["Vsc"])
@@ -327,7 +336,10 @@ SWEEP = {"waveform": "chirp", "start_frequency": 20.0, "end_frequency": 500.0, "
 
 @pytest.mark.parametrize(
     ("drive", "shift"),
-    [({"waveform": "burst"}, 0.0), pytest.param(SWEEP, 1.37e-3, marks=pytest.mark.slow)],
+    [
+        pytest.param({"waveform": "burst"}, 0.0, marks=pytest.mark.slow),
+        pytest.param(SWEEP, 1.37e-3, marks=pytest.mark.slow),
+    ],
     ids=["burst", "shifted chirp"],
 )
 def test_burst_and_chirp_against_scipy(drive: dict[str, object], shift: float):
@@ -349,7 +361,10 @@ def test_burst_and_chirp_against_scipy(drive: dict[str, object], shift: float):
     assert abs(deviation(fit, "b", 130e3 * 20.7e-9)) < 4.0
 
 
-@pytest.mark.parametrize(("off", "with_V"), [(1e-3, True), (1e-3, False), (1e-4, False), (0.0, False)])
+@pytest.mark.parametrize(
+    ("off", "with_V"),
+    [(1e-3, True), (1e-4, False), *(pytest.param(off, False, marks=pytest.mark.slow) for off in (1e-3, 0.0))],
+)
 def test_a_recorder_whose_clock_is_not_the_generators(off: float, with_V: bool):
     """A named sine at another frequency; a thousandth, unnoticed, biases b by 3 standard errors."""
     time = np.arange(10_000) * 5e-6

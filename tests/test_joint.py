@@ -199,6 +199,7 @@ def test_two_equal_records_are_worth_twice_one(first: fitact.Record, alone: fita
         assert known(both, name) == pytest.approx(known(alone, name) / np.sqrt(2.0), rel=0.05)
 
 
+@pytest.mark.slow
 def test_records_of_different_drives_noises_gains_and_offsets(first: fitact.Record, alone: fitact.Fit):
     """A measured trapezoid, and a named sine of another amplitude and frequency."""
     sine = record(

@@ -50,6 +50,7 @@ def test_interval_of_b_against_a_brute_force_profile(noisy: fitact.Fit, level: f
     np.testing.assert_allclose([found.low, found.high], [low, high], rtol=5e-4)
 
 
+@pytest.mark.slow
 def test_along_the_blind_direction_the_profile_is_the_priors_normal(fit: fitact.Fit):
     """Linear and Gaussian there: ± z standard deviations, by scipy's quantile of chi-square."""
     z = np.sqrt(scipy.stats.chi2.ppf(0.9, 1))

@@ -31,7 +31,7 @@ def fitted(waveform: str, off: float, periods: int, per_period: int) -> fitact.F
     ("waveform", "off", "periods", "per_period"),
     [
         ("sine", 1e-5, 50, 400),
-        ("square", 3e-5, 50, 400),  # no edge has passed a sample
+        pytest.param("square", 3e-5, 50, 400, marks=pytest.mark.slow),  # no edge has passed a sample
         pytest.param("square", 3e-4, 5, 2000, marks=pytest.mark.slow),  # edges have
     ],
 )

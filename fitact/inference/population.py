@@ -4,8 +4,6 @@ import hashlib
 import importlib.metadata
 import json
 import os
-import sys
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -29,6 +27,7 @@ from fitact.inference.proposal import Proposal
 from fitact.inference.sampling import Target, finite, run
 from fitact.model.prior import Prior
 from fitact.model.scene import Scene
+from fitact.progress import watched
 
 _WALKERS, _ENSEMBLES = 128, 4
 _KEPT = 2500  # points per ensemble
@@ -36,7 +35,6 @@ _DRAWS = {64: "chain.h5", 1024: "chain_1024.h5"}  # in the fingers' tables, and 
 _LEAST_CHECKED = 256  # other draws that these are checked against
 _TERMS, _MORE_TERMS = 9, 13  # of the tables, and of those that they are checked against
 _CHECKED = 500  # points at which
-_SAID = 2.0  # seconds between lines that tell how many are fitted
 _NAMED = 5  # refused records, beside the first
 
 
@@ -136,8 +134,9 @@ def _fitted(records: Sequence[Record], scene: Scene, progress: bool) -> tuple[tu
         raise InputError(f"{len(records)} records: a population needs one of each of two or more fingers")
     fingers: dict[str, Finger] = {}
     refused: list[InputError] = []
-    new, said = None, time.perf_counter()
-    for number in range(len(records)):
+    new = None
+    numbers = range(len(records))
+    for number in watched(numbers, "fitting the fingers", len(records)) if progress else numbers:
         try:
             record = records[number]
             twice = fingers.get(record.fingerprint)
@@ -153,9 +152,6 @@ def _fitted(records: Sequence[Record], scene: Scene, progress: bool) -> tuple[tu
         with jax.enable_x64(True):
             fingers[record.fingerprint] = Finger.of(found)
             new = new or NewFinger.under_drive_of(found, _factors(scene))
-        if progress and time.perf_counter() - said > _SAID:
-            said = time.perf_counter()
-            print(f"fitted {number + 1:,} of {len(records):,}", file=sys.stderr)
     if refused or new is None:
         # an error begins with the record that it is about
         others = [os.path.basename(str(error).partition(":")[0]) for error in refused[1:]]

@@ -82,7 +82,7 @@ def _draw_force(axes: Axes, values: Float[np.ndarray, "laws fingers"]) -> None:
     )
     axes.plot(middle, next_one, color=_LAW, drawstyle="steps-mid", label="next finger: people and ignorance")
     axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
     axes.xaxis.set_major_formatter(EngFormatter("N"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_ylim(0.0, 1.3 * float(np.max(high)))  # room for the legend
