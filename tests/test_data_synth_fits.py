@@ -94,9 +94,9 @@ def test_people_with_areas():
     records = [fitact.read(path.with_suffix(".csv.gz"), scene) for path in paths]
     found = fitact.population(records, scene, seed=1, progress=False)
     assert found.trusted
-    for path, fit in zip(paths, found.fits, strict=True):
+    for path, finger in zip(paths, found.fingers, strict=True):
         for parameter in ("Rsc", "Csc", "Ci"):
-            assert abs(deviation(fit.parameters()[parameter], truths(path)[parameter])) < SIGMAS
+            assert abs(deviation(finger.parameters[parameter], truths(path)[parameter])) < SIGMAS
     law = shipped(paths[0])["recipe"]["population"]
     wanted = {"Rsc": 110e3, "Csc": 27e-9, "Ci": 1.41e-9} | {
         f"log_sd_{n}": law[f"log_sd_{n}"] for n in ("Rsc", "Csc", "area")
