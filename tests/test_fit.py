@@ -273,7 +273,10 @@ def test_coarse_samples_of_a_smooth_drive_are_not_trusted(samples: int):
     assert any("too coarsely" in warning for warning in fit.warnings)
 
 
-@pytest.mark.parametrize("noise", [0.0, *(pytest.param(noise, marks=pytest.mark.slow) for noise in (1e-8, 1e-6, 1e-4))])
+@pytest.mark.parametrize(
+    "noise",
+    [0.0, *(pytest.param(noise, marks=(pytest.mark.slow, pytest.mark.thorough)) for noise in (1e-8, 1e-6, 1e-4))],
+)
 def test_a_record_without_noise_is_not_called_identified(noise: float):
     fit = fitact.fit(square_record(noise=noise), SQUARE)
     assert fit.identifiability.verdict == "prior-limited"
@@ -301,7 +304,12 @@ def test_scene_that_contradicts_the_recorded_drive_is_refused(drive: dict[str, f
 
 
 @pytest.mark.parametrize(
-    "shift", [50e-6, -4.99e-3, *(pytest.param(shift, marks=pytest.mark.slow) for shift in (-50e-6, 2e-3))]
+    "shift",
+    [
+        50e-6,
+        -4.99e-3,
+        *(pytest.param(shift, marks=(pytest.mark.slow, pytest.mark.thorough)) for shift in (-50e-6, 2e-3)),
+    ],
 )
 def test_any_shift_is_found(shift: float):
     record = square_record()
@@ -363,7 +371,11 @@ def test_burst_and_chirp_against_scipy(drive: dict[str, object], shift: float):
 
 @pytest.mark.parametrize(
     ("off", "with_V"),
-    [(1e-3, True), (1e-4, False), *(pytest.param(off, False, marks=pytest.mark.slow) for off in (1e-3, 0.0))],
+    [
+        (1e-3, True),
+        (1e-4, False),
+        *(pytest.param(off, False, marks=(pytest.mark.slow, pytest.mark.thorough)) for off in (1e-3, 0.0)),
+    ],
 )
 def test_a_recorder_whose_clock_is_not_the_generators(off: float, with_V: bool):
     """A named sine at another frequency; a thousandth, unnoticed, biases b by 3 standard errors."""

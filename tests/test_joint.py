@@ -121,11 +121,13 @@ def test_unequal_skins_by_vsc_and_current():
     ("elements", "R0", "sections"),
     [
         ([SKIN, tuple(GROUNDING.values())], 500.0, {"grounding": GROUNDING | {"R_H": 500.0}}),
-        ([SKIN, SKIN], 500.0, {"grounding": {"R_H": 500.0}}),
-        ([SKIN, SKIN], 500.0, {"grounding": {"R_H": 500.0}, "prior": free(R_H=5.0)}),
-        ([SKIN, SKIN], 0.0, {}),
-        ([SKIN], 14.5e6, {"grounding": NATURAL}),
-        ([SKIN], 14.5e6, {"grounding": NATURAL, "prior": free(Z=3.0)}),
+        pytest.param([SKIN, SKIN], 500.0, {"grounding": {"R_H": 500.0}}, marks=pytest.mark.thorough),
+        pytest.param(
+            [SKIN, SKIN], 500.0, {"grounding": {"R_H": 500.0}, "prior": free(R_H=5.0)}, marks=pytest.mark.thorough
+        ),
+        pytest.param([SKIN, SKIN], 0.0, {}, marks=pytest.mark.thorough),
+        pytest.param([SKIN], 14.5e6, {"grounding": NATURAL}, marks=pytest.mark.thorough),
+        pytest.param([SKIN], 14.5e6, {"grounding": NATURAL, "prior": free(Z=3.0)}, marks=pytest.mark.thorough),
         ([SKIN, EARTH], 0.0, {"grounding": NATURAL | {"Z_capacitance": EARTH[1]}}),
         (
             [SKIN, EARTH],
