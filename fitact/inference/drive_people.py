@@ -9,8 +9,8 @@ import scipy.stats
 from jaxtyping import Float
 
 from fitact.inference.finger import SHARED, SKIN
-from fitact.inference.fingers import Law
-from fitact.inference.people import Population, laws
+from fitact.inference.new_finger import factors_of
+from fitact.inference.people import Population, drawn_laws
 from fitact.inference.prior_predictive import believed
 from fitact.model.scene import Scene
 
@@ -50,15 +50,9 @@ class People:
 
         What the scene holds or ties to these follows; all else is the scene's.
         """
-        law, white = _laws(population), _standard_normal(seed)
-        r, area = law.correlation, 0.0 if law.area is None else law.area * white[..., 2]
-        second = r * white[..., 0] + np.sqrt(1.0 - r**2) * white[..., 1]
-        skin = law.median + law.log_sd * np.stack([white[..., 0], second], axis=-1)
-        values = {
-            SKIN[0]: np.exp(skin[..., 0] - area),
-            SKIN[1]: np.exp(skin[..., 1] + area),
-            SHARED: np.exp(law.log_Ci + area + np.zeros_like(second)),
-        }
+        Rsc, Csc, Ci, *areas = np.moveaxis(factors_of(drawn_laws(population, _LAWS), _standard_normal(seed)), -1, 0)
+        area = areas[0] if areas else 0.0
+        values = {SKIN[0]: np.exp(Rsc - area), SKIN[1]: np.exp(Csc + area), SHARED: np.exp(Ci + area)}
         held = {name: np.full((_LAWS, _FINGERS), value) for name, value in scene.fixed().items()}
         known: dict[str, Any] = {**scene.nominal(), **held, **values}
         tied = {name: ratio * known[other] for name, (other, ratio) in scene.prior.tied().items()}
@@ -80,13 +74,6 @@ class People:
 
 def _of_the_circuit(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: x for name, x in values.items() if name not in _NOT_OF_THE_CIRCUIT}
-
-
-def _laws(population: Population) -> Law:
-    """Draws of it, spread over the chain; each leaf (laws, 1, ...)."""
-    flat = population.points.reshape(-1, population.points.shape[-1])
-    drawn = flat[np.linspace(0, len(flat) - 1, _LAWS).astype(int), None]
-    return laws(population.hierarchy, drawn).at(population.at)
 
 
 def _standard_normal(seed: int) -> Float[np.ndarray, "laws fingers 3"]:

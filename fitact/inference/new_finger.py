@@ -149,11 +149,16 @@ def draw_factors(
     `thickness_sd`: log-standard deviation of each of `THICKNESSES` that is a factor.
     """
     white = random.standard_normal((len(law.median), fingers, 3))
+    thicknesses = [sd * random.standard_normal(white.shape[:2]) for sd in thickness_sd.values()]
+    return np.concatenate([factors_of(law, white), *(each[..., None] for each in thicknesses)], axis=-1)
+
+
+def factors_of(law: Law, white: Float[np.ndarray, "laws fingers 3"]) -> Float[np.ndarray, "laws fingers factors"]:
+    """Logarithms of Rsc, Csc, Ci and, where it varies, area of the fingers that standard normal numbers draw."""
     r = law.correlation
     second = r * white[..., 0] + np.sqrt(1.0 - r**2) * white[..., 1]
     skin = law.median + law.log_sd * np.stack([white[..., 0], second], axis=-1)
     factors = [skin[..., 0], skin[..., 1], np.broadcast_to(law.log_Ci, second.shape)]
     if law.area is not None:
         factors.append(law.area * white[..., 2])
-    factors += [sd * random.standard_normal(second.shape) for sd in thickness_sd.values()]
     return np.stack(factors, axis=-1)

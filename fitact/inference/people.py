@@ -96,9 +96,8 @@ class Population:
     @functools.cached_property
     def factors(self) -> Float[np.ndarray, "laws fingers factors"]:
         """Logarithms of what makes the new fingers, in the order of `finger.factors`."""
-        flat = self.points.reshape(-1, self.points.shape[-1])
-        drawn = laws(self.hierarchy, flat[np.linspace(0, len(flat) - 1, _LAWS).astype(int), None])
-        return draw_factors(drawn.at(self.at), self._thickness_sd, _FINGERS, np.random.default_rng([self.seed, 1]))
+        random = np.random.default_rng([self.seed, 1])
+        return draw_factors(drawn_laws(self, _LAWS), self._thickness_sd, _FINGERS, random)
 
     @property
     def prior_factors(self) -> Float[np.ndarray, "laws fingers factors"]:
@@ -231,6 +230,13 @@ def laws(hierarchy: Hierarchy, points: Float[np.ndarray, "chains draws n"]) -> L
     """At many points."""
     with jax.enable_x64(True):
         return jax.tree.map(np.asarray, jax.jit(jax.vmap(jax.vmap(hierarchy.law)))(points))
+
+
+def drawn_laws(population: Population, count: int) -> Law:
+    """So many draws of the law that the next finger follows, spread over the chain; leaves (count, 1)."""
+    flat = population.points.reshape(-1, population.points.shape[-1])
+    drawn = flat[np.linspace(0, len(flat) - 1, count).astype(int), None]
+    return laws(population.hierarchy, drawn).at(population.at)
 
 
 def log_medians(law: Law) -> dict[str, np.ndarray]:

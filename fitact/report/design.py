@@ -1,16 +1,13 @@
 """What to measure next as a picture: the force's expected error of each option, and along what can be set."""
 
 import os
-from pathlib import Path
 
-import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from fitact.files import replacing
 from fitact.inference.design import Curve, MeasurementDesign
-from fitact.report.plots import style
+from fitact.report.plots import write_svg
 
 _NOW, _OPTION, _BEST, _CHOSEN = "#999999", "#0072B2", "#009E73", "#D55E00"
 _LABELS = {
@@ -26,8 +23,7 @@ def write_design(path: str | os.PathLike[str], design: MeasurementDesign) -> Non
     Raises:
         InputError: the place cannot be written.
     """
-    with mpl.rc_context(style()), replacing(Path(path)) as temporary:
-        _figure(design).savefig(temporary, format="svg", metadata={"Date": None})
+    write_svg(path, lambda: _figure(design))
 
 
 def _figure(design: MeasurementDesign) -> Figure:

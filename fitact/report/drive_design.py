@@ -2,20 +2,16 @@
 
 import os
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, PercentFormatter
+from matplotlib.ticker import PercentFormatter
 
-from fitact.files import replacing
 from fitact.inference.drive_design import DriveDesign
 from fitact.inference.drive_option import DriveOption, quantile
-from fitact.report.plots import style
+from fitact.report.plots import log_ticks, write_svg
 
 _COLORS = {
     "sine": "#0072B2",
@@ -33,8 +29,7 @@ def write_drive_design(path: str | os.PathLike[str], design: DriveDesign) -> Non
     Raises:
         InputError: the place cannot be written.
     """
-    with mpl.rc_context(style()), replacing(Path(path)) as temporary:
-        _figure(design).savefig(temporary, format="svg", metadata={"Date": None})
+    write_svg(path, lambda: _figure(design))
 
 
 def _figure(design: DriveDesign) -> Figure:
@@ -47,7 +42,7 @@ def _figure(design: DriveDesign) -> Figure:
     thickness = [option.device.insulator_thickness for option in design.by_thickness]
     thicknesses.set_xlim(0.8 * thickness[0], 1.25 * thickness[-1])
     thicknesses.set_xlabel("insulator thickness")
-    _log_ticks(thicknesses.xaxis, "m", (1.0,))
+    log_ticks(thicknesses.xaxis, "m", (1.0,))
     thicknesses.legend(fontsize=9)
     _draw_insulators(permittivities, design, design.by_permittivity, lambda o: o.device.insulator_permittivity)
     permittivities.set_xlabel("insulator's relative permittivity")
@@ -71,7 +66,7 @@ def _draw_curves(axes: Axes, design: DriveDesign) -> None:
         axes.fill_between(curve["peak_to_peak"], curve["q05"], curve["q95"], color=_COLORS[name], alpha=0.2, lw=0)
     axes.axhline(design.share, color=_LIMIT, lw=1.0, ls="--")
     axes.set_xscale("log")
-    _log_ticks(axes.xaxis, "V")
+    log_ticks(axes.xaxis, "V")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.set_xlabel("peak-to-peak amplitude")
     axes.set_ylabel("people who feel it" + (" (band: 90 %)" if design.people.separated else ""))
@@ -93,7 +88,7 @@ def _draw_frequencies(axes: Axes, design: DriveDesign) -> None:
         axes.plot(frequency, _drawn(median), color=_COLORS[name], lw=_width(design, name), label=title)
     axes.set_xscale("log")
     axes.set_xlim(8.0, 1250.0)
-    _log_ticks(axes.xaxis, "Hz")
+    log_ticks(axes.xaxis, "Hz")
     _volts(axes)
     axes.set_xlabel("frequency of the drive")
     axes.set_ylabel("peak-to-peak amplitude needed")
@@ -140,10 +135,4 @@ def _volts(axes: Axes) -> None:
         axes.text(0.5, 0.5, "too few feel it at any amplitude", transform=axes.transAxes, ha="center")
         return
     axes.set_yscale("log")
-    _log_ticks(axes.yaxis, "V")
-
-
-def _log_ticks(axis: Axis, unit: str, subs: tuple[float, ...] = (1.0, 2.0, 5.0)) -> None:
-    axis.set_major_locator(LogLocator(subs=subs))
-    axis.set_major_formatter(EngFormatter(unit))
-    axis.set_minor_formatter(NullFormatter())
+    log_ticks(axes.yaxis, "V")

@@ -1,15 +1,13 @@
 """The plan as a picture: what each omission changes, beside the tolerance."""
 
 import os
-from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from fitact.files import replacing
 from fitact.model.plan import Plan
-from fitact.report.plots import style
+from fitact.report.plots import write_svg
 
 _KEPT, _LEFT_OUT, _LIMIT = "#999999", "#0072B2", "#D55E00"
 _LEAST = 1e-8  # an error drawn on a logarithmic axis
@@ -21,8 +19,7 @@ def write_plan(path: str | os.PathLike[str], plan: Plan) -> None:
     Raises:
         InputError: the place cannot be written.
     """
-    with mpl.rc_context(style()), replacing(Path(path)) as temporary:
-        _figure(plan).savefig(temporary, format="svg", metadata={"Date": None})
+    write_svg(path, lambda: _figure(plan))
 
 
 def _figure(plan: Plan) -> Figure:

@@ -3,15 +3,19 @@
 import base64
 import io
 import math
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, MaxNLocator
+from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullFormatter
+
+from fitact.files import replacing
 
 _DATA, _MODEL, _PRIOR, _ALERT = (
     "#333333",
@@ -167,6 +171,23 @@ def _ticks(axis: mpl.axis.Axis, limits: tuple[float, float], unit: str, labelled
     axis.set_major_locator(mpl.ticker.FixedLocator([float(f"{place:.{digits}g}") for place in places]))
     axis.set_minor_locator(mpl.ticker.NullLocator())
     axis.set_major_formatter(EngFormatter(_SYMBOLS.get(unit, unit)) if labelled else mpl.ticker.NullFormatter())
+
+
+def log_ticks(axis: Axis, unit: str, subs: tuple[float, ...] = (1.0, 2.0, 5.0)) -> None:
+    """Ticks of a logarithmic axis at so many of each power of ten, with prefixes of the unit."""
+    axis.set_major_locator(LogLocator(subs=subs))
+    axis.set_major_formatter(EngFormatter(unit))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def write_svg(path: str | os.PathLike[str], draw: Callable[[], Figure], **settings: Any) -> None:
+    """Write a figure as SVG at `path`, drawn in the shared style and `settings` beside it.
+
+    Raises:
+        InputError: the place cannot be written.
+    """
+    with mpl.rc_context(style() | settings), replacing(path) as temporary:
+        draw().savefig(temporary, format="svg", metadata={"Date": None})
 
 
 def svg(figure: Figure) -> str:

@@ -1,19 +1,16 @@
 """A population as a picture: its fingers with its law, the force of the next one, and what that depends on."""
 
 import os
-from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, PercentFormatter
+from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from fitact.files import replacing
 from fitact.inference.people import Population
-from fitact.report.plots import style
+from fitact.report.plots import log_ticks, write_svg
 
 _LAW, _FINGER, _OTHER = "#0072B2", "#333333", "#D55E00"
 _SHOWN = 4000  # new fingers
@@ -28,8 +25,7 @@ def write_population(path: str | os.PathLike[str], population: Population) -> No
     Raises:
         InputError: the place cannot be written.
     """
-    with mpl.rc_context(style() | {"legend.fontsize": 9.0}), replacing(Path(path)) as temporary:
-        _figure(population).savefig(temporary, format="svg", metadata={"Date": None})
+    write_svg(path, lambda: _figure(population), **{"legend.fontsize": 9.0})
 
 
 def _figure(population: Population) -> Figure:
@@ -58,9 +54,7 @@ def _draw_skin(
     axes.set_xscale("log")
     axes.set_yscale("log")
     for axis, unit in ((axes.xaxis, "Ω"), (axes.yaxis, "F")):
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.set_major_formatter(EngFormatter(unit))
-        axis.set_minor_formatter(NullFormatter())
+        log_ticks(axis, unit)
     axes.set_xlabel("Rsc")
     axes.set_ylabel("Csc")
     axes.set_title("Fingers")
@@ -82,9 +76,7 @@ def _draw_force(axes: Axes, values: Float[np.ndarray, "laws fingers"]) -> None:
     )
     axes.plot(middle, next_one, color=_LAW, drawstyle="steps-mid", label="next finger: people and ignorance")
     axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-    axes.xaxis.set_major_formatter(EngFormatter("N"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    log_ticks(axes.xaxis, "N", (1.0, 3.0))
     axes.set_ylim(0.0, 1.3 * float(np.max(high)))  # room for the legend
     axes.set_yticks([])
     axes.set_xlabel("mean electrostatic force")
