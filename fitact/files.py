@@ -39,6 +39,12 @@ def _temporary(path: Path) -> Path:
     return path.with_name(f".{path.name}.tmp")  # one name, so that what a kill leaves is overwritten
 
 
+def unreadable(source: str, error: Exception) -> InputError:
+    """What to raise where a file cannot be read."""
+    reason = getattr(error, "strerror", None) or str(error)
+    return InputError(f"{source}: cannot be read ({reason.lower()}); check the path and the file")
+
+
 def to_json(content: Any) -> str:
     """Plain JSON, with null for what is not finite; keys in the order given."""
     return json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n"

@@ -28,10 +28,10 @@ FREQUENCY, PEAK_TO_PEAK = 100.0, 360.0  # Hz, V
 GROUNDING_RSC = (80e3, 110e3, 140e3, 170e3, 200e3)  # of Fig. 5
 GROUNDING_CSC = (8.85e-9, 17.7e-9, 26.5e-9, 35.4e-9, 44.2e-9)  # of Fig. 6
 SKIN_AT = {"10Hz": (1e4, 1e5), "100Hz": (5e3, 8e4), "1kHz": (2e3, 4e4)}  # permittivity, resistivity (ohm m)
-TEXT_CI = "1.35 nF"
+TEXT_CI, CI = "1.35 nF", 1.35e-9  # F
 _OMEGA = 2.0 * math.pi * FREQUENCY
 INSULATORS = {
-    TEXT_CI: 1.35e-9,
+    TEXT_CI: CI,
     "3.45 nF": float(plate_capacitance(PERMITTIVITY, AREA, INSULATOR)),
     "0.69 nF": 1.0 / (_OMEGA * 2.3e6),
 }  # F: the text's, that of eq. (3), and that of |Z_Ci| = 2.3 Mohm
@@ -88,7 +88,7 @@ def _by_insulator(function: Callable[[float], Any]) -> dict[str, float]:
 
 def _plates() -> Iterator[Claim]:
     yield _judged(
-        "eq3_Ci", "Ci of 1 um, permittivity 3.9 and 1 cm^2 is 1.35 nF", 1.35e-9, INSULATORS["3.45 nF"], "F",
+        "eq3_Ci", "Ci of 1 um, permittivity 3.9 and 1 cm^2 is 1.35 nF", CI, INSULATORS["3.45 nF"], "F",
         "eq. (3) with the paper's own values gives 3.45 nF; 1.35 nF would need 2.56 um, a permittivity of 1.53 or"
         " 0.39 cm^2",
     )  # fmt: skip
@@ -136,16 +136,14 @@ def _grounding() -> Iterator[Claim]:
         return NaturalGround(RSC, CSC, Ci, Z)
 
     square = Square(peak_to_peak=PEAK_TO_PEAK, frequency=FREQUENCY)
-    of_square = float(peak(direct(1.35e-9), square) / peak(natural(1.35e-9), square))
+    of_square = float(peak(direct(CI), square) / peak(natural(CI), square))
     yield _judged(
         "fig4_ratio", "Vsc under direct ground is six times that under natural ground (sine, 100 Hz)", 6.0,
         _by_insulator(lambda Ci: gain(direct(Ci)) / gain(natural(Ci))), "1",
         f"six times needs the 0.69 nF of the paper's |Z_Ci|; with 1.35 nF a square's peaks are {of_square:.1f} times",
         0.02,
     )  # fmt: skip
-    total = abs(1.0 / complex(direct(1.35e-9).admittance(_OMEGA))) / abs(
-        1.0 / complex(natural(1.35e-9).admittance(_OMEGA))
-    )
+    total = abs(1.0 / complex(direct(CI).admittance(_OMEGA))) / abs(1.0 / complex(natural(CI).admittance(_OMEGA)))
     yield Claim(
         "text_Ztotal", "Z_dir-total is much larger than Z_nat-total (their ratio at 100 Hz)", None, total, "1",
         "differs", "it is much smaller, which is why Vsc is larger under direct ground: a slip of the pen",
@@ -276,7 +274,7 @@ def _waveforms() -> Iterator[Claim]:
 
     larger = waveforms(PEAK_TO_PEAK)
     for name, drive in waveforms(30.0).items():
-        at_360 = 2.0 * float(peak(FinalCircuit(RSC, CSC, 1.35e-9), larger[name]))
+        at_360 = 2.0 * float(peak(FinalCircuit(RSC, CSC, CI), larger[name]))
         yield _judged(
             f"fig15_{name}", f"a {name} of 30 Vpp and 100 Hz gives Vsc of about {30 if name == 'square' else 15} Vpp",
             30.0 if name == "square" else 15.0,
@@ -295,7 +293,7 @@ def _equations() -> Iterator[Claim]:
 
 def _formulas() -> dict[str, tuple[str, float, str]]:
     frequency = np.geomspace(10.0, 1000.0, 41)
-    Ci, final, direct = 1.35e-9, FinalCircuit(RSC, CSC, 1.35e-9), DirectGround(RSC, CSC, 1.35e-9, R_H=R_H)
+    Ci, final, direct = CI, FinalCircuit(RSC, CSC, CI), DirectGround(RSC, CSC, CI, R_H=R_H)
     natural = NaturalGround(RSC, CSC, Ci, Z)
 
     def off(printed: Callable[[float], complex], ours: Any) -> float:
@@ -345,6 +343,6 @@ def _formulas() -> dict[str, tuple[str, float, str]]:
 def _force_law() -> float:
     """Eq. (22) as printed against the mean force; with v = Vsc it is eq. (1)."""
     contact = Contact(AREA, INSULATOR, PERMITTIVITY, SKIN, 5e3)
-    drive, circuit = Square(peak_to_peak=PEAK_TO_PEAK, frequency=FREQUENCY), FinalCircuit(RSC, CSC, 1.35e-9)
+    drive, circuit = Square(peak_to_peak=PEAK_TO_PEAK, frequency=FREQUENCY), FinalCircuit(RSC, CSC, CI)
     printed = 8.85e-12 * AREA / (2 * (INSULATOR / PERMITTIVITY + SKIN / 5e3) * (INSULATOR + SKIN))
     return abs(float(mean_force(circuit, drive, contact) / mean_square(circuit, drive)) / printed - 1.0)

@@ -89,6 +89,12 @@ def test_files_of_analysers(tmp_path: Path, name: str):
     np.testing.assert_allclose(read.impedance, z, rtol=1e-7)
 
 
+@pytest.mark.parametrize(("unit", "factor"), [("mohm", 1e-3), ("kOHM", 1e3), ("MΩ", 1e6), ("GOhm", 1e9)])
+def test_prefixes_of_the_unit(tmp_path: Path, unit: str, factor: float):
+    read = fitact.read_spectrum(broken(tmp_path, f"f_Hz,Re(Z)/{unit},Im(Z)/{unit}", *GOOD))
+    np.testing.assert_allclose(read.impedance, factor * (1e5 - 1e5j), rtol=1e-12)
+
+
 def broken(tmp_path: Path, header: str, *rows: str) -> Path:
     path = tmp_path / "spectrum.csv"
     path.write_text("\n".join([header, *rows]) + "\n")

@@ -14,7 +14,7 @@ from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.data.spectrum import is_spectrum
 from fitact.data.text import is_binary, read_text
 from fitact.errors import InputError
-from fitact.files import replacing
+from fitact.files import replacing, unreadable
 
 if TYPE_CHECKING:
     from fitact.model.scene import Scene  # which brings JAX along
@@ -67,15 +67,16 @@ def read_capture(path: str | os.PathLike[str], pick: Pick = lambda names, place:
         with path.open("rb") as file:
             head = file.read(4096)
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise InputError(f"{source}: cannot be read ({reason.lower()}); check the path and the file") from error
+        raise unreadable(source, error) from error
     if not head.strip():
         raise InputError(f"{source}: the file holds no data; expected a header such as time_s,V_V,Vsc_V,I_A")
+    if head[:2] == b"\x1f\x8b":
+        return read_text(path, source, pick)
+    if is_binary(head) or is_known_binary(head, path.suffix):
+        return read_binary(path, source, head, pick)
     if is_spectrum(path):
         raise InputError(f"{source}: is an impedance spectrum, without time; give it to: fitact fit (fit_spectrum)")
-    if head[:2] == b"\x1f\x8b" or not (is_binary(head) or is_known_binary(head, path.suffix)):
-        return read_text(path, source, pick)
-    return read_binary(path, source, head, pick)
+    return read_text(path, source, pick)
 
 
 def with_other_files(capture: Capture, path: str | os.PathLike[str], channels: Mapping[str, str]) -> Capture:

@@ -165,7 +165,7 @@ def rounding_noise(values: Float[np.ndarray, " samples"]) -> float:
     A few levels only are an ideal wave's, not a converter's.
     """
     noise, step = white_noise(values), math.inf
-    for part in (values[:_PART], values):  # mostly some samples tell
+    for part in (values[:_PART], values)[values.size <= _PART :]:  # mostly some samples tell
         levels = np.unique(part)
         step = float(np.diff(levels).min(initial=math.inf))
         if step <= noise:

@@ -12,20 +12,21 @@ from jaxtyping import Complex, Float
 
 from fitact.data.header import cells_of, number
 from fitact.errors import InputError
+from fitact.files import unreadable
 from fitact.units import engineering
 
 MINIMUM_POINTS = 5
 _MOST = 67_108_864  # bytes: a spectrum has hundreds of points
 _HEAD = 16_384
 _MOST_UNITS = 2  # lines between the names and the numbers
-_FREQUENCY = re.compile(r"^(definition=.*)?f(req(uency)?)?\b|^freq", re.IGNORECASE)
+_FREQUENCY = re.compile(r"^f(req|(?![a-z]))", re.IGNORECASE)
 _REAL = re.compile(r"^-?(re\s*\(?z|z?\s*_?re(al)?\b|zre|z_re|z')(?!')", re.IGNORECASE)
 _IMAGINARY = re.compile(r"""^-?(im\s*\(?z|z?\s*_?im(ag)?\b|zim|z_im|z''|z")""", re.IGNORECASE)
 _SIZE = re.compile(r"^(\|z\||z\s*_?mod|abs\s*\(?z|z_abs|z_magnitude|magnitude)", re.IGNORECASE)
 _PHASE = re.compile(r"^(-?phase|z\s*_?ph(z|ase)?\b|theta|arg\s*\(?z)", re.IGNORECASE)
-_PREFIX = re.compile(r"[(/_\[\s]([kMGm]?)\s*(?:ohms?|Ω|Ω)", re.IGNORECASE)
+_PREFIX = re.compile(r"[(/_\[\s]([kKMGm]?)\s*(?:(?i:ohms?)|Ω|Ω)")
 _PREFIXES = {"": 1.0, "k": 1e3, "K": 1e3, "M": 1e6, "G": 1e9, "m": 1e-3}
-_HERTZ = re.compile(r"[(/_\[\s]([kM]?)hz", re.IGNORECASE)
+_HERTZ = re.compile(r"[(/_\[\s]([kKM]?)(?i:hz)")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,8 +144,7 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
         with Path(path).open("rb") as file:
             lines = _decoded(file.read(_MOST)).splitlines()
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise InputError(f"{source}: cannot be read ({reason.lower()}); check the path and the file") from error
+        raise unreadable(source, error) from error
     place, delimiter, columns = next(_headers(lines), None) or _bare(lines, source)
     rows = np.array(list(_rows(lines, place, delimiter, columns, source))).reshape(-1, 3)
     first, second = columns.ohm * rows[:, 1], columns.sign * rows[:, 2]

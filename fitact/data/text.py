@@ -16,6 +16,7 @@ from fitact.data import layouts
 from fitact.data.capture import Capture, Pick, Trace
 from fitact.data.header import Column, Header, cells_of, number, read_header
 from fitact.errors import InputError
+from fitact.files import unreadable
 from fitact.progress import watched
 
 _HEAD = 32_768  # bytes that hold any header and some rows
@@ -43,8 +44,7 @@ def read_text(path: Path, source: str, pick: Pick) -> Capture:
             for block in blocks:
                 table.add(block)
     except (OSError, EOFError, zlib.error) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"{source}: cannot be read ({reason.lower()}); check the path and the file") from error
+        raise unreadable(source, error) from error
     return table.capture([column.name for column in header.columns if column.name not in wanted])
 
 

@@ -85,38 +85,30 @@ def assess(
     `names` are theta's coordinates; those free in `experiment` that are no gains are judged, the others are
     nuisances with priors of their own. `force_gradient` is that of the log mean force in theta.
     """
-    force_sd = float(np.linalg.norm(root.T @ force_gradient))
     free = [name for name in experiment.free if name not in gain_names(experiment.channels)]
-    verdict, shares, direction, along = seen_directions(names, root, prior_root, free)
-    structural, remedy, offered = False, "", tuple[Option, ...]()
-    if verdict != "identified":
-        known = [list(names).index(name) for name in experiment.free]
-        structure = blind_directions(experiment.circuit, experiment.free, experiment.channels)
-        structural, offered = structure.hides(direction), remedies(experiment, force_gradient[known])
-        remedy = _remedy(verdict, force_sd, offered, structure)
-    return Identifiability(
-        verdict=verdict,
-        eigenvalues=tuple(map(float, shares)),
-        blind_direction=direction,
-        blind_name=name_direction(direction),
-        structural=structural,
-        prior_sd=along,
-        force_from_prior=from_prior(root, prior_root, force_gradient),
-        force_sd=force_sd,
-        force_contraction=1.0 - force_sd / float(np.linalg.norm(prior_root.T @ force_gradient)),
-        remedy=remedy,
+    found = judge(names, root, prior_root, force_gradient, free, experiment.channels)
+    if found.verdict == "identified":
+        return found
+    known = [list(names).index(name) for name in experiment.free]
+    structure = blind_directions(experiment.circuit, experiment.free, experiment.channels)
+    offered = remedies(experiment, force_gradient[known])
+    return dataclasses.replace(
+        found,
+        structural=structure.hides(found.blind_direction),
+        remedy=_remedy(found.verdict, found.force_sd, offered, structure),
         remedies=offered,
-        channels=experiment.channels,
     )
 
 
-def seen_directions(
+def judge(
     names: Sequence[str],
     root: Float[np.ndarray, "parameters parameters"],
     prior_root: Float[np.ndarray, "parameters parameters"],
+    force_gradient: Float[np.ndarray, " parameters"],
     free: Sequence[str],
-) -> tuple[str, Float[np.ndarray, " free"], dict[str, float], float]:
-    """The verdict, the eigenvalues, the blind direction and `prior_sd` of the parameters `free` among `names`."""
+    channels: tuple[str, ...],
+) -> Identifiability:
+    """As `assess`, of the parameters `free` among `names`, with no remedy and no word on what is structural."""
     rows = [list(names).index(name) for name in free]
     believed = np.linalg.cholesky((prior_root @ prior_root.T)[np.ix_(rows, rows)])
     # of the prior's spread in each direction, what is left
@@ -126,11 +118,25 @@ def seen_directions(
     blind *= (-1.0 if "Ci" in free and blind[list(free).index("Ci")] < 0.0 else 1.0) / np.linalg.norm(blind)
     along = float(np.max(np.abs(blind)) / np.linalg.norm(np.linalg.solve(believed, blind)))
     verdict = "prior-limited" if along <= _WIDE else "unidentified"
-    verdict = "identified" if shares[0] >= _IDENTIFIED else verdict
-    return verdict, shares, dict(zip(free, map(float, blind), strict=True)), along
+    direction = dict(zip(free, map(float, blind), strict=True))
+    force_sd = float(np.linalg.norm(root.T @ force_gradient))
+    return Identifiability(
+        verdict="identified" if shares[0] >= _IDENTIFIED else verdict,
+        eigenvalues=tuple(map(float, shares)),
+        blind_direction=direction,
+        blind_name=name_direction(direction),
+        structural=False,
+        prior_sd=along,
+        force_from_prior=_from_prior(root, prior_root, force_gradient),
+        force_sd=force_sd,
+        force_contraction=1.0 - force_sd / float(np.linalg.norm(prior_root.T @ force_gradient)),
+        remedy="",
+        remedies=(),
+        channels=channels,
+    )
 
 
-def from_prior(root: np.ndarray, prior_root: np.ndarray, gradient: np.ndarray) -> float:
+def _from_prior(root: np.ndarray, prior_root: np.ndarray, gradient: np.ndarray) -> float:
     """The share of a quantity's variance that comes from the prior, by its gradient."""
     moved = np.linalg.solve(prior_root, root @ (root.T @ gradient))
     return float(moved @ moved / np.sum((root.T @ gradient) ** 2))

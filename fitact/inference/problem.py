@@ -122,7 +122,7 @@ def pose(records: Sequence[Record], scenes: Sequence[Scene | None], believed: bo
     stated, tied = first.make_prior(), first.prior.tied()
     noise = {name: stated[name] for name in ("sigma", "sigma_I") if name in stated.names}
     prior = stated.without(*noise)
-    template = with_level(template_of(first, prior, tied), records, scenes)
+    template = with_level(first.make_rc_circuit(circuit_values(first, prior, tied)), records, scenes)
     opened = [
         _open(record, scene, channel, number if len(records) > 1 else None, template)
         for number, (record, scene) in enumerate(zip(records, scenes, strict=True), 1)
@@ -143,15 +143,15 @@ def pose(records: Sequence[Record], scenes: Sequence[Scene | None], believed: bo
     return Problem(likelihood, sources, _start(likelihood, sources))
 
 
-def template_of(scene: Scene, prior: Prior, tied: dict[str, tuple[str, float]]) -> RC:
-    """The scene's circuit with all that is held, free or tied in it, and with constant skins."""
+def circuit_values(scene: Scene, prior: Prior, tied: dict[str, tuple[str, float]]) -> dict[str, float]:
+    """All that is held, free or tied in the scene's circuit, by name."""
     values = scene.fixed() | {name: math.exp(prior[name].log_mean) for name in prior.names}
     for name, (other, ratio) in tied.items():
         value = values.get(other, scene.nominal()[other])
         if value is None:
             raise InputError(f"scene: [prior] {name} is tied to {other}, which the scene does not have; give it there")
         values[name] = ratio * value
-    return scene.make_rc_circuit(values)
+    return values
 
 
 def compiled_once(prior: Prior) -> Prior:

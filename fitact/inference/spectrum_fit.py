@@ -14,15 +14,14 @@ from jaxtyping import Array, Complex, Float
 from fitact.data.spectrum import Spectrum
 from fitact.inference import derived, summary
 from fitact.inference.expected import covariance_root
-from fitact.inference.identifiability import Identifiability, from_prior, seen_directions
+from fitact.inference.identifiability import Identifiability, judge
 from fitact.inference.laplace import Laplace
 from fitact.inference.likelihood import Likelihood
-from fitact.inference.problem import compiled_once, template_of
+from fitact.inference.problem import circuit_values, compiled_once
 from fitact.inference.solver import Minimum, minimise, result_message, result_name
 from fitact.inference.start import as_arrays
-from fitact.inference.structure import name_direction
 from fitact.model.scene import Scene
-from fitact.model.skin import Dispersive, Fractional, WithSkin, parameters
+from fitact.model.skin import parameters
 from fitact.units import engineering, percent
 
 _LEAST = 1e-6  # of the impedance: no analyser is better
@@ -156,11 +155,7 @@ def fit_spectrum(spectrum: Spectrum, scene: Scene | None = None) -> SpectrumFit:
 def _posed(scene: Scene) -> Likelihood:
     """The scene's circuit and prior, without traces."""
     prior, tied = scene.make_prior().without("sigma", "sigma_I"), scene.prior.tied()
-    template: Any = template_of(scene, prior, tied)
-    if scene.skin.level == "dispersive":
-        template = WithSkin(template, Dispersive())
-    elif scene.skin.level == "fractional":
-        template = WithSkin(template, Fractional(jnp.asarray(scene.fixed().get("alpha", scene.skin.alpha))))
+    template: Any = scene.make_circuit(circuit_values(scene, prior, tied))
     return Likelihood(
         traces=(),
         template=as_arrays(template),
@@ -236,23 +231,11 @@ def _figures(residuals: Complex[np.ndarray, " points"], noise: float, used: int)
 def _seen(likelihood: Likelihood, root: np.ndarray, force: np.ndarray) -> Identifiability:
     of_circuit = parameters(likelihood.template)
     free = [name for name in likelihood.names if name in of_circuit]
-    verdict, shares, direction, along = seen_directions(likelihood.names, root, likelihood.prior_root, free)
-    sd = float(np.linalg.norm(root.T @ force))
-    remedy = f"The mean force is known to ± {percent(sd)}; measure from below the skin's corner to above it."
-    return Identifiability(
-        verdict=verdict,
-        eigenvalues=tuple(map(float, shares)),
-        blind_direction=direction,
-        blind_name=name_direction(direction),
-        structural=False,
-        prior_sd=along,
-        force_from_prior=from_prior(root, likelihood.prior_root, force),
-        force_sd=sd,
-        force_contraction=1.0 - sd / float(np.linalg.norm(likelihood.prior_root.T @ force)),
-        remedy="" if verdict == "identified" else remedy,
-        remedies=(),
-        channels=("impedance",),
-    )
+    found = judge(likelihood.names, root, likelihood.prior_root, force, free, ("impedance",))
+    if found.verdict == "identified":
+        return found
+    known = f"The mean force is known to ± {percent(found.force_sd)}"
+    return dataclasses.replace(found, remedy=f"{known}; measure from below the skin's corner to above it.")
 
 
 def _warnings(scene: Scene | None) -> tuple[str, ...]:
