@@ -1,0 +1,108 @@
+"""The charts of a posterior's page: each record with its fit, the parameters' distributions, and the force's."""
+
+import itertools
+from typing import Any
+
+import numpy as np
+
+from fitact.report.charts import (
+    Axis,
+    Chart,
+    Plot,
+    band,
+    chart,
+    density,
+    extremes,
+    line,
+    logarithmic,
+    plot,
+    points,
+    toggle,
+)
+from fitact.report.plots import ALERT, DATA, MODEL, PRIOR, without_spikes
+
+CHANNELS = {"Vsc": "skin voltage Vsc", "I": "trunk current I"}
+_FORCES = {"force_mean": "mean force", "force_rms": "rms force", "force_peak": "peak force"}
+_PAIRED = ("Rsc", "Csc", "Ci")
+_CLOUD = 600  # draws shown of each pair
+
+
+def charts(tree: Any) -> dict[str, Chart]:
+    """By the names of the pictures that they replace; `tree`: a posterior's DataTree."""
+    found = {"corner": _corner(tree), "force": _force(tree)}
+    for number, name in enumerate(tree["observed_data"].data_vars):
+        found[f"trace_{number}"] = _record(tree, str(name))
+    return found
+
+
+def _record(tree: Any, name: str) -> Chart:
+    observed, predicted = tree["observed_data"][name], tree["posterior_predictive"][name]
+    (axis,) = observed.dims
+    time, values = observed[axis].values, observed.values
+    fitted = tree["constant_data"][f"{name}_fit"].values
+    kept = np.isfinite(fitted)
+    time, values, fitted = time[kept], values[kept], fitted[kept]
+    residuals = values - fitted
+    low, high = np.quantile(predicted.values.reshape(-1, predicted.sizes[axis]), [0.05, 0.95], axis=0)
+    shown = np.isfinite(low)
+
+    unit = observed.attrs["units"]
+    x = Axis.of("time", "s", time, limits=(time[0], time[-1]))
+    y = Axis.of(CHANNELS[name.partition("_")[0]], unit, values, limits=without_spikes(values))
+    rest = Axis.of("record − fit", unit, residuals)
+    edges = ("5 % of predicted records", "95 %", "90 % of predicted records")
+    above = [
+        *band(x, y, predicted[axis].values[shown], low[shown], high[shown], edges),
+        _thinned(x, y, time, values, "record", DATA),
+        _thinned(x, y, time, fitted, "fit", MODEL),
+    ]
+    below = [_thinned(x, rest, time, residuals, "record − fit", ALERT)]
+    return chart(plot(x, (y, above), (rest, below), heights=(2.2, 1.0), size=480, together=True))
+
+
+def _thinned(x: Axis, y: Axis, time: np.ndarray, values: np.ndarray, name: str, color: str) -> dict[str, Any]:
+    at = extremes(values)
+    return line(x, y, time[at], values[at], name, color, width=1.0)
+
+
+def _corner(tree: Any) -> Chart:
+    """Each parameter's distribution, then Rsc, Csc and Ci in pairs."""
+    posterior, prior = tree["posterior"], tree["prior"]
+    names = [str(name) for name in posterior.data_vars if name in prior.data_vars]
+    axes = {name: Axis.of(name, posterior[name].attrs["units"], np.median(posterior[name]), log=True) for name in names}
+    plots = [_marginal(axes[name], posterior[name].values, prior[name].values) for name in names]
+    pairs = list(itertools.combinations([name for name in _PAIRED if name in names], 2))
+    clouds = [_pair((axes[a], axes[b]), [(each[a], each[b]) for each in (prior, posterior)]) for a, b in pairs]
+    switch = logarithmic(plots, label="logarithmic axes")
+    switch["updates"] += logarithmic(clouds, "xy")["updates"] if clouds else []
+    return chart(*plots, *clouds, controls=[toggle("prior", [*plots, *clouds], "prior"), switch])
+
+
+def _marginal(x: Axis, posterior: np.ndarray, prior: np.ndarray) -> Plot:
+    traces = [density(x, prior, "prior", PRIOR), density(x, posterior, "posterior", MODEL)]
+    return plot(x, (_heights(), traces), size=230)
+
+
+def _pair(axes: tuple[Axis, Axis], clouds: list[tuple[Any, Any]]) -> Plot:
+    x, y = axes
+    hover = f"{x.hover('x')}, {y.hover('y')}<extra></extra>"
+    traces = []
+    for (a, b), name, color in zip(clouds, ("prior", "posterior"), (PRIOR, MODEL), strict=True):
+        shown = slice(None, None, max(1, a.size // _CLOUD))
+        cloud = points(x, y, a.values.ravel()[shown], b.values.ravel()[shown], name, color, size=4.0, opacity=0.6)
+        traces.append(cloud | {"hovertemplate": hover})
+    return plot(x, (y, traces))
+
+
+def _force(tree: Any) -> Chart:
+    posterior = tree["posterior"]
+    plots = []
+    for name, title in _FORCES.items():
+        x = Axis.of(title, "N", np.median(posterior[name]))
+        plots.append(plot(x, (_heights(), [density(x, posterior[name].values, title)]), size=230, legend=False))
+    return chart(*plots, controls=[logarithmic(plots)])
+
+
+def _heights() -> Axis:
+    """Of densities: without numbers, since each is scaled to its own peak."""
+    return Axis("density", bare=True)
