@@ -1,7 +1,7 @@
 """Charts that a reader can zoom and ask for values: what plotly.js draws, as plain dictionaries.
 
-A chart is one or more plots beside each other under common controls. Numbers go into the page as 64-bit floats in
-base64, in the units that the axes show.
+A chart is one or more plots beside each other under common controls. Numbers go into the page as floats in base64, in
+the units that the axes show: along x with 64 bits, so that two samples late in a record differ.
 """
 
 import base64
@@ -19,13 +19,13 @@ Trace = dict[str, Any]
 Plot = dict[str, Any]
 Chart = dict[str, Any]
 
-_COLUMNS = 2000  # a longer series is drawn by its extremes in so many stretches
+COLUMNS = 2000  # a series of more than twice as many points is drawn by its extremes in so many stretches
 _DECADES = 4.0  # an axis that spans more has a prefix at each tick
 _BINS = 80
 _FONT = {"family": "system-ui, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif", "size": 13, "color": "#1c2733"}
 _AXIS = {
     "showline": True, "linecolor": "#51606f", "ticks": "outside", "tickcolor": "#51606f", "gridcolor": "#e3e7eb",
-    "zeroline": False, "automargin": True, "exponentformat": "SI",
+    "zeroline": False, "automargin": True, "exponentformat": "SI", "nticks": 6,
 }  # fmt: skip
 
 
@@ -40,6 +40,7 @@ class Axis:
         log: whether the axis is logarithmic to begin with.
         limits: shown to begin with, SI; None: all there is.
         bare: without numbers, from 0.
+        wide: over so many decades that each tick has a prefix of its own.
     """
 
     title: str
@@ -48,6 +49,7 @@ class Axis:
     log: bool = False
     limits: tuple[float, float] | None = None
     bare: bool = False
+    wide: bool = False
 
     @classmethod
     def of(
@@ -56,21 +58,21 @@ class Axis:
         """With the prefix of `unit` (SI) that suits `values`."""
         sizes = np.abs(np.asarray(values, dtype=float))
         sizes = sizes[np.isfinite(sizes) & (sizes > 0.0)]
-        wide = log and sizes.size and np.log10(sizes.max() / sizes.min()) > _DECADES
+        wide = log and sizes.size > 0 and bool(np.log10(sizes.max() / sizes.min()) > _DECADES)
         size, symbol = prefixed(float(sizes.max()) if sizes.size and not wide else 0.0, unit)
-        return cls(title, symbol, size, log, limits)
+        return cls(title, symbol, size, log, limits, wide=wide)
 
-    def shown(self, values: ArrayLike) -> dict[str, str]:
+    def shown(self, values: ArrayLike, dtype: str = "f4") -> dict[str, str]:
         """`values` (SI) in the unit shown, as plotly.js reads numbers."""
-        numbers = np.asarray(values, dtype="<f8") / self.size
-        return {"dtype": "f8", "bdata": base64.b64encode(numbers.tobytes()).decode()}
+        numbers = (np.asarray(values, dtype=float) / self.size).astype(f"<{dtype}")
+        return {"dtype": dtype, "bdata": base64.b64encode(numbers.tobytes()).decode()}
 
     def layout(self) -> dict[str, Any]:
         """What plotly.js calls an axis."""
         title = f"{self.title} / {self.symbol}" if self.symbol else self.title
         layout = _AXIS | {"title": {"text": title, "standoff": 6}, "type": "log" if self.log else "linear"}
         if self.bare:
-            layout |= {"showticklabels": False, "ticks": "", "rangemode": "tozero"}
+            layout |= {"showticklabels": False, "ticks": "", "showgrid": False, "rangemode": "tozero"}
         if self.limits is not None:
             ends = np.asarray(self.limits) / self.size
             layout["range"] = (np.log10(ends) if self.log else ends).tolist()
@@ -78,7 +80,7 @@ class Axis:
 
     def hover(self, letter: str) -> str:
         """The value under the pointer with its unit."""
-        return f"%{{{letter}:.5~g}} {self.symbol}".rstrip()
+        return f"%{{{letter}:.4~s}}{self.symbol}" if self.wide else f"%{{{letter}:.5~g}} {self.symbol}".rstrip()
 
 
 def line(
@@ -86,7 +88,7 @@ def line(
     dash: str = "solid",
 ) -> Trace:  # fmt: skip
     """A curve; `dash` as in SVG's and plotly's words: solid, dash, dot."""
-    style = {"color": color, "width": width, "dash": dash}
+    style = {"color": color, "width": width, "dash": dash, "simplify": False}
     return _trace(x, y, at, values, name) | {"mode": "lines", "line": style}
 
 
@@ -144,7 +146,7 @@ def density(x: Axis, draws: ArrayLike, name: str, color: str = MODEL) -> Trace:
     height = {kind: np.append(each, 0.0) for kind, each in heights.items()}
     plain = Axis("")
     return {
-        "type": "scatter", "mode": "lines", "name": name, "x": x.shown(edges),
+        "type": "scatter", "mode": "lines", "name": name, "x": x.shown(edges, "f8"),
         "y": plain.shown(height["log" if x.log else "linear"]),
         "line": {"shape": "hv", "color": color, "width": 1.2}, "fill": "tozeroy", "fillcolor": _faint(color),
         "customdata": plain.shown(below), "meta": {kind: plain.shown(each) for kind, each in height.items()},
@@ -152,12 +154,12 @@ def density(x: Axis, draws: ArrayLike, name: str, color: str = MODEL) -> Trace:
     }  # fmt: skip
 
 
-def extremes(values: ArrayLike) -> np.ndarray:
-    """Indices, at most some 4,000, at which a series looks as it does whole: each stretch's least and greatest."""
+def extremes(values: ArrayLike, columns: int = COLUMNS) -> np.ndarray:
+    """Indices, at most 2 `columns`, at which a series looks as it does whole: each stretch's least and greatest."""
     numbers = np.asarray(values, dtype=float)
-    if numbers.size <= 2 * _COLUMNS:
+    if numbers.size <= 2 * columns:
         return np.arange(numbers.size)
-    stretches = np.array_split(np.arange(numbers.size), _COLUMNS)
+    stretches = np.array_split(np.arange(numbers.size), columns)
     ends = [index for part in stretches for index in (part[numbers[part].argmin()], part[numbers[part].argmax()])]
     return np.unique(ends)
 
@@ -176,7 +178,8 @@ def plot(
         legend: whether to show one.
         together: whether the pointer asks for the values of all traces at its x, or of the nearest point.
     """
-    data, layout = [], _layout(x, title, size, legend, together)
+    data: list[Trace] = []
+    layout = _layout(x, title, size, legend, together)
     shares = np.cumsum([0.0, *heights[: len(rows)]])
     tops, gap = 1.0 - shares / shares[-1], 0.06 if len(rows) > 1 else 0.0
     for number, (y, traces) in enumerate(rows, start=1):
@@ -186,6 +189,16 @@ def plot(
         data += [trace | {"yaxis": f"y{suffix}"} for trace in traces]
     layout["xaxis"] |= {"anchor": "y" if len(rows) == 1 else f"y{len(rows)}"}
     return {"data": data, "layout": layout}
+
+
+def shaded(plot: Plot, x: Axis, low: float, high: float) -> Plot:
+    """With an interval of x marked."""
+    return _with_shape(plot, low / x.size, high / x.size, {"line": {"width": 0}, "fillcolor": _faint(MODEL, 0.12)})
+
+
+def marked(plot: Plot, x: Axis, at: float, color: str) -> Plot:
+    """With a dashed line upwards at one x."""
+    return _with_shape(plot, at / x.size, at / x.size, {"line": {"width": 1.2, "color": color, "dash": "dash"}})
 
 
 def chart(*plots: Plot, controls: Sequence[dict[str, Any]] = ()) -> Chart:
@@ -206,6 +219,12 @@ def logarithmic(plots: Sequence[Plot], axes: str = "x", label: str = "logarithmi
     return {"label": label, "pressed": pressed, "updates": updates}
 
 
+def _with_shape(plot: Plot, low: float, high: float, style: dict[str, Any]) -> Plot:
+    shape = {"type": "rect", "x0": low, "x1": high, "yref": "paper", "y0": 0, "y1": 1} | style
+    shapes = [*plot["layout"].get("shapes", []), shape]
+    return plot | {"layout": plot["layout"] | {"shapes": shapes}}
+
+
 def _update(plot: Plot, name: str) -> dict[str, Any]:
     traces = [i for i, trace in enumerate(plot["data"]) if name in (trace["name"], trace.get("legendgroup"))]
     return {state: {"traces": traces, "restyle": {"visible": state == "on"}, "relayout": {}} for state in ("on", "off")}
@@ -223,7 +242,7 @@ def _scaled(plot: Plot, axes: str, kind: str) -> dict[str, Any]:
 
 def _trace(x: Axis, y: Axis, at: ArrayLike, values: ArrayLike, name: str) -> Trace:
     return {
-        "type": "scatter", "x": x.shown(at), "y": y.shown(values), "name": name,
+        "type": "scatter", "x": x.shown(at, "f8"), "y": y.shown(values), "name": name,
         "hovertemplate": f"{name}: {y.hover('y')}<extra></extra>",
     }  # fmt: skip
 
@@ -243,7 +262,7 @@ def _layout(x: Axis, title: str, size: int, legend: bool, together: bool) -> dic
     return layout | ({"title": {"text": title, "font": {"size": 14}, "x": 0.5}} if title else {})
 
 
-def _faint(color: str) -> str:
+def _faint(color: str, opacity: float = 0.35) -> str:
     """With most of the white behind it showing through."""
     red, green, blue = (int(color[i : i + 2], 16) for i in (1, 3, 5))
-    return f"rgba({red},{green},{blue},0.35)"
+    return f"rgba({red},{green},{blue},{opacity})"

@@ -6,9 +6,11 @@ from typing import Any
 import numpy as np
 
 from fitact.report.charts import (
+    COLUMNS,
     Axis,
     Chart,
     Plot,
+    Trace,
     band,
     chart,
     density,
@@ -17,6 +19,7 @@ from fitact.report.charts import (
     logarithmic,
     plot,
     points,
+    shaded,
     toggle,
 )
 from fitact.report.plots import ALERT, DATA, MODEL, PRIOR, without_spikes
@@ -24,18 +27,20 @@ from fitact.report.plots import ALERT, DATA, MODEL, PRIOR, without_spikes
 CHANNELS = {"Vsc": "skin voltage Vsc", "I": "trunk current I"}
 _FORCES = {"force_mean": "mean force", "force_rms": "rms force", "force_peak": "peak force"}
 _PAIRED = ("Rsc", "Csc", "Ci")
+_ALL_COLUMNS = 10_000  # of all records of a page
 _CLOUD = 600  # draws shown of each pair
 
 
 def charts(tree: Any) -> dict[str, Chart]:
     """By the names of the pictures that they replace; `tree`: a posterior's DataTree."""
     found = {"corner": _corner(tree), "force": _force(tree)}
-    for number, name in enumerate(tree["observed_data"].data_vars):
-        found[f"trace_{number}"] = _record(tree, str(name))
+    records = tree["observed_data"].data_vars
+    for number, name in enumerate(records):
+        found[f"trace_{number}"] = _record(tree, str(name), min(COLUMNS, _ALL_COLUMNS // len(records)))
     return found
 
 
-def _record(tree: Any, name: str) -> Chart:
+def _record(tree: Any, name: str, columns: int) -> Chart:
     observed, predicted = tree["observed_data"][name], tree["posterior_predictive"][name]
     (axis,) = observed.dims
     time, values = observed[axis].values, observed.values
@@ -53,15 +58,15 @@ def _record(tree: Any, name: str) -> Chart:
     edges = ("5 % of predicted records", "95 %", "90 % of predicted records")
     above = [
         *band(x, y, predicted[axis].values[shown], low[shown], high[shown], edges),
-        _thinned(x, y, time, values, "record", DATA),
-        _thinned(x, y, time, fitted, "fit", MODEL),
+        _thinned(x, y, time, values, "record", DATA, columns),
+        _thinned(x, y, time, fitted, "fit", MODEL, columns),
     ]
-    below = [_thinned(x, rest, time, residuals, "record − fit", ALERT)]
+    below = [_thinned(x, rest, time, residuals, "record − fit", ALERT, columns)]
     return chart(plot(x, (y, above), (rest, below), heights=(2.2, 1.0), size=480, together=True))
 
 
-def _thinned(x: Axis, y: Axis, time: np.ndarray, values: np.ndarray, name: str, color: str) -> dict[str, Any]:
-    at = extremes(values)
+def _thinned(x: Axis, y: Axis, time: np.ndarray, values: np.ndarray, name: str, color: str, columns: int) -> Trace:
+    at = extremes(values, columns)
     return line(x, y, time[at], values[at], name, color, width=1.0)
 
 
@@ -98,8 +103,10 @@ def _force(tree: Any) -> Chart:
     posterior = tree["posterior"]
     plots = []
     for name, title in _FORCES.items():
-        x = Axis.of(title, "N", np.median(posterior[name]))
-        plots.append(plot(x, (_heights(), [density(x, posterior[name].values, title)]), size=230, legend=False))
+        draws = posterior[name].values
+        x, (low, high) = Axis.of(title, "N", np.median(draws)), np.quantile(draws, [0.05, 0.95])
+        distribution = plot(x, (_heights(), [density(x, draws, title)]), size=230, legend=False)
+        plots.append(shaded(distribution, x, float(low), float(high)))
     return chart(*plots, controls=[logarithmic(plots)])
 
 

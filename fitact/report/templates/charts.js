@@ -39,8 +39,8 @@
   function press(button, control, plots) {
     const on = button.getAttribute("aria-pressed") !== "true";
     button.setAttribute("aria-pressed", on);
-    plots.forEach((plot, i) => {
-      const { restyle, relayout, traces } = control.updates[i][on ? "on" : "off"];
+    control.updates.forEach((update, i) => {
+      const { restyle, relayout, traces } = update[on ? "on" : "off"], plot = plots[i];
       Plotly.update(plot, restyle, { ...relayout, ...home(plot, relayout) }, traces);
     });
   }
@@ -48,9 +48,8 @@
   async function build(figure) {
     const spec = JSON.parse(figure.querySelector("script").textContent);
     const plots = [...figure.querySelectorAll(".plot")];
-    figure.classList.add("live");
     try {
-      await Promise.all(plots.map((plot, i) => draw(plot, spec.plots[i])));
+      for (const [i, plot] of plots.entries()) await draw(plot, spec.plots[i]);
     } catch (error) {
       figure.classList.remove("live");
       throw error;
@@ -73,5 +72,16 @@
     });
   }
 
-  document.querySelectorAll("figure.chart").forEach(build);
+  // A chart is drawn when it comes near, so that a page of many opens as soon as one of few.
+  const near = new IntersectionObserver((entries) => {
+    for (const { isIntersecting, target } of entries) {
+      if (!isIntersecting) continue;
+      near.unobserve(target);
+      build(target);
+    }
+  }, { rootMargin: "50%" });
+  for (const figure of document.querySelectorAll("figure.chart")) {
+    figure.classList.add("live");
+    near.observe(figure);
+  }
 })();
