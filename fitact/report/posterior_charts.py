@@ -85,7 +85,7 @@ def _corner(tree: Any) -> Chart:
 
 def _marginal(x: Axis, posterior: np.ndarray, prior: np.ndarray) -> Plot:
     traces = [density(x, prior, "prior", PRIOR), density(x, posterior, "posterior", MODEL)]
-    return plot(x, (_heights(), traces), size=230)
+    return plot(x, (_heights(), traces), size=230, together=True)
 
 
 def _pair(axes: tuple[Axis, Axis], clouds: list[tuple[Any, Any]]) -> Plot:
@@ -105,7 +105,7 @@ def _force(tree: Any) -> Chart:
     for name, title in _FORCES.items():
         draws = posterior[name].values
         x, (low, high) = Axis.of(title, "N", np.median(draws)), np.quantile(draws, [0.05, 0.95])
-        distribution = plot(x, (_heights(), [density(x, draws, title)]), size=230, legend=False)
+        distribution = plot(x, (_heights(), [density(x, draws, title)]), size=230, legend=False, together=True)
         plots.append(shaded(distribution, x, float(low), float(high)))
     return chart(*plots, controls=[logarithmic(plots)])
 
