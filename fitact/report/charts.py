@@ -179,7 +179,7 @@ def plot(
         together: whether the pointer asks for the values of all traces at its x, or of the nearest point.
     """
     data: list[Trace] = []
-    layout = _layout(x, title, size, legend, together)
+    layout = _layout(x, size, legend, together)
     shares = np.cumsum([0.0, *heights[: len(rows)]])
     tops, gap = 1.0 - shares / shares[-1], 0.06 if len(rows) > 1 else 0.0
     for number, (y, traces) in enumerate(rows, start=1):
@@ -188,7 +188,8 @@ def plot(
         layout[f"yaxis{suffix}"] = y.layout() | {"domain": ends}
         data += [trace | {"yaxis": f"y{suffix}"} for trace in traces]
     layout["xaxis"] |= {"anchor": "y" if len(rows) == 1 else f"y{len(rows)}"}
-    return {"data": data, "layout": layout}
+    label = " and ".join(y.title for y, _ in rows) + f" against {x.title}"
+    return {"data": data, "layout": layout, "title": title, "label": f"{title}: {label}" if title else label}
 
 
 def shaded(plot: Plot, x: Axis, low: float, high: float) -> Plot:
@@ -251,15 +252,14 @@ def _pair(x: Axis, y: Axis) -> str:
     return f"{x.title}: {x.hover('x')}<br>{y.title}: {y.hover('y')}"
 
 
-def _layout(x: Axis, title: str, size: int, legend: bool, together: bool) -> dict[str, Any]:
-    layout = {
+def _layout(x: Axis, size: int, legend: bool, together: bool) -> dict[str, Any]:
+    return {
         "font": _FONT, "height": size, "paper_bgcolor": "#fff", "plot_bgcolor": "#fff",
-        "margin": {"l": 56, "r": 12, "t": 34 if title or legend else 12, "b": 44},
+        "margin": {"l": 56, "r": 12, "t": 34 if legend else 12, "b": 44},
         "hovermode": "x unified" if together else "closest", "hoversubplots": "axis", "showlegend": legend,
         "legend": {"orientation": "h", "x": 0, "y": 1, "yanchor": "bottom"},
         "xaxis": x.layout() | {"hoverformat": ".5~g", "unifiedhovertitle": {"text": x.hover("x")}},
     }  # fmt: skip
-    return layout | ({"title": {"text": title, "font": {"size": 14}, "x": 0.5}} if title else {})
 
 
 def _faint(color: str, opacity: float = 0.35) -> str:

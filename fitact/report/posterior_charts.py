@@ -1,7 +1,7 @@
 """The charts of a posterior's page: each record with its fit, the parameters' distributions, and the force's."""
 
 import itertools
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,29 +40,50 @@ def charts(tree: Any) -> dict[str, Chart]:
     return found
 
 
+class _Record(NamedTuple):
+    """A channel where it was fitted, SI."""
+
+    time: np.ndarray
+    values: np.ndarray
+    fitted: np.ndarray
+    channel: str
+    unit: str
+
+
 def _record(tree: Any, name: str, columns: int) -> Chart:
+    """A channel over time; of a long one also its beginning, sample by sample."""
     observed, predicted = tree["observed_data"][name], tree["posterior_predictive"][name]
     (axis,) = observed.dims
-    time, values = observed[axis].values, observed.values
     fitted = tree["constant_data"][f"{name}_fit"].values
     kept = np.isfinite(fitted)
-    time, values, fitted = time[kept], values[kept], fitted[kept]
-    residuals = values - fitted
-    low, high = np.quantile(predicted.values.reshape(-1, predicted.sizes[axis]), [0.05, 0.95], axis=0)
-    shown = np.isfinite(low)
+    channel, unit = CHANNELS[name.partition("_")[0]], observed.attrs["units"]
+    record = _Record(observed[axis].values[kept], observed.values[kept], fitted[kept], channel, unit)
 
-    unit = observed.attrs["units"]
-    x = Axis.of("time", "s", time, limits=(time[0], time[-1]))
-    y = Axis.of(CHANNELS[name.partition("_")[0]], unit, values, limits=without_spikes(values))
-    rest = Axis.of("record − fit", unit, residuals)
+    ends = np.quantile(predicted.values.reshape(-1, predicted.sizes[axis]), [0.05, 0.95], axis=0)
+    expected = np.stack([predicted[axis].values, *ends])[:, np.isfinite(ends[0])]
+    if record.time.size <= 2 * columns:
+        return chart(_over_time(record, columns, expected))
+    start = record._replace(**{each: getattr(record, each)[: 2 * columns] for each in ("time", "values", "fitted")})
+    return chart(
+        _over_time(record, columns, expected, f"all of it, by the extremes of {columns:,} stretches"),
+        _over_time(start, columns, None, f"its first {2 * columns:,} samples"),
+    )
+
+
+def _over_time(record: _Record, columns: int, expected: np.ndarray | None, title: str = "") -> Plot:
+    """Record and fit, and what is left below; `expected`: times, and the ends of what 90 % of records keep to."""
+    time, residuals = record.time, record.values - record.fitted
+    x, limits = Axis.of("time", "s", time, limits=(time[0], time[-1])), without_spikes(record.values)
+    y = Axis.of(record.channel, record.unit, limits, limits=limits)
+    rest = Axis.of("record − fit", record.unit, residuals)
     edges = ("5 % of predicted records", "95 %", "90 % of predicted records")
-    above = [
-        *band(x, y, predicted[axis].values[shown], low[shown], high[shown], edges),
-        _thinned(x, y, time, values, "record", DATA, columns),
-        _thinned(x, y, time, fitted, "fit", MODEL, columns),
+    above = [] if expected is None else band(x, y, expected[0], expected[1], expected[2], edges)
+    above += [
+        _thinned(x, y, time, record.values, "record", DATA, columns),
+        _thinned(x, y, time, record.fitted, "fit", MODEL, columns),
     ]
-    below = [_thinned(x, rest, time, residuals, "record − fit", ALERT, columns)]
-    return chart(plot(x, (y, above), (rest, below), heights=(2.2, 1.0), size=480, together=True))
+    below = [_thinned(x, rest, time, residuals, "record − fit", ALERT, columns) | {"showlegend": False}]
+    return plot(x, (y, above), (rest, below), heights=(2.2, 1.0), title=title, size=480, together=True)
 
 
 def _thinned(x: Axis, y: Axis, time: np.ndarray, values: np.ndarray, name: str, color: str, columns: int) -> Trace:
