@@ -1,4 +1,4 @@
-"""How long a report takes to open in Chromium, and to answer a button: of the demo, and of a record of 1,000,000 samples.
+"""How long a report takes to open in Chromium, and to answer a button: the demo's, and that of 1,000,000 samples.
 
     python benchmarks/report.py [--json]
 
@@ -20,7 +20,7 @@ from timing import medians, show
 import fitact
 
 RECORDS = Path(__file__).parents[1] / "data_synth" / "records"
-ROUNDS, SAMPLES, RATE = 9, 1_000_000, 200e3
+ROUNDS, SAMPLES, RATE = 7, 1_000_000, 200e3
 
 
 def written(folder: Path) -> dict[str, Path]:
