@@ -27,13 +27,14 @@ def written(folder: Path) -> dict[str, Path]:
     """The pages, from independent draws: they differ from the demo's in numbers alone."""
     scene = fitact.Scene.load(RECORDS / "finger_direct.toml")
     demo = fitact.fit(fitact.read(RECORDS / "finger_direct.csv", scene), scene)
-    drive = fitact.Square(peak_to_peak=360.0, frequency=100.0)
+    known = fitact.Scene.from_dict({"drive": {"waveform": "trapezoid", "rise_time": "50 us"}})
+    drive = fitact.Trapezoid(peak_to_peak=360.0, frequency=100.0, rise_time=50e-6)
     time = np.arange(SAMPLES) / RATE
     vsc = np.asarray(fitact.response(fitact.FinalCircuit(160e3, 22e-9, 1.35e-9), drive, jnp.asarray(time)))
     noisy = vsc + 0.05 * np.random.default_rng(1).standard_normal(SAMPLES)
     record = fitact.Record.from_arrays(time, V=np.asarray(drive.value(jnp.asarray(time))), Vsc=noisy)
     pages = {}
-    for name, fit in {"demo": demo, "long": fitact.fit(record, fitact.Scene())}.items():
+    for name, fit in {"demo": demo, "long": fitact.fit(record, known)}.items():
         pages[name] = folder / f"{name}.html"
         fitact.sample(fit, level="laplace", seed=1, progress=False).report(pages[name])
     return pages

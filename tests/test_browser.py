@@ -232,6 +232,10 @@ def test_a_drag_zooms_and_a_button_resets(browser: Browser, page: Path):
     buttons["reset zoom"].click()
     assert browser.range(figure) == whole
     buttons["zoom in"].click()
+    webdriver.ActionChains(browser.driver).double_click(plot).perform()
+    browser.wait("arguments[0].querySelector('.plot').layout.xaxis.range[0] === arguments[1]", figure, whole[0])
+    assert browser.range(figure) == whole
+    buttons["zoom in"].click()
     assert np.diff(browser.range(figure)) == pytest.approx(0.5 * np.diff(whole))
     buttons["zoom out"].click()
     assert browser.range(figure) == pytest.approx(whole)

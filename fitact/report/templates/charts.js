@@ -2,7 +2,7 @@
 "use strict";
 (() => {
   const coarse = matchMedia("(pointer: coarse)").matches; // a finger's drag is for scrolling
-  const config = { displayModeBar: false, responsive: true, doubleClick: "reset", showTips: false };
+  const config = { displayModeBar: false, responsive: true, doubleClick: false, showTips: false };
   const keys = {
     ArrowLeft: (plot) => pan(plot, "xaxis", -0.1), ArrowRight: (plot) => pan(plot, "xaxis", 0.1),
     ArrowDown: (plot) => pan(plot, "yaxis", -0.1), ArrowUp: (plot) => pan(plot, "yaxis", 0.1),
@@ -64,6 +64,7 @@
     const axes = Object.entries(layout).filter(([name]) => /^[xy]axis/.test(name));
     plot.given = Object.fromEntries(axes.map(([name, { type, range }]) => [name, { type, range: range && [...range] }]));
     await Plotly.newPlot(plot, data, { ...layout, dragmode: coarse ? false : "zoom" }, config);
+    plot.on("plotly_doubleclick", () => reset(plot));
     plot.addEventListener("keydown", (event) => {
       const act = keys[event.key];
       if (!act || event.ctrlKey || event.metaKey || event.altKey) return;
