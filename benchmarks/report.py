@@ -44,7 +44,13 @@ def browser() -> Any:
     """Chromium, as a reader has it but for its window."""
     options = webdriver.ChromeOptions()
     options.binary_location = shutil.which("chromium")
-    for each in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"):
+    for each in (
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-dev-shm-usage",
+        "--window-size=1280,900",
+    ):
         options.add_argument(each)
     return webdriver.Chrome(options, webdriver.ChromeService(shutil.which("chromedriver")))
 

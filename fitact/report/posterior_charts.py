@@ -28,7 +28,7 @@ CHANNELS = {"Vsc": "skin voltage Vsc", "I": "trunk current I"}
 _FORCES = {"force_mean": "mean force", "force_rms": "rms force", "force_peak": "peak force"}
 _PAIRED = ("Rsc", "Csc", "Ci")
 _ALL_COLUMNS = 10_000  # of all records of a page
-_CLOUD = 600  # draws shown of each pair
+_CLOUD = 300  # draws shown of each pair
 
 
 def charts(tree: Any) -> dict[str, Chart]:
