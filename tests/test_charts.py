@@ -8,10 +8,12 @@ import jinja2
 import numpy as np
 import pytest
 import scipy.stats
+import xarray as xr
 
-from fitact.report import charts
+from fitact.report import charts, posterior_charts
 from fitact.report.charts import Axis
 
+FORCES = ("force_mean", "force_rms", "force_peak")
 TIME = Axis.of("time", "s", [0.0, 0.02])
 VOLTAGE = Axis.of("Vsc", "V", [-15.0, 15.0])
 
@@ -71,6 +73,31 @@ def test_buttons_switch_what_they_say():
     assert log["pressed"]
     assert log["updates"][0]["off"]["relayout"] == {"xaxis.type": "linear"}
     assert log["updates"][0]["off"]["restyle"]["y"] == [trace["meta"]["linear"] for trace in traces]
+
+
+def test_a_long_record_is_drawn_whole_and_its_beginning_sample_by_sample():
+    time, rng = np.arange(1_000_000) * 5e-6, np.random.default_rng(2)
+    vsc = rng.standard_normal(time.size)
+    vsc[700_001] = 40.0
+    drawn = {name: (("chain", "draw"), rng.lognormal(size=(2, 50)), {"units": "N"}) for name in FORCES}
+    skin = {name: (("chain", "draw"), rng.lognormal(size=(2, 50)), {"units": "F"}) for name in ("Csc", "Ci")}
+    seen = {"Vsc": ("time", vsc, {"units": "V"})}
+    predicted = {"Vsc": (("chain", "draw", "time"), rng.standard_normal((1, 20, 4000)), {"units": "V"})}
+    tree = xr.DataTree.from_dict(
+        {
+            "posterior": xr.Dataset(drawn | skin),
+            "prior": xr.Dataset(skin),
+            "observed_data": xr.Dataset(seen, {"time": time}),
+            "constant_data": xr.Dataset({"Vsc_fit": ("time", np.zeros(time.size))}, {"time": time}),
+            "posterior_predictive": xr.Dataset(predicted, {"time": time[::250]}),
+        }
+    )
+    found = posterior_charts.charts(tree)
+    whole, beginning = ({trace["name"]: trace for trace in each["data"]} for each in found["trace_0"]["plots"])
+    assert numbers(whole["record"]["y"]).max() == 40.0
+    np.testing.assert_allclose(numbers(beginning["record"]["x"]), 1e3 * time[:4000], rtol=1e-12)
+    np.testing.assert_array_equal(numbers(beginning["record"]["y"]), vsc[:4000].astype("f4"))
+    assert len(json.dumps(found)) < 1e6
 
 
 def test_nothing_in_a_name_becomes_markup():
