@@ -4,7 +4,7 @@ PY = .venv/bin/python
 # what one process of the tests compiles serves the others, and the next run
 COMPILED = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/out/jax JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
 .DEFAULT_GOAL = help
-.PHONY: help env demo test test-slow test-slow-quick notebooks extremes calibration calibration-quick fuzz check lock clean
+.PHONY: help env demo test test-slow test-slow-quick notebooks extremes calibration calibration-quick fuzz check lock plotly clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -57,6 +57,11 @@ check: env
 lock: env
 	.venv/bin/uv pip compile --quiet --upgrade --universal --all-extras --generate-hashes --no-emit-index-url --no-header pyproject.toml -o requirements/all.txt
 	echo uv | .venv/bin/uv pip compile --quiet --upgrade --universal --generate-hashes --no-emit-index-url --no-header - -o requirements/uv.txt
+
+# make plotly   renew the script that draws the pages' charts: plotly.js, basic bundle, MIT, from npm
+plotly:
+	cd fitact/report/templates && npm pack --silent plotly.js-basic-dist-min && tar -xzf plotly.js-*.tgz --strip-components=1 \
+	  package/plotly-basic.min.js package/LICENSE && mv LICENSE plotly-basic.LICENSE && rm plotly.js-*.tgz
 
 # make clean   remove what the above made
 clean:

@@ -71,11 +71,17 @@ def written(value: float, unit: str) -> str:
 
 def engineering(value: float, unit: str, digits: int = 4) -> str:
     """`value` with an SI prefix, for people: ``engineering(1.35e-9, "F") == "1.35 nF"``."""
+    size, symbol = prefixed(value, unit)
+    return f"{value / size:.{digits}g} {symbol}".rstrip()
+
+
+def prefixed(value: float, unit: str) -> tuple[float, str]:
+    """The multiple of `unit` that suits `value`, and its symbol: ``prefixed(1.35e-9, "F") == (1e-9, "nF")``."""
     symbol = _SYMBOLS.get(unit, unit)
     if not math.isfinite(value) or value == 0.0 or not symbol:
-        return f"{value:.{digits}g} {symbol}".rstrip()
+        return 1.0, symbol
     exponent = max(-15, min(12, 3 * math.floor(math.log10(abs(value)) / 3 + 1e-12)))
-    return f"{value / 10.0**exponent:.{digits}g} {_PREFIXES[exponent]}{symbol}"
+    return 10.0**exponent, _PREFIXES[exponent] + symbol
 
 
 def unit_of(name: str) -> str:

@@ -10,11 +10,13 @@ from typing import Any
 
 import jinja2
 import matplotlib as mpl
+from markupsafe import Markup
 
 from fitact.errors import InputError
 from fitact.files import replacing
 from fitact.inference.summary import BY_FORCE, load, width
-from fitact.report import plots
+from fitact.report import plots, posterior_charts
+from fitact.report.posterior_charts import CHANNELS
 from fitact.units import engineering
 
 _LABELS = {
@@ -53,7 +55,6 @@ _LABELS = {
 }
 
 
-_CHANNELS = {"Vsc": "skin voltage Vsc", "I": "trunk current I"}
 _CIRCUITS = {
     "final": "the paper's final circuit",
     "direct": "direct ground with more than the paper's final circuit",
@@ -69,8 +70,9 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
         "report.html",
         summary=summary,
         figures=figures,
+        charts=posterior_charts.charts(tree),
         label=_label,
-        channels=_CHANNELS,
+        channels=CHANNELS,
         force=BY_FORCE[summary["model"].get("force", "paper")],
         circuits=_CIRCUITS,
         engineering=engineering,
@@ -85,9 +87,9 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
 
 def render(template: str, **content: Any) -> str:
     """A page of the folder of templates."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("fitact.report"), autoescape=True, undefined=jinja2.StrictUndefined
-    )
+    loader = jinja2.PackageLoader("fitact.report")
+    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    environment.globals["verbatim"] = lambda name: Markup(loader.get_source(environment, name)[0])  # scripts of ours
     return environment.get_template(template).render(**content)
 
 
@@ -123,7 +125,7 @@ def _figures(tree: Any) -> dict[str, str]:
             tree["constant_data"][f"{name}_fit"].values,
             predicted[axis].values,
             predicted.values.reshape(-1, predicted.sizes[axis]),
-            _CHANNELS[str(name).partition("_")[0]],
+            CHANNELS[str(name).partition("_")[0]],
             observed.attrs["units"],
         )
     return {name: plots.source(svg) for name, svg in figures.items()}

@@ -17,7 +17,7 @@ from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullFormatt
 
 from fitact.files import replacing
 
-_DATA, _MODEL, _PRIOR, _ALERT = (
+DATA, MODEL, PRIOR, ALERT = (
     "#333333",
     "#0072B2",
     "#999999",
@@ -62,17 +62,17 @@ def record_figure(
     beside = figure.add_subplot(grid[1, 1], sharey=below)
     low, high = np.quantile(predicted, [0.05, 0.95], axis=0)
     above.fill_between(
-        predicted_time, low, high, color=_MODEL, alpha=0.45, lw=0, zorder=3, label="90 % of predicted records"
+        predicted_time, low, high, color=MODEL, alpha=0.45, lw=0, zorder=3, label="90 % of predicted records"
     )
-    above.plot(time, observed, ".", color=_DATA, ms=1.5, label="record", rasterized=True)
+    above.plot(time, observed, ".", color=DATA, ms=1.5, label="record", rasterized=True)
     above.set_ylabel(channel)
-    above.set_ylim(*_without_spikes(observed))
+    above.set_ylim(*without_spikes(observed))
     above.legend(loc="upper right", framealpha=0.9, markerscale=5)
     residuals = observed - fitted
-    below.plot(time, residuals, ".", color=_ALERT, ms=1.5, rasterized=True)
-    below.axhline(0.0, color=_DATA, lw=0.8)
+    below.plot(time, residuals, ".", color=ALERT, ms=1.5, rasterized=True)
+    below.axhline(0.0, color=DATA, lw=0.8)
     below.set_ylabel("record − fit")
-    beside.hist(residuals, bins=60, orientation="horizontal", color=_ALERT, alpha=0.7)
+    beside.hist(residuals, bins=60, orientation="horizontal", color=ALERT, alpha=0.7)
     beside.tick_params(labelleft=False, labelbottom=False)
     for axes in (above, below):
         axes.xaxis.set_major_formatter(EngFormatter("s"))
@@ -82,7 +82,7 @@ def record_figure(
     return svg(figure)
 
 
-def _without_spikes(values: np.ndarray) -> tuple[float, float]:
+def without_spikes(values: np.ndarray) -> tuple[float, float]:
     """Limits that show a channel, but not the few samples of a current at edges that would flatten all others."""
     low, high = np.quantile(values, [0.02, 0.98])
     whole = float(values.min()), float(values.max())
@@ -111,15 +111,15 @@ def corner_figure(posterior: Draws, prior: Draws, units: Mapping[str, str]) -> s
             else:
                 here.set_yscale("log")
                 here.set_ylim(*limits[y])
-                _cloud(here, prior[x], prior[y], _PRIOR, 0.25)
-                _cloud(here, posterior[x], posterior[y], _MODEL, 0.5)
+                _cloud(here, prior[x], prior[y], PRIOR, 0.25)
+                _cloud(here, posterior[x], posterior[y], MODEL, 0.5)
                 _ticks(here.yaxis, limits[y], units[y], column == 0)
             _ticks(here.xaxis, limits[x], units[x], row == len(names) - 1)
             if row == len(names) - 1:
                 here.set_xlabel(x)
             if column == 0 and row > 0:
                 here.set_ylabel(y)
-    handles = [mpl.lines.Line2D([], [], color=c, lw=6, alpha=0.7) for c in (_MODEL, _PRIOR)]
+    handles = [mpl.lines.Line2D([], [], color=c, lw=6, alpha=0.7) for c in (MODEL, PRIOR)]
     figure.legend(handles, ["posterior", "prior"], loc="upper right", fontsize=13)
     return svg(figure)
 
@@ -130,9 +130,9 @@ def force_figure(force: Draws) -> str:
     titles = {"force_mean": "mean force", "force_rms": "rms force", "force_peak": "peak force"}
     for axes, (name, title) in zip(figure.subplots(1, 3), titles.items(), strict=True):
         low, median, high = np.quantile(force[name], [0.05, 0.5, 0.95])
-        axes.hist(force[name], bins=60, color=_MODEL, alpha=0.75, density=True)
-        axes.axvline(median, color=_DATA)
-        axes.axvspan(low, high, color=_MODEL, alpha=0.12)
+        axes.hist(force[name], bins=60, color=MODEL, alpha=0.75, density=True)
+        axes.axvline(median, color=DATA)
+        axes.axvspan(low, high, color=MODEL, alpha=0.12)
         axes.xaxis.set_major_formatter(EngFormatter("N"))
         axes.xaxis.set_major_locator(MaxNLocator(4))
         axes.set_yticks([])
@@ -142,7 +142,7 @@ def force_figure(force: Draws) -> str:
 
 def _histograms(axes: Axes, posterior: np.ndarray, prior: np.ndarray, limits: tuple[float, float]) -> None:
     edges = np.geomspace(*limits, 80)
-    for draws, color in ((prior, _PRIOR), (posterior, _MODEL)):
+    for draws, color in ((prior, PRIOR), (posterior, MODEL)):
         # per unit of the logarithm, as the axis shows it
         counts, _ = np.histogram(draws, edges)
         axes.stairs(counts / len(draws), edges, fill=True, color=color, alpha=0.6)

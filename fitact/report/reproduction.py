@@ -1,31 +1,32 @@
 """The paper's figures in its own form, and its claims beside what they come to."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import matplotlib as mpl
-import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fitact import paper
 from fitact.files import replacing, write_json
-from fitact.model.circuit import Circuit, DirectGround, FinalCircuit, NaturalGround
-from fitact.model.drive import Drive, Square
-from fitact.model.response import response
-from fitact.report import plots
+from fitact.model.circuit import Circuit
+from fitact.report import plots, reproduction_charts, reproduction_curves
+from fitact.report.charts import Chart
 from fitact.report.page import render
+from fitact.report.reproduction_curves import COLORS, KNEES, OTHERS, OURS
 from fitact.units import engineering
 
-_CI = paper.INSULATORS[paper.TEXT_CI]
-_COLORS = ("#D55E00", "#009E73", "#CC79A7", "#8C564B", "#222222")  # in the order of the paper's figures
 _MARKERS = ("o", "s", "^", "*", "P")
-_TIMES = 2001
-_BEFORE_EDGE = 1e-9  # of a period
+
+
+class _Shown(NamedTuple):
+    title: str
+    draw: Callable[[], Figure]
+    chart: Callable[[], Chart]
+    alt: str
 
 
 def write_reproduction(directory: str | os.PathLike[str], claims: tuple[paper.Claim, ...]) -> Path:
@@ -36,7 +37,7 @@ def write_reproduction(directory: str | os.PathLike[str], claims: tuple[paper.Cl
     """
     directory = Path(directory)
     with mpl.rc_context(plots.style()), jax.enable_x64(True):
-        figures = [(title, plots.source(plots.svg(draw())), alt) for title, draw, alt in _FIGURES]
+        figures = [(each.title, each.chart(), plots.source(plots.svg(each.draw())), each.alt) for each in _FIGURES]
     page = render("reproduction.html", claims=claims, figures=figures, value=_value, counts=_counts(claims))
     write_json(directory / "reproduction.json", [claim.to_dict() for claim in claims])
     with replacing(directory / "reproduction.html") as temporary:
@@ -54,44 +55,24 @@ def _value(value: float | None, unit: str) -> str:
     return f"{value:.4g}" if unit == "1" else engineering(value, unit)
 
 
-def _square() -> Square:
-    return Square(peak_to_peak=paper.PEAK_TO_PEAK, frequency=paper.FREQUENCY)
-
-
-def _in_time(circuit: Circuit, drive: Drive) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, " times"]]:
-    """Two periods of the steady state (ms, V), both sides of each jump among them."""
-    period = 1.0 / paper.FREQUENCY
-    edges = np.arange(4) * 0.5 * period
-    inside = np.linspace(0.0, 2.0 * period, _TIMES)[:-1]
-    time = np.union1d(inside, np.append(edges, edges[1:] - _BEFORE_EDGE * period))
-    return 1e3 * time, np.asarray(response(circuit, drive, jnp.asarray(time)))
-
-
 def _curves(axes: Axes, circuits: dict[str, Circuit]) -> None:
-    for (label, circuit), color, marker in zip(circuits.items(), _COLORS, _MARKERS, strict=False):
-        axes.plot(*_in_time(circuit, _square()), color=color, marker=marker, markevery=171, ms=4, lw=1.2, label=label)
+    for (label, circuit), color, marker in zip(circuits.items(), COLORS, _MARKERS, strict=False):
+        time, vsc = reproduction_curves.in_time(circuit)
+        axes.plot(1e3 * time, vsc, color=color, marker=marker, markevery=171, ms=4, lw=1.2, label=label)
     axes.set_xlabel("time / ms")
     axes.set_ylabel("Vsc1 / V")
     axes.legend(fontsize=9)
 
 
-def _grounding() -> Figure:
+def _in_time(circuits: dict[str, Circuit]) -> Figure:
     figure = Figure(figsize=(8.0, 3.6), layout="constrained")
-    direct = DirectGround(paper.RSC, paper.CSC, _CI, R_H=paper.R_H)
-    _curves(figure.subplots(), {"direct": direct, "natural": NaturalGround(paper.RSC, paper.CSC, _CI, paper.Z)})
+    _curves(figure.subplots(), circuits)
     return figure
 
 
-def _grounding_points(name: str, values: tuple[float, ...], unit: str) -> Figure:
+def _with_peak(circuits: dict[str, Circuit]) -> Figure:
     figure = Figure(figsize=(10.0, 3.8), layout="constrained")
     whole, part = figure.subplots(1, 2, width_ratios=[1.6, 1.0])
-    fixed: dict[str, Any] = {"grounding_Rsc": paper.RSC, "grounding_Csc": paper.CSC}
-    circuits: dict[str, Circuit] = {
-        f"{name.removeprefix('grounding_')}1 = {engineering(value, unit, 3)}": DirectGround(
-            paper.RSC, paper.CSC, _CI, R_H=paper.R_H, **(fixed | {name: value})
-        )
-        for value in values
-    }
     _curves(whole, circuits)
     _curves(part, circuits)
     part.set_xlim(-0.05, 1.0)
@@ -101,27 +82,12 @@ def _grounding_points(name: str, values: tuple[float, ...], unit: str) -> Figure
     return figure
 
 
-def _body() -> Figure:
-    figure = Figure(figsize=(8.0, 3.6), layout="constrained")
-    with_body = DirectGround(paper.RSC, paper.CSC, _CI, R_H=paper.R_H)
-    _curves(figure.subplots(), {"without R_H": FinalCircuit(paper.RSC, paper.CSC, _CI), "with R_H": with_body})
-    return figure
-
-
 def _insulator() -> Figure:
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    permittivities, thicknesses = np.linspace(1.0, 10.0, 37), 1e-6 * np.geomspace(0.01, 10.0, 46)
-    own = paper.force_over(paper.PERMITTIVITY, paper.INSULATOR)
-    for axes, x, forces, at, label in (
-        (left, permittivities, [paper.force_over(e, paper.INSULATOR) for e in permittivities], paper.PERMITTIVITY,
-         "relative permittivity"),
-        (right, 1e6 * thicknesses, [paper.force_over(paper.PERMITTIVITY, t) for t in thicknesses],
-         1e6 * paper.INSULATOR, "thickness / µm"),
-    ):  # fmt: skip
-        top = max(forces)
-        axes.plot(x, np.array(forces) / top, color="#0072B2")
-        axes.plot([at], [own / top], "o", color=_COLORS[0], label="the paper's panel")
+    for axes, each in zip(figure.subplots(1, 2), reproduction_curves.insulator(), strict=True):
+        size, label = (1e-6, f"{each.title} / µm") if each.unit == "m" else (1.0, each.title)
+        axes.plot(each.force.at / size, each.force.values, color=OURS)
+        axes.plot([each.own[0] / size], [each.own[1]], "o", color=COLORS[0], label="the paper's panel")
         axes.set_xlabel(label)
         axes.set_ylabel("mean force, normalised")
         axes.legend(fontsize=9)
@@ -130,33 +96,26 @@ def _insulator() -> Figure:
 
 def _frequencies(low: float, high: float) -> Figure:
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
-    amplitude, phase = figure.subplots(1, 2)
-    frequency = np.geomspace(low, high, 400)
-    for (name, Ci), color in zip(paper.INSULATORS.items(), ("#0072B2", "#999999", "#555555"), strict=True):
-        circuit = FinalCircuit(paper.RSC, paper.CSC, Ci)
-        omega = jnp.asarray(2.0 * np.pi * frequency)
-        amplitude.plot(frequency, np.asarray(circuit.amplitude(omega)), color=color, label=f"Ci = {name}")
-        phase.plot(frequency, np.degrees(np.asarray(circuit.phase(omega))), color=color)
-    marks = {amplitude: (40.0, 300.0), phase: (90.0, 270.0)} if high <= 1e3 else {}
-    for axes, places in marks.items():
-        for place in places:
-            axes.axvline(place, color=_COLORS[0], lw=1.0, ls="--")
-    for axes, label in ((amplitude, "|H|"), (phase, "phase / degrees")):
+    panels = dict(zip(KNEES, figure.subplots(1, 2), strict=True))
+    for (name, curves), color in zip(reproduction_curves.frequencies(low, high).items(), (OURS, *OTHERS), strict=True):
+        for axes, curve in zip(panels.values(), curves, strict=True):
+            axes.plot(curve.at, curve.values, color=color, label=name)
+    for (label, axes), places in zip(panels.items(), KNEES.values(), strict=True):
+        for place in places if high <= 1e3 else ():
+            axes.axvline(place, color=COLORS[0], lw=1.0, ls="--")
         axes.set_xscale("log")
         axes.set_xlabel("frequency / Hz")
-        axes.set_ylabel(label)
-    amplitude.legend(fontsize=9)
+        axes.set_ylabel(f"{label} / degrees" if label == "phase" else label)
+    panels["|H|"].legend(fontsize=9)
     return figure
 
 
 def _waveforms() -> Figure:
     figure = Figure(figsize=(10.0, 4.6), layout="constrained")
     rows = figure.subplots(2, 3, sharex=True)
-    circuit = FinalCircuit(paper.RSC, paper.CSC, _CI)
-    for column, (name, drive) in enumerate(paper.waveforms(30.0).items()):
-        time, vsc = _in_time(circuit, drive)
-        rows[0, column].plot(time, np.asarray(drive.value(jnp.asarray(1e-3 * time))), color="#333333")
-        rows[1, column].plot(time, vsc, color="#0072B2")
+    for column, (name, (drive, vsc)) in enumerate(reproduction_curves.waveforms().items()):
+        rows[0, column].plot(1e3 * drive.at, drive.values, color="#333333")
+        rows[1, column].plot(1e3 * vsc.at, vsc.values, color=OURS)
         rows[0, column].set_title(name, fontsize=10)
         rows[1, column].set_xlabel("time / ms")
         rows[1, column].set_ylim(-2.8, 2.8)
@@ -165,19 +124,33 @@ def _waveforms() -> Figure:
     return figure
 
 
+def _of(
+    title: str, draw: Callable[[dict[str, Circuit]], Figure], circuits: Callable[[], dict[str, Circuit]], alt: str
+) -> _Shown:
+    """Of Vsc of some circuits."""
+    return _Shown(title, lambda: draw(circuits()), lambda: reproduction_charts.in_time(circuits()), alt)
+
+
+def _between(title: str, low: float, high: float, alt: str) -> _Shown:
+    """Of frequencies."""
+    return _Shown(title, lambda: _frequencies(low, high), lambda: reproduction_charts.frequencies(low, high), alt)
+
+
 _FIGURES = (
-    ("Fig. 4: direct and natural ground", _grounding,
-     "Vsc over two periods: large under direct ground, a tenth of it under natural ground."),
-    ("Fig. 5: the grounding finger's Rsc", lambda: _grounding_points("grounding_Rsc", paper.GROUNDING_RSC, "ohm"),
-     "Five curves that differ in how they decay and hardly at the peak."),
-    ("Fig. 6: the grounding finger's Csc", lambda: _grounding_points("grounding_Csc", paper.GROUNDING_CSC, "F"),
-     "Five curves whose peaks rise from 13.7 V to 15.9 V with the capacitance."),
-    ("Fig. 10: with and without R_H", _body, "Two curves on top of each other."),
-    ("Fig. 12: the insulator", _insulator,
-     "Mean force against permittivity, bending upwards, and against thickness, falling."),
-    ("Fig. 13: frequency characteristics", lambda: _frequencies(0.1, 1e5), "A first-order high-pass."),
-    ("Fig. 14: 10 to 1000 Hz, the paper's knees and steady frequencies dashed", lambda: _frequencies(10.0, 1e3),
-     "Amplitude and phase of the high-pass for three values of Ci."),
-    ("Fig. 15: waveforms of 30 Vpp", _waveforms,
-     "Sine, triangle and square above, Vsc below: 1.5, 1.5 and 2.6 V from peak to peak."),
+    _of("Fig. 4: direct and natural ground", _in_time, reproduction_curves.grounding,
+        "Vsc over two periods: large under direct ground, a tenth of it under natural ground."),
+    _of("Fig. 5: the grounding finger's Rsc", _with_peak,
+        lambda: reproduction_curves.grounding_points("grounding_Rsc", paper.GROUNDING_RSC, "ohm"),
+        "Five curves that differ in how they decay and hardly at the peak."),
+    _of("Fig. 6: the grounding finger's Csc", _with_peak,
+        lambda: reproduction_curves.grounding_points("grounding_Csc", paper.GROUNDING_CSC, "F"),
+        "Five curves whose peaks rise from 13.7 V to 15.9 V with the capacitance."),
+    _of("Fig. 10: with and without R_H", _in_time, reproduction_curves.body, "Two curves on top of each other."),
+    _Shown("Fig. 12: the insulator", _insulator, reproduction_charts.insulator,
+           "Mean force against permittivity, bending upwards, and against thickness, falling."),
+    _between("Fig. 13: frequency characteristics", 0.1, 1e5, "A first-order high-pass."),
+    _between("Fig. 14: 10 to 1000 Hz, the paper's knees and steady frequencies dashed", 10.0, 1e3,
+             "Amplitude and phase of the high-pass for three values of Ci."),
+    _Shown("Fig. 15: waveforms of 30 Vpp", _waveforms, reproduction_charts.waveforms,
+           "Sine, triangle and square above, Vsc below: 1.5, 1.5 and 2.6 V from peak to peak."),
 )  # fmt: skip
