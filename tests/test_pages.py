@@ -328,7 +328,6 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
         (("plan", "scene.toml"), "Which model the scene requires"),
         (("design", "measurement", "scene.toml"), "What to measure next"),
         (("design", "drive", "scene.toml"), "The smallest drive that 95 % of people feel"),
-        (("tradeoff", "--scene", "scene.toml"), "Speed against accuracy"),
     ],
 )
 def test_a_command_leaves_a_page(arguments: tuple[str, ...], title: str, tmp_path: Path, monkeypatch):

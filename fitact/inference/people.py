@@ -135,31 +135,13 @@ class Population:
 
     def to_dict(self) -> dict[str, Any]:
         """What `fitact population --json` prints and population.json holds."""
-        draws = self.parameters()
-        law: dict[str, Any] = {
-            name: {
-                "median": summary.of_draws(name, draws[name]),
-                "log_sd": summary.of_draws("log_sd", draws[f"log_sd_{name}"]),
-            }
-            for name in SKIN
-        }
-        law |= {name: summary.of_draws(name, draws[name]) for name in (SHARED, "correlation")}
-        if self.hierarchy.area_varies:
-            law[AREA] = {"log_sd": summary.of_draws("log_sd", draws["log_sd_area"])}
-        law["covariates"] = {
-            name: {"mean": float(mean), "sd": float(sd), "next_finger": float(mean + at * sd)}
-            | {skin: {"slope": summary.of_draws("slope", draws[f"slope_{skin}_{name}"])} for skin in SKIN}
-            for name, mean, sd, at in zip(
-                self.covariates.names, self.covariates.mean, self.covariates.sd, self.at, strict=True
-            )
-        }
         new: dict[str, dict[str, Any]] = {}
         for name, values in self.new_fingers().items():
             spread = Spread.of(values)
             shares = {"people": spread.share_of_people, "ignorance": 1.0 - spread.share_of_people}
             new[name] = summary.of_draws(name, values) | {"variance": shares}
         return {
-            "population": law,
+            "population": self._law(),
             "new_finger": new,
             "variance_shares": self.shares,
             "variance_shares_prior": self.prior_shares,
@@ -181,6 +163,28 @@ class Population:
             "scene": self.scene.model_dump(mode="json", exclude_unset=True),
             "versions": summary.versions(),
         }
+
+    def _law(self) -> dict[str, Any]:
+        """Summaries of the law."""
+        draws = self.parameters()
+        law: dict[str, Any] = {
+            name: {
+                "median": summary.of_draws(name, draws[name]),
+                "log_sd": summary.of_draws("log_sd", draws[f"log_sd_{name}"]),
+            }
+            for name in SKIN
+        }
+        law |= {name: summary.of_draws(name, draws[name]) for name in (SHARED, "correlation")}
+        if self.hierarchy.area_varies:
+            law[AREA] = {"log_sd": summary.of_draws("log_sd", draws["log_sd_area"])}
+        law["covariates"] = {
+            name: {"mean": float(mean), "sd": float(sd), "next_finger": float(mean + at * sd)}
+            | {skin: {"slope": summary.of_draws("slope", draws[f"slope_{skin}_{name}"])} for skin in SKIN}
+            for name, mean, sd, at in zip(
+                self.covariates.names, self.covariates.mean, self.covariates.sd, self.at, strict=True
+            )
+        }
+        return law
 
     def summary(self) -> str:
         """A table for people, what the force's variance depends on, and warnings."""

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 from fitact.errors import InputError
+from fitact.files import to_json
 from fitact.inference.people import SHARED_OUT, SHARES, table, variance_sentences
 from fitact.inference.summary import width
 from fitact.report import charts
@@ -46,6 +48,7 @@ _NAMES = {
     "friction_at_f": "friction at f",
     "friction_at_2f": "friction at 2 f",
 }
+_FORCES = {"force_mean": "mean force", "force_peak": "peak force"}
 _TO_COME, _BEFORE, _AFTER = "fingers to come", "before the records", "next finger"
 
 
@@ -55,6 +58,7 @@ def write_population_page(path: str | os.PathLike[str], tree: Any, content: dict
     Raises:
         InputError: the place cannot be written.
     """
+    content = json.loads(to_json(content))  # as it is read again: null for what is not finite
     panels = {name: image(_panel(draw, tree, content), **SETTINGS) for name, draw in _PANELS.items()}
     write_page(
         path,
@@ -62,7 +66,7 @@ def write_population_page(path: str | os.PathLike[str], tree: Any, content: dict
         _frame(content),
         _origin(content),
         content=content,
-        panels=panels,
+        panels=panels | {"densities": image(lambda: _densities(tree), **SETTINGS)},
         skin=_skin_chart(tree, content),
         force=_force_chart(tree),
         law=[row for row in table(content) if not row[0].startswith("next finger")],
@@ -123,13 +127,17 @@ def _frame(content: dict[str, Any]) -> Frame:
     )
 
 
+def _quantity(s: dict[str, Any], key: str, digits: int = 4) -> str:
+    return "open" if s[key] is None else engineering(s[key], s["unit"], digits)
+
+
 def _range(s: dict[str, Any]) -> str:
-    median, low, high = (engineering(s[key], s["unit"]) for key in ("q50", "q025", "q975"))
+    median, low, high = (_quantity(s, key) for key in ("q50", "q025", "q975"))
     return f"{median} ({low} to {high})"
 
 
 def _answer(title: str, s: dict[str, Any]) -> Answer:
-    median, low, high = (engineering(s[key], s["unit"], 3) for key in ("q50", "q025", "q975"))
+    median, low, high = (_quantity(s, key, 3) for key in ("q50", "q025", "q975"))
     return Answer(title, median, f"95 %: {low} to {high}")
 
 
@@ -145,7 +153,7 @@ def _finger_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
     yield ("finger", "Rsc", "± 1 sd", "Csc", "± 1 sd", "Ci", "± 1 sd", "fit")
     for each in content["fingers"]:
         own = [each["parameters"][name] for name in ("Rsc", "Csc", "Ci")]
-        cells = (cell for s in own for cell in (engineering(s["q50"], s["unit"]), width(s)))
+        cells = (cell for s in own for cell in (_quantity(s, "q50"), "open" if s["sd"] is None else width(s)))
         yield (each["record"], *cells, each["result"])
 
 
@@ -184,13 +192,18 @@ def _panel(
     return drawn
 
 
-def _draw_densities(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
-    for group, label, color in (("prior_new_fingers", _BEFORE, PRIOR), ("new_fingers", _AFTER, MODEL)):
-        logs = np.log10(tree[group]["force_peak"].values.ravel())
-        axes.hist(logs, bins=80, density=True, color=color, alpha=0.6, label=label)
-    axes.set_yticks([])
-    axes.set_xlabel("log10 of the peak force in N")
-    axes.legend()
+def _densities(tree: Any) -> Figure:
+    figure = Figure(figsize=(9.0, 3.4), layout="constrained")
+    for axes, (name, title) in zip(figure.subplots(1, 2), _FORCES.items(), strict=True):
+        for group, label, color in (("prior_new_fingers", _BEFORE, PRIOR), ("new_fingers", _AFTER, MODEL)):
+            counts, edges = np.histogram(np.log(tree[group][name].values), 80)
+            axes.stairs(counts / counts.max(), np.exp(edges), fill=True, color=color, alpha=0.6, label=label)
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter(EngFormatter("N"))
+        axes.set_yticks([])
+        axes.set_xlabel(title)
+        axes.legend()
+    return figure
 
 
 _PANELS = {
@@ -198,7 +211,6 @@ _PANELS = {
     "force": draw_force,
     "time": draw_time,
     "shares": draw_shares,
-    "densities": _draw_densities,
 }
 
 
@@ -226,7 +238,7 @@ def _skin_chart(tree: Any, content: dict[str, Any]) -> charts.Chart:
 def _force_chart(tree: Any) -> charts.Chart:
     """Mean and peak force of the next finger, and what was believed before."""
     plots = []
-    for name, title in (("force_mean", "mean force"), ("force_peak", "peak force")):
+    for name, title in _FORCES.items():
         after, before = (tree[group][name].values for group in ("new_fingers", "prior_new_fingers"))
         x = Axis.of(title, "N", np.median(after), log=True)
         plots.append(
