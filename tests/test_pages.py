@@ -236,12 +236,20 @@ def test_the_verdict_comes_first_and_how_to_repeat_it_last(pages, name: str):
     assert "Do not trust" not in text
 
 
-@pytest.mark.parametrize("name", sorted(set(WRITE) - {"plan"}))
+AGAINST = {
+    "tradeoff": "emcee has not converged.",
+    "measurement": "the fit is a misfit.",
+    "drive": "the population is not to be trusted",
+    "population": "NOT converged: 4 ensembles; integrals over",
+}
+
+
+@pytest.mark.parametrize("name", AGAINST)
 def test_an_untrusted_answer_says_so_at_the_top(name: str, tmp_path: Path):
     WRITE[name](tmp_path / "report.html", False)
     text = words(Page((tmp_path / "report.html").read_text()))
-    assert VERDICTS[name] not in text[: text.index("How to repeat it")]
-    assert text.index("Do not trust these numbers") < text.index("Why") < text.index("Read this first")
+    assert VERDICTS[name] not in text
+    assert text.index("Do not trust these numbers") < text.index(AGAINST[name]) < text.index("Read this first")
 
 
 SHOWN = {

@@ -147,6 +147,7 @@ def _frame(design: MeasurementDesign) -> Frame:
         findings={"What else": " ".join(others)} if others else {},
         answers=answers,
         warnings=design.warnings,
+        reserved=best is None,
     )
 
 

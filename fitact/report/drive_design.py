@@ -198,6 +198,7 @@ def _frame(design: DriveDesign) -> Frame:
             for name, option in design.options.items()
         ],
         warnings=design.warnings,
+        reserved=not kept,
     )
 
 

@@ -62,6 +62,7 @@ class Frame:
         findings: sentences, by what they answer.
         answers: the few numbers.
         warnings: sentences.
+        reserved: whether a trusted answer is not the one that was hoped for, as the verdict says.
     """
 
     title: str
@@ -71,6 +72,7 @@ class Frame:
     findings: Mapping[str, str]
     answers: Sequence[Answer]
     warnings: Sequence[str]
+    reserved: bool = False
 
 
 def write_page(path: str | os.PathLike[str], template: str, frame: Frame, origin: Origin, **content: Any) -> None:

@@ -73,6 +73,7 @@ def write_plan_page(path: str | os.PathLike[str], plan: Plan, origin: Origin) ->
             Answer("speed", f"{plan.speedup:.3g}×", "of the full model"),
         ],
         warnings=plan.warnings,
+        reserved=bool(plan.warnings),
     )
     picture = image(lambda: _figure(plan))
     write_page(path, "plan.html", frame, origin, table=plan.table, legend=LEGEND, model=plan.model(), picture=picture)
