@@ -234,6 +234,7 @@ def _curve_chart(design: DriveDesign) -> charts.Chart:
     at = curves[design.own]["peak_to_peak"][[0, -1]]
     traces.append(charts.line(x, y, at, [design.share] * 2, "asked for", _LIMIT, dash="dash"))
     plot = charts.plot(x, (y, traces), size=420)
+    plot["layout"]["legend"]["traceorder"] = "normal"  # bands would turn it over
     return charts.chart(plot, controls=[charts.logarithmic([plot])])
 
 

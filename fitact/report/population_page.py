@@ -244,7 +244,10 @@ def _force_chart(tree: Any) -> charts.Chart:
         plots.append(
             charts.plot(
                 x,
-                (Axis("density"), [charts.density(x, before, _BEFORE, PRIOR), charts.density(x, after, _AFTER)]),
+                (
+                    Axis("density", bare=True),
+                    [charts.density(x, before, _BEFORE, PRIOR), charts.density(x, after, _AFTER)],
+                ),
                 size=320,
             )
         )

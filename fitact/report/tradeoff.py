@@ -157,7 +157,7 @@ def write_tradeoff_page(path: str | os.PathLike[str], tradeoff: Tradeoff, origin
         }
         | {f"Front of {kind}, cheapest first": f"{levels}." for kind, levels in front.items()},
         answers=[
-            Answer(f"{kind}, cheapest", level.name, f"{engineering(level.seconds, 's', 3)}, error {level.error:.2g}")
+            Answer(f"{kind}, cheapest", engineering(level.seconds, "s", 3), f"{level.name}, error {level.error:.2g}")
             for kind, level in cheapest.items()
         ],
         warnings=tradeoff.notes,
