@@ -16,6 +16,7 @@ import xarray as xr
 from test_report import Page
 
 import fitact
+from fitact.files import write_json
 from fitact.inference.design import Curve, MeasurementDesign
 from fitact.inference.drive_design import DriveDesign
 from fitact.inference.drive_option import DriveOption
@@ -322,6 +323,22 @@ def test_a_population_is_read_again(tmp_path: Path):
     (tmp_path / "population.json").write_text('{"population": {}}')
     with pytest.raises(fitact.InputError, match="not this version's"):
         read_population(tmp_path)
+
+
+def test_a_chain_cut_short_is_told_without_figures(tmp_path: Path):
+    """Its draws may overflow; JSON has null for what is not finite."""
+    tree, content = population(trusted=False)
+    tree["new_fingers"]["force_mean"].values[3] = math.inf
+    content["new_finger"]["force_mean"] |= {"q975": math.inf, "sd": math.nan}
+    content["convergence"]["rhat_max"] = math.nan
+    write_population_page(tmp_path / "first.html", tree, content)
+    page = Page((tmp_path / "first.html").read_text())
+    assert words(page).index("Do not trust these numbers") < words(page).index("Not drawn: some draws are not finite.")
+    assert not page.images
+    write_json(tmp_path / "population.json", content)
+    tree.to_netcdf(tmp_path / "population.nc", engine="h5netcdf")
+    write_population_page(tmp_path / "again.html", *read_population(tmp_path))
+    assert (tmp_path / "again.html").read_text() == (tmp_path / "first.html").read_text()
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:

@@ -11,6 +11,7 @@ from matplotlib.ticker import EngFormatter, PercentFormatter
 from fitact.inference.people import Population
 from fitact.report.plots import log_ticks, write_svg
 
+NOT_DRAWN = "Not drawn: some draws are not finite."
 SETTINGS = {"legend.fontsize": 9.0}
 _LAW, _FINGER, _OTHER = "#0072B2", "#333333", "#D55E00"
 _SHOWN = 4000  # new fingers
@@ -30,9 +31,18 @@ def write_population(path: str | os.PathLike[str], population: Population) -> No
 
 def _figure(tree: Any, content: dict[str, Any]) -> Figure:
     figure = Figure(figsize=(11.0, 8.4), layout="constrained")
+    if not drawable(tree):
+        figure.text(0.5, 0.5, NOT_DRAWN, ha="center")
+        return figure
     for axes, draw in zip(figure.subplots(2, 2).flat, (draw_skin, draw_force, draw_time, draw_shares), strict=True):
         draw(axes, tree, content)
     return figure
+
+
+def drawable(tree: Any) -> bool:
+    """Whether every draw has a place on a logarithmic axis; a chain that was cut short may hold others."""
+    drawn = (values.values for name in ("new_fingers", "prior_new_fingers") for values in tree[name].data_vars.values())
+    return all(bool(np.all(np.isfinite(values))) for values in drawn)
 
 
 def draw_skin(axes: Axes, tree: Any, content: dict[str, Any]) -> None:

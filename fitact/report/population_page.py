@@ -1,6 +1,7 @@
 """A population's page: how people differ, what the next finger feels, and what that depends on."""
 
 import json
+import math
 import os
 import shlex
 from collections.abc import Callable, Iterator
@@ -13,14 +14,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from fitact.errors import InputError
-from fitact.files import to_json
-from fitact.inference.people import SHARED_OUT, SHARES, table, variance_sentences
+from fitact.inference.people import OFF, SHARED_OUT, SHARES, table, variance_sentences
 from fitact.inference.summary import width
 from fitact.report import charts
 from fitact.report.charts import Axis
 from fitact.report.frame import Answer, Frame, Origin, image, write_page
 from fitact.report.plots import DATA, MODEL, PRIOR
-from fitact.report.population import SETTINGS, draw_force, draw_shares, draw_skin, draw_time
+from fitact.report.population import NOT_DRAWN, SETTINGS, draw_force, draw_shares, draw_skin, draw_time, drawable
 from fitact.units import engineering, percent
 
 _SHOWN = 1500  # fingers to come
@@ -49,6 +49,15 @@ _NAMES = {
     "friction_at_2f": "friction at 2 f",
 }
 _FORCES = {"force_mean": "mean force", "force_peak": "peak force"}
+_NUMERIC = (
+    "population",
+    "new_finger",
+    "variance_shares",
+    "variance_shares_prior",
+    "fingers",
+    "convergence",
+    "integrals_off",
+)
 _TO_COME, _BEFORE, _AFTER = "fingers to come", "before the records", "next finger"
 
 
@@ -58,17 +67,14 @@ def write_population_page(path: str | os.PathLike[str], tree: Any, content: dict
     Raises:
         InputError: the place cannot be written.
     """
-    content = json.loads(to_json(content))  # as it is read again: null for what is not finite
-    panels = {name: image(_panel(draw, tree, content), **SETTINGS) for name, draw in _PANELS.items()}
+    content = content | {name: _numbers(content[name]) for name in _NUMERIC}
     write_page(
         path,
         "population.html",
         _frame(content),
         _origin(content),
         content=content,
-        panels=panels | {"densities": image(lambda: _densities(tree), **SETTINGS)},
-        skin=_skin_chart(tree, content),
-        force=_force_chart(tree),
+        **(_figures(tree, content) if drawable(tree) else {"panels": None, "not_drawn": NOT_DRAWN}),
         law=[row for row in table(content) if not row[0].startswith("next finger")],
         fingers=tuple(_finger_rows(content)),
         new=tuple(_new_rows(content)),
@@ -99,11 +105,30 @@ def read_population(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, A
         ) from error
 
 
+def _numbers(content: Any) -> Any:
+    """With NaN for whatever is not finite, which JSON has as null."""
+    if isinstance(content, dict):
+        return {name: _numbers(value) for name, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_numbers(value) for value in content]
+    infinite = isinstance(content, float) and not math.isfinite(content)
+    return math.nan if content is None or infinite else content
+
+
+def _figures(tree: Any, content: dict[str, Any]) -> dict[str, Any]:
+    panels = {name: image(_panel(draw, tree, content), **SETTINGS) for name, draw in _PANELS.items()}
+    return {
+        "panels": panels | {"densities": image(lambda: _densities(tree), **SETTINGS)},
+        "skin": _skin_chart(tree, content),
+        "force": _force_chart(tree),
+    }
+
+
 def _frame(content: dict[str, Any]) -> Frame:
     law, new, count = content["population"], content["new_finger"], len(content["fingers"])
     force, friction = new["force_mean"], new["friction_mean"]
-    off = "not known" if content["integrals_off"] is None else f"{content['integrals_off']:.2g}"
-    certificate = f"integrals over the fingers shift no mean by more than {off} standard deviations"
+    off = f"{content['integrals_off']:.2g} standard deviations"
+    certificate = f"integrals over the fingers shift no mean by more than {off}"
     return Frame(
         title=f"How people differ: {count} fingers",
         subject=f"What {count} fingers on one panel, a record of each, tell of people: how skins differ, what force the"
@@ -111,7 +136,7 @@ def _frame(content: dict[str, Any]) -> Frame:
         trusted=content["trusted"],
         verdict=f"Trusted: the chain has converged, and {certificate}"
         if content["trusted"]
-        else f"{content['convergence']['sentence']}; {certificate}.",
+        else f"{content['convergence']['sentence']}; {certificate} ({OFF:g} are trusted).",
         findings={
             "What the next finger feels": f"A mean electrostatic force of {_range(force)}, and a mean friction of"
             f" {_range(friction)}; 95 % lie between.",
@@ -127,17 +152,13 @@ def _frame(content: dict[str, Any]) -> Frame:
     )
 
 
-def _quantity(s: dict[str, Any], key: str, digits: int = 4) -> str:
-    return "open" if s[key] is None else engineering(s[key], s["unit"], digits)
-
-
 def _range(s: dict[str, Any]) -> str:
-    median, low, high = (_quantity(s, key) for key in ("q50", "q025", "q975"))
+    median, low, high = (engineering(s[key], s["unit"]) for key in ("q50", "q025", "q975"))
     return f"{median} ({low} to {high})"
 
 
 def _answer(title: str, s: dict[str, Any]) -> Answer:
-    median, low, high = (_quantity(s, key, 3) for key in ("q50", "q025", "q975"))
+    median, low, high = (engineering(s[key], s["unit"], 3) for key in ("q50", "q025", "q975"))
     return Answer(title, median, f"95 %: {low} to {high}")
 
 
@@ -153,7 +174,7 @@ def _finger_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
     yield ("finger", "Rsc", "± 1 sd", "Csc", "± 1 sd", "Ci", "± 1 sd", "fit")
     for each in content["fingers"]:
         own = [each["parameters"][name] for name in ("Rsc", "Csc", "Ci")]
-        cells = (cell for s in own for cell in (_quantity(s, "q50"), "open" if s["sd"] is None else width(s)))
+        cells = (cell for s in own for cell in (engineering(s["q50"], s["unit"]), width(s)))
         yield (each["record"], *cells, each["result"])
 
 
