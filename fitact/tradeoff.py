@@ -24,8 +24,14 @@ Kind: TypeAlias = Literal["response", "likelihood", "uncertainty"]
 
 _TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # of the compressed log-likelihood
 _DEFAULT = 1e-3
+_WIDTHS = (10, 11, 9, 11, 10, 11)
 _EXACT = 1e-12  # of Vsc: what docs/numerics.md guarantees; less counts as this on the front
-_COLUMNS = f"{'level':24}{'error':>10}{'time':>11}{'ratio':>9}{'gradient':>11}{'compile':>10}{'memory':>11}"
+COLUMNS = ("level", "error", "time", "ratio", "gradient", "compile", "memory")
+KINDS: dict[Kind, str] = {
+    "response": "error of Vsc, relative rms; time of one evaluation",
+    "likelihood": "error of its logarithm; time of one evaluation, of many at once",
+    "uncertainty": "error in posterior standard deviations; time of one effective draw",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,13 +62,21 @@ class Level:
     dominated_by: str
     details: dict[str, Any]
 
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """Of a table of `COLUMNS`, for people."""
+        return (
+            self.name,
+            f"{self.error:.2g}",
+            engineering(self.seconds, "s", 3),
+            f"{self.ratio:.3g}",
+            "" if self.gradient_seconds is None else engineering(self.gradient_seconds, "s", 3),
+            f"{self.compile_seconds:.2f} s" if self.compile_seconds > 0.0 else "",
+            "" if self.memory is None else engineering(self.memory, "B", 3),
+        )
+
     def __str__(self) -> str:
-        gradient = "" if self.gradient_seconds is None else engineering(self.gradient_seconds, "s", 3)
-        memory = "" if self.memory is None else engineering(self.memory, "B", 3)
-        compiling = f"{self.compile_seconds:.2f} s" if self.compile_seconds > 0.0 else ""
-        seconds = engineering(self.seconds, "s", 3)
-        row = f"{self.name:24}{self.error:10.2g}{seconds:>11}{self.ratio:9.3g}{gradient:>11}{compiling:>10}{memory:>11}"
-        return row + (f"  dominated by {self.dominated_by}" if self.dominated_by else "")
+        return _row(self.cells) + (f"  dominated by {self.dominated_by}" if self.dominated_by else "")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,16 +117,15 @@ class Tradeoff:
         return dataclasses.asdict(self)
 
     def __str__(self) -> str:
-        titles = {
-            "response": "response: error of Vsc, relative rms; time of one evaluation",
-            "likelihood": "likelihood: error of its logarithm; time of one evaluation, of many at once",
-            "uncertainty": "uncertainty: error in posterior standard deviations; time of one effective draw",
-        }
         rows = [f"{self.record}; {self.machine['cpu']}, {self.machine['cores']} cores", ""]
-        for kind in ("response", "likelihood", "uncertainty"):
-            rows += [titles[kind], _COLUMNS, *map(str, self.of(kind)), ""]
-        rows.append(f"errors of uncertainty below {self.resolution:.2g} cannot be told from 0")
-        return "\n".join([*rows, *self.notes])
+        for kind, title in KINDS.items():
+            rows += [f"{kind}: {title}", _row(COLUMNS), *map(str, self.of(kind)), ""]
+        return "\n".join([*rows, self.resolved, *self.notes])
+
+    @property
+    def resolved(self) -> str:
+        """From where on errors of an uncertainty mean something."""
+        return f"errors of uncertainty below {self.resolution:.2g} cannot be told from 0"
 
 
 def measure_tradeoff(record: Record | None = None, scene: Scene | None = None, *, progress: bool = True) -> Tradeoff:
@@ -155,6 +168,11 @@ def measure_tradeoff(record: Record | None = None, scene: Scene | None = None, *
         machine=machine(),
         notes=_notes(full, fits, converged),
     )
+
+
+def _row(cells: Sequence[str]) -> str:
+    name, *others = cells
+    return f"{name:24}" + "".join(f"{x:>{width}}" for x, width in zip(others, _WIDTHS, strict=True))
 
 
 def _judged(kind: Kind, rows: Sequence[Measured], resolution: float) -> list[Level]:

@@ -93,4 +93,4 @@ def unit_of(name: str) -> str:
 
 def percent(share: float) -> str:
     """A share of 1, for people: ``percent(0.0123) == "1.2 %"``."""
-    return f"{100.0 * share:.2g} %"
+    return f"{100.0 * share:.0f} %" if share >= 0.995 else f"{100.0 * share:.2g} %"

@@ -205,6 +205,7 @@ def test_tradeoff_is_written_or_ends_without_a_trace(fitact_command, environment
     assert json.loads((tmp_path / "whole" / "tradeoff.json").read_text()) == content
     assert {level["kind"] for level in content["levels"]} == {"response", "likelihood", "uncertainty"}
     assert (tmp_path / "whole" / "tradeoff.svg").read_text().startswith("<?xml")
+    assert f"tradeoff {finger_path} --out whole" in (tmp_path / "whole" / "report.html").read_text()
 
 
 def test_prior_is_shown_before_any_data(fitact_command, tmp_path):

@@ -377,7 +377,7 @@ def test_the_command_writes_what_it_prints(tmp_path: Path, capsys: pytest.Captur
     assert command("design", "drive", file, "--out", tmp_path / "out", "--seed", 3, "--json") == 0
     content = json.loads(capsys.readouterr().out)
     assert content == json.loads((tmp_path / "out" / "drive.json").read_text())
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"drive.json", "drive.svg"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.html", "drive.json", "drive.svg"}
     assert [option["waveform"] for option in content["options"]] == ["sine", "triangle", "square"]
     assert content["options"][2]["at_assured"]["current_peak"] is None  # unbounded at an ideal edge
     assert command("design", "drive", "paper") == 2

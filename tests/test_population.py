@@ -367,6 +367,7 @@ def eight(tmp_path_factory) -> dict:
         "population.json",
         "population.nc",
         "population.svg",
+        "report.html",
         "chain.h5",
     }
     assert json.loads((folder / "out" / "population.json").read_text()) == json.loads(done.stdout)

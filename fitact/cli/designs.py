@@ -7,7 +7,7 @@ import typer
 
 from fitact.cli.app import app
 from fitact.cli.options import Channels, Json, Out, Scales, Seed, mapping
-from fitact.cli.terminal import finish, show, use_compilation_cache
+from fitact.cli.terminal import finish, show, typed, use_compilation_cache
 from fitact.files import write_json
 
 design = typer.Typer(
@@ -34,7 +34,7 @@ def measurement(
 ) -> None:
     """Which measurement would tell most of the mean force: the error to expect of each option, best first.
 
-    Into DIR it writes design.json and design.svg.
+    Into DIR it writes report.html, design.json and design.svg.
     """
     from fitact.model.scene import Scene
 
@@ -48,10 +48,12 @@ def measurement(
 
     found = design_measurement(stated, measured)
     if out is not None:
-        from fitact.report.design import write_design
+        from fitact.report.design import write_design, write_design_page
+        from fitact.report.frame import Origin
 
         write_json(out / "design.json", found.to_dict())
         write_design(out / "design.svg", found)
+        write_design_page(out / "report.html", found, Origin.of(typed(), stated, measured))
     show(str(found), found.to_dict(), json)
     finish(found.trusted)
 
@@ -72,7 +74,7 @@ def drive(
 ) -> None:
     """The smallest drive that enough people feel: by waveform, frequency and insulator, within stated limits.
 
-    Into DIR it writes drive.json and drive.svg.
+    Into DIR it writes report.html, drive.json and drive.svg.
     """
     from fitact.model.scene import Scene
 
@@ -92,9 +94,11 @@ def drive(
         people = population(measured, stated, seed=seed)
     found = design_drive(stated, people, share, seed=seed)
     if out is not None:
-        from fitact.report.drive_design import write_drive_design
+        from fitact.report.drive_design import write_drive_design, write_drive_design_page
+        from fitact.report.frame import Origin
 
         write_json(out / "drive.json", found.to_dict())
         write_drive_design(out / "drive.svg", found)
+        write_drive_design_page(out / "report.html", found, Origin.of(typed(), stated, measured))
     show(str(found), found.to_dict(), json)
     finish(found.trusted)

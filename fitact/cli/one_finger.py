@@ -148,14 +148,21 @@ def summary(directory: Results, json: Json = False) -> None:
 
 @app.command()
 def report(directory: Results, json: Json = False) -> None:
-    """Write the report of a folder of results again."""
-    from fitact.inference.summary import trusted as is_trusted
-    from fitact.report import read_results, write_report
-
-    tree, content = read_results(directory)
+    """Write the report of a folder of results again; of a population's, too."""
     page = directory / "report.html"
-    write_report(page, tree, content)
-    trusted = is_trusted(content)
+    if (directory / "population.json").exists():
+        from fitact.report.population_page import read_population, write_population_page
+
+        tree, content = read_population(directory)
+        write_population_page(page, tree, content)
+        trusted = bool(content["trusted"])
+    else:
+        from fitact.inference.summary import trusted as is_trusted
+        from fitact.report import read_results, write_report
+
+        tree, content = read_results(directory)
+        write_report(page, tree, content)
+        trusted = is_trusted(content)
     show(f"open {page}", {"report": str(page), "trusted": trusted}, json)
     finish(trusted)
 

@@ -8,7 +8,7 @@ import typer
 
 from fitact.cli.app import app
 from fitact.cli.options import Channels, Fresh, Json, Out, RecordFiles, Scales, Seed, mapping, numbers
-from fitact.cli.terminal import finish, say, show, use_compilation_cache
+from fitact.cli.terminal import finish, say, show, typed, use_compilation_cache
 from fitact.files import write_json
 
 if TYPE_CHECKING:
@@ -105,7 +105,8 @@ def population(
 ) -> None:
     """From one finger to people: how fingers differ, what force the next one will feel, and why.
 
-    Into DIR it writes population.json, population.nc (the draws), population.svg, and chain.h5 (for going on).
+    Into DIR it writes report.html, population.json, population.nc (the draws), population.svg, and chain.h5 (for
+    going on).
     """
     from fitact.data.covariates import read_covariates
     from fitact.model.scene import Scene
@@ -124,10 +125,12 @@ def population(
     )
     if out is not None:
         from fitact.report.population import write_population
+        from fitact.report.population_page import write_population_page
 
         write_json(out / "population.json", found.to_dict())
         found.to_netcdf(out / "population.nc")
         write_population(out / "population.svg", found)
+        write_population_page(out / "report.html", found.to_datatree(), found.to_dict())
     show(str(found), found.to_dict(), json)
     finish(found.trusted)
 
@@ -147,7 +150,7 @@ def tradeoff(
 ) -> None:
     """Measure what each level of response, likelihood and uncertainty costs and is off by, on this machine.
 
-    Takes a minute or two. With --out writes tradeoff.json and tradeoff.svg.
+    Takes a minute or two. With --out writes report.html, tradeoff.json and tradeoff.svg.
     """
     from fitact.data.formats import read
     from fitact.model.scene import Scene
@@ -162,9 +165,11 @@ def tradeoff(
         say("fitact: interrupted; nothing was written")
         raise typer.Exit(130) from None
     if out is not None:
-        from fitact.report.tradeoff import write_tradeoff
+        from fitact.report.frame import Origin
+        from fitact.report.tradeoff import write_tradeoff, write_tradeoff_page
 
         write_json(out / "tradeoff.json", found.to_dict())
         write_tradeoff(out / "tradeoff.svg", found)
+        write_tradeoff_page(out / "report.html", found, Origin.of(typed(), stated, [measured] if measured else []))
     show(str(found), found.to_dict(), json)
     finish(found.trusted)

@@ -7,7 +7,7 @@ import typer
 
 from fitact.cli.app import app
 from fitact.cli.options import Channels, Json, Out, Scales, Seed, mapping
-from fitact.cli.terminal import show, use_compilation_cache
+from fitact.cli.terminal import show, typed, use_compilation_cache
 from fitact.files import write_json
 
 
@@ -62,7 +62,7 @@ def plan(
 ) -> None:
     """What a scene requires of its model: what may be left out, what that changes, and what it saves.
 
-    Into DIR it writes plan.json and plan.svg.
+    Into DIR it writes report.html, plan.json and plan.svg.
     """
     from fitact.model.scene import Scene
 
@@ -82,10 +82,12 @@ def plan(
 
         found = plan_for(measured, stated)
     if out is not None:
-        from fitact.report.plan import write_plan
+        from fitact.report.frame import Origin
+        from fitact.report.plan import write_plan, write_plan_page
 
         write_json(out / "plan.json", found.to_dict())
         write_plan(out / "plan.svg", found)
+        write_plan_page(out / "report.html", found, Origin.of(typed(), stated, [measured] if measured else []))
     show(str(found), found.to_dict(), json)
 
 

@@ -2,6 +2,7 @@
 
 import os
 import platform
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,11 @@ def use_compilation_cache() -> None:
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # the many small ones take a second
+
+
+def typed() -> str:
+    """The command as it was typed."""
+    return shlex.join(["fitact", *sys.argv[1:]])
 
 
 def show(text: str, content: dict[str, Any], as_json: bool) -> None:

@@ -68,8 +68,11 @@ class MeasurementDesign:
     @property
     def best_for_effort(self) -> Option | None:
         """The option that gives most for its effort; None where nothing gains one part in a hundred."""
-        useful = [option for option in self.options if option.gain > _GAIN]
-        return max(useful, key=lambda option: option.gain_per_effort, default=None)
+        return max(self._telling, key=lambda option: option.gain_per_effort, default=None)
+
+    @property
+    def _telling(self) -> tuple[Option, ...]:
+        return tuple(option for option in self.options if option.gain > _GAIN)
 
     def to_dict(self) -> dict[str, Any]:
         """As in design.json."""
@@ -85,20 +88,33 @@ class MeasurementDesign:
         }
 
     def __str__(self) -> str:
-        """A table for people, what gives most for its effort, and what gives nothing."""
-        rows = [f"{'mean force':>10} {'contraction':>12} {'effort':>7} {'gain/effort':>12}"]
-        telling = [option for option in self.options if option.gain > _GAIN]
-        for option in (*telling, self.now):
-            figures = f"{'± ' + percent(option.force_sd):>10} {option.contraction:12.4f}"
-            cost = f"{option.effort:8.3g} {option.gain_per_effort:12.2f}" if option.effort else " " * 21
-            rows.append(f"{figures}{cost}  {option.text}")
-        best, others = self.best_for_effort, [option.name for option in self.options if option not in telling]
+        """The table for people, what gives most for its effort, and what gives nothing."""
+        rows = [
+            f"{sd:>10} {known:>12}{effort:>8} {gain:>12}  {text}".rstrip()
+            for text, sd, known, effort, gain in self.table
+        ]
+        return "\n".join([*rows, *self.sentences, *(f"warning: {warning}" for warning in self.warnings)])
+
+    @property
+    def table(self) -> tuple[tuple[str, ...], ...]:
+        """Titles; then what each option that tells more, and the measurement as it stands, tell of the force."""
+        rows = [("", "mean force", "contraction", "effort", "gain/effort")]
+        for option in (*self._telling, self.now):
+            cost = (f"{option.effort:.3g}", f"{option.gain_per_effort:.2f}") if option.effort else ("", "")
+            rows.append((option.text, f"± {percent(option.force_sd)}", f"{option.contraction:.4f}", *cost))
+        return tuple(rows)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What gives most for its effort, and what gives nothing."""
+        best, others = self.best_for_effort, [o.name for o in self.options if o not in self._telling]
+        found = []
         if best is not None:
             known = f"from ± {percent(self.now.force_sd)} to ± {percent(best.force_sd)}"
-            rows.append(f"Most for its effort: {best.text}, {known}.")
+            found.append(f"Most for its effort: {best.text}, {known}.")
         if others:
-            rows.append(f"Nothing is gained by: {', '.join(others)}.")
-        return "\n".join([*rows, *(f"warning: {warning}" for warning in self.warnings)])
+            found.append(f"Nothing is gained by: {', '.join(others)}.")
+        return tuple(found)
 
 
 def design_measurement(scene: Scene, records: Record | Sequence[Record] = ()) -> MeasurementDesign:

@@ -27,6 +27,10 @@ from fitact.model.skin import with_values
 from fitact.units import engineering
 
 COMPARED = ("sine", "triangle", "square", "trapezoid")
+LEGEND = (
+    f"* the scene's own; assured: met with {100.0 * ASSURANCE:g} % probability, and what is drawn there: power by the"
+    " median finger, current and insulator's voltage at most"
+)
 
 _FREQUENCIES = np.geomspace(10.0, 1000.0, 9)  # Hz, at which people feel
 _THICKNESSES = np.geomspace(0.01, 10.0, 13)  # over the scene's own, as in the paper's Fig. 12
@@ -134,29 +138,45 @@ class DriveDesign:
         return tuple(found)
 
     def summary(self) -> str:
-        """A table for people."""
-        smallest = self.smallest()
-        here = engineering(self.options[self.own].frequency, "Hz", 3)
-        titles = "".join(f"{title:>11}" for title in ("assured", "real", "apparent", "rms", "peak", "insulator"))
+        """The question, the table for people, what follows from it, and warnings."""
         rows = [
-            f"{100.0 * self.share:g} % of people feel {_threshold(self.scene)}; people: {self.people.source}",
-            f"{here:13}{'peak-to-peak':>13}{'90 %':>20}{titles}",
-            *(_row(name, option, name == self.own) for name, option in self.options.items()),
-            f"* the scene's own; assured: met with {100.0 * ASSURANCE:g} % probability, and what is drawn there: power"
-            " by the median finger, current and insulator's voltage at most",
+            f"{name:13}{median:>13}{between:>20}" + "".join(f"{x:>11}" for x in others)
+            for name, median, between, *others in self.table
         ]
-        rows += [f"{name}: excluded, {each}" for name, option in self.options.items() for each in option.violations]
+        warnings = (f"warning: {warning}" for warning in self.warnings)
+        return "\n".join([self.question, *rows, LEGEND, *self.excluded, *self.sentences, *warnings])
+
+    __str__ = summary
+
+    @property
+    def question(self) -> str:
+        """Who is to feel what."""
+        return f"{100.0 * self.share:g} % of people feel {_threshold(self.scene)}; people: {self.people.source}"
+
+    @property
+    def table(self) -> tuple[tuple[str, ...], ...]:
+        """Titles; then what each waveform takes, for people."""
+        here = engineering(self.options[self.own].frequency, "Hz", 3)
+        titles = here, "peak-to-peak", "90 %", "assured", "real", "apparent", "rms", "peak", "insulator"
+        return titles, *(_cells(name, option, name == self.own) for name, option in self.options.items())
+
+    @property
+    def excluded(self) -> tuple[str, ...]:
+        """Waveforms that break a limit, and which."""
+        return tuple(f"{name}: excluded, {each}" for name, option in self.options.items() for each in option.violations)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The smallest drives, the easiest frequencies and the thinnest insulator."""
+        smallest, found = self.smallest(), []
         for what, unit in DriveOption.CRITERIA.items():
             name = smallest[what]
             least = name and f"{name}, {shown(self.options[name].takes(what), unit)}"
-            rows.append(f"smallest {what.replace('_', ' ')}: {least or 'no waveform keeps the limits'}")
+            found.append(f"smallest {what.replace('_', ' ')}: {least or 'no waveform keeps the limits'}")
         best = {name: min(options, key=lambda option: option.assured) for name, options in self.by_frequency.items()}
         at = (f"{name} {engineering(o.frequency, 'Hz', 3)} ({shown(o.assured, 'V')})" for name, o in best.items())
-        rows += [f"easiest frequency of 10 Hz to 1 kHz, with the same threshold at all: {', '.join(at)}"]
-        rows += [f"{self.own}, {_thinnest(self.by_thickness)}"]
-        return "\n".join([*rows, *(f"warning: {warning}" for warning in self.warnings)])
-
-    __str__ = summary
+        found.append(f"easiest frequency of 10 Hz to 1 kHz, with the same threshold at all: {', '.join(at)}")
+        return *found, f"{self.own}, {_thinnest(self.by_thickness)}"
 
 
 def _threshold(scene: Scene) -> str:
@@ -166,7 +186,7 @@ def _threshold(scene: Scene) -> str:
     return f"friction that alternates by {change:.3g} of its mean"
 
 
-def _row(name: str, option: DriveOption, own: bool) -> str:
+def _cells(name: str, option: DriveOption, own: bool) -> tuple[str, ...]:
     low, median, high = (shown(quantile(option.amplitude, q), "V") for q in (0.05, 0.5, 0.95))
     between = f"{low} to {high}" if option.amplitude.size > 1 else ""
     of = option.at_assured
@@ -178,8 +198,7 @@ def _row(name: str, option: DriveOption, own: bool) -> str:
         (of.current_peak, "A"),
         (of.insulator_peak, "V"),
     )
-    columns = "".join(f"{shown(x, unit):>11}" for x, unit in values)
-    return f"{name + (' *' if own else ''):13}{median:>13}{between:>20}{columns}"
+    return name + (" *" if own else ""), median, between, *(shown(x, unit) for x, unit in values)
 
 
 def _thinnest(options: tuple[DriveOption, ...]) -> str:

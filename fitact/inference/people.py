@@ -23,8 +23,11 @@ from fitact.model.scene import Scene
 from fitact.units import engineering, unit_of
 
 _LAWS, _FINGERS = 1000, 32  # that new fingers are drawn from, and of each
+_IN_TIME, _TIMES = 4000, 256  # new fingers whose force is followed in time, and times
+QUANTILES = (0.025, 0.05, 0.25, 0.5, 0.75, 0.95, 0.975)  # of it
 OFF = 0.1  # standard deviations of a mean that the fingers' tables may shift it by
 SHARED_OUT = ("force_mean", "force_peak")  # whose variance is
+SHARES = "factors: the share of the variance that goes once each is known (that stays if only it is not)"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,6 +117,10 @@ class Population:
         return self.finger.each(self.factors)
 
     @functools.cached_property
+    def _believed(self) -> Float[np.ndarray, "laws fingers names"]:
+        return self.finger.each(self.prior_factors)
+
+    @functools.cached_property
     def shares(self) -> Shares:
         """Of each factor in the variance of the next finger's force; see `variance_shares`."""
         return self._shares_of(self.factors)
@@ -128,6 +135,37 @@ class Population:
 
     def to_dict(self) -> dict[str, Any]:
         """What `fitact population --json` prints and population.json holds."""
+        new: dict[str, dict[str, Any]] = {}
+        for name, values in self.new_fingers().items():
+            spread = Spread.of(values)
+            shares = {"people": spread.share_of_people, "ignorance": 1.0 - spread.share_of_people}
+            new[name] = summary.of_draws(name, values) | {"variance": shares}
+        return {
+            "population": self._law(),
+            "new_finger": new,
+            "variance_shares": self.shares,
+            "variance_shares_prior": self.prior_shares,
+            "fingers": [
+                {
+                    "record": each.source,
+                    "sha256": each.fingerprint,
+                    "result": each.result,
+                    "message": each.message,
+                    "parameters": each.parameters,
+                }
+                for each in self.fingers
+            ],
+            "convergence": dataclasses.asdict(self.convergence) | {"sentence": str(self.convergence)},
+            "integrals_off": self.off,
+            "warnings": list(self.warnings),
+            "trusted": self.trusted,
+            "seed": self.seed,
+            "scene": self.scene.model_dump(mode="json", exclude_unset=True),
+            "versions": summary.versions(),
+        }
+
+    def _law(self) -> dict[str, Any]:
+        """Summaries of the law."""
         draws = self.parameters()
         law: dict[str, Any] = {
             name: {
@@ -146,59 +184,29 @@ class Population:
                 self.covariates.names, self.covariates.mean, self.covariates.sd, self.at, strict=True
             )
         }
-        new: dict[str, dict[str, Any]] = {}
-        for name, values in self.new_fingers().items():
-            spread = Spread.of(values)
-            shares = {"people": spread.share_of_people, "ignorance": 1.0 - spread.share_of_people}
-            new[name] = summary.of_draws(name, values) | {"variance": shares}
-        return {
-            "population": law,
-            "new_finger": new,
-            "variance_shares": self.shares,
-            "variance_shares_prior": self.prior_shares,
-            "fingers": [
-                {"record": each.source, "result": each.result, "parameters": each.parameters} for each in self.fingers
-            ],
-            "convergence": dataclasses.asdict(self.convergence) | {"sentence": str(self.convergence)},
-            "integrals_off": self.off,
-            "warnings": list(self.warnings),
-            "seed": self.seed,
-            "scene": self.scene.model_dump(mode="json", exclude_unset=True),
-        }
+        return law
 
     def summary(self) -> str:
-        """A table for people."""
+        """A table for people, what the force's variance depends on, and warnings."""
         content = self.to_dict()
-        rows = [f"{len(self.fingers)} fingers{'':14}{'median':>12}{'2.5 %':>14}{'97.5 %':>12}"]
-        shown = {f"{name}, {key}": s for name in SKIN for key, s in content["population"][name].items()}
-        shown |= {name: content["population"][name] for name in (SHARED, "correlation")}
-        if self.hierarchy.area_varies:
-            shown["contact area, log_sd"] = content["population"][AREA]["log_sd"]
-        shown |= {
-            f"{skin}, slope in {name}": of[skin]["slope"]
-            for name, of in content["population"]["covariates"].items()
-            for skin in SKIN
-        }
-        new = content["new_finger"]
-        shown |= {f"next finger, {name}": new[name] for name in NAMES}
-        for name, s in shown.items():
-            median, low, high = (engineering(float(s[q]), str(s["unit"])) for q in ("q50", "q025", "q975"))
-            rows.append(f"{name:26}{median:>12}{low:>14}{high:>12}")
-        for name in SHARED_OUT:
-            people = 100.0 * new[name]["variance"]["people"]
-            parts = (
-                f"{factor} {100.0 * share['first']:.0f} % ({100.0 * share['total']:.0f} %)"
-                for factor, share in content["variance_shares"][name].items()
-            )
-            rows.append(f"variance of {name}: {people:.0f} % people, the rest ignorance; {', '.join(parts)}")
-        rows.append("factors: the share of the variance that goes once each is known (that stays if only it is not)")
-        rows.append(str(self.convergence))
+        rows = [f"{name:26}{median:>12}{low:>14}{high:>12}" for name, median, low, high in table(content)]
+        rows += [*variance_sentences(content), SHARES, str(self.convergence)]
         return "\n".join([*rows, *(f"warning: {warning}" for warning in self.warnings)])
 
     __str__ = summary
 
+    @functools.cached_property
+    def force_in_time(self) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "quantiles times"]]:
+        """Times (s) of a period (all of a drive without one), and `QUANTILES` of the next finger's force (N)."""
+        factors = self.factors.reshape(-1, len(self.finger.factors))
+        time, force = self.finger.force_in_time(factors[:: max(1, len(factors) // _IN_TIME)], _TIMES)
+        return time, np.quantile(force, QUANTILES, axis=0)
+
     def to_datatree(self) -> Any:
-        """An `xarray.DataTree`: the law's draws in ArviZ's `posterior`, and `new_fingers` with their `factors`."""
+        """An `xarray.DataTree`: the law's draws in ArviZ's `posterior`, and `new_fingers` with their `factors`.
+
+        Beside them the force of fingers before any record, `prior_new_fingers`, and of those to come, `force_in_time`.
+        """
         import xarray as xr
 
         def dataset(draws: dict[str, np.ndarray], dims: tuple[str, str]) -> xr.Dataset:
@@ -206,6 +214,18 @@ class Population:
 
         drawn = dataset(self.new_fingers(), ("law", "finger"))
         drawn["log_factors"] = ("law", "finger", "factor"), self.factors
+        prior = {name: self._believed[..., self.finger.names.index(name)] for name in SHARED_OUT}
+        time, force = self.force_in_time
+        friction = {
+            "friction_coefficient": float(self.finger.derive.coefficient),
+            "normal_force": float(self.finger.derive.normal_force),
+            "periodic": int(self.finger.frequency is not None),
+        }
+        in_time = xr.Dataset(
+            {"force": (("quantile", "time"), force, {"units": "N"})},
+            {"quantile": list(QUANTILES), "time": ("time", time, {"units": "s"})},
+            friction,
+        )
         about = {
             "inference_library": "fitact",
             "inference_library_version": importlib.metadata.version("fitact"),
@@ -217,6 +237,8 @@ class Population:
                 "/": xr.Dataset(attrs=about),
                 "posterior": dataset(self.parameters(), ("chain", "draw")),
                 "new_fingers": drawn.assign_coords(factor=list(self.finger.factors)),
+                "prior_new_fingers": dataset(prior, ("law", "finger")),
+                "force_in_time": in_time,
             }
         )
 
@@ -224,6 +246,32 @@ class Population:
         """Write `to_datatree()` as NetCDF."""
         with replacing(path) as temporary:
             self.to_datatree().to_netcdf(temporary, engine="h5netcdf")
+
+
+def table(content: dict[str, Any]) -> tuple[tuple[str, ...], ...]:
+    """Titles; then the law and the next finger of what population.json holds, for people."""
+    law, new = content["population"], content["new_finger"]
+    shown = {f"{name}, {key}": s for name in SKIN for key, s in law[name].items()}
+    shown |= {name: law[name] for name in (SHARED, "correlation")}
+    if AREA in law:
+        shown["contact area, log_sd"] = law[AREA]["log_sd"]
+    shown |= {f"{skin}, slope in {name}": of[skin]["slope"] for name, of in law["covariates"].items() for skin in SKIN}
+    shown |= {f"next finger, {name}": new[name] for name in NAMES}
+    rows = ((name, *(engineering(s[q], s["unit"]) for q in ("q50", "q025", "q975"))) for name, s in shown.items())
+    return (f"{len(content['fingers'])} fingers", "median", "2.5 %", "97.5 %"), *rows
+
+
+def variance_sentences(content: dict[str, Any]) -> tuple[str, ...]:
+    """What the variance of the next finger's force comes from, by what population.json holds."""
+    found = []
+    for name in SHARED_OUT:
+        people = 100.0 * content["new_finger"][name]["variance"]["people"]
+        parts = (
+            f"{factor} {100.0 * share['first']:.0f} % ({100.0 * share['total']:.0f} %)"
+            for factor, share in content["variance_shares"][name].items()
+        )
+        found.append(f"variance of {name}: {people:.0f} % people, the rest ignorance; {', '.join(parts)}")
+    return tuple(found)
 
 
 def laws(hierarchy: Hierarchy, points: Float[np.ndarray, "chains draws n"]) -> Law:

@@ -5,7 +5,6 @@ import dataclasses
 import functools
 import importlib.metadata
 import os
-import platform
 from collections.abc import Callable
 from typing import Any, Self
 
@@ -32,7 +31,6 @@ _DRAWS = 2500  # kept per ensemble, spread over its walkers and steps
 _CHAINS = 4  # that independent draws are dealt out to
 _PREDICTED = 50  # records predicted per ensemble
 _PREDICTED_SAMPLES = 4000  # at most that many of the record's samples are predicted
-_PACKAGES = ("fitact", "jax", "equinox", "optimistix", "emcee", "numpy", "xarray")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,7 +158,7 @@ class Posterior:
             "seed": self.seed,
             "record": self._record(),
             "scene": self.fit.scene.model_dump(mode="json", exclude_unset=True),
-            "versions": _versions(),
+            "versions": summary.versions(),
         }
 
     def _record(self) -> dict[str, Any]:
@@ -270,10 +268,6 @@ class Posterior:
 
         stated = {} if plan is None else {"plan": {"used": "planned", "sentence": plan.sentence} | plan.to_dict()}
         write_report(path, self.to_datatree(), self.summary() | stated)
-
-
-def _versions() -> dict[str, str]:
-    return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in _PACKAGES}
 
 
 def _axis(trace: TraceFit) -> str:

@@ -1,8 +1,10 @@
 """Summaries of one quantity: mean, sd and quantiles, from draws or from a Laplace approximation; and of them all."""
 
+import importlib.metadata
 import json
 import math
 import os
+import platform
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from jaxtyping import Float
 from fitact.errors import InputError
 from fitact.units import engineering, unit_of
 
+_PACKAGES = ("fitact", "jax", "equinox", "optimistix", "emcee", "numpy", "xarray")
 _OPEN = 1e6  # times the mean: a standard deviation that says nothing
 _SECTIONS = {"parameters", "derived", "identifiability", "convergence", "fit", "model", "warnings", "record"}
 # standard normal quantiles of the summary's probabilities
@@ -93,6 +96,11 @@ def table(content: dict[str, Any]) -> str:
     rows += [f"force: {BY_FORCE[content['model'].get('force', 'paper')]}."]
     rows += [content[section]["sentence"] for section in ("convergence", "identifiability")]
     return "\n".join([*rows, *(f"warning: {warning}" for warning in content["warnings"])])
+
+
+def versions() -> dict[str, str]:
+    """Of Python and of what results depend on."""
+    return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in _PACKAGES}
 
 
 def trusted(content: dict[str, Any]) -> bool:

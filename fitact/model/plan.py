@@ -23,6 +23,7 @@ from fitact.units import engineering, percent
 _NOT_OF_THE_CIRCUIT = ("sigma", "sigma_I")
 _QUANTILE = 0.95
 _TITLES = ("Vsc rms", "Vsc peak", "mean force", "peak force")
+LEGEND = "Relative errors at the nominal values; in brackets, what 95 % of the prior stay below."
 
 Values = Mapping[str, Float[np.ndarray, " draws"]]
 
@@ -128,17 +129,25 @@ class Plan:
         return {"omissions": each, "model": self.model(), "warnings": list(self.warnings)}
 
     def summary(self) -> str:
-        """A table for people: errors of every omission, at the nominal values and at 95 % of the prior."""
-        rows = [f"{'omission':17}" + "".join(f"{title:>22}" for title in _TITLES) + f"{'speedup':>9}  decision"]
-        for omission in self.omissions:
-            decision = f"{'kept' if omission.kept else 'left out'}: {omission.because}"
-            rows.append(_row(omission.name, omission.nominal, omission.q95, omission.speedup) + f"  {decision}")
-        rows += [
-            _row("planned model", self.nominal, self.q95, self.speedup),
-            "Relative errors at the nominal values; in brackets, what 95 % of the prior stay below.",
-            self.sentence,
+        """The table for people, what is left out, and warnings."""
+        rows = [
+            f"{name:17}" + "".join(f"{error:>22}" for error in errors) + f"{speedup:>9}  {decision}".rstrip()
+            for name, *errors, speedup, decision in self.table
         ]
-        return "\n".join([*rows, *(f"warning: {warning}" for warning in self.warnings)])
+        return "\n".join([*rows, LEGEND, self.sentence, *(f"warning: {warning}" for warning in self.warnings)])
+
+    @property
+    def table(self) -> tuple[tuple[str, ...], ...]:
+        """Titles; then errors and speed of every omission and of the planned model, and why, for people."""
+        decisions = [f"{'kept' if each.kept else 'left out'}: {each.because}" for each in self.omissions]
+        return (
+            ("omission", *_TITLES, "speedup", "decision"),
+            *(
+                (*_cells(o.name, o.nominal, o.q95, o.speedup), why)
+                for o, why in zip(self.omissions, decisions, strict=True)
+            ),
+            (*_cells("planned model", self.nominal, self.q95, self.speedup), ""),
+        )
 
     @property
     def sentence(self) -> str:
@@ -261,6 +270,6 @@ def _named_errors(nominal: Errors, q95: Errors) -> dict[str, float]:
     }
 
 
-def _row(name: str, nominal: Errors, q95: Errors, speedup: float) -> str:
-    cells = (f"{percent(a)} ({percent(b)})" for a, b in zip(nominal, q95, strict=True))
-    return f"{name:17}" + "".join(f"{cell:>22}" for cell in cells) + f"{speedup:8.2f}x"
+def _cells(name: str, nominal: Errors, q95: Errors, speedup: float) -> tuple[str, ...]:
+    errors = (f"{percent(a)} ({percent(b)})" for a, b in zip(nominal, q95, strict=True))
+    return name, *errors, f"{speedup:.2f}x"

@@ -1,4 +1,4 @@
-"""A drive's design as a picture: who feels it, at which frequency, on which insulator."""
+"""A drive's design as a picture and as a page: who feels it, at which frequency, on which insulator."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -9,9 +9,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from fitact.inference.drive_design import DriveDesign
-from fitact.inference.drive_option import DriveOption, quantile
+from fitact.inference.drive_design import LEGEND, DriveDesign
+from fitact.inference.drive_option import PEOPLE, DriveOption, quantile, shown
+from fitact.report import charts
+from fitact.report.charts import Axis
+from fitact.report.frame import Answer, Frame, Origin, image, write_page
 from fitact.report.plots import log_ticks, write_svg
+from fitact.units import engineering
 
 _COLORS = {
     "sine": "#0072B2",
@@ -37,6 +41,18 @@ def _figure(design: DriveDesign) -> Figure:
     (curves, frequencies), (thicknesses, permittivities) = figure.subplots(2, 2)
     _draw_curves(curves, design)
     _draw_frequencies(frequencies, design)
+    _draw_both_insulators(thicknesses, permittivities, design)
+    return figure
+
+
+def _insulator_figure(design: DriveDesign) -> Figure:
+    figure = Figure(figsize=(11.0, 4.0), layout="constrained")
+    thicknesses, permittivities = figure.subplots(1, 2)
+    _draw_both_insulators(thicknesses, permittivities, design)
+    return figure
+
+
+def _draw_both_insulators(thicknesses: Axes, permittivities: Axes, design: DriveDesign) -> None:
     _draw_insulators(thicknesses, design, design.by_thickness, lambda o: o.device.insulator_thickness)
     thicknesses.set_xscale("log")
     thickness = [option.device.insulator_thickness for option in design.by_thickness]
@@ -46,7 +62,6 @@ def _figure(design: DriveDesign) -> Figure:
     thicknesses.legend(fontsize=9)
     _draw_insulators(permittivities, design, design.by_permittivity, lambda o: o.device.insulator_permittivity)
     permittivities.set_xlabel("insulator's relative permittivity")
-    return figure
 
 
 def _own_first(design: DriveDesign) -> list[str]:
@@ -136,3 +151,108 @@ def _volts(axes: Axes) -> None:
         return
     axes.set_yscale("log")
     log_ticks(axes.yaxis, "V")
+
+
+def write_drive_design_page(path: str | os.PathLike[str], design: DriveDesign, origin: Origin) -> None:
+    """Write a drive's design as a page.
+
+    Raises:
+        InputError: the place cannot be written.
+    """
+    people = [("waveform", *(f"{100.0 * share:g} %" for share in PEOPLE))]
+    people += [(name, *(shown(each, "V") for each in option.people)) for name, option in design.options.items()]
+    write_page(
+        path,
+        "drive.html",
+        _frame(design),
+        origin,
+        table=design.table,
+        legend=LEGEND,
+        excluded=design.excluded,
+        separated=design.people.separated,
+        people=people,
+        limits=_limits(design),
+        curves=_curve_chart(design),
+        curves_image=image(lambda: _alone(_draw_curves, design)),
+        frequencies=_frequency_chart(design),
+        frequencies_image=image(lambda: _alone(_draw_frequencies, design)),
+        insulators=image(lambda: _insulator_figure(design)),
+    )
+
+
+def _frame(design: DriveDesign) -> Frame:
+    least, *others = (sentence.split(": ", 1) for sentence in design.sentences)
+    kept = design.smallest()["peak_to_peak"] is not None
+    verdict = f"The {least[0]} within the limits: {least[1]}" if kept else "No waveform keeps the limits"
+    findings = {"Who is to feel what": f"{design.question}."}
+    findings |= {f"{what[0].upper()}{what[1:]}": f"{answer}." for what, answer in (others if kept else others[2:])}
+    return Frame(
+        title=f"The smallest drive that {100.0 * design.share:g} % of people feel",
+        subject=f"Peak-to-peak amplitude, power, current and the insulator's voltage by waveform at"
+        f" {engineering(design.options[design.own].frequency, 'Hz', 3)}, by frequency and by insulator.",
+        trusted=design.trusted,
+        verdict=verdict if design.trusted else f"{'; '.join(design.warnings)}.",
+        findings=findings,
+        answers=[
+            Answer(name, shown(option.assured, "V"), "excluded" if option.violations else "keeps the limits stated")
+            for name, option in design.options.items()
+        ],
+        warnings=design.warnings,
+        reserved=not kept,
+    )
+
+
+def _limits(design: DriveDesign) -> tuple[tuple[str, str], ...]:
+    device = design.scene.device
+    stated = (
+        ("the insulator breaks down", design.options[design.own].breakdown_voltage, "V"),
+        ("rms current", device.current_limit_rms, "A"),
+        ("peak current", device.current_limit_peak, "A"),
+    )
+    return tuple((name, "not stated" if x is None else engineering(x, unit)) for name, x, unit in stated)
+
+
+def _alone(draw: Callable[[Axes, DriveDesign], None], design: DriveDesign) -> Figure:
+    figure = Figure(figsize=(9.0, 4.6), layout="constrained")
+    draw(figure.add_subplot(), design)
+    return figure
+
+
+def _curve_chart(design: DriveDesign) -> charts.Chart:
+    curves = {name: design.curve(name) for name in design.options}
+    x = Axis.of("peak-to-peak amplitude", "V", curves[design.own]["peak_to_peak"], log=True)
+    y = Axis("people who feel it", "%", 0.01)
+    traces = []
+    for name in _own_first(design):
+        curve, color = curves[name], _COLORS[name]
+        at = curve["peak_to_peak"]
+        if design.people.separated:
+            edges = (f"{name}, 5 %", f"{name}, 95 %", f"{name}, 90 % band")
+            band = charts.band(x, y, at, curve["q05"], curve["q95"], edges, color)
+            traces += [each | {"showlegend": False} for each in band]
+        traces.append(charts.line(x, y, at, curve["q50"], name, color, width=_width(design, name)))
+    at = curves[design.own]["peak_to_peak"][[0, -1]]
+    traces.append(charts.line(x, y, at, [design.share] * 2, "asked for", _LIMIT, dash="dash"))
+    plot = charts.plot(x, (y, traces), size=420)
+    plot["layout"]["legend"]["traceorder"] = "normal"  # bands would turn it over
+    return charts.chart(plot, controls=[charts.logarithmic([plot])])
+
+
+def _frequency_chart(design: DriveDesign) -> charts.Chart:
+    needed = {
+        name: [float(quantile(option.amplitude, 0.5)) for option in options]
+        for name, options in design.by_frequency.items()
+    }
+    x = Axis.of(
+        "frequency of the drive", "Hz", [option.frequency for option in design.by_frequency[design.own]], log=True
+    )
+    y = Axis.of("peak-to-peak amplitude needed", "V", needed[design.own], log=True)
+    traces = [
+        charts.line(
+            x, y, [option.frequency for option in design.by_frequency[name]], _drawn(needed[name]), name, _COLORS[name],
+            width=_width(design, name),
+        )
+        for name in _own_first(design)
+    ]  # fmt: skip
+    plot = charts.plot(x, (y, traces), size=420)
+    return charts.chart(plot, controls=[charts.logarithmic([plot], "xy", "logarithmic axes")])

@@ -1,4 +1,4 @@
-"""The plan as a picture: what each omission changes, beside the tolerance."""
+"""The plan as a picture and as a page: what each omission changes, beside the tolerance."""
 
 import os
 
@@ -6,8 +6,10 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from fitact.model.plan import Plan
+from fitact.model.plan import LEGEND, Plan
+from fitact.report.frame import Answer, Frame, Origin, image, write_page
 from fitact.report.plots import write_svg
+from fitact.units import percent
 
 _KEPT, _LEFT_OUT, _LIMIT = "#999999", "#0072B2", "#D55E00"
 _LEAST = 1e-8  # an error drawn on a logarithmic axis
@@ -43,3 +45,35 @@ def _figure(plan: Plan) -> Figure:
     handles = [mpl.patches.Patch(color=_LEFT_OUT, label="left out"), mpl.patches.Patch(color=_KEPT, label="kept")]
     figure.legend(handles=[*handles, *axes.get_legend_handles_labels()[0]], loc="outside upper center", ncols=4)
     return figure
+
+
+def write_plan_page(path: str | os.PathLike[str], plan: Plan, origin: Origin) -> None:
+    """Write a plan's page.
+
+    Raises:
+        InputError: the place cannot be written.
+    """
+    tolerance = percent(plan.full.tolerance.force)
+    kept = "" if not plan.warnings else " at the nominal values, but not over the prior"
+    frame = Frame(
+        title="Which model the scene requires",
+        subject="What everything that the scene names changes in Vsc and force, and the cheapest model that keeps"
+        f" [tolerance] force = {tolerance}.",
+        trusted=True,
+        verdict=f"The planned model keeps the tolerance of {tolerance} of the force{kept}",
+        findings={"What is left out": plan.sentence},
+        answers=[
+            Answer(
+                "mean force", percent(plan.nominal.force_mean), f"95 % of the prior: {percent(plan.q95.force_mean)}"
+            ),
+            Answer(
+                "peak force", percent(plan.nominal.force_peak), f"95 % of the prior: {percent(plan.q95.force_peak)}"
+            ),
+            Answer("peak of Vsc", percent(plan.nominal.Vsc_peak), f"95 % of the prior: {percent(plan.q95.Vsc_peak)}"),
+            Answer("speed", f"{plan.speedup:.3g}×", "of the full model"),
+        ],
+        warnings=plan.warnings,
+        reserved=bool(plan.warnings),
+    )
+    picture = image(lambda: _figure(plan))
+    write_page(path, "plan.html", frame, origin, table=plan.table, legend=LEGEND, model=plan.model(), picture=picture)

@@ -4,7 +4,6 @@ import os
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
@@ -12,10 +11,11 @@ from matplotlib.ticker import EngFormatter, PercentFormatter
 from fitact.inference.people import Population
 from fitact.report.plots import log_ticks, write_svg
 
+NOT_DRAWN = "Not drawn: some draws are not finite."
+SETTINGS = {"legend.fontsize": 9.0}
 _LAW, _FINGER, _OTHER = "#0072B2", "#333333", "#D55E00"
 _SHOWN = 4000  # new fingers
-_TIMES = 256  # in a period
-_BANDS = {50: 0.55, 90: 0.3, 95: 0.15}  # per cent of the fingers: how opaque
+_BANDS = {(0.025, 0.975): 0.15, (0.05, 0.95): 0.3, (0.25, 0.75): 0.55}  # quantiles: how opaque between
 _BINS = 50
 
 
@@ -25,27 +25,33 @@ def write_population(path: str | os.PathLike[str], population: Population) -> No
     Raises:
         InputError: the place cannot be written.
     """
-    write_svg(path, lambda: _figure(population), **{"legend.fontsize": 9.0})
+    tree, content = population.to_datatree(), population.to_dict()
+    write_svg(path, lambda: _figure(tree, content), **SETTINGS)
 
 
-def _figure(population: Population) -> Figure:
+def _figure(tree: Any, content: dict[str, Any]) -> Figure:
     figure = Figure(figsize=(11.0, 8.4), layout="constrained")
-    (skin, force), (time, shares) = figure.subplots(2, 2)
-    new = population.new_fingers()
-    _draw_skin(skin, population, new["Rsc"].ravel()[:_SHOWN], new["Csc"].ravel()[:_SHOWN])
-    _draw_force(force, new["force_mean"])
-    _draw_time(time, population)
-    _draw_shares(shares, population)
+    if not drawable(tree):
+        figure.text(0.5, 0.5, NOT_DRAWN, ha="center")
+        return figure
+    for axes, draw in zip(figure.subplots(2, 2).flat, (draw_skin, draw_force, draw_time, draw_shares), strict=True):
+        draw(axes, tree, content)
     return figure
 
 
-def _draw_skin(
-    axes: Axes, population: Population, Rsc: Float[np.ndarray, " fingers"], Csc: Float[np.ndarray, " fingers"]
-) -> None:
+def drawable(tree: Any) -> bool:
+    """Whether every draw has a place on a logarithmic axis; a chain that was cut short may hold others."""
+    drawn = (values.values for name in ("new_fingers", "prior_new_fingers") for values in tree[name].data_vars.values())
+    return all(bool(np.all(np.isfinite(values))) for values in drawn)
+
+
+def draw_skin(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
+    """Rsc and Csc of the fingers, with 95 % intervals, and of fingers to come."""
+    Rsc, Csc = (tree["new_fingers"][name].values.ravel()[:_SHOWN] for name in ("Rsc", "Csc"))
     axes.plot(Rsc, Csc, ".", ms=2, color=_LAW, alpha=0.25, rasterized=True, label="fingers to come")
-    for number, finger in enumerate(population.fingers):
+    for number, finger in enumerate(content["fingers"]):
         (x, y), (dx, dy) = (
-            [np.array([finger.parameters[name][key] for key in keys], dtype=float) for name in ("Rsc", "Csc")]
+            [np.array([finger["parameters"][name][key] for key in keys], dtype=float) for name in ("Rsc", "Csc")]
             for keys in (["q50"], ["q025", "q975"])
         )
         label = "fingers, 95 %" if number == 0 else None
@@ -61,9 +67,9 @@ def _draw_skin(
     axes.legend(markerscale=2)
 
 
-def _draw_force(axes: Axes, values: Float[np.ndarray, "laws fingers"]) -> None:
+def draw_force(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
     """What the next finger may feel; and for each law that may be the true one, what its fingers feel."""
-    logs = np.log(values)
+    logs = np.log(tree["new_fingers"]["force_mean"].values)
     least, largest = np.quantile(logs, [0.002, 0.998]).tolist()
     edges = np.linspace(least, largest, _BINS + 1)
     middle = np.exp(0.5 * (edges[1:] + edges[:-1]))
@@ -84,16 +90,15 @@ def _draw_force(axes: Axes, values: Float[np.ndarray, "laws fingers"]) -> None:
     axes.legend()
 
 
-def _draw_time(axes: Axes, population: Population) -> None:
+def draw_time(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
     """Bands of force in time over fingers to come; friction, by eq. (2), on the other side."""
-    finger = population.finger
-    factors = population.factors.reshape(-1, len(finger.factors))
-    time, force = finger.force_in_time(factors[:: max(1, len(factors) // _SHOWN)], _TIMES)
-    for share, opaque in reversed(_BANDS.items()):
-        low, high = np.quantile(force, [0.5 - share / 200.0, 0.5 + share / 200.0], axis=0)
-        axes.fill_between(time, low, high, color=_LAW, alpha=opaque, lw=0, label=f"{share} % of fingers")
-    axes.plot(time, np.median(force, axis=0), color=_FINGER, lw=1.0, label="median")
-    coefficient, normal = (float(x) for x in (finger.derive.coefficient, finger.derive.normal_force))
+    drawn = tree["force_in_time"]
+    time, force = drawn["time"].values, dict(zip(drawn["quantile"].values.tolist(), drawn["force"].values, strict=True))
+    for (low, high), opaque in _BANDS.items():
+        label = f"{100.0 * (high - low):g} % of fingers"
+        axes.fill_between(time, force[low], force[high], color=_LAW, alpha=opaque, lw=0, label=label)
+    axes.plot(time, force[0.5], color=_FINGER, lw=1.0, label="median")
+    coefficient, normal = drawn.attrs["friction_coefficient"], drawn.attrs["normal_force"]
 
     def friction(force: Any) -> Any:
         return coefficient * (np.asarray(force) + normal)
@@ -106,18 +111,17 @@ def _draw_time(axes: Axes, population: Population) -> None:
     axes.yaxis.set_major_formatter(EngFormatter("N"))
     right.yaxis.set_major_formatter(EngFormatter("N"))
     axes.set_xlim(time[0], time[-1])
-    axes.set_ylim(0.0, 1.3 * float(np.quantile(force, 0.975, axis=0).max()))  # room for the legend
-    axes.set_xlabel("time in the period" if finger.frequency is not None else "time")
+    axes.set_ylim(0.0, 1.3 * float(max(force[high].max() for _, high in _BANDS)))  # room for the legend
+    axes.set_xlabel("time in the period" if drawn.attrs["periodic"] else "time")
     axes.set_ylabel("electrostatic force")
     right.set_ylabel("friction")
     axes.set_title("The next finger in time")
     axes.legend(ncols=2)
 
 
-def _draw_shares(axes: Axes, population: Population) -> None:
+def draw_shares(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
     """Each factor's share of the variance of the mean force, the largest on top; before the records, too."""
-    name = "force_mean"
-    after, before = population.shares[name], population.prior_shares[name]
+    after, before = (content[key]["force_mean"] for key in ("variance_shares", "variance_shares_prior"))
     order = sorted(after, key=lambda factor: after[factor]["total"])
     height = 0.2
     rows = (

@@ -1,6 +1,9 @@
-"""Speed against accuracy as a picture: error over cost, one panel a kind, the Pareto front joined."""
+"""Speed against accuracy as a picture and as a page: error over cost, the Pareto front joined."""
 
+import functools
 import itertools
+import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -12,14 +15,19 @@ from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, NullLocat
 from matplotlib.transforms import Bbox
 
 from fitact.files import replacing
-from fitact.report.plots import style
-from fitact.tradeoff import Kind, Level, Tradeoff
+from fitact.report import charts
+from fitact.report.charts import Axis
+from fitact.report.frame import Answer, Frame, Origin, image, write_page
+from fitact.report.plots import PRIOR, style
+from fitact.tradeoff import COLUMNS, KINDS, Kind, Level, Tradeoff
+from fitact.units import engineering
 
 _TITLES: dict[Kind, tuple[str, str, str]] = {
     "response": ("response", "one evaluation", "error of Vsc, relative rms"),
     "likelihood": ("likelihood", "one evaluation, of many at once", "error of the log-likelihood"),
     "uncertainty": ("uncertainty", "one effective draw", "error, posterior standard deviations"),
 }
+_STYLE = {"axes.grid": False}
 _FRONT, _DOMINATED = "#0072B2", "#D55E00"
 _BELOW = 30.0  # times below the least error is where an error of 0 is drawn
 _SIDES = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1)]
@@ -32,15 +40,15 @@ def write_tradeoff(path: Path, tradeoff: Tradeoff) -> None:
         InputError: the place cannot be written.
     """
     metadata = {"Date": None} if path.suffix == ".svg" else {}
-    with mpl.rc_context(style() | {"axes.grid": False}), replacing(path) as temporary:
+    with mpl.rc_context(style() | _STYLE), replacing(path) as temporary:
         draw(tradeoff).savefig(temporary, format=path.suffix[1:], dpi=150, metadata=metadata)
 
 
-def draw(tradeoff: Tradeoff) -> Figure:
-    """The picture."""
-    figure = Figure(figsize=(13.0, 4.8), layout="constrained")
+def draw(tradeoff: Tradeoff, kinds: Sequence[Kind] = tuple(_TITLES)) -> Figure:
+    """The picture of some kinds of level."""
+    figure = Figure(figsize=(13.0 if len(kinds) > 1 else 9.0, 4.8), layout="constrained")
     canvas = FigureCanvasAgg(figure)
-    panels = dict(zip(_TITLES, figure.subplots(1, len(_TITLES)), strict=True))
+    panels = dict(zip(kinds, figure.subplots(1, len(kinds), squeeze=False)[0], strict=True))
     for kind, axes in panels.items():
         _draw(axes, kind, tradeoff)
     canvas.draw()  # so that it is known where everything is
@@ -127,3 +135,81 @@ def _name(axes: Axes, levels: tuple[Level, ...], canvas: FigureCanvasAgg) -> Non
         else:
             axes.add_artist(text)
         taken.append(box)
+
+
+def write_tradeoff_page(path: str | os.PathLike[str], tradeoff: Tradeoff, origin: Origin) -> None:
+    """Write its page.
+
+    Raises:
+        InputError: the place cannot be written.
+    """
+    cheapest = {kind: tradeoff.front(kind)[0] for kind in KINDS}
+    names = ", ".join(f"{level.name} ({kind})" for kind, level in cheapest.items())
+    front = {kind: "; ".join(map(_told, tradeoff.front(kind))) for kind in KINDS}
+    frame = Frame(
+        title="Speed against accuracy",
+        subject=f"Measured on {tradeoff.record}; {tradeoff.machine['cpu']}, {tradeoff.machine['cores']} cores.",
+        trusted=tradeoff.trusted,
+        verdict=f"The cheapest of each front: {names}" if tradeoff.trusted else f"{'; '.join(tradeoff.notes)}.",
+        findings={
+            "How to choose": "Of a front take the cheapest level whose error you accept; every other level costs more"
+            " and is off by no less than one on the front.",
+        }
+        | {f"Front of {kind}, cheapest first": f"{levels}." for kind, levels in front.items()},
+        answers=[
+            Answer(f"{kind}, cheapest", engineering(level.seconds, "s", 3), f"{level.name}, error {level.error:.2g}")
+            for kind, level in cheapest.items()
+        ],
+        warnings=tradeoff.notes,
+    )
+    write_page(
+        path,
+        "tradeoff.html",
+        frame,
+        origin,
+        kinds=KINDS,
+        charts={kind: _chart(tradeoff, kind) for kind in KINDS},
+        pictures={kind: image(functools.partial(draw, tradeoff, (kind,)), **_STYLE) for kind in KINDS},
+        tables={
+            kind: [(*COLUMNS, "dominated by"), *((*each.cells, each.dominated_by) for each in tradeoff.of(kind))]
+            for kind in KINDS
+        },
+        resolved=tradeoff.resolved,
+        machine=tradeoff.machine,
+    )
+
+
+def _told(level: Level) -> str:
+    return f"{level.name}, {engineering(level.seconds, 's', 3)}, error {level.error:.2g}"
+
+
+def _chart(tradeoff: Tradeoff, kind: Kind) -> charts.Chart:
+    """Levels by name."""
+    levels, height = tradeoff.of(kind), _heights(tradeoff.of(kind))
+    _, cost, error = _TITLES[kind]
+    seconds = [level.seconds for level in levels]
+    x, y = Axis.of(f"time of {cost}", "s", seconds, log=True), Axis(error, log=True)
+    middle = (min(seconds) * max(seconds)) ** 0.5
+    traces = []
+    for name, some, color in (
+        ("front", tradeoff.front(kind), _FRONT),
+        ("dominated", tuple(level for level in levels if level.dominated_by), _DOMINATED),
+    ):
+        at = [level.seconds for level in some]
+        heights = [height[level.name] for level in some]
+        trace = charts.points(x, y, at, heights, name, color, size=9.0, hollow=name == "dominated")
+        traces.append(
+            trace
+            | {
+                "mode": "markers+text" if name == "dominated" else "lines+markers+text",
+                "line": {"color": color, "width": 1.2},
+                "text": [level.name for level in some],
+                "textposition": ["top right" if each < middle else "top left" for each in at],
+                "customdata": [_told(level) for level in some],
+                "hovertemplate": "%{customdata}<extra></extra>",  # a height is not always the error
+            }
+        )
+    if kind == "uncertainty":
+        ends, least = (min(seconds), max(seconds)), (tradeoff.resolution, tradeoff.resolution)
+        traces.append(charts.line(x, y, ends, least, "cannot be told from 0 below", PRIOR, dash="dash"))
+    return charts.chart(charts.plot(x, (y, traces), size=400))

@@ -1,0 +1,92 @@
+"""The frame that pages of results share: what it is about, the verdict, the answers, and how to repeat it."""
+
+import dataclasses
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Self
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+from fitact.data.record import Record
+from fitact.files import replacing
+from fitact.inference.summary import versions
+from fitact.model.scene import Scene
+from fitact.report import plots
+from fitact.report.page import render
+
+
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """How a result came about.
+
+    Attributes:
+        command: that gives it.
+        scene: what the scene states, SI; {}: nothing.
+        records: SHA-256 of the numbers of each, by name.
+    """
+
+    command: str
+    scene: Mapping[str, Any]
+    records: Mapping[str, str]
+
+    @classmethod
+    def of(cls, command: str, scene: Scene | None, records: Sequence[Record] = ()) -> Self:
+        """From what the command was given."""
+        stated = {} if scene is None else scene.model_dump(mode="json", exclude_unset=True)
+        return cls(command, stated, {os.path.basename(each.source): each.fingerprint for each in records})
+
+    @property
+    def scene_text(self) -> str:
+        """The scene for people; "": it states nothing."""
+        return json.dumps(self.scene, indent=2, ensure_ascii=False) if self.scene else ""
+
+
+class Answer(NamedTuple):
+    """A tile: a number that people came for, what it is, and how sure it is."""
+
+    title: str
+    value: str
+    note: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """What stands at the top of every page.
+
+    Attributes:
+        title, subject: of the page, and what it is about.
+        trusted: whether nothing stands against the answer.
+        verdict: one sentence; of an untrusted answer, what stands against it.
+        findings: sentences, by what they answer.
+        answers: the few numbers.
+        warnings: sentences.
+        reserved: whether a trusted answer is not the one that was hoped for, as the verdict says.
+    """
+
+    title: str
+    subject: str
+    trusted: bool
+    verdict: str
+    findings: Mapping[str, str]
+    answers: Sequence[Answer]
+    warnings: Sequence[str]
+    reserved: bool = False
+
+
+def write_page(path: str | os.PathLike[str], template: str, frame: Frame, origin: Origin, **content: Any) -> None:
+    """Write a page: `frame`, what `template` makes of `content`, and `origin`.
+
+    Raises:
+        InputError: the place cannot be written.
+    """
+    page = render(template, frame=frame, origin=origin, versions=versions(), **content)
+    with replacing(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def image(draw: Callable[[], Figure], **settings: Any) -> str:
+    """A figure in the shared style, as the source of an image."""
+    with mpl.rc_context(plots.style() | settings):
+        return plots.source(plots.svg(draw()))
