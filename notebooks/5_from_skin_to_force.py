@@ -143,8 +143,8 @@ assert half["square"] < 0.8 * half["sine"]
 assert nearly_all["sine"] < nearly_all["square"]
 
 # %% [markdown]
-# Half of the people feel the square first. For the last few per cent the sine takes less: where Rsc Csc is large Vsc
-# hardly decays between the edges, so a square presses on them steadily, and what is steady is not felt.
+# Half of the people feel the square first. To be sure of nearly all, the sine takes less: where Rsc Csc is large, Vsc
+# hardly decays between the edges, so a square presses steadily, and what is steady is not felt.
 
 # %% [markdown]
 # ## What to take away

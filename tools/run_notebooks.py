@@ -10,7 +10,7 @@ from nbclient import NotebookClient
 from nbclient.exceptions import CellControlSignal, DeadKernelError
 
 TARGET = Path("out/notebooks")
-SECONDS = 180  # that a cell may take
+SECONDS = 600  # that a cell may take; a tenth is what it takes on a quiet machine
 QUIET = ["--IPKernelApp.log_level=ERROR"]
 
 

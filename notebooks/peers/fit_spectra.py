@@ -166,8 +166,7 @@ FITTERS: dict[tuple[str, str], Fitter] = {
     ("AutoEIS", "the same, scaled units"): scaled(of_autoeis(False)),
     ("AutoEIS", "Bayesian inference"): of_autoeis(True),
 }
-FEWER = {("pyimpspec", "default (all methods and weights)"): 10}  # which takes long
-FEWER |= {key: 5 for key in FITTERS if key[0] == "AutoEIS"}  # which compiles anew for each
+FEWER = {key: 5 for key in FITTERS if key[0] == "AutoEIS"}  # it compiles anew for each
 
 
 def attempts(fitter: Fitter, f: np.ndarray, cases: list[dict[str, Any]]) -> dict[str, Any]:
