@@ -1,7 +1,8 @@
-"""Run notebooks given as text, each in its own folder; leave the executed copies in out/notebooks."""
+"""Run notebooks given as text, two at a time, each in its own folder; leave the executed copies in out/notebooks."""
 
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jupytext
@@ -14,9 +15,9 @@ SECONDS = 600  # that a cell may take; a tenth is what it takes on a quiet machi
 QUIET = ["--IPKernelApp.log_level=ERROR"]
 
 
-def run(path: Path) -> str:
-    """Where and why it failed; "" where it did not."""
-    notebook = jupytext.read(path)
+def run(path: Path) -> tuple[str, float]:
+    """Where and why it failed ("" where it did not), and the seconds that it took."""
+    notebook, began = jupytext.read(path), time.perf_counter()
     place = {"metadata": {"path": str(path.parent)}}
     client = NotebookClient(notebook, timeout=SECONDS, resources=place, extra_arguments=QUIET)
     failure = ""
@@ -29,18 +30,18 @@ def run(path: Path) -> str:
         why = f"{error.ename}: {error.evalue}" if hasattr(error, "ename") else str(error).strip()
         failure = f"{path}, code cell {number} of {len(code)}:\n\n{code[number - 1].source}\n\n{why}"
     nbformat.write(notebook, TARGET / f"{path.stem}.ipynb")
-    return failure
+    return failure, time.perf_counter() - began
 
 
 def main() -> None:
-    """Run all; stop at the first that fails."""
+    """Run all, then tell of those that failed."""
     TARGET.mkdir(parents=True, exist_ok=True)
-    for path in map(Path, sys.argv[1:]):
-        began = time.perf_counter()
-        failure = run(path)
-        print(f"{path}: {'failed' if failure else 'ran'}, {time.perf_counter() - began:.0f} s", flush=True)
-        if failure:
-            sys.exit(failure)
+    paths, failures = [Path(argument) for argument in sys.argv[1:]], []
+    with ThreadPoolExecutor(2) as pool:
+        for path, (failure, seconds) in zip(paths, pool.map(run, paths), strict=True):
+            print(f"{path}: {'failed' if failure else 'ran'}, {seconds:.0f} s", flush=True)
+            failures += [failure] if failure else []
+    sys.exit("\n\n".join(failures) or 0)
 
 
 if __name__ == "__main__":
