@@ -4,7 +4,7 @@ PY = .venv/bin/python
 # what one process of the tests compiles serves the others, and the next run
 COMPILED = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/out/jax JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
 .DEFAULT_GOAL = help
-.PHONY: help env demo test test-slow test-slow-quick notebooks extremes calibration calibration-quick fuzz check lock plotly clean
+.PHONY: help env demo test test-slow test-slow-quick notebooks peers extremes calibration calibration-quick fuzz check lock plotly clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -28,7 +28,13 @@ test-slow-quick: env
 
 # make notebooks   run the notebooks; executed copies in out/notebooks
 notebooks: env
-	$(PY) tools/run_notebooks.py notebooks/*.py
+	$(COMPILED) $(PY) tools/run_notebooks.py notebooks/[1-5]_*.py
+
+# make peers   the notebook on other fitters, which run in an environment of their own, out/peers
+peers: env
+	.venv/bin/uv venv --quiet --allow-existing --python $(PY) out/peers
+	.venv/bin/uv pip install --quiet --no-deps --require-hashes --python out/peers/bin/python -r notebooks/peers/requirements.txt
+	$(COMPILED) $(PY) tools/run_notebooks.py notebooks/6_other_fitters.py
 
 # make extremes   the worst point of every quantity over the whole range of parameters, against mpmath
 extremes: env
@@ -56,6 +62,7 @@ check: env
 # make lock   lock the newest versions of the dependencies
 lock: env
 	.venv/bin/uv pip compile --quiet --upgrade --universal --all-extras --generate-hashes --no-emit-index-url --no-header pyproject.toml -o requirements/all.txt
+	.venv/bin/uv pip compile --quiet --upgrade --universal --override notebooks/peers/override.txt --generate-hashes --no-emit-index-url --no-header notebooks/peers/requirements.in -o notebooks/peers/requirements.txt
 	echo uv | .venv/bin/uv pip compile --quiet --upgrade --universal --generate-hashes --no-emit-index-url --no-header - -o requirements/uv.txt
 
 # make plotly   renew the script that draws the pages' charts: plotly.js, basic bundle, MIT, from npm
