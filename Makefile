@@ -4,7 +4,7 @@ PY = .venv/bin/python
 # what one process of the tests compiles serves the others, and the next run
 COMPILED = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/out/jax JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
 .DEFAULT_GOAL = help
-.PHONY: help env demo test test-slow test-slow-quick notebooks extremes calibration calibration-quick fuzz check lock clean
+.PHONY: help env demo test test-slow test-slow-quick notebooks docs extremes calibration calibration-quick fuzz check lock clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -29,6 +29,13 @@ test-slow-quick: env
 # make notebooks   run the notebooks; executed copies in out/notebooks
 notebooks: env
 	$(PY) tools/run_notebooks.py notebooks/*.py
+
+# make docs   the documentation, out/site/index.html; runs the notebooks that have no copy yet, or an older one
+docs: env $(patsubst notebooks/%.py,out/notebooks/%.ipynb,$(wildcard notebooks/*.py))
+	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --quiet --strict
+
+out/notebooks/%.ipynb: notebooks/%.py | env
+	$(PY) tools/run_notebooks.py $<
 
 # make extremes   the worst point of every quantity over the whole range of parameters, against mpmath
 extremes: env
