@@ -11,6 +11,7 @@ import tomllib
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import pytest
 import typer
 from markdown_it import MarkdownIt
@@ -28,11 +29,13 @@ MINUTES = {"population", "design", "tradeoff", "compare", "reproduce"}
 
 
 class Block(NamedTuple):
-    """A fenced block: its language, the file it is (`title="scene.toml"`), and its text."""
+    """A fenced block: its language, the file it is (`title="scene.toml"`), its text, and its lines of the page."""
 
     language: str
     title: str | None
     text: str
+    begin: int
+    end: int
 
 
 def blocks(page: Path, *languages: str) -> list[Block]:
@@ -41,7 +44,7 @@ def blocks(page: Path, *languages: str) -> list[Block]:
         if token.type in ("fence", "code_block"):
             language, _, options = token.info.partition(" ")
             title = re.search(r'title="(.*?)"', options)
-            found.append(Block(language, title and title[1], token.content))
+            found.append(Block(language, title and title[1], token.content, *token.map))
     return [block for block in found if block.language in languages] if languages else found
 
 
@@ -120,9 +123,13 @@ def folder(tmp_path, monkeypatch):
     device = (records / "finger_direct.toml").read_text().replace('waveform = "measured"', "")
     for name in ("scene.toml", "plain.toml"):
         (tmp_path / name).write_text(device)
+    felt = '[drive]\nwaveform = "trapezoid"\nrise_time = "50 us"\n[perception]\nthreshold_force = "0.1 mN"\n'
+    (tmp_path / "panel.toml").write_text(felt)
     (tmp_path / "gap.toml").write_text(f'{device}[gap]\ncapacitance = "10 nF"\n')
     monkeypatch.chdir(tmp_path)
-    return tmp_path
+    precision = jax.config.jax_enable_x64
+    yield
+    jax.config.update("jax_enable_x64", precision)  # which a page may change
 
 
 @pytest.mark.parametrize(
@@ -140,18 +147,19 @@ def test_python_runs(page, folder):
         if block.title:
             Path(block.title).write_text(block.text)
         elif block.language == "python":
-            exec(compile(block.text, str(page), "exec"), names)
+            above = "\n" * (block.begin + 1)  # so that a traceback names the page's line
+            exec(compile(above + block.text, page, "exec"), names)
 
 
 def shell_blocks():
-    """Each block with a command of `fitact` on files, and what the page says it prints."""
+    """Each block with a command of `fitact` on files, and the block that follows at once, what it prints."""
     for page in PAGES:
         found = blocks(page)
-        for index, block in enumerate(found):
+        for block in found:
             own = [words for words in commands(block.text) if words[0] == "fitact"] if block.language == "sh" else []
             if own and "[" not in block.text and "FILE" not in block.text:  # those state what can be given
                 marks = [pytest.mark.slow, pytest.mark.thorough] if own[0][1] in MINUTES else pytest.mark.slow
-                printed = next((after.text for after in found[index + 1 : index + 2] if after.language == "text"), None)
+                printed = next((after.text for after in found if after.begin == block.end + 1), None)
                 yield pytest.param(page, own, printed, id=f"{by_name(page)}-{' '.join(own[0][:3])}", marks=marks)
 
 
