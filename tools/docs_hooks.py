@@ -41,9 +41,14 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_content(content: str, **_: Any) -> str:
     """TeX as MathML, which browsers set without a script."""
-    return _EQUATION.sub(
-        lambda found: convert(html.unescape(found[3]), display="block" if found[2] == "[" else "inline"), content
-    )
+    return _EQUATION.sub(_mathml, content)
+
+
+def _mathml(found: re.Match[str]) -> str:
+    tex = html.unescape(found[3])
+    if found[2] == "(":
+        return convert(tex)
+    return f'<div class="equation" tabindex="0">{convert(tex, display="block")}</div>'  # to be scrolled where it is wide
 
 
 def _sources() -> list[Path]:
