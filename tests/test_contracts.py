@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+import typer
 
 import fitact.cli
+from fitact.cli.app import app
 
 ROOT = Path(__file__).parents[1]
 RECORDS = ROOT / "data_synth" / "records"
@@ -79,6 +81,7 @@ CASES = [
     pytest.param("fit", [*FINGER, "--intervals"], id="fit --intervals", marks=pytest.mark.slow),
     pytest.param("inspect", [FINGER[0]], id="inspect"),
     pytest.param("plan", ["natural-ground"], id="plan"),
+    pytest.param("simulate", ["phone", "--out", "phone.csv"], id="simulate"),
     pytest.param("prior", ["paper"], id="prior"),
     pytest.param("reproduce", ["--out", "out"], id="reproduce", marks=pytest.mark.slow),
     pytest.param(
@@ -118,3 +121,17 @@ def test_keys_are_those_of_the_page(command, arguments, tmp_path, monkeypatch):
     assert not unknown, "not on the page"
     missing = [key.pattern for key in known if key.always and not any(key.covers(path, value) for path, value in found)]
     assert not missing, "not in the output"
+
+
+def test_every_command_has_its_place():
+    page = (ROOT / "docs" / "contracts.md").read_text(encoding="utf-8")
+    printing = {name.split(" --json")[0] for name in re.findall(r"`fitact (.+?)`", page)}
+    assert printing >= set(names(typer.main.get_command(app)))
+
+
+def names(command: Any) -> list[str]:
+    """Of all commands, with those of a group behind its own."""
+    found = []
+    for name, inner in command.commands.items():
+        found += [f"{name} {last}" for last in names(inner)] if hasattr(inner, "commands") else [name]
+    return found

@@ -48,7 +48,8 @@ def _mathml(found: re.Match[str]) -> str:
     tex = html.unescape(found[3])
     if found[2] == "(":
         return convert(tex)
-    return f'<div class="equation" tabindex="0">{convert(tex, display="block")}</div>'  # to be scrolled where it is wide
+    # a wide one is scrolled, also by keyboard
+    return f'<div class="equation" tabindex="0">{convert(tex, display="block")}</div>'
 
 
 def _sources() -> list[Path]:
