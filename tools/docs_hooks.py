@@ -80,4 +80,4 @@ def _output(output: Any, name: str, heading: str, pictures: dict[str, bytes]) ->
     else:
         text = _ANSI.sub("", output.get("text") or data.get("text/plain", "")).rstrip()
         if text:
-            yield f"```text\n{text}\n```"
+            yield f"``` {{.text .printed}}\n{text}\n```"
