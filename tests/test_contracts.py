@@ -82,7 +82,7 @@ CASES = [
     pytest.param("inspect", [FINGER[0]], id="inspect"),
     pytest.param("plan", ["natural-ground"], id="plan"),
     pytest.param("simulate", ["phone", "--out", "phone.csv"], id="simulate"),
-    pytest.param("prior", ["paper"], id="prior"),
+    pytest.param("prior", ["paper"], id="prior", marks=pytest.mark.slow),
     pytest.param("reproduce", ["--out", "out"], id="reproduce", marks=pytest.mark.slow),
     pytest.param(
         "run", [*FINGER, "--out", "out", "--level", "laplace", "--seed", "1"], id="run laplace", marks=pytest.mark.slow
