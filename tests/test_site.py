@@ -38,3 +38,13 @@ def test_every_equation_is_set(pages):
 def test_every_picture_is_described(pages):
     for name, page in pages.items():
         assert all(re.search(r'alt="[^"]{8,}"', picture) for picture in re.findall(r"<img[^>]*>", page)), name
+
+
+@pytest.mark.slow
+def test_constructors_are_shown(pages):
+    for page, begins in (
+        ("drives", r"Sine\(\s*peak_to_peak"),
+        ("scene", r"FinalCircuit\(\s*Rsc"),
+        ("fit", r"Fit\(\s*theta"),
+    ):
+        assert re.search(begins, re.sub(r"<[^>]+>", "", pages[f"api/{page}.html"])), begins
