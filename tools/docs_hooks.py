@@ -15,6 +15,7 @@ from mkdocs.structure.files import File, Files
 
 NOTEBOOKS = Path("notebooks")
 EXECUTED = Path("out/notebooks")
+_LINK = re.compile(r"\]\((\w+)\.ipynb\)")  # to another notebook
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
 _EQUATION = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 
@@ -62,7 +63,7 @@ def _blocks(notebook: Any, stem: str, pictures: dict[str, bytes]) -> Iterator[st
     for cell in notebook.cells:
         if cell.cell_type == "markdown":
             heading = next((line.lstrip("# ") for line in cell.source.splitlines() if line.startswith("#")), heading)
-            yield cell.source
+            yield _LINK.sub(r"](\1.md)", cell.source)
         elif cell.cell_type == "code":
             yield f"```python\n{cell.source}\n```"
             for output in cell.get("outputs", []):
