@@ -117,9 +117,9 @@ def intervals(
         if name not in sd:
             raise InputError(f"there is no interval of {name}; choose from {', '.join(sd)}")
     timing = likelihood.timing
-    likelihood = dataclasses.replace(likelihood.without_samples(), believed=prior and likelihood.believed)
     found = {}
     with jax.enable_x64(True):
+        likelihood = dataclasses.replace(likelihood.without_samples(), believed=prior and likelihood.believed)
         for known, of in ((likelihood.names, None), (DERIVED, derive)):
             chosen = [name for name in names if name in known]
             if not chosen:
