@@ -7,6 +7,7 @@ from .inference.comparison import Comparison, compare
 from .inference.design import MeasurementDesign, design_measurement
 from .inference.drive_design import DriveDesign, design_drive
 from .inference.fit import Fit, fit
+from .inference.many import Fits, fit_many
 from .inference.people import Population
 from .inference.population import population
 from .inference.posterior import Posterior
@@ -40,6 +41,7 @@ __all__ = [
     "DriveDesign",
     "FinalCircuit",
     "Fit",
+    "Fits",
     "Fractional",
     "InputError",
     "Inspection",
@@ -73,6 +75,7 @@ __all__ = [
     "design_measurement",
     "electrostatic_force",
     "fit",
+    "fit_many",
     "fit_spectrum",
     "friction",
     "harmonic_error",
