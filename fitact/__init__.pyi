@@ -1,3 +1,4 @@
+from .campaign import run_campaign
 from .data.formats import read
 from .data.inspection import Inspection, inspect
 from .data.record import Record
@@ -92,6 +93,7 @@ __all__ = [
     "read",
     "read_spectrum",
     "response",
+    "run_campaign",
     "sample",
     "series_equivalent",
 ]

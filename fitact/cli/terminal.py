@@ -27,6 +27,17 @@ def use_compilation_cache() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # the many small ones take a second
 
 
+def keep_compiled() -> None:
+    """As `use_compilation_cache`, for this process's children."""
+    use_compilation_cache()
+    import jax
+
+    folder = jax.config.jax_compilation_cache_dir
+    if folder:
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+
+
 def show(text: str, content: dict[str, Any], as_json: bool) -> None:
     sys.stdout.write(to_json(content) if as_json else text + "\n")
     sys.stdout.flush()

@@ -56,6 +56,11 @@ class Fits(Sequence[dict[str, Any]]):
         return tuple(row for row in self.rows if "samples" not in row)
 
     @property
+    def answered(self) -> "Fits":
+        """The rows with an answer."""
+        return Fits(tuple(row for row in self.rows if "samples" in row))
+
+    @property
     def columns(self) -> dict[str, np.ndarray]:
         """The table by columns; NaN, or "", where a row has no answer."""
         names = dict.fromkeys(name for row in sorted(self.rows, key=len, reverse=True)[:1] for name in row)
@@ -64,14 +69,14 @@ class Fits(Sequence[dict[str, Any]]):
         blank = {name: "" if isinstance(sample, str) else np.nan for name, sample in samples.items()}
         return {name: np.array([row.get(name, blank[name]) for row in self.rows]) for name in names}
 
-    def to_csv(self, path: str | os.PathLike[str]) -> None:
-        """Write the table as CSV; empty where there is no answer.
+    def to_csv(self, path: str | os.PathLike[str], columns: Sequence[str] | None = None) -> None:
+        """Write the table, or some of its columns, as CSV; empty where there is no answer.
 
         Raises:
             InputError: the place cannot be written.
         """
         with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(self.columns))
+            writer = csv.DictWriter(file, list(columns or self.columns), extrasaction="ignore")
             writer.writeheader()
             writer.writerows(self.rows)
 
@@ -150,7 +155,7 @@ def _opened(
 
 def _in_threads(batches: Iterable[Batch]) -> Iterator[tuple[list[Member], dict[int, dict[str, Any]]]]:
     """The members of batches and the rows of those that could be settled together, a batch ahead for each core."""
-    cores = os.cpu_count() or 1
+    cores = int(os.environ.get("OMP_NUM_THREADS") or len(os.sched_getaffinity(0)))
     under_way: collections.deque[tuple[list[Member], Future[dict[int, dict[str, Any]]]]] = collections.deque()
     with ThreadPoolExecutor(cores) as pool:
         for together, members in batches:
