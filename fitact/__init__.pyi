@@ -1,3 +1,4 @@
+from .campaign import run_campaign
 from .data.formats import read
 from .data.inspection import Inspection, inspect
 from .data.record import Record
@@ -7,6 +8,7 @@ from .inference.comparison import Comparison, compare
 from .inference.design import MeasurementDesign, design_measurement
 from .inference.drive_design import DriveDesign, design_drive
 from .inference.fit import Fit, fit
+from .inference.many import Fits, fit_many
 from .inference.people import Population
 from .inference.population import population
 from .inference.posterior import Posterior
@@ -40,6 +42,7 @@ __all__ = [
     "DriveDesign",
     "FinalCircuit",
     "Fit",
+    "Fits",
     "Fractional",
     "InputError",
     "Inspection",
@@ -73,6 +76,7 @@ __all__ = [
     "design_measurement",
     "electrostatic_force",
     "fit",
+    "fit_many",
     "fit_spectrum",
     "friction",
     "harmonic_error",
@@ -89,6 +93,7 @@ __all__ = [
     "read",
     "read_spectrum",
     "response",
+    "run_campaign",
     "sample",
     "series_equivalent",
 ]

@@ -50,6 +50,11 @@ def to_json(content: Any) -> str:
     return json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
+def to_line(content: Any) -> str:
+    """The same on one line."""
+    return json.dumps(_plain(content), ensure_ascii=False, allow_nan=False) + "\n"
+
+
 def _plain(content: Any) -> Any:
     if isinstance(content, dict):
         return {str(key): _plain(value) for key, value in content.items()}

@@ -6,7 +6,7 @@ from typing import Any
 
 import typer
 
-from fitact.cli import designs, one_finger, records, scenes  # noqa: F401  (their commands)
+from fitact.cli import campaigns, designs, one_finger, records, scenes  # noqa: F401  (their commands)
 from fitact.cli.app import app
 from fitact.cli.terminal import say
 from fitact.errors import InputError

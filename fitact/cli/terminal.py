@@ -33,6 +33,17 @@ def typed() -> str:
     return shlex.join(["fitact", *sys.argv[1:]])
 
 
+def keep_compiled() -> None:
+    """As `use_compilation_cache`, for this process's children."""
+    use_compilation_cache()
+    import jax
+
+    folder = jax.config.jax_compilation_cache_dir
+    if folder:
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+
+
 def show(text: str, content: dict[str, Any], as_json: bool) -> None:
     sys.stdout.write(to_json(content) if as_json else text + "\n")
     sys.stdout.flush()

@@ -36,7 +36,7 @@ _SLOW = slice(-3 - len(SLOW), -3)
 _RATE, _SLOPE, _OBSERVED = -3, -2, -1
 
 NODES = 41  # odd, so that the middle of the table is a node
-_REACH = math.log(9.0)  # half width of the table in log tau
+REACH = math.log(9.0)  # half width of the table in log tau
 _RANK = 1e-13  # singular values of the exponentials, relative, that are left out
 _EXACT = 1e-9  # of a step: how evenly samples must lie to be folded
 _BLOCK = 64  # samples in a block of the recurrence
@@ -108,7 +108,7 @@ class Compression(eqx.Module):
         Left-out terms change no response to the drive, and no decay of a `charge` (V), by more than `precision`
         (V, root of the sum of squares); with no charge its decay is left out altogether.
         """
-        x, to_series = _chebyshev(NODES)
+        x, to_series = chebyshev(NODES)
         # nodes of the narrow table, in the wide one; by NumPy, since JAX would compile its loop for every record
         inside = (center + reach * x - float(self.center)) / float(self.reach)
         at = np.polynomial.chebyshev.chebvander(inside, self.signal.shape[1] - 1)
@@ -190,7 +190,7 @@ class _Table(eqx.Module):
     @classmethod
     def around(cls, near: Terms, time: np.ndarray) -> "_Table":
         (tau,) = map(float, near.tau)
-        relative, mix, series = _basis()
+        relative, mix, series = exponentials()
         return cls(
             center=jnp.asarray(math.log(tau)),
             nodes=jnp.asarray(tau * relative),
@@ -204,10 +204,10 @@ class _Table(eqx.Module):
 
 
 @functools.cache
-def _basis() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def exponentials() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Nodes of any table over its middle, their combinations that matter, and the series that give back a response."""
-    x, to_series = _chebyshev(NODES)
-    relative = np.exp(_REACH * x)
+    x, to_series = chebyshev(NODES)
+    relative = np.exp(REACH * x)
     ages = np.concatenate([[0.0], np.geomspace(1e-3 * relative.min(), 40.0 * relative.max(), 400)])
     _, sizes, modes = np.linalg.svd(np.exp(-ages[:, None] / relative), full_matrices=False)
     rank = int(np.count_nonzero(sizes > _RANK * sizes[0]))
@@ -419,7 +419,7 @@ def _assemble(table: _Table, total: np.ndarray, decays: bool, samples: int) -> C
     following = 0.0 if table.near.rate is None else float(table.near.rate) * rows[:, _RATE]
     return Compression(
         center=table.center,
-        reach=jnp.asarray(_REACH),
+        reach=jnp.asarray(REACH),
         signal=jnp.asarray(signal[:rank]),
         decay=jnp.asarray(rows[:, rank : 2 * rank] @ table.series if decays else np.zeros((size, NODES))),
         slow=jnp.asarray(rows[:, _SLOW].T),
@@ -430,7 +430,7 @@ def _assemble(table: _Table, total: np.ndarray, decays: bool, samples: int) -> C
     )
 
 
-def _chebyshev(count: int) -> tuple[np.ndarray, np.ndarray]:
+def chebyshev(count: int) -> tuple[np.ndarray, np.ndarray]:
     """The nodes in [-1, 1], and the matrix from values there to a series' coefficients (terms, nodes)."""
     angle = np.pi * (np.arange(count) + 0.5) / count
     matrix = 2.0 / count * np.cos(np.arange(count)[:, None] * angle)

@@ -154,9 +154,14 @@ def white_noise(values: Float[np.ndarray, " samples"]) -> float:
 
     Edges, being rare, leave the median alone.
     """
+    return float(white_noises(values))
+
+
+def white_noises(values: Float[np.ndarray, "*records samples"]) -> Float[np.ndarray, "*records"]:
+    """As `white_noise`, of each record."""
     third = np.diff(values, 3)
     np.abs(third, out=third)
-    return float(np.median(third, overwrite_input=True) / 0.6744897501960817 / math.sqrt(20.0))
+    return np.median(third, axis=-1, overwrite_input=True) / 0.6744897501960817 / math.sqrt(20.0)
 
 
 def rounding_noise(values: Float[np.ndarray, " samples"]) -> float:

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -142,7 +143,7 @@ def _near(theta: np.ndarray, root: np.ndarray) -> Float[np.ndarray, "n parameter
 def _believed(wide: Likelihood, theta: np.ndarray) -> Float[np.ndarray, "n parameters"]:
     """Points of the prior that the tables reach, the optimum where there are too few."""
     draws = wide.draws(theta, 1000)
-    slowest = jax.vmap(_log_b, (None, 0))(wide, jnp.asarray(draws))
+    slowest = _each_log_b(wide.without_samples(), jnp.asarray(draws))
     held = [trace.compression.holds(jnp.exp(slowest)) for trace in wide.traces if trace.compression is not None]
     draws = draws[np.all(held, axis=0)]
     return np.vstack([draws, np.tile(theta, (_POINTS, 1))])[:_POINTS]
@@ -182,7 +183,7 @@ def _narrowed(
     trace: Trace, wide: Likelihood, index: int, theta: np.ndarray, spread: float, sigma: float, tolerance: float
 ) -> Trace:
     """With the part of the table that the posterior can want, where there is a table that reaches the optimum."""
-    table, center = trace.compression, float(_log_b(wide, jnp.asarray(theta)))
+    table, center = trace.compression, float(_log_b(wide.without_samples(), jnp.asarray(theta)))
     if not isinstance(table, Compression) or not table.holds(np.exp(center)):
         return trace
     seen = wide.seen(jnp.asarray(theta), index)
@@ -197,10 +198,21 @@ def _narrowed(
 
 def _spread_of_log_b(likelihood: Likelihood, theta: np.ndarray, root: np.ndarray) -> float:
     """Standard deviation of the logarithm of the slowest time constant."""
-    slope = jax.grad(_log_b, argnums=1)(likelihood, jnp.asarray(theta))
+    slope = _slope_of_log_b(likelihood.without_samples(), jnp.asarray(theta))
     return float(np.linalg.norm(np.asarray(slope) @ root))
 
 
+@eqx.filter_jit
+def _slope_of_log_b(likelihood: Likelihood, theta: Array) -> Array:
+    return jax.grad(_log_b, argnums=1)(likelihood, theta)
+
+
+@eqx.filter_jit
+def _each_log_b(likelihood: Likelihood, theta: Float[Array, "n parameters"]) -> Float[Array, " n"]:
+    return jax.vmap(lambda each: _log_b(likelihood, each))(theta)
+
+
+@eqx.filter_jit
 def _log_b(likelihood: Likelihood, theta: Array) -> Array:
     """Logarithm of the slowest time constant, s."""
     return jnp.log(likelihood.circuit(theta).b)

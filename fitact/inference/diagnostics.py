@@ -1,14 +1,14 @@
 """Do the residuals look like the noise that the record itself shows?"""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from statistics import NormalDist
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import betainc
-from jaxtyping import Float
+import scipy.fft
+import scipy.special
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float
 
 from fitact.data.record import Record, rounding_noise, white_noise
 from fitact.inference.start import DriveChoice
@@ -40,19 +40,37 @@ def statistics(
     """
     measured = choice.name == "measured"
     expected = math.hypot(noise, gain * record.noise("V") if measured else 0.0)
-    freedom = residuals.size - freed
-    return {
-        "chi2_reduced": float(residuals @ residuals / (freedom * expected**2)),
-        "rms_residual": float(np.sqrt(np.mean(residuals**2))),
-        "noise_expected": expected,
-        "runs_z": runs_z(residuals),
-        "folded_p": folded_p(residuals, time, record.frequency() if choice.periodic else None),
-        "spectrum_p": spectrum_p(residuals),
-        "line_p": line_p(residuals),
+    repeats = record.frequency() if choice.periodic else None
+    found = tests(residuals, time, np.asarray(expected), residuals.size - freed, repeats)
+    return {name: float(value) for name, value in found.items()} | {
         "rounding_noise": rounding_noise(record[channel]),
         "interpolation_error": gain * interpolation_error(record["V"]) if measured else 0.0,
         "samples": residuals.size,
-        "degrees_of_freedom": freedom,
+    }
+
+
+def tests(
+    residuals: Float[np.ndarray, "*records kept"],
+    time: Float[np.ndarray, " kept"],
+    expected: Float[np.ndarray, "*records"],
+    freedom: float,
+    frequency: float | None,
+) -> dict[str, Float[np.ndarray, "*records"]]:
+    """The part of `statistics` that needs no more than residuals, of each record.
+
+    `expected` is their standard deviation, `frequency` (Hz) that of the drive, if it repeats.
+    """
+    square = np.einsum("...i,...i->...", residuals, residuals)
+    shares = _periodogram(residuals)
+    return {
+        "chi2_reduced": square / (freedom * expected**2),
+        "rms_residual": np.sqrt(square / residuals.shape[-1]),
+        "noise_expected": expected,
+        "runs_z": runs_z(residuals),
+        "folded_p": folded_p(residuals, time, frequency),
+        "spectrum_p": _spectrum_p(shares),
+        "line_p": _line_p(shares),
+        "degrees_of_freedom": np.full(square.shape, freedom),
     }
 
 
@@ -62,12 +80,12 @@ def outliers(residuals: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"], 
     The noise is that of the middle half of them, or the one to expect where that is larger; `first_outlier` is in s.
     """
     core = float(np.median(np.abs(residuals[residuals != 0.0]))) / 0.6744897501960817 if residuals.any() else 0.0
-    beyond = np.abs(residuals) > _far(residuals.size) * max(core, noise)
+    beyond = np.abs(residuals) > far(residuals.size) * max(core, noise)
     count = int(np.count_nonzero(beyond))
     return {"outliers": count, **({"first_outlier": float(time[np.argmax(beyond)])} if count else {})}
 
 
-def _far(count: int) -> float:
+def far(count: int) -> float:
     """Standard deviations beyond which one of that many normal numbers lies with a probability of 1e-3."""
     return -NormalDist().inv_cdf(0.5e-3 / count)
 
@@ -84,23 +102,24 @@ def together(figures: Sequence[dict[str, float]]) -> dict[str, float]:
     }
 
 
-def is_misfit(figures: dict[str, float]) -> bool:
+def is_misfit(figures: Mapping[str, ArrayLike]) -> Bool[np.ndarray, "*records"]:
     """Whether the residuals are larger than the noise, or have structure."""
-    significant = 6.0 * math.sqrt(2.0 / figures["degrees_of_freedom"])
+    significant = 6.0 * np.sqrt(2.0 / np.asarray(figures["degrees_of_freedom"]))
     # a rounded channel's residuals come in stretches that repeat, and its noise is known less well
-    rounded = figures["rounding_noise"] > 0.0
-    excess = figures["chi2_reduced"] > 1.0 + max(1.0 if rounded else _EXCESS, significant)
-    return excess or (is_structured(figures) and not rounded) or is_coarse(figures)
+    rounded = np.asarray(figures["rounding_noise"]) > 0.0
+    excess = np.asarray(figures["chi2_reduced"]) > 1.0 + np.maximum(np.where(rounded, 1.0, _EXCESS), significant)
+    return excess | (is_structured(figures) & ~rounded) | is_coarse(figures)
 
 
-def is_structured(figures: dict[str, float]) -> bool:
+def is_structured(figures: Mapping[str, ArrayLike]) -> Bool[np.ndarray, "*records"]:
     """Whether any test tells the residuals from white noise."""
-    return figures["runs_z"] < -_RUNS or min(figures[name] for name in _P_VALUES) < _FALSE_ALARM / _TESTS
+    least = np.minimum.reduce([np.asarray(figures[name]) for name in _P_VALUES])
+    return (np.asarray(figures["runs_z"]) < -_RUNS) | (least < _FALSE_ALARM / _TESTS)
 
 
-def is_coarse(figures: dict[str, float]) -> bool:
+def is_coarse(figures: Mapping[str, ArrayLike]) -> Bool[np.ndarray, "*records"]:
     """Whether the straight lines between the drive's samples err by more than the noise hides."""
-    return figures["interpolation_error"] > _COARSE * figures["rms_residual"]
+    return np.asarray(figures["interpolation_error"]) > _COARSE * np.asarray(figures["rms_residual"])
 
 
 def interpolation_error(voltage: Float[np.ndarray, " samples"]) -> float:
@@ -110,72 +129,78 @@ def interpolation_error(voltage: Float[np.ndarray, " samples"]) -> float:
     return math.sqrt(max(bend**2 - 1.5 * noise**2, 0.0)) / 8.0
 
 
-def runs_z(residuals: Float[np.ndarray, " samples"]) -> float:
+def runs_z(residuals: Float[np.ndarray, "*records samples"]) -> Float[np.ndarray, "*records"]:
     """Wald and Wolfowitz's runs test of signs, in standard deviations; far below zero: signs come in stretches."""
-    positive = residuals > np.median(residuals)
-    above = int(positive.sum())
-    below = positive.size - above
-    if above == 0 or below == 0:
-        return -math.inf
-    runs = 1 + int(np.count_nonzero(positive[1:] != positive[:-1]))
-    both = 2.0 * above * below
-    mean = both / positive.size + 1.0
-    variance = both * (both - positive.size) / (positive.size**2 * (positive.size - 1.0))
-    return (runs - mean) / math.sqrt(variance)
+    positive = residuals > np.median(residuals, axis=-1, keepdims=True)
+    size = positive.shape[-1]
+    above = np.count_nonzero(positive, axis=-1).astype(float)
+    runs = 1.0 + np.count_nonzero(positive[..., 1:] != positive[..., :-1], axis=-1)
+    both = 2.0 * above * (size - above)
+    mean = both / size + 1.0
+    variance = both * (both - size) / (size**2 * (size - 1.0))
+    return np.where(both > 0.0, (runs - mean) / np.sqrt(np.where(both > 0.0, variance, 1.0)), -np.inf)
 
 
-def folded_p(residuals: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"], frequency: float | None) -> float:
+def folded_p(
+    residuals: Float[np.ndarray, "*records n"], time: Float[np.ndarray, " n"], frequency: float | None
+) -> Float[np.ndarray, "*records"]:
     """Probability that white noise repeats with the drive (Hz) as much as this: the least of F tests, uncorrected.
 
     Each compares the means of the residuals in as many phases of the period with their scatter. What a wrong
     circuit leaves repeats with the drive, and adds up over the periods. 1 where nothing is expected to repeat.
     """
-    if frequency is None or residuals.size < _LEAST_TESTED:
-        return 1.0
-    phase = np.mod(time * frequency, 1.0)
-    place = np.minimum((phase * _PHASES[-1]).astype(int), _PHASES[-1] - 1)
-    count, total = (np.bincount(place, x, _PHASES[-1]) for x in (None, residuals))
-    square = float(residuals @ residuals)
-    found = []
+    size, of = residuals.shape[-1], residuals.shape[:-1]
+    if frequency is None or size < _LEAST_TESTED:
+        return np.ones(of)
+    place = np.minimum((np.mod(time * frequency, 1.0) * _PHASES[-1]).astype(int), _PHASES[-1] - 1)
+    count = np.bincount(place, minlength=_PHASES[-1])
+    total = np.stack([np.bincount(place, row, _PHASES[-1]) for row in residuals.reshape(-1, size)])
+    square = np.einsum("...i,...i->...", residuals, residuals)
+    found = [np.ones(of)]
     for phases in _PHASES:
-        n, mean = (x.reshape(phases, -1).sum(axis=1) for x in (count, total))
-        between, within = np.count_nonzero(n), residuals.size - np.count_nonzero(n)
-        if within < residuals.size // 2:  # too few samples in each phase to know their scatter
+        n = count.reshape(phases, -1).sum(axis=-1)
+        between, within = np.count_nonzero(n), size - np.count_nonzero(n)
+        if within < size // 2:  # too few samples in each phase to know their scatter
             break
-        share = float(np.sum(mean[n > 0] ** 2 / n[n > 0])) / square if square > 0.0 else 0.0
+        mean = total.reshape(*of, phases, -1).sum(axis=-1)
+        share = np.sum(mean[..., n > 0] ** 2 / n[n > 0], axis=-1) / np.where(square > 0.0, square, 1.0)
         # the share of `between` directions in the sum of squares of white noise has a beta distribution
-        found.append(float(_beta_cdf(0.5 * within, 0.5 * between, max(1.0 - share, 0.0))))
-    return min(found, default=1.0)
+        found.append(scipy.special.betainc(0.5 * within, 0.5 * between, np.maximum(1.0 - share, 0.0)))
+    return np.minimum.reduce(found)
 
 
-@jax.jit
-def _beta_cdf(a: float, b: float, x: float) -> jax.Array:
-    return betainc(jnp.asarray(a, float), jnp.asarray(b, float), jnp.asarray(x, float))
-
-
-def spectrum_p(residuals: Float[np.ndarray, " n"]) -> float:
+def spectrum_p(residuals: Float[np.ndarray, "*records n"]) -> Float[np.ndarray, "*records"]:
     """Bartlett's test of the cumulative periodogram, by Kolmogorov and Smirnov's law: low where noise is not white."""
-    share = _periodogram(residuals)
-    if share.size < _LEAST_TESTED // 2:
-        return 1.0
-    even = np.arange(1, share.size + 1) / share.size
-    distance = float(np.max(np.abs(np.cumsum(share) - even))) * math.sqrt(share.size)
-    if distance < 0.2:  # where the series converges slowly, to 1
-        return 1.0
+    return _spectrum_p(_periodogram(residuals))
+
+
+def _spectrum_p(share: Float[np.ndarray, "*records lines"]) -> Float[np.ndarray, "*records"]:
+    lines = share.shape[-1]
+    if lines < _LEAST_TESTED // 2:
+        return np.ones(share.shape[:-1])
+    distance = np.max(np.abs(np.cumsum(share, axis=-1) - np.arange(1, lines + 1) / lines), axis=-1) * math.sqrt(lines)
     k = np.arange(1, 31)
-    return float(np.clip(2.0 * np.sum((-1.0) ** (k - 1) * np.exp(-2.0 * (k * distance) ** 2)), 0.0, 1.0))
+    series = 2.0 * np.sum((-1.0) ** (k - 1) * np.exp(-2.0 * (k * distance[..., None]) ** 2), axis=-1)
+    # 1 where the series converges slowly
+    return np.where(distance < 0.2, 1.0, np.clip(series, 0.0, 1.0))
 
 
-def line_p(residuals: Float[np.ndarray, " n"]) -> float:
+def line_p(residuals: Float[np.ndarray, "*records n"]) -> Float[np.ndarray, "*records"]:
     """Fisher's test: low where one line of the periodogram, as of hum, is too strong for white noise."""
-    share = _periodogram(residuals)
-    if share.size < _LEAST_TESTED // 2:
-        return 1.0
-    log_p = math.log(share.size) + (share.size - 1) * math.log1p(-min(float(share.max()), 1.0 - 1e-16))
-    return math.exp(min(log_p, 0.0))
+    return _line_p(_periodogram(residuals))
 
 
-def _periodogram(residuals: Float[np.ndarray, " n"]) -> Float[np.ndarray, " lines"]:
-    """Shares of the lines between 0 and half the sampling rate; none where there is nothing to share."""
-    power = np.abs(np.fft.rfft(residuals)[1 : (residuals.size + 1) // 2]) ** 2
-    return power / power.sum() if power.sum() > 0.0 else power[:0]
+def _line_p(share: Float[np.ndarray, "*records lines"]) -> Float[np.ndarray, "*records"]:
+    lines = share.shape[-1]
+    if lines < _LEAST_TESTED // 2:
+        return np.ones(share.shape[:-1])
+    log_p = math.log(lines) + (lines - 1) * np.log1p(-np.minimum(np.max(share, axis=-1), 1.0 - 1e-16))
+    return np.exp(np.minimum(log_p, 0.0))
+
+
+def _periodogram(residuals: Float[np.ndarray, "*records n"]) -> Float[np.ndarray, "*records lines"]:
+    """Shares of the lines between 0 and half the sampling rate; even ones where there is nothing to share."""
+    lines = scipy.fft.rfft(residuals)[..., 1 : (residuals.shape[-1] + 1) // 2]
+    power = lines.real**2 + lines.imag**2
+    whole = power.sum(axis=-1, keepdims=True)
+    return np.where(whole > 0.0, power / np.where(whole > 0.0, whole, 1.0), 1.0 / max(power.shape[-1], 1))

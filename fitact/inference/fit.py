@@ -31,6 +31,7 @@ from fitact.model.scene import Scene
 from fitact.model.skin import constant
 from fitact.units import engineering, unit_of
 
+GOOD = "The fit is at its optimum and leaves only noise."
 _SKIN = ("Rsc", "Csc", "Ci")
 _RESPONSE = {
     "constant": "exact",
@@ -107,7 +108,7 @@ class Fit(Laplace):
     @property
     def message(self) -> str:
         """The result as a sentence."""
-        return "The fit is at its optimum and leaves only noise." if self.trusted else result_message(self.result)
+        return GOOD if self.trusted else result_message(self.result)
 
     @property
     def point_names(self) -> tuple[str, ...]:

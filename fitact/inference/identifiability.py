@@ -109,25 +109,17 @@ def judge(
     channels: tuple[str, ...],
 ) -> Identifiability:
     """As `assess`, of the parameters `free` among `names`, with no remedy and no word on what is structural."""
-    rows = [list(names).index(name) for name in free]
-    believed = np.linalg.cholesky((prior_root @ prior_root.T)[np.ix_(rows, rows)])
-    # of the prior's spread in each direction, what is left
-    directions, left, _ = np.linalg.svd(np.linalg.solve(believed, root[rows]))
-    shares = np.clip(1.0 - left**2, 0.0, 1.0)
-    blind = believed @ directions[:, 0]
-    blind *= (-1.0 if "Ci" in free and blind[list(free).index("Ci")] < 0.0 else 1.0) / np.linalg.norm(blind)
-    along = float(np.max(np.abs(blind)) / np.linalg.norm(np.linalg.solve(believed, blind)))
-    verdict = "prior-limited" if along <= _WIDE else "unidentified"
+    shares, blind, along = directions(names, root, prior_root, free)
     direction = dict(zip(free, map(float, blind), strict=True))
     force_sd = float(np.linalg.norm(root.T @ force_gradient))
     return Identifiability(
-        verdict="identified" if shares[0] >= _IDENTIFIED else verdict,
+        verdict=str(verdicts(shares, along)),
         eigenvalues=tuple(map(float, shares)),
         blind_direction=direction,
         blind_name=name_direction(direction),
         structural=False,
-        prior_sd=along,
-        force_from_prior=_from_prior(root, prior_root, force_gradient),
+        prior_sd=float(along),
+        force_from_prior=float(from_prior(root, prior_root, force_gradient)),
         force_sd=force_sd,
         force_contraction=1.0 - force_sd / float(np.linalg.norm(prior_root.T @ force_gradient)),
         remedy="",
@@ -136,10 +128,38 @@ def judge(
     )
 
 
-def _from_prior(root: np.ndarray, prior_root: np.ndarray, gradient: np.ndarray) -> float:
+def directions(
+    names: Sequence[str],
+    root: Float[np.ndarray, "*fits parameters parameters"],
+    prior_root: Float[np.ndarray, "parameters parameters"],
+    free: Sequence[str],
+) -> tuple[Float[np.ndarray, "*fits free"], Float[np.ndarray, "*fits free"], Float[np.ndarray, "*fits"]]:
+    """Eigenvalues, the blind direction and `prior_sd` of the parameters `free` among `names`, of one or many fits."""
+    rows = [list(names).index(name) for name in free]
+    believed = np.linalg.cholesky((prior_root @ prior_root.T)[np.ix_(rows, rows)])
+    inverse = np.linalg.inv(believed)
+    # of the prior's spread in each direction, what is left
+    axes, left, _ = np.linalg.svd(inverse @ root[..., rows, :])
+    blind = axes[..., 0] @ believed.T
+    against = blind[..., list(free).index("Ci")] < 0.0 if "Ci" in free else np.zeros(blind.shape[:-1], bool)
+    blind *= (np.where(against, -1.0, 1.0) / np.linalg.norm(blind, axis=-1))[..., None]
+    along = np.max(np.abs(blind), axis=-1) / np.linalg.norm(blind @ inverse.T, axis=-1)
+    return np.clip(1.0 - left**2, 0.0, 1.0), blind, along
+
+
+def verdicts(shares: Float[np.ndarray, "*fits free"], along: Float[np.ndarray, "*fits"]) -> np.ndarray:
+    """ "identified", "prior-limited" or "unidentified", by the eigenvalues and `prior_sd`."""
+    limited = np.where(along <= _WIDE, "prior-limited", "unidentified")
+    return np.where(shares[..., 0] >= _IDENTIFIED, "identified", limited)
+
+
+def from_prior(
+    root: Float[np.ndarray, "*fits n n"], prior_root: Float[np.ndarray, "n n"], gradient: Float[np.ndarray, "*fits n"]
+) -> Float[np.ndarray, "*fits"]:
     """The share of a quantity's variance that comes from the prior, by its gradient."""
-    moved = np.linalg.solve(prior_root, root @ (root.T @ gradient))
-    return float(moved @ moved / np.sum((root.T @ gradient) ** 2))
+    along = np.einsum("...ij,...i->...j", root, gradient)
+    moved = np.einsum("...ij,...j->...i", np.linalg.inv(prior_root) @ root, along)
+    return np.sum(moved**2, axis=-1) / np.sum(along**2, axis=-1)
 
 
 def _remedy(verdict: str, force_sd: float, offered: tuple[Option, ...], structure: Structure) -> str:

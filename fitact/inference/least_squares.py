@@ -27,7 +27,7 @@ NUISANCES = {  # by name, the columns of `LINEAR` that a trace may ask for; besi
     "hum_50Hz": (2, 3),
     "hum_60Hz": (4, 5),
 }
-_EVIDENCE = 10.0  # a nuisance is freed when it lowers the Bayesian information criterion by this much
+EVIDENCE = 10.0  # a nuisance is freed when it lowers the Bayesian information criterion by this much
 
 
 class Solved(eqx.Module):
@@ -143,7 +143,7 @@ def solve(
     for _ in range(sum(map(len, freeable))):
         gains = _evidence(solved, freeable)
         which, name = max(gains, key=gains.__getitem__, default=(0, ""))
-        if not name or not gains[which, name] > _EVIDENCE:
+        if not name or not gains[which, name] > EVIDENCE:
             break
         likelihood, theta = _freed(solved, which, name)
         solved = _coloured(likelihood, theta, solved.sigma)
@@ -214,7 +214,7 @@ def _evidence(solved: Solved, freeable: tuple[tuple[str, ...], ...]) -> dict[tup
     basis = basis[:, values > 1e-9 * values[0]]
     remainder = np.concatenate(remainders)
     gains = {
-        (i, "clock"): _gain(clock_drop(trace, likelihood.seen(solved.theta, i), sigma[i]), float(trace.count), 1)
+        (i, "clock"): bic_gain(clock_drop(trace, likelihood.seen(solved.theta, i), sigma[i]), float(trace.count), 1)
         for i, trace in enumerate(likelihood.traces)
         if "clock" in freeable[i] and "clock" not in trace.timing
     }
@@ -223,10 +223,10 @@ def _evidence(solved: Solved, freeable: tuple[tuple[str, ...], ...]) -> dict[tup
         modes, sizes, _ = np.linalg.svd(left, full_matrices=False)
         modes = modes[:, sizes > 1e-9 * max(float(np.linalg.norm(added)), 1e-300)]
         share = float(np.sum((modes.T @ remainder) ** 2)) / float(remainders[i] @ remainders[i])
-        gains[i, name] = _gain(share, float(likelihood.traces[i].count), added.shape[1])
+        gains[i, name] = bic_gain(share, float(likelihood.traces[i].count), added.shape[1])
     return gains
 
 
-def _gain(share: float, count: float, added: int) -> float:
+def bic_gain(share: ArrayLike, count: float, added: int) -> Any:
     """By how much the Bayesian information criterion falls with a share of `count` samples' sum of squares."""
-    return -count * math.log1p(-min(share, 1.0 - 1e-12)) - added * math.log(count)
+    return -count * np.log1p(-np.minimum(share, 1.0 - 1e-12)) - added * math.log(count)

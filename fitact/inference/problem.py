@@ -324,9 +324,15 @@ def _start(likelihood: Likelihood, sources: Sequence[Source]) -> Float[np.ndarra
         current = None  # of one frequency, what a constant skin makes of such a current need be no skin
     if vsc is None and current is None:
         return _best_of_prior(likelihood, theta)
-    mean, sd = _believed(likelihood)
+    mean, sd = believed_skin(likelihood)
     skin = _skin_of(vsc, current)
-    logs = np.log(skin) if skin is not None else _on_the_ridge(vsc, mean, sd) if vsc is not None else mean
+    logs = (
+        np.log(skin)
+        if skin is not None
+        else on_the_ridge(np.asarray(vsc.g), np.asarray(vsc.b), mean, sd)
+        if vsc is not None
+        else mean
+    )
     for name, value in zip(("Rsc", "Csc", "Ci"), logs, strict=True):
         if name in likelihood.prior.names:
             theta[likelihood.prior.names.index(name)] = value
@@ -349,7 +355,7 @@ def _skin_of(vsc: LinearStart | None, current: CurrentStart | None) -> tuple[flo
     return (Rsc, (1.0 - 2.0 * g) * b / Rsc, g * b / Rsc) if g < 0.5 else None
 
 
-def _believed(likelihood: Likelihood) -> tuple[np.ndarray, np.ndarray]:
+def believed_skin(likelihood: Likelihood) -> tuple[np.ndarray, np.ndarray]:
     """Means and standard deviations of log Rsc, log Csc and log Ci; what is held has next to none."""
     prior, known = likelihood.prior, parameters(likelihood.template)
     pairs = [
@@ -360,17 +366,19 @@ def _believed(likelihood: Likelihood) -> tuple[np.ndarray, np.ndarray]:
     return mean, sd
 
 
-def _on_the_ridge(start: LinearStart, mean: np.ndarray, sd: np.ndarray) -> Float[np.ndarray, "3"]:
-    """The most probable point, by the prior, among those with the start's g and b.
+def on_the_ridge(
+    g: Float[np.ndarray, "*n"], b: Float[np.ndarray, "*n"], mean: np.ndarray, sd: np.ndarray
+) -> Float[np.ndarray, "*n 3"]:
+    """The most probable points, by the prior, among those with that divider and time constant (s; infinite: unknown).
 
     They are the line (log Rsc, log Csc, log Ci) = point + t (-1, 1, 1).
     """
-    g = np.clip(start.g, 1e-9, 0.4999)
-    b = start.b if np.isfinite(start.b) else math.exp(mean[0] + mean[1])
+    g = np.clip(g, 1e-9, 0.4999)
+    b = np.where(np.isfinite(b), b, math.exp(mean[0] + mean[1]))
     ci = math.exp(mean[2])
-    point = np.array([math.log(g * b / ci), math.log((1.0 / g - 2.0) * ci), math.log(ci)])
+    point = np.stack([np.log(g * b / ci), np.log((1.0 / g - 2.0) * ci), np.full_like(g, math.log(ci))], axis=-1)
     along, weight = np.array([-1.0, 1.0, 1.0]), sd**-2.0
-    return point + along * np.sum(weight * along * (mean - point)) / np.sum(weight)
+    return point + along * np.sum(weight * along * (mean - point), axis=-1, keepdims=True) / np.sum(weight)
 
 
 def _best_of_prior(likelihood: Likelihood, theta: np.ndarray) -> Float[np.ndarray, " parameters"]:

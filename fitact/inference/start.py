@@ -82,6 +82,7 @@ def choose_drive(record: Record, scene: Scene | None) -> DriveChoice:
             f"the record repeats at {slowest:.6g} Hz, not at the scene's {stated:.6g} Hz, and its own"
             " frequency is used",
         )
+    drive = as_arrays(drive)
     shift = _align(record, drive, slowest, scene.drive.steady_state)
     if shift != 0.0 and "V" not in record and isinstance(drive, Sine):
         raise InputError(
@@ -107,7 +108,7 @@ def choose_drive(record: Record, scene: Scene | None) -> DriveChoice:
                 f"V_V differs from the scene's {scene.drive.waveform} by {percent(error)} rms;"
                 " [drive] waveform = 'measured' would use V_V as recorded",
             )
-    return DriveChoice(as_arrays(drive), voltage, scene.drive.steady_state, False, shift, scene.drive.waveform, notes)
+    return DriveChoice(drive, voltage, scene.drive.steady_state, False, shift, scene.drive.waveform, notes)
 
 
 def as_arrays(module: _Module) -> _Module:
@@ -242,19 +243,24 @@ def has_ideal_edges(drive: Drive) -> bool:
 
 def jumps_within(drive: Drive, time: np.ndarray, margin: float) -> Bool[np.ndarray, " samples"]:
     """Which times lie within a margin (s) of an ideal edge of a square wave."""
-    before, after = (np.asarray(drive.value(jnp.asarray(t))) for t in (time - margin, time + margin))
+    before, after = (np.asarray(_value(drive, t, True)) for t in (time - margin, time + margin))
     return np.abs(after - before) > 1e-9 * np.ptp(after)
 
 
 def _voltage(drive: Drive, time: np.ndarray, steady_state: bool) -> np.ndarray:
     """The drive at `time`; from rest there is none before t = 0."""
-    voltage = np.asarray(_value(drive, time))
-    return voltage if steady_state else np.where(time < 0.0, 0.0, voltage)
+    return np.asarray(_value(drive, time, steady_state))
 
 
 @eqx.filter_jit
-def _value(drive: Drive, time: ArrayLike) -> Array:
-    return drive.value(time)
+def _value(drive: Drive, time: ArrayLike, steady_state: bool) -> Array:
+    voltage = drive.value(time)
+    return voltage if steady_state else jnp.where(time < 0.0, 0.0, voltage)
+
+
+@eqx.filter_jit
+def _shifted(drive: Drive, time: Array, shifts: Array, steady_state: bool) -> Float[Array, "shifts times"]:
+    return jax.vmap(lambda shift: _value(drive, time - shift, steady_state))(shifts)
 
 
 def slope_of(choice: DriveChoice, time: np.ndarray) -> Float[np.ndarray, " samples"]:
@@ -290,23 +296,25 @@ def _align(record: Record, drive: Drive, frequency: float, steady_state: bool) -
     time, target = record.time[few], record["V" if "V" in record else "Vsc"][few]
     target = target - target.mean()
 
-    def left(shift: float) -> float:
-        wave = _voltage(drive, time - shift, steady_state)
-        columns = [np.ones_like(wave), wave]
-        if "V" not in record:
-            columns.append(np.cumsum(wave - wave.mean()))
-        design = np.stack(columns, axis=1)
-        weights = np.linalg.lstsq(design, target, rcond=None)[0]
-        remainder = target - design @ weights
-        return float(remainder @ remainder) if weights[1] > 0.0 else math.inf  # else half a period off
+    def left(shifts: np.ndarray) -> np.ndarray:
+        waves = np.asarray(_shifted(drive, time, shifts, steady_state))
+        return np.array([_left_by(wave - wave.mean(), target, "V" not in record) for wave in waves])
 
     shifts = np.arange(0.0, 1.0, 1.0 / 128.0) / frequency
-    errors = np.array([left(shift) for shift in shifts])
+    errors = left(shifts)
     best = int(np.argmin(errors))
     fine = shifts[best] + np.linspace(-1.0, 1.0, 129) / (128.0 * frequency)
-    left_fine = np.array([left(shift) for shift in fine])
+    left_fine = left(fine)
     if errors[0] <= 2.0 * left_fine.min():
         return 0.0
     # the middle of what fits equally well: an ideal edge may lie anywhere between two samples
     shift = float(np.mean(fine[left_fine <= left_fine.min() * (1.0 + 25.0 / target.size)]))
     return shift - 1.0 / frequency if shift > 0.5 / frequency else shift
+
+
+def _left_by(wave: np.ndarray, target: np.ndarray, integrated: bool) -> float:
+    """The least sum of squares that a wave (and its integral) leaves of a target, all of mean 0; inf if upside down."""
+    columns = np.stack([wave, *([(integral := np.cumsum(wave)) - integral.mean()] if integrated else [])])
+    products = columns @ target
+    weights = np.linalg.lstsq(columns @ columns.T, products, rcond=None)[0]
+    return float(target @ target - weights @ products) if weights[0] > 0.0 else math.inf  # else half a period off

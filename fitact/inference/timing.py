@@ -99,8 +99,9 @@ def clock_drop(trace: Trace, seen: Seen, sigma: float) -> float:
 
 def _drop(rows: np.ndarray) -> float:
     clock, remainder, *known = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
-    basis, sizes, _ = np.linalg.svd(np.array(known).T, full_matrices=False)
-    basis = basis[:, sizes > 1e-9 * sizes[0]]
+    q, r = np.linalg.qr(np.array([row for row in known if row.any()]).T)
+    modes, sizes, _ = np.linalg.svd(r)
+    basis = q @ modes[:, sizes > 1e-9 * sizes[0]]
     clock, remainder = (x - basis @ (basis.T @ x) for x in (clock, remainder))
     return float((clock @ remainder) ** 2 / max((clock @ clock) * (remainder @ remainder), 1e-300))
 

@@ -3,10 +3,11 @@
 import math
 from collections.abc import Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from fitact.inference.diagnostics import is_misfit
 from fitact.inference.least_squares import Solved
@@ -57,7 +58,12 @@ def is_out_of_bounds(
     axes, sizes, _ = np.linalg.svd(root)
     along = np.linspace(-_ALONG, _ALONG, 241)[:, None] * (axes[:, 0] * sizes[0])
     points = np.hstack([_with_possible_exponent(likelihood, theta, root) + along, np.tile(np.log(sigma), (241, 1))])
-    return not bool(jnp.any(jnp.isfinite(jax.vmap(likelihood.log_prior)(jnp.asarray(points)))))
+    return not bool(_any_possible(likelihood.without_samples(), jnp.asarray(points)))
+
+
+@eqx.filter_jit
+def _any_possible(likelihood: Likelihood, points: Float[Array, "n coordinates"]) -> Array:
+    return jnp.any(jnp.isfinite(jax.vmap(likelihood.log_prior)(points)))
 
 
 def _with_possible_exponent(likelihood: Likelihood, theta: np.ndarray, root: np.ndarray) -> np.ndarray:

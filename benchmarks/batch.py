@@ -1,0 +1,121 @@
+"""Many records fitted by `fit_many`, against a Python loop of lmfit and of scipy on the same ones.
+
+The peers minimise the same sum of squares, prior included, in log-parameters from the prior's medians, with the noise
+that fitact found; beside an optimum, fitact also judges each fit, and the peers do not.
+
+    python benchmarks/batch.py [--json] [--records 10000] [--samples 5000]
+"""
+
+import argparse
+import statistics
+import time
+
+import lmfit
+import numpy as np
+import scipy.optimize
+from timing import show
+
+import fitact
+
+V0, FREQUENCY, NOISE = 180.0, 100.0, 0.1  # V, Hz, V
+NAMES = ("Rsc", "Csc", "Ci")
+SCENE = fitact.Scene.from_dict(
+    {
+        "drive": {"waveform": "square", "peak_to_peak": 2.0 * V0, "frequency": FREQUENCY},
+        "prior": {
+            "Rsc": {"median": 160e3, "relative_sd": 0.3},
+            "Csc": {"median": 22e-9, "relative_sd": 0.3},
+            "Ci": {"median": 1.35e-9, "relative_sd": 0.05},
+        },
+    }
+)
+MEANS, SDS = np.log([160e3, 22e-9, 1.35e-9]), np.sqrt(np.log1p(np.square([0.3, 0.3, 0.05])))
+PEERS = 60  # records of each round that the peers fit
+ROUNDS = 5
+
+
+class Square:
+    """The paper's final circuit under a settled square, in closed form, on samples that meet the period."""
+
+    def __init__(self, time: np.ndarray) -> None:
+        self.time = time
+        half = np.floor(time * 2.0 * FREQUENCY + 1e-9)
+        self.sign, self.since = np.where(half % 2 == 0.0, 1.0, -1.0), time - half / (2.0 * FREQUENCY)
+
+    def __call__(self, theta: np.ndarray) -> np.ndarray:
+        R, C, Ci = np.exp(theta)
+        g, b = Ci / (2.0 * Ci + C), R * (2.0 * Ci + C)
+        return self.sign * (2.0 * V0 * g / (1.0 + np.exp(-0.5 / FREQUENCY / b))) * np.exp(-self.since / b)
+
+
+def simulated(count: int, samples: int) -> list[fitact.Record]:
+    """People, whose panel is the same; two periods of each."""
+    time = np.arange(samples) * (2.0 / FREQUENCY / samples)
+    model, random = Square(time), np.random.default_rng(1)
+    truths = MEANS + random.standard_normal((count, 3)) * [0.3, 0.3, 0.0]
+    return [
+        fitact.Record.from_arrays(time, Vsc=model(truth) + NOISE * random.standard_normal(samples), source=f"{i}")
+        for i, truth in enumerate(truths)
+    ]
+
+
+def by_lmfit(model: Square, observed: np.ndarray, sigma: float) -> np.ndarray:
+    """As one writes it, with lmfit's own settings."""
+    parameters = lmfit.Parameters()
+    for name, mean in zip(NAMES, MEANS, strict=True):
+        parameters.add(name, value=mean)
+
+    def residuals(p: lmfit.Parameters) -> np.ndarray:
+        theta = np.array([p[name].value for name in NAMES])
+        return np.append((observed - model(theta)) / sigma, (theta - MEANS) / SDS)
+
+    found = lmfit.minimize(residuals, parameters, scale_covar=False)
+    return np.array([found.params[name].value for name in NAMES])
+
+
+def by_scipy(model: Square, observed: np.ndarray, sigma: float) -> np.ndarray:
+    """MINPACK's Levenberg-Marquardt, as tight as it goes."""
+
+    def residuals(theta: np.ndarray) -> np.ndarray:
+        return np.append((observed - model(theta)) / sigma, (theta - MEANS) / SDS)
+
+    tight = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
+    return scipy.optimize.least_squares(residuals, MEANS, method="lm", jac="3-point", **tight).x
+
+
+def measure(count: int, samples: int) -> dict[str, float]:
+    """Ratios of fits per second, and how far optima are apart in the logarithms."""
+    records = simulated(count, samples)
+    model = Square(records[0].time)
+    fitact.fit_many(records[:300], SCENE, progress=False)  # compiles
+    taken: dict[str, list[float]] = {"fitact": [], "lmfit": [], "scipy": []}
+    apart: dict[str, list[float]] = {"lmfit": [], "scipy": []}
+    for turn in range(ROUNDS):
+        start = time.perf_counter()
+        fits = fitact.fit_many(records, SCENE, progress=False)
+        taken["fitact"].append((time.perf_counter() - start) / count)
+        some = [(turn * PEERS + i) % count for i in range(PEERS)]
+        for name, peer in (("lmfit", by_lmfit), ("scipy", by_scipy)):
+            start = time.perf_counter()
+            found = [peer(model, records[i]["Vsc"], fits[i]["noise"]) for i in some]
+            taken[name].append((time.perf_counter() - start) / PEERS)
+            ours = np.log([[fits[i][key] for key in NAMES] for i in some])
+            apart[name].append(float(np.max(np.abs(ours - found))))
+    seconds = {name: statistics.median(values) for name, values in taken.items()}
+    return {
+        "fits_per_second": 1.0 / seconds["fitact"],
+        "vs_lmfit": seconds["lmfit"] / seconds["fitact"],
+        "vs_scipy": seconds["scipy"] / seconds["fitact"],
+        "apart_lmfit": max(apart["lmfit"]),
+        "apart_scipy": max(apart["scipy"]),
+        "alone": float(np.mean([row["freed"] != "" or not row["trusted"] for row in fits])),
+    }
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="one JSON object")
+    parser.add_argument("--records", type=int, default=10_000)
+    parser.add_argument("--samples", type=int, default=5_000)
+    asked = parser.parse_args()
+    show(measure(asked.records, asked.samples), asked.json)

@@ -1,0 +1,53 @@
+"""The command on many records."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fitact.cli.app import app
+from fitact.cli.options import Channels, Json, Scales, Seed, mapping
+from fitact.cli.terminal import keep_compiled, show
+
+
+@app.command()
+def campaign(
+    records: Annotated[list[Path], typer.Argument(metavar="RECORD...", help="One of each finger or condition.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results; the same one goes on.")],
+    scene: Annotated[
+        Path | None, typer.Option("--scene", metavar="FILE", help="Scene (TOML) of all; absent: the paper's device.")
+    ] = None,
+    channel: Channels = None,
+    scale: Scales = None,
+    scheduler: Annotated[
+        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Of a Dask scheduler, as tcp://host:8786.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", min=1, help="Workers of this machine; absent: one for each core.")
+    ] = None,
+    memory: Annotated[str, typer.Option("--memory", help="What each of these may take.")] = "2 GiB",
+    reports: Annotated[
+        bool, typer.Option("--reports", help="Sample the posterior of each, too, and write its report.")
+    ] = False,
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """Fit many records, each by itself, on this machine's cores or any Dask cluster; nothing is lost or done twice.
+
+    Into DIR it writes results.parquet, failures.csv and index.html. The same command goes on after any interruption.
+    Exit code 0: every record has an answer or a reason why not.
+    """
+    from fitact.model.scene import Scene
+
+    stated = None if scene is None else Scene.load(scene)
+    keep_compiled()
+    from fitact.campaign import run_campaign
+    from fitact.report.campaign import write_campaign
+
+    fits = run_campaign(
+        records, out, stated, **mapping((channel, scale)),
+        scheduler=scheduler, workers=workers, memory=memory, reports=reports, seed=seed,
+    )  # fmt: skip
+    page = write_campaign(out, fits)
+    counted = {"records": len(fits), "answers": len(fits.answered), "failures": len(fits.failures)}
+    show(f"{fits}\nopen {page}", counted | {"page": str(page)}, json)

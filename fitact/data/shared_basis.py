@@ -1,0 +1,90 @@
+"""Records of one drive on one time grid, in coordinates that they share.
+
+As a `fitact.data.compress.Compression` of each, but the basis is worked out once, so that a record costs one product
+with a matrix of some forty columns.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitact.data.compress import NODES, REACH, Compression, chebyshev, exponentials, slow_shapes
+from fitact.model.drive import Drive
+from fitact.model.response import highpass
+
+
+class SharedBasis(NamedTuple):
+    """Orthonormal functions over the samples, whose first span the responses of time constants around a middle one.
+
+    Attributes:
+        center: of the table, log s.
+        functions: over the samples; the last is how a faster clock changes the record, to first order.
+        signal: Chebyshev coefficients in log tau of the response to the drive (V), in the first coordinates.
+        slow, slope, clock: the shapes of a `Compression` in these coordinates, and that of the clock.
+    """
+
+    center: float
+    functions: Float[np.ndarray, "samples coordinates"]
+    signal: Float[np.ndarray, "rank terms"]
+    slow: Float[np.ndarray, "shapes coordinates"]
+    slope: Float[np.ndarray, " coordinates"]
+    clock: Float[np.ndarray, " coordinates"]
+
+    @classmethod
+    def around(cls, drive: Drive, time: Float[np.ndarray, " samples"], steady_state: bool, tau: float) -> "SharedBasis":
+        """For time constants within a factor 9 of `tau` (s). Call it in double precision."""
+        relative, mix, _ = exponentials()
+        u, slow, slope = map(
+            np.asarray, _over_samples(drive, jnp.asarray(time), jnp.asarray(tau * relative), steady_state)
+        )
+        clock = (time - 0.5 * (time[0] + time[-1])) * slope
+        columns = [(mix.T @ u), slow, slope[None], clock[None]]
+        functions, rows = np.linalg.qr(np.concatenate(columns).T)
+        rank = mix.shape[1]
+        series = functions[:, :rank].T @ u.T @ chebyshev(NODES)[1].T
+        places = np.cumsum([rank, len(slow), 1])
+        slow, slope, clock = np.split(rows[:, rank:].T, places[1:] - rank)
+        return cls(float(np.log(tau)), functions, series, slow, slope[0], clock[0])
+
+    def compression(self, samples: int) -> Compression:
+        """What all records have in common; `observed` is to be replaced by a row of `project`."""
+        size = self.functions.shape[1] + 1
+
+        def padded(rows: np.ndarray) -> Array:
+            return jnp.asarray(np.pad(rows, [(0, 0)] * (rows.ndim - 1) + [(0, 1)]))
+
+        return Compression(
+            center=jnp.asarray(self.center),
+            reach=jnp.asarray(REACH),
+            signal=jnp.asarray(self.signal),
+            decay=jnp.zeros((size, NODES)),
+            slow=padded(self.slow),
+            rate=jnp.zeros(size),
+            slope=padded(self.slope),
+            observed=jnp.zeros(size),
+            samples=jnp.asarray(float(samples)),
+        )
+
+    def project(self, observed: Float[np.ndarray, "records samples"]) -> Float[np.ndarray, "records coordinates+1"]:
+        """Coordinates of records; the last is the length of what lies outside of the basis."""
+        inside = observed @ self.functions
+        square = np.einsum("ij,ij->i", observed, observed) - np.einsum("ij,ij->i", inside, inside)
+        return np.column_stack([inside, np.sqrt(np.maximum(square, 0.0))])
+
+
+@eqx.filter_jit
+def _over_samples(drive: Drive, time: Array, nodes: Array, steady_state: bool) -> tuple[Array, Array, Array]:
+    """Responses of the nodes, the slow shapes, and dV/dt over two samples."""
+    u = jax.vmap(lambda tau: highpass(drive, time, tau, steady_state=steady_state))(nodes)
+    step = (time[-1] - time[0]) / (time.size - 1)
+
+    def voltage(time: Array) -> Array:
+        return jnp.where(steady_state | (time >= 0.0), drive.value(time), 0.0)
+
+    slope = (voltage(time + step) - voltage(time - step)) / (2.0 * step)
+    slow = slow_shapes(time, 0.5 * (time[0] + time[-1]), 0.5 * (time[-1] - time[0]))
+    return u, slow, slope

@@ -1,0 +1,246 @@
+"""Records of one scene, drive and time grid, fitted together: each step of least squares is taken for all of them.
+
+Only what is beyond doubt is settled here: a record that asks for a nuisance, was clipped, is not described, or does
+not converge within a few steps is left for a fit of its own.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from fitact.data.compress import NODES, REACH, chebyshev
+from fitact.data.record import white_noises
+from fitact.data.shared_basis import SharedBasis
+from fitact.inference import derived
+from fitact.inference.derived import Derived
+from fitact.inference.diagnostics import is_misfit, tests
+from fitact.inference.least_squares import EVIDENCE, NUISANCES, bic_gain
+from fitact.inference.likelihood import Likelihood
+from fitact.inference.problem import Problem, believed_skin, on_the_ridge
+from fitact.model.chirp import Chirp
+from fitact.model.skin import WithSkin
+
+_LONGEST = 65_536  # samples, above which a fit by itself costs no more
+_STEPS = 20
+_CONVERGED = 1e-6  # standard errors from the optimum before the last step
+_STRIDE = 1.0  # longest step in a logarithm
+_DEPENDENT = 1e-9  # of a column's length: what rounding leaves of one that depends on others
+_DOUBT = 3.0  # of the Bayesian information criterion: error of a clock's evidence, whose shape is not exact here
+_RESOLVED = 512  # samples that tell whether noise hides the converter's steps
+_RAIL = 3  # samples at an extreme, from which it may be a rail
+
+
+class Settled(NamedTuple):
+    """Optima of records fitted together, one a row.
+
+    Attributes:
+        clear: where nothing is in doubt; elsewhere the other fields mean nothing.
+        theta, sigma, root: as `Fit.theta`, `Fit.sigma` and `Fit.covariance_root`.
+        logs, gradients: of `derived.NAMES`, as of `Derived.logs`.
+        figures: as `Fit.figures`.
+    """
+
+    clear: Bool[np.ndarray, " records"]
+    theta: Float[np.ndarray, "records parameters"]
+    sigma: Float[np.ndarray, " records"]
+    root: Float[np.ndarray, "records parameters parameters"]
+    logs: Float[np.ndarray, "records derived"]
+    gradients: Float[np.ndarray, "records derived parameters"]
+    figures: dict[str, np.ndarray]
+
+
+class Together(NamedTuple):
+    """What records of one scene, drive and time grid share.
+
+    Attributes:
+        likelihood: in the coordinates of `basis`.
+        time: s.
+        frequency: of the drive, Hz; None: it does not repeat.
+        freeable: nuisances that a record may ask for.
+    """
+
+    likelihood: Likelihood
+    derive: Derived
+    basis: SharedBasis
+    time: Float[np.ndarray, " samples"]
+    frequency: float | None
+    freeable: tuple[str, ...]
+
+    @classmethod
+    def like(cls, problem: Problem) -> "Together | None":
+        """For records like that of `problem`; None where such cannot be fitted together. In double precision."""
+        likelihood, (source, *others) = problem.likelihood, problem.sources
+        (trace, *_), choice, start = likelihood.traces, source.choice, source.start
+        plain = trace.channel == "Vsc" and trace.noise == "white" and trace.weight is None and not trace.timing
+        known = not (isinstance(likelihood.template, WithSkin) or isinstance(choice.drive, Chirp))
+        known = known and choice.name != "measured" and start is not None and math.isfinite(start.b)
+        own = bool(np.any(np.asarray(trace.linear_sd))) or bool(choice.notes) or choice.shift != 0.0
+        if others or not (plain and known) or own or trace.time.size > _LONGEST or start is None:
+            return None
+        time = source.record.time
+        basis = SharedBasis.around(choice.drive, time, choice.steady_state, start.b)
+        shared = dataclasses.replace(trace, compression=basis.compression(time.size), columns=()).without_samples()
+        derive = derived.for_fit(likelihood, source.record, choice, source.scene, start.b)
+        frequency = source.record.frequency() if choice.periodic else None
+        return cls(likelihood.with_trace(0, shared), derive, basis, time, frequency, source.freeable)
+
+    def settle(self, observed: Float[np.ndarray, "records samples"]) -> Settled:
+        """Fit records. In double precision."""
+        coordinates = self.basis.project(observed)
+        start, held = self._starts(coordinates)
+        noise = white_noises(observed)
+        least = 1e-9 * np.ptp(observed, axis=1)
+        begun = jnp.asarray(start), jnp.asarray(np.maximum(noise, least)), jnp.asarray(least)
+        ends = _settle(self.likelihood, jnp.asarray(np.append(self.basis.clock, 0.0)), jnp.asarray(coordinates), *begun)
+        theta, sigma, triangle, shares, signal = map(np.asarray, ends[:5])
+        logs, gradients = map(np.asarray, _derived(self.derive, ends[0], ends[1]))
+        left = observed - signal @ self.basis.functions.T
+        freedom = self.time.size - theta.shape[1]
+        figures = tests(left, self.time, noise, freedom, self.frequency)
+        figures |= {"rounding_noise": np.zeros(len(left)), "interpolation_error": np.zeros(len(left))}
+        clear = held & np.asarray(ends[5]) & ~self._asked_for(shares) & _is_plain(observed, noise) & ~is_misfit(figures)
+        return Settled(clear, theta, sigma, np.linalg.inv(triangle), logs, gradients, figures)
+
+    def _starts(
+        self, coordinates: Float[np.ndarray, "records coordinates"]
+    ) -> tuple[Float[np.ndarray, "records parameters"], Bool[np.ndarray, " records"]]:
+        """The best response of the table's nodes to each, on the ridge, and whether the table holds it."""
+        x, _ = chebyshev(NODES)
+        signal = self.basis.signal @ np.polynomial.chebyshev.chebvander(x, NODES - 1).T
+        size = np.einsum("ij,ij->j", signal, signal)
+        products = coordinates[:, : len(signal)] @ signal
+        best = np.argmax(np.where(products > 0.0, products**2 / size, -1.0), axis=1)
+        inside = (best > 0) & (best < NODES - 1) & (products[np.arange(len(best)), best] > 0.0)
+        g, b = products[np.arange(len(best)), best] / size[best], np.exp(self.basis.center + REACH * x[best])
+        theta = np.tile(self.likelihood.prior.log_mean, (len(best), 1))
+        for name, logs in zip(("Rsc", "Csc", "Ci"), on_the_ridge(g, b, *believed_skin(self.likelihood)).T, strict=True):
+            if name in self.likelihood.names:
+                theta[:, self.likelihood.names.index(name)] = logs
+        return theta, inside
+
+    def _asked_for(self, shares: Float[np.ndarray, "records nuisances"]) -> Bool[np.ndarray, " records"]:
+        """Whether a nuisance may be asked for."""
+        gains = [
+            bic_gain(share, self.time.size, len(NUISANCES.get(name, (0,)))) + (_DOUBT if name == "clock" else 0.0)
+            for name, share in zip(_CANDIDATES, shares.T, strict=True)
+            if name in self.freeable
+        ]
+        return np.max(gains, axis=0, initial=-math.inf) > EVIDENCE
+
+
+_CANDIDATES = (*NUISANCES, "delay", "clock")
+
+
+def _is_plain(observed: np.ndarray, noise: np.ndarray) -> Bool[np.ndarray, " records"]:
+    """Whether records show neither a rail nor the steps of a converter."""
+    levels = np.sort(observed[:, :_RESOLVED], axis=1)
+    steps = np.diff(levels, axis=1)
+    step = np.min(np.where(steps > 0.0, steps, np.inf), axis=1)
+    extremes = (observed.max(axis=1, keepdims=True), observed.min(axis=1, keepdims=True))
+    railed = [np.count_nonzero(observed == extreme, axis=1) > _RAIL for extreme in extremes]
+    return (step <= noise) & ~np.any(railed, axis=0)
+
+
+@eqx.filter_jit
+def _settle(likelihood: Likelihood, clock: Array, *of_each: Array) -> tuple[Array, ...]:
+    return jax.vmap(lambda *of: _settle_one(likelihood, clock, *of))(*of_each)
+
+
+def _settle_one(
+    likelihood: Likelihood, clock: Array, observed: Array, start: Array, noise: Array, least: Array
+) -> tuple[Array, ...]:
+    """Gauss-Newton from a start near the optimum, the noise being that of the residuals.
+
+    Gives theta, sigma, the triangle of the Jacobian, the shares of `_CANDIDATES` in the residuals' square, the
+    signal's coordinates, whether it ended at the optimum, and the steps.
+    """
+    trace = likelihood.traces[0]
+    assert trace.compression is not None
+    table = dataclasses.replace(trace.compression, observed=observed)
+    model = likelihood.with_trace(0, dataclasses.replace(trace, compression=table))
+    size = start.size
+
+    def linearised(theta: Array, sigma: Array) -> tuple[Array, Array]:
+        def whitened(theta: Array) -> Array:
+            return jnp.concatenate([*model.residuals(theta, sigma[None]), model.prior_residuals(theta)])
+
+        columns = jax.vmap(lambda along: jax.jvp(whitened, (theta,), (along,)), out_axes=(None, -1))
+        return columns(jnp.eye(size))
+
+    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        theta, sigma, _, steps = state
+        residuals, jacobian = linearised(theta, sigma)
+        triangle, along = _triangular(jacobian, residuals)
+        move = -_solved(triangle, along)
+        move = move * jnp.minimum(1.0, _STRIDE / jnp.max(jnp.abs(move)))
+        spread = sigma * jnp.linalg.norm(residuals[:-size]) / jnp.sqrt(trace.count - size)
+        return theta + move, jnp.maximum(spread, least), jnp.linalg.norm(along), steps + 1
+
+    def goes_on(state: tuple[Array, ...]) -> Array:
+        return (state[2] > _CONVERGED) & (state[3] < _STEPS)
+
+    theta, sigma, offset, steps = lax.while_loop(goes_on, step, (start, noise, jnp.array(jnp.inf), jnp.array(0)))
+    residuals, jacobian = linearised(theta, sigma)
+    left, triangle = sigma * residuals[:-size], _triangular(jacobian, residuals)[0]
+    within = jnp.isfinite(model.log_prior(jnp.append(theta, jnp.log(sigma))))
+    ended = (offset <= _CONVERGED) & within & table.holds(model.circuit(theta).b)
+    candidates = [[table.slow[place] for place in places] for places in NUISANCES.values()]
+    candidates += [[trace.slope(model.seen(theta))], [clock]]
+    known = _orthonormal(list(jacobian[:-size].T), [])
+    shares = [sum(jnp.square(q @ left) for q in _orthonormal(each, known)) for each in candidates]
+    return theta, sigma, triangle, jnp.stack(shares) / (left @ left), (observed - left)[:-1], ended, steps
+
+
+def _orthonormal(columns: list[Array], others: list[Array]) -> list[Array]:
+    """Columns made so against `others` and each other, by Gram and Schmidt, twice; 0 for what depends on these."""
+    found: list[Array] = []
+    for column in columns:
+        rest = column
+        for _ in range(2):
+            for q in (*others, *found):
+                rest = rest - (q @ rest) * q
+        length = jnp.linalg.norm(rest)
+        found.append(jnp.where(length > _DEPENDENT * jnp.linalg.norm(column), rest / length, 0.0))
+    return found
+
+
+def _triangular(jacobian: Float[Array, "rows n"], residuals: Array) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+    """R and Q' residuals of the QR decomposition: vectorised over many small ones, unlike LAPACK's."""
+    columns, rows, along = list(jacobian.T), [], []
+    for i, column in enumerate(columns):
+        length = jnp.linalg.norm(column)
+        q = column / length
+        products = [q @ other for other in columns[i + 1 :]]
+        columns[i + 1 :] = [other - p * q for other, p in zip(columns[i + 1 :], products, strict=True)]
+        rows.append(jnp.stack([*[jnp.zeros(())] * i, length, *products]))
+        along.append(q @ residuals)
+        residuals = residuals - along[-1] * q
+    return jnp.stack(rows), jnp.stack(along)
+
+
+def _solved(triangle: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Of an upper triangle, by substitution."""
+    found = jnp.zeros_like(right)
+    for i in reversed(range(right.size)):
+        found = found.at[i].set((right[i] - triangle[i] @ found) / triangle[i, i])
+    return found
+
+
+@eqx.filter_jit
+def _derived(derive: Derived, theta: Array, sigma: Array) -> tuple[Array, Array]:
+    """As `Derived.logs`, of each record."""
+
+    def logs(theta: Array, sigma: Array) -> tuple[Array, Array]:
+        def of(theta: Array) -> Array:
+            return jnp.log(derive(theta, sigma[None]))
+
+        return of(theta), jax.jacfwd(of)(theta)
+
+    return jax.vmap(logs)(theta, sigma)

@@ -1,0 +1,308 @@
+"""Fits of many records, each by itself: alike ones together, a failure kept apart from the others."""
+
+import collections
+import csv
+import dataclasses
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import jax
+import numpy as np
+
+from fitact.data.record import Record
+from fitact.errors import InputError
+from fitact.files import replacing
+from fitact.inference import derived
+from fitact.inference.alike import Settled, Together
+from fitact.inference.fit import GOOD, fit
+from fitact.inference.identifiability import directions, from_prior, verdicts
+from fitact.inference.problem import pose
+from fitact.model.scene import Scene
+from fitact.progress import watched
+
+_TOGETHER = 256  # records; so many are stacked, whatever their number, and compiled for once
+_FEW = 16  # alike ones, below which fits by themselves take less than compiling
+_TRIES = 4  # records from which to learn what a group shares, since the first may be an odd one
+_MATCH = 0.01  # relative rms difference between V and the scene's drive
+_FORCE = derived.NAMES.index("force_mean")
+
+Input = Record | str | os.PathLike[str]
+
+
+@dataclasses.dataclass(frozen=True)
+class Fits(Sequence[dict[str, Any]]):
+    """Fits of many records as a table: a row for each, in the order in which they were given.
+
+    Attributes:
+        rows: of each record: `record` (its name), `result` (a member of `RESULTS`, "refused" or "crashed"), `trusted`,
+            `message`, and where there is an answer `samples`, `noise` (V or A), `chi2_reduced`, `rms_residual`,
+            `verdict`, `force_from_prior`, `freed`, and of each parameter and derived quantity the median, by its name
+            (SI), and the standard deviation of its logarithm, by name_log_sd.
+    """
+
+    rows: tuple[dict[str, Any], ...]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.rows[index]
+
+    @property
+    def failures(self) -> tuple[dict[str, Any], ...]:
+        """The rows without an answer."""
+        return tuple(row for row in self.rows if "samples" not in row)
+
+    @property
+    def answered(self) -> "Fits":
+        """The rows with an answer."""
+        return Fits(tuple(row for row in self.rows if "samples" in row))
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """The table by columns; NaN, or "", where a row has no answer."""
+        names = dict.fromkeys(name for row in sorted(self.rows, key=len, reverse=True)[:1] for name in row)
+        names |= dict.fromkeys(name for row in self.rows for name in row)
+        samples = {name: next(row[name] for row in self.rows if name in row) for name in names}
+        blank = {name: "" if isinstance(sample, str) else np.nan for name, sample in samples.items()}
+        return {name: np.array([row.get(name, blank[name]) for row in self.rows]) for name in names}
+
+    def to_csv(self, path: str | os.PathLike[str], columns: Sequence[str] | None = None) -> None:
+        """Write the table, or some of its columns, as CSV; empty where there is no answer.
+
+        Raises:
+            InputError: the place cannot be written.
+        """
+        with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(columns or self.columns), extrasaction="ignore")
+            writer.writeheader()
+            writer.writerows(self.rows)
+
+    def to_parquet(self, path: str | os.PathLike[str]) -> None:
+        """Write the table as Parquet; needs `pip install 'fitact[campaign]'`.
+
+        Raises:
+            InputError: the place cannot be written, or pyarrow is not installed.
+        """
+        try:
+            import pyarrow as pa
+            import pyarrow.parquet as pq
+        except ImportError as error:
+            raise InputError(f"{path}: Parquet needs pyarrow; pip install 'fitact[campaign]', or write CSV") from error
+        with replacing(path) as temporary:
+            names = list(self.columns)
+            pq.write_table(pa.table({name: [row.get(name) for row in self.rows] for name in names}), temporary)
+
+    def __str__(self) -> str:
+        trusted = sum(bool(row["trusted"]) for row in self.rows)
+        text = f"{len(self)} records: {trusted} answers to be trusted, {len(self) - len(self.failures) - trusted} not"
+        return "\n".join([f"{text}, {len(self.failures)} without", *(row["message"] for row in self.failures)])
+
+
+def fit_many(
+    records: Iterable[Input],
+    scene: Scene | None = None,
+    *,
+    channels: Mapping[str, str] | None = None,
+    scale: Mapping[str, float] | None = None,
+    progress: bool = True,
+) -> Fits:
+    """Fit each of many records by itself, as `fitact.fit` does, in one go.
+
+    Records of Vsc on one time grid, under a drive that the scene names, are fitted together, which takes a hundredth
+    of the time; those of them that are in any way doubtful, and all others, one after the other. A record that is
+    refused or fails leaves the others alone; its row says why.
+
+    Args:
+        records: records, or the paths of files; taken one after the other.
+        scene: of all of them.
+        channels, scale: of files, as in `fitact.read`.
+        progress: report on standard error.
+
+    Raises:
+        InputError: the scene asks for what is not available.
+    """
+    (scene or Scene()).require_available(fit=True)
+    rows: dict[int, dict[str, Any]] = {}
+    total = len(records) if isinstance(records, Sequence) else 0
+    with jax.enable_x64(True):
+        opened = _opened(records, scene, {"channels": channels, "scale": scale}, rows)
+        batches = _batches(watched(opened, "fitting the records", total) if progress and total else opened, scene)
+        for members, settled in _in_threads(batches):
+            left = ((number, record) for number, record in members if number not in settled)
+            rows |= settled | {number: _alone(record, scene) for number, record in left}
+    return Fits(tuple(rows[number] for number in sorted(rows)))
+
+
+Member = tuple[int, Record]
+Batch = tuple[Together | None, list[Member]]
+
+
+def _opened(
+    records: Iterable[Input], scene: Scene | None, columns: Mapping[str, Any], rows: dict[int, dict[str, Any]]
+) -> Iterator[Member]:
+    """Records by their number; those that cannot be read become rows."""
+    from fitact.data.formats import read
+
+    for number, given in enumerate(records):
+        try:
+            yield number, given if isinstance(given, Record) else read(given, scene, **columns)
+        except Exception as error:
+            rows[number] = _failed(str(given), error)
+
+
+def _in_threads(batches: Iterable[Batch]) -> Iterator[tuple[list[Member], dict[int, dict[str, Any]]]]:
+    """The members of batches and the rows of those that could be settled together, a batch ahead for each core."""
+    cores = int(os.environ.get("OMP_NUM_THREADS") or len(os.sched_getaffinity(0)))
+    under_way: collections.deque[tuple[list[Member], Future[dict[int, dict[str, Any]]]]] = collections.deque()
+    with ThreadPoolExecutor(cores) as pool:
+        for together, members in batches:
+            under_way.append((members, pool.submit(_settled, together, members)))
+            if len(under_way) > cores:
+                done, rows = under_way.popleft()
+                yield done, rows.result()
+        yield from ((done, rows.result()) for done, rows in under_way)
+
+
+class _Group:
+    """Records of one time grid that wait for each other."""
+
+    def __init__(self, time: np.ndarray) -> None:
+        self.time, self.members, self.tries = time, list[Member](), 0
+        self.together: Together | None = None
+        self.voltage: np.ndarray | None = None
+
+    def alike(self, scene: Scene | None) -> bool:
+        """Whether they can be fitted together; learnt from some of them."""
+        if len(self.members) < _FEW:
+            return False
+        for _, record in self.members[: _TRIES - self.tries]:
+            if self.together is not None:
+                break
+            self.tries += 1
+            try:
+                problem = pose([record], [scene])
+                self.together, self.voltage = Together.like(problem), problem.sources[0].choice.voltage
+            except (InputError, np.linalg.LinAlgError):
+                continue
+        return self.together is not None
+
+
+def _batches(records: Iterable[Member], scene: Scene | None) -> Iterator[Batch]:
+    """Records to be fitted together, or each by itself."""
+    groups: dict[tuple[float, ...], _Group] = {}
+    for number, record in records:
+        time = record.time
+        group = groups.setdefault((time.size, time[0], time[1], time[-1]), _Group(time))
+        if not np.array_equal(time, group.time):
+            yield None, [(number, record)]
+            continue
+        group.members.append((number, record))
+        if len(group.members) == _TOGETHER:
+            yield from _sorted_out(group, scene)
+    for group in groups.values():
+        yield from _sorted_out(group, scene)
+
+
+def _sorted_out(group: _Group, scene: Scene | None) -> Iterator[Batch]:
+    if group.alike(scene):
+        assert group.voltage is not None
+        near = [member for member in group.members if _driven_alike(member[1], group.voltage)]
+        yield group.together, near
+        taken = {number for number, _ in near}
+        group.members = [member for member in group.members if member[0] not in taken]
+    yield None, group.members
+    group.members = []
+
+
+def _driven_alike(record: Record, voltage: np.ndarray) -> bool:
+    """Whether the record has no V, or the scene's."""
+    if "Vsc" not in record:
+        return False
+    if "V" not in record:
+        return True
+    off = record["V"] - voltage
+    return bool(off @ off <= _MATCH**2 * (voltage @ voltage))
+
+
+def _settled(together: Together | None, members: list[Member]) -> dict[int, dict[str, Any]]:
+    """Rows of those that are beyond doubt."""
+    if together is None or not members:
+        return {}
+    observed = np.stack([record["Vsc"] for _, record in members])
+    missing = _TOGETHER - len(observed)
+    with jax.enable_x64(True):  # of each thread
+        found = together.settle(np.concatenate([observed, np.repeat(observed[-1:], missing, axis=0)]))
+        table = _columns(together, found)
+    return {
+        number: {"record": os.path.basename(record.source)} | {name: values[i] for name, values in table.items()}
+        for i, (number, record) in enumerate(members)
+        if found.clear[i]
+    }
+
+
+def _columns(together: Together, found: Settled) -> dict[str, list[Any]]:
+    likelihood, count = together.likelihood, len(found.theta)
+    free = likelihood.names
+    force = found.gradients[:, _FORCE]
+    shares, _, along = directions(free, found.root, likelihood.prior_root, free)
+    table: dict[str, Any] = {
+        "result": ["successful"] * count,
+        "trusted": [True] * count,
+        "message": [GOOD] * count,
+        "samples": [together.time.size] * count,
+        "noise": found.sigma,
+        "chi2_reduced": found.figures["chi2_reduced"],
+        "rms_residual": found.figures["rms_residual"],
+        "verdict": verdicts(shares, along),
+        "force_from_prior": from_prior(found.root, likelihood.prior_root, force),
+        "freed": [""] * count,
+    }
+    spread = np.linalg.norm(found.root, axis=2)
+    sd = np.linalg.norm(found.gradients @ found.root, axis=2)
+    table |= _values(free, np.exp(found.theta).T, spread.T) | _values(derived.NAMES, np.exp(found.logs).T, sd.T)
+    return {name: values.tolist() if isinstance(values, np.ndarray) else values for name, values in table.items()}
+
+
+def _values(names: Sequence[str], medians: np.ndarray, log_sds: np.ndarray) -> dict[str, Any]:
+    return {
+        key: value
+        for name, median, sd in zip(names, medians, log_sds, strict=True)
+        for key, value in ((name, median), (f"{name}_log_sd", sd))
+    }
+
+
+def _alone(record: Record, scene: Scene | None) -> dict[str, Any]:
+    """The row of a record that is fitted by itself."""
+    try:
+        found = fit(record, scene)
+    except Exception as error:
+        return _failed(record.source, error)
+    of_circuit = found.identifiability.blind_direction
+    free = [i for i, name in enumerate(found.names) if name in of_circuit]
+    logs, gradients = found.derive.logs(found.theta, np.array([trace.sigma for trace in found.traces]))
+    row = {
+        "record": os.path.basename(record.source),
+        "result": found.result,
+        "trusted": found.trusted,
+        "message": found.message,
+        "samples": int(found.figures["samples"]),
+        "noise": found.sigma,
+        "chi2_reduced": found.figures["chi2_reduced"],
+        "rms_residual": found.figures["rms_residual"],
+        "verdict": found.identifiability.verdict,
+        "force_from_prior": found.identifiability.force_from_prior,
+        "freed": ", ".join(found.model()["freed"]),
+    }
+    row |= _values([found.names[i] for i in free], np.exp(found.theta[free]), found.sd[free])
+    row |= _values(derived.NAMES, np.exp(logs), np.linalg.norm(gradients @ found.covariance_root, axis=1))
+    return {name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()}
+
+
+def _failed(source: str, error: Exception) -> dict[str, Any]:
+    refused = isinstance(error, InputError)
+    message = str(error) if refused else f"{source}: {type(error).__name__}: {error}"
+    result = "refused" if refused else "crashed"
+    return {"record": os.path.basename(source), "result": result, "trusted": False, "message": message}

@@ -1,0 +1,138 @@
+"""Many records at once: the same answers as one by one, and a failure that stays where it is."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.optimize
+from conftest import square_record
+
+import fitact
+
+COUNT = 20
+NAMES = ("Rsc", "Csc", "Ci")
+MEDIANS, LOG_SDS = np.log([130e3, 18e-9, 1.35e-9]), np.array([0.5, 0.5, 0.05])
+SCENE = fitact.Scene.from_dict(
+    {
+        "drive": {"waveform": "square", "peak_to_peak": 360.0, "frequency": 100.0},
+        "prior": {
+            name: {"median": float(np.exp(median)), "relative_sd": float(np.sqrt(np.expm1(sd**2)))}
+            for name, median, sd in zip(NAMES, MEDIANS, LOG_SDS, strict=True)
+        },
+    }
+)
+
+
+def record(number: int, **how) -> fitact.Record:
+    scale = np.exp(0.2 * np.sin(np.arange(3) + number))
+    skin = {"Rsc": 130e3 * scale[0], "Csc": 18e-9 * scale[1]}
+    made = square_record(noise=0.1, seed=number, per_period=1000, **skin | how)
+    return fitact.Record.from_arrays(made.time, Vsc=made["Vsc"], source=f"finger_{number}.csv")
+
+
+def optimum(record: fitact.Record, sigma: float) -> np.ndarray:
+    """By MINPACK, from the closed form of a settled square."""
+    half = np.floor(record.time * 200.0 + 1e-9)
+    sign, since = np.where(half % 2 == 0.0, 1.0, -1.0), record.time - half / 200.0
+
+    def residuals(theta):
+        R, C, Ci = np.exp(theta)
+        g, b = Ci / (2.0 * Ci + C), R * (2.0 * Ci + C)
+        model = sign * 360.0 * g / (1.0 + np.exp(-0.005 / b)) * np.exp(-since / b)
+        return np.append((record["Vsc"] - model) / sigma, (theta - MEDIANS) / LOG_SDS)
+
+    tight = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
+    return scipy.optimize.least_squares(residuals, MEDIANS, method="lm", jac="3-point", **tight).x
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory) -> list:
+    """Clean records, and among them odd ones of each kind."""
+    folder = tmp_path_factory.mktemp("records")
+    (folder / "broken.csv").write_text("time_s,Vsc_V\n0,1\n1,nan\n")
+    given: list = [record(number) for number in range(COUNT)]
+    clipped = np.minimum(given[3]["Vsc"], 0.6 * given[3]["Vsc"].max())
+    time, vsc = given[4].time, given[4]["Vsc"]
+    given[3] = fitact.Record.from_arrays(time, Vsc=clipped, source="clipped")
+    given[4] = fitact.Record.from_arrays(time, Vsc=vsc + 2.0, source="offset")
+    given[5] = fitact.Record.from_arrays(time, Vsc=vsc + 1.5 * np.sin(2.0 * np.pi * 730.0 * time), source="misfit")
+    given[6] = fitact.Record.from_arrays(time * 1.3, Vsc=vsc, source="of another frequency")
+    given[7] = folder / "broken.csv"
+    given[8] = str(folder)
+    return given
+
+
+@pytest.fixture(scope="module")
+def fits(given) -> fitact.Fits:
+    return fitact.fit_many(given, SCENE, progress=False)
+
+
+def test_rows_stand_in_the_order_of_the_records(fits, given):
+    assert len(fits) == len(given)
+    names = [Path(each.source if isinstance(each, fitact.Record) else each).name for each in given]
+    assert [row["record"] for row in fits] == names
+
+
+@pytest.mark.parametrize("number", [0, 3, 4, 5, 19])
+def test_each_row_is_the_fit_of_its_record(fits, given, number):
+    row, alone = fits[number], fitact.fit(given[number], SCENE)
+    assert (row["result"], row["trusted"]) == (alone.result, alone.trusted)
+    assert row["verdict"] == alone.identifiability.verdict
+    assert row["freed"] == ", ".join(alone.model()["freed"])
+    for i, name in enumerate(NAMES):
+        assert row[name] == pytest.approx(np.exp(alone.theta[i]), rel=1e-6)
+        assert row[f"{name}_log_sd"] == pytest.approx(alone.sd[i], rel=1e-4)
+    force = alone.derived()["force_mean"]
+    assert row["force_mean"] == pytest.approx(force["q50"], rel=1e-6)
+    assert row["force_from_prior"] == pytest.approx(alone.identifiability.force_from_prior, rel=1e-4)
+    assert row["chi2_reduced"] == pytest.approx(alone.figures["chi2_reduced"], rel=1e-9)
+
+
+@pytest.mark.parametrize("number", [0, 11])
+def test_optimum_against_scipy(fits, given, number):
+    row = fits[number]
+    np.testing.assert_allclose(
+        np.log([row[name] for name in NAMES]), optimum(given[number], row["noise"]), rtol=0.0, atol=1e-6
+    )
+
+
+def test_failures_stay_by_themselves(fits):
+    assert {row["record"] for row in fits.failures} >= {"broken.csv", "of another frequency"}
+    assert {row["result"] for row in fits.failures} == {"refused"}
+    assert "too few" in fits[7]["message"]
+    assert "directory" in fits[8]["message"]
+    assert "76.9" in fits[6]["message"]
+    assert fits[5]["result"] == "misfit"
+    clean = [row for number, row in enumerate(fits) if number not in (3, 4, 5, 6, 7, 8)]
+    assert all(row["trusted"] for row in clean)
+
+
+def test_what_no_one_foresaw_is_told_as_a_crash(monkeypatch):
+    def breaks(*_):
+        raise ZeroDivisionError("of all things")
+
+    monkeypatch.setattr("fitact.inference.many.fit", breaks)
+    (row,) = fitact.fit_many([record(0)], SCENE, progress=False)
+    assert (row["result"], row["trusted"]) == ("crashed", False)
+    assert "ZeroDivisionError: of all things" in row["message"]
+
+
+def test_tables_hold_every_row(fits, tmp_path: Path):
+    fits.to_csv(tmp_path / "fits.csv")
+    with (tmp_path / "fits.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["record"] for row in rows] == [row["record"] for row in fits]
+    assert [float(row["Rsc"]) for row in rows if row["Rsc"]] == [row["Rsc"] for row in fits if "Rsc" in row]
+    parquet = pytest.importorskip("pyarrow.parquet")
+    fits.to_parquet(tmp_path / "fits.parquet")
+    table = parquet.read_table(tmp_path / "fits.parquet").to_pydict()
+    assert table["Rsc"] == [row.get("Rsc") for row in fits]
+    assert table["trusted"] == [row["trusted"] for row in fits]
+    np.testing.assert_array_equal(np.isnan(fits.columns["Rsc"]), [x is None for x in table["Rsc"]])
+
+
+def test_a_channel_that_is_missing_is_a_row(given):
+    scene = fitact.Scene.from_dict({"measurement": {"channels": ["I"]}})
+    (row,) = fitact.fit_many(given[:1], scene, progress=False)
+    assert row["result"] == "refused"
