@@ -6,7 +6,8 @@ from typing import Annotated
 import typer
 
 from fitact.cli.app import app
-from fitact.cli.options import Channels, Json, Out, Scales, Seed, mapping
+from fitact.cli.files import Files
+from fitact.cli.options import Channels, Json, Out, Scales, Seed
 from fitact.cli.terminal import finish, show, typed, use_compilation_cache
 from fitact.files import write_json
 
@@ -38,11 +39,8 @@ def measurement(
     """
     from fitact.model.scene import Scene
 
-    stated, asked, measured = Scene.load(scene), mapping((channel, scale)), []
-    if record:
-        from fitact.data.formats import read
-
-        measured = [read(path, stated, **asked) for path in record]  # refused before the slow imports
+    stated = Scene.load(scene)
+    measured = list(Files(record, stated, (channel, scale)))  # refused before the slow imports
     use_compilation_cache()
     from fitact.inference.design import design_measurement
 
@@ -74,15 +72,12 @@ def drive(
 ) -> None:
     """The smallest drive that enough people feel: by waveform, frequency and insulator, within stated limits.
 
-    Into DIR it writes report.html, drive.json and drive.svg.
+    Into DIR it writes report.html, drive.json and drive.svg, and of records chain.h5 (for going on).
     """
     from fitact.model.scene import Scene
 
-    stated, asked, measured = Scene.load(scene), mapping((channel, scale)), []
-    if records:
-        from fitact.data.formats import read
-
-        measured = [read(path, stated, **asked) for path in records]
+    stated = Scene.load(scene)
+    measured = Files(records, stated, (channel, scale))
     use_compilation_cache()
     from fitact.inference.drive_design import design_drive, require_designable
 
@@ -91,7 +86,7 @@ def drive(
     if measured:
         from fitact.inference.population import population
 
-        people = population(measured, stated, seed=seed)
+        people = population(measured, stated, folder=out, seed=seed)
     found = design_drive(stated, people, share, seed=seed)
     if out is not None:
         from fitact.report.drive_design import write_drive_design, write_drive_design_page
@@ -99,6 +94,7 @@ def drive(
 
         write_json(out / "drive.json", found.to_dict())
         write_drive_design(out / "drive.svg", found)
-        write_drive_design_page(out / "report.html", found, Origin.of(typed(), stated, measured))
+        fingers = () if people is None else people.fingers
+        write_drive_design_page(out / "report.html", found, Origin.of(typed(), stated, fingers))
     show(str(found), found.to_dict(), json)
     finish(found.trusted)

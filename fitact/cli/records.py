@@ -1,19 +1,18 @@
 """Commands on records: what they hold, which model they prefer, what people they come from, what accuracy costs."""
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fitact.cli.app import app
+from fitact.cli.files import Files
 from fitact.cli.options import Channels, Fresh, Json, Out, RecordFiles, Scales, Seed, mapping, numbers
 from fitact.cli.terminal import finish, say, show, typed, use_compilation_cache
 from fitact.files import write_json
 
 if TYPE_CHECKING:
-    from fitact.data.record import Record
-    from fitact.model.scene import Scene
+    pass
 
 
 @app.command()
@@ -51,36 +50,19 @@ def compare(
     json: Json = False,
 ) -> None:
     """Fit the model of each scene to the same records, in full, and say which the data prefer."""
-    from fitact.data.formats import read
     from fitact.model.scene import Scene
 
     alike = len({path.stem for path in scenes}) < len(scenes)
     stated = {str(path) if alike else path.stem: Scene.load(path) for path in scenes}
     for each in stated.values():
         each.require_available(fit=True)
-    first, columns = next(iter(stated.values())), mapping((channel, scale))
-    measured = [read(record, first, **columns) for record in records]
+    measured = list(Files(records, next(iter(stated.values())), (channel, scale)))
     use_compilation_cache()
     from fitact.inference.comparison import compare as compared
 
     found = compared(measured, stated)
     show(str(found), found.to_dict(), json)
     finish(found.trusted)
-
-
-class _Files(Sequence["Record"]):
-    """Records, each read when it is asked for."""
-
-    def __init__(self, paths: list[Path], scene: "Scene | None", columns: dict[str, Any]) -> None:
-        self._paths, self._scene, self._columns = paths, scene, columns
-
-    def __len__(self) -> int:
-        return len(self._paths)
-
-    def __getitem__(self, index: Any) -> Any:
-        from fitact.data.formats import read
-
-        return read(self._paths[index], self._scene, **self._columns)
 
 
 @app.command()
@@ -119,7 +101,7 @@ def population(
 
     if fresh and out is not None:
         forget(out)
-    measured = _Files(records, stated, mapping((channel, scale)))
+    measured = Files(records, stated, (channel, scale))
     found = find_population(
         measured, stated, covariates=known, at=numbers("--at moisture=0.4", at), folder=out, seed=seed
     )

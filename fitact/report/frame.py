@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from fitact.data.record import Record
 from fitact.files import replacing
+from fitact.inference.finger import Finger
 from fitact.inference.summary import versions
 from fitact.model.scene import Scene
 from fitact.report import plots
@@ -32,7 +33,7 @@ class Origin:
     records: Mapping[str, str]
 
     @classmethod
-    def of(cls, command: str, scene: Scene | None, records: Sequence[Record] = ()) -> Self:
+    def of(cls, command: str, scene: Scene | None, records: Sequence[Record | Finger] = ()) -> Self:
         """From what the command was given."""
         stated = {} if scene is None else scene.model_dump(mode="json", exclude_unset=True)
         return cls(command, stated, {os.path.basename(each.source): each.fingerprint for each in records})
