@@ -107,3 +107,13 @@ def test_nothing_in_a_record_becomes_markup(finger_posterior: fitact.Posterior, 
 def test_whatever_can_be_free_has_a_name_for_people():
     for name in set(PriorSection.model_fields) - {"correlation", "order"}:
         assert _label(name) != name
+
+
+def test_results_of_another_version_are_refused(finger_posterior: fitact.Posterior, tmp_path):
+    from fitact.report import write_report
+
+    summary = finger_posterior.to_dict()
+    summary["record"] = {name: value for name, value in summary["record"].items() if name != "sources"}
+    with pytest.raises(fitact.InputError, match="lack 'sources'"):
+        write_report(tmp_path / "report.html", finger_posterior.to_datatree(), summary)
+    assert not (tmp_path / "report.html").exists()

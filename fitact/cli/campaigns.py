@@ -7,7 +7,7 @@ import typer
 
 from fitact.cli.app import app
 from fitact.cli.options import Channels, Json, Scales, Seed, mapping
-from fitact.cli.terminal import keep_compiled, show
+from fitact.cli.terminal import keep_compiled, show, typed
 
 
 @app.command()
@@ -43,11 +43,12 @@ def campaign(
     keep_compiled()
     from fitact.campaign import run_campaign
     from fitact.report.campaign import write_campaign
+    from fitact.report.frame import Origin
 
     fits = run_campaign(
         records, out, stated, **mapping((channel, scale)),
         scheduler=scheduler, workers=workers, memory=memory, reports=reports, seed=seed,
     )  # fmt: skip
-    page = write_campaign(out, fits)
+    page = write_campaign(out, fits, Origin.of(typed(), stated))
     counted = {"records": len(fits), "answers": len(fits.answered), "failures": len(fits.failures)}
     show(f"{fits}\nopen {page}", counted | {"page": str(page)}, json)

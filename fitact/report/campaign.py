@@ -3,31 +3,37 @@
 import os
 from pathlib import Path
 
-from fitact.files import replacing
 from fitact.inference.many import Fits
-from fitact.report.page import render
+from fitact.report.frame import Answer, Frame, Origin, write_page
 from fitact.units import engineering
 
 _SHOWN = 2_000  # rows on the page; the tables have all
 
 
-def write_campaign(folder: str | os.PathLike[str], fits: Fits) -> Path:
+def write_campaign(folder: str | os.PathLike[str], fits: Fits, origin: Origin) -> Path:
     """Write results.parquet, failures.csv and index.html into a folder; gives the page.
 
     Raises:
         InputError: the place cannot be written.
     """
-    place = Path(folder)
-    fits.answered.to_parquet(place / "results.parquet")
-    Fits(fits.failures).to_csv(place / "failures.csv", ("record", "result", "message"))
-    page = render(
-        "campaign.html",
-        answers=fits.answered[:_SHOWN],
-        failures=fits.failures[:_SHOWN],
-        counts={"records": len(fits), "answers": len(fits.answered), "failures": len(fits.failures)},
-        trusted=sum(bool(row["trusted"]) for row in fits),
-        engineering=engineering,
+    place, answered, failures = Path(folder), fits.answered, Fits(fits.failures)
+    answered.to_parquet(place / "results.parquet")
+    failures.to_csv(place / "failures.csv", ("record", "result", "message"))
+    trusted = sum(bool(row["trusted"]) for row in fits)
+    frame = Frame(
+        title="Campaign",
+        subject=f"{len(fits):,} records, each fitted by itself.",
+        trusted=True,
+        verdict=f"{trusted:,} of {len(fits):,} records have an answer to be trusted",
+        findings={},
+        answers=(
+            Answer("trusted", f"{trusted:,}", "answers"),
+            Answer("not to be trusted", f"{len(answered) - trusted:,}", "answers; their result says why"),
+            Answer("without an answer", f"{len(failures):,}", "records; failures.csv has the reasons"),
+        ),
+        warnings=(),
+        reserved=trusted < len(fits),
     )
-    with replacing(place / "index.html") as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    shown = {"answers": answered[:_SHOWN], "failures": failures[:_SHOWN], "count": len(answered)}
+    write_page(place / "index.html", "campaign.html", frame, origin, engineering=engineering, **shown)
     return place / "index.html"

@@ -63,10 +63,25 @@ _CIRCUITS = {
 
 
 def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any]) -> None:
-    """Write the page from a posterior's DataTree and the content of summary.json."""
+    """Write the page from a posterior's DataTree and the content of summary.json.
+
+    Raises:
+        InputError: the place cannot be written, or the results are of another version.
+    """
+    try:
+        page = _page(tree, summary)
+    except (KeyError, jinja2.UndefinedError) as error:
+        raise InputError(
+            f"{path}: its results lack {error}, as of another version of fitact; make them anew"
+        ) from error
+    with replacing(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def _page(tree: Any, summary: dict[str, Any]) -> str:
     with mpl.rc_context(plots.style()):
         figures = _figures(tree)
-    page = render(
+    return render(
         "report.html",
         summary=summary,
         figures=figures,
@@ -81,8 +96,6 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
         command=_command(summary),
         scene=json.dumps(summary["scene"], indent=2, ensure_ascii=False),
     )
-    with replacing(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
 
 
 def render(template: str, **content: Any) -> str:
