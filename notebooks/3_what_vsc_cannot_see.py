@@ -157,7 +157,7 @@ design = fitact.design_measurement(scene)
 print(design)
 
 # %% [markdown]
-# What is expected is no evidence. So four fingers, drawn from the prior, are measured in three ways and fitted, and
+# What is expected is no evidence. So six fingers, drawn from the prior, are measured in three ways and fitted, and
 # the answers compared with the truth. Bars are the fit's own standard deviations.
 
 # %%
@@ -167,7 +167,7 @@ cures = {
     "100 kΩ in series, and I": {"series_resistor": "100 kohm", "channels": ["Vsc", "I"]},
 }
 random = np.random.default_rng(3)
-fingers = [np.exp(np.array([0.3, 0.3, 0.05]) * random.standard_normal(3)) * [160e3, 22e-9, 1.35e-9] for _ in range(4)]
+fingers = [np.exp(np.array([0.3, 0.3, 0.05]) * random.standard_normal(3)) * [160e3, 22e-9, 1.35e-9] for _ in range(6)]
 figure, axes = plt.subplots(1, 3, figsize=(12, 3.4))
 widths = []
 for (name, change), here in zip(cures.items(), axes, strict=True):
@@ -180,7 +180,7 @@ for (name, change), here in zip(cures.items(), axes, strict=True):
         ]
         off.append(100 * (found["q50"] / Ci - 1))
         sd.append(100 * found["sd"] / found["mean"])
-    here.errorbar(range(1, 5), off, sd, fmt="o", capsize=3)
+    here.errorbar(range(1, 7), off, sd, fmt="o", capsize=3)
     here.axhline(0, color="0.5", lw=1)
     here.set(xlabel="finger", ylabel="Ci, fit − truth (%)", title=f"{name}: ± {np.median(sd):.2g} %")
     widths.append(np.median(sd))
