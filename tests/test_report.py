@@ -112,7 +112,7 @@ def test_whatever_can_be_free_has_a_name_for_people():
 def test_results_of_another_version_are_refused(finger_posterior: fitact.Posterior, tmp_path):
     from fitact.report import write_report
 
-    summary = finger_posterior.to_dict()
+    summary = finger_posterior.summary()
     summary["record"] = {name: value for name, value in summary["record"].items() if name != "sources"}
     with pytest.raises(fitact.InputError, match="lack 'sources'"):
         write_report(tmp_path / "report.html", finger_posterior.to_datatree(), summary)
