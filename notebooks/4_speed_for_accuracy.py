@@ -153,6 +153,7 @@ def moments(posterior) -> np.ndarray:
 
 
 reference = moments(runs["emcee, all samples"])
+reference_draws = runs["emcee, all samples"].log_prob.size
 off_by = {name: np.max(np.abs(moments(run) - reference) / reference[:, 1:2]) for name, run in runs.items()}
 each = {name: run.convergence.seconds / run.convergence.ess["force_mean"] for name, run in runs.items()}
 cost = {name: each[name] / each["emcee, all samples"] for name in ways}
@@ -160,14 +161,16 @@ figure, (left, right) = plt.subplots(1, 2, figsize=(10, 2.6), sharey=True)
 left.barh(list(ways), cost.values())
 left.set(xscale="log", xlim=(0.01, 2), xlabel="time of an effective draw", title="Cost, over that of the first")
 right.barh(list(ways), off_by.values(), color="C1")
-right.axvspan(0, 0.07, color="0.9", zorder=0)
-right.text(0.068, 0, "grey: not told from 0\nby so many draws", ha="right", va="center")
+# the sd of a 5 % quantile is 2.11 sd / sqrt(draws); the largest of ten differences is hardly ever above 2.5 of those
+resolution = 2.5 * 2.11 * np.sqrt(2 / reference_draws)
+right.axvspan(0, resolution, color="0.9", zorder=0)
+right.text(0.97 * resolution, 0, "grey: not told from 0\nby so many draws", ha="right", va="center")
 right.set(xlim=(0, 0.1), xlabel="largest error (posterior sd)", title="Mean, sd and quantiles of Rsc and force")
 left.invert_yaxis()
 plt.show()
 for name in ways:
     print(f"{name:20} off by {off_by[name]:.3f} sd, time {cost[name]:.2g} for each effective draw")
-assert max(off_by.values()) < 0.15
+assert max(off_by.values()) < resolution
 assert cost["emcee, compressed"] < 0.3
 
 # %% [markdown]

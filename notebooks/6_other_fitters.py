@@ -67,6 +67,9 @@ print(
 
 # %% [markdown]
 # ## Their answers
+#
+# AutoEIS compiles anew for each spectrum and gets the first five; what it is known for, the search for a circuit, is
+# not asked of it.
 
 # %%
 done = subprocess.run(
