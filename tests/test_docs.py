@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PROGRAMS = ("fitact", "make", "python", "pytest")
 # pages whose Python samples a posterior or fits many times; the rest is quick
-SAMPLING = {"README.md", "plan.md", "compare.md"}
+SAMPLING = {"README.md", "plan.md", "compare.md", "many.md"}
 # commands that take minutes; their own tests run them with fewer records
 MINUTES = {"population", "design", "tradeoff", "compare", "reproduce"}
 

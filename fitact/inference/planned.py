@@ -4,6 +4,8 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, Literal, TypeAlias
 
+import jax
+
 from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.inference.fit import Fit, fit
@@ -100,7 +102,8 @@ def _no_plan(scenes: Sequence[Scene], model: Model) -> str:
 
 def _recorded(record: Record, scene: Scene) -> Sampled | None:
     """The beginning of the recorded V, where that drives the fit: whole periods of it where it holds some."""
-    choice = choose_drive(record, scene)
+    with jax.enable_x64(True):
+        choice = choose_drive(record, scene)
     if choice.name != "measured":
         return None
     begin = Record(record.time[:_SAMPLES], {"V": choice.voltage[:_SAMPLES]}, record.source)

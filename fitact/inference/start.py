@@ -24,6 +24,7 @@ _Module = TypeVar("_Module", bound=eqx.Module)
 
 _PART = 1_048_576  # samples at a time
 _ALIGNED = 20_000  # samples on which a drive is laid
+_ROUNDING = 1e-12  # of a square, that of what is left of it
 _CONTRADICTION = 0.05  # relative difference between the stated and the recorded drive that cannot be an inaccuracy
 _SMOOTH_STEPS, _EDGE_STEPS = 0.5, 2.0  # error, over a whole record, of the frequency at which it repeats
 
@@ -317,4 +318,6 @@ def _left_by(wave: np.ndarray, target: np.ndarray, integrated: bool) -> float:
     columns = np.stack([wave, *([(integral := np.cumsum(wave)) - integral.mean()] if integrated else [])])
     products = columns @ target
     weights = np.linalg.lstsq(columns @ columns.T, products, rcond=None)[0]
-    return float(target @ target - weights @ products) if weights[0] > 0.0 else math.inf  # else half a period off
+    square = float(target @ target)
+    # else half a period off; what is left of records without noise is rounding
+    return max(square - float(weights @ products), _ROUNDING * square) if weights[0] > 0.0 else math.inf
