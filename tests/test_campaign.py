@@ -114,6 +114,7 @@ def test_workers_are_killed_three_times(folder: Path, undisturbed: Path, tmp_pat
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_everything_is_killed_and_goes_on(folder: Path, undisturbed: Path, tmp_path: Path):
     process = started(folder, tmp_path, "--workers", "2")
     until(lambda: lines(tmp_path) >= 1, process)
@@ -143,6 +144,7 @@ def cluster(port: int) -> Iterator[subprocess.Popen[bytes]]:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_the_scheduler_is_killed_and_comes_back(folder: Path, undisturbed: Path, tmp_path: Path, port: int):
     running = list(cluster(port))
     try:

@@ -70,6 +70,7 @@ def test_run_leaves_everything_and_says_what_to_open(results):
     assert summary["convergence"]["converged"] is True
 
 
+@pytest.mark.slow
 def test_run_again_goes_on_from_the_chain_and_json_stands_alone(
     results, fitact_command, finger_path, finger_scene_path
 ):

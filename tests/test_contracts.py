@@ -76,33 +76,34 @@ def leaves(path: str, value: Any, known: list[Stated]):
         yield path, value
 
 
+OWN = [pytest.mark.slow, pytest.mark.thorough]  # commands that other tests run, too
 CASES = [
     pytest.param("fit", [*FINGER], id="fit"),
-    pytest.param("fit", [*FINGER, "--intervals"], id="fit --intervals", marks=pytest.mark.slow),
+    pytest.param("fit", [*FINGER, "--intervals"], id="fit --intervals", marks=OWN),
     pytest.param("inspect", [FINGER[0]], id="inspect"),
     pytest.param("plan", ["natural-ground"], id="plan"),
     pytest.param("simulate", ["phone", "--out", "phone.csv"], id="simulate"),
-    pytest.param("prior", ["paper"], id="prior", marks=pytest.mark.slow),
-    pytest.param("reproduce", ["--out", "out"], id="reproduce", marks=pytest.mark.slow),
+    pytest.param("prior", ["paper"], id="prior", marks=OWN),
+    pytest.param("reproduce", ["--out", "out"], id="reproduce", marks=OWN),
     pytest.param(
         "run", [*FINGER, "--out", "out", "--level", "laplace", "--seed", "1"], id="run laplace", marks=pytest.mark.slow
     ),
-    pytest.param("run", [*FINGER, "--out", "out", "--seed", "1"], id="run", marks=pytest.mark.slow),
+    pytest.param("run", [*FINGER, "--out", "out", "--seed", "1"], id="run", marks=OWN),
     pytest.param("design measurement", ["paper"], id="design measurement", marks=pytest.mark.slow),
-    pytest.param("design drive", ["felt.toml"], id="design drive", marks=pytest.mark.slow),
+    pytest.param("design drive", ["felt.toml"], id="design drive", marks=OWN),
     pytest.param(
         "compare",
         [FINGER[0], "--scene", FINGER[2], "--scene", str(RECORDS / "trapezoid.toml")],
         id="compare",
-        marks=pytest.mark.slow,
+        marks=OWN,
     ),
     pytest.param(
         "population",
         [*(str(RECORDS / "fingers" / f"finger0{i}.csv.gz") for i in (0, 1)), *FINGER[1:], "--seed", "1"],
         id="population",
-        marks=pytest.mark.slow,
+        marks=OWN,
     ),
-    pytest.param("tradeoff", [*FINGER], id="tradeoff", marks=[pytest.mark.slow, pytest.mark.thorough]),
+    pytest.param("tradeoff", [*FINGER], id="tradeoff", marks=OWN),
 ]
 
 

@@ -22,8 +22,13 @@ import fitact.cli
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PROGRAMS = ("fitact", "make", "python", "pytest")
-# pages whose Python samples a posterior or fits many times; the rest is quick
-SAMPLING = {"README.md", "plan.md", "compare.md", "many.md"}
+# pages whose Python samples a posterior, fits many times or compiles much; the rest is quick
+OWN = [pytest.mark.slow, pytest.mark.thorough]  # what they show has tests of its own
+SLOW = {
+    "README.md": [pytest.mark.slow],
+    "theory.md": [pytest.mark.slow],
+    **dict.fromkeys(("plan.md", "compare.md", "many.md"), OWN),
+}
 # commands that take minutes; their own tests run them with fewer records
 MINUTES = {"population", "design", "tradeoff", "compare", "reproduce"}
 
@@ -134,11 +139,7 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     "page",
-    [
-        pytest.param(page, id=by_name(page), marks=pytest.mark.slow if page.name in SAMPLING else ())
-        for page in PAGES
-        if blocks(page, "python")
-    ],
+    [pytest.param(page, id=by_name(page), marks=SLOW.get(page.name, ())) for page in PAGES if blocks(page, "python")],
 )
 def test_python_runs(page, folder):
     """The blocks of a page one after the other, as a reader would paste them."""
@@ -158,7 +159,7 @@ def shell_blocks():
         for block in found:
             own = [words for words in commands(block.text) if words[0] == "fitact"] if block.language == "sh" else []
             if own and "[" not in block.text and "FILE" not in block.text:  # those state what can be given
-                marks = [pytest.mark.slow, pytest.mark.thorough] if own[0][1] in MINUTES else pytest.mark.slow
+                marks = [pytest.mark.slow] + [pytest.mark.thorough] * (page.name != "README.md" or own[0][1] in MINUTES)
                 printed = next((after.text for after in found if after.begin == block.end + 1), None)
                 yield pytest.param(page, own, printed, id=f"{by_name(page)}-{' '.join(own[0][:3])}", marks=marks)
 

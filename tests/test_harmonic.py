@@ -111,7 +111,9 @@ def test_current_of_a_trapezoid():
     np.testing.assert_allclose(ours, exact, rtol=0.0, atol=2e-4 * np.abs(exact).max())
 
 
-@pytest.mark.parametrize("name", ["sine", "square", "trapezoid", "triangle", "sampled"])
+@pytest.mark.parametrize(
+    "name", ["sine", "square", *(pytest.param(n, marks=pytest.mark.slow) for n in ("trapezoid", "triangle", "sampled"))]
+)
 def test_differentiable_in_every_parameter(name: str):
     def vsc(logs: jax.Array, peak_to_peak: jax.Array, frequency: jax.Array) -> jax.Array:
         drive = {

@@ -352,7 +352,11 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
     [
         (("plan", "scene.toml"), "Which model the scene requires"),
         (("design", "measurement", "scene.toml"), "What to measure next"),
-        (("design", "drive", "scene.toml"), "The smallest drive that 95 % of people feel"),
+        pytest.param(
+            ("design", "drive", "scene.toml"),
+            "The smallest drive that 95 % of people feel",
+            marks=pytest.mark.thorough,
+        ),
     ],
 )
 def test_a_command_leaves_a_page(arguments: tuple[str, ...], title: str, tmp_path: Path, monkeypatch):
@@ -369,6 +373,7 @@ def test_a_command_leaves_a_page(arguments: tuple[str, ...], title: str, tmp_pat
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_population_leaves_a_page_that_report_writes_again(tmp_path: Path):
     scene = tmp_path / "scene.toml"
     scene.write_text('[drive]\nwaveform = "trapezoid"\nrise_time = "50 us"\n[measurement]\nchannels = ["Vsc", "I"]\n')

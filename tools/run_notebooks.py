@@ -29,7 +29,8 @@ def run(path: Path) -> tuple[str, float]:
         number = max(len(begun), 1)
         why = f"{error.ename}: {error.evalue}" if hasattr(error, "ename") else str(error).strip()
         failure = f"{path}, code cell {number} of {len(code)}:\n\n{code[number - 1].source}\n\n{why}"
-    nbformat.write(notebook, TARGET / f"{path.stem}.ipynb")
+    # under another name where it failed, lest make take it for done
+    nbformat.write(notebook, TARGET / f"{path.stem}{'.failed' if failure else ''}.ipynb")
     return failure, time.perf_counter() - began
 
 

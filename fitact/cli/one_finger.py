@@ -22,7 +22,7 @@ from fitact.cli.options import (
     Tolerance,
     mapping,
 )
-from fitact.cli.terminal import finish, say, show, use_compilation_cache
+from fitact.cli.terminal import finish, say, show, typed, use_compilation_cache
 from fitact.files import write_json
 
 if TYPE_CHECKING:
@@ -218,6 +218,6 @@ def _sampled(
     posterior = sample(planned.fit, level=level, seed=seed, chain_file=chain)
     write_json(folder / "fit.json", planned.fit.to_dict() | {"plan": planned.to_dict()})
     posterior.to_netcdf(folder / "posterior.nc")
-    content = posterior.summary() | {"plan": planned.to_dict()}
+    content = posterior.summary() | {"plan": planned.to_dict(), "command": typed()}
     write_json(folder / "summary.json", content)
     return posterior, content

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import shlex
 from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
@@ -72,10 +73,16 @@ def resolve(names: list[str], channels: Mapping[str, str], source: str, place: s
     if not known:
         raise InputError(
             f"{source}{place}: no column is named time_s, V_V, Vsc_V or I_A, and which is which is not guessed"
-            f" (found: {_listed(names)}); say it, as --channel Vsc={names[-1] if names else 'NAME'}"
+            f" (found: {_listed(names)}); say it, as {_options(names)}"
             " (in Python: channels={'Vsc': ...})"
         )
     return known
+
+
+def _options(names: list[str]) -> str:
+    """What to type, by way of example."""
+    given = zip(("V", "Vsc"), names[-2:] if len(names) > 1 else ["NAME", *names], strict=False)
+    return " ".join(f"--channel {shlex.quote(f'{channel}={name}')}" for channel, name in given)
 
 
 def named(asked: str, names: list[str], source: str) -> str:

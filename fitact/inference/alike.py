@@ -35,6 +35,7 @@ _DEPENDENT = 1e-9  # of a column's length: what rounding leaves of one that depe
 _DOUBT = 3.0  # of the Bayesian information criterion: error of a clock's evidence, whose shape is not exact here
 _RESOLVED = 512  # samples that tell whether noise hides the converter's steps
 _RAIL = 3  # samples at an extreme, from which it may be a rail
+_CANDIDATES = (*NUISANCES, "delay", "clock")  # nuisances that a record may ask for
 
 
 class Settled(NamedTuple):
@@ -133,9 +134,6 @@ class Together(NamedTuple):
             if name in self.freeable
         ]
         return np.max(gains, axis=0, initial=-math.inf) > EVIDENCE
-
-
-_CANDIDATES = (*NUISANCES, "delay", "clock")
 
 
 def _is_plain(observed: np.ndarray, noise: np.ndarray) -> Bool[np.ndarray, " records"]:

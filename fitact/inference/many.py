@@ -155,7 +155,8 @@ def _opened(
 
 def _in_threads(batches: Iterable[Batch]) -> Iterator[tuple[list[Member], dict[int, dict[str, Any]]]]:
     """The members of batches and the rows of those that could be settled together, a batch ahead for each core."""
-    cores = int(os.environ.get("OMP_NUM_THREADS") or len(os.sched_getaffinity(0)))
+    asked = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
+    cores = int(asked) if asked.isdigit() else len(os.sched_getaffinity(0))
     under_way: collections.deque[tuple[list[Member], Future[dict[int, dict[str, Any]]]]] = collections.deque()
     with ThreadPoolExecutor(cores) as pool:
         for together, members in batches:
@@ -233,9 +234,12 @@ def _settled(together: Together | None, members: list[Member]) -> dict[int, dict
         return {}
     observed = np.stack([record["Vsc"] for _, record in members])
     missing = _TOGETHER - len(observed)
-    with jax.enable_x64(True):  # of each thread
-        found = together.settle(np.concatenate([observed, np.repeat(observed[-1:], missing, axis=0)]))
-        table = _columns(together, found)
+    try:
+        with jax.enable_x64(True):  # of each thread
+            found = together.settle(np.concatenate([observed, np.repeat(observed[-1:], missing, axis=0)]))
+            table = _columns(together, found)
+    except np.linalg.LinAlgError:  # one of them spoils what is computed for all
+        return {}
     return {
         number: {"record": os.path.basename(record.source)} | {name: values[i] for name, values in table.items()}
         for i, (number, record) in enumerate(members)

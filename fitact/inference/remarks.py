@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitact.data.checks import check_divider
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.inference.diagnostics import is_coarse
 from fitact.inference.likelihood import Likelihood
@@ -19,7 +20,7 @@ _IMPLAUSIBLE = 0.005  # share of the prior further out than g or b, below which 
 
 def on_trace(record: Record, choice: DriveChoice, channel: str, figures: dict[str, float]) -> list[str]:
     """Of one trace; `figures` are those of `fitact.inference.diagnostics`."""
-    found = []
+    found = check_divider({name: record[name] for name in ("V", "Vsc")}) if "V" in record and channel == "Vsc" else []
     span = record.time[-1] - record.time[0]
     if record.frequency() is None and choice.periodic:
         found.append(

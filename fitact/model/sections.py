@@ -282,7 +282,7 @@ class DriveSection(Section):
             return Trapezoid(*height, self.rise_time, self.duty, offset, phase)
         raise InputError(
             f"scene: [drive] waveform = '{shape}' gives no drive to compute; name sine, triangle, square, trapezoid,"
-            " burst, chirp or multitone"
+            " burst, chirp or multitone, or give the record that has it where the command takes one (--record)"
         )
 
 

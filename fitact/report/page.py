@@ -160,6 +160,9 @@ def _label(name: str) -> str:
 
 
 def _command(summary: dict[str, Any]) -> str:
+    """As it was typed; what comes near it of results from Python."""
+    if "command" in summary:
+        return summary["command"]
     scene = " --scene SCENE.toml" if summary["scene"] else ""
     records = " ".join(shlex.quote(each["source"]) for each in summary["record"]["sources"])
     return f"fitact run {records}{scene} --seed {summary['seed']}"
