@@ -38,4 +38,4 @@ def test_a_failing_cell_is_named(tmp_path: Path):
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
     assert "broken.py, code cell 2 of 3:\n\nassert x == 2, 'x is one'\n\nAssertionError: x is one" in done.stderr
-    assert (tmp_path / "out" / "notebooks" / "broken.ipynb").exists()
+    assert [path.name for path in (tmp_path / "out" / "notebooks").iterdir()] == ["broken.failed.ipynb"]

@@ -158,7 +158,8 @@ class Plan:
             f"Left out: {', '.join(self.left_out)}; that changes the peak of Vsc by {percent(self.nominal.Vsc_peak)},"
             f" the mean force by {percent(self.nominal.force_mean)} and the peak force by"
             f" {percent(self.nominal.force_peak)} (tolerance {percent(self.full.tolerance.force)}), and is"
-            f" {self.speedup:.2g} times faster. This is judged by the force; parameters are those of the smaller circuit."
+            f" {self.speedup:.2g} times faster."
+            " This is judged by the force; parameters are those of the smaller circuit."
         )
 
     __str__ = summary
