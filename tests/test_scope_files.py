@@ -360,9 +360,7 @@ def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch):
 
 def test_the_mapping_is_asked_for_and_noted():
     path = SCOPE / "keysight_scope_0.csv"
-    with pytest.raises(
-        fitact.InputError, match=r"not guessed \(found: 1, 2\); say it, as --channel V=1 --channel Vsc"
-    ):
+    with pytest.raises(fitact.InputError, match=r"not guessed \(found: 1, 2\); say it, as --channel V=1 --channel Vsc"):
         fitact.read(path)
     record = fitact.read(path, channels=SKIN, scale={"Vsc": -10.0})
     table = np.loadtxt(path, delimiter=",", skiprows=2)
