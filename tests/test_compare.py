@@ -69,6 +69,7 @@ def predicted_by_scipy(made: fitact.Record) -> np.ndarray:
     return found
 
 
+@pytest.mark.slow
 def test_blocks_left_out_are_predicted_as_by_scipys_refits():
     made = sine_record(0)
     ours = held_out(fitact.fit(made, sine_scene()))

@@ -251,6 +251,7 @@ def test_help_loads_no_library():
     assert done.stdout.splitlines()[-1] == ""
 
 
+@pytest.mark.slow
 def test_the_committed_records_can_be_made_again_without_fitact(tmp_path: Path):
     """In a process where fitact cannot be imported; ngspice's times and the last digits are the machine's."""
     done = run("committed", "--out", str(tmp_path))

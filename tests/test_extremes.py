@@ -10,7 +10,11 @@ import fitact
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
-@pytest.mark.parametrize("name", ["transfer", *extremes.DRIVES])
+@pytest.mark.parametrize(
+    "name",
+    # `make extremes` takes all over the whole range
+    ["transfer", *(pytest.param(n, marks=[pytest.mark.slow] * (n not in ("sine", "square"))) for n in extremes.DRIVES)],
+)
 def test_accuracy(name: str, kind: type):
     """On every fourth point; `make extremes`, which CI runs, takes them all."""
     for _, quantity, what, worst in extremes.sweep(kind, (name,), every=4):

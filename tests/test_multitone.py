@@ -104,6 +104,7 @@ def test_peaks_are_the_largest_whatever_the_tones():
         assert peak <= brute * (1.0 + 2e-5)  # (pi 39 / 20000)^2 / 2: what a crest falls by between two points
 
 
+@pytest.mark.slow
 def test_gradients():
     def force(logs: jax.Array) -> jax.Array:
         circuit = fitact.FinalCircuit(*jnp.exp(logs[:3]))
@@ -128,6 +129,7 @@ def test_one_amplitude_and_phase_for_each_tone():
             fitact.Multitone(F0, (1, 2), amplitudes, phases)
 
 
+@pytest.mark.slow
 def test_a_record_of_tones_is_fitted():
     """Data by scipy's frequency response; the shipped scene has the drive, off by a clock of 2e-4."""
     scene = fitact.Scene.load("multitone")

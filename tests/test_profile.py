@@ -62,6 +62,7 @@ def test_along_the_blind_direction_the_profile_is_the_priors_normal(fit: fitact.
             )
 
 
+@pytest.mark.slow
 def test_the_records_alone_leave_the_contact_area_open(fit: fitact.Fit):
     found = fit.intervals(prior=False)
     for name in ("Rsc", "Csc", "Ci", "force_mean"):

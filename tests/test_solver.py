@@ -178,6 +178,7 @@ def finger_ends(fit: fitact.Fit, with_prior: bool) -> solver.Minimum:
     return ends(fit.likelihood, jnp.array([fit.sigma]), jnp.asarray(starts))
 
 
+@pytest.mark.slow
 def test_hundred_far_starts_with_the_prior(finger: fitact.Fit):
     """Against scipy from the truth."""
     ends = finger_ends(finger, with_prior=True)
