@@ -387,8 +387,10 @@ def on_two_panels(seed: int) -> np.ndarray:
         (vsc_alone, SCENE, (), ()),
         (with_resistor, SCENE, ("series resistor",), (166e3,)),
         (with_current, SCENE, ("current",), ()),
-        (at_two_frequencies, scene(**NATURAL), ("two frequencies",), (10.0, 100.0)),
-        (on_two_panels, SCENE, ("second panel",), (13.5e-9,)),
+        pytest.param(
+            at_two_frequencies, scene(**NATURAL), ("two frequencies",), (10.0, 100.0), marks=pytest.mark.thorough
+        ),
+        pytest.param(on_two_panels, SCENE, ("second panel",), (13.5e-9,), marks=pytest.mark.thorough),
     ],
 )
 def test_posteriors_are_as_wide_as_was_to_be_expected(drawn, stated: fitact.Scene, names, values):

@@ -13,7 +13,13 @@ import fitact
 @pytest.mark.parametrize(
     "name",
     # `make extremes` takes all over the whole range
-    ["transfer", *(pytest.param(n, marks=[pytest.mark.slow] * (n not in ("sine", "square"))) for n in extremes.DRIVES)],
+    [
+        "transfer",
+        *(
+            pytest.param(n, marks=[] if n in ("sine", "square") else [pytest.mark.slow, pytest.mark.thorough])
+            for n in extremes.DRIVES
+        ),
+    ],
 )
 def test_accuracy(name: str, kind: type):
     """On every fourth point; `make extremes`, which CI runs, takes them all."""

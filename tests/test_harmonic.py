@@ -112,7 +112,15 @@ def test_current_of_a_trapezoid():
 
 
 @pytest.mark.parametrize(
-    "name", ["sine", "square", *(pytest.param(n, marks=pytest.mark.slow) for n in ("trapezoid", "triangle", "sampled"))]
+    "name",
+    [
+        "sine",
+        "square",
+        *(
+            pytest.param(n, marks=[pytest.mark.slow, pytest.mark.thorough])
+            for n in ("trapezoid", "triangle", "sampled")
+        ),
+    ],
 )
 def test_differentiable_in_every_parameter(name: str):
     def vsc(logs: jax.Array, peak_to_peak: jax.Array, frequency: jax.Array) -> jax.Array:
