@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -64,12 +65,14 @@ def lines(out: Path) -> int:
     return journal.read_bytes().count(b"\n") if journal.exists() else 0
 
 
-def until(condition: Callable[[], object], process: subprocess.Popen[str]) -> None:
+def until(condition: Callable[[], Any], process: subprocess.Popen[str]) -> Any:
+    """What the condition found, once it is true."""
     deadline = time.monotonic() + 300.0
-    while not condition():
+    while not (found := condition()):
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.05)
+    return found
 
 
 def workers(process: subprocess.Popen[str]) -> list["psutil.Process"]:
@@ -107,8 +110,10 @@ def assert_done_once(out: Path, undisturbed: Path) -> None:
 def test_workers_are_killed_three_times(folder: Path, undisturbed: Path, tmp_path: Path):
     process = started(folder, tmp_path, "--workers", "2")
     for kills in range(3):
-        until(lambda: workers(process), process)
-        os.kill(workers(process)[kills % len(workers(process))].pid, signal.SIGKILL)
+        alive = until(lambda: workers(process), process)
+        victim = alive[kills % len(alive)]
+        victim.kill()
+        victim.wait()
     ended(process)
     assert_done_once(tmp_path, undisturbed)
 

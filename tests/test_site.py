@@ -1,11 +1,13 @@
 """The documentation's site, as `make docs` builds it: complete by itself, its equations set."""
 
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from nbformat import v4
 
 ROOT = Path(__file__).parents[1]
 
@@ -32,6 +34,17 @@ def test_every_equation_is_set(pages):
     for name, page in pages.items():
         prose = re.sub(r"<(pre|code|script)\b.*?</\1>", "", page, flags=re.DOTALL)
         assert not re.search(r"arithmatex|\$\$|\\(frac|tau|mathrm)", prose), name
+
+
+def test_a_notebooks_picture_is_described():
+    picture = v4.new_output("display_data", {"image/png": "iVBORw0KGgo="})
+    title, section = v4.new_markdown_cell("# What can be seen?"), v4.new_markdown_cell("## Fit")
+    notebook = v4.new_notebook(cells=[title, section, v4.new_code_cell("show()", outputs=[picture])])
+    blocks = runpy.run_path(str(ROOT / "tools/docs_hooks.py"))["_blocks"]
+    pictures: dict[str, bytes] = {}
+    text = "\n".join(blocks(notebook, "seen", pictures))
+    assert "![What can be seen? Fit](seen_0.png)" in text
+    assert list(pictures) == ["seen_0.png"]
 
 
 @pytest.mark.slow

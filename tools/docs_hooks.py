@@ -58,16 +58,18 @@ def _sources() -> list[Path]:
 
 
 def _blocks(notebook: Any, stem: str, pictures: dict[str, bytes]) -> Iterator[str]:
-    """The notebook as Markdown; a picture is described by the heading above it."""
-    heading = stem
+    """The notebook as Markdown; a picture is described by the notebook's title and the heading above it."""
+    title = heading = ""
     for cell in notebook.cells:
         if cell.cell_type == "markdown":
             heading = next((line.lstrip("# ") for line in cell.source.splitlines() if line.startswith("#")), heading)
+            title = title or heading
             yield _LINK.sub(r"](\1.md)", cell.source)
         elif cell.cell_type == "code":
             yield f"```python\n{cell.source}\n```"
+            described = " ".join(dict.fromkeys((title, heading)))
             for output in cell.get("outputs", []):
-                yield from _output(output, f"{stem}_{len(pictures)}", heading, pictures)
+                yield from _output(output, f"{stem}_{len(pictures)}", described, pictures)
 
 
 def _output(output: Any, name: str, heading: str, pictures: dict[str, bytes]) -> Iterator[str]:
