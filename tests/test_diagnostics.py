@@ -8,7 +8,8 @@ import scipy.signal
 import scipy.stats
 
 import fitact
-from fitact.inference.diagnostics import folded_p, line_p, outliers, spectrum_p
+from fitact.data.record import white_noises
+from fitact.inference.diagnostics import folded_p, is_misfit, line_p, outliers, periodogram, phases, spectrum_p
 
 SQUARE = fitact.Scene.from_dict({"drive": {"waveform": "square"}})
 NOISE, PERIOD = 0.05, 2000
@@ -74,16 +75,31 @@ def test_the_shipped_record_is_no_misfit_and_shows_no_structure(finger_fit: fita
 def test_false_alarms_of_white_noise_are_as_many_as_stated():
     """Of 2,000 records, each test calls 1 % (folded: up to 4 tests) at a level of 1 %."""
     time, rng = np.arange(1000) * 1e-4, np.random.default_rng(0)
-    found = {"folded": 0, "spectrum": 0, "line": 0}
+    found, of_time = {"folded": 0, "spectrum": 0, "line": 0}, phases(time, 37.3)
     with jax.enable_x64(True):
         for _ in range(2000):
             noise = rng.standard_normal(time.size)
-            found["folded"] += folded_p(noise, time, 37.3) < 0.01
-            found["spectrum"] += spectrum_p(noise) < 0.01
-            found["line"] += line_p(noise) < 0.01
+            found["folded"] += folded_p(noise, of_time) < 0.01
+            found["spectrum"] += spectrum_p(periodogram(noise)) < 0.01
+            found["line"] += line_p(periodogram(noise)) < 0.01
     assert 20 - 15 <= found["folded"] <= 80 + 15
     assert found["spectrum"] <= 20 + 15  # the law of large samples is a little strict
     assert 20 - 15 <= found["line"] <= 20 + 15
+
+
+def test_noise_alone_is_never_larger_than_expected():
+    """The expectation is uncertain as well: of 20,000 records, none may be called a misfit at one in a million each."""
+    rng, samples = np.random.default_rng(4), 500
+    noise = rng.standard_normal((20_000, samples))
+    of_residuals = {"rounding_noise": 0.0, "interpolation_error": 0.0, "runs_z": 0.0, "rms_residual": 1.0}
+    figures = of_residuals | dict.fromkeys(("folded_p", "spectrum_p", "line_p"), 1.0)
+    figures |= {
+        "chi2_reduced": np.mean(noise**2, axis=1) / white_noises(noise) ** 2,
+        "degrees_of_freedom": np.full(len(noise), samples),
+    }
+    assert not is_misfit(figures).any()
+    larger = figures | {"chi2_reduced": 3.0 * figures["chi2_reduced"]}
+    assert is_misfit(larger).mean() > 0.99
 
 
 def test_folding_is_the_F_test_of_the_phase_means():
@@ -95,7 +111,7 @@ def test_folding_is_the_F_test_of_the_phase_means():
     within = float(residuals @ residuals) - between
     with jax.enable_x64(True):
         p8 = scipy.stats.f.sf((between / 8) / (within / 56), 8, 56)
-        assert folded_p(residuals, time + 1e-9, 125.0) == pytest.approx(p8, rel=1e-10)
+        assert folded_p(residuals, phases(time + 1e-9, 125.0)) == pytest.approx(p8, rel=1e-10)
 
 
 def test_hum_and_colour_are_seen_and_a_million_samples_are_no_trouble():
@@ -103,13 +119,14 @@ def test_hum_and_colour_are_seen_and_a_million_samples_are_no_trouble():
     noise = rng.standard_normal(time.size)
     hum = noise + 0.015 * np.sin(2.0 * np.pi * 333.3 * time)
     coloured = scipy.signal.lfilter([1.0], [1.0, -0.02], noise)
-    assert line_p(noise) > 1e-3
-    assert line_p(hum) < 1e-7
-    assert spectrum_p(noise) > 1e-3
-    assert spectrum_p(coloured) < 1e-7
+    assert line_p(periodogram(noise)) > 1e-3
+    assert line_p(periodogram(hum)) < 1e-7
+    assert spectrum_p(periodogram(noise)) > 1e-3
+    assert spectrum_p(periodogram(coloured)) < 1e-7
     with jax.enable_x64(True):
-        assert folded_p(noise, time, 100.0) > 1e-3
-        assert folded_p(noise + 0.01 * np.sign(np.sin(2.0 * np.pi * 100.0 * time)), time, 100.0) < 1e-7
+        assert folded_p(noise, phases(time, 100.0)) > 1e-3
+        square = np.sign(np.sin(2.0 * np.pi * 100.0 * time))
+        assert folded_p(noise + 0.01 * square, phases(time, 100.0)) < 1e-7
 
 
 def test_outliers_are_counted_and_placed():

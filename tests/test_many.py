@@ -109,10 +109,10 @@ def test_failures_stay_by_themselves(fits):
 
 
 def test_what_no_one_foresaw_is_told_as_a_crash(monkeypatch):
-    def breaks(*_):
+    def breaks(*_, **__):
         raise ZeroDivisionError("of all things")
 
-    monkeypatch.setattr("fitact.inference.many.fit", breaks)
+    monkeypatch.setattr("fitact.inference.many.fitted", breaks)
     (row,) = fitact.fit_many([record(0)], SCENE, progress=False)
     assert (row["result"], row["trusted"]) == ("crashed", False)
     assert "ZeroDivisionError: of all things" in row["message"]

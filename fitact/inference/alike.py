@@ -14,16 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
+from scipy.sparse import csr_array
 
 from fitact.data.compress import NODES, REACH, chebyshev
 from fitact.data.record import white_noises
 from fitact.data.shared_basis import SharedBasis
 from fitact.inference import derived
 from fitact.inference.derived import Derived
-from fitact.inference.diagnostics import is_misfit, tests
+from fitact.inference.diagnostics import is_misfit, phases, tests
 from fitact.inference.least_squares import EVIDENCE, NUISANCES, bic_gain
 from fitact.inference.likelihood import Likelihood
-from fitact.inference.problem import Problem, believed_skin, on_the_ridge
+from fitact.inference.problem import PRECISION, Problem, believed_skin, on_the_ridge
 from fitact.model.chirp import Chirp
 from fitact.model.skin import WithSkin
 
@@ -35,6 +36,7 @@ _DEPENDENT = 1e-9  # of a column's length: what rounding leaves of one that depe
 _DOUBT = 3.0  # of the Bayesian information criterion: error of a clock's evidence, whose shape is not exact here
 _RESOLVED = 512  # samples that tell whether noise hides the converter's steps
 _RAIL = 3  # samples at an extreme, from which it may be a rail
+_AT_ONCE = 16  # records, whose samples stay in the processor's cache
 _CANDIDATES = (*NUISANCES, "delay", "clock")  # nuisances that a record may ask for
 
 
@@ -62,16 +64,16 @@ class Together(NamedTuple):
 
     Attributes:
         likelihood: in the coordinates of `basis`.
-        time: s.
-        frequency: of the drive, Hz; None: it does not repeat.
+        phases: of the samples in the drive's period, as in `diagnostics.phases`.
+        samples: of each.
         freeable: nuisances that a record may ask for.
     """
 
     likelihood: Likelihood
     derive: Derived
     basis: SharedBasis
-    time: Float[np.ndarray, " samples"]
-    frequency: float | None
+    phases: csr_array | None
+    samples: int
     freeable: tuple[str, ...]
 
     @classmethod
@@ -79,34 +81,38 @@ class Together(NamedTuple):
         """For records like that of `problem`; None where such cannot be fitted together. In double precision."""
         likelihood, (source, *others) = problem.likelihood, problem.sources
         (trace, *_), choice, start = likelihood.traces, source.choice, source.start
+        if others or start is None or not math.isfinite(start.b) or trace.time.size > _LONGEST:
+            return None
         plain = trace.channel == "Vsc" and trace.noise == "white" and trace.weight is None and not trace.timing
         known = not (isinstance(likelihood.template, WithSkin) or isinstance(choice.drive, Chirp))
-        known = known and choice.name != "measured" and start is not None and math.isfinite(start.b)
         own = bool(np.any(np.asarray(trace.linear_sd))) or bool(choice.notes) or choice.shift != 0.0
-        if others or not (plain and known) or own or trace.time.size > _LONGEST or start is None:
+        if not (plain and known) or own or choice.name == "measured":
             return None
         time = source.record.time
         basis = SharedBasis.around(choice.drive, time, choice.steady_state, start.b)
         shared = dataclasses.replace(trace, compression=basis.compression(time.size), columns=()).without_samples()
         derive = derived.for_fit(likelihood, source.record, choice, source.scene, start.b)
-        frequency = source.record.frequency() if choice.periodic else None
-        return cls(likelihood.with_trace(0, shared), derive, basis, time, frequency, source.freeable)
+        of_time = phases(time, source.record.frequency() if choice.periodic else None)
+        return cls(likelihood.with_trace(0, shared), derive, basis, of_time, time.size, source.freeable)
 
     def settle(self, observed: Float[np.ndarray, "records samples"]) -> Settled:
         """Fit records. In double precision."""
         coordinates = self.basis.project(observed)
         start, held = self._starts(coordinates)
-        noise = white_noises(observed)
-        least = 1e-9 * np.ptp(observed, axis=1)
+        noise, height, plain = map(np.concatenate, zip(*map(_seen, _parts(observed)), strict=True))
+        least = PRECISION * height
         begun = jnp.asarray(start), jnp.asarray(np.maximum(noise, least)), jnp.asarray(least)
         ends = _settle(self.likelihood, jnp.asarray(np.append(self.basis.clock, 0.0)), jnp.asarray(coordinates), *begun)
         theta, sigma, triangle, shares, signal = map(np.asarray, ends[:5])
         logs, gradients = map(np.asarray, _derived(self.derive, ends[0], ends[1]))
-        left = observed - signal @ self.basis.functions.T
-        freedom = self.time.size - theta.shape[1]
-        figures = tests(left, self.time, noise, freedom, self.frequency)
-        figures |= {"rounding_noise": np.zeros(len(left)), "interpolation_error": np.zeros(len(left))}
-        clear = held & np.asarray(ends[5]) & ~self._asked_for(shares) & _is_plain(observed, noise) & ~is_misfit(figures)
+        freedom = self.samples - theta.shape[1]
+        of_parts = [
+            tests(part - inside @ self.basis.functions.T, expected, freedom, self.phases)
+            for part, inside, expected in zip(*map(_parts, (observed, signal, noise)), strict=True)
+        ]
+        figures = {name: np.concatenate([part[name] for part in of_parts]) for name in of_parts[0]}
+        figures |= {"rounding_noise": np.zeros(len(noise)), "interpolation_error": np.zeros(len(noise))}
+        clear = held & np.asarray(ends[5]) & ~self._asked_for(shares) & plain & ~is_misfit(figures)
         return Settled(clear, theta, sigma, np.linalg.inv(triangle), logs, gradients, figures)
 
     def _starts(
@@ -129,21 +135,24 @@ class Together(NamedTuple):
     def _asked_for(self, shares: Float[np.ndarray, "records nuisances"]) -> Bool[np.ndarray, " records"]:
         """Whether a nuisance may be asked for."""
         gains = [
-            bic_gain(share, self.time.size, len(NUISANCES.get(name, (0,)))) + (_DOUBT if name == "clock" else 0.0)
+            bic_gain(share, self.samples, len(NUISANCES.get(name, (0,)))) + (_DOUBT if name == "clock" else 0.0)
             for name, share in zip(_CANDIDATES, shares.T, strict=True)
             if name in self.freeable
         ]
         return np.max(gains, axis=0, initial=-math.inf) > EVIDENCE
 
 
-def _is_plain(observed: np.ndarray, noise: np.ndarray) -> Bool[np.ndarray, " records"]:
-    """Whether records show neither a rail nor the steps of a converter."""
-    levels = np.sort(observed[:, :_RESOLVED], axis=1)
-    steps = np.diff(levels, axis=1)
+def _parts(rows: np.ndarray) -> list[np.ndarray]:
+    return [rows[i : i + _AT_ONCE] for i in range(0, len(rows), _AT_ONCE)]
+
+
+def _seen(observed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of records: their noise, their height, and whether they show neither a rail nor the steps of a converter."""
+    noise, low, high = white_noises(observed), observed.min(axis=1), observed.max(axis=1)
+    steps = np.diff(np.sort(observed[:, :_RESOLVED], axis=1), axis=1)
     step = np.min(np.where(steps > 0.0, steps, np.inf), axis=1)
-    extremes = (observed.max(axis=1, keepdims=True), observed.min(axis=1, keepdims=True))
-    railed = [np.count_nonzero(observed == extreme, axis=1) > _RAIL for extreme in extremes]
-    return (step <= noise) & ~np.any(railed, axis=0)
+    railed = [np.count_nonzero(observed == extreme[:, None], axis=1) > _RAIL for extreme in (low, high)]
+    return noise, high - low, (step <= noise) & ~np.any(railed, axis=0)
 
 
 @eqx.filter_jit
@@ -211,16 +220,8 @@ def _orthonormal(columns: list[Array], others: list[Array]) -> list[Array]:
 
 def _triangular(jacobian: Float[Array, "rows n"], residuals: Array) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
     """R and Q' residuals of the QR decomposition: vectorised over many small ones, unlike LAPACK's."""
-    columns, rows, along = list(jacobian.T), [], []
-    for i, column in enumerate(columns):
-        length = jnp.linalg.norm(column)
-        q = column / length
-        products = [q @ other for other in columns[i + 1 :]]
-        columns[i + 1 :] = [other - p * q for other, p in zip(columns[i + 1 :], products, strict=True)]
-        rows.append(jnp.stack([*[jnp.zeros(())] * i, length, *products]))
-        along.append(q @ residuals)
-        residuals = residuals - along[-1] * q
-    return jnp.stack(rows), jnp.stack(along)
+    q = jnp.stack(_orthonormal(list(jacobian.T), []))
+    return jnp.triu(q @ jacobian), q @ residuals
 
 
 def _solved(triangle: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:

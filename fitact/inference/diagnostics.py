@@ -6,11 +6,12 @@ from statistics import NormalDist
 
 import numpy as np
 import scipy.fft
+import scipy.sparse
 import scipy.special
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
-from fitact.data.record import Record, rounding_noise, white_noise
+from fitact.data.record import Record, medians, rounding_noise, white_noise
 from fitact.inference.start import DriveChoice
 
 _RUNS = 6.0  # standard deviations of the runs test at which residuals count as structured
@@ -21,6 +22,8 @@ _TESTS = len(_PHASES) + 2
 _LEAST_TESTED = 64  # samples, below which a spectrum says little
 _P_VALUES = ("folded_p", "spectrum_p", "line_p")
 _EXCESS = 0.1  # excess of the residual variance over the noise's that counts, if it is also significant
+_RATIO = 2.66  # sd of the log of residual variance over `white_noise`'s, times the root of the samples, by simulation
+_SURE = -NormalDist().inv_cdf(_FALSE_ALARM)  # standard deviations
 
 
 def statistics(
@@ -41,7 +44,7 @@ def statistics(
     measured = choice.name == "measured"
     expected = math.hypot(noise, gain * record.noise("V") if measured else 0.0)
     repeats = record.frequency() if choice.periodic else None
-    found = tests(residuals, time, np.asarray(expected), residuals.size - freed, repeats)
+    found = tests(residuals, np.asarray(expected), residuals.size - freed, phases(time, repeats))
     return {name: float(value) for name, value in found.items()} | {
         "rounding_noise": rounding_noise(record[channel]),
         "interpolation_error": gain * interpolation_error(record["V"]) if measured else 0.0,
@@ -51,25 +54,24 @@ def statistics(
 
 def tests(
     residuals: Float[np.ndarray, "*records kept"],
-    time: Float[np.ndarray, " kept"],
     expected: Float[np.ndarray, "*records"],
     freedom: float,
-    frequency: float | None,
+    of_time: scipy.sparse.csr_array | None,
 ) -> dict[str, Float[np.ndarray, "*records"]]:
     """The part of `statistics` that needs no more than residuals, of each record.
 
-    `expected` is their standard deviation, `frequency` (Hz) that of the drive, if it repeats.
+    `expected` is their standard deviation, `of_time` the samples' `phases`.
     """
     square = np.einsum("...i,...i->...", residuals, residuals)
-    shares = _periodogram(residuals)
+    shares = periodogram(residuals)
     return {
         "chi2_reduced": square / (freedom * expected**2),
         "rms_residual": np.sqrt(square / residuals.shape[-1]),
         "noise_expected": expected,
         "runs_z": runs_z(residuals),
-        "folded_p": folded_p(residuals, time, frequency),
-        "spectrum_p": _spectrum_p(shares),
-        "line_p": _line_p(shares),
+        "folded_p": folded_p(residuals, of_time),
+        "spectrum_p": spectrum_p(shares),
+        "line_p": line_p(shares),
         "degrees_of_freedom": np.full(square.shape, freedom),
     }
 
@@ -104,7 +106,7 @@ def together(figures: Sequence[dict[str, float]]) -> dict[str, float]:
 
 def is_misfit(figures: Mapping[str, ArrayLike]) -> Bool[np.ndarray, "*records"]:
     """Whether the residuals are larger than the noise, or have structure."""
-    significant = 6.0 * np.sqrt(2.0 / np.asarray(figures["degrees_of_freedom"]))
+    significant = np.expm1(_SURE * _RATIO / np.sqrt(np.asarray(figures["degrees_of_freedom"])))
     # a rounded channel's residuals come in stretches that repeat, and its noise is known less well
     rounded = np.asarray(figures["rounding_noise"]) > 0.0
     excess = np.asarray(figures["chi2_reduced"]) > 1.0 + np.maximum(np.where(rounded, 1.0, _EXCESS), significant)
@@ -131,7 +133,7 @@ def interpolation_error(voltage: Float[np.ndarray, " samples"]) -> float:
 
 def runs_z(residuals: Float[np.ndarray, "*records samples"]) -> Float[np.ndarray, "*records"]:
     """Wald and Wolfowitz's runs test of signs, in standard deviations; far below zero: signs come in stretches."""
-    positive = residuals > np.median(residuals, axis=-1, keepdims=True)
+    positive = residuals > medians(residuals.copy())[..., None]
     size = positive.shape[-1]
     above = np.count_nonzero(positive, axis=-1).astype(float)
     runs = 1.0 + np.count_nonzero(positive[..., 1:] != positive[..., :-1], axis=-1)
@@ -141,56 +143,57 @@ def runs_z(residuals: Float[np.ndarray, "*records samples"]) -> Float[np.ndarray
     return np.where(both > 0.0, (runs - mean) / np.sqrt(np.where(both > 0.0, variance, 1.0)), -np.inf)
 
 
-def folded_p(
-    residuals: Float[np.ndarray, "*records n"], time: Float[np.ndarray, " n"], frequency: float | None
-) -> Float[np.ndarray, "*records"]:
-    """Probability that white noise repeats with the drive (Hz) as much as this: the least of F tests, uncorrected.
+def phases(time: Float[np.ndarray, " n"], frequency: float | None) -> scipy.sparse.csr_array | None:
+    """Which samples are in each of the many parts of the drive's period (Hz); None where too little repeats."""
+    if frequency is None or time.size < _LEAST_TESTED:
+        return None
+    place = np.minimum((np.mod(time * frequency, 1.0) * _PHASES[-1]).astype(int), _PHASES[-1] - 1)
+    return scipy.sparse.csr_array((np.ones(time.size), (place, np.arange(time.size))), (_PHASES[-1], time.size))
 
-    Each compares the means of the residuals in as many phases of the period with their scatter. What a wrong
+
+def folded_p(
+    residuals: Float[np.ndarray, "*records n"], of_time: scipy.sparse.csr_array | None
+) -> Float[np.ndarray, "*records"]:
+    """Probability that white noise repeats with the drive as much as this: the least of F tests, uncorrected.
+
+    Each compares the means of the residuals in as many of the `phases` of the period with their scatter. What a wrong
     circuit leaves repeats with the drive, and adds up over the periods. 1 where nothing is expected to repeat.
     """
     size, of = residuals.shape[-1], residuals.shape[:-1]
-    if frequency is None or size < _LEAST_TESTED:
+    if of_time is None:
         return np.ones(of)
-    place = np.minimum((np.mod(time * frequency, 1.0) * _PHASES[-1]).astype(int), _PHASES[-1] - 1)
-    count = np.bincount(place, minlength=_PHASES[-1])
-    total = np.stack([np.bincount(place, row, _PHASES[-1]) for row in residuals.reshape(-1, size)])
+    count = of_time.sum(axis=1)
+    total = np.ascontiguousarray((of_time @ residuals.reshape(-1, size).T).T)
     square = np.einsum("...i,...i->...", residuals, residuals)
     found = [np.ones(of)]
-    for phases in _PHASES:
-        n = count.reshape(phases, -1).sum(axis=-1)
+    for parts in _PHASES:
+        n = count.reshape(parts, -1).sum(axis=-1)
         between, within = np.count_nonzero(n), size - np.count_nonzero(n)
         if within < size // 2:  # too few samples in each phase to know their scatter
             break
-        mean = total.reshape(*of, phases, -1).sum(axis=-1)
-        share = np.sum(mean[..., n > 0] ** 2 / n[n > 0], axis=-1) / np.where(square > 0.0, square, 1.0)
+        sums = total.reshape(*of, parts, -1).sum(axis=-1)
+        share = sums**2 @ (1.0 / np.maximum(n, 1)) / np.where(square > 0.0, square, 1.0)
         # the share of `between` directions in the sum of squares of white noise has a beta distribution
         found.append(scipy.special.betainc(0.5 * within, 0.5 * between, np.maximum(1.0 - share, 0.0)))
     return np.minimum.reduce(found)
 
 
-def spectrum_p(residuals: Float[np.ndarray, "*records n"]) -> Float[np.ndarray, "*records"]:
-    """Bartlett's test of the cumulative periodogram, by Kolmogorov and Smirnov's law: low where noise is not white."""
-    return _spectrum_p(_periodogram(residuals))
-
-
-def _spectrum_p(share: Float[np.ndarray, "*records lines"]) -> Float[np.ndarray, "*records"]:
+def spectrum_p(share: Float[np.ndarray, "*records lines"]) -> Float[np.ndarray, "*records"]:
+    """Bartlett's test of the cumulative `periodogram`, by Kolmogorov's law: low where noise is not white."""
     lines = share.shape[-1]
     if lines < _LEAST_TESTED // 2:
         return np.ones(share.shape[:-1])
-    distance = np.max(np.abs(np.cumsum(share, axis=-1) - np.arange(1, lines + 1) / lines), axis=-1) * math.sqrt(lines)
+    above = np.cumsum(share, axis=-1, dtype=float)
+    above -= np.arange(1, lines + 1) / lines
+    distance = np.maximum(above.max(axis=-1), -above.min(axis=-1)) * math.sqrt(lines)
     k = np.arange(1, 31)
     series = 2.0 * np.sum((-1.0) ** (k - 1) * np.exp(-2.0 * (k * distance[..., None]) ** 2), axis=-1)
     # 1 where the series converges slowly
     return np.where(distance < 0.2, 1.0, np.clip(series, 0.0, 1.0))
 
 
-def line_p(residuals: Float[np.ndarray, "*records n"]) -> Float[np.ndarray, "*records"]:
-    """Fisher's test: low where one line of the periodogram, as of hum, is too strong for white noise."""
-    return _line_p(_periodogram(residuals))
-
-
-def _line_p(share: Float[np.ndarray, "*records lines"]) -> Float[np.ndarray, "*records"]:
+def line_p(share: Float[np.ndarray, "*records lines"]) -> Float[np.ndarray, "*records"]:
+    """Fisher's test: low where one line of the `periodogram`, as of hum, is too strong for white noise."""
     lines = share.shape[-1]
     if lines < _LEAST_TESTED // 2:
         return np.ones(share.shape[:-1])
@@ -198,9 +201,16 @@ def _line_p(share: Float[np.ndarray, "*records lines"]) -> Float[np.ndarray, "*r
     return np.exp(np.minimum(log_p, 0.0))
 
 
-def _periodogram(residuals: Float[np.ndarray, "*records n"]) -> Float[np.ndarray, "*records lines"]:
-    """Shares of the lines between 0 and half the sampling rate; even ones where there is nothing to share."""
-    lines = scipy.fft.rfft(residuals)[..., 1 : (residuals.shape[-1] + 1) // 2]
+def periodogram(residuals: Float[np.ndarray, "*records n"]) -> Float[np.ndarray, "*records lines"]:
+    """Shares of the lines between 0 and half the sampling rate; even ones where there is nothing to share.
+
+    In single precision, which is plenty for tests, and takes half the time.
+    """
+    height = np.max(np.abs(residuals), axis=-1, keepdims=True)
+    unit = np.multiply(residuals, 1.0 / np.where(height > 0.0, height, 1.0), dtype=np.float32, casting="same_kind")
+    lines = scipy.fft.rfft(unit)[..., 1 : (residuals.shape[-1] + 1) // 2]
     power = lines.real**2 + lines.imag**2
     whole = power.sum(axis=-1, keepdims=True)
-    return np.where(whole > 0.0, power / np.where(whole > 0.0, whole, 1.0), 1.0 / max(power.shape[-1], 1))
+    power /= np.where(whole > 0.0, whole, 1.0)
+    power[whole[..., 0] == 0.0] = 1.0 / max(power.shape[-1], 1)
+    return power

@@ -79,15 +79,16 @@ def assess(
     prior_root: Float[np.ndarray, "parameters parameters"],
     force_gradient: Float[np.ndarray, " parameters"],
     experiment: Experiment,
+    offer: bool = True,
 ) -> Identifiability:
     """Judge a fit by roots of theta's covariance (`covariance_root`) and of the prior's.
 
     `names` are theta's coordinates; those free in `experiment` that are no gains are judged, the others are
-    nuisances with priors of their own. `force_gradient` is that of the log mean force in theta.
+    nuisances with priors of their own. `force_gradient` is that of the log mean force in theta. `offer`: with remedies.
     """
     free = [name for name in experiment.free if name not in gain_names(experiment.channels)]
     found = judge(names, root, prior_root, force_gradient, free, experiment.channels)
-    if found.verdict == "identified":
+    if found.verdict == "identified" or not offer:
         return found
     known = [list(names).index(name) for name in experiment.free]
     structure = blind_directions(experiment.circuit, experiment.free, experiment.channels)

@@ -10,13 +10,15 @@ from typing import Any
 
 import jax
 import numpy as np
+from threadpoolctl import threadpool_limits
 
+from fitact.data.formats import read
 from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.files import replacing
 from fitact.inference import derived
 from fitact.inference.alike import Settled, Together
-from fitact.inference.fit import GOOD, fit
+from fitact.inference.fit import GOOD, fitted
 from fitact.inference.identifiability import directions, from_prior, verdicts
 from fitact.inference.problem import pose
 from fitact.model.scene import Scene
@@ -63,8 +65,7 @@ class Fits(Sequence[dict[str, Any]]):
     @property
     def columns(self) -> dict[str, np.ndarray]:
         """The table by columns; NaN, or "", where a row has no answer."""
-        names = dict.fromkeys(name for row in sorted(self.rows, key=len, reverse=True)[:1] for name in row)
-        names |= dict.fromkeys(name for row in self.rows for name in row)
+        names = dict.fromkeys(name for row in sorted(self.rows, key=len, reverse=True) for name in row)
         samples = {name: next(row[name] for row in self.rows if name in row) for name in names}
         blank = {name: "" if isinstance(sample, str) else np.nan for name, sample in samples.items()}
         return {name: np.array([row.get(name, blank[name]) for row in self.rows]) for name in names}
@@ -127,7 +128,8 @@ def fit_many(
     (scene or Scene()).require_available(fit=True)
     rows: dict[int, dict[str, Any]] = {}
     total = len(records) if isinstance(records, Sequence) else 0
-    with jax.enable_x64(True):
+    # threads of the linear algebra's own would fight with those of `_in_threads` for the cores
+    with jax.enable_x64(True), threadpool_limits(1):
         opened = _opened(records, scene, {"channels": channels, "scale": scale}, rows)
         batches = _batches(watched(opened, "fitting the records", total) if progress and total else opened, scene)
         for members, settled in _in_threads(batches):
@@ -144,8 +146,6 @@ def _opened(
     records: Iterable[Input], scene: Scene | None, columns: Mapping[str, Any], rows: dict[int, dict[str, Any]]
 ) -> Iterator[Member]:
     """Records by their number; those that cannot be read become rows."""
-    from fitact.data.formats import read
-
     for number, given in enumerate(records):
         try:
             yield number, given if isinstance(given, Record) else read(given, scene, **columns)
@@ -232,11 +232,10 @@ def _settled(together: Together | None, members: list[Member]) -> dict[int, dict
     """Rows of those that are beyond doubt."""
     if together is None or not members:
         return {}
-    observed = np.stack([record["Vsc"] for _, record in members])
-    missing = _TOGETHER - len(observed)
+    padded = [*members, *members[-1:] * (_TOGETHER - len(members))]
     try:
         with jax.enable_x64(True):  # of each thread
-            found = together.settle(np.concatenate([observed, np.repeat(observed[-1:], missing, axis=0)]))
+            found = together.settle(np.stack([record["Vsc"] for _, record in padded]))
             table = _columns(together, found)
     except np.linalg.LinAlgError:  # one of them spoils what is computed for all
         return {}
@@ -256,7 +255,7 @@ def _columns(together: Together, found: Settled) -> dict[str, list[Any]]:
         "result": ["successful"] * count,
         "trusted": [True] * count,
         "message": [GOOD] * count,
-        "samples": [together.time.size] * count,
+        "samples": [together.samples] * count,
         "noise": found.sigma,
         "chi2_reduced": found.figures["chi2_reduced"],
         "rms_residual": found.figures["rms_residual"],
@@ -281,7 +280,7 @@ def _values(names: Sequence[str], medians: np.ndarray, log_sds: np.ndarray) -> d
 def _alone(record: Record, scene: Scene | None) -> dict[str, Any]:
     """The row of a record that is fitted by itself."""
     try:
-        found = fit(record, scene)
+        found = fitted(record, scene, remedies=False)
     except Exception as error:
         return _failed(record.source, error)
     of_circuit = found.identifiability.blind_direction

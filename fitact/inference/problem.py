@@ -38,7 +38,7 @@ from fitact.model.skin import WithSkin, constant, limits_current, parameters
 _OFFSET = 0.02  # of a channel's span: standard deviation of an offset that the record is too short to show
 _CHARGE = 10.0  # spans: that of an unknown charge
 _HELD = 1e-6  # standard deviation, in its logarithm, of a parameter that is held
-_PRECISION = 1e-9  # of a channel's span: least noise assumed
+PRECISION = 1e-9  # of a channel's span: least noise assumed
 _CLOCK = 5.0  # steps at a record's ends: that of the drive's clock, since its frequency is known to one or two
 _DRAWS = 256  # of the prior, to start from the best of
 
@@ -261,7 +261,7 @@ def _trace(
         observed=shared(record[channel]),
         weight=None,
         whitening=None,
-        least_noise=jnp.asarray(max(_PRECISION * height, rounding_noise(record[channel]))),
+        least_noise=jnp.asarray(max(PRECISION * height, rounding_noise(record[channel]))),
         rate=None,
         drive=choice.drive,
         linear_sd=jnp.zeros(len(LINEAR)).at[0].set(offset).at[charges].set(_CHARGE * height),
