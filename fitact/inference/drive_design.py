@@ -53,6 +53,7 @@ class DriveDesign:
         needed: the peak-to-peak amplitude at which each finger feels that waveform, V; infinite: it never does.
         by_frequency: the same waveforms from 10 Hz to 1 kHz.
         by_thickness, by_permittivity: the scene's own drive on other insulators, Ci following eq. (3).
+        seed: of the fingers drawn.
     """
 
     scene: Scene
