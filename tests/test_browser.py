@@ -82,6 +82,14 @@ class Browser:
     def range(self, figure: Any, axis: str = "xaxis") -> list[float]:
         return self.ask(f"arguments[0].querySelector('.plot').layout.{axis}.range", figure)
 
+    def check_alone(self, path: Path) -> None:
+        """The page at `path` asked for nothing from outside, and complained of nothing."""
+        assert self.driver.get_log("browser") == []
+        events = [json.loads(entry["message"])["message"] for entry in self.driver.get_log("performance")]
+        asked = [e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"]
+        assert path.as_uri() in asked
+        assert [url for url in asked if not url.startswith(("file:", "data:"))] == []
+
     def picture(self) -> np.ndarray:
         shot = base64.b64decode(self.command("Page.captureScreenshot", format="png")["data"])
         image = PIL.Image.open(io.BytesIO(shot)).convert("L")
@@ -122,11 +130,7 @@ def _font() -> str:
 def test_opens_without_complaint_and_without_the_net(browser: Browser, page: Path):
     browser.open(page)
     browser.whole()
-    assert browser.driver.get_log("browser") == []
-    events = [json.loads(entry["message"])["message"] for entry in browser.driver.get_log("performance")]
-    asked = [e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"]
-    assert page.as_uri() in asked
-    assert [url for url in asked if not url.startswith(("file:", "data:"))] == []
+    browser.check_alone(page)
 
 
 def test_charts_take_the_place_of_the_pictures(browser: Browser, page: Path):

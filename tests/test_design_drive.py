@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 import fitact
 from fitact.cli import _guarded
 from fitact.cli.app import app
-from fitact.inference.drive_option import quantile
+from fitact.inference.drive_option import quantile, quantile_error
 from fitact.inference.drive_people import People
 from fitact.inference.fingers import Law
 from fitact.model.cycle import cycle
@@ -240,6 +240,10 @@ def test_the_share_is_that_of_fingers_drawn_by_scipy(believed):
     # five standard deviations of a share among 4096
     tolerance = 5.0 * math.sqrt(0.9 * 0.1 / 4096)
     assert np.mean(needed <= believed.options["square"].assured) == pytest.approx(0.9, abs=tolerance)
+    # a quantile's error, from the density that scipy's fingers have there
+    slope = (np.quantile(needed, 0.92) - np.quantile(needed, 0.88)) / 0.04
+    error = math.sqrt(0.9 * 0.1 / 4096) * slope
+    assert believed.options["square"].assured_error == pytest.approx(error, rel=0.3)
     curve = believed.curve("square")
     shares = np.mean(needed[:, None] <= curve["peak_to_peak"], axis=0)
     np.testing.assert_allclose(curve["q50"], shares, atol=5.0 * math.sqrt(0.25 / 4096))
@@ -297,6 +301,22 @@ def test_quantiles_hold_where_some_never_feel_it():
     assert quantile(np.arange(1.0, 1001.0), 0.95) == pytest.approx(
         scipy.stats.mstats.mquantiles(np.arange(1.0, 1001.0), 0.95, 0.5, 0.5)[0], rel=1e-4
     )
+
+
+@pytest.mark.parametrize("share", [0.05, 0.5, 0.95])
+def test_the_error_of_a_quantile_is_that_of_an_order_statistic(share: float):
+    """Of exponential draws (Renyi): the k-th of n has the variance of 1/n to 1/(n - k + 1), each squared, in all."""
+    count = 2000
+    at = scipy.stats.expon.ppf((np.arange(count) + 0.5) / count)
+    expected = math.sqrt(np.sum(np.arange(count, count * (1.0 - share), -1.0) ** -2.0))
+    assert quantile_error(at, share) == pytest.approx(expected, rel=0.02)
+
+
+def test_the_error_of_a_quantile_where_some_never_feel_it():
+    amplitude = np.array([1.0, 2.0, 4.0, np.inf, np.inf])
+    assert 0.0 < quantile_error(amplitude, 0.3) < math.inf
+    assert math.isinf(quantile_error(amplitude, 0.9))
+    assert quantile_error(np.full(512, 300.0), 0.95) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_friction_changes_by_a_share_of_itself(tmp_path: Path):

@@ -1,7 +1,6 @@
 """The pages of test_pages.py in a real Chromium, as test_browser.py has the report."""
 
 import itertools
-import json
 from pathlib import Path
 
 import pytest
@@ -31,11 +30,7 @@ def test_it_opens_alone_draws_its_charts_and_fits_its_window(browser: Browser, p
         before = button.get_attribute("aria-pressed")
         button.click()
         assert button.get_attribute("aria-pressed") != before
-    assert browser.driver.get_log("browser") == []
-    events = [json.loads(entry["message"])["message"] for entry in browser.driver.get_log("performance")]
-    asked = [e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"]
-    assert page.as_uri() in asked
-    assert [url for url in asked if not url.startswith(("file:", "data:"))] == []
+    browser.check_alone(page)
 
 
 def test_it_reads_aloud_and_is_legible(browser: Browser, page: Path):

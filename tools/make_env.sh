@@ -36,8 +36,9 @@ if .venv/bin/python -m pip install --quiet --disable-pip-version-check --require
     .venv/bin/uv pip install --quiet --python .venv/bin/python --require-hashes -r requirements/all.txt; then
     .venv/bin/uv pip install --quiet --python .venv/bin/python --no-deps --no-build-isolation --editable .
 else
-    echo "set-up: uv did not succeed; trying pip" >&2
+    echo "set-up: uv did not succeed; installing the same with pip, which takes some minutes" >&2
     .venv/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/all.txt
     .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 fi
 echo "$wanted $(pwd)" >"$stamp"
+echo "set-up: done, .venv/bin/fitact" >&2

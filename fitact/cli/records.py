@@ -1,7 +1,7 @@
 """Commands on records: what they hold, which model they prefer, what people they come from, what accuracy costs."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -10,9 +10,6 @@ from fitact.cli.files import Files
 from fitact.cli.options import Channels, Fresh, Json, Out, RecordFiles, Scales, Seed, mapping, numbers
 from fitact.cli.terminal import finish, say, show, typed, use_compilation_cache
 from fitact.files import write_json
-
-if TYPE_CHECKING:
-    pass
 
 
 @app.command()
@@ -105,15 +102,17 @@ def population(
     found = find_population(
         measured, stated, covariates=known, at=numbers("--at moisture=0.4", at), folder=out, seed=seed
     )
+    content = found.to_dict()
     if out is not None:
         from fitact.report.population import write_population
         from fitact.report.population_page import write_population_page
 
-        write_json(out / "population.json", found.to_dict())
+        tree = found.to_datatree()
+        write_json(out / "population.json", content)
         found.to_netcdf(out / "population.nc")
-        write_population(out / "population.svg", found)
-        write_population_page(out / "report.html", found.to_datatree(), found.to_dict())
-    show(str(found), found.to_dict(), json)
+        write_population(out / "population.svg", tree, content)
+        write_population_page(out / "report.html", tree, content)
+    show(str(found), content, json)
     finish(found.trusted)
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from fitact.data.compress import SLOW, Compression, compress
 from fitact.data.on_grid import compress_on_grid
 from fitact.inference.likelihood import Batched, Likelihood
-from fitact.inference.trace import Trace
+from fitact.inference.trace import Seen, Trace
 from fitact.model.circuit import Circuit
 from fitact.model.drive import Sampled
 from fitact.model.skin import WithSkin
@@ -107,11 +107,16 @@ def certify(
     )
     if all(trace.compression is None for trace in wide.traces):
         return Certified(wide, None, tuple(r or _OFF_TIME for r in reasons))
-    spread = _spread_of_log_b(wide, theta, root)
-    near = tuple(_narrowed(trace, wide, i, theta, spread, sigma[i], tolerance) for i, trace in enumerate(wide.traces))
-    points = np.vstack([_near(theta, root), _believed(wide, theta)])
-    narrow = dataclasses.replace(wide, traces=near)
-    exact, compressed, tabulated = (_at(model, points, sigma) for model in (wide.summed(), narrow, wide))
+    light, optimum = wide.without_samples(), jnp.asarray(theta)
+    log_b, slope = _log_b_and_slope(light, optimum)
+    reach = max(_REACH * float(np.linalg.norm(np.asarray(slope) @ root)), _LEAST_REACH)
+    near = tuple(
+        _narrowed(trace, seen, float(log_b), reach, 0.1 * tolerance * noise)
+        for (trace, seen), noise in zip(wide.each(optimum), sigma, strict=True)
+    )
+    points = np.vstack([_near(theta, root), _believed(light, theta)])
+    narrow = dataclasses.replace(wide, traces=near).without_samples()
+    exact, compressed, tabulated = (_at(model, points, sigma) for model in (wide.summed(), narrow, light))
     found = [
         reason or (_OFF_TIME if trace.compression is None else _against(*parts, tolerance / len(near)))
         for reason, trace, parts in zip(
@@ -140,11 +145,11 @@ def _near(theta: np.ndarray, root: np.ndarray) -> Float[np.ndarray, "n parameter
     return np.vstack([theta, theta + 1.5 * deviates @ root.T])
 
 
-def _believed(wide: Likelihood, theta: np.ndarray) -> Float[np.ndarray, "n parameters"]:
+def _believed(likelihood: Likelihood, theta: np.ndarray) -> Float[np.ndarray, "n parameters"]:
     """Points of the prior that the tables reach, the optimum where there are too few."""
-    draws = wide.draws(theta, 1000)
-    slowest = _each_log_b(wide.without_samples(), jnp.asarray(draws))
-    held = [trace.compression.holds(jnp.exp(slowest)) for trace in wide.traces if trace.compression is not None]
+    draws = likelihood.draws(theta, 1000)
+    slowest = _each_log_b(likelihood, jnp.asarray(draws))
+    held = [trace.compression.holds(jnp.exp(slowest)) for trace in likelihood.traces if trace.compression is not None]
     draws = draws[np.all(held, axis=0)]
     return np.vstack([draws, np.tile(theta, (_POINTS, 1))])[:_POINTS]
 
@@ -152,7 +157,7 @@ def _believed(wide: Likelihood, theta: np.ndarray) -> Float[np.ndarray, "n param
 def _at(likelihood: Likelihood, theta: Float[np.ndarray, "n parameters"], sigma: np.ndarray) -> np.ndarray:
     """Log-likelihoods of each trace at points of one sigma, (n, traces)."""
     points = np.column_stack([theta, np.tile(np.log(sigma), (len(theta), 1))])
-    evaluate = Batched(Likelihood.log_likelihoods, likelihood.without_samples(), likelihood.rows)
+    evaluate = Batched(Likelihood.log_likelihoods, likelihood, likelihood.rows)
     batches = [points[i : i + evaluate.batch] for i in range(0, len(points), evaluate.batch)]
     return np.concatenate([evaluate(batch) for batch in watched(batches, "checking the compression", len(batches))])
 
@@ -179,32 +184,25 @@ def log_prob(likelihood: Likelihood, walkers: int) -> Callable[[np.ndarray], np.
     return values
 
 
-def _narrowed(
-    trace: Trace, wide: Likelihood, index: int, theta: np.ndarray, spread: float, sigma: float, tolerance: float
-) -> Trace:
-    """With the part of the table that the posterior can want, where there is a table that reaches the optimum."""
-    table, center = trace.compression, float(_log_b(wide.without_samples(), jnp.asarray(theta)))
+def _narrowed(trace: Trace, seen: Seen, center: float, reach: float, error: float) -> Trace:
+    """With the part of the table that the posterior can want, where there is a table that holds the optimum.
+
+    That is `reach` around `center`, in log b, to an `error` of the signal (V or A).
+    """
+    table = trace.compression
     if not isinstance(table, Compression) or not table.holds(np.exp(center)):
         return trace
-    seen = wide.seen(jnp.asarray(theta), index)
     largest = float(jnp.sum(jnp.abs(jnp.stack(seen.circuit.terms_of(trace.channel).weight))) * seen.gain)
     charge = float(np.ptp(trace.observed)) / largest if max(trace.columns, default=0) >= len(SLOW) else 0.0
-    reach = max(_REACH * spread, _LEAST_REACH)
     low, high = (float(table.center + side * table.reach) for side in (-1.0, 1.0))
     low, high = max(center - reach, low), min(center + reach, high)
-    narrow = table.narrowed(0.5 * (low + high), 0.5 * (high - low), 0.1 * tolerance * sigma / largest, charge=charge)
+    narrow = table.narrowed(0.5 * (low + high), 0.5 * (high - low), error / largest, charge=charge)
     return dataclasses.replace(trace, compression=narrow)
 
 
-def _spread_of_log_b(likelihood: Likelihood, theta: np.ndarray, root: np.ndarray) -> float:
-    """Standard deviation of the logarithm of the slowest time constant."""
-    slope = _slope_of_log_b(likelihood.without_samples(), jnp.asarray(theta))
-    return float(np.linalg.norm(np.asarray(slope) @ root))
-
-
 @eqx.filter_jit
-def _slope_of_log_b(likelihood: Likelihood, theta: Array) -> Array:
-    return jax.grad(_log_b, argnums=1)(likelihood, theta)
+def _log_b_and_slope(likelihood: Likelihood, theta: Array) -> tuple[Array, Array]:
+    return jax.value_and_grad(_log_b, argnums=1)(likelihood, theta)
 
 
 @eqx.filter_jit
@@ -212,7 +210,6 @@ def _each_log_b(likelihood: Likelihood, theta: Float[Array, "n parameters"]) -> 
     return jax.vmap(lambda each: _log_b(likelihood, each))(theta)
 
 
-@eqx.filter_jit
 def _log_b(likelihood: Likelihood, theta: Array) -> Array:
     """Logarithm of the slowest time constant, s."""
     return jnp.log(likelihood.circuit(theta).b)

@@ -28,8 +28,8 @@ from fitact.units import engineering
 
 COMPARED = ("sine", "triangle", "square", "trapezoid")
 LEGEND = (
-    f"* the scene's own; assured: met with {100.0 * ASSURANCE:g} % probability, and what is drawn there: power by the"
-    " median finger, current and insulator's voltage at most"
+    f"* the scene's own; assured: met with {100.0 * ASSURANCE:g} % probability, ± the standard error of its draws, and"
+    " what is drawn there: power by the median finger, current and insulator's voltage at most"
 )
 
 _FREQUENCIES = np.geomspace(10.0, 1000.0, 9)  # Hz, at which people feel
@@ -53,6 +53,7 @@ class DriveDesign:
         needed: the peak-to-peak amplitude at which each finger feels that waveform, V; infinite: it never does.
         by_frequency: the same waveforms from 10 Hz to 1 kHz.
         by_thickness, by_permittivity: the scene's own drive on other insulators, Ci following eq. (3).
+        seed: of the fingers drawn.
     """
 
     scene: Scene
@@ -140,8 +141,8 @@ class DriveDesign:
     def summary(self) -> str:
         """The question, the table for people, what follows from it, and warnings."""
         rows = [
-            f"{name:13}{median:>13}{between:>20}" + "".join(f"{x:>11}" for x in others)
-            for name, median, between, *others in self.table
+            f"{name:13}{median:>13}{between:>20}{assured:>17}" + "".join(f"{x:>11}" for x in others)
+            for name, median, between, assured, *others in self.table
         ]
         warnings = (f"warning: {warning}" for warning in self.warnings)
         return "\n".join([self.question, *rows, LEGEND, *self.excluded, *self.sentences, *warnings])
@@ -190,15 +191,15 @@ def _cells(name: str, option: DriveOption, own: bool) -> tuple[str, ...]:
     low, median, high = (shown(quantile(option.amplitude, q), "V") for q in (0.05, 0.5, 0.95))
     between = f"{low} to {high}" if option.amplitude.size > 1 else ""
     of = option.at_assured
+    assured = shown(option.assured, "V", option.assured_error)
     values = (
-        (option.assured, "V"),
         (of.real_power, "W"),
         (of.apparent_power, "VA"),
         (of.current_rms, "A"),
         (of.current_peak, "A"),
         (of.insulator_peak, "V"),
     )
-    return name + (" *" if own else ""), median, between, *(shown(x, unit) for x, unit in values)
+    return name + (" *" if own else ""), median, between, assured, *(shown(x, unit) for x, unit in values)
 
 
 def _thinnest(options: tuple[DriveOption, ...]) -> str:

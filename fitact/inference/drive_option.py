@@ -5,6 +5,7 @@ import math
 from typing import Any, ClassVar, Self
 
 import numpy as np
+import scipy.stats
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
@@ -23,9 +24,21 @@ def quantile(amplitude: Float[np.ndarray, "*shape"], share: float, axis: int | N
         return np.divide(1.0, np.quantile(1.0 / amplitude, 1.0 - share, axis=axis, method="hazen"))
 
 
-def shown(value: ArrayLike, unit: str) -> str:
-    """For people."""
-    return engineering(float(value), unit, 3) if math.isfinite(value) else "unbounded"
+def quantile_error(amplitude: Float[np.ndarray, " n"], share: float) -> float:
+    """Standard error of `quantile` over independent draws: that over all bootstrap samples (Maritz & Jarrett 1978)."""
+    place, count = float(quantile(amplitude, share)), amplitude.size
+    if not math.isfinite(place):
+        return math.inf
+    rank = scipy.stats.beta(0.5 + count * (1.0 - share), 0.5 + count * share)  # between reciprocals, as `quantile`
+    weight, inverse = np.diff(rank.cdf(np.arange(count + 1) / count)), np.sort(1.0 / amplitude)
+    return place**2 * math.sqrt(weight @ (inverse - weight @ inverse) ** 2)
+
+
+def shown(value: ArrayLike, unit: str, error: float | None = None) -> str:
+    """For people, with its standard error if that is given."""
+    if not math.isfinite(value):
+        return "unbounded"
+    return engineering(float(value), unit, 3) + ("" if error is None else f" ± {engineering(error, unit, 2)}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +50,7 @@ class DriveOption:
         frequency: Hz.
         device: the panel, with its limits.
         amplitude: peak-to-peak, V, that the share of people needs, under each law.
+        assured_error: of `assured`, V: the standard error that its draws, of laws or of a prior's fingers, leave.
         people: peak-to-peak, V, up to which `PEOPLE` of all fingers feel it.
         at_assured: at the assured amplitude: forces and powers of the median finger, the voltage over the insulator
             and the currents the largest of all fingers.
@@ -48,6 +62,7 @@ class DriveOption:
     frequency: float
     device: Device
     amplitude: Float[np.ndarray, " laws"]
+    assured_error: float
     people: Float[np.ndarray, " shares"]
     at_assured: Cycle
 
@@ -64,8 +79,9 @@ class DriveOption:
         """From the amplitude that each finger needs, and what a drive of 1 Vpp does at it."""
         amplitude = quantile(needed, share, axis=1)
         assured = float(quantile(amplitude, ASSURANCE))
+        error = quantile_error(amplitude, ASSURANCE) if amplitude.size > 1 else quantile_error(needed[0], share)
         people = np.array([quantile(needed, each) for each in PEOPLE])
-        return cls(waveform, frequency, device, amplitude, people, _at(found, assured))
+        return cls(waveform, frequency, device, amplitude, error, people, _at(found, assured))
 
     @property
     def assured(self) -> float:
@@ -110,7 +126,8 @@ class DriveOption:
             "frequency": self.frequency,
             "insulator_thickness": self.device.insulator_thickness,
             "insulator_permittivity": self.device.insulator_permittivity,
-            "peak_to_peak": {"unit": "V", "q05": low, "q50": median, "q95": high, "assured": self.assured},
+            "peak_to_peak": {"unit": "V", "q05": low, "q50": median, "q95": high}
+            | {"assured": self.assured, "assured_error": self.assured_error},
             "people": {"unit": "V"} | dict(zip(("q05", "q25", "q50", "q75", "q95"), self.people.tolist(), strict=True)),
             "at_assured": shown,
             "breakdown_voltage": self.breakdown_voltage,

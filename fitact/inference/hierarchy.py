@@ -29,6 +29,7 @@ class Hierarchy(eqx.Module):
     Attributes:
         fingers: what the records say.
         prior: of the medians of Rsc and Csc, and of Ci.
+        area_varies: whether each finger has an area of its own.
         covariates: of the fingers, standardised.
     """
 

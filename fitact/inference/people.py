@@ -83,7 +83,7 @@ class Population:
 
         Where there are covariates, also slopes: by how much log Rsc and log Csc change per unit of each.
         """
-        law = laws(self.hierarchy, self.points)
+        law = self._sampled
         found = {f"log_sd_{name}": law.log_sd[..., i] for i, name in enumerate(SKIN)}
         found |= {} if law.area is None else {"log_sd_area": law.area}
         if law.slopes is not None:
@@ -91,6 +91,10 @@ class Population:
             for i, name in enumerate(self.covariates.names):
                 found |= {f"slope_{skin}_{name}": per_unit[..., i, j] for j, skin in enumerate(SKIN)}
         return found | {"correlation": law.correlation} | {k: np.exp(x) for k, x in log_medians(law).items()}
+
+    @functools.cached_property
+    def _sampled(self) -> Law:
+        return laws(self.hierarchy, self.points)
 
     def new_fingers(self) -> dict[str, Float[np.ndarray, "laws fingers"]]:
         """Draws of fingers to come, some of each of many laws: Rsc, Csc, g, b, force and friction, SI units."""

@@ -31,6 +31,7 @@ class PriorPredictive:
         derived: g, b (s) of the final circuit; Vsc_peak_to_peak (V), force_mean, force_peak (N).
         time: two periods of the steady state, or the scene's duration, s.
         Vsc: skin voltage, V.
+        seed: of the draws.
     """
 
     parameters: dict[str, Float[np.ndarray, " draws"]]

@@ -1,4 +1,4 @@
-"""What people look at: one self-contained HTML page."""
+"""What people look at: self-contained pages, and pictures."""
 
 from fitact.report.page import read_results, write_report
 

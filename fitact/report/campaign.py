@@ -34,6 +34,14 @@ def write_campaign(folder: str | os.PathLike[str], fits: Fits, origin: Origin) -
         warnings=(),
         reserved=trusted < len(fits),
     )
-    shown = {"answers": answered[:_SHOWN], "failures": failures[:_SHOWN], "count": len(answered)}
-    write_page(place / "index.html", "campaign.html", frame, origin, engineering=engineering, **shown)
+    write_page(
+        place / "index.html",
+        "campaign.html",
+        frame,
+        origin,
+        answers=answered[:_SHOWN],
+        failures=[(row["record"], row["result"], row["message"]) for row in failures[:_SHOWN]],
+        count=len(answered),
+        engineering=engineering,
+    )
     return place / "index.html"

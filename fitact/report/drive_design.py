@@ -194,7 +194,11 @@ def _frame(design: DriveDesign) -> Frame:
         verdict=verdict if design.trusted else f"{'; '.join(design.warnings)}.",
         findings=findings,
         answers=[
-            Answer(name, shown(option.assured, "V"), "excluded" if option.violations else "keeps the limits stated")
+            Answer(
+                name,
+                shown(option.assured, "V", option.assured_error),
+                "excluded" if option.violations else "keeps the limits stated",
+            )
             for name, option in design.options.items()
         ],
         warnings=design.warnings,

@@ -10,12 +10,11 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from fitact.data.record import Record
-from fitact.files import replacing
 from fitact.inference.finger import Finger
 from fitact.inference.summary import versions
 from fitact.model.scene import Scene
 from fitact.report import plots
-from fitact.report.page import render
+from fitact.report.html import write_html
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,9 +81,7 @@ def write_page(path: str | os.PathLike[str], template: str, frame: Frame, origin
     Raises:
         InputError: the place cannot be written.
     """
-    page = render(template, frame=frame, origin=origin, versions=versions(), **content)
-    with replacing(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    write_html(path, template, frame=frame, origin=origin, versions=versions(), **content)
 
 
 def image(draw: Callable[[], Figure], **settings: Any) -> str:

@@ -10,12 +10,11 @@ from typing import Any
 
 import jinja2
 import matplotlib as mpl
-from markupsafe import Markup
 
 from fitact.errors import InputError
-from fitact.files import replacing
 from fitact.inference.summary import BY_FORCE, load, width
 from fitact.report import plots, posterior_charts
+from fitact.report.html import write_html
 from fitact.report.posterior_charts import CHANNELS
 from fitact.units import engineering
 
@@ -69,41 +68,30 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
         InputError: the place cannot be written, or the results are of another version.
     """
     try:
-        page = _page(tree, summary)
+        write_html(path, "report.html", **_content(tree, summary))
     except (KeyError, jinja2.UndefinedError) as error:
         raise InputError(
             f"{path}: its results lack {error}, as of another version of fitact; make them anew"
         ) from error
-    with replacing(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
 
 
-def _page(tree: Any, summary: dict[str, Any]) -> str:
+def _content(tree: Any, summary: dict[str, Any]) -> dict[str, Any]:
     with mpl.rc_context(plots.style()):
         figures = _figures(tree)
-    return render(
-        "report.html",
-        summary=summary,
-        figures=figures,
-        charts=posterior_charts.charts(tree),
-        label=_label,
-        channels=CHANNELS,
-        force=BY_FORCE[summary["model"].get("force", "paper")],
-        circuits=_CIRCUITS,
-        engineering=engineering,
-        quantity=_quantity,
-        width=width,
-        command=_command(summary),
-        scene=json.dumps(summary["scene"], indent=2, ensure_ascii=False),
-    )
-
-
-def render(template: str, **content: Any) -> str:
-    """A page of the folder of templates."""
-    loader = jinja2.PackageLoader("fitact.report")
-    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    environment.globals["verbatim"] = lambda name: Markup(loader.get_source(environment, name)[0])  # scripts of ours
-    return environment.get_template(template).render(**content)
+    return {
+        "summary": summary,
+        "figures": figures,
+        "charts": posterior_charts.charts(tree),
+        "label": _label,
+        "channels": CHANNELS,
+        "force": BY_FORCE[summary["model"].get("force", "paper")],
+        "circuits": _CIRCUITS,
+        "engineering": engineering,
+        "quantity": _quantity,
+        "width": width,
+        "command": _command(summary),
+        "scene": json.dumps(summary["scene"], indent=2, ensure_ascii=False),
+    }
 
 
 def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]]:

@@ -5,6 +5,7 @@ import io
 import math
 import os
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -188,6 +189,12 @@ def write_svg(path: str | os.PathLike[str], draw: Callable[[], Figure], **settin
     """
     with mpl.rc_context(style() | settings), replacing(path) as temporary:
         draw().savefig(temporary, format="svg", metadata={"Date": None})
+
+
+def save(figure: Figure, path: Path, suffix: str) -> None:
+    """Write a figure at `path`, as the ending of what it becomes says: ".svg" or ".png"."""
+    metadata = {"Date": None} if suffix == ".svg" else {}
+    figure.savefig(path, format=suffix[1:], dpi=150, metadata=metadata)
 
 
 def svg(figure: Figure) -> str:

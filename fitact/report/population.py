@@ -8,7 +8,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from fitact.inference.people import Population
 from fitact.report.plots import log_ticks, write_svg
 
 NOT_DRAWN = "Not drawn: some draws are not finite."
@@ -19,13 +18,14 @@ _BANDS = {(0.025, 0.975): 0.15, (0.05, 0.95): 0.3, (0.25, 0.75): 0.55}  # quanti
 _BINS = 50
 
 
-def write_population(path: str | os.PathLike[str], population: Population) -> None:
+def write_population(path: str | os.PathLike[str], tree: Any, content: dict[str, Any]) -> None:
     """Draw the fingers, those to come, their force, and what makes it differ, as SVG at `path`.
+
+    From the content of population.nc and population.json.
 
     Raises:
         InputError: the place cannot be written.
     """
-    tree, content = population.to_datatree(), population.to_dict()
     write_svg(path, lambda: _figure(tree, content), **SETTINGS)
 
 

@@ -11,7 +11,7 @@ from matplotlib.ticker import EngFormatter
 from fitact.errors import InputError
 from fitact.files import replacing
 from fitact.inference.prior_predictive import PriorPredictive
-from fitact.report.plots import style, svg
+from fitact.report.plots import save, style, svg
 
 _FORMATS = (".html", ".svg", ".png")
 _COLOR, _LINE = "#0072B2", "#333333"
@@ -30,8 +30,7 @@ def write_prior(path: Path, predicted: PriorPredictive) -> None:
         if path.suffix == ".html":
             temporary.write_text(_page(figure, predicted), encoding="utf-8")
         else:
-            metadata = {"Date": None} if path.suffix == ".svg" else {}
-            figure.savefig(temporary, format=path.suffix[1:], dpi=150, metadata=metadata)
+            save(figure, temporary, path.suffix)
 
 
 def _figure(predicted: PriorPredictive) -> Figure:

@@ -13,7 +13,7 @@ from fitact.data.clipping import clipped
 from fitact.data.inspection import Channel, Inspection
 from fitact.errors import InputError
 from fitact.files import replacing
-from fitact.report.plots import style
+from fitact.report.plots import save, style
 
 _COLOR, _RAIL = "#333333", "#D55E00"
 _COLUMNS = 2000  # beyond twice as many samples, the extremes of so many stretches are drawn
@@ -29,8 +29,7 @@ def write_record(path: str | os.PathLike[str], inspection: Inspection) -> None:
     if path.suffix not in (".svg", ".png"):
         raise InputError(f"{path}: the drawing is written as .svg or .png; choose one of these endings")
     with mpl.rc_context(style()), replacing(path) as temporary:
-        metadata = {"Date": None} if path.suffix == ".svg" else {}
-        _figure(inspection).savefig(temporary, format=path.suffix[1:], dpi=150, metadata=metadata)
+        save(_figure(inspection), temporary, path.suffix)
 
 
 def _figure(inspection: Inspection) -> Figure:

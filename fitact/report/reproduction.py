@@ -6,16 +6,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
-import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fitact import paper
-from fitact.files import replacing, write_json
+from fitact.files import write_json
 from fitact.model.circuit import Circuit
-from fitact.report import plots, reproduction_charts, reproduction_curves
+from fitact.report import reproduction_charts, reproduction_curves
 from fitact.report.charts import Chart
-from fitact.report.page import render
+from fitact.report.frame import image
+from fitact.report.html import write_html
 from fitact.report.reproduction_curves import COLORS, KNEES, OTHERS, OURS
 from fitact.units import engineering
 
@@ -36,13 +36,12 @@ def write_reproduction(directory: str | os.PathLike[str], claims: tuple[paper.Cl
         InputError: the place cannot be written.
     """
     directory = Path(directory)
-    with mpl.rc_context(plots.style()), jax.enable_x64(True):
-        figures = [(each.title, each.chart(), plots.source(plots.svg(each.draw())), each.alt) for each in _FIGURES]
-    page = render("reproduction.html", claims=claims, figures=figures, value=_value, counts=_counts(claims))
+    page = directory / "reproduction.html"
+    with jax.enable_x64(True):
+        figures = [(each.title, each.chart(), image(each.draw), each.alt) for each in _FIGURES]
     write_json(directory / "reproduction.json", [claim.to_dict() for claim in claims])
-    with replacing(directory / "reproduction.html") as temporary:
-        temporary.write_text(page, encoding="utf-8")
-    return directory / "reproduction.html"
+    write_html(page, "reproduction.html", claims=claims, figures=figures, value=_value, counts=_counts(claims))
+    return page
 
 
 def _counts(claims: tuple[paper.Claim, ...]) -> dict[str, int]:

@@ -16,7 +16,6 @@ from fitact.units import engineering
 COLORS = ("#D55E00", "#009E73", "#CC79A7", "#8C564B", "#222222")  # in the order of the paper's figures
 OURS, OTHERS = "#0072B2", ("#999999", "#555555")
 KNEES = {"|H|": (40.0, 300.0), "phase": (90.0, 270.0)}  # Hz: the paper's, and where it calls the curve steady
-_CI = paper.INSULATORS[paper.TEXT_CI]
 _TIMES = 2001
 _BEFORE_EDGE = 1e-9  # of a period
 
@@ -41,8 +40,8 @@ class Insulator(NamedTuple):
 
 def grounding() -> dict[str, Circuit]:
     """Fig. 4."""
-    direct = DirectGround(paper.RSC, paper.CSC, _CI, R_H=paper.R_H)
-    return {"direct": direct, "natural": NaturalGround(paper.RSC, paper.CSC, _CI, paper.Z)}
+    direct = DirectGround(paper.RSC, paper.CSC, paper.CI, R_H=paper.R_H)
+    return {"direct": direct, "natural": NaturalGround(paper.RSC, paper.CSC, paper.CI, paper.Z)}
 
 
 def grounding_points(name: str, values: Sequence[float], unit: str) -> dict[str, Circuit]:
@@ -50,7 +49,7 @@ def grounding_points(name: str, values: Sequence[float], unit: str) -> dict[str,
     fixed: dict[str, Any] = {"grounding_Rsc": paper.RSC, "grounding_Csc": paper.CSC}
     return {
         f"{name.removeprefix('grounding_')}1 = {engineering(value, unit, 3)}": DirectGround(
-            paper.RSC, paper.CSC, _CI, R_H=paper.R_H, **(fixed | {name: value})
+            paper.RSC, paper.CSC, paper.CI, R_H=paper.R_H, **(fixed | {name: value})
         )
         for value in values
     }
@@ -58,8 +57,8 @@ def grounding_points(name: str, values: Sequence[float], unit: str) -> dict[str,
 
 def body() -> dict[str, Circuit]:
     """Fig. 10."""
-    with_body = DirectGround(paper.RSC, paper.CSC, _CI, R_H=paper.R_H)
-    return {"without R_H": FinalCircuit(paper.RSC, paper.CSC, _CI), "with R_H": with_body}
+    with_body = DirectGround(paper.RSC, paper.CSC, paper.CI, R_H=paper.R_H)
+    return {"without R_H": FinalCircuit(paper.RSC, paper.CSC, paper.CI), "with R_H": with_body}
 
 
 def in_time(circuit: Circuit, drive: Drive | None = None) -> Curve:
@@ -71,7 +70,7 @@ def in_time(circuit: Circuit, drive: Drive | None = None) -> Curve:
 
 def waveforms() -> dict[str, tuple[Curve, Curve]]:
     """Fig. 15: V and Vsc of each drive."""
-    time, circuit = _two_periods(), FinalCircuit(paper.RSC, paper.CSC, _CI)
+    time, circuit = _two_periods(), FinalCircuit(paper.RSC, paper.CSC, paper.CI)
     return {
         name: (Curve(time, np.asarray(drive.value(jnp.asarray(time)))), in_time(circuit, drive))
         for name, drive in paper.waveforms(30.0).items()

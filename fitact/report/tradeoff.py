@@ -18,7 +18,7 @@ from fitact.files import replacing
 from fitact.report import charts
 from fitact.report.charts import Axis
 from fitact.report.frame import Answer, Frame, Origin, image, write_page
-from fitact.report.plots import PRIOR, style
+from fitact.report.plots import PRIOR, save, style
 from fitact.tradeoff import COLUMNS, KINDS, Kind, Level, Tradeoff
 from fitact.units import engineering
 
@@ -39,9 +39,8 @@ def write_tradeoff(path: Path, tradeoff: Tradeoff) -> None:
     Raises:
         InputError: the place cannot be written.
     """
-    metadata = {"Date": None} if path.suffix == ".svg" else {}
     with mpl.rc_context(style() | _STYLE), replacing(path) as temporary:
-        draw(tradeoff).savefig(temporary, format=path.suffix[1:], dpi=150, metadata=metadata)
+        save(draw(tradeoff), temporary, path.suffix)
 
 
 def draw(tradeoff: Tradeoff, kinds: Sequence[Kind] = tuple(_TITLES)) -> Figure:
