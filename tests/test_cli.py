@@ -184,6 +184,7 @@ def test_scene_is_printed_as_a_file(fitact_command, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_tradeoff_is_written_or_ends_without_a_trace(fitact_command, environment, finger_path, tmp_path):
     command = [sys.executable, "-u", "-c", INTERRUPTIBLE, "tradeoff", str(finger_path)]
     running = subprocess.Popen(
@@ -236,6 +237,7 @@ def test_plan_is_a_table_json_and_a_picture(fitact_command, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_run_reports_what_was_left_out(fitact_command, tmp_path):
     (tmp_path / "scene.toml").write_text('[grounding]\nR_H = "500 ohm"\n')
     assert fitact_command("simulate", "scene.toml", "--out", "record.csv").returncode == 0

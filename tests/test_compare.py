@@ -167,7 +167,8 @@ WITH = scene(measurement=RESISTOR, gap={"resistance": RGAP, "capacitance": CGAP}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("gap", [pytest.param(True, marks=pytest.mark.thorough), False])
+@pytest.mark.thorough
+@pytest.mark.parametrize("gap", [True, False])
 def test_a_gap_is_preferred_where_there_is_one_and_only_there(gap: bool):
     made = record([SKIN, SKIN, *[(RGAP, CGAP)] * gap], 100e3)
     found = fitact.compare(made, {"plain": scene(measurement=RESISTOR), "gap": WITH})
@@ -180,6 +181,7 @@ def test_a_gap_is_preferred_where_there_is_one_and_only_there(gap: bool):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_nested_models_differ_by_the_chi_square_law():
     """Twice the log-likelihood that one true parameter more gains: chi-square of 1, so AIC by that less 2."""
     measured = {"channels": ["Vsc", "I"]}

@@ -96,7 +96,7 @@ def test_square_from_rest():
 
 @pytest.mark.parametrize(
     "scene",
-    [pytest.param(each, marks=pytest.mark.slow) for each in (None, SQUARE)],
+    [pytest.param(None, marks=(pytest.mark.slow, pytest.mark.thorough)), pytest.param(SQUARE, marks=pytest.mark.slow)],
     ids=["measured drive", "folded square"],
 )
 def test_fit_and_log_probabilities_are_those_of_the_samples(scene):
@@ -118,6 +118,7 @@ def test_fit_and_log_probabilities_are_those_of_the_samples(scene):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_cost_does_not_grow_with_the_record():
     rows = [fitact.fit(square_record(periods=n), SQUARE).likelihood.rows for n in (1, 40)]
     assert rows[1] <= rows[0] + 2  # a longer record is known better, and asks for a term or two more

@@ -250,7 +250,7 @@ def trapezoid_record(step: float, edge: float = 20e-6, noise: float = 0.05) -> f
     [
         pytest.param(5e-6, marks=pytest.mark.slow),
         pytest.param(50e-6, marks=pytest.mark.slow),
-        pytest.param(100e-6, marks=pytest.mark.slow),
+        pytest.param(100e-6, marks=(pytest.mark.slow, pytest.mark.thorough)),
     ],
 )
 def test_edges_faster_than_the_samples_widen_g(step: float):

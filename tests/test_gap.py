@@ -194,6 +194,7 @@ def test_fit_of_vsc_and_current_tells_the_gap_and_its_force():
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_fit_of_vsc_alone_says_that_the_prior_speaks():
     fit = fitact.fit(record([SKIN, SKIN, (RGAP, CGAP)]), scene(**SLIDING))
     assert fit.identifiability.verdict == "prior-limited"

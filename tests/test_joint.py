@@ -129,12 +129,18 @@ def test_unequal_skins_by_vsc_and_current():
         pytest.param([SKIN], 14.5e6, {"grounding": NATURAL}, marks=pytest.mark.thorough),
         pytest.param([SKIN], 14.5e6, {"grounding": NATURAL, "prior": free(Z=3.0)}, marks=pytest.mark.thorough),
         ([SKIN, EARTH], 0.0, {"grounding": NATURAL | {"Z_capacitance": EARTH[1]}}),
-        (
+        pytest.param(
             [SKIN, EARTH],
             0.0,
             {"grounding": NATURAL | {"Z_capacitance": EARTH[1]}, "prior": free(Z=3.0, Z_capacitance=3.0)},
+            marks=pytest.mark.thorough,
         ),
-        ([PROBED, SKIN], 0.0, {"measurement": {"probe_resistance": 10e6, "probe_capacitance": 10e-12}}),
+        pytest.param(
+            [PROBED, SKIN],
+            0.0,
+            {"measurement": {"probe_resistance": 10e6, "probe_capacitance": 10e-12}},
+            marks=pytest.mark.thorough,
+        ),
     ],
     ids=["direct", "R_H", "free R_H", "final", "natural", "free Z", "natural with C", "free Z and C", "probe"],
 )
@@ -147,6 +153,7 @@ def test_the_papers_circuits(elements, R0: float, sections):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_parameters_tied_to_others():
     ties = {"grounding_Rsc": {"tied": "Rsc", "ratio": 0.5}, "grounding_Csc": {"tied": "Csc", "ratio": 2.0}}
     made = record([SKIN, (0.5 * SKIN[0], 2.0 * SKIN[1])])

@@ -92,6 +92,7 @@ def test_burg_finds_a_known_process():
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_outliers_cost_student_little_and_white_much():
     record = square_record(per_period=200)
     rng = np.random.default_rng(5)
@@ -115,7 +116,7 @@ def test_outliers_cost_student_little_and_white_much():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("model", "covers"), [("ar1", True), ("white", False)])
+@pytest.mark.parametrize(("model", "covers"), [("ar1", True), pytest.param("white", False, marks=pytest.mark.thorough)])
 def test_intervals_cover_under_autoregressive_noise(model: str, covers: bool):
     """Errors over their standard deviations have a root mean square of 1 ± 0.13 for 30 records."""
     record = square_record(per_period=200, noise=0.0)
@@ -151,7 +152,8 @@ def pink(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("channel", ["Vsc", pytest.param("I", marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("channel", ["Vsc", "I"])
 def test_a_measured_spectrum_widens_what_white_noise_would_make_too_narrow(channel: str):
     """The root mean square of 12 errors is 1 ± 0.2."""
     record = burst_record()

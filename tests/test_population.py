@@ -316,7 +316,8 @@ def nuts(fits: list[fitact.Fit], prior: Prior) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [3, pytest.param(6, marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("count", [3, 6])
 def test_law_is_that_of_nuts_over_all_parameters(count: int):
     """Of fingers known no better than they differ; within four standard errors of means, and 5 % in width."""
     simulated = simulate(5, 1, fingers=count, noise=4.0)
@@ -340,6 +341,7 @@ def test_law_is_that_of_nuts_over_all_parameters(count: int):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_misfit_is_named_and_the_population_stays_trusted():
     simulated = simulate(1, 0, fingers=4)
     first, *others = simulated.records

@@ -96,7 +96,8 @@ def test_slopes_of_a_covariate_and_fingers_at_one_are_covered():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("channels", [("I",), pytest.param(("Vsc", "I"), marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("channels", [("I",), ("Vsc", "I")])
 def test_areas_are_seen_by_the_current(channels: tuple[str, ...]):
     """Ten fingers whose areas differ by a factor of two and more: their spread and Ci, each within its 99 %."""
     rng = np.random.default_rng(12)

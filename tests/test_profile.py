@@ -63,6 +63,7 @@ def test_along_the_blind_direction_the_profile_is_the_priors_normal(fit: fitact.
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_the_records_alone_leave_the_contact_area_open(fit: fitact.Fit):
     found = fit.intervals(prior=False)
     for name in ("Rsc", "Csc", "Ci", "force_mean"):
@@ -95,6 +96,7 @@ def test_without_the_prior_vsc_alone_is_rank_deficient(fit: fitact.Fit):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_the_command_line_adds_them(finger_path, tmp_path):
     record = fitact.read(finger_path)
     few = tmp_path / "few.csv"

@@ -293,6 +293,7 @@ def test_a_measured_drive(steady: bool):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_plan_that_leaves_dispersion_out_fits_a_constant_skin():
     held = {"skin": {"level": "fractional", "alpha": 0.99995}, "prior": {}, "tolerance": {"force": 0.002}}
     stated = scene("trapezoid", **held)

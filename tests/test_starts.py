@@ -36,7 +36,8 @@ def test_a_start_where_the_circuit_gives_no_signal(fit: fitact.Fit):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("prior", [True, pytest.param(False, marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("prior", [True, False])
 def test_a_hundred_starts_reach_the_optimum(fit: fitact.Fit, prior: bool):
     """Without the prior, the optimum is the ridge: g and b are what there is to reach."""
     rng = np.random.default_rng(3)
