@@ -3,7 +3,7 @@
 The peers minimise the same sum of squares, prior included, in log-parameters from the prior's medians, with the noise
 that fitact found; beside an optimum, fitact also judges each fit, and the peers do not. lmfit is run with the model as
 one writes it (`vs_lmfit`) and with all that does not change from step to step worked out before (`vs_lmfit_good`, as
-for scipy).
+for scipy). `optimum_vs` are ratios of the time for the optimum alone, on one core each.
 
     python benchmarks/batch.py [--json] [--records 10000] [--samples 5000]
 """
@@ -14,12 +14,16 @@ import statistics
 import time
 from collections.abc import Callable
 
+import jax
 import lmfit
 import numpy as np
 import scipy.optimize
+from threadpoolctl import threadpool_limits
 from timing import show
 
 import fitact
+from fitact.inference.alike import Together
+from fitact.inference.problem import pose
 
 V0, FREQUENCY, NOISE = 180.0, 100.0, 0.1  # V, Hz, V
 NAMES = ("Rsc", "Csc", "Ci")
@@ -100,6 +104,19 @@ def by_scipy(model: Model, observed: np.ndarray, sigma: float) -> np.ndarray:
     return scipy.optimize.least_squares(residuals, MEANS, method="lm", jac="3-point", **tight).x
 
 
+def optima_alone(records: list[fitact.Record]) -> float:
+    """Seconds a record on one core for what the peers give: the optimum, with the noise known."""
+    batches = [np.stack([record["Vsc"] for record in records[i : i + 256]]) for i in range(0, len(records) - 255, 256)]
+    with jax.enable_x64(True), threadpool_limits(1):
+        together = Together.like(pose([records[0]], [SCENE]))
+        noise, least = np.full(256, NOISE), np.zeros(256)
+        jax.block_until_ready(together.optima(batches[0], noise, least)[0])
+        start = time.perf_counter()
+        for batch in batches:
+            jax.block_until_ready(together.optima(batch, noise, least)[0])
+        return (time.perf_counter() - start) / (256 * len(batches))
+
+
 def measure(count: int, samples: int) -> dict[str, float]:
     """Ratios of fits per second, and how far optima are apart in the logarithms."""
     records = simulated(count, samples)
@@ -112,6 +129,7 @@ def measure(count: int, samples: int) -> dict[str, float]:
     fitact.fit_many(records[:300], SCENE, progress=False)  # compiles
     taken: dict[str, list[float]] = {name: [] for name in ("fitact", *peers)}
     apart: dict[str, list[float]] = {name: [] for name in peers}
+    optimum: list[float] = []
     for turn in range(ROUNDS):
         start = time.perf_counter()
         fits = fitact.fit_many(records, SCENE, progress=False)
@@ -123,10 +141,12 @@ def measure(count: int, samples: int) -> dict[str, float]:
             taken[name].append((time.perf_counter() - start) / PEERS)
             ours = np.log([[fits[i][key] for key in NAMES] for i in some])
             apart[name].append(float(np.max(np.abs(ours - found))))
+        optimum.append(optima_alone(records))
     seconds = {name: statistics.median(values) for name, values in taken.items()}
     return {
         "fits_per_second": 1.0 / seconds["fitact"],
         **{f"vs_{name}": seconds[name] / seconds["fitact"] for name in peers},
+        **{f"optimum_vs_{name}": seconds[name] / statistics.median(optimum) for name in peers},
         **{f"apart_{name}": max(apart[name]) for name in peers},
         "alone": float(np.mean([row["freed"] != "" or not row["trusted"] for row in fits])),
     }

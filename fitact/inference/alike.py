@@ -36,7 +36,7 @@ _DEPENDENT = 1e-9  # of a column's length: what rounding leaves of one that depe
 _DOUBT = 3.0  # of the Bayesian information criterion: error of a clock's evidence, whose shape is not exact here
 _RESOLVED = 512  # samples that tell whether noise hides the converter's steps
 _RAIL = 3  # samples at an extreme, from which it may be a rail
-_AT_ONCE = 16  # records, whose samples stay in the processor's cache
+_AT_ONCE = 64  # records, whose samples stay in the processor's cache
 _CANDIDATES = (*NUISANCES, "delay", "clock")  # nuisances that a record may ask for
 
 
@@ -57,6 +57,25 @@ class Settled(NamedTuple):
     logs: Float[np.ndarray, "records derived"]
     gradients: Float[np.ndarray, "records derived parameters"]
     figures: dict[str, np.ndarray]
+
+
+class Optima(NamedTuple):
+    """Where least squares end, of a record or of many.
+
+    Attributes:
+        theta, sigma: as `Fit.theta`, `Fit.sigma`.
+        triangle: of the whitened Jacobian's QR decomposition.
+        shares: of `_CANDIDATES` in the residuals' square.
+        signal: in the coordinates of the basis.
+        ended: whether at the optimum.
+    """
+
+    theta: Float[Array, "*records parameters"]
+    sigma: Float[Array, "*records"]
+    triangle: Float[Array, "*records parameters parameters"]
+    shares: Float[Array, "*records nuisances"]
+    signal: Float[Array, "*records coordinates"]
+    ended: Bool[Array, "*records"]
 
 
 class Together(NamedTuple):
@@ -97,14 +116,10 @@ class Together(NamedTuple):
 
     def settle(self, observed: Float[np.ndarray, "records samples"]) -> Settled:
         """Fit records. In double precision."""
-        coordinates = self.basis.project(observed)
-        start, held = self._starts(coordinates)
         noise, height, plain = map(np.concatenate, zip(*map(_seen, _parts(observed)), strict=True))
-        least = PRECISION * height
-        begun = jnp.asarray(start), jnp.asarray(np.maximum(noise, least)), jnp.asarray(least)
-        ends = _settle(self.likelihood, jnp.asarray(np.append(self.basis.clock, 0.0)), jnp.asarray(coordinates), *begun)
-        theta, sigma, triangle, shares, signal = map(np.asarray, ends[:5])
-        logs, gradients = map(np.asarray, _derived(self.derive, ends[0], ends[1]))
+        found, held = self.optima(observed, noise, PRECISION * height)
+        theta, sigma, triangle, shares, signal, ended = map(np.asarray, found)
+        logs, gradients = map(np.asarray, _derived(self.derive, found.theta, found.sigma))
         freedom = self.samples - theta.shape[1]
         of_parts = [
             tests(part - inside @ self.basis.functions.T, expected, freedom, self.phases)
@@ -112,8 +127,20 @@ class Together(NamedTuple):
         ]
         figures = {name: np.concatenate([part[name] for part in of_parts]) for name in of_parts[0]}
         figures |= {"rounding_noise": np.zeros(len(noise)), "interpolation_error": np.zeros(len(noise))}
-        clear = held & np.asarray(ends[5]) & ~self._asked_for(shares) & plain & ~is_misfit(figures)
+        clear = held & ended & ~self._asked_for(shares) & plain & ~is_misfit(figures)
         return Settled(clear, theta, sigma, np.linalg.inv(triangle), logs, gradients, figures)
+
+    def optima(
+        self,
+        observed: Float[np.ndarray, "records samples"],
+        noise: Float[np.ndarray, " records"],
+        least: Float[np.ndarray, " records"],
+    ) -> tuple[Optima, Bool[np.ndarray, " records"]]:
+        """Least squares alone, and which records the table holds; sigma begins at `noise` and ends above `least`, V."""
+        coordinates = self.basis.project(observed)
+        theta, held = self._starts(coordinates)
+        of_each = map(jnp.asarray, (coordinates, theta, np.maximum(noise, least), least))
+        return _optima(self.likelihood, jnp.asarray(np.append(self.basis.clock, 0.0)), *of_each), held
 
     def _starts(
         self, coordinates: Float[np.ndarray, "records coordinates"]
@@ -156,18 +183,12 @@ def _seen(observed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @eqx.filter_jit
-def _settle(likelihood: Likelihood, clock: Array, *of_each: Array) -> tuple[Array, ...]:
-    return jax.vmap(lambda *of: _settle_one(likelihood, clock, *of))(*of_each)
+def _optima(likelihood: Likelihood, clock: Array, *of_each: Array) -> Optima:
+    return jax.vmap(lambda *of: _optimum(likelihood, clock, *of))(*of_each)
 
 
-def _settle_one(
-    likelihood: Likelihood, clock: Array, observed: Array, start: Array, noise: Array, least: Array
-) -> tuple[Array, ...]:
-    """Gauss-Newton from a start near the optimum, the noise being that of the residuals.
-
-    Gives theta, sigma, the triangle of the Jacobian, the shares of `_CANDIDATES` in the residuals' square, the
-    signal's coordinates, whether it ended at the optimum, and the steps.
-    """
+def _optimum(likelihood: Likelihood, clock: Array, observed: Array, start: Array, noise: Array, least: Array) -> Optima:
+    """Gauss-Newton from a start near the optimum, the noise being that of the residuals."""
     trace = likelihood.traces[0]
     assert trace.compression is not None
     table = dataclasses.replace(trace.compression, observed=observed)
@@ -193,7 +214,7 @@ def _settle_one(
     def goes_on(state: tuple[Array, ...]) -> Array:
         return (state[2] > _CONVERGED) & (state[3] < _STEPS)
 
-    theta, sigma, offset, steps = lax.while_loop(goes_on, step, (start, noise, jnp.array(jnp.inf), jnp.array(0)))
+    theta, sigma, offset, _ = lax.while_loop(goes_on, step, (start, noise, jnp.array(jnp.inf), jnp.array(0)))
     residuals, jacobian = linearised(theta, sigma)
     left, triangle = sigma * residuals[:-size], _triangular(jacobian, residuals)[0]
     within = jnp.isfinite(model.log_prior(jnp.append(theta, jnp.log(sigma))))
@@ -202,7 +223,7 @@ def _settle_one(
     candidates += [[trace.slope(model.seen(theta))], [clock]]
     known = _orthonormal(list(jacobian[:-size].T), [])
     shares = [sum(jnp.square(q @ left) for q in _orthonormal(each, known)) for each in candidates]
-    return theta, sigma, triangle, jnp.stack(shares) / (left @ left), (observed - left)[:-1], ended, steps
+    return Optima(theta, sigma, triangle, jnp.stack(shares) / (left @ left), (observed - left)[:-1], ended)
 
 
 def _orthonormal(columns: list[Array], others: list[Array]) -> list[Array]:

@@ -19,6 +19,7 @@ _COARSE = 0.2  # of the residuals' rms: error of the drive's interpolation from 
 _PHASES = (8, 32, 128, 512)  # parts of a period whose means are compared; few show what is slow, many what is brief
 _FALSE_ALARM = 1e-6  # of a trace that holds nothing but noise, by all tests of structure together
 _TESTS = len(_PHASES) + 2
+_BANDS = 500  # about as many places are looked at in the cumulative periodogram, for colour is broad
 _LEAST_TESTED = 64  # samples, below which a spectrum says little
 _P_VALUES = ("folded_p", "spectrum_p", "line_p")
 _EXCESS = 0.1  # excess of the residual variance over the noise's that counts, if it is also significant
@@ -183,8 +184,10 @@ def spectrum_p(share: Float[np.ndarray, "*records lines"]) -> Float[np.ndarray, 
     lines = share.shape[-1]
     if lines < _LEAST_TESTED // 2:
         return np.ones(share.shape[:-1])
-    above = np.cumsum(share, axis=-1, dtype=float)
-    above -= np.arange(1, lines + 1) / lines
+    width = max(lines // _BANDS, 1)
+    bands = share[..., : lines // width * width].reshape(*share.shape[:-1], -1, width) @ np.ones(width, share.dtype)
+    above = np.cumsum(bands, axis=-1, dtype=float)
+    above -= width * np.arange(1, above.shape[-1] + 1) / lines
     distance = np.maximum(above.max(axis=-1), -above.min(axis=-1)) * math.sqrt(lines)
     k = np.arange(1, 31)
     series = 2.0 * np.sum((-1.0) ** (k - 1) * np.exp(-2.0 * (k * distance[..., None]) ** 2), axis=-1)

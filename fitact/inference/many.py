@@ -239,10 +239,11 @@ def _settled(together: Together | None, members: list[Member]) -> dict[int, dict
             table = _columns(together, found)
     except np.linalg.LinAlgError:  # one of them spoils what is computed for all
         return {}
+    rows = (dict(zip(table, values, strict=True)) for values in zip(*table.values(), strict=True))
     return {
-        number: {"record": os.path.basename(record.source)} | {name: values[i] for name, values in table.items()}
-        for i, (number, record) in enumerate(members)
-        if found.clear[i]
+        number: {"record": os.path.basename(record.source)} | row
+        for (number, record), row, clear in zip(members, rows, found.clear, strict=False)  # the others fill up
+        if clear
     }
 
 
