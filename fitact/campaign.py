@@ -12,7 +12,7 @@ import json
 import os
 import sys
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from pathlib import Path
@@ -142,9 +142,8 @@ def run_campaign(
 ) -> Fits:
     """Fit many files on Dask's workers, each once; the same call goes on where an interrupted one stopped.
 
-    Into `folder` go journal.jsonl as the work proceeds and results.parquet (a row for each record with an answer),
-    failures.csv (the others, with the reason) and index.html when it is done. A record counts as done when its
-    content, the settings and fitact's version are those of the journal. A batch whose workers die is taken apart until
+    Into `folder` goes journal.jsonl as the work proceeds. A record counts as done when its content, the settings and
+    fitact's version are those of the journal. A batch whose workers die is taken apart until
     the record that kills them is known, which is then set aside.
 
     Args:
@@ -165,9 +164,9 @@ def run_campaign(
     """
     (scene or Scene()).require_available(fit=True)
     paths = [os.path.abspath(path) for path in records]
-    if len(set(paths)) < len(paths):
-        twice = next(path for i, path in enumerate(paths) if path in paths[:i])
-        raise InputError(f"{twice}: is named twice; name each record once")
+    most = Counter(paths).most_common(1)
+    if most and most[0][1] > 1:
+        raise InputError(f"{most[0][0]}: is named twice; name each record once")
     place = Path(folder)
     columns = {"channels": dict(channels or {}), "scale": dict(scale or {})}
     task = Task(None if scene is None else scene.to_json(), columns, str(place / "reports") if reports else None, seed)
@@ -187,6 +186,7 @@ def run_campaign(
 
 def _keys(paths: Sequence[str], task: Task) -> list[str]:
     """What a row is kept under: settings, name and content."""
+    settings = task.fingerprint
 
     def key(path: str) -> str:
         try:
@@ -194,7 +194,7 @@ def _keys(paths: Sequence[str], task: Task) -> list[str]:
                 content = hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:
             content = f"unreadable: {error}"
-        return hashlib.sha256("\0".join([task.fingerprint, path, content]).encode()).hexdigest()
+        return hashlib.sha256("\0".join([settings, path, content]).encode()).hexdigest()
 
     with ThreadPoolExecutor() as pool:
         return list(pool.map(key, paths))
@@ -221,9 +221,9 @@ def _run(
     progress: "_Progress",
 ) -> None:
     progress.done = progress.total - sum(len(batch.keys) for batch in batches)
-    lost = 0.0
+    deadline = time.monotonic()  # until which a scheduler is waited for: one that was there may come back
     while batches:
-        with _connected(scheduler, workers, memory, progress, lost) as client:
+        with _connected(scheduler, workers, memory, progress, deadline) as client:
             under_way: dict[Any, _Batch] = {}
             try:
                 for batch, rows in _answers(client, task, batches, under_way):
@@ -234,7 +234,7 @@ def _run(
                 if scheduler is None:
                     raise
                 batches.extendleft(under_way.values())
-                lost = time.monotonic()
+                deadline = time.monotonic() + _PATIENCE
                 progress.say(f"the scheduler at {scheduler} is gone ({type(error).__name__}); waiting for it")
 
 
@@ -278,7 +278,7 @@ def _answers(
 
 @contextlib.contextmanager
 def _connected(
-    scheduler: str | None, workers: int | None, memory: str, progress: "_Progress", lost: float
+    scheduler: str | None, workers: int | None, memory: str, progress: "_Progress", deadline: float
 ) -> Iterator["Client"]:
     """A client of the scheduler at that address, or of one with workers of its own."""
     try:
@@ -287,13 +287,11 @@ def _connected(
     except ImportError as error:
         raise InputError("campaign: needs Dask; pip install 'fitact[campaign]'") from error
     if scheduler is not None:
-        with _client(scheduler, lost) as client:
+        with _client(scheduler, deadline) as client:
             yield client
         return
-    cache = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    environment = _ONE_THREAD | ({"JAX_COMPILATION_CACHE_DIR": cache} if cache else {})
     settings = {
-        "distributed.nanny.pre-spawn-environ": environment,
+        "distributed.nanny.pre-spawn-environ": _ONE_THREAD,
         "distributed.worker.multiprocessing-method": "spawn",
         "distributed.scheduler.allowed-failures": _KILLS,
         "distributed.admin.log-format": "",
@@ -305,15 +303,15 @@ def _connected(
         yield client
 
 
-def _client(scheduler: str, lost: float) -> "Client":
-    """Of a scheduler, for which it waits a while where it was `lost` (a time), since it may come back."""
+def _client(scheduler: str, deadline: float) -> "Client":
+    """Of a scheduler, for which it waits until the deadline."""
     from distributed import Client
 
     while True:
         try:
             return Client(scheduler, timeout="5s")
         except (OSError, TimeoutError, ValueError) as error:
-            if time.monotonic() - lost > _PATIENCE or lost == 0.0:
+            if time.monotonic() >= deadline:
                 raise InputError(
                     f"--scheduler {scheduler}: is not to be reached ({error}); what is done is kept, and the same"
                     " command goes on"
