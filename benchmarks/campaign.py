@@ -38,7 +38,7 @@ LEAST_ALIKE, LONGEST_ALIKE = 16, 65_536  # records, samples: what fit_many fits 
 ROUNDS, REPEATS = 5, 3
 SIZES = {"alike": (1, 10, 96, 1_024, 10_016), "own": (1, 10, 96, 1_024)}  # records
 LENGTHS = {"alike": ((320, 10_000), (96, 50_000)), "own": ((192, 10_000), (64, 100_000))}  # records, samples
-PAIR = {"alike": 1_024, "own": 256}  # records of the comparison of 2 workers with 1
+PAIR = {"alike": 1_024, "own": 128}  # records of the comparison of 2 workers with 1
 REPORTED = 8  # records
 WALKERS = (32, 64, 128, 256)
 STUBBED = 100_000  # records, whose fits are left out
@@ -244,6 +244,7 @@ def parent(folder: Path, count: int) -> dict[str, float]:
         before = peak()
         for name in ("parent_ms", "replay_ms"):
             with timed(found, name, count):
+                fits = None  # one copy at a time
                 fits = campaign.run_campaign(paths, out, SCENE, scheduler=client.scheduler.address, progress=False)
         with timed(found, "tables_ms", count):
             write_campaign(out, fits, Origin.of("fitact campaign", SCENE))

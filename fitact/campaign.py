@@ -18,6 +18,8 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import jax
+
 from fitact.errors import InputError
 from fitact.files import to_line
 from fitact.inference.many import Fits, fit_many
@@ -36,7 +38,9 @@ _ONE_THREAD = {
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
+    "MALLOC_TRIM_THRESHOLD_": "65536",  # bytes: what is freed goes back to the machine
 }
+_MOST_MAPS = 20_000  # of the 65,530 areas of memory that Linux grants a process by default; a length takes some 600
 JOURNAL = "journal.jsonl"
 
 Row = dict[str, Any]
@@ -66,6 +70,7 @@ class Task:
 
     def rows(self, paths: Sequence[str]) -> list[Row]:
         """The rows of a batch; runs on a worker."""
+        _make_room()
         scene = None if self.scene is None else Scene.from_json(self.scene)
         found = [dict(row) for row in fit_many(paths, scene, **self.columns, progress=False)]
         for path, row in zip(paths, found, strict=True):
@@ -86,6 +91,13 @@ class Task:
         posterior.to_netcdf(place / "posterior.nc")
         posterior.report(place / "report.html")
         return {"report": f"{place.parent.name}/{place.name}/report.html", "trusted": posterior.trusted}
+
+
+def _make_room() -> None:
+    """Drop what JAX compiled once it is much: it compiles anew for every length of record, and keeps it all."""
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > _MOST_MAPS:
+        jax.clear_caches()
 
 
 class Journal:
@@ -294,6 +306,8 @@ def _connected(
         "distributed.nanny.pre-spawn-environ": _ONE_THREAD,
         "distributed.worker.multiprocessing-method": "spawn",
         "distributed.scheduler.allowed-failures": _KILLS,
+        # compiled code cannot be spilled: a worker that paused for it would wait for ever
+        **{f"distributed.worker.memory.{name}": False for name in ("target", "spill", "pause")},
         "distributed.admin.log-format": "",
     }
     count = workers or len(os.sched_getaffinity(0))

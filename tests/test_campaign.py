@@ -244,6 +244,30 @@ def test_three_workers_and_the_scheduler_are_killed(many: Study, tmp_path: Path,
     many.assert_done_once(tmp_path)
 
 
+def fill(size: float) -> None:
+    """Make a worker hold so many bytes in all, and keep them."""
+    sys.held = b"\1" * (int(size) - psutil.Process().memory_info().rss)
+    time.sleep(1.0)  # Dask looks ten times a second
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_nearly_full_goes_on():
+    with module._connected(None, 1, "1 GiB", module._Progress(0, False), 0.0) as client:
+        client.submit(fill, 0.88 * 2**30).result(timeout=60)  # Dask would have it pause from 0.8 on
+        assert client.submit(os.getpid).result(timeout=60) != os.getpid()
+
+
+def test_compiled_code_is_dropped_once_it_is_much(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    dropped = []
+    monkeypatch.setattr(module.jax, "clear_caches", lambda: dropped.append(1))
+    task = Task(None, {}, None, 0)
+    assert [row["result"] for row in task.rows([str(tmp_path / "none.csv")])] == ["refused"]
+    assert not dropped
+    monkeypatch.setattr(module, "_MOST_MAPS", 10)
+    task.rows([str(tmp_path / "none.csv")])
+    assert dropped
+
+
 def test_a_torn_line_is_dropped(tmp_path: Path):
     journal = Journal(tmp_path / JOURNAL)
     journal.add({"a": {"record": "a"}})
