@@ -22,7 +22,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
+import psutil
 import scipy.optimize
 from timing import show
 
@@ -40,6 +42,7 @@ SIZES = {"alike": (1, 10, 96, 1_024, 10_016), "own": (1, 10, 96, 1_024)}  # reco
 LENGTHS = {"alike": ((320, 10_000), (96, 50_000)), "own": ((192, 10_000), (64, 100_000))}  # records, samples
 PAIR = {"alike": 1_024, "own": 128}  # records of the comparison of 2 workers with 1
 REPORTED = 8  # records
+NEW_LENGTHS = 5
 WALKERS = (32, 64, 128, 256)
 STUBBED = 100_000  # records, whose fits are left out
 QUICK = {
@@ -211,6 +214,24 @@ def reports(folder: Path, two: Any) -> dict[str, float]:
     return found
 
 
+def compiling(lengths: list[str]) -> tuple[float, float]:
+    """Processor seconds and MB of a fit of each of these, which differ in length; nothing is taken from JAX's cache."""
+    jax.config.update("jax_enable_compilation_cache", False)
+    fitact.fit_many(lengths[:1], progress=False)
+    before, start = psutil.Process().memory_info().rss, time.process_time()
+    fitact.fit_many(lengths[1:], progress=False)
+    seconds, more = time.process_time() - start, psutil.Process().memory_info().rss - before
+    return seconds / (len(lengths) - 1), more / (len(lengths) - 1) / 2**20
+
+
+def lengths(folder: Path) -> dict[str, float]:
+    """What it costs when records differ in length, which is what would break the model."""
+    paths = [written(folder, "own", 1, SAMPLES + 2 * i)[0] for i in range(NEW_LENGTHS + 1)]
+    with workers(1) as client:
+        seconds, more = client.submit(compiling, paths).result()
+    return {"length_core_s": seconds, "length_mb": more}
+
+
 def peak() -> float:
     """Most memory that this process had, MB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
@@ -266,6 +287,7 @@ def million(found: dict[str, float]) -> dict[str, float]:
         for kind in ("alike", "own")
     }
     return needs | {
+        "million_core_hours_if_all_lengths_differ": MILLION * found["length_core_s"] / 3600.0,
         "million_core_hours_reports": MILLION * found["reports_core_s"] / 3600.0,
         "million_hours_of_the_command": MILLION * (found["parent_ms"] + found["tables_ms"]) / 3.6e6,
         "million_workers_that_the_command_feeds_alike": found[f"core_ms_alike_{SAMPLES}_samples"] / found["parent_ms"],
@@ -280,10 +302,13 @@ def measure(folder: Path) -> dict[str, float]:
     start = time.perf_counter()
     with workers(2) as client:
         cost(client, written(folder, "own", 1), "own")
-    found = {"startup_s": time.perf_counter() - start}
+        found = {"startup_s": time.perf_counter() - start}
+        for kind, count in PAIR.items():
+            cost(client, written(folder, kind, count), kind)
+        found["worker_mb"] = max(client.run(peak).values())
+    found |= lengths(folder)
     with workers(1) as one, workers(2) as two:
         found |= two_against_one(folder, one, two)
-        found["worker_mb"] = max(two.run(peak).values())
         found |= scale(folder, one, two)
         found["worker_of_long_records_mb"] = max(two.run(peak).values())
         found |= reports(folder, two)
