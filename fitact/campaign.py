@@ -12,11 +12,13 @@ import json
 import os
 import sys
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import jax
 
 from fitact.errors import InputError
 from fitact.files import to_line
@@ -36,7 +38,9 @@ _ONE_THREAD = {
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
+    "MALLOC_TRIM_THRESHOLD_": "65536",  # bytes: what is freed goes back to the machine
 }
+_MOST_MAPS = 20_000  # of the 65,530 areas of memory that Linux grants a process by default; a length takes some 600
 JOURNAL = "journal.jsonl"
 
 Row = dict[str, Any]
@@ -66,6 +70,7 @@ class Task:
 
     def rows(self, paths: Sequence[str]) -> list[Row]:
         """The rows of a batch; runs on a worker."""
+        _make_room()
         scene = None if self.scene is None else Scene.from_json(self.scene)
         found = [dict(row) for row in fit_many(paths, scene, **self.columns, progress=False)]
         for path, row in zip(paths, found, strict=True):
@@ -86,6 +91,13 @@ class Task:
         posterior.to_netcdf(place / "posterior.nc")
         posterior.report(place / "report.html")
         return {"report": f"{place.parent.name}/{place.name}/report.html", "trusted": posterior.trusted}
+
+
+def _make_room() -> None:
+    """Drop what JAX compiled once it is much: it compiles anew for every length of record, and keeps it all."""
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > _MOST_MAPS:
+        jax.clear_caches()
 
 
 class Journal:
@@ -142,9 +154,8 @@ def run_campaign(
 ) -> Fits:
     """Fit many files on Dask's workers, each once; the same call goes on where an interrupted one stopped.
 
-    Into `folder` go journal.jsonl as the work proceeds and results.parquet (a row for each record with an answer),
-    failures.csv (the others, with the reason) and index.html when it is done. A record counts as done when its
-    content, the settings and fitact's version are those of the journal. A batch whose workers die is taken apart until
+    Into `folder` goes journal.jsonl as the work proceeds. A record counts as done when its content, the settings and
+    fitact's version are those of the journal. A batch whose workers die is taken apart until
     the record that kills them is known, which is then set aside.
 
     Args:
@@ -165,9 +176,9 @@ def run_campaign(
     """
     (scene or Scene()).require_available(fit=True)
     paths = [os.path.abspath(path) for path in records]
-    if len(set(paths)) < len(paths):
-        twice = next(path for i, path in enumerate(paths) if path in paths[:i])
-        raise InputError(f"{twice}: is named twice; name each record once")
+    most = Counter(paths).most_common(1)
+    if most and most[0][1] > 1:
+        raise InputError(f"{most[0][0]}: is named twice; name each record once")
     place = Path(folder)
     columns = {"channels": dict(channels or {}), "scale": dict(scale or {})}
     task = Task(None if scene is None else scene.to_json(), columns, str(place / "reports") if reports else None, seed)
@@ -187,6 +198,7 @@ def run_campaign(
 
 def _keys(paths: Sequence[str], task: Task) -> list[str]:
     """What a row is kept under: settings, name and content."""
+    settings = task.fingerprint
 
     def key(path: str) -> str:
         try:
@@ -194,7 +206,7 @@ def _keys(paths: Sequence[str], task: Task) -> list[str]:
                 content = hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:
             content = f"unreadable: {error}"
-        return hashlib.sha256("\0".join([task.fingerprint, path, content]).encode()).hexdigest()
+        return hashlib.sha256("\0".join([settings, path, content]).encode()).hexdigest()
 
     with ThreadPoolExecutor() as pool:
         return list(pool.map(key, paths))
@@ -221,9 +233,9 @@ def _run(
     progress: "_Progress",
 ) -> None:
     progress.done = progress.total - sum(len(batch.keys) for batch in batches)
-    lost = 0.0
+    deadline = time.monotonic()  # until which a scheduler is waited for: one that was there may come back
     while batches:
-        with _connected(scheduler, workers, memory, progress, lost) as client:
+        with _connected(scheduler, workers, memory, progress, deadline) as client:
             under_way: dict[Any, _Batch] = {}
             try:
                 for batch, rows in _answers(client, task, batches, under_way):
@@ -234,7 +246,7 @@ def _run(
                 if scheduler is None:
                     raise
                 batches.extendleft(under_way.values())
-                lost = time.monotonic()
+                deadline = time.monotonic() + _PATIENCE
                 progress.say(f"the scheduler at {scheduler} is gone ({type(error).__name__}); waiting for it")
 
 
@@ -278,7 +290,7 @@ def _answers(
 
 @contextlib.contextmanager
 def _connected(
-    scheduler: str | None, workers: int | None, memory: str, progress: "_Progress", lost: float
+    scheduler: str | None, workers: int | None, memory: str, progress: "_Progress", deadline: float
 ) -> Iterator["Client"]:
     """A client of the scheduler at that address, or of one with workers of its own."""
     try:
@@ -287,15 +299,15 @@ def _connected(
     except ImportError as error:
         raise InputError("campaign: needs Dask; pip install 'fitact[campaign]'") from error
     if scheduler is not None:
-        with _client(scheduler, lost) as client:
+        with _client(scheduler, deadline) as client:
             yield client
         return
-    cache = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    environment = _ONE_THREAD | ({"JAX_COMPILATION_CACHE_DIR": cache} if cache else {})
     settings = {
-        "distributed.nanny.pre-spawn-environ": environment,
+        "distributed.nanny.pre-spawn-environ": _ONE_THREAD,
         "distributed.worker.multiprocessing-method": "spawn",
         "distributed.scheduler.allowed-failures": _KILLS,
+        # compiled code cannot be spilled: a worker that paused for it would wait for ever
+        **{f"distributed.worker.memory.{name}": False for name in ("target", "spill", "pause")},
         "distributed.admin.log-format": "",
     }
     count = workers or len(os.sched_getaffinity(0))
@@ -305,15 +317,15 @@ def _connected(
         yield client
 
 
-def _client(scheduler: str, lost: float) -> "Client":
-    """Of a scheduler, for which it waits a while where it was `lost` (a time), since it may come back."""
+def _client(scheduler: str, deadline: float) -> "Client":
+    """Of a scheduler, for which it waits until the deadline."""
     from distributed import Client
 
     while True:
         try:
             return Client(scheduler, timeout="5s")
         except (OSError, TimeoutError, ValueError) as error:
-            if time.monotonic() - lost > _PATIENCE or lost == 0.0:
+            if time.monotonic() >= deadline:
                 raise InputError(
                     f"--scheduler {scheduler}: is not to be reached ({error}); what is done is kept, and the same"
                     " command goes on"

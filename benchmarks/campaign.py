@@ -1,0 +1,332 @@
+"""What a campaign costs: two workers against one, overhead, a model of its time, and what a million records need.
+
+Campaigns run on workers that are up and have compiled; what that takes is stated apart. Records are of two kinds: alike
+ones, of Vsc under a drive that the scene names, which a worker fits 32 at a time, and others, whose drive was recorded,
+each of which needs a fit of its own. Names are hard links to 250 files.
+
+    python benchmarks/campaign.py [--json] [--quick]
+"""
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import psutil
+import scipy.optimize
+from timing import show
+
+import fitact
+from fitact import campaign
+from fitact.report.campaign import write_campaign
+from fitact.report.frame import Origin
+
+V0, FREQUENCY, NOISE = 180.0, 100.0, 0.1  # V, Hz, V
+SCENE = fitact.Scene.from_dict({"drive": {"waveform": "square", "peak_to_peak": 2.0 * V0, "frequency": FREQUENCY}})
+FILES, SAMPLES = 250, 1_000
+LEAST_ALIKE, LONGEST_ALIKE = 16, 65_536  # records, samples: what fit_many fits together
+ROUNDS, REPEATS = 5, 3
+SIZES = {"alike": (1, 10, 96, 1_024, 10_016), "own": (1, 10, 96, 1_024)}  # records
+LENGTHS = {"alike": ((320, 10_000), (96, 50_000)), "own": ((192, 10_000), (64, 100_000))}  # records, samples
+PAIR = {"alike": 1_024, "own": 128}  # records of the comparison of 2 workers with 1
+REPORTED = 8  # records
+NEW_LENGTHS = 5
+WALKERS = (32, 64, 128, 256)
+STUBBED = 100_000  # records, whose fits are left out
+QUICK = {
+    "SIZES": {"alike": (1, 10, 96, 512), "own": (1, 10, 64)},
+    "LENGTHS": {"alike": ((64, 10_000),), "own": ((32, 10_000),)},
+    "PAIR": {"alike": 256, "own": 64},
+    "REPORTED": 2,
+    "WALKERS": (64, 128),
+    "STUBBED": 10_000,
+}
+MILLION = 1e6
+
+
+def written(folder: Path, kind: str, count: int, samples: int = SAMPLES) -> list[str]:
+    """Names of so many records: two settled periods of people under a square, in closed form."""
+    place = folder / f"{kind}-{samples}"
+    place.mkdir(exist_ok=True)
+    names = [place / f"finger{i:06d}.csv" for i in range(count)]
+    for i, name in enumerate(names):
+        if name.exists():
+            continue
+        if i >= FILES:
+            os.link(names[i % FILES], name)
+            continue
+        random = np.random.default_rng([i, samples])
+        R, C = np.exp(np.log([130e3, 18e-9]) + 0.2 * random.standard_normal(2))
+        time = np.arange(samples) * (2.0 / FREQUENCY / samples)
+        half = np.floor(time * 2.0 * FREQUENCY + 1e-9)
+        sign, since = np.where(half % 2 == 0.0, 1.0, -1.0), time - half / (2.0 * FREQUENCY)
+        g, b = 1.35e-9 / (2.7e-9 + C), R * (2.7e-9 + C)
+        vsc = sign * (2.0 * V0 * g / (1.0 + np.exp(-0.5 / FREQUENCY / b))) * np.exp(-since / b)
+        columns = {"time_s": time, "V_V": V0 * sign, "Vsc_V": vsc + NOISE * random.standard_normal(samples)}
+        if kind == "alike":
+            del columns["V_V"]
+        table = np.column_stack(list(columns.values()))
+        np.savetxt(name, table, "%.7g", ",", header=",".join(columns), comments="")
+    return [str(name) for name in names]
+
+
+def scene_of(kind: str) -> fitact.Scene | None:
+    return SCENE if kind == "alike" else None
+
+
+def workers(count: int) -> contextlib.AbstractContextManager[Any]:
+    """A client of workers as the command starts them."""
+    return campaign._connected(None, count, "2 GiB", campaign._Progress(0, False), 0.0)
+
+
+class Cost(NamedTuple):
+    """Seconds of a campaign, on the wall and of the processors, here and in the workers; bytes of what it left."""
+
+    wall: float
+    here: float
+    there: float
+    left: dict[str, int]
+
+
+def cost(client: Any, paths: list[str], kind: str, **more: Any) -> Cost:
+    def processors() -> np.ndarray:
+        return np.array([time.process_time(), sum(client.run(time.process_time).values())])
+
+    with tempfile.TemporaryDirectory() as folder:
+        before, start = processors(), time.perf_counter()
+        found = campaign.run_campaign(
+            paths, folder, scene_of(kind), scheduler=client.scheduler.address, progress=False, **more
+        )
+        write_campaign(folder, found, Origin.of("fitact campaign", scene_of(kind)))
+        wall = time.perf_counter() - start
+        here, there = processors() - before
+        left = {path.name: _size(path) for path in Path(folder).iterdir()}
+    if not all(row["trusted"] for row in found):
+        raise SystemExit(str(found))
+    return Cost(wall, float(here), float(there), left)
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.is_file() else sum(_size(inner) for inner in path.iterdir())
+
+
+def plain(paths: list[str], kind: str) -> float:
+    """Seconds of the same fits without a campaign."""
+    start = time.perf_counter()
+    fitact.fit_many(paths, scene_of(kind), progress=False)
+    return time.perf_counter() - start
+
+
+def compiled(paths: list[str], kind: str, *clients: Any) -> None:
+    """See to it that every worker has compiled what such records need."""
+    for client in clients:
+        client.run(plain, paths[: campaign.BATCH], kind)
+        client.run(plain, paths[:1], kind)
+
+
+def two_against_one(folder: Path, one: Any, two: Any) -> dict[str, float]:
+    """Throughput, and what a campaign of one worker takes beyond the same fits in that worker's process, in turn."""
+    found: dict[str, float] = {}
+    for kind, count in PAIR.items():
+        paths = written(folder, kind, count)
+        gains, overheads = [], []
+        compiled(paths, kind, one, two)
+        for _ in range(ROUNDS):
+            alone, both = cost(one, paths, kind).wall, cost(two, paths, kind).wall
+            fits = one.submit(plain, paths, kind, pure=False).result()
+            gains.append(alone / both)
+            overheads.append(1e3 * (alone - fits) / count)
+        found[f"throughput_{kind}_2_workers_vs_1"] = statistics.median(gains)
+        found[f"overhead_{kind}_ms"] = statistics.median(overheads)
+    return found
+
+
+def busiest(count: int, workers: int) -> int:
+    """Records of the worker that has most."""
+    return min(count, campaign.BATCH * math.ceil(math.ceil(count / campaign.BATCH) / workers))
+
+
+def terms(kind: str, count: int, samples: int, workers: int) -> list[float]:
+    """What the seconds of a campaign are linear in, with coefficients that are not negative."""
+    together = kind == "alike" and count >= LEAST_ALIKE and samples <= LONGEST_ALIKE
+    most = busiest(count, workers)
+    of_kind = [most * together, most * samples * together, most * (not together), most * samples * (not together)]
+    return [1.0, *map(float, of_kind), float(count)]
+
+
+def scale(folder: Path, one: Any, two: Any) -> dict[str, float]:
+    """The model of a campaign's time, fitted to campaigns of all sizes by least relative squares, and its errors."""
+    points = [(kind, count, SAMPLES) for kind, counts in SIZES.items() for count in counts]
+    points += [(kind, *length) for kind, lengths in LENGTHS.items() for length in lengths]
+    rows, walls, found = [], [], {}
+    for kind, count, samples in points:
+        paths = written(folder, kind, count, samples)
+        compiled(paths, kind, one, two)
+        for number, client in ((1, one), (2, two)):
+            taken = [cost(client, paths, kind) for _ in range(REPEATS if count * samples < 200_000 else 1)]
+            walls.append(statistics.median(each.wall for each in taken))
+            rows.append(terms(kind, count, samples, number))
+            found[f"seconds_{kind}_{count}_records_{samples}_samples_{number}_workers"] = walls[-1]
+            cores = statistics.median(each.here + each.there for each in taken)
+            found[f"core_ms_{kind}_{samples}_samples"] = 1e3 * cores / count  # of most records
+    relative = np.array(rows) / np.array(walls)[:, None]
+    model, _ = scipy.optimize.nnls(relative, np.ones(len(walls)))
+    off = relative @ model - 1.0
+    names = ("start_s", "alike_ms", "alike_us_a_sample", "own_ms", "own_us_a_sample", "serial_ms")
+    units = np.array([1.0, 1e3, 1e6, 1e3, 1e6, 1e3])
+    found |= {f"model_{name}": float(value) for name, value in zip(names, model * units, strict=True)}
+    return found | {"model_rms_error": float(np.sqrt(np.mean(off**2))), "model_worst_error": float(np.abs(off).max())}
+
+
+def sampled(path: str, walkers: int) -> tuple[float, int]:
+    """Seconds of the sampling of a record's posterior, and the draws kept."""
+    found = fitact.fit(fitact.read(path))
+    fitact.sample(found, walkers=walkers, seed=1, progress=False)  # compiles
+    start = time.perf_counter()
+    posterior = fitact.sample(found, walkers=walkers, seed=1, progress=False)
+    return time.perf_counter() - start, posterior.points[..., 0].size
+
+
+def reports(folder: Path, two: Any) -> dict[str, float]:
+    """What posteriors and reports cost, and sampling with more walkers."""
+    paths = written(folder, "own", REPORTED + 2)
+    cost(two, paths[:2], "own", reports=True)  # compiles
+    taken = cost(two, paths[2:], "own", reports=True)
+    found = {
+        "reports_core_s": (taken.here + taken.there) / REPORTED,
+        "reports_mb": taken.left["reports"] / REPORTED / 1e6,
+    }
+    for walkers in WALKERS:
+        seconds, draws = two.submit(sampled, paths[0], walkers, pure=False).result()
+        found |= {f"sampling_{walkers}_walkers_s": seconds, f"sampling_{walkers}_walkers_draws": float(draws)}
+    return found
+
+
+def compiling(lengths: list[str]) -> tuple[float, float]:
+    """Processor seconds and MB of a fit of each of these, which differ in length; nothing is taken from JAX's cache."""
+    jax.config.update("jax_enable_compilation_cache", False)
+    fitact.fit_many(lengths[:1], progress=False)
+    before, start = psutil.Process().memory_info().rss, time.process_time()
+    fitact.fit_many(lengths[1:], progress=False)
+    seconds, more = time.process_time() - start, psutil.Process().memory_info().rss - before
+    return seconds / (len(lengths) - 1), more / (len(lengths) - 1) / 2**20
+
+
+def lengths(folder: Path) -> dict[str, float]:
+    """What it costs when records differ in length, which is what would break the model."""
+    paths = [written(folder, "own", 1, SAMPLES + 2 * i)[0] for i in range(NEW_LENGTHS + 1)]
+    with workers(1) as client:
+        seconds, more = client.submit(compiling, paths).result()
+    return {"length_core_s": seconds, "length_mb": more}
+
+
+def peak() -> float:
+    """Most memory that this process had, MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def without_fits(path: str) -> None:
+    """Make a worker give back rows at once, whose numbers differ."""
+    (row,) = fitact.fit_many([path], SCENE, progress=False)
+    numbers = [name for name, value in row.items() if isinstance(value, float)]
+
+    def rows(self: campaign.Task, paths: list[str]) -> list[dict[str, Any]]:
+        own = [{name: row[name] * (1.0 + 1e-6 * i) for name in numbers} for i in range(len(paths))]
+        return [row | {"record": os.path.basename(path)} | values for path, values in zip(paths, own, strict=True)]
+
+    campaign.Task.rows = rows
+
+
+@contextlib.contextmanager
+def timed(found: dict[str, float], name: str, count: int) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    found[name] = 1e3 * (time.perf_counter() - start) / count
+
+
+def parent(folder: Path, count: int) -> dict[str, float]:
+    """What the command itself does for each record, with Dask's scheduler; fits are left out."""
+    found: dict[str, float] = {}
+    paths, out = written(folder, "alike", count), folder / f"parent-{count}"
+    with workers(2) as client:
+        client.run(without_fits, paths[0])
+        before = peak()
+        for name in ("parent_ms", "replay_ms"):
+            with timed(found, name, count):
+                fits = None  # one copy at a time
+                fits = campaign.run_campaign(paths, out, SCENE, scheduler=client.scheduler.address, progress=False)
+        with timed(found, "tables_ms", count):
+            write_campaign(out, fits, Origin.of("fitact campaign", SCENE))
+        found["parent_kb"] = 1024.0 * (peak() - before) / count
+    found |= {f"{path.stem}_bytes": path.stat().st_size / count for path in out.iterdir()}
+    found["page_bytes"] = found.pop("index_bytes") * count
+    return found
+
+
+def in_a_process(folder: Path, count: int) -> dict[str, float]:
+    command = [sys.executable, __file__, "--parent", str(folder), str(count)]
+    return json.loads(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout)
+
+
+def million(found: dict[str, float]) -> dict[str, float]:
+    """What a million records of 1,000 samples need."""
+    needs = {
+        f"million_core_hours_{kind}": MILLION * found[f"core_ms_{kind}_{SAMPLES}_samples"] / 3.6e6
+        for kind in ("alike", "own")
+    }
+    return needs | {
+        "million_core_hours_if_all_lengths_differ": MILLION * found["length_core_s"] / 3600.0,
+        "million_core_hours_reports": MILLION * found["reports_core_s"] / 3600.0,
+        "million_hours_of_the_command": MILLION * (found["parent_ms"] + found["tables_ms"]) / 3.6e6,
+        "million_workers_that_the_command_feeds_alike": found[f"core_ms_alike_{SAMPLES}_samples"] / found["parent_ms"],
+        "million_workers_that_the_command_feeds_own": found[f"core_ms_own_{SAMPLES}_samples"] / found["parent_ms"],
+        "million_gb_of_memory_of_the_command": MILLION * found["parent_kb"] / 1024.0**2,
+        "million_gb_of_journal_and_tables": MILLION * (found["journal_bytes"] + found["results_bytes"]) / 1e9,
+        "million_tb_of_reports": MILLION * found["reports_mb"] / 1e6,
+    }
+
+
+def measure(folder: Path) -> dict[str, float]:
+    start = time.perf_counter()
+    with workers(2) as client:
+        cost(client, written(folder, "own", 1), "own")
+        found = {"startup_s": time.perf_counter() - start}
+        for kind, count in PAIR.items():
+            cost(client, written(folder, kind, count), kind)
+        found["worker_mb"] = max(client.run(peak).values())
+    found |= lengths(folder)
+    with workers(1) as one, workers(2) as two:
+        found |= two_against_one(folder, one, two)
+        found |= scale(folder, one, two)
+        found["worker_of_long_records_mb"] = max(two.run(peak).values())
+        found |= reports(folder, two)
+        found["worker_with_reports_mb"] = max(two.run(peak).values())
+    tenth, whole = in_a_process(folder, STUBBED // 10), in_a_process(folder, STUBBED)
+    found |= whole | {"parent_ms_vs_a_tenth_of_the_records": whole["parent_ms"] / tenth["parent_ms"]}
+    return found | million(found)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="one JSON object")
+    parser.add_argument("--quick", action="store_true", help="fewer and smaller campaigns")
+    parser.add_argument("--parent", nargs=2, metavar=("FOLDER", "RECORDS"), help="the command alone")
+    asked = parser.parse_args()
+    if asked.parent:
+        print(json.dumps(parent(Path(asked.parent[0]), int(asked.parent[1]))))
+        sys.exit()
+    globals().update(QUICK if asked.quick else {})
+    with tempfile.TemporaryDirectory() as place:
+        show(measure(Path(place)), asked.json)
