@@ -10,6 +10,8 @@ from fitact.data import layouts
 from fitact.errors import InputError
 
 _EXAMPLE = "time_s,V_V,Vsc_V,I_A"
+_SHORT = 4096  # characters of which a header mostly is a small part: to part lines into cells takes longest
+_ENOUGH = 64  # rows that show what the rows are
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 _QUANTITY = re.compile(r"(?:analog:)?\s*([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*([a-zµμ]*)", re.IGNORECASE)
 _MOST_ROWS = 1e12  # that a header can mean
@@ -69,7 +71,9 @@ def read_header(text: str, source: str, companion: str = "") -> Header:
     Raises:
         InputError: there are no numbers, no time, or several segments.
     """
-    sheet = _Sheet.of(text, companion, source)
+    sheet = _Sheet.of(text[:_SHORT].rpartition("\n")[0], companion, source)
+    if len(sheet.below) < max(_ENOUGH, 2 * len(sheet.above)):
+        sheet = _Sheet.of(text, companion, source)
     if not sheet.numeric:
         raise InputError(
             f"{source}: there are no rows of numbers; expected a header such as {_EXAMPLE}, and rows of numbers"
