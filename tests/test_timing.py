@@ -1,9 +1,11 @@
 """Recorders whose clock is not the generator's, against closed forms."""
 
+import jax
 import numpy as np
 import pytest
 
 import fitact
+from fitact.inference.start import choose_drive
 
 RSC, CSC, CI = 130e3, 18e-9, 1.35e-9
 G, B = CI / (2.0 * CI + CSC), RSC * (2.0 * CI + CSC)
@@ -50,6 +52,17 @@ def test_no_clock_where_there_is_none():
     fit = fitted("square", 0.0, 50, 400)
     assert fit.trusted
     assert fit.names == ("Rsc", "Csc", "Ci")
+
+
+@pytest.mark.parametrize("periods", [2, 5])
+@pytest.mark.parametrize("samples", [10_000, 50_000, 400_000])
+def test_a_fine_record_is_not_of_another_frequency(samples: int, periods: int):
+    """The correlation that shows the frequency peaks beside the period, by many of its small steps."""
+    found = record("square", 100.0, periods, samples // periods)
+    with jax.enable_x64(True):
+        choice = choose_drive(found, fitact.Scene.from_dict({"drive": {"waveform": "square"}}))
+    assert float(choice.drive.frequency) == 100.0
+    assert choice.notes == ()
 
 
 @pytest.mark.slow

@@ -27,6 +27,8 @@ _ALIGNED = 20_000  # samples on which a drive is laid
 _ROUNDING = 1e-12  # of a square, that of what is left of it
 _CONTRADICTION = 0.05  # relative difference between the stated and the recorded drive that cannot be an inaccuracy
 _SMOOTH_STEPS, _EDGE_STEPS = 0.5, 2.0  # error, over a whole record, of the frequency at which it repeats
+_LAG = 3e-3  # over the periods in the record, squared: relative error of that frequency, however fine the samples,
+_NOISY = 100.0  # and how many times as much it is where the noise is as large as the signal
 
 
 @dataclasses.dataclass(frozen=True)
@@ -212,7 +214,10 @@ def _is_off(record: Record, stated: DriveSection) -> bool:
         return False
     # an edge between two samples may lie anywhere there
     steps = _SMOOTH_STEPS if stated.waveform in ("sine", "triangle", "multitone") else _EDGE_STEPS
-    return abs(found / stated.slowest - 1.0) > steps * record.time_step / float(record.time[-1] - record.time[0])
+    duration, channel = float(record.time[-1] - record.time[0]), "V" if "V" in record else "Vsc"
+    noise = record.noise(channel) / float(np.std(record[channel]))
+    seen = max(steps * record.time_step / duration, _LAG * (1.0 + _NOISY * noise**2) / (duration * stated.slowest) ** 2)
+    return abs(found / stated.slowest - 1.0) > seen
 
 
 def _check_amplitude(record: Record, voltage: np.ndarray) -> None:
