@@ -22,7 +22,7 @@ test: env
 test-slow: env
 	$(COMPILED) $(PY) -m pytest -n auto -m slow
 
-# make test-slow-quick   the same without those that repeat a case for thoroughness
+# make test-slow-quick   the same without those on ground that others cover, too
 test-slow-quick: env
 	$(COMPILED) $(PY) -m pytest -n auto -m "slow and not thorough"
 

@@ -3,7 +3,7 @@
 The peers minimise the same sum of squares, prior included, in log-parameters from the prior's medians, with the noise
 that fitact found; beside an optimum, fitact also judges each fit, and the peers do not. lmfit is run with the model as
 one writes it (`vs_lmfit`) and with all that does not change from step to step worked out before (`vs_lmfit_good`, as
-for scipy). `optimum_vs` are ratios of the time for the optimum alone, on one core each.
+for scipy). `optimum_vs` are ratios of the time for the optimum alone, one batch after the other.
 
     python benchmarks/batch.py [--json] [--records 10000] [--samples 5000]
 """
@@ -105,7 +105,7 @@ def by_scipy(model: Model, observed: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def optima_alone(records: list[fitact.Record]) -> float:
-    """Seconds a record on one core for what the peers give: the optimum, with the noise known."""
+    """Seconds a record for what the peers give: the optimum, with the noise known."""
     batches = [np.stack([record["Vsc"] for record in records[i : i + 256]]) for i in range(0, len(records) - 255, 256)]
     with jax.enable_x64(True), threadpool_limits(1):
         together = Together.like(pose([records[0]], [SCENE]))
@@ -155,7 +155,7 @@ def measure(count: int, samples: int) -> dict[str, float]:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="one JSON object")
-    parser.add_argument("--records", type=int, default=10_000)
+    parser.add_argument("--records", type=int, default=10_000, help="256 or more")
     parser.add_argument("--samples", type=int, default=5_000)
     asked = parser.parse_args()
     show(measure(asked.records, asked.samples), asked.json)

@@ -30,13 +30,14 @@ from timing import show
 
 import fitact
 from fitact import campaign
+from fitact.inference import alike, many
 from fitact.report.campaign import write_campaign
 from fitact.report.frame import Origin
 
 V0, FREQUENCY, NOISE = 180.0, 100.0, 0.1  # V, Hz, V
 SCENE = fitact.Scene.from_dict({"drive": {"waveform": "square", "peak_to_peak": 2.0 * V0, "frequency": FREQUENCY}})
 FILES, SAMPLES = 250, 1_000
-LEAST_ALIKE, LONGEST_ALIKE = 16, 65_536  # records, samples: what fit_many fits together
+LEAST_ALIKE, LONGEST_ALIKE = many._FEW, alike._LONGEST  # records, samples: what fit_many fits together
 ROUNDS, REPEATS = 5, 3
 SIZES = {"alike": (1, 10, 96, 1_024, 10_016), "own": (1, 10, 96, 1_024)}  # records
 LENGTHS = {"alike": ((320, 10_000), (96, 50_000)), "own": ((192, 10_000), (64, 100_000))}  # records, samples

@@ -40,7 +40,8 @@ _ONE_THREAD = {
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
     "MALLOC_TRIM_THRESHOLD_": "65536",  # bytes: what is freed goes back to the machine
 }
-_MOST_MAPS = 20_000  # of the 65,530 areas of memory that Linux grants a process by default; a length takes some 600
+# of the 65,530 areas of memory that Linux grants a process by default; a new length takes some 600, and a batch has 32
+_MOST_MAPS = 20_000
 JOURNAL = "journal.jsonl"
 
 Row = dict[str, Any]
@@ -70,13 +71,14 @@ class Task:
 
     def rows(self, paths: Sequence[str]) -> list[Row]:
         """The rows of a batch; runs on a worker."""
-        _make_room()
         scene = None if self.scene is None else Scene.from_json(self.scene)
+        _make_room()
         found = [dict(row) for row in fit_many(paths, scene, **self.columns, progress=False)]
         for path, row in zip(paths, found, strict=True):
             if row["result"] == "crashed":  # it may have been the machine
                 row |= fit_many([path], scene, **self.columns, progress=False)[0]
             if self.reports is not None and "samples" in row:
+                _make_room()
                 row |= self._reported(path, scene)
         return found
 
@@ -154,9 +156,9 @@ def run_campaign(
 ) -> Fits:
     """Fit many files on Dask's workers, each once; the same call goes on where an interrupted one stopped.
 
-    Into `folder` goes journal.jsonl as the work proceeds. A record counts as done when its content, the settings and
-    fitact's version are those of the journal. A batch whose workers die is taken apart until
-    the record that kills them is known, which is then set aside.
+    Into `folder` go journal.jsonl and the reports as the work proceeds; the tables are what comes back. A record counts
+    as done when its content, the settings and fitact's version are those of the journal. A batch whose workers die is
+    taken apart until the record that kills them is known, which is then set aside.
 
     Args:
         records: paths, which workers on other machines must see, too.

@@ -246,7 +246,9 @@ def test_three_workers_and_the_scheduler_are_killed(many: Study, tmp_path: Path,
 
 def fill(size: float) -> None:
     """Make a worker hold so many bytes in all, and keep them."""
-    sys.held = b"\1" * (int(size) - psutil.Process().memory_info().rss)
+    missing = int(size) - psutil.Process().memory_info().rss
+    assert missing > 0
+    sys.held = b"\1" * missing
     time.sleep(1.0)  # Dask looks ten times a second
 
 
@@ -260,6 +262,7 @@ def test_a_worker_that_is_nearly_full_goes_on():
 def test_compiled_code_is_dropped_once_it_is_much(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     dropped = []
     monkeypatch.setattr(module.jax, "clear_caches", lambda: dropped.append(1))
+    monkeypatch.setattr(module, "_MOST_MAPS", 10**9)
     task = Task(None, {}, None, 0)
     assert [row["result"] for row in task.rows([str(tmp_path / "none.csv")])] == ["refused"]
     assert not dropped

@@ -7,6 +7,7 @@ import pytest
 
 import fitact
 from fitact.data.formats import write_csv
+from fitact.data.record import white_noise
 
 Rows = list[list[str]]
 
@@ -188,3 +189,20 @@ def test_a_sweep_is_no_noise(spacing: str):
     }[spacing]
     sweep = 180.0 * np.sin(2.0 * np.pi * phase)
     assert len(fitact.Record.from_arrays(time, V=sweep, Vsc=0.05 * sweep)) == time.size
+
+
+def test_what_shows_only_further_down_is_read(tmp_path: Path):
+    """A channel that begins late, and a decimal comma that comes late."""
+    values = np.sin(0.01 * np.arange(1000)) + (np.arange(1000) > 700)
+    late = ["time_s,V_V,Vsc_V", *(f"{1e-5 * i:.6f},{v:.4f}," + f"{v:.3f}" * (i >= 500) for i, v in enumerate(values))]
+    (tmp_path / "late.csv").write_text("\n".join(late))
+    with pytest.raises(fitact.InputError, match="line 2, column 3: the cell is empty"):  # not: there is no Vsc
+        fitact.read(tmp_path / "late.csv")
+    shown = ["0" if i < 700 else f"{v:.4f}".replace(".", ",") for i, v in enumerate(values)]
+    comma = ["time_us;V_V;Vsc_V", *(f"{10 * i};{v};{v}" for i, v in enumerate(shown))]
+    (tmp_path / "comma.csv").write_text("\n".join(comma))
+    np.testing.assert_allclose(fitact.read(tmp_path / "comma.csv")["Vsc"][700:], values[700:], atol=5e-5)
+
+
+def test_nothing_shows_no_noise():
+    assert np.isnan(white_noise(np.zeros(3)))

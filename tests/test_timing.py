@@ -35,6 +35,7 @@ def fitted(waveform: str, off: float, periods: int, per_period: int) -> fitact.F
         ("sine", 1e-5, 50, 400),
         pytest.param("square", 3e-5, 50, 400, marks=pytest.mark.slow),  # no edge has passed a sample
         pytest.param("square", 3e-4, 5, 2000, marks=pytest.mark.slow),  # edges have
+        pytest.param("square", 5e-4, 2, 25_000, marks=pytest.mark.slow),  # by many
     ],
 )
 def test_a_clock_is_found(waveform: str, off: float, periods: int, per_period: int):

@@ -67,7 +67,7 @@ def _blocks(notebook: Any, stem: str, pictures: dict[str, bytes]) -> Iterator[st
             yield _LINK.sub(r"](\1.md)", cell.source)
         elif cell.cell_type == "code":
             yield f"```python\n{cell.source}\n```"
-            described = " ".join(dict.fromkeys((title, heading)))
+            described = " ".join(dict.fromkeys((title, heading))).strip() or stem
             for output in cell.get("outputs", []):
                 yield from _output(output, f"{stem}_{len(pictures)}", described, pictures)
 

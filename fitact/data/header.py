@@ -72,7 +72,7 @@ def read_header(text: str, source: str, companion: str = "") -> Header:
         InputError: there are no numbers, no time, or several segments.
     """
     sheet = _Sheet.of(text[:_SHORT].rpartition("\n")[0], companion, source)
-    if len(sheet.below) < max(_ENOUGH, 2 * len(sheet.above)):
+    if not sheet.is_plain:
         sheet = _Sheet.of(text, companion, source)
     if not sheet.numeric:
         raise InputError(
@@ -166,6 +166,14 @@ class _Sheet:
         comments = [row for row in rows if row.cells[0].startswith("#") and row.number < end]
         comments += [Line(0, line.split(":")) for line in companion.splitlines()]
         return cls(delimiter, decimal_comma, comments, data[:first], data[first:], numeric, source)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether further rows have nothing to tell: enough of them, only numbers, and the decimal mark seen."""
+        cells = [cell for row in self.below for cell in row.cells]
+        enough = len(self.below) >= max(_ENOUGH, 2 * len(self.above))
+        marked = self.delimiter == "," or any("," in cell or "." in cell for cell in cells)
+        return enough and marked and all(number(cell, self.decimal_comma) is not None for cell in cells)
 
     @functools.cached_property
     def width(self) -> int:

@@ -169,6 +169,8 @@ def medians(values: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*rows"]:
     at once, and only for one does the processor work on several numbers at a time.
     """
     half = values.shape[-1] // 2
+    if not values.shape[-1]:
+        return np.full(values.shape[:-1], np.nan)
     values.partition(half, axis=-1)
     upper = values[..., half]
     return upper if values.shape[-1] % 2 else 0.5 * (upper + np.max(values[..., :half], axis=-1))

@@ -59,7 +59,7 @@ class Settled(NamedTuple):
     figures: dict[str, np.ndarray]
 
 
-class Optima(NamedTuple):
+class Ends(NamedTuple):
     """Where least squares end, of a record or of many.
 
     Attributes:
@@ -83,7 +83,7 @@ class Together(NamedTuple):
 
     Attributes:
         likelihood: in the coordinates of `basis`.
-        phases: of the samples in the drive's period, as in `diagnostics.phases`.
+        phases: of the samples in the drive's period, as in `diagnostics.phases`; None: too little repeats.
         samples: of each.
         freeable: nuisances that a record may ask for.
     """
@@ -135,7 +135,7 @@ class Together(NamedTuple):
         observed: Float[np.ndarray, "records samples"],
         noise: Float[np.ndarray, " records"],
         least: Float[np.ndarray, " records"],
-    ) -> tuple[Optima, Bool[np.ndarray, " records"]]:
+    ) -> tuple[Ends, Bool[np.ndarray, " records"]]:
         """Least squares alone, and which records the table holds; sigma begins at `noise` and ends above `least`, V."""
         coordinates = self.basis.project(observed)
         theta, held = self._starts(coordinates)
@@ -183,11 +183,11 @@ def _seen(observed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @eqx.filter_jit
-def _optima(likelihood: Likelihood, clock: Array, *of_each: Array) -> Optima:
+def _optima(likelihood: Likelihood, clock: Array, *of_each: Array) -> Ends:
     return jax.vmap(lambda *of: _optimum(likelihood, clock, *of))(*of_each)
 
 
-def _optimum(likelihood: Likelihood, clock: Array, observed: Array, start: Array, noise: Array, least: Array) -> Optima:
+def _optimum(likelihood: Likelihood, clock: Array, observed: Array, start: Array, noise: Array, least: Array) -> Ends:
     """Gauss-Newton from a start near the optimum, the noise being that of the residuals."""
     trace = likelihood.traces[0]
     assert trace.compression is not None
@@ -223,11 +223,14 @@ def _optimum(likelihood: Likelihood, clock: Array, observed: Array, start: Array
     candidates += [[trace.slope(model.seen(theta))], [clock]]
     known = _orthonormal(list(jacobian[:-size].T), [])
     shares = [sum(jnp.square(q @ left) for q in _orthonormal(each, known)) for each in candidates]
-    return Optima(theta, sigma, triangle, jnp.stack(shares) / (left @ left), (observed - left)[:-1], ended)
+    return Ends(theta, sigma, triangle, jnp.stack(shares) / (left @ left), (observed - left)[:-1], ended)
 
 
-def _orthonormal(columns: list[Array], others: list[Array]) -> list[Array]:
-    """Columns made so against `others` and each other, by Gram and Schmidt, twice; 0 for what depends on these."""
+def _orthonormal(columns: list[Array], others: list[Array], least: float = _DEPENDENT) -> list[Array]:
+    """Columns made so against `others` and each other, by Gram and Schmidt, twice.
+
+    0 for one of which no more than `least` of its length is left.
+    """
     found: list[Array] = []
     for column in columns:
         rest = column
@@ -235,13 +238,13 @@ def _orthonormal(columns: list[Array], others: list[Array]) -> list[Array]:
             for q in (*others, *found):
                 rest = rest - (q @ rest) * q
         length = jnp.linalg.norm(rest)
-        found.append(jnp.where(length > _DEPENDENT * jnp.linalg.norm(column), rest / length, 0.0))
+        found.append(jnp.where(length > least * jnp.linalg.norm(column), rest / length, 0.0))
     return found
 
 
 def _triangular(jacobian: Float[Array, "rows n"], residuals: Array) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
     """R and Q' residuals of the QR decomposition: vectorised over many small ones, unlike LAPACK's."""
-    q = jnp.stack(_orthonormal(list(jacobian.T), []))
+    q = jnp.stack(_orthonormal(list(jacobian.T), [], least=0.0))
     return jnp.triu(q @ jacobian), q @ residuals
 
 

@@ -172,7 +172,7 @@ def folded_p(
         between, within = np.count_nonzero(n), size - np.count_nonzero(n)
         if within < size // 2:  # too few samples in each phase to know their scatter
             break
-        sums = total.reshape(*of, parts, -1).sum(axis=-1)
+        sums = total.reshape(*of, parts, _PHASES[-1] // parts).sum(axis=-1)
         share = sums**2 @ (1.0 / np.maximum(n, 1)) / np.where(square > 0.0, square, 1.0)
         # the share of `between` directions in the sum of squares of white noise has a beta distribution
         found.append(scipy.special.betainc(0.5 * within, 0.5 * between, np.maximum(1.0 - share, 0.0)))
@@ -185,9 +185,10 @@ def spectrum_p(share: Float[np.ndarray, "*records lines"]) -> Float[np.ndarray, 
     if lines < _LEAST_TESTED // 2:
         return np.ones(share.shape[:-1])
     width = max(lines // _BANDS, 1)
-    bands = share[..., : lines // width * width].reshape(*share.shape[:-1], -1, width) @ np.ones(width, share.dtype)
+    count = lines // width
+    bands = share[..., : count * width].reshape(*share.shape[:-1], count, width) @ np.ones(width, share.dtype)
     above = np.cumsum(bands, axis=-1, dtype=float)
-    above -= width * np.arange(1, above.shape[-1] + 1) / lines
+    above -= width * np.arange(1, count + 1) / lines
     distance = np.maximum(above.max(axis=-1), -above.min(axis=-1)) * math.sqrt(lines)
     k = np.arange(1, 31)
     series = 2.0 * np.sum((-1.0) ** (k - 1) * np.exp(-2.0 * (k * distance[..., None]) ** 2), axis=-1)

@@ -1,9 +1,11 @@
 """Fits of many records, each by itself: alike ones together, a failure kept apart from the others."""
 
 import collections
+import contextlib
 import csv
 import dataclasses
 import os
+import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
@@ -128,8 +130,7 @@ def fit_many(
     (scene or Scene()).require_available(fit=True)
     rows: dict[int, dict[str, Any]] = {}
     total = len(records) if isinstance(records, Sequence) else 0
-    # threads of the linear algebra's own would fight with those of `_in_threads` for the cores
-    with jax.enable_x64(True), threadpool_limits(1):
+    with jax.enable_x64(True), _LINEAR_ALGEBRA.in_one_thread():
         opened = _opened(records, scene, {"channels": channels, "scale": scale}, rows)
         batches = _batches(watched(opened, "fitting the records", total) if progress and total else opened, scene)
         for members, settled in _in_threads(batches):
@@ -137,6 +138,30 @@ def fit_many(
             rows |= settled | {number: _alone(record, scene) for number, record in left}
     return Fits(tuple(rows[number] for number in sorted(rows)))
 
+
+class _Threads:
+    """Those of the linear algebra, which would fight with those of `_in_threads` for the cores."""
+
+    def __init__(self) -> None:
+        self._lock, self._users = threading.Lock(), 0
+
+    @contextlib.contextmanager
+    def in_one_thread(self) -> Iterator[None]:
+        """The limit holds for the whole process: until the last of several calls at once has ended."""
+        with self._lock:
+            self._users += 1
+            if self._users == 1:
+                self._limits = threadpool_limits(1)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._users -= 1
+                if self._users == 0:
+                    self._limits.restore_original_limits()
+
+
+_LINEAR_ALGEBRA = _Threads()
 
 Member = tuple[int, Record]
 Batch = tuple[Together | None, list[Member]]

@@ -23,6 +23,7 @@ from fitact.inference.start import (
     LinearStart,
     as_arrays,
     choose_drive,
+    frequency_error,
     has_ideal_edges,
     has_unresolved_edge,
     linear_start,
@@ -39,7 +40,8 @@ _OFFSET = 0.02  # of a channel's span: standard deviation of an offset that the 
 _CHARGE = 10.0  # spans: that of an unknown charge
 _HELD = 1e-6  # standard deviation, in its logarithm, of a parameter that is held
 PRECISION = 1e-9  # of a channel's span: least noise assumed
-_CLOCK = 5.0  # steps at a record's ends: that of the drive's clock, since its frequency is known to one or two
+_CLOCK = 5.0  # steps at a record's ends: that of the drive's clock, since its frequency is known to one or two, or as
+# well as `frequency_error` says
 _DRAWS = 256  # of the prior, to start from the best of
 
 
@@ -256,6 +258,8 @@ def _trace(
     charges = len(LINEAR) - len(CHARGES) + np.arange(len(template.terms().tau) if choice.unknown_charge else 0)
     # a part of a wave cannot show an offset, so one within an oscilloscope's accuracy is allowed for
     offset = _OFFSET * height if record.frequency() is None and choice.periodic else 0.0
+    named = channel == "Vsc" and choice.name != "measured"
+    steps = frequency_error(record, choice.name) * record.time.size if named else 0.0
     return Trace(
         time=shared(record.time),
         observed=shared(record[channel]),
@@ -268,7 +272,7 @@ def _trace(
         shift=jnp.asarray(choice.shift, dtype=float),
         time_step=jnp.asarray(record.time_step, dtype=float),
         clock=jnp.zeros(()),
-        timing_sd=jnp.array([_delay_sd(choice), _CLOCK]),
+        timing_sd=jnp.array([_delay_sd(choice), max(_CLOCK, steps)]),
         compression=None,
         label=label,
         channel=channel,

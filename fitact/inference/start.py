@@ -27,7 +27,9 @@ _ALIGNED = 20_000  # samples on which a drive is laid
 _ROUNDING = 1e-12  # of a square, that of what is left of it
 _CONTRADICTION = 0.05  # relative difference between the stated and the recorded drive that cannot be an inaccuracy
 _SMOOTH_STEPS, _EDGE_STEPS = 0.5, 2.0  # error, over a whole record, of the frequency at which it repeats
-_LAG = 3e-3  # over the periods in the record, squared: relative error of that frequency, however fine the samples,
+_SMOOTH = ("sine", "triangle", "multitone")
+_PLACES = 10  # on each side, at which a lag is looked for at a time
+_LAG = 3e-3  # over the periods in the record, squared: relative error of a correlation's frequency,
 _NOISY = 100.0  # and how many times as much it is where the noise is as large as the signal
 
 
@@ -78,8 +80,9 @@ def choose_drive(record: Record, scene: Scene | None) -> DriveChoice:
     notes: tuple[str, ...] = ()
     if scene.states_waveform() and not isinstance(drive, Chirp):
         _check_frequency(record, slowest)
-    if scene.states_waveform() and isinstance(drive, Periodic) and _is_off(record, scene.drive):
-        stated, slowest = slowest, record.frequency() or slowest
+    own = _own_frequency(record, scene.drive) if scene.states_waveform() and isinstance(drive, Periodic) else None
+    if own is not None and isinstance(drive, Periodic):
+        stated, slowest = slowest, own
         drive = dataclasses.replace(drive, frequency=slowest)
         notes = (
             f"the record repeats at {slowest:.6g} Hz, not at the scene's {stated:.6g} Hz, and its own"
@@ -203,21 +206,59 @@ def _check_frequency(record: Record, stated: float) -> None:
         )
 
 
-def _is_off(record: Record, stated: DriveSection) -> bool:
-    """Whether the record's frequency differs from the stated one by more than it is seen without a model.
+def _own_frequency(record: Record, stated: DriveSection) -> float | None:
+    """The record's frequency (Hz) where it differs from the stated one by more than it is seen without a model.
 
     A thousandth biases b by several standard errors: generator and recorder have clocks of their own. What is less
     than this the fit finds, as a trace's clock.
     """
     found = record.frequency()
     if found is None or not stated.steady_state:  # from rest, what came before and the transient shift where it repeats
-        return False
+        return None
+    if stated.waveform not in _SMOOTH:
+        found = _by_edges(record, found)
+    return found if abs(found / stated.slowest - 1.0) > frequency_error(record, stated.waveform) else None
+
+
+def frequency_error(record: Record, waveform: str) -> float:
+    """Relative error of the frequency that a record of a waveform shows by itself; 0 where it shows none."""
+    if record.frequency() is None:
+        return 0.0
     # an edge between two samples may lie anywhere there
-    steps = _SMOOTH_STEPS if stated.waveform in ("sine", "triangle", "multitone") else _EDGE_STEPS
-    duration, channel = float(record.time[-1] - record.time[0]), "V" if "V" in record else "Vsc"
+    steps = _SMOOTH_STEPS if waveform in _SMOOTH else _EDGE_STEPS
+    of_step = steps * record.time_step / float(record.time[-1] - record.time[0])
+    return max(of_step, _by_correlation(record)) if waveform in _SMOOTH else of_step
+
+
+def _by_correlation(record: Record) -> float:
+    """Relative error of `Record.frequency`, however fine the samples: what is correlated changes with the lag."""
+    periods = (record.frequency() or math.inf) * float(record.time[-1] - record.time[0])
+    channel = "V" if "V" in record else "Vsc"
     noise = record.noise(channel) / float(np.std(record[channel]))
-    seen = max(steps * record.time_step / duration, _LAG * (1.0 + _NOISY * noise**2) / (duration * stated.slowest) ** 2)
-    return abs(found / stated.slowest - 1.0) > seen
+    return _LAG * (1.0 + _NOISY * noise**2) / periods**2
+
+
+def _by_edges(record: Record, frequency: float) -> float:
+    """A better frequency (Hz) of a signal with edges: one part of it, compared with others as long, finds itself."""
+    time, count = record.time, record.time.size
+    step = float(time[-1] - time[0]) / (count - 1)
+    periods = int(2.0 / 3.0 * frequency * step * count)
+    lag = periods / (frequency * step)
+    reach = math.ceil(lag * _by_correlation(record))
+    length = count - round(lag) - 2 * reach
+    if periods < 1 or reach <= _EDGE_STEPS or length < 1:
+        return frequency
+    values = np.interp(np.linspace(time[0], time[-1], count), time, record["V" if "V" in record else "Vsc"])
+
+    def unlike(lag: int) -> float:
+        off = values[lag : lag + length] - values[:length]
+        return float(off @ off)
+
+    best, stride = round(lag), reach
+    while stride > 1:
+        reach, stride = stride, max(stride // _PLACES, 1)
+        best = min(range(best - reach, best + reach + 1, stride), key=unlike)
+    return periods / (best * step)
 
 
 def _check_amplitude(record: Record, voltage: np.ndarray) -> None:
