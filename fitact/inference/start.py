@@ -29,8 +29,9 @@ _CONTRADICTION = 0.05  # relative difference between the stated and the recorded
 _SMOOTH_STEPS, _EDGE_STEPS = 0.5, 2.0  # error, over a whole record, of the frequency at which it repeats
 _SMOOTH = ("sine", "triangle", "multitone")
 _PLACES = 10  # on each side, at which a lag is looked for at a time
-_LAG = 3e-3  # over the periods in the record, squared: relative error of a correlation's frequency,
-_NOISY = 100.0  # and how many times as much it is where the noise is as large as the signal
+_LAG = 4e-4  # over the periods in the record, squared: relative error of a smooth signal's frequency by correlation,
+_NOISY = 1000.0  # and how many times as much it is where the noise is as large as the signal
+_OF_EDGES = 3.0  # and of one with edges, in these
 
 
 @dataclasses.dataclass(frozen=True)
@@ -244,7 +245,7 @@ def _by_edges(record: Record, frequency: float) -> float:
     step = float(time[-1] - time[0]) / (count - 1)
     periods = int(2.0 / 3.0 * frequency * step * count)
     lag = periods / (frequency * step)
-    reach = math.ceil(lag * _by_correlation(record))
+    reach = math.ceil(_OF_EDGES * lag * _by_correlation(record))
     length = count - round(lag) - 2 * reach
     if periods < 1 or reach <= _EDGE_STEPS or length < 1:
         return frequency
