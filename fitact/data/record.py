@@ -108,9 +108,14 @@ class Record:
             self._noises[channel] = math.hypot(white_noise(values), rounding_noise(values))
         return self._noises[channel]
 
+    @property
+    def leading(self) -> str:
+        """The channel that shows the drive best: V, or without it Vsc."""
+        return "V" if "V" in self else "Vsc"
+
     def frequency(self, channel: str | None = None) -> float | None:
         """Fundamental frequency in Hz of a channel (of V, else Vsc); None unless the record shows 1.5 periods."""
-        channel = channel or ("V" if "V" in self else "Vsc")
+        channel = channel or self.leading
         if channel not in self._frequencies:
             self._frequencies[channel] = fundamental(self.time, self[channel])
         return self._frequencies[channel]
@@ -165,8 +170,10 @@ def white_noises(values: Float[np.ndarray, "*records samples"]) -> Float[np.ndar
 
 
 def medians(values: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*rows"]:
-    """Of each row, which is left in another order. NumPy's own takes eight times as long: it asks for two places
-    at once, and only for one does the processor work on several numbers at a time.
+    """Of each row, which is left in another order.
+
+    NumPy's own takes eight times as long: it asks for two places at once, and only for one does the processor work on
+    several numbers at a time.
     """
     half = values.shape[-1] // 2
     if not values.shape[-1]:
@@ -193,8 +200,7 @@ def rounding_noise(values: Float[np.ndarray, " samples"]) -> float:
 def fundamental(time: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"]) -> float | None:
     """Frequency (Hz) at which the signal repeats, from its correlation with itself, or None."""
     count = time.size
-    grid = np.linspace(time[0], time[-1], count)
-    correlation = _self_correlation(np.interp(grid, time, values))
+    correlation = _self_correlation(evenly(time, values))
     below = np.flatnonzero(correlation < 0.5)
     last = (2 * count) // 3  # a lag of one period must leave half a period of overlap
     if below.size == 0 or below[0] >= last - 2:
@@ -214,7 +220,12 @@ def fundamental(time: Float[np.ndarray, " samples"], values: Float[np.ndarray, "
         if further <= lag:  # repeats at two or three samples, whose peaks run into each other
             return None
         lag, periods = further, 2 * periods
-    return periods / (lag * float(grid[1] - grid[0]))
+    return periods * (count - 1) / (lag * float(time[-1] - time[0]))
+
+
+def evenly(time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """The values on an even grid of as many times from the first to the last."""
+    return np.interp(np.linspace(time[0], time[-1], time.size), time, values)
 
 
 def _self_correlation(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

@@ -67,10 +67,14 @@ class Fits(Sequence[dict[str, Any]]):
     @property
     def columns(self) -> dict[str, np.ndarray]:
         """The table by columns; NaN, or "", where a row has no answer."""
-        names = dict.fromkeys(name for row in sorted(self.rows, key=len, reverse=True) for name in row)
-        samples = {name: next(row[name] for row in self.rows if name in row) for name in names}
+        samples = {name: next(row[name] for row in self.rows if name in row) for name in self._names}
         blank = {name: "" if isinstance(sample, str) else np.nan for name, sample in samples.items()}
-        return {name: np.array([row.get(name, blank[name]) for row in self.rows]) for name in names}
+        return {name: np.array([row.get(name, blank[name]) for row in self.rows]) for name in samples}
+
+    @property
+    def _names(self) -> list[str]:
+        """Of the columns: as in the fullest row, then what others have beside."""
+        return list(dict.fromkeys(name for row in sorted(self.rows, key=len, reverse=True) for name in row))
 
     def to_csv(self, path: str | os.PathLike[str], columns: Sequence[str] | None = None) -> None:
         """Write the table, or some of its columns, as CSV; empty where there is no answer.
@@ -79,7 +83,7 @@ class Fits(Sequence[dict[str, Any]]):
             InputError: the place cannot be written.
         """
         with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(columns or self.columns), extrasaction="ignore")
+            writer = csv.DictWriter(file, list(columns or self._names), extrasaction="ignore")
             writer.writeheader()
             writer.writerows(self.rows)
 
@@ -95,8 +99,7 @@ class Fits(Sequence[dict[str, Any]]):
         except ImportError as error:
             raise InputError(f"{path}: Parquet needs pyarrow; pip install 'fitact[campaign]', or write CSV") from error
         with replacing(path) as temporary:
-            names = list(self.columns)
-            pq.write_table(pa.table({name: [row.get(name) for row in self.rows] for name in names}), temporary)
+            pq.write_table(pa.table({name: [row.get(name) for row in self.rows] for name in self._names}), temporary)
 
     def __str__(self) -> str:
         trusted = sum(bool(row["trusted"]) for row in self.rows)

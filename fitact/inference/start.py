@@ -11,7 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from fitact.data.record import Record
+from fitact.data.record import Record, evenly
 from fitact.errors import InputError
 from fitact.model.chirp import Chirp
 from fitact.model.drive import Burst, Drive, Periodic, Sampled, Sine, Square
@@ -79,10 +79,10 @@ def choose_drive(record: Record, scene: Scene | None) -> DriveChoice:
         return _measured(record, scene.steady_state() if scene else None, ())
     drive, slowest = scene.make_drive(), scene.drive.slowest
     notes: tuple[str, ...] = ()
-    if scene.states_waveform() and not isinstance(drive, Chirp):
+    named = scene.states_waveform()
+    if named and not isinstance(drive, Chirp):
         _check_frequency(record, slowest)
-    own = _own_frequency(record, scene.drive) if scene.states_waveform() and isinstance(drive, Periodic) else None
-    if own is not None and isinstance(drive, Periodic):
+    if named and isinstance(drive, Periodic) and (own := _own_frequency(record, scene.drive)) is not None:
         stated, slowest = slowest, own
         drive = dataclasses.replace(drive, frequency=slowest)
         notes = (
@@ -223,19 +223,19 @@ def _own_frequency(record: Record, stated: DriveSection) -> float | None:
 
 def frequency_error(record: Record, waveform: str) -> float:
     """Relative error of the frequency that a record of a waveform shows by itself; 0 where it shows none."""
-    if record.frequency() is None:
+    found = record.frequency()
+    if found is None:
         return 0.0
-    # an edge between two samples may lie anywhere there
-    steps = _SMOOTH_STEPS if waveform in _SMOOTH else _EDGE_STEPS
-    of_step = steps * record.time_step / float(record.time[-1] - record.time[0])
-    return max(of_step, _by_correlation(record)) if waveform in _SMOOTH else of_step
+    of_step = record.time_step / float(record.time[-1] - record.time[0])
+    if waveform not in _SMOOTH:  # an edge between two samples may lie anywhere there
+        return _EDGE_STEPS * of_step
+    return max(_SMOOTH_STEPS * of_step, _by_correlation(record, found))
 
 
-def _by_correlation(record: Record) -> float:
+def _by_correlation(record: Record, frequency: float) -> float:
     """Relative error of `Record.frequency`, however fine the samples: what is correlated changes with the lag."""
-    periods = (record.frequency() or math.inf) * float(record.time[-1] - record.time[0])
-    channel = "V" if "V" in record else "Vsc"
-    noise = record.noise(channel) / float(np.std(record[channel]))
+    periods = frequency * float(record.time[-1] - record.time[0])
+    noise = record.noise(record.leading) / float(np.std(record[record.leading]))
     return _LAG * (1.0 + _NOISY * noise**2) / periods**2
 
 
@@ -245,11 +245,11 @@ def _by_edges(record: Record, frequency: float) -> float:
     step = float(time[-1] - time[0]) / (count - 1)
     periods = int(2.0 / 3.0 * frequency * step * count)
     lag = periods / (frequency * step)
-    reach = math.ceil(_OF_EDGES * lag * _by_correlation(record))
+    reach = math.ceil(_OF_EDGES * lag * _by_correlation(record, frequency))
     length = count - round(lag) - 2 * reach
     if periods < 1 or reach <= _EDGE_STEPS or length < 1:
         return frequency
-    values = np.interp(np.linspace(time[0], time[-1], count), time, record["V" if "V" in record else "Vsc"])
+    values = evenly(time, record[record.leading])
 
     def unlike(lag: int) -> float:
         off = values[lag : lag + length] - values[:length]
@@ -341,7 +341,7 @@ def _align(record: Record, drive: Drive, frequency: float, steady_state: bool) -
     few = slice(0, max(_ALIGNED, math.ceil(3.0 / frequency / record.time_step)))  # of a long record, its beginning
     if "V" not in record and "Vsc" not in record:
         raise InputError(f"{record.source}: I alone does not show where the drive begins; record V_V as well")
-    time, target = record.time[few], record["V" if "V" in record else "Vsc"][few]
+    time, target = record.time[few], record[record.leading][few]
     target = target - target.mean()
 
     def left(shifts: np.ndarray) -> np.ndarray:
