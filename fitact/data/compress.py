@@ -37,7 +37,7 @@ _RATE, _SLOPE, _OBSERVED = -3, -2, -1
 
 NODES = 41  # odd, so that the middle of the table is a node
 REACH = math.log(9.0)  # half width of the table in log tau
-_RANK = 1e-13  # singular values of the exponentials, relative, that are left out
+RANK = 1e-13  # singular values of what spans the responses, relative, that are left out
 _EXACT = 1e-9  # of a step: how evenly samples must lie to be folded
 _BLOCK = 64  # samples in a block of the recurrence
 _LONGEST = 65_536  # samples until a drive repeats on the sampling grid, for folding
@@ -190,7 +190,7 @@ class _Table(eqx.Module):
     @classmethod
     def around(cls, near: Terms, time: np.ndarray) -> "_Table":
         (tau,) = map(float, near.tau)
-        relative, mix, series = exponentials()
+        relative, mix, series = _exponentials()
         return cls(
             center=jnp.asarray(math.log(tau)),
             nodes=jnp.asarray(tau * relative),
@@ -204,13 +204,13 @@ class _Table(eqx.Module):
 
 
 @functools.cache
-def exponentials() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _exponentials() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Nodes of any table over its middle, their combinations that matter, and the series that give back a response."""
     x, to_series = chebyshev(NODES)
     relative = np.exp(REACH * x)
     ages = np.concatenate([[0.0], np.geomspace(1e-3 * relative.min(), 40.0 * relative.max(), 400)])
     _, sizes, modes = np.linalg.svd(np.exp(-ages[:, None] / relative), full_matrices=False)
-    rank = int(np.count_nonzero(sizes > _RANK * sizes[0]))
+    rank = int(np.count_nonzero(sizes > RANK * sizes[0]))
     return relative, modes[:rank].T / sizes[:rank], (sizes[:rank, None] * modes[:rank]) @ to_series.T
 
 

@@ -163,10 +163,10 @@ def white_noise(values: Float[np.ndarray, " samples"]) -> float:
 
 
 def white_noises(values: Float[np.ndarray, "*records samples"]) -> Float[np.ndarray, "*records"]:
-    """As `white_noise`, of each record."""
-    third = np.diff(values, 3)
+    """As `white_noise`, of each record; of differences in single precision, whose median takes half the time."""
+    third = np.diff(np.diff(values).astype(np.float32), 2)
     np.abs(third, out=third)
-    return medians(third) / 0.6744897501960817 / math.sqrt(20.0)
+    return medians(third).astype(float) / 0.6744897501960817 / math.sqrt(20.0)
 
 
 def medians(values: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*rows"]:

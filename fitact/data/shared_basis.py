@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitact.data.compress import NODES, REACH, Compression, chebyshev, exponentials, slow_shapes
+from fitact.data.compress import NODES, RANK, REACH, Compression, chebyshev, slow_shapes
 from fitact.model.drive import Drive
 from fitact.model.response import highpass
 
@@ -37,15 +37,14 @@ class SharedBasis(NamedTuple):
     @classmethod
     def around(cls, drive: Drive, time: Float[np.ndarray, " samples"], steady_state: bool, tau: float) -> "SharedBasis":
         """For time constants within a factor 9 of `tau` (s). Call it in double precision."""
-        relative, mix, _ = exponentials()
-        u, slow, slope = map(
-            np.asarray, _over_samples(drive, jnp.asarray(time), jnp.asarray(tau * relative), steady_state)
-        )
+        x, to_series = chebyshev(NODES)
+        nodes = jnp.asarray(tau * np.exp(REACH * x))
+        u, slow, slope = map(np.asarray, _over_samples(drive, jnp.asarray(time), nodes, steady_state))
         clock = (time - 0.5 * (time[0] + time[-1])) * slope
-        columns = [(mix.T @ u), slow, slope[None], clock[None]]
-        functions, rows = np.linalg.qr(np.concatenate(columns).T)
-        rank = mix.shape[1]
-        series = functions[:, :rank].T @ u.T @ chebyshev(NODES)[1].T
+        _, sizes, spanning = np.linalg.svd(u, full_matrices=False)
+        rank = int(np.count_nonzero(sizes > RANK * sizes[0]))
+        functions, rows = np.linalg.qr(np.concatenate([spanning[:rank], slow, slope[None], clock[None]]).T)
+        series = functions[:, :rank].T @ u.T @ to_series.T
         places = np.cumsum([rank, len(slow), 1])
         slow, slope, clock = np.split(rows[:, rank:].T, places[1:] - rank)
         return cls(float(np.log(tau)), functions, series, slow, slope[0], clock[0])

@@ -14,17 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
-from scipy.sparse import csr_array
 
 from fitact.data.compress import NODES, REACH, chebyshev
 from fitact.data.record import white_noises
 from fitact.data.shared_basis import SharedBasis
 from fitact.inference import derived
 from fitact.inference.derived import Derived
-from fitact.inference.diagnostics import is_misfit, phases, tests
+from fitact.inference.diagnostics import Residuals, is_misfit
 from fitact.inference.least_squares import EVIDENCE, NUISANCES, bic_gain
 from fitact.inference.likelihood import Likelihood
 from fitact.inference.problem import PRECISION, Problem, believed_skin, on_the_ridge
+from fitact.inference.whiteness import Phases, counts
 from fitact.model.chirp import Chirp
 from fitact.model.skin import WithSkin
 
@@ -36,7 +36,7 @@ _DEPENDENT = 1e-9  # of a column's length: what rounding leaves of one that depe
 _DOUBT = 3.0  # of the Bayesian information criterion: error of a clock's evidence, whose shape is not exact here
 _RESOLVED = 512  # samples that tell whether noise hides the converter's steps
 _RAIL = 3  # samples at an extreme, from which it may be a rail
-_AT_ONCE = 64  # records, whose samples stay in the processor's cache
+_AT_ONCE = 64
 _CANDIDATES = (*NUISANCES, "delay", "clock")  # nuisances that a record may ask for
 
 
@@ -83,7 +83,7 @@ class Together(NamedTuple):
 
     Attributes:
         likelihood: in the coordinates of `basis`.
-        phases: of the samples in the drive's period, as in `diagnostics.phases`; None: too little repeats.
+        phases: of the samples in the drive's period; None: too little repeats.
         samples: of each.
         freeable: nuisances that a record may ask for.
     """
@@ -91,7 +91,7 @@ class Together(NamedTuple):
     likelihood: Likelihood
     derive: Derived
     basis: SharedBasis
-    phases: csr_array | None
+    phases: Phases | None
     samples: int
     freeable: tuple[str, ...]
 
@@ -111,7 +111,7 @@ class Together(NamedTuple):
         basis = SharedBasis.around(choice.drive, time, choice.steady_state, start.b)
         shared = dataclasses.replace(trace, compression=basis.compression(time.size), columns=()).without_samples()
         derive = derived.for_fit(likelihood, source.record, choice, source.scene, start.b)
-        of_time = phases(time, source.record.frequency() if choice.periodic else None)
+        of_time = Phases.of(time, source.record.frequency() if choice.periodic else None)
         return cls(likelihood.with_trace(0, shared), derive, basis, of_time, time.size, source.freeable)
 
     def settle(self, observed: Float[np.ndarray, "records samples"]) -> Settled:
@@ -120,12 +120,12 @@ class Together(NamedTuple):
         found, held = self.optima(observed, noise, PRECISION * height)
         theta, sigma, triangle, shares, signal, ended = map(np.asarray, found)
         logs, gradients = map(np.asarray, _derived(self.derive, found.theta, found.sigma))
-        freedom = self.samples - theta.shape[1]
         of_parts = [
-            tests(part - inside @ self.basis.functions.T, expected, freedom, self.phases)
-            for part, inside, expected in zip(*map(_parts, (observed, signal, noise)), strict=True)
+            Residuals.of(part - inside @ self.basis.functions.T, self.phases)
+            for part, inside in zip(*map(_parts, (observed, signal)), strict=True)
         ]
-        figures = {name: np.concatenate([part[name] for part in of_parts]) for name in of_parts[0]}
+        left: Residuals = jax.tree.map(lambda *parts: np.concatenate(parts), *of_parts)
+        figures = left.judged(self.samples, noise, self.samples - theta.shape[1], self.phases)
         figures |= {"rounding_noise": np.zeros(len(noise)), "interpolation_error": np.zeros(len(noise))}
         clear = held & ended & ~self._asked_for(shares) & plain & ~is_misfit(figures)
         return Settled(clear, theta, sigma, np.linalg.inv(triangle), logs, gradients, figures)
@@ -176,10 +176,10 @@ def _parts(rows: np.ndarray) -> list[np.ndarray]:
 def _seen(observed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of records: their noise, their height, and whether they show neither a rail nor the steps of a converter."""
     noise, low, high = white_noises(observed), observed.min(axis=1), observed.max(axis=1)
-    steps = np.diff(np.sort(observed[:, :_RESOLVED], axis=1), axis=1)
-    step = np.min(np.where(steps > 0.0, steps, np.inf), axis=1)
-    railed = [np.count_nonzero(observed == extreme[:, None], axis=1) > _RAIL for extreme in (low, high)]
-    return noise, high - low, (step <= noise) & ~np.any(railed, axis=0)
+    apart = np.abs(np.diff(observed[:, :_RESOLVED], axis=1))
+    fine = np.any((apart > 0.0) & (apart <= noise[:, None]), axis=1)
+    railed = [counts(observed == extreme[:, None]) > _RAIL for extreme in (low, high)]
+    return noise, high - low, fine & ~np.any(railed, axis=0)
 
 
 @eqx.filter_jit

@@ -3,24 +3,19 @@
 import math
 from collections.abc import Mapping, Sequence
 from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
-import scipy.fft
-import scipy.sparse
-import scipy.special
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
-from fitact.data.record import Record, medians, rounding_noise, white_noise
+from fitact.data.record import Record, rounding_noise, white_noise
 from fitact.inference.start import DriveChoice
+from fitact.inference.whiteness import TESTS, Phases, Structure, probabilities, runs_z
 
 _RUNS = 6.0  # standard deviations of the runs test at which residuals count as structured
 _COARSE = 0.2  # of the residuals' rms: error of the drive's interpolation from which g and b are off by several sd
-_PHASES = (8, 32, 128, 512)  # parts of a period whose means are compared; few show what is slow, many what is brief
 _FALSE_ALARM = 1e-6  # of a trace that holds nothing but noise, by all tests of structure together
-_TESTS = len(_PHASES) + 2
-_BANDS = 500  # about as many places are looked at in the cumulative periodogram, for colour is broad
-_LEAST_TESTED = 64  # samples, below which a spectrum says little
 _P_VALUES = ("folded_p", "spectrum_p", "line_p")
 _EXCESS = 0.1  # excess of the residual variance over the noise's that counts, if it is also significant
 _RATIO = 2.66  # sd of the log of residual variance over `white_noise`'s, times the root of the samples, by simulation
@@ -45,7 +40,10 @@ def statistics(
     measured = choice.name == "measured"
     expected = math.hypot(noise, gain * record.noise("V") if measured else 0.0)
     repeats = record.frequency() if choice.periodic else None
-    found = tests(residuals, np.asarray(expected), residuals.size - freed, phases(time, repeats))
+    of_time = Phases.of(time, repeats)
+    found = Residuals.of(residuals, of_time).judged(
+        residuals.size, np.asarray(expected), residuals.size - freed, of_time
+    )
     return {name: float(value) for name, value in found.items()} | {
         "rounding_noise": rounding_noise(record[channel]),
         "interpolation_error": gain * interpolation_error(record["V"]) if measured else 0.0,
@@ -53,28 +51,36 @@ def statistics(
     }
 
 
-def tests(
-    residuals: Float[np.ndarray, "*records kept"],
-    expected: Float[np.ndarray, "*records"],
-    freedom: float,
-    of_time: scipy.sparse.csr_array | None,
-) -> dict[str, Float[np.ndarray, "*records"]]:
-    """The part of `statistics` that needs no more than residuals, of each record.
+class Residuals(NamedTuple):
+    """What there is to judge of residuals, of each record.
 
-    `expected` is their standard deviation, `of_time` the samples' `phases`.
+    Attributes:
+        square: their sum of squares.
+        structure: of these, in single precision, which is plenty for tests, and takes half the time.
     """
-    square = np.einsum("...i,...i->...", residuals, residuals)
-    shares = periodogram(residuals)
-    return {
-        "chi2_reduced": square / (freedom * expected**2),
-        "rms_residual": np.sqrt(square / residuals.shape[-1]),
-        "noise_expected": expected,
-        "runs_z": runs_z(residuals),
-        "folded_p": folded_p(residuals, of_time),
-        "spectrum_p": spectrum_p(shares),
-        "line_p": line_p(shares),
-        "degrees_of_freedom": np.full(square.shape, freedom),
-    }
+
+    square: Float[np.ndarray, "*records"]
+    structure: Structure
+
+    @classmethod
+    def of(cls, residuals: Float[np.ndarray, "*records kept"], of_time: Phases | None) -> "Residuals":
+        """`of_time`: the samples' phases."""
+        square = np.einsum("...i,...i->...", residuals, residuals)
+        unit = 1.0 / np.where(square > 0.0, np.sqrt(square / residuals.shape[-1]), 1.0)[..., None]
+        return cls(square, Structure.of((residuals * unit).astype(np.float32), of_time))
+
+    def judged(
+        self, samples: int, expected: Float[np.ndarray, "*records"], freedom: float, of_time: Phases | None
+    ) -> dict[str, Float[np.ndarray, "*records"]]:
+        """The part of `statistics` that needs no more; `expected` is the standard deviation of the `samples`."""
+        return {
+            "chi2_reduced": self.square / (freedom * expected**2),
+            "rms_residual": np.sqrt(self.square / samples),
+            "noise_expected": expected,
+            "runs_z": runs_z(self.structure, samples),
+            **probabilities(self.structure, samples, of_time),
+            "degrees_of_freedom": np.full(self.square.shape, freedom),
+        }
 
 
 def outliers(residuals: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"], noise: float) -> dict[str, float]:
@@ -117,7 +123,7 @@ def is_misfit(figures: Mapping[str, ArrayLike]) -> Bool[np.ndarray, "*records"]:
 def is_structured(figures: Mapping[str, ArrayLike]) -> Bool[np.ndarray, "*records"]:
     """Whether any test tells the residuals from white noise."""
     least = np.minimum.reduce([np.asarray(figures[name]) for name in _P_VALUES])
-    return (np.asarray(figures["runs_z"]) < -_RUNS) | (least < _FALSE_ALARM / _TESTS)
+    return (np.asarray(figures["runs_z"]) < -_RUNS) | (least < _FALSE_ALARM / TESTS)
 
 
 def is_coarse(figures: Mapping[str, ArrayLike]) -> Bool[np.ndarray, "*records"]:
@@ -130,91 +136,3 @@ def interpolation_error(voltage: Float[np.ndarray, " samples"]) -> float:
     bend = float(np.median(np.abs(np.diff(voltage, 2))))
     noise = 0.6744897501960817 * math.sqrt(6.0) * white_noise(voltage)
     return math.sqrt(max(bend**2 - 1.5 * noise**2, 0.0)) / 8.0
-
-
-def runs_z(residuals: Float[np.ndarray, "*records samples"]) -> Float[np.ndarray, "*records"]:
-    """Wald and Wolfowitz's runs test of signs, in standard deviations; far below zero: signs come in stretches."""
-    positive = residuals > medians(residuals.copy())[..., None]
-    size = positive.shape[-1]
-    above = np.count_nonzero(positive, axis=-1).astype(float)
-    runs = 1.0 + np.count_nonzero(positive[..., 1:] != positive[..., :-1], axis=-1)
-    both = 2.0 * above * (size - above)
-    mean = both / size + 1.0
-    variance = both * (both - size) / (size**2 * (size - 1.0))
-    return np.where(both > 0.0, (runs - mean) / np.sqrt(np.where(both > 0.0, variance, 1.0)), -np.inf)
-
-
-def phases(time: Float[np.ndarray, " n"], frequency: float | None) -> scipy.sparse.csr_array | None:
-    """Which samples are in each of the many parts of the drive's period (Hz); None where too little repeats."""
-    if frequency is None or time.size < _LEAST_TESTED:
-        return None
-    place = np.minimum((np.mod(time * frequency, 1.0) * _PHASES[-1]).astype(int), _PHASES[-1] - 1)
-    return scipy.sparse.csr_array((np.ones(time.size), (place, np.arange(time.size))), (_PHASES[-1], time.size))
-
-
-def folded_p(
-    residuals: Float[np.ndarray, "*records n"], of_time: scipy.sparse.csr_array | None
-) -> Float[np.ndarray, "*records"]:
-    """Probability that white noise repeats with the drive as much as this: the least of F tests, uncorrected.
-
-    Each compares the means of the residuals in as many of the `phases` of the period with their scatter. What a wrong
-    circuit leaves repeats with the drive, and adds up over the periods. 1 where nothing is expected to repeat.
-    """
-    size, of = residuals.shape[-1], residuals.shape[:-1]
-    if of_time is None:
-        return np.ones(of)
-    count = of_time.sum(axis=1)
-    total = np.ascontiguousarray((of_time @ residuals.reshape(-1, size).T).T)
-    square = np.einsum("...i,...i->...", residuals, residuals)
-    found = [np.ones(of)]
-    for parts in _PHASES:
-        n = count.reshape(parts, -1).sum(axis=-1)
-        between, within = np.count_nonzero(n), size - np.count_nonzero(n)
-        if within < size // 2:  # too few samples in each phase to know their scatter
-            break
-        sums = total.reshape(*of, parts, _PHASES[-1] // parts).sum(axis=-1)
-        share = sums**2 @ (1.0 / np.maximum(n, 1)) / np.where(square > 0.0, square, 1.0)
-        # the share of `between` directions in the sum of squares of white noise has a beta distribution
-        found.append(scipy.special.betainc(0.5 * within, 0.5 * between, np.maximum(1.0 - share, 0.0)))
-    return np.minimum.reduce(found)
-
-
-def spectrum_p(share: Float[np.ndarray, "*records lines"]) -> Float[np.ndarray, "*records"]:
-    """Bartlett's test of the cumulative `periodogram`, by Kolmogorov's law: low where noise is not white."""
-    lines = share.shape[-1]
-    if lines < _LEAST_TESTED // 2:
-        return np.ones(share.shape[:-1])
-    width = max(lines // _BANDS, 1)
-    count = lines // width
-    bands = share[..., : count * width].reshape(*share.shape[:-1], count, width) @ np.ones(width, share.dtype)
-    above = np.cumsum(bands, axis=-1, dtype=float)
-    above -= width * np.arange(1, count + 1) / lines
-    distance = np.maximum(above.max(axis=-1), -above.min(axis=-1)) * math.sqrt(lines)
-    k = np.arange(1, 31)
-    series = 2.0 * np.sum((-1.0) ** (k - 1) * np.exp(-2.0 * (k * distance[..., None]) ** 2), axis=-1)
-    # 1 where the series converges slowly
-    return np.where(distance < 0.2, 1.0, np.clip(series, 0.0, 1.0))
-
-
-def line_p(share: Float[np.ndarray, "*records lines"]) -> Float[np.ndarray, "*records"]:
-    """Fisher's test: low where one line of the `periodogram`, as of hum, is too strong for white noise."""
-    lines = share.shape[-1]
-    if lines < _LEAST_TESTED // 2:
-        return np.ones(share.shape[:-1])
-    log_p = math.log(lines) + (lines - 1) * np.log1p(-np.minimum(np.max(share, axis=-1), 1.0 - 1e-16))
-    return np.exp(np.minimum(log_p, 0.0))
-
-
-def periodogram(residuals: Float[np.ndarray, "*records n"]) -> Float[np.ndarray, "*records lines"]:
-    """Shares of the lines between 0 and half the sampling rate; even ones where there is nothing to share.
-
-    In single precision, which is plenty for tests, and takes half the time.
-    """
-    height = np.max(np.abs(residuals), axis=-1, keepdims=True)
-    unit = np.multiply(residuals, 1.0 / np.where(height > 0.0, height, 1.0), dtype=np.float32, casting="same_kind")
-    lines = scipy.fft.rfft(unit)[..., 1 : (residuals.shape[-1] + 1) // 2]
-    power = lines.real**2 + lines.imag**2
-    whole = power.sum(axis=-1, keepdims=True)
-    power /= np.where(whole > 0.0, whole, 1.0)
-    power[whole[..., 0] == 0.0] = 1.0 / max(power.shape[-1], 1)
-    return power

@@ -1,0 +1,166 @@
+"""Are residuals white noise? By the runs of signs, what repeats with the drive, their colour, and single lines."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import scipy.fft
+import scipy.sparse
+import scipy.special
+from jaxtyping import Bool, Float, Int
+
+from fitact.data.record import medians
+
+_PHASES = (8, 32, 128, 512)  # parts of a period whose means are compared; few show what is slow, many what is brief
+_BANDS = 500  # about as many places are looked at in the cumulative periodogram, for colour is broad
+_LEAST_TESTED = 64  # samples, below which a spectrum says little
+TESTS = len(_PHASES) + 2  # whose probabilities are looked at
+
+
+class Fold(NamedTuple):
+    """Parts of a period whose means are compared.
+
+    Attributes:
+        weight: one over the samples in each part; 0 where there are none.
+        between, within: degrees of freedom of the means, and of what scatters about them.
+    """
+
+    weight: Float[np.ndarray, " parts"]
+    between: int
+    within: int
+
+
+class Phases(NamedTuple):
+    """Samples by their place in the drive's period.
+
+    Attributes:
+        places: which are in each of the finest parts, as a matrix of ones.
+        folds: from the finest on.
+    """
+
+    places: scipy.sparse.csr_array
+    folds: tuple[Fold, ...]
+
+    @classmethod
+    def of(cls, time: Float[np.ndarray, " n"], frequency: float | None) -> "Phases | None":
+        """For a drive's frequency (Hz); None where too little repeats."""
+        if frequency is None or time.size < _LEAST_TESTED:
+            return None
+        place = np.minimum((np.mod(time * frequency, 1.0) * _PHASES[-1]).astype(int), _PHASES[-1] - 1)
+        ones = np.ones(time.size, np.float32)
+        places = scipy.sparse.csr_array((ones, (place, np.arange(time.size))), (_PHASES[-1], time.size))
+        counts = (np.bincount(place, minlength=_PHASES[-1]).reshape(parts, -1).sum(axis=1) for parts in _PHASES[::-1])
+        between = [(n, int(np.count_nonzero(n))) for n in counts]
+        folds = [Fold(np.where(n > 0, 1.0 / np.maximum(n, 1), 0.0), size, time.size - size) for n, size in between]
+        # with too few samples in each phase their scatter is not known
+        return cls(places, tuple(fold for fold in folds if fold.within >= time.size // 2))
+
+
+class Structure(NamedTuple):
+    """What the tests look at, of each record.
+
+    Attributes:
+        above, runs: residuals above their median, and stretches of them on one side of it.
+        folded: share of the means over parts of a period in the sum of squares, for each of the folds.
+        distance: of the cumulative periodogram from that of white noise, times the root of the lines.
+        strongest: the share of the strongest line.
+    """
+
+    above: Int[np.ndarray, "*records"]
+    runs: Int[np.ndarray, "*records"]
+    folded: Float[np.ndarray, "*records folds"]
+    distance: Float[np.ndarray, "*records"]
+    strongest: Float[np.ndarray, "*records"]
+
+    @classmethod
+    def of(cls, residuals: Float[np.ndarray, "*records n"], of_time: Phases | None) -> "Structure":
+        """In the precision of the residuals."""
+        positive = residuals > medians(residuals.copy())[..., None]
+        turns = counts(positive[..., 1:] != positive[..., :-1])
+        distance, strongest = _spectrum(residuals)
+        folded = _folded(residuals, of_time)
+        return cls(counts(positive), 1 + turns, folded, distance, strongest)
+
+
+def counts(true: Bool[np.ndarray, "*rows n"]) -> Int[np.ndarray, "*rows"]:
+    """How many are true in each row; NumPy's own takes twice as long, for it adds numbers."""
+    rows = true.reshape(-1, true.shape[-1])
+    return np.array([np.count_nonzero(row) for row in rows], dtype=int).reshape(true.shape[:-1])
+
+
+def _folded(residuals: Float[np.ndarray, "*records n"], of_time: Phases | None) -> Float[np.ndarray, "*records folds"]:
+    of = residuals.shape[:-1]
+    if of_time is None:
+        return np.empty((*of, 0))
+    square = np.einsum("...i,...i->...", residuals, residuals)
+    sums, found = of_time.places @ residuals.reshape(-1, residuals.shape[-1]).T, []
+    for weight, _, _ in of_time.folds:
+        sums = sums.reshape(weight.size, len(sums) // weight.size, -1).sum(axis=1)
+        found.append((weight @ sums**2).reshape(of) / np.where(square > 0.0, square, 1.0))
+    return np.stack(found, axis=-1) if found else np.empty((*of, 0))
+
+
+def _spectrum(residuals: Float[np.ndarray, "*records n"]) -> tuple[np.ndarray, np.ndarray]:
+    """The distance of the cumulative periodogram, and the strongest line's share; 0 where there is nothing to share."""
+    spectrum = scipy.fft.rfft(residuals)[..., 1 : (residuals.shape[-1] + 1) // 2]
+    power = np.square(spectrum.real)
+    power += np.square(spectrum.imag)
+    whole, lines = power.sum(axis=-1), power.shape[-1]
+    share = np.where(whole > 0.0, 1.0 / np.where(whole > 0.0, whole, 1.0), 0.0)
+    width = max(lines // _BANDS, 1)
+    count = lines // width
+    bands = sum(power[..., i : count * width : width] for i in range(width))
+    apart = np.cumsum(bands, axis=-1, dtype=float)
+    apart *= share[..., None]
+    apart -= width * np.arange(1, count + 1) / lines
+    distance = np.maximum(apart.max(axis=-1), -apart.min(axis=-1)) * math.sqrt(lines)
+    return np.where(whole > 0.0, distance, 0.0), power.max(axis=-1) * share
+
+
+def probabilities(found: Structure, samples: int, of_time: Phases | None) -> dict[str, Float[np.ndarray, "*records"]]:
+    """Of white noise to show more of it than `found`, by test; uncorrected for their number."""
+    return {
+        "folded_p": _folded_p(found.folded, of_time),
+        "spectrum_p": _spectrum_p(found.distance, (samples - 1) // 2),
+        "line_p": _line_p(found.strongest, (samples - 1) // 2),
+    }
+
+
+def runs_z(found: Structure, samples: int) -> Float[np.ndarray, "*records"]:
+    """Wald and Wolfowitz's runs test of signs, in standard deviations; far below zero: signs come in stretches."""
+    above = found.above.astype(float)
+    both = 2.0 * above * (samples - above)
+    mean = both / samples + 1.0
+    variance = both * (both - samples) / (samples**2 * (samples - 1.0))
+    return np.where(both > 0.0, (found.runs - mean) / np.sqrt(np.where(both > 0.0, variance, 1.0)), -np.inf)
+
+
+def _folded_p(shares: Float[np.ndarray, "*records folds"], of_time: Phases | None) -> Float[np.ndarray, "*records"]:
+    """The least of F tests, each of which compares the means in as many parts of the drive's period with their scatter.
+
+    What a wrong circuit leaves repeats with the drive, and adds up over the periods. 1 where nothing is expected to.
+    """
+    least = np.ones(shares.shape[:-1])
+    for fold, share in zip(of_time.folds if of_time else (), np.moveaxis(shares, -1, 0), strict=True):
+        # the share of `between` directions in the sum of squares of white noise has a beta distribution
+        p = scipy.special.betainc(0.5 * fold.within, 0.5 * fold.between, np.maximum(1.0 - share, 0.0))
+        least = np.minimum(least, p)
+    return least
+
+
+def _spectrum_p(distance: Float[np.ndarray, "*records"], lines: int) -> Float[np.ndarray, "*records"]:
+    """Bartlett's test of the cumulative periodogram, by Kolmogorov's law: low where noise is not white."""
+    if lines < _LEAST_TESTED // 2:
+        return np.ones(distance.shape)
+    k = np.arange(1, 31)
+    series = 2.0 * np.sum((-1.0) ** (k - 1) * np.exp(-2.0 * (k * distance[..., None]) ** 2), axis=-1)
+    # 1 where the series converges slowly
+    return np.where(distance < 0.2, 1.0, np.clip(series, 0.0, 1.0))
+
+
+def _line_p(strongest: Float[np.ndarray, "*records"], lines: int) -> Float[np.ndarray, "*records"]:
+    """Fisher's test: low where one line of the periodogram, as of hum, is too strong for white noise."""
+    if lines < _LEAST_TESTED // 2:
+        return np.ones(strongest.shape)
+    log_p = math.log(lines) + (lines - 1) * np.log1p(-np.minimum(strongest, 1.0 - 1e-16))
+    return np.exp(np.minimum(log_p, 0.0))
