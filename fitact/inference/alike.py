@@ -30,7 +30,8 @@ from fitact.model.skin import WithSkin
 
 _LONGEST = 65_536  # samples, above which a fit by itself costs no more
 _STEPS = 20
-_CONVERGED = 1e-6  # standard errors from the optimum before the last step
+_CONVERGED = 1e-6  # standard errors from the optimum at the end,
+_NEAR = 1e-4  # and before the last step, which squares what is left
 _STRIDE = 1.0  # longest step in a logarithm
 _DEPENDENT = 1e-9  # of a column's length: what rounding leaves of one that depends on others
 _DOUBT = 3.0  # of the Bayesian information criterion: error of a clock's evidence, whose shape is not exact here
@@ -212,13 +213,13 @@ def _optimum(likelihood: Likelihood, clock: Array, observed: Array, start: Array
         return theta + move, jnp.maximum(spread, least), jnp.linalg.norm(along), steps + 1
 
     def goes_on(state: tuple[Array, ...]) -> Array:
-        return (state[2] > _CONVERGED) & (state[3] < _STEPS)
+        return (state[2] > _NEAR) & (state[3] < _STEPS)
 
-    theta, sigma, offset, _ = lax.while_loop(goes_on, step, (start, noise, jnp.array(jnp.inf), jnp.array(0)))
+    theta, sigma, _, _ = lax.while_loop(goes_on, step, (start, noise, jnp.array(jnp.inf), jnp.array(0)))
     residuals, jacobian = linearised(theta, sigma)
-    left, triangle = sigma * residuals[:-size], _triangular(jacobian, residuals)[0]
+    left, (triangle, along) = sigma * residuals[:-size], _triangular(jacobian, residuals)
     within = jnp.isfinite(model.log_prior(jnp.append(theta, jnp.log(sigma))))
-    ended = (offset <= _CONVERGED) & within & table.holds(model.circuit(theta).b)
+    ended = (jnp.linalg.norm(along) <= _CONVERGED) & within & table.holds(model.circuit(theta).b)
     candidates = [[table.slow[place] for place in places] for places in NUISANCES.values()]
     candidates += [[trace.slope(model.seen(theta))], [clock]]
     known = _orthonormal(list(jacobian[:-size].T), [])

@@ -224,7 +224,8 @@ def _batches(records: Iterable[Member], scene: Scene | None) -> Iterator[Batch]:
     groups: dict[tuple[float, ...], _Group] = {}
     for number, record in records:
         time = record.time
-        group = groups.setdefault((time.size, time[0], time[1], time[-1]), _Group(time))
+        key = time.size, time[0], time[1], time[-1]
+        group = groups[key] = groups.get(key) or _Group(time)
         if not np.array_equal(time, group.time):
             yield None, [(number, record)]
             continue
@@ -264,15 +265,12 @@ def _settled(together: Together | None, members: list[Member]) -> dict[int, dict
     try:
         with jax.enable_x64(True):  # of each thread
             found = together.settle(np.stack([record["Vsc"] for _, record in padded]))
-            table = _columns(together, found)
+            table = {"record": [os.path.basename(record.source) for _, record in padded]} | _columns(together, found)
     except np.linalg.LinAlgError:  # one of them spoils what is computed for all
         return {}
     rows = (dict(zip(table, values, strict=True)) for values in zip(*table.values(), strict=True))
-    return {
-        number: {"record": os.path.basename(record.source)} | row
-        for (number, record), row, clear in zip(members, rows, found.clear, strict=False)  # the others fill up
-        if clear
-    }
+    # the others fill up
+    return {number: row for (number, _), row, clear in zip(members, rows, found.clear, strict=False) if clear}
 
 
 def _columns(together: Together, found: Settled) -> dict[str, list[Any]]:

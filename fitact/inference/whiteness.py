@@ -9,8 +9,6 @@ import scipy.sparse
 import scipy.special
 from jaxtyping import Bool, Float, Int
 
-from fitact.data.record import medians
-
 _PHASES = (8, 32, 128, 512)  # parts of a period whose means are compared; few show what is slow, many what is brief
 _BANDS = 500  # about as many places are looked at in the cumulative periodogram, for colour is broad
 _LEAST_TESTED = 64  # samples, below which a spectrum says little
@@ -60,7 +58,7 @@ class Structure(NamedTuple):
     """What the tests look at, of each record.
 
     Attributes:
-        above, runs: residuals above their median, and stretches of them on one side of it.
+        above, runs: residuals above 0, and stretches of them on one side of it.
         folded: share of the means over parts of a period in the sum of squares, for each of the folds.
         distance: of the cumulative periodogram from that of white noise, times the root of the lines.
         strongest: the share of the strongest line.
@@ -75,7 +73,7 @@ class Structure(NamedTuple):
     @classmethod
     def of(cls, residuals: Float[np.ndarray, "*records n"], of_time: Phases | None) -> "Structure":
         """In the precision of the residuals."""
-        positive = residuals > medians(residuals.copy())[..., None]
+        positive = residuals > 0.0
         turns = counts(positive[..., 1:] != positive[..., :-1])
         distance, strongest = _spectrum(residuals)
         folded = _folded(residuals, of_time)
