@@ -110,10 +110,10 @@ def optima_alone(records: list[fitact.Record]) -> float:
     with jax.enable_x64(True), threadpool_limits(1):
         together = Together.like(pose([records[0]], [SCENE]))
         noise, least = np.full(256, NOISE), np.zeros(256)
-        jax.block_until_ready(together.optima(batches[0], noise, least)[0])
+        jax.block_until_ready(together.optima(together.basis.project(batches[0]), noise, least)[0])
         start = time.perf_counter()
         for batch in batches:
-            jax.block_until_ready(together.optima(batch, noise, least)[0])
+            jax.block_until_ready(together.optima(together.basis.project(batch), noise, least)[0])
         return (time.perf_counter() - start) / (256 * len(batches))
 
 

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import hashlib
 import math
+import weakref
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -21,6 +22,9 @@ _NEAR_PEAK = 0.02  # of correlation: the first period's peak may be that much lo
 _NEAR_LAG = 4  # samples, within which twice a period is known once one is
 _TOP = 0.002  # of correlation: the part of a peak that is taken for a parabola
 CHANNEL_UNITS = {"V": "V", "Vsc": "V", "I": "A"}
+
+# of records that are there, so that many of one grid hold them once
+_TIMES: weakref.WeakValueDictionary[tuple[float, ...], np.ndarray] = weakref.WeakValueDictionary()
 
 _Where = Callable[[int], str]
 
@@ -70,7 +74,7 @@ class Record:
         notes = (*notes, *grid_notes(time, source))
         for array in (time, *channels.values()):
             array.flags.writeable = False
-        return cls(time, channels, source, notes)
+        return cls(_kept_once(time), channels, source, notes)
 
     def __getitem__(self, channel: str) -> Float[np.ndarray, " samples"]:
         try:
@@ -277,6 +281,12 @@ def _copy(values: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"
     found = memory[first : first + values.size].reshape(values.shape)
     found[...] = values
     return found
+
+
+def _kept_once(time: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+    """The times, or the same ones of a record that is still there."""
+    known = _TIMES.setdefault((time.size, time[0], time[-1]), time)
+    return known if np.array_equal(known, time) else time
 
 
 def _check_shapes(time: np.ndarray, channels: Mapping[str, np.ndarray], source: str) -> None:

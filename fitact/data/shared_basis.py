@@ -71,8 +71,12 @@ class SharedBasis(NamedTuple):
     def project(self, observed: Float[np.ndarray, "records samples"]) -> Float[np.ndarray, "records coordinates+1"]:
         """Coordinates of records; the last is the length of what lies outside of the basis."""
         inside = observed @ self.functions
-        square = np.einsum("ij,ij->i", observed, observed) - np.einsum("ij,ij->i", inside, inside)
+        square = np.vecdot(observed, observed) - np.vecdot(inside, inside)
         return np.column_stack([inside, np.sqrt(np.maximum(square, 0.0))])
+
+    def response(self, signal: Float[np.ndarray, "records rank"]) -> Float[np.ndarray, "records samples"]:
+        """In time, from its coordinates."""
+        return signal @ self.functions[:, : signal.shape[1]].T
 
 
 @eqx.filter_jit

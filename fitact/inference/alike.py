@@ -6,6 +6,7 @@ not converge within a few steps is left for a fit of its own.
 
 import dataclasses
 import math
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -20,11 +21,11 @@ from fitact.data.record import white_noises
 from fitact.data.shared_basis import SharedBasis
 from fitact.inference import derived
 from fitact.inference.derived import Derived
-from fitact.inference.diagnostics import Residuals, is_misfit
+from fitact.inference.diagnostics import is_misfit, judged
 from fitact.inference.least_squares import EVIDENCE, NUISANCES, bic_gain
 from fitact.inference.likelihood import Likelihood
 from fitact.inference.problem import PRECISION, Problem, believed_skin, on_the_ridge
-from fitact.inference.whiteness import Phases, counts
+from fitact.inference.whiteness import Phases, Structure, counts
 from fitact.model.chirp import Chirp
 from fitact.model.skin import WithSkin
 
@@ -37,7 +38,7 @@ _DEPENDENT = 1e-9  # of a column's length: what rounding leaves of one that depe
 _DOUBT = 3.0  # of the Bayesian information criterion: error of a clock's evidence, whose shape is not exact here
 _RESOLVED = 512  # samples that tell whether noise hides the converter's steps
 _RAIL = 3  # samples at an extreme, from which it may be a rail
-_AT_ONCE = 64
+_AT_ONCE = 32  # records, whose samples stay in the processor's cache
 _CANDIDATES = (*NUISANCES, "delay", "clock")  # nuisances that a record may ask for
 
 
@@ -65,17 +66,19 @@ class Ends(NamedTuple):
 
     Attributes:
         theta, sigma: as `Fit.theta`, `Fit.sigma`.
+        square: sum of the residuals' squares, V^2.
         triangle: of the whitened Jacobian's QR decomposition.
         shares: of `_CANDIDATES` in the residuals' square.
-        signal: in the coordinates of the basis.
+        signal: the response, in the first coordinates of the basis.
         ended: whether at the optimum.
     """
 
     theta: Float[Array, "*records parameters"]
     sigma: Float[Array, "*records"]
+    square: Float[Array, "*records"]
     triangle: Float[Array, "*records parameters parameters"]
     shares: Float[Array, "*records nuisances"]
-    signal: Float[Array, "*records coordinates"]
+    signal: Float[Array, "*records rank"]
     ended: Bool[Array, "*records"]
 
 
@@ -115,30 +118,32 @@ class Together(NamedTuple):
         of_time = Phases.of(time, source.record.frequency() if choice.periodic else None)
         return cls(likelihood.with_trace(0, shared), derive, basis, of_time, time.size, source.freeable)
 
-    def settle(self, observed: Float[np.ndarray, "records samples"]) -> Settled:
+    def settle(self, observed: Sequence[Float[np.ndarray, " samples"]]) -> Settled:
         """Fit records. In double precision."""
-        noise, height, plain = map(np.concatenate, zip(*map(_seen, _parts(observed)), strict=True))
-        found, held = self.optima(observed, noise, PRECISION * height)
-        theta, sigma, triangle, shares, signal, ended = map(np.asarray, found)
+        seen = [(*_seen(part), self.basis.project(part)) for part in _parts(observed)]
+        noise, height, plain, coordinates = map(np.concatenate, zip(*seen, strict=True))
+        found, held = self.optima(coordinates, noise, PRECISION * height)
+        theta, sigma, square, triangle, shares, signal, ended = map(np.asarray, found)
         logs, gradients = map(np.asarray, _derived(self.derive, found.theta, found.sigma))
-        of_parts = [
-            Residuals.of(part - inside @ self.basis.functions.T, self.phases)
-            for part, inside in zip(*map(_parts, (observed, signal)), strict=True)
-        ]
-        left: Residuals = jax.tree.map(lambda *parts: np.concatenate(parts), *of_parts)
-        figures = left.judged(self.samples, noise, self.samples - theta.shape[1], self.phases)
+        parts = zip(_parts(observed), _parts(signal), strict=True)
+        left = [Structure.of((part - self.basis.response(s)).astype(np.float32), self.phases) for part, s in parts]
+        structure = Structure(*map(np.concatenate, zip(*left, strict=True)))
+        freedom = self.samples - theta.shape[1]
+        figures = judged(square, self.samples, structure, noise, freedom, self.phases)
         figures |= {"rounding_noise": np.zeros(len(noise)), "interpolation_error": np.zeros(len(noise))}
         clear = held & ended & ~self._asked_for(shares) & plain & ~is_misfit(figures)
         return Settled(clear, theta, sigma, np.linalg.inv(triangle), logs, gradients, figures)
 
     def optima(
         self,
-        observed: Float[np.ndarray, "records samples"],
+        coordinates: Float[np.ndarray, "records coordinates"],
         noise: Float[np.ndarray, " records"],
         least: Float[np.ndarray, " records"],
     ) -> tuple[Ends, Bool[np.ndarray, " records"]]:
-        """Least squares alone, and which records the table holds; sigma begins at `noise` and ends above `least`, V."""
-        coordinates = self.basis.project(observed)
+        """Least squares alone, and which records the table holds; sigma begins at `noise` and ends above `least`, V.
+
+        `coordinates` are those that `basis` projects records on.
+        """
         theta, held = self._starts(coordinates)
         of_each = map(jnp.asarray, (coordinates, theta, np.maximum(noise, least), least))
         return _optima(self.likelihood, jnp.asarray(np.append(self.basis.clock, 0.0)), *of_each), held
@@ -170,8 +175,8 @@ class Together(NamedTuple):
         return np.max(gains, axis=0, initial=-math.inf) > EVIDENCE
 
 
-def _parts(rows: np.ndarray) -> list[np.ndarray]:
-    return [rows[i : i + _AT_ONCE] for i in range(0, len(rows), _AT_ONCE)]
+def _parts(rows: Sequence[np.ndarray] | np.ndarray) -> Iterator[np.ndarray]:
+    return (np.stack(rows[i : i + _AT_ONCE]) for i in range(0, len(rows), _AT_ONCE))
 
 
 def _seen(observed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -224,7 +229,8 @@ def _optimum(likelihood: Likelihood, clock: Array, observed: Array, start: Array
     candidates += [[trace.slope(model.seen(theta))], [clock]]
     known = _orthonormal(list(jacobian[:-size].T), [])
     shares = [sum(jnp.square(q @ left) for q in _orthonormal(each, known)) for each in candidates]
-    return Ends(theta, sigma, triangle, jnp.stack(shares) / (left @ left), (observed - left)[:-1], ended)
+    square, signal = left @ left, (observed - left)[: table.signal.shape[0]]
+    return Ends(theta, sigma, square, triangle, jnp.stack(shares) / square, signal, ended)
 
 
 def _orthonormal(columns: list[Array], others: list[Array], least: float = _DEPENDENT) -> list[Array]:

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping, Sequence
 from statistics import NormalDist
-from typing import NamedTuple
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -41,9 +40,10 @@ def statistics(
     expected = math.hypot(noise, gain * record.noise("V") if measured else 0.0)
     repeats = record.frequency() if choice.periodic else None
     of_time = Phases.of(time, repeats)
-    found = Residuals.of(residuals, of_time).judged(
-        residuals.size, np.asarray(expected), residuals.size - freed, of_time
-    )
+    square = residuals @ residuals
+    unit = math.sqrt(square / residuals.size) or 1.0
+    structure = Structure.of((residuals / unit).astype(np.float32), of_time)  # tests need no more than that
+    found = judged(square, residuals.size, structure, np.asarray(expected), residuals.size - freed, of_time)
     return {name: float(value) for name, value in found.items()} | {
         "rounding_noise": rounding_noise(record[channel]),
         "interpolation_error": gain * interpolation_error(record["V"]) if measured else 0.0,
@@ -51,36 +51,26 @@ def statistics(
     }
 
 
-class Residuals(NamedTuple):
-    """What there is to judge of residuals, of each record.
+def judged(
+    square: Float[np.ndarray, "*records"],
+    samples: int,
+    structure: Structure,
+    expected: Float[np.ndarray, "*records"],
+    freedom: float,
+    of_time: Phases | None,
+) -> dict[str, Float[np.ndarray, "*records"]]:
+    """The part of `statistics` that needs no more than what residuals come to, of each record.
 
-    Attributes:
-        square: their sum of squares.
-        structure: of these, in single precision, which is plenty for tests, and takes half the time.
+    That is the sum of their squares, and their `structure`; `expected` is their standard deviation.
     """
-
-    square: Float[np.ndarray, "*records"]
-    structure: Structure
-
-    @classmethod
-    def of(cls, residuals: Float[np.ndarray, "*records kept"], of_time: Phases | None) -> "Residuals":
-        """`of_time`: the samples' phases."""
-        square = np.einsum("...i,...i->...", residuals, residuals)
-        unit = 1.0 / np.where(square > 0.0, np.sqrt(square / residuals.shape[-1]), 1.0)[..., None]
-        return cls(square, Structure.of((residuals * unit).astype(np.float32), of_time))
-
-    def judged(
-        self, samples: int, expected: Float[np.ndarray, "*records"], freedom: float, of_time: Phases | None
-    ) -> dict[str, Float[np.ndarray, "*records"]]:
-        """The part of `statistics` that needs no more; `expected` is the standard deviation of the `samples`."""
-        return {
-            "chi2_reduced": self.square / (freedom * expected**2),
-            "rms_residual": np.sqrt(self.square / samples),
-            "noise_expected": expected,
-            "runs_z": runs_z(self.structure, samples),
-            **probabilities(self.structure, samples, of_time),
-            "degrees_of_freedom": np.full(self.square.shape, freedom),
-        }
+    return {
+        "chi2_reduced": square / (freedom * expected**2),
+        "rms_residual": np.sqrt(square / samples),
+        "noise_expected": expected,
+        "runs_z": runs_z(structure, samples),
+        **probabilities(structure, samples, of_time),
+        "degrees_of_freedom": np.full(square.shape, freedom),
+    }
 
 
 def outliers(residuals: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"], noise: float) -> dict[str, float]:

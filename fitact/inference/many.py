@@ -226,7 +226,7 @@ def _batches(records: Iterable[Member], scene: Scene | None) -> Iterator[Batch]:
         time = record.time
         key = time.size, time[0], time[1], time[-1]
         group = groups[key] = groups.get(key) or _Group(time)
-        if not np.array_equal(time, group.time):
+        if time is not group.time and not np.array_equal(time, group.time):
             yield None, [(number, record)]
             continue
         group.members.append((number, record))
@@ -264,7 +264,7 @@ def _settled(together: Together | None, members: list[Member]) -> dict[int, dict
     padded = [*members, *members[-1:] * (_TOGETHER - len(members))]
     try:
         with jax.enable_x64(True):  # of each thread
-            found = together.settle(np.stack([record["Vsc"] for _, record in padded]))
+            found = together.settle([record["Vsc"] for _, record in padded])
             table = {"record": [os.path.basename(record.source) for _, record in padded]} | _columns(together, found)
     except np.linalg.LinAlgError:  # one of them spoils what is computed for all
         return {}
