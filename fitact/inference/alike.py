@@ -176,7 +176,7 @@ class Together(NamedTuple):
 
 
 def _parts(rows: Sequence[np.ndarray] | np.ndarray) -> Iterator[np.ndarray]:
-    return (np.stack(rows[i : i + _AT_ONCE]) for i in range(0, len(rows), _AT_ONCE))
+    return (np.stack(list(rows[i : i + _AT_ONCE])) for i in range(0, len(rows), _AT_ONCE))
 
 
 def _seen(observed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
