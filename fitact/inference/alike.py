@@ -38,7 +38,7 @@ _DEPENDENT = 1e-9  # of a column's length: what rounding leaves of one that depe
 _DOUBT = 3.0  # of the Bayesian information criterion: error of a clock's evidence, whose shape is not exact here
 _RESOLVED = 512  # samples that tell whether noise hides the converter's steps
 _RAIL = 3  # samples at an extreme, from which it may be a rail
-_AT_ONCE = 32  # records, whose samples stay in the processor's cache
+_AT_ONCE = 64  # records, whose samples stay in the processor's cache
 _CANDIDATES = (*NUISANCES, "delay", "clock")  # nuisances that a record may ask for
 
 
