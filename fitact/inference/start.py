@@ -23,6 +23,7 @@ from fitact.units import percent
 _Module = TypeVar("_Module", bound=eqx.Module)
 
 _PART = 1_048_576  # samples at a time
+_PARTS = 8  # of the waves that a record is compared with
 _ALIGNED = 20_000  # samples on which a drive is laid
 _ROUNDING = 1e-12  # of a square, that of what is left of it
 _CONTRADICTION = 0.05  # relative difference between the stated and the recorded drive that cannot be an inaccuracy
@@ -346,7 +347,8 @@ def _align(record: Record, drive: Drive, frequency: float, steady_state: bool) -
 
     def left(shifts: np.ndarray) -> np.ndarray:
         waves = np.asarray(_shifted(drive, time, shifts, steady_state))
-        return np.array([_left_by(wave - wave.mean(), target, "V" not in record) for wave in waves])
+        parts = np.array_split(waves, _PARTS)  # which bounds memory
+        return np.concatenate([_left_by(part, target, "V" not in record) for part in parts])
 
     shifts = np.arange(0.0, 1.0, 1.0 / 128.0) / frequency
     errors = left(shifts)
@@ -360,11 +362,16 @@ def _align(record: Record, drive: Drive, frequency: float, steady_state: bool) -
     return shift - 1.0 / frequency if shift > 0.5 / frequency else shift
 
 
-def _left_by(wave: np.ndarray, target: np.ndarray, integrated: bool) -> float:
-    """The least sum of squares that a wave (and its integral) leaves of a target, all of mean 0; inf if upside down."""
-    columns = np.stack([wave, *([(integral := np.cumsum(wave)) - integral.mean()] if integrated else [])])
+def _left_by(
+    waves: Float[np.ndarray, "waves times"], target: Float[np.ndarray, " times"], integrated: bool
+) -> Float[np.ndarray, " waves"]:
+    """The least sum of squares that each wave (and its integral) leaves of a target of mean 0; inf if upside down."""
+    waves = waves - waves.mean(axis=1, keepdims=True)
+    integral = np.cumsum(waves, axis=1)
+    columns = np.stack([waves, integral - integral.mean(axis=1, keepdims=True)][: 1 + integrated], axis=1)
     products = columns @ target
-    weights = np.linalg.lstsq(columns @ columns.T, products, rcond=None)[0]
+    weights = np.vecdot(np.linalg.pinv(columns @ columns.mT, hermitian=True), products[:, None])
     square = float(target @ target)
     # else half a period off; what is left of records without noise is rounding
-    return max(square - float(weights @ products), _ROUNDING * square) if weights[0] > 0.0 else math.inf
+    left = np.maximum(square - np.vecdot(weights, products), _ROUNDING * square)
+    return np.where(weights[:, 0] > 0.0, left, math.inf)

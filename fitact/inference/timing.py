@@ -17,6 +17,9 @@ from fitact.model.skin import constant
 _STEP = 1 / 8  # of the grids, in units of the coordinates
 _REACH = {"delay": 5.0, "clock": 2.0}
 _WRONG_SIDE = 0.1  # of a trace's height: less than what a sample beyond an edge is off by
+_AT_ONCE = 27  # places whose signals are computed side by side,
+_NUMBERS = 1 << 20  # where these are no more than so many numbers
+_DEPENDENT = 1e-9  # of the largest singular value
 _BESIDE = 3  # steps from an ideal edge, within which its time shows
 
 
@@ -69,20 +72,39 @@ def _part(trace: Trace, chosen: np.ndarray) -> Trace:
 
 def _left(trace: Trace, seen: Seen, names: tuple[str, ...], places: np.ndarray) -> Float[np.ndarray, " places"]:
     """What each of the places, in SI units, leaves of the trace with the best gain and linear nuisances."""
-    shapes = np.asarray(trace.shapes(seen))[np.asarray(trace.linear_sd) > 0.0]
-    observed = np.asarray(trace.observed) * trace.weights
-    left = []
-    for place in places:
-        moved = {name: getattr(seen, name) + jnp.asarray(x) for name, x in zip(names, place, strict=True)}
-        design = (np.vstack([_signal(trace, dataclasses.replace(seen, **moved)), shapes]) * trace.weights).T
-        remainder = observed - design @ np.linalg.lstsq(design, observed, rcond=None)[0]
-        left.append(float(remainder @ remainder))
-    return np.array(left)
+    weights, shapes = trace.weights, np.asarray(trace.shapes(seen))[np.asarray(trace.linear_sd) > 0.0]
+    basis = _spanned(shapes * weights)
+
+    def beyond(values: np.ndarray) -> np.ndarray:
+        weighted = values * weights
+        return weighted - (weighted @ basis) @ basis.T
+
+    observed, left = beyond(np.asarray(trace.observed)), []
+    size = max(1, min(_AT_ONCE, _NUMBERS // weights.size))
+    for first in range(0, len(places), size):
+        some = places[first : first + size]
+        filled = np.pad(some, ((0, size - len(some)), (0, 0)), mode="edge")
+        signals = beyond(np.asarray(_signals(trace, seen, dict(zip(names, filled.T, strict=True)))))[: len(some)]
+        gains = signals @ observed / np.maximum(np.vecdot(signals, signals), 1e-300)
+        remainders = observed - gains[:, None] * signals
+        left.append(np.vecdot(remainders, remainders))
+    return np.concatenate(left)
 
 
 @eqx.filter_jit
-def _signal(trace: Trace, seen: Seen) -> Array:
-    return trace.signal(seen)
+def _signals(trace: Trace, seen: Seen, moves: dict[str, Float[Array, " places"]]) -> Float[Array, "places samples"]:
+    def at(moved: dict[str, Array]) -> Array:
+        return trace.signal(dataclasses.replace(seen, **{name: getattr(seen, name) + moved[name] for name in moved}))
+
+    return jax.vmap(at)(moves)
+
+
+def _spanned(rows: Float[np.ndarray, "n samples"]) -> Float[np.ndarray, "samples rank"]:
+    """Orthonormal functions over the samples that span the rows."""
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    q, r = np.linalg.qr((rows / np.where(lengths > 0.0, lengths, 1.0)).T)
+    modes, sizes, _ = np.linalg.svd(r)
+    return q @ modes[:, sizes > _DEPENDENT * np.max(sizes, initial=0.0)]
 
 
 def clock_drop(trace: Trace, seen: Seen, sigma: float) -> float:
@@ -98,11 +120,8 @@ def clock_drop(trace: Trace, seen: Seen, sigma: float) -> float:
 
 
 def _drop(rows: np.ndarray) -> float:
-    clock, remainder, *known = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
-    q, r = np.linalg.qr(np.array([row for row in known if row.any()]).T)
-    modes, sizes, _ = np.linalg.svd(r)
-    basis = q @ modes[:, sizes > 1e-9 * sizes[0]]
-    clock, remainder = (x - basis @ (basis.T @ x) for x in (clock, remainder))
+    basis = _spanned(rows[2:])
+    clock, remainder = (x - basis @ (basis.T @ x) for x in rows[:2])
     return float((clock @ remainder) ** 2 / max((clock @ clock) * (remainder @ remainder), 1e-300))
 
 
