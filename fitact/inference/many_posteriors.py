@@ -35,6 +35,7 @@ from fitact.inference.many import (
     settle,
 )
 from fitact.inference.noise import scale_information
+from fitact.inference.posterior import Posterior
 from fitact.inference.proposal import PROBES, is_normal
 from fitact.inference.sampling import sample
 from fitact.inference.summary import PROBABILITIES
@@ -285,13 +286,16 @@ def _alone(record: Record, scene: Scene | None, seed: int) -> Row:
     """The row of a record that is sampled by itself."""
     try:
         found = fitted(record, scene, remedies=False)
-        row = row_of(found)
-        posterior = sample(found, seed=seed, progress=False)
-        sigma, *_ = found.likelihood.sigma_names
-        parameters = posterior.parameters()
-        draws = parameters | {"sigma": parameters[sigma]} | posterior.derived()
+        return with_posterior(row_of(found), sample(found, seed=seed, progress=False))
     except Exception as error:
         return failed(record.source, error)
+
+
+def with_posterior(row: Row, posterior: Posterior) -> Row:
+    """A fit's row, and beside what its posterior says."""
+    sigma, *_ = posterior.fit.likelihood.sigma_names
+    parameters = posterior.parameters()
+    draws = parameters | {"sigma": parameters[sigma]} | posterior.derived()
     if row["trusted"] and not posterior.trusted:
-        row |= {"trusted": False, "message": posterior.convergence.warning}
+        row = row | {"trusted": False, "message": posterior.convergence.warning}
     return row | _quantiles(row, draws) | _told(posterior.convergence)
