@@ -4,7 +4,7 @@
 quantity), `vs_sampling_alone` and `ess_vs_sampling_alone` the same against `sample` without the fit. `together`: share
 of the records that were sampled side by side.
 
-    python benchmarks/many_posteriors.py [--json] [--records 512] [--samples 2000]
+    python benchmarks/many_posteriors.py [--json] [--records 128] [--samples 2000]
 """
 
 import argparse
@@ -17,7 +17,7 @@ from timing import show
 import fitact
 from fitact.inference.ensembles import WALKERS
 
-ALONE = 8  # records of each round that are sampled one by one
+ALONE = 4  # records of each round that are sampled one by one
 ROUNDS = 5
 
 
@@ -59,7 +59,7 @@ def measure(count: int, samples: int) -> dict[str, float]:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="one JSON object")
-    parser.add_argument("--records", type=int, default=512, help="16 or more")
+    parser.add_argument("--records", type=int, default=128, help="16 or more")
     parser.add_argument("--samples", type=int, default=2_000)
     options = parser.parse_args()
     show(measure(options.records, options.samples), options.json)

@@ -42,8 +42,8 @@ from fitact.inference.summary import PROBABILITIES
 from fitact.model.scene import Scene
 from fitact.progress import watched
 
-_BLOCK = 32  # records sampled side by side, always so many; 33 MB of draws
-_STEPS = 200  # of each, twice what most need
+_BLOCK = 32  # records sampled side by side, always so many; 16 MB of draws
+_STEPS = 200  # of each ensemble; those near to normal need some 120
 _AT_ONCE = 32  # points of each record in an evaluation: half of its walkers, so that one size is compiled
 _RANKED = 1000  # draws of an ensemble that R-hat looks at
 _FOLLOWED = 4  # walkers of an ensemble whose g, b and mean force are judged in every step
@@ -148,14 +148,15 @@ def _targets(batch: Batch) -> _Targets | None:
     members = [members[place] for place in places]
     sigma, root = found.sigma[places], found.root[places]
     coordinates = together.basis.project(np.stack([record["Vsc"] for _, record in members]))
+    log_b, whole = found.logs[places, _B], together.basis.center
     reach = reach_of(np.linalg.norm(np.einsum("ki,kij->kj", found.gradients[places, _B], root), axis=1))
-    tables = together.basis.narrowed(coordinates, found.logs[places, _B], reach, precision_of(sigma))
+    low, high = np.maximum(log_b - reach, whole - REACH), np.minimum(log_b + reach, whole + REACH)
+    tables = together.basis.narrowed(coordinates, 0.5 * (low + high), 0.5 * (high - low), precision_of(sigma))
     near = _laplace(found.theta[places], sigma, root, together.samples)
     of_fits = [rows[number] for number, _ in members]
     targets = _Targets(members, of_fits, together.likelihood, together.derive, tables, near)
     targets = targets._replace(near=near.refined(_probed(targets)))
-    normal = np.all(is_normal(_probed(targets)), axis=1)
-    kept = np.flatnonzero(normal & (np.abs(tables.center - together.basis.center) + reach <= REACH))
+    kept = np.flatnonzero(np.all(is_normal(_probed(targets)), axis=1))
     return targets.taken(kept.tolist()) if kept.size else None
 
 
