@@ -9,6 +9,7 @@ from .inference.design import MeasurementDesign, design_measurement
 from .inference.drive_design import DriveDesign, design_drive
 from .inference.fit import Fit, fit
 from .inference.many import Fits, fit_many
+from .inference.many_posteriors import sample_many
 from .inference.people import Population
 from .inference.population import population
 from .inference.posterior import Posterior
@@ -95,6 +96,7 @@ __all__ = [
     "response",
     "run_campaign",
     "sample",
+    "sample_many",
     "series_equivalent",
 ]
 

@@ -54,37 +54,48 @@ class Task:
     Attributes:
         scene: as JSON; None: the paper's device.
         columns: `channels` and `scale` of files, as in `fitact.read`.
-        reports: folder for a sampled posterior and a report of each record; None: only fits.
+        reports: folder for a sampled posterior and a report of each record; None: none.
         seed: of the sampling.
+        posteriors: whether rows are those of `sample_many`, or of `fit_many`.
     """
 
     scene: str | None
     columns: dict[str, Any]
     reports: str | None
     seed: int
+    posteriors: bool = False
 
     @property
     def fingerprint(self) -> str:
         """What, beside a record, an answer depends on."""
-        settings = [importlib.metadata.version("fitact"), self.scene, self.columns, bool(self.reports), self.seed]
+        sampled = [bool(self.reports), self.posteriors, self.seed]
+        settings = [importlib.metadata.version("fitact"), self.scene, self.columns, *sampled]
         return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
 
     def rows(self, paths: Sequence[str]) -> list[Row]:
         """The rows of a batch; runs on a worker."""
         scene = None if self.scene is None else Scene.from_json(self.scene)
         _make_room()
-        found = [dict(row) for row in fit_many(paths, scene, **self.columns, progress=False)]
+        found = [dict(row) for row in self._table(paths, scene)]
         for path, row in zip(paths, found, strict=True):
             if row["result"] == "crashed":  # it may have been the machine
-                row |= fit_many([path], scene, **self.columns, progress=False)[0]
+                row |= self._table([path], scene)[0]
             if self.reports is not None and "samples" in row:
                 _make_room()
-                row |= self._reported(path, scene)
+                row |= self._reported(path, scene, row)
         return found
 
-    def _reported(self, path: str, scene: Scene | None) -> Row:
+    def _table(self, paths: Sequence[str], scene: Scene | None) -> Fits:
+        from fitact.inference.many_posteriors import sample_many
+
+        if self.posteriors and self.reports is None:  # reports sample each by itself
+            return sample_many(paths, scene, **self.columns, seed=self.seed, progress=False)
+        return fit_many(paths, scene, **self.columns, progress=False)
+
+    def _reported(self, path: str, scene: Scene | None, row: Row) -> Row:
         from fitact.data.formats import read
         from fitact.inference.fit import fit
+        from fitact.inference.many_posteriors import with_posterior
         from fitact.inference.sampling import sample
 
         assert self.reports is not None
@@ -92,7 +103,8 @@ class Task:
         posterior = sample(fit(read(path, scene, **self.columns), scene), seed=self.seed, progress=False)
         posterior.to_netcdf(place / "posterior.nc")
         posterior.report(place / "report.html")
-        return {"report": f"{place.parent.name}/{place.name}/report.html", "trusted": posterior.trusted}
+        told = with_posterior(row, posterior) if self.posteriors else row
+        return told | {"report": f"{place.parent.name}/{place.name}/report.html", "trusted": posterior.trusted}
 
 
 def _make_room() -> None:
@@ -150,6 +162,7 @@ def run_campaign(
     scheduler: str | None = None,
     workers: int | None = None,
     memory: str = "2 GiB",
+    posteriors: bool = False,
     reports: bool = False,
     seed: int = 0,
     progress: bool = True,
@@ -168,7 +181,8 @@ def run_campaign(
         scheduler: address of a Dask scheduler; absent: workers of this machine.
         workers: how many of these, of one thread each; absent: one for each core.
         memory: what each of these may take before it is started anew.
-        reports: sample the posterior of each, too, and write its report.
+        posteriors: sample the posterior of each, as `fitact.sample_many` does.
+        reports: sample the posterior of each by itself, and write its report.
         seed: of the sampling.
         progress: report on standard error.
 
@@ -183,7 +197,8 @@ def run_campaign(
         raise InputError(f"{most[0][0]}: is named twice; name each record once")
     place = Path(folder)
     columns = {"channels": dict(channels or {}), "scale": dict(scale or {})}
-    task = Task(None if scene is None else scene.to_json(), columns, str(place / "reports") if reports else None, seed)
+    stated = None if scene is None else scene.to_json()
+    task = Task(stated, columns, str(place / "reports") if reports else None, seed, posteriors)
     try:
         journal = Journal(place / JOURNAL)
     except (OSError, ValueError) as error:

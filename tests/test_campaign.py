@@ -271,6 +271,23 @@ def test_compiled_code_is_dropped_once_it_is_much(monkeypatch: pytest.MonkeyPatc
     assert dropped
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("reports", [False, True], ids=["rows", "reports"])
+def test_rows_of_posteriors_are_those_of_sample_many(reports: bool, tmp_path: Path):
+    """A report's own draws are those of a record by itself, as here."""
+    made = square_record(noise=0.1, per_period=500)
+    path = tmp_path / "finger.csv"
+    write_csv(path, fitact.Record.from_arrays(made.time, Vsc=made["Vsc"]))
+    (tmp_path / "scene.toml").write_text(SCENE)
+    scene = fitact.Scene.load(tmp_path / "scene.toml")
+    task = Task(scene.to_json(), {}, str(tmp_path / "out") if reports else None, 3, posteriors=True)
+    (row,) = task.rows([str(path)])
+    (expected,) = fitact.sample_many([path], scene, seed=3, progress=False)
+    place = row.pop("report", None)
+    assert row == expected
+    assert (tmp_path / str(place)).exists() == reports
+
+
 def test_a_torn_line_is_dropped(tmp_path: Path):
     journal = Journal(tmp_path / JOURNAL)
     journal.add({"a": {"record": "a"}})
@@ -297,6 +314,7 @@ def test_changed_inputs_and_settings_are_done_again(tmp_path: Path):
     first = key()
     assert key() == first
     assert key(Task(None, {}, None, 1)) != first
+    assert key(Task(None, {}, None, 0, posteriors=True)) != first
     assert key(Task(None, {"scale": {"V": 2.0}}, None, 0)) != first
     path.write_text("2")
     assert key() != first

@@ -101,6 +101,15 @@ def test_autocorrelation_time_and_effective_size(chain: np.ndarray):
     assert c.ess["x"] == pytest.approx(array_stats.ess(kept, chain_axis=0, draw_axis=1), rel=0.1)
 
 
+@pytest.mark.parametrize("apart", [0.0, 0.3], ids=["agreeing", "apart"])
+def test_split_rhat_is_that_of_arviz(chain: np.ndarray, apart: float):
+    """Of all draws after the burn-in; rejected moves repeat each value."""
+    walked = np.repeat(chain[:, ::2], 2, axis=1) + apart * np.arange(4)[:, None, None, None]
+    c = judge_chain(("x",), walked, ACCEPTED, {}, ranked=10**9)
+    kept = walked[:, c.burn :].reshape(4, -1)
+    assert c.rhat_max - 1.0 == pytest.approx(array_stats.rhat(kept, chain_axis=0, draw_axis=1) - 1.0, rel=1e-3)
+
+
 def test_autocorrelation_time_is_that_of_emcee(chain: np.ndarray):
     for scale, steps in ((1.0, 100), (1.0, 1999), (0.01, 160)):
         values = 5.0 + scale * chain[0, :steps, :, 0]

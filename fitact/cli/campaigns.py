@@ -26,8 +26,11 @@ def campaign(
         int | None, typer.Option("--workers", min=1, help="Workers of this machine; absent: one for each core.")
     ] = None,
     memory: Annotated[str, typer.Option("--memory", help="What each of these may take.")] = "2 GiB",
+    posteriors: Annotated[
+        bool, typer.Option("--posteriors", help="Sample the posterior of each, alike records together.")
+    ] = False,
     reports: Annotated[
-        bool, typer.Option("--reports", help="Sample the posterior of each, too, and write its report.")
+        bool, typer.Option("--reports", help="Sample the posterior of each by itself, and write its report.")
     ] = False,
     seed: Seed = 0,
     json: Json = False,
@@ -47,7 +50,8 @@ def campaign(
 
     fits = run_campaign(
         records, out, stated, **mapping((channel, scale)),
-        scheduler=scheduler, workers=workers, memory=memory, reports=reports, seed=seed,
+        scheduler=scheduler, workers=workers, memory=memory, posteriors=posteriors,
+        reports=reports, seed=seed,
     )  # fmt: skip
     page = write_campaign(out, fits, Origin.of(typed(), stated))
     counted = {"records": len(fits), "answers": len(fits.answered), "failures": len(fits.failures)}

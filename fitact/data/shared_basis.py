@@ -17,6 +17,19 @@ from fitact.model.drive import Drive
 from fitact.model.response import highpass
 
 
+class Narrow(NamedTuple):
+    """Records on tables of their own, of few coordinates: signal and record of a `Compression` around each center.
+
+    Attributes:
+        center, reach: of each, in log s.
+    """
+
+    center: Float[np.ndarray, " records"]
+    reach: Float[np.ndarray, " records"]
+    signal: Float[np.ndarray, "records terms terms"]
+    observed: Float[np.ndarray, "records terms+1"]
+
+
 class SharedBasis(NamedTuple):
     """Orthonormal functions over the samples, whose first span the responses of time constants around a middle one.
 
@@ -77,6 +90,29 @@ class SharedBasis(NamedTuple):
     def response(self, signal: Float[np.ndarray, "records rank"]) -> Float[np.ndarray, "records samples"]:
         """In time, from its coordinates."""
         return signal @ self.functions[:, : signal.shape[1]].T
+
+    def narrowed(
+        self,
+        coordinates: Float[np.ndarray, "records coordinates+1"],
+        center: Float[np.ndarray, " records"],
+        reach: Float[np.ndarray, " records"],
+        precision: Float[np.ndarray, " records"],
+    ) -> Narrow:
+        """Tables for log tau within `reach` of each record's `center`, which cost less to evaluate.
+
+        What is left out changes the response to the drive by no more than `precision` (V, root of the sum of squares).
+        """
+        x, to_series = chebyshev(NODES)
+        inside = (center[:, None] + reach[:, None] * x - self.center) / REACH
+        at = np.polynomial.chebyshev.chebvander(inside, NODES - 1)
+        series = self.signal @ np.swapaxes(at, 1, 2) @ to_series.T
+        left = np.cumsum(np.linalg.norm(series, axis=1)[:, ::-1], axis=1)[:, ::-1]
+        # in fours, so that most batches share what is compiled
+        terms = min(4 * int(np.ceil(np.max(np.count_nonzero(left > precision[:, None], axis=1)) / 4)), NODES)
+        others = ((0, 0), (0, coordinates.shape[1] - len(self.signal)), (0, 0))
+        columns = np.concatenate([np.pad(series[..., :terms], others), coordinates[..., None]], axis=2)
+        _, rows = np.linalg.qr(columns)
+        return Narrow(center, reach, rows[:, :terms, :terms], rows[:, :, terms])
 
 
 @eqx.filter_jit

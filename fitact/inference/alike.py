@@ -47,12 +47,14 @@ class Settled(NamedTuple):
 
     Attributes:
         clear: where nothing is in doubt; elsewhere the other fields mean nothing.
+        coordinates: of the records, in those of `Together.basis`.
         theta, sigma, root: as `Fit.theta`, `Fit.sigma` and `Fit.covariance_root`.
         logs, gradients: of `derived.NAMES`, as of `Derived.logs`.
         figures: as `Fit.figures`.
     """
 
     clear: Bool[np.ndarray, " records"]
+    coordinates: Float[np.ndarray, "records coordinates"]
     theta: Float[np.ndarray, "records parameters"]
     sigma: Float[np.ndarray, " records"]
     root: Float[np.ndarray, "records parameters parameters"]
@@ -132,7 +134,7 @@ class Together(NamedTuple):
         figures = judged(square, self.samples, structure, noise, freedom, self.phases)
         figures |= {"rounding_noise": np.zeros(len(noise)), "interpolation_error": np.zeros(len(noise))}
         clear = held & ended & ~self._asked_for(shares) & plain & ~is_misfit(figures)
-        return Settled(clear, theta, sigma, np.linalg.inv(triangle), logs, gradients, figures)
+        return Settled(clear, coordinates, theta, sigma, np.linalg.inv(triangle), logs, gradients, figures)
 
     def optima(
         self,

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from fitact.data.compress import SLOW, Compression, compress
 from fitact.data.on_grid import compress_on_grid
@@ -109,9 +110,9 @@ def certify(
         return Certified(wide, None, tuple(r or _OFF_TIME for r in reasons))
     light, optimum = wide.without_samples(), jnp.asarray(theta)
     log_b, slope = _log_b_and_slope(light, optimum)
-    reach = max(_REACH * float(np.linalg.norm(np.asarray(slope) @ root)), _LEAST_REACH)
+    reach = float(reach_of(np.linalg.norm(np.asarray(slope) @ root)))
     near = tuple(
-        _narrowed(trace, seen, float(log_b), reach, 0.1 * tolerance * noise)
+        _narrowed(trace, seen, float(log_b), reach, float(precision_of(noise, tolerance)))
         for (trace, seen), noise in zip(wide.each(optimum), sigma, strict=True)
     )
     points = np.vstack([_near(theta, root), _believed(light, theta)])
@@ -126,6 +127,16 @@ def certify(
     error = None if any(found) else float(np.sum(np.max(np.abs(compressed - exact)[: _POINTS + 1], axis=0)))
     kept = tuple(trace.summed() if reason else trace for trace, reason in zip(near, found, strict=True))
     return Certified(dataclasses.replace(wide, traces=kept), error, tuple(found))
+
+
+def reach_of(log_b_sd: ArrayLike) -> Float[np.ndarray, "*shape"]:
+    """What a table for sampling holds on either side of the optimum, in log b."""
+    return np.maximum(_REACH * np.asarray(log_b_sd), _LEAST_REACH)
+
+
+def precision_of(noise: ArrayLike, tolerance: float = TOLERANCE) -> Float[np.ndarray, "*shape"]:
+    """What a table for sampling may be off by, V or A (root of the sum of squares), under a noise, V or A."""
+    return 0.1 * tolerance * np.asarray(noise)
 
 
 def _against(exact: np.ndarray, compressed: np.ndarray, tabulated: np.ndarray, tolerance: float) -> str:

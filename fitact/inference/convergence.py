@@ -7,6 +7,7 @@ import emcee
 import numpy as np
 from arviz_stats.base import array_stats
 from jaxtyping import Float, Int
+from scipy.special import ndtri
 
 from fitact.units import percent
 
@@ -106,8 +107,12 @@ def judge_chain(
     points: Float[np.ndarray, "ensembles steps walkers n"],
     accepted: Int[np.ndarray, "ensembles walkers"],
     derived: dict[str, Float[np.ndarray, "ensembles steps followed"]],
+    ranked: int = _RANKED,
 ) -> Convergence:
-    """Autocorrelation times, effective sizes and split-R-hat of ensembles, and of `derived` for some walkers."""
+    """Autocorrelation times, effective sizes and split-R-hat of ensembles, and of `derived` for some walkers.
+
+    R-hat is that of `ranked` draws of each ensemble.
+    """
     ensembles, steps, walkers, _ = points.shape
     if steps < _LEAST:
         return Convergence(steps=steps, walkers=walkers, ensembles=ensembles)
@@ -115,7 +120,7 @@ def judge_chain(
     tau = {name: _tau(values[:, steps // 5 :]) for name, values in seen.items()}
     tau_max = max(tau.values())
     burn = int(min(np.ceil(5.0 * tau_max), steps // 2))
-    rhat = max(_rhat(values[:, burn:]) for values in seen.values())
+    rhat = max(_rhat(values[:, burn:], ranked) for values in seen.values())
     stuck = _stuck(points[:, burn:], float(np.median(list(tau.values()))))
     count = ensembles * (steps - burn) * walkers
     return Convergence(
@@ -152,11 +157,20 @@ def integrated_time(values: Float[np.ndarray, "steps walkers"]) -> float:
     return float(taus[emcee.autocorr.auto_window(taus, _WINDOW)])
 
 
-def _rhat(values: Float[np.ndarray, "ensembles steps walkers"]) -> float:
-    """Rank-normalised split-R-hat; of long ensembles, of steps evenly apart."""
-    apart = max(1, values[0].size // _RANKED)
-    draws = values[:, ::apart].reshape(len(values), -1)
-    return float(array_stats.rhat(draws, chain_axis=0, draw_axis=1))
+def _rhat(values: Float[np.ndarray, "ensembles steps walkers"], ranked: int) -> float:
+    """Rank-normalised split-R-hat (Vehtari et al. 2021); of long ensembles, of steps evenly apart."""
+    draws = values[:, :: max(1, values[0].size // ranked)].reshape(len(values), -1)
+    halves = draws[:, : draws.shape[1] // 2 * 2].reshape(2 * len(draws), -1)
+    return max(_rhat_of_ranks(halves), _rhat_of_ranks(np.abs(halves - np.median(halves))))
+
+
+def _rhat_of_ranks(draws: Float[np.ndarray, "chains draws"]) -> float:
+    """Of the normal scores of the draws' ranks."""
+    rank = np.empty(draws.size)
+    rank[np.argsort(draws, axis=None, kind="stable")] = np.arange(1, draws.size + 1)
+    scores = ndtri((rank - 0.375) / (draws.size + 0.25)).reshape(draws.shape)
+    between, within = np.var(scores.mean(axis=1), ddof=1), np.mean(np.var(scores, axis=1, ddof=1))
+    return float(np.sqrt(between / within + 1.0 - 1.0 / draws.shape[1]))
 
 
 def _stuck(points: Float[np.ndarray, "ensembles steps walkers n"], tau: float) -> tuple[str, ...]:

@@ -6,9 +6,9 @@ import csv
 import dataclasses
 import os
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -20,7 +20,7 @@ from fitact.errors import InputError
 from fitact.files import replacing
 from fitact.inference import derived
 from fitact.inference.alike import Settled, Together
-from fitact.inference.fit import GOOD, fitted
+from fitact.inference.fit import GOOD, Fit, fitted
 from fitact.inference.identifiability import directions, from_prior, verdicts
 from fitact.inference.problem import pose
 from fitact.model.scene import Scene
@@ -131,15 +131,22 @@ def fit_many(
         InputError: the scene asks for what is not available.
     """
     (scene or Scene()).require_available(fit=True)
-    rows: dict[int, dict[str, Any]] = {}
+    rows: dict[int, Row] = {}
     total = len(records) if isinstance(records, Sequence) else 0
-    with jax.enable_x64(True), _LINEAR_ALGEBRA.in_one_thread():
-        opened = _opened(records, scene, {"channels": channels, "scale": scale}, rows)
-        batches = _batches(watched(opened, "fitting the records", total) if progress and total else opened, scene)
-        for members, settled in _in_threads(batches):
+    with in_double_precision():
+        given = opened(records, scene, {"channels": channels, "scale": scale}, rows)
+        found = batches(watched(given, "fitting the records", total) if progress and total else given, scene)
+        for (_, members), (settled, _) in in_threads(found, settle):
             left = ((number, record) for number, record in members if number not in settled)
             rows |= settled | {number: _alone(record, scene) for number, record in left}
     return Fits(tuple(rows[number] for number in sorted(rows)))
+
+
+@contextlib.contextmanager
+def in_double_precision() -> Iterator[None]:
+    """JAX of this thread, and the linear algebra in one."""
+    with jax.enable_x64(True), _LINEAR_ALGEBRA.in_one_thread():
+        yield
 
 
 class _Threads:
@@ -166,33 +173,43 @@ class _Threads:
 
 _LINEAR_ALGEBRA = _Threads()
 
+Row = dict[str, Any]
 Member = tuple[int, Record]
 Batch = tuple[Together | None, list[Member]]
 
 
-def _opened(
-    records: Iterable[Input], scene: Scene | None, columns: Mapping[str, Any], rows: dict[int, dict[str, Any]]
+_Job = TypeVar("_Job")
+_Done = TypeVar("_Done")
+
+
+def opened(
+    records: Iterable[Input], scene: Scene | None, columns: Mapping[str, Any], rows: dict[int, Row]
 ) -> Iterator[Member]:
     """Records by their number; those that cannot be read become rows."""
     for number, given in enumerate(records):
         try:
             yield number, given if isinstance(given, Record) else read(given, scene, **columns)
         except Exception as error:
-            rows[number] = _failed(str(given), error)
+            rows[number] = failed(str(given), error)
 
 
-def _in_threads(batches: Iterable[Batch]) -> Iterator[tuple[list[Member], dict[int, dict[str, Any]]]]:
-    """The members of batches and the rows of those that could be settled together, a batch ahead for each core."""
+def in_threads(jobs: Iterable[_Job], work: Callable[[_Job], _Done]) -> Iterator[tuple[_Job, _Done]]:
+    """Jobs and what `work` makes of them, a job ahead for each core. In double precision."""
     asked = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
     cores = int(asked) if asked.isdigit() else len(os.sched_getaffinity(0))
-    under_way: collections.deque[tuple[list[Member], Future[dict[int, dict[str, Any]]]]] = collections.deque()
+    under_way: collections.deque[tuple[_Job, Future[_Done]]] = collections.deque()
+
+    def done(job: _Job) -> _Done:
+        with jax.enable_x64(True):  # of each thread
+            return work(job)
+
     with ThreadPoolExecutor(cores) as pool:
-        for together, members in batches:
-            under_way.append((members, pool.submit(_settled, together, members)))
+        for job in jobs:
+            under_way.append((job, pool.submit(done, job)))
             if len(under_way) > cores:
-                done, rows = under_way.popleft()
-                yield done, rows.result()
-        yield from ((done, rows.result()) for done, rows in under_way)
+                first, result = under_way.popleft()
+                yield first, result.result()
+        yield from ((job, result.result()) for job, result in under_way)
 
 
 class _Group:
@@ -219,7 +236,7 @@ class _Group:
         return self.together is not None
 
 
-def _batches(records: Iterable[Member], scene: Scene | None) -> Iterator[Batch]:
+def batches(records: Iterable[Member], scene: Scene | None) -> Iterator[Batch]:
     """Records to be fitted together, or each by itself."""
     groups: dict[tuple[float, ...], _Group] = {}
     for number, record in records:
@@ -257,20 +274,20 @@ def _driven_alike(record: Record, voltage: np.ndarray) -> bool:
     return bool(off @ off <= _MATCH**2 * (voltage @ voltage))
 
 
-def _settled(together: Together | None, members: list[Member]) -> dict[int, dict[str, Any]]:
-    """Rows of those that are beyond doubt."""
+def settle(batch: Batch) -> tuple[dict[int, Row], Settled | None]:
+    """Rows of those that are beyond doubt, and the optima of all."""
+    together, members = batch
     if together is None or not members:
-        return {}
+        return {}, None
     padded = [*members, *members[-1:] * (_TOGETHER - len(members))]
     try:
-        with jax.enable_x64(True):  # of each thread
-            found = together.settle([record["Vsc"] for _, record in padded])
-            table = {"record": [os.path.basename(record.source) for _, record in padded]} | _columns(together, found)
+        found = together.settle([record["Vsc"] for _, record in padded])
+        table = {"record": [os.path.basename(record.source) for _, record in padded]} | _columns(together, found)
     except np.linalg.LinAlgError:  # one of them spoils what is computed for all
-        return {}
+        return {}, None
     rows = (dict(zip(table, values, strict=True)) for values in zip(*table.values(), strict=True))
     # the others fill up
-    return {number: row for (number, _), row, clear in zip(members, rows, found.clear, strict=False) if clear}
+    return {number: row for (number, _), row, clear in zip(members, rows, found.clear, strict=False) if clear}, found
 
 
 def _columns(together: Together, found: Settled) -> dict[str, list[Any]]:
@@ -304,17 +321,21 @@ def _values(names: Sequence[str], medians: np.ndarray, log_sds: np.ndarray) -> d
     }
 
 
-def _alone(record: Record, scene: Scene | None) -> dict[str, Any]:
+def _alone(record: Record, scene: Scene | None) -> Row:
     """The row of a record that is fitted by itself."""
     try:
-        found = fitted(record, scene, remedies=False)
+        return row_of(fitted(record, scene, remedies=False))
     except Exception as error:
-        return _failed(record.source, error)
+        return failed(record.source, error)
+
+
+def row_of(found: Fit) -> Row:
+    """Of a fit."""
     of_circuit = found.identifiability.blind_direction
     free = [i for i, name in enumerate(found.names) if name in of_circuit]
     logs, gradients = found.derive.logs(found.theta, np.array([trace.sigma for trace in found.traces]))
     row = {
-        "record": os.path.basename(record.source),
+        "record": os.path.basename(found.record.source),
         "result": found.result,
         "trusted": found.trusted,
         "message": found.message,
@@ -331,7 +352,8 @@ def _alone(record: Record, scene: Scene | None) -> dict[str, Any]:
     return {name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()}
 
 
-def _failed(source: str, error: Exception) -> dict[str, Any]:
+def failed(source: str, error: Exception) -> Row:
+    """The row of a record without an answer."""
     refused = isinstance(error, InputError)
     message = str(error) if refused else f"{source}: {type(error).__name__}: {error}"
     result = "refused" if refused else "crashed"

@@ -10,14 +10,14 @@ from collections.abc import Callable
 from typing import Self
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 LogProb = Callable[[np.ndarray], np.ndarray]
 Random = np.random.RandomState | np.random.Generator
 
 DEGREES = 8.0  # of freedom: tails above any posterior's seen here
 _SAFE = 0.1  # share drawn from the Student-t even where there are tables, so that no place is out of reach
-_PROBES = np.array([-2.5, -1.0, 0.0, 1.0, 2.5])  # standard deviations along an axis, at which it is compared
+PROBES = np.array([-2.5, -1.0, 0.0, 1.0, 2.5])  # standard deviations along an axis, at which it is compared
 _NORMAL = 0.3  # departure from the normal's log-density there, above which an axis is tabulated
 _FAR = 40.0  # standard deviations that are searched either way
 _CELLS = 256
@@ -94,7 +94,7 @@ class Proposal:
 
     def draw(self, random: Random, count: int) -> Float[np.ndarray, "count n"]:
         """Points."""
-        white = _student(random, count, self.center.size)
+        white = student(random, count, self.center.size)
         tabulated = random.uniform(size=count) >= _SAFE
         for i, table in self.tables.items():
             white[:, i] = np.where(tabulated, table.draw(random, count), white[:, i])
@@ -104,12 +104,12 @@ class Proposal:
         """Up to a constant."""
         white = np.linalg.solve(self.axes, (points - self.center).T).T
         if not self.tables:
-            return _student_log_density(white)
+            return student_log_density(white)
         others = [i for i in range(self.center.size) if i not in self.tables]
-        tabulated = _student_log_density(white[:, others])
+        tabulated = student_log_density(white[:, others])
         for i, table in self.tables.items():
             tabulated = tabulated + table.log_density(white[:, i])
-        return np.logaddexp(np.log(1.0 - _SAFE) + tabulated, np.log(_SAFE) + _student_log_density(white))
+        return np.logaddexp(np.log(1.0 - _SAFE) + tabulated, np.log(_SAFE) + student_log_density(white))
 
     def move(
         self, points: Float[np.ndarray, "count n"], random: np.random.RandomState
@@ -119,14 +119,23 @@ class Proposal:
         return proposed, self.log_density(points) - self.log_density(proposed)
 
 
-def _student(random: Random, count: int, size: int) -> Float[np.ndarray, "count size"]:
+def student(random: Random, count: int, size: int) -> Float[np.ndarray, "count size"]:
+    """Draws around 0, a standard deviation of the normal that it stands over being 1."""
     return random.standard_normal((count, size)) * np.sqrt(DEGREES / random.chisquare(DEGREES, (count, 1)))
 
 
-def _student_log_density(white: Float[np.ndarray, "count size"]) -> Float[np.ndarray, " count"]:
-    size = white.shape[1]
+def student_log_density(white: Float[np.ndarray, "*shape size"]) -> Float[np.ndarray, "*shape"]:
+    """Of such draws."""
+    size = white.shape[-1]
     scale = math.lgamma(0.5 * (DEGREES + size)) - math.lgamma(0.5 * DEGREES) - 0.5 * size * math.log(math.pi * DEGREES)
-    return scale - 0.5 * (DEGREES + size) * np.log1p(np.sum(white**2, axis=1) / DEGREES)
+    return scale - 0.5 * (DEGREES + size) * np.log1p(np.sum(white**2, axis=-1) / DEGREES)
+
+
+def is_normal(probed: Float[np.ndarray, "*shape probes"]) -> Bool[np.ndarray, "*shape"]:
+    """Whether log-densities at `PROBES` along an axis are those of a normal, or nearly so."""
+    with np.errstate(invalid="ignore"):  # the center itself may be impossible
+        departure = probed - probed[..., 2:3] + 0.5 * PROBES**2
+    return np.all(np.abs(departure) < _NORMAL, axis=-1)
 
 
 def _along(center: Float[np.ndarray, " n"], axis: Float[np.ndarray, " n"], log_prob: LogProb) -> Table | None:
@@ -135,10 +144,8 @@ def _along(center: Float[np.ndarray, " n"], axis: Float[np.ndarray, " n"], log_p
     def on_line(places: np.ndarray) -> np.ndarray:
         return log_prob(center + places[:, None] * axis)
 
-    probed = on_line(_PROBES)
-    with np.errstate(invalid="ignore"):  # the center itself may be impossible
-        departure = probed - probed[2] + 0.5 * _PROBES**2
-    if np.all(np.abs(departure) < _NORMAL):
+    probed = on_line(PROBES)
+    if is_normal(probed):
         return None
     reach = np.arcsinh(_FAR)
     places = np.sinh(np.linspace(-reach, reach, _CELLS + 1))  # dense where it is likely

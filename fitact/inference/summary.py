@@ -23,6 +23,8 @@ _NORMAL = {
     "q75": 0.6744897501960817, "q95": 1.6448536269514722, "q975": 1.959963984540054,
 }  # fmt: skip
 
+PROBABILITIES = {key: float(f"0.{key[1:]}") for key in _NORMAL}  # of the quantiles
+
 Summary = dict[str, float | str]
 BY_FORCE = {  # what makes the force, by the name of its model
     "paper": "by Vsc, eq. (22)",
@@ -32,13 +34,13 @@ BY_FORCE = {  # what makes the force, by the name of its model
 
 def of_draws(name: str, draws: Float[np.ndarray, "*shape"]) -> Summary:
     """Summary of draws of the quantity `name`, in its SI unit."""
-    quantiles = np.quantile(draws, [float(f"0.{key[1:]}") for key in _NORMAL])
+    quantiles = np.quantile(draws, list(PROBABILITIES.values()))
     summary: Summary = {
         "unit": unit_of(name),
         "mean": float(np.mean(draws)),
         "sd": float(np.std(draws, ddof=1)),
     }
-    return summary | {key: float(value) for key, value in zip(_NORMAL, quantiles, strict=True)}
+    return summary | {key: float(value) for key, value in zip(PROBABILITIES, quantiles, strict=True)}
 
 
 def log_normal(name: str, median: float, log_sd: float) -> Summary:
