@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitact.data.compress import NODES, REACH, Compression, chebyshev, exponentials, slow_shapes
+from fitact.data.padding import padded
 from fitact.model.drive import Drive
 from fitact.model.response import highpass
 
@@ -76,11 +77,16 @@ class SharedBasis(NamedTuple):
         return np.column_stack([inside, np.sqrt(np.maximum(square, 0.0))])
 
 
-@eqx.filter_jit
-def _over_samples(drive: Drive, time: Array, nodes: Array, steady_state: bool) -> tuple[Array, Array, Array]:
+def _over_samples(drive: Drive, time: Array, nodes: Array, steady_state: bool) -> tuple[np.ndarray, ...]:
     """Responses of the nodes, the slow shapes, and dV/dt over two samples."""
-    u = jax.vmap(lambda tau: highpass(drive, time, tau, steady_state=steady_state))(nodes)
     step = (time[-1] - time[0]) / (time.size - 1)
+    found = _at_times(drive, jnp.asarray(padded(np.asarray(time))), step, nodes, steady_state)
+    return tuple(np.asarray(x)[..., : time.size] for x in found)
+
+
+@eqx.filter_jit
+def _at_times(drive: Drive, time: Array, step: Array, nodes: Array, steady_state: bool) -> tuple[Array, Array, Array]:
+    u = jax.vmap(lambda tau: highpass(drive, time, tau, steady_state=steady_state))(nodes)
 
     def voltage(time: Array) -> Array:
         return jnp.where(steady_state | (time >= 0.0), drive.value(time), 0.0)
