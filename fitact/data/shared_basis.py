@@ -39,9 +39,7 @@ class SharedBasis(NamedTuple):
     def around(cls, drive: Drive, time: Float[np.ndarray, " samples"], steady_state: bool, tau: float) -> "SharedBasis":
         """For time constants within a factor 9 of `tau` (s). Call it in double precision."""
         relative, mix, _ = exponentials()
-        u, slow, slope = map(
-            np.asarray, _over_samples(drive, jnp.asarray(time), jnp.asarray(tau * relative), steady_state)
-        )
+        u, slow, slope = _over_samples(drive, time, jnp.asarray(tau * relative), steady_state)
         clock = (time - 0.5 * (time[0] + time[-1])) * slope
         columns = [(mix.T @ u), slow, slope[None], clock[None]]
         functions, rows = np.linalg.qr(np.concatenate(columns).T)
@@ -77,11 +75,10 @@ class SharedBasis(NamedTuple):
         return np.column_stack([inside, np.sqrt(np.maximum(square, 0.0))])
 
 
-def _over_samples(drive: Drive, time: Array, nodes: Array, steady_state: bool) -> tuple[np.ndarray, ...]:
+def _over_samples(drive: Drive, time: np.ndarray, nodes: Array, steady_state: bool) -> list[np.ndarray]:
     """Responses of the nodes, the slow shapes, and dV/dt over two samples."""
-    step = (time[-1] - time[0]) / (time.size - 1)
-    found = _at_times(drive, jnp.asarray(padded(np.asarray(time))), step, nodes, steady_state)
-    return tuple(np.asarray(x)[..., : time.size] for x in found)
+    step = jnp.asarray((time[-1] - time[0]) / (time.size - 1))
+    return [np.asarray(x)[..., : time.size] for x in _at_times(drive, padded(time), step, nodes, steady_state)]
 
 
 @eqx.filter_jit

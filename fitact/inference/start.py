@@ -149,7 +149,8 @@ def _measured(record: Record, steady_state: bool | None, notes: tuple[str, ...])
             " leave steady_state out to have the charge at the first sample fitted"
         )
     time, samples = (padded(x[:kept], len(record)) for x in (record.time, voltage))
-    return DriveChoice(Sampled(time, samples, period), voltage, True, False, 0.0, "measured", notes)
+    drive = as_arrays(Sampled(time, samples, period))
+    return DriveChoice(drive, voltage, True, False, 0.0, "measured", notes)
 
 
 def whole_periods(record: Record) -> tuple[int, float | None]:
