@@ -157,8 +157,8 @@ def test_filling_up_changes_no_answer(kind: str, monkeypatch: pytest.MonkeyPatch
     filled = fitact.fit(made, given)
     monkeypatch.setattr(padding, "padded_length", lambda samples: samples)
     plain = fitact.fit(made, given)
-    # where rounding lets the fit take another step, as far as a step may change it at the end
-    same = 1e-9 if filled.figures["steps"] == plain.figures["steps"] else 1e-6
+    # where rounding lets least squares stop a step sooner, as far as they end from the optimum
+    same = 1e-9 if filled.figures["steps"] == plain.figures["steps"] else 1e-5
     assert np.abs(filled.theta - plain.theta).max() < same * plain.sd.min()
     assert np.allclose(filled.residuals, plain.residuals, rtol=0.0, atol=same * plain.sigma)
     assert filled.warnings == plain.warnings
