@@ -108,7 +108,7 @@ class Task:
 
 
 def _make_room() -> None:
-    """Drop what JAX compiled once it is much: it compiles anew for every length of record, and keeps it all."""
+    """Drop what JAX compiled once it is much: it compiles anew for every kind of record, and keeps it all."""
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > _MOST_MAPS:
         jax.clear_caches()

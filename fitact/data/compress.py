@@ -22,6 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from fitact.data.padding import padded, padded_weight
 from fitact.data.record import is_uniform
 from fitact.model.chirp import Chirp
 from fitact.model.circuit import Terms
@@ -151,7 +152,7 @@ def compress(
     the record's own sampling grid, its periods are folded first, exactly. Call it in double precision.
 
     Args:
-        drive: as in `fitact.response`; a `Sampled` one has the record's own times.
+        drive: as in `fitact.response`; a `Sampled` one has the record's own times, and may be filled up.
         time: s.
         observed: Vsc or I, V or A.
         steady_state: as in `fitact.response`.
@@ -306,14 +307,16 @@ def _folded(table: _Table, drive: Drive, samples: _Samples, period: int) -> Iter
     sums = np.zeros((len(SLOW) + 1, period))
     squares = np.zeros((len(SLOW) + 1, len(SLOW) + 1))
     for t, y, weight, _ in _chunks(samples, periods * period):
-        z = _over_periods(table, t, y, weight, reference)
+        difference = (y.reshape(periods, period) - reference).reshape(-1)
+        z = np.concatenate([np.asarray(_slow(table, padded(t)))[:, : t.size], difference[None]])
         count += weight.reshape(periods, period).sum(axis=0)
-        sums += np.asarray(z[0])
-        squares += np.asarray(z[1])
+        weighted = z * weight
+        sums += weighted.reshape(len(z), periods, period).sum(axis=1)
+        squares += weighted @ z.T
     means = sums / np.where(count > 0.0, count, 1.0)
     rate = np.zeros(period) if samples.rate is None else np.asarray(samples.rate[:period])
-    time, mean = np.asarray(samples.time[:period]), means[-1] + reference
-    total = np.array(_at_times(table, drive, time, mean, count, rate, means[:-1], True))
+    time, mean, rate, slow = map(padded, (np.asarray(samples.time[:period]), means[-1] + reference, rate, means[:-1]))
+    total = np.array(_at_times(table, drive, time, mean, padded_weight(count), rate, slow, True))
     # what the samples of one phase scatter about their mean
     kept = np.r_[_SLOW, _OBSERVED]
     total[np.ix_(kept, kept)] += squares - means @ sums.T
@@ -321,11 +324,8 @@ def _folded(table: _Table, drive: Drive, samples: _Samples, period: int) -> Iter
 
 
 @eqx.filter_jit
-def _over_periods(table: _Table, time: Array, observed: Array, weight: Array, reference: Array) -> tuple[Array, Array]:
-    difference = (observed.reshape(-1, reference.size) - reference).reshape(-1)
-    z = jnp.concatenate([slow_shapes(time, table.middle, table.half), difference[None]])
-    weighted = z * weight
-    return weighted.reshape(z.shape[0], -1, reference.size).sum(axis=1), weighted @ z.T
+def _slow(table: _Table, time: Array) -> Array:
+    return slow_shapes(time, table.middle, table.half)
 
 
 def _samples_a_period(drive: Drive, time: np.ndarray) -> int | None:
@@ -354,7 +354,7 @@ def _along_samples(table: _Table, drive: Sampled, samples: _Samples) -> Iterator
     last = jnp.zeros(NODES), jnp.asarray(time[0]), jnp.zeros(())  # the first sample is a jump from 0
     if x is not None:
         last = first * jnp.exp(x), jnp.asarray(time[0] - step), jnp.asarray(first)
-    voltages = _chunks(_Samples(time, drive.samples, None, None), length)
+    voltages = _chunks(_Samples(time, np.asarray(drive.samples)[: time.size], None, None), length)
     for (t, y, weight, rate), (_, v, _, _) in zip(_chunks(samples, length), voltages, strict=True):
         total, last = _from_sample_to_sample(table, t, v, y, weight, rate, last, time[0], x)
         yield np.asarray(total)

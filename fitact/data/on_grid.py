@@ -9,12 +9,14 @@ from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from fitact.data.compress import SLOW, slow_shapes
+from fitact.data.padding import padded
 from fitact.model.circuit import Terms
 from fitact.model.drive import Drive, Sampled
 from fitact.model.relaxation import Grid
@@ -78,8 +80,9 @@ def compress_on_grid(
     around = np.array([0.0, -step, step])
     scale = max(float(np.max(np.abs(observed))), 1e-300)  # the record's column as long as the others, for rounding
     triangle: Any = np.zeros((0, 0))
+    middle, half = 0.5 * (time[0] + time[-1]), 0.5 * (time[-1] - time[0])
     for part, u in _responses(drive, grid.tau, time, around, steady_state):
-        slow = np.asarray(slow_shapes(jnp.asarray(time[part]), 0.5 * (time[0] + time[-1]), 0.5 * (time[-1] - time[0])))
+        slow = np.asarray(_slow(padded(time[part]), middle, half))[:, : time[part].size]
         slope = np.zeros(u.shape[-1]) if rate is None else np.asarray(rate[part])
         rows = [u[0], slow, slope[None], observed[part][None] / scale, (u[1] - u[2]) / (2.0 * step)]
         columns = np.concatenate(rows).T
@@ -102,12 +105,17 @@ def _responses(
     drive: Drive, tau: Array, time: np.ndarray, around: np.ndarray, steady_state: bool
 ) -> Iterator[tuple[slice, Float[np.ndarray, "around terms samples"]]]:
     """Of each time constant, chunk by chunk, at the samples' times and beside them."""
-    length = time.size if isinstance(drive, Sampled) else min(_CHUNK, time.size)  # a long drive is gone through once
+    length = time.size if isinstance(drive, Sampled) else _CHUNK  # a long drive is gone through once
     for first in range(0, time.size, length):
         part = slice(first, first + length)
-        times = np.pad(time[part], (0, max(0, first + length - time.size)), mode="edge")
+        times = padded(time[part], min(length, time.size))
         u = np.stack([np.asarray(_each(drive, tau, times + x, steady_state)) for x in around])
         yield part, u[..., : time[part].size]
+
+
+@jax.jit
+def _slow(time: Array, middle: Array, half: Array) -> Array:
+    return slow_shapes(time, middle, half)
 
 
 @eqx.filter_jit

@@ -4,6 +4,7 @@ As a `fitact.data.compress.Compression` of each, but the basis is worked out onc
 with a matrix of some forty columns.
 """
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitact.data.compress import NODES, RANK, REACH, Compression, chebyshev, slow_shapes
+from fitact.data.padding import padded
 from fitact.model.drive import Drive
 from fitact.model.response import highpass
 
@@ -52,10 +54,11 @@ class SharedBasis(NamedTuple):
         """For time constants within a factor 9 of `tau` (s). Call it in double precision."""
         x, to_series = chebyshev(NODES)
         nodes = jnp.asarray(tau * np.exp(REACH * x))
-        u, slow, slope = map(np.asarray, _over_samples(drive, jnp.asarray(time), nodes, steady_state))
+        u, slow, slope = _over_samples(drive, time, nodes, steady_state)
         clock = (time - 0.5 * (time[0] + time[-1])) * slope
         _, sizes, spanning = np.linalg.svd(u, full_matrices=False)
-        rank = int(np.count_nonzero(sizes > RANK * sizes[0]))
+        # in fours, so that most groups of records share what is compiled
+        rank = min(4 * math.ceil(np.count_nonzero(sizes > RANK * sizes[0]) / 4), NODES)
         functions, rows = np.linalg.qr(np.concatenate([spanning[:rank], slow, slope[None], clock[None]]).T)
         series = functions[:, :rank].T @ u.T @ to_series.T
         places = np.cumsum([rank, len(slow), 1])
@@ -108,18 +111,22 @@ class SharedBasis(NamedTuple):
         series = self.signal @ np.swapaxes(at, 1, 2) @ to_series.T
         left = np.cumsum(np.linalg.norm(series, axis=1)[:, ::-1], axis=1)[:, ::-1]
         # in fours, so that most batches share what is compiled
-        terms = min(4 * int(np.ceil(np.max(np.count_nonzero(left > precision[:, None], axis=1)) / 4)), NODES)
+        terms = min(4 * math.ceil(np.max(np.count_nonzero(left > precision[:, None], axis=1)) / 4), NODES)
         others = ((0, 0), (0, coordinates.shape[1] - len(self.signal)), (0, 0))
         columns = np.concatenate([np.pad(series[..., :terms], others), coordinates[..., None]], axis=2)
         _, rows = np.linalg.qr(columns)
         return Narrow(center, reach, rows[:, :terms, :terms], rows[:, :, terms])
 
 
-@eqx.filter_jit
-def _over_samples(drive: Drive, time: Array, nodes: Array, steady_state: bool) -> tuple[Array, Array, Array]:
+def _over_samples(drive: Drive, time: np.ndarray, nodes: Array, steady_state: bool) -> list[np.ndarray]:
     """Responses of the nodes, the slow shapes, and dV/dt over two samples."""
+    step = jnp.asarray((time[-1] - time[0]) / (time.size - 1))
+    return [np.asarray(x)[..., : time.size] for x in _at_times(drive, padded(time), step, nodes, steady_state)]
+
+
+@eqx.filter_jit
+def _at_times(drive: Drive, time: Array, step: Array, nodes: Array, steady_state: bool) -> tuple[Array, Array, Array]:
     u = jax.vmap(lambda tau: highpass(drive, time, tau, steady_state=steady_state))(nodes)
-    step = (time[-1] - time[0]) / (time.size - 1)
 
     def voltage(time: Array) -> Array:
         return jnp.where(steady_state | (time >= 0.0), drive.value(time), 0.0)

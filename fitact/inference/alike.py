@@ -106,9 +106,9 @@ class Together(NamedTuple):
         """For records like that of `problem`; None where such cannot be fitted together. In double precision."""
         likelihood, (source, *others) = problem.likelihood, problem.sources
         (trace, *_), choice, start = likelihood.traces, source.choice, source.start
-        if others or start is None or not math.isfinite(start.b) or trace.time.size > _LONGEST:
+        if others or start is None or not math.isfinite(start.b) or trace.own > _LONGEST:
             return None
-        plain = trace.channel == "Vsc" and trace.noise == "white" and trace.weight is None and not trace.timing
+        plain = trace.channel == "Vsc" and trace.noise == "white" and trace.equally_weighted and not trace.timing
         known = not (isinstance(likelihood.template, WithSkin) or isinstance(choice.drive, Chirp))
         own = bool(np.any(np.asarray(trace.linear_sd))) or bool(choice.notes) or choice.shift != 0.0
         if not (plain and known) or own or choice.name == "measured":

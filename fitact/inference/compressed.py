@@ -52,11 +52,12 @@ def project(trace: Trace, circuit: Circuit, shown: bool, tolerance: float) -> tu
     reason = _reason_against(trace, circuit, shown, tolerance)
     if reason:
         return trace, reason
-    arrays = np.asarray(trace.time), np.asarray(trace.observed)
+    own = slice(trace.own)
+    arrays = np.asarray(trace.time)[own], np.asarray(trace.observed)[own]
     how: dict[str, Any] = {
         "steady_state": trace.steady_state,
-        "weight": None if trace.weight is None else np.asarray(trace.weight),
-        "rate": None if trace.rate is None else np.asarray(trace.rate),
+        "weight": None if trace.equally_weighted else trace.weights[own],
+        "rate": None if trace.rate is None else np.asarray(trace.rate)[own],
     }
     if isinstance(circuit, WithSkin):
         assert circuit.grid is not None  # there would be a reason against it
@@ -74,7 +75,7 @@ def _reason_against(trace: Trace, circuit: Circuit, shown: bool, tolerance: floa
         return "noise with outliers is more than lengths and angles"
     if trace.whitening is not None:
         return "the noise is coloured"
-    if trace.time.size < _SHORT:
+    if trace.own < _SHORT:
         return f"the record is shorter than {_SHORT} samples"
     if trace.timing:
         return _OFF_TIME

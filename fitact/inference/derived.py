@@ -9,6 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from fitact.data.padding import padded, padded_weight
 from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.inference.likelihood import Likelihood
@@ -160,7 +161,8 @@ def _last_periods(record: Record, choice: DriveChoice, b: float) -> tuple[Drive,
     lead = int(np.searchsorted(time, time[begin] - _LEAD * b))
     if lead == 0:
         return None
-    return Sampled(time[lead:], record["V"][lead:]), (time[begin:], np.gradient(time)[begin:])
+    drive = Sampled(padded(time[lead:]), padded(record["V"][lead:]))
+    return drive, (padded(time[begin:]), padded_weight(np.gradient(time)[begin:]))
 
 
 def for_scene(likelihood: Likelihood, scene: Scene) -> Derived:
@@ -197,7 +199,7 @@ def _grid(record: Record, choice: DriveChoice, after: float) -> tuple[np.ndarray
     cells = np.gradient(record.time)
     if period is None:  # the trapezoid rule; over whole periods the ends meet
         cells[[0, -1]] *= 0.5
-    return record.time[:kept] - choice.shift, cells[:kept]
+    return padded(record.time[:kept] - choice.shift, len(record)), padded_weight(cells[:kept], len(record))
 
 
 def _of_period(drive: Periodic, after: float) -> tuple[np.ndarray, np.ndarray]:

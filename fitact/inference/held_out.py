@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from fitact.data.padding import padded
 from fitact.data.record import Record
 from fitact.inference.fit import Fit
 from fitact.inference.least_squares import least_squares
@@ -67,7 +68,7 @@ def held_out(fit: Fit) -> HeldOut:
     for record in fit.records:
         starts[id(record)] = total
         total += int(blocks(record)[-1]) + 1
-    of_rows = [starts[id(trace.record)] + blocks(trace.record) for trace in fit.traces]
+    of_rows = [padded(starts[id(trace.record)] + blocks(trace.record)) for trace in fit.traces]
     # dealt out at random, so that no fold holds the same part of every period; any dealing does
     folds = min(_FOLDS, total)
     fold = np.random.default_rng(0).permutation(total) % folds

@@ -103,7 +103,7 @@ class Posterior:
 
     @functools.cached_property
     def _derived(self) -> np.ndarray:
-        return self._each(_derived_of, self.fit.derive, rows=len(self.fit.record))
+        return self._each(_derived_of, self.fit.derive, rows=self.fit.likelihood.traces[0].time.size)
 
     @functools.cached_property
     def _linear(self) -> np.ndarray:
@@ -236,14 +236,14 @@ class Posterior:
         for i, (trace, model) in enumerate(zip(self.fit.traces, self.fit.likelihood.traces, strict=True)):
             stride = -(-len(trace.record) // _PREDICTED_SAMPLES)
             signal = functools.partial(_signal_of, i, stride)
-            mean = self._each(signal, self.fit.likelihood, len(trace.record), draws)
+            time = trace.record.time[::stride]
+            mean = self._each(signal, self.fit.likelihood, model.time.size, draws)[..., : time.size]
             sigma = np.exp(self.points[:, draws, self.fit.theta.size + i, None])
             noise = draw_noise(rng, model.noise, model.whitening, mean.shape, stride)
             noisy = mean + sigma * self._spread(trace)[::stride] * noise
-            time = _axis(trace)
-            unit = {"units": CHANNEL_UNITS[trace.channel]}
-            found[_name(trace)] = ("chain", "draw", time), noisy.astype(np.float32), unit
-            found = found.assign_coords({time: (time, trace.record.time[::stride], {"units": "s"})})
+            axis, unit = _axis(trace), {"units": CHANNEL_UNITS[trace.channel]}
+            found[_name(trace)] = ("chain", "draw", axis), noisy.astype(np.float32), unit
+            found = found.assign_coords({axis: (axis, time, {"units": "s"})})
         return found
 
     @staticmethod

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.data.clipping import clipped
+from fitact.data.padding import LONGEST, padded, padded_weight
 from fitact.data.record import Record, rounding_noise, white_noise
 from fitact.errors import InputError
 from fitact.inference import compressed
@@ -196,11 +197,14 @@ def _open(
             start, notes = current_start(record, choice, seen), (*notes, *seen.notes)
     weight, left_out = _weight(record, channel, seen)
     weight, at_jumps = without_jumps(template, record, choice, weight)
+    if weight is None and len(record) <= LONGEST:
+        weight = np.ones(len(record))
+    weight = None if weight is None else padded_weight(weight)
     colour, noise = _noise(record, channel, given)
     trace = dataclasses.replace(
         _trace(record, choice, channel, label, template, given.measurement.noise_model),
         weight=None if weight is None else jnp.asarray(weight),
-        rate=None if seen is None else jnp.asarray(seen.rate),
+        rate=None if seen is None else shared(padded(seen.rate)),
         whitening=colour and colour.whitening(np.ones(len(record), bool) if weight is None else weight > 0.0),
     )
     drowned = seen is not None and seen.drowned
@@ -261,8 +265,8 @@ def _trace(
     named = channel == "Vsc" and choice.name != "measured"
     steps = frequency_error(record, choice.name) * record.time.size if named else 0.0
     return Trace(
-        time=shared(record.time),
-        observed=shared(record[channel]),
+        time=shared(padded(record.time)),
+        observed=shared(padded(record[channel])),
         weight=None,
         whitening=None,
         least_noise=jnp.asarray(max(PRECISION * height, rounding_noise(record[channel]))),

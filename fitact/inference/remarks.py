@@ -1,5 +1,7 @@
 """What a user should know about an answer although nothing stands against it, in sentences."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -74,7 +76,7 @@ def on_parameters(likelihood: Likelihood, theta: Float[np.ndarray, " parameters"
 def _plausibility(likelihood: Likelihood, theta: np.ndarray) -> list[tuple[str, float, float]]:
     """For g and b, which the record knows: name, ratio to the prior's median, share of the prior further out."""
     points = np.vstack([theta, likelihood.draws(theta, _DRAWS)])
-    g, b = (np.asarray(x) for x in _divider(likelihood, jnp.asarray(points)))
+    g, b = (np.asarray(x) for x in _divider(dataclasses.replace(likelihood, traces=()), jnp.asarray(points)))
     return [
         (name, float(x[0] / np.median(x[1:])), float(min(np.mean(x[1:] < x[0]), np.mean(x[1:] > x[0]))))
         for name, x in (("the divider g", g), ("the time constant b", b))

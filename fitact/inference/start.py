@@ -11,6 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from fitact.data.padding import padded
 from fitact.data.record import Record, evenly
 from fitact.errors import InputError
 from fitact.model.chirp import Chirp
@@ -40,7 +41,7 @@ class DriveChoice:
     """The drive of a fit.
 
     Attributes:
-        drive: the scene's waveform or the measured one.
+        drive: the scene's waveform or the measured one, which is filled up as a `Trace` is.
         voltage: it, at the record's times, V.
         steady_state: or from rest.
         unknown_charge: whether the charge at the first sample must be left free.
@@ -140,7 +141,7 @@ def _measured(record: Record, steady_state: bool | None, notes: tuple[str, ...])
             " step (freed as a gain); record faster, or name the waveform in a scene",
         )
     if not steady_state:
-        drive = Sampled(shared(record.time), shared(voltage))
+        drive = Sampled(shared(padded(record.time)), shared(padded(voltage)))
         return DriveChoice(drive, voltage, False, steady_state is None, 0.0, "measured", notes)
     kept, period = whole_periods(record)
     if period is None:
@@ -148,9 +149,9 @@ def _measured(record: Record, steady_state: bool | None, notes: tuple[str, ...])
             f"{record.source}: [drive] steady_state = true needs a record of at least 1.5 periods of V_V;"
             " leave steady_state out to have the charge at the first sample fitted"
         )
-    return DriveChoice(
-        Sampled(record.time[:kept], voltage[:kept], period), voltage, True, False, 0.0, "measured", notes
-    )
+    time, samples = (padded(x[:kept], len(record)) for x in (record.time, voltage))
+    drive = as_arrays(Sampled(time, samples, period))
+    return DriveChoice(drive, voltage, True, False, 0.0, "measured", notes)
 
 
 def whole_periods(record: Record) -> tuple[int, float | None]:
@@ -292,13 +293,13 @@ def has_ideal_edges(drive: Drive) -> bool:
 
 def jumps_within(drive: Drive, time: np.ndarray, margin: float) -> Bool[np.ndarray, " samples"]:
     """Which times lie within a margin (s) of an ideal edge of a square wave."""
-    before, after = (np.asarray(_value(drive, t, True)) for t in (time - margin, time + margin))
+    before, after = (_voltage(drive, t, True) for t in (time - margin, time + margin))
     return np.abs(after - before) > 1e-9 * np.ptp(after)
 
 
 def _voltage(drive: Drive, time: np.ndarray, steady_state: bool) -> np.ndarray:
     """The drive at `time`; from rest there is none before t = 0."""
-    return np.asarray(_value(drive, time, steady_state))
+    return np.asarray(_value(drive, padded(time), steady_state))[: time.size]
 
 
 @eqx.filter_jit
@@ -314,13 +315,14 @@ def _shifted(drive: Drive, time: Array, shifts: Array, steady_state: bool) -> Fl
 
 def slope_of(choice: DriveChoice, time: np.ndarray) -> Float[np.ndarray, " samples"]:
     """dV/dt of the drive at the record's times, V/s."""
-    return np.asarray(_slope(choice.drive, time - choice.shift, choice.steady_state))
+    return np.asarray(_slope(choice.drive, padded(time - choice.shift), choice.steady_state))[: time.size]
 
 
 def unit_response(choice: DriveChoice, time: np.ndarray, tau: float) -> Float[np.ndarray, " samples"]:
     """The drive's response of one time constant (s) at the record's times, V."""
     # an array: for a number jit would compile anew
-    return np.asarray(_highpass(choice.drive, time - choice.shift, jnp.asarray(tau), choice.steady_state))
+    found = _highpass(choice.drive, padded(time - choice.shift), jnp.asarray(tau), choice.steady_state)
+    return np.asarray(found)[: time.size]
 
 
 @eqx.filter_jit
@@ -346,7 +348,7 @@ def _align(record: Record, drive: Drive, frequency: float, steady_state: bool) -
     target = target - target.mean()
 
     def left(shifts: np.ndarray) -> np.ndarray:
-        waves = np.asarray(_shifted(drive, time, shifts, steady_state))
+        waves = np.asarray(_shifted(drive, padded(time), shifts, steady_state))[:, : time.size]
         parts = np.array_split(waves, _PARTS)  # which bounds memory
         return np.concatenate([_left_by(part, target, "V" not in record) for part in parts])
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitact.data.padding import padded, padded_weight
 from fitact.inference.noise import student_weight
 from fitact.inference.start import has_ideal_edges, jumps_within
 from fitact.inference.trace import TIMING, Seen, Trace
@@ -44,7 +45,7 @@ def opened(trace: Trace, seen: Seen, name: str) -> Trace:
         good = grid[left < left.min() + (_WRONG_SIDE * np.ptp(np.asarray(trace.observed))) ** 2]
     else:
         left = _left(trace, seen, names, grid * units)
-        good = grid[left < left.min() * (1.0 + 25.0 / trace.time.size)]
+        good = grid[left < left.min() * (1.0 + 25.0 / trace.own)]
     moved = dict(zip(names, good.mean(axis=0) * units, strict=True))
     trace = dataclasses.replace(
         trace, shift=trace.shift + moved.get("delay", 0.0), clock=trace.clock + moved.get("clock", 0.0)
@@ -66,13 +67,15 @@ def _beside_edges(trace: Trace) -> np.ndarray:
 
 def _part(trace: Trace, chosen: np.ndarray) -> Trace:
     """With some of its samples only."""
-    weight = None if trace.weight is None else trace.weight[chosen]
-    return dataclasses.replace(trace, time=trace.time[chosen], observed=trace.observed[chosen], weight=weight)
+    places, arrays = np.flatnonzero(chosen), (trace.time, trace.observed)
+    time, observed = (jnp.asarray(padded(np.asarray(x)[places])) for x in arrays)
+    weight = jnp.asarray(padded_weight(trace.weights[places]))
+    return dataclasses.replace(trace, time=time, observed=observed, weight=weight)
 
 
 def _left(trace: Trace, seen: Seen, names: tuple[str, ...], places: np.ndarray) -> Float[np.ndarray, " places"]:
     """What each of the places, in SI units, leaves of the trace with the best gain and linear nuisances."""
-    weights, shapes = trace.weights, np.asarray(trace.shapes(seen))[np.asarray(trace.linear_sd) > 0.0]
+    weights, shapes = trace.weights, np.asarray(_shapes(trace, seen))[np.asarray(trace.linear_sd) > 0.0]
     basis = _spanned(shapes * weights)
 
     def beyond(values: np.ndarray) -> np.ndarray:
@@ -105,6 +108,11 @@ def _spanned(rows: Float[np.ndarray, "n samples"]) -> Float[np.ndarray, "samples
     q, r = np.linalg.qr((rows / np.where(lengths > 0.0, lengths, 1.0)).T)
     modes, sizes, _ = np.linalg.svd(r)
     return q @ modes[:, sizes > _DEPENDENT * np.max(sizes, initial=0.0)]
+
+
+@eqx.filter_jit
+def _shapes(trace: Trace, seen: Seen) -> Array:
+    return trace.shapes(seen)
 
 
 def clock_drop(trace: Trace, seen: Seen, sigma: float) -> float:

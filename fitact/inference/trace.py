@@ -50,7 +50,7 @@ class Seen(eqx.Module):
 
 
 class Trace(eqx.Module):
-    """One channel of one record, and what drives it.
+    """One channel of one record, and what drives it, filled up as `fitact.data.padding` does.
 
     Attributes:
         time: s.
@@ -123,9 +123,20 @@ class Trace(eqx.Module):
         return self.time.size if self.compression is None else self.compression.observed.size
 
     @property
+    def own(self) -> int:
+        """How many samples are the record's own, from the first on."""
+        time = np.asarray(self.time)
+        return 1 + int(np.searchsorted(time, time[-1]))
+
+    @property
     def weights(self) -> Float[np.ndarray, " samples"]:
         """Of each sample."""
         return np.ones(self.time.size) if self.weight is None else np.asarray(self.weight)
+
+    @property
+    def equally_weighted(self) -> bool:
+        """Whether all of the record's own samples count, and equally."""
+        return self.weight is None or bool(np.all(self.weights[: self.own] == 1.0))
 
     def without_samples(self) -> "Trace":
         """With no more of the samples than their ends, where a compression stands for them.
@@ -134,11 +145,12 @@ class Trace(eqx.Module):
         """
         if self.compression is None:
             return self
-        drive = self.drive
+        # by NumPy, since JAX would compile this for every length
+        time, observed, drive = np.asarray(self.time), np.asarray(self.observed), self.drive
         if isinstance(drive, Sampled):
-            drive = dataclasses.replace(drive, time=drive.time[:2], samples=drive.samples[:2])
-        extremes = jnp.stack([jnp.min(self.observed), jnp.max(self.observed)])
-        return dataclasses.replace(self, time=self.time[:2], observed=extremes, drive=drive, weight=None, rate=None)
+            drive = Sampled(np.asarray(drive.time)[:2], np.asarray(drive.samples)[:2], drive.period)
+        ends, extremes = jnp.asarray(time[:2]), jnp.array([observed.min(), observed.max()])
+        return dataclasses.replace(self, time=ends, observed=extremes, drive=drive, weight=None, rate=None)
 
     def signal(self, seen: Seen, later: ArrayLike = 0.0) -> Float[Array, " samples"]:
         """The channel as recorded, but for linear nuisances and noise; `later` (s) delays it further."""

@@ -58,13 +58,15 @@ class TraceFit:
         """The trace of that index at the optimum `theta` with the noise `sigma`."""
         trace, seen = likelihood.traces[index].summed(), likelihood.seen(jnp.asarray(theta), index)
         # the noise as an array: a float would be compiled in, anew for every record
-        left, beta = (np.asarray(x) for x in _over_samples(trace, seen, jnp.asarray(sigma)))
-        weight = None if trace.weight is None else np.asarray(trace.weight)
+        left, even, beta = (np.asarray(x) for x in _over_samples(trace, seen, jnp.asarray(sigma)))
+        own = slice(trace.own)
+        left, weight = left[own], None if trace.equally_weighted else trace.weights[own]
         linear = {
             trace.named(LINEAR[column]): float(value * trace.linear_sd[column])
             for column, value in zip(trace.columns, beta, strict=True)
         }
-        kept, counted = _equal_noise(trace, left, sigma)
+        counted = (trace.weights if trace.whitening is None else np.asarray(trace.whitening.kept))[own] > 0.0
+        kept = even[own][counted]
         used = theta.size * kept.size / float(likelihood.count) + len(linear)
         gain = _gain(seen.circuit, trace)
         noise = sigma if trace.noise == "ar1" else source.noise  # coloured, only the residuals show it
@@ -87,7 +89,7 @@ class TraceFit:
             linear=linear,
             residuals=left,
             weight=weight,
-            log_likelihood=_log_likelihood(trace, left, sigma),
+            log_likelihood=_log_likelihood(trace, left, kept, sigma),
             figures=figures,
             full_because=reason,
         )
@@ -100,32 +102,28 @@ def _gain(circuit: Circuit, trace: Trace) -> float:
     return abs(sum(float(w) for w in circuit.terms_of(trace.channel).weight))
 
 
-def _equal_noise(trace: Trace, left: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals that should be independent and equally noisy, and which samples they belong to."""
-    values = np.asarray(trace.weighted(jnp.asarray(left)))
-    if trace.noise == "student":
-        values = values * np.sqrt(np.asarray(student_weight(values / sigma)))
-    counted = trace.weights > 0.0 if trace.whitening is None else np.asarray(trace.whitening.kept) > 0.0
-    return values[counted], counted
-
-
-def _log_likelihood(trace: Trace, left: np.ndarray, sigma: float) -> float:
+def _log_likelihood(trace: Trace, left: np.ndarray, even: np.ndarray, sigma: float) -> float:
     """At the noise that makes it largest; under Student's t, at `sigma`."""
     if trace.whitening is None:
+        weights = trace.weights[: left.size]
         if trace.noise == "student":
-            return student_log_likelihood(left, trace.weights, sigma)
-        return gaussian_log_likelihood(left, trace.weights)
+            return student_log_likelihood(left, weights, sigma)
+        return gaussian_log_likelihood(left, weights)
     kept = np.asarray(trace.whitening.kept) > 0.0
-    innovations = np.asarray(trace.weighted(jnp.asarray(left)))[kept] / float(trace.whitening.taps[0])
+    innovations = even / float(trace.whitening.taps[0])
     return gaussian_log_likelihood(innovations, None) + float(np.sum(np.log(trace.weights[kept])))
 
 
 @eqx.filter_jit
-def _over_samples(trace: Trace, seen: Seen, sigma: Array) -> tuple[Array, Array]:
-    """What is left of the samples, and the linear nuisances in prior standard deviations."""
+def _over_samples(trace: Trace, seen: Seen, sigma: Array) -> tuple[Array, Array, Array]:
+    """What is left of the samples; that with noise independent and equal; and the linear nuisances in prior sds."""
     _, beta, _ = trace.linear(seen, sigma)
     remainder, shapes = dataclasses.replace(trace, weight=None, whitening=None).before_linear(seen)
-    return remainder - beta @ (trace.linear_sd[np.array(trace.columns, dtype=int), None] * shapes), beta
+    left = remainder - beta @ (trace.linear_sd[np.array(trace.columns, dtype=int), None] * shapes)
+    even = trace.weighted(left)
+    if trace.noise == "student":
+        even = even * jnp.sqrt(student_weight(even / sigma))
+    return left, even, beta
 
 
 def compare(parameters: int, traces: Sequence[TraceFit]) -> dict[str, float]:
