@@ -178,7 +178,9 @@ class Together(NamedTuple):
 
 
 def _parts(rows: Sequence[np.ndarray] | np.ndarray) -> Iterator[np.ndarray]:
-    return (np.stack(list(rows[i : i + _AT_ONCE])) for i in range(0, len(rows), _AT_ONCE))
+    for first in range(0, len(rows), _AT_ONCE):
+        part = rows[first : first + _AT_ONCE]
+        yield np.concatenate(part).reshape(len(part), -1)  # which takes less than `np.stack`
 
 
 def _seen(observed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -28,6 +28,7 @@ from fitact.progress import watched
 
 _TOGETHER = 256  # records; so many are stacked, whatever their number, and compiled for once
 _FEW = 16  # alike ones, below which fits by themselves take less than compiling
+_AHEAD = 4  # jobs for each core, so that a record that is fitted by itself keeps none waiting
 _TRIES = 4  # records from which to learn what a group shares, since the first may be an odd one
 _MATCH = 0.01  # relative rms difference between V and the scene's drive
 _FORCE = derived.NAMES.index("force_mean")
@@ -194,7 +195,7 @@ def opened(
 
 
 def in_threads(jobs: Iterable[_Job], work: Callable[[_Job], _Done]) -> Iterator[tuple[_Job, _Done]]:
-    """Jobs and what `work` makes of them, a job ahead for each core. In double precision."""
+    """Jobs and what `work` makes of them, some ahead for each core. In double precision."""
     asked = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
     cores = int(asked) if asked.isdigit() else len(os.sched_getaffinity(0))
     under_way: collections.deque[tuple[_Job, Future[_Done]]] = collections.deque()
@@ -206,7 +207,7 @@ def in_threads(jobs: Iterable[_Job], work: Callable[[_Job], _Done]) -> Iterator[
     with ThreadPoolExecutor(cores) as pool:
         for job in jobs:
             under_way.append((job, pool.submit(done, job)))
-            if len(under_way) > cores:
+            if len(under_way) > _AHEAD * cores:
                 first, result = under_way.popleft()
                 yield first, result.result()
         yield from ((job, result.result()) for job, result in under_way)
