@@ -72,9 +72,10 @@ def test_the_shipped_record_is_no_misfit_and_shows_no_structure(finger_fit: fita
     assert min(finger_fit.figures[name] for name in ("folded_p", "spectrum_p", "line_p")) > 1e-3
 
 
-def p_values(residuals: np.ndarray, time: np.ndarray, frequency: float) -> dict[str, np.ndarray]:
+def p_values(residuals: np.ndarray, time: np.ndarray, frequency: float, precision=np.float32) -> dict[str, np.ndarray]:
+    """In the precision in which fits are tested, unless another is given."""
     of_time = Phases.of(time, frequency)
-    return probabilities(Structure.of(residuals, of_time), time.size, of_time)
+    return probabilities(Structure.of(residuals.astype(precision), of_time), time.size, of_time)
 
 
 def test_false_alarms_of_white_noise_are_as_many_as_stated():
@@ -111,7 +112,7 @@ def test_folding_is_the_F_test_of_the_phase_means():
     between = 8.0 * float(means @ means)
     within = float(residuals @ residuals) - between
     p8 = scipy.stats.f.sf((between / 8) / (within / 56), 8, 56)
-    assert p_values(residuals, time + 1e-9, 125.0)["folded_p"] == pytest.approx(p8, rel=1e-10)
+    assert p_values(residuals, time + 1e-9, 125.0, float)["folded_p"] == pytest.approx(p8, rel=1e-10)
 
 
 def test_hum_and_colour_are_seen_and_a_million_samples_are_no_trouble():

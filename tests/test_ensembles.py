@@ -50,7 +50,7 @@ def test_moves_give_known_normals(shares, monkeypatch):
 
     The 192 ensembles are independent, so that their own scatter gives the standard error.
     """
-    monkeypatch.setattr(ensembles, "_SHARES", shares)
+    monkeypatch.setattr(ensembles, "SHARES", shares)
     off, error = off_by(whitened(range(COUNT)))
     assert np.all(error < 0.0075)
     assert np.all(np.abs(off) < (0.01 if shares[0] else 4.5 * error))
@@ -58,7 +58,7 @@ def test_moves_give_known_normals(shares, monkeypatch):
 
 def test_walkers_of_neighbours_would_be_seen(monkeypatch):
     """emcee's own stretch move over the same walkers: any anchor leaves a normal alone, but few moves are accepted."""
-    monkeypatch.setattr(ensembles, "_SHARES", (0.0, 1.0))
+    monkeypatch.setattr(ensembles, "SHARES", (0.0, 1.0))
     monkeypatch.setattr(ensembles, "Stretch", lambda shape, generators: emcee.moves.StretchMove())
     _, error = off_by(whitened(range(8)))
     assert np.all(error > 0.012)  # of 32 ensembles; 0.0075 of 192 would be 0.018

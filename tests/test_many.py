@@ -3,12 +3,14 @@
 import csv
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 import scipy.optimize
 from conftest import square_record
 
 import fitact
+from fitact.data.shared_basis import SharedBasis
 
 COUNT = 20
 NAMES = ("Rsc", "Csc", "Ci")
@@ -27,20 +29,24 @@ SCENE = fitact.Scene.from_dict(
 def record(number: int, **how) -> fitact.Record:
     scale = np.exp(0.2 * np.sin(np.arange(3) + number))
     skin = {"Rsc": 130e3 * scale[0], "Csc": 18e-9 * scale[1]}
-    made = square_record(noise=0.1, seed=number, per_period=1000, **skin | how)
+    made = square_record(seed=number, per_period=1000, **{"noise": 0.1} | skin | how)
     return fitact.Record.from_arrays(made.time, Vsc=made["Vsc"], source=f"finger_{number}.csv")
+
+
+def settled(time: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    """Under the square of `SCENE`, of logarithms."""
+    half = np.floor(time * 200.0 + 1e-9)
+    sign, since = np.where(half % 2 == 0.0, 1.0, -1.0), time - half / 200.0
+    R, C, Ci = np.exp(theta)
+    g, b = Ci / (2.0 * Ci + C), R * (2.0 * Ci + C)
+    return sign * 360.0 * g / (1.0 + np.exp(-0.005 / b)) * np.exp(-since / b)
 
 
 def optimum(record: fitact.Record, sigma: float) -> np.ndarray:
     """By MINPACK, from the closed form of a settled square."""
-    half = np.floor(record.time * 200.0 + 1e-9)
-    sign, since = np.where(half % 2 == 0.0, 1.0, -1.0), record.time - half / 200.0
 
     def residuals(theta):
-        R, C, Ci = np.exp(theta)
-        g, b = Ci / (2.0 * Ci + C), R * (2.0 * Ci + C)
-        model = sign * 360.0 * g / (1.0 + np.exp(-0.005 / b)) * np.exp(-since / b)
-        return np.append((record["Vsc"] - model) / sigma, (theta - MEDIANS) / LOG_SDS)
+        return np.append((record["Vsc"] - settled(record.time, theta)) / sigma, (theta - MEDIANS) / LOG_SDS)
 
     tight = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
     return scipy.optimize.least_squares(residuals, MEDIANS, method="lm", jac="3-point", **tight).x
@@ -95,6 +101,24 @@ def test_optimum_against_scipy(fits, given, number):
     np.testing.assert_allclose(
         np.log([row[name] for name in NAMES]), optimum(given[number], row["noise"]), rtol=0.0, atol=1e-6
     )
+
+
+def test_noise_so_low_that_coordinates_lose_it():
+    """Some billionths of the height: what is left of a record must be told from its samples."""
+    quiet = [record(number, noise=1e-7) for number in range(16)]
+    error = 5.0 / np.sqrt(2.0 * len(quiet[0]))
+    for row in fitact.fit_many(quiet, SCENE, progress=False):
+        assert row["rms_residual"] == pytest.approx(1e-7, rel=error)
+
+
+@pytest.mark.parametrize("samples", [20, 21, 22, 23, 24])
+def test_a_basis_of_hardly_more_functions_than_samples_holds_the_responses(samples):
+    time = np.append(0.0, np.geomspace(1e-6, 4.9e-3, samples - 1))
+    with jax.enable_x64(True):
+        basis = SharedBasis.around(fitact.Square(peak_to_peak=360.0, frequency=100.0), time, True, 3e-5)
+    response = 360.0 / (1.0 + np.exp(-0.005 / 4e-5)) * np.exp(-time / 4e-5)
+    coordinates = basis.project(response[None])
+    assert basis.response(coordinates[:, : len(basis.signal)])[0] == pytest.approx(response, abs=1e-9)
 
 
 def test_failures_stay_by_themselves(fits):

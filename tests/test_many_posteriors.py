@@ -1,5 +1,6 @@
 """Posteriors of many records: the same as one by one and as an integral, each by itself whatever is beside it."""
 
+import dataclasses
 import functools
 from pathlib import Path
 
@@ -217,9 +218,22 @@ def test_crashes_of_the_sampler_stay_where_they_are(given, monkeypatch, tmp_path
         raise ZeroDivisionError("of all things")
 
     monkeypatch.setattr(many_posteriors, "sample", breaks)
-    crashed, refused = sample_many([given[0], given[BROKEN]], SCENE, progress=False)
-    assert (crashed["result"], refused["result"]) == ("crashed", "refused")
-    assert "ZeroDivisionError: of all things" in crashed["message"]
+    only_fitted, refused = sample_many([given[0], given[BROKEN]], SCENE, progress=False)
+    assert (only_fitted["result"], refused["result"]) == ("successful", "refused")
+    assert not only_fitted["trusted"]
+    assert not only_fitted["converged"]
+    assert "ZeroDivisionError: of all things" in only_fitted["message"]
+
+
+def test_an_interrupted_chain_ends_the_call(given, monkeypatch):
+    def interrupted(fit, **how):
+        posterior = fitact.sample(fit, **how)
+        judged = dataclasses.replace(posterior.convergence, interrupted=True)
+        return dataclasses.replace(posterior, convergence=judged)
+
+    monkeypatch.setattr(many_posteriors, "sample", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        sample_many([given[0]], SCENE, progress=False)
 
 
 def drawn_from_the_prior(number: int, time: np.ndarray) -> tuple[fitact.Record, dict[str, float]]:

@@ -58,7 +58,7 @@ class SharedBasis(NamedTuple):
         clock = (time - 0.5 * (time[0] + time[-1])) * slope
         _, sizes, spanning = np.linalg.svd(u, full_matrices=False)
         # in fours, so that most groups of records share what is compiled
-        rank = min(4 * math.ceil(np.count_nonzero(sizes > RANK * sizes[0]) / 4), NODES)
+        rank = min(4 * math.ceil(np.count_nonzero(sizes > RANK * sizes[0]) / 4), len(spanning))
         functions, rows = np.linalg.qr(np.concatenate([spanning[:rank], slow, slope[None], clock[None]]).T)
         series = functions[:, :rank].T @ u.T @ to_series.T
         places = np.cumsum([rank, len(slow), 1])
@@ -69,7 +69,7 @@ class SharedBasis(NamedTuple):
         """What all records have in common; `observed` is to be replaced by a row of `project`."""
         size = self.functions.shape[1] + 1
 
-        def padded(rows: np.ndarray) -> Array:
+        def lengthened(rows: np.ndarray) -> Array:
             return jnp.asarray(np.pad(rows, [(0, 0)] * (rows.ndim - 1) + [(0, 1)]))
 
         return Compression(
@@ -77,9 +77,9 @@ class SharedBasis(NamedTuple):
             reach=jnp.asarray(REACH),
             signal=jnp.asarray(self.signal),
             decay=jnp.zeros((size, NODES)),
-            slow=padded(self.slow),
+            slow=lengthened(self.slow),
             rate=jnp.zeros(size),
-            slope=padded(self.slope),
+            slope=lengthened(self.slope),
             observed=jnp.zeros(size),
             samples=jnp.asarray(float(samples)),
         )

@@ -33,6 +33,7 @@ _LONGEST = 65_536  # samples, above which a fit by itself costs no more
 _STEPS = 20
 _CONVERGED = 1e-6  # standard errors from the optimum at the end,
 _NEAR = 1e-4  # and before the last step, which squares what is left
+_ROUNDED = 1e-3  # of the residuals' square: what coordinates may lose of it where noise is very low
 _STRIDE = 1.0  # longest step in a logarithm
 _DEPENDENT = 1e-9  # of a column's length: what rounding leaves of one that depends on others
 _DOUBT = 3.0  # of the Bayesian information criterion: error of a clock's evidence, whose shape is not exact here
@@ -47,14 +48,14 @@ class Settled(NamedTuple):
 
     Attributes:
         clear: where nothing is in doubt; elsewhere the other fields mean nothing.
-        coordinates: of the records, in those of `Together.basis`.
+        coordinates: of the records, as by `SharedBasis.project`.
         theta, sigma, root: as `Fit.theta`, `Fit.sigma` and `Fit.covariance_root`.
         logs, gradients: of `derived.NAMES`, as of `Derived.logs`.
         figures: as `Fit.figures`.
     """
 
     clear: Bool[np.ndarray, " records"]
-    coordinates: Float[np.ndarray, "records coordinates"]
+    coordinates: Float[np.ndarray, "records coordinates+1"]
     theta: Float[np.ndarray, "records parameters"]
     sigma: Float[np.ndarray, " records"]
     root: Float[np.ndarray, "records parameters parameters"]
@@ -68,7 +69,7 @@ class Ends(NamedTuple):
 
     Attributes:
         theta, sigma: as `Fit.theta`, `Fit.sigma`.
-        square: sum of the residuals' squares, V^2.
+        square: sum of the residuals' squares by the coordinates, V^2.
         triangle: of the whitened Jacobian's QR decomposition.
         shares: of `_CANDIDATES` in the residuals' square.
         signal: the response, in the first coordinates of the basis.
@@ -125,12 +126,13 @@ class Together(NamedTuple):
         seen = [(*_seen(part), self.basis.project(part)) for part in _parts(observed)]
         noise, height, plain, coordinates = map(np.concatenate, zip(*seen, strict=True))
         found, held = self.optima(coordinates, noise, PRECISION * height)
-        theta, sigma, square, triangle, shares, signal, ended = map(np.asarray, found)
+        theta, sigma, inside, triangle, shares, signal, ended = map(np.asarray, found)
         logs, gradients = map(np.asarray, _derived(self.derive, found.theta, found.sigma))
         parts = zip(_parts(observed), _parts(signal), strict=True)
-        left = [Structure.of((part - self.basis.response(s)).astype(np.float32), self.phases) for part, s in parts]
-        structure = Structure(*map(np.concatenate, zip(*left, strict=True)))
-        freedom = self.samples - theta.shape[1]
+        of_parts = [_left(part - self.basis.response(s), self.phases) for part, s in parts]
+        square, *shown = map(np.concatenate, zip(*of_parts, strict=True))
+        freedom, structure = self.samples - theta.shape[1], Structure(*shown)
+        held &= np.abs(inside - square) <= _ROUNDED * square
         figures = judged(square, self.samples, structure, noise, freedom, self.phases)
         figures |= {"rounding_noise": np.zeros(len(noise)), "interpolation_error": np.zeros(len(noise))}
         clear = held & ended & ~self._asked_for(shares) & plain & ~is_misfit(figures)
@@ -138,7 +140,7 @@ class Together(NamedTuple):
 
     def optima(
         self,
-        coordinates: Float[np.ndarray, "records coordinates"],
+        coordinates: Float[np.ndarray, "records coordinates+1"],
         noise: Float[np.ndarray, " records"],
         least: Float[np.ndarray, " records"],
     ) -> tuple[Ends, Bool[np.ndarray, " records"]]:
@@ -151,7 +153,7 @@ class Together(NamedTuple):
         return _optima(self.likelihood, jnp.asarray(np.append(self.basis.clock, 0.0)), *of_each), held
 
     def _starts(
-        self, coordinates: Float[np.ndarray, "records coordinates"]
+        self, coordinates: Float[np.ndarray, "records coordinates+1"]
     ) -> tuple[Float[np.ndarray, "records parameters"], Bool[np.ndarray, " records"]]:
         """The best response of the table's nodes to each, on the ridge, and whether the table holds it."""
         x, _ = chebyshev(NODES)
@@ -181,6 +183,11 @@ def _parts(rows: Sequence[np.ndarray] | np.ndarray) -> Iterator[np.ndarray]:
     for first in range(0, len(rows), _AT_ONCE):
         part = rows[first : first + _AT_ONCE]
         yield np.concatenate(part).reshape(len(part), -1)  # which takes less than `np.stack`
+
+
+def _left(residuals: np.ndarray, of_time: Phases | None) -> tuple[np.ndarray, ...]:
+    """The sum of their squares, and their structure."""
+    return np.vecdot(residuals, residuals), *Structure.of(residuals.astype(np.float32), of_time)
 
 
 def _seen(observed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -12,12 +12,10 @@ import emcee
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fitact.inference.proposal import student, student_log_density
+from fitact.inference.proposal import OVERDISPERSION, SHARES, student, student_log_density
 
 ENSEMBLES = 4
 WALKERS = 16  # of each ensemble: posteriors side by side keep emcee busy, few walkers make steps cheap
-_OVERDISPERSION = 1.5  # of the walkers' start
-_SHARES = (0.7, 0.3)  # of the moves, as in `fitact.sample`
 _STRETCH = 2.0  # Goodman and Weare's a
 
 # of points (posteriors, any, n), not NaN
@@ -77,10 +75,10 @@ def run(log_probs: LogProbs, near: Normals, steps: int, seeds: Sequence[Sequence
 
     moves = [Independence(shape, generators, near), Stretch(shape, generators)]
     sampler = emcee.EnsembleSampler(
-        count * ENSEMBLES * WALKERS, size, flat, moves=list(zip(moves, _SHARES, strict=True)), vectorize=True
+        count * ENSEMBLES * WALKERS, size, flat, moves=list(zip(moves, SHARES, strict=True)), vectorize=True
     )
     white = np.stack([student(generator, ENSEMBLES * WALKERS, size) for generator in generators])
-    start = near.placed(_OVERDISPERSION * white).reshape(-1, size)
+    start = near.placed(OVERDISPERSION * white).reshape(-1, size)
     state = emcee.State(start, random_state=_order(seed))
     sampler.run_mcmc(state, steps, skip_initial_state_check=True)
     points = sampler.get_chain().reshape(steps, *shape, size)

@@ -151,7 +151,7 @@ def in_double_precision() -> Iterator[None]:
 
 
 class _Threads:
-    """Those of the linear algebra, which would fight with those of `_in_threads` for the cores."""
+    """Those of the linear algebra, which would fight with those of `in_threads` for the cores."""
 
     def __init__(self) -> None:
         self._lock, self._users = threading.Lock(), 0

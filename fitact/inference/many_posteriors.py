@@ -37,7 +37,7 @@ from fitact.inference.many import (
 from fitact.inference.noise import scale_information
 from fitact.inference.posterior import Posterior
 from fitact.inference.proposal import PROBES, is_normal
-from fitact.inference.sampling import sample
+from fitact.inference.sampling import FOLLOWED, sample
 from fitact.inference.summary import PROBABILITIES
 from fitact.model.scene import Scene
 from fitact.progress import watched
@@ -46,7 +46,6 @@ _BLOCK = 32  # records sampled side by side, always so many; 16 MB of draws
 _STEPS = 200  # of each ensemble; those near to normal need some 120
 _AT_ONCE = 32  # points of each record in an evaluation: half of its walkers, so that one size is compiled
 _RANKED = 1000  # draws of an ensemble that R-hat looks at
-_FOLLOWED = 4  # walkers of an ensemble whose g, b and mean force are judged in every step
 _APART = 4  # steps between the draws whose derived quantities are summarised, some autocorrelation times
 _POINTS = 1024  # of which derived quantities are worked out at a time
 _JUDGED = 3  # of `derived.NAMES`: g, b, force_mean
@@ -70,8 +69,9 @@ def sample_many(
     `acceptance`, `steps` and `walkers` of each ensemble. What has not converged is not `trusted`.
 
     Records that are fitted together and whose posterior is near its Laplace approximation are sampled together, 32 in
-    a run of emcee; what has not converged then, and all others, by themselves. Each draws its random numbers from
-    `seed` and its own content, so that it hardly matters for a record what else is in the list.
+    a run of emcee, and each draws its random numbers from `seed` and its own content, so that it hardly matters for a
+    record what else is in the list. What has not converged then, and all others, are sampled by themselves, as
+    `fitact.sample` does with that seed.
 
     Args:
         records: records, or the paths of files; taken one after the other.
@@ -141,6 +141,13 @@ def _blocks(members: list[Member], targets: _Targets | None) -> Iterator[tuple[l
 
 def _targets(batch: Batch) -> _Targets | None:
     """Of those records of a batch whose fits are beyond doubt; None where there are none."""
+    try:
+        return _beyond_doubt(batch)
+    except np.linalg.LinAlgError:  # one of them spoils what is computed for all
+        return None
+
+
+def _beyond_doubt(batch: Batch) -> _Targets | None:
     (together, members), (rows, found) = batch, settle(batch)
     places = [place for place, (number, _) in enumerate(members) if number in rows]
     if together is None or found is None or not places or not _has_tables(together.likelihood, found.theta[0]):
@@ -231,7 +238,7 @@ def _sampled(job: tuple[list[Member], _Targets | None], seed: int) -> dict[int, 
     log_probs = _LogProbs(full)
     seeds = [[seed, int(record.fingerprint, 16)] for _, record in full.members]
     drawn = run(log_probs, full.near, _STEPS, seeds, seed)
-    judged = _derived(_judged_of, full.derive, drawn.points[:, :, :, :_FOLLOWED])
+    judged = _derived(_judged_of, full.derive, drawn.points[:, :, :, :FOLLOWED])
     names = (*full.likelihood.names, "sigma")
     rows = {}
     for i, ((number, _), row) in enumerate(zip(members, targets.rows, strict=True)):
@@ -285,12 +292,20 @@ def _told(convergence: Convergence) -> Row:
 
 
 def _alone(record: Record, scene: Scene | None, seed: int) -> Row:
-    """The row of a record that is sampled by itself."""
+    """The row of a record that is sampled by itself; that of its fit alone where the sampler fails."""
     try:
         found = fitted(record, scene, remedies=False)
-        return with_posterior(row_of(found), sample(found, seed=seed, progress=False))
+        row = row_of(found)
     except Exception as error:
         return failed(record.source, error)
+    try:
+        posterior = sample(found, seed=seed, progress=False)
+        row = with_posterior(row, posterior)
+    except Exception as error:
+        return row | {"trusted": False, "converged": False, "message": failed(record.source, error)["message"]}
+    if posterior.convergence.interrupted:
+        raise KeyboardInterrupt
+    return row
 
 
 def with_posterior(row: Row, posterior: Posterior) -> Row:

@@ -15,6 +15,8 @@ from jaxtyping import Bool, Float
 LogProb = Callable[[np.ndarray], np.ndarray]
 Random = np.random.RandomState | np.random.Generator
 
+SHARES = (0.7, 0.3)  # of moves that draw from here, and of stretch moves
+OVERDISPERSION = 1.5  # of the walkers' start, so that ensembles that agree have had to find each other
 DEGREES = 8.0  # of freedom: tails above any posterior's seen here
 _SAFE = 0.1  # share drawn from the Student-t even where there are tables, so that no place is out of reach
 PROBES = np.array([-2.5, -1.0, 0.0, 1.0, 2.5])  # standard deviations along an axis, at which it is compared

@@ -27,17 +27,16 @@ from fitact.inference.convergence import Convergence, judge_chain
 from fitact.inference.fit import Fit
 from fitact.inference.posterior import Posterior
 from fitact.inference.progress import Reporter
-from fitact.inference.proposal import LogProb, Proposal
+from fitact.inference.proposal import OVERDISPERSION, SHARES, LogProb, Proposal
 
 Level = Literal["emcee", "psis", "laplace"]
 
-_OVERDISPERSION = 1.5  # of the walkers' start, so that ensembles that agree have had to find each other
 _LOOK = 100  # steps; the chain is judged at multiples of it,
 _GROWTH = 1.1  # ever further apart, so that judging never outweighs sampling
 _ROUND = (1.0, 4.0)  # seconds that the ensembles take turns for
 _CHECKPOINT = 2.0  # seconds between checkpoints, at least,
 _SHARE = 20.0  # and so many times what writing one takes
-_FOLLOWED = 4  # walkers per ensemble whose derived quantities are looked at
+FOLLOWED = 4  # walkers per ensemble whose derived quantities are looked at
 
 
 def sample(
@@ -139,7 +138,7 @@ def run(
 
 def moves(proposal: Proposal) -> list[tuple[emcee.moves.Move, float]]:
     """What emcee's walkers do, and how often."""
-    return [(emcee.moves.MHMove(proposal.move), 0.7), (emcee.moves.StretchMove(), 0.3)]
+    return list(zip((emcee.moves.MHMove(proposal.move), emcee.moves.StretchMove()), SHARES, strict=True))
 
 
 def finite(log_prob: LogProb) -> LogProb:
@@ -182,7 +181,7 @@ class _Run:
         states = []
         for child in np.random.SeedSequence(seed).spawn(ensembles):
             random = np.random.RandomState(child.generate_state(8))
-            points, values = _starts(proposal.widened(_OVERDISPERSION), log_prob, walkers, random)
+            points, values = _starts(proposal.widened(OVERDISPERSION), log_prob, walkers, random)
             states.append(emcee.State(points, log_prob=values, random_state=random.get_state()))
         return cls(target, Chain.empty(names, target.fingerprint, states), samplers, path, began)
 
@@ -247,7 +246,7 @@ class _Run:
     def _follow(self) -> None:
         """Derived quantities of some walkers, for the steps that lack them."""
         known = next(iter(self.derived.values())).shape[1] if self.derived else 0
-        fresh = self.chain.points[:, known:, :_FOLLOWED]
+        fresh = self.chain.points[:, known:, :FOLLOWED]
         if not fresh.size:
             return
         ensembles, steps, followed, size = fresh.shape

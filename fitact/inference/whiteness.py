@@ -103,6 +103,8 @@ def _spectrum(residuals: Float[np.ndarray, "*records n"]) -> tuple[np.ndarray, n
     power = np.square(spectrum.real)
     power += np.square(spectrum.imag)
     whole, lines = power.sum(axis=-1), power.shape[-1]
+    if lines == 0:
+        return whole, whole
     share = np.where(whole > 0.0, 1.0 / np.where(whole > 0.0, whole, 1.0), 0.0)
     width = max(lines // _BANDS, 1)
     count = lines // width
