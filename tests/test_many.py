@@ -108,7 +108,7 @@ def test_noise_so_low_that_coordinates_lose_it():
     quiet = [record(number, noise=1e-7) for number in range(16)]
     error = 5.0 / np.sqrt(2.0 * len(quiet[0]))
     for row in fitact.fit_many(quiet, SCENE, progress=False):
-        assert row["rms_residual"] == pytest.approx(1e-7, rel=error)
+        assert (row["noise"], row["rms_residual"]) == pytest.approx((1e-7, 1e-7), rel=error)
 
 
 @pytest.mark.parametrize("samples", [20, 21, 22, 23, 24])
