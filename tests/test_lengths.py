@@ -100,7 +100,7 @@ def compiled_for(kind: str, caplog: pytest.LogCaptureFixture) -> list[str]:
     return [each.getMessage() for each in caplog.records if each.getMessage().startswith("Compiling")]
 
 
-@pytest.mark.parametrize("kind", ["named", "measured"])
+@pytest.mark.parametrize("kind", ["named", pytest.param("measured", marks=pytest.mark.slow)])
 def test_another_length_compiles_nothing_anew(kind: str, caplog: pytest.LogCaptureFixture):
     assert compiled_for(kind, caplog) == []
 

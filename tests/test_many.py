@@ -103,6 +103,7 @@ def test_optimum_against_scipy(fits, given, number):
     )
 
 
+@pytest.mark.slow
 def test_noise_so_low_that_coordinates_lose_it():
     """Some billionths of the height: what is left of a record must be told from its samples."""
     quiet = [record(number, noise=1e-7) for number in range(16)]
