@@ -13,13 +13,14 @@ import functools
 import math
 from collections.abc import Iterator
 from fractions import Fraction
-from typing import NamedTuple
+from typing import NamedTuple, SupportsFloat
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.data.padding import padded, padded_weight
@@ -117,8 +118,7 @@ class Compression(eqx.Module):
         decay = np.asarray(self.decay @ at.T) @ to_series.T
         sizes = np.linalg.norm(signal, axis=0) + charge * np.linalg.norm(decay, axis=0)
         left = np.cumsum(sizes[::-1])[::-1]  # what leaving out this term and all later ones would cost
-        # in fours, so that most records of a kind share what is compiled
-        terms = min(4 * max(1, math.ceil(np.count_nonzero(left > precision) / 4)), left.size)
+        terms = in_fours(np.count_nonzero(left > precision), left.size)
         signal = np.pad(signal[:, :terms], ((0, self.observed.size - signal.shape[0]), (0, 0)))
         others = [decay[:, :terms]] if charge > 0.0 else []
         columns = [signal, *others, self.slow.T, *(x[:, None] for x in (self.rate, self.slope, self.observed))]
@@ -223,6 +223,14 @@ def slow_shapes(time: Float[Array, " n"], middle: Array, half: Array) -> Float[A
     return jnp.stack([jnp.ones_like(since), since / half, *waves])
 
 
+def slow_at(time: np.ndarray, middle: ArrayLike, half: ArrayLike) -> Float[np.ndarray, "6 n"]:
+    """The same at however many times, for which nothing is compiled anew."""
+    return np.asarray(_slow_shapes(padded(time), middle, half))[:, : time.size]
+
+
+_slow_shapes = jax.jit(slow_shapes)
+
+
 class _Samples(NamedTuple):
     """Arrays over the samples, which may be on disk."""
 
@@ -308,7 +316,7 @@ def _folded(table: _Table, drive: Drive, samples: _Samples, period: int) -> Iter
     squares = np.zeros((len(SLOW) + 1, len(SLOW) + 1))
     for t, y, weight, _ in _chunks(samples, periods * period):
         difference = (y.reshape(periods, period) - reference).reshape(-1)
-        z = np.concatenate([np.asarray(_slow(table, padded(t)))[:, : t.size], difference[None]])
+        z = np.concatenate([slow_at(t, table.middle, table.half), difference[None]])
         count += weight.reshape(periods, period).sum(axis=0)
         weighted = z * weight
         sums += weighted.reshape(len(z), periods, period).sum(axis=1)
@@ -321,11 +329,6 @@ def _folded(table: _Table, drive: Drive, samples: _Samples, period: int) -> Iter
     kept = np.r_[_SLOW, _OBSERVED]
     total[np.ix_(kept, kept)] += squares - means @ sums.T
     yield total
-
-
-@eqx.filter_jit
-def _slow(table: _Table, time: Array) -> Array:
-    return slow_shapes(time, table.middle, table.half)
 
 
 def _samples_a_period(drive: Drive, time: np.ndarray) -> int | None:
@@ -428,6 +431,11 @@ def _assemble(table: _Table, total: np.ndarray, decays: bool, samples: int) -> C
         observed=jnp.asarray(rows[:, _OBSERVED] + float(table.near.weight[0]) * middle + following),
         samples=jnp.asarray(float(samples)),
     )
+
+
+def in_fours(count: SupportsFloat, most: int) -> int:
+    """Columns to keep where `count` of `most` matter; in fours, so that most records share what is compiled."""
+    return min(4 * max(1, math.ceil(float(count) / 4)), most)
 
 
 def chebyshev(count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -9,13 +9,12 @@ from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from fitact.data.compress import SLOW, slow_shapes
+from fitact.data.compress import SLOW, slow_at
 from fitact.data.padding import padded
 from fitact.model.circuit import Terms
 from fitact.model.drive import Drive, Sampled
@@ -82,7 +81,7 @@ def compress_on_grid(
     triangle: Any = np.zeros((0, 0))
     middle, half = 0.5 * (time[0] + time[-1]), 0.5 * (time[-1] - time[0])
     for part, u in _responses(drive, grid.tau, time, around, steady_state):
-        slow = np.asarray(_slow(padded(time[part]), middle, half))[:, : time[part].size]
+        slow = slow_at(time[part], middle, half)
         slope = np.zeros(u.shape[-1]) if rate is None else np.asarray(rate[part])
         rows = [u[0], slow, slope[None], observed[part][None] / scale, (u[1] - u[2]) / (2.0 * step)]
         columns = np.concatenate(rows).T
@@ -111,11 +110,6 @@ def _responses(
         times = padded(time[part], min(length, time.size))
         u = np.stack([np.asarray(_each(drive, tau, times + x, steady_state)) for x in around])
         yield part, u[..., : time[part].size]
-
-
-@jax.jit
-def _slow(time: Array, middle: Array, half: Array) -> Array:
-    return slow_shapes(time, middle, half)
 
 
 @eqx.filter_jit

@@ -1,10 +1,9 @@
 """Records of one drive on one time grid, in coordinates that they share.
 
 As a `fitact.data.compress.Compression` of each, but the basis is worked out once, so that a record costs one product
-with a matrix of some forty columns.
+with a matrix of some twenty columns.
 """
 
-import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitact.data.compress import NODES, RANK, REACH, Compression, chebyshev, slow_shapes
+from fitact.data.compress import NODES, RANK, REACH, Compression, chebyshev, in_fours, slow_shapes
 from fitact.data.padding import padded
 from fitact.model.drive import Drive
 from fitact.model.response import highpass
@@ -57,8 +56,7 @@ class SharedBasis(NamedTuple):
         u, slow, slope = _over_samples(drive, time, nodes, steady_state)
         clock = (time - 0.5 * (time[0] + time[-1])) * slope
         _, sizes, spanning = np.linalg.svd(u, full_matrices=False)
-        # in fours, so that most groups of records share what is compiled
-        rank = min(4 * math.ceil(np.count_nonzero(sizes > RANK * sizes[0]) / 4), len(spanning))
+        rank = in_fours(np.count_nonzero(sizes > RANK * sizes[0]), len(spanning))
         functions, rows = np.linalg.qr(np.concatenate([spanning[:rank], slow, slope[None], clock[None]]).T)
         series = functions[:, :rank].T @ u.T @ to_series.T
         places = np.cumsum([rank, len(slow), 1])
@@ -110,8 +108,7 @@ class SharedBasis(NamedTuple):
         at = np.polynomial.chebyshev.chebvander(inside, NODES - 1)
         series = self.signal @ np.swapaxes(at, 1, 2) @ to_series.T
         left = np.cumsum(np.linalg.norm(series, axis=1)[:, ::-1], axis=1)[:, ::-1]
-        # in fours, so that most batches share what is compiled
-        terms = min(4 * math.ceil(np.max(np.count_nonzero(left > precision[:, None], axis=1)) / 4), NODES)
+        terms = in_fours(np.max(np.count_nonzero(left > precision[:, None], axis=1)), NODES)
         others = ((0, 0), (0, coordinates.shape[1] - len(self.signal)), (0, 0))
         columns = np.concatenate([np.pad(series[..., :terms], others), coordinates[..., None]], axis=2)
         _, rows = np.linalg.qr(columns)

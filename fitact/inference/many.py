@@ -4,6 +4,7 @@ import collections
 import contextlib
 import csv
 import dataclasses
+import functools
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -131,23 +132,37 @@ def fit_many(
     Raises:
         InputError: the scene asks for what is not available.
     """
+    how = functools.partial(_rows, scene=scene)
+    return tabulated(
+        records, scene, {"channels": channels, "scale": scale}, how, "fitting the records" if progress else ""
+    )
+
+
+def tabulated(
+    records: Iterable[Input],
+    scene: Scene | None,
+    columns: Mapping[str, Any],
+    rows_of: Callable[[Iterable["Batch"]], Iterator[tuple[int, "Row"]]],
+    doing: str,
+) -> Fits:
+    """The rows that batches of records give, by their numbers, and those of what cannot be read.
+
+    `columns` as in `fitact.read`; what is under way is told as `doing`, if anything.
+    """
     (scene or Scene()).require_available(fit=True)
     rows: dict[int, Row] = {}
     total = len(records) if isinstance(records, Sequence) else 0
-    with in_double_precision():
-        given = opened(records, scene, {"channels": channels, "scale": scale}, rows)
-        found = batches(watched(given, "fitting the records", total) if progress and total else given, scene)
-        for (_, members), (settled, _) in in_threads(found, settle):
-            left = ((number, record) for number, record in members if number not in settled)
-            rows |= settled | {number: _alone(record, scene) for number, record in left}
+    with jax.enable_x64(True), _LINEAR_ALGEBRA.in_one_thread():
+        done = rows_of(_batches(_opened(records, scene, columns, rows), scene))
+        for number, row in watched(done, doing, total) if doing and total else done:
+            rows[number] = row
     return Fits(tuple(rows[number] for number in sorted(rows)))
 
 
-@contextlib.contextmanager
-def in_double_precision() -> Iterator[None]:
-    """JAX of this thread, and the linear algebra in one."""
-    with jax.enable_x64(True), _LINEAR_ALGEBRA.in_one_thread():
-        yield
+def _rows(found: Iterable["Batch"], scene: Scene | None) -> Iterator[tuple[int, "Row"]]:
+    for (_, members), (settled, _) in in_threads(found, settle):
+        for number, record in members:
+            yield number, settled[number] if number in settled else _alone(record, scene)
 
 
 class _Threads:
@@ -183,7 +198,7 @@ _Job = TypeVar("_Job")
 _Done = TypeVar("_Done")
 
 
-def opened(
+def _opened(
     records: Iterable[Input], scene: Scene | None, columns: Mapping[str, Any], rows: dict[int, Row]
 ) -> Iterator[Member]:
     """Records by their number; those that cannot be read become rows."""
@@ -237,7 +252,7 @@ class _Group:
         return self.together is not None
 
 
-def batches(records: Iterable[Member], scene: Scene | None) -> Iterator[Batch]:
+def _batches(records: Iterable[Member], scene: Scene | None) -> Iterator[Batch]:
     """Records to be fitted together, or each by itself."""
     groups: dict[tuple[float, ...], _Group] = {}
     for number, record in records:
@@ -283,10 +298,10 @@ def settle(batch: Batch) -> tuple[dict[int, Row], Settled | None]:
     padded = [*members, *members[-1:] * (_TOGETHER - len(members))]
     try:
         found = together.settle([record["Vsc"] for _, record in padded])
-        table = {"record": [os.path.basename(record.source) for _, record in padded]} | _columns(together, found)
+        columns = {"record": [os.path.basename(record.source) for _, record in padded]} | _columns(together, found)
     except np.linalg.LinAlgError:  # one of them spoils what is computed for all
         return {}, None
-    rows = (dict(zip(table, values, strict=True)) for values in zip(*table.values(), strict=True))
+    rows = (dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True))
     # the others fill up
     return {number: row for (number, _), row, clear in zip(members, rows, found.clear, strict=False) if clear}, found
 

@@ -20,27 +20,13 @@ from fitact.inference.derived import Derived
 from fitact.inference.ensembles import WALKERS, Normals, run
 from fitact.inference.fit import fitted
 from fitact.inference.likelihood import Batched, Likelihood
-from fitact.inference.many import (
-    Batch,
-    Fits,
-    Input,
-    Member,
-    Row,
-    batches,
-    failed,
-    in_double_precision,
-    in_threads,
-    opened,
-    row_of,
-    settle,
-)
+from fitact.inference.many import Batch, Fits, Input, Member, Row, failed, in_threads, row_of, settle, tabulated
 from fitact.inference.noise import scale_information
 from fitact.inference.posterior import Posterior
 from fitact.inference.proposal import PROBES, is_normal
 from fitact.inference.sampling import FOLLOWED, sample
 from fitact.inference.summary import PROBABILITIES
 from fitact.model.scene import Scene
-from fitact.progress import watched
 
 _BLOCK = 32  # records sampled side by side, always so many; 16 MB of draws
 _STEPS = 200  # of each ensemble; those near to normal need some 120
@@ -83,15 +69,8 @@ def sample_many(
     Raises:
         InputError: the scene asks for what is not available.
     """
-    (scene or Scene()).require_available(fit=True)
-    rows: dict[int, Row] = {}
-    total = len(records) if isinstance(records, Sequence) else 0
-    with in_double_precision():
-        given = opened(records, scene, {"channels": channels, "scale": scale}, rows)
-        done = _rows(batches(given, scene), scene, seed)
-        for number, row in watched(done, "sampling the posteriors", total) if progress and total else done:
-            rows[number] = row
-    return Fits(tuple(rows[number] for number in sorted(rows)))
+    how, doing = functools.partial(_rows, scene=scene, seed=seed), "sampling the posteriors" if progress else ""
+    return tabulated(records, scene, {"channels": channels, "scale": scale}, how, doing)
 
 
 class _Targets(NamedTuple):

@@ -47,8 +47,9 @@ class Phases(NamedTuple):
         place = np.minimum((np.mod(time * frequency, 1.0) * _PHASES[-1]).astype(int), _PHASES[-1] - 1)
         ones = np.ones(time.size, np.float32)
         places = scipy.sparse.csr_array((ones, (place, np.arange(time.size))), (_PHASES[-1], time.size))
-        counts = (np.bincount(place, minlength=_PHASES[-1]).reshape(parts, -1).sum(axis=1) for parts in _PHASES[::-1])
-        between = [(n, int(np.count_nonzero(n))) for n in counts]
+        finest = np.bincount(place, minlength=_PHASES[-1])
+        held = [finest.reshape(parts, -1).sum(axis=1) for parts in _PHASES[::-1]]
+        between = [(n, int(np.count_nonzero(n))) for n in held]
         folds = [Fold(np.where(n > 0, 1.0 / np.maximum(n, 1), 0.0), size, time.size - size) for n, size in between]
         # with too few samples in each phase their scatter is not known
         return cls(places, tuple(fold for fold in folds if fold.within >= time.size // 2))
