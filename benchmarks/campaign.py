@@ -39,23 +39,47 @@ SCENE = fitact.Scene.from_dict({"drive": {"waveform": "square", "peak_to_peak": 
 FILES, SAMPLES = 250, 1_000
 LEAST_ALIKE, LONGEST_ALIKE = many._FEW, alike._LONGEST  # records, samples: what fit_many fits together
 ROUNDS, REPEATS = 5, 3
-SIZES = {"alike": (1, 10, 96, 1_024, 10_016), "own": (1, 10, 96, 1_024)}  # records
-LENGTHS = {"alike": ((320, 10_000), (96, 50_000)), "own": ((192, 10_000), (64, 100_000))}  # records, samples
-PAIR = {"alike": 1_024, "own": 128}  # records of the comparison of 2 workers with 1
-REPORTED = 8  # records
 NEW_LENGTHS = 5
 PADDED = (1_100, 1_250, 1_400)  # samples: lengths that records are filled up to, beside that of `SAMPLES`
-WALKERS = (32, 64, 128, 256)
-STUBBED = 100_000  # records, whose fits are left out
-QUICK = {
-    "SIZES": {"alike": (1, 10, 96, 512), "own": (1, 10, 64)},
-    "LENGTHS": {"alike": ((64, 10_000),), "own": ((32, 10_000),)},
-    "PAIR": {"alike": 256, "own": 64},
-    "REPORTED": 2,
-    "WALKERS": (64, 128),
-    "STUBBED": 10_000,
-}
 MILLION = 1e6
+
+
+class Extent(NamedTuple):
+    """How much is measured.
+
+    Attributes:
+        counts: records of campaigns, by kind.
+        longer: records and samples of those with more samples.
+        pair: records of the comparison of 2 workers with 1.
+        reported: records with reports.
+        walkers: of the sampler.
+        stubbed: records whose fits are left out.
+    """
+
+    counts: dict[str, tuple[int, ...]]
+    longer: dict[str, tuple[tuple[int, int], ...]]
+    pair: dict[str, int]
+    reported: int
+    walkers: tuple[int, ...]
+    stubbed: int
+
+
+WHOLE = Extent(
+    counts={"alike": (1, 10, 96, 1_024, 10_016), "own": (1, 10, 96, 1_024)},
+    longer={"alike": ((320, 10_000), (96, 50_000)), "own": ((192, 10_000), (64, 100_000))},
+    pair={"alike": 1_024, "own": 128},
+    reported=8,
+    walkers=(32, 64, 128, 256),
+    stubbed=100_000,
+)
+QUICK = Extent(
+    counts={"alike": (1, 10, 96, 512), "own": (1, 10, 64)},
+    longer={"alike": ((64, 10_000),), "own": ((32, 10_000),)},
+    pair={"alike": 256, "own": 64},
+    reported=2,
+    walkers=(64, 128),
+    stubbed=10_000,
+)
 
 
 def written(folder: Path, kind: str, count: int, samples: int = SAMPLES) -> list[str]:
@@ -138,10 +162,10 @@ def compiled(paths: list[str], kind: str, *clients: Any) -> None:
         client.run(plain, paths[:1], kind)
 
 
-def two_against_one(folder: Path, one: Any, two: Any) -> dict[str, float]:
+def two_against_one(folder: Path, one: Any, two: Any, pair: dict[str, int]) -> dict[str, float]:
     """Throughput, and what a campaign of one worker takes beyond the same fits in that worker's process, in turn."""
     found: dict[str, float] = {}
-    for kind, count in PAIR.items():
+    for kind, count in pair.items():
         paths = written(folder, kind, count)
         gains, overheads = [], []
         compiled(paths, kind, one, two)
@@ -168,10 +192,10 @@ def terms(kind: str, count: int, samples: int, workers: int) -> list[float]:
     return [1.0, *map(float, of_kind), float(count)]
 
 
-def scale(folder: Path, one: Any, two: Any) -> dict[str, float]:
+def scale(folder: Path, one: Any, two: Any, extent: Extent) -> dict[str, float]:
     """The model of a campaign's time, fitted to campaigns of all sizes by least relative squares, and its errors."""
-    points = [(kind, count, SAMPLES) for kind, counts in SIZES.items() for count in counts]
-    points += [(kind, *length) for kind, lengths in LENGTHS.items() for length in lengths]
+    points = [(kind, count, SAMPLES) for kind, counts in extent.counts.items() for count in counts]
+    points += [(kind, *length) for kind, lengths in extent.longer.items() for length in lengths]
     rows, walls, found = [], [], {}
     for kind, count, samples in points:
         paths = written(folder, kind, count, samples)
@@ -201,16 +225,16 @@ def sampled(path: str, walkers: int) -> tuple[float, int]:
     return time.perf_counter() - start, posterior.points[..., 0].size
 
 
-def reports(folder: Path, two: Any) -> dict[str, float]:
+def reports(folder: Path, two: Any, extent: Extent) -> dict[str, float]:
     """What posteriors and reports cost, and sampling with more walkers."""
-    paths = written(folder, "own", REPORTED + 2)
+    paths = written(folder, "own", extent.reported + 2)
     cost(two, paths[:2], "own", reports=True)  # compiles
     taken = cost(two, paths[2:], "own", reports=True)
     found = {
-        "reports_core_s": (taken.here + taken.there) / REPORTED,
-        "reports_mb": taken.left["reports"] / REPORTED / 1e6,
+        "reports_core_s": (taken.here + taken.there) / extent.reported,
+        "reports_mb": taken.left["reports"] / extent.reported / 1e6,
     }
-    for walkers in WALKERS:
+    for walkers in extent.walkers:
         seconds, draws = two.submit(sampled, paths[0], walkers, pure=False).result()
         found |= {f"sampling_{walkers}_walkers_s": seconds, f"sampling_{walkers}_walkers_draws": float(draws)}
     return found
@@ -221,7 +245,7 @@ def each_cost(paths: list[str]) -> tuple[float, float]:
     before, start = psutil.Process().memory_info().rss, time.process_time()
     fitact.fit_many(paths, progress=False)
     seconds, more = time.process_time() - start, psutil.Process().memory_info().rss - before
-    return seconds / len(paths), more / len(paths) / 2**20
+    return seconds / len(paths), more / len(paths) / 1e6
 
 
 def of_lengths(known: list[str], new: list[str], padded: list[str]) -> dict[str, float]:
@@ -246,7 +270,7 @@ def lengths(folder: Path) -> dict[str, float]:
 
 def peak() -> float:
     """Most memory that this process had, MB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0 / 1e6
 
 
 def without_fits(path: str) -> None:
@@ -281,7 +305,7 @@ def parent(folder: Path, count: int) -> dict[str, float]:
                 fits = campaign.run_campaign(paths, out, SCENE, scheduler=client.scheduler.address, progress=False)
         with timed(found, "tables_ms", count):
             write_campaign(out, fits, Origin.of("fitact campaign", SCENE))
-        found["parent_kb"] = 1024.0 * (peak() - before) / count
+        found["parent_kb"] = 1e3 * (peak() - before) / count
     found |= {f"{path.stem}_bytes": path.stat().st_size / count for path in out.iterdir()}
     found["page_bytes"] = found.pop("index_bytes") * count
     return found
@@ -304,28 +328,28 @@ def million(found: dict[str, float]) -> dict[str, float]:
         "million_hours_of_the_command": MILLION * (found["parent_ms"] + found["tables_ms"]) / 3.6e6,
         "million_workers_that_the_command_feeds_alike": found[f"core_ms_alike_{SAMPLES}_samples"] / found["parent_ms"],
         "million_workers_that_the_command_feeds_own": found[f"core_ms_own_{SAMPLES}_samples"] / found["parent_ms"],
-        "million_gb_of_memory_of_the_command": MILLION * found["parent_kb"] / 1024.0**2,
+        "million_gb_of_memory_of_the_command": MILLION * found["parent_kb"] / 1e6,
         "million_gb_of_journal_and_tables": MILLION * (found["journal_bytes"] + found["results_bytes"]) / 1e9,
         "million_tb_of_reports": MILLION * found["reports_mb"] / 1e6,
     }
 
 
-def measure(folder: Path) -> dict[str, float]:
+def measure(folder: Path, extent: Extent) -> dict[str, float]:
     start = time.perf_counter()
     with workers(2) as client:
         cost(client, written(folder, "own", 1), "own")
         found = {"startup_s": time.perf_counter() - start}
-        for kind, count in PAIR.items():
+        for kind, count in extent.pair.items():
             cost(client, written(folder, kind, count), kind)
         found["worker_mb"] = max(client.run(peak).values())
     found |= lengths(folder)
     with workers(1) as one, workers(2) as two:
-        found |= two_against_one(folder, one, two)
-        found |= scale(folder, one, two)
+        found |= two_against_one(folder, one, two, extent.pair)
+        found |= scale(folder, one, two, extent)
         found["worker_of_long_records_mb"] = max(two.run(peak).values())
-        found |= reports(folder, two)
+        found |= reports(folder, two, extent)
         found["worker_with_reports_mb"] = max(two.run(peak).values())
-    tenth, whole = in_a_process(folder, STUBBED // 10), in_a_process(folder, STUBBED)
+    tenth, whole = (in_a_process(folder, count) for count in (extent.stubbed // 10, extent.stubbed))
     found |= whole | {"parent_ms_vs_a_tenth_of_the_records": whole["parent_ms"] / tenth["parent_ms"]}
     return found | million(found)
 
@@ -339,6 +363,5 @@ if __name__ == "__main__":
     if asked.parent:
         print(json.dumps(parent(Path(asked.parent[0]), int(asked.parent[1]))))
         sys.exit()
-    globals().update(QUICK if asked.quick else {})
     with tempfile.TemporaryDirectory() as place:
-        show(measure(Path(place)), asked.json)
+        show(measure(Path(place), QUICK if asked.quick else WHOLE), asked.json)

@@ -32,8 +32,11 @@ if ! "$python" -m venv .venv >/dev/null; then
     exit 1
 fi
 # uv installs several times faster; where it is not to be had, pip installs the same lock
+locked() {
+    .venv/bin/uv pip install --quiet "$@" --python .venv/bin/python --require-hashes -r requirements/all.txt
+}
 if .venv/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/uv.txt &&
-    .venv/bin/uv pip install --quiet --python .venv/bin/python --require-hashes -r requirements/all.txt; then
+    { locked || locked --system-certs; }; then # the latter behind a proxy with a certificate of its own
     .venv/bin/uv pip install --quiet --python .venv/bin/python --no-deps --no-build-isolation --editable .
 else
     echo "set-up: uv did not succeed; installing the same with pip, which takes some minutes" >&2
