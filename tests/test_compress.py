@@ -125,6 +125,7 @@ def test_cost_does_not_grow_with_the_record():
     assert rows[1] < 40
 
 
+@pytest.mark.slow
 def test_points_beyond_the_table_are_summed_over_the_samples():
     fit = fitact.fit(square_record(), SQUARE)
     far = np.append(fit.theta, np.log(fit.sigma)) + np.array([0.7, 0.0, 0.0, 0.0])
@@ -137,7 +138,7 @@ def test_points_beyond_the_table_are_summed_over_the_samples():
 @pytest.mark.parametrize(
     ("made", "tolerance", "reason"),
     [
-        ({"per_period": 200}, 1e-3, "shorter than 512 samples"),
+        pytest.param({"per_period": 200}, 1e-3, "shorter than 512 samples", marks=pytest.mark.slow),
         ({"delay_samples": 2}, 1e-3, "delay"),
         ({}, 1e-13, "off by .* near the optimum"),
     ],

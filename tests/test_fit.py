@@ -79,7 +79,7 @@ def test_errors_are_those_of_the_linear_theory(finger_fit: fitact.Fit):
     [
         ({}, set()),
         pytest.param({"offset": 0.2}, {"offset"}, marks=pytest.mark.slow),
-        ({"offset": 0.2, "drift": 2.0}, {"offset", "drift"}),
+        pytest.param({"offset": 0.2, "drift": 2.0}, {"offset", "drift"}, marks=pytest.mark.slow),
         ({"delay_samples": 2}, {"delay"}),
     ],
 )
@@ -94,7 +94,7 @@ def test_nuisances_are_freed_by_evidence_and_leave_g_and_b_unbiased(made: dict[s
         )  # the edge lies between two samples
 
 
-@pytest.mark.parametrize("frequency", [50.0, 60.0])
+@pytest.mark.parametrize("frequency", [50.0, pytest.param(60.0, marks=pytest.mark.slow)])
 def test_hum_of_the_mains_is_modelled(frequency: float):
     """Left out, 1 V of it on this record would shift g and b by many of their errors."""
     made = square_record(periods=5)
@@ -108,6 +108,7 @@ def test_hum_of_the_mains_is_modelled(frequency: float):
     assert abs(deviation(fit, "b", 130e3 * 20.7e-9)) < 4.0
 
 
+@pytest.mark.slow
 def test_gain_is_freed_only_with_its_prior():
     record = square_record()
     assert "gain" not in fitact.fit(record, SQUARE).names
@@ -119,6 +120,7 @@ def test_gain_is_freed_only_with_its_prior():
     assert "gain" in fit.identifiability.remedy
 
 
+@pytest.mark.slow
 def test_ideal_square_in_the_file_is_not_read_as_ramps():
     """The scene's square is used, V is checked against it; without a scene, the edges are warned of."""
     record = square_record()
@@ -372,7 +374,7 @@ def test_burst_and_chirp_against_scipy(drive: dict[str, object], shift: float):
 @pytest.mark.parametrize(
     ("off", "with_V"),
     [
-        (1e-3, True),
+        pytest.param(1e-3, True, marks=pytest.mark.slow),
         (1e-4, False),
         *(pytest.param(off, False, marks=(pytest.mark.slow, pytest.mark.thorough)) for off in (1e-3, 0.0)),
     ],
@@ -393,6 +395,7 @@ def test_a_recorder_whose_clock_is_not_the_generators(off: float, with_V: bool):
         assert abs(deviation(fit, name, truth)) < 4.0
 
 
+@pytest.mark.slow
 def test_another_drive_and_prior_compile_nothing_anew(caplog: pytest.LogCaptureFixture):
     """What is compiled takes most of a first fit's time, so numbers must not be constants of it."""
 

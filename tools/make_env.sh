@@ -32,8 +32,9 @@ if ! "$python" -m venv .venv >/dev/null; then
     exit 1
 fi
 # uv installs several times faster; where it is not to be had, pip installs the same lock
+# (bytecode at once, as pip does: where Python may not write any, each start would take seconds more)
 locked() {
-    .venv/bin/uv pip install --quiet "$@" --python .venv/bin/python --require-hashes -r requirements/all.txt
+    .venv/bin/uv pip install --quiet --compile-bytecode "$@" --python .venv/bin/python --require-hashes -r requirements/all.txt
 }
 if .venv/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/uv.txt &&
     { locked || locked --system-certs; }; then # the latter behind a proxy with a certificate of its own
