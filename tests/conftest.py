@@ -13,6 +13,14 @@ import fitact
 _MOST_MAPS = 25_000  # of the 65,530 areas of memory that Linux grants a process by default
 
 
+@pytest.hookimpl(tryfirst=True)  # before those that the command line names are chosen
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What is thorough is slow."""
+    for item in items:
+        if item.get_closest_marker("thorough"):
+            item.add_marker("slow")
+
+
 @pytest.fixture(autouse=True)
 def _room_for_programs():
     """Drop what JAX compiled before there are more programs than a process can hold: beyond, it crashes."""

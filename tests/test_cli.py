@@ -116,7 +116,7 @@ def test_summary_is_printed_again_with_the_runs_exit_code(results, fitact_comman
     assert "fitact sample" in refused.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_other_levels_of_uncertainty(fitact_command, finger_path, finger_scene_path, tmp_path):
     command = ("sample", finger_path, "--scene", finger_scene_path, "--json", "--out", "out", "--level")
     for level in ("psis", "laplace"):
@@ -150,7 +150,7 @@ def test_misfit_is_exit_code_1_with_an_answer(fitact_command, finger_path, tmp_p
     assert "must not be trusted" in done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_simulate_then_fit_recovers_the_scene(fitact_command, tmp_path):
     (tmp_path / "scene.toml").write_text(
         '[skin]\nRsc = "90 kohm"\nCsc = "30 nF"\n[drive]\nwaveform = "trapezoid"\nrise_time = "50 us"\n'
@@ -183,7 +183,6 @@ def test_scene_is_printed_as_a_file(fitact_command, tmp_path):
     assert refused.stderr.startswith("fitact: scene.toml, line 3: [drive]")
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 def test_tradeoff_is_written_or_ends_without_a_trace(fitact_command, environment, finger_path, tmp_path):
     command = [sys.executable, "-u", "-c", INTERRUPTIBLE, "tradeoff", str(finger_path)]
@@ -236,7 +235,6 @@ def test_plan_is_a_table_json_and_a_picture(fitact_command, tmp_path):
     assert fitact_command("plan", "measured.toml").returncode == 2
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 def test_run_reports_what_was_left_out(fitact_command, tmp_path):
     (tmp_path / "scene.toml").write_text('[grounding]\nR_H = "500 ohm"\n')

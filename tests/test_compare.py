@@ -166,7 +166,6 @@ RESISTOR = {"channels": ["Vsc", "I"], "series_resistor": 100e3}
 WITH = scene(measurement=RESISTOR, gap={"resistance": RGAP, "capacitance": CGAP}, prior=free(Rgap=100.0, Cgap=100.0))
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 @pytest.mark.parametrize("gap", [True, False])
 def test_a_gap_is_preferred_where_there_is_one_and_only_there(gap: bool):
@@ -180,7 +179,6 @@ def test_a_gap_is_preferred_where_there_is_one_and_only_there(gap: bool):
         assert found.preferred in ("plain", None)
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 def test_nested_models_differ_by_the_chi_square_law():
     """Twice the log-likelihood that one true parameter more gains: chi-square of 1, so AIC by that less 2."""
@@ -198,7 +196,7 @@ def test_nested_models_differ_by_the_chi_square_law():
     assert scipy.stats.kstest(gains, scipy.stats.chi2(1).cdf).pvalue > 1e-4
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_command(tmp_path: Path):
     made = sine_record(0)
     table = np.column_stack([made.time, made["V"], made["Vsc"]])

@@ -96,7 +96,7 @@ def test_square_from_rest():
 
 @pytest.mark.parametrize(
     "scene",
-    [pytest.param(None, marks=(pytest.mark.slow, pytest.mark.thorough)), pytest.param(SQUARE, marks=pytest.mark.slow)],
+    [pytest.param(None, marks=pytest.mark.thorough), pytest.param(SQUARE, marks=pytest.mark.slow)],
     ids=["measured drive", "folded square"],
 )
 def test_fit_and_log_probabilities_are_those_of_the_samples(scene):
@@ -117,7 +117,6 @@ def test_fit_and_log_probabilities_are_those_of_the_samples(scene):
     assert np.ptp(b) > 10.0
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 def test_cost_does_not_grow_with_the_record():
     rows = [fitact.fit(square_record(periods=n), SQUARE).likelihood.rows for n in (1, 40)]
@@ -186,7 +185,7 @@ def test_a_tolerance_that_is_none_is_refused(tolerance: float):
         fitact.fit(square_record(), SQUARE, tolerance=tolerance)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_force_of_a_long_record_is_that_of_a_short_one():
     """Above 20,000 samples only its last periods are computed, after the charge has decayed."""
     short, long = (fitact.fit(square_record(periods=n, noise=1e-3)).derived() for n in (9, 30))

@@ -76,7 +76,7 @@ def leaves(path: str, value: Any, known: list[Stated]):
         yield path, value
 
 
-OWN = [pytest.mark.slow, pytest.mark.thorough]  # commands that other tests run, too
+OWN = pytest.mark.thorough  # commands that other tests run, too
 CASES = [
     pytest.param("fit", [*FINGER], id="fit"),
     pytest.param("fit", [*FINGER, "--intervals"], id="fit --intervals", marks=OWN),
@@ -85,11 +85,9 @@ CASES = [
     pytest.param("simulate", ["phone", "--out", "phone.csv"], id="simulate"),
     pytest.param("prior", ["paper"], id="prior", marks=OWN),
     pytest.param("reproduce", ["--out", "out"], id="reproduce", marks=OWN),
-    pytest.param(
-        "run", [*FINGER, "--out", "out", "--level", "laplace", "--seed", "1"], id="run laplace", marks=pytest.mark.slow
-    ),
+    pytest.param("run", [*FINGER, "--out", "out", "--level", "laplace", "--seed", "1"], id="run laplace", marks=OWN),
     pytest.param("run", [*FINGER, "--out", "out", "--seed", "1"], id="run", marks=OWN),
-    pytest.param("design measurement", ["paper"], id="design measurement", marks=pytest.mark.slow),
+    pytest.param("design measurement", ["paper"], id="design measurement", marks=OWN),
     pytest.param("design drive", ["felt.toml"], id="design drive", marks=OWN),
     pytest.param(
         "compare",

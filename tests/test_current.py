@@ -11,8 +11,7 @@ import fitact
 
 FINGERS = RECORDS / "fingers"
 TRUTH = json.loads((FINGERS / "truth.json").read_text())
-# of eight fingers, the first in make test, the last in CI too
-MARKS = [(), *((pytest.mark.slow, pytest.mark.thorough),) * 6, (pytest.mark.slow,)]
+MARKS = [(), *(pytest.mark.thorough,) * 7]  # of eight fingers, the first in make test
 
 
 def scene(channels: list[str], **drive: object) -> fitact.Scene:
@@ -38,7 +37,7 @@ def test_current_fixes_all_three(number: int, channels: list[str]):
     assert any("38 of 4,000 samples" in warning for warning in found.warnings)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_named_waveform_gives_the_same():
     measured, named = (
         fit(3, scene(["Vsc", "I"], **drive)) for drive in ({}, {"waveform": "trapezoid", "rise_time": 50e-6})

@@ -44,7 +44,13 @@ def deviation(summary: dict[str, Any], truth: float) -> float:
     return (float(summary["q50"]) - truth) / float(summary["sd"])
 
 
-@pytest.mark.parametrize("name", ["clean", "low_snr", "hum", "clipped", "eight_bit", "late_trigger", "burst", "chirp"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("clean", "low_snr", "clipped", "eight_bit"),
+        *(pytest.param(name, marks=pytest.mark.thorough) for name in ("hum", "late_trigger", "burst", "chirp")),
+    ],
+)
 def test_vsc_alone_gives_g_and_b(name: str):
     """A gain of the probe counts to g, which no record of Vsc alone could tell apart."""
     fit, truth = fitted(name), truths(RECORDS / f"{name}.json")
@@ -70,7 +76,7 @@ def test_a_late_trigger_is_found():
     assert abs(deviation(fitted("late_trigger").parameters()["delay"], -recipe["clock"]["trigger_error"])) < SIGMAS
 
 
-@pytest.mark.parametrize("name", ["natural_ground", "fractional"])
+@pytest.mark.parametrize("name", ["natural_ground", pytest.param("fractional", marks=pytest.mark.thorough)])
 def test_vsc_and_current_give_everything(name: str):
     fit, truth = fitted(name), truths(RECORDS / f"{name}.json")
     assert fit.trusted

@@ -419,7 +419,7 @@ def eight() -> tuple[fitact.Population, fitact.DriveDesign]:
     return people, fitact.design_drive(stated, people, seed=1)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_people_are_those_of_the_population(eight):
     """What share of other fingers of the same laws feel a sine, by its closed form."""
     people, design = eight
@@ -468,7 +468,7 @@ def test_an_area_scales_capacitances_up_and_the_resistance_down():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ground", ["direct", "natural"])
+@pytest.mark.parametrize("ground", ["direct", pytest.param("natural", marks=pytest.mark.thorough)])
 def test_each_finger_of_a_prior_needs_what_its_impedances_say(ground: str):
     """A sine, all that the prior frees, holds or ties included."""
     skins = {"Rsc": {"factor": 3}, "Csc": {"factor": 3}, "Ci": {"relative_sd": 0.1}, "sigma": {"factor": 2}}

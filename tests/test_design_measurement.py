@@ -385,8 +385,8 @@ def on_two_panels(seed: int) -> np.ndarray:
     ("drawn", "stated", "names", "values"),
     [
         (vsc_alone, SCENE, (), ()),
-        (with_resistor, SCENE, ("series resistor",), (166e3,)),
-        (with_current, SCENE, ("current",), ()),
+        pytest.param(with_resistor, SCENE, ("series resistor",), (166e3,), marks=pytest.mark.thorough),
+        pytest.param(with_current, SCENE, ("current",), (), marks=pytest.mark.thorough),
         pytest.param(
             at_two_frequencies, scene(**NATURAL), ("two frequencies",), (10.0, 100.0), marks=pytest.mark.thorough
         ),

@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PROGRAMS = ("fitact", "make", "python", "pytest")
 # pages whose Python samples a posterior, fits many times or compiles much; the rest is quick
-OWN = [pytest.mark.slow, pytest.mark.thorough]  # what they show has tests of its own
+OWN = pytest.mark.thorough  # what they show has tests of its own
 SLOW = {
     "README.md": [pytest.mark.slow],
     "theory.md": [pytest.mark.slow],
@@ -159,7 +159,8 @@ def shell_blocks():
         for block in found:
             own = [words for words in commands(block.text) if words[0] == "fitact"] if block.language == "sh" else []
             if own and "[" not in block.text and "FILE" not in block.text:  # those state what can be given
-                marks = [pytest.mark.slow] + [pytest.mark.thorough] * (page.name != "README.md" or own[0][1] in MINUTES)
+                short = page.name == "README.md" and own[0][1] not in MINUTES
+                marks = pytest.mark.slow if short else pytest.mark.thorough
                 printed = next((after.text for after in found if after.begin == block.end + 1), None)
                 yield pytest.param(page, own, printed, id=f"{by_name(page)}-{' '.join(own[0][:3])}", marks=marks)
 

@@ -15,10 +15,7 @@ import fitact
     # `make extremes` takes all over the whole range
     [
         "transfer",
-        *(
-            pytest.param(n, marks=[] if n in ("sine", "square") else [pytest.mark.slow, pytest.mark.thorough])
-            for n in extremes.DRIVES
-        ),
+        *(pytest.param(n, marks=[] if n in ("sine", "square") else pytest.mark.thorough) for n in extremes.DRIVES),
     ],
 )
 def test_accuracy(name: str, kind: type):
@@ -47,7 +44,9 @@ def loops(point: jax.Array) -> dict[str, fitact.DirectGround | fitact.NaturalGro
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["unequal skins", "R_H", "natural"])
+@pytest.mark.parametrize(
+    "name", [*(pytest.param(name, marks=pytest.mark.thorough) for name in ("unequal skins", "R_H")), "natural"]
+)
 def test_other_circuits(name: str):
     """All finite, although time constants may lie 24 decades apart; |H| against numpy's complex impedances."""
     rows = extremes.points()[::3]

@@ -94,7 +94,7 @@ def test_nuisances_are_freed_by_evidence_and_leave_g_and_b_unbiased(made: dict[s
         )  # the edge lies between two samples
 
 
-@pytest.mark.parametrize("frequency", [50.0, pytest.param(60.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("frequency", [50.0, pytest.param(60.0, marks=pytest.mark.thorough)])
 def test_hum_of_the_mains_is_modelled(frequency: float):
     """Left out, 1 V of it on this record would shift g and b by many of their errors."""
     made = square_record(periods=5)
@@ -135,7 +135,7 @@ def test_partial_scene_does_not_replace_a_recorded_drive(finger_path):
     assert any("V_V" in warning for warning in fit.warnings)
 
 
-@pytest.mark.parametrize("waveform", ["square", pytest.param("triangle", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("waveform", ["square", pytest.param("triangle", marks=pytest.mark.thorough)])
 def test_record_that_starts_anywhere_without_V(waveform: str, tmp_path):
     record = square_record()
     scene = SQUARE
@@ -251,8 +251,8 @@ def trapezoid_record(step: float, edge: float = 20e-6, noise: float = 0.05) -> f
     "step",
     [
         pytest.param(5e-6, marks=pytest.mark.slow),
-        pytest.param(50e-6, marks=pytest.mark.slow),
-        pytest.param(100e-6, marks=(pytest.mark.slow, pytest.mark.thorough)),
+        pytest.param(50e-6, marks=pytest.mark.thorough),
+        pytest.param(100e-6, marks=pytest.mark.thorough),
     ],
 )
 def test_edges_faster_than_the_samples_widen_g(step: float):
@@ -263,7 +263,7 @@ def test_edges_faster_than_the_samples_widen_g(step: float):
 
 
 @pytest.mark.parametrize(
-    "samples", [pytest.param(10, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.slow)]
+    "samples", [pytest.param(10, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.thorough)]
 )
 def test_coarse_samples_of_a_smooth_drive_are_not_trusted(samples: int):
     time = np.arange(5 * samples) * 0.01 / samples
@@ -277,7 +277,7 @@ def test_coarse_samples_of_a_smooth_drive_are_not_trusted(samples: int):
 
 @pytest.mark.parametrize(
     "noise",
-    [0.0, *(pytest.param(noise, marks=(pytest.mark.slow, pytest.mark.thorough)) for noise in (1e-8, 1e-6, 1e-4))],
+    [0.0, *(pytest.param(noise, marks=pytest.mark.thorough) for noise in (1e-8, 1e-6, 1e-4))],
 )
 def test_a_record_without_noise_is_not_called_identified(noise: float):
     fit = fitact.fit(square_record(noise=noise), SQUARE)
@@ -310,7 +310,7 @@ def test_scene_that_contradicts_the_recorded_drive_is_refused(drive: dict[str, f
     [
         50e-6,
         -4.99e-3,
-        *(pytest.param(shift, marks=(pytest.mark.slow, pytest.mark.thorough)) for shift in (-50e-6, 2e-3)),
+        *(pytest.param(shift, marks=pytest.mark.thorough) for shift in (-50e-6, 2e-3)),
     ],
 )
 def test_any_shift_is_found(shift: float):
@@ -347,7 +347,7 @@ SWEEP = {"waveform": "chirp", "start_frequency": 20.0, "end_frequency": 500.0, "
 @pytest.mark.parametrize(
     ("drive", "shift"),
     [
-        pytest.param({"waveform": "burst"}, 0.0, marks=pytest.mark.slow),
+        pytest.param({"waveform": "burst"}, 0.0, marks=pytest.mark.thorough),
         pytest.param(SWEEP, 1.37e-3, marks=pytest.mark.slow),
     ],
     ids=["burst", "shifted chirp"],
@@ -376,7 +376,7 @@ def test_burst_and_chirp_against_scipy(drive: dict[str, object], shift: float):
     [
         pytest.param(1e-3, True, marks=pytest.mark.slow),
         (1e-4, False),
-        *(pytest.param(off, False, marks=(pytest.mark.slow, pytest.mark.thorough)) for off in (1e-3, 0.0)),
+        *(pytest.param(off, False, marks=pytest.mark.thorough) for off in (1e-3, 0.0)),
     ],
 )
 def test_a_recorder_whose_clock_is_not_the_generators(off: float, with_V: bool):

@@ -178,7 +178,7 @@ SLIDING = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_fit_of_vsc_and_current_tells_the_gap_and_its_force():
     elements, R0 = [SKIN, SKIN, (RGAP, CGAP)], 100e3
     measurement = {"channels": ["Vsc", "I"], "series_resistor": R0}
@@ -193,7 +193,6 @@ def test_fit_of_vsc_and_current_tells_the_gap_and_its_force():
     assert "by the voltage across the gap" in str(fit)
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 def test_fit_of_vsc_alone_says_that_the_prior_speaks():
     fit = fitact.fit(record([SKIN, SKIN, (RGAP, CGAP)]), scene(**SLIDING))

@@ -116,10 +116,7 @@ def test_current_of_a_trapezoid():
     [
         "sine",
         "square",
-        *(
-            pytest.param(n, marks=[pytest.mark.slow, pytest.mark.thorough])
-            for n in ("trapezoid", "triangle", "sampled")
-        ),
+        *(pytest.param(n, marks=pytest.mark.thorough) for n in ("trapezoid", "triangle", "sampled")),
     ],
 )
 def test_differentiable_in_every_parameter(name: str):

@@ -97,7 +97,7 @@ EARTH = (14.5e6, 100e-12)
 PROBED = (1.0 / (1.0 / SKIN[0] + 1.0 / 10e6), SKIN[1] + 10e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_known_series_resistor_identifies_all_three():
     fit = fitact.fit(record([SKIN, SKIN], 100e3), scene(measurement={"series_resistor": 100e3}))
     assert fit.trusted
@@ -106,7 +106,7 @@ def test_known_series_resistor_identifies_all_three():
     assert np.all(fit.sd < 0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_unequal_skins_by_vsc_and_current():
     sections = {"grounding": GROUNDING, "prior": free(grounding_Rsc=10.0, grounding_Csc=10.0)}
     made = record([SKIN, tuple(GROUNDING.values())])
@@ -120,7 +120,12 @@ def test_unequal_skins_by_vsc_and_current():
 @pytest.mark.parametrize(
     ("elements", "R0", "sections"),
     [
-        ([SKIN, tuple(GROUNDING.values())], 500.0, {"grounding": GROUNDING | {"R_H": 500.0}}),
+        pytest.param(
+            [SKIN, tuple(GROUNDING.values())],
+            500.0,
+            {"grounding": GROUNDING | {"R_H": 500.0}},
+            marks=pytest.mark.thorough,
+        ),
         pytest.param([SKIN, SKIN], 500.0, {"grounding": {"R_H": 500.0}}, marks=pytest.mark.thorough),
         pytest.param(
             [SKIN, SKIN], 500.0, {"grounding": {"R_H": 500.0}, "prior": free(R_H=5.0)}, marks=pytest.mark.thorough
@@ -152,7 +157,6 @@ def test_the_papers_circuits(elements, R0: float, sections):
     assert_true(fit, **{name: TRUTH.get(name, nominal[name]) for name in fit.names})
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 def test_parameters_tied_to_others():
     ties = {"grounding_Rsc": {"tied": "Rsc", "ratio": 0.5}, "grounding_Csc": {"tied": "Csc", "ratio": 2.0}}

@@ -105,7 +105,6 @@ def test_another_length_compiles_nothing_anew(kind: str, caplog: pytest.LogCaptu
     assert compiled_for(kind, caplog) == []
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ("named", "measured")])
 def test_another_length_of_other_kinds_compiles_nothing_anew(kind: str, caplog: pytest.LogCaptureFixture):

@@ -256,7 +256,7 @@ def drawn_from_the_prior(number: int, time: np.ndarray) -> tuple[fitact.Record, 
     return fitact.Record.from_arrays(time, Vsc=vsc, source=str(number)), truth
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_calibration(monkeypatch):
     """Ranks of 300 truths from the prior among 99 independent draws of each posterior, as `calibration` judges them."""
     time = np.arange(1000) / (calibration.PER_PERIOD * FREQUENCY)

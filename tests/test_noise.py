@@ -91,7 +91,6 @@ def test_burg_finds_a_known_process():
     assert found.share**-2.0 == pytest.approx(variance, rel=0.05)
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 def test_outliers_cost_student_little_and_white_much():
     record = square_record(per_period=200)
@@ -151,7 +150,6 @@ def pink(rng: np.random.Generator, size: int) -> np.ndarray:
     return values[:size] / values.std()
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 @pytest.mark.parametrize("channel", ["Vsc", "I"])
 def test_a_measured_spectrum_widens_what_white_noise_would_make_too_narrow(channel: str):
@@ -188,7 +186,7 @@ def test_a_decay_in_the_quiet_stretch_is_noticed():
     assert fit.figures["rms_residual"] < 0.1 < fit.sigma
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_student_noise_is_as_wide_as_sampled_and_predicted_with_its_tails():
     record, rng = square_record(per_period=200, noise=0.0), np.random.default_rng(3)
     noisy = record["Vsc"] + 0.05 * rng.standard_t(4, len(record))
@@ -213,7 +211,7 @@ def test_autoregressive_noise_is_predicted_with_its_correlation():
     assert noise.std() == pytest.approx(fit.sigma, rel=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_current_is_predicted_as_noisy_as_its_drive_makes_it():
     """Where V is noisy, its slope over two steps, of noise sd / (sqrt(2) step), reaches I through Ci Csc / b Rsc."""
     record, rng = burst_record(), np.random.default_rng(3)

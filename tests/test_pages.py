@@ -352,7 +352,7 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
     ("arguments", "title"),
     [
         (("plan", "scene.toml"), "Which model the scene requires"),
-        (("design", "measurement", "scene.toml"), "What to measure next"),
+        pytest.param(("design", "measurement", "scene.toml"), "What to measure next", marks=pytest.mark.thorough),
         pytest.param(
             ("design", "drive", "scene.toml"),
             "The smallest drive that 95 % of people feel",
@@ -373,7 +373,6 @@ def test_a_command_leaves_a_page(arguments: tuple[str, ...], title: str, tmp_pat
     assert '"R_H": 500.0' in text
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 def test_a_population_leaves_a_page_that_report_writes_again(tmp_path: Path):
     scene = tmp_path / "scene.toml"

@@ -315,7 +315,6 @@ def nuts(fits: list[fitact.Fit], prior: Prior) -> dict[str, np.ndarray]:
     return found
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 @pytest.mark.parametrize("count", [3, 6])
 def test_law_is_that_of_nuts_over_all_parameters(count: int):
@@ -340,7 +339,6 @@ def test_law_is_that_of_nuts_over_all_parameters(count: int):
         assert wider == pytest.approx(0.0, abs=0.05), name
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 def test_a_misfit_is_named_and_the_population_stays_trusted():
     simulated = simulate(1, 0, fingers=4)
@@ -376,7 +374,7 @@ def eight(tmp_path_factory) -> dict:
     return json.loads(done.stdout)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_eight_fingers_and_their_panel(eight):
     truth = json.loads((FINGERS / "truth.json").read_text())
     for name in ("Rsc", "Csc"):

@@ -19,7 +19,7 @@ def few() -> Any:
     return simulate(SEED, 0, fingers=6)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_population_goes_on_where_it_stopped(few, tmp_path):
     """To the draws of an undisturbed run; a chain of another seed is refused."""
     undisturbed = fitact.population(few.records, few.scene, seed=1, progress=False)
@@ -71,7 +71,7 @@ def arrays_of(tree: Any) -> list[np.ndarray]:
     return [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_slopes_of_a_covariate_and_fingers_at_one_are_covered():
     """Log Rsc falls by 0.15 and log Csc rises by 0.05 with each unit of moisture; and stays easy to sample."""
     rng = np.random.default_rng(11)
@@ -95,7 +95,6 @@ def test_slopes_of_a_covariate_and_fingers_at_one_are_covered():
     assert np.mean(np.log(new["Rsc"])) == pytest.approx(expected, abs=0.25)  # 0.45 less than at the mean
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 @pytest.mark.parametrize("channels", [("I",), ("Vsc", "I")])
 def test_areas_are_seen_by_the_current(channels: tuple[str, ...]):

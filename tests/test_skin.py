@@ -185,7 +185,9 @@ def test_more_harmonics_change_no_more_than_the_stated_error():
         assert np.sqrt(np.mean((few - many) ** 2) / np.mean(many**2)) < error
 
 
-@pytest.mark.parametrize("skin", [fitact.Dispersive(), fitact.Fractional(0.8, harmonics=8)])
+@pytest.mark.parametrize(
+    "skin", [fitact.Dispersive(), pytest.param(fitact.Fractional(0.8, harmonics=8), marks=pytest.mark.thorough)]
+)
 @pytest.mark.slow
 def test_differentiable_under_jit_and_vmap(skin: fitact.Dispersive | fitact.Fractional):
 
@@ -202,7 +204,7 @@ def test_differentiable_under_jit_and_vmap(skin: fitact.Dispersive | fitact.Frac
     np.testing.assert_allclose(both, np.stack([vsc(row, 360.0) for row in rows]), rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_exponent_is_differentiable_up_to_one():
     @jax.jit
     def vsc(alpha: jax.Array) -> jax.Array:

@@ -200,7 +200,7 @@ def test_hundred_far_starts_with_the_prior(finger: fitact.Fit):
     assert np.all(successful)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_hundred_far_starts_without_a_prior(finger: fitact.Fit):
     """Vsc alone sees two of three parameters, so no end is the answer."""
     results = names(finger_ends(finger, with_prior=False))

@@ -158,7 +158,7 @@ def test_force_is_that_of_the_circuit_under_the_scenes_drive():
     assert found.derived()["force_mean"]["q50"] == pytest.approx(float(mean), rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_another_skin_is_a_misfit_until_the_scene_has_it():
     cole = spectrum(noise=1e-3, alpha=0.8)
     assert fitact.fit_spectrum(cole).result == "misfit"

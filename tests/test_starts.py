@@ -35,7 +35,6 @@ def test_a_start_where_the_circuit_gives_no_signal(fit: fitact.Fit):
     assert found.derived()["b"]["q50"] == pytest.approx(fit.derived()["b"]["q50"], rel=1e-6)
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 @pytest.mark.parametrize("prior", [True, False])
 def test_a_hundred_starts_reach_the_optimum(fit: fitact.Fit, prior: bool):
@@ -58,7 +57,7 @@ def test_one_optimum_from_many_starts(fit: fitact.Fit):
     np.testing.assert_array_equal(found.theta, fit.theta)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_current_alone_cannot_tell_which_skin_is_which():
     """The admittance is the same with the two skins exchanged; beliefs in both are alike."""
     made = record([SKIN, (80e3, 44e-9)], per_period=250)

@@ -181,7 +181,9 @@ def test_what_does_not_repeat_is_refused():
             function(fitact.FinalCircuit(R, C, CI), drive)
 
 
-@pytest.mark.parametrize("name", ["sine", "square", "triangle", "trapezoid", "sampled"])
+@pytest.mark.parametrize(
+    "name", ["sine", "square", "triangle", pytest.param("trapezoid", marks=pytest.mark.thorough), "sampled"]
+)
 @pytest.mark.slow
 def test_differentiable_in_every_parameter(name: str):
     def force(logs: jax.Array, peak_to_peak: jax.Array, frequency: jax.Array, shape: jax.Array) -> jax.Array:
@@ -207,7 +209,7 @@ def test_second_derivatives(x: float):
     check_grads(lambda x: jnp.stack([phi(x), psi(x), _rectangle(0.2, x)]), (x,), order=2, rtol=1e-4, atol=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_differentiable_with_several_time_constants():
     def figures(logs: jax.Array) -> jax.Array:
         Rsc, Csc, Ci, R_H, grounding_Rsc = jnp.exp(logs)

@@ -34,8 +34,8 @@ def fitted(waveform: str, off: float, periods: int, per_period: int) -> fitact.F
     [
         ("sine", 1e-5, 50, 400),
         pytest.param("square", 3e-5, 50, 400, marks=pytest.mark.slow),  # no edge has passed a sample
-        pytest.param("square", 3e-4, 5, 2000, marks=pytest.mark.slow),  # edges have
-        pytest.param("square", 5e-4, 2, 25_000, marks=pytest.mark.slow),  # by many
+        pytest.param("square", 3e-4, 5, 2000, marks=pytest.mark.thorough),  # edges have
+        pytest.param("square", 5e-4, 2, 25_000, marks=pytest.mark.thorough),  # by many
     ],
 )
 def test_a_clock_is_found(waveform: str, off: float, periods: int, per_period: int):
@@ -66,7 +66,7 @@ def test_a_fine_record_is_not_of_another_frequency(samples: int, periods: int):
     assert choice.notes == ()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_clock_is_sampled():
     fit = fitted("sine", 1e-5, 50, 400)
     posterior = fitact.sample(fit, seed=0, progress=False)

@@ -150,7 +150,7 @@ def test_without_vsc_there_is_nothing_to_compare():
         fitact.measure_tradeoff(scene=scene)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_whole(record: fitact.Record, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     monkeypatch.setattr(tradeoff, "_TOLERANCES", (1e-1, 1e-3))
     monkeypatch.setattr(levels, "_RUNS", 1)
