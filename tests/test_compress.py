@@ -138,7 +138,7 @@ def test_points_beyond_the_table_are_summed_over_the_samples():
     ("made", "tolerance", "reason"),
     [
         pytest.param({"per_period": 200}, 1e-3, "shorter than 512 samples", marks=pytest.mark.slow),
-        ({"delay_samples": 2}, 1e-3, "delay"),
+        pytest.param({"delay_samples": 2}, 1e-3, "delay", marks=pytest.mark.slow),
         ({}, 1e-13, "off by .* near the optimum"),
     ],
 )

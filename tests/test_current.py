@@ -22,7 +22,7 @@ def fit(number: int, given: fitact.Scene) -> fitact.Fit:
     return fitact.fit(fitact.read(FINGERS / f"finger{number:02}.csv.gz", given), given)
 
 
-@pytest.mark.parametrize("channels", [["I"], ["Vsc", "I"]], ids="+".join)
+@pytest.mark.parametrize("channels", [pytest.param(["I"], marks=pytest.mark.slow), ["Vsc", "I"]], ids="+".join)
 @pytest.mark.parametrize("number", [pytest.param(n, marks=marks) for n, marks in enumerate(MARKS)])
 def test_current_fixes_all_three(number: int, channels: list[str]):
     found, truth = fit(number, scene(channels)), TRUTH[number]

@@ -195,7 +195,9 @@ def misfits(record: fitact.Record) -> dict[str, fitact.Record]:
     }
 
 
-@pytest.mark.parametrize("name", ["lost", pytest.param("saturating", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", [pytest.param("lost", marks=pytest.mark.thorough), pytest.param("saturating", marks=pytest.mark.slow)]
+)
 def test_misfit_is_named(finger_path, name: str):
     fit = fitact.fit(misfits(fitact.read(finger_path))[name])
     assert fit.result == "misfit"
@@ -336,6 +338,7 @@ def test_from_rest_with_what_was_recorded_before_the_trigger():
     assert abs(deviation(fit, "g", 1.35 / 20.7)) < 4.0
 
 
+@pytest.mark.slow
 def test_huge_offset_is_not_trusted(finger_path):
     record = fitact.read(finger_path)
     assert not fitact.fit(fitact.Record.from_arrays(record.time, V=record["V"], Vsc=record["Vsc"] + 1e6)).trusted
@@ -375,8 +378,7 @@ def test_burst_and_chirp_against_scipy(drive: dict[str, object], shift: float):
     ("off", "with_V"),
     [
         pytest.param(1e-3, True, marks=pytest.mark.slow),
-        (1e-4, False),
-        *(pytest.param(off, False, marks=pytest.mark.thorough) for off in (1e-3, 0.0)),
+        *(pytest.param(off, False, marks=pytest.mark.thorough) for off in (1e-3, 1e-4, 0.0)),
     ],
 )
 def test_a_recorder_whose_clock_is_not_the_generators(off: float, with_V: bool):

@@ -111,6 +111,7 @@ def test_another_length_of_other_kinds_compiles_nothing_anew(kind: str, caplog: 
     assert compiled_for(kind, caplog) == []
 
 
+@pytest.mark.slow
 def test_other_lengths_fitted_together_compile_nothing_anew(caplog: pytest.LogCaptureFixture):
     def rows(missing: int) -> fitact.Fits:
         made = record("named", missing)

@@ -172,6 +172,7 @@ def test_quantiles_against_an_integral(found, given, number):
         assert_shares(cumulative(quantiles(found[number], name)), effective(found[number], name))
 
 
+@pytest.mark.slow
 def test_rows_do_not_depend_on_what_else_is_sampled(found, given):
     again = sample_many(given, SCENE, seed=2, progress=False)
     assert again.rows == found.rows

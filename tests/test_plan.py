@@ -361,6 +361,7 @@ def test_only_what_the_scene_names_is_an_omission():
         planned(drive={"waveform": "measured"})
 
 
+@pytest.mark.slow
 def test_a_chirp_against_scipy():
     chirp = {"waveform": "chirp", "start_frequency": 50, "end_frequency": 500, "sweep_time": "15 ms"}
     scene = {"grounding": {"R_H": "20 kohm"}, "measurement": {"duration": "15 ms"}, "drive": chirp}

@@ -130,6 +130,7 @@ def test_integral_over_a_finger_is_that_of_quadrature():
     np.testing.assert_allclose(np.diff(found), np.diff(expected), atol=0.05)
 
 
+@pytest.mark.slow
 def test_force_of_a_new_finger_is_that_of_scipys_response():
     """Mean, and amplitudes at f and 2 f, of a finger with its own area and thicknesses: eqs. (2), (3), (4) and (22)."""
     simulated = simulate(5, 0, fingers=1)

@@ -126,6 +126,7 @@ def trapezoid() -> fitact.Fit:
     return fitact.fit(record("trapezoid", cole()), scene("trapezoid"))
 
 
+@pytest.mark.slow
 def test_a_fractional_skin_is_found_with_its_exponent(trapezoid: fitact.Fit):
     assert_recovers(trapezoid, **TRUTH)
     assert trapezoid.names == ("Rsc", "Csc", "Ci", "alpha")

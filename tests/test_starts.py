@@ -27,6 +27,7 @@ def test_from_far_starts_beyond_the_table(fit: fitact.Fit, factors: list[float])
     np.testing.assert_allclose(found.theta, fit.theta, atol=1e-3 * fit.sd.min())
 
 
+@pytest.mark.thorough
 def test_a_start_where_the_circuit_gives_no_signal(fit: fitact.Fit):
     """A time constant far below a sample: without the prior no step leads out."""
     start = {"Rsc": 1e-6 * np.exp(fit.theta[0])}
@@ -49,6 +50,7 @@ def test_a_hundred_starts_reach_the_optimum(fit: fitact.Fit, prior: bool):
             assert found.derived()[name]["q50"] == pytest.approx(fit.derived()[name]["q50"], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_one_optimum_from_many_starts(fit: fitact.Fit):
     found = fitact.fit(fit.record, SQUARE, starts=8)
     assert found.trusted
