@@ -141,6 +141,7 @@ def test_a_fractional_skin_is_found_with_its_exponent(trapezoid: fitact.Fit):
     assert trapezoid.identifiability.eigenvalues[1] > 0.999
 
 
+@pytest.mark.slow
 def test_its_compressed_likelihood_is_the_sum_over_the_samples(trapezoid: fitact.Fit):
     assert trapezoid.compression_error < 1e-8
     assert trapezoid.model()["likelihood"] == "compressed"
