@@ -158,6 +158,7 @@ def force_of(impedance: Impedance, values: dict[str, float]) -> tuple[float, flo
     return constant * 2.0 * float(np.sum(np.abs(vsc) ** 2)), constant * highest**2
 
 
+@pytest.mark.slow
 def test_the_force_is_that_of_the_harmonics(trapezoid: fitact.Fit):
     values = dict(zip(trapezoid.names, np.exp(trapezoid.theta), strict=True))
     mean, peak = force_of(cole(values["alpha"], values["Rsc"], values["Csc"]), values)
@@ -166,6 +167,7 @@ def test_the_force_is_that_of_the_harmonics(trapezoid: fitact.Fit):
     assert derived["force_peak"]["q50"] == pytest.approx(peak, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_an_exponent_just_beyond_one_is_noise(trapezoid: fitact.Fit):
     root, sigma = trapezoid.covariance_root, np.array([trapezoid.sigma])
 
