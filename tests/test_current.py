@@ -66,7 +66,7 @@ def test_current_is_taken_where_there_is_no_skin_voltage():
     )
 
 
-@pytest.mark.parametrize(("noise", "trusted"), [(0.05, True), pytest.param(0.4, False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("noise", "trusted"), [(0.05, True), pytest.param(0.4, False, marks=pytest.mark.thorough)])
 def test_noise_of_the_drive_is_not_taken_for_that_of_the_current(noise: float, trusted: bool):
     """It reaches the current through its derivative; where that drowns the current's own, the answer is not trusted."""
     record, truth = fitact.read(FINGERS / "finger00.csv.gz"), TRUTH[0]

@@ -43,10 +43,8 @@ def loops(point: jax.Array) -> dict[str, fitact.DirectGround | fitact.NaturalGro
     }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [*(pytest.param(name, marks=pytest.mark.thorough) for name in ("unequal skins", "R_H")), "natural"]
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", ["unequal skins", "R_H", "natural"])
 def test_other_circuits(name: str):
     """All finite, although time constants may lie 24 decades apart; |H| against numpy's complex impedances."""
     rows = extremes.points()[::3]

@@ -347,13 +347,9 @@ def test_huge_offset_is_not_trusted(finger_path):
 SWEEP = {"waveform": "chirp", "start_frequency": 20.0, "end_frequency": 500.0, "sweep_time": 0.05}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
-    ("drive", "shift"),
-    [
-        pytest.param({"waveform": "burst"}, 0.0, marks=pytest.mark.thorough),
-        pytest.param(SWEEP, 1.37e-3, marks=pytest.mark.slow),
-    ],
-    ids=["burst", "shifted chirp"],
+    ("drive", "shift"), [({"waveform": "burst"}, 0.0), (SWEEP, 1.37e-3)], ids=["burst", "shifted chirp"]
 )
 def test_burst_and_chirp_against_scipy(drive: dict[str, object], shift: float):
     """scipy on a fine grid of steps (burst) or straight lines (chirp), sampled; perhaps the trigger came earlier."""

@@ -116,36 +116,23 @@ def test_unequal_skins_by_vsc_and_current():
     assert_true(fit, **TRUTH, **GROUNDING)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("elements", "R0", "sections"),
     [
-        pytest.param(
-            [SKIN, tuple(GROUNDING.values())],
-            500.0,
-            {"grounding": GROUNDING | {"R_H": 500.0}},
-            marks=pytest.mark.thorough,
-        ),
-        pytest.param([SKIN, SKIN], 500.0, {"grounding": {"R_H": 500.0}}, marks=pytest.mark.thorough),
-        pytest.param(
-            [SKIN, SKIN], 500.0, {"grounding": {"R_H": 500.0}, "prior": free(R_H=5.0)}, marks=pytest.mark.thorough
-        ),
-        pytest.param([SKIN, SKIN], 0.0, {}, marks=pytest.mark.thorough),
-        pytest.param([SKIN], 14.5e6, {"grounding": NATURAL}, marks=pytest.mark.thorough),
-        pytest.param([SKIN], 14.5e6, {"grounding": NATURAL, "prior": free(Z=3.0)}, marks=pytest.mark.thorough),
+        ([SKIN, tuple(GROUNDING.values())], 500.0, {"grounding": GROUNDING | {"R_H": 500.0}}),
+        ([SKIN, SKIN], 500.0, {"grounding": {"R_H": 500.0}}),
+        ([SKIN, SKIN], 500.0, {"grounding": {"R_H": 500.0}, "prior": free(R_H=5.0)}),
+        ([SKIN, SKIN], 0.0, {}),
+        ([SKIN], 14.5e6, {"grounding": NATURAL}),
+        ([SKIN], 14.5e6, {"grounding": NATURAL, "prior": free(Z=3.0)}),
         ([SKIN, EARTH], 0.0, {"grounding": NATURAL | {"Z_capacitance": EARTH[1]}}),
-        pytest.param(
+        (
             [SKIN, EARTH],
             0.0,
             {"grounding": NATURAL | {"Z_capacitance": EARTH[1]}, "prior": free(Z=3.0, Z_capacitance=3.0)},
-            marks=pytest.mark.thorough,
         ),
-        pytest.param(
-            [PROBED, SKIN],
-            0.0,
-            {"measurement": {"probe_resistance": 10e6, "probe_capacitance": 10e-12}},
-            marks=pytest.mark.thorough,
-        ),
+        ([PROBED, SKIN], 0.0, {"measurement": {"probe_resistance": 10e6, "probe_capacitance": 10e-12}}),
     ],
     ids=["direct", "R_H", "free R_H", "final", "natural", "free Z", "natural with C", "free Z and C", "probe"],
 )
@@ -177,7 +164,7 @@ def alone(first: fitact.Record) -> fitact.Fit:
     return fitact.fit(first, scene())
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_held_insulator_leaves_nothing_to_the_prior(first: fitact.Record):
     fit = fitact.fit(first, scene(prior={"Ci": {"fixed": True}}))
     assert fit.names == ("Rsc", "Csc")

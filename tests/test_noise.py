@@ -114,8 +114,8 @@ def test_outliers_cost_student_little_and_white_much():
     assert student.sigma == pytest.approx(scale, rel=0.02)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("model", "covers"), [("ar1", True), pytest.param("white", False, marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize(("model", "covers"), [("ar1", True), ("white", False)])
 def test_intervals_cover_under_autoregressive_noise(model: str, covers: bool):
     """Errors over their standard deviations have a root mean square of 1 ± 0.13 for 30 records."""
     record = square_record(per_period=200, noise=0.0)

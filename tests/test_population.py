@@ -90,7 +90,7 @@ def test_log_posterior_of_known_fingers_is_scipys(varies: bool, known_of_each: i
     np.testing.assert_allclose(difference, difference[0], atol=2e-3 if varies else 1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_integral_over_a_finger_is_that_of_quadrature():
     """A finger from scipy's state space, so noisy that it is known no better than fingers differ; noise integrated."""
     noise = 8.0

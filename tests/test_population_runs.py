@@ -55,7 +55,7 @@ class Counted(Sequence[fitact.Record]):
         return record
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_records_are_not_held(few):
     """Two at most, the one at hand and the one before; and none of what is left has as many numbers as a record."""
     records = Counted(simulate(SEED, 0, fingers=6, noise=0.0).records, 10)

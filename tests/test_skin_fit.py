@@ -254,13 +254,13 @@ def test_an_exponent_of_one_is_the_constant_skin():
         assert held.derived()[name]["q50"] == pytest.approx(constant.derived()[name]["q50"], rel=1e-8)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_constant_skin_has_an_exponent_of_one(seed: int):
     assert_recovers(fitact.fit(record("trapezoid", cole(1.0), seed), scene("trapezoid")), **TRUTH | {"alpha": 1.0})
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_constant_skin_does_not_describe_a_fractional_one(trapezoid: fitact.Fit):
     fit = fitact.fit(trapezoid.record, scene("trapezoid", "constant"))
     assert not fit.trusted

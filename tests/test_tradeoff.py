@@ -65,7 +65,7 @@ def responses(fit: fitact.Fit) -> dict[str, levels.Measured]:
         return {level.name: level for level in levels.responses(fit)}
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_errors_of_responses_against_scipy(fit: fitact.Fit, responses: dict[str, levels.Measured]):
     assert responses["exact"].error == 0.0
     assert 1e-8 < responses["float32"].error < 1e-5
@@ -91,7 +91,7 @@ def test_errors_of_responses_against_scipy(fit: fitact.Fit, responses: dict[str,
         assert responses[f"harmonic({n})"].error == pytest.approx(left_out, rel=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_costs_of_responses_are_told(responses: dict[str, levels.Measured]):
     assert all(level.seconds > 0.0 for level in responses.values())
     assert responses["ODE (scipy)"].gradient_seconds is None
