@@ -22,7 +22,7 @@ test: env
 test-slow: env
 	$(COMPILED) $(PY) -m pytest -n auto -m slow
 
-# make test-slow-quick   the same without those on ground that others cover, too
+# make test-slow-quick   the same without the thorough ones, which are more than CI has time for
 test-slow-quick: env
 	$(COMPILED) $(PY) -m pytest -n auto -m "slow and not thorough"
 

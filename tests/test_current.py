@@ -11,7 +11,6 @@ import fitact
 
 FINGERS = RECORDS / "fingers"
 TRUTH = json.loads((FINGERS / "truth.json").read_text())
-MARKS = [(), *(pytest.mark.thorough,) * 7]  # of eight fingers, the first in make test
 
 
 def scene(channels: list[str], **drive: object) -> fitact.Scene:
@@ -23,7 +22,7 @@ def fit(number: int, given: fitact.Scene) -> fitact.Fit:
 
 
 @pytest.mark.parametrize("channels", [pytest.param(["I"], marks=pytest.mark.slow), ["Vsc", "I"]], ids="+".join)
-@pytest.mark.parametrize("number", [pytest.param(n, marks=marks) for n, marks in enumerate(MARKS)])
+@pytest.mark.parametrize("number", [0, *(pytest.param(n, marks=pytest.mark.thorough) for n in range(1, 8))])
 def test_current_fixes_all_three(number: int, channels: list[str]):
     found, truth = fit(number, scene(channels)), TRUTH[number]
     assert found.result == "successful"

@@ -25,8 +25,8 @@ PROGRAMS = ("fitact", "make", "python", "pytest")
 # pages whose Python samples a posterior, fits many times or compiles much; the rest is quick
 OWN = pytest.mark.thorough  # what they show has tests of its own
 SLOW = {
-    "README.md": [pytest.mark.slow],
-    "theory.md": [pytest.mark.slow],
+    "README.md": pytest.mark.slow,
+    "theory.md": pytest.mark.slow,
     **dict.fromkeys(("plan.md", "compare.md", "many.md"), OWN),
 }
 # commands that take minutes; their own tests run them with fewer records
