@@ -334,6 +334,29 @@ def test_help_is_a_page_to_start_from(fitact_command):
     assert fitact_command().stdout.split() == done.stdout.split()
 
 
+def test_an_interrupt_that_python_drops_comes_again(environment):
+    """SIGINT within a weak reference's callback, where Python prints what is raised and goes on."""
+    script = """
+import signal, time, weakref
+import fitact.cli
+
+class Thing: pass
+
+def command(**_):
+    thing = Thing()
+    kept = weakref.ref(thing, lambda _: signal.raise_signal(signal.SIGINT))
+    del thing
+    time.sleep(60)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+fitact.cli.app = command
+fitact.cli.main()
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment, timeout=50)
+    assert done.returncode == 130
+    assert done.stderr == "fitact: interrupted; the same command goes on from the last checkpoint\n"
+
+
 @pytest.mark.slow
 def test_an_interrupted_run_goes_on(environment, finger_path, finger_scene_path, results, tmp_path):
     """SIGINT while it samples: no traceback, exit code not 0, and the same command finishes with the same draws."""

@@ -1,5 +1,6 @@
 import dataclasses
 import signal
+import weakref
 
 import emcee
 import jax
@@ -8,7 +9,7 @@ import pytest
 from conftest import square_record
 
 import fitact
-from fitact.inference import compressed
+from fitact.inference import compressed, sampling
 
 
 def test_log_normal_prior_along_the_blind_direction(finger_posterior: fitact.Posterior, finger_fit: fitact.Fit):
@@ -118,6 +119,36 @@ def test_interrupted_sampling_keeps_what_there_is(finger_fit: fitact.Fit, tmp_pa
         short(finger_fit, 3, max_steps=300, chain_file=path).points,
         short(finger_fit, 3, max_steps=300).points,
     )
+
+
+def test_an_interrupt_between_rounds_is_not_lost(finger_fit: fitact.Fit, monkeypatch):
+    """Also within a weak reference's callback, where Python drops what is raised; JAX has many."""
+    judge = sampling._Run.judge
+
+    def judged(self):
+        if not self.derived:
+            thing = np.zeros(1)
+            reference = weakref.ref(thing, lambda _: signal.raise_signal(signal.SIGINT))
+            del thing
+            assert reference() is None
+        return judge(self)
+
+    monkeypatch.setattr(sampling._Run, "judge", judged)
+    posterior = short(finger_fit, 3, max_steps=300)
+    assert posterior.convergence.interrupted
+    assert posterior.convergence.steps == 100
+
+
+def test_a_second_interrupt_does_not_wait(finger_fit: fitact.Fit, monkeypatch):
+    def stuck(self, *args, **kwargs):
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        raise AssertionError("went on")
+
+    monkeypatch.setattr(emcee.moves.StretchMove, "propose", stuck)
+    monkeypatch.setattr(emcee.moves.DEMove, "propose", stuck)
+    with pytest.raises(KeyboardInterrupt):
+        short(finger_fit, 3, max_steps=300)
 
 
 def test_log_probability_is_minus_infinity_for_nonsense(finger_fit: fitact.Fit):

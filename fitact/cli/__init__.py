@@ -1,6 +1,9 @@
 """The command line: parses, calls, prints. Heavy imports wait until a command needs them."""
 
 import os
+import signal
+import sys
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -11,10 +14,22 @@ from fitact.cli.app import app
 from fitact.cli.terminal import say
 from fitact.errors import InputError
 
+_AGAIN = 0.01  # s: to be out of the place where it was dropped
+
 
 def main() -> None:
     """Entry point: every error becomes one line and an exit code."""
+    sys.unraisablehook = _interrupted_again
     raise SystemExit(_guarded(lambda: app(standalone_mode=False)))
+
+
+def _interrupted_again(lost: "sys.UnraisableHookArgs") -> None:
+    """A Ctrl-C that came where Python drops what is raised, as in a weak reference's callback, comes again."""
+    if issubclass(lost.exc_type, KeyboardInterrupt):
+        main = threading.main_thread().ident or 0
+        threading.Timer(_AGAIN, signal.pthread_kill, (main, signal.SIGINT)).start()
+    else:
+        sys.__unraisablehook__(lost)
 
 
 def _guarded(command: Callable[[], Any]) -> int:

@@ -188,36 +188,37 @@ class _Run:
     def until_converged(self, max_steps: int, report: Reporter) -> Convergence:
         """Sample, judge and save in turn."""
         convergence = self.judge() if self._is_look() or self.chain.steps >= max_steps else Convergence()
-        try:
-            while not convergence.converged and self.chain.steps < max_steps:
-                goal = min(_next_look(self.chain.steps), max_steps)
-                while self.chain.steps < goal:
-                    self.advance(min(self.pace, goal - self.chain.steps))
+        with _interrupts_between_steps() as check:
+            try:
+                while not convergence.converged and self.chain.steps < max_steps:
+                    goal = min(_next_look(self.chain.steps), max_steps)
+                    while self.chain.steps < goal:
+                        self.advance(min(self.pace, goal - self.chain.steps), check)
+                        report(self.chain.steps, convergence)
+                    convergence = self.judge()
                     report(self.chain.steps, convergence)
-                convergence = self.judge()
-                report(self.chain.steps, convergence)
-        except KeyboardInterrupt:
-            if self.chain.steps == 0:
-                raise
-            convergence = dataclasses.replace(self.judge(), converged=False, interrupted=True)
-        finally:
-            report.close()
-            self.save()
+                    check()
+            except KeyboardInterrupt:
+                if self.chain.steps == 0:
+                    raise
+                convergence = dataclasses.replace(self.judge(), converged=False, interrupted=True)
+            finally:
+                report.close()
+                self.save()
         return convergence
 
     def _is_look(self) -> bool:
         return self.chain.steps == _next_look(self.chain.steps - 1)
 
-    def advance(self, steps: int) -> None:
-        """Take `steps` with every ensemble; an interrupted call leaves no trace."""
+    def advance(self, steps: int, check: Callable[[], None]) -> None:
+        """Take `steps` with every ensemble, calling `check` after each; where it raises, nothing has changed."""
         began, done = time.perf_counter(), []
-        with _interrupts_between_steps() as check:
-            for sampler, last in zip(self.samplers, self.chain.states, strict=True):
-                sampler.reset()
-                for _ in sampler.sample(last, iterations=steps, skip_initial_state_check=True):
-                    check()
-                state = sampler.get_last_sample()
-                done.append((sampler.get_chain(), sampler.get_log_prob(), state, sampler.backend.accepted))
+        for sampler, last in zip(self.samplers, self.chain.states, strict=True):
+            sampler.reset()
+            for _ in sampler.sample(last, iterations=steps, skip_initial_state_check=True):
+                check()
+            state = sampler.get_last_sample()
+            done.append((sampler.get_chain(), sampler.get_log_prob(), state, sampler.backend.accepted))
         self.chain.extend(done)
         took = time.perf_counter() - began
         if took < _ROUND[0]:
@@ -266,21 +267,32 @@ def _next_look(steps: int) -> int:
 
 @contextlib.contextmanager
 def _interrupts_between_steps() -> Iterator[Callable[[], None]]:
-    """Hold Ctrl-C back until the function it gives is called: emcee prints a traceback for any error inside a step."""
+    """Hold Ctrl-C back until the function it gives is called, or until it comes a second time.
+
+    Inside a step emcee prints a traceback for any error, and Python drops what is raised in a weak reference's
+    callback, of which JAX has many.
+    """
     pending: list[int] = []
 
     def check() -> None:
         if pending:
+            pending.clear()
             raise KeyboardInterrupt
+
+    def hold(number: int, _: object) -> None:
+        check()
+        pending.append(number)
 
     if threading.current_thread() is not threading.main_thread():
         yield check
         return
-    before = signal.signal(signal.SIGINT, lambda number, _: pending.append(number))
+    before = signal.signal(signal.SIGINT, hold)
     try:
         yield check
     finally:
         signal.signal(signal.SIGINT, before)
+        if pending:
+            signal.raise_signal(signal.SIGINT)
 
 
 def _starts(
