@@ -3,7 +3,8 @@
 The peers minimise the same sum of squares, prior included, in log-parameters from the prior's medians, with the noise
 that fitact found; beside an optimum, fitact also judges each fit, and the peers do not. lmfit is run with the model as
 one writes it (`vs_lmfit`) and with all that does not change from step to step worked out before (`vs_lmfit_good`, as
-for scipy). `optimum_vs` are ratios of the time for the optimum alone, one batch after the other.
+for scipy). `untested_vs` are the same ratios where residuals are not tested for structure (`whiteness=False`);
+`optimum_vs` those of the time for the optimum alone, one batch after the other.
 
     python benchmarks/batch.py [--json] [--records 10000] [--samples 5000]
 """
@@ -127,13 +128,14 @@ def measure(count: int, samples: int) -> dict[str, float]:
         "scipy": (by_scipy, good),
     }
     fitact.fit_many(records[:300], SCENE, progress=False)  # compiles
-    taken: dict[str, list[float]] = {name: [] for name in ("fitact", *peers)}
+    taken: dict[str, list[float]] = {name: [] for name in ("fitact", "untested", *peers)}
     apart: dict[str, list[float]] = {name: [] for name in peers}
     optimum: list[float] = []
     for turn in range(ROUNDS):
-        start = time.perf_counter()
-        fits = fitact.fit_many(records, SCENE, progress=False)
-        taken["fitact"].append((time.perf_counter() - start) / count)
+        for name, whiteness in (("untested", False), ("fitact", True)):
+            start = time.perf_counter()
+            fits = fitact.fit_many(records, SCENE, whiteness=whiteness, progress=False)
+            taken[name].append((time.perf_counter() - start) / count)
         some = [(turn * PEERS + i) % count for i in range(PEERS)]
         for name, (peer, model) in peers.items():
             start = time.perf_counter()
@@ -146,6 +148,7 @@ def measure(count: int, samples: int) -> dict[str, float]:
     return {
         "fits_per_second": 1.0 / seconds["fitact"],
         **{f"vs_{name}": seconds[name] / seconds["fitact"] for name in peers},
+        **{f"untested_vs_{name}": seconds[name] / seconds["untested"] for name in peers},
         **{f"optimum_vs_{name}": seconds[name] / statistics.median(optimum) for name in peers},
         **{f"apart_{name}": max(apart[name]) for name in peers},
         "alone": float(np.mean([row["freed"] != "" or not row["trusted"] for row in fits])),

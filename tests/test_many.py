@@ -42,14 +42,14 @@ def settled(time: np.ndarray, theta: np.ndarray) -> np.ndarray:
     return sign * 360.0 * g / (1.0 + np.exp(-0.005 / b)) * np.exp(-since / b)
 
 
-def optimum(record: fitact.Record, sigma: float) -> np.ndarray:
+def optimum(record: fitact.Record, sigma: float, start: np.ndarray = MEDIANS) -> np.ndarray:
     """By MINPACK, from the closed form of a settled square."""
 
     def residuals(theta):
         return np.append((record["Vsc"] - settled(record.time, theta)) / sigma, (theta - MEDIANS) / LOG_SDS)
 
     tight = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
-    return scipy.optimize.least_squares(residuals, MEDIANS, method="lm", jac="3-point", **tight).x
+    return scipy.optimize.least_squares(residuals, start, method="lm", jac="3-point", **tight).x
 
 
 @pytest.fixture(scope="module")
@@ -95,6 +95,29 @@ def test_each_row_is_the_fit_of_its_record(fits, given, number):
     assert row["chi2_reduced"] == pytest.approx(alone.figures["chi2_reduced"], rel=1e-9)
 
 
+def with_line(clean: fitact.Record, amplitude: float) -> fitact.Record:
+    """The record with a sine beside its noise, whose standard deviation is the unit of `amplitude`."""
+    line = 0.1 * amplitude * np.sin(2.0 * np.pi * 730.0 * clean.time)
+    return fitact.Record.from_arrays(clean.time, Vsc=clean["Vsc"] + line, source=clean.source)
+
+
+def test_without_tests_of_whiteness_only_size_is_judged():
+    """A sine of 0.35 standard deviations adds 6 % to the variance, which its noise may be off by; of 1.5, 110 %."""
+    given = [record(number) for number in range(COUNT)]
+    given[2], given[3] = with_line(given[2], 0.35), with_line(given[3], 1.5)
+    tested = fitact.fit_many(given, SCENE, progress=False)
+    untested = fitact.fit_many(given, SCENE, whiteness=False, progress=False)
+    assert [tested[2]["result"], tested[3]["result"]] == ["misfit", "misfit"]
+    assert [untested[2]["result"], untested[3]["result"]] == ["successful", "misfit"]
+    assert "not tested" in untested[2]["message"]
+    for quick, whole in zip(untested[4:], tested[4:], strict=True):
+        assert quick.keys() == whole.keys()
+        assert quick["trusted"]
+        assert "not tested" in quick["message"]
+        for name in ("chi2_reduced", "rms_residual", "force_mean", *NAMES):
+            assert quick[name] == pytest.approx(whole[name], rel=1e-9)
+
+
 @pytest.mark.parametrize("number", [0, 11])
 def test_optimum_against_scipy(fits, given, number):
     row = fits[number]
@@ -110,6 +133,16 @@ def test_noise_so_low_that_coordinates_lose_it():
     error = 5.0 / np.sqrt(2.0 * len(quiet[0]))
     for row in fitact.fit_many(quiet, SCENE, progress=False):
         assert (row["noise"], row["rms_residual"]) == pytest.approx((1e-7, 1e-7), rel=error)
+
+
+@pytest.mark.slow
+def test_without_tests_of_whiteness_low_noise_is_told_from_samples():
+    """Coordinates would be off by some per cent."""
+    quiet = [record(number, noise=6e-7, Rsc=20e3) for number in range(16)]
+    for each, row in zip(quiet, fitact.fit_many(quiet, SCENE, whiteness=False, progress=False), strict=True):
+        near = np.log([row[name] for name in NAMES])  # from the medians it ends elsewhere
+        left = each["Vsc"] - settled(each.time, optimum(each, row["noise"], near))
+        assert row["rms_residual"] == pytest.approx(np.sqrt(np.mean(left**2)), rel=1e-3)
 
 
 @pytest.mark.parametrize("samples", [20, 21, 22, 23, 24])

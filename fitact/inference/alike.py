@@ -5,6 +5,7 @@ not converge within a few steps is left for a fit of its own.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -21,7 +22,7 @@ from fitact.data.record import white_noises
 from fitact.data.shared_basis import SharedBasis
 from fitact.inference import derived
 from fitact.inference.derived import Derived
-from fitact.inference.diagnostics import is_misfit, judged
+from fitact.inference.diagnostics import is_excessive, is_misfit, judged
 from fitact.inference.least_squares import EVIDENCE, NUISANCES, bic_gain
 from fitact.inference.likelihood import Likelihood
 from fitact.inference.problem import PRECISION, Problem, believed_skin, on_the_ridge
@@ -33,7 +34,8 @@ _LONGEST = 65_536  # samples, above which a fit by itself costs no more
 _STEPS = 20
 _CONVERGED = 1e-6  # standard errors from the optimum at the end,
 _NEAR = 1e-4  # and before the last step, which squares what is left
-_ROUNDED = 1e-3  # of the residuals' square: what coordinates may lose of it where noise is very low
+_ROUNDED = 1e-3  # of the residuals' square: what coordinates may lose of it where noise is very low,
+_SUMMED = 32.0 * np.finfo(float).eps  # which is no more than this part of the record's own square (12 eps was seen)
 _STRIDE = 1.0  # longest step in a logarithm
 _DEPENDENT = 1e-9  # of a column's length: what rounding leaves of one that depends on others
 _DOUBT = 3.0  # of the Bayesian information criterion: error of a clock's evidence, whose shape is not exact here
@@ -85,7 +87,8 @@ class Ends(NamedTuple):
     ended: Bool[Array, "*records"]
 
 
-class Together(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Together:
     """What records of one scene, drive and time grid share.
 
     Attributes:
@@ -121,22 +124,36 @@ class Together(NamedTuple):
         of_time = Phases.of(time, source.record.frequency() if choice.periodic else None)
         return cls(likelihood.with_trace(0, shared), derive, basis, of_time, time.size, source.freeable)
 
-    def settle(self, observed: Sequence[Float[np.ndarray, " samples"]]) -> Settled:
-        """Fit records. In double precision."""
-        seen = [(*_seen(part), self.basis.project(part)) for part in _parts(observed)]
+    def settle(self, observed: Sequence[Float[np.ndarray, " samples"]], whiteness: bool = True) -> Settled:
+        """Fit records, and test their residuals for structure (`whiteness`). In double precision."""
+        parts = list(_parts(observed))
+        seen = [(*_seen(part), self.basis.project(part)) for part in parts]
         noise, height, plain, coordinates = map(np.concatenate, zip(*seen, strict=True))
         found, held = self.optima(coordinates, noise, PRECISION * height)
         theta, sigma, inside, triangle, shares, signal, ended = map(np.asarray, found)
         logs, gradients = map(np.asarray, _derived(self.derive, found.theta, found.sigma))
-        parts = zip(_parts(observed), _parts(signal), strict=True)
-        of_parts = [_left(part - self.basis.response(s), self.phases) for part, s in parts]
-        square, *shown = map(np.concatenate, zip(*of_parts, strict=True))
-        freedom, structure = self.samples - theta.shape[1], Structure(*shown)
-        held &= np.abs(inside - square) <= _ROUNDED * square
-        figures = judged(square, self.samples, structure, noise, freedom, self.phases)
+        if whiteness:
+            square, structure = self._left(parts, signal)
+            held &= np.abs(inside - square) <= _ROUNDED * square
+        else:
+            square, structure = inside, None
+            held &= _SUMMED * np.vecdot(coordinates, coordinates) <= _ROUNDED * square
+        figures = judged(square, self.samples, structure, noise, self.samples - theta.shape[1], self.phases)
         figures |= {"rounding_noise": np.zeros(len(noise)), "interpolation_error": np.zeros(len(noise))}
-        clear = held & ended & ~self._asked_for(shares) & plain & ~is_misfit(figures)
+        described = ~(is_misfit(figures) if whiteness else is_excessive(figures))
+        clear = held & ended & ~self._asked_for(shares) & plain & described
         return Settled(clear, coordinates, theta, sigma, np.linalg.inv(triangle), logs, gradients, figures)
+
+    def _left(
+        self, parts: Sequence[np.ndarray], signal: Float[np.ndarray, "records rank"]
+    ) -> tuple[Float[np.ndarray, " records"], Structure]:
+        """Of the samples, when the responses are taken off: the sums of squares, and what structure is left."""
+        starts = range(0, len(signal), _AT_ONCE)
+        responses = (self.basis.response(signal[start : start + _AT_ONCE]) for start in starts)
+        residuals = (np.subtract(part, u, out=u) for part, u in zip(parts, responses, strict=True))
+        found = [(np.vecdot(r, r), *Structure.of(r.astype(np.float32), self.phases)) for r in residuals]
+        square, *shown = map(np.concatenate, zip(*found, strict=True))
+        return square, Structure(*shown)
 
     def optima(
         self,
@@ -156,18 +173,33 @@ class Together(NamedTuple):
         self, coordinates: Float[np.ndarray, "records coordinates+1"]
     ) -> tuple[Float[np.ndarray, "records parameters"], Bool[np.ndarray, " records"]]:
         """The best response of the table's nodes to each, on the ridge, and whether the table holds it."""
-        x, _ = chebyshev(NODES)
-        signal = self.basis.signal @ np.polynomial.chebyshev.chebvander(x, NODES - 1).T
-        size = np.einsum("ij,ij->j", signal, signal)
+        tau, signal, size = self._nodes
         products = coordinates[:, : len(signal)] @ signal
         best = np.argmax(np.where(products > 0.0, products**2 / size, -1.0), axis=1)
-        inside = (best > 0) & (best < NODES - 1) & (products[np.arange(len(best)), best] > 0.0)
-        g, b = products[np.arange(len(best)), best] / size[best], np.exp(self.basis.center + REACH * x[best])
+        most = products[np.arange(len(best)), best]
+        inside = (best > 0) & (best < NODES - 1) & (most > 0.0)
         theta = np.tile(self.likelihood.prior.log_mean, (len(best), 1))
-        for name, logs in zip(("Rsc", "Csc", "Ci"), on_the_ridge(g, b, *believed_skin(self.likelihood)).T, strict=True):
+        ridge = on_the_ridge(most / size[best], tau[best], *self._believed)
+        for name, logs in zip(("Rsc", "Csc", "Ci"), ridge.T, strict=True):
             if name in self.likelihood.names:
                 theta[:, self.likelihood.names.index(name)] = logs
         return theta, inside
+
+    @functools.cached_property
+    def _nodes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of the table: time constants (s), the responses to the drive (one a column), and their squares."""
+        x, _ = chebyshev(NODES)
+        signal = self.basis.signal @ np.polynomial.chebyshev.chebvander(x, NODES - 1).T
+        return np.exp(self.basis.center + REACH * x), signal, np.einsum("ij,ij->j", signal, signal)
+
+    @functools.cached_property
+    def _believed(self) -> tuple[np.ndarray, np.ndarray]:
+        return believed_skin(self.likelihood)
+
+    @functools.cached_property
+    def prior_root(self) -> Float[np.ndarray, "parameters parameters"]:
+        """As of the likelihood."""
+        return self.likelihood.prior_root
 
     def _asked_for(self, shares: Float[np.ndarray, "records nuisances"]) -> Bool[np.ndarray, " records"]:
         """Whether a nuisance may be asked for."""
@@ -179,15 +211,10 @@ class Together(NamedTuple):
         return np.max(gains, axis=0, initial=-math.inf) > EVIDENCE
 
 
-def _parts(rows: Sequence[np.ndarray] | np.ndarray) -> Iterator[np.ndarray]:
+def _parts(rows: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
     for first in range(0, len(rows), _AT_ONCE):
         part = rows[first : first + _AT_ONCE]
         yield np.concatenate(part).reshape(len(part), -1)  # which takes less than `np.stack`
-
-
-def _left(residuals: np.ndarray, of_time: Phases | None) -> tuple[np.ndarray, ...]:
-    """The sum of their squares, and their structure."""
-    return np.vecdot(residuals, residuals), *Structure.of(residuals.astype(np.float32), of_time)
 
 
 def _seen(observed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

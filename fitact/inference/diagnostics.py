@@ -54,21 +54,23 @@ def statistics(
 def judged(
     square: Float[np.ndarray, "*records"],
     samples: int,
-    structure: Structure,
+    structure: Structure | None,
     expected: Float[np.ndarray, "*records"],
     freedom: float,
     of_time: Phases | None,
 ) -> dict[str, Float[np.ndarray, "*records"]]:
     """The part of `statistics` that needs no more than what residuals come to, of each record.
 
-    That is the sum of their squares, and their `structure`; `expected` is their standard deviation.
+    That is the sum of their squares, and their `structure`, if tested; `expected` is their standard deviation.
     """
+    tests = {}
+    if structure is not None:
+        tests = {"runs_z": runs_z(structure, samples), **probabilities(structure, samples, of_time)}
     return {
         "chi2_reduced": square / (freedom * expected**2),
         "rms_residual": np.sqrt(square / samples),
         "noise_expected": expected,
-        "runs_z": runs_z(structure, samples),
-        **probabilities(structure, samples, of_time),
+        **tests,
         "degrees_of_freedom": np.full(square.shape, freedom),
     }
 
@@ -103,11 +105,16 @@ def together(figures: Sequence[dict[str, float]]) -> dict[str, float]:
 
 def is_misfit(figures: Mapping[str, ArrayLike]) -> Bool[np.ndarray, "*records"]:
     """Whether the residuals are larger than the noise, or have structure."""
+    rounded = np.asarray(figures["rounding_noise"]) > 0.0
+    return is_excessive(figures) | (is_structured(figures) & ~rounded) | is_coarse(figures)
+
+
+def is_excessive(figures: Mapping[str, ArrayLike]) -> Bool[np.ndarray, "*records"]:
+    """Whether the residuals are larger than the noise."""
     significant = np.expm1(_SURE * _RATIO / np.sqrt(np.asarray(figures["degrees_of_freedom"])))
     # a rounded channel's residuals come in stretches that repeat, and its noise is known less well
     rounded = np.asarray(figures["rounding_noise"]) > 0.0
-    excess = np.asarray(figures["chi2_reduced"]) > 1.0 + np.maximum(np.where(rounded, 1.0, _EXCESS), significant)
-    return excess | (is_structured(figures) & ~rounded) | is_coarse(figures)
+    return np.asarray(figures["chi2_reduced"]) > 1.0 + np.maximum(np.where(rounded, 1.0, _EXCESS), significant)
 
 
 def is_structured(figures: Mapping[str, ArrayLike]) -> Bool[np.ndarray, "*records"]:

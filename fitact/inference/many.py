@@ -32,6 +32,7 @@ _FEW = 16  # alike ones, below which fits by themselves take less than compiling
 _AHEAD = 4  # jobs for each core, so that a record that is fitted by itself keeps none waiting
 _TRIES = 4  # records from which to learn what a group shares, since the first may be an odd one
 _MATCH = 0.01  # relative rms difference between V and the scene's drive
+_UNTESTED = "The fit is at its optimum and leaves no more than noise; what it leaves was not tested for structure."
 _FORCE = derived.NAMES.index("force_mean")
 
 Input = Record | str | os.PathLike[str]
@@ -115,6 +116,7 @@ def fit_many(
     *,
     channels: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
+    whiteness: bool = True,
     progress: bool = True,
 ) -> Fits:
     """Fit each of many records by itself, as `fitact.fit` does, in one go.
@@ -127,12 +129,14 @@ def fit_many(
         records: records, or the paths of files; taken one after the other.
         scene: of all of them.
         channels, scale: of files, as in `fitact.read`.
+        whiteness: test the residuals of records that are fitted together for structure. Otherwise such a record is
+            trusted where they are no larger than its noise, and its `message` says that no more was tested.
         progress: report on standard error.
 
     Raises:
         InputError: the scene asks for what is not available.
     """
-    how = functools.partial(_rows, scene=scene)
+    how = functools.partial(_rows, scene=scene, whiteness=whiteness)
     return tabulated(
         records, scene, {"channels": channels, "scale": scale}, how, "fitting the records" if progress else ""
     )
@@ -159,8 +163,8 @@ def tabulated(
     return Fits(tuple(rows[number] for number in sorted(rows)))
 
 
-def _rows(found: Iterable["Batch"], scene: Scene | None) -> Iterator[tuple[int, "Row"]]:
-    for (_, members), (settled, _) in in_threads(found, settle):
+def _rows(found: Iterable["Batch"], scene: Scene | None, whiteness: bool) -> Iterator[tuple[int, "Row"]]:
+    for (_, members), (settled, _) in in_threads(found, functools.partial(settle, whiteness=whiteness)):
         for number, record in members:
             yield number, settled[number] if number in settled else _alone(record, scene)
 
@@ -290,15 +294,16 @@ def _driven_alike(record: Record, voltage: np.ndarray) -> bool:
     return bool(off @ off <= _MATCH**2 * (voltage @ voltage))
 
 
-def settle(batch: Batch) -> tuple[dict[int, Row], Settled | None]:
-    """Rows of those that are beyond doubt, and the optima of all."""
+def settle(batch: Batch, whiteness: bool = True) -> tuple[dict[int, Row], Settled | None]:
+    """Rows of those that are beyond doubt, and the optima of all; `whiteness` as of `fit_many`."""
     together, members = batch
     if together is None or not members:
         return {}, None
     padded = [*members, *members[-1:] * (_TOGETHER - len(members))]
     try:
-        found = together.settle([record["Vsc"] for _, record in padded])
-        columns = {"record": [os.path.basename(record.source) for _, record in padded]} | _columns(together, found)
+        found = together.settle([record["Vsc"] for _, record in padded], whiteness)
+        columns = {"record": [os.path.basename(record.source) for _, record in padded]}
+        columns |= _columns(together, found, GOOD if whiteness else _UNTESTED)
     except np.linalg.LinAlgError:  # one of them spoils what is computed for all
         return {}, None
     rows = (dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True))
@@ -306,21 +311,21 @@ def settle(batch: Batch) -> tuple[dict[int, Row], Settled | None]:
     return {number: row for (number, _), row, clear in zip(members, rows, found.clear, strict=False) if clear}, found
 
 
-def _columns(together: Together, found: Settled) -> dict[str, list[Any]]:
+def _columns(together: Together, found: Settled, message: str) -> dict[str, list[Any]]:
     likelihood, count = together.likelihood, len(found.theta)
     free = likelihood.names
     force = found.gradients[:, _FORCE]
-    shares, _, along = directions(free, found.root, likelihood.prior_root, free)
+    shares, _, along = directions(free, found.root, together.prior_root, free)
     table: dict[str, Any] = {
         "result": ["successful"] * count,
         "trusted": [True] * count,
-        "message": [GOOD] * count,
+        "message": [message] * count,
         "samples": [together.samples] * count,
         "noise": found.sigma,
         "chi2_reduced": found.figures["chi2_reduced"],
         "rms_residual": found.figures["rms_residual"],
         "verdict": verdicts(shares, along),
-        "force_from_prior": from_prior(found.root, likelihood.prior_root, force),
+        "force_from_prior": from_prior(found.root, together.prior_root, force),
         "freed": [""] * count,
     }
     spread = np.linalg.norm(found.root, axis=2)
