@@ -146,7 +146,6 @@ def test_a_second_interrupt_does_not_wait(finger_fit: fitact.Fit, monkeypatch):
         raise AssertionError("went on")
 
     monkeypatch.setattr(emcee.moves.StretchMove, "propose", stuck)
-    monkeypatch.setattr(emcee.moves.DEMove, "propose", stuck)
     with pytest.raises(KeyboardInterrupt):
         short(finger_fit, 3, max_steps=300)
 

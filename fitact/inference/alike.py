@@ -22,7 +22,7 @@ from fitact.data.record import white_noises
 from fitact.data.shared_basis import SharedBasis
 from fitact.inference import derived
 from fitact.inference.derived import Derived
-from fitact.inference.diagnostics import is_excessive, is_misfit, judged
+from fitact.inference.diagnostics import is_misfit, judged
 from fitact.inference.least_squares import EVIDENCE, NUISANCES, bic_gain
 from fitact.inference.likelihood import Likelihood
 from fitact.inference.problem import PRECISION, Problem, believed_skin, on_the_ridge
@@ -140,8 +140,7 @@ class Together:
             held &= _SUMMED * np.vecdot(coordinates, coordinates) <= _ROUNDED * square
         figures = judged(square, self.samples, structure, noise, self.samples - theta.shape[1], self.phases)
         figures |= {"rounding_noise": np.zeros(len(noise)), "interpolation_error": np.zeros(len(noise))}
-        described = ~(is_misfit(figures) if whiteness else is_excessive(figures))
-        clear = held & ended & ~self._asked_for(shares) & plain & described
+        clear = held & ended & ~self._asked_for(shares) & plain & ~is_misfit(figures)
         return Settled(clear, coordinates, theta, sigma, np.linalg.inv(triangle), logs, gradients, figures)
 
     def _left(

@@ -105,20 +105,17 @@ def together(figures: Sequence[dict[str, float]]) -> dict[str, float]:
 
 def is_misfit(figures: Mapping[str, ArrayLike]) -> Bool[np.ndarray, "*records"]:
     """Whether the residuals are larger than the noise, or have structure."""
-    rounded = np.asarray(figures["rounding_noise"]) > 0.0
-    return is_excessive(figures) | (is_structured(figures) & ~rounded) | is_coarse(figures)
-
-
-def is_excessive(figures: Mapping[str, ArrayLike]) -> Bool[np.ndarray, "*records"]:
-    """Whether the residuals are larger than the noise."""
     significant = np.expm1(_SURE * _RATIO / np.sqrt(np.asarray(figures["degrees_of_freedom"])))
     # a rounded channel's residuals come in stretches that repeat, and its noise is known less well
     rounded = np.asarray(figures["rounding_noise"]) > 0.0
-    return np.asarray(figures["chi2_reduced"]) > 1.0 + np.maximum(np.where(rounded, 1.0, _EXCESS), significant)
+    excess = np.asarray(figures["chi2_reduced"]) > 1.0 + np.maximum(np.where(rounded, 1.0, _EXCESS), significant)
+    return excess | (is_structured(figures) & ~rounded) | is_coarse(figures)
 
 
 def is_structured(figures: Mapping[str, ArrayLike]) -> Bool[np.ndarray, "*records"]:
-    """Whether any test tells the residuals from white noise."""
+    """Whether any test tells the residuals from white noise; what was not tested is not told from it."""
+    if "runs_z" not in figures:
+        return np.zeros(np.shape(figures["chi2_reduced"]), bool)
     least = np.minimum.reduce([np.asarray(figures[name]) for name in _P_VALUES])
     return (np.asarray(figures["runs_z"]) < -_RUNS) | (least < _FALSE_ALARM / TESTS)
 
