@@ -23,8 +23,8 @@ from threadpoolctl import threadpool_limits
 from timing import show
 
 import fitact
-from fitact.inference.alike import Together
-from fitact.inference.problem import pose
+from fitact.batch.gauss_newton import Together
+from fitact.fitting.problem import pose
 
 V0, FREQUENCY, NOISE = 180.0, 100.0, 0.1  # V, Hz, V
 NAMES = ("Rsc", "Csc", "Ci")

@@ -29,8 +29,9 @@ import scipy.optimize
 from timing import show
 
 import fitact
-from fitact import campaign
-from fitact.inference import alike, many
+from fitact.batch import campaign
+from fitact.batch import fit_many as many
+from fitact.batch import gauss_newton as alike
 from fitact.report.campaign import write_campaign
 from fitact.report.frame import Origin
 

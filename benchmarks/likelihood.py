@@ -19,8 +19,8 @@ import numpy as np
 from timing import medians, show
 
 import fitact
-from fitact.data import compress as compression
-from fitact.inference.compressed import log_prob
+from fitact.likelihood import compression
+from fitact.likelihood.certificate import log_prob
 
 TRUTH = np.log([160e3, 22e-9, 1.35e-9, 0.1])  # and sigma, V
 SQUARE = fitact.Scene.from_dict({"drive": {"waveform": "square"}})

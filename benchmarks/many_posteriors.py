@@ -15,7 +15,7 @@ from batch import SCENE, simulated
 from timing import show
 
 import fitact
-from fitact.inference.ensembles import WALKERS
+from fitact.batch.moves import WALKERS
 
 ALONE = 4  # records of each round that are sampled one by one
 ROUNDS = 5

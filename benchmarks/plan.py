@@ -19,9 +19,9 @@ import numpy as np
 from timing import minima, show
 
 import fitact
-from fitact.model import omissions
 from fitact.model.drive import Sampled
-from fitact.model.waves import Reference
+from fitact.model_selection import omissions
+from fitact.model_selection.model_errors import Reference
 
 CIRCUITS, SAMPLES, ROUNDS = 64, 4000, 200
 SAME = 1.1  # times closer than this count as equal

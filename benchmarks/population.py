@@ -20,7 +20,7 @@ import numpy as np
 from timing import medians, show
 
 import fitact
-from fitact.inference.sensitivity import Surrogate, shares_of
+from fitact.populations.sobol import Surrogate, shares_of
 
 SAMPLES = 500
 LONGER = 10  # times

@@ -51,7 +51,7 @@ from peers import (
 from timing import show
 
 import fitact
-from fitact.data.formats import write_csv
+from fitact.data.readers.read import write_csv
 
 SCENE = """[drive]
 waveform = "square"

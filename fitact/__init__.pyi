@@ -1,36 +1,36 @@
-from .campaign import run_campaign
-from .data.formats import read
+from .batch.campaign import run_campaign
+from .batch.fit_many import Fits, fit_many
+from .batch.sample_many import sample_many
 from .data.inspection import Inspection, inspect
+from .data.readers.read import read
 from .data.record import Record
 from .data.spectrum import Spectrum, read_spectrum
+from .design.drive import DriveDesign, design_drive
+from .design.measurement import MeasurementDesign, design_measurement
 from .errors import InputError
-from .inference.comparison import Comparison, compare
-from .inference.design import MeasurementDesign, design_measurement
-from .inference.drive_design import DriveDesign, design_drive
-from .inference.fit import Fit, fit
-from .inference.many import Fits, fit_many
-from .inference.many_posteriors import sample_many
-from .inference.people import Population
-from .inference.population import population
-from .inference.posterior import Posterior
-from .inference.sampling import sample
-from .inference.solver import RESULTS
-from .inference.spectrum_fit import SpectrumFit, fit_spectrum
+from .fitting.fit import Fit, fit
+from .fitting.fit_spectrum import SpectrumFit, fit_spectrum
+from .fitting.levenberg_marquardt import RESULTS
 from .model.chirp import Chirp
 from .model.circuit import DirectGround, FinalCircuit, NaturalGround, Probe
-from .model.distribution import LogNormal, LogUniform, TruncatedLogNormal, Uniform
 from .model.drive import Burst, Polyline, Sampled, Sine, Square, Trapezoid, Triangle
 from .model.equivalents import quality_factor, series_equivalent
 from .model.force import Contact, electrostatic_force, friction, mean_force, peak_force
 from .model.harmonic import harmonic_error, harmonic_response
 from .model.multitone import Multitone
-from .model.plan import Plan, plan
-from .model.prior import Prior
 from .model.response import response
-from .model.scene import Scene
 from .model.skin import Dispersive, Fractional, WithSkin
 from .model.steady import body_current, mean_square, peak
-from .tradeoff import Tradeoff, measure_tradeoff
+from .model_selection.comparison import Comparison, compare
+from .model_selection.plan import Plan, plan
+from .populations.fit_population import population
+from .populations.population import Population
+from .prior.distributions import LogNormal, LogUniform, TruncatedLogNormal, Uniform
+from .prior.prior import Prior
+from .sampling.ensemble import sample
+from .sampling.posterior import Posterior
+from .scene.scene import Scene
+from .tradeoff.tradeoff import Tradeoff, measure_tradeoff
 
 __all__ = [
     "RESULTS",

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 
 import fitact
-from fitact.data.capture import resolve
-from fitact.data.formats import read_capture
+from fitact.data.readers.capture import resolve
+from fitact.data.readers.read import read_capture
 
 SCOPE = Path(__file__).parent / "data" / "scope"
 SECONDS = 10.0  # for one file

@@ -18,9 +18,9 @@ import pytest
 from conftest import square_record
 
 import fitact
-import fitact.campaign as module
-from fitact.campaign import JOURNAL, Journal, Task
-from fitact.data.formats import write_csv
+import fitact.batch.campaign as module
+from fitact.batch.campaign import JOURNAL, Journal, Task
+from fitact.data.readers.read import write_csv
 
 psutil = pytest.importorskip("psutil")
 pytest.importorskip("distributed")

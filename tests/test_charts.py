@@ -10,8 +10,9 @@ import pytest
 import scipy.stats
 import xarray as xr
 
-from fitact.report import charts, posterior_charts
-from fitact.report.charts import Axis
+from fitact.charts import interactive as charts
+from fitact.charts.interactive import Axis
+from fitact.report import posterior_charts
 
 FORCES = ("force_mean", "force_rms", "force_peak")
 TIME = Axis.of("time", "s", [0.0, 0.02])

@@ -15,8 +15,8 @@ import scipy.stats
 from test_joint import SKIN, free, record, scene
 
 import fitact
-from fitact.inference.comparison import Comparison, Scored
-from fitact.inference.held_out import HeldOut, _Near, blocks, held_out
+from fitact.model_selection.comparison import Comparison, Scored
+from fitact.model_selection.cross_validation import HeldOut, _Near, blocks, held_out
 
 PRIOR = {"Rsc": (160e3, 3.0), "Csc": (22e-9, 3.0), "Ci": (1.35e-9, 1.5)}  # median, and a factor that holds 95 %
 AMPLITUDE, OMEGA, SAMPLES = 180.0, 2.0 * np.pi * 100.0, 400

@@ -9,9 +9,9 @@ import pytest
 from conftest import skin_voltage, square_record
 
 import fitact
-from fitact.data.compress import compress
-from fitact.inference import compressed
-from fitact.inference.likelihood import Likelihood
+from fitact.likelihood import certificate as compressed
+from fitact.likelihood.compression import compress
+from fitact.likelihood.likelihood import Likelihood
 from fitact.model.circuit import Terms
 
 TAU = 4e-3

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from arviz_stats.base import array_stats
 
-from fitact.inference.convergence import integrated_time, judge_chain, judge_weights, smoothed
-from fitact.inference.importance import systematic
-from fitact.inference.proposal import Proposal, Table
-from fitact.inference.sampling import moves
+from fitact.sampling.convergence import integrated_time, judge_chain, judge_weights, smoothed
+from fitact.sampling.ensemble import moves
+from fitact.sampling.importance import systematic
+from fitact.sampling.proposal import Proposal, Table
 
 COVARIANCE = np.array([[1.0, 0.6, -0.3], [0.6, 2.0, 0.5], [-0.3, 0.5, 0.7]])
 PRECISION = np.linalg.inv(COVARIANCE)

@@ -20,10 +20,10 @@ from hypothesis import strategies as st
 import fitact
 from fitact.cli import _guarded
 from fitact.cli.app import app
-from fitact.inference.drive_option import quantile, quantile_error
-from fitact.inference.drive_people import People
-from fitact.inference.fingers import Law
-from fitact.model.cycle import cycle
+from fitact.design.drive_option import quantile, quantile_error
+from fitact.design.drive_people import People
+from fitact.model.steady_cycle import cycle
+from fitact.populations.finger_likelihoods import Law
 from fitact.report.drive_design import write_drive_design
 
 EPS0, AREA, TI, TSC = 8.85e-12, 1e-4, 1e-6, 200e-6

@@ -15,11 +15,11 @@ from test_expected import BOTH, NOMINAL, PRIOR_SD, RESISTOR
 
 import fitact
 from fitact.cli import main
-from fitact.inference.changes import changes, remedies
-from fitact.inference.design import stated_experiment
-from fitact.inference.expected import Experiment, force_gradient
-from fitact.inference.optimum import force_sd, log_force_sd_slope, optimise
-from fitact.inference.trial import Option, Trial, judge
+from fitact.design.measurement import stated_experiment
+from fitact.experiment.experiment import Option, Trial, judge
+from fitact.experiment.fisher import Experiment, force_gradient
+from fitact.experiment.optimise import force_sd, log_force_sd_slope, optimise
+from fitact.experiment.options import changes, remedies
 
 VALUES = {"Rsc": 160e3, "Csc": 22e-9, "Ci": 1.35e-9}
 LOGS = np.log(list(VALUES.values()))
@@ -268,8 +268,8 @@ def test_remedies_at_a_circuit_whose_current_overflows():
 
 def test_a_record_s_values_and_noise(finger_fit: fitact.Fit, monkeypatch):
     """The fit's own; one of the changes is enough here."""
-    monkeypatch.setattr("fitact.inference.design.fit", lambda records, scene: finger_fit)
-    monkeypatch.setattr("fitact.inference.design.changes", lambda steps: changes(steps)[-2:-1])
+    monkeypatch.setattr("fitact.design.measurement.fit", lambda records, scene: finger_fit)
+    monkeypatch.setattr("fitact.design.measurement.changes", lambda steps: changes(steps)[-2:-1])
     found = fitact.design_measurement(finger_fit.scene, finger_fit.record)
     known = finger_fit.identifiability
     assert found.now.force_sd == pytest.approx(known.force_sd, rel=0.01)
@@ -291,7 +291,7 @@ def test_what_cannot_be_asked():
 def test_command_line(design: fitact.MeasurementDesign, tmp_path: Path, monkeypatch, capsys):
     (tmp_path / "scene.toml").write_text(str(SCENE))
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))  # so that this process keeps its own
-    monkeypatch.setattr("fitact.inference.design.design_measurement", lambda scene, records: design)
+    monkeypatch.setattr("fitact.design.measurement.design_measurement", lambda scene, records: design)
     monkeypatch.setattr(
         sys,
         "argv",

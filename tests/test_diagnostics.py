@@ -8,8 +8,8 @@ import scipy.stats
 
 import fitact
 from fitact.data.record import white_noises
-from fitact.inference.diagnostics import is_misfit, outliers
-from fitact.inference.whiteness import Phases, Structure, probabilities
+from fitact.fitting.residual_statistics import is_misfit, outliers
+from fitact.fitting.residual_tests import Phases, Structure, probabilities
 
 SQUARE = fitact.Scene.from_dict({"drive": {"waveform": "square"}})
 NOISE, PERIOD = 0.05, 2000

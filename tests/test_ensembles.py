@@ -4,8 +4,8 @@ import emcee
 import numpy as np
 import pytest
 
-from fitact.inference import ensembles
-from fitact.inference.ensembles import Normals, run
+from fitact.batch import moves as ensembles
+from fitact.batch.moves import Normals, run
 
 COUNT, SIZE, STEPS, BURN = 48, 3, 800, 200
 SCALES = 10.0 ** np.resize([0.0, 2.0, -1.0], COUNT)  # of neighbours

@@ -8,7 +8,7 @@ import pytest
 import scipy.signal
 
 import fitact
-from fitact.inference.expected import Expected, Experiment, expected_sd
+from fitact.experiment.fisher import Expected, Experiment, expected_sd
 
 VALUES = {"Rsc": 160e3, "Csc": 22e-9, "Ci": 1.35e-9}
 PRIOR_SD = np.array([0.3, 0.3, 0.05])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fitact
-from fitact.data.formats import write_csv
+from fitact.data.readers.read import write_csv
 from fitact.data.record import white_noise
 
 Rows = list[list[str]]

@@ -10,8 +10,8 @@ from test_joint import SKIN, TRUTH, assert_true, channels, free, record, scene, 
 from test_ngspice import DRIVES, PERIOD, away_from, computed, simulate
 
 import fitact
-from fitact.inference.structure import blind_directions
-from fitact.inference.trace import CHARGES
+from fitact.experiment.blind_directions import blind_directions
+from fitact.likelihood.channel import CHARGES
 from fitact.model.circuit import gain_at
 from fitact.model.force import AirGap
 from fitact.units import unit_of

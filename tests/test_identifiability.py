@@ -17,8 +17,8 @@ from test_expected import (
     scipy_vsc,
 )
 
-from fitact.inference.expected import Experiment, covariance_root
-from fitact.inference.identifiability import Identifiability, assess
+from fitact.experiment.fisher import Experiment, covariance_root
+from fitact.fitting.identifiability import Identifiability, assess
 
 
 def judged(experiment: Experiment, jacobian: np.ndarray) -> Identifiability:

@@ -16,7 +16,7 @@ STEPS = 4000
 SAMPLE = """
 import sys
 import fitact
-from fitact.inference import convergence
+from fitact.sampling import convergence
 convergence._RHAT = 0.0
 record, scene, chain, out = sys.argv[1:]
 scene = fitact.Scene.load(scene)

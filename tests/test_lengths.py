@@ -8,7 +8,7 @@ import pytest
 import scipy.optimize
 
 import fitact
-from fitact.data import padding
+from fitact import compiled as padding
 from fitact.data.simulate import simulate
 
 NAMES = ("Rsc", "Csc", "Ci")

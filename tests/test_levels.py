@@ -8,7 +8,7 @@ import pytest
 from conftest import square_record
 
 import fitact
-from fitact.inference import compressed
+from fitact.likelihood import certificate as compressed
 
 WIDE = {"Csc": ("0.1 nF", "900 nF"), "Ci": ("0.01 nF", "100 nF")}
 BOXES = {

@@ -10,7 +10,7 @@ import scipy.optimize
 from conftest import square_record
 
 import fitact
-from fitact.data.shared_basis import SharedBasis
+from fitact.batch.shared_basis import SharedBasis
 
 COUNT = 20
 NAMES = ("Rsc", "Csc", "Ci")
@@ -170,7 +170,7 @@ def test_what_no_one_foresaw_is_told_as_a_crash(monkeypatch):
     def breaks(*_, **__):
         raise ZeroDivisionError("of all things")
 
-    monkeypatch.setattr("fitact.inference.many.fitted", breaks)
+    monkeypatch.setattr("fitact.batch.fit_many.fitted", breaks)
     (row,) = fitact.fit_many([record(0)], SCENE, progress=False)
     assert (row["result"], row["trusted"]) == ("crashed", False)
     assert "ZeroDivisionError: of all things" in row["message"]

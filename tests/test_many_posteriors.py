@@ -11,9 +11,9 @@ import scipy.stats
 from conftest import square_record
 
 import fitact
-from fitact.inference import many_posteriors
-from fitact.inference.many_posteriors import sample_many
-from fitact.inference.summary import PROBABILITIES
+from fitact.batch import sample_many as many_posteriors
+from fitact.batch.sample_many import sample_many
+from fitact.summary import PROBABILITIES
 
 COUNT, SAMPLES, FREQUENCY, AMPLITUDE = 18, 2000, 100.0, 180.0
 OFFSET, BROKEN = 4, 7

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from jax import Array
 
-from fitact.inference import solver
+from fitact.fitting import levenberg_marquardt as solver
 
 DATA = Path(__file__).parent / "nist_strd"
 

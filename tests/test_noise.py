@@ -10,7 +10,7 @@ from conftest import skin_voltage, square_record
 
 import fitact
 from fitact.data.clipping import clipped
-from fitact.inference.noise import (
+from fitact.likelihood.noise import (
     Autoregression,
     burg,
     draw_noise,

@@ -7,7 +7,7 @@ import pytest
 from arviz_stats.base import array_stats
 
 import fitact
-from fitact.inference.convergence import Convergence
+from fitact.sampling.convergence import Convergence
 
 CHAINS, STEPS = 4, 10_000
 

@@ -16,21 +16,21 @@ import xarray as xr
 from test_report import Page
 
 import fitact
+from fitact.design.drive import DriveDesign
+from fitact.design.drive_option import DriveOption
+from fitact.design.drive_people import People
+from fitact.design.measurement import Curve, MeasurementDesign
+from fitact.experiment.experiment import Option
 from fitact.files import write_json
-from fitact.inference.design import Curve, MeasurementDesign
-from fitact.inference.drive_design import DriveDesign
-from fitact.inference.drive_option import DriveOption
-from fitact.inference.drive_people import People
-from fitact.inference.trial import Option
-from fitact.model.cycle import Cycle
-from fitact.model.plan import Errors, Omission, Plan
+from fitact.model.steady_cycle import Cycle
+from fitact.model_selection.plan import Errors, Omission, Plan
 from fitact.report.design import write_design_page
 from fitact.report.drive_design import write_drive_design_page
 from fitact.report.frame import Origin
 from fitact.report.plan import write_plan_page
 from fitact.report.population_page import read_population, write_population_page
 from fitact.report.tradeoff import write_tradeoff_page
-from fitact.tradeoff import Level, Tradeoff
+from fitact.tradeoff.tradeoff import Level, Tradeoff
 
 ROOT = Path(__file__).parents[1]
 HOSTILE = "<script>alert(1).csv"

@@ -16,7 +16,7 @@ import scipy.stats
 from test_ngspice import JUMP, simulate
 
 import fitact
-from fitact.model import omissions
+from fitact.model_selection import omissions
 from fitact.report.plan import write_plan
 
 PAPER = {"grounding": {"R_H": "500 ohm"}}

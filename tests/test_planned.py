@@ -9,8 +9,8 @@ import scipy.signal
 
 import fitact
 from fitact.data.simulate import simulate
-from fitact.inference import planned
-from fitact.inference.planned import fit_planned
+from fitact.model_selection import fit_planned as planned
+from fitact.model_selection.fit_planned import fit_planned
 
 SCENE = {"grounding": {"R_H": "500 ohm"}}
 # a skin at the ground that is thinner, and a tolerance that lets it go

@@ -18,13 +18,13 @@ from arviz_stats.base import array_stats
 from population_calibration import FREQUENCY, simulate, steady, vsc, wave
 
 import fitact
-from fitact.data.covariates import Covariates, read_covariates
-from fitact.inference.finger import Finger
-from fitact.inference.fingers import Fingers, Law
-from fitact.inference.hierarchy import Hierarchy
-from fitact.inference.new_finger import FACTORS, NewFinger, Spread
-from fitact.inference.sensitivity import Surrogate, shares_of, variance_shares
-from fitact.model.prior import Prior
+from fitact.populations.covariates import Covariates, read_covariates
+from fitact.populations.finger import Finger
+from fitact.populations.finger_likelihoods import Fingers, Law
+from fitact.populations.hierarchy import Hierarchy
+from fitact.populations.next_finger import FACTORS, NewFinger, Spread
+from fitact.populations.sobol import Surrogate, shares_of, variance_shares
+from fitact.prior.prior import Prior
 
 NUTS_CHAINS, NUTS_STEPS = 4, 3000
 FINGERS = Path(__file__).parents[1] / "data_synth" / "records" / "fingers"

@@ -9,7 +9,7 @@ import pytest
 
 import fitact
 from fitact.files import to_json
-from fitact.inference.summary import log_normal, width
+from fitact.summary import log_normal, width
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def test_scene_drives_force_is_that_of_one_steady_period():
     """Mean square of Vsc for a square wave: 4 V0^2 g^2 tanh(x/4) / x, x = T / b."""
     from conftest import square_record
 
-    from fitact.inference.derived import NAMES
+    from fitact.fitting.derived import NAMES
 
     fit = fitact.fit(square_record(), fitact.Scene())
     values = {name: s["q50"] for name, s in fit.derived().items()}

@@ -7,8 +7,8 @@ import pytest
 import fitact
 from data_synth.make import respond
 from data_synth.scene import make_scene
-from fitact.inference.prior_predictive import believed, prior_predictive
 from fitact.report.prior import write_prior
+from fitact.scene.prior_predictive import believed, prior_predictive
 
 TIED = {
     "prior": {

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import fitact
 from fitact.cli import app
-from fitact.inference.criteria import criteria, gaussian_log_likelihood
+from fitact.fitting.criteria import criteria, gaussian_log_likelihood
 
 SQUARE = fitact.Scene.from_dict({"drive": {"waveform": "square"}})
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 import fitact
-from fitact.model.beliefs import PriorSection
 from fitact.report.page import _label
+from fitact.scene.prior_section import PriorSection
 
 
 class Page(HTMLParser):

@@ -9,7 +9,8 @@ import pytest
 from conftest import square_record
 
 import fitact
-from fitact.inference import compressed, sampling
+from fitact.likelihood import certificate as compressed
+from fitact.sampling import ensemble as sampling
 
 
 def test_log_normal_prior_along_the_blind_direction(finger_posterior: fitact.Posterior, finger_fit: fitact.Fit):
@@ -58,7 +59,7 @@ def short(fit: fitact.Fit, seed: int, **settings) -> fitact.Posterior:
 @pytest.fixture
 def endless(monkeypatch):
     """No chain counts as converged."""
-    monkeypatch.setattr("fitact.inference.convergence._RHAT", 0.0)
+    monkeypatch.setattr("fitact.sampling.convergence._RHAT", 0.0)
 
 
 def test_same_seed_same_chain(finger_fit: fitact.Fit):

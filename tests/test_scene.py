@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 import fitact
 from fitact import units
 from fitact.data.simulate import simulate
-from fitact.model.scene_file import shipped, value_text
-from fitact.model.sections import unit_of
+from fitact.scene.sections import unit_of
+from fitact.scene.toml import shipped, value_text
 
 CONTRACT = """
 [device]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import fitact
-from fitact.data.formats import read_capture
-from fitact.data.matlab import read_mat
+from fitact.data.readers.matlab import read_mat
+from fitact.data.readers.read import read_capture
 
 SCOPE = Path(__file__).parent / "data" / "scope"
 SKIN = {"V": "CH1", "Vsc": "CH2"}
@@ -147,7 +147,7 @@ def test_many_blocks_and_gzip(tmp_path: Path, monkeypatch, finger_path: Path):
     plain = fitact.read(finger_path)
     path = tmp_path / "record.csv.gz"
     path.write_bytes(gzip.compress(finger_path.read_bytes()))
-    monkeypatch.setattr("fitact.data.text._BLOCK", 1009)
+    monkeypatch.setattr("fitact.data.readers.text._BLOCK", 1009)
     assert fitact.read(path).fingerprint == plain.fingerprint
     lines = finger_path.read_text().splitlines()
     lines[3000] = lines[3000].replace(",", ",x", 1)

@@ -9,10 +9,10 @@ import pytest
 
 import fitact
 from fitact.data.simulate import simulate
-from fitact.inference.planned import fit_planned
-from fitact.inference.verdict import is_out_of_bounds
+from fitact.fitting.verdict import is_out_of_bounds
 from fitact.model.relaxation import Grid
 from fitact.model.steady import mean_square
+from fitact.model_selection.fit_planned import fit_planned
 
 R, C, CI, ALPHA = 130e3, 18e-9, 1.35e-9, 0.8
 TRUTH = {"Rsc": R, "Csc": C, "Ci": CI, "alpha": ALPHA}

@@ -13,9 +13,9 @@ from conftest import square_record
 from jax import Array
 
 import fitact
-from fitact.inference import solver
-from fitact.inference.likelihood import Likelihood
-from fitact.inference.solver import result_name
+from fitact.fitting import levenberg_marquardt as solver
+from fitact.fitting.levenberg_marquardt import result_name
+from fitact.likelihood.likelihood import Likelihood
 
 TIME = np.linspace(0.0, 3.0, 40)
 

@@ -5,7 +5,7 @@ import pytest
 import scipy.linalg
 
 import fitact
-from fitact.inference.structure import blind_directions
+from fitact.experiment.blind_directions import blind_directions
 
 SKIN = ("Rsc", "Csc", "Ci")
 VALUES = (160e3, 22e-9, 1.35e-9)

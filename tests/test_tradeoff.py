@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import fitact
-from fitact import levels, tradeoff
 from fitact.report.tradeoff import draw, write_tradeoff
-from fitact.tradeoff import Level, Tradeoff, dominators
+from fitact.tradeoff import timings as levels
+from fitact.tradeoff import tradeoff
+from fitact.tradeoff.tradeoff import Level, Tradeoff, dominators
 
 PAIRS = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=12)
 

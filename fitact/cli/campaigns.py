@@ -40,11 +40,11 @@ def campaign(
     Into DIR it writes results.parquet, failures.csv and index.html. The same command goes on after any interruption.
     Exit code 0: every record has an answer or a reason why not.
     """
-    from fitact.model.scene import Scene
+    from fitact.scene.scene import Scene
 
     stated = None if scene is None else Scene.load(scene)
     keep_compiled()
-    from fitact.campaign import run_campaign
+    from fitact.batch.campaign import run_campaign
     from fitact.report.campaign import write_campaign
     from fitact.report.frame import Origin
 

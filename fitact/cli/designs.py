@@ -37,12 +37,12 @@ def measurement(
 
     Into DIR it writes report.html, design.json and design.svg.
     """
-    from fitact.model.scene import Scene
+    from fitact.scene.scene import Scene
 
     stated = Scene.load(scene)
     measured = list(Files(record, stated, (channel, scale)))  # refused before the slow imports
     use_compilation_cache()
-    from fitact.inference.design import design_measurement
+    from fitact.design.measurement import design_measurement
 
     found = design_measurement(stated, measured)
     if out is not None:
@@ -74,17 +74,17 @@ def drive(
 
     Into DIR it writes report.html, drive.json and drive.svg, and of records chain.h5 (for going on).
     """
-    from fitact.model.scene import Scene
+    from fitact.scene.scene import Scene
 
     stated = Scene.load(scene)
     measured = Files(records, stated, (channel, scale))
     use_compilation_cache()
-    from fitact.inference.drive_design import design_drive, require_designable
+    from fitact.design.drive import design_drive, require_designable
 
     require_designable(stated, share)  # before the people are sampled
     people = None
     if measured:
-        from fitact.inference.population import population
+        from fitact.populations.fit_population import population
 
         people = population(measured, stated, folder=out, seed=seed)
     found = design_drive(stated, people, share, seed=seed)

@@ -8,7 +8,7 @@ from fitact.cli.options import Columns, mapping
 
 if TYPE_CHECKING:
     from fitact.data.record import Record
-    from fitact.model.scene import Scene
+    from fitact.scene.scene import Scene
 
 
 class Files(Sequence["Record"]):
@@ -21,6 +21,6 @@ class Files(Sequence["Record"]):
         return len(self._paths)
 
     def __getitem__(self, index: Any) -> Any:
-        from fitact.data.formats import read
+        from fitact.data.readers.read import read
 
         return read(self._paths[index], self._scene, **self._columns)

@@ -26,8 +26,8 @@ from fitact.cli.terminal import finish, say, show, typed, use_compilation_cache
 from fitact.files import write_json
 
 if TYPE_CHECKING:
-    from fitact.inference.planned import PlannedFit
-    from fitact.inference.posterior import Posterior
+    from fitact.model_selection.fit_planned import PlannedFit
+    from fitact.sampling.posterior import Posterior
 
 
 @app.command()
@@ -86,7 +86,7 @@ def fit(
     fitted = planned.fit
     text, content = f"{fitted}\n{planned.sentence}", fitted.to_dict() | {"plan": planned.to_dict()}
     if intervals:
-        from fitact.inference.profile import table
+        from fitact.fitting.profile import table
 
         both = fitted.intervals(), fitted.intervals(prior=False)
         text = f"{text}\n{table(*both)}"
@@ -101,12 +101,12 @@ def fit(
 
 def _fit_spectrum(path: Path, scenes: list[Path] | None, out: Path | None, json: bool) -> None:
     from fitact.data.spectrum import read_spectrum
-    from fitact.model.scene import Scene
+    from fitact.scene.scene import Scene
 
     stated = Scene.load(scenes[0]) if scenes else None
     spectrum = read_spectrum(path)
     use_compilation_cache()
-    from fitact.inference.spectrum_fit import fit_spectrum
+    from fitact.fitting.fit_spectrum import fit_spectrum
 
     fitted = fit_spectrum(spectrum, stated)
     if out is not None:
@@ -139,7 +139,7 @@ def sample(
 @app.command()
 def summary(directory: Results, json: Json = False) -> None:
     """Print the table of a folder of results again."""
-    from fitact.inference.summary import load, table, trusted
+    from fitact.summary import load, table, trusted
 
     content = load(directory)
     show(table(content), content, json)
@@ -157,8 +157,8 @@ def report(directory: Results, json: Json = False) -> None:
         write_population_page(page, tree, content)
         trusted = bool(content["trusted"])
     else:
-        from fitact.inference.summary import trusted as is_trusted
         from fitact.report import read_results, write_report
+        from fitact.summary import trusted as is_trusted
 
         tree, content = read_results(directory)
         write_report(page, tree, content)
@@ -179,8 +179,8 @@ def _fitted(
     tolerance: float,
     starts: int = 1,
 ) -> "PlannedFit":
-    from fitact.data.formats import read
-    from fitact.model.scene import Scene
+    from fitact.data.readers.read import read
+    from fitact.scene.scene import Scene
 
     stated = [Scene.load(path) for path in scenes or []]
     for scene in stated:
@@ -189,7 +189,7 @@ def _fitted(
     asked = mapping(columns)
     measured = [read(*pair, **asked) for pair in zip(records, of_each, strict=True)]  # refused before the slow imports
     use_compilation_cache()
-    from fitact.inference.planned import fit_planned
+    from fitact.model_selection.fit_planned import fit_planned
 
     for path, record in zip(records, measured, strict=True):
         say(f"fitting {path} ({len(record):,} samples)")
@@ -210,7 +210,7 @@ def _sampled(
     """Fit and sample, and write all but the report, once the chain is known to belong there."""
     planned = _fitted(records, scene, columns, model, tolerance)
     say(planned.sentence)
-    from fitact.inference.sampling import sample
+    from fitact.sampling.ensemble import sample
 
     chain = folder / "chain.h5"
     if fresh:

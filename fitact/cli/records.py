@@ -47,7 +47,7 @@ def compare(
     json: Json = False,
 ) -> None:
     """Fit the model of each scene to the same records, in full, and say which the data prefer."""
-    from fitact.model.scene import Scene
+    from fitact.scene.scene import Scene
 
     alike = len({path.stem for path in scenes}) < len(scenes)
     stated = {str(path) if alike else path.stem: Scene.load(path) for path in scenes}
@@ -55,7 +55,7 @@ def compare(
         each.require_available(fit=True)
     measured = list(Files(records, next(iter(stated.values())), (channel, scale)))
     use_compilation_cache()
-    from fitact.inference.comparison import compare as compared
+    from fitact.model_selection.comparison import compare as compared
 
     found = compared(measured, stated)
     show(str(found), found.to_dict(), json)
@@ -87,14 +87,14 @@ def population(
     Into DIR it writes report.html, population.json, population.nc (the draws), population.svg, and chain.h5 (for
     going on).
     """
-    from fitact.data.covariates import read_covariates
-    from fitact.model.scene import Scene
+    from fitact.populations.covariates import read_covariates
+    from fitact.scene.scene import Scene
 
     stated = None if scene is None else Scene.load(scene)
     known = {} if covariates is None else read_covariates(covariates, records)
     use_compilation_cache()
-    from fitact.inference.population import forget
-    from fitact.inference.population import population as find_population
+    from fitact.populations.fit_population import forget
+    from fitact.populations.fit_population import population as find_population
 
     if fresh and out is not None:
         forget(out)
@@ -133,12 +133,12 @@ def tradeoff(
 
     Takes a minute or two. With --out writes report.html, tradeoff.json and tradeoff.svg.
     """
-    from fitact.data.formats import read
-    from fitact.model.scene import Scene
+    from fitact.data.readers.read import read
+    from fitact.scene.scene import Scene
 
     stated = None if scene is None else Scene.load(scene)
     measured = None if record is None else read(record, stated, **mapping((channel, scale)))
-    from fitact.tradeoff import measure_tradeoff
+    from fitact.tradeoff.tradeoff import measure_tradeoff
 
     try:
         found = measure_tradeoff(measured, stated)

@@ -17,7 +17,7 @@ def scene(
     json: Json = False,
 ) -> None:
     """Print a scene with every key, its unit and, as comments, the defaults; without one: a template to fill in."""
-    from fitact.model.scene import Scene
+    from fitact.scene.scene import Scene
 
     stated = Scene.load(file) if file else Scene()
     show(str(stated).rstrip(), stated.model_dump(mode="json"), json)
@@ -34,11 +34,11 @@ def prior(
     json: Json = False,
 ) -> None:
     """What a scene's prior means for Vsc and force, before any data."""
-    from fitact.model.scene import Scene
+    from fitact.scene.scene import Scene
 
     stated = Scene.load(scene)
     use_compilation_cache()
-    from fitact.inference.prior_predictive import prior_predictive
+    from fitact.scene.prior_predictive import prior_predictive
 
     predicted = prior_predictive(stated, draws, seed)
     if out is not None:
@@ -64,21 +64,21 @@ def plan(
 
     Into DIR it writes report.html, plan.json and plan.svg.
     """
-    from fitact.model.scene import Scene
+    from fitact.scene.scene import Scene
 
     stated = Scene.load(scene)
     measured = None
     if record is not None:
-        from fitact.data.formats import read
+        from fitact.data.readers.read import read
 
         measured = read(record, stated, **mapping((channel, scale)))
     use_compilation_cache()
     if measured is None:
-        from fitact.model.plan import plan as planned
+        from fitact.model_selection.plan import plan as planned
 
         found = planned(stated)
     else:
-        from fitact.inference.planned import plan_for
+        from fitact.model_selection.fit_planned import plan_for
 
         found = plan_for(measured, stated)
     if out is not None:
@@ -99,9 +99,9 @@ def simulate(
     json: Json = False,
 ) -> None:
     """Simulate a record of a scene: V and what it measures (Vsc, I), with noise, as CSV."""
-    from fitact.data.formats import write_csv
+    from fitact.data.readers.read import write_csv
     from fitact.data.simulate import simulate as simulated
-    from fitact.model.scene import Scene
+    from fitact.scene.scene import Scene
 
     stated = Scene.load(scene)
     record = simulated(stated, seed)

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from fitact.data.capture import Capture, is_mapped, to_record
 from fitact.data.checks import check_channel, check_divider, check_time
 from fitact.data.clipping import clipped
-from fitact.data.formats import read_capture, with_other_files
+from fitact.data.readers.capture import Capture, is_mapped, to_record
+from fitact.data.readers.read import read_capture, with_other_files
 from fitact.data.record import (
     CHANNEL_UNITS,
     MINIMUM_SAMPLES,

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from fitact.data.record import MINIMUM_SAMPLES, Record
 from fitact.errors import InputError
 from fitact.model.response import response
-from fitact.model.scene import Scene
+from fitact.scene.scene import Scene
 
 _MOST_SAMPLES = 100_000_000
 

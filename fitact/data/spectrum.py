@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from fitact.data.header import cells_of, number
+from fitact.data.readers.header import cells_of, number
 from fitact.errors import InputError
 from fitact.files import unreadable
 from fitact.units import engineering

@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from fitact.inference.many import Fits
+from fitact.batch.fit_many import Fits
 from fitact.report.frame import Answer, Frame, Origin, write_page
 from fitact.units import engineering
 

@@ -6,12 +6,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.ticker import EngFormatter
 
-from fitact.inference.design import Curve, MeasurementDesign
-from fitact.inference.trial import Option
-from fitact.report import charts
-from fitact.report.charts import Axis
+from fitact.charts import interactive as charts
+from fitact.charts.figure import write_svg
+from fitact.charts.interactive import Axis
+from fitact.design.measurement import Curve, MeasurementDesign
+from fitact.experiment.experiment import Option
 from fitact.report.frame import Answer, Frame, Origin, image, write_page
-from fitact.report.plots import write_svg
 from fitact.units import percent
 
 _NOW, _OPTION, _BEST, _CHOSEN = "#999999", "#0072B2", "#009E73", "#D55E00"

@@ -9,12 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from fitact.inference.drive_design import LEGEND, DriveDesign
-from fitact.inference.drive_option import PEOPLE, DriveOption, quantile, shown
-from fitact.report import charts
-from fitact.report.charts import Axis
+from fitact.charts import interactive as charts
+from fitact.charts.figure import log_ticks, write_svg
+from fitact.charts.interactive import Axis
+from fitact.design.drive import LEGEND, DriveDesign
+from fitact.design.drive_option import PEOPLE, DriveOption, quantile, shown
 from fitact.report.frame import Answer, Frame, Origin, image, write_page
-from fitact.report.plots import log_ticks, write_svg
 from fitact.units import engineering
 
 _COLORS = {

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple, Self
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
+from fitact.charts import figure as plots
 from fitact.data.record import Record
-from fitact.inference.finger import Finger
-from fitact.inference.summary import versions
-from fitact.model.scene import Scene
-from fitact.report import plots
+from fitact.populations.finger import Finger
 from fitact.report.html import write_html
+from fitact.scene.scene import Scene
+from fitact.summary import versions
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,11 +11,12 @@ from typing import Any
 import jinja2
 import matplotlib as mpl
 
+from fitact.charts import figure as plots
 from fitact.errors import InputError
-from fitact.inference.summary import BY_FORCE, load, width
-from fitact.report import plots, posterior_charts
+from fitact.report import posterior_charts
 from fitact.report.html import write_html
 from fitact.report.posterior_charts import CHANNELS
+from fitact.summary import BY_FORCE, load, width
 from fitact.units import engineering
 
 _LABELS = {

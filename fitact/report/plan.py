@@ -6,9 +6,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from fitact.model.plan import LEGEND, Plan
+from fitact.charts.figure import write_svg
+from fitact.model_selection.plan import LEGEND, Plan
 from fitact.report.frame import Answer, Frame, Origin, image, write_page
-from fitact.report.plots import write_svg
 from fitact.units import percent
 
 _KEPT, _LEFT_OUT, _LIMIT = "#999999", "#0072B2", "#D55E00"

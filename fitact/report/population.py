@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from fitact.report.plots import log_ticks, write_svg
+from fitact.charts.figure import log_ticks, write_svg
 
 NOT_DRAWN = "Not drawn: some draws are not finite."
 SETTINGS = {"legend.fontsize": 9.0}

@@ -13,14 +13,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from fitact.charts import interactive as charts
+from fitact.charts.figure import DATA, MODEL, PRIOR
+from fitact.charts.interactive import Axis
 from fitact.errors import InputError
-from fitact.inference.people import OFF, SHARED_OUT, SHARES, table, variance_sentences
-from fitact.inference.summary import width
-from fitact.report import charts
-from fitact.report.charts import Axis
+from fitact.populations.population import OFF, SHARED_OUT, SHARES, table, variance_sentences
 from fitact.report.frame import Answer, Frame, Origin, image, write_page
-from fitact.report.plots import DATA, MODEL, PRIOR
 from fitact.report.population import NOT_DRAWN, SETTINGS, draw_force, draw_shares, draw_skin, draw_time, drawable
+from fitact.summary import width
 from fitact.units import engineering, percent
 
 _SHOWN = 1500  # fingers to come

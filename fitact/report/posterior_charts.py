@@ -5,7 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fitact.report.charts import (
+from fitact.charts.figure import ALERT, DATA, MODEL, PRIOR, without_spikes
+from fitact.charts.interactive import (
     COLUMNS,
     Axis,
     Chart,
@@ -22,7 +23,6 @@ from fitact.report.charts import (
     shaded,
     toggle,
 )
-from fitact.report.plots import ALERT, DATA, MODEL, PRIOR, without_spikes
 
 CHANNELS = {"Vsc": "skin voltage Vsc", "I": "trunk current I"}
 _FORCES = {"force_mean": "mean force", "force_rms": "rms force", "force_peak": "peak force"}

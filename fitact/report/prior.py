@@ -8,10 +8,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from fitact.charts.figure import save, style, svg
 from fitact.errors import InputError
 from fitact.files import replacing
-from fitact.inference.prior_predictive import PriorPredictive
-from fitact.report.plots import save, style, svg
+from fitact.scene.prior_predictive import PriorPredictive
 
 _FORMATS = (".html", ".svg", ".png")
 _COLOR, _LINE = "#0072B2", "#333333"

@@ -9,11 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from fitact.charts.figure import save, style
 from fitact.data.clipping import clipped
 from fitact.data.inspection import Channel, Inspection
 from fitact.errors import InputError
 from fitact.files import replacing
-from fitact.report.plots import save, style
 
 _COLOR, _RAIL = "#333333", "#D55E00"
 _COLUMNS = 2000  # beyond twice as many samples, the extremes of so many stretches are drawn

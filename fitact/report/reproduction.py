@@ -10,10 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fitact import paper
+from fitact.charts.interactive import Chart
 from fitact.files import write_json
 from fitact.model.circuit import Circuit
 from fitact.report import reproduction_charts, reproduction_curves
-from fitact.report.charts import Chart
 from fitact.report.frame import image
 from fitact.report.html import write_html
 from fitact.report.reproduction_curves import COLORS, KNEES, OTHERS, OURS

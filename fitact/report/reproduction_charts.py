@@ -1,9 +1,9 @@
 """The charts of the paper's figures."""
 
+from fitact.charts.figure import DATA
+from fitact.charts.interactive import Axis, Chart, Plot, chart, line, logarithmic, marked, plot, points
 from fitact.model.circuit import Circuit
 from fitact.report import reproduction_curves
-from fitact.report.charts import Axis, Chart, Plot, chart, line, logarithmic, marked, plot, points
-from fitact.report.plots import DATA
 from fitact.report.reproduction_curves import COLORS, KNEES, OTHERS, OURS
 
 _TIME = Axis.of("time", "s", 0.02)

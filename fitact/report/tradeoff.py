@@ -14,12 +14,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, NullLocator
 from matplotlib.transforms import Bbox
 
+from fitact.charts import interactive as charts
+from fitact.charts.figure import PRIOR, save, style
+from fitact.charts.interactive import Axis
 from fitact.files import replacing
-from fitact.report import charts
-from fitact.report.charts import Axis
 from fitact.report.frame import Answer, Frame, Origin, image, write_page
-from fitact.report.plots import PRIOR, save, style
-from fitact.tradeoff import COLUMNS, KINDS, Kind, Level, Tradeoff
+from fitact.tradeoff.tradeoff import COLUMNS, KINDS, Kind, Level, Tradeoff
 from fitact.units import engineering
 
 _TITLES: dict[Kind, tuple[str, str, str]] = {

@@ -1,0 +1,375 @@
+"""Fit records: parameters, their covariance, and whether the answer may be trusted."""
+
+import dataclasses
+import math
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from fitact import summary
+from fitact.data.record import Record
+from fitact.errors import InputError
+from fitact.experiment.fisher import Experiment, covariance_root
+from fitact.fitting import derived, remarks
+from fitact.fitting.channel_fit import TraceFit, compare
+from fitact.fitting.drive_choice import DriveChoice
+from fitact.fitting.identifiability import Identifiability, assess
+from fitact.fitting.laplace import Laplace
+from fitact.fitting.least_squares import Solved, solve
+from fitact.fitting.levenberg_marquardt import Optima, result_message
+from fitact.fitting.multistart import begin, better, explore
+from fitact.fitting.problem import Problem, pose
+from fitact.fitting.profile import DERIVED, Interval, intervals
+from fitact.fitting.residual_statistics import together
+from fitact.fitting.verdict import misfits, verdict
+from fitact.likelihood import certificate as compressed
+from fitact.likelihood.noise import scale_information
+from fitact.model.skin import constant
+from fitact.scene.scene import Scene
+from fitact.units import engineering, unit_of
+
+GOOD = "The fit is at its optimum and leaves only noise."
+_SKIN = ("Rsc", "Csc", "Ci")
+_RESPONSE = {
+    "constant": "exact",
+    "dispersive": "harmonics and time constants",
+    "fractional": "time constants on a grid",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit(Laplace):
+    """The best parameters, their Laplace approximation, and a judgement.
+
+    Attributes:
+        traces: the channels fitted, by record.
+        result: name of a member of `RESULTS`; `message` is its sentence.
+        figures: of all traces together: chi2_reduced, steps and the like.
+        identifiability: what the records can and cannot tell.
+        warnings: sentences.
+        compression_error: of the compressed log-likelihood near the optimum; None: samples are summed.
+        scene: the first record's.
+        experiment: the measurement that was done, at the optimum.
+    """
+
+    traces: tuple[TraceFit, ...]
+    result: str
+    figures: dict[str, float]
+    identifiability: Identifiability
+    warnings: tuple[str, ...]
+    compression_error: float | None
+    scene: Scene
+    experiment: Experiment
+
+    @property
+    def record(self) -> Record:
+        """The record, or the first of several."""
+        return self.traces[0].record
+
+    @property
+    def records(self) -> tuple[Record, ...]:
+        """All of them."""
+        return tuple({id(trace.record): trace.record for trace in self.traces}.values())
+
+    @property
+    def choice(self) -> DriveChoice:
+        """The drive of `record`."""
+        return self.traces[0].choice
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the first trace's noise, V or A, from the residuals."""
+        return self.traces[0].sigma
+
+    @property
+    def residuals(self) -> Float[np.ndarray, " samples"]:
+        """Record minus fit of the first trace, V or A."""
+        return self.traces[0].residuals
+
+    @property
+    def linear(self) -> dict[str, float]:
+        """What entered linearly and was freed, V or A, at the optimum."""
+        return {name: value for trace in self.traces for name, value in trace.linear.items()}
+
+    @property
+    def full_because(self) -> str:
+        """Why samples are summed, as a clause; "" where none are."""
+        reasons = {f"{trace.label}: " * bool(trace.label) + trace.full_because: trace for trace in self.traces}
+        return "; ".join(reason for reason, trace in reasons.items() if trace.full_because)
+
+    @property
+    def trusted(self) -> bool:
+        """Whether nothing stands against the answer."""
+        return self.result == "successful"
+
+    @property
+    def message(self) -> str:
+        """The result as a sentence."""
+        return GOOD if self.trusted else result_message(self.result)
+
+    @property
+    def point_names(self) -> tuple[str, ...]:
+        """Coordinates of the posterior: those of theta, and the logarithm of each trace's sigma."""
+        return (*self.names, *self.likelihood.sigma_names)
+
+    @property
+    def point(self) -> Float[np.ndarray, " coordinates"]:
+        """The optimum in the coordinates of the posterior."""
+        return np.append(self.theta, np.log([trace.sigma for trace in self.traces]))
+
+    @property
+    def point_root(self) -> Float[np.ndarray, "coordinates coordinates"]:
+        """As `covariance_root`, in the coordinates of the posterior; sigma's by its Fisher information."""
+        freedom = np.array([trace.figures["degrees_of_freedom"] for trace in self.traces])
+        information = freedom * [scale_information(trace.noise) for trace in self.likelihood.traces]
+        size = self.theta.size
+        root = np.diag(np.append(np.zeros(size), information**-0.5))
+        root[:size, :size] = self.covariance_root
+        return root
+
+    def profile(self, name: str, level: float = 0.95, *, prior: bool = True) -> Interval:
+        """The profile-likelihood interval of one parameter, or of g, b or force_mean.
+
+        `prior`: whether the circuit's prior speaks in it (that of the posterior), or the records alone. The noise is
+        held at its estimate. A side that the records leave open, to a factor of a million, is 0 or infinite.
+
+        Raises:
+            InputError: there is no quantity of that name, or the level is not between 0 and 1.
+        """
+        return self._intervals((name,), level, prior)[name]
+
+    def intervals(self, level: float = 0.95, *, prior: bool = True) -> dict[str, Interval]:
+        """As `profile`, of all parameters, and of g, b and force_mean.
+
+        Raises:
+            InputError: the level is not between 0 and 1.
+        """
+        return self._intervals((*self.names, *DERIVED), level, prior)
+
+    def _intervals(self, names: tuple[str, ...], level: float, prior: bool) -> dict[str, Interval]:
+        _, gradient = self.derive.logs(self.theta, self._sigmas)
+        places = [derived.NAMES.index(name) for name in DERIVED]
+        sd = np.append(self.sd, np.linalg.norm(gradient[places] @ self.covariance_root, axis=1))
+        expected = dict(zip((*self.names, *DERIVED), sd.tolist(), strict=True))
+        return intervals(self.likelihood, self.derive, self.theta, self._sigmas, expected, names, level, prior)
+
+    @property
+    def _sigmas(self) -> Float[np.ndarray, " traces"]:
+        return np.array([trace.sigma for trace in self.traces])
+
+    def model(self) -> dict[str, Any]:
+        """What was fitted, by name."""
+        circuit = type(constant(self.likelihood.template)).__name__
+        return {
+            "circuit": {"FinalCircuit": "final", "DirectGround": "direct", "NaturalGround": "natural"}[circuit],
+            "skin": self.scene.skin.level,
+            "response": _RESPONSE[self.scene.skin.level],
+            "drive": self.choice.name,
+            "steady_state": self.choice.steady_state,
+            "channels": [trace.channel for trace in self.traces],
+            "force": self.derive.geometry.model,
+            "freed": [*self.linear, *(name for name in self.names if name not in _SKIN)],
+            "likelihood": "full" if self.compression_error is None else "compressed",
+            "compression_error": self.compression_error,
+            "full_because": self.full_because,
+        }
+
+    def _likelihood(self) -> str:
+        if self.compression_error is None:
+            return f"summed over the samples each time, since {self.full_because}"
+        return f"compressed to {self.likelihood.rows} numbers, off by {self.compression_error:.1g} at most"
+
+    def judgement(self) -> dict[str, Any]:
+        """The result, and the figures of merit of all traces and of each."""
+        traces = [
+            {"channel": t.channel, "record": os.path.basename(t.record.source), "label": t.label, **t.figures}
+            for t in self.traces
+        ]
+        found = {"result": self.result, "message": self.message, "misfit": self.result == "misfit"}
+        return found | self.figures | {"traces": traces}
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `fitact fit --json` prints and fit.json holds."""
+        return {
+            "parameters": self.parameters(),
+            "derived": self.derived(),
+            "nuisances": {name: {"unit": unit_of(name), "value": value} for name, value in self._nuisances().items()},
+            "correlation": {"names": list(self.names), "matrix": self.correlation.tolist()},
+            "identifiability": self.identifiability.to_dict(),
+            "fit": self.judgement(),
+            "model": self.model(),
+            "warnings": list(self.warnings),
+        }
+
+    def _nuisances(self) -> dict[str, float]:
+        return dict(zip(self.likelihood.sigma_names, self._sigmas.tolist(), strict=True)) | self.linear
+
+    def summary(self) -> str:
+        """A table for people: values with errors, correlations, the verdict."""
+        rows = [f"{'':14}{'median':>12}{'± 1 sd':>12}{'contraction':>14}"]
+        for name, s in (self.parameters() | self.derived()).items():
+            median = engineering(float(s["q50"]), str(s["unit"]))
+            contraction = f"{s['contraction']:14.3f}" if "contraction" in s else ""
+            rows.append(f"{name:14}{median:>12}{summary.width(s):>12}{contraction}")
+        pairs = [(i, j) for i in range(len(self.names)) for j in range(i)]
+        rows += [
+            "nuisances: "
+            + ", ".join(f"{name} {engineering(value, unit_of(name))}" for name, value in self._nuisances().items()),
+            "correlations of the logs: "
+            + ", ".join(f"{self.names[j]}-{self.names[i]} {self.correlation[i, j]:+.3f}" for i, j in pairs),
+            f"reduced chi-square {self.figures['chi2_reduced']:.3f}. {self.message}",
+            f"log-likelihood: {self._likelihood()}.",
+            f"force: {summary.BY_FORCE[self.derive.geometry.model]}.",
+            str(self.identifiability),
+        ]
+        return "\n".join([*rows, *(f"warning: {warning}" for warning in self.warnings)])
+
+    __str__ = summary
+
+
+def fit(
+    record: Record | Sequence[Record],
+    scene: Scene | Sequence[Scene] | None = None,
+    *,
+    prior: bool = True,
+    start: Mapping[str, float] | None = None,
+    starts: int = 1,
+    tolerance: float = compressed.TOLERANCE,
+) -> Fit:
+    """Fit one circuit to a record, or to several jointly, by Levenberg-Marquardt in log-parameters with their prior.
+
+    The circuit, the prior and the device are the (first) scene's. Each record has the drive of its scene: the
+    recorded V where there is no scene or its waveform is "measured", else the scene's. Each of the scene's
+    channels has its own noise; offset, drift, hum of the mains and (Vsc) a delay and a clock are freed where it asks
+    for them, a gain only with the scene's prior. The start comes from the records. Runs in double precision whatever
+    JAX is set to, and leaves that setting alone.
+
+    Args:
+        record: with the scene's channels, and V unless the scene has the drive.
+        scene: the device, and what is believed of it; one for all records, or one for each.
+        prior: False leaves the circuit's out, for least squares alone; gains, delays and clocks keep theirs.
+        start: values (SI) to start from in place of the records' own.
+        starts: how many; those after the first are draws of the prior, and tell whether there are other optima.
+        tolerance: error of the log-likelihood that compressing the records may cause; 0: sum over the samples
+            each time. Where compression does not hold, `Fit.full_because` says why.
+
+    Raises:
+        InputError: a record cannot come from this circuit, the scene asks for what is not available, a start is
+            none of its parameters, or the tolerance is no number of 0 or more.
+    """
+    return fitted(record, scene, prior=prior, start=start, starts=starts, tolerance=tolerance)
+
+
+def fitted(
+    record: Record | Sequence[Record],
+    scene: Scene | Sequence[Scene] | None,
+    *,
+    prior: bool = True,
+    start: Mapping[str, float] | None = None,
+    starts: int = 1,
+    tolerance: float = compressed.TOLERANCE,
+    remedies: bool = True,
+) -> Fit:
+    """As `fit`, on wish without the remedies of `Identifiability`, which take a sixth of the time."""
+    if not 0.0 <= tolerance < math.inf:
+        raise InputError(f"tolerance = {tolerance}: give an error of the log-likelihood, 0.001 or so, or 0 for none")
+    if starts < 1:
+        raise InputError(f"starts = {starts}: give 1 or more")
+    records = (record,) if isinstance(record, Record) else tuple(record)
+    scenes = (scene,) * len(records) if scene is None or isinstance(scene, Scene) else tuple(scene)
+    if not records or len(scenes) != len(records):
+        raise InputError(f"{len(records)} records and {len(scenes)} scenes: give one scene for all, or one for each")
+    if len({each.fingerprint for each in records}) < len(records):
+        raise InputError(
+            f"{records[0].source}: one record was given twice, which would count its samples twice; drop one"
+        )
+    for each in scenes:
+        (each or Scene()).require_available(fit=True)
+    with jax.enable_x64(True):
+        try:
+            problem = pose(records, scenes, prior)
+            solved, certified, root = _solved(problem, tolerance, start)
+            optima = explore(solved, starts) if starts > 1 else None
+            lower = None if optima is None else better(optima, solved)
+            if lower is not None:
+                solved, certified, root = _solved(problem, tolerance, lower)
+            return _judged(problem, solved, certified, root, optima, scenes[0], remedies)
+        except np.linalg.LinAlgError as error:
+            raise InputError(
+                f"{records[0].source}: the channels cannot be computed with ({error}); check for a huge offset or a"
+                " wrong unit"
+            ) from error
+
+
+def _solved(
+    problem: Problem, tolerance: float, start: Mapping[str, float] | None
+) -> tuple[Solved, compressed.Certified, np.ndarray]:
+    """The fit, with compressions where they hold, and its covariance's root; again where they turn out not to."""
+    (likelihood, reasons), theta_0 = problem.compressed(tolerance), begin(problem, start)
+    noise = np.array([source.noise for source in problem.sources])
+    freeable = tuple(source.freeable for source in problem.sources)
+    while True:
+        solved = solve(likelihood, theta_0, noise, freeable)
+        root = covariance_root(np.concatenate(solved.jacobian), solved.likelihood.prior_root)
+        theta, sigma = np.asarray(solved.theta), np.asarray(solved.sigma)
+        certified = compressed.certify(solved.likelihood, reasons, theta, root, sigma, tolerance)
+        failed = [
+            i
+            for i, (trace, reason) in enumerate(zip(solved.likelihood.traces, certified.reasons, strict=True))
+            if reason and trace.compression is not None
+        ]
+        if not failed:
+            return solved, certified, root
+        for i in failed:
+            likelihood = likelihood.with_trace(i, likelihood.traces[i].summed())
+        reasons = certified.reasons
+
+
+def _judged(
+    problem: Problem,
+    solved: Solved,
+    certified: compressed.Certified,
+    root: Float[np.ndarray, "parameters parameters"],
+    optima: Optima | None,
+    scene: Scene | None,
+    remedies: bool,
+) -> Fit:
+    likelihood, theta, sigma = certified.likelihood, np.asarray(solved.theta), np.asarray(solved.sigma)
+    source, given = problem.sources[0], scene or Scene()
+    circuit = likelihood.circuit(jnp.asarray(theta))
+    derive = derived.for_fit(likelihood, source.record, source.choice, given, float(circuit.b))
+    _, gradient = derive.logs(theta, sigma)
+    traces = tuple(
+        TraceFit.of(likelihood, i, theta, float(sigma[i]), source, certified.reasons[i])
+        for i, source in enumerate(problem.sources)
+    )
+    figures = together([trace.figures for trace in traces]) | {"steps": int(solved.steps)} | compare(theta.size, traces)
+    if optima is not None:
+        figures |= {"optima": len(optima.reached), "starts_failed": optima.failed}
+    force = gradient[derived.NAMES.index("force_mean")]
+    on_traces = [
+        note
+        for source, trace in zip(problem.sources, traces, strict=True)
+        for note in (*source.notes, *remarks.on_trace(source.record, source.choice, trace.channel, trace.figures))
+    ]
+    on_all = remarks.on_parameters(likelihood, theta, scene is None)
+    experiment = problem.experiment(likelihood, theta, sigma)
+    return Fit(
+        theta=theta,
+        covariance_root=root,
+        traces=traces,
+        result=verdict(solved, root, traces, problem.sources, optima),
+        figures=figures,
+        identifiability=assess(likelihood.names, root, likelihood.prior_root, force, experiment, remedies),
+        warnings=tuple(dict.fromkeys([*on_traces, *misfits(traces), *on_all])),
+        compression_error=certified.error,
+        likelihood=likelihood,
+        derive=derive,
+        scene=given,
+        experiment=experiment,
+    )

@@ -1,0 +1,83 @@
+"""Skins that depend on the frequency in a fit: how a record's circuit is followed, and what it cannot be asked."""
+
+import math
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from fitact.data.record import Record
+from fitact.errors import InputError
+from fitact.fitting.drive_choice import DriveChoice, has_ideal_edges, jumps_within
+from fitact.model.circuit import RC
+from fitact.model.drive import Periodic
+from fitact.model.relaxation import Grid
+from fitact.model.skin import TOP, Dispersive, Fractional, WithSkin
+from fitact.scene.scene import Scene
+
+_BELOW = 0.3  # of the slowest angular frequency there is: from where the grid is fitted,
+_OFF = 0.9  # of a drive's stated frequency, at least, is that of the record
+_ABOVE = 100.0  # and to so many times the inverse of the time step
+_AT_JUMP = 0.5  # steps from an ideal jump, within which a fractional skin's response has no value of its own
+
+
+def with_level(circuit: RC, records: Sequence[Record], scenes: Sequence[Scene | None]) -> RC | WithSkin:
+    """The circuit with the first scene's skin, as the records' drives and time steps ask for."""
+    scene = scenes[0] or Scene()
+    if scene.skin.level == "constant":
+        return circuit
+    slowest = min(_slowest(record, given or Scene()) for record, given in zip(records, scenes, strict=True))
+    if scene.skin.level == "dispersive":
+        return WithSkin(circuit, Dispersive(math.ceil(2.0 * math.pi * TOP / (_OFF * slowest))))
+    fastest = _ABOVE / min(record.time_step for record in records)
+    alpha = jnp.asarray(scene.fixed().get("alpha", scene.skin.alpha))
+    return WithSkin(circuit, Fractional(alpha), Grid.between(_BELOW * slowest, fastest))
+
+
+def _slowest(record: Record, scene: Scene) -> float:
+    """The lowest angular frequency in a record, rad/s: of what repeats, that; else the inverse of its span."""
+    span = float(record.time[-1] - record.time[0])
+    if scene.drive.waveform == "measured":
+        frequency = record.frequency() if scene.steady_state() else None
+    else:
+        frequency = scene.drive.slowest if scene.drive.steady_state else None
+    return 1.0 / span if frequency is None else 2.0 * math.pi * frequency
+
+
+def require_followed(circuit: RC | WithSkin, record: Record, choice: DriveChoice) -> None:
+    """Refuse a drive whose response the skin does not have.
+
+    Raises:
+        InputError: naming the record and the remedy.
+    """
+    if not isinstance(circuit, WithSkin):
+        return
+    if circuit.grid is None and not (choice.steady_state and isinstance(choice.drive, Periodic)):
+        raise InputError(
+            f"{record.source}: a dispersive skin is fitted in the steady state of a named periodic drive only; name the"
+            " waveform in [drive], or take [skin] level = 'fractional'"
+        )
+    if choice.unknown_charge:
+        raise InputError(
+            f"{record.source}: a fractional skin remembers what V was before the record; state [drive] steady_state ="
+            " true (V repeated) or false (all was at rest), or name the waveform"
+        )
+
+
+def without_jumps(
+    circuit: RC | WithSkin, record: Record, choice: DriveChoice, weight: Float[np.ndarray, " samples"] | None
+) -> tuple[Float[np.ndarray, " samples"] | None, tuple[str, ...]]:
+    """The samples' weights, 0 at ideal jumps of a fractional skin's drive, and a sentence about those.
+
+    There the response is that at the highest frequencies, which no record has.
+    """
+    fractional = isinstance(circuit, WithSkin) and circuit.grid is not None
+    if not (fractional and has_ideal_edges(choice.drive)):
+        return weight, ()
+    out = jumps_within(choice.drive, record.time - choice.shift, _AT_JUMP * record.time_step)
+    note = (
+        f"{np.count_nonzero(out):,} of {out.size:,} samples lie at an ideal jump of V, where a fractional skin's"
+        " response has no value, and are left out; [drive] rise_time tells how fast the edges are"
+    )
+    return np.where(out, 0.0, 1.0 if weight is None else weight), (note,) if out.any() else ()

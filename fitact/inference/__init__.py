@@ -1,1 +1,0 @@
-"""What the data say: least squares, identifiability, and posteriors by emcee."""

@@ -1,0 +1,121 @@
+"""A record's projection on responses of fixed time constants: for circuits that a grid of them follows.
+
+The model is linear in the weights of the grid, whose responses to the drive are computed once. The triangle R of
+their QR decomposition, with the slow shapes and the record as further columns, holds coordinates in which the
+difference between record and model has the length it has over all samples.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from fitact.compiled import padded
+from fitact.likelihood.compression import SLOW, slow_at
+from fitact.model.circuit import Terms
+from fitact.model.drive import Drive, Sampled
+from fitact.model.relaxation import Grid
+from fitact.model.response import highpass
+
+_CHUNK = 8_192  # samples at a time, which bounds memory
+
+
+class GridCompression(eqx.Module):
+    """A record in coordinates of the responses of a grid; as `fitact.likelihood.compression.Compression`.
+
+    Attributes:
+        signal: the response to the drive (V) of each time constant.
+        falling: how it changes with a delay, V/s, over two samples.
+        slow: the shapes of `SLOW`, of height 1.
+        rate: dV/dt, V/s, where the channel follows it, else 0.
+        observed: the record, V or A.
+        samples: how many there are.
+    """
+
+    signal: Float[Array, "terms rows"]
+    falling: Float[Array, "terms rows"]
+    slow: Float[Array, "shapes rows"]
+    rate: Float[Array, " rows"]
+    observed: Float[Array, " rows"]
+    samples: Float[Array, ""]
+
+    def holds(self, tau: Array) -> Bool[Array, "*shape"]:
+        """Always: the grid is the circuit's own."""
+        return jnp.ones_like(tau, dtype=bool)
+
+    def response(self, terms: Terms) -> Float[Array, " rows"]:
+        """The response of a circuit, as `fitact.response` gives it in time."""
+        total = jnp.asarray(terms.weight) @ self.signal
+        return total if terms.rate is None else total + terms.rate * self.rate
+
+    def change_by_delay(self, terms: Terms) -> Float[Array, " rows"]:
+        """How a delay changes it, per s."""
+        return jnp.asarray(terms.weight) @ self.falling
+
+    def decays(self, tau: Array) -> Float[Array, " rows"]:
+        """None: what such a circuit remembers is no one decay."""
+        return jnp.zeros_like(self.observed)
+
+
+def compress_on_grid(
+    drive: Drive,
+    time: Float[np.ndarray, " samples"],
+    observed: Float[np.ndarray, " samples"],
+    *,
+    steady_state: bool,
+    grid: Grid,
+    weight: Float[np.ndarray, " samples"] | None = None,
+    rate: Float[np.ndarray, " samples"] | None = None,
+) -> GridCompression:
+    """Project a record on the responses to `drive` of the grid; arguments as in
+    `fitact.likelihood.compression.compress`.
+
+    A chunk at a time, each in a QR decomposition together with the triangle so far, so that no digits are lost.
+    """
+    step = (time[-1] - time[0]) / (time.size - 1)
+    around = np.array([0.0, -step, step])
+    scale = max(float(np.max(np.abs(observed))), 1e-300)  # the record's column as long as the others, for rounding
+    triangle: Any = np.zeros((0, 0))
+    middle, half = 0.5 * (time[0] + time[-1]), 0.5 * (time[-1] - time[0])
+    for part, u in _responses(drive, grid.tau, time, around, steady_state):
+        slow = slow_at(time[part], middle, half)
+        slope = np.zeros(u.shape[-1]) if rate is None else np.asarray(rate[part])
+        rows = [u[0], slow, slope[None], observed[part][None] / scale, (u[1] - u[2]) / (2.0 * step)]
+        columns = np.concatenate(rows).T
+        columns = columns if weight is None else columns * np.asarray(weight[part])[:, None]
+        triangle = np.linalg.qr(np.vstack([triangle, columns]) if triangle.size else columns, mode="r")
+    size = grid.tau.size
+    found = [jnp.asarray(x.T) for x in np.split(triangle, np.cumsum([size, len(SLOW), 1, 1]), axis=1)]
+    count = time.size if weight is None else int(np.count_nonzero(weight))
+    return GridCompression(
+        signal=found[0],
+        falling=found[4],
+        slow=found[1],
+        rate=found[2][0],
+        observed=found[3][0] * scale,
+        samples=jnp.asarray(float(count)),
+    )
+
+
+def _responses(
+    drive: Drive, tau: Array, time: np.ndarray, around: np.ndarray, steady_state: bool
+) -> Iterator[tuple[slice, Float[np.ndarray, "around terms samples"]]]:
+    """Of each time constant, chunk by chunk, at the samples' times and beside them."""
+    length = time.size if isinstance(drive, Sampled) else _CHUNK  # a long drive is gone through once
+    for first in range(0, time.size, length):
+        part = slice(first, first + length)
+        times = padded(time[part], min(length, time.size))
+        u = np.stack([np.asarray(_each(drive, tau, times + x, steady_state)) for x in around])
+        yield part, u[..., : time[part].size]
+
+
+@eqx.filter_jit
+def _each(drive: Drive, tau: Array, time: Array, steady_state: bool) -> Float[Array, "terms samples"]:
+    def one(tau: Array) -> Array:
+        return highpass(drive, time, tau, steady_state=steady_state)
+
+    return lax.map(one, tau, batch_size=8)

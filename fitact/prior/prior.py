@@ -1,0 +1,212 @@
+"""What is believed of the parameters together before the data, in their logarithms."""
+
+import graphlib
+import itertools
+import math
+import statistics
+from collections.abc import Callable, Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Float
+
+from fitact.errors import InputError
+from fitact.prior.distributions import Distribution
+
+_NODES, _TERMS = 96, 24  # of the quadrature and the series behind covariances
+_FIXED_POINT = 64  # steps towards a ratio, which converge by a factor of 2 or more each
+_TRIES = 1000  # rounds of draws, of which an order may leave one in as many
+
+
+class Prior(eqx.Module):
+    """Priors of named parameters, independent or correlated; `Prior.of(Rsc=..., Csc=..., Ci=...)` makes one.
+
+    Correlations are those of the normal scores (a Gaussian copula), so they leave every marginal as it is;
+    where all are log-normal, the logarithms are multivariate normal with these correlations.
+
+    Attributes:
+        names: the parameters, in the order of the chain.
+        marginals: what is believed of each alone.
+        pairs: (name, other, correlation) of those that are correlated.
+        ordered: (lower, higher) of those that must come in that order. The density is then zero elsewhere, and as
+            it would be without where it is not; moments, covariance and residuals are those without, too.
+
+    Raises:
+        InputError: a pair names no two parameters of it, or correlations or orders contradict each other.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    marginals: tuple[Distribution, ...]
+    pairs: tuple[tuple[str, str, float], ...] = eqx.field(static=True, default=())
+    ordered: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
+
+    def __check_init__(self) -> None:
+        for name, other, *_ in (*self.pairs, *self.ordered):
+            if name == other or not {name, other} <= set(self.names):
+                raise InputError(
+                    f"[prior] cannot correlate or order {name} and {other}; name two of its free parameters,"
+                    f" {', '.join(self.names)}"
+                )
+        self._check_orders()
+        if self.pairs:
+            self._check_correlation()
+
+    def _check_orders(self) -> None:
+        sorter = graphlib.TopologicalSorter[str]()
+        for lower, higher in self.ordered:
+            sorter.add(higher, lower)
+        try:
+            sorter.prepare()
+        except graphlib.CycleError as error:
+            stated = " < ".join(error.args[1])
+            raise InputError(f"[prior] the order {stated} contradicts itself; leave one of them out") from None
+
+    def _check_correlation(self) -> None:
+        # a bare sign test would pass what rounding leaves of a singular matrix
+        if not np.linalg.eigvalsh(self.correlation)[0] >= 1e-9:
+            stated = ", ".join(f"{name}-{other} {value:+g}" for name, other, value in self.pairs)
+            raise InputError(
+                f"[prior] the correlations {stated} contradict each other (their matrix is not positive definite);"
+                " bring them nearer to 0"
+            )
+
+    @classmethod
+    def of(
+        cls,
+        correlation: Mapping[tuple[str, str], float] | None = None,
+        ordered: tuple[tuple[str, str], ...] = (),
+        /,
+        **marginals: Distribution,
+    ) -> "Prior":
+        """The prior with these marginals, and the correlations of pairs such as ``{("Rsc", "Csc"): -0.6}``."""
+        pairs = tuple((name, other, float(value)) for (name, other), value in (correlation or {}).items())
+        return cls(tuple(marginals), tuple(marginals.values()), pairs, ordered)
+
+    def including(self, **marginals: Distribution) -> "Prior":
+        """With these marginals in place of, or after, its own."""
+        merged = dict(zip(self.names, self.marginals, strict=True)) | marginals
+        return Prior(tuple(merged), tuple(merged.values()), self.pairs, self.ordered)
+
+    def without(self, *names: str) -> "Prior":
+        """Without the marginals of these names."""
+        kept = {n: m for n, m in zip(self.names, self.marginals, strict=True) if n not in names}
+        return Prior(tuple(kept), tuple(kept.values()), self.pairs, self.ordered)
+
+    def __getitem__(self, name: str) -> Distribution:
+        return self.marginals[self.names.index(name)]
+
+    @property
+    def correlation(self) -> Float[np.ndarray, "parameters parameters"]:
+        """Correlations of the normal scores."""
+        matrix = np.eye(len(self.names))
+        for name, other, value in self.pairs:
+            i, j = self.names.index(name), self.names.index(other)
+            matrix[i, j] = matrix[j, i] = value
+        return matrix
+
+    @property
+    def log_mean(self) -> Float[np.ndarray, " parameters"]:
+        """Means of the log-parameters."""
+        return np.array([marginal.log_mean for marginal in self.marginals])
+
+    @property
+    def log_sd(self) -> Float[np.ndarray, " parameters"]:
+        """Standard deviations of the log-parameters."""
+        return np.array([marginal.log_sd for marginal in self.marginals])
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "parameters parameters"]:
+        """Covariance of the log-parameters.
+
+        With u(z) = sum_k a_k He_k(z) / sqrt(k!), Mehler's formula gives cov(u_i, u_j) = sum_k a_ik a_jk r_ij^k.
+        """
+        variance = np.diag(self.log_sd**2)
+        if not self.pairs:
+            return variance
+        z, weight = np.polynomial.hermite_e.hermegauss(_NODES)
+        powers = np.arange(1, _TERMS)
+        polynomials = np.polynomial.hermite_e.hermevander(z, _TERMS - 1)[:, 1:]
+        polynomials = polynomials / np.sqrt(np.cumprod(powers, dtype=float))
+        with jax.ensure_compile_time_eval(), jax.enable_x64(True):
+            logs = np.array([marginal.at_score(z) for marginal in self.marginals])
+        coefficients = logs @ (polynomials * (weight / math.sqrt(2.0 * math.pi))[:, None])
+        joint = np.einsum("ik,jk,ijk->ij", coefficients, coefficients, self.correlation[..., None] ** powers)
+        return np.where(np.eye(len(self.names)), variance, joint)
+
+    def log_density(self, u: Float[Array, " parameters"]) -> Float[Array, ""]:
+        """Log-density of the log-parameters; -inf where one, or their order, is impossible."""
+        value = sum((marginal.log_density(u[i]) for i, marginal in enumerate(self.marginals)), jnp.zeros(()))
+        for lower, higher in self.ordered:
+            value = jnp.where(u[self.names.index(lower)] < u[self.names.index(higher)], value, -jnp.inf)
+        if not self.pairs:
+            return value
+        z = jnp.stack([marginal.score(u[i]) for i, marginal in enumerate(self.marginals)])
+        root = np.linalg.cholesky(self.correlation)
+        white = solve_triangular(root, z, lower=True)
+        return value - 0.5 * (white @ white - z @ z) - np.log(np.diag(root)).sum()
+
+    def residuals(self, u: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
+        """The log-parameters whitened by mean and covariance: the normal prior with its moments, as residuals."""
+        if not self.pairs:
+            return jnp.array([marginal.whitened(u[i]) for i, marginal in enumerate(self.marginals)])
+        return solve_triangular(np.linalg.cholesky(self.covariance), u - self.log_mean, lower=True)
+
+    def sample(self, rng: np.random.Generator, size: int) -> dict[str, Float[np.ndarray, " size"]]:
+        """Draws of the parameters, by name.
+
+        Raises:
+            InputError: the marginals leave next to nothing in the order asked for.
+        """
+        return self._in_given_order(lambda: rng.standard_normal((len(self.names), size)), size)
+
+    def spread(self, size: int) -> dict[str, Float[np.ndarray, " size"]]:
+        """As `sample`, but spread evenly over the prior, and always the same.
+
+        The Kronecker sequence of the generalised golden ratio (M. Roberts, 2018), as normal scores.
+
+        Raises:
+            InputError: the marginals leave next to nothing in the order asked for.
+        """
+        axes = np.arange(1, len(self.names) + 1)
+        ratio = 2.0
+        for _ in range(_FIXED_POINT):
+            ratio = (1.0 + ratio) ** (1.0 / (axes.size + 1))
+        count = itertools.count()
+
+        def scores() -> np.ndarray:
+            number = next(count) * size + np.arange(1, size + 1)
+            share = (0.5 + number * ratio ** -axes[:, None].astype(float)) % 1.0
+            return np.vectorize(statistics.NormalDist().inv_cdf, otypes=[float])(share)
+
+        return self._in_given_order(scores, size)
+
+    def _in_given_order(
+        self, scores: Callable[[], Float[np.ndarray, "parameters size"]], size: int
+    ) -> dict[str, Float[np.ndarray, " size"]]:
+        """The first `size` of the parameters at `scores()` that are in the order asked for."""
+        drawn = self._at_scores(scores())
+        kept = {name: values[self._in_order(drawn)] for name, values in drawn.items()}
+        for _ in range(_TRIES):
+            if all(values.size >= size for values in kept.values()):
+                return {name: values[:size] for name, values in kept.items()}
+            drawn = self._at_scores(scores())
+            kept = {name: np.append(kept[name], values[self._in_order(drawn)]) for name, values in drawn.items()}
+        stated = ", ".join(f"{lower} < {higher}" for lower, higher in self.ordered)
+        raise InputError(f"the priors leave next to nothing in the order {stated}; widen them, or leave it out")
+
+    def _at_scores(self, scores: Float[np.ndarray, "parameters size"]) -> dict[str, Float[np.ndarray, " size"]]:
+        """The parameters at independent normal scores."""
+        z = np.linalg.cholesky(self.correlation) @ scores
+        with jax.enable_x64(True):
+            return {
+                name: np.exp(np.asarray(marginal.at_score(row)))
+                for name, marginal, row in zip(self.names, self.marginals, z, strict=True)
+            }
+
+    def _in_order(self, drawn: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Which draws are in the order asked for."""
+        size = len(next(iter(drawn.values()), ()))
+        return np.all([np.ones(size, dtype=bool), *(drawn[low] < drawn[high] for low, high in self.ordered)], axis=0)

@@ -1,0 +1,57 @@
+"""Published electrical properties of skin, as priors of the resistance and capacitance of one layer."""
+
+import math
+from typing import Literal, NamedTuple, TypeAlias
+
+from fitact.model.force import EPSILON_0, plate_capacitance, plate_resistance
+from fitact.prior.distributions import Distribution, LogNormal, Uniform
+
+Table: TypeAlias = Literal["gabriel-dry", "gabriel-wet", "paper"]
+
+_HIGH_FREQUENCY = 4.0  # relative permittivity
+# S. Gabriel, R. W. Lau, C. Gabriel, Phys. Med. Biol. 41 (1996) 2271, table 1:
+# conductivity (S/m) and dispersions (height, time constant in s, Cole-Cole exponent alpha)
+_GABRIEL = {
+    "gabriel-dry": (2e-4, ((32.0, 7.234e-12, 0.0), (1100.0, 32.481e-9, 0.2))),
+    "gabriel-wet": (
+        4e-4,
+        ((39.0, 7.958e-12, 0.1), (280.0, 79.577e-9, 0.0), (3e4, 1.592e-6, 0.16), (3e4, 1.592e-3, 0.2)),
+    ),
+}
+# A finger's state is known less well than the tables': from the middle between dry and wet it is a factor
+# sqrt(40) in permittivity to either, so with this one each table reaches half-way to the other.
+_FACTOR = 6.0
+_PAPER_RESISTIVITY, _PAPER_PERMITTIVITY = (4e4, 1e5), (2e3, 1e4)  # ohm m, 1: its ranges over 10 to 1000 Hz
+
+
+class Layer(NamedTuple):
+    """A layer of skin under a contact: m^2, m, and the frequency (Hz) at which it is wanted."""
+
+    area: float
+    thickness: float
+    frequency: float
+
+
+def published(table: Table, name: str, layer: Layer) -> Distribution:
+    """The prior of a layer's resistance (`name` ends in Rsc) or capacitance by a published table, eqs. (3) and (4)."""
+    of_resistance = name.endswith("Rsc")
+    if table == "paper":
+        if of_resistance:
+            return Uniform(*(plate_resistance(rho, layer.area, layer.thickness) for rho in _PAPER_RESISTIVITY))
+        return Uniform(*(plate_capacitance(eps, layer.area, layer.thickness) for eps in _PAPER_PERMITTIVITY))
+    permittivity = skin_permittivity(table, layer.frequency)
+    if of_resistance:
+        resistivity = -1.0 / (permittivity.imag * EPSILON_0 * 2.0 * math.pi * layer.frequency)
+        return LogNormal.within_factor(plate_resistance(resistivity, layer.area, layer.thickness), _FACTOR)
+    return LogNormal.within_factor(plate_capacitance(permittivity.real, layer.area, layer.thickness), _FACTOR)
+
+
+def skin_permittivity(table: Literal["gabriel-dry", "gabriel-wet"], frequency: float) -> complex:
+    """Relative complex permittivity of skin at `frequency` (Hz), conduction included: four Cole-Cole dispersions."""
+    conductivity, dispersions = _GABRIEL[table]
+    s = 2j * math.pi * frequency
+    return (
+        _HIGH_FREQUENCY
+        + sum(height / (1.0 + (s * tau) ** (1.0 - alpha)) for height, tau, alpha in dispersions)
+        + (conductivity / (s * EPSILON_0))
+    )

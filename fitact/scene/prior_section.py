@@ -1,0 +1,234 @@
+"""The section [prior] of a scene file: what is believed of each parameter, and of them together."""
+
+import math
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from fitact import units
+from fitact.errors import InputError
+from fitact.prior.distributions import Distribution, LogNormal, LogUniform, TruncatedLogNormal, Uniform
+from fitact.prior.prior import Prior
+from fitact.prior.published import Layer, Table, published
+from fitact.scene.sections import Section, Unit
+
+_FORMS: tuple[tuple[set[str], set[str]], ...] = (  # keys that a form needs, and keys that it can take
+    ({"factor"}, {"median", "low", "high"}),
+    ({"relative_sd"}, {"median", "low", "high"}),
+    ({"low", "high"}, {"scale"}),
+    ({"tolerance"}, {"nominal"}),
+    ({"table"}, set()),
+    ({"fixed"}, set()),
+    ({"tied"}, {"ratio"}),
+)
+_ORDER = {"above", "below"}
+QUANTITIES = ("median", "low", "high", "nominal", "fixed")  # keys in the unit of the parameter
+_SKIN = ("Rsc", "Csc", "grounding_Rsc", "grounding_Csc")  # what the tables have
+
+
+class Belief(Section):
+    """What is believed of one parameter; docs/priors.md lists the forms."""
+
+    median: float | None = Field(default=None, gt=0)
+    factor: float | None = Field(default=None, gt=1, le=1e6)
+    relative_sd: float | None = Field(default=None, gt=0, le=10)
+    low: float | None = Field(default=None, gt=0)
+    high: float | None = Field(default=None, gt=0)
+    scale: Literal["linear", "log"] = "linear"
+    nominal: float | None = Field(default=None, gt=0)
+    tolerance: float | None = Field(default=None, gt=0, lt=1)
+    table: Table | None = None
+    fixed: bool | float | None = None
+    tied: str | None = None
+    ratio: float = Field(default=1.0, gt=0)
+    above: str | None = None
+    below: str | None = None
+
+    @model_validator(mode="after")
+    def _one_form(self) -> Self:
+        given, ordered = self.model_fields_set - _ORDER, self.model_fields_set & _ORDER
+        known = any(needs <= given <= needs | takes for needs, takes in _FORMS)
+        if not known and not (ordered and not given):
+            raise ValueError(
+                "write {median, factor}, {median, relative_sd}, {low, high}, {nominal, tolerance}, {table}, {fixed}"
+                " or {tied}"
+            )
+        if ordered and not self.free:
+            raise ValueError("above and below order free parameters; leave them out of a fixed or tied one")
+        if self.fixed is False or (self.fixed is not True and self.fixed is not None and self.fixed <= 0.0):
+            raise ValueError("fixed is a value above 0, or true for the scene's")
+        if self.low is not None and self.high is not None and not self.low < self.high:
+            raise ValueError(f"low = {self.low:g} must be below high = {self.high:g}")
+        return self
+
+    @property
+    def free(self) -> bool:
+        """Whether it is a density, rather than fixed or tied."""
+        return self.fixed is None and self.tied is None
+
+    @property
+    def highest(self) -> float:
+        """Above which it allows no value, so far as it says so itself."""
+        if self.tolerance is not None:
+            return (self.nominal or 0.0) * (1.0 + self.tolerance)
+        if self.fixed is not None:
+            return 0.0 if self.fixed is True else self.fixed
+        return math.inf if self.high is None else self.high
+
+    def distribution(self, name: str, nominal: float | None, layer: Layer) -> Distribution:
+        """The density of the parameter `name`, around its `nominal` value in the scene where it states no other.
+
+        Raises:
+            InputError: it needs a nominal value and the scene has none, or its bounds exclude its median by far.
+        """
+        if self.table is not None:
+            return published(self.table, name, layer)
+        if self.tolerance is not None:
+            return Uniform.with_tolerance(_given(name, "nominal", self.nominal, nominal), self.tolerance)
+        if self.factor is None and self.relative_sd is None:
+            assert self.low is not None  # _one_form leaves nothing else
+            assert self.high is not None
+            return (LogUniform if self.scale == "log" else Uniform)(self.low, self.high)
+        median = _given(name, "median", self.median, nominal)
+        if self.factor is not None:
+            whole = LogNormal.within_factor(median, self.factor)
+        else:
+            assert self.relative_sd is not None
+            whole = LogNormal.with_relative_sd(median, self.relative_sd)
+        if self.low is None and self.high is None:
+            return whole
+        try:
+            return TruncatedLogNormal(whole.median, whole.spread, self.low or 0.0, self.high or math.inf)
+        except InputError as error:
+            raise InputError(f"[prior] {name}: {error}") from None
+
+
+def _given(name: str, key: str, stated: float | None, nominal: float | None) -> float:
+    if not (stated or nominal):
+        raise InputError(f"[prior] {name} needs a {key}, since the scene has no {name} of its own")
+    return float(stated or nominal or 0.0)
+
+
+def _belief(unit: str) -> Any:
+    of = dict.fromkeys(QUANTITIES, unit) | {"tolerance": "", "ratio": ""}
+
+    def parse(value: object) -> object:
+        if not isinstance(value, dict):
+            return value
+        return {k: units.parse(v, of[k]) if k in of and not isinstance(v, bool) else v for k, v in value.items()}
+
+    return Annotated[Belief, Unit(unit), BeforeValidator(parse)]
+
+
+if TYPE_CHECKING:
+    BeliefPlain: TypeAlias = Belief
+    BeliefOhm: TypeAlias = Belief
+    BeliefFarad: TypeAlias = Belief
+    BeliefVolt: TypeAlias = Belief
+    BeliefAmpere: TypeAlias = Belief
+else:
+    BeliefPlain = _belief("")
+    BeliefOhm = _belief("ohm")
+    BeliefFarad = _belief("F")
+    BeliefVolt = _belief("V")
+    BeliefAmpere = _belief("A")
+
+
+class PriorSection(Section):
+    """Beliefs; where one is silent on the median, the scene's value is it. An absent parameter is not free.
+
+    The skin's defaults reach, within their 95 %, from the paper's values to published whole-skin ones
+    (10 kohm and 5 nF dry, 4.3 kohm and 200 nF wet); the insulator's is a data sheet's 5 %. Without a belief
+    the noise's standard deviations (`sigma` of Vsc, `sigma_I` of I) are flat in their logarithm.
+    """
+
+    Rsc: BeliefOhm = Belief(factor=50.0)
+    Csc: BeliefFarad = Belief(factor=20.0)
+    Ci: BeliefFarad = Belief(relative_sd=0.05)
+    R_H: BeliefOhm | None = None
+    grounding_Rsc: BeliefOhm | None = None
+    grounding_Csc: BeliefFarad | None = None
+    Z: BeliefOhm | None = None
+    Z_capacitance: BeliefFarad | None = None
+    series_resistor: BeliefOhm | None = None
+    Rgap: BeliefOhm | None = None
+    Cgap: BeliefFarad | None = None
+    alpha: BeliefPlain | None = None
+    sigma: BeliefVolt | None = None
+    sigma_I: BeliefAmpere | None = None
+    correlation: dict[str, Annotated[float, Field(gt=-1, lt=1)]] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        beliefs = self.beliefs()
+        for name, belief in beliefs.items():
+            if belief.table is not None and name not in _SKIN:
+                raise ValueError(f"[prior] {name}: a table has the skin's parameters only: {', '.join(_SKIN)}")
+            if name == "alpha" and belief.highest > 1.0:
+                raise ValueError("[prior] alpha is an exponent of at most 1; give high = 1 or less beside the rest")
+            for key in ("tied", "above", "below"):
+                other = getattr(belief, key)
+                if other is not None:
+                    self._check_pair(name, key, other)
+        free = [name for name, belief in beliefs.items() if belief.free]
+        Prior.of(self.correlations(), self.ordered(), **dict.fromkeys(free, LogNormal(1.0, 1.0)))
+        return self
+
+    def _check_pair(self, name: str, key: str, other: str) -> None:
+        beliefs = self.beliefs()
+        place = f"[prior] {name}: {key} = '{other}'"
+        if other == name or other not in beliefs:
+            raise ValueError(f"{place} is no other parameter with a prior; name one of {', '.join(beliefs)}")
+        if units.unit_of(name) != units.unit_of(other):
+            raise ValueError(
+                f"{place} compares {units.unit_of(name)} with {units.unit_of(other)}; name one of its own unit"
+            )
+        if key == "tied" and beliefs[other].tied is not None:
+            raise ValueError(f"{place} is tied itself; name what {other} is tied to")
+
+    def beliefs(self) -> dict[str, Belief]:
+        """The beliefs that the section holds, by parameter; one that only orders keeps the default's density.
+
+        Raises:
+            InputError: one only orders a parameter that has no default.
+        """
+        found = {}
+        for name in BELIEFS:
+            belief = getattr(self, name)
+            if belief is None:
+                continue
+            if not belief.model_fields_set - _ORDER:
+                default = PriorSection.model_fields[name].default
+                if default is None:
+                    raise InputError(
+                        f"[prior] {name}: give a density beside above or below, such as {{median, factor}}"
+                    )
+                belief = default.model_copy(update=belief.model_dump(exclude_unset=True))
+            found[name] = belief
+        return found
+
+    def tied(self) -> dict[str, tuple[str, float]]:
+        """Parameters that follow another: name -> (the other, ratio to it)."""
+        return {name: (b.tied, b.ratio) for name, b in self.beliefs().items() if b.tied is not None}
+
+    def ordered(self) -> tuple[tuple[str, str], ...]:
+        """Pairs (lower, higher) of parameters that come in that order."""
+        above = [(b.above, name) for name, b in self.beliefs().items() if b.above is not None]
+        return (*above, *((name, b.below) for name, b in self.beliefs().items() if b.below is not None))
+
+    def correlations(self) -> dict[tuple[str, str], float]:
+        """Correlations by pair of parameters.
+
+        Raises:
+            InputError: a key does not read name-name, or names a pair twice.
+        """
+        found: dict[tuple[str, str], float] = {}
+        for key, value in self.correlation.items():
+            pair = tuple(key.split("-"))
+            if len(pair) != 2 or pair[::-1] in found:
+                raise InputError(f"correlation '{key}' must name each pair once, as in Rsc-Csc = -0.6")
+            found[pair[0], pair[1]] = value
+        return found
+
+
+BELIEFS = tuple(name for name in PriorSection.model_fields if name != "correlation")

@@ -1,0 +1,279 @@
+"""Scene: the device, the skin, how it is grounded and driven, what is measured and what is believed.
+
+Read from TOML, where quantities carry units ("160 kohm"); inside, every number is SI. An empty scene
+is the paper's nominal device.
+"""
+
+import difflib
+import json
+import math
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self
+
+import pydantic
+from jax.typing import ArrayLike
+from pydantic import model_validator
+
+from fitact.errors import InputError
+from fitact.model.circuit import RC, Circuit, DirectGround, FinalCircuit, NaturalGround, Probe
+from fitact.model.drive import Drive
+from fitact.model.force import Geometry, plate_capacitance
+from fitact.model.skin import Dispersive, Fractional, WithSkin
+from fitact.prior.prior import Prior
+from fitact.prior.published import Layer
+from fitact.scene import toml as scene_file
+from fitact.scene.prior_section import PriorSection
+from fitact.scene.sections import (
+    Device,
+    DriveSection,
+    ForceSection,
+    Friction,
+    Gap,
+    Grounding,
+    Measurement,
+    Perception,
+    PopulationSection,
+    Section,
+    Skin,
+    Tolerance,
+    section_of,
+)
+
+_DIRECT = ("R_H", "grounding_Rsc", "grounding_Csc")  # what only one way of grounding has
+_NATURAL = ("Z", "Z_capacitance")
+
+
+class Scene(Section):
+    """One case: see the sections. Raises `fitact.InputError` for what it does not understand."""
+
+    device: Device = Device()
+    skin: Skin = Skin()
+    grounding: Grounding = Grounding()
+    gap: Gap = Gap()
+    drive: DriveSection = DriveSection()
+    measurement: Measurement = Measurement()
+    friction: Friction = Friction()
+    prior: PriorSection = PriorSection()
+    force: ForceSection = ForceSection()
+    perception: Perception = Perception()
+    population: PopulationSection = PopulationSection()
+    tolerance: Tolerance = Tolerance()
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a scene file (TOML), or a shipped scene by its name, such as "paper" (docs/scene.md lists them).
+
+        Raises:
+            InputError: naming the file, the line, the section, the key and the remedy.
+        """
+        text = scene_file.read(path)
+        try:
+            content = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise InputError(f"{path}: not valid TOML: {error}") from error
+        try:
+            return cls.model_validate(content)
+        except pydantic.ValidationError as error:
+            sentence = _sentence(error.errors()[0])
+            line = scene_file.line_of(text, sentence)
+            raise InputError(f"{path}{f', line {line}' if line else ''}: {sentence}") from None
+
+    @classmethod
+    def from_dict(cls, content: dict[str, Any], source: str = "scene") -> Self:
+        """From the tables of a scene file; `source` names it in errors."""
+        try:
+            return cls.model_validate(content)
+        except pydantic.ValidationError as error:
+            raise InputError(f"{source}: {_sentence(error.errors()[0])}") from None
+
+    def __str__(self) -> str:
+        """The scene as a file: every key, with its unit; what was not given, as a comment. Loads to an equal scene."""
+        return scene_file.to_toml(self)
+
+    def to_json(self) -> str:
+        """What was given, in SI units; `from_json` reads it back."""
+        given = self.model_dump(mode="json", exclude_unset=True)
+        return json.dumps({name: section for name, section in given.items() if section}, sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """The scene that `to_json` wrote."""
+        return cls.from_dict(json.loads(text))
+
+    def states_waveform(self) -> bool:
+        """Whether the file names the waveform, rather than leaving the default."""
+        return "waveform" in self.drive.model_fields_set
+
+    def steady_state(self) -> bool | None:
+        """What the file says of the steady state; None where it is silent."""
+        return self.drive.steady_state if "steady_state" in self.drive.model_fields_set else None
+
+    def require_available(self, *, fit: bool = False) -> None:
+        """Refuse what this version cannot model (or, with `fit`, cannot fit), rather than leave it out in silence."""
+        follows = ("constant", "fractional") if fit else ("constant",)  # the skins whose transients are computed
+        unavailable = {
+            f"[skin] level = '{self.skin.level}' with [drive] steady_state = false": (
+                self.skin.level not in follows and not self.drive.steady_state
+            ),
+        }
+        for what, asked in unavailable.items():
+            if asked:
+                raise InputError(
+                    f"scene: {what} is not available in this version, which does not model it;"
+                    " leave it out of the scene to go on without it"
+                )
+
+    def nominal(self) -> dict[str, float | None]:
+        """The scene's own values of all that can have a prior, SI; None: it has none."""
+        ground, measured = self.grounding, self.measurement
+        grounding = {name: getattr(ground, name) for name in (*_DIRECT, *_NATURAL)}
+        grounding["Z"] = ground.Z or None  # 0: the body is at earth
+        series = {"series_resistor": measured.series_resistor or None}
+        series["alpha"] = self.skin.alpha if self.skin.level == "fractional" else None
+        noise = {"sigma": measured.noise_Vsc or None, "sigma_I": measured.noise_I or None}
+        gap = {"Rgap": self.gap.resistance, "Cgap": self._gap_capacitance()}
+        skin = {"Rsc": self.skin.Rsc, "Csc": self.skin.Csc, "Ci": self.device.Ci}
+        return {**skin, **grounding, **series, **gap, **noise}
+
+    def _gap_capacitance(self) -> float | None:
+        """As stated, or of air of the stated thickness, eq. (3)."""
+        thickness = self.gap.thickness
+        if self.gap.capacitance is not None or thickness is None:
+            return self.gap.capacitance
+        return float(plate_capacitance(1.0, self.device.contact_area, thickness))
+
+    def geometry(self) -> Geometry:
+        """What the force needs beside the circuit; a gap's thickness follows Cgap unless both are stated."""
+        both = self.gap.capacitance is not None and self.gap.thickness is not None
+        return Geometry(
+            self.device.contact_area,
+            self.device.insulator_thickness,
+            self.skin.thickness,
+            self.gap.thickness if both else None,
+            self.force.model,
+        )
+
+    def make_circuit(self, values: Mapping[str, ArrayLike] | None = None) -> Circuit:
+        """The circuit at the scene's nominal values, or at others by name (ohm, F).
+
+        It is the paper's final one unless the scene, or `values`, asks for more.
+        """
+        self.require_available()
+        circuit = self.make_rc_circuit(values)
+        if self.skin.level == "constant":
+            return circuit
+        alpha = dict(values or {}).get("alpha", self.skin.alpha)
+        return WithSkin(circuit, Dispersive() if self.skin.level == "dispersive" else Fractional(alpha))
+
+    def make_rc_circuit(self, values: Mapping[str, ArrayLike] | None = None) -> RC:
+        """As `make_circuit`, with the skins constant."""
+        self.require_available(fit=True)
+        of: dict[str, Any] = self.nominal() | dict(values or {})
+        skin, names = (of["Rsc"], of["Csc"], of["Ci"]), ("series_resistor", "Rgap", "Cgap")
+        common = {name: of[name] for name in names} | {"probe": self._probe()}
+        if self.grounding.connection == "natural":
+            return NaturalGround(*skin, of["Z"], of["Z_capacitance"], **common)
+        extras = common | {name: of[name] for name in _DIRECT}
+        if all(extra is None for extra in extras.values()):
+            return FinalCircuit(*skin)
+        return DirectGround(*skin, **extras)
+
+    def _probe(self) -> Probe | None:
+        resistance, capacitance = self.measurement.probe_resistance, self.measurement.probe_capacitance
+        if resistance is None and capacitance is None:
+            return None
+        return Probe(math.inf if resistance is None else resistance, capacitance or 0.0)
+
+    def make_drive(self) -> Drive:
+        """The scene's drive.
+
+        Raises:
+            InputError: the waveform is 'measured', so only a record has it.
+        """
+        return self.drive.make()
+
+    def make_prior(self) -> Prior:
+        """The prior of the parameters that the scene frees, but for gains."""
+        layer = Layer(self.device.contact_area, self.skin.thickness, self.drive.slowest)
+        nominal = self.nominal()
+        marginals = {
+            name: belief.distribution(name, nominal[name], layer)
+            for name, belief in self.prior.beliefs().items()
+            if belief.free
+        }
+        return Prior.of(self.prior.correlations(), self.prior.ordered(), **marginals)
+
+    def fixed(self) -> dict[str, float]:
+        """Parameters that the scene holds, and their values, SI.
+
+        Raises:
+            InputError: one is held at a value that the scene does not have.
+        """
+        nominal, found = self.nominal(), {}
+        for name, belief in self.prior.beliefs().items():
+            if belief.fixed is None:
+                continue
+            value = nominal[name] if belief.fixed is True else belief.fixed
+            if value is None:
+                raise InputError(f"[prior] {name} is fixed, but the scene has no {name}; write fixed = its value")
+            found[name] = float(value)
+        return found
+
+    @model_validator(mode="after")
+    def _prior_of_what_there_is(self) -> Self:
+        absent = dict.fromkeys(_DIRECT, "[grounding] connection = 'direct'")
+        if self.grounding.connection == "direct":
+            absent = dict.fromkeys(_NATURAL, "[grounding] connection = 'natural'")
+        if self.skin.level != "fractional":
+            absent["alpha"] = "[skin] level = 'fractional'"
+        for name, channel in {"sigma": "Vsc", "sigma_I": "I"}.items():
+            if channel not in self.measurement.channels:
+                absent[name] = f"'{channel}' among [measurement] channels"
+        for name in self.prior.beliefs():
+            if name in absent:
+                raise InputError(f"[prior] {name} needs {absent[name]}; leave it out of [prior] otherwise")
+        self._check_gap()
+        self.make_prior()
+        self.fixed()
+        return self
+
+    def _check_gap(self) -> None:
+        has = {name for name, value in self.nominal().items() if value is not None} | set(self.prior.beliefs())
+        if "Rgap" in has and "Cgap" not in has:
+            raise InputError(
+                "[gap] resistance needs what lies in parallel with it; give capacitance, or the thickness of air, too"
+            )
+        if self.force.model == "gap" and "Cgap" not in has:
+            raise InputError(
+                "[force] model = 'gap' needs a gap; give [gap] thickness or capacitance, or take model = 'paper'"
+            )
+
+
+def _sentence(error: Any) -> str:
+    """A pydantic error as one sentence with the place and the remedy."""
+    where = [str(part) for part in error["loc"] if part not in ("function-before", "constrained-float")]
+    place = f"[{where[0]}] {'.'.join(where[1:])}".strip() if where else "the scene"
+    if error["type"] == "extra_forbidden":
+        model: type[Section] = Scene
+        for name in where[:-1]:
+            model = section_of(model.model_fields[name])
+        return f"{place} is not a key of a scene; {_nearest(where[-1], list(model.model_fields))}"
+    message = str(error["msg"]).removeprefix("Value error, ")
+    if error["type"] == "model_type":
+        message = "not a table; write its keys in one"
+    if error["type"] == "literal_error":
+        known = re.findall("'([^']+)'", error["ctx"]["expected"])
+        message = f"not a choice; {_nearest(str(error['input']), known)}"
+    if message.startswith("["):  # it names its place itself
+        return message
+    value = error["input"]
+    shown = f" = {value!r}" if isinstance(value, str | int | float | bool) else ""
+    return f"{place}{shown}: {message[0].lower()}{message[1:]}"
+
+
+def _nearest(word: str, known: list[str]) -> str:
+    near = difflib.get_close_matches(word, known, n=1)
+    return (f"did you mean '{near[0]}'? " if near else "") + f"known: {', '.join(known)}"

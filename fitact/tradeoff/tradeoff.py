@@ -1,0 +1,252 @@
+"""What each level of the model costs and what it is off by, measured on one record, in one run, on this machine."""
+
+import dataclasses
+import os
+import platform
+import sys
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import jax
+
+from fitact.data.record import Record
+from fitact.data.simulate import simulate
+from fitact.errors import InputError
+from fitact.fitting.fit import Fit, fit
+from fitact.scene.scene import Scene
+from fitact.tradeoff import timings as levels
+from fitact.tradeoff.timings import Measured
+from fitact.units import engineering
+
+Kind: TypeAlias = Literal["response", "likelihood", "uncertainty"]
+
+_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # of the compressed log-likelihood
+_DEFAULT = 1e-3
+_WIDTHS = (10, 11, 9, 11, 10, 11)
+_EXACT = 1e-12  # of Vsc: what docs/numerics.md guarantees; less counts as this on the front
+COLUMNS = ("level", "error", "time", "ratio", "gradient", "compile", "memory")
+KINDS: dict[Kind, str] = {
+    "response": "error of Vsc, relative rms; time of one evaluation",
+    "likelihood": "error of its logarithm; time of one evaluation, of many at once",
+    "uncertainty": "error in posterior standard deviations; time of one effective draw",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Level:
+    """One level as measured.
+
+    Attributes:
+        kind: what it is a level of: "response", "likelihood" or "uncertainty".
+        name: "exact", "harmonic(100)", "compressed(1e-3)", "psis", ...
+        error: against the kind's reference; see `Tradeoff`.
+        seconds: of one evaluation (of one walker in a batch), or of one effective draw of the mean force.
+        ratio: `seconds` over those of the exact level.
+        gradient_seconds: of one gradient; None: it has none.
+        compile_seconds: before the first evaluation, beyond its time.
+        memory: bytes that an evaluation takes, or that the draws do; None: not known.
+        dominated_by: a level that is off by no more and costs no more, one of both less; "": it is on the front.
+        details: figures of its own.
+    """
+
+    kind: Kind
+    name: str
+    error: float
+    seconds: float
+    ratio: float
+    gradient_seconds: float | None
+    compile_seconds: float
+    memory: int | None
+    dominated_by: str
+    details: dict[str, Any]
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """Of a table of `COLUMNS`, for people."""
+        return (
+            self.name,
+            f"{self.error:.2g}",
+            engineering(self.seconds, "s", 3),
+            f"{self.ratio:.3g}",
+            "" if self.gradient_seconds is None else engineering(self.gradient_seconds, "s", 3),
+            f"{self.compile_seconds:.2f} s" if self.compile_seconds > 0.0 else "",
+            "" if self.memory is None else engineering(self.memory, "B", 3),
+        )
+
+    def __str__(self) -> str:
+        return _row(self.cells) + (f"  dominated by {self.dominated_by}" if self.dominated_by else "")
+
+
+@dataclasses.dataclass(frozen=True)
+class Tradeoff:
+    """Levels of response, likelihood and uncertainty: error against the best reference, and cost.
+
+    A response's error is the rms difference of Vsc from the exact one over that one's rms; a likelihood's the
+    largest difference of the log-posterior from the full sum, over draws around the optimum and up to a constant;
+    an uncertainty's the largest difference, in posterior standard deviations, of mean, sd and 5, 50 and 95 %
+    quantiles of log Rsc and log force from those of emcee on the full sum.
+
+    Attributes:
+        levels: all that were measured.
+        record: what they were measured on, in words.
+        resolution: errors of an uncertainty below it cannot be told from 0 by so many draws, and count as alike.
+        trusted: whether the record's fit and the reference's draws are.
+        machine: what ran it.
+        notes: sentences.
+    """
+
+    levels: tuple[Level, ...]
+    record: str
+    resolution: float
+    trusted: bool
+    machine: dict[str, Any]
+    notes: tuple[str, ...]
+
+    def of(self, kind: Kind) -> tuple[Level, ...]:
+        """The levels of one kind."""
+        return tuple(level for level in self.levels if level.kind == kind)
+
+    def front(self, kind: Kind) -> tuple[Level, ...]:
+        """The Pareto front of one kind, cheapest first."""
+        return tuple(sorted((level for level in self.of(kind) if not level.dominated_by), key=lambda x: x.seconds))
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `fitact tradeoff --json` prints and tradeoff.json holds."""
+        return dataclasses.asdict(self)
+
+    def __str__(self) -> str:
+        rows = [f"{self.record}; {self.machine['cpu']}, {self.machine['cores']} cores", ""]
+        for kind, title in KINDS.items():
+            rows += [f"{kind}: {title}", _row(COLUMNS), *map(str, self.of(kind)), ""]
+        return "\n".join([*rows, self.resolved, *self.notes])
+
+    @property
+    def resolved(self) -> str:
+        """From where on errors of an uncertainty mean something."""
+        return f"errors of uncertainty below {self.resolution:.2g} cannot be told from 0"
+
+
+def measure_tradeoff(record: Record | None = None, scene: Scene | None = None, *, progress: bool = True) -> Tradeoff:
+    """Measure every level's error and cost on a record (V and Vsc), or on one simulated from the scene.
+
+    Times are medians of interleaved rounds; `progress` is told on standard error. Takes a minute or two.
+
+    Raises:
+        InputError: the record or the scene cannot be fitted, or the scene does not measure Vsc.
+    """
+    stated = scene or Scene()
+    if "Vsc" not in stated.measurement.channels:
+        raise InputError("scene: [measurement] channels has no Vsc, which the levels are compared on; add it")
+    if stated.skin.level != "constant":
+        raise InputError(
+            f"scene: [skin] level = '{stated.skin.level}': the levels are those of a constant skin; leave it out"
+        )
+    stated.require_available(fit=True)
+    say = _teller(progress)
+    measured = record or simulate(stated)
+    say(f"fitting {measured.source} at {len(_TOLERANCES)} tolerances and without compression")
+    fits = {tolerance: fit(measured, scene if record else stated, tolerance=tolerance) for tolerance in _TOLERANCES}
+    full = fit(measured, scene if record else stated, tolerance=0.0)
+    with jax.enable_x64(True):
+        say("responses")
+        responses = levels.responses(full)
+        say("likelihoods")
+        likelihoods = levels.likelihoods(full, fits)
+    say("uncertainties")
+    draws, resolution, converged = levels.uncertainties(full, fits[_DEFAULT], say)
+    return Tradeoff(
+        levels=(
+            *_judged("response", responses, _EXACT),
+            *_judged("likelihood", likelihoods, 0.0),
+            *_judged("uncertainty", draws, resolution),
+        ),
+        record=f"{os.path.basename(measured.source)}: {len(measured):,} samples, drive {full.choice.name}",
+        resolution=resolution,
+        trusted=full.trusted and converged,
+        machine=machine(),
+        notes=_notes(full, fits, converged),
+    )
+
+
+def _row(cells: Sequence[str]) -> str:
+    name, *others = cells
+    return f"{name:24}" + "".join(f"{x:>{width}}" for x, width in zip(others, _WIDTHS, strict=True))
+
+
+def _judged(kind: Kind, rows: Sequence[Measured], resolution: float) -> list[Level]:
+    """With ratios to the reference, which comes first, and who dominates whom; errors below `resolution` are alike."""
+    errors = [max(row.error, resolution) for row in rows]
+    by = dominators([row.seconds for row in rows], errors)
+    return [
+        Level(
+            kind,
+            row.name,
+            row.error,
+            row.seconds,
+            row.seconds / rows[0].seconds,
+            row.gradient_seconds,
+            row.compile_seconds,
+            row.memory,
+            "" if j is None else rows[j].name,
+            row.details,
+        )
+        for row, j in zip(rows, by, strict=True)
+    ]
+
+
+def dominators(costs: Sequence[float], errors: Sequence[float]) -> list[int | None]:
+    """For each level the one on the Pareto front that dominates it, the cheapest of several; None: it is on the front.
+
+    One dominates another when neither its cost nor its error is larger, and one of both is smaller. Of equal
+    levels none dominates the other.
+    """
+    order = sorted(range(len(costs)), key=lambda i: (costs[i], errors[i]))
+    found: list[int | None] = [None] * len(costs)
+    front: list[int] = []
+    for i in order:
+        same = [j for j in front if (costs[j], errors[j]) == (costs[i], errors[i])]
+        better = [j for j in front if errors[j] <= errors[i]]
+        if same or not better:
+            front.append(i)
+        else:
+            found[i] = better[0]
+    return found
+
+
+def _notes(full: Fit, fits: dict[float, Fit], converged: bool) -> tuple[str, ...]:
+    notes = []
+    if not full.trusted:
+        notes.append(f"the fit that the levels stand on must not be trusted: {full.message}")
+    if not converged:
+        notes.append("emcee on the full sum, the reference of the uncertainties, has not converged")
+    for tolerance, each in fits.items():
+        if each.compression_error is None:
+            notes.append(f"not compressed at {levels.short(tolerance)}, since {each.full_because}")
+    return tuple(notes)
+
+
+def machine() -> dict[str, Any]:
+    """What a result was measured on, so that runs can be compared."""
+    return {
+        "cpu": _cpu(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "platform": platform.platform(),
+        "device": jax.devices()[0].device_kind,
+        "python": platform.python_version(),
+        **{package: version(package) for package in ("fitact", "jax", "jaxlib", "numpy", "scipy", "emcee")},
+    }
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def _teller(on: bool) -> Callable[[str], None]:
+    return lambda text: print(f"tradeoff: {text}", file=sys.stderr) if on else None
