@@ -23,8 +23,8 @@ from threadpoolctl import threadpool_limits
 from timing import show
 
 import fitact
-from fitact.batch.gauss_newton import Together
-from fitact.fitting.problem import pose
+from fitact.batch.gauss_newton import BatchProblem
+from fitact.fitting.problem import build_problem
 
 V0, FREQUENCY, NOISE = 180.0, 100.0, 0.1  # V, Hz, V
 NAMES = ("Rsc", "Csc", "Ci")
@@ -60,7 +60,7 @@ class Square:
         return self.sign * (2.0 * V0 * g / (1.0 + np.exp(-0.5 / FREQUENCY / b))) * np.exp(-self.since / b)
 
 
-def plain(time: np.ndarray, theta: np.ndarray) -> np.ndarray:
+def plain_model(time: np.ndarray, theta: np.ndarray) -> np.ndarray:
     """The same as one writes it."""
     R, C, Ci = np.exp(theta)
     g, b = Ci / (2.0 * Ci + C), R * (2.0 * Ci + C)
@@ -70,7 +70,7 @@ def plain(time: np.ndarray, theta: np.ndarray) -> np.ndarray:
     return np.where(first, 1.0, -1.0) * 2.0 * V0 * g / (1.0 + np.exp(-0.5 / FREQUENCY / b)) * np.exp(-since / b)
 
 
-def simulated(count: int, samples: int) -> list[fitact.Record]:
+def simulate_records(count: int, samples: int) -> list[fitact.Record]:
     """People, whose panel is the same; two periods of each."""
     time = np.arange(samples) * (2.0 / FREQUENCY / samples)
     model, random = Square(time), np.random.default_rng(1)
@@ -81,7 +81,7 @@ def simulated(count: int, samples: int) -> list[fitact.Record]:
     ]
 
 
-def by_lmfit(model: Model, observed: np.ndarray, sigma: float) -> np.ndarray:
+def fit_lmfit(model: Model, observed: np.ndarray, sigma: float) -> np.ndarray:
     """With lmfit's own settings."""
     parameters = lmfit.Parameters()
     for name, mean in zip(NAMES, MEANS, strict=True):
@@ -95,7 +95,7 @@ def by_lmfit(model: Model, observed: np.ndarray, sigma: float) -> np.ndarray:
     return np.array([found.params[name].value for name in NAMES])
 
 
-def by_scipy(model: Model, observed: np.ndarray, sigma: float) -> np.ndarray:
+def fit_scipy(model: Model, observed: np.ndarray, sigma: float) -> np.ndarray:
     """MINPACK's Levenberg-Marquardt, as tight as it goes."""
 
     def residuals(theta: np.ndarray) -> np.ndarray:
@@ -105,27 +105,27 @@ def by_scipy(model: Model, observed: np.ndarray, sigma: float) -> np.ndarray:
     return scipy.optimize.least_squares(residuals, MEANS, method="lm", jac="3-point", **tight).x
 
 
-def optima_alone(records: list[fitact.Record]) -> float:
+def optimum_seconds(records: list[fitact.Record]) -> float:
     """Seconds a record for what the peers give: the optimum, with the noise known."""
     batches = [np.stack([record["Vsc"] for record in records[i : i + 256]]) for i in range(0, len(records) - 255, 256)]
     with jax.enable_x64(True), threadpool_limits(1):
-        together = Together.like(pose([records[0]], [SCENE]))
+        together = BatchProblem.from_problem(build_problem([records[0]], [SCENE]))
         noise, least = np.full(256, NOISE), np.zeros(256)
-        jax.block_until_ready(together.optima(together.basis.project(batches[0]), noise, least)[0])
+        jax.block_until_ready(together.find_optima(together.basis.project(batches[0]), noise, least)[0])
         start = time.perf_counter()
         for batch in batches:
-            jax.block_until_ready(together.optima(together.basis.project(batch), noise, least)[0])
+            jax.block_until_ready(together.find_optima(together.basis.project(batch), noise, least)[0])
         return (time.perf_counter() - start) / (256 * len(batches))
 
 
 def measure(count: int, samples: int) -> dict[str, float]:
     """Ratios of fits per second, and how far optima are apart in the logarithms."""
-    records = simulated(count, samples)
+    records = simulate_records(count, samples)
     good = Square(records[0].time)
     peers = {
-        "lmfit": (by_lmfit, functools.partial(plain, records[0].time)),
-        "lmfit_good": (by_lmfit, good),
-        "scipy": (by_scipy, good),
+        "lmfit": (fit_lmfit, functools.partial(plain_model, records[0].time)),
+        "lmfit_good": (fit_lmfit, good),
+        "scipy": (fit_scipy, good),
     }
     fitact.fit_many(records[:300], SCENE, progress=False)  # compiles
     taken: dict[str, list[float]] = {name: [] for name in ("fitact", "untested", *peers)}
@@ -143,7 +143,7 @@ def measure(count: int, samples: int) -> dict[str, float]:
             taken[name].append((time.perf_counter() - start) / PEERS)
             ours = np.log([[fits[i][key] for key in NAMES] for i in some])
             apart[name].append(float(np.max(np.abs(ours - found))))
-        optimum.append(optima_alone(records))
+        optimum.append(optimum_seconds(records))
     seconds = {name: statistics.median(values) for name, values in taken.items()}
     return {
         "fits_per_second": 1.0 / seconds["fitact"],

@@ -29,16 +29,17 @@ import scipy.optimize
 from timing import show
 
 import fitact
-from fitact.batch import campaign
-from fitact.batch import fit_many as many
-from fitact.batch import gauss_newton as alike
+from fitact.batch import campaign, fit_many, gauss_newton
 from fitact.report.campaign import write_campaign
-from fitact.report.frame import Origin
+from fitact.report.frame import Provenance
 
 V0, FREQUENCY, NOISE = 180.0, 100.0, 0.1  # V, Hz, V
 SCENE = fitact.Scene.from_dict({"drive": {"waveform": "square", "peak_to_peak": 2.0 * V0, "frequency": FREQUENCY}})
 FILES, SAMPLES = 250, 1_000
-LEAST_ALIKE, LONGEST_ALIKE = many._FEW, alike._LONGEST  # records, samples: what fit_many fits together
+LEAST_ALIKE, LONGEST_ALIKE = (
+    fit_many.RecordGroup.min_records,
+    gauss_newton.GaussNewton.max_samples,
+)  # records, samples: what fit_many fits together
 ROUNDS, REPEATS = 5, 3
 NEW_LENGTHS = 5
 PADDED = (1_100, 1_250, 1_400)  # samples: lengths that records are filled up to, beside that of `SAMPLES`
@@ -83,7 +84,7 @@ QUICK = Extent(
 )
 
 
-def written(folder: Path, kind: str, count: int, samples: int = SAMPLES) -> list[str]:
+def write_records(folder: Path, kind: str, count: int, samples: int = SAMPLES) -> list[str]:
     """Names of so many records: two settled periods of people under a square, in closed form."""
     place = folder / f"{kind}-{samples}"
     place.mkdir(exist_ok=True)
@@ -109,13 +110,13 @@ def written(folder: Path, kind: str, count: int, samples: int = SAMPLES) -> list
     return [str(name) for name in names]
 
 
-def scene_of(kind: str) -> fitact.Scene | None:
+def campaign_scene(kind: str) -> fitact.Scene | None:
     return SCENE if kind == "alike" else None
 
 
 def workers(count: int) -> contextlib.AbstractContextManager[Any]:
     """A client of workers as the command starts them."""
-    return campaign._connected(None, count, "2 GiB", campaign._Progress(0, False), 0.0)
+    return campaign._open_client(None, count, "2 GiB", campaign._Progress(0, False), 0.0)
 
 
 class Cost(NamedTuple):
@@ -134,9 +135,9 @@ def cost(client: Any, paths: list[str], kind: str, **more: Any) -> Cost:
     with tempfile.TemporaryDirectory() as folder:
         before, start = processors(), time.perf_counter()
         found = campaign.run_campaign(
-            paths, folder, scene_of(kind), scheduler=client.scheduler.address, progress=False, **more
+            paths, folder, campaign_scene(kind), scheduler=client.scheduler.address, progress=False, **more
         )
-        write_campaign(folder, found, Origin.of("fitact campaign", scene_of(kind)))
+        write_campaign(folder, found, Provenance.from_inputs("fitact campaign", campaign_scene(kind)))
         wall = time.perf_counter() - start
         here, there = processors() - before
         left = {path.name: _size(path) for path in Path(folder).iterdir()}
@@ -149,30 +150,30 @@ def _size(path: Path) -> int:
     return path.stat().st_size if path.is_file() else sum(_size(inner) for inner in path.iterdir())
 
 
-def plain(paths: list[str], kind: str) -> float:
+def fit_seconds(paths: list[str], kind: str) -> float:
     """Seconds of the same fits without a campaign."""
     start = time.perf_counter()
-    fitact.fit_many(paths, scene_of(kind), progress=False)
+    fitact.fit_many(paths, campaign_scene(kind), progress=False)
     return time.perf_counter() - start
 
 
-def compiled(paths: list[str], kind: str, *clients: Any) -> None:
+def compile_on_workers(paths: list[str], kind: str, *clients: Any) -> None:
     """See to it that every worker has compiled what such records need."""
     for client in clients:
-        client.run(plain, paths[: campaign.BATCH], kind)
-        client.run(plain, paths[:1], kind)
+        client.run(fit_seconds, paths[: campaign.BATCH], kind)
+        client.run(fit_seconds, paths[:1], kind)
 
 
-def two_against_one(folder: Path, one: Any, two: Any, pair: dict[str, int]) -> dict[str, float]:
+def compare_workers(folder: Path, one: Any, two: Any, pair: dict[str, int]) -> dict[str, float]:
     """Throughput, and what a campaign of one worker takes beyond the same fits in that worker's process, in turn."""
     found: dict[str, float] = {}
     for kind, count in pair.items():
-        paths = written(folder, kind, count)
+        paths = write_records(folder, kind, count)
         gains, overheads = [], []
-        compiled(paths, kind, one, two)
+        compile_on_workers(paths, kind, one, two)
         for _ in range(ROUNDS):
             alone, both = cost(one, paths, kind).wall, cost(two, paths, kind).wall
-            fits = one.submit(plain, paths, kind, pure=False).result()
+            fits = one.submit(fit_seconds, paths, kind, pure=False).result()
             gains.append(alone / both)
             overheads.append(1e3 * (alone - fits) / count)
         found[f"throughput_{kind}_2_workers_vs_1"] = statistics.median(gains)
@@ -180,7 +181,7 @@ def two_against_one(folder: Path, one: Any, two: Any, pair: dict[str, int]) -> d
     return found
 
 
-def busiest(count: int, workers: int) -> int:
+def busiest_worker_records(count: int, workers: int) -> int:
     """Records of the worker that has most."""
     return min(count, campaign.BATCH * math.ceil(math.ceil(count / campaign.BATCH) / workers))
 
@@ -188,7 +189,7 @@ def busiest(count: int, workers: int) -> int:
 def terms(kind: str, count: int, samples: int, workers: int) -> list[float]:
     """What the seconds of a campaign are linear in, with coefficients that are not negative."""
     together = kind == "alike" and count >= LEAST_ALIKE and samples <= LONGEST_ALIKE
-    most = busiest(count, workers)
+    most = busiest_worker_records(count, workers)
     of_kind = [most * together, most * samples * together, most * (not together), most * samples * (not together)]
     return [1.0, *map(float, of_kind), float(count)]
 
@@ -199,8 +200,8 @@ def scale(folder: Path, one: Any, two: Any, extent: Extent) -> dict[str, float]:
     points += [(kind, *length) for kind, lengths in extent.longer.items() for length in lengths]
     rows, walls, found = [], [], {}
     for kind, count, samples in points:
-        paths = written(folder, kind, count, samples)
-        compiled(paths, kind, one, two)
+        paths = write_records(folder, kind, count, samples)
+        compile_on_workers(paths, kind, one, two)
         for number, client in ((1, one), (2, two)):
             taken = [cost(client, paths, kind) for _ in range(REPEATS if count * samples < 200_000 else 1)]
             walls.append(statistics.median(each.wall for each in taken))
@@ -217,7 +218,7 @@ def scale(folder: Path, one: Any, two: Any, extent: Extent) -> dict[str, float]:
     return found | {"model_rms_error": float(np.sqrt(np.mean(off**2))), "model_worst_error": float(np.abs(off).max())}
 
 
-def sampled(path: str, walkers: int) -> tuple[float, int]:
+def sampling_seconds(path: str, walkers: int) -> tuple[float, int]:
     """Seconds of the sampling of a record's posterior, and the draws kept."""
     found = fitact.fit(fitact.read(path))
     fitact.sample(found, walkers=walkers, seed=1, progress=False)  # compiles
@@ -228,7 +229,7 @@ def sampled(path: str, walkers: int) -> tuple[float, int]:
 
 def reports(folder: Path, two: Any, extent: Extent) -> dict[str, float]:
     """What posteriors and reports cost, and sampling with more walkers."""
-    paths = written(folder, "own", extent.reported + 2)
+    paths = write_records(folder, "own", extent.reported + 2)
     cost(two, paths[:2], "own", reports=True)  # compiles
     taken = cost(two, paths[2:], "own", reports=True)
     found = {
@@ -236,12 +237,12 @@ def reports(folder: Path, two: Any, extent: Extent) -> dict[str, float]:
         "reports_mb": taken.left["reports"] / extent.reported / 1e6,
     }
     for walkers in extent.walkers:
-        seconds, draws = two.submit(sampled, paths[0], walkers, pure=False).result()
+        seconds, draws = two.submit(sampling_seconds, paths[0], walkers, pure=False).result()
         found |= {f"sampling_{walkers}_walkers_s": seconds, f"sampling_{walkers}_walkers_draws": float(draws)}
     return found
 
 
-def each_cost(paths: list[str]) -> tuple[float, float]:
+def fit_cost(paths: list[str]) -> tuple[float, float]:
     """Processor seconds and MB of a fit."""
     before, start = psutil.Process().memory_info().rss, time.process_time()
     fitact.fit_many(paths, progress=False)
@@ -249,13 +250,13 @@ def each_cost(paths: list[str]) -> tuple[float, float]:
     return seconds / len(paths), more / len(paths) / 1e6
 
 
-def of_lengths(known: list[str], new: list[str], padded: list[str]) -> dict[str, float]:
+def length_costs(known: list[str], new: list[str], padded: list[str]) -> dict[str, float]:
     """What fits cost of new lengths that are filled up to a known one, and to others; JAX's cache is left alone."""
     jax.config.update("jax_enable_compilation_cache", False)
     fitact.fit_many(known, progress=False)  # some ask for an offset, some not
-    found = {"known_length_core_s": each_cost(known)[0]}
+    found = {"known_length_core_s": fit_cost(known)[0]}
     for name, paths in (("new_length", new), ("padded_length", padded)):
-        found[f"{name}_core_s"], found[f"{name}_mb"] = each_cost(paths)
+        found[f"{name}_core_s"], found[f"{name}_mb"] = fit_cost(paths)
     return found
 
 
@@ -263,10 +264,10 @@ def lengths(folder: Path) -> dict[str, float]:
     """What it costs when records differ in length."""
     # time steps that files round: uneven ones are a kind of their own
     first, *new = (SAMPLES + 2 * i for i in range(1, NEW_LENGTHS + 2))
-    others = [written(folder, "own", 1, samples)[0] for samples in (*new, *PADDED)]
+    others = [write_records(folder, "own", 1, samples)[0] for samples in (*new, *PADDED)]
     with workers(1) as client:
-        known = written(folder, "own", campaign.BATCH, first)
-        return client.submit(of_lengths, known, others[:NEW_LENGTHS], others[NEW_LENGTHS:]).result()
+        known = write_records(folder, "own", campaign.BATCH, first)
+        return client.submit(length_costs, known, others[:NEW_LENGTHS], others[NEW_LENGTHS:]).result()
 
 
 def peak() -> float:
@@ -274,7 +275,7 @@ def peak() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0 / 1e6
 
 
-def without_fits(path: str) -> None:
+def stub_fits(path: str) -> None:
     """Make a worker give back rows at once, whose numbers differ."""
     (row,) = fitact.fit_many([path], SCENE, progress=False)
     numbers = [name for name, value in row.items() if isinstance(value, float)]
@@ -287,32 +288,32 @@ def without_fits(path: str) -> None:
 
 
 @contextlib.contextmanager
-def timed(found: dict[str, float], name: str, count: int) -> Iterator[None]:
+def record_time(found: dict[str, float], name: str, count: int) -> Iterator[None]:
     start = time.perf_counter()
     yield
     found[name] = 1e3 * (time.perf_counter() - start) / count
 
 
-def parent(folder: Path, count: int) -> dict[str, float]:
+def measure_parent(folder: Path, count: int) -> dict[str, float]:
     """What the command itself does for each record, with Dask's scheduler; fits are left out."""
     found: dict[str, float] = {}
-    paths, out = written(folder, "alike", count), folder / f"parent-{count}"
+    paths, out = write_records(folder, "alike", count), folder / f"parent-{count}"
     with workers(2) as client:
-        client.run(without_fits, paths[0])
+        client.run(stub_fits, paths[0])
         before = peak()
         for name in ("parent_ms", "replay_ms"):
-            with timed(found, name, count):
+            with record_time(found, name, count):
                 fits = None  # one copy at a time
                 fits = campaign.run_campaign(paths, out, SCENE, scheduler=client.scheduler.address, progress=False)
-        with timed(found, "tables_ms", count):
-            write_campaign(out, fits, Origin.of("fitact campaign", SCENE))
+        with record_time(found, "tables_ms", count):
+            write_campaign(out, fits, Provenance.from_inputs("fitact campaign", SCENE))
         found["parent_kb"] = 1e3 * (peak() - before) / count
     found |= {f"{path.stem}_bytes": path.stat().st_size / count for path in out.iterdir()}
     found["page_bytes"] = found.pop("index_bytes") * count
     return found
 
 
-def in_a_process(folder: Path, count: int) -> dict[str, float]:
+def run_in_process(folder: Path, count: int) -> dict[str, float]:
     command = [sys.executable, __file__, "--parent", str(folder), str(count)]
     return json.loads(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout)
 
@@ -338,19 +339,19 @@ def million(found: dict[str, float]) -> dict[str, float]:
 def measure(folder: Path, extent: Extent) -> dict[str, float]:
     start = time.perf_counter()
     with workers(2) as client:
-        cost(client, written(folder, "own", 1), "own")
+        cost(client, write_records(folder, "own", 1), "own")
         found = {"startup_s": time.perf_counter() - start}
         for kind, count in extent.pair.items():
-            cost(client, written(folder, kind, count), kind)
+            cost(client, write_records(folder, kind, count), kind)
         found["worker_mb"] = max(client.run(peak).values())
     found |= lengths(folder)
     with workers(1) as one, workers(2) as two:
-        found |= two_against_one(folder, one, two, extent.pair)
+        found |= compare_workers(folder, one, two, extent.pair)
         found |= scale(folder, one, two, extent)
         found["worker_of_long_records_mb"] = max(two.run(peak).values())
         found |= reports(folder, two, extent)
         found["worker_with_reports_mb"] = max(two.run(peak).values())
-    tenth, whole = (in_a_process(folder, count) for count in (extent.stubbed // 10, extent.stubbed))
+    tenth, whole = (run_in_process(folder, count) for count in (extent.stubbed // 10, extent.stubbed))
     found |= whole | {"parent_ms_vs_a_tenth_of_the_records": whole["parent_ms"] / tenth["parent_ms"]}
     return found | million(found)
 
@@ -362,7 +363,7 @@ if __name__ == "__main__":
     parser.add_argument("--parent", nargs=2, metavar=("FOLDER", "RECORDS"), help="the command alone")
     asked = parser.parse_args()
     if asked.parent:
-        print(json.dumps(parent(Path(asked.parent[0]), int(asked.parent[1]))))
+        print(json.dumps(measure_parent(Path(asked.parent[0]), int(asked.parent[1]))))
         sys.exit()
     with tempfile.TemporaryDirectory() as place:
         show(measure(Path(place), QUICK if asked.quick else WHOLE), asked.json)

@@ -20,7 +20,8 @@ from timing import medians, show
 
 import fitact
 from fitact.likelihood import compression
-from fitact.likelihood.certificate import log_prob
+from fitact.likelihood.certificate import batched_log_prob
+from fitact.model.circuit import HighpassTerms
 
 TRUTH = np.log([160e3, 22e-9, 1.35e-9, 0.1])  # and sigma, V
 SQUARE = fitact.Scene.from_dict({"drive": {"waveform": "square"}})
@@ -30,12 +31,12 @@ RATE, FREQUENCY, WALKERS = 250e3, 100.0, 1000
 def record(samples: int) -> fitact.Record:
     """A settled square wave in white noise."""
     t = np.arange(samples) / RATE
-    sign, since = folded(t)
+    sign, since = square_phase(t)
     noise = math.exp(TRUTH[3]) * np.random.default_rng(1).standard_normal(samples)
     return fitact.Record.from_arrays(t, V=180.0 * sign, Vsc=skin_voltage(TRUTH, sign, since) + noise)
 
 
-def folded(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def square_phase(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The sign of the square, and the time since its last edge."""
     index = np.arange(t.size) % int(RATE / FREQUENCY)
     half = int(RATE / FREQUENCY) // 2
@@ -49,7 +50,7 @@ def skin_voltage(point: np.ndarray, sign: np.ndarray, since: np.ndarray) -> np.n
     return sign * 360.0 * g / (1.0 + math.exp(-0.5 / FREQUENCY / b)) * np.exp(-since / b)
 
 
-def plain(point: np.ndarray, t: np.ndarray, y: np.ndarray) -> float:
+def plain_log_likelihood(point: np.ndarray, t: np.ndarray, y: np.ndarray) -> float:
     """A log-likelihood as one would write it first (`mod` puts a few samples on the wrong side of an edge)."""
     period = 1.0 / FREQUENCY
     phase = np.mod(t, period)
@@ -59,16 +60,16 @@ def plain(point: np.ndarray, t: np.ndarray, y: np.ndarray) -> float:
     return float(-0.5 * np.sum((residual / sigma) ** 2) - t.size * math.log(sigma))
 
 
-def good(point: np.ndarray, sign: np.ndarray, since: np.ndarray, y: np.ndarray) -> float:
+def good_log_likelihood(point: np.ndarray, sign: np.ndarray, since: np.ndarray, y: np.ndarray) -> float:
     """The same, with what does not change computed beforehand."""
     residual = y - skin_voltage(point, sign, since)
     return -0.5 * float(residual @ residual) * math.exp(-2.0 * point[3]) - y.size * point[3]
 
 
-def compressed(fit: fitact.Fit, points: np.ndarray) -> Callable[[], np.ndarray]:
+def compressed_log_prob(fit: fitact.Fit, points: np.ndarray) -> Callable[[], np.ndarray]:
     """Log-probabilities of all points, NumPy in and out."""
     assert fit.model()["likelihood"] == "compressed", fit.full_because
-    function = log_prob(fit.likelihood, len(points))
+    function = batched_log_prob(fit.likelihood, len(points))
     return lambda: function(points)
 
 
@@ -76,17 +77,17 @@ def evaluation(samples: int, points: np.ndarray) -> dict[str, float]:
     """Ratios of one evaluation over the samples to one of many compressed ones; and whether they agree."""
     data = record(samples)
     t, y = data.time, data["Vsc"]
-    sign, since = folded(t)
+    sign, since = square_phase(t)
     fit = fitact.fit(data, SQUARE)
-    fast = compressed(fit, points)
-    ours, theirs = fast()[:2], [good(point, sign, since, y) for point in points[:2]]
+    fast = compressed_log_prob(fit, points)
+    ours, theirs = fast()[:2], [good_log_likelihood(point, sign, since, y) for point in points[:2]]
     priors = [float(fit.likelihood.prior.log_density(jnp.asarray(point[:3]))) for point in points[:2]]
     difference = (ours[1] - ours[0]) - (theirs[1] - theirs[0] + priors[1] - priors[0])
     assert abs(difference) < 0.01, f"the compressed log-probability is off by {difference}"
     jobs = {
         "compressed": fast,
-        "plain": lambda: plain(points[0], t, y),
-        "good": lambda: good(points[0], sign, since, y),
+        "plain": lambda: plain_log_likelihood(points[0], t, y),
+        "good": lambda: good_log_likelihood(points[0], sign, since, y),
     }
     seconds = medians(jobs, 30 if samples < 1_000_000 else 9)
     each = seconds["compressed"] / len(points)
@@ -98,12 +99,15 @@ def evaluation(samples: int, points: np.ndarray) -> dict[str, float]:
 
 def growth(points: np.ndarray) -> float:
     """Cost of an evaluation at 1e7 samples over that at 1e4."""
-    jobs = {str(samples): compressed(fitact.fit(record(samples), SQUARE), points) for samples in (10_000, 10_000_000)}
+    jobs = {
+        str(samples): compressed_log_prob(fitact.fit(record(samples), SQUARE), points)
+        for samples in (10_000, 10_000_000)
+    }
     seconds = medians(jobs, 100)
     return seconds["10000000"] / seconds["10000"]
 
 
-def building(samples: int) -> dict[str, float]:
+def build_cost(samples: int) -> dict[str, float]:
     """Cost of a compression over that of one `np.dot` for each basis column, read from memory."""
     data = record(samples)
     t, y = data.time, data["Vsc"]
@@ -115,7 +119,7 @@ def building(samples: int) -> dict[str, float]:
     columns = np.random.default_rng(2).standard_normal((4, samples))  # as many as memory holds with ease
     jobs: dict[str, Callable[[], object]] = {
         name: lambda drive=drive, steady=steady: compression.compress(
-            drive, t, y, steady_state=steady, tau=4e-3, gain=0.05
+            drive, t, y, steady_state=steady, expected_terms=HighpassTerms((0.05,), (4e-3,))
         )
         for name, (drive, steady) in drives.items()
     }
@@ -139,7 +143,7 @@ def main() -> None:
         points = np.append(fit.theta, math.log(fit.sigma)) + deviates @ root.T
         ratios = evaluation(5000, points)
         ratios |= evaluation(1_000_000, points)
-        ratios |= building(1_000_000 if given.quick else 10_000_000)
+        ratios |= build_cost(1_000_000 if given.quick else 10_000_000)
         if not given.quick:
             ratios["cost_10000000_vs_10000"] = growth(points)
     show(ratios, given.json)

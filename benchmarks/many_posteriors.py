@@ -11,7 +11,7 @@ import argparse
 import statistics
 import time
 
-from batch import SCENE, simulated
+from batch import SCENE, simulate_records
 from timing import show
 
 import fitact
@@ -23,7 +23,7 @@ ROUNDS = 5
 
 def measure(count: int, samples: int) -> dict[str, float]:
     """Medians of the rounds."""
-    records = simulated(count, samples)
+    records = simulate_records(count, samples)
     fitact.sample_many(records[:300], SCENE, progress=False)  # compiles
     fitact.sample(fitact.fit(records[0], SCENE), progress=False)
     taken: dict[str, list[float]] = {"together": [], "fit": [], "sample": []}

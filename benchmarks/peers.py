@@ -18,7 +18,7 @@ import lmfit
 import numpy as np
 from arviz_stats.base import array_stats
 from jax import Array
-from likelihood import FREQUENCY, RATE, TRUTH, folded, plain, skin_voltage
+from likelihood import FREQUENCY, RATE, TRUTH, plain_log_likelihood, skin_voltage, square_phase
 from numpyro.infer import MCMC, NUTS
 
 import fitact
@@ -32,13 +32,13 @@ LogProb = Callable[[np.ndarray], float]
 def plain_log_prob(record: fitact.Record) -> LogProb:
     """Over all samples, each time from their times."""
     t, y = record.time + 1e-9, record["Vsc"]  # later by less than matters, so that rounding moves none over an edge
-    return lambda point: plain(point, t, y) + _log_prior(point)
+    return lambda point: plain_log_likelihood(point, t, y) + _log_prior(point)
 
 
 def good_log_prob(record: fitact.Record) -> LogProb:
     """The closed form for one period, against every period of the record."""
     period = round(RATE / FREQUENCY)
-    sign, since = folded(record.time[:period])
+    sign, since = square_phase(record.time[:period])
     y = record["Vsc"].reshape(-1, period)
 
     def value(point: np.ndarray) -> float:
@@ -50,7 +50,7 @@ def good_log_prob(record: fitact.Record) -> LogProb:
 
 def raw_log_density(record: fitact.Record) -> Callable[[Array], Array]:
     """Over all samples in JAX."""
-    sign, since = (jnp.asarray(x) for x in folded(record.time))
+    sign, since = (jnp.asarray(x) for x in square_phase(record.time))
     y = jnp.asarray(record["Vsc"])
 
     def value(point: Array) -> Array:
@@ -179,12 +179,12 @@ class Blackjax(Nuts):
     def __init__(self, log_density: Callable[[Array], Array], start: np.ndarray, root: np.ndarray, steps: int) -> None:
         self._start, self._root, self._key = start, root, jax.random.PRNGKey(0)
 
-        def whitened(white: Array) -> Array:
+        def whitened_log_density(white: Array) -> Array:
             return log_density(start + jnp.asarray(root) @ white)
 
-        adaptation = blackjax.window_adaptation(blackjax.nuts, whitened)
+        adaptation = blackjax.window_adaptation(blackjax.nuts, whitened_log_density)
         (self._state, settings), _ = adaptation.run(jax.random.PRNGKey(1), jnp.zeros(4), num_steps=WARMUP)
-        step = blackjax.nuts(whitened, **settings).step
+        step = blackjax.nuts(whitened_log_density, **settings).step
 
         def one(state: Any, key: Array) -> tuple[Any, Array]:
             state, _ = step(key, state)

@@ -21,7 +21,7 @@ from timing import minima, show
 import fitact
 from fitact.model.drive import Sampled
 from fitact.model_selection import omissions
-from fitact.model_selection.model_errors import Reference
+from fitact.model_selection.model_errors import ReferenceModel
 
 CIRCUITS, SAMPLES, ROUNDS = 64, 4000, 200
 SAME = 1.1  # times closer than this count as equal
@@ -54,7 +54,7 @@ Scene = fitact.Scene
 def kind(scene: Scene) -> tuple:
     """What the time depends on: circuits with as many time constants run the same loop."""
     drive = scene.drive
-    return omissions.time_constants(scene.make_rc_circuit()), drive.waveform, drive.shape, drive.steady_state
+    return omissions.count_time_constants(scene.make_rc_circuit()), drive.waveform, drive.shape, drive.steady_state
 
 
 def job(scene: Scene, dtype: type = np.float64) -> Callable[[], object]:
@@ -89,9 +89,9 @@ def table() -> dict[str, tuple[float, float]]:
     jobs = {name: job(scene) for name, scene in scenes.items()}
     jobs |= {f"{name}, float32": job(scenes[name], np.float32) for name in ("final, square", "R_H, square")}
     times = {name: 1e9 * seconds / CIRCUITS / SAMPLES for name, seconds in minima(jobs, ROUNDS).items()}
-    costs = {name: omissions.cost(scene) for name, scene in scenes.items()}
+    costs = {name: omissions.evaluation_cost(scene) for name, scene in scenes.items()}
     costs |= {
-        name: costs[name.removesuffix(", float32")] / omissions.SINGLE_SPEEDUP for name in times if name not in costs
+        name: costs[name.removesuffix(", float32")] / omissions.FLOAT32_SPEEDUP for name in times if name not in costs
     }
     return {name: (costs[name], each) for name, each in times.items()}
 
@@ -99,37 +99,36 @@ def table() -> dict[str, tuple[float, float]]:
 def random_scene(rng: np.random.Generator) -> Scene:
     """A scene with some of everything."""
 
-    def between(low: float, high: float) -> float:
+    def log_uniform(low: float, high: float) -> float:
         return math.exp(rng.uniform(math.log(low), math.log(high)))
 
-    frequency = between(20.0, 1000.0)
-    ground: dict = {"connection": "natural", "Z": between(1e4, 1e8)}
+    frequency = log_uniform(20.0, 1000.0)
+    ground: dict = {"connection": "natural", "Z": log_uniform(1e4, 1e8)}
     if rng.random() < 0.75:
-        ground = {"R_H": between(30.0, 3e3)} if rng.random() < 0.8 else {}
-        ground |= {"grounding_Rsc": between(150e3, 170e3)} if rng.random() < 0.5 else {}
+        ground = {"R_H": log_uniform(30.0, 3e3)} if rng.random() < 0.8 else {}
+        ground |= {"grounding_Rsc": log_uniform(150e3, 170e3)} if rng.random() < 0.5 else {}
     elif rng.random() < 0.5:
-        ground["Z_capacitance"] = between(1e-13, 1e-9)
+        ground["Z_capacitance"] = log_uniform(1e-13, 1e-9)
     measured: dict = {"duration": 2.0 / frequency}
-    measured |= {"probe_capacitance": between(1e-12, 1e-10)} if rng.random() < 0.5 else {}
-    measured |= {"series_resistor": between(10.0, 1e4)} if rng.random() < 0.4 else {}
+    measured |= {"probe_capacitance": log_uniform(1e-12, 1e-10)} if rng.random() < 0.5 else {}
+    measured |= {"series_resistor": log_uniform(10.0, 1e4)} if rng.random() < 0.4 else {}
     drive: dict = {"frequency": frequency}
     drive["waveform"] = str(rng.choice(["square", "trapezoid", "triangle", "sine", "burst"]))
-    drive |= {"rise_time": between(1e-4, 0.05) / frequency} if drive["waveform"] == "trapezoid" else {}
+    drive |= {"rise_time": log_uniform(1e-4, 0.05) / frequency} if drive["waveform"] == "trapezoid" else {}
     drive |= {"steady_state": False} if drive["waveform"] != "burst" and rng.random() < 0.3 else {}
-    tolerance = {"force": between(1e-3, 0.1)}
+    tolerance = {"force": log_uniform(1e-3, 0.1)}
     return Scene.from_dict({"grounding": ground, "measurement": measured, "drive": drive, "tolerance": tolerance})
 
 
-def admissible(scene: Scene) -> list[Scene]:
+def admissible_scenes(scene: Scene) -> list[Scene]:
     """All reduced scenes that keep the tolerance."""
     values = {"Rsc": scene.skin.Rsc, "Csc": scene.skin.Csc, "Ci": scene.device.Ci}
-    reference = Reference(scene, values)
-    free = [name for name in omissions.named(scene) if not omissions.required(scene, name)]
+    reference = ReferenceModel(scene, values)
+    free = [name for name in omissions.applicable_omissions(scene) if not omissions.reason_to_keep(scene, name)]
     found = []
     for names in itertools.chain.from_iterable(itertools.combinations(free, n) for n in range(len(free) + 1)):
-        reduced = omissions.without(scene, names)
-        errors = reference.compare(reduced, values)
-        if max(errors.force_mean[0], errors.force_peak[0]) <= scene.tolerance.force:
+        reduced = omissions.reduce_scene(scene, names)
+        if reference.compare(reduced, values)[2:, 0].max() <= scene.tolerance.force:
             found.append(reduced)
     return found
 
@@ -143,7 +142,7 @@ def hindsight(count: int) -> tuple[np.ndarray, np.ndarray]:
         begin = time.perf_counter()
         plans.append(fitact.plan(scene))
         seconds.append(time.perf_counter() - begin)
-    choices = [admissible(scene) for scene in scenes]
+    choices = [admissible_scenes(scene) for scene in scenes]
     kinds = {kind(each): each for each in itertools.chain(*choices)}
     taken = minima({name: job(each) for name, each in kinds.items()}, ROUNDS)
     ratios = [

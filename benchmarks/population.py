@@ -20,7 +20,7 @@ import numpy as np
 from timing import medians, show
 
 import fitact
-from fitact.populations.sobol import Surrogate, shares_of
+from fitact.populations.sobol import Surrogate, sobol_indices
 
 SAMPLES = 500
 LONGER = 10  # times
@@ -36,7 +36,7 @@ SCENE: dict[str, Any] = {
 NAMES = ("force_mean", "force_peak")
 
 
-class Simulated(Sequence[fitact.Record]):
+class SimulatedRecords(Sequence[fitact.Record]):
     """Two settled periods of fingers, log-normal in Rsc and Csc, by 200 harmonics of the triangle."""
 
     def __init__(self, fingers: int, samples: int) -> None:
@@ -62,38 +62,38 @@ class Simulated(Sequence[fitact.Record]):
         )
 
 
-def found(fingers: int, samples: int) -> fitact.Population:
-    return fitact.population(Simulated(fingers, samples), fitact.Scene.from_dict(SCENE), seed=1, progress=False)
+def fit_simulated(fingers: int, samples: int) -> fitact.Population:
+    return fitact.population(SimulatedRecords(fingers, samples), fitact.Scene.from_dict(SCENE), seed=1, progress=False)
 
 
-def one(fingers: int, samples: int) -> dict[str, float]:
+def measure_run(fingers: int, samples: int) -> dict[str, float]:
     """Seconds with all that is printed, and peak memory, MB, of this process."""
     began = time.perf_counter()
     with contextlib.redirect_stdout(io.StringIO()):
-        print(found(fingers, samples))
+        print(fit_simulated(fingers, samples))
     seconds = time.perf_counter() - began
     return {"seconds": seconds, "memory": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0}
 
 
-def in_a_process(fingers: int, samples: int) -> dict[str, float]:
+def run_in_process(fingers: int, samples: int) -> dict[str, float]:
     command = [sys.executable, __file__, "--one", str(fingers), str(samples)]
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 
 def shares() -> dict[str, float]:
     """Saltelli's design on the model itself over the same on the surrogate, the posterior's factors."""
-    population = found(12, SAMPLES)
+    population = fit_simulated(12, SAMPLES)
     factors = population.factors.reshape(-1, len(population.finger.factors))
     columns = [population.finger.names.index(name) for name in NAMES]
     count = {"exact": 0}
 
     def exact(points: np.ndarray) -> np.ndarray:
         count["exact"] += len(points)
-        return population.finger.each(points)[:, columns]
+        return population.finger.evaluate(points)[:, columns]
 
-    surrogate = Surrogate.of(population.finger, factors, NAMES)
+    surrogate = Surrogate.from_model(population.finger, factors, NAMES)
     named = population.finger.factors, factors, NAMES, 1
-    brute, near = shares_of(exact, *named), shares_of(surrogate.at, *named)
+    brute, near = sobol_indices(exact, *named), sobol_indices(surrogate.predict, *named)
     shifts = [
         abs(brute[name][factor][key] - near[name][factor][key])
         for name in NAMES
@@ -102,12 +102,12 @@ def shares() -> dict[str, float]:
     ]
     rng = np.random.default_rng(2)
     points = {n: factors[rng.integers(len(factors), size=n)] for n in (count["exact"], surrogate.evaluations)}
-    seconds = medians({str(n): lambda at=at: population.finger.each(at) for n, at in points.items()}, 5)
+    seconds = medians({str(n): lambda at=at: population.finger.evaluate(at) for n, at in points.items()}, 5)
     return {
         "shares_evaluations_exact_vs_surrogate": count["exact"] / surrogate.evaluations,
         "shares_model_seconds_exact_vs_surrogate": seconds[str(count["exact"])] / seconds[str(surrogate.evaluations)],
         "shares_largest_shift": max(shifts),
-        "shares_shift_certified": float(np.max(surrogate.off)),
+        "shares_shift_certified": float(np.max(surrogate.cross_validation_error)),
     }
 
 
@@ -118,11 +118,11 @@ def main() -> None:
     parser.add_argument("--one", type=int, nargs=2, metavar=("FINGERS", "SAMPLES"), help="one run alone")
     given = parser.parse_args()
     if given.one:
-        print(json.dumps(one(*given.one)))
+        print(json.dumps(measure_run(*given.one)))
         return
-    tenth = in_a_process(given.fingers // 10, SAMPLES)
-    whole = in_a_process(given.fingers, SAMPLES)
-    longer = in_a_process(given.fingers // 10, LONGER * SAMPLES)
+    tenth = run_in_process(given.fingers // 10, SAMPLES)
+    whole = run_in_process(given.fingers, SAMPLES)
+    longer = run_in_process(given.fingers // 10, LONGER * SAMPLES)
     show(
         {
             f"seconds_{given.fingers}_fingers": whole["seconds"],

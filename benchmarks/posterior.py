@@ -64,7 +64,7 @@ ROUNDS = 5
 STEPS = 5000  # a round
 
 
-class Product:
+class FitactSampler:
     """`fitact.sample`, with another seed each time."""
 
     def __init__(self, fit: fitact.Fit) -> None:
@@ -99,7 +99,7 @@ def rates(data: fitact.Record, quick: bool) -> tuple[dict[str, float], dict[str,
     steps = STEPS // 10 if quick else STEPS
     starts = fit.point + np.random.default_rng(4).standard_normal((WALKERS, 4)) @ fit.point_root.T
     plain, good, raw = plain_log_prob(data), good_log_prob(data), raw_log_density(data)
-    ours = Product(fit)
+    ours = FitactSampler(fit)
     peers: dict[str, Peer] = {
         "plain": Ensemble(plain, starts, steps),
         "good": Ensemble(good, starts, steps),
@@ -129,7 +129,7 @@ def long_record(effective: float) -> float:
     data = record(1_000_000)
     fit = fitact.fit(data, fitact.Scene.from_dict(tomllib.loads(SCENE)))
     starts = fit.point + np.random.default_rng(4).standard_normal((WALKERS, 4)) @ fit.point_root.T
-    ours, good = Product(fit), Ensemble(good_log_prob(data), starts, 10)
+    ours, good = FitactSampler(fit), Ensemble(good_log_prob(data), starts, 10)
     pairs = [(ours.draw(), good.draw()) for _ in range(ROUNDS)]
     own, step = (statistics.median(values) for values in zip(*pairs, strict=True))
     return own * step / effective
@@ -145,21 +145,21 @@ def processes(data: fitact.Record, each: float, quick: bool) -> tuple[dict[str, 
         (folder / "scene.toml").write_text(SCENE)
         write_csv(folder / "record.csv", data)
         fitact_run = [str(Path(sys.executable).with_name("fitact")), "run", "record.csv", "--scene", "scene.toml"]
-        cold, *warm = (_timed(folder, *fitact_run, "--out", str(i)) for i in range(4))
+        cold, *warm = (_time_command(folder, *fitact_run, "--out", str(i)) for i in range(4))
         content = json.loads((folder / "0" / "summary.json").read_text())
         effective, run = content["convergence"]["ess"]["force_mean"], statistics.median(warm)
         steps = round(effective / each)
         script = [sys.executable, str(Path(__file__).with_name("lmfit_script.py")), "record.csv"]
         if quick:
-            start, tenth = (_timed(folder, *script, str(count), "corner.png") for count in (100, steps // 10))
+            start, tenth = (_time_command(folder, *script, str(count), "corner.png") for count in (100, steps // 10))
             lmfit = start + (tenth - start) * (steps - 100) / (steps // 10 - 100)
         else:
-            lmfit = _timed(folder, *script, str(steps), "corner.png")
+            lmfit = _time_command(folder, *script, str(steps), "corner.png")
         print(f"fitact run: {run:.1f} s, first {cold:.1f} s; lmfit's script: {lmfit:.0f} s", file=sys.stderr)
         return {"run_vs_lmfit_script": run / lmfit, "cold_run_vs_lmfit_script": cold / lmfit}, effective / run
 
 
-def _timed(folder: Path, *command: str) -> float:
+def _time_command(folder: Path, *command: str) -> float:
     """Seconds of a process, with caches of its own."""
     kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     kept["XDG_CACHE_HOME"] = str(folder / "cache")

@@ -23,7 +23,7 @@ RECORDS = Path(__file__).parents[1] / "data_synth" / "records"
 ROUNDS, SAMPLES, RATE = 7, 1_000_000, 200e3
 
 
-def written(folder: Path) -> dict[str, Path]:
+def write_pages(folder: Path) -> dict[str, Path]:
     """The pages, from independent draws: they differ from the demo's in numbers alone."""
     scene = fitact.Scene.load(RECORDS / "finger_direct.toml")
     demo = fitact.fit(fitact.read(RECORDS / "finger_direct.csv", scene), scene)
@@ -68,20 +68,20 @@ const look = () => figure.querySelectorAll(".main-svg").length ? setTimeout(done
 look();"""
 
 
-def measured() -> tuple[dict[str, float], dict[str, int]]:
+def measure_pages() -> tuple[dict[str, float], dict[str, int]]:
     """Median seconds of each, and bytes of each page."""
     driver = browser()
     try:
         with tempfile.TemporaryDirectory() as folder:
-            pages = written(Path(folder))
+            pages = write_pages(Path(folder))
 
-            def opened(name: str) -> None:
+            def open_page(name: str) -> None:
                 driver.get(pages[name].as_uri())
                 driver.execute_async_script(WAIT)
 
-            times = medians({f"{name} opened": lambda name=name: opened(name) for name in pages}, ROUNDS)
+            times = medians({f"{name} opened": lambda name=name: open_page(name) for name in pages}, ROUNDS)
             for name in pages:
-                opened(name)
+                open_page(name)
                 driver.execute_async_script(SHOW)
                 times |= medians({f"{name} answered": lambda: driver.execute_async_script(PRESS)}, ROUNDS)
             return times, {name: page.stat().st_size for name, page in pages.items()}
@@ -93,7 +93,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", action="store_true")
     as_json = parser.parse_args().json
-    times, sizes = measured()
+    times, sizes = measure_pages()
     if not as_json:
         for name, value in times.items():
             print(f"{name:16}{value:8.2f} s")

@@ -45,7 +45,7 @@ def contenders() -> dict[str, Callable[[], object]]:
     }
 
 
-def measured() -> dict[str, float]:
+def measure_seconds() -> dict[str, float]:
     """Median seconds of each."""
     with jax.enable_x64(True):
         jobs = contenders()
@@ -55,7 +55,7 @@ def measured() -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", action="store_true")
-    times = measured()
+    times = measure_seconds()
     ratios = {
         "exact_vs_lsim": times["lsim"] / times["exact"],
         "exact_vs_numpy_exp": times["exact"] / times["numpy exp"],

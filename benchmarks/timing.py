@@ -10,15 +10,17 @@ def medians(
     jobs: dict[str, Callable[[], object]], rounds: int, calls: dict[str, int] | None = None
 ) -> dict[str, float]:
     """Median seconds of a call of each job, run in turn; `calls`: how many a round, 1 where it is silent."""
-    return {name: statistics.median(times) for name, times in _taken(jobs, rounds, calls).items()}
+    return {name: statistics.median(times) for name, times in _call_seconds(jobs, rounds, calls).items()}
 
 
 def minima(jobs: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
     """The least seconds of a call of each job, run in turn: what else the machine does only adds to it."""
-    return {name: min(times) for name, times in _taken(jobs, rounds, None).items()}
+    return {name: min(times) for name, times in _call_seconds(jobs, rounds, None).items()}
 
 
-def _taken(jobs: dict[str, Callable[[], object]], rounds: int, calls: dict[str, int] | None) -> dict[str, list[float]]:
+def _call_seconds(
+    jobs: dict[str, Callable[[], object]], rounds: int, calls: dict[str, int] | None
+) -> dict[str, list[float]]:
     taken: dict[str, list[float]] = {name: [] for name in jobs}
     for job in jobs.values():
         job()

@@ -29,7 +29,7 @@ def main() -> int:
     try:
         if chosen.command == "committed":
             for path in sorted(RECORDS.glob("*.recipe.toml")):
-                if _can(path):
+                if _is_route_available(path):
                     _make(path, chosen.out, "csv.gz", None, None)
             return 0
         for path in chosen.recipe:
@@ -40,11 +40,11 @@ def main() -> int:
         return 2
 
 
-def _can(path: Path) -> bool:
+def _is_route_available(path: Path) -> bool:
     """Whether its route is there; says so where it is not."""
     from data_synth import recipe, spice
 
-    there = recipe.load(path).route != "ngspice" or spice.found()
+    there = recipe.load(path).route != "ngspice" or spice.is_installed()
     if not there:
         print(f"{path.name}: left out, since ngspice is not installed", file=sys.stderr)
     return there

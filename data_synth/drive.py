@@ -47,9 +47,9 @@ def make_drive(section: Mapping[str, Any]) -> Drive:
         return _chirp(section)
     if waveform == "burst":
         wave = _wave(section, section["shape"])
-        return _between(wave, 0.0, section["cycles"] / section["frequency"])
+        return _gate_drive(wave, 0.0, section["cycles"] / section["frequency"])
     wave = _multitone(section) if waveform == "multitone" else _wave(section, waveform)
-    return wave if section["steady_state"] else _between(wave, 0.0, math.inf)
+    return wave if section["steady_state"] else _gate_drive(wave, 0.0, math.inf)
 
 
 def _wave(section: Mapping[str, Any], shape: str) -> Drive:
@@ -107,14 +107,14 @@ def _chirp(section: Mapping[str, Any]) -> Drive:
         return section["offset"] + 0.5 * section["peak_to_peak"] * wave
 
     sweep = Drive(value, _no_corners, _SMOOTH, 1.0 / (_STEPS * max(first, last)), None, False)
-    return _between(sweep, 0.0, duration)
+    return _gate_drive(sweep, 0.0, duration)
 
 
 def _no_corners(start: float, end: float) -> np.ndarray:
     return np.empty(0)
 
 
-def _between(wave: Drive, begin: float, end: float) -> Drive:
+def _gate_drive(wave: Drive, begin: float, end: float) -> Drive:
     """The wave from `begin` to `end` (s), and zero before and after."""
 
     def value(time: np.ndarray) -> np.ndarray:
@@ -126,16 +126,18 @@ def _between(wave: Drive, begin: float, end: float) -> Drive:
         return np.append(wave.corners(start, stop), ends)
 
     at_ends = [wave.value(np.array(each)) for each in (begin, end) if math.isfinite(each)]
-    jumps = wave.jumps or max(abs(float(each)) for each in at_ends) > 1e-9 * float(np.ptp(wave.value(_sampled(wave))))
+    jumps = wave.jumps or max(abs(float(each)) for each in at_ends) > 1e-9 * float(
+        np.ptp(wave.value(_sample_times(wave)))
+    )
     return Drive(value, corners, wave.degree, wave.longest, None, jumps)
 
 
-def _sampled(wave: Drive) -> np.ndarray:
+def _sample_times(wave: Drive) -> np.ndarray:
     """Times (s) over which the wave shows its height."""
     return np.linspace(0.0, wave.period or 64.0 * wave.longest, 64)
 
 
-def at_ends(drive: Drive, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def end_values(drive: Drive, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """V at the start and at the end of each stretch between neighbouring times, of which none holds a corner inside."""
     length = np.diff(corners)
     if drive.degree > _STRAIGHT:

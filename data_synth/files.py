@@ -22,13 +22,13 @@ def write_record(path: Path, time: np.ndarray, channels: Columns) -> None:
     Raises:
         RecipeError: the name ends otherwise.
     """
-    write = _FORMATS.get(format_of(path))
+    write = _FORMATS.get(file_format(path))
     if write is None:
         raise RecipeError(f"{path}: no format of that name; end it in {', '.join(_FORMATS)}")
-    _replacing(path, lambda file: write(file, {"time": time, **channels}))
+    _write_atomically(path, lambda file: write(file, {"time": time, **channels}))
 
 
-def format_of(path: Path) -> str:
+def file_format(path: Path) -> str:
     """The end of the name: csv.gz, csv, npz, mat, h5, or something else."""
     return next((end for end in _FORMATS if path.name.endswith(f".{end}")), "")
 
@@ -36,7 +36,7 @@ def format_of(path: Path) -> str:
 def write_json(path: Path, content: Any) -> None:
     """Indented."""
     text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
-    _replacing(path, lambda file: file.write(text.encode()))
+    _write_atomically(path, lambda file: file.write(text.encode()))
 
 
 def _csv(columns: Columns) -> bytes:
@@ -77,7 +77,7 @@ _FORMATS: dict[str, Callable[[IO[bytes], Columns], Any]] = {
 FORMATS = tuple(_FORMATS)
 
 
-def _replacing(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
+def _write_atomically(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
     """A file that is there whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(f"{path.name}.{os.getpid()}.part")

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from data_synth.drive import Drive, at_ends
+from data_synth.drive import Drive, end_values
 from data_synth.errors import RecipeError
 from data_synth.network import Branch, Network, gains, plain_admittance, state_space
 from data_synth.response import response
@@ -41,16 +41,16 @@ def harmonic_response(
     def admittance(branch: Branch, at: np.ndarray) -> np.ndarray:
         if not branch.layer:
             return plain_admittance(branch, at)
-        found = _layer(*values[branch.start, branch.end], skin, at)
+        found = _layer_admittance(*values[branch.start, branch.end], skin, at)
         return found.real + 0j if branch.kind == "R" else 1j * found.imag
 
-    def at_top(branch: Branch) -> Branch:
+    def high_frequency_branch(branch: Branch) -> Branch:
         top = admittance(branch, omega[-1:])[0]
         return branch._replace(value=1.0 / top.real if branch.kind == "R" else top.imag / omega[-1])
 
-    above = circuit._replace(branches=tuple(map(at_top, circuit.branches)))
+    above = circuit._replace(branches=tuple(map(high_frequency_branch, circuit.branches)))
     voltage, Vsc, current = response(state_space(above), drive, time)
-    heights = 2.0 * coefficients(drive, count)
+    heights = 2.0 * fourier_coefficients(drive, count)
     whole, part = gains(circuit, omega, admittance), gains(above, omega, plain_admittance)
     missing = heights[:, None] * np.column_stack([whole[0] - part[0], whole[1] - part[1]])
     there = np.flatnonzero(np.any(np.abs(missing) > _NOTHING * np.max(np.abs(missing), axis=0), axis=1))
@@ -61,7 +61,7 @@ def harmonic_response(
     return voltage, Vsc, current
 
 
-def _layer(R: float, C: float, skin: Mapping[str, Any], omega: np.ndarray) -> np.ndarray:
+def _layer_admittance(R: float, C: float, skin: Mapping[str, Any], omega: np.ndarray) -> np.ndarray:
     """Admittance (S) of an outer layer of `R` ohm and `C` F."""
     if skin["level"] == "fractional":
         return (1.0 + (1j * omega * R * C) ** skin["alpha"]) / R
@@ -70,7 +70,7 @@ def _layer(R: float, C: float, skin: Mapping[str, Any], omega: np.ndarray) -> np
     return 1.0 / resistance + 1j * omega * C * np.exp(np.interp(where, knots, np.log(_CAPACITANCE)))
 
 
-def coefficients(drive: Drive, count: int) -> np.ndarray:
+def fourier_coefficients(drive: Drive, count: int) -> np.ndarray:
     """Fourier's c_1 to c_count (V) of a drive that repeats: v = sum of c_n exp(2 pi i n t / period) over all n."""
     assert drive.period is not None
     if drive.degree > 1:
@@ -79,7 +79,7 @@ def coefficients(drive: Drive, count: int) -> np.ndarray:
         return np.pad(found, (0, count - found.size))
     corners = np.unique(np.mod(drive.corners(0.0, drive.period), drive.period))
     starts, ends = corners, np.append(corners[1:], corners[0] + drive.period)
-    first, last = at_ends(drive, np.append(starts, ends[-1]))
+    first, last = end_values(drive, np.append(starts, ends[-1]))
     omega = 2.0 * np.pi / drive.period * np.arange(1, count + 1)[:, None]
     at_start, at_end = np.exp(-1j * omega * starts), np.exp(-1j * omega * ends)
     straight = (first * at_start - last * at_end) / (1j * omega)

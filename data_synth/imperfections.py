@@ -20,13 +20,13 @@ def generator(seed: int, finger: int, kind: str, channel: str = "V") -> np.rando
     return np.random.default_rng([seed, finger, _STREAMS.index(kind), _CHANNELS.index(channel)])
 
 
-def instants(time: np.ndarray, clock: Mapping[str, Any], seed: int, finger: int) -> np.ndarray:
+def sampling_times(time: np.ndarray, clock: Mapping[str, Any], seed: int, finger: int) -> np.ndarray:
     """When samples are taken (s) that the record says were taken at `time`: jitter, normal, and a late trigger."""
     jitter = clock["jitter"] * generator(seed, finger, "clock").standard_normal(time.size) if clock["jitter"] else 0.0
     return time + clock["trigger_error"] + jitter
 
 
-def spoil(
+def add_imperfections(
     values: np.ndarray, channel: str, time: np.ndarray, parts: Mapping[str, Mapping[str, Any]], seed: int, finger: int
 ) -> np.ndarray:
     """A channel as it is recorded."""
@@ -39,13 +39,13 @@ def spoil(
     if parts["pink"][channel]:
         rng, pink = generator(seed, finger, "pink", channel), parts["pink"]
         step = float(np.median(np.diff(time)))
-        values = values + pink[channel] * coloured(time.size, step, pink["exponent"], pink["corner"], rng)
+        values = values + pink[channel] * power_law_noise(time.size, step, pink["exponent"], pink["corner"], rng)
     if parts["white"][channel]:
         values = values + parts["white"][channel] * generator(seed, finger, "white", channel).standard_normal(time.size)
     if parts["clip"][channel]:
         values = np.clip(values, -parts["clip"][channel], parts["clip"][channel])
     if parts["converter"][channel]:
-        values = converted(values, parts["converter"][channel], parts["converter"]["bits"])
+        values = quantize(values, parts["converter"][channel], parts["converter"]["bits"])
     return values
 
 
@@ -56,7 +56,9 @@ def hum(time: np.ndarray, section: Mapping[str, Any], phases: np.ndarray) -> np.
     return np.sin(angle) @ np.array(section["harmonics"])
 
 
-def coloured(size: int, step: float, exponent: float, corner: float | None, rng: np.random.Generator) -> np.ndarray:
+def power_law_noise(
+    size: int, step: float, exponent: float, corner: float | None, rng: np.random.Generator
+) -> np.ndarray:
     """Normal noise of expected variance 1 whose power falls as frequency^-exponent above `corner` (Hz), flat below.
 
     Without a corner it is the lowest frequency that a record of `size` samples of `step` s shows. Made on a circle
@@ -71,12 +73,12 @@ def coloured(size: int, step: float, exponent: float, corner: float | None, rng:
     return np.fft.irfft(np.append(0.0, heights), 2 * size)[:size] * 2 * size
 
 
-def converted(values: np.ndarray, span: float, bits: int) -> np.ndarray:
+def quantize(values: np.ndarray, span: float, bits: int) -> np.ndarray:
     """To the nearest of 2^bits levels over `span` around 0, the lowest at -span / 2; values beyond get the last one."""
     step, half = span / 2**bits, 2 ** (bits - 1)
     return np.clip(np.round(values / step), -half, half - 1) * step
 
 
-def kept(size: int, share: float, seed: int, finger: int) -> np.ndarray:
+def sample_mask(size: int, share: float, seed: int, finger: int) -> np.ndarray:
     """Which samples are there: each is lost, with its time, with probability `share`."""
     return generator(seed, finger, "missing").uniform(size=size) >= share

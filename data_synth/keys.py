@@ -26,25 +26,25 @@ class Choice(NamedTuple):
     options: tuple[Any, ...]
 
 
-class Listed(NamedTuple):
+class ListKey(NamedTuple):
     """A list, of quantities or of words."""
 
     of: Quantity | Choice
     default: tuple[Any, ...] | None = None
 
 
-class Whole(NamedTuple):
+class WholeNumber(NamedTuple):
     """A whole number."""
 
     default: int | None
     least: int = 0
 
 
-class Unread(NamedTuple):
+class IgnoredKey(NamedTuple):
     """What says nothing about a record: known, and passed over."""
 
 
-Key = Quantity | Choice | Listed | Whole | Unread
+Key = Quantity | Choice | ListKey | WholeNumber | IgnoredKey
 Table = Mapping[str, Mapping[str, Key]]
 
 
@@ -61,7 +61,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise RecipeError(f"{path}: cannot be read as TOML ({reason}); check the path and the file") from error
 
 
-def checked(content: Mapping[str, Any], table: Table, place: str) -> dict[str, dict[str, Any]]:
+def validate_sections(content: Mapping[str, Any], table: Table, place: str) -> dict[str, dict[str, Any]]:
     """Sections with every key of `table`, in SI units; `place` names the file.
 
     Raises:
@@ -69,47 +69,49 @@ def checked(content: Mapping[str, Any], table: Table, place: str) -> dict[str, d
     """
     for section, given in content.items():
         if section not in table:
-            raise RecipeError(f"{place}: [{section}] is not a section; {_nearest(section, list(table))}")
+            raise RecipeError(f"{place}: [{section}] is not a section; {_suggest_name(section, list(table))}")
         if not isinstance(given, dict):
             raise RecipeError(f"{place}: [{section}] is not a table; write its keys under [{section}]")
         for key in given:
             if key not in table[section]:
-                raise RecipeError(f"{place}: [{section}] {key} is not a key; {_nearest(key, list(table[section]))}")
+                raise RecipeError(
+                    f"{place}: [{section}] {key} is not a key; {_suggest_name(key, list(table[section]))}"
+                )
     return {
         section: {
-            name: value(content[section][name], key, f"{place}: [{section}] {name}")
+            name: validate_value(content[section][name], key, f"{place}: [{section}] {name}")
             if name in content.get(section, {})
-            else default(key)
+            else default_value(key)
             for name, key in keys.items()
         }
         for section, keys in table.items()
     }
 
 
-def default(key: Key) -> Any:
+def default_value(key: Key) -> Any:
     """What stands where a file is silent."""
     if isinstance(key, Choice):
         return key.options[0]
-    return None if isinstance(key, Unread) else key.default
+    return None if isinstance(key, IgnoredKey) else key.default
 
 
-def value(given: Any, key: Key, place: str) -> Any:
+def validate_value(given: Any, key: Key, place: str) -> Any:
     """One value, checked."""
-    if isinstance(key, Unread):
+    if isinstance(key, IgnoredKey):
         return given
-    if isinstance(key, Listed):
+    if isinstance(key, ListKey):
         if not isinstance(given, list) or not given:
             raise RecipeError(f"{place} = {given!r} is not a list; write one in brackets")
-        return tuple(value(each, key.of, place) for each in given)
+        return tuple(validate_value(each, key.of, place) for each in given)
     if isinstance(key, Choice):
         if given not in key.options:
             raise RecipeError(f"{place} = {given!r} is not a choice; write one of {', '.join(map(repr, key.options))}")
         return given
-    if isinstance(key, Whole):
+    if isinstance(key, WholeNumber):
         if isinstance(given, bool) or not isinstance(given, int) or given < key.least:
             raise RecipeError(f"{place} = {given!r}; write a whole number of at least {key.least}")
         return given
-    found = quantity(given, key.unit, place)
+    found = parse_quantity(given, key.unit, place)
     if found < key.low or (found == key.low and not key.least):
         raise RecipeError(f"{place} = {given!r} must be {'at least' if key.least else 'above'} {key.low:g}")
     return found
@@ -124,7 +126,7 @@ def _registry() -> Any:
     return registry
 
 
-def quantity(given: Any, unit: str, place: str) -> float:
+def parse_quantity(given: Any, unit: str, place: str) -> float:
     """Text such as "160 kohm", or a bare number in SI, as a float in the SI unit `unit`.
 
     Raises:
@@ -141,6 +143,6 @@ def quantity(given: Any, unit: str, place: str) -> float:
     return float(f"{found:.15g}")
 
 
-def _nearest(word: str, known: list[str]) -> str:
+def _suggest_name(word: str, known: list[str]) -> str:
     near = difflib.get_close_matches(word, known, n=1)
     return (f"did you mean '{near[0]}'? " if near else "") + f"known: {', '.join(known)}"

@@ -10,7 +10,7 @@ import numpy as np
 from data_synth import imperfections
 from data_synth.drive import Drive, make_drive
 from data_synth.errors import RecipeError
-from data_synth.keys import default
+from data_synth.keys import default_value
 from data_synth.network import Network, network, state_space
 from data_synth.recipe import AS_IT_IS, KEYS, UNITS, Recipe
 from data_synth.scene import KEYS as SCENE
@@ -74,39 +74,41 @@ def _population(recipe: Recipe) -> list[Scene]:
 
 
 def _record(recipe: Recipe, scene: Scene, finger: int) -> Synthetic:
-    measured, parts = scene["measurement"], _with_noise(recipe)
+    measured, parts = scene["measurement"], _resolve_noise(recipe)
     count = round(measured["duration"] * measured["sampling_rate"])
     if not 2 <= count <= _MOST_SAMPLES:
         raise RecipeError(f"{recipe.name}: duration times sampling_rate is {count:,} samples; give 2 to 10,000,000")
     time = np.arange(count) / measured["sampling_rate"]
-    taken = imperfections.instants(time, parts["clock"], recipe.seed, finger)
+    taken = imperfections.sampling_times(time, parts["clock"], recipe.seed, finger)
     area = scene["device"]["contact_area"] / recipe.scene["device"]["contact_area"]
-    found = dict(zip(UNITS, respond(scene, taken, _of_area(parts["skin"], area), recipe.route), strict=True))
+    found = dict(
+        zip(UNITS, simulate_response(scene, taken, _scale_second_layer(parts["skin"], area), recipe.route), strict=True)
+    )
     wanted = [name for name in UNITS if name == "V" or name in measured["channels"]]
     if "I" in wanted and not np.all(np.isfinite(found["I"])):
         raise RecipeError(
             f"{recipe.name}: the current has an impulse at each ideal jump of the drive; give the drive a rise time, or"
             " the circuit R_H or a series_resistor"
         )
-    channels = {n: imperfections.spoil(found[n], n, time, parts, recipe.seed, finger) for n in wanted}
-    there = imperfections.kept(count, parts["missing"]["share"], recipe.seed, finger)
+    channels = {n: imperfections.add_imperfections(found[n], n, time, parts, recipe.seed, finger) for n in wanted}
+    there = imperfections.sample_mask(count, parts["missing"]["share"], recipe.seed, finger)
     channels = {name: values[there] for name, values in channels.items()}
     return Synthetic(time[there], channels, _truth(recipe, scene, parts))
 
 
-def _of_area(skin: Mapping[str, Any], area: float) -> Mapping[str, Any]:
+def _scale_second_layer(skin: Mapping[str, Any], area: float) -> Mapping[str, Any]:
     """A second layer, where there is one, of `area` times the median's."""
     return {**skin, "Rsc_2": skin["Rsc_2"] / area, "Csc_2": skin["Csc_2"] * area} if skin["Rsc_2"] else skin
 
 
-def _with_noise(recipe: Recipe) -> dict[str, dict[str, Any]]:
+def _resolve_noise(recipe: Recipe) -> dict[str, dict[str, Any]]:
     """The recipe's sections; where it is silent on white noise, the scene's counts."""
     measured, white = recipe.scene["measurement"], recipe.parts["white"]
     stated = {"V": 0.0, "Vsc": measured["noise_Vsc"], "I": measured["noise_I"]}
     return {**recipe.parts, "white": {n: stated[n] if white[n] is None else white[n] for n in UNITS}}
 
 
-def respond(
+def simulate_response(
     scene: Scene, time: np.ndarray, skin: Mapping[str, Any] | None = None, route: str = "scipy"
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """V, Vsc (V) and I (A) at `time` (s), without imperfections; `skin` is a recipe's section of that name.
@@ -125,10 +127,10 @@ def respond(
         if level != "constant":
             raise RecipeError(f"[skin] level = '{level}' is not among ngspice's circuits; take route = 'scipy'")
         return spice_response(circuit, law, drive, time)
-    return _by_scipy(circuit, law, scene["skin"], drive, time)
+    return _scipy_response(circuit, law, scene["skin"], drive, time)
 
 
-def _by_scipy(
+def _scipy_response(
     circuit: Network, law: Mapping[str, Any] | None, skin: Mapping[str, Any], drive: Drive, time: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     # each brings a part of scipy along
@@ -150,7 +152,7 @@ def _truth(recipe: Recipe, scene: Scene, parts: dict[str, dict[str, Any]]) -> di
     if scene["skin"]["level"] != "fractional":
         del values["alpha"]
     values |= {f"noise_{name}": (parts["white"][name], UNITS[name]) for name in scene["measurement"]["channels"]}
-    stated = {key: value for key, value in scene["drive"].items() if value != default(SCENE["drive"][key])}
+    stated = {key: value for key, value in scene["drive"].items() if value != default_value(SCENE["drive"][key])}
     added = {name: parts[name] for name in KEYS if name in recipe.given}
     return {
         "scene": recipe.scene_file,
@@ -168,5 +170,5 @@ def _versions(route: str) -> dict[str, str]:
     if route == "ngspice":
         from data_synth import spice
 
-        found["ngspice"] = spice.version()
+        found["ngspice"] = spice.ngspice_version()
     return found

@@ -46,7 +46,7 @@ def network(scene: Mapping[str, Mapping[str, Any]], second: tuple[float, float] 
     skin, measured = scene["skin"], scene["measurement"]
     touching = [(skin["Rsc"], skin["Csc"], "outer"), *([(*second, "")] if second else [])]
     before = [(measured["series_resistor"], None, ""), (None, scene["device"]["Ci"], ""), (*_gap(scene), "")]
-    before, after = (list(filter(_is_there, part)) for part in (before, _to_ground(scene, second)))
+    before, after = (list(filter(_has_impedance, part)) for part in (before, _ground_elements(scene, second)))
     branches = []
     for node, (R, C, layer) in enumerate([*before, *touching, *after]):
         start, end = node + 1, node + 2
@@ -63,7 +63,7 @@ def network(scene: Mapping[str, Mapping[str, Any]], second: tuple[float, float] 
     return Network(tuple(branches), (first, last), layers)
 
 
-def _is_there(part: tuple[float | None, float | None, str]) -> bool:
+def _has_impedance(part: tuple[float | None, float | None, str]) -> bool:
     return bool(part[0] or part[1])
 
 
@@ -73,7 +73,7 @@ def _gap(scene: Mapping[str, Mapping[str, Any]]) -> tuple[float | None, float | 
     return gap["resistance"], gap["capacitance"] or air
 
 
-def _to_ground(scene: Mapping[str, Mapping[str, Any]], second: tuple[float, float] | None) -> Iterator[tuple]:
+def _ground_elements(scene: Mapping[str, Mapping[str, Any]], second: tuple[float, float] | None) -> Iterator[tuple]:
     """What lies between the touching skin and ground, in series."""
     ground, skin = scene["grounding"], scene["skin"]
     if ground["connection"] == "natural":

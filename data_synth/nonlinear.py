@@ -20,7 +20,7 @@ _MOST_PERIODS = 400
 _BESIDE = 1e-9  # of a stretch between corners: so near to one the drive is taken from inside
 
 
-class Skin(NamedTuple):
+class NonlinearSkin(NamedTuple):
     """The circuit, its outer layers' resistance (ohm) at no voltage, and the law by which they conduct more.
 
     nonlinear: 1 + (v / half_voltage)^2 times as much, at once. electroporated: up to `factor` times, as a share of
@@ -63,12 +63,12 @@ def nonlinear_response(
         RecipeError: it has not settled after many periods.
     """
     system = state_space(circuit)
-    skin = Skin(system, np.array([layer[2] for layer in circuit.layers]), law)
+    skin = NonlinearSkin(system, np.array([layer[2] for layer in circuit.layers]), law)
     size = len(system.A)
     grid, place = steps(drive, time)
     state = np.zeros(size + skin.remembers * skin.R.size)
     if drive.period:
-        state = _settled(skin, drive, state, float(grid[0]))
+        state = _steady_state(skin, drive, state, float(grid[0]))
     states = _states(skin, drive, state, grid)[:-1].T
     taylor = polynomials(drive, grid)
     voltage, slope = taylor[:, 0], taylor[:, 1] / np.diff(grid)
@@ -79,7 +79,7 @@ def nonlinear_response(
     return voltage[place], out[0, place], out[1, place]
 
 
-def _states(skin: Skin, drive: Drive, state: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def _states(skin: NonlinearSkin, drive: Drive, state: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """The states at `wanted` (s, increasing), from that at the first."""
 
     def change(at: float, state: np.ndarray, start: float, end: float) -> np.ndarray:
@@ -98,7 +98,7 @@ def _states(skin: Skin, drive: Drive, state: np.ndarray, wanted: np.ndarray) -> 
     return np.array(found)
 
 
-def _settled(skin: Skin, drive: Drive, state: np.ndarray, start: float) -> np.ndarray:
+def _steady_state(skin: NonlinearSkin, drive: Drive, state: np.ndarray, start: float) -> np.ndarray:
     """The states at `start` (s), after as many periods as leave them alone."""
     assert drive.period is not None
     for _ in range(_MOST_PERIODS):

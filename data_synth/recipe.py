@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from data_synth.errors import RecipeError
-from data_synth.keys import Choice, Key, Listed, Quantity, Table, Whole, checked, read_toml
+from data_synth.keys import Choice, Key, ListKey, Quantity, Table, WholeNumber, read_toml, validate_sections
 from data_synth.scene import KEYS as SCENE
 from data_synth.scene import Scene, make_scene
 
@@ -15,7 +15,7 @@ AS_IT_IS = "as the scene says"  # what skin a recipe has that names no other
 _SUFFIX = ".recipe"
 
 
-def _each(low: float = 0.0, default: float | None = None) -> dict[str, Key]:
+def _channel_quantities(low: float = 0.0, default: float | None = None) -> dict[str, Key]:
     """A quantity of each channel, `low` or more."""
     return {name: Quantity(unit, default, low, least=True) for name, unit in UNITS.items()}
 
@@ -33,7 +33,7 @@ KEYS: Table = {
         "factor": Quantity("", low=1.0),
     },
     "population": {
-        "fingers": Whole(None, 1),
+        "fingers": WholeNumber(None, 1),
         "log_sd_Rsc": Quantity("", 0.0, least=True),
         "log_sd_Csc": Quantity("", 0.0, least=True),
         "correlation": Quantity("", 0.0, low=-1.0),
@@ -42,13 +42,17 @@ KEYS: Table = {
     # in the order in which they act
     "clock": {"jitter": Quantity("s", 0.0, least=True), "trigger_error": Quantity("s", 0.0, -math.inf)},
     "gain": dict.fromkeys(UNITS, Quantity("", 1.0, -math.inf)),
-    "offset": _each(-math.inf),
-    "drift": _each(-math.inf),
-    "hum": {**_each(), "frequency": Quantity("Hz", 50.0), "harmonics": Listed(Quantity("", least=True), (1.0,))},
-    "pink": {**_each(), "exponent": Quantity("", 1.0), "corner": Quantity("Hz")},
-    "white": _each(),
+    "offset": _channel_quantities(-math.inf),
+    "drift": _channel_quantities(-math.inf),
+    "hum": {
+        **_channel_quantities(),
+        "frequency": Quantity("Hz", 50.0),
+        "harmonics": ListKey(Quantity("", least=True), (1.0,)),
+    },
+    "pink": {**_channel_quantities(), "exponent": Quantity("", 1.0), "corner": Quantity("Hz")},
+    "white": _channel_quantities(),
     "clip": {name: Quantity(unit) for name, unit in UNITS.items()},
-    "converter": {"bits": Whole(12, 2), **{name: Quantity(unit) for name, unit in UNITS.items()}},
+    "converter": {"bits": WholeNumber(12, 2), **{name: Quantity(unit) for name, unit in UNITS.items()}},
     "missing": {"share": Quantity("", 0.0, least=True)},
 }
 _MODELS = {
@@ -57,7 +61,7 @@ _MODELS = {
     "electroporated": ("threshold", "width", "time_constant", "factor"),
 }
 _TOP = ("scene", "truth", "seed", "route")
-_RECIPE: Table = {"recipe": {"seed": Whole(0), "route": Choice(("scipy", "ngspice"))}}
+_RECIPE: Table = {"recipe": {"seed": WholeNumber(0), "route": Choice(("scipy", "ngspice"))}}
 
 
 class Recipe(NamedTuple):
@@ -91,11 +95,13 @@ def load(path: Path) -> Recipe:
     truth = content.get("truth", {})
     if not isinstance(truth, dict):
         raise RecipeError(f"{path}: truth is not a table; write [truth.skin] and the like")
-    checked(truth, SCENE, f"{path}, truth")
+    validate_sections(truth, SCENE, f"{path}, truth")
     scene = make_scene(tables, truth, str(scene_path))
     rest = {name: part for name, part in content.items() if name not in _TOP}
-    parts = checked(rest, KEYS, str(path))
-    top = checked({"recipe": {k: content[k] for k in _RECIPE["recipe"] if k in content}}, _RECIPE, str(path))["recipe"]
+    parts = validate_sections(rest, KEYS, str(path))
+    top = validate_sections({"recipe": {k: content[k] for k in _RECIPE["recipe"] if k in content}}, _RECIPE, str(path))[
+        "recipe"
+    ]
     _check(parts, scene, str(path))
     name = path.name.removesuffix(".toml").removesuffix(_SUFFIX)
     return Recipe(name, scene_path.name, scene, parts, tuple(rest), top["seed"], top["route"])

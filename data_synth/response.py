@@ -24,7 +24,7 @@ def response(system: StateSpace, drive: Drive, time: np.ndarray) -> tuple[np.nda
     """
     grid, place = steps(drive, time)
     taylor = polynomials(drive, grid)
-    charge = _settled(system, drive, float(grid[0])) if drive.period else np.zeros(len(system.A))
+    charge = _steady_state(system, drive, float(grid[0])) if drive.period else np.zeros(len(system.A))
     states = _states(system, grid, taylor, charge)[:-1]
     voltage, slope = taylor[:, 0], taylor[:, 1] / np.diff(grid)
     out = states @ system.C.T + np.outer(voltage, system.D[:, 0])
@@ -56,13 +56,13 @@ def steps(drive: Drive, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     keep = np.append(True, np.diff(wanted) > _SAME * np.median(apart))
     wanted = wanted[keep]
     parts = np.ceil(np.diff(wanted) / drive.longest * (1.0 - 1e-9)).astype(int)
-    fine = [wanted[:-1]] if np.all(parts <= 1) else _divided(wanted, parts)
+    fine = [wanted[:-1]] if np.all(parts <= 1) else _subdivide_steps(wanted, parts)
     grid = np.append(np.concatenate(fine), wanted[-1])
     place = np.searchsorted(grid, time + _SAME * np.median(apart), side="right") - 1
     return grid, place
 
 
-def _divided(wanted: np.ndarray, parts: np.ndarray) -> list[np.ndarray]:
+def _subdivide_steps(wanted: np.ndarray, parts: np.ndarray) -> list[np.ndarray]:
     ends = zip(wanted[:-1], wanted[1:], parts, strict=True)
     return [np.linspace(start, end, count, endpoint=False) for start, end, count in ends]
 
@@ -78,11 +78,11 @@ def polynomials(drive: Drive, grid: np.ndarray) -> np.ndarray:
     values = drive.value(grid[:-1, None] + 0.5 * (1.0 - np.cos(angle)) * np.diff(grid)[:, None])
     series = np.cos(np.outer(np.arange(count), angle)) * (2.0 - (np.arange(count) == 0)[:, None]) / count
     # derivatives of T_m(2 s - 1) at s = 0; points run from s = 0 on, where T_m is (-1)^m
-    ends = [[_at_start(m, order) for m in range(count)] for order in range(count)]
+    ends = [[_chebyshev_derivative(m, order) for m in range(count)] for order in range(count)]
     return values @ (np.array(ends) @ ((-1.0) ** np.arange(count)[:, None] * series)).T
 
 
-def _at_start(m: int, order: int) -> float:
+def _chebyshev_derivative(m: int, order: int) -> float:
     """d^order/ds^order of T_m(2 s - 1) at s = 0."""
     return 2.0**order * float(chebyshev.chebval(-1.0, chebyshev.chebder(np.eye(m + 1)[m], order)))
 
@@ -104,7 +104,7 @@ def _states(system: StateSpace, grid: np.ndarray, taylor: np.ndarray, charge: np
     return states
 
 
-def _settled(system: StateSpace, drive: Drive, start: float) -> np.ndarray:
+def _steady_state(system: StateSpace, drive: Drive, start: float) -> np.ndarray:
     """The states at `start` (s) that a period leaves as they were: the fixed point of its map."""
     assert drive.period is not None
     grid, _ = steps(drive, np.array([start, start + drive.period]))

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from data_synth.errors import RecipeError
-from data_synth.keys import Choice, Listed, Quantity, Table, Unread, Whole, checked
+from data_synth.keys import Choice, IgnoredKey, ListKey, Quantity, Table, WholeNumber, validate_sections
 from data_synth.network import EPS0
 
 Scene = dict[str, dict[str, Any]]
@@ -19,7 +19,7 @@ KEYS: Table = {
         "insulator_thickness": Quantity("m", 1e-6),
         "insulator_permittivity": Quantity("", 3.9),
         "contact_area": Quantity("m^2", 1e-4),
-        **dict.fromkeys(("breakdown_field", "current_limit_rms", "current_limit_peak"), Unread()),
+        **dict.fromkeys(("breakdown_field", "current_limit_rms", "current_limit_peak"), IgnoredKey()),
     },
     "skin": {
         "Rsc": Quantity("ohm", 160e3),
@@ -46,18 +46,18 @@ KEYS: Table = {
         "offset": Quantity("V", 0.0, _ANY),
         "phase": Quantity("rad", 0.0, _ANY),
         "shape": Choice(("square", "sine", "triangle")),
-        "cycles": Whole(5, 1),
+        "cycles": WholeNumber(5, 1),
         "start_frequency": Quantity("Hz"),
         "end_frequency": Quantity("Hz"),
         "sweep_time": Quantity("s"),
         "spacing": Choice(("linear", "logarithmic")),
-        "frequencies": Listed(Quantity("Hz")),
-        "amplitudes": Listed(Quantity("V")),
-        "phases": Listed(Quantity("rad", None, _ANY)),
+        "frequencies": ListKey(Quantity("Hz")),
+        "amplitudes": ListKey(Quantity("V")),
+        "phases": ListKey(Quantity("rad", None, _ANY)),
         "steady_state": Choice((True, False)),
     },
     "measurement": {
-        "channels": Listed(Choice(("Vsc", "I")), ("Vsc",)),
+        "channels": ListKey(Choice(("Vsc", "I")), ("Vsc",)),
         "series_resistor": Quantity("ohm", 0.0, least=True),
         "probe_resistance": Quantity("ohm"),
         "probe_capacitance": Quantity("F"),
@@ -65,16 +65,16 @@ KEYS: Table = {
         "duration": Quantity("s", 20e-3),
         "noise_Vsc": Quantity("V", 0.1, least=True),
         "noise_I": Quantity("A", 20e-9, least=True),
-        **dict.fromkeys(("gain_relative_sd", "gain_I_relative_sd", "noise_model", "quiet"), Unread()),
+        **dict.fromkeys(("gain_relative_sd", "gain_I_relative_sd", "noise_model", "quiet"), IgnoredKey()),
     },
-    "friction": dict.fromkeys(("coefficient", "normal_force"), Unread()),
-    "prior": dict.fromkeys(_BELIEFS.split(), Unread()),
-    "force": {"model": Unread()},
-    "perception": dict.fromkeys(("threshold_force", "friction_change"), Unread()),
+    "friction": dict.fromkeys(("coefficient", "normal_force"), IgnoredKey()),
+    "prior": dict.fromkeys(_BELIEFS.split(), IgnoredKey()),
+    "force": {"model": IgnoredKey()},
+    "perception": dict.fromkeys(("threshold_force", "friction_change"), IgnoredKey()),
     "population": dict.fromkeys(
-        ("contact_area", "skin_thickness_relative_sd", "insulator_thickness_relative_sd"), Unread()
+        ("contact_area", "skin_thickness_relative_sd", "insulator_thickness_relative_sd"), IgnoredKey()
     ),
-    "tolerance": {"force": Unread()},
+    "tolerance": {"force": IgnoredKey()},
 }
 _NEEDED = {
     "trapezoid": ("rise_time",),
@@ -90,7 +90,7 @@ def make_scene(content: Mapping[str, Any], truth: Mapping[str, Any], place: str)
         RecipeError: an unknown key, a value that is not possible, or keys that need others.
     """
     merged = {name: {**content.get(name, {}), **truth.get(name, {})} for name in {**content, **truth}}
-    scene = checked(merged, KEYS, place)
+    scene = validate_sections(merged, KEYS, place)
     device, drive, skin = scene["device"], scene["drive"], scene["skin"]
     given = merged.get("device", {})
     if "Ci" not in given and {"insulator_thickness", "insulator_permittivity"} <= given.keys():  # eq. (3)

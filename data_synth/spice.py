@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from data_synth.drive import Drive, at_ends
+from data_synth.drive import Drive, end_values
 from data_synth.errors import RecipeError
 from data_synth.network import Network, state_space
 
@@ -21,12 +21,12 @@ _STEPS = 4  # of time in one of the record's
 _LONG = 600  # s
 
 
-def found() -> bool:
+def is_installed() -> bool:
     """Whether ngspice is installed."""
     return shutil.which("ngspice") is not None
 
 
-def version() -> str:
+def ngspice_version() -> str:
     """Of ngspice, as it says it."""
     said = subprocess.run(["ngspice", "--version"], capture_output=True, text=True, timeout=60).stdout
     return next((word for word in said.split() if word.startswith("ngspice-")), "ngspice")
@@ -40,7 +40,7 @@ def spice_response(
     Raises:
         RecipeError: ngspice is not installed, failed, or the skin is one that only scipy's route has.
     """
-    if not found():
+    if not is_installed():
         raise RecipeError("ngspice is not installed; install it (apt-get install ngspice), or take route = 'scipy'")
     begin = min(float(time.min()), 0.0)
     if drive.period:
@@ -51,21 +51,21 @@ def spice_response(
     step = float(np.median(np.diff(np.unique(time)))) / _STEPS
     kept = max(float(time.min()) - begin - 2.0 * step, 0.0)
     skin = ",".join(str(node) for node in circuit.skin if node)
-    deck = ["* a finger", f"Vdrive 99 0 PWL({_points(drive, begin, end)})", "Vmeter 99 1 0"]
+    deck = ["* a finger", f"Vdrive 99 0 PWL({_source_points(drive, begin, end)})", "Vmeter 99 1 0"]
     deck += [f"{each.kind}{n} {each.start} {each.end} {each.value:.15g}" for n, each in enumerate(circuit.branches)]
-    deck += _extra(circuit, law)
+    deck += _nonlinear_sources(circuit, law)
     deck += [".options reltol=1e-6 abstol=1e-15 vntol=1e-9 trtol=1 method=gear", ".control"]
     deck += ["set wr_vecnames", "set wr_singlescale", "set numdgt=12"]
     deck += [f"tran {step:.12g} {end - begin:.15g} {kept:.15g} {step:.12g} uic"]
     deck += [f"wrdata out.txt v(1) v({skin}) i(Vmeter)"]
-    table = _run([*deck, "quit", ".endc", ".end"], end - begin)
+    table = _run_ngspice([*deck, "quit", ".endc", ".end"], end - begin)
     # at a jump the value after it is wanted
     wanted = time - begin + (2.0 * _JUMP if drive.jumps else 0.0)
     voltage, Vsc, current = (np.interp(wanted, table[:, 0], table[:, column]) for column in (1, 2, 3))
     return voltage, Vsc, current
 
 
-def _points(drive: Drive, begin: float, end: float) -> str:
+def _source_points(drive: Drive, begin: float, end: float) -> str:
     """Times from `begin` on, and voltages, through which the source goes in straight lines."""
     corners = drive.corners(begin, end)
     corners = np.unique([begin, *corners[(corners > begin) & (corners < end)], end + _JUMP])
@@ -73,7 +73,7 @@ def _points(drive: Drive, begin: float, end: float) -> str:
         fine = np.arange(begin, end, drive.longest / _POINTS)
         corners = np.unique(np.concatenate([corners, fine]))
         corners = corners[np.append(True, np.diff(corners) > 4.0 * _JUMP)]
-    after, before = at_ends(drive, corners)
+    after, before = end_values(drive, corners)
     points = [(0.0, 0.0 if drive.period is None else after[0])]
     for time, left, right in zip(corners[:-1] - begin, [points[0][1], *before[:-1]], after, strict=True):
         points += [(time, left)] if time > 0.0 else []
@@ -82,7 +82,7 @@ def _points(drive: Drive, begin: float, end: float) -> str:
     return "\n+ ".join(f"{time:.15g} {voltage:.12g}" for time, voltage in points)
 
 
-def _extra(circuit: Network, law: Mapping[str, Any] | None) -> list[str]:
+def _nonlinear_sources(circuit: Network, law: Mapping[str, Any] | None) -> list[str]:
     """Sources of what a nonlinear skin conducts besides."""
     if law is None:
         return []
@@ -95,7 +95,7 @@ def _extra(circuit: Network, law: Mapping[str, Any] | None) -> list[str]:
     return found
 
 
-def _run(deck: list[str], end: float) -> np.ndarray:
+def _run_ngspice(deck: list[str], end: float) -> np.ndarray:
     """What the deck writes, which must reach `end` (s)."""
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "deck.cir").write_text("\n".join(deck) + "\n")

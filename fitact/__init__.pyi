@@ -13,13 +13,11 @@ from .fitting.fit_spectrum import SpectrumFit, fit_spectrum
 from .fitting.levenberg_marquardt import RESULTS
 from .model.chirp import Chirp
 from .model.circuit import DirectGround, FinalCircuit, NaturalGround, Probe
-from .model.drive import Burst, Polyline, Sampled, Sine, Square, Trapezoid, Triangle
-from .model.equivalents import quality_factor, series_equivalent
+from .model.drive import Burst, Multitone, Polyline, Sampled, Sine, Square, Trapezoid, Triangle
 from .model.force import Contact, electrostatic_force, friction, mean_force, peak_force
 from .model.harmonic import harmonic_error, harmonic_response
-from .model.multitone import Multitone
 from .model.response import response
-from .model.skin import Dispersive, Fractional, WithSkin
+from .model.skin import Dispersive, Fractional, WithSkin, quality_factor, series_equivalent
 from .model.steady import body_current, mean_square, peak
 from .model_selection.comparison import Comparison, compare
 from .model_selection.plan import Plan, plan

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,14 +12,14 @@ from fitact.errors import InputError
 
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary name beside `path`, which takes its place when the block ends well, and goes when it does not.
 
     Raises:
         InputError: the place cannot be written.
     """
     path = Path(path)
-    temporary = _temporary(path)
+    temporary = _temporary_path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
@@ -26,46 +27,46 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from error
     finally:
-        clean(path)
+        remove_temporary(path)
 
 
-def clean(path: str | os.PathLike[str]) -> None:
-    """Remove what a killed program left of `replacing(path)`."""
+def remove_temporary(path: str | os.PathLike[str]) -> None:
+    """Remove what a killed program left of `atomic_write(path)`."""
     with contextlib.suppress(OSError):
-        _temporary(Path(path)).unlink()
+        _temporary_path(Path(path)).unlink()
 
 
-def _temporary(path: Path) -> Path:
+def _temporary_path(path: Path) -> Path:
     return path.with_name(f".{path.name}.tmp")  # one name, so that what a kill leaves is overwritten
 
 
-def unreadable(source: str, error: Exception) -> InputError:
-    """What to raise where a file cannot be read."""
+def read_error(source: str, error: Exception) -> InputError:
+    """The error to raise where a file cannot be read."""
     reason = getattr(error, "strerror", None) or str(error)
     return InputError(f"{source}: cannot be read ({reason.lower()}); check the path and the file")
 
 
 def to_json(content: Any) -> str:
     """Plain JSON, with null for what is not finite; keys in the order given."""
-    return json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    return json.dumps(_to_plain(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def to_line(content: Any) -> str:
+def to_json_line(content: Any) -> str:
     """The same on one line."""
-    return json.dumps(_plain(content), ensure_ascii=False, allow_nan=False) + "\n"
+    return json.dumps(_to_plain(content), ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def _plain(content: Any) -> Any:
+def _to_plain(content: Any) -> Any:
     if isinstance(content, dict):
-        return {str(key): _plain(value) for key, value in content.items()}
+        return {str(key): _to_plain(value) for key, value in content.items()}
     if isinstance(content, list | tuple):
-        return [_plain(value) for value in content]
-    if isinstance(content, float) and (content != content or content in (float("inf"), float("-inf"))):
+        return [_to_plain(value) for value in content]
+    if isinstance(content, float) and not math.isfinite(content):
         return None
     return content
 
 
 def write_json(path: str | os.PathLike[str], content: Any) -> None:
     """`content` as JSON at `path`."""
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(to_json(content), encoding="utf-8")

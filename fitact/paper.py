@@ -15,8 +15,8 @@ import numpy as np
 
 from fitact.model.circuit import DirectGround, FinalCircuit, NaturalGround
 from fitact.model.drive import Drive, Sine, Square, Triangle
-from fitact.model.equivalents import quality_factor, series_equivalent
 from fitact.model.force import Contact, mean_force, plate_capacitance, plate_resistance
+from fitact.model.skin import quality_factor, series_equivalent
 from fitact.model.steady import mean_square, peak
 
 Value = float | dict[str, float]
@@ -35,10 +35,7 @@ INSULATORS = {
     "3.45 nF": float(plate_capacitance(PERMITTIVITY, AREA, INSULATOR)),
     "0.69 nF": 1.0 / (_OMEGA * 2.3e6),
 }  # F: the text's, that of eq. (3), and that of |Z_Ci| = 2.3 Mohm
-
-_DIGITS = 0.005  # relative: how far rounding to the paper's digits may be off
-_ROUGHLY = 0.1  # where the paper says so
-_NEGLIGIBLE = 0.01
+_SQUARE = Square(peak_to_peak=PEAK_TO_PEAK, frequency=FREQUENCY)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,68 +61,71 @@ class Claim:
     reason: str
 
     def to_dict(self) -> dict[str, Any]:
-        """As in reproduction.json."""
+        """Return the claim as in reproduction.json."""
         return dataclasses.asdict(self)
 
 
 def reproduce() -> tuple[Claim, ...]:
-    """All claims, in the paper's order."""
+    """Compute and judge all claims, in the paper's order."""
+    parts = (
+        _plate_claims, _impedance_claims, _grounding_claims, _grounding_finger_claims, _equivalent_claims,
+        _body_claims, _insulator_claims, _frequency_claims, _waveform_claims, _equation_claims,
+    )  # fmt: skip
     with jax.enable_x64(True):
-        parts = (_plates, _impedances, _grounding, _grounding_points, _equivalents, _body, _insulator, _frequencies)
-        return tuple(claim for part in (*parts, _waveforms, _equations) for claim in part())
+        return tuple(claim for part in parts for claim in part())
 
 
-def _judged(id: str, claim: str, paper: float, ours: Value, unit: str, reason: str, within: float = _DIGITS) -> Claim:
-    """By the relative difference, or the absolute one of what is claimed to be nothing."""
+def _make_claim(
+    id: str, claim: str, paper: float, ours: Value, unit: str, reason: str, tolerance: float = 0.005
+) -> Claim:
+    """Judge by the relative difference, or the absolute one of what is claimed to be nothing.
+
+    `tolerance`: half a per cent for rounding to the paper's digits, 1 % is nothing, and a tenth where it says "about".
+    """
     value = ours[TEXT_CI] if isinstance(ours, dict) else ours
     off = abs(value / paper - 1.0) if paper else abs(value)
-    return Claim(id, claim, paper, ours, unit, "agrees" if off <= within else "differs", reason)
+    return Claim(id, claim, paper, ours, unit, "agrees" if off <= tolerance else "differs", reason)
 
 
-def _by_insulator(function: Callable[[float], Any]) -> dict[str, float]:
+def _map_insulators(function: Callable[[float], Any]) -> dict[str, float]:
     return {name: float(function(Ci)) for name, Ci in INSULATORS.items()}
 
 
-def _plates() -> Iterator[Claim]:
-    yield _judged(
+def _plate_claims() -> Iterator[Claim]:
+    yield _make_claim(
         "eq3_Ci", "Ci of 1 um, permittivity 3.9 and 1 cm^2 is 1.35 nF", CI, INSULATORS["3.45 nF"], "F",
         "eq. (3) with the paper's own values gives 3.45 nF; 1.35 nF would need 2.56 um, a permittivity of 1.53 or"
         " 0.39 cm^2",
     )  # fmt: skip
-    said = {"10Hz": (44.25e-9, 200e3), "100Hz": (22e-9, 160e3), "1kHz": (8.85e-9, 80e3)}
-    for at, (permittivity, resistivity) in SKIN_AT.items():
-        C = float(plate_capacitance(permittivity, AREA, SKIN))
-        R = float(plate_resistance(resistivity, AREA, SKIN))
-        end = "the end of the range that the paper gives"
-        where = at.replace("k", " k") if "k" in at else at.replace("H", " H")
-        middle = "the paper gives none for 100 Hz: this one, within its range, is what its value comes to"
-        why = middle if at == "100Hz" else end
-        yield _judged(
-            f"eq3_Csc_{at}",
-            f"Csc at {where}",
-            said[at][0],
-            C,
-            "F",
-            f"permittivity {permittivity:g}: {why}",
-            2 * _DIGITS,
-        )
-        yield _judged(
-            f"eq4_Rsc_{at}", f"Rsc at {where}", said[at][1], R, "ohm", f"resistivity {resistivity:g} ohm m: {why}"
-        )
+    end = "the end of the range that the paper gives"
+    middle = "the paper gives none for 100 Hz: this one, within its range, is what its value comes to"
+    for frequency, Csc, Rsc, why in (
+        ("10 Hz", 44.25e-9, 200e3, end), ("100 Hz", 22e-9, 160e3, middle), ("1 kHz", 8.85e-9, 80e3, end)
+    ):  # fmt: skip
+        suffix = frequency.replace(" ", "")
+        permittivity, resistivity = SKIN_AT[suffix]
+        yield _make_claim(
+            f"eq3_Csc_{suffix}", f"Csc at {frequency}", Csc, float(plate_capacitance(permittivity, AREA, SKIN)), "F",
+            f"permittivity {permittivity:g}: {why}", 0.01,
+        )  # fmt: skip
+        yield _make_claim(
+            f"eq4_Rsc_{suffix}", f"Rsc at {frequency}", Rsc, float(plate_resistance(resistivity, AREA, SKIN)), "ohm",
+            f"resistivity {resistivity:g} ohm m: {why}",
+        )  # fmt: skip
 
 
-def _impedances() -> Iterator[Claim]:
-    yield _judged(
-        "eq7_ZCi_100Hz", "|1 / (j w Ci)| at 100 Hz is 2.3 Mohm", 2.3e6, _by_insulator(lambda Ci: 1.0 / (_OMEGA * Ci)),
+def _impedance_claims() -> Iterator[Claim]:
+    yield _make_claim(
+        "eq7_ZCi_100Hz", "|1 / (j w Ci)| at 100 Hz is 2.3 Mohm", 2.3e6, _map_insulators(lambda Ci: 1.0 / (_OMEGA * Ci)),
         "ohm", "1.35 nF gives 1.18 Mohm; 2.3 Mohm is that of 0.69 nF",
     )  # fmt: skip
-    yield _judged(
+    yield _make_claim(
         "eq8_Zsc_100Hz", "|Zsc| at 100 Hz is 65.7 kohm", 65.7e3, abs(RSC / (1.0 + 1j * _OMEGA * RSC * CSC)), "ohm",
         "65.9 kohm with 22 nF; 65.7 kohm is that of 22.1 nF",
     )  # fmt: skip
 
 
-def _grounding() -> Iterator[Claim]:
+def _grounding_claims() -> Iterator[Claim]:
     def gain(circuit: DirectGround | NaturalGround) -> Any:
         return jnp.abs(circuit.transfer_function(_OMEGA))
 
@@ -135,11 +135,10 @@ def _grounding() -> Iterator[Claim]:
     def natural(Ci: float) -> NaturalGround:
         return NaturalGround(RSC, CSC, Ci, Z)
 
-    square = Square(peak_to_peak=PEAK_TO_PEAK, frequency=FREQUENCY)
-    of_square = float(peak(direct(CI), square) / peak(natural(CI), square))
-    yield _judged(
+    of_square = float(peak(direct(CI), _SQUARE) / peak(natural(CI), _SQUARE))
+    yield _make_claim(
         "fig4_ratio", "Vsc under direct ground is six times that under natural ground (sine, 100 Hz)", 6.0,
-        _by_insulator(lambda Ci: gain(direct(Ci)) / gain(natural(Ci))), "1",
+        _map_insulators(lambda Ci: gain(direct(Ci)) / gain(natural(Ci))), "1",
         f"six times needs the 0.69 nF of the paper's |Z_Ci|; with 1.35 nF a square's peaks are {of_square:.1f} times",
         0.02,
     )  # fmt: skip
@@ -152,113 +151,106 @@ def _grounding() -> Iterator[Claim]:
 
 def peaks_over_grounding(Ci: float, name: str, values: tuple[float, ...]) -> np.ndarray:
     """Peaks of Vsc (V) under Figs. 5 and 6's square, with the grounding finger's Rsc or Csc varied."""
-    square = Square(peak_to_peak=PEAK_TO_PEAK, frequency=FREQUENCY)
-    grounding: dict[str, Any] = {"grounding_Rsc": RSC, "grounding_Csc": CSC}
-    return np.array(
-        [float(peak(DirectGround(RSC, CSC, Ci, R_H=R_H, **(grounding | {name: v})), square)) for v in values]
-    )
+    skin: dict[str, Any] = {"grounding_Rsc": RSC, "grounding_Csc": CSC}
+    circuits = [DirectGround(RSC, CSC, Ci, R_H=R_H, **(skin | {name: value})) for value in values]
+    return np.array([float(peak(circuit, _SQUARE)) for circuit in circuits])
 
 
-def _grounding_points() -> Iterator[Claim]:
+def _grounding_finger_claims() -> Iterator[Claim]:
     def spread(Ci: float) -> float:
         peaks = peaks_over_grounding(Ci, "grounding_Rsc", GROUNDING_RSC)
         return float(np.ptp(peaks) / peaks.mean())
 
-    yield _judged(
+    yield _make_claim(
         "fig5_peak_spread", "the grounding finger's Rsc does not change the peak of Vsc (spread over 80 to 200 kohm)",
-        0.0, _by_insulator(spread), "1", "less than 1 % with 1.35 nF; it shows in the decay, as the paper says",
-        _NEGLIGIBLE,
+        0.0, _map_insulators(spread), "1", "less than 1 % with 1.35 nF; it shows in the decay, as the paper says",
+        0.01,
     )  # fmt: skip
 
-    def of_capacitance(C: float) -> dict[str, float]:
-        return _by_insulator(lambda Ci: peaks_over_grounding(Ci, "grounding_Csc", (C,))[0])
-
-    for id, said, C in (("fig6_Csc_8p85nF", 13.84, 8.85e-9), ("fig6_Csc_44p2nF", 11.96, 44.2e-9)):
-        yield _judged(
-            id, f"the peak of Vsc with a grounding Csc of {C * 1e9:g} nF", said,
-            of_capacitance(C), "V",
+    for id, printed, C in (("fig6_Csc_8p85nF", 13.84, 8.85e-9), ("fig6_Csc_44p2nF", 11.96, 44.2e-9)):
+        peaks = {name: float(peaks_over_grounding(Ci, "grounding_Csc", (C,))[0]) for name, Ci in INSULATORS.items()}
+        yield _make_claim(
+            id, f"the peak of Vsc with a grounding Csc of {C * 1e9:g} nF", printed, peaks, "V",
             "in the circuit as drawn a larger grounding capacitance takes less of the drive, so Vsc rises with it, from"
             " 13.7 to 15.9 V; the paper's falls",
         )  # fmt: skip
 
 
-def _equivalents() -> Iterator[Claim]:
+def _equivalent_claims() -> Iterator[Claim]:
     series = series_equivalent(RSC, CSC, FREQUENCY)
     with_body, without = (float(quality_factor(RSC, CSC, FREQUENCY, R)) for R in (R_H, 0.0))
-    yield _judged("eq11_Rx", "Rx at 100 Hz", 27.16e3, float(series.Rx), "ohm", "to the paper's digits")
-    yield _judged("eq13_Cx", "Cx at 100 Hz", 26.5e-9, float(series.Cx), "F", "to the paper's digits")
-    yield _judged("eq14_Rx2", "Rx' of both skins", 54.32e3, 2.0 * float(series.Rx), "ohm", "to the paper's digits")
+    yield _make_claim("eq11_Rx", "Rx at 100 Hz", 27.16e3, float(series.Rx), "ohm", "to the paper's digits")
+    yield _make_claim("eq13_Cx", "Cx at 100 Hz", 26.5e-9, float(series.Cx), "F", "to the paper's digits")
+    yield _make_claim("eq14_Rx2", "Rx' of both skins", 54.32e3, 2.0 * float(series.Rx), "ohm", "to the paper's digits")
     rounded = "the paper's last digit follows from its rounded Cx' = 13.25 nF"
-    yield _judged("eq16_Qwith", "Q with R_H", 2.1911, with_body, "1", rounded)
-    yield _judged("eq17_Qwithout", "Q without R_H", 2.2112, without, "1", rounded)
-    yield _judged(
+    yield _make_claim("eq16_Qwith", "Q with R_H", 2.1911, with_body, "1", rounded)
+    yield _make_claim("eq17_Qwithout", "Q without R_H", 2.2112, without, "1", rounded)
+    yield _make_claim(
         "q_difference", "1 - Qwith / Qwithout is 0.909 %", 0.00909, 1.0 - with_body / without, "1",
         "R_H / (Rx' + R_H) = 0.912 %; the paper took it from rounded numbers",
     )  # fmt: skip
 
 
-def _body() -> Iterator[Claim]:
-    square = Square(peak_to_peak=PEAK_TO_PEAK, frequency=FREQUENCY)
+def _body_claims() -> Iterator[Claim]:
+    def relative_change(Ci: float) -> Any:
+        return 1.0 - peak(DirectGround(RSC, CSC, Ci, R_H=R_H), _SQUARE) / peak(FinalCircuit(RSC, CSC, Ci), _SQUARE)
 
-    def change(Ci: float) -> Any:
-        return 1.0 - peak(DirectGround(RSC, CSC, Ci, R_H=R_H), square) / peak(FinalCircuit(RSC, CSC, Ci), square)
-
-    yield _judged(
-        "fig10_RH", "R_H changes Vsc too little to have an effect (of the peak)", 0.0, _by_insulator(change), "1",
-        "0.14 % of the peak with 1.35 nF; only at the edge, within microseconds, it matters", _NEGLIGIBLE,
+    yield _make_claim(
+        "fig10_RH", "R_H changes Vsc too little to have an effect (of the peak)", 0.0,
+        _map_insulators(relative_change), "1",
+        "0.14 % of the peak with 1.35 nF; only at the edge, within microseconds, it matters", 0.01,
     )  # fmt: skip
 
 
 def force_over(permittivity: float, thickness: float) -> float:
-    """The mean force (N) of Fig. 12 under a 360 Vpp square, Ci following from the insulator by eq. (3)."""
+    """Return the mean force (N) of Fig. 12 under a 360 Vpp square, Ci following from the insulator by eq. (3)."""
     Ci = plate_capacitance(permittivity, AREA, thickness)
     contact = Contact(AREA, thickness, permittivity, SKIN, float(CSC * SKIN / plate_capacitance(1.0, AREA, 1.0)))
-    drive = Square(peak_to_peak=PEAK_TO_PEAK, frequency=FREQUENCY)
-    return float(mean_force(FinalCircuit(RSC, CSC, Ci), drive, contact))
+    return float(mean_force(FinalCircuit(RSC, CSC, Ci), _SQUARE, contact))
 
 
-def _insulator() -> Iterator[Claim]:
+def _insulator_claims() -> Iterator[Claim]:
     values = np.linspace(1.0, 10.0, 19)
     forces = [force_over(eps, INSULATOR) for eps in values]
     exponent = float(np.polyfit(np.log(values), np.log(forces), 1)[0])
-    yield _judged(
+    yield _make_claim(
         "fig12_eps", "the force grows about linearly with the permittivity (its exponent, 1 to 10)", 1.0, exponent, "1",
         "it grows faster, since Vsc grows with Ci as well; at a fixed voltage over the finger eq. (1) is nearly linear",
-        _ROUGHLY,
+        0.1,
     )  # fmt: skip
-    left = force_over(PERMITTIVITY, 0.2e-6) / force_over(PERMITTIVITY, 0.01e-6)
-    yield _judged(
-        "fig12_T", "the force falls with the thickness, to almost nothing at 0.2 um (of that at 0.01 um)", 0.0, left,
-        "1",
-        f"it falls throughout; {100 * left:.0f} % is left at 0.2 um and 1 % at 0.9 um (the paper's text also says that"
-        " it falls until 1 um)",
-        _NEGLIGIBLE,
+    remainder = force_over(PERMITTIVITY, 0.2e-6) / force_over(PERMITTIVITY, 0.01e-6)
+    yield _make_claim(
+        "fig12_T", "the force falls with the thickness, to almost nothing at 0.2 um (of that at 0.01 um)", 0.0,
+        remainder, "1",
+        f"it falls throughout; {100 * remainder:.0f} % is left at 0.2 um and 1 % at 0.9 um (the paper's text also says"
+        " that it falls until 1 um)", 0.01,
     )  # fmt: skip
 
 
-def _frequencies() -> Iterator[Claim]:
-    def corner(Ci: float) -> float:
+def _frequency_claims() -> Iterator[Claim]:
+    def corner_frequency(Ci: float) -> float:
         return 1.0 / (2.0 * math.pi * float(FinalCircuit(RSC, CSC, Ci).b))
 
-    def steady(Ci: float) -> float:
-        return corner(Ci) * 0.99 / math.sqrt(1.0 - 0.99**2)
+    def steady_frequency(Ci: float) -> float:
+        return corner_frequency(Ci) * 0.99 / math.sqrt(1.0 - 0.99**2)
 
-    yield _judged(
-        "fig14_amplitude_knee", "the amplitude's knee is at about 40 Hz", 40.0, _by_insulator(corner), "Hz",
+    yield _make_claim(
+        "fig14_amplitude_knee", "the amplitude's knee is at about 40 Hz", 40.0, _map_insulators(corner_frequency), "Hz",
         "the corner 1 / (2 pi b) of the first-order high-pass", 0.02,
     )  # fmt: skip
-    yield _judged(
-        "fig14_amplitude_steady", "the amplitude is steady from about 300 Hz", 300.0, _by_insulator(steady), "Hz",
-        "where it has 99 % of its limit; the paper does not say what steady means", _ROUGHLY,
+    yield _make_claim(
+        "fig14_amplitude_steady", "the amplitude is steady from about 300 Hz", 300.0,
+        _map_insulators(steady_frequency), "Hz",
+        "where it has 99 % of its limit; the paper does not say what steady means", 0.1,
     )  # fmt: skip
-    yield _judged(
-        "fig14_phase_knee", "the phase's knee is at about 90 Hz", 90.0, _by_insulator(corner), "Hz",
+    yield _make_claim(
+        "fig14_phase_knee", "the phase's knee is at about 90 Hz", 90.0, _map_insulators(corner_frequency), "Hz",
         "a first-order high-pass has one corner, of amplitude and phase alike; at 90 Hz the lead is still 24 degrees",
-        _ROUGHLY,
+        0.1,
     )  # fmt: skip
-    yield _judged(
-        "fig14_phase_steady", "the phase is steady from about 270 Hz", 270.0, _by_insulator(steady), "Hz",
-        "where the lead is 8.1 degrees, which is where the amplitude has 99 % of its limit", _ROUGHLY,
+    yield _make_claim(
+        "fig14_phase_steady", "the phase is steady from about 270 Hz", 270.0, _map_insulators(steady_frequency), "Hz",
+        "where the lead is 8.1 degrees, which is where the amplitude has 99 % of its limit", 0.1,
     )  # fmt: skip
 
 
@@ -268,37 +260,37 @@ def waveforms(peak_to_peak: float) -> dict[str, Drive]:
     return {name: kind(peak_to_peak=peak_to_peak, frequency=FREQUENCY) for name, kind in kinds.items()}
 
 
-def _waveforms() -> Iterator[Claim]:
+def _waveform_claims() -> Iterator[Claim]:
     def peak_to_peak(drive: Drive) -> dict[str, float]:
-        return _by_insulator(lambda Ci: 2.0 * peak(FinalCircuit(RSC, CSC, Ci), drive))
+        return _map_insulators(lambda Ci: 2.0 * peak(FinalCircuit(RSC, CSC, Ci), drive))
 
     larger = waveforms(PEAK_TO_PEAK)
     for name, drive in waveforms(30.0).items():
         at_360 = 2.0 * float(peak(FinalCircuit(RSC, CSC, CI), larger[name]))
-        yield _judged(
+        yield _make_claim(
             f"fig15_{name}", f"a {name} of 30 Vpp and 100 Hz gives Vsc of about {30 if name == 'square' else 15} Vpp",
             30.0 if name == "square" else 15.0,
             peak_to_peak(drive), "V",
             f"no divider gives half or all of the drive; the ordinate is that of a drive near 300 to 360 Vpp"
             f" ({at_360:.1f} Vpp at 360 Vpp)",
-            _ROUGHLY,
+            0.1,
         )  # fmt: skip
 
 
-def _equations() -> Iterator[Claim]:
+def _equation_claims() -> Iterator[Claim]:
     """The formulas without a number: the paper's as printed, in complex arithmetic, against fitact's."""
     for id, (claim, off, reason) in _formulas().items():
-        yield _judged(id, f"{claim} (largest relative difference, 10 to 1000 Hz)", 0.0, off, "1", reason, 1e-9)
+        yield _make_claim(id, f"{claim} (largest relative difference, 10 to 1000 Hz)", 0.0, off, "1", reason, 1e-9)
 
 
 def _formulas() -> dict[str, tuple[str, float, str]]:
     frequency = np.geomspace(10.0, 1000.0, 41)
+    omega = 2.0 * np.pi * frequency
     Ci, final, direct = CI, FinalCircuit(RSC, CSC, CI), DirectGround(RSC, CSC, CI, R_H=R_H)
     natural = NaturalGround(RSC, CSC, Ci, Z)
 
-    def off(printed: Callable[[float], complex], ours: Any) -> float:
-        there = np.array([printed(2.0 * math.pi * f) for f in frequency])
-        return float(np.max(np.abs(np.asarray(ours) / there - 1.0)))
+    def max_error(printed: Callable[[float], complex], ours: Any) -> float:
+        return float(np.max(np.abs(np.asarray(ours) / np.array([printed(w) for w in omega]) - 1.0)))
 
     def skin(w: float) -> complex:
         return RSC / (1.0 + 1j * w * RSC * CSC)
@@ -312,37 +304,37 @@ def _formulas() -> dict[str, tuple[str, float, str]]:
     def printed10(w: float) -> complex:
         return (RSC * (1j * X(w)) ** 2 + 1j * RSC**2 * X(w)) / (RSC**2 + X(w) ** 2)
 
-    omega = 2.0 * np.pi * frequency
     series = [series_equivalent(RSC, CSC, f) for f in frequency]
     both = [complex(float(s.Rx), 1.0 / (w * float(s.Cx))) for s, w in zip(series, omega, strict=True)]
     a, b = RSC * Ci, 2.0 * RSC * Ci + RSC * CSC
     H = final.transfer_function(omega)
     same = "the same, to rounding"
     return {
-        "eq5": ("Vsc under direct ground", off(lambda w: skin(w) / (2 * skin(w) + insulator(w) + R_H),
+        "eq5": ("Vsc under direct ground", max_error(lambda w: skin(w) / (2 * skin(w) + insulator(w) + R_H),
                 direct.transfer_function(omega)), same),
-        "eq6": ("Vsc under natural ground", off(lambda w: skin(w) / (skin(w) + insulator(w) + Z),
+        "eq6": ("Vsc under natural ground", max_error(lambda w: skin(w) / (skin(w) + insulator(w) + Z),
                 natural.transfer_function(omega)), same),
-        "eq10": ("the series equivalent, resistance and reactance", off(printed10, both),
+        "eq10": ("the series equivalent, resistance and reactance", max_error(printed10, both),
                  "as printed its real part is negative: (jX)^2 = -X^2; eqs. (11) to (13), which follow, are right"),
-        "eq12": ("Xx", off(lambda w: w * CSC * RSC**2 / (1 + (w * CSC * RSC) ** 2), [z.imag for z in both]), same),
-        "eq15": ("Q, series and parallel", off(lambda w: RSC / X(w), [z.imag / z.real for z in both]),
+        "eq12": ("Xx",
+                 max_error(lambda w: w * CSC * RSC**2 / (1 + (w * CSC * RSC) ** 2), [z.imag for z in both]), same),
+        "eq15": ("Q, series and parallel", max_error(lambda w: RSC / X(w), [z.imag / z.real for z in both]),
                  same),
-        "eq18": ("V over I", off(lambda w: 2 * skin(w) + insulator(w), 1.0 / final.admittance(omega)), same),
-        "eq19": ("Vsc over I", off(skin, H / final.admittance(omega)), same),
-        "eq21": ("H, eqs. (20) and (21)", off(lambda w: 1j * w * a / (1j * w * b + 1.0), H), same),
+        "eq18": ("V over I", max_error(lambda w: 2 * skin(w) + insulator(w), 1 / final.admittance(omega)), same),
+        "eq19": ("Vsc over I", max_error(skin, H / final.admittance(omega)), same),
+        "eq21": ("H, eqs. (20) and (21)", max_error(lambda w: 1j * w * a / (1j * w * b + 1.0), H), same),
         "eq24": ("real and imaginary part of H, eqs. (23) and (24)",
-                 off(lambda w: a * w / (1 + (b * w) ** 2) * (b * w + 1j), H), same),
-        "eq25": ("|H|", off(lambda w: math.sqrt(a**2 * w**2 / (1 + b**2 * w**2)), final.amplitude(omega)), same),
-        "eq26": ("the phase of H", off(lambda w: math.atan(1 / (b * w)), final.phase(omega)),
+                 max_error(lambda w: a * w / (1 + (b * w) ** 2) * (b * w + 1j), H), same),
+        "eq25": ("|H|", max_error(lambda w: math.sqrt(a**2 * w**2 / (1 + b**2 * w**2)), final.amplitude(omega)), same),
+        "eq26": ("the phase of H", max_error(lambda w: math.atan(1 / (b * w)), final.phase(omega)),
                  "the formula is right; the text calls it the arctangent of Re over Im"),
-        "eq22": ("mean force over mean Vsc^2", _force_law(), same),
+        "eq22": ("mean force over mean Vsc^2", _force_law_error(), same),
     }  # fmt: skip
 
 
-def _force_law() -> float:
+def _force_law_error() -> float:
     """Eq. (22) as printed against the mean force; with v = Vsc it is eq. (1)."""
     contact = Contact(AREA, INSULATOR, PERMITTIVITY, SKIN, 5e3)
-    drive, circuit = Square(peak_to_peak=PEAK_TO_PEAK, frequency=FREQUENCY), FinalCircuit(RSC, CSC, CI)
+    circuit = FinalCircuit(RSC, CSC, CI)
     printed = 8.85e-12 * AREA / (2 * (INSULATOR / PERMITTIVITY + SKIN / 5e3) * (INSULATOR + SKIN))
-    return abs(float(mean_force(circuit, drive, contact) / mean_square(circuit, drive)) / printed - 1.0)
+    return abs(float(mean_force(circuit, _SQUARE, contact) / mean_square(circuit, _SQUARE)) / printed - 1.0)

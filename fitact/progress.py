@@ -10,43 +10,50 @@ if TYPE_CHECKING:
 
 _Item = TypeVar("_Item")
 
-_PATIENCE = 3.0  # s, within which nothing is said
-_APART = 10.0  # s between lines where standard error is no terminal
-_SHOWN = 0.1  # s between changes of a bar
 
-
-def watched(
-    items: Iterable[_Item], what: str, total: float, done: Callable[[], float] | None = None
+def track_progress(
+    items: Iterable[_Item],
+    description: str,
+    total: float,
+    completed: Callable[[], float] | None = None,
+    *,
+    patience: float = 3.0,
+    line_interval: float = 10.0,
+    bar_interval: float = 0.1,
 ) -> Iterator[_Item]:
-    """The items; once they take a while, `what` is said to be under way, and how much of `total` is done.
+    """The items; once they take a while, `description` is said to be under way, and how much of `total` is done.
 
-    That is how many items there were, unless `done` tells it. A bar where standard error is a terminal, else lines.
+    That is how many items there were, unless `completed` tells it. A bar where standard error is a terminal, else
+    lines. Nothing is said within `patience`, then no sooner than a `line_interval` or `bar_interval` apart, s.
     """
-    terminal, bar, next_look = sys.stderr.isatty(), None, time.monotonic() + _PATIENCE
+    terminal, bar, next_look = sys.stderr.isatty(), None, time.monotonic() + patience
     try:
         for count, item in enumerate(items):
             now = time.monotonic()
             if now >= next_look:
-                share = (count if done is None else done()) / max(total, 1.0)
+                share = (count if completed is None else completed()) / max(total, 1.0)
                 if terminal:
-                    bar = bar or _bar(what)
+                    bar = bar or open_bar(description)
                     bar.update(bar.task_ids[0], completed=share)
                 else:
-                    print(f"{what}: {share:.0%}", file=sys.stderr)
-                next_look = now + (_SHOWN if terminal else _APART)
+                    print(f"{description}: {share:.0%}", file=sys.stderr)
+                next_look = now + (bar_interval if terminal else line_interval)
             yield item
     finally:
         if bar is not None:
             bar.stop()
 
 
-def _bar(what: str) -> "Progress":
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+def open_bar(label: str, status: str = "") -> "Progress":
+    """A bar with one task, out of 1; it goes when stopped, unless it shows a `status` beside the share done."""
+    from rich import console, markup, progress
 
-    columns = TextColumn(escape(what)), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
-    bar = Progress(*columns, console=Console(stderr=True), transient=True)
-    bar.add_task(what, total=1.0)
+    columns = [progress.TextColumn(markup.escape(label)), progress.BarColumn()]
+    if status:
+        columns += [progress.TextColumn("{task.description}"), progress.TimeElapsedColumn()]
+    else:
+        columns += [progress.TaskProgressColumn(), progress.TimeRemainingColumn()]
+    bar = progress.Progress(*columns, console=console.Console(stderr=True), transient=not status)
+    bar.add_task(status, total=1.0)
     bar.start()
     return bar

@@ -12,10 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.errors import InputError
-from fitact.units import engineering, unit_of
+from fitact.units import format_engineering, quantity_unit
 
 _PACKAGES = ("fitact", "jax", "equinox", "optimistix", "emcee", "numpy", "xarray")
-_OPEN = 1e6  # times the mean: a standard deviation that says nothing
 _SECTIONS = {"parameters", "derived", "identifiability", "convergence", "fit", "model", "warnings", "record"}
 # standard normal quantiles of the summary's probabilities
 _NORMAL = {
@@ -26,49 +25,49 @@ _NORMAL = {
 PROBABILITIES = {key: float(f"0.{key[1:]}") for key in _NORMAL}  # of the quantiles
 
 Summary = dict[str, float | str]
-BY_FORCE = {  # what makes the force, by the name of its model
+FORCE_DESCRIPTIONS = {  # what makes the force, by the name of its model
     "paper": "by Vsc, eq. (22)",
     "gap": "by the voltage across the gap, eps0 A Vgap^2 / (2 d^2)",
 }
 
 
-def of_draws(name: str, draws: Float[np.ndarray, "*shape"]) -> Summary:
+def summarize_draws(name: str, draws: Float[np.ndarray, "*shape"]) -> Summary:
     """Summary of draws of the quantity `name`, in its SI unit."""
     quantiles = np.quantile(draws, list(PROBABILITIES.values()))
     summary: Summary = {
-        "unit": unit_of(name),
+        "unit": quantity_unit(name),
         "mean": float(np.mean(draws)),
         "sd": float(np.std(draws, ddof=1)),
     }
     return summary | {key: float(value) for key, value in zip(PROBABILITIES, quantiles, strict=True)}
 
 
-def log_normal(name: str, median: float, log_sd: float) -> Summary:
+def summarize_log_normal(name: str, median: float, log_sd: float) -> Summary:
     """Summary of a quantity whose logarithm is normal; infinite where a number of that size overflows."""
     with np.errstate(over="ignore"):
         mean = median * np.exp(0.5 * log_sd**2)
         quantiles = median * np.exp(log_sd * np.array(list(_NORMAL.values())))
         summary: Summary = {
-            "unit": unit_of(name),
+            "unit": quantity_unit(name),
             "mean": float(mean),
             "sd": float(mean * np.sqrt(np.expm1(log_sd**2))),
         }
     return summary | dict(zip(_NORMAL, quantiles.tolist(), strict=True))
 
 
-def normal(name: str, mean: float, sd: float) -> Summary:
+def summarize_normal(name: str, mean: float, sd: float) -> Summary:
     """Summary of a normal quantity."""
-    summary: Summary = {"unit": unit_of(name), "mean": mean, "sd": sd}
+    summary: Summary = {"unit": quantity_unit(name), "mean": mean, "sd": sd}
     return summary | {key: mean + z * sd for key, z in _NORMAL.items()}
 
 
-def width(summary: Summary) -> str:
+def format_sd(summary: Summary) -> str:
     """Its standard deviation for people: in per cent of the mean, or as it is where that says little."""
     mean, sd = float(summary["mean"]), float(summary["sd"])
-    if not sd <= _OPEN * abs(mean) or math.isinf(sd):
+    if not sd <= 1e6 * abs(mean) or math.isinf(sd):  # it says nothing
         return "open"
     if sd > 0.5 * abs(mean):
-        return engineering(sd, str(summary["unit"]), 2)
+        return format_engineering(sd, str(summary["unit"]), 2)
     return f"{np.format_float_positional(100.0 * sd / abs(mean), 2, fractional=False, trim='-')} %"
 
 
@@ -93,9 +92,9 @@ def table(content: dict[str, Any]) -> str:
     """What summary.json holds, for people."""
     rows = [f"{'':14}{'median':>12}{'5 %':>14}{'95 %':>12}"]
     for name, s in (content["parameters"] | content["derived"]).items():
-        median, low, high = (engineering(float(s[q]), str(s["unit"])) for q in ("q50", "q05", "q95"))
+        median, low, high = (format_engineering(float(s[q]), str(s["unit"])) for q in ("q50", "q05", "q95"))
         rows.append(f"{name:14}{median:>12}{low:>14}{high:>12}")
-    rows += [f"force: {BY_FORCE[content['model'].get('force', 'paper')]}."]
+    rows += [f"force: {FORCE_DESCRIPTIONS[content['model'].get('force', 'paper')]}."]
     rows += [content[section]["sentence"] for section in ("convergence", "identifiability")]
     return "\n".join([*rows, *(f"warning: {warning}" for warning in content["warnings"])])
 
@@ -105,6 +104,6 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in _PACKAGES}
 
 
-def trusted(content: dict[str, Any]) -> bool:
+def is_trusted(content: dict[str, Any]) -> bool:
     """Whether nothing stands against the answer that summary.json holds."""
     return bool(content["convergence"]["converged"]) and content["fit"]["result"] == "successful"

@@ -5,9 +5,15 @@ import math
 import re
 from typing import Any
 
+import lazy_loader
+
 from fitact.errors import InputError
 
+pint = lazy_loader.load("pint")  # 0.4 s, and only needed where text is read
+
 _PREFIXES = {-15: "f", -12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
+# as they are read, with the spellings of them that keyboards have
+PREFIX_FACTORS = {symbol: float(f"1e{n}") for n, symbol in (*_PREFIXES.items(), (-6, "u"), (-6, "μ"), (3, "K"))}
 _SYMBOLS = {"ohm": "Ω", "1": ""}
 
 _UNITS = {
@@ -24,14 +30,12 @@ _UNITS = {
 
 @functools.cache
 def _registry() -> Any:
-    import pint  # 0.4 s, and only needed where text is read
-
     registry = pint.UnitRegistry()
     registry.define("@alias ohm = Ohm = OHM = ohms")
     return registry
 
 
-def parse(value: object, unit: str) -> float:
+def parse_quantity(value: object, unit: str) -> float:
     """A quantity such as ``"160 kohm"`` as a float in the SI unit `unit`; a bare number is in `unit` already.
 
     Raises:
@@ -40,8 +44,6 @@ def parse(value: object, unit: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise InputError(f"{value!r} is not a quantity; write a number with a unit, such as '1 {unit}'")
     if isinstance(value, str):
-        import pint
-
         try:
             quantity = _registry().Quantity(value)
             value = float(quantity.to("" if quantity.unitless else unit).magnitude)  # "10 %" is 0.1
@@ -55,42 +57,45 @@ def parse(value: object, unit: str) -> float:
     return float(f"{value:.15g}")  # 200 um is 2e-4 m, not 1.9999999999999998e-4
 
 
-def scale(text: str, unit: str) -> float:
-    """How many `unit` one `text` is: ``scale("ms", "s") == 1e-3``."""
-    return parse(f"1 {text}", unit)
+def unit_factor(text: str, unit: str) -> float:
+    """How many `unit` one `text` is: ``unit_factor("ms", "s") == 1e-3``."""
+    return parse_quantity(f"1 {text}", unit)
 
 
-def written(value: float, unit: str) -> str:
-    """`value` as text that `parse` reads back to its last digit: ``written(1.35e-9, "F") == "1.35 nF"``."""
-    exponent = 0
-    if value and unit and "^" not in unit:  # there a prefix would be raised to a power
-        exponent = max(-15, min(12, 3 * math.floor(math.log10(abs(value)) / 3 + 1e-12)))
+def format_exact(value: float, unit: str) -> str:
+    """`value` as text that `parse_quantity` reads back to its last digit, "1.35 nF" for 1.35e-9 and "F"."""
+    # of a power a prefix would be raised to it
+    exponent = _prefix_exponent(value) if value and unit and "^" not in unit else 0
     prefix = _PREFIXES[exponent].replace("µ", "u")
     return f"{value / 10.0**exponent:.15g} {prefix}{unit}".rstrip()
 
 
-def engineering(value: float, unit: str, digits: int = 4) -> str:
-    """`value` with an SI prefix, for people: ``engineering(1.35e-9, "F") == "1.35 nF"``."""
-    size, symbol = prefixed(value, unit)
+def format_engineering(value: float, unit: str, digits: int = 4) -> str:
+    """`value` with an SI prefix, for people: ``format_engineering(1.35e-9, "F") == "1.35 nF"``."""
+    size, symbol = choose_prefixed_unit(value, unit)
     return f"{value / size:.{digits}g} {symbol}".rstrip()
 
 
-def prefixed(value: float, unit: str) -> tuple[float, str]:
-    """The multiple of `unit` that suits `value`, and its symbol: ``prefixed(1.35e-9, "F") == (1e-9, "nF")``."""
+def choose_prefixed_unit(value: float, unit: str) -> tuple[float, str]:
+    """The multiple of `unit` that suits `value`, and its symbol: (1e-9, "nF") for 1.35e-9 and "F"."""
     symbol = _SYMBOLS.get(unit, unit)
     if not math.isfinite(value) or value == 0.0 or not symbol:
         return 1.0, symbol
-    exponent = max(-15, min(12, 3 * math.floor(math.log10(abs(value)) / 3 + 1e-12)))
+    exponent = _prefix_exponent(value)
     return 10.0**exponent, _PREFIXES[exponent] + symbol
 
 
-def unit_of(name: str) -> str:
+def _prefix_exponent(value: float) -> int:
+    return max(min(_PREFIXES), min(max(_PREFIXES), 3 * math.floor(math.log10(abs(value)) / 3 + 1e-12)))
+
+
+def quantity_unit(name: str) -> str:
     """The SI unit of a quantity; a nuisance's name may end in its trace's label, as "sigma_I_2"."""
     bare = name if name in _UNITS else re.sub(r"_\d+$", "", name)
-    found = _UNITS[bare.removesuffix("_I")]
-    return "A" if bare.endswith("_I") and found == "V" else found
+    unit = _UNITS[bare.removesuffix("_I")]
+    return "A" if bare.endswith("_I") and unit == "V" else unit
 
 
-def percent(share: float) -> str:
-    """A share of 1, for people: ``percent(0.0123) == "1.2 %"``."""
-    return f"{100.0 * share:.0f} %" if share >= 0.995 else f"{100.0 * share:.2g} %"
+def format_percent(fraction: float) -> str:
+    """A share of 1, for people: ``format_percent(0.0123) == "1.2 %"``."""
+    return f"{100.0 * fraction:.0f} %" if fraction >= 0.995 else f"{100.0 * fraction:.2g} %"

@@ -9,7 +9,7 @@ Laplace is shown for the same records, so that luck of the data, which all level
 Every record counts, also one whose fit is not trusted or whose level is refused: to leave out by what the data look
 like would bend the ranks. A record that `fitact.fit` refuses has no ranks, and fails the run.
 
-    python tests/calibration.py [--records 1000] [--seed 1] [--workers 2] [--out out/calibration]
+    python -m tests.calibration [--records 1000] [--seed 1] [--workers 2] [--out out/calibration]
 
 Ranks are kept in DIR/ranks.jsonl, and the next run of the same code goes on from there. Each record has a seed of its
 own, so that the first 100 are the same in every run.
@@ -37,7 +37,7 @@ import scipy.signal
 import scipy.stats
 
 import fitact
-from fitact.files import replacing
+from fitact.files import atomic_write
 
 QUANTITIES = ("Rsc", "Csc", "Ci", "a", "b", "sigma", "force_mean")
 LEVELS = ("emcee", "psis", "laplace")
@@ -207,7 +207,7 @@ def collect(
         whole = []
     rows = {row["record"]: row for row in whole[1:]}
     missing = [number for number in range(records) if number not in rows]
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text("".join(json.dumps(row) + "\n" for row in [header, *rows.values()]))
     began = time.monotonic()
     with path.open("a") as file:
@@ -243,11 +243,11 @@ def sources(script: str) -> str:
 
 
 def pool(workers: int, compiled: Path) -> concurrent.futures.ProcessPoolExecutor:
-    """Spawned processes of one thread each, which share what they compile."""
+    """Spawned processes of one thread each, which share what they compile: in `compiled`, unless a place is set."""
     threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     threads["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
     cache = {"JAX_COMPILATION_CACHE_DIR": str(compiled), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1"}
-    os.environ.update(threads | cache)
+    os.environ.update(threads | {name: os.environ.get(name, value) for name, value in cache.items()})
     return concurrent.futures.ProcessPoolExecutor(
         workers, multiprocessing.get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)
     )

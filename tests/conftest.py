@@ -1,6 +1,11 @@
-"""Records from routes outside fitact: the shipped one (ngspice), and scipy's state space."""
+"""Records from routes outside fitact: the shipped one (ngspice), and scipy's state space; fits that many tests ask.
+
+A fit of another structure (circuit, channels, kind of drive, what is free, length) compiles for some 10 s, so a test
+takes one of these, or of their structures, unless the structure is what it tests.
+"""
 
 import json
+import zlib
 from pathlib import Path
 
 import jax
@@ -13,12 +18,38 @@ import fitact
 _MOST_MAPS = 25_000  # of the 65,530 areas of memory that Linux grants a process by default
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--rotate",
+        metavar="N/M",
+        type=_part,
+        help="of the thorough tests only part N modulo M, and all M parts in M consecutive N",
+    )
+
+
+def _part(text: str) -> tuple[int, int]:
+    number, parts = map(int, text.split("/"))
+    return number % parts, parts
+
+
+def pytest_report_header(config: pytest.Config) -> str | None:
+    rotate = config.getoption("rotate")
+    return f"thorough tests: part {rotate[0]} of 0 to {rotate[1] - 1}" if rotate else None
+
+
 @pytest.hookimpl(tryfirst=True)  # before those that the command line names are chosen
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What is thorough is slow."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """What is thorough is slow; of that only the part whose turn it is, by a hash of the test's name."""
+    rotate, waiting = config.getoption("rotate"), []
     for item in items:
         if item.get_closest_marker("thorough"):
             item.add_marker("slow")
+            if rotate and zlib.crc32(item.nodeid.encode()) % rotate[1] != rotate[0]:
+                waiting.append(item)
+    if waiting:
+        config.hook.pytest_deselected(items=waiting)
+        left_out = set(waiting)
+        items[:] = [item for item in items if item not in left_out]
 
 
 @pytest.fixture(autouse=True)
@@ -62,6 +93,23 @@ def finger_fit(finger_path: Path, finger_scene_path: Path) -> fitact.Fit:
 @pytest.fixture(scope="session")
 def finger_posterior(finger_fit: fitact.Fit) -> fitact.Posterior:
     return fitact.sample(finger_fit, seed=1, progress=False)
+
+
+SQUARE = fitact.Scene.from_dict({"drive": {"waveform": "square"}})
+
+
+@pytest.fixture(scope="session")
+def square_fit() -> fitact.Fit:
+    """Of `square_record()`, compressed."""
+    return fitact.fit(square_record(), SQUARE)
+
+
+@pytest.fixture(scope="session")
+def summed_fit() -> fitact.Fit:
+    """Of so few samples that they are summed."""
+    fit = fitact.fit(square_record(per_period=200), SQUARE)
+    assert fit.compression_error is None
+    return fit
 
 
 def skin_voltage(

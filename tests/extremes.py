@@ -5,7 +5,7 @@ Rsc 1 ohm to 1 Tohm, Csc 1 aF to 1 mF (every tenth: 0), Ci 1 aF to 1 uF, f 1 uHz
 the binary numbers that fitact gets. It solves one period with plain formulas and 220 digits, so that nothing
 clever is needed (differences cancel up to 100 of them), and takes derivatives as central differences.
 
-    python tests/extremes.py
+    python -m tests.extremes
 """
 
 import itertools

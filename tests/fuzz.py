@@ -1,6 +1,6 @@
 """Break oscilloscope files at random: each must end in a record or in one sentence, soon, in little memory.
 
-    python tests/fuzz.py --count 20000 --seed 0
+    python -m tests.fuzz --count 20000 --seed 0
 
 A finding is printed with its number, which alone makes the file again: --first NUMBER --count 1 --keep broken.csv
 """
@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 import fitact
-from fitact.data.readers.capture import resolve
+from fitact.data.readers.capture import resolve_channels
 from fitact.data.readers.read import read_capture
 
 SCOPE = Path(__file__).parent / "data" / "scope"
@@ -34,7 +34,7 @@ TOKENS = (
 
 def samples() -> dict[str, bytes]:
     """The files to break: the shipped ones, and one of named arrays for each of their kinds."""
-    from test_scope_files import NAMED
+    from tests.data.test_scope_files import NAMED
 
     found = {path.name: path.read_bytes() for path in sorted(SCOPE.iterdir()) if path.suffix != ".md"}
     with tempfile.TemporaryDirectory() as folder:
@@ -112,15 +112,15 @@ def outcome(path: Path) -> str:
     """What comes of a file: "record", "capture" or "refused"; anything else is raised."""
     try:
         capture = read_capture(path)
-        assert len({trace.values.size for trace in capture.traces} | {capture.time.size}) == 1
+        assert len({trace.values.size for trace in capture.channels} | {capture.time.size}) == 1
         fitact.inspect(path)
     except fitact.InputError as error:
         _one_sentence(error, path)
         return "refused"
-    names = [trace.name for trace in capture.traces]
+    names = [trace.name for trace in capture.channels]
     try:
         asked = {} if any(n.lower() == "vsc" for n in names) else {"Vsc": names[-1]}
-        resolve(names, asked, str(path))
+        resolve_channels(names, asked, str(path))
         scene = fitact.Scene(drive={"waveform": "square"})
         record = fitact.read(path, scene, channels=asked)
     except fitact.InputError as error:

@@ -6,7 +6,7 @@ posterior below it. Central intervals of 50 % and 90 % must cover within three b
 law's parameters, and of the mean force of one more finger. Every population counts; one that is refused has no places,
 and fails the run.
 
-    python tests/population_calibration.py [--populations 100] [--seed 1] [--workers 2] [--out out/population]
+    python -m tests.population_calibration [--populations 100] [--seed 1] [--workers 2] [--out out/population]
 
 Places are kept in DIR/places.jsonl, and the next run of the same code goes on from there. Each population has a seed of
 its own, so that the first 20 are the same in every run.
@@ -20,10 +20,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.stats
-from calibration import PER_PERIOD as SAMPLES
-from calibration import THICKNESS, collect, steady, wave
 
 import fitact
+from tests.calibration import PER_PERIOD as SAMPLES
+from tests.calibration import THICKNESS, collect, steady, wave
 
 FINGERS = 20
 MEDIANS = {"Rsc": 130e3, "Csc": 20e-9, "Ci": 1.35e-9}  # ohm, F, F

@@ -1,11 +1,11 @@
 """The statistic of `make calibration`: exact under uniform ranks, and not blind."""
 
-import calibration
 import jax
 import numpy as np
 import pytest
 
 import fitact
+from tests import calibration
 
 
 def ranks_of(truths: np.ndarray, rng: np.random.Generator) -> np.ndarray:

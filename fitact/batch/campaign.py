@@ -9,6 +9,7 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import json
+import logging
 import os
 import sys
 import time
@@ -20,19 +21,19 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 
-from fitact.batch.fit_many import Fits, fit_many
+from fitact.batch.fit_many import Fits, Row, fit_many
+from fitact.batch.sample_many import add_posterior, sample_many
+from fitact.data.readers.read import read
 from fitact.errors import InputError
-from fitact.files import to_line
+from fitact.files import to_json_line
+from fitact.fitting.fit import fit
+from fitact.sampling.ensemble import sample
 from fitact.scene.scene import Scene
 
 if TYPE_CHECKING:
     from distributed import Client
 
 BATCH = 32  # records in a task, which take seconds; a batch is the least that is done again
-_AHEAD = 3  # batches for each worker that the scheduler knows of
-_KILLS = 3  # workers that a batch may lose before it is taken apart
-_PATIENCE = 60.0  # s to wait for a scheduler that is gone
-_SAY = 5.0  # s between lines of progress
 _ONE_THREAD = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
@@ -40,11 +41,9 @@ _ONE_THREAD = {
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
     "MALLOC_TRIM_THRESHOLD_": "65536",  # bytes: what is freed goes back to the machine
 }
-# of the 65,530 areas of memory that Linux grants a process by default; a new length takes some 600, and a batch has 32
-_MOST_MAPS = 20_000
 JOURNAL = "journal.jsonl"
 
-Row = dict[str, Any]
+Batch = tuple[tuple[str, str], ...]  # keys of the journal and paths
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,6 +56,8 @@ class Task:
         reports: folder for a sampled posterior and a report of each record; None: none.
         seed: of the sampling.
         posteriors: whether rows are those of `sample_many`, or of `fit_many`.
+        max_maps: areas of memory, above which what JAX compiled is dropped; Linux grants a process 65,530 by default,
+            a new length of records takes some 600, and a batch has 32.
     """
 
     scene: str | None
@@ -64,54 +65,46 @@ class Task:
     reports: str | None
     seed: int
     posteriors: bool = False
+    max_maps: int = 20_000
 
     @property
     def fingerprint(self) -> str:
-        """What, beside a record, an answer depends on."""
+        """Return a hash of all that an answer depends on beside the record."""
         sampled = [bool(self.reports), self.posteriors, self.seed]
         settings = [importlib.metadata.version("fitact"), self.scene, self.columns, *sampled]
         return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
 
     def rows(self, paths: Sequence[str]) -> list[Row]:
-        """The rows of a batch; runs on a worker."""
+        """Compute the rows of a batch; runs on a worker."""
         scene = None if self.scene is None else Scene.from_json(self.scene)
-        _make_room()
-        found = [dict(row) for row in self._table(paths, scene)]
-        for path, row in zip(paths, found, strict=True):
+        self._clear_large_caches()
+        rows = [dict(row) for row in self._fit_or_sample(paths, scene)]
+        for path, row in zip(paths, rows, strict=True):
             if row["result"] == "crashed":  # it may have been the machine
-                row |= self._table([path], scene)[0]
+                row |= self._fit_or_sample([path], scene)[0]
             if self.reports is not None and "samples" in row:
-                _make_room()
-                row |= self._reported(path, scene, row)
-        return found
+                self._clear_large_caches()
+                row |= self._write_record_report(Path(self.reports), path, scene, row)
+        return rows
 
-    def _table(self, paths: Sequence[str], scene: Scene | None) -> Fits:
-        from fitact.batch.sample_many import sample_many
-
+    def _fit_or_sample(self, paths: Sequence[str], scene: Scene | None) -> Fits:
         if self.posteriors and self.reports is None:  # reports sample each by itself
             return sample_many(paths, scene, **self.columns, seed=self.seed, progress=False)
         return fit_many(paths, scene, **self.columns, progress=False)
 
-    def _reported(self, path: str, scene: Scene | None, row: Row) -> Row:
-        from fitact.batch.sample_many import with_posterior
-        from fitact.data.readers.read import read
-        from fitact.fitting.fit import fit
-        from fitact.sampling.ensemble import sample
-
-        assert self.reports is not None
-        place = Path(self.reports) / f"{Path(path).stem}-{hashlib.sha256(path.encode()).hexdigest()[:8]}"
+    def _write_record_report(self, reports: Path, path: str, scene: Scene | None, row: Row) -> Row:
+        place = reports / f"{Path(path).stem}-{hashlib.sha256(path.encode()).hexdigest()[:8]}"
         posterior = sample(fit(read(path, scene, **self.columns), scene), seed=self.seed, progress=False)
         posterior.to_netcdf(place / "posterior.nc")
         posterior.report(place / "report.html")
-        told = with_posterior(row, posterior) if self.posteriors else row
-        return told | {"report": f"{place.parent.name}/{place.name}/report.html", "trusted": posterior.trusted}
+        row = add_posterior(row, posterior) if self.posteriors else row
+        return row | {"report": f"{reports.name}/{place.name}/report.html", "trusted": posterior.trusted}
 
-
-def _make_room() -> None:
-    """Drop what JAX compiled once it is much: it compiles anew for every kind of record, and keeps it all."""
-    maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > _MOST_MAPS:
-        jax.clear_caches()
+    def _clear_large_caches(self) -> None:
+        """Drop what JAX compiled once it is much: it compiles anew for every kind of record, and keeps it all."""
+        maps = Path("/proc/self/maps")
+        if maps.exists() and maps.read_bytes().count(b"\n") > self.max_maps:
+            jax.clear_caches()
 
 
 class Journal:
@@ -120,36 +113,26 @@ class Journal:
     def __init__(self, path: Path) -> None:
         self.rows: dict[str, Row] = {}
         path.parent.mkdir(parents=True, exist_ok=True)
-        whole = 0  # bytes of whole lines: a kill may have left part of one
+        size = 0  # bytes of whole lines: a kill may have left part of one
         if path.exists():
             with path.open("rb") as file:
                 for line in file:
                     if not line.endswith(b"\n"):
                         break
                     self.rows |= json.loads(line)
-                    whole += len(line)
+                    size += len(line)
         self._file = path.open("ab")
-        self._file.truncate(whole)
+        self._file.truncate(size)
 
     def add(self, rows: Mapping[str, Row]) -> None:
-        """Rows of a batch, which are on disk when this returns."""
+        """Add the rows of a batch, which are on disk when this returns."""
         self.rows |= rows
-        self._file.write(to_line(rows).encode())
+        self._file.write(to_json_line(rows).encode())
         self._file.flush()
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
         self._file.close()
-
-
-@dataclasses.dataclass(frozen=True)
-class _Batch:
-    keys: tuple[str, ...]
-    paths: tuple[str, ...]
-
-    def halves(self) -> "tuple[_Batch, ...]":
-        middle = len(self.keys) // 2
-        return tuple(_Batch(self.keys[part], self.paths[part]) for part in (slice(0, middle), slice(middle, None)))
 
 
 def run_campaign(
@@ -192,9 +175,9 @@ def run_campaign(
     """
     (scene or Scene()).require_available(fit=True)
     paths = [os.path.abspath(path) for path in records]
-    most = Counter(paths).most_common(1)
-    if most and most[0][1] > 1:
-        raise InputError(f"{most[0][0]}: is named twice; name each record once")
+    for path, count in Counter(paths).most_common(1):
+        if count > 1:
+            raise InputError(f"{path}: is named twice; name each record once")
     place = Path(folder)
     columns = {"channels": dict(channels or {}), "scale": dict(scale or {})}
     stated = None if scene is None else scene.to_json()
@@ -204,17 +187,17 @@ def run_campaign(
     except (OSError, ValueError) as error:
         raise InputError(f"{place / JOURNAL}: cannot be used ({error}); choose another folder") from error
     try:
-        keys = _keys(paths, task)
-        batches = _left(keys, paths, journal)
+        keys = _journal_keys(paths, task)
+        batches = _pending_batches(keys, paths, journal)
         if batches:
-            _run(task, batches, journal, scheduler, workers, memory, _Progress(len(paths), progress))
+            _run_batches(task, batches, journal, scheduler, workers, memory, _Progress(len(paths), progress))
     finally:
         journal.close()
     return Fits(tuple(journal.rows[key] for key in keys))
 
 
-def _keys(paths: Sequence[str], task: Task) -> list[str]:
-    """What a row is kept under: settings, name and content."""
+def _journal_keys(paths: Sequence[str], task: Task) -> list[str]:
+    """Hash what a row is kept under: settings, name and content."""
     settings = task.fingerprint
 
     def key(path: str) -> str:
@@ -229,118 +212,124 @@ def _keys(paths: Sequence[str], task: Task) -> list[str]:
         return list(pool.map(key, paths))
 
 
-def _left(keys: Sequence[str], paths: Sequence[str], journal: Journal) -> deque[_Batch]:
+def _pending_batches(keys: Sequence[str], paths: Sequence[str], journal: Journal) -> deque[Batch]:
     """Batches of what is not done: always the same ones, whatever was interrupted."""
-    batches: deque[_Batch] = deque()
-    for first in range(0, len(keys), BATCH):
-        pairs = zip(keys[first : first + BATCH], paths[first : first + BATCH], strict=True)
-        left = [(key, path) for key, path in pairs if key not in journal.rows]
-        if left:
-            batches.append(_Batch(*zip(*left, strict=True)))
-    return batches
+    pairs = list(zip(keys, paths, strict=True))
+    parts = (pairs[first : first + BATCH] for first in range(0, len(pairs), BATCH))
+    batches = (tuple(pair for pair in part if pair[0] not in journal.rows) for part in parts)
+    return deque(filter(None, batches))
 
 
-def _run(
+def _run_batches(
     task: Task,
-    batches: deque[_Batch],
+    batches: deque[Batch],
     journal: Journal,
     scheduler: str | None,
     workers: int | None,
     memory: str,
     progress: "_Progress",
+    patience: float = 60.0,
 ) -> None:
-    progress.done = progress.total - sum(len(batch.keys) for batch in batches)
+    """Run all batches; a scheduler that is gone is waited for, `patience` seconds."""
+    progress.done = progress.total - sum(map(len, batches))
     deadline = time.monotonic()  # until which a scheduler is waited for: one that was there may come back
     while batches:
-        with _connected(scheduler, workers, memory, progress, deadline) as client:
-            under_way: dict[Any, _Batch] = {}
+        with _open_client(scheduler, workers, memory, progress, deadline) as client:
+            futures: dict[Any, Batch] = {}
             try:
-                for batch, rows in _answers(client, task, batches, under_way):
-                    journal.add(dict(zip(batch.keys, rows, strict=True)))
+                for batch, rows in _completed_batches(client, task, batches, futures):
+                    journal.add({key: row for (key, _), row in zip(batch, rows, strict=True)})
                     progress.add(rows)
                 return
             except (CancelledError, OSError) as error:  # the scheduler is gone, and with it what it knew
                 if scheduler is None:
                     raise
-                batches.extendleft(under_way.values())
-                deadline = time.monotonic() + _PATIENCE
-                progress.say(f"the scheduler at {scheduler} is gone ({type(error).__name__}); waiting for it")
+                batches.extendleft(futures.values())
+                deadline = time.monotonic() + patience
+                progress.print_status(f"the scheduler at {scheduler} is gone ({type(error).__name__}); waiting for it")
 
 
-def _answers(
-    client: "Client", task: Task, batches: deque[_Batch], under_way: dict[Any, _Batch]
-) -> Iterator[tuple[_Batch, list[Row]]]:
-    """Batches as they are done; those that kill their workers are taken apart."""
-    from distributed import as_completed
-    from distributed.scheduler import KilledWorker
-
-    done = as_completed()
+def _completed_batches(
+    client: "Client", task: Task, batches: deque[Batch], futures: dict[Any, Batch], per_worker: int = 3
+) -> Iterator[tuple[Batch, list[Row]]]:
+    """Yield batches as they are done, `per_worker` being sent ahead; those that kill their workers are taken apart."""
+    completed = _import_distributed().as_completed()
 
     def submit() -> None:
-        room = _AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"])) - len(under_way)
-        for _ in range(min(room, len(batches))):
+        workers = client.scheduler_info(n_workers=-1)["workers"]  # all that the scheduler knows of
+        for _ in range(min(per_worker * max(1, len(workers)) - len(futures), len(batches))):
             batch = batches.popleft()
-            future = client.submit(task.rows, list(batch.paths), pure=False)
-            under_way[future] = batch
-            done.add(future)
+            future = client.submit(task.rows, [path for _, path in batch], pure=False)
+            futures[future] = batch
+            completed.add(future)
 
     submit()
-    for future in done:
-        batch = under_way[future]
+    for future in completed:
+        batch, half = futures[future], len(futures[future]) // 2
         if future.cancelled():
             raise CancelledError
         error = future.exception()
         if error is None:
             yield batch, future.result()
-        elif len(batch.keys) > 1:
-            batches.extend(batch.halves())
+        elif half:
+            batches.extend((batch[:half], batch[half:]))
         else:
-            killed = isinstance(error, KilledWorker)
-            why = f"killed the {_KILLS + 1} workers that tried it" if killed else f"{type(error).__name__}: {error}"
-            name = os.path.basename(batch.paths[0])
-            message = f"{batch.paths[0]}: {why}"
-            yield batch, [{"record": name, "result": "crashed", "trusted": False, "message": message}]
-        del under_way[future]
+            yield batch, [_crash_row(batch[0][1], error)]
+        del futures[future]
         future.release()
         submit()
 
 
-@contextlib.contextmanager
-def _connected(
-    scheduler: str | None, workers: int | None, memory: str, progress: "_Progress", deadline: float
-) -> Iterator["Client"]:
-    """A client of the scheduler at that address, or of one with workers of its own."""
+def _crash_row(path: str, error: BaseException) -> Row:
+    reason = f"{type(error).__name__}: {error}"
+    if isinstance(error, _import_distributed().scheduler.KilledWorker):
+        reason = f"killed the {error.allowed_failures + 1} workers that tried it"
+    return {"record": os.path.basename(path), "result": "crashed", "trusted": False, "message": f"{path}: {reason}"}
+
+
+def _import_distributed() -> Any:
     try:
-        import dask
-        from distributed import Client, LocalCluster
+        import distributed
     except ImportError as error:
         raise InputError("campaign: needs Dask; pip install 'fitact[campaign]'") from error
+    return distributed
+
+
+@contextlib.contextmanager
+def _open_client(
+    scheduler: str | None, workers: int | None, memory: str, progress: "_Progress", deadline: float
+) -> Iterator["Client"]:
+    """Connect to the scheduler at that address, or to one with workers of its own."""
+    distributed = _import_distributed()
     if scheduler is not None:
-        with _client(scheduler, deadline) as client:
+        with _connect_scheduler(scheduler, deadline) as client:
             yield client
         return
     settings = {
         "distributed.nanny.pre-spawn-environ": _ONE_THREAD,
         "distributed.worker.multiprocessing-method": "spawn",
-        "distributed.scheduler.allowed-failures": _KILLS,
+        "distributed.scheduler.allowed-failures": 3,  # workers that a batch may lose before it is taken apart
         # compiled code cannot be spilled: a worker that paused for it would wait for ever
         **{f"distributed.worker.memory.{name}": False for name in ("target", "spill", "pause")},
         "distributed.admin.log-format": "",
     }
     count = workers or len(os.sched_getaffinity(0))
-    how: dict[str, Any] = {"n_workers": count, "threads_per_worker": 1, "memory_limit": memory.replace(" ", "")}
-    with dask.config.set(settings), LocalCluster(**how, silence_logs=50) as cluster, Client(cluster) as client:
-        progress.say(f"{count} workers of at most {memory} each; Dask's dashboard: {cluster.dashboard_link}")
+    with (
+        distributed.dask.config.set(settings),
+        distributed.LocalCluster(
+            n_workers=count, threads_per_worker=1, memory_limit=memory.replace(" ", ""), silence_logs=logging.CRITICAL
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        progress.print_status(f"{count} workers of at most {memory} each; Dask's dashboard: {cluster.dashboard_link}")
         yield client
 
 
-def _client(scheduler: str, deadline: float) -> "Client":
-    """Of a scheduler, for which it waits until the deadline."""
-    from distributed import Client
-
+def _connect_scheduler(scheduler: str, deadline: float) -> "Client":
+    """Wait for a scheduler until the deadline."""
     while True:
         try:
-            return Client(scheduler, timeout="5s")
+            return _import_distributed().Client(scheduler, timeout="5s")
         except (OSError, TimeoutError, ValueError) as error:
             if time.monotonic() >= deadline:
                 raise InputError(
@@ -353,28 +342,29 @@ def _client(scheduler: str, deadline: float) -> "Client":
 class _Progress:
     """How many records are done and failed, how fast, and for how long still; on standard error."""
 
-    def __init__(self, total: int, on: bool) -> None:
-        self.total, self.done, self.failed = total, 0, 0
-        self._on, self._here, self._since, self._next = on, 0, 0.0, 0.0
+    def __init__(self, total: int, show: bool, interval: float = 5.0) -> None:
+        """`interval`: s between lines."""
+        self.total, self.done, self.failed, self._interval = total, 0, 0, interval
+        self._show, self._timed_records, self._start_time, self._next_report = show, 0, 0.0, 0.0
 
-    def say(self, text: str) -> None:
-        if self._on:
+    def print_status(self, text: str) -> None:
+        if self._show:
             print(f"campaign: {text}", file=sys.stderr, flush=True)
 
     def add(self, rows: Sequence[Row]) -> None:
-        """Count rows, and tell now and then."""
+        """Count rows, and print a line now and then."""
         self.done += len(rows)
         self.failed += sum("samples" not in row for row in rows)
         now = time.monotonic()
-        if not self._since:  # before the first, workers start and compile
-            self._since = now
+        if not self._start_time:  # before the first, workers start and compile
+            self._start_time = now
         else:
-            self._here += len(rows)
-        if now < self._next and self.done < self.total:
+            self._timed_records += len(rows)
+        if now < self._next_report and self.done < self.total:
             return
-        self._next = now + _SAY
+        self._next_report = now + self._interval
         text = f"{self.done:,} of {self.total:,} done, {self.failed:,} failed"
-        if self._here:
-            rate = self._here / max(now - self._since, 1e-3)
+        if self._timed_records:
+            rate = self._timed_records / max(now - self._start_time, 1e-3)
             text += f", {rate:.3g}/s, {(self.total - self.done) / rate:.0f} s left"
-        self.say(text)
+        self.print_status(text)

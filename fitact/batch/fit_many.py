@@ -5,6 +5,7 @@ import contextlib
 import csv
 import dataclasses
 import functools
+import itertools
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -15,31 +16,33 @@ import jax
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from fitact.batch.gauss_newton import Settled, Together
+from fitact.batch.gauss_newton import BatchFit, BatchProblem
 from fitact.data.readers.read import read
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.files import replacing
+from fitact.files import atomic_write
 from fitact.fitting import derived
-from fitact.fitting.fit import GOOD, Fit, fitted
-from fitact.fitting.identifiability import directions, from_prior, verdicts
-from fitact.fitting.problem import pose
-from fitact.progress import watched
+from fitact.fitting.fit import SUCCESS_MESSAGE, Fit, fit
+from fitact.fitting.identifiability import information_directions, prior_variance_fraction, verdicts
+from fitact.fitting.problem import build_problem
+from fitact.progress import track_progress
 from fitact.scene.scene import Scene
 
-_TOGETHER = 256  # records; so many are stacked, whatever their number, and compiled for once
-_FEW = 16  # alike ones, below which fits by themselves take less than compiling
-_AHEAD = 4  # jobs for each core, so that a record that is fitted by itself keeps none waiting
-_TRIES = 4  # records from which to learn what a group shares, since the first may be an odd one
-_MATCH = 0.01  # relative rms difference between V and the scene's drive
-_UNTESTED = "The fit is at its optimum and leaves no more than noise; what it leaves was not tested for structure."
-_FORCE = derived.NAMES.index("force_mean")
+_BATCH_RECORDS = 256  # records; so many are stacked, whatever their number, and compiled for once
+_UNTESTED_MESSAGE = (
+    "The fit is at its optimum and leaves no more than noise; what it leaves was not tested for structure."
+)
 
 Input = Record | str | os.PathLike[str]
+Row = dict[str, Any]
+Member = tuple[int, Record]
+Batch = tuple[BatchProblem | None, list[Member]]
+_Job = TypeVar("_Job")
+_Done = TypeVar("_Done")
 
 
 @dataclasses.dataclass(frozen=True)
-class Fits(Sequence[dict[str, Any]]):
+class Fits(Sequence[Row]):
     """Fits of many records as a table: a row for each, in the order in which they were given.
 
     Attributes:
@@ -49,7 +52,7 @@ class Fits(Sequence[dict[str, Any]]):
             (SI), and the standard deviation of its logarithm, by name_log_sd.
     """
 
-    rows: tuple[dict[str, Any], ...]
+    rows: tuple[Row, ...]
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -58,7 +61,7 @@ class Fits(Sequence[dict[str, Any]]):
         return self.rows[index]
 
     @property
-    def failures(self) -> tuple[dict[str, Any], ...]:
+    def failures(self) -> tuple[Row, ...]:
         """The rows without an answer."""
         return tuple(row for row in self.rows if "samples" not in row)
 
@@ -70,13 +73,13 @@ class Fits(Sequence[dict[str, Any]]):
     @property
     def columns(self) -> dict[str, np.ndarray]:
         """The table by columns; NaN, or "", where a row has no answer."""
-        samples = {name: next(row[name] for row in self.rows if name in row) for name in self._names}
+        samples = {name: next(row[name] for row in self.rows if name in row) for name in self._column_names}
         blank = {name: "" if isinstance(sample, str) else np.nan for name, sample in samples.items()}
         return {name: np.array([row.get(name, blank[name]) for row in self.rows]) for name in samples}
 
     @property
-    def _names(self) -> list[str]:
-        """Of the columns: as in the fullest row, then what others have beside."""
+    def _column_names(self) -> list[str]:
+        """Names of the columns: those of the fullest row, then what others have beside."""
         return list(dict.fromkeys(name for row in sorted(self.rows, key=len, reverse=True) for name in row))
 
     def to_csv(self, path: str | os.PathLike[str], columns: Sequence[str] | None = None) -> None:
@@ -85,8 +88,8 @@ class Fits(Sequence[dict[str, Any]]):
         Raises:
             InputError: the place cannot be written.
         """
-        with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(columns or self._names), extrasaction="ignore")
+        with atomic_write(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(columns or self._column_names), extrasaction="ignore")
             writer.writeheader()
             writer.writerows(self.rows)
 
@@ -101,8 +104,10 @@ class Fits(Sequence[dict[str, Any]]):
             import pyarrow.parquet as pq
         except ImportError as error:
             raise InputError(f"{path}: Parquet needs pyarrow; pip install 'fitact[campaign]', or write CSV") from error
-        with replacing(path) as temporary:
-            pq.write_table(pa.table({name: [row.get(name) for row in self.rows] for name in self._names}), temporary)
+        with atomic_write(path) as temporary:
+            pq.write_table(
+                pa.table({name: [row.get(name) for row in self.rows] for name in self._column_names}), temporary
+            )
 
     def __str__(self) -> str:
         trusted = sum(bool(row["trusted"]) for row in self.rows)
@@ -136,48 +141,45 @@ def fit_many(
     Raises:
         InputError: the scene asks for what is not available.
     """
-    how = functools.partial(_rows, scene=scene, whiteness=whiteness)
-    return tabulated(
-        records, scene, {"channels": channels, "scale": scale}, how, "fitting the records" if progress else ""
-    )
+    make_rows = functools.partial(_fit_rows, scene=scene, whiteness=whiteness)
+    title = "fitting the records" if progress else ""
+    return tabulate_records(records, scene, {"channels": channels, "scale": scale}, make_rows, title)
 
 
-def tabulated(
+def tabulate_records(
     records: Iterable[Input],
     scene: Scene | None,
     columns: Mapping[str, Any],
-    rows_of: Callable[[Iterable["Batch"]], Iterator[tuple[int, "Row"]]],
-    doing: str,
+    make_rows: Callable[[Iterable[Batch]], Iterator[tuple[int, Row]]],
+    progress_title: str,
 ) -> Fits:
-    """The rows that batches of records give, by their numbers, and those of what cannot be read.
-
-    `columns` as in `fitact.read`; what is under way is told as `doing`, if anything.
-    """
+    """Tabulate the rows that batches of records give, and those of what cannot be read; `columns` as in `read`."""
     (scene or Scene()).require_available(fit=True)
     rows: dict[int, Row] = {}
     total = len(records) if isinstance(records, Sequence) else 0
-    with jax.enable_x64(True), _LINEAR_ALGEBRA.in_one_thread():
-        done = rows_of(_batches(_opened(records, scene, columns, rows), scene))
-        for number, row in watched(done, doing, total) if doing and total else done:
-            rows[number] = row
+    with jax.enable_x64(True), _BLAS_THREADS.limit_to_one():
+        numbered_rows = make_rows(_group_records(_read_records(records, scene, columns, rows), scene))
+        if progress_title and total:
+            numbered_rows = track_progress(numbered_rows, progress_title, total)
+        rows.update(numbered_rows)
     return Fits(tuple(rows[number] for number in sorted(rows)))
 
 
-def _rows(found: Iterable["Batch"], scene: Scene | None, whiteness: bool) -> Iterator[tuple[int, "Row"]]:
-    for (_, members), (settled, _) in in_threads(found, functools.partial(settle, whiteness=whiteness)):
+def _fit_rows(batches: Iterable[Batch], scene: Scene | None, whiteness: bool) -> Iterator[tuple[int, Row]]:
+    for (_, members), (rows, _) in run_in_threads(batches, functools.partial(fit_batch, whiteness=whiteness)):
         for number, record in members:
-            yield number, settled[number] if number in settled else _alone(record, scene)
+            yield number, rows[number] if number in rows else _fit_single(record, scene)
 
 
-class _Threads:
-    """Those of the linear algebra, which would fight with those of `in_threads` for the cores."""
+class _BlasThreadLimit:
+    """One thread for linear algebra, whose threads would fight with those of `run_in_threads` for the cores."""
 
     def __init__(self) -> None:
         self._lock, self._users = threading.Lock(), 0
 
     @contextlib.contextmanager
-    def in_one_thread(self) -> Iterator[None]:
-        """The limit holds for the whole process: until the last of several calls at once has ended."""
+    def limit_to_one(self) -> Iterator[None]:
+        """Hold the limit, which is of the whole process, until the last of several calls at once has ended."""
         with self._lock:
             self._users += 1
             if self._users == 1:
@@ -191,150 +193,156 @@ class _Threads:
                     self._limits.restore_original_limits()
 
 
-_LINEAR_ALGEBRA = _Threads()
-
-Row = dict[str, Any]
-Member = tuple[int, Record]
-Batch = tuple[Together | None, list[Member]]
+_BLAS_THREADS = _BlasThreadLimit()
 
 
-_Job = TypeVar("_Job")
-_Done = TypeVar("_Done")
-
-
-def _opened(
+def _read_records(
     records: Iterable[Input], scene: Scene | None, columns: Mapping[str, Any], rows: dict[int, Row]
 ) -> Iterator[Member]:
-    """Records by their number; those that cannot be read become rows."""
-    for number, given in enumerate(records):
+    """Yield records by their number; those that cannot be read become rows."""
+    for number, record in enumerate(records):
         try:
-            yield number, given if isinstance(given, Record) else read(given, scene, **columns)
+            yield number, record if isinstance(record, Record) else read(record, scene, **columns)
         except Exception as error:
-            rows[number] = failed(str(given), error)
+            rows[number] = failure_row(str(record), error)
 
 
-def in_threads(jobs: Iterable[_Job], work: Callable[[_Job], _Done]) -> Iterator[tuple[_Job, _Done]]:
-    """Jobs and what `work` makes of them, some ahead for each core. In double precision."""
+def run_in_threads(
+    jobs: Iterable[_Job], work: Callable[[_Job], _Done], jobs_per_core: int = 4
+) -> Iterator[tuple[_Job, _Done]]:
+    """Yield jobs and what `work` makes of them, in double precision.
+
+    `jobs_per_core` are ahead for each core, so that a record that is fitted by itself keeps none waiting.
+    """
     asked = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
     cores = int(asked) if asked.isdigit() else len(os.sched_getaffinity(0))
     under_way: collections.deque[tuple[_Job, Future[_Done]]] = collections.deque()
 
-    def done(job: _Job) -> _Done:
+    def run_job(job: _Job) -> _Done:
         with jax.enable_x64(True):  # of each thread
             return work(job)
 
     with ThreadPoolExecutor(cores) as pool:
         for job in jobs:
-            under_way.append((job, pool.submit(done, job)))
-            if len(under_way) > _AHEAD * cores:
+            under_way.append((job, pool.submit(run_job, job)))
+            if len(under_way) > jobs_per_core * cores:
                 first, result = under_way.popleft()
                 yield first, result.result()
         yield from ((job, result.result()) for job, result in under_way)
 
 
-class _Group:
-    """Records of one time grid that wait for each other."""
+@dataclasses.dataclass
+class RecordGroup:
+    """Records of one time grid that wait for each other.
 
-    def __init__(self, time: np.ndarray) -> None:
-        self.time, self.members, self.tries = time, list[Member](), 0
-        self.together: Together | None = None
-        self.voltage: np.ndarray | None = None
+    Attributes:
+        min_records: alike ones, below which fits by themselves take less than compiling.
+        tries: records from which to learn what the group shares, since the first may be an odd one.
+    """
 
-    def alike(self, scene: Scene | None) -> bool:
+    time: np.ndarray
+    min_records: int = 16
+    tries: int = 4
+    members: list[Member] = dataclasses.field(default_factory=list)
+    batch_problem: BatchProblem | None = None
+    voltage: np.ndarray | None = None
+
+    def is_batchable(self, scene: Scene | None) -> bool:
         """Whether they can be fitted together; learnt from some of them."""
-        if len(self.members) < _FEW:
+        if len(self.members) < self.min_records:
             return False
-        for _, record in self.members[: _TRIES - self.tries]:
-            if self.together is not None:
+        for _, record in self.members[: self.tries]:
+            if self.batch_problem is not None:
                 break
-            self.tries += 1
+            self.tries -= 1
             try:
-                problem = pose([record], [scene])
-                self.together, self.voltage = Together.like(problem), problem.sources[0].choice.voltage
+                problem = build_problem([record], [scene])
+                self.batch_problem, self.voltage = BatchProblem.from_problem(problem), problem.sources[0].choice.voltage
             except (InputError, np.linalg.LinAlgError):
                 continue
-        return self.together is not None
+        return self.batch_problem is not None
 
 
-def _batches(records: Iterable[Member], scene: Scene | None) -> Iterator[Batch]:
+def _group_records(records: Iterable[Member], scene: Scene | None) -> Iterator[Batch]:
     """Records to be fitted together, or each by itself."""
-    groups: dict[tuple[float, ...], _Group] = {}
+    groups: dict[tuple[float, ...], RecordGroup] = {}
     for number, record in records:
         time = record.time
         key = time.size, time[0], time[1], time[-1]
-        group = groups[key] = groups.get(key) or _Group(time)
+        group = groups[key] = groups.get(key) or RecordGroup(time)
         if time is not group.time and not np.array_equal(time, group.time):
             yield None, [(number, record)]
             continue
         group.members.append((number, record))
-        if len(group.members) == _TOGETHER:
-            yield from _sorted_out(group, scene)
+        if len(group.members) == _BATCH_RECORDS:
+            yield from _split_group(group, scene)
     for group in groups.values():
-        yield from _sorted_out(group, scene)
+        yield from _split_group(group, scene)
 
 
-def _sorted_out(group: _Group, scene: Scene | None) -> Iterator[Batch]:
-    if group.alike(scene):
+def _split_group(group: RecordGroup, scene: Scene | None) -> Iterator[Batch]:
+    if group.is_batchable(scene):
         assert group.voltage is not None
-        near = [member for member in group.members if _driven_alike(member[1], group.voltage)]
-        yield group.together, near
-        taken = {number for number, _ in near}
-        group.members = [member for member in group.members if member[0] not in taken]
+        alike = [_has_same_drive(record, group.voltage) for _, record in group.members]
+        yield group.batch_problem, list(itertools.compress(group.members, alike))
+        group.members = [member for member, same in zip(group.members, alike, strict=True) if not same]
     yield None, group.members
     group.members = []
 
 
-def _driven_alike(record: Record, voltage: np.ndarray) -> bool:
-    """Whether the record has no V, or the scene's."""
+def _has_same_drive(record: Record, voltage: np.ndarray, tolerance: float = 0.01) -> bool:
+    """Whether the record has no V, or the scene's but for a relative rms difference of `tolerance`."""
     if "Vsc" not in record:
         return False
     if "V" not in record:
         return True
-    off = record["V"] - voltage
-    return bool(off @ off <= _MATCH**2 * (voltage @ voltage))
+    difference = record["V"] - voltage
+    return bool(difference @ difference <= tolerance**2 * (voltage @ voltage))
 
 
-def settle(batch: Batch, whiteness: bool = True) -> tuple[dict[int, Row], Settled | None]:
-    """Rows of those that are beyond doubt, and the optima of all; `whiteness` as of `fit_many`."""
-    together, members = batch
-    if together is None or not members:
+def fit_batch(batch: Batch, whiteness: bool = True) -> tuple[dict[int, Row], BatchFit | None]:
+    """Fit a batch: rows of those that are beyond doubt, and the optima of all; `whiteness` as of `fit_many`."""
+    problem, members = batch
+    if problem is None or not members:
         return {}, None
-    padded = [*members, *members[-1:] * (_TOGETHER - len(members))]
+    padded = [record for _, record in [*members, *members[-1:] * (_BATCH_RECORDS - len(members))]]
     try:
-        found = together.settle([record["Vsc"] for _, record in padded], whiteness)
-        columns = {"record": [os.path.basename(record.source) for _, record in padded]}
-        columns |= _columns(together, found, GOOD if whiteness else _UNTESTED)
+        optima = problem.fit([record["Vsc"] for record in padded], whiteness)
+        columns = {"record": [os.path.basename(record.source) for record in padded]}
+        columns |= _fit_columns(problem, optima, SUCCESS_MESSAGE if whiteness else _UNTESTED_MESSAGE)
     except np.linalg.LinAlgError:  # one of them spoils what is computed for all
         return {}, None
-    rows = (dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True))
-    # the others fill up
-    return {number: row for (number, _), row, clear in zip(members, rows, found.clear, strict=False) if clear}, found
+    rows = {
+        member[0]: dict(zip(columns, values, strict=True))
+        for member, accepted, *values in zip(members, optima.accepted, *columns.values(), strict=False)  # less padding
+        if accepted
+    }
+    return rows, optima
 
 
-def _columns(together: Together, found: Settled, message: str) -> dict[str, list[Any]]:
-    likelihood, count = together.likelihood, len(found.theta)
-    free = likelihood.names
-    force = found.gradients[:, _FORCE]
-    shares, _, along = directions(free, found.root, together.prior_root, free)
+def _fit_columns(problem: BatchProblem, result: BatchFit, message: str) -> dict[str, list[Any]]:
+    free, count, factor = problem.likelihood.names, len(result.theta), result.covariance_factor
+    force = result.gradients[:, derived.DERIVED_NAMES.index("force_mean")]
+    shares, _, along = information_directions(free, factor, problem.prior_factor, free)
     table: dict[str, Any] = {
         "result": ["successful"] * count,
         "trusted": [True] * count,
         "message": [message] * count,
-        "samples": [together.samples] * count,
-        "noise": found.sigma,
-        "chi2_reduced": found.figures["chi2_reduced"],
-        "rms_residual": found.figures["rms_residual"],
+        "samples": [problem.samples] * count,
+        "noise": result.sigma,
+        "chi2_reduced": result.figures["chi2_reduced"],
+        "rms_residual": result.figures["rms_residual"],
         "verdict": verdicts(shares, along),
-        "force_from_prior": from_prior(found.root, together.prior_root, force),
+        "force_from_prior": prior_variance_fraction(factor, problem.prior_factor, force),
         "freed": [""] * count,
     }
-    spread = np.linalg.norm(found.root, axis=2)
-    sd = np.linalg.norm(found.gradients @ found.root, axis=2)
-    table |= _values(free, np.exp(found.theta).T, spread.T) | _values(derived.NAMES, np.exp(found.logs).T, sd.T)
+    table |= _median_columns(free, np.exp(result.theta).T, np.linalg.norm(factor, axis=2).T)
+    log_sds = np.linalg.norm(result.gradients @ factor, axis=2).T
+    table |= _median_columns(derived.DERIVED_NAMES, np.exp(result.logs).T, log_sds)
     return {name: values.tolist() if isinstance(values, np.ndarray) else values for name, values in table.items()}
 
 
-def _values(names: Sequence[str], medians: np.ndarray, log_sds: np.ndarray) -> dict[str, Any]:
+def _median_columns(names: Sequence[str], medians: np.ndarray, log_sds: np.ndarray) -> dict[str, Any]:
     return {
         key: value
         for name, median, sd in zip(names, medians, log_sds, strict=True)
@@ -342,40 +350,36 @@ def _values(names: Sequence[str], medians: np.ndarray, log_sds: np.ndarray) -> d
     }
 
 
-def _alone(record: Record, scene: Scene | None) -> Row:
-    """The row of a record that is fitted by itself."""
+def _fit_single(record: Record, scene: Scene | None) -> Row:
     try:
-        return row_of(fitted(record, scene, remedies=False))
+        return row_from_fit(fit(record, scene))
     except Exception as error:
-        return failed(record.source, error)
+        return failure_row(record.source, error)
 
 
-def row_of(found: Fit) -> Row:
-    """Of a fit."""
-    of_circuit = found.identifiability.blind_direction
-    free = [i for i, name in enumerate(found.names) if name in of_circuit]
-    logs, gradients = found.derive.logs(found.theta, np.array([trace.sigma for trace in found.traces]))
+def row_from_fit(fit: Fit) -> Row:
+    free = [i for i, name in enumerate(fit.names) if name in fit.identifiability.blind_direction]
+    logs, gradients = fit.derive.log_value_and_grad(fit.theta, np.array([trace.sigma for trace in fit.traces]))
     row = {
-        "record": os.path.basename(found.record.source),
-        "result": found.result,
-        "trusted": found.trusted,
-        "message": found.message,
-        "samples": int(found.figures["samples"]),
-        "noise": found.sigma,
-        "chi2_reduced": found.figures["chi2_reduced"],
-        "rms_residual": found.figures["rms_residual"],
-        "verdict": found.identifiability.verdict,
-        "force_from_prior": found.identifiability.force_from_prior,
-        "freed": ", ".join(found.model()["freed"]),
+        "record": os.path.basename(fit.record.source),
+        "result": fit.result,
+        "trusted": fit.trusted,
+        "message": fit.message,
+        "samples": int(fit.figures["samples"]),
+        "noise": fit.sigma,
+        "chi2_reduced": fit.figures["chi2_reduced"],
+        "rms_residual": fit.figures["rms_residual"],
+        "verdict": fit.identifiability.verdict,
+        "force_from_prior": fit.identifiability.force_from_prior,
+        "freed": ", ".join(fit.model()["freed"]),
     }
-    row |= _values([found.names[i] for i in free], np.exp(found.theta[free]), found.sd[free])
-    row |= _values(derived.NAMES, np.exp(logs), np.linalg.norm(gradients @ found.covariance_root, axis=1))
+    row |= _median_columns([fit.names[i] for i in free], np.exp(fit.theta[free]), fit.sd[free])
+    row |= _median_columns(derived.DERIVED_NAMES, np.exp(logs), np.linalg.norm(gradients @ fit.covariance_root, axis=1))
     return {name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()}
 
 
-def failed(source: str, error: Exception) -> Row:
-    """The row of a record without an answer."""
-    refused = isinstance(error, InputError)
-    message = str(error) if refused else f"{source}: {type(error).__name__}: {error}"
-    result = "refused" if refused else "crashed"
+def failure_row(source: str, error: Exception) -> Row:
+    result, message = "crashed", f"{source}: {type(error).__name__}: {error}"
+    if isinstance(error, InputError):
+        result, message = "refused", str(error)
     return {"record": os.path.basename(source), "result": result, "trusted": False, "message": message}

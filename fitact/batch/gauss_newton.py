@@ -18,296 +18,323 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from fitact.batch.shared_basis import SharedBasis
-from fitact.data.record import white_noises
+from fitact.data.record import white_noise_sds
 from fitact.fitting import derived
-from fitact.fitting.derived import Derived
-from fitact.fitting.least_squares import EVIDENCE, NUISANCES, bic_gain
-from fitact.fitting.problem import PRECISION, Problem, believed_skin, on_the_ridge
-from fitact.fitting.residual_statistics import is_misfit, judged
-from fitact.fitting.residual_tests import Phases, Structure, counts
-from fitact.likelihood.compression import NODES, REACH, chebyshev
+from fitact.fitting.derived import DerivedQuantities, log_derivatives
+from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES, bic_decrease
+from fitact.fitting.problem import MIN_RELATIVE_NOISE, Problem
+from fitact.fitting.residual_statistics import is_misfit, residual_statistics
+from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics, count_true
+from fitact.fitting.starting_point import most_probable_skin, prior_skin_moments
+from fitact.likelihood.compression import NODES, TABLE_HALF_WIDTH, chebyshev
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.chirp import Chirp
 from fitact.model.skin import WithSkin
 
-_LONGEST = 65_536  # samples, above which a fit by itself costs no more
-_STEPS = 20
-_CONVERGED = 1e-6  # standard errors from the optimum at the end,
-_NEAR = 1e-4  # and before the last step, which squares what is left
-_ROUNDED = 1e-3  # of the residuals' square: what coordinates may lose of it where noise is very low,
-_SUMMED = 32.0 * np.finfo(float).eps  # which is no more than this part of the record's own square (12 eps was seen)
-_STRIDE = 1.0  # longest step in a logarithm
-_DEPENDENT = 1e-9  # of a column's length: what rounding leaves of one that depends on others
-_DOUBT = 3.0  # of the Bayesian information criterion: error of a clock's evidence, whose shape is not exact here
-_RESOLVED = 512  # samples that tell whether noise hides the converter's steps
-_RAIL = 3  # samples at an extreme, from which it may be a rail
-_AT_ONCE = 64  # records, whose samples stay in the processor's cache
 _CANDIDATES = (*NUISANCES, "delay", "clock")  # nuisances that a record may ask for
 
 
-class Settled(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class GaussNewton:
+    """Settings of the least squares, and of what is left for a fit by itself.
+
+    Attributes:
+        max_samples: above which a fit by itself costs no more.
+        max_steps: of each record.
+        max_log_change: longest step in a logarithm.
+        loop_tolerance: standard errors from the optimum before the last step, which squares what is left,
+        tolerance: and at the end.
+        max_rounding_loss: of the residuals' sum of squares: what coordinates may lose of it where noise is very low.
+        clock_bic_error: of the Bayesian information criterion: a clock's evidence, whose shape is not exact here.
+        adc_samples: that tell whether noise hides the converter's steps.
+        max_rail_samples: at an extreme, from which it may be a rail.
+    """
+
+    max_samples: int = 65_536
+    max_steps: int = 20
+    max_log_change: float = 1.0
+    loop_tolerance: float = 1e-4
+    tolerance: float = 1e-6
+    max_rounding_loss: float = 1e-3
+    clock_bic_error: float = 3.0
+    adc_samples: int = 512
+    max_rail_samples: int = 3
+
+
+class BatchFit(NamedTuple):
     """Optima of records fitted together, one a row.
 
     Attributes:
-        clear: where nothing is in doubt; elsewhere the other fields mean nothing.
+        accepted: where nothing is in doubt; elsewhere the other fields mean nothing.
         coordinates: of the records, as by `SharedBasis.project`.
-        theta, sigma, root: as `Fit.theta`, `Fit.sigma` and `Fit.covariance_root`.
-        logs, gradients: of `derived.NAMES`, as of `Derived.logs`.
+        theta, sigma, covariance_factor: as `Fit.theta`, `Fit.sigma` and `Fit.covariance_root`.
+        logs, gradients: as of `DerivedQuantities.log_value_and_grad`.
         figures: as `Fit.figures`.
     """
 
-    clear: Bool[np.ndarray, " records"]
+    accepted: Bool[np.ndarray, " records"]
     coordinates: Float[np.ndarray, "records coordinates+1"]
     theta: Float[np.ndarray, "records parameters"]
     sigma: Float[np.ndarray, " records"]
-    root: Float[np.ndarray, "records parameters parameters"]
+    covariance_factor: Float[np.ndarray, "records parameters parameters"]
     logs: Float[np.ndarray, "records derived"]
     gradients: Float[np.ndarray, "records derived parameters"]
     figures: dict[str, np.ndarray]
 
 
-class Ends(NamedTuple):
+class GaussNewtonResult(NamedTuple):
     """Where least squares end, of a record or of many.
 
     Attributes:
         theta, sigma: as `Fit.theta`, `Fit.sigma`.
-        square: sum of the residuals' squares by the coordinates, V^2.
-        triangle: of the whitened Jacobian's QR decomposition.
-        shares: of `_CANDIDATES` in the residuals' square.
+        sum_of_squares: of the residuals by the coordinates, V^2.
+        r_factor: of the whitened Jacobian's QR decomposition.
+        r_squared: shares of `_CANDIDATES` in the residuals' sum of squares.
         signal: the response, in the first coordinates of the basis.
-        ended: whether at the optimum.
+        converged: whether at the optimum.
     """
 
     theta: Float[Array, "*records parameters"]
     sigma: Float[Array, "*records"]
-    square: Float[Array, "*records"]
-    triangle: Float[Array, "*records parameters parameters"]
-    shares: Float[Array, "*records nuisances"]
+    sum_of_squares: Float[Array, "*records"]
+    r_factor: Float[Array, "*records parameters parameters"]
+    r_squared: Float[Array, "*records nuisances"]
     signal: Float[Array, "*records rank"]
-    ended: Bool[Array, "*records"]
+    converged: Bool[Array, "*records"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Together:
+class BatchProblem:
     """What records of one scene, drive and time grid share.
 
     Attributes:
         likelihood: in the coordinates of `basis`.
         phases: of the samples in the drive's period; None: too little repeats.
         samples: of each.
-        freeable: nuisances that a record may ask for.
+        optional_nuisances: that a record may ask for.
     """
 
     likelihood: Likelihood
-    derive: Derived
+    derive: DerivedQuantities
     basis: SharedBasis
-    phases: Phases | None
+    phases: PhaseBins | None
     samples: int
-    freeable: tuple[str, ...]
+    optional_nuisances: tuple[str, ...]
+    settings: GaussNewton = GaussNewton()
 
     @classmethod
-    def like(cls, problem: Problem) -> "Together | None":
-        """For records like that of `problem`; None where such cannot be fitted together. In double precision."""
+    def from_problem(cls, problem: Problem) -> "BatchProblem | None":
+        """Pose the problem of records like that of `problem`; None where such cannot be fitted together.
+
+        In double precision.
+        """
         likelihood, (source, *others) = problem.likelihood, problem.sources
-        (trace, *_), choice, start = likelihood.traces, source.choice, source.start
-        if others or start is None or not math.isfinite(start.b) or trace.own > _LONGEST:
+        (trace, *_), choice, start = likelihood.channels, source.choice, source.start
+        if others or start is None or not math.isfinite(start.b) or trace.n_samples > cls.settings.max_samples:
             return None
-        plain = trace.channel == "Vsc" and trace.noise == "white" and trace.equally_weighted and not trace.timing
-        known = not (isinstance(likelihood.template, WithSkin) or isinstance(choice.drive, Chirp))
-        own = bool(np.any(np.asarray(trace.linear_sd))) or bool(choice.notes) or choice.shift != 0.0
-        if not (plain and known) or own or choice.name == "measured":
+        is_plain = trace.channel == "Vsc" and trace.noise == "white" and trace.equally_weighted and not trace.timing
+        has_other_model = isinstance(likelihood.template, WithSkin) or isinstance(choice.drive, Chirp)
+        has_nuisances = bool(np.any(np.asarray(trace.linear_sd))) or bool(choice.notes) or choice.shift != 0.0
+        if not is_plain or has_other_model or has_nuisances or choice.name == "measured":
             return None
         time = source.record.time
-        basis = SharedBasis.around(choice.drive, time, choice.steady_state, start.b)
+        basis = SharedBasis.from_drive(choice.drive, time, choice.steady_state, start.b)
         shared = dataclasses.replace(trace, compression=basis.compression(time.size), columns=()).without_samples()
-        derive = derived.for_fit(likelihood, source.record, choice, source.scene, start.b)
-        of_time = Phases.of(time, source.record.frequency() if choice.periodic else None)
-        return cls(likelihood.with_trace(0, shared), derive, basis, of_time, time.size, source.freeable)
+        derive = derived.derived_from_fit(likelihood, source.record, choice, source.scene, start.b)
+        phases = PhaseBins.from_times(time, source.record.frequency() if choice.periodic else None)
+        return cls(likelihood.replace_channel(0, shared), derive, basis, phases, time.size, source.optional_nuisances)
 
-    def settle(self, observed: Sequence[Float[np.ndarray, " samples"]], whiteness: bool = True) -> Settled:
+    def fit(self, observed: Sequence[Float[np.ndarray, " samples"]], whiteness: bool = True) -> BatchFit:
         """Fit records, and test their residuals for structure (`whiteness`). In double precision."""
-        parts = list(_parts(observed))
-        seen = [(*_seen(part), self.basis.project(part)) for part in parts]
-        noise, height, plain, coordinates = map(np.concatenate, zip(*seen, strict=True))
-        found, held = self.optima(coordinates, noise, PRECISION * height)
-        theta, sigma, inside, triangle, shares, signal, ended = map(np.asarray, found)
-        logs, gradients = map(np.asarray, _derived(self.derive, found.theta, found.sigma))
+        parts = list(_chunk_records(observed))
+        screened = [(*self._screen_records(part), self.basis.project(part)) for part in parts]
+        noise, height, plain, coordinates = map(np.concatenate, zip(*screened, strict=True))
+        optima, accepted = self.find_optima(coordinates, noise, MIN_RELATIVE_NOISE * height)
+        theta, sigma, square_in_basis, r_factor, r_squared, signal, converged = map(np.asarray, optima)
+        logs, gradients = map(np.asarray, _log_derived(self.derive, optima.theta, optima.sigma))
         if whiteness:
-            square, structure = self._left(parts, signal)
-            held &= np.abs(inside - square) <= _ROUNDED * square
+            square, tests = self._residual_statistics(parts, signal)
+            loss = np.abs(square_in_basis - square)
         else:
-            square, structure = inside, None
-            held &= _SUMMED * np.vecdot(coordinates, coordinates) <= _ROUNDED * square
-        figures = judged(square, self.samples, structure, noise, self.samples - theta.shape[1], self.phases)
+            square, tests = square_in_basis, None
+            # of the record's own square; 12 eps was seen
+            loss = 32.0 * np.finfo(float).eps * np.vecdot(coordinates, coordinates)
+        accepted &= loss <= self.settings.max_rounding_loss * square
+        figures = residual_statistics(square, self.samples, tests, noise, self.samples - theta.shape[1], self.phases)
         figures |= {"rounding_noise": np.zeros(len(noise)), "interpolation_error": np.zeros(len(noise))}
-        clear = held & ended & ~self._asked_for(shares) & plain & ~is_misfit(figures)
-        return Settled(clear, coordinates, theta, sigma, np.linalg.inv(triangle), logs, gradients, figures)
+        accepted &= converged & ~self._needs_nuisance(r_squared) & plain & ~is_misfit(figures)
+        return BatchFit(accepted, coordinates, theta, sigma, np.linalg.inv(r_factor), logs, gradients, figures)
 
-    def _left(
+    def _residual_statistics(
         self, parts: Sequence[np.ndarray], signal: Float[np.ndarray, "records rank"]
-    ) -> tuple[Float[np.ndarray, " records"], Structure]:
-        """Of the samples, when the responses are taken off: the sums of squares, and what structure is left."""
-        starts = range(0, len(signal), _AT_ONCE)
-        responses = (self.basis.response(signal[start : start + _AT_ONCE]) for start in starts)
+    ) -> tuple[Float[np.ndarray, " records"], ResidualTestStatistics]:
+        """Take the responses off the samples: the sums of squares, and what structure is left."""
+        responses = map(self.basis.response, _chunk_records(list(signal)))
         residuals = (np.subtract(part, u, out=u) for part, u in zip(parts, responses, strict=True))
-        found = [(np.vecdot(r, r), *Structure.of(r.astype(np.float32), self.phases)) for r in residuals]
-        square, *shown = map(np.concatenate, zip(*found, strict=True))
-        return square, Structure(*shown)
+        statistics = [
+            (np.vecdot(r, r), *ResidualTestStatistics.from_residuals(r.astype(np.float32), self.phases))
+            for r in residuals
+        ]
+        square, *tests = map(np.concatenate, zip(*statistics, strict=True))
+        return square, ResidualTestStatistics(*tests)
 
-    def optima(
+    def find_optima(
         self,
         coordinates: Float[np.ndarray, "records coordinates+1"],
         noise: Float[np.ndarray, " records"],
-        least: Float[np.ndarray, " records"],
-    ) -> tuple[Ends, Bool[np.ndarray, " records"]]:
-        """Least squares alone, and which records the table holds; sigma begins at `noise` and ends above `least`, V.
+        noise_floor: Float[np.ndarray, " records"],
+    ) -> tuple[GaussNewtonResult, Bool[np.ndarray, " records"]]:
+        """Solve the least squares alone, and say which records the table holds, by their `coordinates` in `basis`.
 
-        `coordinates` are those that `basis` projects records on.
+        Sigma begins at `noise` and ends above `noise_floor`, V.
         """
-        theta, held = self._starts(coordinates)
-        of_each = map(jnp.asarray, (coordinates, theta, np.maximum(noise, least), least))
-        return _optima(self.likelihood, jnp.asarray(np.append(self.basis.clock, 0.0)), *of_each), held
+        theta, in_table = self._initial_estimates(coordinates)
+        per_record = map(jnp.asarray, (coordinates, theta, np.maximum(noise, noise_floor), noise_floor))
+        clock = jnp.asarray(np.append(self.basis.clock, 0.0))
+        return _find_optima(self.likelihood, self.settings, clock, *per_record), in_table
 
-    def _starts(
+    def _initial_estimates(
         self, coordinates: Float[np.ndarray, "records coordinates+1"]
     ) -> tuple[Float[np.ndarray, "records parameters"], Bool[np.ndarray, " records"]]:
-        """The best response of the table's nodes to each, on the ridge, and whether the table holds it."""
-        tau, signal, size = self._nodes
+        """Take the best response of the table's nodes to each, on the ridge, and say whether the table holds it."""
+        tau, signal, size = self._table_responses
         products = coordinates[:, : len(signal)] @ signal
         best = np.argmax(np.where(products > 0.0, products**2 / size, -1.0), axis=1)
-        most = products[np.arange(len(best)), best]
-        inside = (best > 0) & (best < NODES - 1) & (most > 0.0)
+        highest = products[np.arange(len(best)), best]
+        in_table = (best > 0) & (best < NODES - 1) & (highest > 0.0)
         theta = np.tile(self.likelihood.prior.log_mean, (len(best), 1))
-        ridge = on_the_ridge(most / size[best], tau[best], *self._believed)
+        ridge = most_probable_skin(highest / size[best], tau[best], *self._prior_skin_moments)
         for name, logs in zip(("Rsc", "Csc", "Ci"), ridge.T, strict=True):
             if name in self.likelihood.names:
                 theta[:, self.likelihood.names.index(name)] = logs
-        return theta, inside
+        return theta, in_table
 
     @functools.cached_property
-    def _nodes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of the table: time constants (s), the responses to the drive (one a column), and their squares."""
+    def _table_responses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Time constants of the table's nodes (s), their responses to the drive (one a column), and those squared."""
         x, _ = chebyshev(NODES)
         signal = self.basis.signal @ np.polynomial.chebyshev.chebvander(x, NODES - 1).T
-        return np.exp(self.basis.center + REACH * x), signal, np.einsum("ij,ij->j", signal, signal)
+        return np.exp(self.basis.center + TABLE_HALF_WIDTH * x), signal, np.einsum("ij,ij->j", signal, signal)
 
     @functools.cached_property
-    def _believed(self) -> tuple[np.ndarray, np.ndarray]:
-        return believed_skin(self.likelihood)
+    def _prior_skin_moments(self) -> tuple[np.ndarray, np.ndarray]:
+        return prior_skin_moments(self.likelihood)
 
     @functools.cached_property
-    def prior_root(self) -> Float[np.ndarray, "parameters parameters"]:
-        """As of the likelihood."""
-        return self.likelihood.prior_root
+    def prior_factor(self) -> Float[np.ndarray, "parameters parameters"]:
+        """That of the likelihood, worked out once for all records."""
+        return self.likelihood.prior_factor
 
-    def _asked_for(self, shares: Float[np.ndarray, "records nuisances"]) -> Bool[np.ndarray, " records"]:
-        """Whether a nuisance may be asked for."""
+    def _needs_nuisance(self, r_squared: Float[np.ndarray, "records nuisances"]) -> Bool[np.ndarray, " records"]:
         gains = [
-            bic_gain(share, self.samples, len(NUISANCES.get(name, (0,)))) + (_DOUBT if name == "clock" else 0.0)
-            for name, share in zip(_CANDIDATES, shares.T, strict=True)
-            if name in self.freeable
+            bic_decrease(share, self.samples, len(NUISANCES.get(name, (0,))))
+            + (self.settings.clock_bic_error if name == "clock" else 0.0)
+            for name, share in zip(_CANDIDATES, r_squared.T, strict=True)
+            if name in self.optional_nuisances
         ]
-        return np.max(gains, axis=0, initial=-math.inf) > EVIDENCE
+        return np.max(gains, axis=0, initial=-math.inf) > MIN_BIC_DECREASE
+
+    def _screen_records(self, observed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Noise and height of records, and whether they show neither a rail nor the steps of a converter."""
+        noise, low, high = white_noise_sds(observed), observed.min(axis=1), observed.max(axis=1)
+        steps = np.abs(np.diff(observed[:, : self.settings.adc_samples], axis=1))
+        is_fine = np.any((steps > 0.0) & (steps <= noise[:, None]), axis=1)
+        limit = self.settings.max_rail_samples
+        is_railed = [count_true(observed == extreme[:, None]) > limit for extreme in (low, high)]
+        return noise, high - low, is_fine & ~np.any(is_railed, axis=0)
 
 
-def _parts(rows: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
-    for first in range(0, len(rows), _AT_ONCE):
-        part = rows[first : first + _AT_ONCE]
+def _chunk_records(rows: Sequence[np.ndarray], size: int = 64) -> Iterator[np.ndarray]:
+    """Stack `size` records at a time, whose samples stay in the processor's cache."""
+    for first in range(0, len(rows), size):
+        part = rows[first : first + size]
         yield np.concatenate(part).reshape(len(part), -1)  # which takes less than `np.stack`
 
 
-def _seen(observed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of records: their noise, their height, and whether they show neither a rail nor the steps of a converter."""
-    noise, low, high = white_noises(observed), observed.min(axis=1), observed.max(axis=1)
-    apart = np.abs(np.diff(observed[:, :_RESOLVED], axis=1))
-    fine = np.any((apart > 0.0) & (apart <= noise[:, None]), axis=1)
-    railed = [counts(observed == extreme[:, None]) > _RAIL for extreme in (low, high)]
-    return noise, high - low, fine & ~np.any(railed, axis=0)
-
-
 @eqx.filter_jit
-def _optima(likelihood: Likelihood, clock: Array, *of_each: Array) -> Ends:
-    return jax.vmap(lambda *of: _optimum(likelihood, clock, *of))(*of_each)
+def _find_optima(likelihood: Likelihood, settings: GaussNewton, clock: Array, *per_record: Array) -> GaussNewtonResult:
+    return jax.vmap(functools.partial(_find_optimum, likelihood, settings, clock))(*per_record)
 
 
-def _optimum(likelihood: Likelihood, clock: Array, observed: Array, start: Array, noise: Array, least: Array) -> Ends:
-    """Gauss-Newton from a start near the optimum, the noise being that of the residuals."""
-    trace = likelihood.traces[0]
+def _find_optimum(
+    likelihood: Likelihood,
+    settings: GaussNewton,
+    clock: Array,
+    observed: Array,
+    start: Array,
+    noise: Array,
+    noise_floor: Array,
+) -> GaussNewtonResult:
+    """Iterate by Gauss and Newton from a start near the optimum, the noise being that of the residuals."""
+    trace = likelihood.channels[0]
     assert trace.compression is not None
     table = dataclasses.replace(trace.compression, observed=observed)
-    model = likelihood.with_trace(0, dataclasses.replace(trace, compression=table))
+    model = likelihood.replace_channel(0, dataclasses.replace(trace, compression=table))
     size = start.size
 
-    def linearised(theta: Array, sigma: Array) -> tuple[Array, Array]:
-        def whitened(theta: Array) -> Array:
+    def linearise(theta: Array, sigma: Array) -> tuple[Array, Array]:
+        def whitened_residuals(theta: Array) -> Array:
             return jnp.concatenate([*model.residuals(theta, sigma[None]), model.prior_residuals(theta)])
 
-        columns = jax.vmap(lambda along: jax.jvp(whitened, (theta,), (along,)), out_axes=(None, -1))
+        columns = jax.vmap(lambda axis: jax.jvp(whitened_residuals, (theta,), (axis,)), out_axes=(None, -1))
         return columns(jnp.eye(size))
 
     def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
         theta, sigma, _, steps = state
-        residuals, jacobian = linearised(theta, sigma)
-        triangle, along = _triangular(jacobian, residuals)
-        move = -_solved(triangle, along)
-        move = move * jnp.minimum(1.0, _STRIDE / jnp.max(jnp.abs(move)))
-        spread = sigma * jnp.linalg.norm(residuals[:-size]) / jnp.sqrt(trace.count - size)
-        return theta + move, jnp.maximum(spread, least), jnp.linalg.norm(along), steps + 1
+        residuals, jacobian = linearise(theta, sigma)
+        r_factor, projections = _qr_decompose(jacobian, residuals)
+        move = -_back_substitute(r_factor, projections)
+        move = move * jnp.minimum(1.0, settings.max_log_change / jnp.max(jnp.abs(move)))
+        rms = sigma * jnp.linalg.norm(residuals[:-size]) / jnp.sqrt(trace.count - size)
+        return theta + move, jnp.maximum(rms, noise_floor), jnp.linalg.norm(projections), steps + 1
 
-    def goes_on(state: tuple[Array, ...]) -> Array:
-        return (state[2] > _NEAR) & (state[3] < _STEPS)
+    def should_continue(state: tuple[Array, ...]) -> Array:
+        return (state[2] > settings.loop_tolerance) & (state[3] < settings.max_steps)
 
-    theta, sigma, _, _ = lax.while_loop(goes_on, step, (start, noise, jnp.array(jnp.inf), jnp.array(0)))
-    residuals, jacobian = linearised(theta, sigma)
-    left, (triangle, along) = sigma * residuals[:-size], _triangular(jacobian, residuals)
-    within = jnp.isfinite(model.log_prior(jnp.append(theta, jnp.log(sigma))))
-    ended = (jnp.linalg.norm(along) <= _CONVERGED) & within & table.holds(model.circuit(theta).b)
-    candidates = [[table.slow[place] for place in places] for places in NUISANCES.values()]
-    candidates += [[trace.slope(model.seen(theta))], [clock]]
-    known = _orthonormal(list(jacobian[:-size].T), [])
-    shares = [sum(jnp.square(q @ left) for q in _orthonormal(each, known)) for each in candidates]
-    square, signal = left @ left, (observed - left)[: table.signal.shape[0]]
-    return Ends(theta, sigma, square, triangle, jnp.stack(shares) / square, signal, ended)
+    theta, sigma, _, _ = lax.while_loop(should_continue, step, (start, noise, jnp.array(jnp.inf), jnp.array(0)))
+    whitened, jacobian = linearise(theta, sigma)
+    residuals, (r_factor, projections) = sigma * whitened[:-size], _qr_decompose(jacobian, whitened)
+    is_possible = jnp.isfinite(model.log_prior(jnp.append(theta, jnp.log(sigma))))
+    converged = (
+        (jnp.linalg.norm(projections) <= settings.tolerance) & is_possible & table.covers(model.circuit(theta).b)
+    )
+    candidates = [[table.baseline[place] for place in places] for places in NUISANCES.values()]
+    candidates += [[trace.whitened_delay_derivative(model.channel_inputs(theta))], [clock]]
+    fitted = _orthonormalise(list(jacobian[:-size].T), [])
+    shares = [sum(jnp.square(q @ residuals) for q in _orthonormalise(columns, fitted)) for columns in candidates]
+    square, signal = residuals @ residuals, (observed - residuals)[: table.signal.shape[0]]
+    return GaussNewtonResult(theta, sigma, square, r_factor, jnp.stack(shares) / square, signal, converged)
 
 
-def _orthonormal(columns: list[Array], others: list[Array], least: float = _DEPENDENT) -> list[Array]:
-    """Columns made so against `others` and each other, by Gram and Schmidt, twice.
+def _orthonormalise(columns: list[Array], others: list[Array], tolerance: float = 1e-9) -> list[Array]:
+    """Make columns orthonormal against `others` and each other, by Gram and Schmidt, twice.
 
-    0 for one of which no more than `least` of its length is left.
+    0 for one of which no more than `tolerance` of its length is left, as rounding leaves of one that depends on others.
     """
-    found: list[Array] = []
+    basis: list[Array] = []
     for column in columns:
         rest = column
         for _ in range(2):
-            for q in (*others, *found):
+            for q in (*others, *basis):
                 rest = rest - (q @ rest) * q
         length = jnp.linalg.norm(rest)
-        found.append(jnp.where(length > least * jnp.linalg.norm(column), rest / length, 0.0))
-    return found
+        basis.append(jnp.where(length > tolerance * jnp.linalg.norm(column), rest / length, 0.0))
+    return basis
 
 
-def _triangular(jacobian: Float[Array, "rows n"], residuals: Array) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
-    """R and Q' residuals of the QR decomposition: vectorised over many small ones, unlike LAPACK's."""
-    q = jnp.stack(_orthonormal(list(jacobian.T), [], least=0.0))
+def _qr_decompose(jacobian: Float[Array, "rows n"], residuals: Array) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+    """Compute R and Q' residuals of the QR decomposition: vectorised over many small ones, unlike LAPACK's."""
+    q = jnp.stack(_orthonormalise(list(jacobian.T), [], tolerance=0.0))
     return jnp.triu(q @ jacobian), q @ residuals
 
 
-def _solved(triangle: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Of an upper triangle, by substitution."""
-    found = jnp.zeros_like(right)
-    for i in reversed(range(right.size)):
-        found = found.at[i].set((right[i] - triangle[i] @ found) / triangle[i, i])
-    return found
+def _back_substitute(r_factor: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Array, " n"]:
+    solution = jnp.zeros_like(rhs)
+    for i in reversed(range(rhs.size)):
+        solution = solution.at[i].set((rhs[i] - r_factor[i] @ solution) / r_factor[i, i])
+    return solution
 
 
 @eqx.filter_jit
-def _derived(derive: Derived, theta: Array, sigma: Array) -> tuple[Array, Array]:
-    """As `Derived.logs`, of each record."""
-
-    def logs(theta: Array, sigma: Array) -> tuple[Array, Array]:
-        def of(theta: Array) -> Array:
-            return jnp.log(derive(theta, sigma[None]))
-
-        return of(theta), jax.jacfwd(of)(theta)
-
-    return jax.vmap(logs)(theta, sigma)
+def _log_derived(derive: DerivedQuantities, theta: Array, sigma: Array) -> tuple[Array, Array]:
+    return jax.vmap(lambda theta, sigma: log_derivatives(derive, theta, sigma[None]))(theta, sigma)

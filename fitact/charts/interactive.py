@@ -13,15 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fitact.charts.figure import DATA, MODEL
-from fitact.units import prefixed
+from fitact.units import choose_prefixed_unit
 
-Trace = dict[str, Any]
+PlotlyTrace = dict[str, Any]
 Plot = dict[str, Any]
 Chart = dict[str, Any]
 
-COLUMNS = 2000  # a series of more than twice as many points is drawn by its extremes in so many stretches
-_DECADES = 4.0  # an axis that spans more has a prefix at each tick
-_BINS = 80
 _FONT = {"family": "system-ui, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif", "size": 13, "color": "#1c2733"}
 _AXIS = {
     "showline": True, "linecolor": "#51606f", "ticks": "outside", "tickcolor": "#51606f", "gridcolor": "#e3e7eb",
@@ -39,8 +36,8 @@ class Axis:
         size: of that unit, SI.
         log: whether the axis is logarithmic to begin with.
         limits: shown to begin with, SI; None: all there is.
-        bare: without numbers, from 0.
-        wide: over so many decades that each tick has a prefix of its own.
+        hides_numbers: starts at 0, without numbers.
+        has_tick_prefixes: over so many decades that each tick has a prefix of its own.
     """
 
     title: str
@@ -48,21 +45,22 @@ class Axis:
     size: float = 1.0
     log: bool = False
     limits: tuple[float, float] | None = None
-    bare: bool = False
-    wide: bool = False
+    hides_numbers: bool = False
+    has_tick_prefixes: bool = False
 
     @classmethod
-    def of(
+    def from_values(
         cls, title: str, unit: str, values: ArrayLike, *, log: bool = False, limits: tuple[float, float] | None = None
     ) -> Self:
         """With the prefix of `unit` (SI) that suits `values`."""
         sizes = np.abs(np.asarray(values, dtype=float))
         sizes = sizes[np.isfinite(sizes) & (sizes > 0.0)]
-        wide = log and sizes.size > 0 and bool(np.log10(sizes.max() / sizes.min()) > _DECADES)
-        size, symbol = prefixed(float(sizes.max()) if sizes.size and not wide else 0.0, unit)
-        return cls(title, symbol, size, log, limits, wide=wide)
+        # over four decades no single prefix reads well
+        wide = log and sizes.size > 0 and bool(np.log10(sizes.max() / sizes.min()) > 4.0)
+        size, symbol = choose_prefixed_unit(float(sizes.max()) if sizes.size and not wide else 0.0, unit)
+        return cls(title, symbol, size, log, limits, has_tick_prefixes=wide)
 
-    def shown(self, values: ArrayLike, dtype: str = "f4") -> dict[str, str]:
+    def encode(self, values: ArrayLike, dtype: str = "f4") -> dict[str, str]:
         """`values` (SI) in the unit shown, as plotly.js reads numbers."""
         numbers = (np.asarray(values, dtype=float) / self.size).astype(f"<{dtype}")
         return {"dtype": dtype, "bdata": base64.b64encode(numbers.tobytes()).decode()}
@@ -71,7 +69,7 @@ class Axis:
         """What plotly.js calls an axis."""
         title = f"{self.title} / {self.symbol}" if self.symbol else self.title
         layout = _AXIS | {"title": {"text": title, "standoff": 6}, "type": "log" if self.log else "linear"}
-        if self.bare:
+        if self.hides_numbers:
             layout |= {"showticklabels": False, "ticks": "", "showgrid": False, "rangemode": "tozero"}
         if self.limits is not None:
             ends = np.asarray(self.limits) / self.size
@@ -80,82 +78,69 @@ class Axis:
 
     def hover(self, letter: str) -> str:
         """The value under the pointer with its unit."""
-        return f"%{{{letter}:.4~s}}{self.symbol}" if self.wide else f"%{{{letter}:.5~g}} {self.symbol}".rstrip()
+        if self.has_tick_prefixes:
+            return f"%{{{letter}:.4~s}}{self.symbol}"
+        return f"%{{{letter}:.5~g}} {self.symbol}".rstrip()
 
 
 def line(
-    x: Axis, y: Axis, at: ArrayLike, values: ArrayLike, name: str, color: str = MODEL, *, width: float = 1.8,
+    x: Axis, y: Axis, x_values: ArrayLike, values: ArrayLike, name: str, color: str = MODEL, *, width: float = 1.8,
     dash: str = "solid",
-) -> Trace:  # fmt: skip
+) -> PlotlyTrace:  # fmt: skip
     """A curve; `dash` as in SVG's and plotly's words: solid, dash, dot."""
     style = {"color": color, "width": width, "dash": dash, "simplify": False}
-    return _trace(x, y, at, values, name) | {"mode": "lines", "line": style}
+    return _trace(x, y, x_values, values, name) | {"mode": "lines", "line": style}
 
 
 def points(
-    x: Axis, y: Axis, at: ArrayLike, values: ArrayLike, name: str, color: str = DATA, *, size: float = 6.0,
+    x: Axis, y: Axis, x_values: ArrayLike, values: ArrayLike, name: str, color: str = DATA, *, size: float = 6.0,
     hollow: bool = False, names: Sequence[str] | None = None, opacity: float = 1.0,
-) -> Trace:  # fmt: skip
+) -> PlotlyTrace:  # fmt: skip
     """Markers; `names`: of each, shown under the pointer."""
     marker = {"color": color, "size": size, "symbol": "circle-open" if hollow else "circle", "opacity": opacity}
-    trace = _trace(x, y, at, values, name) | {"mode": "markers", "marker": marker}
+    trace = _trace(x, y, x_values, values, name) | {"mode": "markers", "marker": marker}
     if names is not None:
-        trace |= {"text": list(names), "hovertemplate": f"%{{text}}<br>{_pair(x, y)}<extra></extra>"}
+        trace |= {"text": list(names), "hovertemplate": f"%{{text}}<br>{_hover_pair(x, y)}<extra></extra>"}
     return trace
 
 
 def band(
-    x: Axis, y: Axis, at: ArrayLike, low: ArrayLike, high: ArrayLike, names: tuple[str, str, str], color: str = MODEL
-) -> list[Trace]:
+    x: Axis, y: Axis, x_values: ArrayLike, low: ArrayLike, high: ArrayLike, names: tuple[str, str, str],
+    color: str = MODEL,
+) -> list[PlotlyTrace]:  # fmt: skip
     """The area between two curves; `names`: of the lower and upper edge, and of the area."""
     below, above, area = names
     edge = {"mode": "lines", "line": {"width": 0, "color": color}, "legendgroup": area}
-    lower = _trace(x, y, at, low, below) | edge | {"showlegend": False}
-    upper = _trace(x, y, at, high, area) | edge | {"fill": "tonexty", "fillcolor": _faint(color)}
+    lower = _trace(x, y, x_values, low, below) | edge | {"showlegend": False}
+    upper = _trace(x, y, x_values, high, area) | edge | {"fill": "tonexty", "fillcolor": _rgba(color)}
     return [lower, upper | {"hovertemplate": f"{above}: {y.hover('y')}<extra></extra>"}]
 
 
-def bars(
-    x: Axis, values: ArrayLike, names: Sequence[str], name: str, colors: str | Sequence[str] = MODEL, *,
-    low: ArrayLike | None = None, high: ArrayLike | None = None,
-) -> Trace:  # fmt: skip
-    """Horizontal bars, one for each of `names`, downwards; `low` and `high`: the ends of an interval of each."""
-    trace = {"type": "bar", "orientation": "h", "x": x.shown(values), "y": list(names), "name": name,
-             "marker": {"color": colors}, "hovertemplate": f"%{{y}}: {x.hover('x')}<extra></extra>"}  # fmt: skip
-    if low is not None and high is not None:
-        value = np.asarray(values, dtype=float)
-        trace["error_x"] = {
-            "array": x.shown(np.asarray(high) - value), "arrayminus": x.shown(value - np.asarray(low)),
-            "color": DATA, "thickness": 1.5,
-        }  # fmt: skip
-    return trace
-
-
-def density(x: Axis, draws: ArrayLike, name: str, color: str = MODEL) -> Trace:
+def density(x: Axis, draws: ArrayLike, name: str, color: str = MODEL, *, bins: int = 80) -> PlotlyTrace:
     """The distribution of positive draws, its peak at 1; under the pointer, the share of them below.
 
-    Heights are densities over the axis as it is drawn: `logarithmic` swaps those of the linear axis, given here, with
-    those of the logarithmic one.
+    Heights are densities over the axis as it is drawn: `log_axis_button` swaps those of the linear axis with those of
+    the logarithmic one.
     """
     values = np.asarray(draws, dtype=float).ravel()
-    edges = np.geomspace(values.min(), values.max() * (1.0 + 1e-9), _BINS + 1)
+    edges = np.geomspace(values.min(), values.max() * (1.0 + 1e-9), bins + 1)
     counts, _ = np.histogram(values, edges)
     below = np.concatenate([[0.0], np.cumsum(counts)]) / values.size
     heights = {"log": counts / counts.max(), "linear": counts / np.diff(edges)}
     heights["linear"] /= heights["linear"].max()
-    height = {kind: np.append(each, 0.0) for kind, each in heights.items()}
     plain = Axis("")
+    encoded = {kind: plain.encode(np.append(values, 0.0)) for kind, values in heights.items()}
     return {
-        "type": "scatter", "mode": "lines", "name": name, "x": x.shown(edges, "f8"),
-        "y": plain.shown(height["log" if x.log else "linear"]),
-        "line": {"shape": "hv", "color": color, "width": 1.2}, "fill": "tozeroy", "fillcolor": _faint(color),
-        "customdata": plain.shown(below), "meta": {kind: plain.shown(each) for kind, each in height.items()},
+        "type": "scatter", "mode": "lines", "name": name, "x": x.encode(edges, "f8"),
+        "y": encoded["log" if x.log else "linear"],
+        "line": {"shape": "hv", "color": color, "width": 1.2}, "fill": "tozeroy", "fillcolor": _rgba(color),
+        "customdata": plain.encode(below), "meta": encoded,
         "hovertemplate": f"{name}: %{{customdata:.1%}} below {x.hover('x')}<extra></extra>",
     }  # fmt: skip
 
 
-def extremes(values: ArrayLike, columns: int = COLUMNS) -> np.ndarray:
-    """Indices, at most 2 `columns`, at which a series looks as it does whole: each stretch's least and greatest."""
+def extremes(values: ArrayLike, columns: int = 2000) -> np.ndarray:
+    """Indices at which a series looks as it does whole: the least and greatest of so many stretches, `columns`."""
     numbers = np.asarray(values, dtype=float)
     if numbers.size <= 2 * columns:
         return np.arange(numbers.size)
@@ -165,8 +150,8 @@ def extremes(values: ArrayLike, columns: int = COLUMNS) -> np.ndarray:
 
 
 def plot(
-    x: Axis, *rows: tuple[Axis, Iterable[Trace]], heights: Sequence[float] = (1.0,), title: str = "",
-    size: int = 320, legend: bool = True, together: bool = False,
+    x: Axis, *rows: tuple[Axis, Iterable[PlotlyTrace]], heights: Sequence[float] = (1.0,), title: str = "",
+    size: int = 320, legend: bool = True, unified_hover: bool = False,
 ) -> Plot:  # fmt: skip
     """Rows of traces above each other over one x axis.
 
@@ -176,10 +161,10 @@ def plot(
         title: above it.
         size: height in pixels.
         legend: whether to show one.
-        together: whether the pointer asks for the values of all traces at its x, or of the nearest point.
+        unified_hover: whether the pointer asks for the values of all traces at its x, or of the nearest point.
     """
-    data: list[Trace] = []
-    layout = _layout(x, size, legend, together)
+    data: list[PlotlyTrace] = []
+    layout = _layout(x, size, legend, unified_hover)
     shares = np.cumsum([0.0, *heights[: len(rows)]])
     tops, gap = 1.0 - shares / shares[-1], 0.06 if len(rows) > 1 else 0.0
     for number, (y, traces) in enumerate(rows, start=1):
@@ -192,14 +177,15 @@ def plot(
     return {"data": data, "layout": layout, "title": title, "label": f"{title}: {label}" if title else label}
 
 
-def shaded(plot: Plot, x: Axis, low: float, high: float) -> Plot:
+def shade_interval(plot: Plot, x: Axis, low: float, high: float) -> Plot:
     """With an interval of x marked."""
-    return _with_shape(plot, low / x.size, high / x.size, {"line": {"width": 0}, "fillcolor": _faint(MODEL, 0.12)})
+    return _with_shape(plot, low / x.size, high / x.size, {"line": {"width": 0}, "fillcolor": _rgba(MODEL, 0.12)})
 
 
-def marked(plot: Plot, x: Axis, at: float, color: str) -> Plot:
+def mark_position(plot: Plot, x: Axis, position: float, color: str) -> Plot:
     """With a dashed line upwards at one x."""
-    return _with_shape(plot, at / x.size, at / x.size, {"line": {"width": 1.2, "color": color, "dash": "dash"}})
+    at = position / x.size
+    return _with_shape(plot, at, at, {"line": {"width": 1.2, "color": color, "dash": "dash"}})
 
 
 def chart(*plots: Plot, controls: Sequence[dict[str, Any]] = ()) -> Chart:
@@ -207,14 +193,14 @@ def chart(*plots: Plot, controls: Sequence[dict[str, Any]] = ()) -> Chart:
     return {"plots": list(plots), "controls": list(controls)}
 
 
-def toggle(label: str, plots: Sequence[Plot], name: str) -> dict[str, Any]:
+def visibility_button(label: str, plots: Sequence[Plot], name: str) -> dict[str, Any]:
     """A button that shows and hides the traces called `name`."""
-    return {"label": label, "pressed": True, "updates": [_update(p, name) for p in plots]}
+    return {"label": label, "pressed": True, "updates": [_visibility_update(p, name) for p in plots]}
 
 
-def logarithmic(plots: Sequence[Plot], axes: str = "x", label: str = "logarithmic axis") -> dict[str, Any]:
+def log_axis_button(plots: Sequence[Plot], axes: str = "x", label: str = "logarithmic axis") -> dict[str, Any]:
     """A button between logarithmic and linear axes; `axes`: "x", "y" or "xy". All plots begin alike."""
-    states = {kind: [_scaled(p, axes, kind) for p in plots] for kind in ("log", "linear")}
+    states = {kind: [_axis_type_update(p, axes, kind) for p in plots] for kind in ("log", "linear")}
     updates = [{"on": on, "off": off} for on, off in zip(states["log"], states["linear"], strict=True)]
     pressed = plots[0]["layout"][f"{axes[0]}axis"]["type"] == "log"
     return {"label": label, "pressed": pressed, "updates": updates}
@@ -226,12 +212,12 @@ def _with_shape(plot: Plot, low: float, high: float, style: dict[str, Any]) -> P
     return plot | {"layout": plot["layout"] | {"shapes": shapes}}
 
 
-def _update(plot: Plot, name: str) -> dict[str, Any]:
+def _visibility_update(plot: Plot, name: str) -> dict[str, Any]:
     traces = [i for i, trace in enumerate(plot["data"]) if name in (trace["name"], trace.get("legendgroup"))]
     return {state: {"traces": traces, "restyle": {"visible": state == "on"}, "relayout": {}} for state in ("on", "off")}
 
 
-def _scaled(plot: Plot, axes: str, kind: str) -> dict[str, Any]:
+def _axis_type_update(plot: Plot, axes: str, kind: str) -> dict[str, Any]:
     names = [name for name in plot["layout"] if name[:5] in [f"{letter}axis" for letter in axes]]
     traces = [i for i, trace in enumerate(plot["data"]) if "x" in axes and "meta" in trace]
     return {
@@ -241,28 +227,28 @@ def _scaled(plot: Plot, axes: str, kind: str) -> dict[str, Any]:
     }
 
 
-def _trace(x: Axis, y: Axis, at: ArrayLike, values: ArrayLike, name: str) -> Trace:
+def _trace(x: Axis, y: Axis, x_values: ArrayLike, values: ArrayLike, name: str) -> PlotlyTrace:
     return {
-        "type": "scatter", "x": x.shown(at, "f8"), "y": y.shown(values), "name": name,
+        "type": "scatter", "x": x.encode(x_values, "f8"), "y": y.encode(values), "name": name,
         "hovertemplate": f"{name}: {y.hover('y')}<extra></extra>",
     }  # fmt: skip
 
 
-def _pair(x: Axis, y: Axis) -> str:
+def _hover_pair(x: Axis, y: Axis) -> str:
     return f"{x.title}: {x.hover('x')}<br>{y.title}: {y.hover('y')}"
 
 
-def _layout(x: Axis, size: int, legend: bool, together: bool) -> dict[str, Any]:
+def _layout(x: Axis, size: int, legend: bool, unified_hover: bool) -> dict[str, Any]:
     return {
         "font": _FONT, "height": size, "paper_bgcolor": "#fff", "plot_bgcolor": "#fff",
         "margin": {"l": 56, "r": 12, "t": 34 if legend else 12, "b": 44},
-        "hovermode": "x unified" if together else "closest", "hoversubplots": "axis", "showlegend": legend,
+        "hovermode": "x unified" if unified_hover else "closest", "hoversubplots": "axis", "showlegend": legend,
         "legend": {"orientation": "h", "x": 0, "y": 1, "yanchor": "bottom"},
         "xaxis": x.layout() | {"hoverformat": ".5~g", "unifiedhovertitle": {"text": x.hover("x")}},
     }  # fmt: skip
 
 
-def _faint(color: str, opacity: float = 0.35) -> str:
+def _rgba(color: str, opacity: float = 0.35) -> str:
     """With most of the white behind it showing through."""
     red, green, blue = (int(color[i : i + 2], 16) for i in (1, 3, 5))
     return f"rgba({red},{green},{blue},{opacity})"

@@ -11,44 +11,45 @@ import typer
 
 from fitact.cli import campaigns, designs, one_finger, records, scenes  # noqa: F401  (their commands)
 from fitact.cli.app import app
-from fitact.cli.terminal import say
+from fitact.cli.terminal import print_stderr
 from fitact.errors import InputError
-
-_AGAIN = 0.01  # s: to be out of the place where it was dropped
 
 
 def main() -> None:
     """Entry point: every error becomes one line and an exit code."""
-    sys.unraisablehook = _interrupted_again
-    raise SystemExit(_guarded(lambda: app(standalone_mode=False)))
+    sys.unraisablehook = _resend_interrupt
+    raise SystemExit(_run_command(lambda: app(standalone_mode=False)))
 
 
-def _interrupted_again(lost: "sys.UnraisableHookArgs") -> None:
+def _resend_interrupt(unraisable: "sys.UnraisableHookArgs") -> None:
     """A Ctrl-C that came where Python drops what is raised, as in a weak reference's callback, comes again."""
-    if issubclass(lost.exc_type, KeyboardInterrupt):
+    if issubclass(unraisable.exc_type, KeyboardInterrupt):
         main = threading.main_thread().ident or 0
-        threading.Timer(_AGAIN, signal.pthread_kill, (main, signal.SIGINT)).start()
+        # 0.01 s later, to be out of the place where it was dropped
+        threading.Timer(0.01, signal.pthread_kill, (main, signal.SIGINT)).start()
     else:
-        sys.__unraisablehook__(lost)
+        sys.__unraisablehook__(unraisable)
 
 
-def _guarded(command: Callable[[], Any]) -> int:
+def _run_command(command: Callable[[], Any]) -> int:
     try:
         result = command()
         return result if isinstance(result, int) else 0
     except InputError as error:
-        say(f"fitact: {error}")
+        print_stderr(f"fitact: {error}")
         return 2
     except typer.exceptions.TyperException as error:  # a wrong option or argument; it knows how to show itself
         error.show()  # type: ignore[attr-defined]
         return 2
     except (KeyboardInterrupt, typer.Abort):
-        say("fitact: interrupted; the same command goes on from the last checkpoint")
+        print_stderr("fitact: interrupted; the same command goes on from the last checkpoint")
         return 130
     except BrokenPipeError:
         return 0
     except Exception as error:
         if os.environ.get("FITACT_DEBUG"):
             raise
-        say(f"fitact: internal error ({type(error).__name__}: {error}); please report it, with FITACT_DEBUG=1 set")
+        print_stderr(
+            f"fitact: internal error ({type(error).__name__}: {error}); please report it, with FITACT_DEBUG=1 set"
+        )
         return 3

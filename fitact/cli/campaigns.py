@@ -5,22 +5,24 @@ from typing import Annotated
 
 import typer
 
+import fitact
+from fitact import report
+from fitact.cli import internal
 from fitact.cli.app import app
-from fitact.cli.options import Channels, Json, Scales, Seed, mapping
-from fitact.cli.terminal import keep_compiled, show, typed
+from fitact.cli.options import Channels, CommonScene, Json, Scales, Seed, column_options, load_scene
+from fitact.cli.terminal import command_line, show
 
 
 @app.command()
 def campaign(
     records: Annotated[list[Path], typer.Argument(metavar="RECORD...", help="One of each finger or condition.")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results; the same one goes on.")],
-    scene: Annotated[
-        Path | None, typer.Option("--scene", metavar="FILE", help="Scene (TOML) of all; absent: the paper's device.")
-    ] = None,
+    scene: CommonScene = None,
     channel: Channels = None,
     scale: Scales = None,
     scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Of a Dask scheduler, as tcp://host:8786.")
+        str | None,
+        typer.Option("--scheduler", metavar="ADDRESS", help="Of a Dask scheduler, as tcp://host:8786."),
     ] = None,
     workers: Annotated[
         int | None, typer.Option("--workers", min=1, help="Workers of this machine; absent: one for each core.")
@@ -40,19 +42,13 @@ def campaign(
     Into DIR it writes results.parquet, failures.csv and index.html. The same command goes on after any interruption.
     Exit code 0: every record has an answer or a reason why not.
     """
-    from fitact.scene.scene import Scene
-
-    stated = None if scene is None else Scene.load(scene)
-    keep_compiled()
-    from fitact.batch.campaign import run_campaign
-    from fitact.report.campaign import write_campaign
-    from fitact.report.frame import Origin
-
-    fits = run_campaign(
-        records, out, stated, **mapping((channel, scale)),
+    stated = load_scene(scene)
+    internal.use_compilation_cache()
+    fits = fitact.run_campaign(
+        records, out, stated, **column_options((channel, scale)),
         scheduler=scheduler, workers=workers, memory=memory, posteriors=posteriors,
         reports=reports, seed=seed,
     )  # fmt: skip
-    page = write_campaign(out, fits, Origin.of(typed(), stated))
-    counted = {"records": len(fits), "answers": len(fits.answered), "failures": len(fits.failures)}
-    show(f"{fits}\nopen {page}", counted | {"page": str(page)}, json)
+    page = report.write_campaign(out, fits, report.Provenance.from_inputs(command_line(), stated))
+    counts = {"records": len(fits), "answers": len(fits.answered), "failures": len(fits.failures)}
+    show(f"{fits}\nopen {page}", counts | {"page": str(page)}, json)

@@ -5,11 +5,12 @@ from typing import Annotated
 
 import typer
 
+import fitact
+from fitact import report
+from fitact.cli import internal
 from fitact.cli.app import app
-from fitact.cli.files import Files
-from fitact.cli.options import Channels, Json, Out, Scales, Seed
-from fitact.cli.terminal import finish, show, typed, use_compilation_cache
-from fitact.files import write_json
+from fitact.cli.options import Channels, Json, LazyRecords, Out, Scales, Seed
+from fitact.cli.terminal import command_line, show
 
 design = typer.Typer(
     name="design",
@@ -37,23 +38,13 @@ def measurement(
 
     Into DIR it writes report.html, design.json and design.svg.
     """
-    from fitact.scene.scene import Scene
-
-    stated = Scene.load(scene)
-    measured = list(Files(record, stated, (channel, scale)))  # refused before the slow imports
-    use_compilation_cache()
-    from fitact.design.measurement import design_measurement
-
-    found = design_measurement(stated, measured)
+    stated = fitact.Scene.load(scene)
+    measured = list(LazyRecords(record, stated, (channel, scale)))  # refused before the slow imports
+    internal.use_compilation_cache()
+    options = fitact.design_measurement(stated, measured)
     if out is not None:
-        from fitact.report.design import write_design, write_design_page
-        from fitact.report.frame import Origin
-
-        write_json(out / "design.json", found.to_dict())
-        write_design(out / "design.svg", found)
-        write_design_page(out / "report.html", found, Origin.of(typed(), stated, measured))
-    show(str(found), found.to_dict(), json)
-    finish(found.trusted)
+        report.write_folder(out, options, command_line(), stated, measured)
+    show(str(options), options.to_dict(), json, options.trusted)
 
 
 @design.command()
@@ -74,27 +65,13 @@ def drive(
 
     Into DIR it writes report.html, drive.json and drive.svg, and of records chain.h5 (for going on).
     """
-    from fitact.scene.scene import Scene
-
-    stated = Scene.load(scene)
-    measured = Files(records, stated, (channel, scale))
-    use_compilation_cache()
-    from fitact.design.drive import design_drive, require_designable
-
-    require_designable(stated, share)  # before the people are sampled
-    people = None
-    if measured:
-        from fitact.populations.fit_population import population
-
-        people = population(measured, stated, folder=out, seed=seed)
-    found = design_drive(stated, people, share, seed=seed)
+    stated = fitact.Scene.load(scene)
+    measured = LazyRecords(records, stated, (channel, scale))
+    internal.use_compilation_cache()
+    internal.require_designable(stated, share)  # before the people are sampled
+    people = fitact.population(measured, stated, folder=out, seed=seed) if measured else None
+    options = fitact.design_drive(stated, people, share, seed=seed)
     if out is not None:
-        from fitact.report.drive_design import write_drive_design, write_drive_design_page
-        from fitact.report.frame import Origin
-
-        write_json(out / "drive.json", found.to_dict())
-        write_drive_design(out / "drive.svg", found)
         fingers = () if people is None else people.fingers
-        write_drive_design_page(out / "report.html", found, Origin.of(typed(), stated, fingers))
-    show(str(found), found.to_dict(), json)
-    finish(found.trusted)
+        report.write_folder(out, options, command_line(), stated, fingers)
+    show(str(options), options.to_dict(), json, options.trusted)

@@ -1,10 +1,12 @@
-"""What several commands ask for."""
+"""What several commands ask for, and what they make of it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
+import fitact
 from fitact.errors import InputError
 
 RecordFiles = Annotated[
@@ -13,6 +15,10 @@ RecordFiles = Annotated[
         metavar="RECORD...",
         help="CSV with time_s, V_V, Vsc_V, I_A, or an oscilloscope's file with --channel. Several: fitted jointly.",
     ),
+]
+SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene (TOML).")]
+CommonScene = Annotated[
+    Path | None, typer.Option("--scene", metavar="FILE", help="Scene (TOML) of all; absent: the paper's device.")
 ]
 Channels = Annotated[
     list[str] | None,
@@ -62,22 +68,40 @@ Results = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `run` 
 Fresh = Annotated[bool, typer.Option("--fresh", help="Start the chain anew instead of going on from one in DIR.")]
 
 
-def mapping(given: Columns) -> dict[str, Any]:
+class LazyRecords(Sequence["fitact.Record"]):
+    """Records of one scene, each read when it is asked for, with what --channel and --scale say of their columns."""
+
+    def __init__(self, paths: Sequence[Path] | None, scene: "fitact.Scene | None", columns: Columns) -> None:
+        self._paths, self._scene, self._columns = paths or (), scene, column_options(columns)
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    def __getitem__(self, index: Any) -> Any:
+        return fitact.read(self._paths[index], self._scene, **self._columns)
+
+
+def load_scene(path: Path | str | None) -> "fitact.Scene | None":
+    """What is stated; None: nothing."""
+    return None if path is None else fitact.Scene.load(path)
+
+
+def column_options(columns: Columns) -> dict[str, Any]:
     """What --channel and --scale say, as `fitact.read` takes it."""
-    channels, scale = given
-    return {"channels": pairs("--channel Vsc=CH2", channels), "scale": numbers("--scale Vsc=10", scale)}
+    channels, scale = columns
+    return {"channels": parse_pairs("--channel Vsc=CH2", channels), "scale": parse_numbers("--scale Vsc=10", scale)}
 
 
-def numbers(example: str, texts: list[str] | None) -> dict[str, float]:
+def parse_numbers(example: str, texts: list[str] | None) -> dict[str, float]:
     """Pairs of a name and a number, as the option's `example` has them."""
-    given = pairs(example, texts)
+    given = parse_pairs(example, texts)
     try:
         return {name: float(value) for name, value in given.items()}
     except ValueError as error:
         raise InputError(f"{example.split()[0]}: {error}; write a number, as {example}") from error
 
 
-def pairs(example: str, texts: list[str] | None) -> dict[str, str]:
+def parse_pairs(example: str, texts: list[str] | None) -> dict[str, str]:
     """Pairs of a name and a value, as the option's `example` has them."""
     found = {}
     for name, _, value in (text.partition("=") for text in texts or []):

@@ -5,10 +5,25 @@ from typing import Annotated
 
 import typer
 
+import fitact
+from fitact import report
+from fitact.cli import internal
 from fitact.cli.app import app
-from fitact.cli.files import Files
-from fitact.cli.options import Channels, Fresh, Json, Out, RecordFiles, Scales, Seed, mapping, numbers
-from fitact.cli.terminal import finish, say, show, typed, use_compilation_cache
+from fitact.cli.options import (
+    Channels,
+    CommonScene,
+    Fresh,
+    Json,
+    LazyRecords,
+    Out,
+    RecordFiles,
+    Scales,
+    Seed,
+    column_options,
+    load_scene,
+    parse_numbers,
+)
+from fitact.cli.terminal import command_line, print_stderr, show
 from fitact.files import write_json
 
 
@@ -21,19 +36,14 @@ def inspect(
     json: Json = False,
 ) -> None:
     """Look at a file before fitting it: channels, rate, units, noise, clipping, frequency, and what is doubtful."""
-    from fitact.data.inspection import inspect as inspected
-    from fitact.data.spectrum import is_spectrum, read_spectrum
-
-    if is_spectrum(file):
-        spectrum = read_spectrum(file)
+    if internal.is_spectrum(file):
+        spectrum = fitact.read_spectrum(file)
         show(str(spectrum), spectrum.to_dict(), json)
         return
-    seen = inspected(file, **mapping((channel, scale)))
+    inspection = fitact.inspect(file, **column_options((channel, scale)))
     if out is not None:
-        from fitact.report.record import write_record
-
-        write_record(out, seen)
-    show(str(seen), seen.to_dict(), json)
+        report.write_record(out, inspection)
+    show(str(inspection), inspection.to_dict(), json)
 
 
 @app.command()
@@ -47,27 +57,20 @@ def compare(
     json: Json = False,
 ) -> None:
     """Fit the model of each scene to the same records, in full, and say which the data prefer."""
-    from fitact.scene.scene import Scene
-
     alike = len({path.stem for path in scenes}) < len(scenes)
-    stated = {str(path) if alike else path.stem: Scene.load(path) for path in scenes}
-    for each in stated.values():
-        each.require_available(fit=True)
-    measured = list(Files(records, next(iter(stated.values())), (channel, scale)))
-    use_compilation_cache()
-    from fitact.model_selection.comparison import compare as compared
-
-    found = compared(measured, stated)
-    show(str(found), found.to_dict(), json)
-    finish(found.trusted)
+    models = {str(path) if alike else path.stem: fitact.Scene.load(path) for path in scenes}
+    for model in models.values():
+        model.require_available(fit=True)
+    measured = list(LazyRecords(records, next(iter(models.values())), (channel, scale)))
+    internal.use_compilation_cache()
+    comparison = fitact.compare(measured, models)
+    show(str(comparison), comparison.to_dict(), json, comparison.trusted)
 
 
 @app.command()
 def population(
     records: Annotated[list[Path], typer.Argument(metavar="RECORD...", help="One of each finger, on one panel.")],
-    scene: Annotated[
-        Path | None, typer.Option("--scene", metavar="FILE", help="Scene (TOML) of all; absent: the paper's device.")
-    ] = None,
+    scene: CommonScene = None,
     channel: Channels = None,
     scale: Scales = None,
     covariates: Annotated[
@@ -87,33 +90,23 @@ def population(
     Into DIR it writes report.html, population.json, population.nc (the draws), population.svg, and chain.h5 (for
     going on).
     """
-    from fitact.populations.covariates import read_covariates
-    from fitact.scene.scene import Scene
-
-    stated = None if scene is None else Scene.load(scene)
-    known = {} if covariates is None else read_covariates(covariates, records)
-    use_compilation_cache()
-    from fitact.populations.fit_population import forget
-    from fitact.populations.fit_population import population as find_population
-
+    stated = load_scene(scene)
+    known = {} if covariates is None else internal.read_covariates(covariates, records)
+    internal.use_compilation_cache()
     if fresh and out is not None:
-        forget(out)
-    measured = Files(records, stated, (channel, scale))
-    found = find_population(
-        measured, stated, covariates=known, at=numbers("--at moisture=0.4", at), folder=out, seed=seed
-    )
-    content = found.to_dict()
+        internal.delete_chains(out)
+    people = fitact.population(
+        LazyRecords(records, stated, (channel, scale)), stated, covariates=known,
+        at=parse_numbers("--at moisture=0.4", at), folder=out, seed=seed,
+    )  # fmt: skip
+    content = people.to_dict()
     if out is not None:
-        from fitact.report.population import write_population
-        from fitact.report.population_page import write_population_page
-
-        tree = found.to_datatree()
+        tree = people.to_datatree()
         write_json(out / "population.json", content)
-        found.to_netcdf(out / "population.nc")
-        write_population(out / "population.svg", tree, content)
-        write_population_page(out / "report.html", tree, content)
-    show(str(found), content, json)
-    finish(found.trusted)
+        people.to_netcdf(out / "population.nc")
+        report.write_population(out / "population.svg", tree, content)
+        report.write_population_page(out / "report.html", tree, content)
+    show(str(people), content, json, people.trusted)
 
 
 @app.command()
@@ -133,24 +126,13 @@ def tradeoff(
 
     Takes a minute or two. With --out writes report.html, tradeoff.json and tradeoff.svg.
     """
-    from fitact.data.readers.read import read
-    from fitact.scene.scene import Scene
-
-    stated = None if scene is None else Scene.load(scene)
-    measured = None if record is None else read(record, stated, **mapping((channel, scale)))
-    from fitact.tradeoff.tradeoff import measure_tradeoff
-
+    stated = load_scene(scene)
+    measured = None if record is None else fitact.read(record, stated, **column_options((channel, scale)))
     try:
-        found = measure_tradeoff(measured, stated)
+        costs = fitact.measure_tradeoff(measured, stated)
     except KeyboardInterrupt:
-        say("fitact: interrupted; nothing was written")
+        print_stderr("fitact: interrupted; nothing was written")
         raise typer.Exit(130) from None
     if out is not None:
-        from fitact.report.frame import Origin
-        from fitact.report.tradeoff import write_tradeoff, write_tradeoff_page
-
-        write_json(out / "tradeoff.json", found.to_dict())
-        write_tradeoff(out / "tradeoff.svg", found)
-        write_tradeoff_page(out / "report.html", found, Origin.of(typed(), stated, [measured] if measured else []))
-    show(str(found), found.to_dict(), json)
-    finish(found.trusted)
+        report.write_folder(out, costs, command_line(), stated, [measured] if measured else [])
+    show(str(costs), costs.to_dict(), json, costs.trusted)

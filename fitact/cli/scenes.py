@@ -5,10 +5,12 @@ from typing import Annotated
 
 import typer
 
+import fitact
+from fitact import report
+from fitact.cli import internal
 from fitact.cli.app import app
-from fitact.cli.options import Channels, Json, Out, Scales, Seed, mapping
-from fitact.cli.terminal import show, typed, use_compilation_cache
-from fitact.files import write_json
+from fitact.cli.options import Channels, Json, Out, Scales, SceneFile, Seed, column_options
+from fitact.cli.terminal import command_line, show
 
 
 @app.command()
@@ -17,15 +19,13 @@ def scene(
     json: Json = False,
 ) -> None:
     """Print a scene with every key, its unit and, as comments, the defaults; without one: a template to fill in."""
-    from fitact.scene.scene import Scene
-
-    stated = Scene.load(file) if file else Scene()
+    stated = fitact.Scene.load(file) if file else fitact.Scene()
     show(str(stated).rstrip(), stated.model_dump(mode="json"), json)
 
 
 @app.command()
 def prior(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene (TOML).")],
+    scene: SceneFile,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="Figure to write: .html, .svg or .png.")
     ] = None,
@@ -34,23 +34,17 @@ def prior(
     json: Json = False,
 ) -> None:
     """What a scene's prior means for Vsc and force, before any data."""
-    from fitact.scene.scene import Scene
-
-    stated = Scene.load(scene)
-    use_compilation_cache()
-    from fitact.scene.prior_predictive import prior_predictive
-
-    predicted = prior_predictive(stated, draws, seed)
+    stated = fitact.Scene.load(scene)
+    internal.use_compilation_cache()
+    predicted = internal.prior_predictive(stated, draws, seed)
     if out is not None:
-        from fitact.report.prior import write_prior
-
-        write_prior(out, predicted)
+        report.write_prior(out, predicted)
     show(str(predicted), predicted.to_dict(), json)
 
 
 @app.command()
 def plan(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene (TOML).")],
+    scene: SceneFile,
     record: Annotated[
         Path | None,
         typer.Option("--record", metavar="RECORD", help="Plan for this record: for its V where that drives the fit."),
@@ -64,48 +58,26 @@ def plan(
 
     Into DIR it writes report.html, plan.json and plan.svg.
     """
-    from fitact.scene.scene import Scene
-
-    stated = Scene.load(scene)
-    measured = None
-    if record is not None:
-        from fitact.data.readers.read import read
-
-        measured = read(record, stated, **mapping((channel, scale)))
-    use_compilation_cache()
-    if measured is None:
-        from fitact.model_selection.plan import plan as planned
-
-        found = planned(stated)
-    else:
-        from fitact.model_selection.fit_planned import plan_for
-
-        found = plan_for(measured, stated)
+    stated = fitact.Scene.load(scene)
+    measured = None if record is None else fitact.read(record, stated, **column_options((channel, scale)))
+    internal.use_compilation_cache()
+    planned = fitact.plan(stated) if measured is None else internal.plan_for_record(measured, stated)
     if out is not None:
-        from fitact.report.frame import Origin
-        from fitact.report.plan import write_plan, write_plan_page
-
-        write_json(out / "plan.json", found.to_dict())
-        write_plan(out / "plan.svg", found)
-        write_plan_page(out / "report.html", found, Origin.of(typed(), stated, [measured] if measured else []))
-    show(str(found), found.to_dict(), json)
+        report.write_folder(out, planned, command_line(), stated, [measured] if measured else [])
+    show(str(planned), planned.to_dict(), json)
 
 
 @app.command()
 def simulate(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene (TOML).")],
+    scene: SceneFile,
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="CSV to write.")],
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
     """Simulate a record of a scene: V and what it measures (Vsc, I), with noise, as CSV."""
-    from fitact.data.readers.read import write_csv
-    from fitact.data.simulate import simulate as simulated
-    from fitact.scene.scene import Scene
-
-    stated = Scene.load(scene)
-    record = simulated(stated, seed)
-    write_csv(out, record)
+    stated = fitact.Scene.load(scene)
+    record = internal.simulate(stated, seed)
+    internal.write_csv(out, record)
     truth = {"Rsc": stated.skin.Rsc, "Csc": stated.skin.Csc, "Ci": stated.device.Ci}
     content = {
         "file": str(out),
@@ -123,11 +95,8 @@ def reproduce(out: Out = Path("reproduction"), json: Json = False) -> None:
 
     Into DIR it writes reproduction.json and reproduction.html.
     """
-    use_compilation_cache()
-    from fitact import paper
-    from fitact.report.reproduction import write_reproduction
-
-    claims = paper.reproduce()
-    page = write_reproduction(out or Path(), claims)
+    internal.use_compilation_cache()
+    claims = internal.reproduce()
+    page = report.write_reproduction(out or Path(), claims)
     lines = [f"{claim.verdict:8} {claim.id:24} {claim.claim}" for claim in claims]
     show("\n".join([*lines, f"open {page}"]), {"claims": [claim.to_dict() for claim in claims]}, json)

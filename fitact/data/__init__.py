@@ -1,1 +1,4 @@
-"""What was measured: records, how they are read, and what is refused."""
+"""What was recorded?
+
+Takes files and arrays; gives checked `Record`s and `Spectrum`s, with sentences on what looks wrong.
+"""

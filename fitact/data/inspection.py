@@ -3,29 +3,29 @@
 import dataclasses
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from fitact.data.checks import check_channel, check_divider, check_time
-from fitact.data.clipping import clipped
-from fitact.data.readers.capture import Capture, is_mapped, to_record
-from fitact.data.readers.read import read_capture, with_other_files
+from fitact.data.clipping import clipping_mask
+from fitact.data.readers.capture import Capture, has_standard_names, to_record
+from fitact.data.readers.read import merge_other_files, read_capture
 from fitact.data.record import (
     CHANNEL_UNITS,
     MINIMUM_SAMPLES,
     OVERFLOW,
-    fundamental,
+    fundamental_frequency,
     grid_notes,
-    rounding_noise,
-    white_noise,
+    is_uniform,
+    rounding_noise_sd,
+    white_noise_sd,
 )
 from fitact.errors import InputError
-from fitact.units import engineering
+from fitact.units import format_engineering
 
-_ENOUGH = 2_097_152  # samples from which the frequency of a long record is found
+Samples = Float[np.ndarray, " samples"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,12 +34,11 @@ class Channel:
 
     name: str
     unit: str
-    values: Float[np.ndarray, " samples"]
+    values: Samples
     noise: float
     clipped: int
 
     def to_dict(self) -> dict[str, Any]:
-        """As `fitact inspect --json` lists it."""
         low, high = float(self.values.min()), float(self.values.max())
         return {
             "name": self.name, "unit": self.unit, "min": low, "max": high, "noise": self.noise,
@@ -53,7 +52,7 @@ class Inspection:
 
     source: str
     format: str
-    time: Float[np.ndarray, " samples"]
+    time: Samples
     channels: tuple[Channel, ...]
     frequency: float | None
     notes: tuple[str, ...]
@@ -77,15 +76,19 @@ class Inspection:
     def __str__(self) -> str:
         step = float(np.median(np.diff(self.time)))
         lines = [
-            f"{self.source} ({self.format}): {self.time.size:,} samples, every {engineering(step, 's')}"
-            f" ({engineering(1.0 / step, 'Hz')}), from {engineering(self.time[0], 's')} to"
-            f" {engineering(self.time[-1], 's')}; "
-            + ("no whole wave seen" if self.frequency is None else f"repeats at {engineering(self.frequency, 'Hz')}")
+            f"{self.source} ({self.format}): {self.time.size:,} samples, every {format_engineering(step, 's')}"
+            f" ({format_engineering(1.0 / step, 'Hz')}), from {format_engineering(self.time[0], 's')} to"
+            f" {format_engineering(self.time[-1], 's')}; "
+            + (
+                "no whole wave seen"
+                if self.frequency is None
+                else f"repeats at {format_engineering(self.frequency, 'Hz')}"
+            )
         ]
         width = max(len(channel.name) for channel in self.channels)
         for channel in self.channels:
             low, high, noise = (
-                engineering(x, channel.unit) for x in (channel.values.min(), channel.values.max(), channel.noise)
+                format_engineering(x, channel.unit) for x in (channel.values.min(), channel.values.max(), channel.noise)
             )
             rail = f", {channel.clipped:,} samples clipped" if channel.clipped else ""
             lines.append(f"  {channel.name:<{width}}  {low} to {high}, noise {noise}{rail}")
@@ -105,20 +108,20 @@ def inspect(
     Raises:
         InputError: the file cannot be read, or what is known as V, Vsc or I could not be fitted.
     """
-    capture = with_other_files(read_capture(path), path, channels or {})
-    if channels or scale or is_mapped(capture):
+    capture = merge_other_files(read_capture(path), path, channels or {})
+    if channels or scale or has_standard_names(capture):
         record = to_record(capture, channels or {}, scale or {})
         arrays = {name: (record[name], CHANNEL_UNITS[name]) for name in record.channels}
-        return _looked_at(capture, record.time, arrays, record.notes)
+        return _inspect_channels(capture, record.time, arrays, record.notes)
     _check_times(capture)
-    arrays = {trace.name: (trace.values, trace.unit) for trace in capture.traces}
+    arrays = {trace.name: (trace.values, trace.unit) for trace in capture.channels}
     names = ", ".join(arrays)
     notes = (
         *capture.notes,
         *grid_notes(capture.time, capture.source),
         f"{capture.source}: before a fit, say which of {names} is which, as --channel V=NAME --channel Vsc=NAME",
     )
-    return _looked_at(capture, capture.time, arrays, notes)
+    return _inspect_channels(capture, capture.time, arrays, notes)
 
 
 def _check_times(capture: Capture) -> None:
@@ -131,41 +134,176 @@ def _check_times(capture: Capture) -> None:
         )
 
 
-def _looked_at(
+def _inspect_channels(
     capture: Capture,
-    time: Float[np.ndarray, " samples"],
-    arrays: Mapping[str, tuple[Float[np.ndarray, " samples"], str]],
+    time: Samples,
+    arrays: Mapping[str, tuple[Samples, str]],
     notes: tuple[str, ...],
 ) -> Inspection:
-    frequency = next((f for f in (_frequency(time, values) for values, _ in arrays.values()) if f is not None), None)
+    frequency = next(
+        (f for f in (_estimate_frequency(time, values) for values, _ in arrays.values()) if f is not None), None
+    )
     warnings = check_time(time, frequency) if time.size > 3 else []
     for name, (values, unit) in arrays.items():
         warnings += check_channel(name, unit, time, values, frequency)
     warnings += check_divider({name: values for name, (values, _) in arrays.items()})
-    seen = tuple(_channel(name, unit, values) for name, (values, unit) in arrays.items())
+    seen = tuple(_inspect_channel(name, unit, values) for name, (values, unit) in arrays.items())
     return Inspection(capture.source, capture.format, time, seen, frequency, notes, tuple(warnings))
 
 
-def _channel(name: str, unit: str, values: Float[np.ndarray, " samples"]) -> Channel:
+def _inspect_channel(name: str, unit: str, values: Samples) -> Channel:
     if values.size < MINIMUM_SAMPLES or not _is_signal(values):
         return Channel(name, unit, values, math.nan, 0)
-    railed = clipped(values)
+    railed = clipping_mask(values)
     free = values if railed.all() else values[~railed]
-    noise = math.hypot(white_noise(free), rounding_noise(free)) if free.size > 4 and np.ptp(free) else 0.0
+    noise = math.hypot(white_noise_sd(free), rounding_noise_sd(free)) if free.size > 4 and np.ptp(free) else 0.0
     return Channel(name, unit, values, noise, int(np.count_nonzero(railed)))
 
 
-def _is_signal(values: Float[np.ndarray, " samples"]) -> bool:
+def _is_signal(values: Samples) -> bool:
     """Whether there is anything to judge: finite numbers that vary."""
     return bool(np.all(np.abs(values) < OVERFLOW) and np.ptp(values) > 0.0)
 
 
-def _frequency(time: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"]) -> float | None:
+def _estimate_frequency(time: Samples, values: Samples, max_samples: int = 2_097_152) -> float | None:
     """From a part of a long record, or from each n-th sample of it."""
     if time.size < MINIMUM_SAMPLES or not _is_signal(values):
         return None
-    whole = fundamental(time[:_ENOUGH], values[:_ENOUGH])
-    if whole is None and time.size > _ENOUGH:
-        every = -(-time.size // _ENOUGH)
-        whole = fundamental(time[::every], values[::every])
+    whole = fundamental_frequency(time[:max_samples], values[:max_samples])
+    if whole is None and time.size > max_samples:
+        every = -(-time.size // max_samples)
+        whole = fundamental_frequency(time[::every], values[::every])
     return whole
+
+
+def check_time(time: Samples, frequency: float | None, min_samples_per_period: int = 20) -> list[str]:
+    """What is doubtful about the times, s, and the rate that they make for a signal of `frequency`.
+
+    With fewer samples than `min_samples_per_period`, edges and bends are lost.
+    """
+    found = []
+    step = (time[-1] - time[0]) / (time.size - 1)
+    off = float(np.max(np.abs(time - np.linspace(time[0], time[-1], time.size)))) / step
+    if off > 1e-6 and is_uniform(time):  # double precision is off by less
+        found.append(f"the time is rounded: off an even grid by {off:.2g} of a step, as float32 leaves it; harmless")
+    if not time[0] <= 0.0 <= time[-1]:
+        found.append(
+            f"the trigger (0 s) lies outside of the record ({format_engineering(time[0], 's')} to"
+            f" {format_engineering(time[-1], 's')}); a drive that a scene states is found by its phase, not by the"
+            f" trigger"
+        )
+    if frequency is None:
+        found.append("no channel shows 1.5 periods of a wave; record two periods or more")
+    elif 1.0 / (frequency * step) < min_samples_per_period:
+        found.append(
+            f"{1.0 / (frequency * step):.3g} samples a period: what changes faster is lost or aliased; record faster"
+        )
+    return found
+
+
+def check_channel(
+    name: str,
+    unit: str,
+    time: Samples,
+    values: Samples,
+    frequency: float | None,
+    max_V: float = 5e3,
+    max_A: float = 0.1,
+) -> list[str]:
+    """What is doubtful about a channel; unit V, A or "" where none is known, and the most that drives a display."""
+    bad = np.flatnonzero(~np.isfinite(values) | (np.abs(values) >= OVERFLOW))
+    if bad.size:
+        return [f"{name} is not finite, or a code for overflow, at {bad.size:,} samples; they will be refused"]
+    spread = float(np.ptp(values))
+    if spread == 0.0:
+        return [f"{name} is constant at {values[0]:.6g}; is it connected?"]
+    found = []
+    railed = int(np.count_nonzero(clipping_mask(values)))
+    if railed:
+        found.append(
+            f"{name} is clipped at {railed:,} samples ({values.min():.4g} to {values.max():.4g}): the oscilloscope's"
+            " range or the amplifier is exceeded"
+        )
+    if rounding_noise_sd(values) > 0.0:
+        found.append(f"{name} is rounded to steps wider than its noise; record with a finer range")
+    largest = float(np.max(np.abs(values)))
+    if largest > {"V": max_V, "A": max_A}.get(unit, math.inf):
+        found.append(
+            f"{name} reaches {format_engineering(largest, unit)}, more than a touch display takes; is the unit right?"
+        )
+    return found + [f"{name} {sentence}" for sentence in _check_hum_and_drift(time, values, spread, frequency)]
+
+
+def check_divider(channels: Mapping[str, Samples], low: float = 2e-2, high: float = 0.5) -> list[str]:
+    """What is doubtful about Vsc over V: below `low` a probe's attenuation may be missing, from `high` on no circuit
+    does it.
+    """
+    if not {"V", "Vsc"} <= set(channels) or np.ptp(channels["V"]) == 0.0:
+        return []
+    ratio = float(np.ptp(channels["Vsc"]) / np.ptp(channels["V"]))
+    if low <= ratio < high:
+        return []
+    doubt = (
+        "a 10x probe read as 1x (--scale Vsc=10), or a wet finger" if ratio < low else "swapped columns or a wrong unit"
+    )
+    return [f"Vsc spans {ratio:.3g} times V, which suggests {doubt}"]
+
+
+def _check_hum_and_drift(
+    time: Samples,
+    values: Samples,
+    value_range: float,
+    frequency: float | None,
+    *,
+    min_mains_periods: int = 4,
+    hum_fraction: float = 0.01,
+    drift_fraction: float = 0.02,
+    min_significance: float = 6.0,
+) -> Iterator[str]:
+    """Hum and drift beside a periodic signal: by a line of the spectrum, and by the means of the periods.
+
+    Args:
+        min_mains_periods: that a record must hold to tell mains hum from drift.
+        hum_fraction: hum worth a word, over the channel's range.
+        drift_fraction: drift over the record worth a word, over the channel's range.
+        min_significance: of a drift, in standard errors.
+    """
+    span = float(time[-1] - time[0])
+    if frequency is None or not is_uniform(time) or span * frequency < 3.0:
+        return
+    for mains in (50.0, 60.0):  # Hz
+        harmonic = abs(mains / frequency - round(mains / frequency)) * frequency * span < 2.0
+        if span * mains < min_mains_periods or harmonic:
+            continue  # too short to tell, or of the signal itself
+        line = _spectral_line(time, values, mains)
+        beside = max(abs(_spectral_line(time, values, mains + away / span)) for away in (-3.0, 3.0))
+        if abs(line) > max(hum_fraction * value_range, 3.0 * beside):
+            yield f"holds {mains:.0f} Hz of {abs(line):.3g}: mains hum; the fit frees it where the data ask for it"
+            values = values - np.real(line * np.exp(2j * np.pi * mains * time))
+    step = span / (time.size - 1)
+    means, centres = _period_means(values, 1.0 / (frequency * step))
+    slope, error = _fit_slope(centres * step, means)
+    if abs(slope * span) > drift_fraction * value_range and abs(slope) > min_significance * error:
+        yield f"drifts by {slope * span:.3g} over the record; the fit frees a drift where the data ask for one"
+
+
+def _period_means(values: Samples, samples: float) -> tuple[np.ndarray, np.ndarray]:
+    """Mean over each whole period, and its middle in samples."""
+    edges = np.round(np.arange(int(values.size / samples) + 1) * samples).astype(int)
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    return np.diff(sums[edges]) / np.diff(edges), 0.5 * (edges[1:] + edges[:-1])
+
+
+def _fit_slope(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """The slope of a straight line, and its standard error."""
+    x = x - x.mean()
+    slope = float(x @ y / (x @ x))
+    rest = y - y.mean() - slope * x
+    return slope, math.sqrt(float(rest @ rest) / max(y.size - 2, 1) / float(x @ x))
+
+
+def _spectral_line(time: Samples, values: Samples, frequency: float) -> complex:
+    """One line of the spectrum under a Hann window: amplitude and phase."""
+    window = np.hanning(values.size)
+    wave = np.exp(-2j * np.pi * frequency * time)
+    return complex(2.0 * np.sum(window * wave * (values - values.mean())) / window.sum())

@@ -10,23 +10,17 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from jaxtyping import Float
 
-from fitact.data.clipping import clipped
+from fitact.data.clipping import clipping_mask
 from fitact.errors import InputError
 
 MINIMUM_SAMPLES = 20
 OVERFLOW = 9e36  # what oscilloscopes write for a value out of range is 9.9E+37 or more
-_PART = 65_536  # samples
-_SMOOTH = 0.3  # of a signal's sd: its noise, when it is more than noise
-_LEVELS = 12  # distinct values from which a channel counts as rounded by a converter
-_NEAR_PEAK = 0.02  # of correlation: the first period's peak may be that much lower than a later one's
-_NEAR_LAG = 4  # samples, within which twice a period is known once one is
-_TOP = 0.002  # of correlation: the part of a peak that is taken for a parabola
 CHANNEL_UNITS = {"V": "V", "Vsc": "V", "I": "A"}
 
 # of records that are there, so that many of one grid hold them once
-_TIMES: weakref.WeakValueDictionary[tuple[float, ...], np.ndarray] = weakref.WeakValueDictionary()
+_SHARED_TIMES: weakref.WeakValueDictionary[tuple[float, ...], np.ndarray] = weakref.WeakValueDictionary()
 
-_Where = Callable[[int], str]
+_RowLabel = Callable[[int], str]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,26 +49,26 @@ class Record:
         I: Float[np.ndarray, " samples"] | None = None,  # noqa: E741  (the field's symbol for current)
         source: str = "record",
         notes: tuple[str, ...] = (),
-        where: _Where = lambda row: f"sample {row}",
+        where: _RowLabel = lambda row: f"sample {row}",
     ) -> "Record":
         """Check arrays (s, V, V, A; equal lengths) and make them a record; `where` names a row in errors.
 
         Raises:
             InputError: too few samples, not finite, not increasing, or a channel that holds no signal.
         """
+        time = _aligned_copy(time)
         given = {"V": V, "Vsc": Vsc, "I": I}
-        time, channels = _copy(time), {name: _copy(values) for name, values in given.items() if values is not None}
+        channels = {name: _aligned_copy(values) for name, values in given.items() if values is not None}
         _check_shapes(time, channels, source)
         for name, values in {"time": time, **channels}.items():
-            _check_finite(values, name, source, where)
-            _check_range(values, name, source, where)
+            _check_values(values, name, source, where)
         _check_increasing(time, source, where)
         for name, values in channels.items():
             _check_signal(values, name, source)
         notes = (*notes, *grid_notes(time, source))
         for array in (time, *channels.values()):
             array.flags.writeable = False
-        return cls(_kept_once(time), channels, source, notes)
+        return cls(_share_times(time), channels, source, notes)
 
     def __getitem__(self, channel: str) -> Float[np.ndarray, " samples"]:
         try:
@@ -108,8 +102,8 @@ class Record:
     def noise(self, channel: str) -> float:
         """Standard deviation of the channel's noise, judged without a model: white noise and rounding."""
         if channel not in self._noises:
-            values = self[channel] if channel == "V" else self[channel][~clipped(self[channel])]
-            self._noises[channel] = math.hypot(white_noise(values), rounding_noise(values))
+            values = self[channel] if channel == "V" else self[channel][~clipping_mask(self[channel])]
+            self._noises[channel] = math.hypot(white_noise_sd(values), rounding_noise_sd(values))
         return self._noises[channel]
 
     @property
@@ -121,7 +115,7 @@ class Record:
         """Fundamental frequency in Hz of a channel (of V, else Vsc); None unless the record shows 1.5 periods."""
         channel = channel or self.leading
         if channel not in self._frequencies:
-            self._frequencies[channel] = fundamental(self.time, self[channel])
+            self._frequencies[channel] = fundamental_frequency(self.time, self[channel])
         return self._frequencies[channel]
 
     @functools.cached_property
@@ -135,16 +129,16 @@ class Record:
         return {}
 
 
-def is_uniform(time: Float[np.ndarray, " samples"], tolerance: float = 1e-2) -> bool:
-    """Whether every sample lies on an even grid, to `tolerance` of a step; looked at a part at a time."""
+def is_uniform(time: Float[np.ndarray, " samples"], tolerance: float = 1e-2, block: int = 65_536) -> bool:
+    """Whether every sample lies on an even grid, to `tolerance` of a step; `block` samples are looked at at a time."""
     step = (time[-1] - time[0]) / (time.size - 1)
 
-    def near(first: int) -> bool:
-        part = time[first : first + _PART]
+    def is_on_grid(first: int) -> bool:
+        part = time[first : first + block]
         grid = time[0] + step * np.arange(first, first + part.size)
         return bool(np.all(np.abs(part - grid) <= tolerance * step))
 
-    return all(near(first) for first in range(0, time.size, _PART))
+    return all(is_on_grid(first) for first in range(0, time.size, block))
 
 
 def grid_notes(time: Float[np.ndarray, " samples"], source: str) -> tuple[str, ...]:
@@ -158,22 +152,22 @@ def grid_notes(time: Float[np.ndarray, " samples"], source: str) -> tuple[str, .
     )
 
 
-def white_noise(values: Float[np.ndarray, " samples"]) -> float:
+def white_noise_sd(values: Float[np.ndarray, " samples"]) -> float:
     """Standard deviation of white noise under a smooth signal, from the median of third differences.
 
     Edges, being rare, leave the median alone.
     """
-    return float(white_noises(values))
+    return float(white_noise_sds(values))
 
 
-def white_noises(values: Float[np.ndarray, "*records samples"]) -> Float[np.ndarray, "*records"]:
-    """As `white_noise`, of each record; of differences in single precision, whose median takes half the time."""
+def white_noise_sds(values: Float[np.ndarray, "*records samples"]) -> Float[np.ndarray, "*records"]:
+    """As `white_noise_sd`, of each record; of differences in single precision, whose median takes half the time."""
     third = np.diff(np.diff(values).astype(np.float32), 2)
     np.abs(third, out=third)
-    return medians(third).astype(float) / 0.6744897501960817 / math.sqrt(20.0)
+    return row_medians(third).astype(float) / 0.6744897501960817 / math.sqrt(20.0)
 
 
-def medians(values: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*rows"]:
+def row_medians(values: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*rows"]:
     """Of each row, which is left in another order.
 
     NumPy's own takes eight times as long: it asks for two places at once, and only for one does the processor work on
@@ -187,52 +181,66 @@ def medians(values: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*rows"]:
     return upper if values.shape[-1] % 2 else 0.5 * (upper + np.max(values[..., :half], axis=-1))
 
 
-def rounding_noise(values: Float[np.ndarray, " samples"]) -> float:
+def rounding_noise_sd(values: Float[np.ndarray, " samples"], min_levels: int = 12, some: int = 65_536) -> float:
     """Standard deviation that the resolution of the samples alone brings about, where white noise does not hide it.
 
-    A few levels only are an ideal wave's, not a converter's.
+    Fewer levels than `min_levels` are an ideal wave's, not a converter's. Mostly the first `some` samples tell.
     """
-    noise, step = white_noise(values), math.inf
-    for part in (values[:_PART], values)[values.size <= _PART :]:  # mostly some samples tell
+    noise, step = white_noise_sd(values), math.inf
+    for part in (values[:some], values)[values.size <= some :]:
         levels = np.unique(part)
         step = float(np.diff(levels).min(initial=math.inf))
         if step <= noise:
             return 0.0
-    return step / math.sqrt(12.0) if levels.size >= _LEVELS else 0.0
+    return step / math.sqrt(12.0) if levels.size >= min_levels else 0.0
 
 
-def fundamental(time: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"]) -> float | None:
-    """Frequency (Hz) at which the signal repeats, from its correlation with itself, or None."""
+def fundamental_frequency(
+    time: Float[np.ndarray, " samples"],
+    values: Float[np.ndarray, " samples"],
+    *,
+    min_correlation: float = 0.8,
+    peak_tolerance: float = 0.02,
+    lag_tolerance: int = 4,
+) -> float | None:
+    """Frequency (Hz) at which the signal repeats, from its correlation with itself, or None.
+
+    Args:
+        min_correlation: of a signal that counts as repeating.
+        peak_tolerance: correlation by which the first period's peak may be lower than a later one's.
+        lag_tolerance: samples within which twice a period is known once one is.
+    """
     count = time.size
-    correlation = _self_correlation(evenly(time, values))
+    correlation = _autocorrelation(resample_uniform(time, values))
     below = np.flatnonzero(correlation < 0.5)
     last = (2 * count) // 3  # a lag of one period must leave half a period of overlap
     if below.size == 0 or below[0] >= last - 2:
         return None
     window = correlation[below[0] : last]
     best = float(window.max())
-    if best < 0.8:
+    if best < min_correlation:
         return None
-    start, stop = _stretch(window >= best - _NEAR_PEAK, int(np.argmax(window >= best - _NEAR_PEAK)))
+    high = window >= best - peak_tolerance
+    start, stop = _run_around(high, int(np.argmax(high)))
     top = start + int(np.argmax(window[start:stop]))  # of the first period, not of a later one
-    lag, periods = below[0] + _peak(window, top), 1
-    reach = min(_NEAR_LAG, int(lag) // 4)
+    lag, periods = below[0] + _peak_position(window, top), 1
+    reach = min(lag_tolerance, int(lag) // 4)
     while 2.0 * lag < last - reach:  # twice as many periods show one twice as well
         near = round(2.0 * lag) - below[0] - reach
         top = near + int(np.argmax(window[near : near + 2 * reach + 1]))
-        further = below[0] + _peak(window, top)
+        further = below[0] + _peak_position(window, top)
         if further <= lag:  # repeats at two or three samples, whose peaks run into each other
             return None
         lag, periods = further, 2 * periods
     return periods * (count - 1) / (lag * float(time[-1] - time[0]))
 
 
-def evenly(time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def resample_uniform(time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """The values on an even grid of as many times from the first to the last."""
     return np.interp(np.linspace(time[0], time[-1], time.size), time, values)
 
 
-def _self_correlation(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def _autocorrelation(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Correlation coefficient of x[:n - lag] and x[lag:] for each lag; 1 at a period, however few there are."""
     x = x - x.mean()
     count = x.size
@@ -251,41 +259,36 @@ def _self_correlation(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     return correlation
 
 
-def _stretch(inside: np.ndarray, index: int) -> tuple[int, int]:
+def _run_around(mask: np.ndarray, index: int) -> tuple[int, int]:
     """The run of true values around `index`: its start and the first place after it."""
-    outside = np.flatnonzero(~inside)
+    outside = np.flatnonzero(~mask)
     place = int(np.searchsorted(outside, index))
     start = int(outside[place - 1]) + 1 if place > 0 else 0
-    return start, int(outside[place]) if place < outside.size else inside.size
+    return start, int(outside[place]) if place < outside.size else mask.size
 
 
-def _peak(curve: Float[np.ndarray, " n"], top: int) -> float:
-    """Where the curve peaks around its largest value, at `top`."""
-    start, stop = _stretch(curve >= curve[top] - _TOP - 0.3 * (1.0 - curve[top]), top)
-    return _vertex(curve, start, stop, top)
-
-
-def _vertex(curve: Float[np.ndarray, " n"], start: int, stop: int, top: int) -> float:
-    """Where the curve between `start` and `stop` peaks, by a parabola."""
+def _peak_position(curve: Float[np.ndarray, " n"], top: int) -> float:
+    """Where the curve peaks around its largest value, at `top`, by a parabola through what is little lower."""
+    start, stop = _run_around(curve >= curve[top] - 0.002 - 0.3 * (1.0 - curve[top]), top)
     if stop - start < 5:
         return float(top)
     bend, slope, _ = np.polyfit(np.arange(stop - start), curve[start:stop], 2)
     return float(start + np.clip(-0.5 * slope / bend, 0.0, stop - start) if bend < 0.0 else top)
 
 
-def _copy(values: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+def _aligned_copy(values: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
     """In double precision, and where JAX can use it without one of its own: from a multiple of 64 bytes on."""
     values = np.asarray(values, dtype=float)
     memory = np.empty(values.size + 8)
     first = -memory.ctypes.data % 64 // 8
-    found = memory[first : first + values.size].reshape(values.shape)
-    found[...] = values
-    return found
+    copy = memory[first : first + values.size].reshape(values.shape)
+    copy[...] = values
+    return copy
 
 
-def _kept_once(time: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+def _share_times(time: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
     """The times, or the same ones of a record that is still there."""
-    known = _TIMES.setdefault((time.size, time[0], time[-1]), time)
+    known = _SHARED_TIMES.setdefault((time.size, time[0], time[-1]), time)
     same = np.array_equal(known.view(np.int64), time.view(np.int64))  # to the last bit, as of a fingerprint
     return known if same else time
 
@@ -303,16 +306,13 @@ def _check_shapes(time: np.ndarray, channels: Mapping[str, np.ndarray], source: 
         )
 
 
-def _check_finite(values: np.ndarray, name: str, source: str, where: _Where) -> None:
+def _check_values(values: np.ndarray, name: str, source: str, where: _RowLabel) -> None:
     bad = np.flatnonzero(~np.isfinite(values))
     if bad.size:
         raise InputError(
             f"{source}, {where(int(bad[0]))}: {name} is {values[bad[0]]} ({bad.size} such values);"
             " remove those rows or record again"
         )
-
-
-def _check_range(values: np.ndarray, name: str, source: str, where: _Where) -> None:
     bad = np.flatnonzero(np.abs(values) >= OVERFLOW)
     if bad.size:
         raise InputError(
@@ -321,7 +321,7 @@ def _check_range(values: np.ndarray, name: str, source: str, where: _Where) -> N
         )
 
 
-def _check_increasing(time: np.ndarray, source: str, where: _Where) -> None:
+def _check_increasing(time: np.ndarray, source: str, where: _RowLabel) -> None:
     bad = np.flatnonzero(np.diff(time) <= 0.0)
     if bad.size:
         row = int(bad[0]) + 1
@@ -340,7 +340,7 @@ def _check_signal(values: np.ndarray, name: str, source: str) -> None:
     middle = np.median(values)
     if np.max(np.abs(values - middle)) > 7.0 * np.median(np.abs(values - middle)) / 0.6744897501960817:
         return  # an edge, however short
-    if white_noise(values) < _SMOOTH * np.std(values):
+    if white_noise_sd(values) < 0.3 * np.std(values):
         return  # a smooth signal, though a sweep has no spectral line
     power = np.abs(np.fft.rfft(values - values.mean())[1:]) ** 2
     # Fisher's test: the share of the largest of m spectral lines of white noise exceeds x with p < m (1 - x)^(m - 1)

@@ -9,8 +9,6 @@ from fitact.errors import InputError
 from fitact.model.response import response
 from fitact.scene.scene import Scene
 
-_MOST_SAMPLES = 100_000_000
-
 
 def simulate(scene: Scene, seed: int = 0) -> Record:
     """V, and the channels that the scene measures with its noise, at its sampling rate and for its duration.
@@ -35,7 +33,7 @@ def simulate(scene: Scene, seed: int = 0) -> Record:
     return Record.from_arrays(time, V=channels["V"], Vsc=channels.get("Vsc"), I=channels.get("I"), source="simulation")
 
 
-def sample_times(scene: Scene) -> Float[np.ndarray, " samples"]:
+def sample_times(scene: Scene, max_samples: int = 100_000_000) -> Float[np.ndarray, " samples"]:
     """When the scene's measurement samples, s.
 
     Raises:
@@ -43,9 +41,9 @@ def sample_times(scene: Scene) -> Float[np.ndarray, " samples"]:
     """
     measured = scene.measurement
     count = round(measured.duration * measured.sampling_rate)
-    if not MINIMUM_SAMPLES <= count <= _MOST_SAMPLES:
+    if not MINIMUM_SAMPLES <= count <= max_samples:
         raise InputError(
             f"scene: [measurement] duration times sampling_rate is {count:,} samples; choose them to give"
-            f" {MINIMUM_SAMPLES} to {_MOST_SAMPLES:,}"
+            f" {MINIMUM_SAMPLES} to {max_samples:,}"
         )
     return np.arange(count) / measured.sampling_rate

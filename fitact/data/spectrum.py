@@ -10,22 +10,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from fitact.data.readers.header import cells_of, number
+from fitact.data.readers.header import parse_number, split_cells
 from fitact.errors import InputError
-from fitact.files import unreadable
-from fitact.units import engineering
+from fitact.files import read_error
+from fitact.units import PREFIX_FACTORS, format_engineering
 
 MINIMUM_POINTS = 5
-_MOST = 67_108_864  # bytes: a spectrum has hundreds of points
-_HEAD = 16_384
-_MOST_UNITS = 2  # lines between the names and the numbers
 _FREQUENCY = re.compile(r"^f(req|(?![a-z]))", re.IGNORECASE)
 _REAL = re.compile(r"^-?(re\s*\(?z|z?\s*_?re(al)?\b|zre|z_re|z')(?!')", re.IGNORECASE)
 _IMAGINARY = re.compile(r"""^-?(im\s*\(?z|z?\s*_?im(ag)?\b|zim|z_im|z''|z")""", re.IGNORECASE)
-_SIZE = re.compile(r"^(\|z\||z\s*_?mod|abs\s*\(?z|z_abs|z_magnitude|magnitude)", re.IGNORECASE)
+_MAGNITUDE = re.compile(r"^(\|z\||z\s*_?mod|abs\s*\(?z|z_abs|z_magnitude|magnitude)", re.IGNORECASE)
 _PHASE = re.compile(r"^(-?phase|z\s*_?ph(z|ase)?\b|theta|arg\s*\(?z)", re.IGNORECASE)
 _PREFIX = re.compile(r"[(/_\[\s]([kKMGm]?)\s*(?:(?i:ohms?)|Ω|Ω)")
-_PREFIXES = {"": 1.0, "k": 1e3, "K": 1e3, "M": 1e6, "G": 1e9, "m": 1e-3}
 _HERTZ = re.compile(r"[(/_\[\s]([kKM]?)(?i:hz)")
 
 
@@ -102,8 +98,8 @@ class Spectrum:
         }
 
     def __str__(self) -> str:
-        low, high = (engineering(float(f), "Hz") for f in self.frequency[[0, -1]])
-        small, large = (engineering(float(z), "ohm") for z in np.sort(np.abs(self.impedance))[[0, -1]])
+        low, high = (format_engineering(float(f), "Hz") for f in self.frequency[[0, -1]])
+        small, large = (format_engineering(float(z), "ohm") for z in np.sort(np.abs(self.impedance))[[0, -1]])
         return f"{self.source} (impedance spectrum): {len(self)} points, {low} to {high}, |Z| {small} to {large}"
 
 
@@ -123,10 +119,10 @@ def is_spectrum(path: str | os.PathLike[str]) -> bool:
     """Whether a file's header names a frequency and an impedance."""
     try:
         with Path(path).open("rb") as file:
-            head = _decoded(file.read(_HEAD))
+            head = _decode(file.read(16_384))  # which holds any header
     except OSError:
         return False
-    return next(_headers(head.splitlines()), None) is not None
+    return next(_find_headers(head.splitlines()), None) is not None
 
 
 def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
@@ -142,71 +138,70 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
     source = os.fspath(path)
     try:
         with Path(path).open("rb") as file:
-            lines = _decoded(file.read(_MOST)).splitlines()
+            lines = _decode(file.read(2**26)).splitlines()  # more than any spectrum has
     except OSError as error:
-        raise unreadable(source, error) from error
-    place, delimiter, columns = next(_headers(lines), None) or _bare(lines, source)
-    rows = np.array(list(_rows(lines, place, delimiter, columns, source))).reshape(-1, 3)
+        raise read_error(source, error) from error
+    place, delimiter, columns = next(_find_headers(lines), None) or _headerless_columns(lines, source)
+    rows = np.array(list(_parse_rows(lines, place, delimiter, columns, source))).reshape(-1, 3)
     first, second = columns.ohm * rows[:, 1], columns.sign * rows[:, 2]
     z = first * np.exp(1j * columns.radian * second) if columns.radian else first + 1j * columns.ohm * second
     return Spectrum.from_arrays(columns.hertz * rows[:, 0], z, source)
 
 
-def _decoded(content: bytes) -> str:
+def _decode(content: bytes) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
         return content.decode("latin-1")
 
 
-def _headers(lines: list[str]) -> Iterator[tuple[int, str, _Columns]]:
+def _find_headers(lines: list[str]) -> Iterator[tuple[int, str, _Columns]]:
     """Lines that name the columns: the first line after each, its delimiter, its columns."""
     for place, line in enumerate(lines):
         if "req" not in line.lower() and not line.lower().startswith("f"):
             continue
         for delimiter in ("\t", ";", ",", " "):
-            columns = _columns(_named(line, delimiter))
+            columns = _find_columns(_split_names(line, delimiter))
             if columns is not None:
                 yield place + 1, delimiter, columns
                 break
 
 
-def _named(line: str, delimiter: str) -> list[str]:
+def _split_names(line: str, delimiter: str) -> list[str]:
     names = re.split(r"\s{2,}", line.strip()) if delimiter == " " else line.split(delimiter)
     return [name.strip().strip('"#').strip() for name in names]
 
 
-def _columns(names: list[str]) -> _Columns | None:
-    def first(pattern: re.Pattern[str]) -> int | None:
+def _find_columns(names: list[str]) -> _Columns | None:
+    def find_first(pattern: re.Pattern[str]) -> int | None:
         return next((place for place, name in enumerate(names) if pattern.search(name)), None)
 
-    frequency, real, imaginary = first(_FREQUENCY), first(_REAL), first(_IMAGINARY)
-    size, phase = first(_SIZE), first(_PHASE)
+    frequency, real, imaginary = find_first(_FREQUENCY), find_first(_REAL), find_first(_IMAGINARY)
+    size, phase = find_first(_MAGNITUDE), find_first(_PHASE)
     if frequency is None:
         return None
     hertz = _HERTZ.search(names[frequency])
-    of_hertz = _PREFIXES[hertz[1]] if hertz else 1.0
+    hertz_factor = PREFIX_FACTORS[hertz[1]] if hertz else 1.0
     if real is not None and imaginary is not None:
         sign = -1.0 if names[imaginary].startswith("-") else 1.0
-        return _Columns(frequency, real, imaginary, of_hertz, _ohm(names[real]), sign, 0.0)
+        return _Columns(frequency, real, imaginary, hertz_factor, _ohm_factor(names[real]), sign, 0.0)
     if size is None or phase is None:
         return None
     sign = -1.0 if names[phase].startswith("-") else 1.0
     radian = 1.0 if "rad" in names[phase].lower() else np.pi / 180.0
-    return _Columns(frequency, size, phase, of_hertz, _ohm(names[size]), sign, radian)
+    return _Columns(frequency, size, phase, hertz_factor, _ohm_factor(names[size]), sign, radian)
 
 
-def _ohm(name: str) -> float:
-    found = _PREFIX.search(name)
-    return _PREFIXES[found[1]] if found else 1.0
+def _ohm_factor(name: str) -> float:
+    prefix = _PREFIX.search(name)
+    return PREFIX_FACTORS[prefix[1]] if prefix else 1.0
 
 
-def _bare(lines: list[str], source: str) -> tuple[int, str, _Columns]:
-    """Three columns without names."""
+def _headerless_columns(lines: list[str], source: str) -> tuple[int, str, _Columns]:
     first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
     for delimiter in ("\t", ";", ",", " "):
-        cells = cells_of(first, delimiter)
-        if len(cells) == 3 and all(number(cell, delimiter != ",") is not None for cell in cells):
+        cells = split_cells(first, delimiter)
+        if len(cells) == 3 and all(parse_number(cell, delimiter != ",") is not None for cell in cells):
             return 0, delimiter, _Columns(0, 1, 2, 1.0, 1.0, 1.0, 0.0)
     raise InputError(
         f"{source}: no line names a frequency and an impedance; write a header such as"
@@ -214,20 +209,20 @@ def _bare(lines: list[str], source: str) -> tuple[int, str, _Columns]:
     )
 
 
-def _rows(
-    lines: list[str], place: int, delimiter: str, columns: _Columns, source: str
-) -> Iterator[tuple[float, float, float]]:
-    """Numbers below the header, as far as they go."""
+def _parse_rows(
+    lines: list[str], place: int, delimiter: str, columns: _Columns, source: str, max_unit_lines: int = 2
+) -> Iterator[tuple[float, ...]]:
+    """Numbers below the header and lines of units, as far as they go."""
     begun, comma = False, delimiter in ("\t", ";")
     for line, text in enumerate(lines[place:], place + 1):
         # names apart by blanks stand above numbers apart by anything
-        cells = re.split(r"[\s,;]+", text.strip()) if delimiter == " " else cells_of(text, delimiter)
+        cells = re.split(r"[\s,;]+", text.strip()) if delimiter == " " else split_cells(text, delimiter)
         places = columns.frequency, columns.first, columns.second
-        found = [number(cells[i], comma) if i < len(cells) else None for i in places]
-        if None not in found:
+        numbers = [parse_number(cells[i], comma) if i < len(cells) else None for i in places]
+        if None not in numbers:
             begun = True
-            yield found[0] or 0.0, found[1] or 0.0, found[2] or 0.0
+            yield tuple(number or 0.0 for number in numbers)
         elif begun and (not text.strip() or text.lstrip()[0] not in "0123456789+-."):
             return  # what follows the table
-        elif begun or line - place > _MOST_UNITS + 1:
+        elif begun or line - place > max_unit_lines + 1:
             raise InputError(f"{source}, line {line}: '{text.strip()[:40]}' is no row of numbers; mend or remove it")

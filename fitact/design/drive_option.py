@@ -9,12 +9,12 @@ import scipy.stats
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from fitact.model.steady_cycle import Cycle
+from fitact.model.steady_cycle import PeriodQuantities
 from fitact.scene.sections import Device
-from fitact.units import engineering
+from fitact.units import format_engineering
 
 ASSURANCE = 0.95  # the probability that the share of people is reached at the assured amplitude
-PEOPLE = (0.05, 0.25, 0.5, 0.75, 0.95)
+FINGER_QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
 def quantile(amplitude: Float[np.ndarray, "*shape"], share: float, axis: int | None = None) -> np.ndarray:
@@ -34,11 +34,12 @@ def quantile_error(amplitude: Float[np.ndarray, " n"], share: float) -> float:
     return place**2 * math.sqrt(weight @ (inverse - weight @ inverse) ** 2)
 
 
-def shown(value: ArrayLike, unit: str, error: float | None = None) -> str:
-    """For people, with its standard error if that is given."""
+def format_quantity(value: ArrayLike, unit: str, error: float | None = None) -> str:
+    """Format a value for people, with its standard error if that is given."""
     if not math.isfinite(value):
         return "unbounded"
-    return engineering(float(value), unit, 3) + ("" if error is None else f" ± {engineering(error, unit, 2)}")
+    text = format_engineering(float(value), unit, 3)
+    return text if error is None else f"{text} ± {format_engineering(error, unit, 2)}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +52,7 @@ class DriveOption:
         device: the panel, with its limits.
         amplitude: peak-to-peak, V, that the share of people needs, under each law.
         assured_error: of `assured`, V: the standard error that its draws, of laws or of a prior's fingers, leave.
-        people: peak-to-peak, V, up to which `PEOPLE` of all fingers feel it.
+        people: peak-to-peak, V, up to which `FINGER_QUANTILES` of all fingers feel it.
         at_assured: at the assured amplitude: forces and powers of the median finger, the voltage over the insulator
             and the currents the largest of all fingers.
     """
@@ -64,33 +65,35 @@ class DriveOption:
     amplitude: Float[np.ndarray, " laws"]
     assured_error: float
     people: Float[np.ndarray, " shares"]
-    at_assured: Cycle
+    at_assured: PeriodQuantities
 
     @classmethod
-    def of(
+    def from_amplitudes(
         cls,
         waveform: str,
         frequency: float,
         device: Device,
-        needed: Float[np.ndarray, "laws fingers"],
-        found: Cycle,
+        required_amplitudes: Float[np.ndarray, "laws fingers"],
+        unit_quantities: PeriodQuantities,
         share: float,
     ) -> Self:
-        """From the amplitude that each finger needs, and what a drive of 1 Vpp does at it."""
-        amplitude = quantile(needed, share, axis=1)
+        """Evaluate an option by the amplitude that each finger needs, and what a drive of 1 Vpp does at it."""
+        amplitude = quantile(required_amplitudes, share, axis=1)
         assured = float(quantile(amplitude, ASSURANCE))
-        error = quantile_error(amplitude, ASSURANCE) if amplitude.size > 1 else quantile_error(needed[0], share)
-        people = np.array([quantile(needed, each) for each in PEOPLE])
-        return cls(waveform, frequency, device, amplitude, error, people, _at(found, assured))
+        error = quantile_error(amplitude, ASSURANCE)
+        if amplitude.size == 1:
+            error = quantile_error(required_amplitudes[0], share)
+        people = np.array([quantile(required_amplitudes, q) for q in FINGER_QUANTILES])
+        return cls(waveform, frequency, device, amplitude, error, people, _scale_to_amplitude(unit_quantities, assured))
 
     @property
     def assured(self) -> float:
         """The peak-to-peak amplitude that meets the share with a probability of `ASSURANCE`, V."""
         return float(quantile(self.amplitude, ASSURANCE))
 
-    def takes(self, what: str) -> float:
+    def criterion_value(self, criterion: str) -> float:
         """The assured amplitude, or a power there, by the names of `CRITERIA` and in their units."""
-        return self.assured if what == "peak_to_peak" else float(getattr(self.at_assured, what))
+        return self.assured if criterion == "peak_to_peak" else float(getattr(self.at_assured, criterion))
 
     @property
     def breakdown_voltage(self) -> float | None:
@@ -109,7 +112,7 @@ class DriveOption:
             ("the peak current", "A", self.at_assured.current_peak, self.device.current_limit_peak),
         )
         return tuple(
-            f"{what} is {shown(value, unit)}, above {engineering(limit, unit, 3)}"
+            f"{what} is {format_quantity(value, unit)}, above {format_engineering(limit, unit, 3)}"
             for what, unit, value, limit in checked
             if limit is not None and not value <= limit
         )
@@ -120,7 +123,6 @@ class DriveOption:
             float(quantile(self.amplitude, q)) if self.amplitude.size > 1 or q == 0.5 else None
             for q in (0.05, 0.5, 0.95)
         )
-        shown = {name: np.asarray(value).tolist() for name, value in self.at_assured._asdict().items()}
         return {
             "waveform": self.waveform,
             "frequency": self.frequency,
@@ -129,19 +131,18 @@ class DriveOption:
             "peak_to_peak": {"unit": "V", "q05": low, "q50": median, "q95": high}
             | {"assured": self.assured, "assured_error": self.assured_error},
             "people": {"unit": "V"} | dict(zip(("q05", "q25", "q50", "q75", "q95"), self.people.tolist(), strict=True)),
-            "at_assured": shown,
+            "at_assured": {name: np.asarray(value).tolist() for name, value in self.at_assured._asdict().items()},
             "breakdown_voltage": self.breakdown_voltage,
             "violations": list(self.violations),
         }
 
 
-def _at(found: Cycle, amplitude: float) -> Cycle:
-    """At another amplitude than 1 Vpp: forces and powers of the median finger, voltage and currents the largest."""
+def _scale_to_amplitude(unit_quantities: PeriodQuantities, amplitude: float) -> PeriodQuantities:
+    """Scale from 1 Vpp: forces and powers of the median finger, voltage and currents the largest."""
+    linear = ("insulator_peak", "current_rms", "current_peak")  # the others are quadratic
     with np.errstate(invalid="ignore"):
-        typical = {name: np.median(getattr(found, name), axis=(0, 1)) * amplitude**2 for name in _QUADRATIC}
-        largest = {name: np.max(getattr(found, name)) * amplitude for name in _LINEAR}
-    return Cycle(**typical, **largest)
-
-
-_QUADRATIC = ("force_mean", "force_alternating", "force_harmonics", "real_power", "apparent_power")
-_LINEAR = ("insulator_peak", "current_rms", "current_peak")
+        scaled = {
+            name: np.max(values) * amplitude if name in linear else np.median(values, axis=(0, 1)) * amplitude**2
+            for name, values in unit_quantities._asdict().items()
+        }
+    return PeriodQuantities(**scaled)

@@ -6,6 +6,7 @@ no record. The first derivatives of the gains' logarithms know it: it is their n
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -17,55 +18,59 @@ from jaxtyping import Array, Complex, Float
 
 from fitact.errors import InputError
 from fitact.model.circuit import Channel, Circuit
-from fitact.model.skin import constant, parameters, with_values
-
-_POINTS = 8  # at random, beside the circuit as given, which may be special: two equal skins
-_SPREAD = np.log(10.0)  # how far they lie from it, in logs
-_SPREAD_OF_ALPHA = 0.1  # likewise of a fractional skin's exponent, which 1 bounds
-_FREQUENCIES = 128
-_BEYOND = 100.0  # the frequencies reach so many times beyond the circuit's own, at both ends
-_NULL = 1e-11  # singular values below count as rounding: it leaves 1e-15, and what is real is above 1e-5,
-_GAP = 1e-3  # if they lie so far below the others; without that gap nothing is called structural
-_SAME = 1e-6  # sine of the angle between directions that count as one
-_LIKE = 0.1  # that between a direction that data leave open and the structural one it stands for
+from fitact.model.skin import circuit_parameters, constant_skin_circuit, with_values
 
 
 @dataclasses.dataclass(frozen=True)
-class Structure:
-    """The directions that no record of these channels can see.
+class NullSpaceSettings:
+    """Where the gains' derivatives are taken, and which of their directions count as without effect."""
 
-    Attributes:
-        names: the free parameters.
-        channels: what is recorded beside V.
-        directions: unit vectors in the log-parameters, at the circuit's own values.
-        constant: whether they are the same for all values; if not, the ridges of equal answers curve.
-    """
+    points: int = 8  # at random, beside the circuit as given, which may be special: two equal skins
+    spread: float = math.log(10.0)  # how far they lie from it, in logs
+    alpha_spread: float = 0.1  # likewise of a fractional skin's exponent, which 1 bounds
+    frequencies: int = 128
+    frequency_margin: float = 100.0  # the frequencies reach so many times beyond the circuit's own, at both ends
+    rounding: float = 1e-11  # of the largest singular value: what rounding leaves is 1e-15, what is real above 1e-5,
+    gap: float = 1e-3  # if they lie so far below the others; without that gap nothing is called structural
+    same_direction: float = 1e-6  # sine of the angle between directions that count as one
 
-    names: tuple[str, ...]
-    channels: tuple[Channel, ...]
-    directions: Float[np.ndarray, "dimension parameters"]
-    constant: bool
+
+@dataclasses.dataclass(frozen=True)
+class StructuralIdentifiability:
+    """The directions that no record of these channels can see."""
+
+    names: tuple[str, ...]  # the free parameters
+    channels: tuple[Channel, ...]  # recorded beside V
+    directions: Float[np.ndarray, "dimension parameters"]  # unit vectors in the log-parameters, at the circuit's values
+    is_constant: bool  # whether they are the same for all values; if not, the ridges of equal answers curve
 
     @property
     def dimension(self) -> int:
         """How many independent combinations cannot be told."""
         return len(self.directions)
 
-    def hides(self, direction: dict[str, float]) -> bool:
+    def contains(self, direction: dict[str, float], *, max_sine: float = 0.1) -> bool:
         """Whether a direction in some of the log-parameters is one of those, whatever the others do along it."""
+        if self.dimension == 0:
+            return False
         part = self.directions[:, [self.names.index(name) for name in direction]]
-        return self.dimension > 0 and _distance(part, np.array([list(direction.values())])) < _LIKE
+        return _subspace_distance(part, np.array([list(direction.values())])) < max_sine
 
     def __str__(self) -> str:
         channels = " and ".join(self.channels)
         if self.dimension == 0:
             return f"A record of {channels} can tell {', '.join(self.names)}."
         what = "; ".join(name_direction(dict(zip(self.names, row, strict=True))) for row in self.directions)
-        here = "" if self.constant else " (the direction at these values; elsewhere it differs)"
+        here = "" if self.is_constant else " (the direction at these values; elsewhere it differs)"
         return f"No record of {channels}{' alone' * (len(self.channels) == 1)} can tell {what}{here}."
 
 
-def blind_directions(circuit: Circuit, free: Sequence[str], channels: Sequence[Channel]) -> Structure:
+def blind_directions(
+    circuit: Circuit,
+    free: Sequence[str],
+    channels: Sequence[Channel],
+    settings: NullSpaceSettings = NullSpaceSettings(),
+) -> StructuralIdentifiability:
     """The directions in the logarithms of `free` that no record of `channels` can see.
 
     `free` names fields of the circuit, "gain" (of the channel Vsc) and "gain_I"; all else is known. A direction
@@ -76,19 +81,21 @@ def blind_directions(circuit: Circuit, free: Sequence[str], channels: Sequence[C
     """
     free, channels = tuple(free), tuple(channels)
     nominal = log_values(circuit, free, channels)
-    spread = np.array([_SPREAD_OF_ALPHA if name == "alpha" else _SPREAD for name in free])
-    away = spread * np.random.default_rng(0).uniform(-1.0, 1.0, (_POINTS, len(free)))  # any points would do
-    points = nominal + np.vstack([np.zeros(len(free)), away])
+    spread = np.array([settings.alpha_spread if name == "alpha" else settings.spread for name in free])
+    offsets = spread * np.random.default_rng(0).uniform(-1.0, 1.0, (settings.points, len(free)))  # any points would do
+    points = nominal + np.vstack([np.zeros(len(free)), offsets])
     with jax.enable_x64(True):
-        sensitivities = _sensitivities(jax.tree.map(jnp.asarray, circuit), free, channels, points)
-    found = [_null_space(sensitivity) for sensitivity in sensitivities]
-    dimension = min(len(directions) for directions in found)
-    generic = [directions for directions in found if len(directions) == dimension]
-    constant = dimension == 0 or all(_distance(generic[0], other) < _SAME for other in generic)
-    directions = _readable(generic[0])
+        sensitivities = _sensitivities(jax.tree.map(jnp.asarray, circuit), free, channels, points, settings)
+    null_spaces = [_null_space(sensitivity, settings) for sensitivity in sensitivities]
+    dimension = min(len(directions) for directions in null_spaces)
+    generic = [directions for directions in null_spaces if len(directions) == dimension]
+    constant = dimension == 0 or all(
+        _subspace_distance(generic[0], other) < settings.same_direction for other in generic
+    )
+    directions = _sparse_basis(generic[0])
     if "Ci" in free:
-        directions[directions[:, free.index("Ci")] < -_SAME] *= -1.0
-    return Structure(free, channels, directions, constant)
+        directions[directions[:, free.index("Ci")] < -settings.same_direction] *= -1.0
+    return StructuralIdentifiability(free, channels, directions, constant)
 
 
 def gain_names(channels: Sequence[Channel]) -> dict[str, Channel]:
@@ -97,25 +104,27 @@ def gain_names(channels: Sequence[Channel]) -> dict[str, Channel]:
     return {name: channel for name, channel in names.items() if channel in channels}
 
 
-def log_values(circuit: Circuit, free: Sequence[str], channels: Sequence[Channel]) -> Float[np.ndarray, " parameters"]:
+def log_values(
+    circuit: Circuit, free: Sequence[str], channels: Sequence[Channel]
+) -> Float[np.ndarray, " circuit_parameters"]:
     """Logarithms of the parameters `free`; a gain is 1.
 
     Raises:
         InputError: a name in `free` is no parameter of the circuit above zero, and no gain of these channels.
     """
     gains = dict.fromkeys(gain_names(channels), 1.0)
-    known = gains | {name: float(value) for name, value in parameters(circuit).items() if value is not None}
+    known = gains | {name: float(value) for name, value in circuit_parameters(circuit).items() if value is not None}
     for name in free:
         if not known.get(name, 0.0) > 0.0:
             raise InputError(
-                f"free: {name!r} has no value above zero in this {type(constant(circuit)).__name__}; give it one,"
-                f" or free some of {', '.join(known)}"
+                f"free: {name!r} has no value above zero in this {type(constant_skin_circuit(circuit)).__name__};"
+                f" give it one, or free some of {', '.join(known)}"
             )
     return np.log([known[name] for name in free])
 
 
 def with_parameters(
-    circuit: Circuit, free: Sequence[str], channels: Sequence[Channel], theta: Float[Array, " parameters"]
+    circuit: Circuit, free: Sequence[str], channels: Sequence[Channel], theta: Float[Array, " circuit_parameters"]
 ) -> tuple[Circuit, list[ArrayLike]]:
     """The circuit and the gain of each channel where the parameters `free` have the logarithms `theta`."""
     values = dict(zip(free, jnp.exp(theta), strict=True))
@@ -141,11 +150,16 @@ def _area_power(name: str) -> float:
 
 
 def _sensitivities(
-    circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], points: Float[np.ndarray, "n parameters"]
+    circuit: Circuit,
+    free: tuple[str, ...],
+    channels: tuple[Channel, ...],
+    points: Float[np.ndarray, "n parameters"],
+    settings: NullSpaceSettings,
 ) -> Float[np.ndarray, "n rows parameters"]:
     """Derivatives of the logarithms of the channels' gains, at frequencies all around the circuit's own."""
     tau = np.asarray(_time_constants(circuit, free, channels, jnp.asarray(points)))
-    omega = np.geomspace(1.0 / (_BEYOND * tau.max(axis=1)), _BEYOND / tau.min(axis=1), _FREQUENCIES, axis=1)
+    margin = settings.frequency_margin
+    omega = np.geomspace(1.0 / (margin * tau.max(axis=1)), margin / tau.min(axis=1), settings.frequencies, axis=1)
     slope = np.asarray(_log_gain_slopes(circuit, free, channels, jnp.asarray(points), jnp.asarray(omega)))
     return np.concatenate([slope.real, slope.imag], axis=1)
 
@@ -153,7 +167,7 @@ def _sensitivities(
 @eqx.filter_jit
 def _time_constants(circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], points: Array) -> Array:
     def taus(theta: Array) -> Array:
-        return jnp.stack(constant(with_parameters(circuit, free, channels, theta)[0]).terms().tau)
+        return jnp.stack(constant_skin_circuit(with_parameters(circuit, free, channels, theta)[0]).terms().tau)
 
     return jax.vmap(taus)(points)
 
@@ -164,14 +178,18 @@ def _log_gain_slopes(
 ) -> Complex[Array, "n rows parameters"]:
     def gain(theta: Array, omega: Array) -> tuple[Array, Array]:
         there, gains = with_parameters(circuit, free, channels, theta)
-        value = jnp.concatenate([g * there.gain_of(channel, omega) for g, channel in zip(gains, channels, strict=True)])
+        value = jnp.concatenate(
+            [g * there.channel_gain(channel, omega) for g, channel in zip(gains, channels, strict=True)]
+        )
         return value, value
 
     slope, value = jax.vmap(jax.jacfwd(gain, has_aux=True))(points, omega)
     return slope / value[..., None]
 
 
-def _null_space(sensitivity: Float[np.ndarray, "rows parameters"]) -> Float[np.ndarray, "dimension parameters"]:
+def _null_space(
+    sensitivity: Float[np.ndarray, "rows parameters"], settings: NullSpaceSettings
+) -> Float[np.ndarray, "dimension parameters"]:
     """An orthonormal basis of the directions without effect.
 
     The frequencies reach all corners of the circuit, so that even the smallest resistance has its effect at some;
@@ -180,24 +198,26 @@ def _null_space(sensitivity: Float[np.ndarray, "rows parameters"]) -> Float[np.n
     scale = np.linalg.norm(sensitivity, axis=0)
     scale = np.where(scale > 0.0, scale, 1.0)
     _, sizes, directions = np.linalg.svd(sensitivity / scale, full_matrices=False)
-    null = sizes < _NULL * sizes[0]
-    if not null.any() or sizes[null].max() > _GAP * sizes[~null].min():
+    null = sizes < settings.rounding * sizes[0]
+    if not null.any() or sizes[null].max() > settings.gap * sizes[~null].min():
         return np.zeros((0, scale.size))
     return np.linalg.qr((directions[null] / scale).T)[0].T
 
 
-def _distance(directions: Float[np.ndarray, "n parameters"], others: Float[np.ndarray, "m parameters"]) -> float:
+def _subspace_distance(
+    directions: Float[np.ndarray, "n parameters"], others: Float[np.ndarray, "m parameters"]
+) -> float:
     """Sine of the largest angle by which `others` stand out of the space of `directions`."""
-    inside = others @ np.linalg.pinv(directions, rcond=_SAME) @ directions
+    inside = others @ np.linalg.pinv(directions, rcond=1e-6) @ directions  # parts of directions may be parallel
     return float(np.linalg.norm((others - inside) / np.linalg.norm(others, axis=1, keepdims=True), 2))
 
 
-def _readable(basis: Float[np.ndarray, "dimension parameters"]) -> Float[np.ndarray, "dimension parameters"]:
+def _sparse_basis(basis: Float[np.ndarray, "dimension parameters"]) -> Float[np.ndarray, "dimension parameters"]:
     """Unit vectors of the same space that move few parameters each, the circuit's own first: a reduced echelon form."""
     rows = basis.copy()
     for i in range(len(rows)):
-        left = np.max(np.abs(rows[i:]), axis=0)
-        pivot = np.flatnonzero(left > 0.5 * left.max())[-1]  # of those that move much, the last
+        largest = np.max(np.abs(rows[i:]), axis=0)
+        pivot = np.flatnonzero(largest > 0.5 * largest.max())[-1]  # of those that move much, the last
         best = i + int(np.argmax(np.abs(rows[i:, pivot])))
         rows[[i, best]] = rows[[best, i]]
         rows[i] /= rows[i, pivot]

@@ -1,4 +1,4 @@
-"""The best values of a trial's settings: a coarse grid, and from its lowest points downhill by exact gradients."""
+"""The best values of the settings of a measurement: of a coarse grid, or downhill from there by exact gradients."""
 
 import itertools
 from collections.abc import Sequence
@@ -9,82 +9,80 @@ import scipy.ndimage
 import scipy.optimize
 from jaxtyping import Float
 
-from fitact.experiment.experiment import Trial, joint_jacobian, joint_prior
-from fitact.experiment.fisher import covariance_root
+from fitact.experiment.experiment import CandidateDesign, joint_jacobian, joint_prior_factor
+from fitact.experiment.fisher import covariance_factor
 from fitact.model.skin import has_time_constants
-
-_POINTS = {1: 33, 2: 6}  # of the grid along each of so many settings; along more, 4
-_STARTS = 3  # of its lowest points
-_WORTH = 1e-3  # of the error: by so much, at least, it must fall for a setting to be moved
 
 
 class Optimum(NamedTuple):
-    """The best settings found, and the standard deviation of the log mean force on the way.
+    """The best settings found, and the standard deviation of the log mean force on the way."""
 
-    Attributes:
-        values: of the settings, SI.
-        grid: along each setting.
-        force_sd: at all combinations.
-    """
-
-    values: tuple[float, ...]
-    grid: tuple[Float[np.ndarray, " points"], ...]
-    force_sd: Float[np.ndarray, "*points"]
+    values: tuple[float, ...]  # of the settings, SI
+    grid: tuple[Float[np.ndarray, " points"], ...]  # along each setting
+    force_sd: Float[np.ndarray, "*points"]  # at all combinations
 
 
-def optimise(trial: Trial, gradient: Float[np.ndarray, " parameters"]) -> Optimum:
+def optimise(
+    design: CandidateDesign, gradient: Float[np.ndarray, " parameters"], starts: int = 3, min_improvement: float = 1e-3
+) -> Optimum:
     """The settings that tell most of a force, by its `gradient` in the logarithms of the free parameters.
 
     A skin without time constants has no derivatives in the settings here: the best of the grid is taken.
+
+    Args:
+        design: whose settings are to be chosen.
+        gradient: of the logarithm of the force.
+        starts: how many of the grid's lowest points are followed downhill.
+        min_improvement: of the error: by so much, at least, it must fall for a setting to be moved.
     """
-    bounds = [(setting.low, setting.high) for setting in trial.settings]
-    count = _POINTS.get(len(bounds), 4)
+    bounds = [(setting.low, setting.high) for setting in design.settings]
+    count = {1: 33, 2: 6}.get(len(bounds), 4)  # points of the grid along each of so many settings
     grid = tuple(np.geomspace(*pair, count) for pair in bounds)
     points = list(itertools.product(*grid))
-    coarse = np.array([force_sd(trial, point, gradient) for point in points])
+    coarse = np.array([force_sd(design, point, gradient) for point in points])
     shape = (count,) * len(bounds)
     lowest = scipy.ndimage.minimum_filter(coarse.reshape(shape), 3, mode="nearest").ravel() == coarse
-    order = [i for i in np.argsort(coarse) if lowest[i]][:_STARTS]
-    found = [(coarse[i], points[i]) for i in order]
-    if all(has_time_constants(e.circuit) for e in trial.experiments):
-        found += [_downhill(trial, gradient, points[i], bounds) for i in order]
-    best, values = min(found)
-    if force_sd(trial, trial.starts, gradient) < (1.0 + _WORTH) * best:
-        values = trial.starts
-    if len({setting.field for setting in trial.settings}) == 1:  # of records alike but for it
+    order = [i for i in np.argsort(coarse) if lowest[i]][:starts]
+    optima = [(coarse[i], points[i]) for i in order]
+    if all(has_time_constants(e.circuit) for e in design.experiments):
+        optima += [_minimise(design, gradient, points[i], bounds) for i in order]
+    best, values = min(optima)
+    if force_sd(design, design.start_values, gradient) < (1.0 + min_improvement) * best:
+        values = design.start_values
+    if len({setting.field for setting in design.settings}) == 1:  # of records alike but for it
         values = sorted(values)
     return Optimum(tuple(map(float, values)), grid, coarse.reshape(shape))
 
 
-def force_sd(trial: Trial, values: Sequence[float], gradient: Float[np.ndarray, " parameters"]) -> float:
+def force_sd(design: CandidateDesign, values: Sequence[float], gradient: Float[np.ndarray, " parameters"]) -> float:
     """The standard deviation of the log mean force with the settings at `values`."""
-    experiments = trial.at(values, in_step=True)
-    root = covariance_root(joint_jacobian(experiments)[0], joint_prior(experiments))
+    experiments = design.make_experiments(values, keep_phase=True)
+    root = covariance_factor(joint_jacobian(experiments)[0], joint_prior_factor(experiments))
     return float(np.linalg.norm(gradient @ root[: gradient.size]))
 
 
 def log_force_sd_slope(
-    trial: Trial, values: Sequence[float], gradient: Float[np.ndarray, " parameters"]
+    design: CandidateDesign, values: Sequence[float], gradient: Float[np.ndarray, " parameters"]
 ) -> tuple[float, Float[np.ndarray, " settings"]]:
     """The logarithm of `force_sd`, and its derivatives in the logarithms of the settings.
 
     The variance is g C g with 1 / C = J J + 1 / prior: its derivative is -2 (J v) (J' v) with v = C g.
     """
-    experiments = trial.at(values, in_step=True)
-    jacobian, *slopes = joint_jacobian(experiments, trial.settings)
-    root = covariance_root(jacobian, joint_prior(experiments))
+    experiments = design.make_experiments(values, keep_phase=True)
+    jacobian, *slopes = joint_jacobian(experiments, design.settings)
+    root = covariance_factor(jacobian, joint_prior_factor(experiments))
     half = gradient @ root[: gradient.size]
     moved = root @ half
     variance = float(half @ half)
-    found = [-float((jacobian @ moved) @ (slope @ moved)) / variance for slope in slopes]
-    return 0.5 * float(np.log(variance)), np.array(found)
+    slope = [-float((jacobian @ moved) @ (slope @ moved)) / variance for slope in slopes]
+    return 0.5 * float(np.log(variance)), np.array(slope)
 
 
-def _downhill(
-    trial: Trial, gradient: np.ndarray, start: Sequence[float], bounds: list[tuple[float, float]]
+def _minimise(
+    design: CandidateDesign, gradient: np.ndarray, start: Sequence[float], bounds: list[tuple[float, float]]
 ) -> tuple[float, tuple[float, ...]]:
     def objective(logs: np.ndarray) -> tuple[float, np.ndarray]:
-        return log_force_sd_slope(trial, np.exp(logs), gradient)
+        return log_force_sd_slope(design, np.exp(logs), gradient)
 
     end = scipy.optimize.minimize(objective, np.log(start), jac=True, method="L-BFGS-B", bounds=np.log(bounds))
     return float(np.exp(end.fun)), tuple(np.exp(end.x))

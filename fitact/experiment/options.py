@@ -3,252 +3,247 @@
 import contextlib
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from fitact.experiment.experiment import Option, Setting, Trial, judge
+from fitact.experiment.experiment import CandidateDesign, DesignOption, Setting, evaluate_design
 from fitact.experiment.fisher import FREQUENCY, Experiment
-from fitact.model.circuit import Channel, DirectGround, FinalCircuit, NaturalGround, Probe
-from fitact.model.drive import Periodic, Trapezoid
-from fitact.model.multitone import Multitone
-from fitact.model.skin import WithSkin, constant, has_time_constants, parameters
-from fitact.units import engineering
-
-NOISE = {"Vsc": 0.1, "I": 20e-9}  # V and A, of a channel that is not recorded yet and has none stated
-SERIES_RESISTOR = 100e3  # ohm, of one that is recommended unseen
-QUICK = ("current", "series resistor", "better Ci", "longer record")  # what a fit's verdict names
-
-_CAN_HAVE_RESISTOR = (FinalCircuit, DirectGround, NaturalGround)
-_RESISTORS = (1e3, 1e8)  # ohm, that one can buy and that the cable's capacitance does not short
-_PANELS = 10.0  # a second panel's capacitance, at most so many times larger or smaller
-_RESOLVED = 100.0  # samples in a period, at least
-_SLOWEST = 1.0  # Hz
-_EDGES = 4.0  # rises in half a period, at least
-_PROBE = 10.0  # times the impedance of the probe that there is
-_MORE = 4  # times the duration or the sampling rate
-_FLEETING = 0.01  # of a channel's noise: a converter's part in it that is not worth another
+from fitact.model.circuit import RC, Channel, DirectGround, FinalCircuit, Probe
+from fitact.model.drive import Multitone, Periodic, Trapezoid
+from fitact.model.skin import WithSkin, circuit_parameters, constant_skin_circuit, has_time_constants, with_values
+from fitact.units import format_engineering
 
 
 class Change(NamedTuple):
-    """A change of a measurement.
-
-    Attributes:
-        name: of it.
-        group: of changes of one thing, of which only one can be made.
-        effort: turning a knob of an instrument that is there is 1.
-        apply: the trial with it; None: it cannot be made there.
-    """
+    """A change of a measurement."""
 
     name: str
-    group: str
-    effort: float
-    apply: Callable[[Trial], Trial | None]
+    group: str  # of changes of one thing, of which only one can be made
+    effort: float  # turning a knob of an instrument that is there is 1
+    apply: Callable[[CandidateDesign], CandidateDesign | None]  # the candidate with it; None: it cannot be made there
 
-    def __call__(self, trial: Trial) -> Trial | None:
-        """The trial with the change, and its effort; None: it cannot be made there."""
-        found = self.apply(trial)
-        if found is None:
+    def __call__(self, design: CandidateDesign) -> CandidateDesign | None:
+        """The candidate with the change, and its effort; None: it cannot be made there."""
+        changed = self.apply(design)
+        if changed is None:
             return None
-        return dataclasses.replace(found, names=(*trial.names, self.name), effort=trial.effort + self.effort)
+        return dataclasses.replace(changed, names=(*design.names, self.name), effort=design.effort + self.effort)
 
 
-def changes(steps: Mapping[Channel, float] | None = None) -> tuple[Change, ...]:
-    """All changes; `steps` are those of the converter in each channel, V and A, where they are known."""
+def changes(adc_steps: Mapping[Channel, float] | None = None) -> tuple[Change, ...]:
+    """All changes; `adc_steps` are those of the converter in each channel, V and A, where they are known."""
     return (
-        Change("longer record", "length", 1.0, _longer),
-        Change("higher sampling rate", "rate", 1.0, _faster),
-        Change("frequency", "frequency", 1.0, lambda trial: _frequencies(trial, 1)),
-        Change("two frequencies", "frequency", 2.0, lambda trial: _frequencies(trial, 2)),
-        Change("three frequencies", "frequency", 3.0, lambda trial: _frequencies(trial, 3)),
+        Change("longer record", "length", 1.0, _longer_record),
+        Change("higher sampling rate", "rate", 1.0, _higher_sampling_rate),
+        Change("frequency", "frequency", 1.0, lambda d: _frequencies(d, 1)),
+        Change("two frequencies", "frequency", 2.0, lambda d: _frequencies(d, 2)),
+        Change("three frequencies", "frequency", 3.0, lambda d: _frequencies(d, 3)),
         Change("series resistor", "series resistor", 2.0, _series_resistor),
         Change("lighter probe", "probe", 3.0, _lighter_probe),
         Change("no probe load", "probe", 4.0, _no_probe),
         Change("better Ci", "Ci", 3.0, _better_Ci),
-        Change("current", "current", 3.0, lambda trial: _channel(trial, "I", "the trunk current I")),
-        Change("skin voltage", "skin voltage", 3.0, lambda trial: _channel(trial, "Vsc", "the skin voltage Vsc")),
-        Change("finer converter", "converter", 4.0, lambda trial: _finer(trial, steps or {})),
+        Change("current", "current", 3.0, lambda d: _add_channel(d, "I", "the trunk current I", 20e-9)),
+        Change("skin voltage", "skin voltage", 3.0, lambda d: _add_channel(d, "Vsc", "the skin voltage Vsc", 0.1)),
+        Change("finer converter", "converter", 4.0, lambda d: _higher_adc_resolution(d, adc_steps or {})),
         Change("second panel", "panel", 5.0, _second_panel),
     )
 
 
-def remedies(experiment: Experiment, gradient: Float[np.ndarray, " parameters"]) -> tuple[Option, ...]:
-    """What might be done to know a force better, best first; of that, what takes no search and can be computed there.
+def suggest_measurements(
+    experiment: Experiment,
+    gradient: Float[np.ndarray, " circuit_parameters"],
+    names: Sequence[str] = ("current", "series resistor", "better Ci", "longer record"),
+) -> tuple[DesignOption, ...]:
+    """The changes of these `names` as options, best first, where they can be made and computed.
 
     `gradient` is that of the force's logarithm. A fit that failed may have ended at a circuit whose current no
     double holds.
     """
-    as_it_is, found = Trial((experiment,)), []
+    as_it_is, options = CandidateDesign((experiment,)), []
     for change in changes():
-        trial = change(as_it_is) if change.name in QUICK else None
-        if trial is not None and trial.experiments[0] is not experiment:
+        candidate = change(as_it_is) if change.name in names else None
+        if candidate is not None and candidate.experiments[0] is not experiment:
             with contextlib.suppress(np.linalg.LinAlgError):
-                found.append(judge(trial, trial.starts, gradient))
-    return tuple(sorted(found, key=lambda option: option.force_sd))
+                options.append(evaluate_design(candidate, candidate.start_values, gradient))
+    return tuple(sorted(options, key=lambda option: option.force_sd))
 
 
-def _each(trial: Trial, text: str, change: Callable[[Experiment], Experiment], *settings: Setting) -> Trial:
-    """The trial with the same change of all its experiments."""
+def _apply_to_all(
+    design: CandidateDesign, text: str, change: Callable[[Experiment], Experiment], *settings: Setting
+) -> CandidateDesign:
+    """The candidate with the same change of all its experiments."""
     return dataclasses.replace(
-        trial,
-        experiments=tuple(map(change, trial.experiments)),
-        texts=(*trial.texts, text),
-        settings=(*trial.settings, *settings),
+        design,
+        experiments=tuple(map(change, design.experiments)),
+        texts=(*design.texts, text),
+        settings=(*design.settings, *settings),
     )
 
 
-def _longer(trial: Trial) -> Trial:
-    return _each(
-        trial, f"{_count(_MORE)} times the record", lambda e: dataclasses.replace(e, records=_MORE * e.records)
-    )
+def _longer_record(design: CandidateDesign, factor: int = 4) -> CandidateDesign:
+    def repeat_record(e: Experiment) -> Experiment:
+        return dataclasses.replace(e, records=factor * e.records)
+
+    return _apply_to_all(design, f"{_count(factor)} times the record", repeat_record)
 
 
-def _faster(trial: Trial) -> Trial:
-    def faster(e: Experiment) -> Experiment:
-        at = np.arange(_MORE * len(e.time)) / _MORE
+def _higher_sampling_rate(design: CandidateDesign, factor: int = 4) -> CandidateDesign:
+    def raise_rate(e: Experiment) -> Experiment:
+        at = np.arange(factor * len(e.time)) / factor
         end = e.time[-1] + (e.time[-1] - e.time[-2])
         return dataclasses.replace(e, time=np.interp(at, np.arange(len(e.time) + 1), np.append(e.time, end)))
 
-    return _each(trial, f"{_count(_MORE)} times the sampling rate, with the same noise in each sample", faster)
+    text = f"{_count(factor)} times the sampling rate, with the same noise in each sample"
+    return _apply_to_all(design, text, raise_rate)
 
 
 def _count(number: int) -> str:
     return {2: "two", 3: "three", 4: "four"}[number]
 
 
-def _frequencies(trial: Trial, count: int) -> Trial | None:
-    """So many records in place of one, each with a frequency of its own, and as many samples as that one."""
-    first, *others = trial.experiments
+def _frequencies(
+    design: CandidateDesign,
+    count: int,
+    *,
+    lowest: float = 1.0,
+    min_samples_per_period: float = 100.0,
+    min_rises: float = 4.0,
+) -> CandidateDesign | None:
+    """So many records in place of one, each with a frequency of its own, and as many samples as that one.
+
+    They lie between `lowest` (Hz) and where a period has too few samples, or half of one too few rises.
+    """
+    first, *others = design.experiments
     drive = first.drive
     if others or not (isinstance(drive, Periodic) and first.steady_state and has_time_constants(first.circuit)):
         return None
-    step, top = float(np.median(np.diff(first.time))), 1.0
-    low, high = min(_SLOWEST, float(drive.frequency)), 1.0 / (_RESOLVED * step)
-    if isinstance(drive, Multitone):
-        top = max(drive.orders)
+    low = min(lowest, float(drive.frequency))
+    high = 1.0 / (min_samples_per_period * float(np.median(np.diff(first.time))))
     if isinstance(drive, Trapezoid):
-        high = min(high, float(min(drive.duty, 1.0 - drive.duty) / (_EDGES * drive.rise_time)))
-    high /= top
+        high = min(high, float(min(drive.duty, 1.0 - drive.duty) / (min_rises * drive.rise_time)))
+    high /= max(drive.orders) if isinstance(drive, Multitone) else 1.0
     start = min(float(drive.frequency), high)
     numbers = [""] + [f"_{number}" for number in range(2, count + 1)]
     settings = (Setting(FREQUENCY + n, FREQUENCY, "Hz", start, low, high, (i,)) for i, n in enumerate(numbers))
     several = f"{_count(count)} such records, " if count > 1 else ""
     places = ", ".join(["{}"] * (count - 1)) + " and {}" if count > 1 else "{}"
-    return _each(_repeated(trial, (first,) * count), f"{several}the drive at {places}", lambda e: e, *settings)
+    replicated = _replicate_experiment(design, (first,) * count)
+    return _apply_to_all(replicated, f"{several}the drive at {places}", lambda e: e, *settings)
 
 
-def _repeated(trial: Trial, experiments: tuple[Experiment, ...]) -> Trial:
-    """The trial of one experiment with several in its place, which share its settings."""
-    of = tuple(range(len(experiments)))
-    shared = tuple(dataclasses.replace(setting, of=of) for setting in trial.settings)
-    return dataclasses.replace(trial, experiments=experiments, settings=shared)
+def _replicate_experiment(design: CandidateDesign, experiments: tuple[Experiment, ...]) -> CandidateDesign:
+    """The candidate of one experiment with several in its place, which share its settings."""
+    indices = tuple(range(len(experiments)))
+    shared = tuple(dataclasses.replace(setting, experiment_indices=indices) for setting in design.settings)
+    return dataclasses.replace(design, experiments=experiments, settings=shared)
 
 
-def _series_resistor(trial: Trial) -> Trial | None:
-    """A known resistor in series, or another one in place of a known one; it stands where it is, or at a default."""
-    of = parameters(trial.experiments[0].circuit)
-    start, free = of.get("series_resistor"), trial.experiments[0].free
-    if "series_resistor" in free or not isinstance(constant(trial.experiments[0].circuit), _CAN_HAVE_RESISTOR):
+def _series_resistor(
+    design: CandidateDesign, default: float = 100e3, low: float = 1e3, high: float = 1e8
+) -> CandidateDesign | None:
+    """A known resistor in series, or another one in place of a known one; it stands where it is, or at `default`.
+
+    One can buy those between `low` and `high` (ohm), and the cable's capacitance does not short them.
+    """
+    first = design.experiments[0]
+    if "series_resistor" in first.free or not isinstance(constant_skin_circuit(first.circuit), RC):
         return None
-    low, high = _RESISTORS
-    where = Setting(
-        "series_resistor",
-        "series_resistor",
-        "ohm",
-        SERIES_RESISTOR if start is None else float(start),
-        low,
-        high,
-        tuple(range(len(trial.experiments))),
-    )
-    return _each(trial, "a known resistor of {} in series", _with_resistor, where)
+
+    def insert_resistor(e: Experiment) -> Experiment:
+        if circuit_parameters(e.circuit).get("series_resistor") is not None:
+            return e
+        circuit, inner = e.circuit, constant_skin_circuit(e.circuit)
+        if isinstance(inner, FinalCircuit):
+            inner = DirectGround(inner.Rsc, inner.Csc, inner.Ci)
+            circuit = dataclasses.replace(circuit, circuit=inner) if isinstance(circuit, WithSkin) else inner
+        return _with_fields(dataclasses.replace(e, circuit=circuit), series_resistor=default)
+
+    stated = circuit_parameters(first.circuit).get("series_resistor")
+    start, indices = default if stated is None else float(stated), tuple(range(len(design.experiments)))
+    where = Setting("series_resistor", "series_resistor", "ohm", start, low, high, indices)
+    return _apply_to_all(design, "a known resistor of {} in series", insert_resistor, where)
 
 
-def _with_resistor(e: Experiment) -> Experiment:
-    def resisted(circuit: Any) -> Any:
-        if isinstance(circuit, FinalCircuit):
-            circuit = DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci)
-        return dataclasses.replace(circuit, series_resistor=SERIES_RESISTOR)
-
-    return e if parameters(e.circuit).get("series_resistor") is not None else _inside(e, resisted)
+def _with_fields(e: Experiment, **fields: Any) -> Experiment:
+    """The experiment with other fields of its circuit, within a skin level if it has one."""
+    return dataclasses.replace(e, circuit=with_values(e.circuit, fields))
 
 
-def _inside(e: Experiment, change: Callable[[Any], Any]) -> Experiment:
-    """The experiment with its circuit changed, within a skin level if it has one."""
-    circuit: Any = e.circuit
-    if isinstance(circuit, WithSkin):
-        return dataclasses.replace(e, circuit=dataclasses.replace(circuit, circuit=change(circuit.circuit)))
-    return dataclasses.replace(e, circuit=change(circuit))
+def _lighter_probe(design: CandidateDesign, factor: float = 10.0) -> CandidateDesign | None:
+    def lighten_probe(e: Experiment) -> Experiment:
+        probe: Any = _probe(e)
+        return _with_fields(e, probe=Probe(factor * probe.R, probe.C / factor))
+
+    text = f"a probe of {factor:g} times the impedance"
+    return _apply_to_all(design, text, lighten_probe) if _probe(design.experiments[0]) else None
 
 
-def _lighter_probe(trial: Trial) -> Trial | None:
-    def lighter(circuit: Any) -> Any:
-        probe = circuit.probe
-        return dataclasses.replace(circuit, probe=Probe(_PROBE * probe.R, probe.C / _PROBE))
-
-    text = f"a probe of {_PROBE:g} times the impedance"
-    return _each(trial, text, lambda e: _inside(e, lighter)) if _has_probe(trial) else None
+def _no_probe(design: CandidateDesign) -> CandidateDesign | None:
+    if _probe(design.experiments[0]) is None:
+        return None
+    return _apply_to_all(design, "a probe that does not load the skin", lambda e: _with_fields(e, probe=None))
 
 
-def _no_probe(trial: Trial) -> Trial | None:
-    def bare(circuit: Any) -> Any:
-        return dataclasses.replace(circuit, probe=None)
-
-    text = "a probe that does not load the skin"
-    return _each(trial, text, lambda e: _inside(e, bare)) if _has_probe(trial) else None
+def _probe(e: Experiment) -> Probe | None:
+    return getattr(constant_skin_circuit(e.circuit), "probe", None)
 
 
-def _has_probe(trial: Trial) -> bool:
-    return getattr(constant(trial.experiments[0].circuit), "probe", None) is not None
-
-
-def _better_Ci(trial: Trial) -> Trial | None:
-    def better(e: Experiment) -> Experiment:
+def _better_Ci(design: CandidateDesign) -> CandidateDesign | None:
+    def halve_Ci_sd(e: Experiment) -> Experiment:
         halves = np.where([name == "Ci" for name in e.free], 0.5, 1.0)
-        return dataclasses.replace(e, prior_root=halves[:, None] * e.prior_root)
+        return dataclasses.replace(e, prior_factor=halves[:, None] * e.prior_factor)
 
-    return _each(trial, "Ci known twice as well", better) if "Ci" in trial.experiments[0].free else None
+    return _apply_to_all(design, "Ci known twice as well", halve_Ci_sd) if "Ci" in design.experiments[0].free else None
 
 
-def _channel(trial: Trial, channel: Channel, what: str) -> Trial | None:
-    if channel in trial.experiments[0].channels:
+def _add_channel(design: CandidateDesign, channel: Channel, what: str, default_noise: float) -> CandidateDesign | None:
+    """The candidate with a channel that is not recorded yet; its noise is the default where none is stated."""
+    if channel in design.experiments[0].channels:
         return None
-    noise = trial.experiments[0].noise.get(channel) or NOISE[channel]
+    noise = design.experiments[0].noise.get(channel) or default_noise
 
-    def recorded(e: Experiment) -> Experiment:
+    def record_channel(e: Experiment) -> Experiment:
         return dataclasses.replace(e, channels=(*e.channels, channel), noise={**e.noise, channel: noise})
 
-    unit = "V" if channel == "Vsc" else "A"
-    return _each(trial, f"{what} recorded to ± {engineering(noise, unit)}", recorded)
+    shown = format_engineering(noise, "V" if channel == "Vsc" else "A")
+    return _apply_to_all(design, f"{what} recorded to ± {shown}", record_channel)
 
 
-def _finer(trial: Trial, steps: Mapping[Channel, float]) -> Trial | None:
-    """The noise without that of the converters, where there is enough of it."""
-    e = trial.experiments[0]
-    left: dict[str, float] = {
-        channel: math.sqrt(max(e.noise[channel] ** 2 - steps[channel] ** 2 / 12.0, 0.0))
-        for channel in e.channels
-        if channel in steps
-    }
-    left = {channel: noise for channel, noise in left.items() if 0.0 < noise < (1.0 - _FLEETING) * e.noise[channel]}
-    if not left:
+def _higher_adc_resolution(
+    design: CandidateDesign, adc_steps: Mapping[Channel, float], min_share: float = 0.01
+) -> CandidateDesign | None:
+    """The noise without that of the converters, where it is more than `min_share` of a channel's."""
+    e = design.experiments[0]
+    quieter: dict[str, float] = {}
+    for channel in e.channels:
+        noise = math.sqrt(max(e.noise[channel] ** 2 - adc_steps.get(channel, 0.0) ** 2 / 12.0, 0.0))
+        if 0.0 < noise < (1.0 - min_share) * e.noise[channel]:
+            quieter[channel] = noise
+    if not quieter:
         return None
     unit = {"Vsc": "V", "I": "A"}
-    shown = ", ".join(f"± {engineering(noise, unit[channel])} on {channel}" for channel, noise in left.items())
-    return _each(
-        trial,
-        f"converters of finer steps, which leave {shown}",
-        lambda e: dataclasses.replace(e, noise={**e.noise, **left}),
+    shown = ", ".join(
+        f"± {format_engineering(noise, unit[channel])} on {channel}" for channel, noise in quieter.items()
     )
 
+    def lower_noise(e: Experiment) -> Experiment:
+        return dataclasses.replace(e, noise={**e.noise, **quieter})
 
-def _second_panel(trial: Trial) -> Trial | None:
-    """The same finger on another insulator, whose capacitance is known as well as the first's, and on its own."""
-    first, *others = trial.experiments
+    return _apply_to_all(design, f"converters of finer steps, which leave {shown}", lower_noise)
+
+
+def _second_panel(design: CandidateDesign, max_ratio: float = 10.0) -> CandidateDesign | None:
+    """The same finger on another insulator, whose capacitance is known as well as the first's, and on its own.
+
+    It is at most `max_ratio` times larger or smaller than the first's.
+    """
+    first, *others = design.experiments
     if others or "Ci" not in first.free:
         return None
-    Ci = float(parameters(first.circuit)["Ci"])
-    where = Setting("second_Ci", "Ci", "F", Ci, Ci / _PANELS, Ci * _PANELS, (1,))
-    both = _repeated(trial, (first, dataclasses.replace(first, own=("Ci",))))
-    return _each(both, "a second panel, of {} known on its own as well as Ci", lambda e: e, where)
+    Ci = float(circuit_parameters(first.circuit)["Ci"])
+    where = Setting("second_Ci", "Ci", "F", Ci, Ci / max_ratio, Ci * max_ratio, (1,))
+    both = _replicate_experiment(design, (first, dataclasses.replace(first, own_parameters=("Ci",))))
+    return _apply_to_all(both, "a second panel, of {} known on its own as well as Ci", lambda e: e, where)

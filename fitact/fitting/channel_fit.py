@@ -10,20 +10,18 @@ from jaxtyping import Array, Float
 
 from fitact.data.record import Record
 from fitact.fitting.criteria import criteria, gaussian_log_likelihood, student_log_likelihood
-from fitact.fitting.drive_choice import DriveChoice
+from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.problem import Source
-from fitact.fitting.residual_statistics import outliers, statistics
-from fitact.likelihood.channel import LINEAR, Seen, Trace
+from fitact.fitting.residual_statistics import channel_statistics, outliers
+from fitact.likelihood.channel import LINEAR_NUISANCES, ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import student_weight
 from fitact.model.circuit import Circuit
 from fitact.model.skin import WithSkin
 
-_EVEN = 0.7  # weight below which a sample's noise is mostly that of the drive's slope
-
 
 @dataclasses.dataclass(frozen=True)
-class TraceFit:
+class ChannelFit:
     """One channel of one record, fitted.
 
     Attributes:
@@ -42,7 +40,7 @@ class TraceFit:
     label: str
     channel: str
     record: Record
-    choice: DriveChoice
+    choice: DriveModel
     sigma: float
     linear: dict[str, float]
     residuals: Float[np.ndarray, " samples"]
@@ -52,28 +50,32 @@ class TraceFit:
     full_because: str
 
     @classmethod
-    def of(
+    def from_optimum(
         cls, likelihood: Likelihood, index: int, theta: np.ndarray, sigma: float, source: Source, reason: str
-    ) -> "TraceFit":
+    ) -> "ChannelFit":
         """The trace of that index at the optimum `theta` with the noise `sigma`."""
-        trace, seen = likelihood.traces[index].summed(), likelihood.seen(jnp.asarray(theta), index)
+        trace, seen = (
+            likelihood.channels[index].without_compression(),
+            likelihood.channel_inputs(jnp.asarray(theta), index),
+        )
         # the noise as an array: a float would be compiled in, anew for every record
-        left, even, beta = (np.asarray(x) for x in _over_samples(trace, seen, jnp.asarray(sigma)))
-        own = slice(trace.own)
+        left, even, beta = (np.asarray(x) for x in _sample_residuals(trace, seen, jnp.asarray(sigma)))
+        own = slice(trace.n_samples)
         left, weight = left[own], None if trace.equally_weighted else trace.weights[own]
         linear = {
-            trace.named(LINEAR[column]): float(value * trace.linear_sd[column])
+            trace.qualified_name(LINEAR_NUISANCES[column]): float(value * trace.linear_sd[column])
             for column, value in zip(trace.columns, beta, strict=True)
         }
-        counted = (trace.weights if trace.whitening is None else np.asarray(trace.whitening.kept))[own] > 0.0
+        counted = (trace.weights if trace.whitening is None else np.asarray(trace.whitening.mask))[own] > 0.0
         kept = even[own][counted]
         used = theta.size * kept.size / float(likelihood.count) + len(linear)
         gain = _gain(seen.circuit, trace)
         noise = sigma if trace.noise == "ar1" else source.noise  # coloured, only the residuals show it
         time = source.record.time[counted]
-        figures = statistics(kept, time, noise, used, gain, source.record, trace.channel, source.choice)
-        if weight is not None and np.mean((weight > 0.0) & (weight < _EVEN)) > 0.01:
-            figures |= {"spectrum_p": 1.0, "line_p": 1.0}  # the noise that dV/dt brings in is not white
+        figures = channel_statistics(kept, time, noise, used, gain, source.record, trace.channel, source.choice)
+        # below a weight of 0.7 a sample's noise is mostly that of the drive's slope, which is not white
+        if weight is not None and np.mean((weight > 0.0) & (weight < 0.7)) > 0.01:
+            figures |= {"spectrum_p": 1.0, "line_p": 1.0}
         weighted = left if weight is None else left * weight
         if trace.whitening is not None:  # as a user sees them, before the filter
             figures["rms_residual"] = float(np.sqrt(np.mean(weighted[counted] ** 2)))
@@ -95,38 +97,40 @@ class TraceFit:
         )
 
 
-def _gain(circuit: Circuit, trace: Trace) -> float:
+def _gain(circuit: Circuit, trace: ChannelLikelihood) -> float:
     """What makes the channel's noise of a measured drive's."""
     if isinstance(circuit, WithSkin):  # it falls with the frequency, and noise is mostly fast
-        return float(jnp.abs(circuit.gain_of(trace.channel, 1.0 / trace.time_step)))
-    return abs(sum(float(w) for w in circuit.terms_of(trace.channel).weight))
+        return float(jnp.abs(circuit.channel_gain(trace.channel, 1.0 / trace.time_step)))
+    return abs(sum(float(w) for w in circuit.channel_terms(trace.channel).weight))
 
 
-def _log_likelihood(trace: Trace, left: np.ndarray, even: np.ndarray, sigma: float) -> float:
+def _log_likelihood(
+    trace: ChannelLikelihood, residuals: np.ndarray, white_residuals: np.ndarray, sigma: float
+) -> float:
     """At the noise that makes it largest; under Student's t, at `sigma`."""
     if trace.whitening is None:
-        weights = trace.weights[: left.size]
+        weights = trace.weights[: residuals.size]
         if trace.noise == "student":
-            return student_log_likelihood(left, weights, sigma)
-        return gaussian_log_likelihood(left, weights)
-    kept = np.asarray(trace.whitening.kept) > 0.0
-    innovations = even / float(trace.whitening.taps[0])
+            return student_log_likelihood(residuals, weights, sigma)
+        return gaussian_log_likelihood(residuals, weights)
+    kept = np.asarray(trace.whitening.mask) > 0.0
+    innovations = white_residuals / float(trace.whitening.taps[0])
     return gaussian_log_likelihood(innovations, None) + float(np.sum(np.log(trace.weights[kept])))
 
 
 @eqx.filter_jit
-def _over_samples(trace: Trace, seen: Seen, sigma: Array) -> tuple[Array, Array, Array]:
+def _sample_residuals(trace: ChannelLikelihood, inputs: ChannelInputs, sigma: Array) -> tuple[Array, Array, Array]:
     """What is left of the samples; that with noise independent and equal; and the linear nuisances in prior sds."""
-    _, beta, _ = trace.linear(seen, sigma)
-    remainder, shapes = dataclasses.replace(trace, weight=None, whitening=None).before_linear(seen)
+    _, beta, _ = trace.fit_nuisances(inputs, sigma)
+    remainder, shapes = dataclasses.replace(trace, weight=None, whitening=None).residuals_and_shapes(inputs)
     left = remainder - beta @ (trace.linear_sd[np.array(trace.columns, dtype=int), None] * shapes)
-    even = trace.weighted(left)
+    even = trace.apply_whitening(left)
     if trace.noise == "student":
         even = even * jnp.sqrt(student_weight(even / sigma))
     return left, even, beta
 
 
-def compare(parameters: int, traces: Sequence[TraceFit]) -> dict[str, float]:
+def information_criteria(parameters: int, traces: Sequence[ChannelFit]) -> dict[str, float]:
     """Information criteria of a fit with so many `parameters` beside each trace's linear nuisances and noise."""
     counted = parameters + sum(1 + len(trace.linear) for trace in traces)
     samples = sum(int(trace.figures["samples"]) for trace in traces)

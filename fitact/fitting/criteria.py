@@ -5,7 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from fitact.likelihood.noise import FREEDOM
+from fitact.likelihood.noise import STUDENT_DOF
 
 
 def gaussian_log_likelihood(
@@ -25,11 +25,13 @@ def gaussian_log_likelihood(
 def student_log_likelihood(
     residuals: Float[np.ndarray, " samples"], weight: Float[np.ndarray, " samples"], scale: float
 ) -> float:
-    """Likewise under Student's t of `fitact.likelihood.noise.FREEDOM` degrees, with its scale."""
+    """Likewise under Student's t of `fitact.likelihood.noise.STUDENT_DOF` degrees, with its scale."""
     kept = weight > 0.0
     z = residuals[kept] * weight[kept] / scale
-    constant = math.lgamma(0.5 * (FREEDOM + 1.0)) - math.lgamma(0.5 * FREEDOM) - 0.5 * math.log(FREEDOM * math.pi)
-    densities = constant - 0.5 * (FREEDOM + 1.0) * np.log1p(z**2 / FREEDOM) + np.log(weight[kept] / scale)
+    constant = (
+        math.lgamma(0.5 * (STUDENT_DOF + 1.0)) - math.lgamma(0.5 * STUDENT_DOF) - 0.5 * math.log(STUDENT_DOF * math.pi)
+    )
+    densities = constant - 0.5 * (STUDENT_DOF + 1.0) * np.log1p(z**2 / STUDENT_DOF) + np.log(weight[kept] / scale)
     return float(np.sum(densities))
 
 

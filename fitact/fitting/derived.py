@@ -1,6 +1,7 @@
 """What follows from the parameters: divider, time constant, force and friction, at any theta."""
 
 import math
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -9,14 +10,14 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from fitact.compiled import padded, padded_weight
+from fitact.compiled import BatchEvaluator, as_arrays, pad_samples, pad_weight
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.fitting.drive_choice import DriveChoice, as_arrays, has_ideal_edges, whole_periods
-from fitact.likelihood.channel import CHARGES, LINEAR
+from fitact.fitting.drive_choice import DriveModel, has_ideal_edges, whole_periods
+from fitact.likelihood.channel import CHARGES, LINEAR_NUISANCES
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.circuit import Circuit
-from fitact.model.drive import Drive, Periodic, PiecewiseLinear, Sampled, Sine
+from fitact.model.drive import Drive, Multitone, Periodic, PiecewiseLinear, Sampled, Sine
 from fitact.model.force import (
     AirGap,
     Contact,
@@ -27,22 +28,15 @@ from fitact.model.force import (
     peak_force,
     summarize,
 )
-from fitact.model.multitone import Multitone
 from fitact.model.response import response
 from fitact.model.skin import WithSkin
 from fitact.scene.scene import Scene
 
-NAMES = ("g", "b", "force_mean", "force_peak", "force_rms", "friction_mean")
-
-_LONG = 20_000  # samples, above which the force is that of the last periods,
-_WINDOW = 4_000  # of at most so many samples where that holds a period,
-_LEAD = 20.0  # after so many time constants
-_AFTER = 0.5  # steps after an ideal jump, where the peak of a skin that depends on the frequency is taken
-_NODES = 64  # Gauss-Legendre nodes along each straight piece of a drive
+DERIVED_NAMES = ("g", "b", "force_mean", "force_peak", "force_rms", "friction_mean")
 
 
-class Derived(eqx.Module):
-    """Derived quantities of the first record, as functions of theta and the traces' noise; built by `for_fit`.
+class DerivedQuantities(eqx.Module):
+    """Derived quantities of the first record, as functions of theta and the channels' noise; see `derived_from_fit`.
 
     Means are over one period of a scene's drive in the steady state, else over the largest whole number of
     periods that the record holds (the whole record where it holds none); of a long record with a measured
@@ -73,8 +67,8 @@ class Derived(eqx.Module):
     ) -> Float[Array, " times"]:
         """Electrostatic force in time, N; see `fitact.model.force.Geometry`.
 
-        `deviate` holds standard normal numbers (traces, `LINEAR`) that draw the charges from their posterior; 0:
-        their mean.
+        `deviate` holds standard normal numbers (traces, `LINEAR_NUISANCES`) that draw the charges from their
+        posterior; 0: their mean.
         """
         circuit = self.likelihood.circuit(theta)
         contact = self.contact(circuit)
@@ -88,12 +82,12 @@ class Derived(eqx.Module):
 
         Not what one that stays on a gap adds, which no channel shows.
         """
-        trace, seen = self.likelihood.traces[0], self.likelihood.seen(theta)
-        first = jnp.broadcast_to(deviate, (len(self.likelihood.traces), len(LINEAR)))[0]
-        sizes = (trace.drawn(seen, sigma[0], first) * trace.linear_sd)[-len(CHARGES) :]
+        trace, seen = self.likelihood.channels[0], self.likelihood.channel_inputs(theta)
+        first = jnp.broadcast_to(deviate, (len(self.likelihood.channels), len(LINEAR_NUISANCES)))[0]
+        sizes = (trace.sample_nuisances(seen, sigma[0], first) * trace.linear_sd)[-len(CHARGES) :]
         # a charge shows in each channel as the response to a drive does
         acting = self.contact(seen.circuit).channel
-        there, here = (seen.circuit.terms_of(channel).weight for channel in (acting, trace.channel))
+        there, here = (seen.circuit.channel_terms(channel).weight for channel in (acting, trace.channel))
         ratios = jnp.stack([v / jnp.where(w == 0.0, 1.0, w) for v, w in zip(there, here, strict=False)])
         ratios = jnp.pad(ratios, (0, len(CHARGES) - ratios.size))
         return (sizes * ratios) @ trace.decays(seen.circuit, self.time) / seen.gain
@@ -105,7 +99,7 @@ class Derived(eqx.Module):
     def __call__(
         self, theta: Float[Array, " parameters"], sigma: Float[Array, " traces"], deviate: ArrayLike = 0.0
     ) -> Float[Array, " derived"]:
-        """All of `NAMES`, in SI units."""
+        """All of `DERIVED_NAMES`, in SI units."""
         circuit = self.likelihood.circuit(theta)
         force = summarize(self.force(theta, sigma, deviate), self.weight)
         if self.steady_state and isinstance(self.drive, Periodic):  # rms alone needs quadrature
@@ -116,29 +110,68 @@ class Derived(eqx.Module):
         felt = friction(force.mean, self.coefficient, self.normal_force)
         return jnp.stack([circuit.g, circuit.b, force.mean, force.peak, force.rms, felt])
 
-    def logs(
+    def log_value_and_grad(
         self, theta: Float[np.ndarray, " parameters"], sigma: Float[np.ndarray, " traces"]
     ) -> tuple[Float[np.ndarray, " derived"], Float[np.ndarray, "derived parameters"]]:
-        """Logarithms of all of `NAMES`, and their gradients in theta."""
+        """Logarithms of all of `DERIVED_NAMES`, and their gradients in theta."""
         with jax.enable_x64(True):
-            values, gradient = _logs(self, jnp.asarray(theta), jnp.asarray(sigma))
+            values, gradient = log_derivatives(self, jnp.asarray(theta), jnp.asarray(sigma))
             return np.asarray(values), np.asarray(gradient)
 
 
 @eqx.filter_jit
-def _logs(derive: Derived, theta: Array, sigma: Array) -> tuple[Array, Array]:
+def log_derivatives(derive: DerivedQuantities, theta: Array, sigma: Array) -> tuple[Array, Array]:
     def logs(theta: Array) -> Array:
         return jnp.log(derive(theta, sigma))
 
     return logs(theta), jax.jacfwd(logs)(theta)
 
 
-def for_fit(likelihood: Likelihood, record: Record, choice: DriveChoice, scene: Scene, b: float) -> Derived:
-    """Of a fit; `record` and `choice` are its first, `b` (s) the slowest time constant that was found."""
+def draw_derived(
+    derive: DerivedQuantities, likelihood: Likelihood, points: Float[np.ndarray, "*draws coordinates"], seed: int
+) -> Float[np.ndarray, "*draws derived"]:
+    """All of `DERIVED_NAMES` at points of a posterior; unknown charges are drawn with each."""
+    deviates = nuisance_deviates(likelihood, points, seed)
+    return evaluate_draws(_derive_draw, derive, likelihood.channels[0].time.size, points, deviates)
+
+
+def nuisance_deviates(
+    likelihood: Likelihood, points: Float[np.ndarray, "*draws coordinates"], seed: int
+) -> Float[np.ndarray, "*draws channels nuisances"]:
+    """Standard normal numbers that draw the linear nuisances of each channel, for each of the points."""
+    shape = (*points.shape[:-1], len(likelihood.channels), len(LINEAR_NUISANCES))
+    return np.random.default_rng([seed, 1]).standard_normal(shape)
+
+
+def evaluate_draws(
+    function: Callable[..., Array],
+    model: eqx.Module,
+    rows: int,
+    points: Float[np.ndarray, "*draws coordinates"],
+    deviates: Float[np.ndarray, "*draws channels nuisances"],
+) -> np.ndarray:
+    """`function` of the model, each point and its deviates; `rows`: numbers that one evaluation runs over."""
+    draws = points.shape[:-1]
+    flat = points.reshape(-1, points.shape[-1]), deviates.reshape(-1, *deviates.shape[len(draws) :])
+    with jax.enable_x64(True):
+        values = BatchEvaluator(function, model, rows)(*flat)
+    return values.reshape(*draws, *values.shape[1:])
+
+
+def _derive_draw(derive: DerivedQuantities, point: Array, deviate: Array) -> Array:
+    theta, log_sigma = derive.likelihood.split(point)
+    return derive(theta, jnp.exp(log_sigma), deviate)
+
+
+def derived_from_fit(
+    likelihood: Likelihood, record: Record, choice: DriveModel, scene: Scene, b: float
+) -> DerivedQuantities:
+    """The derived quantities of a fit; `record` and `choice` are its first, `b` (s) its slowest time constant."""
     last = None if isinstance(likelihood.template, WithSkin) else _last_periods(record, choice, b)
-    after = _AFTER * record.time_step if isinstance(likelihood.template, WithSkin) else 0.0
-    drive, (time, weight) = (choice.drive, _grid(record, choice, after)) if last is None else last
-    return Derived(
+    # half a step after an ideal jump the peak of a skin that depends on the frequency is taken
+    jump_delay = 0.5 * record.time_step if isinstance(likelihood.template, WithSkin) else 0.0
+    drive, (time, weight) = (choice.drive, _grid(record, choice, jump_delay)) if last is None else last
+    return DerivedQuantities(
         likelihood.without_samples(),
         drive,
         jnp.asarray(time),
@@ -151,22 +184,33 @@ def for_fit(likelihood: Likelihood, record: Record, choice: DriveChoice, scene: 
     )
 
 
-def _last_periods(record: Record, choice: DriveChoice, b: float) -> tuple[Drive, tuple[np.ndarray, np.ndarray]] | None:
-    """The end of a long measured drive, and times and weights of its last whole periods; None: take it all."""
+def _last_periods(
+    record: Record,
+    choice: DriveModel,
+    b: float,
+    max_samples: int = 20_000,
+    window: int = 4_000,
+    lead_taus: float = 20.0,
+) -> tuple[Drive, tuple[np.ndarray, np.ndarray]] | None:
+    """The end of a long measured drive, and times and weights of its last whole periods; None: take it all.
+
+    A record is long above `max_samples`; the force is that of the last periods, of at most `window` samples where that
+    holds one, after `lead_taus` time constants.
+    """
     frequency, time = record.frequency(), record.time
-    if not isinstance(choice.drive, Sampled) or frequency is None or time.size <= _LONG:
+    if not isinstance(choice.drive, Sampled) or frequency is None or time.size <= max_samples:
         return None
-    periods = max(1, math.floor(_WINDOW * record.time_step * frequency))
+    periods = max(1, math.floor(window * record.time_step * frequency))
     begin = int(np.searchsorted(time, time[-1] - periods / frequency + 0.5 * record.time_step))
-    lead = int(np.searchsorted(time, time[begin] - _LEAD * b))
+    lead = int(np.searchsorted(time, time[begin] - lead_taus * b))
     if lead == 0:
         return None
-    drive = Sampled(padded(time[lead:]), padded(record["V"][lead:]))
-    return drive, (padded(time[begin:]), padded_weight(np.gradient(time)[begin:]))
+    drive = Sampled(pad_samples(time[lead:]), pad_samples(record["V"][lead:]))
+    return drive, (pad_samples(time[begin:]), pad_weight(np.gradient(time)[begin:]))
 
 
-def for_scene(likelihood: Likelihood, scene: Scene) -> Derived:
-    """Under the scene's own drive, for a likelihood without records.
+def derived_from_scene(likelihood: Likelihood, scene: Scene) -> DerivedQuantities:
+    """The derived quantities under the scene's own drive, for a likelihood without records.
 
     Raises:
         InputError: the drive has no steady state.
@@ -177,8 +221,8 @@ def for_scene(likelihood: Likelihood, scene: Scene) -> Derived:
             f"scene: without a record the force is that of a periodic drive in its steady state, which a"
             f" {scene.drive.waveform} from rest has not; name another waveform in [drive]"
         )
-    time, weight = _of_period(drive, 0.0)
-    return Derived(
+    time, weight = _period_grid(drive, 0.0)
+    return DerivedQuantities(
         likelihood,
         as_arrays(drive),
         jnp.asarray(time),
@@ -191,25 +235,25 @@ def for_scene(likelihood: Likelihood, scene: Scene) -> Derived:
     )
 
 
-def _grid(record: Record, choice: DriveChoice, after: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times and weights, of a period where the drive has one; `after` as in `_of_period`."""
+def _grid(record: Record, choice: DriveModel, jump_delay: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times and weights, of a period where the drive has one; `jump_delay` as in `_period_grid`."""
     if isinstance(choice.drive, Periodic) and choice.steady_state:
-        return _of_period(choice.drive, after)
+        return _period_grid(choice.drive, jump_delay)
     kept, period = whole_periods(record)
     cells = np.gradient(record.time)
     if period is None:  # the trapezoid rule; over whole periods the ends meet
         cells[[0, -1]] *= 0.5
-    return padded(record.time[:kept] - choice.shift, len(record)), padded_weight(cells[:kept], len(record))
+    return pad_samples(record.time[:kept] - choice.shift, len(record)), pad_weight(cells[:kept], len(record))
 
 
-def _of_period(drive: Periodic, after: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times and weights; at ideal jumps so long `after` them (s), since there a fractional skin's Vsc has no value."""
+def _period_grid(drive: Periodic, jump_delay: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times and weights; at ideal jumps `jump_delay` (s) later, where a fractional skin's Vsc has a value."""
     if not isinstance(drive, PiecewiseLinear):
         return np.arange(1024) / 1024 * float(drive.period), np.ones(1024)
-    knots = np.asarray(drive.pieces().knots) - float(drive.lead)
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    knots = np.asarray(drive.pieces().knots) - float(drive.phase_time)
+    nodes, weights = np.polynomial.legendre.leggauss(64)
     length = np.diff(knots)[:, None]
     inside = knots[:-1, None] + 0.5 * length * (nodes + 1.0)
     # u is monotone along a piece, so peaks sit at the knots
-    peaks = knots[:-1] + (after if has_ideal_edges(drive) else 0.0)
+    peaks = knots[:-1] + (jump_delay if has_ideal_edges(drive) else 0.0)
     return np.append(inside, peaks), np.append(0.5 * length * weights, np.zeros(length.size))

@@ -1,8 +1,7 @@
-"""What a record says before any fit: which drive to use, and the divider and time constant by a linear fit."""
+"""Which drive a fit uses: the recorded one or the scene's, its frequency, and where it lies on the record."""
 
 import dataclasses
 import math
-from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -11,37 +10,27 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from fitact.compiled import padded
-from fitact.data.record import Record, evenly
+from fitact.compiled import as_arrays, pad_samples, to_device
+from fitact.data.record import Record, resample_uniform
 from fitact.errors import InputError
 from fitact.model.chirp import Chirp
 from fitact.model.drive import Burst, Drive, Periodic, Sampled, Sine, Square
 from fitact.model.response import highpass
 from fitact.scene.scene import Scene
 from fitact.scene.sections import DriveSection
-from fitact.units import percent
+from fitact.units import format_percent
 
-_Module = TypeVar("_Module", bound=eqx.Module)
-
-_PART = 1_048_576  # samples at a time
-_PARTS = 8  # of the waves that a record is compared with
-_ALIGNED = 20_000  # samples on which a drive is laid
-_ROUNDING = 1e-12  # of a square, that of what is left of it
 _CONTRADICTION = 0.05  # relative difference between the stated and the recorded drive that cannot be an inaccuracy
-_SMOOTH_STEPS, _EDGE_STEPS = 0.5, 2.0  # error, over a whole record, of the frequency at which it repeats
-_SMOOTH = ("sine", "triangle", "multitone")
-_PLACES = 10  # on each side, at which a lag is looked for at a time
-_LAG = 4e-4  # over the periods in the record, squared: relative error of a smooth signal's frequency by correlation,
-_NOISY = 1000.0  # and how many times as much it is where the noise is as large as the signal
-_OF_EDGES = 3.0  # and of one with edges, in these
+_EDGE_STEPS = 2.0  # error, over a whole record, of the frequency at which edges repeat
+_SMOOTH_WAVEFORMS = ("sine", "triangle", "multitone")
 
 
 @dataclasses.dataclass(frozen=True)
-class DriveChoice:
+class DriveModel:
     """The drive of a fit.
 
     Attributes:
-        drive: the scene's waveform or the measured one, which is filled up as a `Trace` is.
+        drive: the scene's waveform or the measured one, filled up as the samples of a channel are.
         voltage: it, at the record's times, V.
         steady_state: or from rest.
         unknown_charge: whether the charge at the first sample must be left free.
@@ -64,28 +53,26 @@ class DriveChoice:
         return isinstance(self.drive, Periodic | Sampled)
 
 
-class LinearStart(NamedTuple):
-    """The divider g = a / b and the time constant b (s), by a linear fit."""
-
-    g: float
-    b: float
-
-
-def choose_drive(record: Record, scene: Scene | None) -> DriveChoice:
+def choose_drive(record: Record, scene: Scene | None) -> DriveModel:
     """The recorded V where there is no scene or it says so, otherwise the scene's waveform.
 
     A scene that does not name a waveform stands for the nominal square; where the recorded V is not
-    that square, the record is believed.
+    that square, the record is believed. In double precision.
     """
+    with jax.enable_x64(True):
+        return _choose_drive(record, scene)
+
+
+def _choose_drive(record: Record, scene: Scene | None) -> DriveModel:
     if scene is None or scene.drive.waveform == "measured":
-        return _measured(record, scene.steady_state() if scene else None, ())
-    drive, slowest = scene.make_drive(), scene.drive.slowest
+        return _measured_drive(record, scene.steady_state() if scene else None, ())
+    drive, slowest = scene.make_drive(), scene.drive.lowest_frequency
     notes: tuple[str, ...] = ()
     named = scene.states_waveform()
     if named and not isinstance(drive, Chirp):
         _check_frequency(record, slowest)
-    if named and isinstance(drive, Periodic) and (own := _own_frequency(record, scene.drive)) is not None:
-        stated, slowest = slowest, own
+    if named and isinstance(drive, Periodic) and (frequency := _record_frequency(record, scene.drive)) is not None:
+        stated, slowest = slowest, frequency
         drive = dataclasses.replace(drive, frequency=slowest)
         notes = (
             f"the record repeats at {slowest:.6g} Hz, not at the scene's {stated:.6g} Hz, and its own"
@@ -100,39 +87,24 @@ def choose_drive(record: Record, scene: Scene | None) -> DriveChoice:
         )
     voltage = _voltage(drive, record.time - shift, scene.drive.steady_state)
     if shift != 0.0:
-        notes = (
-            *notes,
-            f"the scene's drive was shifted by {shift:.4g} s to lie on the record",
-        )
+        notes = (*notes, f"the scene's drive was shifted by {shift:.4g} s to lie on the record")
     if "V" in record:
         error = _mismatch(record, voltage)
-        if scene.states_waveform():
+        if named:
             _check_amplitude(record, voltage)
-        if error > 0.02 and not scene.states_waveform():
+        if error > 0.02 and not named:
             note = "the scene names no waveform and V_V is not its nominal square: the recorded V_V drives the fit"
-            return _measured(record, scene.steady_state(), (note,))
+            return _measured_drive(record, scene.steady_state(), (note,))
         if error > 0.02:
             notes = (
                 *notes,
-                f"V_V differs from the scene's {scene.drive.waveform} by {percent(error)} rms;"
+                f"V_V differs from the scene's {scene.drive.waveform} by {format_percent(error)} rms;"
                 " [drive] waveform = 'measured' would use V_V as recorded",
             )
-    return DriveChoice(drive, voltage, scene.drive.steady_state, False, shift, scene.drive.waveform, notes)
+    return DriveModel(drive, voltage, scene.drive.steady_state, False, shift, scene.drive.waveform, notes)
 
 
-def as_arrays(module: _Module) -> _Module:
-    """With its numbers as arrays, so that what is compiled for one serves all others of its kind."""
-    with jax.enable_x64(True):
-        return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, module)
-
-
-def shared(values: Float[np.ndarray, " samples"]) -> Float[Array, " samples"]:
-    """A record's samples for JAX, in the memory that they are in."""
-    with jax.enable_x64(True):
-        return jax.device_put(values, may_alias=True)
-
-
-def _measured(record: Record, steady_state: bool | None, notes: tuple[str, ...]) -> DriveChoice:
+def _measured_drive(record: Record, steady_state: bool | None, notes: tuple[str, ...]) -> DriveModel:
     voltage = record["V"]
     if has_unresolved_edge(voltage):
         notes = (
@@ -141,17 +113,17 @@ def _measured(record: Record, steady_state: bool | None, notes: tuple[str, ...])
             " step (freed as a gain); record faster, or name the waveform in a scene",
         )
     if not steady_state:
-        drive = Sampled(shared(padded(record.time)), shared(padded(voltage)))
-        return DriveChoice(drive, voltage, False, steady_state is None, 0.0, "measured", notes)
+        drive = Sampled(to_device(pad_samples(record.time)), to_device(pad_samples(voltage)))
+        return DriveModel(drive, voltage, False, steady_state is None, 0.0, "measured", notes)
     kept, period = whole_periods(record)
     if period is None:
         raise InputError(
             f"{record.source}: [drive] steady_state = true needs a record of at least 1.5 periods of V_V;"
             " leave steady_state out to have the charge at the first sample fitted"
         )
-    time, samples = (padded(x[:kept], len(record)) for x in (record.time, voltage))
+    time, samples = (pad_samples(x[:kept], len(record)) for x in (record.time, voltage))
     drive = as_arrays(Sampled(time, samples, period))
-    return DriveChoice(drive, voltage, True, False, 0.0, "measured", notes)
+    return DriveModel(drive, voltage, True, False, 0.0, "measured", notes)
 
 
 def whole_periods(record: Record) -> tuple[int, float | None]:
@@ -167,100 +139,69 @@ def whole_periods(record: Record) -> tuple[int, float | None]:
     return kept, float(length)
 
 
-def linear_start(record: Record, choice: DriveChoice, largest: float = 0.5) -> LinearStart:
-    """g (below `largest`) and b from  Vsc = g V - (1/b) ∫ Vsc dt + line,  the circuit's equation integrated once.
-
-    Raises:
-        InputError: g is not between 0 and `largest` (1/2, or a little more with a free gain), so not this circuit's.
-    """
-    time, vsc, voltage = record.time, record["Vsc"], choice.voltage
-    integral = np.concatenate([[0.0], np.cumsum(0.5 * np.diff(time) * (vsc[1:] + vsc[:-1]))])
-    if has_ideal_edges(choice.drive):  # the trapezoid rule misreads the samples beside an ideal edge
-        inside = np.abs(np.diff(voltage, prepend=voltage[0])) < 1e-9 * np.ptp(voltage)
-    else:
-        inside = np.ones(time.size, dtype=bool)
-    span = time[-1] - time[0]
-    R = np.zeros((0, 5))
-    for first in range(0, time.size, _PART):  # a part at a time, which bounds memory
-        part = slice(first, first + _PART)
-        line = (time[part] - time[0]) / span
-        rows = np.stack([voltage[part], integral[part] / span, np.ones_like(line), line, vsc[part]], axis=1)
-        R = np.asarray(np.linalg.qr(np.vstack([R, rows[inside[part]]]), mode="r"))
-    (g, slope, _, _), *_ = np.linalg.lstsq(R[:, :4], R[:, 4], rcond=None)
-    if g >= largest:
-        raise InputError(
-            f"{record.source}: Vsc is {g:.3g} times V at a step, but this circuit cannot give 1/2 or more;"
-            " check for swapped columns or a wrong unit of V_V or Vsc_V"
-        )
-    if g <= 0.0:
-        raise InputError(
-            f"{record.source}: Vsc steps against V (divider {g:.3g}); check the polarity of the probes"
-            " and that V_V and Vsc_V belong to one recording"
-        )
-    return LinearStart(float(g), float(span / -slope) if slope < 0.0 else float("inf"))
-
-
 def _check_frequency(record: Record, stated: float) -> None:
-    found = record.frequency()
-    if found is not None and abs(found / stated - 1.0) > _CONTRADICTION:
+    frequency = record.frequency()
+    if frequency is not None and abs(frequency / stated - 1.0) > _CONTRADICTION:
         raise InputError(
-            f"{record.source}: repeats at {found:.5g} Hz, but the scene's [drive] frequency is {stated:.5g} Hz;"
+            f"{record.source}: repeats at {frequency:.5g} Hz, but the scene's [drive] frequency is {stated:.5g} Hz;"
             " mend the scene, or check the unit of time"
         )
 
 
-def _own_frequency(record: Record, stated: DriveSection) -> float | None:
+def _record_frequency(record: Record, stated: DriveSection) -> float | None:
     """The record's frequency (Hz) where it differs from the stated one by more than it is seen without a model.
 
     A thousandth biases b by several standard errors: generator and recorder have clocks of their own. What is less
     than this the fit finds, as a trace's clock.
     """
-    found = record.frequency()
-    if found is None or not stated.steady_state:  # from rest, what came before and the transient shift where it repeats
+    frequency = record.frequency()
+    if frequency is None or not stated.steady_state:  # from rest, the transient shifts where it repeats
         return None
-    if stated.waveform not in _SMOOTH:
-        found = _by_edges(record, found)
-    return found if abs(found / stated.slowest - 1.0) > frequency_error(record, stated.waveform) else None
+    if stated.waveform not in _SMOOTH_WAVEFORMS:
+        frequency = _frequency_from_edges(record, frequency)
+    difference = abs(frequency / stated.lowest_frequency - 1.0)
+    return frequency if difference > frequency_error(record, stated.waveform) else None
 
 
 def frequency_error(record: Record, waveform: str) -> float:
     """Relative error of the frequency that a record of a waveform shows by itself; 0 where it shows none."""
-    found = record.frequency()
-    if found is None:
+    frequency = record.frequency()
+    if frequency is None:
         return 0.0
-    of_step = record.time_step / float(record.time[-1] - record.time[0])
-    if waveform not in _SMOOTH:  # an edge between two samples may lie anywhere there
-        return _EDGE_STEPS * of_step
-    return max(_SMOOTH_STEPS * of_step, _by_correlation(record, found))
+    step = record.time_step / float(record.time[-1] - record.time[0])
+    if waveform not in _SMOOTH_WAVEFORMS:  # an edge between two samples may lie anywhere there
+        return _EDGE_STEPS * step
+    return max(0.5 * step, _correlation_error(record, frequency))
 
 
-def _by_correlation(record: Record, frequency: float) -> float:
+def _correlation_error(record: Record, frequency: float) -> float:
     """Relative error of `Record.frequency`, however fine the samples: what is correlated changes with the lag."""
     periods = frequency * float(record.time[-1] - record.time[0])
     noise = record.noise(record.leading) / float(np.std(record[record.leading]))
-    return _LAG * (1.0 + _NOISY * noise**2) / periods**2
+    # a smooth signal's, and a thousand times as much where the noise is as large as the signal
+    return 4e-4 * (1.0 + 1000.0 * noise**2) / periods**2
 
 
-def _by_edges(record: Record, frequency: float) -> float:
+def _frequency_from_edges(record: Record, frequency: float) -> float:
     """A better frequency (Hz) of a signal with edges: one part of it, compared with others as long, finds itself."""
     time, count = record.time, record.time.size
     step = float(time[-1] - time[0]) / (count - 1)
     periods = int(2.0 / 3.0 * frequency * step * count)
     lag = periods / (frequency * step)
-    reach = math.ceil(_OF_EDGES * lag * _by_correlation(record, frequency))
+    reach = math.ceil(3.0 * lag * _correlation_error(record, frequency))  # which is a smooth signal's error
     length = count - round(lag) - 2 * reach
     if periods < 1 or reach <= _EDGE_STEPS or length < 1:
         return frequency
-    values = evenly(time, record[record.leading])
+    values = resample_uniform(time, record[record.leading])
 
-    def unlike(lag: int) -> float:
+    def squared_difference(lag: int) -> float:
         off = values[lag : lag + length] - values[:length]
         return float(off @ off)
 
     best, stride = round(lag), reach
     while stride > 1:
-        reach, stride = stride, max(stride // _PLACES, 1)
-        best = min(range(best - reach, best + reach + 1, stride), key=unlike)
+        reach, stride = stride, max(stride // 10, 1)
+        best = min(range(best - reach, best + reach + 1, stride), key=squared_difference)
     return periods / (best * step)
 
 
@@ -291,7 +232,7 @@ def has_ideal_edges(drive: Drive) -> bool:
     return isinstance(drive.wave if isinstance(drive, Burst) else drive, Square)
 
 
-def jumps_within(drive: Drive, time: np.ndarray, margin: float) -> Bool[np.ndarray, " samples"]:
+def ideal_edge_mask(drive: Drive, time: np.ndarray, margin: float) -> Bool[np.ndarray, " samples"]:
     """Which times lie within a margin (s) of an ideal edge of a square wave."""
     before, after = (_voltage(drive, t, True) for t in (time - margin, time + margin))
     return np.abs(after - before) > 1e-9 * np.ptp(after)
@@ -299,7 +240,7 @@ def jumps_within(drive: Drive, time: np.ndarray, margin: float) -> Bool[np.ndarr
 
 def _voltage(drive: Drive, time: np.ndarray, steady_state: bool) -> np.ndarray:
     """The drive at `time`; from rest there is none before t = 0."""
-    return np.asarray(_value(drive, padded(time), steady_state))[: time.size]
+    return np.asarray(_value(drive, pad_samples(time), steady_state))[: time.size]
 
 
 @eqx.filter_jit
@@ -309,20 +250,20 @@ def _value(drive: Drive, time: ArrayLike, steady_state: bool) -> Array:
 
 
 @eqx.filter_jit
-def _shifted(drive: Drive, time: Array, shifts: Array, steady_state: bool) -> Float[Array, "shifts times"]:
+def _shifted_voltages(drive: Drive, time: Array, shifts: Array, steady_state: bool) -> Float[Array, "shifts times"]:
     return jax.vmap(lambda shift: _value(drive, time - shift, steady_state))(shifts)
 
 
-def slope_of(choice: DriveChoice, time: np.ndarray) -> Float[np.ndarray, " samples"]:
+def drive_slope(choice: DriveModel, time: np.ndarray) -> Float[np.ndarray, " samples"]:
     """dV/dt of the drive at the record's times, V/s."""
-    return np.asarray(_slope(choice.drive, padded(time - choice.shift), choice.steady_state))[: time.size]
+    return np.asarray(_slope(choice.drive, pad_samples(time - choice.shift), choice.steady_state))[: time.size]
 
 
-def unit_response(choice: DriveChoice, time: np.ndarray, tau: float) -> Float[np.ndarray, " samples"]:
+def unit_response(choice: DriveModel, time: np.ndarray, tau: float) -> Float[np.ndarray, " samples"]:
     """The drive's response of one time constant (s) at the record's times, V."""
-    # an array: for a number jit would compile anew
-    found = _highpass(choice.drive, padded(time - choice.shift), jnp.asarray(tau), choice.steady_state)
-    return np.asarray(found)[: time.size]
+    # tau as an array: for a number jit would compile anew
+    voltage = _highpass(choice.drive, pad_samples(time - choice.shift), jnp.asarray(tau), choice.steady_state)
+    return np.asarray(voltage)[: time.size]
 
 
 @eqx.filter_jit
@@ -335,45 +276,48 @@ def _highpass(drive: Drive, time: ArrayLike, tau: Array, steady_state: bool) -> 
     return highpass(drive, time, tau, steady_state=steady_state)
 
 
-def _align(record: Record, drive: Drive, frequency: float, steady_state: bool) -> float:
+def _align(
+    record: Record, drive: Drive, frequency: float, steady_state: bool, min_samples: int = 20_000, n_parts: int = 8
+) -> float:
     """The shift (s) that lays the drive on the record, 0 unless the record is plainly shifted.
 
     On V where it was recorded, otherwise on Vsc through its best linear combination of the drive and
-    the drive's integral.
+    the drive's integral. A long record is looked at by its beginning, of `min_samples` or three periods, and the
+    shifted drives in `n_parts`, which bounds memory.
     """
-    few = slice(0, max(_ALIGNED, math.ceil(3.0 / frequency / record.time_step)))  # of a long record, its beginning
+    few = slice(0, max(min_samples, math.ceil(3.0 / frequency / record.time_step)))
     if "V" not in record and "Vsc" not in record:
         raise InputError(f"{record.source}: I alone does not show where the drive begins; record V_V as well")
     time, target = record.time[few], record[record.leading][few]
     target = target - target.mean()
 
-    def left(shifts: np.ndarray) -> np.ndarray:
-        waves = np.asarray(_shifted(drive, padded(time), shifts, steady_state))[:, : time.size]
-        parts = np.array_split(waves, _PARTS)  # which bounds memory
-        return np.concatenate([_left_by(part, target, "V" not in record) for part in parts])
+    def sums_of_squares(shifts: np.ndarray) -> np.ndarray:
+        waves = np.asarray(_shifted_voltages(drive, pad_samples(time), shifts, steady_state))[:, : time.size]
+        parts = np.array_split(waves, n_parts)
+        return np.concatenate([_residual_sums_of_squares(part, target, "V" not in record) for part in parts])
 
     shifts = np.arange(0.0, 1.0, 1.0 / 128.0) / frequency
-    errors = left(shifts)
+    errors = sums_of_squares(shifts)
     best = int(np.argmin(errors))
     fine = shifts[best] + np.linspace(-1.0, 1.0, 129) / (128.0 * frequency)
-    left_fine = left(fine)
-    if errors[0] <= 2.0 * left_fine.min():
+    fine_errors = sums_of_squares(fine)
+    if errors[0] <= 2.0 * fine_errors.min():
         return 0.0
     # the middle of what fits equally well: an ideal edge may lie anywhere between two samples
-    shift = float(np.mean(fine[left_fine <= left_fine.min() * (1.0 + 25.0 / target.size)]))
+    shift = float(np.mean(fine[fine_errors <= fine_errors.min() * (1.0 + 25.0 / target.size)]))
     return shift - 1.0 / frequency if shift > 0.5 / frequency else shift
 
 
-def _left_by(
-    waves: Float[np.ndarray, "waves times"], target: Float[np.ndarray, " times"], integrated: bool
+def _residual_sums_of_squares(
+    waves: Float[np.ndarray, "waves times"], target: Float[np.ndarray, " times"], use_integral: bool
 ) -> Float[np.ndarray, " waves"]:
     """The least sum of squares that each wave (and its integral) leaves of a target of mean 0; inf if upside down."""
     waves = waves - waves.mean(axis=1, keepdims=True)
     integral = np.cumsum(waves, axis=1)
-    columns = np.stack([waves, integral - integral.mean(axis=1, keepdims=True)][: 1 + integrated], axis=1)
+    columns = np.stack([waves, integral - integral.mean(axis=1, keepdims=True)][: 1 + use_integral], axis=1)
     products = columns @ target
     weights = np.vecdot(np.linalg.pinv(columns @ columns.mT, hermitian=True), products[:, None])
     square = float(target @ target)
-    # else half a period off; what is left of records without noise is rounding
-    left = np.maximum(square - np.vecdot(weights, products), _ROUNDING * square)
-    return np.where(weights[:, 0] > 0.0, left, math.inf)
+    # what is left of records without noise is rounding
+    remainders = np.maximum(square - np.vecdot(weights, products), 1e-12 * square)
+    return np.where(weights[:, 0] > 0.0, remainders, math.inf)

@@ -14,26 +14,27 @@ from jaxtyping import Float
 from fitact import summary
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.experiment.fisher import Experiment, covariance_root
+from fitact.experiment.fisher import Experiment, covariance_factor
 from fitact.fitting import derived, remarks
-from fitact.fitting.channel_fit import TraceFit, compare
-from fitact.fitting.drive_choice import DriveChoice
-from fitact.fitting.identifiability import Identifiability, assess
-from fitact.fitting.laplace import Laplace
-from fitact.fitting.least_squares import Solved, solve
+from fitact.fitting.channel_fit import ChannelFit, information_criteria
+from fitact.fitting.drive_choice import DriveModel
+from fitact.fitting.identifiability import assess_identifiability
+from fitact.fitting.laplace import FitResult, Laplace
+from fitact.fitting.least_squares import LeastSquaresResult, solve
 from fitact.fitting.levenberg_marquardt import Optima, result_message
-from fitact.fitting.multistart import begin, better, explore
-from fitact.fitting.problem import Problem, pose
-from fitact.fitting.profile import DERIVED, Interval, intervals
-from fitact.fitting.residual_statistics import together
-from fitact.fitting.verdict import misfits, verdict
-from fitact.likelihood import certificate as compressed
+from fitact.fitting.multistart import choose_start, find_optima, lower_optimum
+from fitact.fitting.problem import Problem, build_problem
+from fitact.fitting.profile import PROFILE_QUANTITIES, Interval, profile_intervals
+from fitact.fitting.residual_statistics import pooled_statistics
+from fitact.fitting.verdict import diagnose_fit, misfit_warnings
+from fitact.likelihood import certificate
 from fitact.likelihood.noise import scale_information
-from fitact.model.skin import constant
+from fitact.model.skin import constant_skin_circuit
 from fitact.scene.scene import Scene
-from fitact.units import engineering, unit_of
+from fitact.tables import align_rows, join_lines
+from fitact.units import format_engineering, quantity_unit
 
-GOOD = "The fit is at its optimum and leaves only noise."
+SUCCESS_MESSAGE = "The fit is at its optimum and leaves only noise."
 _SKIN = ("Rsc", "Csc", "Ci")
 _RESPONSE = {
     "constant": "exact",
@@ -43,27 +44,17 @@ _RESPONSE = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Fit(Laplace):
+class Fit(FitResult):
     """The best parameters, their Laplace approximation, and a judgement.
 
     Attributes:
         traces: the channels fitted, by record.
-        result: name of a member of `RESULTS`; `message` is its sentence.
-        figures: of all traces together: chi2_reduced, steps and the like.
-        identifiability: what the records can and cannot tell.
-        warnings: sentences.
         compression_error: of the compressed log-likelihood near the optimum; None: samples are summed.
-        scene: the first record's.
         experiment: the measurement that was done, at the optimum.
     """
 
-    traces: tuple[TraceFit, ...]
-    result: str
-    figures: dict[str, float]
-    identifiability: Identifiability
-    warnings: tuple[str, ...]
+    traces: tuple[ChannelFit, ...]
     compression_error: float | None
-    scene: Scene
     experiment: Experiment
 
     @property
@@ -77,7 +68,7 @@ class Fit(Laplace):
         return tuple({id(trace.record): trace.record for trace in self.traces}.values())
 
     @property
-    def choice(self) -> DriveChoice:
+    def choice(self) -> DriveModel:
         """The drive of `record`."""
         return self.traces[0].choice
 
@@ -103,14 +94,9 @@ class Fit(Laplace):
         return "; ".join(reason for reason, trace in reasons.items() if trace.full_because)
 
     @property
-    def trusted(self) -> bool:
-        """Whether nothing stands against the answer."""
-        return self.result == "successful"
-
-    @property
     def message(self) -> str:
         """The result as a sentence."""
-        return GOOD if self.trusted else result_message(self.result)
+        return SUCCESS_MESSAGE if self.trusted else result_message(self.result)
 
     @property
     def point_names(self) -> tuple[str, ...]:
@@ -120,13 +106,13 @@ class Fit(Laplace):
     @property
     def point(self) -> Float[np.ndarray, " coordinates"]:
         """The optimum in the coordinates of the posterior."""
-        return np.append(self.theta, np.log([trace.sigma for trace in self.traces]))
+        return np.append(self.theta, np.log(self.laplace.sigma))
 
     @property
     def point_root(self) -> Float[np.ndarray, "coordinates coordinates"]:
         """As `covariance_root`, in the coordinates of the posterior; sigma's by its Fisher information."""
         freedom = np.array([trace.figures["degrees_of_freedom"] for trace in self.traces])
-        information = freedom * [scale_information(trace.noise) for trace in self.likelihood.traces]
+        information = freedom * [scale_information(trace.noise) for trace in self.likelihood.channels]
         size = self.theta.size
         root = np.diag(np.append(np.zeros(size), information**-0.5))
         root[:size, :size] = self.covariance_root
@@ -141,7 +127,7 @@ class Fit(Laplace):
         Raises:
             InputError: there is no quantity of that name, or the level is not between 0 and 1.
         """
-        return self._intervals((name,), level, prior)[name]
+        return profile_intervals(self.laplace, (name,), level, prior)[name]
 
     def intervals(self, level: float = 0.95, *, prior: bool = True) -> dict[str, Interval]:
         """As `profile`, of all parameters, and of g, b and force_mean.
@@ -149,22 +135,11 @@ class Fit(Laplace):
         Raises:
             InputError: the level is not between 0 and 1.
         """
-        return self._intervals((*self.names, *DERIVED), level, prior)
-
-    def _intervals(self, names: tuple[str, ...], level: float, prior: bool) -> dict[str, Interval]:
-        _, gradient = self.derive.logs(self.theta, self._sigmas)
-        places = [derived.NAMES.index(name) for name in DERIVED]
-        sd = np.append(self.sd, np.linalg.norm(gradient[places] @ self.covariance_root, axis=1))
-        expected = dict(zip((*self.names, *DERIVED), sd.tolist(), strict=True))
-        return intervals(self.likelihood, self.derive, self.theta, self._sigmas, expected, names, level, prior)
-
-    @property
-    def _sigmas(self) -> Float[np.ndarray, " traces"]:
-        return np.array([trace.sigma for trace in self.traces])
+        return profile_intervals(self.laplace, (*self.names, *PROFILE_QUANTITIES), level, prior)
 
     def model(self) -> dict[str, Any]:
         """What was fitted, by name."""
-        circuit = type(constant(self.likelihood.template)).__name__
+        circuit = type(constant_skin_circuit(self.likelihood.template)).__name__
         return {
             "circuit": {"FinalCircuit": "final", "DirectGround": "direct", "NaturalGround": "natural"}[circuit],
             "skin": self.scene.skin.level,
@@ -190,15 +165,17 @@ class Fit(Laplace):
             {"channel": t.channel, "record": os.path.basename(t.record.source), "label": t.label, **t.figures}
             for t in self.traces
         ]
-        found = {"result": self.result, "message": self.message, "misfit": self.result == "misfit"}
-        return found | self.figures | {"traces": traces}
+        judgement = {"result": self.result, "message": self.message, "misfit": self.result == "misfit"}
+        return judgement | self.figures | {"traces": traces}
 
     def to_dict(self) -> dict[str, Any]:
         """What `fitact fit --json` prints and fit.json holds."""
         return {
             "parameters": self.parameters(),
             "derived": self.derived(),
-            "nuisances": {name: {"unit": unit_of(name), "value": value} for name, value in self._nuisances().items()},
+            "nuisances": {
+                name: {"unit": quantity_unit(name), "value": value} for name, value in self._nuisances().items()
+            },
             "correlation": {"names": list(self.names), "matrix": self.correlation.tolist()},
             "identifiability": self.identifiability.to_dict(),
             "fit": self.judgement(),
@@ -207,27 +184,28 @@ class Fit(Laplace):
         }
 
     def _nuisances(self) -> dict[str, float]:
-        return dict(zip(self.likelihood.sigma_names, self._sigmas.tolist(), strict=True)) | self.linear
+        return dict(zip(self.likelihood.sigma_names, self.laplace.sigma.tolist(), strict=True)) | self.linear
 
     def summary(self) -> str:
         """A table for people: values with errors, correlations, the verdict."""
-        rows = [f"{'':14}{'median':>12}{'± 1 sd':>12}{'contraction':>14}"]
+        cells = [("", "median", "± 1 sd", "contraction")]
         for name, s in (self.parameters() | self.derived()).items():
-            median = engineering(float(s["q50"]), str(s["unit"]))
-            contraction = f"{s['contraction']:14.3f}" if "contraction" in s else ""
-            rows.append(f"{name:14}{median:>12}{summary.width(s):>12}{contraction}")
-        pairs = [(i, j) for i in range(len(self.names)) for j in range(i)]
-        rows += [
-            "nuisances: "
-            + ", ".join(f"{name} {engineering(value, unit_of(name))}" for name, value in self._nuisances().items()),
-            "correlations of the logs: "
-            + ", ".join(f"{self.names[j]}-{self.names[i]} {self.correlation[i, j]:+.3f}" for i, j in pairs),
+            median = format_engineering(float(s["q50"]), str(s["unit"]))
+            contraction = f"{s['contraction']:.3f}" if "contraction" in s else ""
+            cells.append((name, median, summary.format_sd(s), contraction))
+        names, correlation = self.names, self.correlation
+        pairs = [f"{names[j]}-{names[i]} {correlation[i, j]:+.3f}" for i in range(len(names)) for j in range(i)]
+        nuisances = [f"{name} {format_engineering(v, quantity_unit(name))}" for name, v in self._nuisances().items()]
+        rows = [
+            *align_rows(cells, (14, 12, 12, 14)),
+            f"nuisances: {', '.join(nuisances)}",
+            f"correlations of the logs: {', '.join(pairs)}",
             f"reduced chi-square {self.figures['chi2_reduced']:.3f}. {self.message}",
             f"log-likelihood: {self._likelihood()}.",
-            f"force: {summary.BY_FORCE[self.derive.geometry.model]}.",
+            f"force: {summary.FORCE_DESCRIPTIONS[self.derive.geometry.model]}.",
             str(self.identifiability),
         ]
-        return "\n".join([*rows, *(f"warning: {warning}" for warning in self.warnings)])
+        return join_lines(rows, self.warnings)
 
     __str__ = summary
 
@@ -239,7 +217,7 @@ def fit(
     prior: bool = True,
     start: Mapping[str, float] | None = None,
     starts: int = 1,
-    tolerance: float = compressed.TOLERANCE,
+    tolerance: float = certificate.TOLERANCE,
 ) -> Fit:
     """Fit one circuit to a record, or to several jointly, by Levenberg-Marquardt in log-parameters with their prior.
 
@@ -262,43 +240,43 @@ def fit(
         InputError: a record cannot come from this circuit, the scene asks for what is not available, a start is
             none of its parameters, or the tolerance is no number of 0 or more.
     """
-    return fitted(record, scene, prior=prior, start=start, starts=starts, tolerance=tolerance)
+    records = (record,) if isinstance(record, Record) else tuple(record)
+    scenes = (scene,) * len(records) if scene is None or isinstance(scene, Scene) else tuple(scene)
+    return fit_records(records, scenes, prior=prior, start=start, starts=starts, tolerance=tolerance)
 
 
-def fitted(
-    record: Record | Sequence[Record],
-    scene: Scene | Sequence[Scene] | None,
+def fit_records(
+    records: tuple[Record, ...],
+    scenes: tuple[Scene | None, ...],
+    drives: Sequence[DriveModel | None] = (),
     *,
     prior: bool = True,
     start: Mapping[str, float] | None = None,
     starts: int = 1,
-    tolerance: float = compressed.TOLERANCE,
-    remedies: bool = True,
+    tolerance: float = certificate.TOLERANCE,
 ) -> Fit:
-    """As `fit`, on wish without the remedies of `Identifiability`, which take a sixth of the time."""
+    """Fit as `fit`; `drives` are those of the first records where they have been chosen already."""
     if not 0.0 <= tolerance < math.inf:
         raise InputError(f"tolerance = {tolerance}: give an error of the log-likelihood, 0.001 or so, or 0 for none")
     if starts < 1:
         raise InputError(f"starts = {starts}: give 1 or more")
-    records = (record,) if isinstance(record, Record) else tuple(record)
-    scenes = (scene,) * len(records) if scene is None or isinstance(scene, Scene) else tuple(scene)
     if not records or len(scenes) != len(records):
         raise InputError(f"{len(records)} records and {len(scenes)} scenes: give one scene for all, or one for each")
-    if len({each.fingerprint for each in records}) < len(records):
+    if len({record.fingerprint for record in records}) < len(records):
         raise InputError(
             f"{records[0].source}: one record was given twice, which would count its samples twice; drop one"
         )
-    for each in scenes:
-        (each or Scene()).require_available(fit=True)
+    for scene in scenes:
+        (scene or Scene()).require_available(fit=True)
     with jax.enable_x64(True):
         try:
-            problem = pose(records, scenes, prior)
-            solved, certified, root = _solved(problem, tolerance, start)
-            optima = explore(solved, starts) if starts > 1 else None
-            lower = None if optima is None else better(optima, solved)
+            problem = build_problem(records, scenes, prior, drives)
+            solved, certified, root = _solve_problem(problem, tolerance, start)
+            optima = find_optima(solved, starts) if starts > 1 else None
+            lower = None if optima is None else lower_optimum(optima, solved)
             if lower is not None:
-                solved, certified, root = _solved(problem, tolerance, lower)
-            return _judged(problem, solved, certified, root, optima, scenes[0], remedies)
+                solved, certified, root = _solve_problem(problem, tolerance, lower)
+            return _assemble_fit(problem, solved, certified, root, optima, without_scene=scenes[0] is None)
         except np.linalg.LinAlgError as error:
             raise InputError(
                 f"{records[0].source}: the channels cannot be computed with ({error}); check for a huge offset or a"
@@ -306,70 +284,72 @@ def fitted(
             ) from error
 
 
-def _solved(
+def _solve_problem(
     problem: Problem, tolerance: float, start: Mapping[str, float] | None
-) -> tuple[Solved, compressed.Certified, np.ndarray]:
+) -> tuple[LeastSquaresResult, certificate.CertifiedLikelihood, np.ndarray]:
     """The fit, with compressions where they hold, and its covariance's root; again where they turn out not to."""
-    (likelihood, reasons), theta_0 = problem.compressed(tolerance), begin(problem, start)
+    (likelihood, reasons), theta_0 = problem.compress_likelihood(tolerance), choose_start(problem, start)
     noise = np.array([source.noise for source in problem.sources])
-    freeable = tuple(source.freeable for source in problem.sources)
+    freeable = tuple(source.optional_nuisances for source in problem.sources)
     while True:
         solved = solve(likelihood, theta_0, noise, freeable)
-        root = covariance_root(np.concatenate(solved.jacobian), solved.likelihood.prior_root)
+        root = covariance_factor(np.concatenate(solved.jacobian), solved.likelihood.prior_factor)
         theta, sigma = np.asarray(solved.theta), np.asarray(solved.sigma)
-        certified = compressed.certify(solved.likelihood, reasons, theta, root, sigma, tolerance)
+        certified = certificate.certify(solved.likelihood, reasons, theta, root, sigma, tolerance)
         failed = [
             i
-            for i, (trace, reason) in enumerate(zip(solved.likelihood.traces, certified.reasons, strict=True))
+            for i, (trace, reason) in enumerate(zip(solved.likelihood.channels, certified.reasons, strict=True))
             if reason and trace.compression is not None
         ]
         if not failed:
             return solved, certified, root
         for i in failed:
-            likelihood = likelihood.with_trace(i, likelihood.traces[i].summed())
+            likelihood = likelihood.replace_channel(i, likelihood.channels[i].without_compression())
         reasons = certified.reasons
 
 
-def _judged(
+def _assemble_fit(
     problem: Problem,
-    solved: Solved,
-    certified: compressed.Certified,
+    solution: LeastSquaresResult,
+    certified: certificate.CertifiedLikelihood,
     root: Float[np.ndarray, "parameters parameters"],
     optima: Optima | None,
-    scene: Scene | None,
-    remedies: bool,
+    without_scene: bool,
 ) -> Fit:
-    likelihood, theta, sigma = certified.likelihood, np.asarray(solved.theta), np.asarray(solved.sigma)
-    source, given = problem.sources[0], scene or Scene()
-    circuit = likelihood.circuit(jnp.asarray(theta))
-    derive = derived.for_fit(likelihood, source.record, source.choice, given, float(circuit.b))
-    _, gradient = derive.logs(theta, sigma)
+    likelihood, theta, sigma = certified.likelihood, np.asarray(solution.theta), np.asarray(solution.sigma)
+    first = problem.sources[0]
+    b = float(likelihood.circuit(jnp.asarray(theta)).b)
+    derive = derived.derived_from_fit(likelihood, first.record, first.choice, first.scene, b)
+    laplace = Laplace(theta, root, sigma, likelihood, derive)
     traces = tuple(
-        TraceFit.of(likelihood, i, theta, float(sigma[i]), source, certified.reasons[i])
+        ChannelFit.from_optimum(likelihood, i, theta, float(sigma[i]), source, certified.reasons[i])
         for i, source in enumerate(problem.sources)
     )
-    figures = together([trace.figures for trace in traces]) | {"steps": int(solved.steps)} | compare(theta.size, traces)
+    figures = (
+        pooled_statistics([trace.figures for trace in traces])
+        | {"steps": int(solution.steps)}
+        | information_criteria(theta.size, traces)
+    )
     if optima is not None:
-        figures |= {"optima": len(optima.reached), "starts_failed": optima.failed}
-    force = gradient[derived.NAMES.index("force_mean")]
-    on_traces = [
-        note
-        for source, trace in zip(problem.sources, traces, strict=True)
-        for note in (*source.notes, *remarks.on_trace(source.record, source.choice, trace.channel, trace.figures))
-    ]
-    on_all = remarks.on_parameters(likelihood, theta, scene is None)
+        figures |= {"optima": len(optima.start_counts), "starts_failed": optima.n_failed}
+    warnings: list[str] = []
+    for source, trace in zip(problem.sources, traces, strict=True):
+        warnings += source.notes
+        warnings += remarks.channel_warnings(source.record, source.choice, trace.channel, trace.figures)
+    warnings += misfit_warnings(traces)
+    warnings += remarks.parameter_warnings(likelihood, theta, without_scene)
     experiment = problem.experiment(likelihood, theta, sigma)
+    force_gradient = laplace.log_gradient("force_mean")
     return Fit(
-        theta=theta,
-        covariance_root=root,
-        traces=traces,
-        result=verdict(solved, root, traces, problem.sources, optima),
+        laplace=laplace,
+        result=diagnose_fit(solution, root, traces, problem.sources, optima),
         figures=figures,
-        identifiability=assess(likelihood.names, root, likelihood.prior_root, force, experiment, remedies),
-        warnings=tuple(dict.fromkeys([*on_traces, *misfits(traces), *on_all])),
+        identifiability=assess_identifiability(
+            likelihood.names, root, likelihood.prior_factor, force_gradient, experiment
+        ),
+        scene=first.scene,
+        warnings=tuple(dict.fromkeys(warnings)),
+        traces=traces,
         compression_error=certified.error,
-        likelihood=likelihood,
-        derive=derive,
-        scene=given,
         experiment=experiment,
     )

@@ -13,24 +13,17 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.fitting.levenberg_marquardt import minimise
-from fitact.fitting.timing import clock_drop, opened
-from fitact.likelihood.channel import TIMING, Seen, Trace
+from fitact.fitting.timing import clock_r_squared, free_timing
+from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
-from fitact.likelihood.noise import first_order, student_curvature, student_weight
+from fitact.likelihood.noise import fit_ar1, student_curvature, student_weight
 
-_SETTLED = 0.01  # relative change of the noise, below which no further round changes what follows
-_ROUNDS = 6
-_SCALE_STEPS = 40  # of Student's scale, each of which gains a quarter of a digit
-NUISANCES = {  # by name, the columns of `LINEAR` that a trace may ask for; beside these, its `TIMING`
-    "offset": (0,),
-    "drift": (1,),
-    "hum_50Hz": (2, 3),
-    "hum_60Hz": (4, 5),
-}
-EVIDENCE = 10.0  # a nuisance is freed when it lowers the Bayesian information criterion by this much
+# by name, the columns of `LINEAR_NUISANCES` that a fit may free; beside these there are `TIMING_NUISANCES`
+NUISANCES = {"offset": (0,), "drift": (1,), "hum_50Hz": (2, 3), "hum_60Hz": (4, 5)}
+MIN_BIC_DECREASE = 10.0  # a nuisance is freed when it lowers the Bayesian information criterion by this much
 
 
-class Solved(eqx.Module):
+class LeastSquaresResult(eqx.Module):
     """Where a fit ended; by trace: rows are its samples, or their coordinates.
 
     Attributes:
@@ -49,65 +42,74 @@ class Solved(eqx.Module):
     result: Any
     steps: Array
     jacobian: tuple[Float[Array, "rows parameters"], ...]
-    remainder: tuple[Float[Array, " rows"], ...]
+    residuals: tuple[Float[Array, " rows"], ...]
     shapes: tuple[Float[Array, "columns rows"], ...]
     slope: tuple[Float[Array, " rows"], ...]
 
 
-def least_squares(likelihood: Likelihood, start: Array, noise: Array) -> Solved:
-    """In rounds: with the noise as given, then with that of the residuals, until it has settled."""
+def least_squares(
+    likelihood: Likelihood, start: Array, noise: Array, noise_tolerance: float = 0.01, max_rounds: int = 6
+) -> LeastSquaresResult:
+    """Fit in rounds: with the noise as given, then with that of the residuals, until it has settled.
+
+    It has where it changes by less than `noise_tolerance` of itself: no further round changes what follows.
+    """
     needed, steps = likelihood.without_samples(), jnp.zeros((), dtype=int)
     theta, sigma = start, noise
-    for _ in range(_ROUNDS):
-        solved = _round(needed, theta, sigma)
+    for _ in range(max_rounds):
+        solved = _solve_round(needed, theta, sigma)
         change = float(jnp.max(jnp.abs(solved.sigma / sigma - 1.0)))
         theta, sigma, steps = solved.theta, solved.sigma, steps + solved.steps
-        if not change > _SETTLED:
+        if not change > noise_tolerance:
             break
     return dataclasses.replace(solved, likelihood=likelihood, steps=steps)
 
 
 @eqx.filter_jit
-def _round(likelihood: Likelihood, start: Array, sigma: Array) -> Solved:
+def _solve_round(likelihood: Likelihood, start: Array, sigma: Array) -> LeastSquaresResult:
     found = minimise(lambda theta: (likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)), start)
-    theta, parts = found.theta, list(likelihood.each(found.theta))
+    theta, parts = found.theta, list(likelihood.channels_and_inputs(found.theta))
     sizes = [trace.rows + len(trace.columns) for trace, _ in parts]
     of_traces = jnp.split(found.jacobian, np.cumsum(sizes))[:-1]
-    remainder = tuple(trace.linear(seen, s)[0] for (trace, seen), s in zip(parts, sigma, strict=True))
+    remainder = tuple(trace.fit_nuisances(seen, s)[0] for (trace, seen), s in zip(parts, sigma, strict=True))
     root = [_root_weight(trace, left / s) for (trace, _), left, s in zip(parts, remainder, sigma, strict=True)]
     if any(trace.noise == "student" for trace, _ in parts):
-        of_traces = _informing(likelihood, theta, sigma, remainder)
+        of_traces = _information_jacobian(likelihood, theta, sigma, remainder)
     used = theta.size / likelihood.count  # of a trace's samples, by the parameters
-    return Solved(
+    return LeastSquaresResult(
         likelihood=likelihood,
         theta=theta,
-        sigma=jnp.stack([_noise(trace, left, used) for trace, left in zip(likelihood.traces, remainder, strict=True)]),
+        sigma=jnp.stack(
+            [_noise(trace, left, used) for trace, left in zip(likelihood.channels, remainder, strict=True)]
+        ),
         result=found.result,
         steps=found.steps,
         jacobian=tuple(of_traces),
-        remainder=tuple(w * left for w, left in zip(root, remainder, strict=True)),
-        shapes=tuple(w * trace.before_linear(seen)[1] for w, (trace, seen) in zip(root, parts, strict=True)),
-        slope=tuple(w * trace.slope(seen) for w, (trace, seen) in zip(root, parts, strict=True)),
+        residuals=tuple(w * left for w, left in zip(root, remainder, strict=True)),
+        shapes=tuple(w * trace.residuals_and_shapes(seen)[1] for w, (trace, seen) in zip(root, parts, strict=True)),
+        slope=tuple(w * trace.whitened_delay_derivative(seen) for w, (trace, seen) in zip(root, parts, strict=True)),
     )
 
 
-def _root_weight(trace: Trace, z: Array) -> ArrayLike:
+def _root_weight(trace: ChannelLikelihood, z: Array) -> ArrayLike:
     """Of the samples, in reweighted least squares."""
     return jnp.sqrt(student_weight(z)) if trace.noise == "student" else 1.0
 
 
-def _informing(
-    likelihood: Likelihood, theta: Array, sigma: Array, remainder: tuple[Array, ...]
+def _information_jacobian(
+    likelihood: Likelihood, theta: Array, sigma: Array, residuals: tuple[Array, ...]
 ) -> list[Float[Array, "rows parameters"]]:
     """The Jacobian whose square is the curvature of -log-likelihood: that of Student's residuals is steeper."""
 
-    def whitened(theta: Array) -> list[Array]:
-        parts = zip(likelihood.each(theta), sigma, strict=True)
-        found = ((trace.linear(seen, s), s) for (trace, seen), s in parts)
+    def whitened_residuals(theta: Array) -> list[Array]:
+        parts = zip(likelihood.channels_and_inputs(theta), sigma, strict=True)
+        found = ((trace.fit_nuisances(seen, s), s) for (trace, seen), s in parts)
         return [jnp.concatenate([left / s, beta]) for (left, beta, _), s in found]
 
     scaled = []
-    for trace, jacobian, left, s in zip(likelihood.traces, jax.jacfwd(whitened)(theta), remainder, sigma, strict=True):
+    for trace, jacobian, left, s in zip(
+        likelihood.channels, jax.jacfwd(whitened_residuals)(theta), residuals, sigma, strict=True
+    ):
         if trace.noise == "student":
             z = left / s
             weight = student_weight(z)
@@ -117,116 +119,120 @@ def _informing(
     return scaled
 
 
-def _noise(trace: Trace, remainder: Array, used: Array) -> Array:
+def _noise(trace: ChannelLikelihood, residuals: Array, parameter_fraction: Array) -> Array:
     """Its standard deviation, or Student's scale, not below the least that is believed."""
-    counted = jnp.maximum(trace.count * (1.0 - used), 1)
-    sigma = jnp.sqrt(jnp.sum(jnp.square(remainder)) / counted)
-    sigma = jnp.maximum(sigma, trace.least_noise)
+    counted = jnp.maximum(trace.count * (1.0 - parameter_fraction), 1)
+    sigma = jnp.sqrt(jnp.sum(jnp.square(residuals)) / counted)
+    sigma = jnp.maximum(sigma, trace.noise_floor)
     if trace.noise != "student":
         return sigma
 
-    def reweighted(_: int, sigma: Array) -> Array:
-        squares = student_weight(remainder / sigma) * jnp.square(remainder)
-        return jnp.maximum(jnp.sqrt(jnp.sum(squares) / counted), trace.least_noise)
+    def update_scale(_: int, sigma: Array) -> Array:
+        squares = student_weight(residuals / sigma) * jnp.square(residuals)
+        return jnp.maximum(jnp.sqrt(jnp.sum(squares) / counted), trace.noise_floor)
 
-    return lax.fori_loop(0, _SCALE_STEPS, reweighted, sigma)
+    return lax.fori_loop(0, 40, update_scale, sigma)  # each step gains a quarter of a digit
 
 
 def solve(
     likelihood: Likelihood,
     start: Float[np.ndarray, " parameters"],
     noise: Float[np.ndarray, " traces"],
-    freeable: tuple[tuple[str, ...], ...],
-) -> Solved:
-    """Fit; then free nuisances (of each trace, `NUISANCES` and `TIMING`), one at a time, while one is asked for."""
-    solved = _coloured(likelihood, jnp.asarray(start), jnp.asarray(noise, dtype=float))
-    for _ in range(sum(map(len, freeable))):
-        gains = _evidence(solved, freeable)
+    optional_nuisances: tuple[tuple[str, ...], ...],
+) -> LeastSquaresResult:
+    """Fit, then free nuisances (`NUISANCES`, `TIMING_NUISANCES`) one at a time while one is asked for."""
+    solved = _solve_coloured_noise(likelihood, jnp.asarray(start), jnp.asarray(noise, dtype=float))
+    for _ in range(sum(map(len, optional_nuisances))):
+        gains = _bic_decreases(solved, optional_nuisances)
         which, name = max(gains, key=gains.__getitem__, default=(0, ""))
-        if not name or not gains[which, name] > EVIDENCE:
+        if not name or not gains[which, name] > MIN_BIC_DECREASE:
             break
-        likelihood, theta = _freed(solved, which, name)
-        solved = _coloured(likelihood, theta, solved.sigma)
+        likelihood, theta = _add_nuisance(solved, which, name)
+        solved = _solve_coloured_noise(likelihood, theta, solved.sigma)
     return solved
 
 
-def _coloured(likelihood: Likelihood, start: Array, noise: Array) -> Solved:
+def _solve_coloured_noise(likelihood: Likelihood, start: Array, noise: Array) -> LeastSquaresResult:
     """Fit; where a trace's noise is AR(1), again with the coefficient that the residuals show.
 
     It is then held: its error and the parameters' are uncorrelated in the limit of many samples (the information
     is block-diagonal), so that not knowing it exactly widens no parameter.
     """
     solved = least_squares(likelihood, start, noise)
-    for i, trace in enumerate(likelihood.traces):
+    for i, trace in enumerate(likelihood.channels):
         if trace.noise == "ar1":
             white = dataclasses.replace(trace, whitening=None)
-            left = np.asarray(_remainder(white, likelihood.seen(solved.theta, i), solved.sigma[i]))
+            left = np.asarray(_residuals(white, likelihood.channel_inputs(solved.theta, i), solved.sigma[i]))
             counted = trace.weights > 0.0
-            whitening = first_order(left, counted).whitening(counted)
-            likelihood = likelihood.with_trace(i, dataclasses.replace(trace, whitening=whitening))
+            whitening = fit_ar1(left, counted).whitening(counted)
+            likelihood = likelihood.replace_channel(i, dataclasses.replace(trace, whitening=whitening))
     if likelihood is solved.likelihood:
         return solved
     return least_squares(likelihood, solved.theta, solved.sigma)
 
 
 @eqx.filter_jit
-def _remainder(trace: Trace, seen: Seen, sigma: Array) -> Array:
-    return trace.linear(seen, sigma)[0]
+def _residuals(trace: ChannelLikelihood, inputs: ChannelInputs, sigma: Array) -> Array:
+    return trace.fit_nuisances(inputs, sigma)[0]
 
 
-def _freed(solved: Solved, which: int, name: str) -> tuple[Likelihood, Array]:
-    """The likelihood with a nuisance of the trace `which` freed, and where to go on from."""
-    likelihood, theta = solved.likelihood, solved.theta
-    trace = likelihood.traces[which]
-    if name in TIMING:
-        trace = opened(trace, likelihood.seen(theta, which), name)
-        new, before = likelihood.with_trace(which, trace).names, likelihood.names
+def _add_nuisance(solution: LeastSquaresResult, index: int, name: str) -> tuple[Likelihood, Array]:
+    """The likelihood with a nuisance of the trace `index` freed, and where to go on from."""
+    likelihood, theta = solution.likelihood, solution.theta
+    trace = likelihood.channels[index]
+    if name in TIMING_NUISANCES:
+        trace = free_timing(trace, likelihood.channel_inputs(theta, index), name)
+        new, before = likelihood.replace_channel(index, trace).names, likelihood.names
         theta = jnp.array([theta[before.index(n)] if n in before else 0.0 for n in new])
     else:
         sd = trace.linear_sd.at[np.array(NUISANCES[name])].set(10.0 * jnp.ptp(trace.observed))
         trace = dataclasses.replace(trace, linear_sd=sd)
-    return likelihood.with_trace(which, trace), theta
+    return likelihood.replace_channel(index, trace), theta
 
 
-def _evidence(solved: Solved, freeable: tuple[tuple[str, ...], ...]) -> dict[tuple[int, str], float]:
+def _bic_decreases(
+    solution: LeastSquaresResult, optional_nuisances: tuple[tuple[str, ...], ...]
+) -> dict[tuple[int, str], float]:
     """By how much freeing each nuisance would lower the Bayesian information criterion, to first order."""
-    likelihood, sigma = solved.likelihood, np.asarray(solved.sigma)
-    remainders = [np.asarray(x) / s for x, s in zip(solved.remainder, sigma, strict=True)]
+    likelihood, sigma = solution.likelihood, np.asarray(solution.sigma)
+    remainders = [np.asarray(x) / s for x, s in zip(solution.residuals, sigma, strict=True)]
     starts = np.cumsum([0, *(x.size for x in remainders)])
-    columns = [np.concatenate([np.asarray(j)[: x.size] for j, x in zip(solved.jacobian, remainders, strict=True)])]
+    columns = [np.concatenate([np.asarray(j)[: x.size] for j, x in zip(solution.jacobian, remainders, strict=True)])]
 
-    def alone(which: int, shapes: np.ndarray) -> np.ndarray:
+    def pad_columns(index: int, shapes: np.ndarray) -> np.ndarray:
         """Columns of one trace, which are nothing in the others."""
-        around = (starts[which], starts[-1] - starts[which + 1])
-        return np.pad(np.atleast_2d(shapes) / sigma[which], ((0, 0), around)).T
+        around = (starts[index], starts[-1] - starts[index + 1])
+        return np.pad(np.atleast_2d(shapes) / sigma[index], ((0, 0), around)).T
 
     candidates = {}
-    for i, trace in enumerate(likelihood.traces):
-        shapes, free = np.asarray(solved.shapes[i]), np.asarray(trace.linear_sd) > 0.0
-        columns.append(alone(i, shapes[free[list(trace.columns)]]))
-        for name in freeable[i]:
+    for i, trace in enumerate(likelihood.channels):
+        shapes, free = np.asarray(solution.shapes[i]), np.asarray(trace.linear_sd) > 0.0
+        columns.append(pad_columns(i, shapes[free[list(trace.columns)]]))
+        for name in optional_nuisances[i]:
             if name == "delay" and name not in trace.timing:
-                candidates[i, name] = alone(i, np.asarray(solved.slope[i]))
+                candidates[i, name] = pad_columns(i, np.asarray(solution.slope[i]))
             elif name in NUISANCES and not free[NUISANCES[name][0]]:
-                candidates[i, name] = alone(i, shapes[list(NUISANCES[name])])
+                candidates[i, name] = pad_columns(i, shapes[list(NUISANCES[name])])
     known = np.concatenate(columns, axis=1)
     basis, values, _ = np.linalg.svd(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300), full_matrices=False)
     basis = basis[:, values > 1e-9 * values[0]]
     remainder = np.concatenate(remainders)
     gains = {
-        (i, "clock"): bic_gain(clock_drop(trace, likelihood.seen(solved.theta, i), sigma[i]), float(trace.count), 1)
-        for i, trace in enumerate(likelihood.traces)
-        if "clock" in freeable[i] and "clock" not in trace.timing
+        (i, "clock"): bic_decrease(
+            clock_r_squared(trace, likelihood.channel_inputs(solution.theta, i), sigma[i]), float(trace.count), 1
+        )
+        for i, trace in enumerate(likelihood.channels)
+        if "clock" in optional_nuisances[i] and "clock" not in trace.timing
     }
     for (i, name), added in candidates.items():
         left = added - basis @ (basis.T @ added)
         modes, sizes, _ = np.linalg.svd(left, full_matrices=False)
         modes = modes[:, sizes > 1e-9 * max(float(np.linalg.norm(added)), 1e-300)]
         share = float(np.sum((modes.T @ remainder) ** 2)) / float(remainders[i] @ remainders[i])
-        gains[i, name] = bic_gain(share, float(likelihood.traces[i].count), added.shape[1])
+        gains[i, name] = bic_decrease(share, float(likelihood.channels[i].count), added.shape[1])
     return gains
 
 
-def bic_gain(share: ArrayLike, count: float, added: int) -> Any:
+def bic_decrease(fraction: ArrayLike, count: float, n_columns: int) -> Any:
     """By how much the Bayesian information criterion falls with a share of `count` samples' sum of squares."""
-    return -count * np.log1p(-np.minimum(share, 1.0 - 1e-12)) - added * math.log(count)
+    return -count * np.log1p(-np.minimum(fraction, 1.0 - 1e-12)) - n_columns * math.log(count)

@@ -1,6 +1,7 @@
 """What is fitted to what: the likelihood of records and their scenes, and where the fit starts."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,155 +10,149 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from fitact.compiled import LONGEST, padded, padded_weight
-from fitact.data.clipping import clipped
-from fitact.data.record import Record, rounding_noise, white_noise
+from fitact.compiled import MAX_PADDED_LENGTH, as_arrays, pad_samples, pad_weight, to_device
+from fitact.data.clipping import clipping_mask
+from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
 from fitact.errors import InputError
 from fitact.experiment.fisher import Experiment
-from fitact.fitting.current import Comparable, CurrentStart, comparable, current_start
-from fitact.fitting.drive_choice import (
-    DriveChoice,
-    LinearStart,
-    as_arrays,
-    choose_drive,
-    frequency_error,
-    has_ideal_edges,
-    has_unresolved_edge,
-    linear_start,
-    shared,
-)
-from fitact.fitting.skin_model import require_followed, with_level, without_jumps
-from fitact.likelihood import certificate as compressed
-from fitact.likelihood.channel import CHARGES, LINEAR, Trace
-from fitact.likelihood.likelihood import Batched, Likelihood
-from fitact.likelihood.noise import Autoregression, NoiseModel, quiet_noise, require_uniform
+from fitact.fitting.current import CurrentSamples, estimate_from_current, select_current_samples
+from fitact.fitting.drive_choice import DriveModel, choose_drive, frequency_error, has_ideal_edges, has_unresolved_edge
+from fitact.fitting.skin_model import apply_skin_model, exclude_jumps, require_skin_response
+from fitact.fitting.starting_point import Estimate, VscEstimate, estimate_from_vsc, start_from_estimates
+from fitact.likelihood import certificate
+from fitact.likelihood.channel import CHARGES, LINEAR_NUISANCES, ChannelLikelihood
+from fitact.likelihood.likelihood import Likelihood
+from fitact.likelihood.noise import Autoregression, NoiseModel, estimate_quiet_noise, require_uniform
 from fitact.model.circuit import RC, Channel, FinalCircuit
-from fitact.model.skin import WithSkin, constant, limits_current, parameters
+from fitact.model.skin import WithSkin, circuit_parameters, constant_skin_circuit, limits_current
 from fitact.prior.distributions import LogNormal
 from fitact.prior.prior import Prior
 from fitact.scene.scene import Scene
 
-_OFFSET = 0.02  # of a channel's span: standard deviation of an offset that the record is too short to show
-_CHARGE = 10.0  # spans: that of an unknown charge
-_HELD = 1e-6  # standard deviation, in its logarithm, of a parameter that is held
-PRECISION = 1e-9  # of a channel's span: least noise assumed
-_CLOCK = 5.0  # steps at a record's ends: that of the drive's clock, since its frequency is known to one or two, or as
-# well as `frequency_error` says
-_DRAWS = 256  # of the prior, to start from the best of
+MIN_RELATIVE_NOISE = 1e-9  # of a channel's span: least noise assumed
 
 
 class Source(NamedTuple):
-    """Where a trace comes from.
+    """Where a channel comes from.
 
     Attributes:
         record, scene, choice: the record, its scene and its drive.
         noise: of the channel, judged without a model.
-        freeable: nuisances that the trace can ask for.
+        optional_nuisances: nuisances that the channel can ask for.
         start: what a linear fit says of it; None: nothing.
         notes: what was assumed, in sentences.
-        drowned: whether the drive's noise drowns the channel, which then biases the answer.
+        drive_noise_dominates: whether the drive's noise drowns the channel, which then biases the answer.
     """
 
     record: Record
     scene: Scene
-    choice: DriveChoice
+    choice: DriveModel
     noise: float
-    freeable: tuple[str, ...]
-    start: LinearStart | CurrentStart | None
+    optional_nuisances: tuple[str, ...]
+    start: Estimate | None
     notes: tuple[str, ...]
-    drowned: bool
+    drive_noise_dominates: bool
 
 
 class Problem(NamedTuple):
-    """A likelihood over the samples, where its traces come from, and where to start."""
+    """A likelihood over the samples, where its channels come from, and where to start."""
 
     likelihood: Likelihood
     sources: tuple[Source, ...]
-    start: Float[np.ndarray, " parameters"]
+    start: Float[np.ndarray, " circuit_parameters"]
 
-    def compressed(self, tolerance: float) -> tuple[Likelihood, tuple[str, ...]]:
-        """With compressed traces where that can hold, and the reasons where it cannot."""
+    def compress_likelihood(self, tolerance: float) -> tuple[Likelihood, tuple[str, ...]]:
+        """Compress the channels where that can hold; the reasons where it cannot."""
         circuit = self.likelihood.circuit(jnp.asarray(self.start))
         pairs = [
-            compressed.project(trace, circuit, _shows(source.start), tolerance)
-            for trace, source in zip(self.likelihood.traces, self.sources, strict=True)
+            certificate.compress_channel(
+                channel, circuit, source.start is not None and math.isfinite(source.start.b), tolerance
+            )
+            for channel, source in zip(self.likelihood.channels, self.sources, strict=True)
         ]
-        traces, reasons = zip(*pairs, strict=True)
-        return dataclasses.replace(self.likelihood, traces=traces), reasons
+        channels, reasons = zip(*pairs, strict=True)
+        return dataclasses.replace(self.likelihood, channels=channels), reasons
 
     def experiment(self, likelihood: Likelihood, theta: np.ndarray, sigma: np.ndarray) -> Experiment:
         """The measurement that was done; of several records, the first as many times."""
         source, records = self.sources[0], len({id(source.record) for source in self.sources})
-        pairs = zip(likelihood.traces, self.sources, strict=True)
-        of_first = [trace for trace, other in pairs if other.record is source.record]
-        fields = parameters(likelihood.template)
+        pairs = zip(likelihood.channels, self.sources, strict=True)
+        channels = tuple(trace.channel for trace, other in pairs if other.record is source.record)
+        fields = circuit_parameters(likelihood.template)
         gains = ("gain", "gain_I") if records == 1 else ()
         free = tuple(name for name in likelihood.prior.names if name in fields or name in gains)
         rows = [likelihood.prior.names.index(name) for name in free]
-        root, measured = likelihood.prior_root, source.scene.measurement
+        root, measured = likelihood.prior_factor, source.scene.measurement
         noise = {"Vsc": measured.noise_Vsc, "I": measured.noise_I}
         return Experiment(
             circuit=likelihood.circuit(jnp.asarray(theta)),
             free=free,
-            prior_root=np.linalg.cholesky((root @ root.T)[np.ix_(rows, rows)]),
+            prior_factor=np.linalg.cholesky((root @ root.T)[np.ix_(rows, rows)]),
             drive=source.choice.drive,
             time=source.record.time - source.choice.shift,
-            channels=tuple(trace.channel for trace in of_first),
-            noise=noise | {trace.channel: float(s) for trace, s in zip(of_first, sigma, strict=False)},
+            channels=channels,
+            noise=noise | dict(zip(channels, map(float, sigma), strict=False)),
             steady_state=source.choice.steady_state,
             records=float(records),
             geometry=source.scene.geometry(),
-            tied=likelihood.tied,
+            ties=likelihood.tied,
         )
 
 
-def _shows(start: LinearStart | CurrentStart | None) -> bool:
-    return start is not None and math.isfinite(start.b)
-
-
-def pose(records: Sequence[Record], scenes: Sequence[Scene | None], believed: bool = True) -> Problem:
+def build_problem(
+    records: Sequence[Record],
+    scenes: Sequence[Scene | None],
+    use_prior: bool = True,
+    drives: Sequence[DriveModel | None] = (),
+) -> Problem:
     """One circuit and one prior, the first scene's; a drive and nuisances for each record.
+
+    `drives`: those of the first records, where they have been chosen already.
 
     Raises:
         InputError: a record cannot come from this circuit, or lacks a channel that its scene asks for.
     """
     first = scenes[0] or Scene()
-    stated, tied = first.make_prior(), first.prior.tied()
+    stated, tied = first.make_prior(), first.prior.ties()
     noise = {name: stated[name] for name in ("sigma", "sigma_I") if name in stated.names}
-    prior = stated.without(*noise)
-    template = with_level(first.make_rc_circuit(circuit_values(first, prior, tied)), records, scenes)
-    opened = [
-        _open(record, scene, channel, number if len(records) > 1 else None, template)
-        for number, (record, scene) in enumerate(zip(records, scenes, strict=True), 1)
-        for channel in _channels(record, scene)
-    ]
-    traces, sources, gains = zip(*opened, strict=True)
-    prior = prior.including(
-        **{trace.named("gain"): LogNormal(1.0, sd) for trace, sd in zip(traces, gains, strict=True) if sd > 0.0}
+    prior = stated.drop_marginals(*noise)
+    template = apply_skin_model(first.make_rc_circuit(circuit_values(first, prior, tied)), records, scenes)
+    parts = []
+    for number, (record, scene, drive) in enumerate(itertools.zip_longest(records, scenes, drives), 1):
+        choice = drive or choose_drive(record, scene)
+        for channel in _channels(record, scene):
+            parts.append(_build_channel(record, scene, choice, channel, number if len(records) > 1 else None, template))
+    channels, sources, gains = zip(*parts, strict=True)
+    prior = prior.replace_marginals(
+        **{
+            channel.qualified_name("gain"): LogNormal(1.0, sd)
+            for channel, sd in zip(channels, gains, strict=True)
+            if sd > 0.0
+        }
     )
     likelihood = Likelihood(
-        traces=traces,
+        channels=channels,
         template=as_arrays(template),
-        prior=compiled_once(prior),
-        sigma_prior=tuple(noise.get("sigma" if trace.channel == "Vsc" else "sigma_I") for trace in traces),
+        prior=prior_as_arrays(prior),
+        sigma_prior=tuple(noise.get("sigma" if channel.channel == "Vsc" else "sigma_I") for channel in channels),
         tied=tuple((name, other, ratio) for name, (other, ratio) in tied.items()),
-        believed=believed,
+        use_prior=use_prior,
     )
-    return Problem(likelihood, sources, _start(likelihood, sources))
+    return Problem(likelihood, sources, start_from_estimates(likelihood, [source.start for source in sources]))
 
 
 def circuit_values(scene: Scene, prior: Prior, tied: dict[str, tuple[str, float]]) -> dict[str, float]:
     """All that is held, free or tied in the scene's circuit, by name."""
-    values = scene.fixed() | {name: math.exp(prior[name].log_mean) for name in prior.names}
+    values = scene.fixed_values() | {name: math.exp(prior[name].log_mean) for name in prior.names}
     for name, (other, ratio) in tied.items():
-        value = values.get(other, scene.nominal()[other])
+        value = values.get(other, scene.nominal_values()[other])
         if value is None:
             raise InputError(f"scene: [prior] {name} is tied to {other}, which the scene does not have; give it there")
         values[name] = ratio * value
     return values
 
 
-def compiled_once(prior: Prior) -> Prior:
+def prior_as_arrays(prior: Prior) -> Prior:
     """The prior whose log-normal marginals are no constants of what is compiled, where none are correlated."""
     if prior.pairs:
         return prior
@@ -172,53 +167,56 @@ def _channels(record: Record, scene: Scene | None) -> tuple[Channel, ...]:
     return tuple(channel for channel in ("Vsc", "I") if channel in scene.measurement.channels)
 
 
-def _open(
-    record: Record, scene: Scene | None, channel: Channel, number: int | None, template: RC | WithSkin
-) -> tuple[Trace, Source, float]:
-    """A trace over its samples, its source, and the standard deviation of a gain's logarithm."""
-    given, choice = scene or Scene(), choose_drive(record, scene)
+def _build_channel(
+    record: Record,
+    scene: Scene | None,
+    choice: DriveModel,
+    channel: Channel,
+    number: int | None,
+    template: RC | WithSkin,
+) -> tuple[ChannelLikelihood, Source, float]:
+    """A channel over its samples, its source, and the standard deviation of a gain's logarithm."""
+    scene = scene or Scene()
     _require_whole_drive(record, choice)
-    require_followed(template, record, choice)
+    require_skin_response(template, record, choice)
     label = "_".join(([channel] if channel != "Vsc" else []) + ([str(number)] if number else []))
-    notes, freeable = choice.notes, ("offset", "drift", *_hum(record, choice))
-    start: LinearStart | CurrentStart | None = None
-    seen: Comparable | None = None
+    notes, optional = choice.notes, ("offset", "drift", *_hum(record, choice))
+    start: Estimate | None = None
+    samples: CurrentSamples | None = None
     if channel == "Vsc":
-        gain, freeable = _log_sd(given.measurement.gain_relative_sd), (*freeable, "delay")
+        gain, optional = _log_sd(scene.measurement.gain_relative_sd), (*optional, "delay")
         if choice.periodic and choice.steady_state and choice.name != "measured":
-            freeable = (*freeable, "clock")
-        if _jumps(template, record):
-            start = linear_start(record, choice, _largest(template) * math.exp(3.0 * gain))
-            gain = math.hypot(gain, _edge_time(record, choice, start))
+            optional = (*optional, "clock")
+        if _has_jumps(template, record):
+            start = estimate_from_vsc(record, choice, _max_divider(template) * math.exp(3.0 * gain))
+            gain = math.hypot(gain, _edge_gain_sd(record, choice, start))
     else:
-        gain = _log_sd(given.measurement.gain_I_relative_sd)
+        gain = _log_sd(scene.measurement.gain_I_relative_sd)
         if not limits_current(template):
-            seen = comparable(record, choice)
-            start, notes = current_start(record, choice, seen), (*notes, *seen.notes)
-    weight, left_out = _weight(record, channel, seen)
-    weight, at_jumps = without_jumps(template, record, choice, weight)
-    if weight is None and len(record) <= LONGEST:
+            samples = select_current_samples(record, choice)
+            start, notes = estimate_from_current(record, choice, samples), (*notes, *samples.notes)
+    weight, clipped = _weight(record, channel, samples)
+    weight, at_jumps = exclude_jumps(template, record, choice, weight)
+    if weight is None and len(record) <= MAX_PADDED_LENGTH:
         weight = np.ones(len(record))
-    weight = None if weight is None else padded_weight(weight)
-    colour, noise = _noise(record, channel, given)
-    trace = dataclasses.replace(
-        _trace(record, choice, channel, label, template, given.measurement.noise_model),
+    weight = None if weight is None else pad_weight(weight)
+    colour, noise = _noise(record, channel, scene)
+    likelihood = dataclasses.replace(
+        _initial_channel(record, choice, channel, label, template, scene.measurement.noise_model),
         weight=None if weight is None else jnp.asarray(weight),
-        rate=None if seen is None else shared(padded(seen.rate)),
+        rate=None if samples is None else to_device(pad_samples(samples.rate)),
         whitening=colour and colour.whitening(np.ones(len(record), bool) if weight is None else weight > 0.0),
     )
-    drowned = seen is not None and seen.drowned
-    source = Source(
-        record, given, choice, noise, freeable, start, (*record.notes, *notes, *left_out, *at_jumps), drowned
-    )
-    return trace, source, gain
+    dominates = samples is not None and samples.drive_noise_dominates
+    notes = (*record.notes, *notes, *clipped, *at_jumps)
+    return likelihood, Source(record, scene, choice, noise, optional, start, notes, dominates), gain
 
 
-def _require_whole_drive(record: Record, choice: DriveChoice) -> None:
+def _require_whole_drive(record: Record, choice: DriveModel) -> None:
     """Refuse a measured drive that was clipped; one whose flat tops carry no noise is taken to be flat."""
-    if choice.name != "measured" or white_noise(record["V"]) == 0.0 or rounding_noise(record["V"]) > 0.0:
+    if choice.name != "measured" or white_noise_sd(record["V"]) == 0.0 or rounding_noise_sd(record["V"]) > 0.0:
         return
-    count = np.count_nonzero(clipped(record["V"]))
+    count = np.count_nonzero(clipping_mask(record["V"]))
     if count:
         raise InputError(
             f"{record.source}: V_V is clipped at {count:,} of {len(record):,} samples, so what drove the finger is not"
@@ -226,9 +224,9 @@ def _require_whole_drive(record: Record, choice: DriveChoice) -> None:
         )
 
 
-def _weight(record: Record, channel: str, seen: Comparable | None) -> tuple[np.ndarray | None, tuple[str, ...]]:
+def _weight(record: Record, channel: str, samples: CurrentSamples | None) -> tuple[np.ndarray | None, tuple[str, ...]]:
     """The samples' weights, 0 where they were clipped, and a sentence about those."""
-    out, weight = clipped(record[channel]), None if seen is None else seen.weight
+    out, weight = clipping_mask(record[channel]), None if samples is None else samples.weight
     if not out.any():
         return weight, ()
     note = (
@@ -247,7 +245,7 @@ def _noise(record: Record, channel: str, scene: Scene) -> tuple[Autoregression |
     return (
         (Autoregression(np.zeros(1), 1.0), record.noise(channel))
         if quiet is None
-        else quiet_noise(record, channel, quiet)
+        else estimate_quiet_noise(record, channel, quiet)
     )
 
 
@@ -255,155 +253,70 @@ def _log_sd(relative_sd: float) -> float:
     return LogNormal.with_relative_sd(1.0, relative_sd).spread if relative_sd > 0.0 else 0.0
 
 
-def _trace(
-    record: Record, choice: DriveChoice, channel: Channel, label: str, template: RC | WithSkin, noise: NoiseModel
-) -> Trace:
+def _initial_channel(
+    record: Record, choice: DriveModel, channel: Channel, label: str, template: RC | WithSkin, noise: NoiseModel
+) -> ChannelLikelihood:
     height = float(np.ptp(record[channel]))
-    charges = len(LINEAR) - len(CHARGES) + np.arange(len(template.terms().tau) if choice.unknown_charge else 0)
-    # a part of a wave cannot show an offset, so one within an oscilloscope's accuracy is allowed for
-    offset = _OFFSET * height if record.frequency() is None and choice.periodic else 0.0
-    named = channel == "Vsc" and choice.name != "measured"
-    steps = frequency_error(record, choice.name) * record.time.size if named else 0.0
-    return Trace(
-        time=shared(padded(record.time)),
-        observed=shared(padded(record[channel])),
+    charges = (
+        len(LINEAR_NUISANCES) - len(CHARGES) + np.arange(len(template.terms().tau) if choice.unknown_charge else 0)
+    )
+    # a part of a wave cannot show an offset, so one within an oscilloscope's accuracy (2 %) is allowed for
+    offset = 0.02 * height if record.frequency() is None and choice.periodic else 0.0
+    # steps at the record's ends: the drive's frequency is known to one or two, or as well as `frequency_error` says
+    clock_sd = 5.0
+    if channel == "Vsc" and choice.name != "measured":
+        clock_sd = max(clock_sd, frequency_error(record, choice.name) * record.time.size)
+    # beside an ideal edge the samples leave the delay open within one step, whose middle is the start
+    delay_sd = math.sqrt(1.0 / 12.0) if has_ideal_edges(choice.drive) else 5.0
+    charge_sd = 10.0 * height  # it may be anything
+    return ChannelLikelihood(
+        time=to_device(pad_samples(record.time)),
+        observed=to_device(pad_samples(record[channel])),
         weight=None,
         whitening=None,
-        least_noise=jnp.asarray(max(PRECISION * height, rounding_noise(record[channel]))),
+        noise_floor=jnp.asarray(max(MIN_RELATIVE_NOISE * height, rounding_noise_sd(record[channel]))),
         rate=None,
         drive=choice.drive,
-        linear_sd=jnp.zeros(len(LINEAR)).at[0].set(offset).at[charges].set(_CHARGE * height),
+        linear_sd=jnp.zeros(len(LINEAR_NUISANCES)).at[0].set(offset).at[charges].set(charge_sd),
         shift=jnp.asarray(choice.shift, dtype=float),
         time_step=jnp.asarray(record.time_step, dtype=float),
         clock=jnp.zeros(()),
-        timing_sd=jnp.array([_delay_sd(choice), max(_CLOCK, steps)]),
+        timing_sd=jnp.array([delay_sd, clock_sd]),
         compression=None,
         label=label,
         channel=channel,
         steady_state=choice.steady_state,
         noise=noise,
-        columns=tuple(range(len(LINEAR))),
+        columns=tuple(range(len(LINEAR_NUISANCES))),
         # a shifted drive's edges are known to within a step only, which g feels; I's samples there are left out
         timing=("delay",) if choice.shift != 0.0 and channel == "Vsc" else (),
     )
 
 
-def _hum(record: Record, choice: DriveChoice) -> list[str]:
+def _hum(record: Record, choice: DriveModel) -> list[str]:
     """The mains hums that the record can tell from its drive's harmonics, or from a part of a wave."""
     span, frequency = float(record.time[-1] - record.time[0]), record.frequency()
 
-    def apart(hum: float) -> bool:
+    def is_distinguishable(hum: float) -> bool:
         if frequency is None:
             return not choice.periodic and hum * span > 2.0
         return abs(hum - frequency * round(hum / frequency)) * span > 0.5
 
-    return [f"hum_{hum:.0f}Hz" for hum in (50.0, 60.0) if apart(hum) and hum * record.time_step < 0.5]
+    return [f"hum_{hum:.0f}Hz" for hum in (50.0, 60.0) if is_distinguishable(hum) and hum * record.time_step < 0.5]
 
 
-def _edge_time(record: Record, choice: DriveChoice, start: LinearStart) -> float:
+def _edge_gain_sd(record: Record, choice: DriveModel, start: VscEstimate) -> float:
     """Where a measured drive jumps within a step, its edge's time is uncertain within it, which acts as a gain."""
     if choice.name != "measured" or not has_unresolved_edge(choice.voltage) or not math.isfinite(start.b):
         return 0.0
     return record.time_step / math.sqrt(12.0) / start.b
 
 
-def _delay_sd(choice: DriveChoice) -> float:
-    """Beside an ideal edge the samples leave the delay open within one step, whose middle is the start."""
-    return math.sqrt(1.0 / 12.0) if has_ideal_edges(choice.drive) else 5.0
-
-
-def _jumps(template: RC | WithSkin, record: Record) -> bool:
+def _has_jumps(template: RC | WithSkin, record: Record) -> bool:
     """Whether Vsc follows a jump of V, within the record's time step."""
-    return not limits_current(template) or float(constant(template).terms().tau[-1]) < record.time_step
+    return not limits_current(template) or float(constant_skin_circuit(template).terms().tau[-1]) < record.time_step
 
 
-def _largest(template: RC | WithSkin) -> float:
+def _max_divider(template: RC | WithSkin) -> float:
     """The largest divider the circuit can have."""
-    return 0.5 if isinstance(constant(template), FinalCircuit) else 1.0
-
-
-def _start(likelihood: Likelihood, sources: Sequence[Source]) -> Float[np.ndarray, " parameters"]:
-    """From the linear fits, where these hold for the circuit; else the best of draws from the prior."""
-    starts = [source.start for source in sources]
-    vsc = next((start for start in starts if isinstance(start, LinearStart)), None)
-    current = next((start for start in starts if isinstance(start, CurrentStart)), None)
-    theta = np.concatenate([likelihood.prior.log_mean, np.zeros(len(likelihood.names) - len(likelihood.prior.names))])
-    if current is not None and not current.capacitance > 0.0 and isinstance(likelihood.template, WithSkin):
-        current = None  # of one frequency, what a constant skin makes of such a current need be no skin
-    if vsc is None and current is None:
-        return _best_of_prior(likelihood, theta)
-    mean, sd = believed_skin(likelihood)
-    skin = _skin_of(vsc, current)
-    logs = (
-        np.log(skin)
-        if skin is not None
-        else on_the_ridge(np.asarray(vsc.g), np.asarray(vsc.b), mean, sd)
-        if vsc is not None
-        else mean
-    )
-    for name, value in zip(("Rsc", "Csc", "Ci"), logs, strict=True):
-        if name in likelihood.prior.names:
-            theta[likelihood.prior.names.index(name)] = value
-    return theta
-
-
-def _skin_of(vsc: LinearStart | None, current: CurrentStart | None) -> tuple[float, float, float] | None:
-    """Rsc, Csc and Ci of a final circuit from what Vsc and I show of it, if those are of one."""
-    if current is None or not current.weight > 0.0:
-        return None
-    if vsc is not None and math.isfinite(vsc.b):
-        g, b = vsc
-    elif vsc is None and current.capacitance > 0.0:
-        # weight = 2 g^2 / Rsc, capacitance = g Csc = b g (1 - 2 g) / Rsc
-        ratio = current.weight * current.b / current.capacitance
-        g, b = 0.5 * ratio / (1.0 + ratio), current.b
-    else:
-        return None
-    Rsc = 2.0 * g * g / current.weight
-    return (Rsc, (1.0 - 2.0 * g) * b / Rsc, g * b / Rsc) if g < 0.5 else None
-
-
-def believed_skin(likelihood: Likelihood) -> tuple[np.ndarray, np.ndarray]:
-    """Means and standard deviations of log Rsc, log Csc and log Ci; what is held has next to none."""
-    prior, known = likelihood.prior, parameters(likelihood.template)
-    pairs = [
-        (prior[name].log_mean, prior[name].log_sd) if name in prior.names else (math.log(float(known[name])), _HELD)
-        for name in ("Rsc", "Csc", "Ci")
-    ]
-    mean, sd = np.array(pairs).T
-    return mean, sd
-
-
-def on_the_ridge(
-    g: Float[np.ndarray, "*n"], b: Float[np.ndarray, "*n"], mean: np.ndarray, sd: np.ndarray
-) -> Float[np.ndarray, "*n 3"]:
-    """The most probable points, by the prior, among those with that divider and time constant (s; infinite: unknown).
-
-    They are the line (log Rsc, log Csc, log Ci) = point + t (-1, 1, 1).
-    """
-    g = np.clip(g, 1e-9, 0.4999)
-    b = np.where(np.isfinite(b), b, math.exp(mean[0] + mean[1]))
-    ci = math.exp(mean[2])
-    point = np.stack([np.log(g * b / ci), np.log((1.0 / g - 2.0) * ci), np.full_like(g, math.log(ci))], axis=-1)
-    along, weight = np.array([-1.0, 1.0, 1.0]), sd**-2.0
-    return point + along * np.sum(weight * along * (mean - point), axis=-1, keepdims=True) / np.sum(weight)
-
-
-def _best_of_prior(likelihood: Likelihood, theta: np.ndarray) -> Float[np.ndarray, " parameters"]:
-    """The draw of the prior that leaves least of the traces, whatever their noise."""
-    points = np.vstack([theta, likelihood.draws(theta, _DRAWS - 1)])
-    return points[int(np.argmin(left(likelihood, points)))]
-
-
-def left(likelihood: Likelihood, points: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, " n"]:
-    """What points leave of the traces, whatever their noise: for comparing one with another."""
-    return Batched(_left, likelihood, likelihood.rows)(points)
-
-
-def _left(likelihood: Likelihood, theta: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, ""]:
-    """What is left of the traces: the sum of the logarithms of the residuals' squares, each for its samples."""
-    parts = [
-        trace.count * jnp.log(jnp.sum(jnp.square(trace.linear(seen, 1e-3 * jnp.ptp(trace.observed))[0])))
-        for trace, seen in likelihood.each(theta)
-    ]
-    return 0.5 * sum(parts, jnp.zeros(()))
+    return 0.5 if isinstance(constant_skin_circuit(template), FinalCircuit) else 1.0

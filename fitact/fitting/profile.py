@@ -18,15 +18,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitact.errors import InputError
-from fitact.fitting.derived import NAMES, Derived
+from fitact.fitting.derived import DERIVED_NAMES, DerivedQuantities
+from fitact.fitting.laplace import Laplace
 from fitact.fitting.levenberg_marquardt import minimise
-from fitact.likelihood.likelihood import OPEN, Likelihood
-from fitact.units import engineering, unit_of
+from fitact.likelihood.likelihood import UNCONSTRAINED_SD, Likelihood
+from fitact.units import format_engineering, quantity_unit
 
-DERIVED = ("g", "b", "force_mean")
-_TIGHT = 0.05  # of the expected error: that of the pseudo-datum
-_CLOSE = 1e-4  # relative, of the root of the deviance
-_WIDER, _ROUNDS, _STEPS = 4.0, 30, 200
+PROFILE_QUANTITIES = ("g", "b", "force_mean")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,140 +54,150 @@ class Interval:
         return ends | {"open": self.open, "level": self.level, "prior": self.prior}
 
 
-class Pinned(eqx.Module):
-    """A fit whose quantities can be pinned: theta, or the logarithms of `DERIVED`.
+class ConstrainedFit(eqx.Module):
+    """A fit whose quantities can be pinned: theta, or the logarithms of `PROFILE_QUANTITIES`.
 
     Attributes:
         likelihood: with or without the circuit's prior.
-        sigma: the traces' noise, which is held.
+        sigma: the channels' noise, which is held.
         derive: None: the quantities are theta itself.
     """
 
     likelihood: Likelihood
     sigma: Float[Array, " traces"]
-    derive: Derived | None
+    derive: DerivedQuantities | None
 
     def quantities(self, theta: Float[Array, " parameters"]) -> Float[Array, " quantities"]:
         """Their values at theta."""
         if self.derive is None:
             return theta
         values = self.derive(theta, self.sigma)
-        return jnp.log(jnp.stack([values[NAMES.index(name)] for name in DERIVED]))
+        return jnp.log(jnp.stack([values[DERIVED_NAMES.index(name)] for name in PROFILE_QUANTITIES]))
 
 
 @eqx.filter_jit
-def _pinned(model: Pinned, which: Array, goal: Array, weight: Array, start: Array) -> tuple[Array, Array, Array]:
+def _fit_constrained(
+    model: ConstrainedFit, indices: Array, goal: Array, weight: Array, start: Array
+) -> tuple[Array, Array, Array]:
     """For each row: theta, the quantity and the deviance where a pseudo-datum `goal` of that weight drags them."""
 
-    def one(which: Array, goal: Array, weight: Array, start: Array) -> tuple[Array, Array, Array]:
+    def fit_row(index: Array, goal: Array, weight: Array, start: Array) -> tuple[Array, Array, Array]:
         def residuals(theta: Array) -> tuple[Any, ...]:
-            pull = weight * (model.quantities(theta)[which] - goal)
+            pull = weight * (model.quantities(theta)[index] - goal)
             return model.likelihood.residuals(theta, model.sigma), model.likelihood.prior_residuals(theta), pull
 
-        found = minimise(residuals, start, max_steps=_STEPS)
-        value = model.quantities(found.theta)[which]
+        found = minimise(residuals, start, max_steps=200)
+        value = model.quantities(found.theta)[index]
         return found.theta, value, 2.0 * found.cost - jnp.square(weight * (value - goal))
 
     # one after the other: side by side, long records would want much memory
-    return jax.lax.map(lambda row: one(*row), (which, goal, weight, start))
+    return jax.lax.map(lambda row: fit_row(*row), (indices, goal, weight, start))
 
 
-def intervals(
-    likelihood: Likelihood,
-    derive: Derived,
-    theta: Float[np.ndarray, " parameters"],
-    sigma: Float[np.ndarray, " traces"],
-    sd: Mapping[str, float],
-    names: Sequence[str],
-    level: float,
-    prior: bool,
-) -> dict[str, Interval]:
-    """Intervals of the quantities `names`, around the optimum `theta` at the noise `sigma`.
-
-    `sd` are the errors to expect of theta and the logarithms of `DERIVED`, by name.
+def profile_intervals(laplace: Laplace, names: Sequence[str], level: float, prior: bool) -> dict[str, Interval]:
+    """Profile-likelihood intervals of the quantities `names` around an optimum, at its noise.
 
     Raises:
         InputError: there is no quantity of that name, or the level is not between 0 and 1.
     """
     if not 0.0 < level < 1.0:
         raise InputError(f"level = {level}: give a probability between 0 and 1, such as 0.95")
+    likelihood, timing = laplace.likelihood, laplace.likelihood.timing
     for name in names:
-        if name not in sd:
-            raise InputError(f"there is no interval of {name}; choose from {', '.join(sd)}")
-    timing = likelihood.timing
-    found = {}
+        if name not in (available := (*likelihood.names, *PROFILE_QUANTITIES)):
+            raise InputError(f"there is no interval of {name}; choose from {', '.join(available)}")
+    derived_sd = np.array([laplace.log_sd(name) for name in PROFILE_QUANTITIES])
+    intervals = {}
     with jax.enable_x64(True):
-        likelihood = dataclasses.replace(likelihood.without_samples(), believed=prior and likelihood.believed)
-        for known, of in ((likelihood.names, None), (DERIVED, derive)):
-            chosen = [name for name in names if name in known]
+        likelihood = dataclasses.replace(likelihood.without_samples(), use_prior=prior and likelihood.use_prior)
+        for kind, sd, derive in (
+            (likelihood.names, laplace.sd, None),
+            (PROFILE_QUANTITIES, derived_sd, laplace.derive),
+        ):
+            chosen = [name for name in names if name in kind]
             if not chosen:
                 continue
-            model, places = Pinned(likelihood, jnp.asarray(sigma), of), [known.index(name) for name in chosen]
-            sides = ends(model, theta, np.array([sd[name] for name in known]), places, level)
+            model = ConstrainedFit(likelihood, jnp.asarray(laplace.sigma), derive)
+            sides = interval_bounds(model, laplace.theta, sd, [kind.index(name) for name in chosen], level)
             for name, side in zip(chosen, sides, strict=True):
                 low, high = timing[name][0] + side * timing[name][1] if name in timing else np.exp(side)
-                found[name] = Interval(float(low), float(high), level, likelihood.believed)
-    return found
+                intervals[name] = Interval(float(low), float(high), level, likelihood.use_prior)
+    return intervals
 
 
-def ends(
-    model: Pinned,
+def interval_bounds(
+    model: ConstrainedFit,
     theta: Float[np.ndarray, " parameters"],
     sd: Float[np.ndarray, " quantities"],
-    which: Sequence[int],
+    indices: Sequence[int],
     level: float,
+    pseudo_datum_sd: float = 0.05,
+    root_tolerance: float = 1e-4,
+    max_rounds: int = 30,
 ) -> Float[np.ndarray, "quantities 2"]:
-    """The ends of the intervals of the quantities `which`; not finite where a side is open.
+    """The ends of the intervals of the quantities `indices`; not finite where a side is open.
 
-    From the optimum `theta`; `sd` are the errors to expect of them. All sides are sought at once, each between
-    the last value that was too near and the last that was too far.
+    All sides are sought at once, each between the last value that was too near and the last that was too far.
+
+    Args:
+        model: what is fitted.
+        theta: the optimum.
+        sd: the errors to expect of the quantities.
+        indices: of the quantities.
+        level: the intervals' probability.
+        pseudo_datum_sd: that of the pseudo-datum, of the expected error.
+        root_tolerance: relative, of the root of the deviance.
+        max_rounds: how often goals are tried.
     """
     z = NormalDist().inv_cdf(0.5 * (1.0 + level))
-    lanes, side = np.repeat(np.asarray(which), 2), np.tile([-1.0, 1.0], len(which))
-    expected = np.minimum(sd[lanes], OPEN / z)
-    weight = 1.0 / (_TIGHT * expected)
+    lanes, side = np.repeat(np.asarray(indices), 2), np.tile([-1.0, 1.0], len(indices))
+    expected = np.minimum(sd[lanes], UNCONSTRAINED_SD / z)
+    weight = 1.0 / (pseudo_datum_sd * expected)
     points = np.tile(theta, (lanes.size, 1))
-    points, middle, least = map(np.asarray, _pinned(model, lanes, np.zeros(lanes.size), 0.0 * weight, points))
+    points, middle, least = map(np.asarray, _fit_constrained(model, lanes, np.zeros(lanes.size), 0.0 * weight, points))
     # the goals last found too near and too far, of which a quantity falls a little short, and the deviance's root there
     near, far = np.zeros((2, lanes.size)), np.full((2, lanes.size), np.inf)
     goal, found, within = z * expected, np.full(lanes.size, np.nan), np.zeros(lanes.size)
-    for _ in range(_ROUNDS):
-        there, value, deviance = map(np.asarray, _pinned(model, lanes, middle + side * goal, weight, points))
+    for _ in range(max_rounds):
+        there, value, deviance = map(np.asarray, _fit_constrained(model, lanes, middle + side * goal, weight, points))
         out, root = side * (value - middle), np.sqrt(np.maximum(deviance - least, 0.0))
         short = root < z  # false where it is not finite
         near, far = np.where(short, [goal, root], near), np.where(short, far, [goal, root])
         within = np.where(short, out, within)
         points = np.where(np.isfinite(there) & short[:, None], there, points)
-        done = np.isnan(found) & (np.abs(root - z) < _CLOSE * z)
-        found = np.where(done, out, np.where(np.isnan(found) & short & (goal >= OPEN), np.inf, found))
+        done = np.isnan(found) & (np.abs(root - z) < root_tolerance * z)
+        found = np.where(done, out, np.where(np.isnan(found) & short & (goal >= UNCONSTRAINED_SD), np.inf, found))
         if not np.isnan(found).any():
             break
-        goal = np.where(np.isnan(found), _next(near, far, z), goal)
+        goal = np.where(np.isnan(found), _next_goal(near, far, z), goal)
     found = np.where(np.isnan(found), within, found)
     return (middle + side * found).reshape(-1, 2)
 
 
-def _next(near: np.ndarray, far: np.ndarray, z: float) -> np.ndarray:
+def _next_goal(inner: np.ndarray, outer: np.ndarray, z: float) -> np.ndarray:
     """Where to look next: by a line through what is known, kept away from the ends of what is left."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        line = near[0] + (far[0] - near[0]) * (z - near[1]) / (far[1] - near[1])
-        ahead = near[0] * np.clip(z / near[1], 1.1, _WIDER)
-    inside = np.clip(line, 0.95 * near[0] + 0.05 * far[0], 0.05 * near[0] + 0.95 * far[0])
-    inside = np.where(np.isfinite(inside), inside, 0.5 * (near[0] + far[0]))
-    return np.minimum(np.where(np.isinf(far[0]), ahead, inside), OPEN)
+        line = inner[0] + (outer[0] - inner[0]) * (z - inner[1]) / (outer[1] - inner[1])
+        ahead = inner[0] * np.clip(z / inner[1], 1.1, 4.0)
+    inside = np.clip(line, 0.95 * inner[0] + 0.05 * outer[0], 0.05 * inner[0] + 0.95 * outer[0])
+    inside = np.where(np.isfinite(inside), inside, 0.5 * (inner[0] + outer[0]))
+    return np.minimum(np.where(np.isinf(outer[0]), ahead, inside), UNCONSTRAINED_SD)
 
 
-def table(with_prior: Mapping[str, Interval], without: Mapping[str, Interval]) -> str:
+def table(with_prior: Mapping[str, Interval], without_prior: Mapping[str, Interval]) -> str:
     """Both kinds of intervals, for people."""
 
-    def shown(name: str, interval: Interval) -> str:
+    def format_interval(name: str, interval: Interval) -> str:
         ends = [
-            "open" if interval.open in (side, "both") else engineering(end, unit_of(name))
+            "open" if interval.open in (side, "both") else format_engineering(end, quantity_unit(name))
             for side, end in (("low", interval.low), ("high", interval.high))
         ]
         return f"{ends[0]} to {ends[1]}"
 
     level = f"{100.0 * next(iter(with_prior.values())).level:g} %"
     rows = [f"{level + ' interval':14}{'with the prior':>28}{'of the records alone':>28}"]
-    rows += [f"{name:14}{shown(name, of):>28}{shown(name, without[name]):>28}" for name, of in with_prior.items()]
+    rows += [
+        f"{name:14}{format_interval(name, of):>28}{format_interval(name, without_prior[name]):>28}"
+        for name, of in with_prior.items()
+    ]
     return "\n".join(rows)

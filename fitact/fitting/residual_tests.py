@@ -10,9 +10,8 @@ import scipy.special
 from jaxtyping import Bool, Float, Int
 
 _PHASES = (8, 32, 128, 512)  # parts of a period whose means are compared; few show what is slow, many what is brief
-_BANDS = 250  # about as many places are looked at in the cumulative periodogram, for colour is broad
-_LEAST_TESTED = 64  # samples, below which a spectrum says little
-TESTS = len(_PHASES) + 2  # whose probabilities are looked at
+_MIN_SAMPLES = 64  # samples, below which a spectrum says little
+N_TESTS = len(_PHASES) + 2  # whose probabilities are looked at
 
 
 class Fold(NamedTuple):
@@ -20,86 +19,95 @@ class Fold(NamedTuple):
 
     Attributes:
         weight: one over the samples in each part; 0 where there are none.
-        between, within: degrees of freedom of the means, and of what scatters about them.
+        means_dof, scatter_dof: degrees of freedom of the means, and of what scatters about them.
     """
 
     weight: Float[np.ndarray, " parts"]
-    between: int
-    within: int
+    means_dof: int
+    scatter_dof: int
 
 
-class Phases(NamedTuple):
+class PhaseBins(NamedTuple):
     """Samples by their place in the drive's period.
 
     Attributes:
-        places: which are in each of the finest parts, as a matrix of ones.
+        bin_matrix: which are in each of the finest parts, as a matrix of ones.
         folds: from the finest on.
     """
 
-    places: scipy.sparse.csr_array
+    bin_matrix: scipy.sparse.csr_array
     folds: tuple[Fold, ...]
 
     @classmethod
-    def of(cls, time: Float[np.ndarray, " n"], frequency: float | None) -> "Phases | None":
+    def from_times(cls, time: Float[np.ndarray, " n"], frequency: float | None) -> "PhaseBins | None":
         """For a drive's frequency (Hz); None where too little repeats."""
-        if frequency is None or time.size < _LEAST_TESTED:
+        if frequency is None or time.size < _MIN_SAMPLES:
             return None
         place = np.minimum((np.mod(time * frequency, 1.0) * _PHASES[-1]).astype(int), _PHASES[-1] - 1)
         ones = np.ones(time.size, np.float32)
         places = scipy.sparse.csr_array((ones, (place, np.arange(time.size))), (_PHASES[-1], time.size))
         finest = np.bincount(place, minlength=_PHASES[-1])
-        held = [finest.reshape(parts, -1).sum(axis=1) for parts in _PHASES[::-1]]
-        between = [(n, int(np.count_nonzero(n))) for n in held]
-        folds = [Fold(np.where(n > 0, 1.0 / np.maximum(n, 1), 0.0), size, time.size - size) for n, size in between]
+        counts = [finest.reshape(parts, -1).sum(axis=1) for parts in _PHASES[::-1]]
+        sized = [(n, int(np.count_nonzero(n))) for n in counts]
+        folds = [Fold(np.where(n > 0, 1.0 / np.maximum(n, 1), 0.0), size, time.size - size) for n, size in sized]
         # with too few samples in each phase their scatter is not known
-        return cls(places, tuple(fold for fold in folds if fold.within >= time.size // 2))
+        return cls(places, tuple(fold for fold in folds if fold.scatter_dof >= time.size // 2))
 
 
-class Structure(NamedTuple):
+class ResidualTestStatistics(NamedTuple):
     """What the tests look at, of each record.
 
     Attributes:
-        above, runs: residuals above 0, and stretches of them on one side of it.
-        folded: share of the means over parts of a period in the sum of squares, for each of the folds.
+        n_positive, n_runs: residuals above 0, and stretches of them on one side of it.
+        fold_fractions: share of the means over parts of a period in the sum of squares, for each of the folds.
         distance: of the cumulative periodogram from that of white noise, times the root of the lines.
-        strongest: the share of the strongest line.
+        line_fraction: the share of the strongest line.
     """
 
-    above: Int[np.ndarray, "*records"]
-    runs: Int[np.ndarray, "*records"]
-    folded: Float[np.ndarray, "*records folds"]
+    n_positive: Int[np.ndarray, "*records"]
+    n_runs: Int[np.ndarray, "*records"]
+    fold_fractions: Float[np.ndarray, "*records folds"]
     distance: Float[np.ndarray, "*records"]
-    strongest: Float[np.ndarray, "*records"]
+    line_fraction: Float[np.ndarray, "*records"]
 
     @classmethod
-    def of(cls, residuals: Float[np.ndarray, "*records n"], of_time: Phases | None) -> "Structure":
+    def from_residuals(
+        cls, residuals: Float[np.ndarray, "*records n"], phase_bins: PhaseBins | None
+    ) -> "ResidualTestStatistics":
         """In the precision of the residuals."""
         positive = residuals > 0.0
-        turns = counts(positive[..., 1:] != positive[..., :-1])
-        distance, strongest = _spectrum(residuals)
-        folded = _folded(residuals, of_time)
-        return cls(counts(positive), 1 + turns, folded, distance, strongest)
+        turns = count_true(positive[..., 1:] != positive[..., :-1])
+        distance, strongest = _periodogram_statistics(residuals)
+        folded = _fold_fractions(residuals, phase_bins)
+        return cls(count_true(positive), 1 + turns, folded, distance, strongest)
 
 
-def counts(true: Bool[np.ndarray, "*rows n"]) -> Int[np.ndarray, "*rows"]:
+def count_true(mask: Bool[np.ndarray, "*rows n"]) -> Int[np.ndarray, "*rows"]:
     """How many are true in each row, added up in the smallest numbers that hold them, which takes least."""
-    return true.view(np.uint8).sum(axis=-1, dtype=np.min_scalar_type(true.shape[-1])).astype(int)
+    return mask.view(np.uint8).sum(axis=-1, dtype=np.min_scalar_type(mask.shape[-1])).astype(int)
 
 
-def _folded(residuals: Float[np.ndarray, "*records n"], of_time: Phases | None) -> Float[np.ndarray, "*records folds"]:
+def _fold_fractions(
+    residuals: Float[np.ndarray, "*records n"], phase_bins: PhaseBins | None
+) -> Float[np.ndarray, "*records folds"]:
     of = residuals.shape[:-1]
-    if of_time is None:
+    if phase_bins is None:
         return np.empty((*of, 0))
     square = np.vecdot(residuals, residuals)
-    sums, found = of_time.places @ residuals.reshape(-1, residuals.shape[-1]).T, []
-    for weight, _, _ in of_time.folds:
+    sums, found = phase_bins.bin_matrix @ residuals.reshape(-1, residuals.shape[-1]).T, []
+    for weight, _, _ in phase_bins.folds:
         sums = sums.reshape(weight.size, len(sums) // weight.size, -1).sum(axis=1)
         found.append((weight @ sums**2).reshape(of) / np.where(square > 0.0, square, 1.0))
     return np.stack(found, axis=-1) if found else np.empty((*of, 0))
 
 
-def _spectrum(residuals: Float[np.ndarray, "*records n"]) -> tuple[np.ndarray, np.ndarray]:
-    """The distance of the cumulative periodogram, and the strongest line's share; 0 where there is nothing to share."""
+def _periodogram_statistics(
+    residuals: Float[np.ndarray, "*records n"], n_bands: int = 250
+) -> tuple[np.ndarray, np.ndarray]:
+    """The distance of the cumulative periodogram, and the strongest line's share; 0 where there is nothing to share.
+
+    The periodogram is looked at in about `n_bands` places, for colour is broad.
+    """
     spectrum = scipy.fft.rfft(residuals)[..., 1 : (residuals.shape[-1] + 1) // 2]
     power = np.square(spectrum.real)
     power += np.square(spectrum.imag)
@@ -107,7 +115,7 @@ def _spectrum(residuals: Float[np.ndarray, "*records n"]) -> tuple[np.ndarray, n
     if lines == 0:
         return whole, whole
     share = np.where(whole > 0.0, 1.0 / np.where(whole > 0.0, whole, 1.0), 0.0)
-    width = max(lines // _BANDS, 1)
+    width = max(lines // n_bands, 1)
     count = lines // width
     bands = power[..., : count * width].reshape(*whole.shape, count, width)
     apart = np.cumsum(bands @ np.ones(width, bands.dtype), axis=-1, dtype=float)
@@ -117,40 +125,44 @@ def _spectrum(residuals: Float[np.ndarray, "*records n"]) -> tuple[np.ndarray, n
     return np.where(whole > 0.0, distance, 0.0), power.max(axis=-1) * share
 
 
-def probabilities(found: Structure, samples: int, of_time: Phases | None) -> dict[str, Float[np.ndarray, "*records"]]:
-    """Of white noise to show more of it than `found`, by test; uncorrected for their number."""
+def p_values(
+    statistics: ResidualTestStatistics, samples: int, phase_bins: PhaseBins | None
+) -> dict[str, Float[np.ndarray, "*records"]]:
+    """Of white noise to show more of it than `statistics`, by test; uncorrected for their number."""
     return {
-        "folded_p": _folded_p(found.folded, of_time),
-        "spectrum_p": _spectrum_p(found.distance, (samples - 1) // 2),
-        "line_p": _line_p(found.strongest, (samples - 1) // 2),
+        "folded_p": _folded_p(statistics.fold_fractions, phase_bins),
+        "spectrum_p": _spectrum_p(statistics.distance, (samples - 1) // 2),
+        "line_p": _line_p(statistics.line_fraction, (samples - 1) // 2),
     }
 
 
-def runs_z(found: Structure, samples: int) -> Float[np.ndarray, "*records"]:
+def runs_z(statistics: ResidualTestStatistics, samples: int) -> Float[np.ndarray, "*records"]:
     """Wald and Wolfowitz's runs test of signs, in standard deviations; far below zero: signs come in stretches."""
-    above = found.above.astype(float)
+    above = statistics.n_positive.astype(float)
     both = 2.0 * above * (samples - above)
     mean = both / samples + 1.0
     variance = both * (both - samples) / (samples**2 * (samples - 1.0))
-    return np.where(both > 0.0, (found.runs - mean) / np.sqrt(np.where(both > 0.0, variance, 1.0)), -np.inf)
+    return np.where(both > 0.0, (statistics.n_runs - mean) / np.sqrt(np.where(both > 0.0, variance, 1.0)), -np.inf)
 
 
-def _folded_p(shares: Float[np.ndarray, "*records folds"], of_time: Phases | None) -> Float[np.ndarray, "*records"]:
+def _folded_p(
+    fractions: Float[np.ndarray, "*records folds"], phase_bins: PhaseBins | None
+) -> Float[np.ndarray, "*records"]:
     """The least of F tests, each of which compares the means in as many parts of the drive's period with their scatter.
 
     What a wrong circuit leaves repeats with the drive, and adds up over the periods. 1 where nothing is expected to.
     """
-    least = np.ones(shares.shape[:-1])
-    for fold, share in zip(of_time.folds if of_time else (), np.moveaxis(shares, -1, 0), strict=True):
+    least = np.ones(fractions.shape[:-1])
+    for fold, share in zip(phase_bins.folds if phase_bins else (), np.moveaxis(fractions, -1, 0), strict=True):
         # the share of `between` directions in the sum of squares of white noise has a beta distribution
-        p = scipy.special.betainc(0.5 * fold.within, 0.5 * fold.between, np.maximum(1.0 - share, 0.0))
+        p = scipy.special.betainc(0.5 * fold.scatter_dof, 0.5 * fold.means_dof, np.maximum(1.0 - share, 0.0))
         least = np.minimum(least, p)
     return least
 
 
 def _spectrum_p(distance: Float[np.ndarray, "*records"], lines: int) -> Float[np.ndarray, "*records"]:
     """Bartlett's test of the cumulative periodogram, by Kolmogorov's law: low where noise is not white."""
-    if lines < _LEAST_TESTED // 2:
+    if lines < _MIN_SAMPLES // 2:
         return np.ones(distance.shape)
     k = np.arange(1, 31)
     series = 2.0 * np.sum((-1.0) ** (k - 1) * np.exp(-2.0 * (k * distance[..., None]) ** 2), axis=-1)
@@ -158,9 +170,9 @@ def _spectrum_p(distance: Float[np.ndarray, "*records"], lines: int) -> Float[np
     return np.where(distance < 0.2, 1.0, np.clip(series, 0.0, 1.0))
 
 
-def _line_p(strongest: Float[np.ndarray, "*records"], lines: int) -> Float[np.ndarray, "*records"]:
+def _line_p(line_fraction: Float[np.ndarray, "*records"], lines: int) -> Float[np.ndarray, "*records"]:
     """Fisher's test: low where one line of the periodogram, as of hum, is too strong for white noise."""
-    if lines < _LEAST_TESTED // 2:
-        return np.ones(strongest.shape)
-    log_p = math.log(lines) + (lines - 1) * np.log1p(-np.minimum(strongest, 1.0 - 1e-16))
+    if lines < _MIN_SAMPLES // 2:
+        return np.ones(line_fraction.shape)
+    log_p = math.log(lines) + (lines - 1) * np.log1p(-np.minimum(line_fraction, 1.0 - 1e-16))
     return np.exp(np.minimum(log_p, 0.0))

@@ -9,37 +9,35 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitact.fitting.channel_fit import TraceFit
-from fitact.fitting.least_squares import Solved
+from fitact.fitting.channel_fit import ChannelFit
+from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.fitting.levenberg_marquardt import Optima, result_name
 from fitact.fitting.problem import Source
 from fitact.fitting.residual_statistics import is_misfit
 from fitact.likelihood.likelihood import Likelihood
 
-_NOISE = 4.0  # standard deviations by which noise may put an exponent beyond its bound
-_WITHIN = 1e-12
-_ALONG = 6.0  # standard deviations along what is known least, within which a bounded prior must leave room
 
-
-def verdict(
-    solved: Solved,
-    root: Float[np.ndarray, "parameters parameters"],
-    traces: Sequence[TraceFit],
+def diagnose_fit(
+    solution: LeastSquaresResult,
+    covariance_factor: Float[np.ndarray, "parameters parameters"],
+    traces: Sequence[ChannelFit],
     sources: Sequence[Source],
     optima: Optima | None,
 ) -> str:
     """The name of the first of the `RESULTS` that stands against the fit; "successful" if none does.
 
-    `root` is that of theta's covariance.
+    `covariance_factor` is that of theta's covariance.
     """
-    found = result_name(solved.result)
+    found = result_name(solution.result)
     if found != "successful":
         return found
-    if is_out_of_bounds(solved.likelihood, np.asarray(solved.theta), np.asarray(solved.sigma), root):
+    if is_out_of_bounds(solution.likelihood, np.asarray(solution.theta), np.asarray(solution.sigma), covariance_factor):
         return "on_bound"
     if optima is not None and result_name(optima.result) == "several_optima":
         return "several_optima"
-    doubtful = any(is_misfit(trace.figures) for trace in traces) or any(source.drowned for source in sources)
+    doubtful = any(is_misfit(trace.figures) for trace in traces) or any(
+        source.drive_noise_dominates for source in sources
+    )
     return "misfit" if doubtful else "successful"
 
 
@@ -47,39 +45,41 @@ def is_out_of_bounds(
     likelihood: Likelihood,
     theta: Float[np.ndarray, " parameters"],
     sigma: Float[np.ndarray, " traces"],
-    root: Float[np.ndarray, "parameters parameters"],
+    covariance_factor: Float[np.ndarray, "parameters parameters"],
+    half_width: float = 6.0,
 ) -> bool:
     """Whether the records put the parameters where a bounded or ordered prior forbids them.
 
     Least squares take a prior by its mean and covariance. Along what the records do not see it may end beyond an
-    edge, which the sampler mends; so what must be allowed is a point of that line. An exponent of 1 is a constant
-    skin, which the records may well have: where their noise alone puts it beyond, the line goes through 1.
+    edge, which the sampler mends; so what must be allowed is a point of that line, within `half_width` standard
+    deviations. An exponent of 1 is a constant skin, which the records may well have: where their noise alone puts it
+    beyond, the line goes through 1.
     """
-    axes, sizes, _ = np.linalg.svd(root)
-    along = np.linspace(-_ALONG, _ALONG, 241)[:, None] * (axes[:, 0] * sizes[0])
-    points = np.hstack([_with_possible_exponent(likelihood, theta, root) + along, np.tile(np.log(sigma), (241, 1))])
-    return not bool(_any_possible(likelihood.without_samples(), jnp.asarray(points)))
+    axes, sizes, _ = np.linalg.svd(covariance_factor)
+    along = np.linspace(-half_width, half_width, 241)[:, None] * (axes[:, 0] * sizes[0])
+    points = np.hstack([_clip_exponent(likelihood, theta, covariance_factor) + along, np.tile(np.log(sigma), (241, 1))])
+    return not bool(_has_possible_point(likelihood.without_samples(), jnp.asarray(points)))
 
 
 @eqx.filter_jit
-def _any_possible(likelihood: Likelihood, points: Float[Array, "n coordinates"]) -> Array:
+def _has_possible_point(likelihood: Likelihood, points: Float[Array, "n coordinates"]) -> Array:
     return jnp.any(jnp.isfinite(jax.vmap(likelihood.log_prior)(points)))
 
 
-def _with_possible_exponent(likelihood: Likelihood, theta: np.ndarray, root: np.ndarray) -> np.ndarray:
+def _clip_exponent(likelihood: Likelihood, theta: np.ndarray, covariance_factor: np.ndarray) -> np.ndarray:
     """Theta, or the most probable point with a fractional skin's exponent at its bound, where noise explains that."""
     if "alpha" not in likelihood.prior.names:
         return theta
     place, high = likelihood.prior.names.index("alpha"), getattr(likelihood.prior["alpha"], "high", 1.0)
-    excess, spread = theta[place] - math.log(high), np.linalg.norm(root[place])
-    if not 0.0 < excess < _NOISE * spread:
+    excess, spread = theta[place] - math.log(high), np.linalg.norm(covariance_factor[place])
+    if not 0.0 < excess < 4.0 * spread:  # as far as noise may put it
         return theta
-    moved = theta - root @ root[place] * (excess / spread**2)
-    moved[place] = math.log(high) * (1.0 + _WITHIN) - _WITHIN  # rounding must not leave it beyond
+    moved = theta - covariance_factor @ covariance_factor[place] * (excess / spread**2)
+    moved[place] = math.log(high) * (1.0 + 1e-12) - 1e-12  # rounding must not leave it beyond
     return moved
 
 
-def misfits(traces: Sequence[TraceFit]) -> list[str]:
+def misfit_warnings(traces: Sequence[ChannelFit]) -> list[str]:
     """Which of several traces the model does not describe, in sentences."""
     return [
         f"{trace.record.source}: {trace.channel} is not described by the model that all records share (reduced"

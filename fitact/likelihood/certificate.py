@@ -11,26 +11,21 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from fitact.likelihood.channel import Seen, Trace
-from fitact.likelihood.compression import SLOW, Compression, compress
-from fitact.likelihood.compression_on_grid import compress_on_grid
-from fitact.likelihood.likelihood import Batched, Likelihood
+from fitact.compiled import BatchEvaluator
+from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
+from fitact.likelihood.compression import BASELINE_NAMES, Compression, compress
+from fitact.likelihood.compression_on_grid import GridCompression, compress_on_grid
+from fitact.likelihood.likelihood import Likelihood
 from fitact.model.circuit import Circuit
 from fitact.model.drive import Sampled
 from fitact.model.skin import WithSkin
-from fitact.progress import watched
 
 TOLERANCE = 1e-3  # in log-likelihood
-_OFF_TIME = "a delay or a clock is free"
-_SHORT = 512  # samples, below which nothing is gained
-_POINTS = 8  # of each kind at which the full sum is taken
-_FAR = 1e-6  # of a point's distance below the optimum, in log-likelihood: error allowed there
-_REACH = 20.0  # standard deviations of log b that the table for sampling holds
-_LEAST_REACH = 0.05  # in log b
+_TIMING_REASON = "a delay or a clock is free"
 FEW_ROWS = 200  # numbers that an evaluation runs over, up to which the call costs more than they do
 
 
-class Certified(NamedTuple):
+class CertifiedLikelihood(NamedTuple):
     """A likelihood to sample from.
 
     Attributes:
@@ -44,172 +39,186 @@ class Certified(NamedTuple):
     reasons: tuple[str, ...]
 
 
-def project(trace: Trace, circuit: Circuit, shown: bool, tolerance: float) -> tuple[Trace, str]:
+def compress_channel(
+    channel: ChannelLikelihood, circuit: Circuit, tau_identified: bool, tolerance: float
+) -> tuple[ChannelLikelihood, str]:
     """The trace with its record's compression, or as it is and the reason why.
 
-    `circuit` nearly made it, and `shown` says whether the record shows it.
+    `circuit` nearly made it, and `tau_identified` says whether the record shows it.
     """
-    reason = _reason_against(trace, circuit, shown, tolerance)
+    reason = _uncompressed_reason(channel, circuit, tau_identified, tolerance)
     if reason:
-        return trace, reason
-    own = slice(trace.own)
-    arrays = np.asarray(trace.time)[own], np.asarray(trace.observed)[own]
+        return channel, reason
+    samples = slice(channel.n_samples)
+    arrays = channel.drive, np.asarray(channel.time)[samples], np.asarray(channel.observed)[samples]
     how: dict[str, Any] = {
-        "steady_state": trace.steady_state,
-        "weight": None if trace.equally_weighted else trace.weights[own],
-        "rate": None if trace.rate is None else np.asarray(trace.rate)[own],
+        "steady_state": channel.steady_state,
+        "weight": None if channel.equally_weighted else channel.weights[samples],
+        "rate": None if channel.rate is None else np.asarray(channel.rate)[samples],
     }
+    compression: Compression | GridCompression
     if isinstance(circuit, WithSkin):
         assert circuit.grid is not None  # there would be a reason against it
-        return dataclasses.replace(
-            trace, compression=compress_on_grid(trace.drive, *arrays, grid=circuit.grid, **how)
-        ), ""
-    near = circuit.terms_of(trace.channel)
-    return dataclasses.replace(trace, compression=compress(trace.drive, *arrays, near=near, **how)), ""
+        compression = compress_on_grid(*arrays, grid=circuit.grid, **how)
+    else:
+        compression = compress(*arrays, expected_terms=circuit.channel_terms(channel.channel), **how)
+    return dataclasses.replace(channel, compression=compression), ""
 
 
-def _reason_against(trace: Trace, circuit: Circuit, shown: bool, tolerance: float) -> str:
+def _uncompressed_reason(
+    channel: ChannelLikelihood, circuit: Circuit, tau_identified: bool, tolerance: float, min_samples: int = 512
+) -> str:
     if tolerance == 0.0:
         return "it was asked for"
-    if trace.noise == "student":
+    if channel.noise == "student":
         return "noise with outliers is more than lengths and angles"
-    if trace.whitening is not None:
+    if channel.whitening is not None:
         return "the noise is coloured"
-    if trace.own < _SHORT:
-        return f"the record is shorter than {_SHORT} samples"
-    if trace.timing:
-        return _OFF_TIME
+    if channel.n_samples < min_samples:  # nothing would be gained
+        return f"the record is shorter than {min_samples} samples"
+    if channel.timing:
+        return _TIMING_REASON
     if isinstance(circuit, WithSkin):
         return "a dispersive skin has no time constants" if circuit.grid is None else ""
-    if isinstance(trace.drive, Sampled) and trace.steady_state:
+    if isinstance(channel.drive, Sampled) and channel.steady_state:
         return "the steady state of a measured drive is not tabulated"
-    if not shown:
+    if not tau_identified:
         return "the record does not show its time constant"
-    if len(circuit.terms_of(trace.channel).tau) > 1:
+    if len(circuit.channel_terms(channel.channel).tau) > 1:
         return "the circuit has several time constants"
     return ""
 
 
 def certify(
-    wide: Likelihood,
+    likelihood: Likelihood,
     reasons: tuple[str, ...],
     theta: np.ndarray,
-    root: np.ndarray,
+    covariance_factor: np.ndarray,
     sigma: Float[np.ndarray, " traces"],
     tolerance: float,
-) -> Certified:
+    check_points: int = 8,
+) -> CertifiedLikelihood:
     """The likelihood for sampling around the optimum `theta`, checked against the full sum.
 
-    `root` is the root of theta's covariance. Each trace's compressed log-likelihood must agree to `tolerance` over
-    their number near the optimum, and at points of the prior to a part in a million of how far they lie below it.
+    `covariance_factor` is the root of theta's covariance. Each trace's compressed log-likelihood must agree to
+    `tolerance` over their number at the optimum and `check_points` around it, and at as many points of the prior to a
+    part in a million of how far they lie below it.
     """
-    asked = tuple(tuple(np.flatnonzero(np.asarray(trace.linear_sd)).tolist()) for trace in wide.traces)
-    wide = dataclasses.replace(
-        wide, traces=tuple(dataclasses.replace(t, columns=c) for t, c in zip(wide.traces, asked, strict=True))
+    free = (tuple(np.flatnonzero(np.asarray(trace.linear_sd)).tolist()) for trace in likelihood.channels)
+    likelihood = dataclasses.replace(
+        likelihood,
+        channels=tuple(dataclasses.replace(t, columns=c) for t, c in zip(likelihood.channels, free, strict=True)),
     )
-    if all(trace.compression is None for trace in wide.traces):
-        return Certified(wide, None, tuple(r or _OFF_TIME for r in reasons))
-    light, optimum = wide.without_samples(), jnp.asarray(theta)
+    if all(trace.compression is None for trace in likelihood.channels):
+        return CertifiedLikelihood(likelihood, None, tuple(r or _TIMING_REASON for r in reasons))
+    light, optimum = likelihood.without_samples(), jnp.asarray(theta)
     log_b, slope = _log_b_and_slope(light, optimum)
-    reach = float(reach_of(np.linalg.norm(np.asarray(slope) @ root)))
+    reach = float(table_half_width(np.linalg.norm(np.asarray(slope) @ covariance_factor)))
     near = tuple(
-        _narrowed(trace, seen, float(log_b), reach, float(precision_of(noise, tolerance)))
-        for (trace, seen), noise in zip(wide.each(optimum), sigma, strict=True)
+        _restrict_table(trace, inputs, float(log_b), reach, float(table_precision(noise, tolerance)))
+        for (trace, inputs), noise in zip(likelihood.channels_and_inputs(optimum), sigma, strict=True)
     )
-    points = np.vstack([_near(theta, root), _believed(light, theta)])
-    narrow = dataclasses.replace(wide, traces=near).without_samples()
-    exact, compressed, tabulated = (_at(model, points, sigma) for model in (wide.summed(), narrow, light))
-    found = [
-        reason or (_OFF_TIME if trace.compression is None else _against(*parts, tolerance / len(near)))
-        for reason, trace, parts in zip(
-            reasons, near, zip(exact.T, compressed.T, tabulated.T, strict=True), strict=True
-        )
-    ]
-    error = None if any(found) else float(np.sum(np.max(np.abs(compressed - exact)[: _POINTS + 1], axis=0)))
-    kept = tuple(trace.summed() if reason else trace for trace, reason in zip(near, found, strict=True))
-    return Certified(dataclasses.replace(wide, traces=kept), error, tuple(found))
+    deviates = np.random.default_rng(0).standard_normal((check_points, theta.size))  # any will do
+    around = np.vstack([theta, theta + 1.5 * deviates @ covariance_factor.T])
+    points = np.vstack([around, _prior_points(light, theta, check_points)])
+    narrow = dataclasses.replace(likelihood, channels=near).without_samples()
+    exact, compressed, tabulated = (
+        _evaluate_log_likelihoods(model, points, sigma) for model in (likelihood.without_compression(), narrow, light)
+    )
+    errors = np.max(np.abs(compressed - exact)[: len(around)], axis=0)
+    # far from the optimum an error may grow with the distance below it, in log-likelihood
+    excesses = np.nanmax(np.abs(tabulated - exact) - 1e-6 * np.abs(exact[0] - exact), axis=0, initial=-np.inf)
+    reasons = tuple(
+        reason
+        or (_TIMING_REASON if trace.compression is None else _compression_failure(error, excess, tolerance / len(near)))
+        for reason, trace, error, excess in zip(reasons, near, errors, excesses, strict=True)
+    )
+    channels = tuple(
+        trace.without_compression() if reason else trace for trace, reason in zip(near, reasons, strict=True)
+    )
+    error = None if any(reasons) else float(np.sum(errors))
+    return CertifiedLikelihood(dataclasses.replace(likelihood, channels=channels), error, reasons)
 
 
-def reach_of(log_b_sd: ArrayLike) -> Float[np.ndarray, "*shape"]:
-    """What a table for sampling holds on either side of the optimum, in log b."""
-    return np.maximum(_REACH * np.asarray(log_b_sd), _LEAST_REACH)
+def table_half_width(
+    log_b_sd: ArrayLike, standard_deviations: float = 20.0, least: float = 0.05
+) -> Float[np.ndarray, "*shape"]:
+    """The width of a table for sampling on either side of the optimum, in log b."""
+    return np.maximum(standard_deviations * np.asarray(log_b_sd), least)
 
 
-def precision_of(noise: ArrayLike, tolerance: float = TOLERANCE) -> Float[np.ndarray, "*shape"]:
-    """What a table for sampling may be off by, V or A (root of the sum of squares), under a noise, V or A."""
+def table_precision(noise: ArrayLike, tolerance: float = TOLERANCE) -> Float[np.ndarray, "*shape"]:
+    """The error that a table for sampling may have, V or A (root of the sum of squares), under a noise, V or A."""
     return 0.1 * tolerance * np.asarray(noise)
 
 
-def _against(exact: np.ndarray, compressed: np.ndarray, tabulated: np.ndarray, tolerance: float) -> str:
-    """What speaks against the compression of a trace, by its log-likelihoods at points near and far; "" if nothing."""
-    error = float(np.max(np.abs(compressed - exact)[: _POINTS + 1]))
+def _compression_failure(error: float, excess: float, tolerance: float) -> str:
+    """The case against the compression of a trace, by errors near the optimum and within the prior; "" if none."""
     if np.isnan(error):
         return "the record leaves its time constant more open than the table is wide"
     if not error <= tolerance:
         return f"the compressed log-likelihood was off by {error:.2g} near the optimum"
-    excess = float(np.nanmax(np.abs(tabulated - exact) - _FAR * np.abs(exact[0] - exact)))
     return f"the compressed log-likelihood was off by {excess:.2g} within the prior" if excess > tolerance else ""
 
 
-def _near(theta: np.ndarray, root: np.ndarray) -> Float[np.ndarray, "n parameters"]:
-    """The optimum and points around it; any will do."""
-    deviates = np.random.default_rng(0).standard_normal((_POINTS, theta.size))
-    return np.vstack([theta, theta + 1.5 * deviates @ root.T])
-
-
-def _believed(likelihood: Likelihood, theta: np.ndarray) -> Float[np.ndarray, "n parameters"]:
+def _prior_points(likelihood: Likelihood, theta: np.ndarray, count: int) -> Float[np.ndarray, "n parameters"]:
     """Points of the prior that the tables reach, the optimum where there are too few."""
-    draws = likelihood.draws(theta, 1000)
-    slowest = _each_log_b(likelihood, jnp.asarray(draws))
-    held = [trace.compression.holds(jnp.exp(slowest)) for trace in likelihood.traces if trace.compression is not None]
-    draws = draws[np.all(held, axis=0)]
-    return np.vstack([draws, np.tile(theta, (_POINTS, 1))])[:_POINTS]
+    draws = likelihood.sample_prior(theta, 1000)
+    tau = jnp.exp(_log_b_at_points(likelihood, jnp.asarray(draws)))
+    covered = [trace.compression.covers(tau) for trace in likelihood.channels if trace.compression is not None]
+    draws = draws[np.all(covered, axis=0)]
+    return np.vstack([draws, np.tile(theta, (count, 1))])[:count]
 
 
-def _at(likelihood: Likelihood, theta: Float[np.ndarray, "n parameters"], sigma: np.ndarray) -> np.ndarray:
+def _evaluate_log_likelihoods(
+    likelihood: Likelihood, theta: Float[np.ndarray, "n parameters"], sigma: np.ndarray
+) -> np.ndarray:
     """Log-likelihoods of each trace at points of one sigma, (n, traces)."""
     points = np.column_stack([theta, np.tile(np.log(sigma), (len(theta), 1))])
-    evaluate = Batched(Likelihood.log_likelihoods, likelihood, likelihood.rows)
-    batches = [points[i : i + evaluate.batch] for i in range(0, len(points), evaluate.batch)]
-    return np.concatenate([evaluate(batch) for batch in watched(batches, "checking the compression", len(batches))])
+    evaluate = BatchEvaluator(Likelihood.log_likelihoods, likelihood, likelihood.rows)
+    return evaluate(points, description="checking the compression")
 
 
-def log_prob(likelihood: Likelihood, walkers: int) -> Callable[[np.ndarray], np.ndarray]:
+def batched_log_prob(likelihood: Likelihood, walkers: int) -> Callable[[np.ndarray], np.ndarray]:
     """Log-posteriors of points (theta, log sigma); where the compression does not reach, the samples are summed.
 
     Fastest for all `walkers` of an ensemble at once, or half of them.
     """
     # halves are filled up where they cost no more, so that one size is compiled
     batch = walkers if likelihood.rows <= FEW_ROWS else walkers // 2
-    tabulated = Batched(Likelihood.log_prob, likelihood.without_samples(), likelihood.rows, batch)
-    full = likelihood.summed()
-    summed = Batched(Likelihood.log_prob, full, full.rows, batch=1)
+    tabulated = BatchEvaluator(Likelihood.log_prob, likelihood.without_samples(), likelihood.rows, batch)
+    full = likelihood.without_compression()
+    summed = BatchEvaluator(Likelihood.log_prob, full, full.rows, batch=1)
 
     def values(points: Float[np.ndarray, "n coordinates"]) -> np.ndarray:
-        found = tabulated(points)
-        beyond = np.isnan(found)
+        log_prob = tabulated(points)
+        beyond = np.isnan(log_prob)
         if beyond.any():
-            found = np.array(found)
-            found[beyond] = summed(points[beyond])
-        return found
+            log_prob = np.array(log_prob)
+            log_prob[beyond] = summed(points[beyond])
+        return log_prob
 
     return values
 
 
-def _narrowed(trace: Trace, seen: Seen, center: float, reach: float, error: float) -> Trace:
+def _restrict_table(
+    channel: ChannelLikelihood, inputs: ChannelInputs, center: float, half_width: float, error: float
+) -> ChannelLikelihood:
     """With the part of the table that the posterior can want, where there is a table that holds the optimum.
 
-    That is `reach` around `center`, in log b, to an `error` of the signal (V or A).
+    That is `half_width` around `center`, in log b, to an `error` of the signal (V or A).
     """
-    table = trace.compression
-    if not isinstance(table, Compression) or not table.holds(np.exp(center)):
-        return trace
-    largest = float(jnp.sum(jnp.abs(jnp.stack(seen.circuit.terms_of(trace.channel).weight))) * seen.gain)
-    charge = float(np.ptp(trace.observed)) / largest if max(trace.columns, default=0) >= len(SLOW) else 0.0
-    low, high = (float(table.center + side * table.reach) for side in (-1.0, 1.0))
-    low, high = max(center - reach, low), min(center + reach, high)
-    narrow = table.narrowed(0.5 * (low + high), 0.5 * (high - low), error / largest, charge=charge)
-    return dataclasses.replace(trace, compression=narrow)
+    table = channel.compression
+    if not isinstance(table, Compression) or not table.covers(np.exp(center)):
+        return channel
+    largest = float(jnp.sum(jnp.abs(jnp.stack(inputs.circuit.channel_terms(channel.channel).weight))) * inputs.gain)
+    charge = (
+        float(np.ptp(channel.observed)) / largest if max(channel.columns, default=0) >= len(BASELINE_NAMES) else 0.0
+    )
+    low, high = (float(table.center + side * table.half_width) for side in (-1.0, 1.0))
+    low, high = max(center - half_width, low), min(center + half_width, high)
+    narrow = table.restrict(0.5 * (low + high), 0.5 * (high - low), error / largest, charge=charge)
+    return dataclasses.replace(channel, compression=narrow)
 
 
 @eqx.filter_jit
@@ -218,7 +227,7 @@ def _log_b_and_slope(likelihood: Likelihood, theta: Array) -> tuple[Array, Array
 
 
 @eqx.filter_jit
-def _each_log_b(likelihood: Likelihood, theta: Float[Array, "n parameters"]) -> Float[Array, " n"]:
+def _log_b_at_points(likelihood: Likelihood, theta: Float[Array, "n parameters"]) -> Float[Array, " n"]:
     return jax.vmap(lambda each: _log_b(likelihood, each))(theta)
 
 

@@ -19,7 +19,7 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from fitact.likelihood.compression import SLOW, Compression, slow_shapes
+from fitact.likelihood.compression import BASELINE_NAMES, Compression, baseline_functions
 from fitact.likelihood.compression_on_grid import GridCompression
 from fitact.likelihood.noise import NoiseModel, Whitening, student_curvature, student_residual, student_weight
 from fitact.model.circuit import Channel, Circuit
@@ -28,12 +28,11 @@ from fitact.model.response import response_and_rate
 from fitact.model.skin import WithSkin
 
 CHARGES = ("charge", "charge_2", "charge_3", "charge_4")  # one for each time constant, the slowest first
-LINEAR = (*SLOW, *CHARGES)
-TIMING = ("delay", "clock")
-_REWEIGHTED = 12  # steps from the Gaussian's linear nuisances to those under Student's t; each gains half a digit
+LINEAR_NUISANCES = (*BASELINE_NAMES, *CHARGES)
+TIMING_NUISANCES = ("delay", "clock")
 
 
-class Seen(eqx.Module):
+class ChannelInputs(eqx.Module):
     """What a trace needs of the parameters.
 
     Attributes:
@@ -49,7 +48,7 @@ class Seen(eqx.Module):
     clock: ArrayLike = 0.0
 
 
-class Trace(eqx.Module):
+class ChannelLikelihood(eqx.Module):
     """One channel of one record, and what drives it, filled up as `fitact.compiled` does.
 
     Attributes:
@@ -58,29 +57,29 @@ class Trace(eqx.Module):
         weight: of each sample: the inverse of its noise's standard deviation relative to the trace's; 0 leaves it
             out. None: all are 1.
         whitening: of coloured noise; None: the noise is white.
-        least_noise: below which its standard deviation is not believed, in the channel's unit.
+        noise_floor: below which its standard deviation is not believed, in the channel's unit.
         rate: dV/dt at the samples, V/s, for a current that follows it.
         drive: what drives the circuit.
-        linear_sd: prior standard deviations of the `LINEAR` nuisances, in the channel's unit (drift: over half the
-            record); 0 leaves one out.
+        linear_sd: prior standard deviations of the `LINEAR_NUISANCES` nuisances, in the channel's unit (drift: over
+            half the record); 0 leaves one out.
         shift: the drive starts this much later than the record's t = 0, s.
         clock: by what share it is faster than stated.
         time_step: s.
-        timing_sd: prior standard deviations of `TIMING`, in time steps; a clock's are those in half a record.
+        timing_sd: prior standard deviations of `TIMING_NUISANCES`, in time steps; a clock's are those in half a record.
         compression: the record's projection; None: the samples are summed.
         label: "" or what tells it from the other traces, as "I_2".
         channel: "Vsc" or "I".
         steady_state: or from rest.
-        timing: which of `TIMING` are parameters, in that order.
+        timing: which of `TIMING_NUISANCES` are parameters, in that order.
         noise: its model.
-        columns: which of `LINEAR` are looked at; the others' linear_sd is 0.
+        columns: which of `LINEAR_NUISANCES` are looked at; the others' linear_sd is 0.
     """
 
     time: Float[Array, " samples"]
     observed: Float[Array, " samples"]
     weight: Float[Array, " samples"] | None
     whitening: Whitening | None
-    least_noise: ArrayLike
+    noise_floor: ArrayLike
     rate: Float[Array, " samples"] | None
     drive: Drive
     linear_sd: Float[Array, " 10"]
@@ -96,25 +95,23 @@ class Trace(eqx.Module):
     noise: NoiseModel = eqx.field(static=True)
     columns: tuple[int, ...] = eqx.field(static=True)
 
-    def named(self, name: str) -> str:
+    def qualified_name(self, name: str) -> str:
         """A nuisance's name, with the trace's label where there are several traces."""
         return f"{name}_{self.label}" if self.label else name
 
     def timing_unit(self, name: str) -> ArrayLike:
-        """What 1 of a coordinate of `TIMING` is: s, or a share of 1."""
+        """What 1 of a coordinate of `TIMING_NUISANCES` is: s, or a share of 1."""
         return self.time_step if name == "delay" else 2.0 * self.time_step / (self.time[-1] - self.time[0])
 
-    def summed(self) -> "Trace":
-        """Without compression."""
+    def without_compression(self) -> "ChannelLikelihood":
         return dataclasses.replace(self, compression=None)
 
     @property
     def count(self) -> ArrayLike:
-        """How many samples count."""
         if self.compression is not None:
             return self.compression.samples
         if self.whitening is not None:
-            return jnp.count_nonzero(self.whitening.kept)
+            return jnp.count_nonzero(self.whitening.mask)
         return self.time.size if self.weight is None else jnp.count_nonzero(self.weight)
 
     @property
@@ -123,22 +120,21 @@ class Trace(eqx.Module):
         return self.time.size if self.compression is None else self.compression.observed.size
 
     @property
-    def own(self) -> int:
+    def n_samples(self) -> int:
         """How many samples are the record's own, from the first on."""
         time = np.asarray(self.time)
         return 1 + int(np.searchsorted(time, time[-1]))
 
     @property
     def weights(self) -> Float[np.ndarray, " samples"]:
-        """Of each sample."""
         return np.ones(self.time.size) if self.weight is None else np.asarray(self.weight)
 
     @property
     def equally_weighted(self) -> bool:
         """Whether all of the record's own samples count, and equally."""
-        return self.weight is None or bool(np.all(self.weights[: self.own] == 1.0))
+        return self.weight is None or bool(np.all(self.weights[: self.n_samples] == 1.0))
 
-    def without_samples(self) -> "Trace":
+    def without_samples(self) -> "ChannelLikelihood":
         """With no more of the samples than their ends, where a compression stands for them.
 
         What is compiled for it serves records of any length.
@@ -152,119 +148,124 @@ class Trace(eqx.Module):
         ends, extremes = jnp.asarray(time[:2]), jnp.array([observed.min(), observed.max()])
         return dataclasses.replace(self, time=ends, observed=extremes, drive=drive, weight=None, rate=None)
 
-    def signal(self, seen: Seen, later: ArrayLike = 0.0) -> Float[Array, " samples"]:
-        """The channel as recorded, but for linear nuisances and noise; `later` (s) delays it further."""
-        undelayed = not self.timing and isinstance(later, float) and later == 0.0
+    def signal(self, inputs: ChannelInputs, extra_delay: ArrayLike = 0.0) -> Float[Array, " samples"]:
+        """The channel as recorded, but for linear nuisances and noise; `extra_delay` (s) delays it further."""
+        undelayed = not self.timing and isinstance(extra_delay, float) and extra_delay == 0.0
         if undelayed and isinstance(self.drive, Sampled) and self.drive.period is None:
             time = self.drive.time  # V's samples, which are the trace's: `highpass` knows u there without a search
         else:
-            time = self.time - (self.shift + seen.delay + later)
+            time = self.time - (self.shift + inputs.delay + extra_delay)
         if "clock" in self.timing:
-            time = time * (1.0 + self.clock + seen.clock)
+            time = time * (1.0 + self.clock + inputs.clock)
         how: dict[str, Any] = {"steady_state": self.steady_state, "channel": self.channel}
-        total, rate = response_and_rate(seen.circuit, self.drive, time, **how)
+        total, rate = response_and_rate(inputs.circuit, self.drive, time, **how)
         if rate is not None and self.rate is not None:
             total = total + rate * self.rate
-        return seen.gain * total
+        return inputs.gain * total
 
-    def shapes(self, seen: Seen) -> Float[Array, "10 samples"]:
+    def shapes(self, inputs: ChannelInputs) -> Float[Array, "10 samples"]:
         """The linear nuisances' shapes in time, each of height 1."""
         middle, half = 0.5 * (self.time[0] + self.time[-1]), 0.5 * (self.time[-1] - self.time[0])
-        return jnp.concatenate([slow_shapes(self.time, middle, half), self.decays(seen.circuit, self.time)])
+        return jnp.concatenate([baseline_functions(self.time, middle, half), self.decays(inputs.circuit, self.time)])
 
     def decays(self, circuit: Circuit, time: Float[Array, " times"]) -> Float[Array, "4 times"]:
         """How unknown charges at the first sample decay; 0 beyond the time constants of constant skins."""
         if isinstance(circuit, WithSkin):
             return jnp.zeros((len(CHARGES), time.size))
         since, taus = time - self.time[0], circuit.terms().tau
-        found = jnp.stack([jnp.exp(-since / tau) for tau in taus])
-        return jnp.pad(found, ((0, len(CHARGES) - len(taus)), (0, 0)))
+        decays = jnp.stack([jnp.exp(-since / tau) for tau in taus])
+        return jnp.pad(decays, ((0, len(CHARGES) - len(taus)), (0, 0)))
 
     @property
-    def _places(self) -> np.ndarray:
+    def _column_indices(self) -> np.ndarray:
         return np.array(self.columns, dtype=int)
 
-    def before_linear(self, seen: Seen) -> tuple[Float[Array, " rows"], Float[Array, "columns rows"]]:
+    def residuals_and_shapes(self, inputs: ChannelInputs) -> tuple[Float[Array, " rows"], Float[Array, "columns rows"]]:
         """The trace less the signal, and the shapes of the `columns`, weighted, over samples or coordinates."""
         if self.compression is None:
-            remainder, shapes = self.observed - self.signal(seen), self.shapes(seen)[self._places]
-            return self.weighted(remainder), self.weighted(shapes)
-        terms = seen.circuit.terms_of(self.channel)
-        remainder = self.compression.observed - seen.gain * self.compression.response(terms)
+            remainder, shapes = self.observed - self.signal(inputs), self.shapes(inputs)[self._column_indices]
+            return self.apply_whitening(remainder), self.apply_whitening(shapes)
+        terms = inputs.circuit.channel_terms(self.channel)
+        remainder = self.compression.observed - inputs.gain * self.compression.response(terms)
         decays = self.compression.decays(terms.tau[0])[None]
-        shapes = jnp.concatenate([self.compression.slow, decays, jnp.zeros((len(CHARGES) - 1, remainder.size))])
-        return remainder, shapes[self._places]
+        shapes = jnp.concatenate([self.compression.baseline, decays, jnp.zeros((len(CHARGES) - 1, remainder.size))])
+        return remainder, shapes[self._column_indices]
 
-    def weighted(self, values: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
+    def apply_whitening(self, values: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
         """What lies over the samples, in units of equal and independent noise; 0 where they do not count."""
         values = values if self.weight is None else values * self.weight
         return values if self.whitening is None else self.whitening(values)
 
     def mean(self, values: Float[Array, " samples"]) -> Float[Array, ""]:
-        """Over the samples that have a weight."""
         return jnp.mean(values, where=None if self.weight is None else self.weight > 0.0)
 
-    def change_by_delay(self, seen: Seen) -> Float[Array, " samples"]:
+    def delay_derivative(self, inputs: ChannelInputs) -> Float[Array, " samples"]:
         """How a further delay changes the signal, per s: over two time steps, so that ideal edges count."""
         step = self.time_step
-        return (self.signal(seen, step) - self.signal(seen, -step)) / (2.0 * step)
+        return (self.signal(inputs, step) - self.signal(inputs, -step)) / (2.0 * step)
 
-    def slope(self, seen: Seen) -> Float[Array, " rows"]:
-        """As `change_by_delay`, weighted, over samples or coordinates."""
+    def whitened_delay_derivative(self, inputs: ChannelInputs) -> Float[Array, " rows"]:
+        """The same weighted, over samples or coordinates."""
         if self.compression is None:
-            return self.weighted(self.change_by_delay(seen))
-        return seen.gain * self.compression.change_by_delay(seen.circuit.terms_of(self.channel))
+            return self.apply_whitening(self.delay_derivative(inputs))
+        return inputs.gain * self.compression.delay_derivative(inputs.circuit.channel_terms(self.channel))
 
-    def linear(
-        self, seen: Seen, sigma: ArrayLike
+    def fit_nuisances(
+        self, inputs: ChannelInputs, sigma: ArrayLike
     ) -> tuple[Float[Array, " rows"], Float[Array, " columns"], Float[Array, "columns columns"]]:
         """What is left of the trace, and the nuisances' posterior given all else.
 
         Gives the remainder (weighted) after the best nuisances, their coefficients in prior standard
         deviations, and the Cholesky factor of their posterior precision.
         """
-        remainder, shapes = self.before_linear(seen)
-        A = self.linear_sd[self._places, None] * shapes
+        remainder, shapes = self.residuals_and_shapes(inputs)
+        A = self.linear_sd[self._column_indices, None] * shapes
         # keep XLA from computing both once per use
         remainder, A = lax.optimization_barrier((remainder, A))
         factor = jnp.linalg.cholesky(jnp.eye(len(A)) + A @ A.T / sigma**2)
         beta = cho_solve((factor, True), A @ remainder / sigma**2)
         if self.noise != "student":
             return remainder - beta @ A, beta, factor
-        return self._reweighted(remainder, A, beta, sigma)
+        return self._fit_nuisances_student(remainder, A, beta, sigma)
 
-    def _reweighted(
-        self, remainder: Array, A: Array, beta: Array, sigma: ArrayLike
+    def _fit_nuisances_student(
+        self, residuals: Array, A: Array, beta: Array, sigma: ArrayLike, steps: int = 12
     ) -> tuple[Float[Array, " rows"], Float[Array, " columns"], Float[Array, "columns columns"]]:
-        """As `linear`, under Student's t, from the Gaussian's `beta`; in Laplace's approximation."""
+        """`fit_nuisances` under Student's t, from the Gaussian's `beta`; in Laplace's approximation.
+
+        Each of the `steps` of reweighting gains half a digit.
+        """
         one = jnp.eye(len(A))
 
         def step(_: int, beta: Array) -> Array:
-            weighted = A * student_weight((remainder - beta @ A) / sigma)
-            return jnp.linalg.solve(one + weighted @ A.T / sigma**2, weighted @ remainder / sigma**2)
+            weighted = A * student_weight((residuals - beta @ A) / sigma)
+            return jnp.linalg.solve(one + weighted @ A.T / sigma**2, weighted @ residuals / sigma**2)
 
-        left = remainder - (beta := lax.fori_loop(0, _REWEIGHTED, step, beta)) @ A
-        curvature = jnp.maximum(self.mean(student_curvature(left / sigma)), 0.0)
-        return left, beta, jnp.linalg.cholesky(one + curvature * A @ A.T / sigma**2)
+        beta = lax.fori_loop(0, steps, step, beta)
+        remainder = residuals - beta @ A
+        curvature = jnp.maximum(self.mean(student_curvature(remainder / sigma)), 0.0)
+        return remainder, beta, jnp.linalg.cholesky(one + curvature * A @ A.T / sigma**2)
 
-    def drawn(self, seen: Seen, sigma: ArrayLike, deviate: ArrayLike = 0.0) -> Float[Array, " 10"]:
+    def sample_nuisances(
+        self, inputs: ChannelInputs, sigma: ArrayLike, deviate: ArrayLike = 0.0
+    ) -> Float[Array, " 10"]:
         """The nuisances' coefficients, in prior standard deviations, as ten standard normal numbers draw them.
 
         With a `deviate` of 0, their posterior mean.
         """
-        _, beta, factor = self.linear(seen, sigma)
-        deviate = jnp.broadcast_to(deviate, len(LINEAR))[self._places]
-        return jnp.zeros(len(LINEAR)).at[self._places].set(beta + solve_triangular(factor.T, deviate))
+        _, beta, factor = self.fit_nuisances(inputs, sigma)
+        deviate = jnp.broadcast_to(deviate, len(LINEAR_NUISANCES))[self._column_indices]
+        return jnp.zeros(len(LINEAR_NUISANCES)).at[self._column_indices].set(beta + solve_triangular(factor.T, deviate))
 
-    def residuals(self, seen: Seen, sigma: ArrayLike) -> Float[Array, " rows+columns"]:
+    def residuals(self, inputs: ChannelInputs, sigma: ArrayLike) -> Float[Array, " rows+columns"]:
         """Whitened residuals, nuisances' priors included: half their square is -log-likelihood."""
-        remainder, beta, _ = self.linear(seen, sigma)
+        remainder, beta, _ = self.fit_nuisances(inputs, sigma)
         whitened = remainder / sigma
         return jnp.concatenate([student_residual(whitened) if self.noise == "student" else whitened, beta])
 
-    def log_likelihood(self, seen: Seen, log_sigma: ArrayLike) -> Float[Array, ""]:
+    def log_likelihood(self, inputs: ChannelInputs, log_sigma: ArrayLike) -> Float[Array, ""]:
         """Up to a constant; NaN where the compression does not reach."""
-        remainder, beta, factor = self.linear(seen, jnp.exp(log_sigma))
+        remainder, beta, factor = self.fit_nuisances(inputs, jnp.exp(log_sigma))
         if self.noise == "student":
             misfit = jnp.sum(jnp.square(student_residual(remainder * jnp.exp(-log_sigma))))
         else:
@@ -273,4 +274,4 @@ class Trace(eqx.Module):
         value = -0.5 * misfit - self.count * log_sigma - jnp.sum(jnp.log(jnp.diagonal(factor)))
         if self.compression is None:
             return value
-        return jnp.where(self.compression.holds(seen.circuit.b), value, jnp.nan)
+        return jnp.where(self.compression.covers(inputs.circuit.b), value, jnp.nan)

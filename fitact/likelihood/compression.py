@@ -23,27 +23,23 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from fitact.compiled import padded, padded_weight
+from fitact.compiled import pad_samples, pad_weight
 from fitact.data.record import is_uniform
 from fitact.model.chirp import Chirp
-from fitact.model.circuit import Terms
+from fitact.model.circuit import HighpassTerms
 from fitact.model.drive import Drive, Periodic, Sampled
 from fitact.model.response import highpass, phi, recurrence
-from fitact.progress import watched
+from fitact.progress import track_progress
 
-SLOW = ("offset", "drift", "hum_50Hz_cos", "hum_50Hz_sin", "hum_60Hz_cos", "hum_60Hz_sin")
+BASELINE_NAMES = ("offset", "drift", "hum_50Hz_cos", "hum_50Hz_sin", "hum_60Hz_cos", "hum_60Hz_sin")
 
 # the last of the functions whose inner products are added up
-_SLOW = slice(-3 - len(SLOW), -3)
 _RATE, _SLOPE, _OBSERVED = -3, -2, -1
+_BASELINE = slice(_RATE - len(BASELINE_NAMES), _RATE)
 
 NODES = 41  # odd, so that the middle of the table is a node
-REACH = math.log(9.0)  # half width of the table in log tau
-RANK = 1e-13  # singular values of what spans the responses, relative, that are left out
-_EXACT = 1e-9  # of a step: how evenly samples must lie to be folded
-_BLOCK = 64  # samples in a block of the recurrence
-_LONGEST = 65_536  # samples until a drive repeats on the sampling grid, for folding
-_CHUNK = 8_192  # samples at a time, which bounds memory
+TABLE_HALF_WIDTH = math.log(9.0)  # half width of the table in log tau
+RANK_TOLERANCE = 1e-13  # singular values of what spans the responses, relative, that are left out
 
 
 class Compression(eqx.Module):
@@ -52,10 +48,10 @@ class Compression(eqx.Module):
     A vector of `rows` coordinates stands for one value a sample; lengths and angles are those over all samples.
 
     Attributes:
-        center, reach: the table holds log tau within `reach` of `center` (tau in s).
+        center, half_width: the table holds log tau within `half_width` of `center` (tau in s).
         signal: Chebyshev coefficients in log tau of the response to the drive (V), rows below its rank being 0.
         decay: those of the decay of an unknown charge from 1 V.
-        slow: the shapes of `SLOW`, of height 1.
+        baseline: the shapes of `BASELINE_NAMES`, of height 1.
         rate: dV/dt, V/s, where the channel follows it, else 0.
         slope: dV/dt, V/s, over two samples, so that a jump shows on both sides of it.
         observed: the record, V or A.
@@ -63,20 +59,20 @@ class Compression(eqx.Module):
     """
 
     center: Float[Array, ""]
-    reach: Float[Array, ""]
+    half_width: Float[Array, ""]
     signal: Float[Array, "rank terms"]
     decay: Float[Array, "rows terms"]
-    slow: Float[Array, "shapes rows"]
+    baseline: Float[Array, "shapes rows"]
     rate: Float[Array, " rows"]
     slope: Float[Array, " rows"]
     observed: Float[Array, " rows"]
     samples: Float[Array, ""]
 
-    def holds(self, tau: Array) -> Array:
+    def covers(self, tau: Array) -> Array:
         """Whether the table reaches the time constant (s)."""
-        return jnp.abs(jnp.log(tau) - self.center) <= self.reach
+        return jnp.abs(jnp.log(tau) - self.center) <= self.half_width
 
-    def response(self, terms: Terms) -> Float[Array, " rows"]:
+    def response(self, terms: HighpassTerms) -> Float[Array, " rows"]:
         """The response of a circuit, as `fitact.response` gives it in time."""
         total = sum(
             weight * (self.signal @ self._series(tau)) for weight, tau in zip(terms.weight, terms.tau, strict=True)
@@ -84,9 +80,9 @@ class Compression(eqx.Module):
         total = jnp.pad(total, (0, self.observed.size - self.signal.shape[0]))
         return total if terms.rate is None else total + terms.rate * self.rate
 
-    def change_by_delay(self, terms: Terms) -> Float[Array, " rows"]:
+    def delay_derivative(self, terms: HighpassTerms) -> Float[Array, " rows"]:
         """How a delay changes it, per s: u' = V' - u / tau."""
-        falling = Terms(tuple(w / t for w, t in zip(terms.weight, terms.tau, strict=True)), terms.tau)
+        falling = HighpassTerms(tuple(w / t for w, t in zip(terms.weight, terms.tau, strict=True)), terms.tau)
         return self.response(falling) - sum(terms.weight) * self.slope
 
     def decays(self, tau: Array) -> Float[Array, " rows"]:
@@ -94,8 +90,7 @@ class Compression(eqx.Module):
         return self.decay @ self._series(tau)
 
     def _series(self, tau: Array) -> Float[Array, " terms"]:
-        """Chebyshev polynomials at log tau."""
-        x = (jnp.log(tau) - self.center) / self.reach
+        x = (jnp.log(tau) - self.center) / self.half_width
         terms = self.signal.shape[1]
 
         def step(last: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
@@ -104,36 +99,33 @@ class Compression(eqx.Module):
         # a loop compiles sooner, but runs slower where the terms are few
         return lax.scan(step, (jnp.ones_like(x), x), None, length=terms, unroll=terms <= NODES // 2)[1]
 
-    def narrowed(self, center: float, reach: float, precision: float, charge: float) -> "Compression":
-        """The same for log tau within `reach` of `center` only, with fewer terms and rows.
+    def restrict(self, center: float, half_width: float, precision: float, charge: float) -> "Compression":
+        """The same for log tau within `half_width` of `center` only, with fewer terms and rows.
 
         Left-out terms change no response to the drive, and no decay of a `charge` (V), by more than `precision`
         (V, root of the sum of squares); with no charge its decay is left out altogether.
         """
         x, to_series = chebyshev(NODES)
         # nodes of the narrow table, in the wide one; by NumPy, since JAX would compile its loop for every record
-        inside = (center + reach * x - float(self.center)) / float(self.reach)
-        at = np.polynomial.chebyshev.chebvander(inside, self.signal.shape[1] - 1)
-        signal = np.asarray(self.signal @ at.T) @ to_series.T
-        decay = np.asarray(self.decay @ at.T) @ to_series.T
+        inside = (center + half_width * x - float(self.center)) / float(self.half_width)
+        polynomials = np.polynomial.chebyshev.chebvander(inside, self.signal.shape[1] - 1).T
+        signal = np.asarray(self.signal @ polynomials) @ to_series.T
+        decay = np.asarray(self.decay @ polynomials) @ to_series.T
         sizes = np.linalg.norm(signal, axis=0) + charge * np.linalg.norm(decay, axis=0)
-        left = np.cumsum(sizes[::-1])[::-1]  # what leaving out this term and all later ones would cost
-        terms = in_fours(np.count_nonzero(left > precision), left.size)
+        costs = np.cumsum(sizes[::-1])[::-1]  # of leaving out this term and all later ones
+        terms = round_up_column_count(np.count_nonzero(costs > precision), costs.size)
         signal = np.pad(signal[:, :terms], ((0, self.observed.size - signal.shape[0]), (0, 0)))
         others = [decay[:, :terms]] if charge > 0.0 else []
-        columns = [signal, *others, self.slow.T, *(x[:, None] for x in (self.rate, self.slope, self.observed))]
+        columns = [signal, *others, self.baseline.T, *(x[:, None] for x in (self.rate, self.slope, self.observed))]
         _, rows = np.linalg.qr(np.hstack(columns))
-        return Compression(
-            center=jnp.asarray(center),
-            reach=jnp.asarray(reach),
-            signal=jnp.asarray(rows[:terms, :terms]),
-            decay=jnp.asarray(rows[:, terms : 2 * terms] if charge > 0.0 else np.zeros((len(rows), terms))),
-            slow=jnp.asarray(rows[:, _SLOW].T),
-            rate=jnp.asarray(rows[:, _RATE]),
-            slope=jnp.asarray(rows[:, _SLOPE]),
-            observed=jnp.asarray(rows[:, _OBSERVED]),
-            samples=self.samples,
-        )
+        decay = rows[:, terms : 2 * terms] if charge > 0.0 else np.zeros((len(rows), terms))
+        table = center, half_width, rows[:terms, :terms], decay
+        return Compression(*map(jnp.asarray, (*table, *_baseline_and_record(rows), self.samples)))
+
+
+def _baseline_and_record(rows: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The last of the columns, in the order of a `Compression`."""
+    return rows[:, _BASELINE].T, rows[:, _RATE], rows[:, _SLOPE], rows[:, _OBSERVED]
 
 
 def compress(
@@ -142,11 +134,11 @@ def compress(
     observed: Float[np.ndarray, " samples"],
     *,
     steady_state: bool,
-    near: Terms,
+    expected_terms: HighpassTerms,
     weight: Float[np.ndarray, " samples"] | None = None,
     rate: Float[np.ndarray, " samples"] | None = None,
 ) -> Compression:
-    """Project a record on the responses to `drive` of time constants within a factor 9 of that of `near`.
+    """Project a record on the responses to `drive` of time constants within a factor 9 of that of `expected_terms`.
 
     One pass over the arrays, a chunk at a time (so they may be `numpy.memmap`); where a steady drive repeats on
     the record's own sampling grid, its periods are folded first, exactly. Call it in double precision.
@@ -156,48 +148,48 @@ def compress(
         time: s.
         observed: Vsc or I, V or A.
         steady_state: as in `fitact.response`.
-        near: one term whose response is near the record; it is taken off before and added after, so that the
+        expected_terms: one term whose response is near the record; it is taken off before and added after, so that the
             record's noise keeps its digits.
         weight: of the samples: what multiplies their differences from a model; 0 leaves one out. None: 1.
         rate: dV/dt, V/s, for a channel that follows it.
     """
-    table = _Table.around(near, time)
+    table = _ResponseTable.from_terms(expected_terms, time)
     samples = _Samples(time, observed, weight, rate)
     if isinstance(drive, Sampled):
-        parts = _along_samples(table, drive, samples)
+        parts = _accumulate_measured(table, drive, samples)
     else:
-        period = _samples_a_period(drive, time) if steady_state else None
+        period = _samples_per_period(drive, time) if steady_state else None
         if period is None:
-            parts = _plainly(table, drive, samples, steady_state)
+            parts = _accumulate_directly(table, drive, samples, steady_state)
         else:
-            parts = _folded(table, drive, samples, period)
+            parts = _accumulate_folded(table, drive, samples, period)
     count = time.size if weight is None else int(np.count_nonzero(weight))
-    parts = watched(parts, "compressing the record", math.ceil(time.size / _chunk_length(time.size)))
+    parts = track_progress(parts, "compressing the record", math.ceil(time.size / _chunk_length(time.size)))
     return _assemble(table, sum(parts, np.zeros(())), isinstance(drive, Sampled), count)
 
 
-class _Table(eqx.Module):
+class _ResponseTable(eqx.Module):
     """What the pass needs of the table: its nodes, and the few combinations of them that matter."""
 
     center: Array
     nodes: Float[Array, " nodes"]  # s
-    mix: Float[Array, "nodes rank"]
+    combinations: Float[Array, "nodes rank"]
     series: np.ndarray  # coefficients (rank, terms) that give back any response from those combinations
-    near: Terms
+    expected_terms: HighpassTerms
     middle: Array  # of the record, s
     half: Array  # its length, s
     step: Array  # between samples, on average, s
 
     @classmethod
-    def around(cls, near: Terms, time: np.ndarray) -> "_Table":
-        (tau,) = map(float, near.tau)
+    def from_terms(cls, expected_terms: HighpassTerms, time: np.ndarray) -> "_ResponseTable":
+        (tau,) = map(float, expected_terms.tau)
         relative, mix, series = _exponentials()
         return cls(
             center=jnp.asarray(math.log(tau)),
             nodes=jnp.asarray(tau * relative),
-            mix=jnp.asarray(mix),
+            combinations=jnp.asarray(mix),
             series=series,
-            near=jax.tree.map(jnp.asarray, near),
+            expected_terms=jax.tree.map(jnp.asarray, expected_terms),
             middle=jnp.asarray(0.5 * (time[0] + time[-1])),
             half=jnp.asarray(0.5 * (time[-1] - time[0])),
             step=jnp.asarray((time[-1] - time[0]) / (time.size - 1)),
@@ -208,27 +200,27 @@ class _Table(eqx.Module):
 def _exponentials() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Nodes of any table over its middle, their combinations that matter, and the series that give back a response."""
     x, to_series = chebyshev(NODES)
-    relative = np.exp(REACH * x)
+    relative = np.exp(TABLE_HALF_WIDTH * x)
     ages = np.concatenate([[0.0], np.geomspace(1e-3 * relative.min(), 40.0 * relative.max(), 400)])
     _, sizes, modes = np.linalg.svd(np.exp(-ages[:, None] / relative), full_matrices=False)
-    rank = int(np.count_nonzero(sizes > RANK * sizes[0]))
+    rank = int(np.count_nonzero(sizes > RANK_TOLERANCE * sizes[0]))
     return relative, modes[:rank].T / sizes[:rank], (sizes[:rank, None] * modes[:rank]) @ to_series.T
 
 
-def slow_shapes(time: Float[Array, " n"], middle: Array, half: Array) -> Float[Array, "6 n"]:
-    """The shapes of `SLOW` in time: 1, a line from -1 to 1 over the record, and hum."""
+def baseline_functions(time: Float[Array, " n"], middle: Array, half: Array) -> Float[Array, "6 n"]:
+    """The shapes of `BASELINE_NAMES` in time: 1, a line from -1 to 1 over the record, and hum."""
     since = time - middle
     turns = 2.0 * np.pi * since
     waves = [wave(frequency * turns) for frequency in (50.0, 60.0) for wave in (jnp.cos, jnp.sin)]
     return jnp.stack([jnp.ones_like(since), since / half, *waves])
 
 
-def slow_at(time: np.ndarray, middle: ArrayLike, half: ArrayLike) -> Float[np.ndarray, "6 n"]:
+def evaluate_baseline(time: np.ndarray, middle: ArrayLike, half: ArrayLike) -> Float[np.ndarray, "6 n"]:
     """The same at however many times, for which nothing is compiled anew."""
-    return np.asarray(_slow_shapes(padded(time), middle, half))[:, : time.size]
+    return np.asarray(_baseline_functions(pad_samples(time), middle, half))[:, : time.size]
 
 
-_slow_shapes = jax.jit(slow_shapes)
+_baseline_functions = jax.jit(baseline_functions)
 
 
 class _Samples(NamedTuple):
@@ -252,120 +244,127 @@ def _chunks(samples: _Samples, length: int) -> Iterator[tuple[np.ndarray, ...]]:
         yield np.pad(t, missing, mode="edge"), *(np.pad(x, missing) for x in (np.asarray(observed[part]), w, slope))
 
 
-def _chunk_length(samples: int, longest: int = _CHUNK) -> int:
+def _chunk_length(samples: int, longest: int = 8_192) -> int:
+    """How many samples are looked at at a time, which bounds memory."""
     return min(longest, 1 << (samples - 1).bit_length())
 
 
-def _plainly(table: _Table, drive: Drive, samples: _Samples, steady_state: bool) -> Iterator[np.ndarray]:
-    length = _chunk_length(samples.time.size, _LONGEST if isinstance(drive, Chirp) else _CHUNK)
+def _accumulate_directly(
+    table: _ResponseTable, drive: Drive, samples: _Samples, steady_state: bool
+) -> Iterator[np.ndarray]:
+    size = samples.time.size
+    length = _chunk_length(size, 65_536) if isinstance(drive, Chirp) else _chunk_length(size)  # of few chirps
     for t, y, weight, rate in _chunks(samples, length):
-        yield np.asarray(_at_times(table, drive, t, y, weight, rate, None, steady_state))
+        yield np.asarray(_chunk_products(table, drive, t, y, weight, rate, None, steady_state))
 
 
 @eqx.filter_jit
-def _at_times(
-    table: _Table,
+def _chunk_products(
+    table: _ResponseTable,
     drive: Drive,
     time: Array,
     observed: Array,
     weight: Array,
     rate: Array,
-    slow: Array | None,
+    baseline: Array | None,
     steady_state: bool,
 ) -> Array:
     """Inner products where the response to the drive can be computed at any time."""
 
-    def one(tau: Array) -> Array:
+    def respond(tau: Array) -> Array:
         return highpass(drive, time, tau, steady_state=steady_state)
 
     # a chirp's many pieces are worked out for each: one after the other, not all side by side
-    u = lax.map(one, table.nodes) if isinstance(drive, Chirp) else jax.vmap(one)(table.nodes)
+    u = lax.map(respond, table.nodes) if isinstance(drive, Chirp) else jax.vmap(respond)(table.nodes)
 
     def voltage(time: Array) -> Array:
         return jnp.where(steady_state | (time >= 0.0), drive.value(time), 0.0)
 
     slope = (voltage(time + table.step) - voltage(time - table.step)) / (2.0 * table.step)
-    slow = slow_shapes(time, table.middle, table.half) if slow is None else slow
-    return _inner(table, u, None, slow, slope, observed, weight, rate)
+    baseline = baseline_functions(time, table.middle, table.half) if baseline is None else baseline
+    return _inner_products(table, u, None, baseline, slope, observed, weight, rate)
 
 
-def _inner(
-    table: _Table,
+def _inner_products(
+    table: _ResponseTable,
     u: Array,
     decays: Array | None,
-    slow: Array,
+    baseline: Array,
     slope: Array,
     observed: Array,
     weight: Array,
     rate: Array,
 ) -> Array:
-    parts = [table.mix.T @ u] + ([] if decays is None else [table.mix.T @ decays])
-    rest = observed - table.near.weight[0] * u[NODES // 2]
-    if table.near.rate is not None:
-        rest = rest - table.near.rate * rate
-    rows = jnp.concatenate([*parts, slow, rate[None], slope[None], rest[None]])
+    parts = [table.combinations.T @ u] + ([] if decays is None else [table.combinations.T @ decays])
+    rest = observed - table.expected_terms.weight[0] * u[NODES // 2]
+    if table.expected_terms.rate is not None:
+        rest = rest - table.expected_terms.rate * rate
+    rows = jnp.concatenate([*parts, baseline, rate[None], slope[None], rest[None]])
     return (rows * weight) @ rows.T
 
 
-def _folded(table: _Table, drive: Drive, samples: _Samples, period: int) -> Iterator[np.ndarray]:
+def _accumulate_folded(table: _ResponseTable, drive: Drive, samples: _Samples, period: int) -> Iterator[np.ndarray]:
     """With the periods laid over each other: the response is computed for one, the rest are sums."""
     periods = max(1, _chunk_length(samples.time.size) // period)
     reference = np.asarray(samples.observed[:period])
     count = np.zeros(period)
-    sums = np.zeros((len(SLOW) + 1, period))
-    squares = np.zeros((len(SLOW) + 1, len(SLOW) + 1))
+    sums = np.zeros((len(BASELINE_NAMES) + 1, period))
+    squares = np.zeros((len(BASELINE_NAMES) + 1, len(BASELINE_NAMES) + 1))
     for t, y, weight, _ in _chunks(samples, periods * period):
         difference = (y.reshape(periods, period) - reference).reshape(-1)
-        z = np.concatenate([slow_at(t, table.middle, table.half), difference[None]])
+        z = np.concatenate([evaluate_baseline(t, table.middle, table.half), difference[None]])
         count += weight.reshape(periods, period).sum(axis=0)
         weighted = z * weight
         sums += weighted.reshape(len(z), periods, period).sum(axis=1)
         squares += weighted @ z.T
     means = sums / np.where(count > 0.0, count, 1.0)
     rate = np.zeros(period) if samples.rate is None else np.asarray(samples.rate[:period])
-    time, mean, rate, slow = map(padded, (np.asarray(samples.time[:period]), means[-1] + reference, rate, means[:-1]))
-    total = np.array(_at_times(table, drive, time, mean, padded_weight(count), rate, slow, True))
+    time = np.asarray(samples.time[:period])
+    time, mean, rate, baseline = map(pad_samples, (time, means[-1] + reference, rate, means[:-1]))
+    total = np.array(_chunk_products(table, drive, time, mean, pad_weight(count), rate, baseline, True))
     # what the samples of one phase scatter about their mean
-    kept = np.r_[_SLOW, _OBSERVED]
+    kept = np.r_[_BASELINE, _OBSERVED]
     total[np.ix_(kept, kept)] += squares - means @ sums.T
     yield total
 
 
-def _samples_a_period(drive: Drive, time: np.ndarray) -> int | None:
-    """After how many samples drive and sampling grid meet again, if the record is long enough to gain by it."""
-    if not isinstance(drive, Periodic) or not _is_even(time):
+def _samples_per_period(
+    drive: Drive, time: np.ndarray, max_samples: int = 65_536, tolerance: float = 1e-9
+) -> int | None:
+    """The samples after which drive and grid meet again, to `tolerance` of a step, if it is worth folding a record."""
+    if not isinstance(drive, Periodic) or not _is_exactly_uniform(time):
         return None
     advance = (time[-1] - time[0]) / (time.size - 1) * float(drive.frequency)  # cycles a sample
-    cycles = Fraction(advance).limit_denominator(max(1, min(time.size // 2, _LONGEST)))
+    cycles = Fraction(advance).limit_denominator(max(1, min(time.size // 2, max_samples)))
     rounding = 4.0 * np.finfo(float).eps * time.size
     error = abs(advance - cycles) * time.size / advance  # by the end of the record, in samples
-    return cycles.denominator if cycles > 0 and error < _EXACT + rounding else None
+    return cycles.denominator if cycles > 0 and error < tolerance + rounding else None
 
 
-def _is_even(time: np.ndarray) -> bool:
-    """Whether the samples lie on a grid but for rounding."""
+def _is_exactly_uniform(time: np.ndarray, tolerance: float = 1e-9) -> bool:
+    """Whether the samples lie on a grid, to `tolerance` of a step but for rounding."""
     step = (time[-1] - time[0]) / (time.size - 1)
     rounding = 4.0 * np.finfo(float).eps * max(abs(time[0]), abs(time[-1]))
-    return is_uniform(time, _EXACT + rounding / step)
+    return is_uniform(time, tolerance + rounding / step)
 
 
-def _along_samples(table: _Table, drive: Sampled, samples: _Samples) -> Iterator[np.ndarray]:
+def _accumulate_measured(table: _ResponseTable, drive: Sampled, samples: _Samples) -> Iterator[np.ndarray]:
     """Along a measured drive, from sample to sample."""
     time = samples.time
     length, step, first = _chunk_length(time.size), float(table.step), float(drive.samples[0])
-    x = step / table.nodes if _is_even(time) and step < float(jnp.min(table.nodes)) else None
+    x = step / table.nodes if _is_exactly_uniform(time) and step < float(jnp.min(table.nodes)) else None
     last = jnp.zeros(NODES), jnp.asarray(time[0]), jnp.zeros(())  # the first sample is a jump from 0
     if x is not None:
         last = first * jnp.exp(x), jnp.asarray(time[0] - step), jnp.asarray(first)
     voltages = _chunks(_Samples(time, np.asarray(drive.samples)[: time.size], None, None), length)
     for (t, y, weight, rate), (_, v, _, _) in zip(_chunks(samples, length), voltages, strict=True):
-        total, last = _from_sample_to_sample(table, t, v, y, weight, rate, last, time[0], x)
+        total, last = _advance_chunk(table, t, v, y, weight, rate, last, time[0], x)
         yield np.asarray(total)
 
 
 @eqx.filter_jit
-def _from_sample_to_sample(
-    table: _Table,
+def _advance_chunk(
+    table: _ResponseTable,
     time: Array,
     voltage: Array,
     observed: Array,
@@ -382,35 +381,37 @@ def _from_sample_to_sample(
         ages = step / table.nodes[:, None]
         u = jax.vmap(recurrence)(jnp.exp(-ages), rise * phi(ages), u)
     else:
-        u = _evenly(rise, u, x)
+        u = _uniform_recurrence(rise, u, x)
     decays = jnp.exp((first - time) / table.nodes[:, None])
     times, voltages = jnp.append(since, time), jnp.append(before, voltage)
     span = jnp.append(times[2:] - times[:-2], step[-1])
     slope = jnp.append(voltages[2:] - voltages[:-2], 0.0) / jnp.where(span > 0.0, span, 1.0)
-    slow = slow_shapes(time, table.middle, table.half)
-    return _inner(table, u, decays, slow, slope, observed, weight, rate), (u[:, -1], time[-1], voltage[-1])
+    baseline = baseline_functions(time, table.middle, table.half)
+    return _inner_products(table, u, decays, baseline, slope, observed, weight, rate), (u[:, -1], time[-1], voltage[-1])
 
 
-def _evenly(rise: Float[Array, " n"], u: Float[Array, " nodes"], x: Float[Array, " nodes"]) -> Float[Array, "nodes n"]:
+def _uniform_recurrence(
+    rise: Float[Array, " n"], u: Float[Array, " nodes"], x: Float[Array, " nodes"], block: int = 64
+) -> Float[Array, "nodes n"]:
     """u[k] = e^{-x} u[k - 1] + phi(x) rise[k]: `recurrence` for one step size, in blocks."""
-    width = math.gcd(rise.size, _BLOCK)
+    width = math.gcd(rise.size, block)
     decay, gain = jnp.exp(-x)[:, None], phi(x)[:, None]
     blocks = rise.reshape(-1, width)
 
-    def within(u: Array, rise: Array) -> tuple[Array, Array]:
+    def advance_sample(u: Array, rise: Array) -> tuple[Array, Array]:
         u = decay * u + rise
         return u, u
 
-    def across(u: Array, end: Array) -> tuple[Array, Array]:
+    def advance_block(u: Array, end: Array) -> tuple[Array, Array]:
         return jnp.exp(-width * x) * u + end, u
 
-    _, alone = lax.scan(within, jnp.zeros((x.size, len(blocks))), blocks.T)
-    _, starts = lax.scan(across, u / gain[:, 0], alone[-1].T)
-    left = jnp.exp(-x[:, None] * jnp.arange(1, width + 1))
-    return gain * (alone.transpose(1, 2, 0) + starts.T[:, :, None] * left[:, None]).reshape(x.size, -1)
+    _, alone = lax.scan(advance_sample, jnp.zeros((x.size, len(blocks))), blocks.T)
+    _, starts = lax.scan(advance_block, u / gain[:, 0], alone[-1].T)
+    decays = jnp.exp(-x[:, None] * jnp.arange(1, width + 1))
+    return gain * (alone.transpose(1, 2, 0) + starts.T[:, :, None] * decays[:, None]).reshape(x.size, -1)
 
 
-def _assemble(table: _Table, total: np.ndarray, decays: bool, samples: int) -> Compression:
+def _assemble(table: _ResponseTable, total: np.ndarray, decays: bool, samples: int) -> Compression:
     """Coordinates in which inner products are those that were added up."""
     size, rank = len(total), table.series.shape[0]
     scale = np.sqrt(np.diagonal(total))
@@ -418,24 +419,18 @@ def _assemble(table: _Table, total: np.ndarray, decays: bool, samples: int) -> C
     values, vectors = np.linalg.eigh(total / np.outer(scale, scale))
     _, rows = np.linalg.qr(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * scale)
     signal = rows[:, :rank] @ table.series
+    decay = rows[:, rank : 2 * rank] @ table.series if decays else np.zeros((size, NODES))
     middle = signal @ np.cos(0.5 * np.pi * np.arange(NODES))  # Chebyshev polynomials at 0
-    following = 0.0 if table.near.rate is None else float(table.near.rate) * rows[:, _RATE]
-    return Compression(
-        center=table.center,
-        reach=jnp.asarray(REACH),
-        signal=jnp.asarray(signal[:rank]),
-        decay=jnp.asarray(rows[:, rank : 2 * rank] @ table.series if decays else np.zeros((size, NODES))),
-        slow=jnp.asarray(rows[:, _SLOW].T),
-        rate=jnp.asarray(rows[:, _RATE]),
-        slope=jnp.asarray(rows[:, _SLOPE]),
-        observed=jnp.asarray(rows[:, _OBSERVED] + float(table.near.weight[0]) * middle + following),
-        samples=jnp.asarray(float(samples)),
-    )
+    baseline, rate, slope, remainder = _baseline_and_record(rows)
+    following = 0.0 if table.expected_terms.rate is None else float(table.expected_terms.rate) * rate
+    observed = remainder + float(table.expected_terms.weight[0]) * middle + following
+    arrays = table.center, TABLE_HALF_WIDTH, signal[:rank], decay, baseline, rate, slope, observed, float(samples)
+    return Compression(*map(jnp.asarray, arrays))
 
 
-def in_fours(count: SupportsFloat, most: int) -> int:
-    """Columns to keep where `count` of `most` matter; in fours, so that most records share what is compiled."""
-    return min(4 * max(1, math.ceil(float(count) / 4)), most)
+def round_up_column_count(count: SupportsFloat, maximum: int) -> int:
+    """Columns to keep where `count` of `maximum` matter; in fours, so that most records share what is compiled."""
+    return min(4 * max(1, math.ceil(float(count) / 4)), maximum)
 
 
 def chebyshev(count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -14,14 +14,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from fitact.compiled import padded
-from fitact.likelihood.compression import SLOW, slow_at
-from fitact.model.circuit import Terms
+from fitact.compiled import pad_samples
+from fitact.likelihood.compression import BASELINE_NAMES, evaluate_baseline
+from fitact.model.circuit import HighpassTerms
 from fitact.model.drive import Drive, Sampled
-from fitact.model.relaxation import Grid
 from fitact.model.response import highpass
-
-_CHUNK = 8_192  # samples at a time, which bounds memory
+from fitact.model.skin import TimeConstantGrid
 
 
 class GridCompression(eqx.Module):
@@ -29,35 +27,32 @@ class GridCompression(eqx.Module):
 
     Attributes:
         signal: the response to the drive (V) of each time constant.
-        falling: how it changes with a delay, V/s, over two samples.
-        slow: the shapes of `SLOW`, of height 1.
-        rate: dV/dt, V/s, where the channel follows it, else 0.
-        observed: the record, V or A.
-        samples: how many there are.
+        delay_slopes: how it changes with a delay, V/s, over two samples.
+        others: as there.
     """
 
     signal: Float[Array, "terms rows"]
-    falling: Float[Array, "terms rows"]
-    slow: Float[Array, "shapes rows"]
+    delay_slopes: Float[Array, "terms rows"]
+    baseline: Float[Array, "shapes rows"]
     rate: Float[Array, " rows"]
     observed: Float[Array, " rows"]
     samples: Float[Array, ""]
 
-    def holds(self, tau: Array) -> Bool[Array, "*shape"]:
+    def covers(self, tau: Array) -> Bool[Array, "*shape"]:
         """Always: the grid is the circuit's own."""
         return jnp.ones_like(tau, dtype=bool)
 
-    def response(self, terms: Terms) -> Float[Array, " rows"]:
+    def response(self, terms: HighpassTerms) -> Float[Array, " rows"]:
         """The response of a circuit, as `fitact.response` gives it in time."""
         total = jnp.asarray(terms.weight) @ self.signal
         return total if terms.rate is None else total + terms.rate * self.rate
 
-    def change_by_delay(self, terms: Terms) -> Float[Array, " rows"]:
+    def delay_derivative(self, terms: HighpassTerms) -> Float[Array, " rows"]:
         """How a delay changes it, per s."""
-        return jnp.asarray(terms.weight) @ self.falling
+        return jnp.asarray(terms.weight) @ self.delay_slopes
 
     def decays(self, tau: Array) -> Float[Array, " rows"]:
-        """None: what such a circuit remembers is no one decay."""
+        """Zeros: what such a circuit remembers is no one decay."""
         return jnp.zeros_like(self.observed)
 
 
@@ -67,12 +62,11 @@ def compress_on_grid(
     observed: Float[np.ndarray, " samples"],
     *,
     steady_state: bool,
-    grid: Grid,
+    grid: TimeConstantGrid,
     weight: Float[np.ndarray, " samples"] | None = None,
     rate: Float[np.ndarray, " samples"] | None = None,
 ) -> GridCompression:
-    """Project a record on the responses to `drive` of the grid; arguments as in
-    `fitact.likelihood.compression.compress`.
+    """Project a record on the responses to `drive` of the grid; arguments as those of `compression.compress`.
 
     A chunk at a time, each in a QR decomposition together with the triangle so far, so that no digits are lost.
     """
@@ -82,40 +76,40 @@ def compress_on_grid(
     triangle: Any = np.zeros((0, 0))
     middle, half = 0.5 * (time[0] + time[-1]), 0.5 * (time[-1] - time[0])
     for part, u in _responses(drive, grid.tau, time, around, steady_state):
-        slow = slow_at(time[part], middle, half)
+        baseline = evaluate_baseline(time[part], middle, half)
         slope = np.zeros(u.shape[-1]) if rate is None else np.asarray(rate[part])
-        rows = [u[0], slow, slope[None], observed[part][None] / scale, (u[1] - u[2]) / (2.0 * step)]
+        rows = [u[0], baseline, slope[None], observed[part][None] / scale, (u[1] - u[2]) / (2.0 * step)]
         columns = np.concatenate(rows).T
         columns = columns if weight is None else columns * np.asarray(weight[part])[:, None]
         triangle = np.linalg.qr(np.vstack([triangle, columns]) if triangle.size else columns, mode="r")
     size = grid.tau.size
-    found = [jnp.asarray(x.T) for x in np.split(triangle, np.cumsum([size, len(SLOW), 1, 1]), axis=1)]
+    parts = [jnp.asarray(x.T) for x in np.split(triangle, np.cumsum([size, len(BASELINE_NAMES), 1, 1]), axis=1)]
     count = time.size if weight is None else int(np.count_nonzero(weight))
     return GridCompression(
-        signal=found[0],
-        falling=found[4],
-        slow=found[1],
-        rate=found[2][0],
-        observed=found[3][0] * scale,
+        signal=parts[0],
+        delay_slopes=parts[4],
+        baseline=parts[1],
+        rate=parts[2][0],
+        observed=parts[3][0] * scale,
         samples=jnp.asarray(float(count)),
     )
 
 
 def _responses(
-    drive: Drive, tau: Array, time: np.ndarray, around: np.ndarray, steady_state: bool
+    drive: Drive, tau: Array, time: np.ndarray, offsets: np.ndarray, steady_state: bool, chunk: int = 8_192
 ) -> Iterator[tuple[slice, Float[np.ndarray, "around terms samples"]]]:
-    """Of each time constant, chunk by chunk, at the samples' times and beside them."""
-    length = time.size if isinstance(drive, Sampled) else _CHUNK  # a long drive is gone through once
+    """Responses of each time constant at the samples' times and beside them, a `chunk` at a time to bound memory."""
+    length = time.size if isinstance(drive, Sampled) else chunk  # a long drive is gone through once
     for first in range(0, time.size, length):
         part = slice(first, first + length)
-        times = padded(time[part], min(length, time.size))
-        u = np.stack([np.asarray(_each(drive, tau, times + x, steady_state)) for x in around])
+        times = pad_samples(time[part], min(length, time.size))
+        u = np.stack([np.asarray(_compute_responses(drive, tau, times + x, steady_state)) for x in offsets])
         yield part, u[..., : time[part].size]
 
 
 @eqx.filter_jit
-def _each(drive: Drive, tau: Array, time: Array, steady_state: bool) -> Float[Array, "terms samples"]:
-    def one(tau: Array) -> Array:
+def _compute_responses(drive: Drive, tau: Array, time: Array, steady_state: bool) -> Float[Array, "terms samples"]:
+    def highpass_response(tau: Array) -> Array:
         return highpass(drive, time, tau, steady_state=steady_state)
 
-    return lax.map(one, tau, batch_size=8)
+    return lax.map(highpass_response, tau, batch_size=8)

@@ -6,10 +6,8 @@ integrated out (`fitact.likelihood.channel`).
 """
 
 import dataclasses
-import functools
 import math
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Iterator
 
 import equinox as eqx
 import jax
@@ -18,15 +16,13 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from fitact.likelihood.channel import TIMING, Seen, Trace
+from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
 from fitact.model.circuit import RC, Circuit
-from fitact.model.skin import WithSkin, parameters, with_values
+from fitact.model.skin import WithSkin, circuit_parameters, with_values
 from fitact.prior.distributions import Distribution
 from fitact.prior.prior import Prior
 
-OPEN = math.log(1e6)  # in a logarithm: what leaves more open than this leaves it open
-_HUGE = 70.0  # in a logarithm: beyond 1e30 or below 1e-30 SI units is no finger, and products overflow
-_BATCH_ROWS = 4_000_000  # samples or coordinates evaluated at a time, which bounds memory
+UNCONSTRAINED_SD = math.log(1e6)  # in a logarithm: what leaves more open than this leaves it open
 
 
 class Likelihood(eqx.Module):
@@ -36,42 +32,42 @@ class Likelihood(eqx.Module):
     clock in its `timing_unit`. Built by `fitact.fitting.fit`.
 
     Attributes:
-        traces: channels of records.
+        channels: those of the records.
         template: the circuit; what the prior does not name keeps its value there.
         prior: of the circuit's free parameters and of free gains.
         sigma_prior: of each trace's noise; None: flat in its logarithm.
         tied: parameters that are a ratio times another: name, the other's, ratio.
-        believed: whether the prior of the circuit counts, beside those of gains and delays.
+        use_prior: whether the prior of the circuit counts, beside those of gains and delays.
     """
 
-    traces: tuple[Trace, ...]
+    channels: tuple[ChannelLikelihood, ...]
     template: RC | WithSkin
     prior: Prior
     sigma_prior: tuple[Distribution | None, ...]
     tied: tuple[tuple[str, str, float], ...] = eqx.field(static=True, default=())
-    believed: bool = eqx.field(static=True, default=True)
+    use_prior: bool = eqx.field(static=True, default=True)
 
     @property
     def names(self) -> tuple[str, ...]:
         """The coordinates of theta."""
-        return (*self.prior.names, *(trace.named(name) for trace, name in self._timing))
+        return (*self.prior.names, *(trace.qualified_name(name) for trace, name in self._timing))
 
     @property
-    def _timing(self) -> list[tuple[Trace, str]]:
+    def _timing(self) -> list[tuple[ChannelLikelihood, str]]:
         """Free delays and clocks: the trace, and which."""
-        return [(trace, name) for trace in self.traces for name in trace.timing]
+        return [(trace, name) for trace in self.channels for name in trace.timing]
 
     @property
     def timing_sd(self) -> list[ArrayLike]:
         """Their standard deviations by the prior."""
-        return [trace.timing_sd[TIMING.index(name)] for trace, name in self._timing]
+        return [trace.timing_sd[TIMING_NUISANCES.index(name)] for trace, name in self._timing]
 
     @property
     def timing(self) -> dict[str, tuple[float, float]]:
         """By name, what they are (s, or a share of 1) where their coordinate is 0, and what 1 of that adds."""
         with jax.enable_x64(True):
             return {
-                trace.named(name): (
+                trace.qualified_name(name): (
                     float(trace.shift if name == "delay" else trace.clock),
                     float(trace.timing_unit(name)),
                 )
@@ -81,90 +77,100 @@ class Likelihood(eqx.Module):
     @property
     def sigma_names(self) -> tuple[str, ...]:
         """The coordinates of a posterior's point after theta."""
-        return tuple(trace.named("sigma") for trace in self.traces)
+        return tuple(trace.qualified_name("sigma") for trace in self.channels)
 
     @property
-    def prior_root(self) -> Float[np.ndarray, "parameters parameters"]:
-        """A root of theta's covariance by the prior; of a circuit without one, `OPEN` in each direction."""
+    def prior_factor(self) -> Float[np.ndarray, "parameters parameters"]:
+        """A root of theta's covariance by the prior; of a circuit without one, `UNCONSTRAINED_SD` in each direction."""
         with jax.enable_x64(True):
             sd = np.append(self.prior.log_sd, np.array(self.timing_sd))
         size, root = len(self.prior.names), np.diag(sd)
         root[:size, :size] = np.linalg.cholesky(self.prior.covariance)
-        return root if self.believed else np.where(self._of_circuit[:, None], OPEN * np.eye(len(root)), root)
+        if not self.use_prior:
+            root[self._circuit_mask] = UNCONSTRAINED_SD * np.eye(len(root))[self._circuit_mask]
+        return root
 
     @property
-    def _of_circuit(self) -> Bool[np.ndarray, " parameters"]:
+    def _circuit_mask(self) -> Bool[np.ndarray, " circuit_parameters"]:
         """Which coordinates of theta are the circuit's."""
-        return np.array([name in parameters(self.template) for name in self.names])
+        return np.array([name in circuit_parameters(self.template) for name in self.names])
 
     @property
     def rows(self) -> int:
         """How many numbers an evaluation runs over."""
-        return sum(trace.rows for trace in self.traces)
+        return sum(trace.rows for trace in self.channels)
 
     @property
     def count(self) -> ArrayLike:
-        """How many samples count."""
-        return sum(trace.count for trace in self.traces)
+        return sum(trace.count for trace in self.channels)
 
-    def summed(self) -> "Likelihood":
-        """Without compression."""
-        return dataclasses.replace(self, traces=tuple(trace.summed() for trace in self.traces))
+    def without_compression(self) -> "Likelihood":
+        return dataclasses.replace(self, channels=tuple(trace.without_compression() for trace in self.channels))
 
     def without_samples(self) -> "Likelihood":
         """With no more of the samples than their ends, where a compression stands for them."""
-        return dataclasses.replace(self, traces=tuple(trace.without_samples() for trace in self.traces))
+        return dataclasses.replace(self, channels=tuple(trace.without_samples() for trace in self.channels))
 
-    def with_trace(self, index: int, trace: Trace) -> "Likelihood":
-        """With another trace in that place."""
-        traces = (*self.traces[:index], trace, *self.traces[index + 1 :])
-        return dataclasses.replace(self, traces=traces)
+    def replace_channel(self, index: int, channel: ChannelLikelihood) -> "Likelihood":
+        traces = (*self.channels[:index], channel, *self.channels[index + 1 :])
+        return dataclasses.replace(self, channels=traces)
 
-    def circuit(self, theta: Float[Array, " parameters"]) -> Circuit:
+    def circuit(self, theta: Float[Array, " circuit_parameters"]) -> Circuit:
         """The circuit at theta; NaN where no double could hold what follows from it, so that no step leads there."""
-        theta = jnp.where(jnp.abs(theta) < _HUGE, theta, jnp.nan)
-        known = parameters(self.template)
+        # beyond 1e30 or below 1e-30 SI units is no finger, and products overflow
+        theta = jnp.where(jnp.abs(theta) < 70.0, theta, jnp.nan)
+        known = circuit_parameters(self.template)
         values = {name: jnp.exp(theta[i]) for i, name in enumerate(self.prior.names) if name in known}
         for name, other, ratio in self.tied:
             values[name] = ratio * values.get(other, known[other])
         return with_values(self.template, values)
 
-    def seen(self, theta: Float[Array, " parameters"], index: int = 0) -> Seen:
+    def channel_inputs(self, theta: Float[Array, " circuit_parameters"], index: int = 0) -> ChannelInputs:
         """What the trace of that index needs of theta."""
-        return self._seen(self.circuit(theta), theta, self.traces[index])
+        return self._make_inputs(self.circuit(theta), theta, self.channels[index])
 
-    def _seen(self, circuit: Circuit, theta: Array, trace: Trace) -> Seen:
-        gain, names = trace.named("gain"), self.names
-        timing = {name: theta[names.index(trace.named(name))] * trace.timing_unit(name) for name in trace.timing}
-        return Seen(circuit, jnp.exp(theta[names.index(gain)]) if gain in names else 1.0, **timing)
+    def _make_inputs(self, circuit: Circuit, theta: Array, channel: ChannelLikelihood) -> ChannelInputs:
+        gain, names = channel.qualified_name("gain"), self.names
+        timing = {
+            name: theta[names.index(channel.qualified_name(name))] * channel.timing_unit(name)
+            for name in channel.timing
+        }
+        return ChannelInputs(circuit, jnp.exp(theta[names.index(gain)]) if gain in names else 1.0, **timing)
 
-    def each(self, theta: Float[Array, " parameters"]) -> Iterator[tuple[Trace, Seen]]:
+    def channels_and_inputs(
+        self, theta: Float[Array, " circuit_parameters"]
+    ) -> Iterator[tuple[ChannelLikelihood, ChannelInputs]]:
         """The traces, and what they need of theta."""
         circuit = self.circuit(theta)
-        return ((trace, self._seen(circuit, theta, trace)) for trace in self.traces)
+        return ((trace, self._make_inputs(circuit, theta, trace)) for trace in self.channels)
 
     def residuals(
-        self, theta: Float[Array, " parameters"], sigma: Float[Array, " traces"]
+        self, theta: Float[Array, " circuit_parameters"], sigma: Float[Array, " channels"]
     ) -> tuple[Float[Array, " rows"], ...]:
         """Whitened residuals of each trace, nuisances' priors included: half their square is -log-likelihood."""
-        return tuple(trace.residuals(seen, s) for (trace, seen), s in zip(self.each(theta), sigma, strict=True))
+        return tuple(
+            trace.residuals(inputs, s)
+            for (trace, inputs), s in zip(self.channels_and_inputs(theta), sigma, strict=True)
+        )
 
-    def prior_residuals(self, theta: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
+    def prior_residuals(self, theta: Float[Array, " circuit_parameters"]) -> Float[Array, " circuit_parameters"]:
         """The prior as residuals: normal in theta, with the moments of the stated prior; 0 for what has none."""
         size = len(self.prior.names)
         scaled = self.prior.residuals(theta[:size])
-        found = jnp.concatenate([scaled, theta[size:] / jnp.asarray(self.timing_sd)]) if self._timing else scaled
-        return found if self.believed else jnp.where(self._of_circuit, 0.0, found)
+        if self._timing:
+            scaled = jnp.concatenate([scaled, theta[size:] / jnp.asarray(self.timing_sd)])
+        return scaled if self.use_prior else jnp.where(self._circuit_mask, 0.0, scaled)
 
-    def split(self, point: Float[Array, " coordinates"]) -> tuple[Float[Array, " parameters"], Float[Array, " traces"]]:
-        """Theta and the logarithms of the noise."""
-        return point[: -len(self.traces)], point[-len(self.traces) :]
+    def split(
+        self, point: Float[Array, " coordinates"]
+    ) -> tuple[Float[Array, " circuit_parameters"], Float[Array, " channels"]]:
+        return point[: -len(self.channels)], point[-len(self.channels) :]
 
-    def log_likelihoods(self, point: Float[Array, " coordinates"]) -> Float[Array, " traces"]:
+    def log_likelihoods(self, point: Float[Array, " coordinates"]) -> Float[Array, " channels"]:
         """Log-likelihood of each trace at (theta, log sigma), up to a constant; NaN where its compression ends."""
         theta, log_sigma = self.split(point)
-        parts = zip(self.each(theta), log_sigma, strict=True)
-        return jnp.stack([trace.log_likelihood(seen, log) for (trace, seen), log in parts])
+        parts = zip(self.channels_and_inputs(theta), log_sigma, strict=True)
+        return jnp.stack([trace.log_likelihood(inputs, log) for (trace, inputs), log in parts])
 
     def log_likelihood(self, point: Float[Array, " coordinates"]) -> Float[Array, ""]:
         """Log-likelihood of (theta, log sigma), up to a constant; NaN where a compression does not reach."""
@@ -186,71 +192,24 @@ class Likelihood(eqx.Module):
 
         Anything that is not finite counts as impossible, but it is NaN where a compression does not reach.
         """
-        believed, value = self.log_prior(point), self.log_likelihood(point)
-        compressed = any(trace.compression is not None for trace in self.traces)
-        beyond = jnp.isnan(value) & jnp.all(jnp.isfinite(point)) & jnp.isfinite(believed) & compressed
-        value = value + believed
+        log_prior, value = self.log_prior(point), self.log_likelihood(point)
+        compressed = any(trace.compression is not None for trace in self.channels)
+        beyond = jnp.isnan(value) & jnp.all(jnp.isfinite(point)) & jnp.isfinite(log_prior) & compressed
+        value = value + log_prior
         return jnp.where(jnp.isfinite(value) | beyond, value, -jnp.inf)
 
-    def draws(self, theta: Float[np.ndarray, " parameters"], count: int) -> Float[np.ndarray, "count parameters"]:
+    def sample_prior(
+        self, theta: Float[np.ndarray, " circuit_parameters"], count: int
+    ) -> Float[np.ndarray, "count parameters"]:
         """Points of the prior, always the same; delays and clocks are those of `theta`."""
         points = np.tile(theta, (count, 1))
-        drawn = self.prior.sample(np.random.default_rng(0), count)
-        points[:, : len(drawn)] = np.log(list(drawn.values())).T
+        draws = self.prior.sample(np.random.default_rng(0), count)
+        points[:, : len(draws)] = np.log(list(draws.values())).T
         return points
 
-    def natural(self, theta: Float[np.ndarray, "*shape parameters"]) -> dict[str, Float[np.ndarray, "*shape"]]:
+    def to_physical(self, theta: Float[np.ndarray, "*shape parameters"]) -> dict[str, Float[np.ndarray, "*shape"]]:
         """Points in SI units, by name; delays and clocks are those of the channel against the drive, in all."""
-        found = {name: np.exp(theta[..., i]) for i, name in enumerate(self.prior.names)}
-        for i, (name, (base, unit)) in enumerate(self.timing.items(), len(found)):
-            found[name] = base + theta[..., i] * unit
-        return found
-
-
-class Batched:
-    """`function(model, *rows)` over the rows of arrays of one length, a batch at a time.
-
-    Batches have one size, filled up where rows are missing, so that they compile once; it shrinks where `rows`,
-    the numbers that one evaluation runs over, are many, which bounds memory. What jit needs of the model is sorted
-    out here once, since a call may take less time than that. Call it in double precision.
-    """
-
-    def __init__(self, function: Callable[..., Array], model: eqx.Module, rows: int, batch: int = 32) -> None:
-        dynamic, static = eqx.partition(model, eqx.is_array)
-        self._dynamic, treedef = jax.tree.flatten(dynamic)
-        self._static = _Static(function, static, treedef)
-        self.batch = max(1, min(batch, _BATCH_ROWS // rows))
-
-    def __call__(self, *arrays: np.ndarray) -> np.ndarray:
-        count = len(arrays[0])
-        batch = self.batch
-        missing = -count % batch
-        if missing:
-            arrays = tuple(np.concatenate([a, np.repeat(a[-1:], missing, axis=0)]) for a in arrays)
-        parts = [
-            np.asarray(_evaluate(self._static, self._dynamic, tuple(a[i : i + batch] for a in arrays)))
-            for i in range(0, count, batch)
-        ]
-        return (parts[0] if len(parts) == 1 else np.concatenate(parts))[:count]
-
-
-class _Static:
-    """A function, and a model but for its arrays; equal where their compiled forms are."""
-
-    def __init__(self, function: Callable[..., Array], model: eqx.Module, arrays: Any) -> None:
-        self.function, self.model, self.arrays = function, model, arrays
-        leaves, treedef = jax.tree.flatten(model)
-        self._key = (function, arrays, tuple(leaves), treedef)
-        self._hash = hash(self._key)
-
-    def __hash__(self) -> int:
-        return self._hash
-
-    def __eq__(self, other: object) -> bool:
-        return self is other or (isinstance(other, _Static) and self._key == other._key)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _evaluate(static: _Static, dynamic: list[Array], rows: tuple[Array, ...]) -> Array:
-    model = eqx.combine(jax.tree.unflatten(static.arrays, dynamic), static.model)
-    return jax.vmap(lambda *row: static.function(model, *row))(*rows)
+        values = {name: np.exp(theta[..., i]) for i, name in enumerate(self.prior.names)}
+        for i, (name, (base, unit)) in enumerate(self.timing.items(), len(values)):
+            values[name] = base + theta[..., i] * unit
+        return values

@@ -1,1 +1,4 @@
-"""What happens on the display, and what is believed of it beforehand: pure JAX that knows no data."""
+"""What happens on the display?
+
+Takes a circuit, a drive and times; gives voltages, currents and forces. Pure JAX functions that know no data.
+"""

@@ -1,7 +1,11 @@
 """Chirps: a sine whose frequency sweeps, and its Taylor series on short pieces of time.
 
 The response to a chirp has no elementary closed form, but that to a polynomial has. So time is cut into
-equal pieces of at most an eighth of a cycle, on which the series to `_DEGREE` is exact to rounding.
+equal pieces of at most an eighth of a cycle, on which the series is exact to rounding.
+Along a piece, the response of a first-order high-pass, u' = v' - z u, has a polynomial solution: with s from 0 to 1
+along it and z its length in time constants, u = p(s) + (u0 - p(0)) e^{-z s}. For z <= 1 the solution with p(0) = 0
+is a series that converges as that of e^{-z}; for z > 1 the one of least degree is computed from its highest
+coefficient down, and nothing cancels either way.
 """
 
 import math
@@ -16,13 +20,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.errors import InputError
-from fitact.model.drive import Drive
-
-_DEGREE = 16  # (pi / 4)^17 / 17! = 5e-17 of the height is left out
-_RATES = 9  # of the series of the frequency: (1 / 8)^9 / 9! = 2e-14 of it, over an eighth of a cycle
-_MOST_PIECES = 8_000_000  # what memory holds
-_PIECES = 8  # a cycle, and an e-fold of the frequency
-_ROUNDING = 64  # ulps of a cycle that are no jump
+from fitact.model.drive import Drive, is_reached
 
 
 class Chirp(Drive):
@@ -54,28 +52,28 @@ class Chirp(Drive):
     pieces: int = eqx.field(init=False, static=True)
 
     def __post_init__(self) -> None:
-        given = (self.start_frequency, self.end_frequency, self.duration)
-        if any(isinstance(value, Tracer) for value in given):
+        stated = (self.start_frequency, self.end_frequency, self.duration)
+        if any(isinstance(value, Tracer) for value in stated):
             raise InputError(
                 "Chirp: its frequencies and duration must be known numbers when it is made; make it outside jit, grad"
                 " and vmap, and pass it in"
             )
-        if not all(np.ndim(value) == 0 and 0.0 < float(value) < math.inf for value in given):
+        if not all(np.ndim(value) == 0 and 0.0 < float(value) < math.inf for value in stated):
             raise InputError("Chirp: give positive, finite start_frequency, end_frequency and duration")
         if self.spacing not in ("linear", "logarithmic"):
             raise InputError(f"Chirp: spacing = '{self.spacing}'; give 'linear' or 'logarithmic'")
-        first, last, duration = (float(value) for value in given)
-        self.pieces = math.ceil(_PIECES * max(max(first, last) * duration, abs(math.log(last / first)), 1.0))
-        if self.pieces > _MOST_PIECES:
+        first, last, duration = (float(value) for value in stated)
+        per_cycle, most = 8, 8_000_000  # pieces of a cycle, or an e-fold of the frequency; pieces that memory holds
+        self.pieces = math.ceil(per_cycle * max(max(first, last) * duration, abs(math.log(last / first)), 1.0))
+        if self.pieces > most:
             raise InputError(
-                f"Chirp: {self.pieces // _PIECES:,} cycles of its highest frequency are more than"
-                f" {_MOST_PIECES // _PIECES:,}; make it shorter, or its frequencies lower"
+                f"Chirp: {self.pieces // per_cycle:,} cycles of its highest frequency are more than"
+                f" {most // per_cycle:,}; make it shorter, or its frequencies lower"
             )
 
     def is_over(self, time: ArrayLike) -> Array:
         """Whether the sweep has ended; a time on its end to within rounding counts as the end."""
-        time = jnp.asarray(time, dtype=float)
-        return time * (1.0 + 8.0 * jnp.finfo(time.dtype).eps) >= self.duration
+        return is_reached(jnp.asarray(time, dtype=float), self.duration)
 
     def frequency(self, time: ArrayLike) -> Float[Array, "*shape"]:
         """Hz, at `time` (s) during the sweep."""
@@ -107,14 +105,14 @@ class Chirp(Drive):
         time = jnp.asarray(time, dtype=float)
         during = (time >= 0.0) & ~self.is_over(time)
         slope = np.pi * jnp.asarray(self.peak_to_peak) * self.frequency(time) * jnp.cos(self._angle(time))
-        eps = jnp.finfo(time.dtype).eps
-        near_end = self.is_over(time) & (time <= self.duration * (1.0 + 8.0 * eps))
-        jumps = ((time == 0.0) & self._stands_off(0.0)) | (near_end & self._stands_off(self.duration))
+        near_end = self.is_over(time) & is_reached(jnp.asarray(self.duration, dtype=time.dtype), time)
+        jumps = ((time == 0.0) & self._is_nonzero(0.0)) | (near_end & self._is_nonzero(self.duration))
         return jnp.where(jumps, jnp.nan, jnp.where(during, slope, 0.0))
 
-    def series(self) -> Float[Array, "degree pieces"]:
+    def taylor_coefficients(self, degree: int = 16) -> Float[Array, "degree pieces"]:
         """Coefficients (V) of s^1, s^2, ... on each piece, s running from 0 to 1 along it.
 
+        (pi / 4)^17 / 17! = 5e-17 of the height is left out, of the frequency (1 / 8)^9 / 9! = 2e-14.
         With v + j w for the wave's complex amplitude, (v + j w)' = j (angular frequency) (v + j w).
         """
         length = jnp.asarray(self.duration, dtype=float) / self.pieces
@@ -125,7 +123,7 @@ class Chirp(Drive):
             rates = jnp.stack([rate, jnp.broadcast_to(bend, rate.shape)])
         else:
             growth = self._log_ratio() / self.pieces
-            rates = jnp.stack([rate * growth**n / math.factorial(n) for n in range(_RATES)])
+            rates = jnp.stack([rate * growth**n / math.factorial(n) for n in range(9)])
         half, angle = 0.5 * jnp.asarray(self.peak_to_peak), self._angle(start)
         none = jnp.zeros((rates.shape[0] - 1, self.pieces))
         first = tuple(jnp.concatenate([x[None], none]) for x in (jnp.sin(angle), jnp.cos(angle)))
@@ -136,7 +134,7 @@ class Chirp(Drive):
             new_v, new_w = jnp.sum(rates * w, axis=0) / order, -jnp.sum(rates * v, axis=0) / order
             return (jnp.concatenate([new_v[None], v[:-1]]), jnp.concatenate([new_w[None], w[:-1]])), new_v
 
-        return half * lax.scan(next_order, first, jnp.arange(1.0, _DEGREE + 1.0))[1]
+        return half * lax.scan(next_order, first, jnp.arange(1.0, degree + 1.0))[1]
 
     def locate(self, time: ArrayLike) -> tuple[Array, Array]:
         """The piece that `time` falls in, and how far along it lies, from 0 to 1."""
@@ -151,9 +149,9 @@ class Chirp(Drive):
         cycles = self.cycles(time)
         return 2.0 * np.pi * (cycles - lax.stop_gradient(jnp.floor(cycles)))
 
-    def _stands_off(self, time: ArrayLike) -> Array:
+    def _is_nonzero(self, time: ArrayLike) -> Array:
         """Whether the wave is not zero at `time`, so that starting or ending there is a jump."""
-        rounding = _ROUNDING * jnp.finfo(float).eps * (1.0 + jnp.abs(self.cycles(time)))
+        rounding = 64.0 * jnp.finfo(float).eps * (1.0 + jnp.abs(self.cycles(time)))  # which is no jump
         return jnp.abs(self.sweep(time)) > rounding * jnp.abs(jnp.asarray(self.peak_to_peak))
 
 
@@ -165,3 +163,40 @@ def _mean_exponential(x: Array) -> Array:
     for n in reversed(range(2, 10)):
         series = 1.0 + near / n * series
     return jnp.where(small, series, jnp.expm1(far) / far)
+
+
+def particular_solution(
+    coefficients: Float[Array, "degree pieces"], z: Float[Array, ""]
+) -> tuple[Float[Array, "degree+1 pieces"], Float[Array, " pieces"]]:
+    """p(s), lowest coefficient first, and p(1), for v = sum_n coefficients[n - 1] s^n on each piece."""
+    degree = coefficients.shape[0]
+    slopes = coefficients * jnp.arange(1.0, degree + 1.0)[:, None]  # of v', from s^0
+    zero = jnp.zeros_like(slopes[0])
+    near, far = jnp.minimum(z, 1.0), jnp.maximum(z, 1.0)
+    order = jnp.arange(1.0, degree + 1.0)
+
+    def ascend(below: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+        n, slope = step
+        p = (slope - near * below) / n
+        return p, p
+
+    def descend(above: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+        n, slope = step
+        p = (slope - n * above) / far
+        return p, p
+
+    up = jnp.concatenate([zero[None], lax.scan(ascend, zero, (order, slopes))[1]])
+    down = jnp.concatenate([lax.scan(descend, zero, (order, slopes), reverse=True)[1], zero[None]])
+    p = jnp.where(z <= 1.0, up, down)
+    return p, jnp.sum(p, axis=0)
+
+
+def evaluate_polynomials(
+    coefficients: Float[Array, "degree+1 pieces"], piece: Array, s: Float[Array, "*shape"]
+) -> Float[Array, "*shape"]:
+    """The pieces' polynomials, lowest coefficient first, at s; memory for one coefficient of each time only."""
+
+    def horner(total: Array, row: Array) -> tuple[Array, None]:
+        return total * s + row[piece], None
+
+    return lax.scan(horner, jnp.zeros_like(s), coefficients, reverse=True)[0]

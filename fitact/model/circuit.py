@@ -26,22 +26,28 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
 from fitact.errors import InputError
-from fitact.model.highpass import highpass_amplitude, highpass_gain
-
-_LEAST = 1e-12  # of Ci: a skin without capacitance counts as having so much, which keeps its time constant from 0
-_ROUNDING = 4.0  # times the largest singular value's rounding: others so close to each other are one
-_NEVER = 1e15  # of the slowest time constant: that with which an open gap loses its charge
-
 
 Channel: TypeAlias = Literal["Vsc", "I", "Vgap"]  # Vgap is not recorded; the force may come from it
 
 
-class Terms(NamedTuple):
+class HighpassTerms(NamedTuple):
     """sum_k weight[k] s tau[k] / (1 + s tau[k]) + rate s."""
 
     weight: tuple[ArrayLike, ...] | Array
     tau: tuple[ArrayLike, ...] | Array  # s
     rate: ArrayLike | None = None  # s times the weight's unit; None: there is no such term
+
+    def are_many(self) -> bool:
+        """Whether they are looped over; few are written out one by one, which XLA fuses."""
+        return len(self.tau) > 8
+
+    def stack(self) -> tuple[Array, Array]:
+        """The weights, and the time constants, as arrays."""
+        return _stack(self.weight), _stack(self.tau)
+
+
+def _stack(values: tuple[ArrayLike, ...] | Array) -> Array:
+    return jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, values))) if isinstance(values, tuple) else values
 
 
 class Circuit(eqx.Module):
@@ -55,57 +61,61 @@ class Circuit(eqx.Module):
     @property
     def b(self) -> ArrayLike:
         """The slowest time constant, s."""
+        return self.terms().tau[0]
+
+    def channel_terms(self, channel: Channel) -> HighpassTerms:
+        """The high-pass terms of a channel over V: those of `terms`, `current_terms` or `gap_terms`."""
         raise NotImplementedError
 
-    def terms(self) -> Terms:
-        """The high-pass terms of Vsc / V."""
-        raise NotImplementedError
+    def channel_gain(self, channel: Channel, omega: ArrayLike) -> Complex[Array, "*shape"]:
+        """A channel over V at the angular frequency `omega` (rad/s, >= 0)."""
+        return gain_at(self.channel_terms(channel), omega)
 
-    def current_terms(self) -> Terms:
+    def terms(self) -> HighpassTerms:
+        """The high-pass terms of Vsc / V: one for each element, and one more with a resistance in the loop."""
+        return self.channel_terms("Vsc")
+
+    def current_terms(self) -> HighpassTerms:
         """The high-pass terms of I / V, in siemens; `rate` is the term that follows dV/dt, in F."""
-        raise NotImplementedError
+        return self.channel_terms("I")
 
-    def gap_terms(self) -> Terms:
+    def gap_terms(self) -> HighpassTerms:
         """The high-pass terms of Vgap / V, the voltage across the gap between finger and panel.
+
+        A gap that does not conduct has one more than `terms`, so slow that it keeps the charge it had.
 
         Raises:
             InputError: there is no gap.
         """
-        raise InputError(f"this {type(self).__name__} has no gap between finger and panel; give it Cgap for Vgap")
+        return self.channel_terms("Vgap")
+
+    def _gap_missing(self) -> InputError:
+        return InputError(f"this {type(self).__name__} has no gap between finger and panel; give it Cgap for Vgap")
 
     def transfer_function(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
         """Vsc / V at the angular frequency `omega` (rad/s, >= 0)."""
-        return gain_at(self.terms(), omega)
+        return self.channel_gain("Vsc", omega)
 
     def admittance(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
         """I / V in siemens at the angular frequency `omega` (rad/s, >= 0)."""
-        return gain_at(self.current_terms(), omega)
+        return self.channel_gain("I", omega)
 
     def gap_transfer_function(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
         """Vgap / V at the angular frequency `omega` (rad/s, >= 0); raises as `gap_terms`."""
-        return gain_at(self.gap_terms(), omega)
-
-    def terms_of(self, channel: Channel) -> Terms:
-        """The high-pass terms of a channel over V."""
-        return {"Vsc": self.terms, "I": self.current_terms, "Vgap": self.gap_terms}[channel]()
-
-    def gain_of(self, channel: Channel, omega: ArrayLike) -> Complex[Array, "*shape"]:
-        """A channel over V at the angular frequency `omega` (rad/s, >= 0)."""
-        of = {"Vsc": self.transfer_function, "I": self.admittance, "Vgap": self.gap_transfer_function}
-        return of[channel](omega)
+        return self.channel_gain("Vgap", omega)
 
     def amplitude(self, omega: ArrayLike) -> Float[Array, "*shape"]:
         """|Vsc / V| at the angular frequency `omega` (rad/s, >= 0), eq. (25)."""
-        gain, size = _scaled(self.transfer_function(omega))
+        gain, size = _normalize_magnitude(self.transfer_function(omega))
         return size * jnp.sqrt(gain.real**2 + gain.imag**2)
 
     def phase(self, omega: ArrayLike) -> Float[Array, "*shape"]:
         """How far Vsc leads V at the angular frequency `omega` (rad/s, >= 0), rad; pi/2 at its zero, eq. (26)."""
-        gain, size = _scaled(self.transfer_function(omega))
+        gain, size = _normalize_magnitude(self.transfer_function(omega))
         return jnp.where(size > 0.0, jnp.arctan2(gain.imag, gain.real), 0.5 * np.pi)
 
 
-def _scaled(gain: Array) -> tuple[Array, Array]:
+def _normalize_magnitude(gain: Array) -> tuple[Array, Array]:
     """A complex number as one near 1 (1 for 0) times its size: the squares of its parts neither vanish nor overflow."""
     size = lax.stop_gradient(jnp.maximum(jnp.abs(gain.real), jnp.abs(gain.imag)))
     some = size > 0.0
@@ -142,9 +152,13 @@ class FinalCircuit(Circuit):
         """The time constant Rsc (2 Ci + Csc), s."""
         return self.Rsc * (2.0 * self.Ci + self.Csc)
 
-    def terms(self) -> Terms:
-        """One term: the divider g with the time constant b."""
-        return Terms((self.g,), (self.b,))
+    def channel_terms(self, channel: Channel) -> HighpassTerms:
+        """One term with the time constant b; of Vsc its weight is g, and I also follows dV/dt."""
+        if channel == "Vsc":
+            return HighpassTerms((self.g,), (self.b,))
+        if channel == "I":  # g (1 + s Rsc Csc) / Rsc: the high-pass of b, and what is left of it at high frequency
+            return HighpassTerms((2.0 * self.g * self.g / self.Rsc,), (self.b,), self.g * self.Csc)
+        raise self._gap_missing()
 
     def amplitude(self, omega: ArrayLike) -> Float[Array, "*shape"]:
         """|Vsc / V| at the angular frequency `omega` (rad/s, >= 0), eq. (25)."""
@@ -153,12 +167,6 @@ class FinalCircuit(Circuit):
     def phase(self, omega: ArrayLike) -> Float[Array, "*shape"]:
         """The angle (rad) by which Vsc leads V at the angular frequency `omega` (rad/s, >= 0), eq. (26)."""
         return jnp.arctan2(1.0, jnp.asarray(omega) * self.b)
-
-    def current_terms(self) -> Terms:
-        """I = Vsc (1 + s Rsc Csc) / Rsc: one term, and one that follows dV/dt."""
-        # g (1 + s Rsc Csc) / Rsc: the high-pass of b, and what is left of it at high frequency
-        weight = 2.0 * self.g * self.g / self.Rsc
-        return Terms((weight,), (self.b,), self.g * self.Csc)
 
 
 class Element(NamedTuple):
@@ -199,7 +207,7 @@ class Loop(Circuit):
 
     def insulator(self) -> ArrayLike:
         """Ci in series with a gap that does not conduct, F."""
-        return self.Ci if self.Cgap is None or self.Rgap is not None else self._share() * self.Cgap
+        return self.Ci if self.Cgap is None or self.Rgap is not None else self._gap_fraction() * self.Cgap
 
     def resistance(self) -> ArrayLike | None:
         """The resistance in the loop, ohm; None where there is none."""
@@ -221,80 +229,60 @@ class Loop(Circuit):
         ratios = [self.insulator() / C for _, C in self.elements()]
         return ratios[0] / (1.0 + sum(ratios))
 
-    @property
-    def b(self) -> ArrayLike:
-        """The slowest time constant, s."""
-        return self.terms().tau[0]
+    def channel_gain(self, channel: Channel, omega: ArrayLike) -> Complex[Array, "*shape"]:
+        """A channel over V at the angular frequency `omega` (rad/s, >= 0), from impedances: they keep all digits."""
+        ratios = self._impedance_ratios(omega)
+        if channel == "Vsc":
+            return ratios[0] / (1.0 + sum(ratios))
+        if channel == "I":
+            return 1j * jnp.asarray(omega) * self.insulator() / (1.0 + sum(ratios))
+        gap = self._gap_fraction() if self.Rgap is None else ratios[len(self.elements()) - 1]
+        return gap / (1.0 + sum(ratios))
 
-    def transfer_function(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
-        """Vsc / V at the angular frequency `omega` (rad/s, >= 0), from the impedances, which keep all digits."""
-        around = self._over_insulator(omega)
-        return around[0] / (1.0 + sum(around))
-
-    def admittance(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
-        """I / V in siemens at the angular frequency `omega` (rad/s, >= 0), from the impedances."""
-        return 1j * jnp.asarray(omega) * self.insulator() / (1.0 + sum(self._over_insulator(omega)))
-
-    def gap_transfer_function(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
-        """Vgap / V at the angular frequency `omega` (rad/s, >= 0), from the impedances; raises as `gap_terms`."""
-        self._require_gap()
-        around = self._over_insulator(omega)
-        gap = self._share() if self.Rgap is None else around[len(self.elements()) - 1]
-        return gap / (1.0 + sum(around))
-
-    def _over_insulator(self, omega: ArrayLike) -> list[Array]:
+    def _impedance_ratios(self, omega: ArrayLike) -> list[Array]:
         """The impedances around the loop, the touching skin's first, over the insulator's: no real part is negative."""
         charging = jnp.asarray(omega) * self.insulator()
-        found = []
+        ratios = []
         for R, C in self.elements():
             x = jnp.asarray(omega) * R * C
-            found.append(charging * R / (1.0 + x**2) * (x + 1j))
+            ratios.append(charging * R / (1.0 + x**2) * (x + 1j))
         R0 = self.resistance()
-        return found if R0 is None else [*found, 1j * charging * R0]
+        return ratios if R0 is None else [*ratios, 1j * charging * R0]
 
-    def terms(self) -> Terms:
-        """One term for each element, and one more with a resistance in the loop."""
-        modes = self._modes()
-        return Terms(tuple(modes.voltages[0]), tuple(modes.tau))
-
-    def current_terms(self) -> Terms:
-        """As `terms`; without a resistance in the loop the current also follows dV/dt."""
-        modes = self._modes()
-        return Terms(tuple(modes.current), tuple(modes.tau), modes.rate)
-
-    def gap_terms(self) -> Terms:
-        """As `terms`; a gap that does not conduct has one more, so slow that it keeps the charge it had."""
-        self._require_gap()
-        tau, voltages, current, _ = self._modes()
+    def channel_terms(self, channel: Channel) -> HighpassTerms:
+        """As many for each channel, but for a gap that does not conduct; I may also follow dV/dt."""
+        tau, voltages, current, rate = self._modes()
+        if channel == "I":
+            return HighpassTerms(tuple(current), tuple(tau), rate)
+        if channel == "Vsc":
+            return HighpassTerms(tuple(voltages[0]), tuple(tau))
         if self.Rgap is not None:
-            return Terms(tuple(voltages[-1]), tuple(tau))
-        R0, share = self.resistance(), self._share()
+            return HighpassTerms(tuple(voltages[-1]), tuple(tau))
+        share, R0 = self._gap_fraction(), self.resistance()
         others = jnp.sum(voltages, axis=0) + (0.0 if R0 is None else R0 * current)
-        return Terms((*(-share * others), share), (*tau, _NEVER * tau[0]))
+        return HighpassTerms((*(-share * others), share), (*tau, 1e15 * tau[0]))  # so slowly an open gap loses charge
 
-    def _require_gap(self) -> None:
+    def _gap_fraction(self) -> ArrayLike:
+        """Of the voltage over Ci and a gap that does not conduct, the gap's; raises where there is no gap."""
         if self.Cgap is None:
-            super().gap_terms()
-
-    def _share(self) -> ArrayLike:
-        """Of the voltage over Ci and a gap that does not conduct, the gap's."""
+            raise self._gap_missing()
         return self.Ci / (self.Ci + jnp.asarray(self.Cgap))
 
     def _modes(self) -> _Modes:
         Ci, R0 = self.insulator(), self.resistance()
         R, C = (jnp.stack(jnp.broadcast_arrays(*x)) for x in zip(*self.elements(), strict=True))
-        C = jnp.maximum(C, _LEAST * Ci)
+        C = jnp.maximum(C, 1e-12 * Ci)  # what a skin without capacitance counts as having: its time constant is not 0
         return _modes_without_resistance(Ci, R, C) if R0 is None else _modes_with_resistance(Ci, R0, R, C)
 
 
 def _modes_without_resistance(Ci: ArrayLike, R: Array, C: Array) -> _Modes:
     """With x = v / sqrt(R) over the elements:  T x' + x = Ci sqrt(R) V',  T = diag(R C) + Ci sqrt(R) sqrt(R)^T."""
     root = jnp.sqrt(R)
-    tau, modes = _modes_of(jnp.vstack([jnp.diag(jnp.sqrt(R * C)), jnp.sqrt(Ci) * root]))
+    tau, modes = _gram_eigenmodes(jnp.vstack([jnp.diag(jnp.sqrt(R * C)), jnp.sqrt(Ci) * root]))
     drive = Ci * (modes.T @ root) / tau
     rate = Ci
-    for each in C:
-        rate = rate * (each / (rate + each))
+    for capacitance in C:
+        rate = rate * (capacitance / (rate + capacitance))
     return _Modes(tau, root[:, None] * modes * drive, drive**2, rate)
 
 
@@ -305,31 +293,33 @@ def _modes_with_resistance(Ci: ArrayLike, R0: ArrayLike, R: Array, C: Array) -> 
     """
     root = jnp.sqrt(jnp.append(C, Ci))
     # each row is one resistance's current, times its square root
-    through = jnp.vstack([jnp.diag(root[:-1]), jnp.zeros_like(C)])
-    current = jnp.append(jnp.full_like(R, -1.0), 1.0)[:, None] * root[-1]
-    tau, modes = _modes_of(jnp.sqrt(jnp.append(R, R0))[:, None] * jnp.hstack([through, current]))
+    in_elements = jnp.vstack([jnp.diag(root[:-1]), jnp.zeros_like(C)])
+    in_Ci = jnp.append(jnp.full_like(R, -1.0), 1.0)[:, None] * root[-1]
+    tau, modes = _gram_eigenmodes(jnp.sqrt(jnp.append(R, R0))[:, None] * jnp.hstack([in_elements, in_Ci]))
     voltages = -modes[:-1] * modes[-1] * (root[-1] / root[:-1, None])
     return _Modes(tau, voltages, Ci * modes[-1] ** 2 / tau)
 
 
 @jax.custom_jvp
-def _modes_of(factor: Array) -> tuple[Array, Array]:
+def _gram_eigenmodes(factor: Array) -> tuple[Array, Array]:
     """Eigenvalues and eigenvectors of factor^T factor: from the factor, small eigenvalues keep twice the digits."""
     _, sigma, modes = jnp.linalg.svd(factor, full_matrices=False)
     return sigma * sigma, modes.T
 
 
-@_modes_of.defjvp
-def _modes_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+@_gram_eigenmodes.defjvp
+def _gram_eigenmodes_jvp(
+    primals: tuple[Array], tangents: tuple[Array]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """That of the singular value decomposition, but finite where modes are apart by no more than rounding.
 
     They then have one time constant, and only their sum matters, which their rotation into each other leaves alone.
     """
     left, sigma, right = jnp.linalg.svd(primals[0], full_matrices=False)
     modes, slope = right.T, left.T @ tangents[0] @ right.T
-    apart = sigma - sigma[:, None]
-    distinct = jnp.abs(apart) > _ROUNDING * jnp.finfo(sigma.dtype).eps * sigma[0]
-    turn = jnp.where(distinct, 1.0 / jnp.where(distinct, apart * (sigma + sigma[:, None]), 1.0), 0.0)
+    gaps = sigma - sigma[:, None]
+    distinct = jnp.abs(gaps) > 4.0 * jnp.finfo(sigma.dtype).eps * sigma[0]  # ulps that rounding makes of equal ones
+    turn = jnp.where(distinct, 1.0 / jnp.where(distinct, gaps * (sigma + sigma[:, None]), 1.0), 0.0)
     scaled = sigma[:, None] * slope
     changes = 2.0 * sigma * jnp.diagonal(slope), modes @ (turn * (scaled + scaled.T))
     return (sigma * sigma, modes), changes
@@ -341,7 +331,7 @@ class Probe(eqx.Module):
     R: ArrayLike
     C: ArrayLike
 
-    def across(self, skin: Element) -> Element:
+    def load_skin(self, skin: Element) -> Element:
         """The skin with the probe in parallel."""
         return Element(1.0 / (1.0 / jnp.asarray(skin.R) + 1.0 / self.R), skin.C + jnp.asarray(self.C))
 
@@ -369,7 +359,7 @@ class DirectGround(Loop):
 
     def resistance(self) -> ArrayLike | None:
         """R_H and the series resistor, ohm."""
-        return _in_series(self.R_H, self.series_resistor)
+        return _series_resistance(self.R_H, self.series_resistor)
 
     def body(self) -> tuple[Element, ...]:
         """The touching skin (with the probe), and the grounding one."""
@@ -377,7 +367,7 @@ class DirectGround(Loop):
             self.Rsc if self.grounding_Rsc is None else self.grounding_Rsc,
             self.Csc if self.grounding_Csc is None else self.grounding_Csc,
         )
-        return _loaded(Element(self.Rsc, self.Csc), self.probe), grounding
+        return _with_probe_load(Element(self.Rsc, self.Csc), self.probe), grounding
 
 
 class NaturalGround(Loop):
@@ -400,30 +390,51 @@ class NaturalGround(Loop):
 
     def resistance(self) -> ArrayLike | None:
         """Z where it is a plain resistance, and the series resistor, ohm."""
-        return _in_series(self.Z if self.Z_capacitance is None else None, self.series_resistor)
+        return _series_resistance(self.Z if self.Z_capacitance is None else None, self.series_resistor)
 
     def body(self) -> tuple[Element, ...]:
         """The touching skin (with the probe), and Z where it has a capacitance."""
-        touching = _loaded(Element(self.Rsc, self.Csc), self.probe)
+        touching = _with_probe_load(Element(self.Rsc, self.Csc), self.probe)
         return (touching,) if self.Z_capacitance is None else (touching, Element(self.Z, self.Z_capacitance))
 
 
 RC: TypeAlias = FinalCircuit | DirectGround | NaturalGround  # those with constant skins, which can be fitted
 
 
-def _loaded(skin: Element, probe: Probe | None) -> Element:
-    return skin if probe is None else probe.across(skin)
+def _with_probe_load(skin: Element, probe: Probe | None) -> Element:
+    return skin if probe is None else probe.load_skin(skin)
 
 
-def _in_series(*resistances: ArrayLike | None) -> ArrayLike | None:
-    given = [jnp.asarray(r) for r in resistances if r is not None]
-    return sum(given[1:], given[0]) if given else None
+def _series_resistance(*resistances: ArrayLike | None) -> ArrayLike | None:
+    stated = [jnp.asarray(r) for r in resistances if r is not None]
+    return sum(stated[1:], stated[0]) if stated else None
 
 
-def gain_at(terms: Terms, omega: ArrayLike) -> Complex[Array, "*shape"]:
+def gain_at(terms: HighpassTerms, omega: ArrayLike) -> Complex[Array, "*shape"]:
     """The sum of `terms` at s = j omega (rad/s, >= 0)."""
     omega = jnp.asarray(omega)
     total = jnp.zeros_like(omega, dtype=complex) if terms.rate is None else 1j * omega * terms.rate
     for weight, tau in zip(terms.weight, terms.tau, strict=True):
         total = total + weight * highpass_gain(omega * tau)
     return total
+
+
+def highpass_gain(x: ArrayLike) -> Complex[Array, "*shape"]:
+    """j x / (1 + j x) for x >= 0, without overflow at either end."""
+    below, small, inverse = _split_range(x)
+    low = small / (1.0 + small**2)  # (x^2 + j x) / (1 + x^2)
+    high = 1.0 / (1.0 + inverse**2)
+    return jnp.where(below, low * small + 1j * low, high + 1j * high * inverse)
+
+
+def highpass_amplitude(x: ArrayLike) -> Float[Array, "*shape"]:
+    """|j x / (1 + j x)| for x >= 0, in forms whose derivatives do not cancel."""
+    below, small, inverse = _split_range(x)
+    return jnp.where(below, small / jnp.sqrt(1.0 + small**2), 1.0 / jnp.sqrt(1.0 + inverse**2))
+
+
+def _split_range(x: ArrayLike) -> tuple[Array, Array, Array]:
+    """Whether x <= 1, x where it is, and 1/x where it is not; 1 elsewhere, which keeps gradients finite."""
+    x = jnp.asarray(x)
+    below = x <= 1.0
+    return below, jnp.where(below, x, 1.0), 1.0 / jnp.where(below, 1.0, x)

@@ -6,7 +6,7 @@ from the start of the rise to the start of the fall, and sine and triangle cross
 is zero before t = 0 (one given by points: before the first), and may jump there.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,20 +14,26 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from fitact.errors import InputError
 
-_SNAP = 8  # ulps of t f within which a time counts as lying on a breakpoint
-_SNAP_PHASE = 32  # ulps of the phase: one that was read from text has 15 digits
-_NO_JUMP = 64  # ulps of a drive's height that are rounding, not a jump
 
-
-def _floats(values: ArrayLike) -> Array:
+def _as_float(values: ArrayLike) -> Array:
     return jnp.asarray(values, dtype=float)
 
 
-class Pieces(NamedTuple):
+def _rounding_error(size: Array, ulps: float = 8.0) -> Array:
+    """So many ulps of numbers of that size: within 8, a time counts as lying on a breakpoint."""
+    return lax.stop_gradient(ulps * jnp.finfo(size.dtype).eps * jnp.abs(size))
+
+
+def is_reached(time: Array, end: ArrayLike) -> Array:
+    """Whether a time is no earlier than `end`, to within 8 ulps."""
+    return time * (1.0 + 8.0 * jnp.finfo(time.dtype).eps) >= end
+
+
+class LinearPieces(NamedTuple):
     """Straight pieces: piece k runs from knot k to knot k + 1, from value `start[k]` to `end[k]`."""
 
     knots: Float[Array, " pieces+1"]  # s
@@ -44,7 +50,7 @@ class Drive(eqx.Module):
     """What every drive offers: its value in time."""
 
     @property
-    def begin(self) -> ArrayLike:
+    def start_time(self) -> ArrayLike:
         """When it begins, from rest (s)."""
         return 0.0
 
@@ -74,7 +80,7 @@ class Periodic(Drive):
         return 1.0 / jnp.asarray(self.frequency, dtype=float)
 
     @property
-    def lead(self) -> Array:
+    def phase_time(self) -> Array:
         """The phase as a time, s."""
         return self.phase / (2.0 * np.pi) * self.period
 
@@ -86,8 +92,8 @@ class Periodic(Drive):
         """
         elapsed = jnp.asarray(time, dtype=float) * self.frequency
         ahead = self.phase / (2.0 * np.pi)
-        ulps = _SNAP * jnp.abs(elapsed) + _SNAP_PHASE * jnp.abs(ahead)
-        slack = lax.stop_gradient(jnp.finfo(elapsed.dtype).eps * ulps)
+        # a phase that was read from text has 15 digits
+        slack = _rounding_error(elapsed) + _rounding_error(jnp.asarray(ahead, dtype=float), ulps=32.0)
         cycles = elapsed + ahead
         return jnp.maximum(cycles - lax.stop_gradient(jnp.floor(cycles + slack)), 0.0), slack
 
@@ -95,7 +101,7 @@ class Periodic(Drive):
 class PiecewiseLinear(Periodic):
     """A periodic drive made of straight pieces."""
 
-    def pieces(self) -> Pieces:
+    def pieces(self) -> LinearPieces:
         """One period of it."""
         raise NotImplementedError
 
@@ -121,7 +127,7 @@ class PiecewiseLinear(Periodic):
         at_start = since <= self.cycle(time)[1] * self.period
         jumps = at_start & (pieces.start != jnp.roll(pieces.end, 1))[piece]
         slope = jnp.where(jumps, jnp.nan, pieces.slopes()[piece])
-        return slope if steady_state else after_rest(self, slope, time, jnp.max(jnp.abs(pieces.start)))
+        return slope if steady_state else slope_from_rest(self, slope, time, jnp.max(jnp.abs(pieces.start)))
 
 
 class Square(PiecewiseLinear):
@@ -133,13 +139,13 @@ class Square(PiecewiseLinear):
     offset: ArrayLike = 0.0
     phase: ArrayLike = 0.0
 
-    def pieces(self) -> Pieces:
+    def pieces(self) -> LinearPieces:
         """High, then low."""
         half = 0.5 * jnp.asarray(self.peak_to_peak, dtype=float)
         values = self.offset + jnp.stack([half, -half])
         one = jnp.ones_like(self.period)
         knots = self.period * jnp.stack([0.0 * one, self.duty * one, one])
-        return Pieces(knots, values, values)
+        return LinearPieces(knots, values, values)
 
 
 class Trapezoid(PiecewiseLinear):
@@ -152,20 +158,14 @@ class Trapezoid(PiecewiseLinear):
     offset: ArrayLike = 0.0
     phase: ArrayLike = 0.0
 
-    def pieces(self) -> Pieces:
+    def pieces(self) -> LinearPieces:
         """Rise, high, fall, low."""
         half = 0.5 * jnp.asarray(self.peak_to_peak, dtype=float)
         rise = jnp.asarray(self.rise_time, dtype=float)
-        knots = [
-            0.0 * self.period,
-            rise,
-            self.duty * self.period,
-            self.duty * self.period + rise,
-            self.period,
-        ]
+        knots = [0.0 * self.period, rise, self.duty * self.period, self.duty * self.period + rise, self.period]
         start = self.offset + jnp.stack([-half, half, half, -half])
         end = self.offset + jnp.stack([half, half, -half, -half])
-        return Pieces(jnp.stack(knots), start, end)
+        return LinearPieces(jnp.stack(knots), start, end)
 
 
 class Triangle(PiecewiseLinear):
@@ -176,11 +176,11 @@ class Triangle(PiecewiseLinear):
     offset: ArrayLike = 0.0
     phase: ArrayLike = 0.0
 
-    def pieces(self) -> Pieces:
+    def pieces(self) -> LinearPieces:
         """Up to the crest, down to the trough, up to the start."""
         half = 0.5 * jnp.asarray(self.peak_to_peak, dtype=float)
         corner = self.offset + half * jnp.array([0.0, 1.0, -1.0, 0.0])
-        return Pieces(self.period * jnp.array([0.0, 0.25, 0.75, 1.0]), corner[:-1], corner[1:])
+        return LinearPieces(self.period * jnp.array([0.0, 0.25, 0.75, 1.0]), corner[:-1], corner[1:])
 
 
 class Sine(Periodic):
@@ -200,10 +200,67 @@ class Sine(Periodic):
         """dV/dt at `time`."""
         cycle, _ = self.cycle(time)
         slope = np.pi * jnp.asarray(self.peak_to_peak) * self.frequency * jnp.cos(2.0 * np.pi * cycle)
-        return slope if steady_state else after_rest(self, slope, time, jnp.abs(jnp.asarray(self.peak_to_peak)))
+        return slope if steady_state else slope_from_rest(self, slope, time, jnp.abs(jnp.asarray(self.peak_to_peak)))
 
 
-class Line(Drive):
+class Multitone(Periodic):
+    """A sum of sines at whole multiples of one frequency, around `offset`; each crosses it upwards at t = 0.
+
+    Attributes:
+        frequency: at which the sum repeats, Hz.
+        orders: of the tones: the multiples of `frequency` that they have, each once, 1 to 250.
+        amplitudes: from the middle to the crest of each tone, V.
+        phases: of each tone, rad; () for none.
+        offset: V.
+        phase: by which the whole runs ahead, in rad of `frequency`.
+
+    Raises:
+        InputError: the orders are no such numbers, or there is not one amplitude and phase for each.
+    """
+
+    frequency: ArrayLike
+    orders: tuple[int, ...] = eqx.field(static=True)
+    amplitudes: tuple[ArrayLike, ...]
+    phases: tuple[ArrayLike, ...] = ()
+    offset: ArrayLike = 0.0
+    phase: ArrayLike = 0.0
+    max_order: ClassVar[int] = 250  # up to which a mean of Vsc^4 over a period's 1024 points is exact
+
+    def __check_init__(self) -> None:
+        orders = self.orders
+        if not orders or len(set(orders)) < len(orders) or not all(n in range(1, self.max_order + 1) for n in orders):
+            raise InputError(f"Multitone: orders = {orders}; give different whole numbers from 1 to {self.max_order}")
+        if len(self.amplitudes) != len(orders) or len(self.phases) not in (0, len(orders)):
+            raise InputError(
+                f"Multitone: {len(orders)} tones, {len(self.amplitudes)} amplitudes, {len(self.phases)} phases;"
+                " give one of each for a tone"
+            )
+
+    def tones(self) -> tuple[Sine, ...]:
+        """The sines that it is the sum of, but for the offset."""
+        phases = self.phases or (0.0,) * len(self.orders)
+        return tuple(
+            Sine(2.0 * jnp.asarray(height), n * jnp.asarray(self.frequency), phase=phase + n * jnp.asarray(self.phase))
+            for n, height, phase in zip(self.orders, self.amplitudes, phases, strict=True)
+        )
+
+    def phasors(self) -> Complex[Array, " tones"]:
+        """A with tone = Im A e^{j order w t} (V), `phase` left out."""
+        phases = jnp.stack(list(map(jnp.asarray, self.phases or (0.0,) * len(self.orders))))
+        return jnp.stack(list(map(jnp.asarray, self.amplitudes))) * jnp.exp(1j * phases)
+
+    def value(self, time: ArrayLike) -> Float[Array, "*shape"]:
+        """V at `time`."""
+        return self.offset + sum((tone.value(time) for tone in self.tones()), jnp.zeros(()))
+
+    def slope(self, time: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
+        """dV/dt at `time`."""
+        slope = sum((tone.slope(time) for tone in self.tones()), jnp.zeros(()))
+        height = sum(map(jnp.abs, map(jnp.asarray, self.amplitudes)))
+        return slope if steady_state else slope_from_rest(self, slope, time, height)
+
+
+class InterpolatedDrive(Drive):
     """A drive through points, joined by straight lines; constant before the first and after the last.
 
     With a period it repeats, running on from the last point to the first one of the next period. Two
@@ -222,17 +279,17 @@ class Line(Drive):
         raise NotImplementedError
 
     @property
-    def begin(self) -> ArrayLike:
+    def start_time(self) -> ArrayLike:
         """The first point (s)."""
         return self.points()[0][0]
 
-    def pieces(self) -> Pieces:
+    def pieces(self) -> LinearPieces:
         """The lines between the points, and the one that closes the period, or the endless one after the last."""
         knots, values = self.points()
         if self.period is None:
-            return Pieces(jnp.append(knots, jnp.inf), values, jnp.append(values[1:], values[-1]))
+            return LinearPieces(jnp.append(knots, jnp.inf), values, jnp.append(values[1:], values[-1]))
         close = jnp.maximum(knots[0] + self.period, knots[-1])
-        return Pieces(jnp.append(knots, close), values, jnp.append(values[1:], values[0]))
+        return LinearPieces(jnp.append(knots, close), values, jnp.append(values[1:], values[0]))
 
     def locate(self, time: ArrayLike) -> tuple[Array, Array]:
         """The piece that `time` falls in, and the time since that piece began (s; negative before the first)."""
@@ -247,7 +304,7 @@ class Line(Drive):
 
     def _slack(self, time: Array) -> Array:
         """The rounding error to allow for in a time (s)."""
-        return lax.stop_gradient(_SNAP * jnp.finfo(time.dtype).eps * jnp.maximum(jnp.abs(time), jnp.abs(self.begin)))
+        return _rounding_error(jnp.maximum(jnp.abs(time), jnp.abs(self.start_time)))
 
     def value(self, time: ArrayLike) -> Float[Array, "*shape"]:
         """V at `time`, by linear interpolation."""
@@ -263,10 +320,10 @@ class Line(Drive):
         jump = jnp.where(jnp.diff(pieces.knots) > 0.0, 0.0, pieces.end - pieces.start)
         at_start = (since >= 0.0) & (since <= self._slack(jnp.asarray(time, dtype=float)))
         slope = jnp.where(at_start & (jnp.roll(jump, 1) != 0.0)[piece], jnp.nan, slope)
-        return slope if steady_state else after_rest(self, slope, time, jnp.max(jnp.abs(self.points()[1])))
+        return slope if steady_state else slope_from_rest(self, slope, time, jnp.max(jnp.abs(self.points()[1])))
 
 
-class Sampled(Line):
+class Sampled(InterpolatedDrive):
     """A measured drive: straight lines between samples, constant before the first and after the last.
 
     Attributes:
@@ -285,7 +342,7 @@ class Sampled(Line):
         return self.time, self.samples
 
 
-class Polyline(Line):
+class Polyline(InterpolatedDrive):
     """Any piecewise linear drive, by its corners; two at one time are a jump.
 
     Attributes:
@@ -297,8 +354,8 @@ class Polyline(Line):
         InputError: the corners do not pair up, go back in time, or reach beyond the period.
     """
 
-    time: Float[Array, " corners"] = eqx.field(converter=_floats)
-    voltage: Float[Array, " corners"] = eqx.field(converter=_floats)
+    time: Float[Array, " corners"] = eqx.field(converter=_as_float)
+    voltage: Float[Array, " corners"] = eqx.field(converter=_as_float)
     period: ArrayLike | None = None
 
     def __check_init__(self) -> None:
@@ -342,8 +399,7 @@ class Burst(Drive):
 
     def is_over(self, time: ArrayLike) -> Array:
         """Whether the burst has ended; a time on its end to within rounding counts as the end."""
-        elapsed = jnp.asarray(time, dtype=float) * self.wave.frequency
-        return elapsed * (1.0 + _SNAP * jnp.finfo(elapsed.dtype).eps) >= self.cycles
+        return is_reached(jnp.asarray(time, dtype=float) * self.wave.frequency, self.cycles)
 
     def value(self, time: ArrayLike) -> Float[Array, "*shape"]:
         """V at `time`."""
@@ -355,14 +411,15 @@ class Burst(Drive):
         time = jnp.asarray(time, dtype=float)
         inside = self.wave.slope(time, steady_state=False)
         # it ends as it began: with a jump or without
-        at_end = self.is_over(time) & (time <= self.duration * (1.0 + _SNAP * jnp.finfo(time.dtype).eps))
+        at_end = self.is_over(time) & is_reached(self.duration, time)
         after = jnp.where(at_end & jnp.isnan(self.wave.slope(0.0, steady_state=False)), jnp.nan, 0.0)
         return jnp.where(self.is_over(time), after, inside)
 
 
-def after_rest(drive: Drive, slope: Array, time: ArrayLike, height: ArrayLike) -> Array:
+def slope_from_rest(drive: Drive, slope: Array, time: ArrayLike, height: ArrayLike) -> Array:
     """A slope from rest: 0 before the drive begins, and NaN there unless it begins at 0."""
     time = jnp.asarray(time, dtype=float)
-    slope = jnp.where(time < drive.begin, 0.0, slope)
-    jumps = jnp.abs(drive.value(drive.begin)) > _NO_JUMP * jnp.finfo(slope.dtype).eps * jnp.asarray(height)
-    return jnp.where((time == drive.begin) & jumps, jnp.nan, slope)
+    slope = jnp.where(time < drive.start_time, 0.0, slope)
+    rounding = 64.0 * jnp.finfo(slope.dtype).eps * jnp.asarray(height)  # which is no jump
+    jumps = jnp.abs(drive.value(drive.start_time)) > rounding
+    return jnp.where((time == drive.start_time) & jumps, jnp.nan, slope)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from fitact.errors import InputError
 from fitact.model.circuit import Channel, Circuit
 from fitact.model.drive import Drive
-from fitact.model.skin import constant
+from fitact.model.skin import constant_skin_circuit
 from fitact.model.steady import mean_square, peak
 
 EPSILON_0 = 8.85e-12  # F/m, the paper's value
@@ -38,21 +38,12 @@ class Contact(eqx.Module):
 
     @classmethod
     def from_capacitances(
-        cls,
-        Ci: ArrayLike,
-        Csc: ArrayLike,
-        area: ArrayLike,
-        insulator_thickness: ArrayLike,
-        skin_thickness: ArrayLike,
+        cls, Ci: ArrayLike, Csc: ArrayLike, area: ArrayLike, insulator_thickness: ArrayLike, skin_thickness: ArrayLike
     ) -> "Contact":
         """The contact whose permittivities give the capacitances `Ci` and `Csc` (F) by eq. (3)."""
         unit = EPSILON_0 * jnp.asarray(area)
         return cls(
-            area,
-            insulator_thickness,
-            Ci * insulator_thickness / unit,
-            skin_thickness,
-            Csc * skin_thickness / unit,
+            area, insulator_thickness, Ci * insulator_thickness / unit, skin_thickness, Csc * skin_thickness / unit
         )
 
 
@@ -92,7 +83,7 @@ class Geometry(eqx.Module):
         Raises:
             InputError: the model is "gap" and the circuit has none.
         """
-        inner: Any = constant(circuit)
+        inner: Any = constant_skin_circuit(circuit)
         if self.model == "paper":
             layers = self.insulator_thickness, self.skin_thickness
             return Contact.from_capacitances(inner.Ci, inner.Csc, self.area, *layers)

@@ -14,20 +14,11 @@ from jaxtyping import Array, Complex, Float
 
 from fitact.errors import InputError
 from fitact.model.circuit import Channel, Circuit
-from fitact.model.drive import Drive, Line, Periodic, PiecewiseLinear, Sine
-from fitact.model.multitone import Multitone
-
-_TAIL = 64  # an error is summed up to this many times the harmonics kept,
-_LEAST = 4096  # and to this harmonic at least
+from fitact.model.drive import Drive, InterpolatedDrive, Multitone, Periodic, PiecewiseLinear, Sine
 
 
 def harmonic_response(
-    circuit: Circuit,
-    drive: Drive,
-    time: ArrayLike,
-    harmonics: int,
-    *,
-    channel: Channel = "Vsc",
+    circuit: Circuit, drive: Drive, time: ArrayLike, harmonics: int, *, channel: Channel = "Vsc"
 ) -> Float[Array, "*shape"]:
     """The steady state of Vsc (V) or I (A) at `time` (s) from the first `harmonics` of a periodic drive, eq. (20).
 
@@ -37,8 +28,8 @@ def harmonic_response(
     Raises:
         InputError: the drive has no period.
     """
-    omega = fundamental(drive) * jnp.arange(1, harmonics + 1)
-    return harmonic_sum(fourier(drive, harmonics) * circuit.gain_of(channel, omega), drive, time)
+    omega = angular_frequency(drive) * jnp.arange(1, harmonics + 1)
+    return harmonic_sum(fourier_coefficients(drive, harmonics) * circuit.channel_gain(channel, omega), drive, time)
 
 
 def harmonic_error(circuit: Circuit, drive: Drive, harmonics: int, *, channel: Channel = "Vsc") -> Float[Array, ""]:
@@ -50,8 +41,9 @@ def harmonic_error(circuit: Circuit, drive: Drive, harmonics: int, *, channel: C
     Raises:
         InputError: the drive has no period.
     """
-    last = max(_TAIL * harmonics, _LEAST)
-    amplitude = fourier(drive, last) * circuit.gain_of(channel, fundamental(drive) * jnp.arange(1, last + 1))
+    last = max(64 * harmonics, 4096)
+    omega = angular_frequency(drive) * jnp.arange(1, last + 1)
+    amplitude = fourier_coefficients(drive, last) * circuit.channel_gain(channel, omega)
     power = amplitude.real**2 + amplitude.imag**2
     octave, before = jnp.sum(power[last // 2 :]), jnp.sum(power[last // 4 : last // 2])
     # a bounded response to jumps, the slowest there is, loses half of its power from octave to octave
@@ -75,7 +67,7 @@ def harmonic_sum(amplitude: Complex[Array, " harmonics"], drive: Drive, time: Ar
     return lax.scan(add, jnp.zeros_like(cycles), (order, amplitude))[0]
 
 
-def fourier(drive: Drive, harmonics: int) -> Complex[Array, " harmonics"]:
+def fourier_coefficients(drive: Drive, harmonics: int) -> Complex[Array, " harmonics"]:
     """c_k (V) for k = 1 to `harmonics`: the drive is its mean plus 2 Re sum_k c_k e^{jkwt}.
 
     Raises:
@@ -88,30 +80,27 @@ def fourier(drive: Drive, harmonics: int) -> Complex[Array, " harmonics"]:
         kept = np.flatnonzero(np.asarray(drive.orders) <= harmonics)
         places = np.asarray(drive.orders)[kept] - 1
         return jnp.zeros(harmonics, dtype=complex).at[places].set(-0.5j * drive.phasors()[kept])
-    fundamental(drive)
-    assert isinstance(drive, PiecewiseLinear | Line)
+    angular_frequency(drive)
+    assert isinstance(drive, PiecewiseLinear | InterpolatedDrive)
     knots, start, end = drive.pieces()
     period = knots[-1] - knots[0]
     at, middle = (knots[:-1] - knots[0]) / period, (0.5 * (knots[1:] + knots[:-1]) - knots[0]) / period
     jump, rise, length = start - jnp.roll(end, 1), end - start, jnp.diff(knots) / period
 
-    def one(k: Array) -> Array:
-        change = jnp.sum(jump * _turn(k * at)) + jnp.sum(rise * jnp.sinc(k * length) * _turn(k * middle))
-        return change / (2j * np.pi * k)
+    def coefficient(k: Array) -> Array:
+        jumps = jnp.sum(jump * _phase_factor(k * at))
+        rises = jnp.sum(rise * jnp.sinc(k * length) * _phase_factor(k * middle))
+        return (jumps + rises) / (2j * np.pi * k)
 
-    return lax.map(one, order)
-
-
-def fundamental(drive: Drive) -> Array:
-    """The angular frequency w of the drive's period, rad/s.
-
-    Raises:
-        InputError: the drive has no period.
-    """
-    return 2.0 * np.pi * jnp.asarray(frequency(drive), dtype=float)
+    return lax.map(coefficient, order)
 
 
-def frequency(drive: Drive) -> ArrayLike:
+def angular_frequency(drive: Drive) -> Array:
+    """The angular frequency w of the drive's period, rad/s; raises as `drive_frequency`."""
+    return 2.0 * np.pi * jnp.asarray(drive_frequency(drive), dtype=float)
+
+
+def drive_frequency(drive: Drive) -> ArrayLike:
     """How often the drive repeats, Hz.
 
     Raises:
@@ -119,7 +108,7 @@ def frequency(drive: Drive) -> ArrayLike:
     """
     if isinstance(drive, Periodic):
         return drive.frequency
-    if isinstance(drive, Line) and drive.period is not None:
+    if isinstance(drive, InterpolatedDrive) and drive.period is not None:
         return 1.0 / drive.period
     raise InputError(
         f"a {type(drive).__name__} drive does not repeat, so it has no harmonics; give one of points its period"
@@ -128,12 +117,12 @@ def frequency(drive: Drive) -> ArrayLike:
 
 def _cycles(drive: Drive, time: Array) -> Array:
     """Cycles since the last start of a period, in [0, 1): their product with k keeps its digits."""
-    if isinstance(drive, Line):
-        return jnp.mod((time - drive.begin) / drive.period, 1.0)
+    if isinstance(drive, InterpolatedDrive):
+        return jnp.mod((time - drive.start_time) / drive.period, 1.0)
     assert isinstance(drive, Periodic)
     return drive.cycle(time)[0]
 
 
-def _turn(cycles: Array) -> Array:
+def _phase_factor(cycles: Array) -> Array:
     angle = 2.0 * np.pi * jnp.mod(cycles, 1.0)
     return lax.complex(jnp.cos(angle), -jnp.sin(angle))

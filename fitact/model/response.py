@@ -8,7 +8,7 @@ L; at a jump u jumps along. Written so that nothing cancels or overflows at eith
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,17 +19,21 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
 from fitact.errors import InputError
-from fitact.model.chirp import Chirp
-from fitact.model.circuit import Channel, Circuit, Terms, gain_at
-from fitact.model.drive import Burst, Drive, Line, Pieces, PiecewiseLinear, Sampled, Sine, Square
-from fitact.model.harmonic import fourier, frequency, fundamental, harmonic_sum
-from fitact.model.highpass import highpass_amplitude
-from fitact.model.multitone import Multitone
-from fitact.model.polynomial import evaluate, particular
+from fitact.model.chirp import Chirp, evaluate_polynomials, particular_solution
+from fitact.model.circuit import Channel, Circuit, HighpassTerms, gain_at, highpass_amplitude
+from fitact.model.drive import (
+    Burst,
+    Drive,
+    InterpolatedDrive,
+    LinearPieces,
+    Multitone,
+    PiecewiseLinear,
+    Sampled,
+    Sine,
+    Square,
+)
+from fitact.model.harmonic import angular_frequency, drive_frequency, fourier_coefficients, harmonic_sum
 from fitact.model.skin import WithSkin, has_time_constants
-
-_LONG = 262_144  # pieces followed at a time
-_FEW = 8  # pieces told apart by comparison rather than looked up
 
 
 def response(
@@ -68,7 +72,7 @@ def response(
         return total
     if steady_state:
         raise InputError("an initial charge has decayed in the steady state: give steady_state=False with initial")
-    return total + _remains(drive, time, circuit.terms_of(channel).tau, initial)
+    return total + _initial_charge_decay(drive, time, circuit.channel_terms(channel).tau, initial)
 
 
 def response_and_rate(
@@ -76,22 +80,25 @@ def response_and_rate(
 ) -> tuple[Float[Array, "*shape"], ArrayLike | None]:
     """As `response` but for what follows dV/dt, and how much does (F); None: nothing."""
     if has_time_constants(circuit):
-        terms = circuit.terms_of(channel)
-        return respond(terms, drive, time, steady_state=steady_state), terms.rate
+        terms = circuit.channel_terms(channel)
+        return superpose_terms(terms, drive, time, steady_state=steady_state), terms.rate
     assert isinstance(circuit, WithSkin)
     if not steady_state:
         raise InputError(
             f"a {type(circuit.skin).__name__.lower()} skin is computed in the steady state only;"
             " ask for steady_state=True, or take the constant skin level"
         )
-    found = by_harmonics(circuit, drive, channel)
-    return respond(found.terms, drive, time) + harmonic_sum(found.drive * found.missed, drive, time), found.terms.rate
+    harmonics = harmonic_decomposition(circuit, drive, channel)
+    missing = harmonic_sum(harmonics.drive * harmonics.missing_gain, drive, time)
+    return superpose_terms(harmonics.terms, drive, time) + missing, harmonics.terms.rate
 
 
-def respond(terms: Terms, drive: Drive, time: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
+def superpose_terms(
+    terms: HighpassTerms, drive: Drive, time: ArrayLike, *, steady_state: bool = True
+) -> Float[Array, "*shape"]:
     """The response of a circuit's `terms`, but for the one that follows dV/dt; arguments as in `response`."""
     time = jnp.asarray(time, dtype=float)
-    if len(terms.tau) <= _FEW:
+    if not terms.are_many():
         total = jnp.zeros_like(time)
         for weight, tau in zip(terms.weight, terms.tau, strict=True):
             total = total + weight * highpass(drive, time, tau, steady_state=steady_state)
@@ -100,66 +107,60 @@ def respond(terms: Terms, drive: Drive, time: ArrayLike, *, steady_state: bool =
     def add(total: Array, term: tuple[Array, Array]) -> tuple[Array, None]:
         return total + term[0] * highpass(drive, time, term[1], steady_state=steady_state), None
 
-    each = (jnp.stack(jnp.broadcast_arrays(*x)) if isinstance(x, tuple) else x for x in (terms.weight, terms.tau))
-    return lax.scan(add, jnp.zeros_like(time), tuple(each))[0]
+    return lax.scan(add, jnp.zeros_like(time), terms.stack())[0]
 
 
 class Harmonics(NamedTuple):
-    """A circuit without time constants in the steady state: terms that stand for high frequencies, and the others.
+    """A circuit without time constants in the steady state: terms that stand for high frequencies, and the others."""
 
-    Attributes:
-        terms: what they are exact or fitted for lies above the harmonics.
-        drive: V, the harmonics' amplitudes.
-        gain: the circuit's at each.
-        missed: of that, what the terms do not have.
-    """
-
-    terms: Terms
-    drive: Complex[Array, " harmonics"]
-    gain: Complex[Array, " harmonics"]
-    missed: Complex[Array, " harmonics"]
+    terms: HighpassTerms  # what they are exact or fitted for lies above the harmonics
+    drive: Complex[Array, " harmonics"]  # V, the harmonics' amplitudes
+    gain: Complex[Array, " harmonics"]  # the circuit's at each
+    missing_gain: Complex[Array, " harmonics"]  # of that, what the terms do not have
 
 
-def by_harmonics(circuit: WithSkin, drive: Drive, channel: Channel) -> Harmonics:
+def harmonic_decomposition(circuit: WithSkin, drive: Drive, channel: Channel) -> Harmonics:
     """The harmonics in which the skin changes, and terms for those above.
 
     Raises:
         InputError: the drive has no period.
     """
-    omega, terms = fundamental(drive), Terms((), ())
+    omega, terms = angular_frequency(drive), HighpassTerms((), ())
     if isinstance(drive, Sine | Multitone):
         count = max(drive.orders) if isinstance(drive, Multitone) else 1
     else:
-        count = circuit.skin.count(frequency(drive))
-        terms = circuit.skin.above(circuit, omega * count, channel)
+        count = circuit.skin.harmonic_count(drive_frequency(drive))
+        terms = circuit.skin.high_frequency_terms(circuit, omega * count, channel)
     harmonics = omega * jnp.arange(1, count + 1)
-    gain = circuit.gain_of(channel, harmonics)
-    return Harmonics(terms, fourier(drive, count), gain, gain - gain_at(terms, harmonics))
+    gain = circuit.channel_gain(channel, harmonics)
+    return Harmonics(terms, fourier_coefficients(drive, count), gain, gain - gain_at(terms, harmonics))
 
 
 def highpass(drive: Drive, time: ArrayLike, tau: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
     """The response of s tau / (1 + s tau) to `drive` at `time`; arguments as in `response`."""
     time = jnp.asarray(time, dtype=float)
     wave = drive.wave if isinstance(drive, Burst) else drive
-    if not isinstance(wave, Sine | Multitone | PiecewiseLinear | Line | Chirp):
+    if not isinstance(wave, Sine | Multitone | PiecewiseLinear | InterpolatedDrive | Chirp):
         raise TypeError(f"no exact response to a {type(wave).__name__}")
     if steady_state:
         _require_steady_state(drive)
     if isinstance(wave, Chirp):
         return _chirp(wave, time, jnp.asarray(tau, dtype=float))
-    if isinstance(wave, Line) and wave.period is None:
+    if isinstance(wave, InterpolatedDrive) and wave.period is None:
         pieces = wave.pieces()
         at_knots = knot_values(pieces, tau, pieces.start[0])
         if isinstance(wave, Sampled) and time is wave.time:  # its own samples need no search
             return at_knots
-        u = _along(wave, time, tau, at_knots)
-        return u if isinstance(wave, Sampled) else jnp.where(time >= wave.begin, u, 0.0)
-    settled = _steady(wave, tau)
+        u = _propagate(wave, time, tau, at_knots)
+        return u if isinstance(wave, Sampled) else jnp.where(time >= wave.start_time, u, 0.0)
+    settled = _steady_response(wave, tau)
     if steady_state:
         return settled(time)
-    begin = jnp.asarray(wave.begin, dtype=float)
+    begin = jnp.asarray(wave.start_time, dtype=float)
     difference = wave.value(begin) - settled(begin)
-    u = _from_rest(settled(time), difference, time - begin, tau)
+    since_begin = time - begin
+    transient = difference * jnp.exp(-jnp.maximum(since_begin, 0.0) / tau)
+    u = jnp.where(since_begin >= 0.0, settled(time) + transient, 0.0)
     if not isinstance(drive, Burst):
         return u
     since = jnp.maximum(time - drive.duration, 0.0)
@@ -172,13 +173,13 @@ def _require_steady_state(drive: Drive) -> None:
     name = type(drive).__name__
     if isinstance(drive, Burst | Chirp):
         raise InputError(f"a {name} has no steady state: give steady_state=False")
-    if isinstance(drive, Line) and drive.period is None:
+    if isinstance(drive, InterpolatedDrive) and drive.period is None:
         raise InputError(
             f"a {name} has no steady state unless its period is given: {name}(..., period=T), or steady_state=False"
         )
 
 
-def _remains(
+def _initial_charge_decay(
     drive: Drive, time: ArrayLike, taus: Sequence[ArrayLike], initial: ArrayLike | Sequence[ArrayLike]
 ) -> Array:
     """What is left at `time` of a charge that was there when the drive began."""
@@ -188,25 +189,30 @@ def _remains(
             f"initial has shape {amplitudes.shape}, but the circuit has {len(taus)} time constants;"
             " give one value for each"
         )
-    since = jnp.asarray(time, dtype=float) - drive.begin
-    left = sum(v * jnp.exp(-jnp.maximum(since, 0.0) / tau) for v, tau in zip(amplitudes, taus, strict=True))
-    return jnp.asarray(left if isinstance(drive, Sampled) else jnp.where(since >= 0.0, left, 0.0))
+    since = jnp.asarray(time, dtype=float) - drive.start_time
+    decayed = sum(v * jnp.exp(-jnp.maximum(since, 0.0) / tau) for v, tau in zip(amplitudes, taus, strict=True))
+    return jnp.asarray(decayed if isinstance(drive, Sampled) else jnp.where(since >= 0.0, decayed, 0.0))
 
 
-def _steady(drive: Sine | Multitone | PiecewiseLinear | Line, tau: ArrayLike) -> Callable[[Array], Array]:
+def _steady_response(
+    drive: Sine | Multitone | PiecewiseLinear | InterpolatedDrive, tau: ArrayLike
+) -> Callable[[Array], Array]:
     """u(t) in the steady state."""
     if isinstance(drive, Sine):
         return partial(_sine, drive, tau)
     if isinstance(drive, Multitone):
         return lambda time: sum((_sine(tone, tau, time) for tone in drive.tones()), jnp.zeros(()))
-    u = steady_knots(drive.pieces(), tau)
-    return lambda time: _along(drive, time, tau, u)
+    u = steady_knot_values(drive.pieces(), tau)
+    return lambda time: _propagate(drive, time, tau, u)
 
 
-def knot_values(pieces: Pieces, tau: ArrayLike, first: ArrayLike) -> Float[Array, " pieces"]:
-    """u just after the start of each piece, given u just after the first start."""
+def knot_values(pieces: LinearPieces, tau: ArrayLike, first: ArrayLike, part: int = 262_144) -> Float[Array, " pieces"]:
+    """u just after the start of each piece, given u just after the first start.
 
-    def along(before: Array, begin: ArrayLike, count: int) -> tuple[Array, Array]:
+    More pieces than `part` are followed a part at a time: what they take in between would be several times the record.
+    """
+
+    def propagate_part(before: Array, begin: ArrayLike, count: int) -> tuple[Array, Array]:
         """Over so many pieces, the first of which begins with u `before`; the last one's u, and all."""
         knots, start = (lax.dynamic_slice_in_dim(x, begin, count + 1) for x in (pieces.knots, pieces.start))
         end = lax.dynamic_slice_in_dim(pieces.end, begin, count)
@@ -216,13 +222,12 @@ def knot_values(pieces: Pieces, tau: ArrayLike, first: ArrayLike) -> Float[Array
         return u[-1], u
 
     steps, first = pieces.start.size - 1, jnp.asarray(first)
-    if steps <= _LONG:
-        return jnp.append(first, along(first, 0, steps)[1]) if steps else first[None]
-    # a part at a time: what it takes in between would be several times the record
-    many, rest = divmod(steps - 2, _LONG)
-    begun, u = along(first, 0, 1)
-    last, parts = lax.scan(lambda before, k: along(before, 1 + k * _LONG, _LONG), begun, jnp.arange(many))
-    rest_of_it = along(last, 1 + many * _LONG, rest + 1)[1]
+    if steps <= part:
+        return jnp.append(first, propagate_part(first, 0, steps)[1]) if steps else first[None]
+    many, rest = divmod(steps - 2, part)
+    begun, u = propagate_part(first, 0, 1)
+    last, parts = lax.scan(lambda before, k: propagate_part(before, 1 + k * part, part), begun, jnp.arange(many))
+    rest_of_it = propagate_part(last, 1 + many * part, rest + 1)[1]
     return jnp.concatenate([first[None].astype(u.dtype), u, parts.ravel(), rest_of_it])
 
 
@@ -238,47 +243,45 @@ def recurrence(decay: Float[Array, " n"], gain: Float[Array, " n"], first: Float
     decay = jnp.pad(decay, (0, missing), constant_values=1.0).reshape(-1, width)
     gain = jnp.pad(gain, (0, missing)).reshape(-1, width)
 
-    def within(
-        carry: tuple[Array, Array], step: tuple[Array, Array]
-    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    def accumulate(carry: tuple[Array, Array], step: tuple[Array, Array]) -> tuple[tuple[Array, Array], Any]:
         carry = carry[0] * step[0], carry[1] * step[0] + step[1]
         return carry, carry
 
-    def across(u: Array, block: tuple[Array, Array]) -> tuple[Array, Array]:
+    def carry_block(u: Array, block: tuple[Array, Array]) -> tuple[Array, Array]:
         return block[0] * u + block[1], u
 
     alone = jnp.ones_like(decay[:, 0]), jnp.zeros_like(gain[:, 0])
-    (whole_decay, whole_gain), (decays, gains) = lax.scan(within, alone, (decay.T, gain.T))
-    _, starts = lax.scan(across, first, (whole_decay, whole_gain))
+    (whole_decay, whole_gain), (decays, gains) = lax.scan(accumulate, alone, (decay.T, gain.T))
+    _, starts = lax.scan(carry_block, first, (whole_decay, whole_gain))
     return (decays * starts + gains).T.reshape(-1)[: decay.size - missing]
 
 
-def _along(drive: PiecewiseLinear | Line, time: Array, tau: ArrayLike, u: Array) -> Array:
+def _propagate(drive: PiecewiseLinear | InterpolatedDrive, time: Array, tau: ArrayLike, u: Array) -> Array:
     """u(t) from its values at the starts of the pieces."""
     piece, since = drive.locate(time)
     since = jnp.maximum(since, 0.0)
-    left = _of_piece(u, piece) * jnp.exp(-since / tau)
+    decaying = _select_piece(u, piece) * jnp.exp(-since / tau)
     if isinstance(drive, Square):
-        return left
-    return left + _of_piece(drive.pieces().slopes(), piece) * since * phi(since / tau)
+        return decaying
+    return decaying + _select_piece(drive.pieces().slopes(), piece) * since * phi(since / tau)
 
 
-def _of_piece(values: Array, piece: Array) -> Array:
-    """values[piece]; of a few values by comparison, which XLA fuses with the rest and a gather it does not."""
-    if values.size > _FEW:
+def _select_piece(values: Array, piece: Array) -> Array:
+    """values[piece]; of up to 8 by comparison, which XLA fuses with the rest and a gather it does not."""
+    if values.size > 8:
         return values[piece]
-    found = values[0]
+    selected = values[0]
     for k in range(1, values.size):
-        found = jnp.where(piece >= k, values[k], found)
-    return jnp.broadcast_to(found, piece.shape)
+        selected = jnp.where(piece >= k, values[k], selected)
+    return jnp.broadcast_to(selected, piece.shape)
 
 
-def steady_knots(pieces: Pieces, tau: ArrayLike) -> Float[Array, " pieces"]:
+def steady_knot_values(pieces: LinearPieces, tau: ArrayLike) -> Float[Array, " pieces"]:
     """u just after the start of each piece, in the steady state."""
-    return knot_values(pieces, tau, _settled(pieces, tau))
+    return knot_values(pieces, tau, _steady_initial_value(pieces, tau))
 
 
-def _settled(pieces: Pieces, tau: ArrayLike) -> Array:
+def _steady_initial_value(pieces: LinearPieces, tau: ArrayLike) -> Array:
     """u just after the start of a period, in the steady state.
 
     u0 (1 - e^{-T/tau}) is the sum over a period of (increment) x (decay until its end). Where T/tau is
@@ -289,15 +292,15 @@ def _settled(pieces: Pieces, tau: ArrayLike) -> Array:
     """
     knots, start, end = pieces
     period = knots[-1] - knots[0]
-    left, share = (knots[-1] - knots[1:]) / period, jnp.diff(knots) / period
+    until_end, share = (knots[-1] - knots[1:]) / period, jnp.diff(knots) / period
     jump, rise = jnp.append(start[1:], start[0]) - end, end - start
     x = period / tau
     few, many = jnp.where(x < 1.0, x, 1.0), jnp.where(x < 1.0, 1.0, x)
 
     lam = share * few
-    ratio = left * phi(left * few) / phi(few)  # (1 - e^{-left x}) / (1 - e^{-x})
+    ratio = until_end * phi(until_end * few) / phi(few)  # (1 - e^{-until_end x}) / (1 - e^{-x})
     slow = -jnp.sum(jump * ratio + rise * (ratio * phi(lam) + share * psi(lam) / phi(few)))
-    fast = jnp.sum((jump + rise * phi(share * many)) * jnp.exp(-left * many)) / (1.0 - jnp.exp(-many))
+    fast = jnp.sum((jump + rise * phi(share * many)) * jnp.exp(-until_end * many)) / (1.0 - jnp.exp(-many))
     return jnp.where(x < 1.0, slow, fast)
 
 
@@ -311,22 +314,16 @@ def _sine(drive: Sine, tau: ArrayLike, time: Array) -> Array:
 def _chirp(drive: Chirp, time: Array, tau: Array) -> Array:
     """From rest: u at the pieces' starts, then along each as its polynomial and what decays."""
     z = drive.duration / tau / drive.pieces
-    series, v = drive.series(), drive.sweep(drive.duration / drive.pieces * jnp.arange(drive.pieces + 1))
-    p, p_end = particular(series, z)
+    series, v = drive.taylor_coefficients(), drive.sweep(drive.duration / drive.pieces * jnp.arange(drive.pieces + 1))
+    p, p_end = particular_solution(series, z)
     rounding = jnp.diff(v) - jnp.sum(series, axis=0)  # what would add up over many pieces
     decay = jnp.broadcast_to(jnp.exp(-z), p_end.shape)
     u = jnp.append(v[0], recurrence(decay, p_end - jnp.exp(-z) * p[0] + rounding, v[0]))
     piece, s = drive.locate(time)
-    during = evaluate(p, piece, s) + (u[piece] - p[0][piece]) * jnp.exp(-z * s)
+    during = evaluate_polynomials(p, piece, s) + (u[piece] - p[0][piece]) * jnp.exp(-z * s)
     since = jnp.maximum(time - drive.duration, 0.0)
     after = (u[-1] - v[-1]) * jnp.exp(-since / tau)
     return jnp.where(time >= 0.0, jnp.where(drive.is_over(time), after, during), 0.0)
-
-
-def _from_rest(settled: Array, difference: ArrayLike, since: Array, tau: ArrayLike) -> Array:
-    """The steady state plus the transient that starts with `difference`; nothing before."""
-    later = jnp.maximum(since, 0.0)
-    return jnp.where(since >= 0.0, settled + difference * jnp.exp(-later / tau), 0.0)
 
 
 @jax.custom_jvp
@@ -339,22 +336,22 @@ def phi(x: ArrayLike) -> Array:
 @phi.defjvp
 def _phi_jvp(primals: tuple[ArrayLike], tangents: tuple[Array]) -> tuple[Array, Array]:
     (x,), (dx,) = primals, tangents
-    return phi(x), phi(x) * log_slope(x) * dx
+    return phi(x), phi(x) * log_phi_derivative(x) * dx
 
 
 def psi(x: ArrayLike) -> Array:
     """(1 - phi(x)) / x = (e^{-x} - 1 + x) / x^2 for x >= 0."""
-    return phi(x) * (0.5 + bend(x))
+    return phi(x) * (0.5 + half_langevin(x))
 
 
-def log_slope(x: ArrayLike) -> Array:
+def log_phi_derivative(x: ArrayLike) -> Array:
     """The derivative of log phi(x), for x >= 0: from -1/2 towards -1/x."""
     x = jnp.asarray(x, dtype=float)
     large = jnp.where(x < 2.0, 2.0, x)
-    return jnp.where(x < 2.0, bend(x) - 0.5, jnp.exp(-large) / (1.0 - jnp.exp(-large)) - 1.0 / large)
+    return jnp.where(x < 2.0, half_langevin(x) - 0.5, jnp.exp(-large) / (1.0 - jnp.exp(-large)) - 1.0 / large)
 
 
-def bend(x: ArrayLike) -> Array:
+def half_langevin(x: ArrayLike) -> Array:
     """1 / (e^x - 1) - 1/x + 1/2 for x >= 0: from x/12 towards 1/2."""
     x = jnp.asarray(x, dtype=float)
     small, large = jnp.where(x < 2.0, x, 0.0), jnp.where(x < 2.0, 2.0, x)

@@ -15,18 +15,32 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from fitact.errors import InputError
-from fitact.model.circuit import Channel, Circuit, Terms
-from fitact.model.drive import Drive, Line, Periodic, Pieces, PiecewiseLinear, Sine, Square, Trapezoid, Triangle
-from fitact.model.highpass import highpass_amplitude
-from fitact.model.multitone import Multitone, largest_sum
-from fitact.model.response import bend, by_harmonics, coth_fraction, log_slope, phi, psi, steady_knots
+from fitact.model.circuit import Channel, Circuit, HighpassTerms, highpass_amplitude
+from fitact.model.drive import (
+    Drive,
+    InterpolatedDrive,
+    LinearPieces,
+    Multitone,
+    Periodic,
+    PiecewiseLinear,
+    Sine,
+    Square,
+    Trapezoid,
+    Triangle,
+)
+from fitact.model.response import (
+    coth_fraction,
+    half_langevin,
+    harmonic_decomposition,
+    log_phi_derivative,
+    phi,
+    psi,
+    steady_knot_values,
+)
 from fitact.model.skin import WithSkin
-
-_FEW = 8  # terms that are taken one by one
-_HALVINGS = 160  # of a bracket that begins at 0: to the last bit of an extreme far closer to 0 than to the end
 
 
 class BodyCurrent(NamedTuple):
@@ -45,47 +59,39 @@ def mean_square(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Flo
         InputError: the drive does not repeat.
     """
     if isinstance(circuit, WithSkin) and circuit.grid is None:
-        found = by_harmonics(circuit, drive, channel)
+        terms, tones, gain, missing_gain = harmonic_decomposition(circuit, drive, channel)
         # by Parseval: what the terms have of the harmonics gives way to what the circuit has
-        instead = _power(found.drive * found.gain) - _power(found.drive * (found.gain - found.missed))
-        return instead + (_of_terms(found.terms, drive) if found.terms.tau else 0.0)
-    return _of_terms(circuit.terms_of(channel), drive)
+        instead = _power(tones * gain) - _power(tones * (gain - missing_gain))
+        return instead + (_terms_mean_square(terms, drive) if terms.tau else 0.0)
+    return _terms_mean_square(circuit.channel_terms(channel), drive)
 
 
-def _of_terms(terms: Terms, drive: Drive) -> Float[Array, ""]:
+def _terms_mean_square(terms: HighpassTerms, drive: Drive) -> Float[Array, ""]:
     """The mean square of what the terms put together."""
-    if len(terms.tau) > _FEW:
-        return _of_many(terms, drive)
-    pairs = list(zip(terms.weight, terms.tau, strict=True))
-    each = [weight * highpass_mean_square(drive, tau) for weight, tau in pairs]
-    total = jnp.asarray(0.0)
-    for j, (weight, tau) in enumerate(pairs):
-        total = total + weight * each[j]
-        for k, (other, other_tau) in enumerate(pairs[:j]):
-            both = tau + other_tau
-            total = total + 2.0 * (other * (other_tau / both) * each[j] + weight * (tau / both) * each[k])
+    if terms.are_many():
+        weight, tau = terms.stack()
+        products = weight * jax.vmap(lambda t: highpass_mean_square(drive, t))(tau)
+        total = jnp.sum(2.0 * (weight[:, None] * tau[:, None] / (tau[:, None] + tau)) * products)
+        with_slope = jnp.sum(products / tau)
+    else:
+        pairs = list(zip(terms.weight, terms.tau, strict=True))
+        parts = [weight * highpass_mean_square(drive, tau) for weight, tau in pairs]
+        total = jnp.asarray(0.0)
+        for j, (weight, tau) in enumerate(pairs):
+            total = total + weight * parts[j]
+            for k, (other, other_tau) in enumerate(pairs[:j]):
+                both = tau + other_tau
+                total = total + 2.0 * (other * (other_tau / both) * parts[j] + weight * (tau / both) * parts[k])
+        with_slope = sum((part / tau for part, (_, tau) in zip(parts, pairs, strict=True)), jnp.zeros(()))
     if terms.rate is None:
         return jnp.maximum(total, 0.0)  # terms of Vsc may cancel down to rounding
-    for part, (_, tau) in zip(each, pairs, strict=True):
-        total = total + 2.0 * terms.rate * part / tau
-    return jnp.where(_impulses(drive, terms.rate), jnp.inf, total + terms.rate**2 * _slope_mean_square(drive))
+    total = total + 2.0 * terms.rate * with_slope
+    return jnp.where(_has_impulses(drive, terms.rate), jnp.inf, total + terms.rate**2 * _slope_mean_square(drive))
 
 
 def _power(amplitude: Array) -> Array:
     """The mean square of 2 Re sum_k amplitude[k - 1] e^{jkwt}."""
     return 2.0 * jnp.sum(amplitude.real**2 + amplitude.imag**2)
-
-
-def _of_many(terms: Terms, drive: Drive) -> Float[Array, ""]:
-    """As `_of_terms`, side by side."""
-    weight, tau = (jnp.stack(jnp.broadcast_arrays(*x)) for x in (terms.weight, terms.tau))
-    each = jax.vmap(lambda t: highpass_mean_square(drive, t))(tau)
-    both = weight * each
-    total = jnp.sum(2.0 * (weight[:, None] * tau[:, None] / (tau[:, None] + tau)) * both)
-    if terms.rate is None:
-        return jnp.maximum(total, 0.0)
-    total = total + 2.0 * terms.rate * jnp.sum(both / tau)
-    return jnp.where(_impulses(drive, terms.rate), jnp.inf, total + terms.rate**2 * _slope_mean_square(drive))
 
 
 def peak(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Float[Array, ""]:
@@ -100,16 +106,38 @@ def peak(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Float[Arra
     """
     if isinstance(drive, Sine):
         omega = 2.0 * np.pi * jnp.asarray(drive.frequency)
-        amplitude = circuit.amplitude(omega) if channel == "Vsc" else abs(circuit.gain_of(channel, omega))
+        amplitude = circuit.amplitude(omega) if channel == "Vsc" else abs(circuit.channel_gain(channel, omega))
         return abs(0.5 * jnp.asarray(drive.peak_to_peak)) * amplitude
     if isinstance(drive, Multitone):
         omega = 2.0 * np.pi * jnp.asarray(drive.frequency) * jnp.asarray(drive.orders)
-        return largest_sum(drive.phasors() * circuit.gain_of(channel, omega), drive.orders)
-    terms = circuit.terms_of(channel)
+        return _largest_sum(drive.phasors() * circuit.channel_gain(channel, omega), drive.orders)
+    terms = circuit.channel_terms(channel)
     if isinstance(drive, Square | Triangle) and len(terms.tau) == 1 and terms.rate is None:
-        return abs(terms.weight[0] * jnp.asarray(drive.peak_to_peak)) * _highest(drive, drive.period / terms.tau[0])
-    largest = jnp.max(jnp.abs(_extremes(terms, _period(drive))))
-    return largest if terms.rate is None else jnp.where(_impulses(drive, terms.rate), jnp.inf, largest)
+        return abs(terms.weight[0] * jnp.asarray(drive.peak_to_peak)) * _unit_peak(drive, drive.period / terms.tau[0])
+    largest = jnp.max(jnp.abs(_extremes(terms, _period_pieces(drive))))
+    return largest if terms.rate is None else jnp.where(_has_impulses(drive, terms.rate), jnp.inf, largest)
+
+
+def _largest_sum(
+    phasors: Complex[Array, " tones"], orders: tuple[int, ...], points_per_cycle: int = 32, steps: int = 6
+) -> Float[Array, ""]:
+    """The largest |Im sum_k phasors[k] e^{j orders[k] x}|: by Newton's method from many points.
+
+    Each of the steps doubles the digits. Where it lies is held fixed, which leaves first derivatives right.
+    """
+    order = jnp.asarray(orders, dtype=float)
+    start = jnp.linspace(0.0, 2.0 * np.pi, points_per_cycle * max(orders), endpoint=False)
+
+    def phasor_sum(x: Array, derivative: int = 0) -> Array:
+        return jnp.imag((phasors * (1j * order) ** derivative) @ jnp.exp(1j * order[:, None] * x))
+
+    def newton(_: int, x: Array) -> Array:
+        bend = phasor_sum(x, 2)
+        step = jnp.where(bend == 0.0, 0.0, -phasor_sum(x, 1) / jnp.where(bend == 0.0, 1.0, bend))
+        return x + jnp.clip(step, -start[1], start[1])
+
+    extremes = lax.stop_gradient(lax.fori_loop(0, steps, newton, lax.stop_gradient(start)))
+    return jnp.maximum(jnp.max(jnp.abs(phasor_sum(start))), jnp.max(jnp.abs(phasor_sum(extremes))))
 
 
 def body_current(circuit: Circuit, drive: Drive) -> BodyCurrent:
@@ -135,12 +163,12 @@ def highpass_mean_square(drive: Drive, tau: ArrayLike) -> Array:
         return jnp.square(jnp.asarray(drive.peak_to_peak)) * _rectangle(drive.duty, drive.period / tau)
     if isinstance(drive, Triangle):
         return _triangle(0.5 * jnp.asarray(drive.peak_to_peak), 0.25 * drive.period / tau)
-    general = _straight_pieces(_period(drive), tau)
+    general = _straight_pieces(_period_pieces(drive), tau)
     return _trapezoid(drive, tau, general) if isinstance(drive, Trapezoid) else general
 
 
-def _period(drive: Drive) -> Pieces:
-    if isinstance(drive, PiecewiseLinear) or (isinstance(drive, Line) and drive.period is not None):
+def _period_pieces(drive: Drive) -> LinearPieces:
+    if isinstance(drive, PiecewiseLinear) or (isinstance(drive, InterpolatedDrive) and drive.period is not None):
         return drive.pieces()
     if isinstance(drive, Periodic):
         raise TypeError(f"no exact response to a {type(drive).__name__}")
@@ -163,8 +191,9 @@ def _rectangle_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) 
     q = 1.0 - jnp.asarray(d, dtype=float)
     value = _rectangle(d, x)
     few, many = jnp.where(x < 2.0, x, 0.0), jnp.where(x < 2.0, 2.0, x)
-    slow = d * bend(d * few) + q * bend(q * few) - bend(few)  # what is left once -d/2 - q/2 + 1/2 has gone
-    fast = d * log_slope(d * many) + q * log_slope(q * many) - log_slope(many)
+    # what is left once -d/2 - q/2 + 1/2 has gone
+    slow = d * half_langevin(d * few) + q * half_langevin(q * few) - half_langevin(few)
+    fast = d * log_phi_derivative(d * many) + q * log_phi_derivative(q * many) - log_phi_derivative(many)
     by_x = jnp.where(x < 2.0, slow, fast)
     by_duty = jnp.exp(-d * x) / (d * phi(d * x)) - jnp.exp(-q * x) / (q * phi(q * x))
     return value, value * by_x * dx + value * by_duty * d_duty
@@ -174,12 +203,11 @@ def _triangle(amplitude: Array, y: Array) -> Array:
     """(1 - tanh(y) / y) / y^2 times the amplitude squared; y = T / (4 tau)."""
     few, many = jnp.where(y < 1.0, y, 0.0), jnp.where(y < 1.0, 1.0, y)
     slow = 1.0 / (coth_fraction(few * few) + few * few)
-    return jnp.where(
-        y < 1.0, amplitude * amplitude * slow, jnp.square(amplitude / many) * (1.0 - jnp.tanh(many) / many)
-    )
+    fast = jnp.square(amplitude / many) * (1.0 - jnp.tanh(many) / many)
+    return jnp.where(y < 1.0, amplitude * amplitude * slow, fast)
 
 
-def _highest(drive: Square | Triangle, x: Array) -> Array:
+def _unit_peak(drive: Square | Triangle, x: Array) -> Array:
     """The highest |u| of one time constant for a peak-to-peak of 1; x = T / tau.
 
     Of a triangle's crest the terms of first order cancel, and of a square's two edges the higher one may be
@@ -219,19 +247,19 @@ def _even_series(z: Array, first: int) -> Array:
     return total
 
 
-def _straight_pieces(pieces: Pieces, tau: ArrayLike) -> Array:
+def _straight_pieces(pieces: LinearPieces, tau: ArrayLike) -> Array:
     """S of any period of straight pieces."""
     length, rise = jnp.diff(pieces.knots), pieces.end - pieces.start
-    u, lam = steady_knots(pieces, tau), length / tau
-    third = phi(lam) * (_bend_over(lam) + 0.5 * psi(lam))  # of a rise from u = 0: (psi - phi^2 / 2) / lam
+    u, lam = steady_knot_values(pieces, tau), length / tau
+    third = phi(lam) * (_half_langevin_ratio(lam) + 0.5 * psi(lam))  # of a rise from u = 0: (psi - phi^2 / 2) / lam
     inside = u * u * phi(2.0 * lam) + u * rise * jnp.square(phi(lam)) + rise * rise * third
     return jnp.sum(length / (pieces.knots[-1] - pieces.knots[0]) * inside)
 
 
-def _bend_over(x: Array) -> Array:
-    """bend(x) / x, finite at 0."""
+def _half_langevin_ratio(x: Array) -> Array:
+    """`half_langevin` of x over x, finite at 0."""
     few, many = jnp.where(x < 2.0, x, 0.0), jnp.where(x < 2.0, 2.0, x)
-    return jnp.where(x < 2.0, 0.25 / coth_fraction(0.25 * few * few), bend(many) / many)
+    return jnp.where(x < 2.0, 0.25 / coth_fraction(0.25 * few * few), half_langevin(many) / many)
 
 
 def _slope_mean_square(drive: Drive) -> Array:
@@ -240,49 +268,49 @@ def _slope_mean_square(drive: Drive) -> Array:
         return 0.5 * jnp.square(np.pi * jnp.asarray(drive.peak_to_peak) * drive.frequency)
     if isinstance(drive, Multitone):
         return sum(map(_slope_mean_square, drive.tones()), jnp.zeros(()))
-    pieces = _period(drive)
+    pieces = _period_pieces(drive)
     return jnp.sum(jnp.square(pieces.slopes()) * jnp.diff(pieces.knots)) / (pieces.knots[-1] - pieces.knots[0])
 
 
-def _impulses(drive: Drive, rate: ArrayLike) -> Array:
+def _has_impulses(drive: Drive, rate: ArrayLike) -> Array:
     """Whether a current that follows dV/dt meets a jump."""
     if isinstance(drive, Sine | Multitone):
         return jnp.asarray(False)
-    knots, start, end = _period(drive)
-    within = (jnp.diff(knots) == 0.0) & (end != start)
-    return jnp.any(rate * (start - jnp.roll(end, 1)) != 0.0) | (jnp.any(within) & (jnp.asarray(rate) != 0.0))
+    knots, start, end = _period_pieces(drive)
+    inside = (jnp.diff(knots) == 0.0) & (end != start)
+    return jnp.any(rate * (start - jnp.roll(end, 1)) != 0.0) | (jnp.any(inside) & (jnp.asarray(rate) != 0.0))
 
 
-def _extremes(terms: Terms, pieces: Pieces) -> Array:
+def _extremes(terms: HighpassTerms, pieces: LinearPieces) -> Array:
     """The response at both ends of every piece and at the extremes in between.
 
     Of the latter the first derivatives are right, not the second: where an extreme lies is held fixed.
     """
     length, rise, slopes = jnp.diff(pieces.knots), pieces.end - pieces.start, pieces.slopes()
-    tau = jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, terms.tau)))
-    u = jnp.stack([steady_knots(pieces, t) for t in terms.tau])
+    weights, tau = terms.stack()
+    u = jnp.stack([steady_knot_values(pieces, t) for t in terms.tau])
 
-    def at(since: Array) -> Array:
+    def piece_response(since: Array) -> Array:
         total = 0.0 if terms.rate is None else terms.rate * slopes
         for weight, t, first in zip(terms.weight, terms.tau, u, strict=True):
             total = total + weight * (first * jnp.exp(-since / t) + slopes * since * phi(since / t))
         return total
 
     # the derivative is a sum of exponentials; to first order, a shift of an extreme does not change it
-    weight = jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, terms.weight)))
-    fall = weight[:, None] * (slopes - u / tau[:, None])
+    fall = weights[:, None] * (slopes - u / tau[:, None])
     inside = _zeros(*lax.stop_gradient((fall, 1.0 / tau, length)))
-    after, before = at(jnp.zeros_like(length)), at(length)
+    start, end = piece_response(jnp.zeros_like(length)), piece_response(length)
     if len(terms.tau) == 1:  # a level only decays; to rounding its end may equal its start, but not in the derivative
-        before = jnp.where(rise == 0.0, 0.0, before)
-    return jnp.stack([after, before, *map(at, inside)])
+        end = jnp.where(rise == 0.0, 0.0, end)
+    return jnp.stack([start, end, *map(piece_response, inside)])
 
 
-def _zeros(factor: Array, rate: Array, length: Array) -> list[Array]:
+def _zeros(factor: Array, rate: Array, length: Array, bisections: int = 160) -> list[Array]:
     """Where sum_k factor[k] e^{-rate[k] s} changes sign in 0 < s < length: one s fewer than terms (or an end).
 
     n exponentials have at most n - 1 zeros: times e^{rate[0] s} and differentiated they are n - 1
-    exponentials, and between two zeros of these the sum times e^{rate[0] s} is monotone.
+    exponentials, and between two zeros of these the sum times e^{rate[0] s} is monotone. A bracket that begins at 0
+    is halved to the last bit of an extreme far closer to 0 than to the end.
     """
     if len(rate) == 1:
         return []
@@ -298,9 +326,9 @@ def _zeros(factor: Array, rate: Array, length: Array) -> list[Array]:
         same = positive(middle) == rising
         return jnp.where(same, middle, low), jnp.where(same, high, middle)
 
-    found = []
+    zeros = []
     ends = [jnp.zeros_like(length), *turns, length]
     for low, high in itertools.pairwise(ends):
         rising = positive(low)
-        found.append(lax.fori_loop(0, _HALVINGS, halve, (low, high))[0])
-    return found
+        zeros.append(lax.fori_loop(0, bisections, halve, (low, high))[0])
+    return zeros

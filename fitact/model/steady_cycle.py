@@ -12,21 +12,16 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from fitact.model.circuit import RC, Terms
-from fitact.model.drive import Periodic, PiecewiseLinear, Sine
+from fitact.model.circuit import RC, HighpassTerms
+from fitact.model.drive import Multitone, Periodic, PiecewiseLinear, Sine
 from fitact.model.force import AirGap, Contact, electrostatic_force
-from fitact.model.multitone import Multitone
-from fitact.model.response import highpass, phi, steady_knots
+from fitact.model.response import highpass, phi, steady_knot_values
 from fitact.model.steady import highpass_mean_square, mean_square
 
 HARMONICS = 4  # of the drive's frequency, at which the force is stated
 
-_NODES = 10  # Gauss-Legendre nodes of each part of a straight piece;
-_PARTS = 4.0 ** -np.arange(9.0, -1.0, -1.0)  # parts grow from its start, where transients of any length begin
-_PER_CYCLE = 32  # points of the fastest sine's cycle: the mean of Vsc^4 is exact from 5 on
 
-
-class Cycle(NamedTuple):
+class PeriodQuantities(NamedTuple):
     """What a drive does at one finger over a period of the steady state.
 
     Attributes:
@@ -49,14 +44,14 @@ class Cycle(NamedTuple):
     current_peak: Array
 
 
-def cycle(circuit: RC, drive: Periodic, contact: Contact | AirGap) -> Cycle:
-    """All of `Cycle`; the force acts on `contact`, eqs. (1) and (22)."""
-    period, terms = Period.of(drive), circuit.terms_of(contact.channel)
+def period_quantities(circuit: RC, drive: Periodic, contact: Contact | AirGap) -> PeriodQuantities:
+    """Compute all of `PeriodQuantities`; the force acts on `contact`, eqs. (1) and (22)."""
+    period, terms = PeriodGrid.from_drive(drive), circuit.channel_terms(contact.channel)
     force = electrostatic_force(period.response(terms), contact)
     mean = period.weight @ force
     rms = jnp.sqrt(mean_square(circuit, drive, "I"))
     turns = jnp.exp(-2j * np.pi * jnp.arange(1, HARMONICS + 1)[:, None] * period.cycles)
-    return Cycle(
+    return PeriodQuantities(
         force_mean=mean,
         force_alternating=jnp.sqrt(2.0 * (period.weight @ jnp.square(force - mean))),
         force_harmonics=2.0 * jnp.abs(turns @ (period.weight * force)),
@@ -64,7 +59,7 @@ def cycle(circuit: RC, drive: Periodic, contact: Contact | AirGap) -> Cycle:
         real_power=real_power(circuit, drive),
         apparent_power=jnp.sqrt(period.weight @ jnp.square(period.voltage)) * rms,
         current_rms=rms,
-        current_peak=jnp.where(jnp.isinf(rms), jnp.inf, period.largest(period.response(circuit.current_terms()))),
+        current_peak=jnp.where(jnp.isinf(rms), jnp.inf, period.max_abs(period.response(circuit.current_terms()))),
     )
 
 
@@ -81,21 +76,21 @@ def real_power(circuit: RC, drive: Periodic) -> Float[Array, ""]:
 
 def insulator_peak(circuit: RC, drive: Periodic) -> Float[Array, ""]:
     """The largest |voltage| over the insulator in V, edges included; the drive's mean lies over it entirely."""
-    period, (weight, tau, rate) = Period.of(drive), circuit.current_terms()
+    period, (weight, tau, rate) = PeriodGrid.from_drive(drive), circuit.current_terms()
     mean = period.weight @ period.voltage
     alternating = period.voltage - mean
     charge = jnp.zeros_like(alternating) if rate is None else rate * alternating
-    for each, of in zip(weight, tau, strict=True):  # the integral of a high-pass response is what it leaves out
-        charge = charge + each * of * (alternating - period.highpass(of))
-    return period.largest(mean + charge / circuit.Ci)
+    for w, t in zip(weight, tau, strict=True):  # the integral of a high-pass response is what it leaves out
+        charge = charge + w * t * (alternating - period.highpass(t))
+    return period.max_abs(mean + charge / circuit.Ci)
 
 
-class Period(eqx.Module):
+class PeriodGrid(eqx.Module):
     """Points of one period of a drive, and weights that integrate over it.
 
     Attributes:
         drive: of straight pieces, whose ends are among the points (with weight 0), or of sines.
-        since: from the start of each piece, s; of sines from that of the period.
+        local_time: from the start of each piece, s; of sines from that of the period.
         cycles: from the start of the period, in periods.
         weight: the share of the period.
         voltage: of the drive, V.
@@ -103,46 +98,47 @@ class Period(eqx.Module):
     """
 
     drive: Periodic
-    since: Float[Array, "pieces nodes"]
+    local_time: Float[Array, "pieces nodes"]
     cycles: Float[Array, " points"]
     weight: Float[Array, " points"]
     voltage: Float[Array, " points"]
     slope: Float[Array, " points"]
 
     @classmethod
-    def of(cls, drive: Periodic) -> "Period":
-        """Of a drive."""
+    def from_drive(cls, drive: Periodic) -> "PeriodGrid":
+        """Make the grid of a drive."""
         if not isinstance(drive, PiecewiseLinear):
-            count = _PER_CYCLE * (max(drive.orders) if isinstance(drive, Multitone) else 1)
+            # points of the fastest sine's cycle: the mean of Vsc^4 is exact from 5 on
+            count = 32 * (max(drive.orders) if isinstance(drive, Multitone) else 1)
             cycles = jnp.arange(count) / count
-            since = cycles * drive.period
-            share = jnp.full(count, 1.0 / count)
-            return cls(drive, since[None], cycles, share, drive.value(since), drive.slope(since))
+            time = cycles * drive.period
+            weight = jnp.full(count, 1.0 / count)
+            return cls(drive, time[None], cycles, weight, drive.value(time), drive.slope(time))
         pieces = drive.pieces()
-        place, weight = _rule()
+        place, weight = _quadrature_rule()
         length = jnp.diff(pieces.knots)[:, None]
         slope = jnp.broadcast_to(pieces.slopes()[:, None], (length.size, place.size))
-        since, period = length * place, pieces.knots[-1]
-        flat = (pieces.knots[:-1, None] + since) / period, length * weight / period
+        local_time, period = length * place, pieces.knots[-1]
+        cycles, weights = (pieces.knots[:-1, None] + local_time) / period, length * weight / period
         voltage = pieces.start[:, None] + (pieces.end - pieces.start)[:, None] * place
-        return cls(drive, since, *(x.reshape(-1) for x in (*flat, voltage, slope)))
+        return cls(drive, local_time, *(x.reshape(-1) for x in (cycles, weights, voltage, slope)))
 
     def highpass(self, tau: ArrayLike) -> Float[Array, " points"]:
         """The response of s tau / (1 + s tau), V."""
         if not isinstance(self.drive, PiecewiseLinear):
-            return highpass(self.drive, self.since[0], tau)
+            return highpass(self.drive, self.local_time[0], tau)
         pieces = self.drive.pieces()
-        left = steady_knots(pieces, tau)[:, None] * jnp.exp(-self.since / tau)
-        return (left + pieces.slopes()[:, None] * self.since * phi(self.since / tau)).reshape(-1)
+        decay = steady_knot_values(pieces, tau)[:, None] * jnp.exp(-self.local_time / tau)
+        return (decay + pieces.slopes()[:, None] * self.local_time * phi(self.local_time / tau)).reshape(-1)
 
-    def response(self, terms: Terms) -> Float[Array, " points"]:
-        """That of a circuit's terms, in their unit."""
+    def response(self, terms: HighpassTerms) -> Float[Array, " points"]:
+        """The response of a circuit's terms, in their unit."""
         total = jnp.zeros_like(self.voltage) if terms.rate is None else terms.rate * self.slope
         for weight, tau in zip(terms.weight, terms.tau, strict=True):
             total = total + weight * self.highpass(tau)
         return total
 
-    def largest(self, values: Float[Array, " points"]) -> Float[Array, ""]:
+    def max_abs(self, values: Float[Array, " points"]) -> Float[Array, ""]:
         """The largest of |values|: exact at the ends of straight pieces and of a sine, elsewhere low by up to 1e-4."""
         size = jnp.abs(values)
         if isinstance(self.drive, Sine):
@@ -151,14 +147,19 @@ class Period(eqx.Module):
         if isinstance(self.drive, PiecewiseLinear):
             return jnp.max(size)
         top = jnp.argmax(size)  # of the parabola through it and its neighbours
-        before, at, after = size[top - 1], size[top], size[(top + 1) % size.size]
-        bend = before - 2.0 * at + after
-        return at - jnp.where(bend < 0.0, jnp.square(before - after) / (8.0 * jnp.where(bend < 0.0, bend, -1.0)), 0.0)
+        before, highest, after = size[top - 1], size[top], size[(top + 1) % size.size]
+        bend = before - 2.0 * highest + after
+        rise = jnp.square(before - after) / (8.0 * jnp.where(bend < 0.0, bend, -1.0))
+        return highest - jnp.where(bend < 0.0, rise, 0.0)
 
 
-def _rule() -> tuple[np.ndarray, np.ndarray]:
-    """Places and weights on a piece of length 1."""
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    length = np.diff(_PARTS, prepend=0.0)[:, None]
-    places, inside = _PARTS[:, None] - length * 0.5 * (1.0 - nodes), 0.5 * length * weights
+def _quadrature_rule(nodes: int = 10, parts: int = 10) -> tuple[np.ndarray, np.ndarray]:
+    """Places and weights on a piece of length 1: Gauss and Legendre's `nodes` of each part.
+
+    The parts grow by 4 from the start of the piece, where transients of any length begin.
+    """
+    ends = 4.0 ** -np.arange(parts - 1.0, -1.0, -1.0)
+    x, weights = np.polynomial.legendre.leggauss(nodes)
+    length = np.diff(ends, prepend=0.0)[:, None]
+    places, inside = ends[:, None] - length * 0.5 * (1.0 - x), 0.5 * length * weights
     return np.concatenate([[0.0], places.ravel(), [1.0]]), np.concatenate([[0.0], inside.ravel(), [0.0]])

@@ -4,21 +4,18 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, Literal, TypeAlias
 
-import jax
-
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.fitting.drive_choice import choose_drive, whole_periods
-from fitact.fitting.fit import Fit, fit
+from fitact.fitting.drive_choice import DriveModel, choose_drive, whole_periods
+from fitact.fitting.fit import Fit, fit_records
 from fitact.model.drive import Sampled
-from fitact.model_selection.omissions import named, without
+from fitact.model_selection.omissions import applicable_omissions, reduce_scene
 from fitact.model_selection.plan import Plan, plan
 from fitact.scene.scene import Scene
 
 Model: TypeAlias = Literal["planned", "full"]
 
-_FAILED = ("misfit", "not_at_optimum")  # how a fit ends whose model is too simple
-_SAMPLES = 20_000  # of a measured drive that a plan looks at
+_FAILED_RESULTS = ("misfit", "not_at_optimum")  # how a fit ends whose model is too simple
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,19 +24,19 @@ class PlannedFit:
 
     Attributes:
         fit: of the model that is used.
-        used: which one that is.
+        model: which one that is.
         sentence: why, and what that costs.
         plan: None where there was nothing to plan.
     """
 
     fit: Fit
-    used: Model
+    model: Model
     sentence: str
     plan: Plan | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """The entry `plan` of fit.json and summary.json."""
-        stated = {"used": self.used, "sentence": self.sentence}
+        """Return the entry `plan` of fit.json and summary.json."""
+        stated = {"used": self.model, "sentence": self.sentence}
         return stated if self.plan is None else stated | self.plan.to_dict()
 
 
@@ -58,63 +55,69 @@ def fit_planned(records: Sequence[Record], scenes: Sequence[Scene], model: Model
     Raises:
         InputError: as `fitact.fit` and `fitact.plan`.
     """
-    full = tuple(scenes) if len(scenes) > 1 else (scenes[0] if scenes else None)
-    why, recorded = _no_plan(scenes, model), None
+    records = tuple(records)
+    full: tuple[Scene | None, ...] = (
+        tuple(scenes) if len(scenes) > 1 else (scenes[0] if scenes else None,) * len(records)
+    )
+    why = _reason_for_full_model(scenes, model)
+    drives: tuple[DriveModel, ...] = ()
     if not why:  # only now is the record worth a look
-        recorded = _recorded(records[0], scenes[0])
-        if recorded is not None and scenes[0].skin.level != "constant":
+        drives = (choose_drive(records[0], scenes[0]),)
+        if drives[0].name == "measured" and scenes[0].skin.level != "constant":
             why = "a skin that depends on the frequency has no plan with a measured drive"
     if why:
-        return PlannedFit(fit(records, full, **options), "full", f"The full model is fitted: {why}.")
-    found = plan(scenes[0], recorded)
-    fitted = fit(records, without(scenes[0], found.left_out), **options)
-    if found.left_out and fitted.result in _FAILED:
-        whole = _fitted_in_full(records, scenes[0], options)
-        if whole is not None and whole.result not in _FAILED:
-            said = (
-                f"the record contradicts the planned model, which leaves out {', '.join(found.left_out)}: its fit does"
-                " not describe it and that of the full model does, so the full model is fitted"
+        return PlannedFit(fit_records(records, full, drives, **options), "full", f"The full model is fitted: {why}.")
+    planned = plan(scenes[0], _measured_part(records[0], drives[0]))
+    reduced = reduce_scene(scenes[0], planned.left_out)
+    same = reduced.drive == scenes[0].drive and reduced.drive.model_fields_set == scenes[0].drive.model_fields_set
+    fitted = fit_records(records, (reduced,) * len(records), drives if same else (), **options)
+    if planned.left_out and fitted.result in _FAILED_RESULTS:
+        whole = _fit_full_model(records, scenes[0], drives, options)
+        if whole is not None and whole.result not in _FAILED_RESULTS:
+            warning = (
+                f"the record contradicts the planned model, which leaves out {', '.join(planned.left_out)}: its fit"
+                " does not describe it and that of the full model does, so the full model is fitted"
             )
-            whole = dataclasses.replace(whole, warnings=(*whole.warnings, said))
-            return PlannedFit(whole, "full", f"{said[0].upper()}{said[1:]}.", found)
-    return PlannedFit(fitted, "planned", found.sentence, found)
+            whole = dataclasses.replace(whole, warnings=(*whole.warnings, warning))
+            return PlannedFit(whole, "full", f"{warning[0].upper()}{warning[1:]}.", planned)
+    return PlannedFit(fitted, "planned", planned.sentence, planned)
 
 
-def plan_for(record: Record, scene: Scene) -> Plan:
-    """The plan for a record: of its V, where that is what drives the fit, else of the scene's drive.
+def plan_for_record(record: Record, scene: Scene) -> Plan:
+    """Plan for a record: for its V, where that is what drives the fit, else for the scene's drive.
 
     Raises:
         InputError: as `fitact.plan`, or the record does not fit the scene's drive.
     """
-    return plan(scene, _recorded(record, scene))
+    return plan(scene, _measured_part(record, choose_drive(record, scene)))
 
 
-def _no_plan(scenes: Sequence[Scene], model: Model) -> str:
-    """Why the full model is fitted from the first, as a clause; "" where there is a plan."""
+def _reason_for_full_model(scenes: Sequence[Scene], model: Model) -> str:
+    """Say why the full model is fitted from the first, as a clause; "" where there is a plan."""
     if model == "full":
         return "it was asked for"
     if not scenes:
         return "without a scene it is the paper's final circuit, which has nothing to leave out"
     if len(scenes) > 1:
         return "several scenes have no common plan"
-    return "" if named(scenes[0]) else "the scene names nothing that it could do without"
+    return "" if applicable_omissions(scenes[0]) else "the scene names nothing that it could do without"
 
 
-def _recorded(record: Record, scene: Scene) -> Sampled | None:
-    """The beginning of the recorded V, where that drives the fit: whole periods of it where it holds some."""
-    with jax.enable_x64(True):
-        choice = choose_drive(record, scene)
+def _measured_part(record: Record, choice: DriveModel, max_samples: int = 20_000) -> Sampled | None:
+    """Take the beginning of the recorded V, where that drives the fit: whole periods of it where it holds some."""
     if choice.name != "measured":
         return None
-    begin = Record(record.time[:_SAMPLES], {"V": choice.voltage[:_SAMPLES]}, record.source)
-    kept, period = whole_periods(begin)
-    return Sampled(begin.time[:kept], begin["V"][:kept], period)
+    begin = Record(record.time[:max_samples], {"V": choice.voltage[:max_samples]}, record.source)
+    samples, period = whole_periods(begin)
+    return Sampled(begin.time[:samples], begin["V"][:samples], period)
 
 
-def _fitted_in_full(records: Sequence[Record], scene: Scene, options: dict[str, Any]) -> Fit | None:
-    """The full model's fit; None where this version cannot fit it."""
+def _fit_full_model(
+    records: tuple[Record, ...], scene: Scene, drives: tuple[DriveModel, ...], options: dict[str, Any]
+) -> Fit | None:
+    """Fit the full model; None where this version cannot fit it."""
     try:
         scene.require_available(fit=True)
     except InputError:
         return None
-    return fit(records, scene, **options)
+    return fit_records(records, (scene,) * len(records), drives, **options)

@@ -1,8 +1,9 @@
-"""Vsc of many circuits under one drive, and what makes the force, for comparing models with each other.
+"""Errors of Vsc and force that a changed model makes, of many circuits under one drive.
 
-The time constants come from `fitact.model_selection.partial_fractions`. The rest is NumPy, where nothing is
-compiled: every response is a sum of exponentials along the straight pieces of its drive, and a window is a set of
-nodes, graded towards the corners, where a small resistance makes its difference.
+The time constants come from `fitact.model_selection.partial_fractions`. The rest is NumPy, where nothing is compiled
+(a vmapped `fitact.response` evaluates 5 times faster, but compiling it for a new drive, regime or length takes 7 times
+as long as a whole plan): every response is a sum of exponentials along the straight pieces of its drive, on nodes that
+are graded towards the corners, where a small resistance makes its difference.
 """
 
 import dataclasses
@@ -19,62 +20,52 @@ from jaxtyping import Array, Complex, Float
 
 from fitact.model.chirp import Chirp
 from fitact.model.circuit import Channel
-from fitact.model.drive import Burst, Drive, Periodic, Pieces, PiecewiseLinear, Sampled, Sine
+from fitact.model.drive import Burst, Drive, LinearPieces, Multitone, Periodic, PiecewiseLinear, Sampled, Sine
 from fitact.model.force import force_constant
-from fitact.model.multitone import Multitone
-from fitact.model.response import highpass, knot_values, steady_knots
+from fitact.model.response import highpass, knot_values, steady_knot_values
 from fitact.model.skin import WithSkin
-from fitact.model_selection.partial_fractions import complete, filled_up, terms, tones
+from fitact.model_selection.partial_fractions import complete_circuit, pad_rows, partial_fractions
 from fitact.scene.scene import Scene
-
-_PIECES = 4  # of a period; fewer are filled up with ones of no length
-_DECADES, _ORDER = 8, 8  # of a piece, and the order of the rule in each
-_PERIODS = 12  # from rest: periods that stand for all, in geometric progression
-_CHIRP_TIMES = 2048, 32768  # at least and at most, and between them 16 a cycle of the highest frequency
-_SNAP = 1e-9  # of a period: corners so close are one
-_HIGHEST = 4  # stretches among which the peak is looked for
-_REFINED, _REFINEMENTS = 17, 3  # times between the neighbours of a peak, and how often
 
 Rows: TypeAlias = Float[np.ndarray, "circuits times"]
 
 
-class Window(NamedTuple):
+class ComparisonGrid(NamedTuple):
     """Nodes over the time in which models are compared."""
 
     cycle: Float[np.ndarray, " times"]  # s since the drive's last start of a period
     elapsed: Float[np.ndarray, " times"]  # s since t = 0
     weight: Float[np.ndarray, " times"]  # the share of the window that each stands for
-    stretches: int = 1  # without a corner, each of as many times as another
+    n_intervals: int = 1  # without a corner, each of as many times as another
 
     @classmethod
-    def of(cls, scene: Scene, measured: Sampled | None = None) -> "Window":
-        """One period of the steady state; else the scene's duration from rest; of a measured drive, its samples."""
+    def from_scene(cls, scene: Scene, measured: Sampled | None = None) -> "ComparisonGrid":
+        """Take one period of the steady state, or the scene's duration from rest; of a measured drive, its samples."""
         if measured is not None:
             time, last = (np.asarray(x) for x in (measured.time, measured.time[-1]))
             step = np.diff(time, append=last if measured.period is None else time[0] + measured.period)
             return cls(time, time, step / step.sum())
         drive, duration = scene.make_drive(), scene.measurement.duration
         if isinstance(drive, Chirp):
-            least, most = _CHIRP_TIMES
-            count = int(np.clip(2 ** math.ceil(math.log2(2 * drive.pieces)), least, most))
+            # some 16 a cycle of the highest frequency; a power of 2, so that few programs are compiled
+            count = int(np.clip(2 ** math.ceil(math.log2(2 * drive.pieces)), 2048, 32768))
             times = duration * (np.arange(count) + 0.5) / count
             return cls(times, times, np.full(times.size, 1.0 / times.size))
         wave: Any = drive.wave if isinstance(drive, Burst) else drive
-        period, lead = 1.0 / wave.frequency, _lead(wave)
-        cuts = _corners(wave)
+        period, lead, cuts = 1.0 / wave.frequency, _phase_offset(wave), _corner_times(wave)
         if scene.drive.steady_state:
             stretches = [(0, low, high, 1.0) for low, high in itertools.pairwise(cuts)]
         else:
             end = lead + duration
             cuts = np.union1d(cuts, [lead, end % period])
-            cuts = np.append(cuts[:-1][np.diff(cuts) > _SNAP * period], cuts[-1])
+            cuts = np.append(cuts[:-1][np.diff(cuts) > 1e-9 * period], cuts[-1])  # corners so close are one
             stretches = [
                 (number, low, high, stands)
-                for number, stands in _representatives(math.ceil(end / period), getattr(drive, "cycles", 0))
+                for number, stands in _representative_periods(math.ceil(end / period), getattr(drive, "cycles", 0))
                 for low, high in itertools.pairwise(cuts)
                 if lead <= number * period + 0.5 * (low + high) <= end
             ]
-        share, share_weight = _nodes()
+        share, share_weight = _quadrature_nodes()
         first, low, length, stands = (
             np.array(x)[:, None] for x in zip(*((n, a, b - a, w) for n, a, b, w in stretches), strict=True)
         )
@@ -85,205 +76,179 @@ class Window(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Waves:
-    """Vsc of circuits under one drive: weighted responses of time constants, and harmonics where a skin has more.
+class CircuitResponses:
+    """A channel of circuits under one drive: weighted responses of time constants, and harmonics that a skin has more.
 
     Attributes:
         drive, steady_state: what drives them all, and whether for ever or from rest.
-        pieces: one period of the drive, where it is straight.
+        segments: one period of the drive, where it is straight.
         weight, tau: of the high-pass terms; s.
         knots: each term's steady state at the starts of the drive's pieces, V.
         harmonics: amplitude that the terms miss, V.
-        factor: the force over the square of the voltage that makes it, N/V^2.
-        acting: those voltages; None: these themselves.
     """
 
     drive: Drive
     steady_state: bool
-    pieces: Pieces | None
+    segments: LinearPieces | None
     weight: Float[np.ndarray, "circuits terms"]
     tau: Float[np.ndarray, "circuits terms"]
     knots: Float[np.ndarray, "circuits terms pieces"]
     harmonics: Complex[np.ndarray, "circuits harmonics"]
-    factor: Float[np.ndarray, " circuits"]
-    acting: "Waves | None" = None
 
     @classmethod
-    def of(
-        cls,
-        scene: Scene,
-        values: Mapping[str, Any],
-        precision: type[np.floating[Any]] = np.float64,
-        measured: Sampled | None = None,
-    ) -> "Waves":
-        """Those of the scene's circuit at `values` (SI, by name; arrays of at most `ROWS`), in that precision.
-
-        `measured` is what drives them in place of the scene's drive.
-        """
-        drive = measured or scene.make_drive()
-        found = cls._of(scene, drive, values, precision, "Vsc")
-        if scene.force.model == "paper":
-            return found
-        return dataclasses.replace(found, acting=cls._of(scene, drive, values, precision, "Vgap"))
-
-    @classmethod
-    def _of(
-        cls,
-        scene: Scene,
-        drive: Drive,
-        values: Mapping[str, Any],
-        precision: type[np.floating[Any]],
-        channel: Channel,
-    ) -> "Waves":
+    def from_scene(
+        cls, scene: Scene, drive: Drive, values: Mapping[str, Any], precision: type[np.floating[Any]], channel: Channel
+    ) -> "CircuitResponses":
+        """Drive the scene's circuit at `values` (SI, by name; arrays of at most `ROWS`), in that precision."""
         count = max(np.size(value) for value in values.values())
         with jax.enable_x64(precision is np.float64):
+            pad = functools.partial(pad_rows, precision=precision)
             circuit = scene.make_circuit(dict(values))
-            skin = None
-            if isinstance(circuit, WithSkin):  # its exponent may differ from circuit to circuit
-                skin = jax.tree.map(lambda x: filled_up(x, precision)[:, None], circuit.skin)
-            whole = complete(scene.make_rc_circuit(dict(values)))
-            filled = jax.tree.map(lambda x: filled_up(x, precision), whole)
-            weight, tau, harmonics = terms(filled, skin, drive, precision, channel)
+            # the skin's exponent may differ from circuit to circuit
+            skin = jax.tree.map(lambda x: pad(x)[:, None], circuit.skin) if isinstance(circuit, WithSkin) else None
+            complete = jax.tree.map(pad, complete_circuit(scene.make_rc_circuit(dict(values))))
+            weight, tau, harmonics = partial_fractions(complete, skin, drive, precision, channel)
             tau = np.maximum(tau, np.finfo(np.float32).tiny)  # single precision may lose that of an absent part
             wave = drive.wave if isinstance(drive, Burst) else drive
-            pieces = _pieces(wave) if isinstance(wave, PiecewiseLinear | Sampled) else None
-            knots = np.zeros((*tau.shape, 0), dtype=precision)
-            if pieces is not None:
+            segments, knots = None, np.zeros((*tau.shape, 0), dtype=precision)
+            if isinstance(wave, PiecewiseLinear | Sampled):
+                segments = _period_segments(wave)
                 settled = not isinstance(drive, Sampled) or drive.period is not None
-                knots = _knots(jax.tree.map(precision, pieces), tau, settled)
+                knots = _knots(jax.tree.map(precision, segments), tau, settled)
         weight, tau, knots, harmonics = (
             x[:count] for x in (weight.astype(precision), tau.astype(precision), knots, harmonics)
         )
-        return cls(
-            drive, scene.drive.steady_state, pieces, weight, tau, knots, harmonics, _factor(scene, values, count)
-        )
+        return cls(drive, scene.drive.steady_state, segments, weight, tau, knots, harmonics)
 
-    def at(self, cycle: np.ndarray, elapsed: np.ndarray) -> Rows:
-        """Vsc at nodes common to all circuits, or at each circuit's own."""
+    @property
+    def wave(self) -> Any:
+        return self.drive.wave if isinstance(self.drive, Burst) else self.drive
+
+    def evaluate(self, cycle: np.ndarray, elapsed: np.ndarray) -> Rows:
+        """Evaluate at nodes common to all circuits, or at each circuit's own."""
         cycle, elapsed = (np.atleast_2d(x).astype(self.tau.dtype) for x in (cycle, elapsed))
         if isinstance(self.drive, Sampled):  # whose samples are the nodes
             u = self.knots
         elif isinstance(self.drive, Chirp):
             with jax.enable_x64(self.tau.dtype == np.float64):
-                u = np.asarray(_chirped(self.drive, elapsed[0], filled_up(self.tau, self.tau.dtype)))[: len(self.tau)]
+                u = np.asarray(_chirp_response(self.drive, elapsed[0], pad_rows(self.tau, self.tau.dtype)))
+                u = u[: len(self.tau)]
         elif self.steady_state:
-            u = self._settled(cycle)
+            u = self._steady_state_response(cycle)
         else:
-            u = self._from_rest(cycle, elapsed)
-        vsc = np.einsum("rk,rkn->rn", self.weight, u)
+            u = self._transient_response(cycle, elapsed)
+        total = np.einsum("rk,rkn->rn", self.weight, u)
         if not self.harmonics.shape[1]:
-            return vsc
+            return total
         assert isinstance(self.drive, Periodic)
         order = 2j * np.pi * self.drive.frequency * np.arange(1, self.harmonics.shape[1] + 1)
-        return vsc + 2.0 * np.einsum("rh,rhn->rn", self.harmonics, np.exp(order[:, None] * cycle[:, None, :])).real
+        return total + 2.0 * np.einsum("rh,rhn->rn", self.harmonics, np.exp(order[:, None] * cycle[:, None, :])).real
 
-    def _from_rest(self, cycle: np.ndarray, elapsed: np.ndarray) -> np.ndarray:
-        wave: Any = self.drive.wave if isinstance(self.drive, Burst) else self.drive
-        begin = np.full((1, 1), _lead(wave), dtype=cycle.dtype)
+    def _transient_response(self, cycle: np.ndarray, elapsed: np.ndarray) -> np.ndarray:
+        begin = np.full((1, 1), _phase_offset(self.wave), dtype=cycle.dtype)
         tau, since = self.tau[..., None], elapsed[:, None, :]
-        difference = self._start(wave) - self._settled(begin)
-        u = self._settled(cycle) + difference * np.exp(-since / tau)
+        difference = self._initial_voltage() - self._steady_state_response(begin)
+        u = self._steady_state_response(cycle) + difference * np.exp(-since / tau)
         if not isinstance(self.drive, Burst):
             return u
-        end = self.drive.cycles / wave.frequency
+        end = self.drive.cycles / self.wave.frequency
         after = difference * np.expm1(-end / tau) * np.exp(-np.maximum(since - end, 0.0) / tau)
         return np.where(since > end, after, u)
 
-    def _start(self, wave: Any) -> float:
+    def _initial_voltage(self) -> float:
         """V at t = 0, from the right."""
-        if self.pieces is None:
+        if self.segments is None:
             with jax.enable_x64(True):
-                return float(wave.value(0.0))
-        piece, since, slope = _along(self.pieces, np.array(_lead(wave)))
-        return float(self.pieces.start[piece] + slope * since)
+                return float(self.wave.value(0.0))
+        piece, since, slope = _locate_segment(self.segments, np.array(_phase_offset(self.wave)))
+        return float(self.segments.start[piece] + slope * since)
 
-    def _settled(self, cycle: np.ndarray) -> np.ndarray:
+    def _steady_state_response(self, cycle: np.ndarray) -> np.ndarray:
         """Each term's response in the steady state."""
-        wave: Any = self.drive.wave if isinstance(self.drive, Burst) else self.drive
         tau, cycle = self.tau[..., None], cycle[:, None, :]
-        if self.pieces is None:
-            omega, u = 2.0 * np.pi * wave.frequency, np.zeros((1, 1, 1), dtype=tau.dtype)
-            for order, height, phase in tones(wave):
+        if self.segments is None:
+            omega, u = 2.0 * np.pi * self.wave.frequency, np.zeros((1, 1, 1), dtype=tau.dtype)
+            for order, height, phase in _tones(self.wave):
                 x = order * omega * tau
                 u = u + height * (x / np.hypot(1.0, x)) * np.sin(order * omega * cycle + (phase + np.arctan2(1.0, x)))
             return u
-        piece, since, slope = _along(self.pieces, cycle)
-        left = np.expm1(-since / tau)
-        return np.take_along_axis(self.knots, piece, axis=2) * (1.0 + left) - slope.astype(tau.dtype) * tau * left
+        piece, since, slope = _locate_segment(self.segments, cycle)
+        decay = np.expm1(-since / tau)
+        return np.take_along_axis(self.knots, piece, axis=2) * (1.0 + decay) - slope.astype(tau.dtype) * tau * decay
 
 
-class Comparison(NamedTuple):
-    """What a changed model makes of Vsc and force, relative to the full one; one value for each circuit."""
+class ReferenceModel:
+    """The full model's Vsc and force over a window, to compare others with.
 
-    Vsc_rms: Float[np.ndarray, " circuits"]
-    Vsc_peak: Float[np.ndarray, " circuits"]
-    force_mean: Float[np.ndarray, " circuits"]
-    force_peak: Float[np.ndarray, " circuits"]
-
-
-class Reference:
-    """The full model's waves over a window, to compare others with.
-
-    `values` of its circuits as in `Waves.of`; `measured`: what drives all of them in place of the scene's drive.
+    `values` of its circuits as in `CircuitResponses.from_scene`; `measured`: what drives all of them in place of the
+    scene's drive.
     """
 
     def __init__(self, scene: Scene, values: Mapping[str, Any], measured: Sampled | None = None) -> None:
-        self.measured, self.window = measured, Window.of(scene, measured)
-        full = Waves.of(scene, values, measured=measured)
-        self.vsc = _Heights.of(self.window, full)
-        self.factor = full.factor
-        self.acting = self.vsc if full.acting is None else _Heights.of(self.window, full.acting)
+        self.measured, self.grid = measured, ComparisonGrid.from_scene(scene, measured)
+        self.full = self._evaluate(scene, values, np.float64)
 
     def compare(
         self, scene: Scene, values: Mapping[str, Any], precision: type[np.floating[Any]] = np.float64
-    ) -> Comparison:
-        """How far those of another scene, of as many of the circuits from the first on, lie from the full model's."""
-        waves = Waves.of(scene, values, precision, self.measured)
-        weight, count = self.window.weight, len(waves.tau)
-        vsc, factor = _Heights.of(self.window, waves), waves.factor / self.factor[:count]
-        acting = vsc if waves.acting is None else _Heights.of(self.window, waves.acting)
-        full, acting_full = (_Heights(at[:count], peak[:count]) for at, peak in (self.vsc, self.acting))
-        return Comparison(
-            np.sqrt((vsc.at - full.at) ** 2 @ weight / (full.at**2 @ weight)),
-            np.abs(vsc.peak / full.peak - 1.0),
-            np.abs(factor * (acting.at**2 @ weight / (acting_full.at**2 @ weight)) - 1.0),
-            np.abs(factor * (acting.peak / acting_full.peak) ** 2 - 1.0),
-        )
+    ) -> Float[np.ndarray, "4 circuits"]:
+        """Return how far another scene's model lies from the full one, of as many circuits from the first on.
+
+        Relative errors: of Vsc the root mean square's and the peak's, of the force the mean's and the peak's.
+        """
+        weight, changed = self.grid.weight, self._evaluate(scene, values, precision)
+        (vsc, peak), (acting, acting_peak), factor = changed
+        full = jax.tree.map(lambda x: x[: len(vsc)], self.full)
+        (full_vsc, full_peak), (full_acting, full_acting_peak), full_factor = full
+        ratio = factor / full_factor
+        return np.array([
+            np.sqrt((vsc - full_vsc) ** 2 @ weight / (full_vsc**2 @ weight)),
+            np.abs(peak / full_peak - 1.0),
+            np.abs(ratio * (acting**2 @ weight / (full_acting**2 @ weight)) - 1.0),
+            np.abs(ratio * (acting_peak / full_acting_peak) ** 2 - 1.0),
+        ])  # fmt: skip
+
+    def _evaluate(
+        self, scene: Scene, values: Mapping[str, Any], precision: type[np.floating[Any]]
+    ) -> tuple[tuple[Rows, np.ndarray], tuple[Rows, np.ndarray], Float[np.ndarray, " circuits"]]:
+        """Vsc and its peak; those of the voltage that makes the force; the force over its square, N/V^2."""
+        drive = self.measured or scene.make_drive()
+        vsc = acting = _voltages(self.grid, CircuitResponses.from_scene(scene, drive, values, precision, "Vsc"))
+        if scene.force.model != "paper":
+            acting = _voltages(self.grid, CircuitResponses.from_scene(scene, drive, values, precision, "Vgap"))
+        with jax.enable_x64(True):  # whatever the voltages' precision
+            contact = scene.geometry().contact(scene.make_rc_circuit(dict(values)))
+            return vsc, acting, np.broadcast_to(np.asarray(force_constant(contact)), len(vsc[0]))
 
 
-class _Heights(NamedTuple):
-    """Voltages at a window's nodes, and the largest."""
+def _voltages(
+    grid: ComparisonGrid, responses: CircuitResponses, candidates: int = 4, points: int = 17, refinements: int = 3
+) -> tuple[Rows, Float[np.ndarray, " circuits"]]:
+    """Voltages at the nodes, and the largest, between the nodes too.
 
-    at: Rows
-    peak: Float[np.ndarray, " circuits"]
-
-    @classmethod
-    def of(cls, window: Window, waves: Waves) -> "_Heights":
-        at = waves.at(window.cycle, window.elapsed)
-        return cls(at, _peak(window, waves, at))
-
-
-def _peak(window: Window, waves: Waves, vsc: Rows) -> Float[np.ndarray, " circuits"]:
-    """The largest |Vsc|, between the nodes too: the highest stretches are looked at more closely."""
-    if isinstance(waves.drive, Chirp | Sampled):  # compiled for its nodes, or not known between them
-        return _parabola(np.abs(vsc)) if isinstance(waves.drive, Chirp) else np.abs(vsc).max(axis=1)
-    height = np.abs(vsc).reshape(len(vsc), window.stretches, -1)
-    node = height.argmax(axis=2)
-    highest = np.argsort(-height.max(axis=2), axis=1)[:, :_HIGHEST]
+    The `candidates` highest stretches are looked at more closely: `refinements` times at so many `points`.
+    """
+    voltage = responses.evaluate(grid.cycle, grid.elapsed)
+    if isinstance(responses.drive, Chirp):  # compiled for its nodes
+        return voltage, _parabola_vertex(np.abs(voltage))
+    if isinstance(responses.drive, Sampled):  # not known between them
+        return voltage, np.abs(voltage).max(axis=1)
+    height = np.abs(voltage).reshape(len(voltage), grid.n_intervals, -1)
+    highest = np.argsort(-height.max(axis=2), axis=1)[:, :candidates]
     first, last = highest * height.shape[2], (highest + 1) * height.shape[2] - 1
-    at = first + np.take_along_axis(node, highest, axis=1)
-    low, high = window.cycle[np.maximum(at - 1, first)], window.cycle[np.minimum(at + 1, last)]
-    offset = (window.elapsed - window.cycle)[at][..., None]
-    for _ in range(_REFINEMENTS):
-        cycle = np.linspace(low, high, _REFINED, axis=2)
-        refined = np.abs(waves.at(*(x.reshape(len(vsc), -1) for x in (cycle, cycle + offset)))).reshape(cycle.shape)
+    node = first + np.take_along_axis(height.argmax(axis=2), highest, axis=1)
+    low, high = grid.cycle[np.maximum(node - 1, first)], grid.cycle[np.minimum(node + 1, last)]
+    offset = (grid.elapsed - grid.cycle)[node][..., None]
+    for _ in range(refinements):
+        cycle = np.linspace(low, high, points, axis=2)
+        flat = (x.reshape(len(voltage), -1) for x in (cycle, cycle + offset))
+        refined = np.abs(responses.evaluate(*flat)).reshape(cycle.shape)
         best = refined.argmax(axis=2)[..., None]
-        low, high = (np.take_along_axis(cycle, np.clip(best + i, 0, _REFINED - 1), 2)[..., 0] for i in (-1, 1))
-    return np.maximum(height.max(axis=(1, 2)), refined.max(axis=(1, 2)))
+        low, high = (np.take_along_axis(cycle, np.clip(best + i, 0, points - 1), 2)[..., 0] for i in (-1, 1))
+    return voltage, np.maximum(height.max(axis=(1, 2)), refined.max(axis=(1, 2)))
 
 
-def _parabola(height: Rows) -> Float[np.ndarray, " circuits"]:
-    """The top of the parabola through the highest node of each row and its neighbours."""
+def _parabola_vertex(height: Rows) -> Float[np.ndarray, " circuits"]:
+    """Return the top of the parabola through the highest node of each row and its neighbours."""
     at = np.clip(height.argmax(axis=1), 1, height.shape[1] - 2)
     before, top, after = (height[np.arange(len(height)), at + i] for i in (-1, 0, 1))
     bend = before - 2.0 * top + after
@@ -292,80 +257,83 @@ def _parabola(height: Rows) -> Float[np.ndarray, " circuits"]:
 
 
 @functools.cache
-def _nodes() -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights on (0, 1), graded towards 0; both ends are nodes of no weight."""
-    x, w = np.polynomial.legendre.leggauss(_ORDER)
-    ends = np.concatenate([[0.0], np.logspace(-_DECADES, -1.0, _DECADES), [0.25, 0.5, 0.75, 1.0]])
+def _quadrature_nodes(decades: int = 8, order: int = 8) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes and weights on (0, 1), graded towards 0, `order` in each decade; both ends have no weight."""
+    x, w = np.polynomial.legendre.leggauss(order)
+    ends = np.concatenate([[0.0], np.logspace(-decades, -1.0, decades), [0.25, 0.5, 0.75, 1.0]])
     low, length = ends[:-1, None], np.diff(ends)[:, None]
     share = (low + 0.5 * length * (x + 1.0)).ravel()
     weight = (0.5 * length * w).ravel()
-    tiny = 1e-12
-    return np.concatenate([[tiny], share, [1.0 - tiny]]), np.concatenate([[0.0], weight, [0.0]])
+    return np.concatenate([[1e-12], share, [1.0 - 1e-12]]), np.concatenate([[0.0], weight, [0.0]])
 
 
-def _representatives(periods: int, cycles: int) -> list[tuple[int, int]]:
-    """Periods from rest, and how many each stands for: every early one, the first, the last and a burst's end alone."""
-    edges = np.unique(np.rint(np.geomspace(1, periods + 1, _PERIODS + 1)).astype(int) - 1)
-    own = np.array([1, periods - 1, cycles, cycles + 1])
-    edges = np.union1d(edges, own[(own > 0) & (own < periods)])
-    return [
-        ((low + high - 1) // 2, high - low) for low, high in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
-    ]
+def _representative_periods(periods: int, cycles: int, groups: int = 12) -> list[tuple[int, int]]:
+    """Return periods from rest, and how many each stands for: the first, the last and a burst's end stand alone.
+
+    The others form some `groups` in geometric progression, so that every early one counts.
+    """
+    edges = np.unique(np.rint(np.geomspace(1, periods + 1, groups + 1)).astype(int) - 1)
+    alone = np.array([1, periods - 1, cycles, cycles + 1])
+    edges = np.union1d(edges, alone[(alone > 0) & (alone < periods)])
+    return [((low + high - 1) // 2, high - low) for low, high in itertools.pairwise(edges.tolist())]
 
 
-def _lead(wave: Any) -> float:
+def _phase_offset(wave: Any) -> float:
     """How far into a period t = 0 lies, s."""
     return float(wave.phase / (2.0 * np.pi) % 1.0 / wave.frequency)
 
 
-def _corners(wave: Periodic) -> np.ndarray:
+def _corner_times(wave: Periodic) -> np.ndarray:
     if isinstance(wave, Sine | Multitone):
-        return np.linspace(0.0, 1.0, 4 * max(order for order, _, _ in tones(wave)) + 1) / float(wave.frequency)
+        return np.linspace(0.0, 1.0, 4 * max(order for order, _, _ in _tones(wave)) + 1) / float(wave.frequency)
     assert isinstance(wave, PiecewiseLinear)
-    return np.unique(_pieces(wave).knots)
+    return np.unique(_period_segments(wave).knots)
 
 
-def _pieces(wave: PiecewiseLinear | Sampled) -> Pieces:
-    """One period, filled up with pieces of no length."""
+def _period_segments(wave: PiecewiseLinear | Sampled) -> LinearPieces:
+    """Return one period, filled up to a trapezoid's 4 pieces with ones of no length, so that one program serves."""
     with jax.enable_x64(True):
         knots, start, end = (np.asarray(x) for x in wave.pieces())
-    missing = max(_PIECES - start.size, 0)
-    filled = [
-        np.append(x, np.full(missing, last)) for x, last in ((knots, knots[-1]), (start, end[-1]), (end, end[-1]))
-    ]
-    return Pieces(*filled)
+    missing = np.zeros(max(4 - start.size, 0))
+    return LinearPieces(*(np.append(x, missing + y[-1]) for x, y in ((knots, knots), (start, end), (end, end))))
 
 
-def _along(pieces: Pieces, cycle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The piece that each time lies in, the time since it began, and its slope."""
-    knots, length = pieces.knots.astype(cycle.dtype), np.diff(pieces.knots)
+def _locate_segment(segments: LinearPieces, cycle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find the piece that each time lies in, the time since it began, and its slope."""
+    knots, length = segments.knots.astype(cycle.dtype), np.diff(segments.knots)
     last = int(np.flatnonzero(length)[-1])
     piece = np.clip(np.searchsorted(knots, cycle, side="right") - 1, 0, last)
-    slope = (pieces.end - pieces.start) / np.where(length > 0.0, length, 1.0)
+    slope = (segments.end - segments.start) / np.where(length > 0.0, length, 1.0)
     return piece, np.maximum(cycle - knots[piece], 0.0), slope[piece]
 
 
-def _factor(scene: Scene, values: Mapping[str, Any], count: int) -> Float[np.ndarray, " circuits"]:
-    """Force over the square of the voltage that makes it, in double precision whatever the waves'."""
-    with jax.enable_x64(True):
-        contact = scene.geometry().contact(scene.make_rc_circuit(dict(values)))
-        return np.broadcast_to(np.asarray(force_constant(contact)), count)
+def _tones(wave: Any) -> list[tuple[int, float, float]]:
+    """List a smooth drive's orders, amplitudes (V), and phases beside the whole's (rad)."""
+    if isinstance(wave, Sine):
+        return [(1, 0.5 * float(wave.peak_to_peak), 0.0)]
+    phases = wave.phases or (0.0,) * len(wave.orders)
+    tones = zip(wave.orders, wave.amplitudes, phases, strict=True)
+    return [(order, float(height), float(phase)) for order, height, phase in tones]
 
 
 def _knots(
-    pieces: Pieces, tau: Float[np.ndarray, "circuits terms"], settled: bool
+    segments: LinearPieces, tau: Float[np.ndarray, "circuits terms"], steady_state: bool
 ) -> Float[np.ndarray, "circuits terms pieces"]:
-    """In columns, so that one program serves any number of terms."""
-    return np.stack([np.asarray(_column_knots(pieces, column, settled)) for column in tau.T], axis=1)
+    """Compute column by column, so that one program serves any number of terms."""
+    return np.stack([np.asarray(_column_knots(segments, column, steady_state)) for column in tau.T], axis=1)
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def _column_knots(pieces: Pieces, tau: Float[Array, " circuits"], settled: bool) -> Float[Array, "circuits pieces"]:
+def _column_knots(
+    segments: LinearPieces, tau: Float[Array, " circuits"], steady_state: bool
+) -> Float[Array, "circuits pieces"]:
     """u just after the start of each piece, in the steady state or without charge before the first."""
-    begin = functools.partial(knot_values, pieces, first=pieces.start[0])
-    return jax.vmap(functools.partial(steady_knots, pieces) if settled else begin)(tau)
+    begin = functools.partial(knot_values, segments, first=segments.start[0])
+    return jax.vmap(functools.partial(steady_knot_values, segments) if steady_state else begin)(tau)
 
 
 @eqx.filter_jit
-def _chirped(drive: Drive, time: Array, tau: Float[Array, "circuits terms"]) -> Float[Array, "circuits terms times"]:
+def _chirp_response(
+    drive: Drive, time: Array, tau: Float[Array, "circuits terms"]
+) -> Float[Array, "circuits terms times"]:
     return jax.vmap(jax.vmap(lambda each: highpass(drive, time, each, steady_state=False)))(tau)

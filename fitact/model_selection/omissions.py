@@ -1,5 +1,6 @@
 """What a scene names that may be left out of its model, what is then left of the scene, and what its model costs."""
 
+import dataclasses
 import json
 from collections.abc import Mapping
 from typing import Any
@@ -26,21 +27,44 @@ _KEYS: dict[str, dict[tuple[str, str], Any]] = {
 }
 _PARAMETERS = {"resistance": "Rgap", "capacitance": "Cgap"}  # those that are not named as their key
 _RESISTANCES = ("R_H", "series resistor")  # what limits the current at an edge
-
-# Nanoseconds a sample, of many circuits side by side in one compiled program: one exponential takes about one.
-# Measured by benchmarks/plan.py; docs/plan.md has the table.
-_LOCATE = 1.0
-_TERM = {"square": 1.0, "trapezoid": 2.0, "triangle": 2.0, "sine": 4.0, "measured": 25.0, "chirp": 15.0}
-_TRANSIENT, _BURST = 0.5, 1.0  # more for each term, from rest
-_HARMONIC = 10.0
-_FRACTIONAL_TERMS = 81
-SINGLE_SPEEDUP = 1.6  # of float32, where many circuits are computed side by side
+FLOAT32_SPEEDUP = 1.6  # by benchmarks/plan.py, where many circuits are computed side by side
 
 
-def named(scene: Scene) -> tuple[str, ...]:
-    """The names of what the scene's model has and might do without."""
+@dataclasses.dataclass(frozen=True)
+class Costs:
+    """Nanoseconds a sample, of many circuits side by side in one compiled program: one exponential takes about one.
+
+    Measured by benchmarks/plan.py, once, so that a plan does not depend on what else a machine does; docs/plan.md has
+    the table.
+
+    Attributes:
+        lookup: to find a time in the drive.
+        square, trapezoid, triangle, sine, measured, chirp: of each time constant, by the drive; a sine's of each tone.
+        transient, burst: more for each time constant, from rest.
+        harmonic: of each.
+        fractional_terms: time constants that a fractional skin counts as.
+    """
+
+    lookup: float = 1.0
+    square: float = 1.0
+    trapezoid: float = 2.0
+    triangle: float = 2.0
+    sine: float = 4.0
+    measured: float = 25.0
+    chirp: float = 15.0
+    transient: float = 0.5
+    burst: float = 1.0
+    harmonic: float = 10.0
+    fractional_terms: int = 81
+
+
+_COSTS = Costs()
+
+
+def applicable_omissions(scene: Scene) -> tuple[str, ...]:
+    """Name what the scene's model has and might do without."""
     ground, drive = scene.grounding, scene.drive
-    has = dict.fromkeys(scene.prior.beliefs(), 1.0) | {k: v for k, v in scene.nominal().items() if v is not None}
+    has = dict.fromkeys(scene.prior.specs(), 1.0) | {k: v for k, v in scene.nominal_values().items() if v is not None}
     present = {
         "R_H": "R_H" in has,
         "grounding skin": "grounding_Rsc" in has or "grounding_Csc" in has,
@@ -56,18 +80,18 @@ def named(scene: Scene) -> tuple[str, ...]:
     return tuple(name for name, there in present.items() if there)
 
 
-def parameters(name: str) -> set[str]:
-    """The circuit's parameters that go with an omission."""
+def omitted_parameters(name: str) -> set[str]:
+    """Name the circuit's parameters that go with an omission."""
     keys = {
         key for section, key in _KEYS[name] if section in ("grounding", "gap") or key in ("series_resistor", "alpha")
     }
     return {_PARAMETERS.get(key, key) for key in keys if key != "thickness"}
 
 
-def required(scene: Scene, name: str) -> str:
-    """Why it may not be left out whatever that changes, as a clause; "" if it may."""
-    gone, beliefs = parameters(name), scene.prior.beliefs()
-    if any(key in gone and belief.free for key, belief in beliefs.items()):
+def reason_to_keep(scene: Scene, name: str) -> str:
+    """Say why it may not be left out whatever that changes, as a clause; "" if it may."""
+    gone, beliefs = omitted_parameters(name), scene.prior.specs()
+    if any(key in gone and belief.is_free for key, belief in beliefs.items()):
         return "the prior frees it"
     if any(belief.tied in gone and key not in gone for key, belief in beliefs.items()):
         return "another parameter is tied to it"
@@ -80,8 +104,8 @@ def required(scene: Scene, name: str) -> str:
     return ""
 
 
-def driven(scene: Scene) -> Scene:
-    """The scene driven by what was recorded.
+def with_measured_drive(scene: Scene) -> Scene:
+    """Let the scene be driven by what was recorded.
 
     Raises:
         InputError: its skin depends on the frequency.
@@ -97,54 +121,53 @@ def driven(scene: Scene) -> Scene:
     return Scene.from_dict(content | {"drive": {"waveform": "measured"} | kept})
 
 
-def without(scene: Scene, names: tuple[str, ...], *, prior: bool = True) -> Scene:
-    """The scene without these; with ``prior=False`` without its beliefs, too."""
+def reduce_scene(scene: Scene, names: tuple[str, ...], *, prior: bool = True) -> Scene:
+    """Leave these out of the scene; with ``prior=False`` its beliefs, too."""
     content = json.loads(scene.to_json())
     for name in names:
-        for (section, key), value in _changes(scene, name).items():
+        changes = _KEYS[name]
+        if name == "transient" and scene.drive.waveform == "burst":
+            changes = {("drive", "waveform"): scene.drive.shape, ("drive", "shape"): None, ("drive", "cycles"): None}
+        for (section, key), value in changes.items():
             part = content.setdefault(section, {})
             part.pop(key, None)
             if value is not None:
                 part[key] = value
-    gone = set().union(*(parameters(name) for name in names))
-    believed = content.pop("prior", {})
-    if prior and believed:
-        content["prior"] = {key: belief for key, belief in believed.items() if key not in gone}
-    return Scene.from_dict(content)
+    beliefs = drop_parameters(content.pop("prior", {}), names)
+    return Scene.from_dict(content | {"prior": beliefs} if prior and beliefs else content)
 
 
-def _changes(scene: Scene, name: str) -> dict[tuple[str, str], Any]:
-    if name == "transient" and scene.drive.waveform == "burst":
-        return {("drive", "waveform"): scene.drive.shape, ("drive", "shape"): None, ("drive", "cycles"): None}
-    return _KEYS[name]
+def drop_parameters(values: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
+    """Leave out the parameters that go with these omissions."""
+    omitted = set().union(*(omitted_parameters(name) for name in names))
+    return {name: value for name, value in values.items() if name not in omitted}
 
 
-def cost(scene: Scene, values: Mapping[str, ArrayLike] | None = None) -> float:
-    """What a sample of Vsc costs, in exponentials, where many circuits are computed side by side.
+def evaluation_cost(scene: Scene, values: Mapping[str, ArrayLike] | None = None, costs: Costs = _COSTS) -> float:
+    """Return what a sample of Vsc costs, in exponentials, where many circuits are computed side by side.
 
-    Each time is looked up in the drive once; each time constant and each harmonic adds its share. The shares were
-    measured once, so that a plan does not depend on what else a machine does; `benchmarks/plan.py` repeats it.
     `values` are of parameters that the scene has by its prior alone.
     """
-    circuit, stated = scene.make_circuit(values), scene.drive
-    terms, harmonics, tones = time_constants(scene.make_rc_circuit(values)), 0, len(stated.frequencies or (1,))
+    circuit, drive = scene.make_circuit(values), scene.drive
+    terms, harmonics, tones = count_time_constants(scene.make_rc_circuit(values)), 0, len(drive.frequencies or (1,))
     if isinstance(circuit, WithSkin):
-        if stated.waveform in ("sine", "multitone"):
+        if drive.waveform in ("sine", "multitone"):
             terms, harmonics = 0, tones
         else:
-            harmonics = circuit.skin.count(stated.frequency)
-            terms = _FRACTIONAL_TERMS if isinstance(circuit.skin, Fractional) else terms
-    if stated.waveform == "multitone":
-        of_term = tones * _TERM["sine"]
+            harmonics = circuit.skin.harmonic_count(drive.frequency)
+            if isinstance(circuit.skin, Fractional):
+                terms = costs.fractional_terms
+    if drive.waveform == "multitone":
+        each_term = tones * costs.sine
     else:
-        of_term = _TERM[stated.shape if stated.waveform == "burst" else stated.waveform]
-    if not stated.steady_state and stated.waveform not in ("chirp", "measured"):
-        of_term += _BURST if stated.waveform == "burst" else _TRANSIENT
-    return _LOCATE + terms * of_term + _HARMONIC * harmonics
+        each_term = getattr(costs, drive.shape if drive.waveform == "burst" else drive.waveform)
+    if not drive.steady_state and drive.waveform not in ("chirp", "measured"):
+        each_term += costs.burst if drive.waveform == "burst" else costs.transient
+    return costs.lookup + terms * each_term + costs.harmonic * harmonics
 
 
-def time_constants(circuit: RC) -> int:
-    """How many a circuit has: one for each capacitor, but for Ci where nothing resistive is in series with it."""
+def count_time_constants(circuit: RC) -> int:
+    """Count one for each capacitor, but for Ci where nothing resistive is in series with it."""
     if isinstance(circuit, FinalCircuit):
         return 1
     return len(circuit.elements()) + (circuit.resistance() is not None)

@@ -14,85 +14,82 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex
 
+from fitact import compiled
 from fitact.model.circuit import RC, Channel, DirectGround, Element, FinalCircuit, NaturalGround, Probe
-from fitact.model.drive import Drive, Periodic, Sine
-from fitact.model.harmonic import fourier
-from fitact.model.multitone import Multitone
-from fitact.model.skin import Fractional, Skin, WithSkin, spread
+from fitact.model.drive import Drive, Multitone, Periodic, Sine
+from fitact.model.harmonic import fourier_coefficients
+from fitact.model.skin import Fractional, SkinModel, WithSkin, high_frequency_basis
 
 ROWS = 128  # circuits side by side; fewer are filled up, so that each program is compiled once
 _BLOCK = 64  # frequencies in one program
-_ABSENT = 1e-6  # ohm: with any capacitance here over long before the first node
 
 
-def tones(wave: Any) -> list[tuple[int, float, float]]:
-    """Of a smooth drive: order, amplitude (V), and phase beside the whole's (rad)."""
-    if isinstance(wave, Sine):
-        return [(1, 0.5 * float(wave.peak_to_peak), 0.0)]
-    phases = wave.phases or (0.0,) * len(wave.orders)
-    return [
-        (n, float(height), float(phase)) for n, height, phase in zip(wave.orders, wave.amplitudes, phases, strict=True)
-    ]
+def complete_circuit(circuit: RC) -> DirectGround | NaturalGround:
+    """Return the circuit with every part that its kind may have but a gap, an absent one too small to matter."""
+    absent = 1e-6  # ohm: with any capacitance here over long before the first node
 
+    def resistance(*parts: Any) -> Any:
+        return sum((part for part in parts if part is not None), start=absent)
 
-def complete(circuit: RC) -> DirectGround | NaturalGround:
-    """The circuit with every part that its kind may have but a gap, an absent one too small to matter."""
     if isinstance(circuit, FinalCircuit):
         circuit = DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci)
     skin, probe = (circuit.Rsc, circuit.Csc, circuit.Ci), circuit.probe or Probe(math.inf, 0.0)
-    gap = {"Rgap": circuit.Rgap, "Cgap": circuit.Cgap}
+    gap, series = {"Rgap": circuit.Rgap, "Cgap": circuit.Cgap}, circuit.series_resistor
     if isinstance(circuit, DirectGround):
         R = circuit.Rsc if circuit.grounding_Rsc is None else circuit.grounding_Rsc
         C = circuit.Csc if circuit.grounding_Csc is None else circuit.grounding_Csc
-        return DirectGround(*skin, _sum(circuit.R_H, circuit.series_resistor), R, C, None, probe, **gap)
+        return DirectGround(*skin, resistance(circuit.R_H, series), R, C, None, probe, **gap)
     if circuit.Z_capacitance is None:
-        return NaturalGround(*skin, _ABSENT, 0.0, _sum(circuit.Z, circuit.series_resistor), probe, **gap)
-    return NaturalGround(*skin, circuit.Z, circuit.Z_capacitance, _sum(circuit.series_resistor), probe, **gap)
+        return NaturalGround(*skin, absent, 0.0, resistance(circuit.Z, series), probe, **gap)
+    return NaturalGround(*skin, circuit.Z, circuit.Z_capacitance, resistance(series), probe, **gap)
 
 
-def _sum(*resistances: Any) -> Any:
-    return sum((resistance for resistance in resistances if resistance is not None), start=_ABSENT)
+def pad_rows(values: Any, precision: Any) -> np.ndarray:
+    """Fill up to as many rows as programs are compiled for."""
+    return compiled.pad_rows(np.atleast_1d(np.asarray(values, dtype=precision)), ROWS)
 
 
-def filled_up(values: Any, precision: Any) -> np.ndarray:
-    """As many rows as programs are compiled for, the first standing in for those that are missing."""
-    values = np.atleast_1d(np.asarray(values, dtype=precision))
-    return np.concatenate([values, np.broadcast_to(values[:1], (ROWS - len(values), *values.shape[1:]))])
-
-
-def terms(
+def partial_fractions(
     circuit: DirectGround | NaturalGround,
-    skin: Skin | None,
+    skin: SkinModel | None,
     drive: Drive,
     precision: type[np.floating[Any]],
     channel: Channel,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weights, time constants, and amplitudes of the harmonics that they miss."""
+    """Return weights, time constants, and amplitudes of the harmonics that they miss, each of `ROWS` circuits.
+
+    The gain at the harmonics is NumPy: a vmapped `harmonic_decomposition` takes 3 to 12 times as long to compile.
+    """
     if skin is None:
-        weight, tau = _constant_terms(circuit, channel)
+        weight, tau = _constant_skin_terms(circuit, channel)
         return weight, tau, np.zeros((ROWS, 0), dtype=complex)
     assert isinstance(drive, Periodic)
     frequency = float(drive.frequency)
     smooth = isinstance(drive, Sine | Multitone)
-    count = max(order for order, _, _ in tones(drive)) if smooth else max(1, skin.count(frequency))
+    if smooth:
+        count = max(drive.orders) if isinstance(drive, Multitone) else 1
+    else:
+        count = max(1, skin.harmonic_count(frequency))
     omega = 2.0 * np.pi * frequency * np.arange(1, count + 1)
     with jax.enable_x64(True):  # the drive's, whatever the precision of what follows
-        amplitude = np.asarray(_fourier(jax.tree.map(np.asarray, drive), _blocks(count) * _BLOCK))[:count]
-    gain = _gain(circuit, skin, omega, channel)
+        amplitude = np.asarray(_fourier(jax.tree.map(np.asarray, drive), _block_count(count) * _BLOCK))[:count]
+    gain = _transfer_function(circuit, skin, omega, channel)
     if smooth:
         return np.zeros((ROWS, 0)), np.zeros((ROWS, 0)), amplitude * gain
     if isinstance(skin, Fractional):
-        tau, x, fitted = spread(True, precision is np.float64)
-        above = _gain(circuit, skin, omega[-1] * x, channel)
+        tau, x, fitted = high_frequency_basis(True, precision is np.float64)
+        above = _transfer_function(circuit, skin, omega[-1] * x, channel)
         weight = np.concatenate([above.real, above.imag], axis=1) @ fitted.T
         tau = np.broadcast_to(tau / omega[-1], weight.shape)
     else:  # above 1000 Hz it is constant
-        weight, tau = _constant_terms(_at(WithSkin(circuit, skin), 1000.0), channel)
+        weight, tau = _constant_skin_terms(_evaluate_circuit(WithSkin(circuit, skin), 1000.0), channel)
     x = 1j * omega * tau[..., None]
     return weight, tau, amplitude * (gain - np.einsum("rk,rkh->rh", weight, x / (1.0 + x)))
 
 
-def _gain(circuit: DirectGround | NaturalGround, skin: Skin, omega: np.ndarray, channel: Channel) -> np.ndarray:
+def _transfer_function(
+    circuit: DirectGround | NaturalGround, skin: SkinModel, omega: np.ndarray, channel: Channel
+) -> np.ndarray:
     """Vsc / V, or Vgap / V, of circuits whose skins follow a level."""
     s = 1j * omega
 
@@ -100,19 +97,19 @@ def _gain(circuit: DirectGround | NaturalGround, skin: Skin, omega: np.ndarray, 
         R, C = (np.atleast_2d(np.asarray(x).T).T for x in element)
         return 1.0 / R + s * C
 
-    def of_skin(R: ArrayLike, C: ArrayLike) -> np.ndarray:
-        missing = _blocks(omega.size) * _BLOCK - omega.size
+    def skin_admittance(R: ArrayLike, C: ArrayLike) -> np.ndarray:
+        missing = _block_count(omega.size) * _BLOCK - omega.size
         blocks = np.pad(omega / (2.0 * np.pi), (0, missing), mode="edge").reshape(-1, _BLOCK)
         constant = Element(*(jnp.asarray(x)[:, None] for x in (R, C)))
-        parts = [_skin_at(skin, constant, block) for block in blocks]
+        parts = [_evaluate_skin(skin, constant, block) for block in blocks]
         return admittance(Element(*(np.concatenate(x, axis=1)[:, : omega.size] for x in zip(*parts, strict=True))))
 
     assert circuit.probe is not None
-    touching = 1.0 / (of_skin(circuit.Rsc, circuit.Csc) + admittance(Element(circuit.probe.R, circuit.probe.C)))
+    touching = 1.0 / (skin_admittance(circuit.Rsc, circuit.Csc) + admittance(Element(circuit.probe.R, circuit.probe.C)))
     if isinstance(circuit, NaturalGround):
         other = 1.0 / admittance(Element(circuit.Z, circuit.Z_capacitance))
     else:
-        other = 1.0 / of_skin(circuit.grounding_Rsc, circuit.grounding_Csc)
+        other = 1.0 / skin_admittance(circuit.grounding_Rsc, circuit.grounding_Csc)
     gap = (
         0.0
         if circuit.Cgap is None
@@ -122,37 +119,37 @@ def _gain(circuit: DirectGround | NaturalGround, skin: Skin, omega: np.ndarray, 
     return (touching if channel == "Vsc" else gap) / (touching + other + rest + gap)
 
 
-def _blocks(count: int) -> int:
+def _block_count(count: int) -> int:
     """In how many blocks frequencies are computed, so that programs are compiled for one size."""
     return -(-count // _BLOCK)
 
 
 @eqx.filter_jit
 def _fourier(drive: Drive, harmonics: int) -> Complex[Array, " harmonics"]:
-    return fourier(drive, harmonics)
+    return fourier_coefficients(drive, harmonics)
 
 
 @eqx.filter_jit
-def _skin_at(skin: Skin, element: Element, frequency: Array) -> Element:
-    return skin.at(element, frequency)
+def _evaluate_skin(skin: SkinModel, element: Element, frequency: Array) -> Element:
+    return skin.parallel_rc(element, frequency)
 
 
 @eqx.filter_jit
-def _at(circuit: WithSkin, frequency: float) -> Any:
-    return circuit.at(frequency)
+def _evaluate_circuit(circuit: WithSkin, frequency: float) -> Any:
+    return circuit.circuit_at_frequency(frequency)
 
 
-def _constant_terms(circuit: Any, channel: Channel) -> tuple[np.ndarray, np.ndarray]:
+def _constant_skin_terms(circuit: Any, channel: Channel) -> tuple[np.ndarray, np.ndarray]:
     """Of constant skins. Z stands in the loop where a grounding skin does, so one program serves both."""
     if isinstance(circuit, NaturalGround):
         loop = circuit.series_resistor, circuit.Z, circuit.Z_capacitance
         gap = {"Rgap": circuit.Rgap, "Cgap": circuit.Cgap}
         circuit = DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci, *loop, None, circuit.probe, **gap)
-    weight, tau = _constant(circuit, channel)
+    weight, tau = _batch_terms(circuit, channel)
     return np.asarray(weight), np.asarray(tau)
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _constant(circuit: DirectGround, channel: Channel) -> tuple[Array, Array]:
-    terms = jax.vmap(lambda one: one.terms_of(channel))(circuit)
+def _batch_terms(circuit: DirectGround, channel: Channel) -> tuple[Array, Array]:
+    terms = jax.vmap(lambda one: one.channel_terms(channel))(circuit)
     return jnp.stack(terms.weight, axis=1), jnp.stack(terms.tau, axis=1)

@@ -15,20 +15,20 @@ from jaxtyping import Float
 from fitact.model.circuit import FinalCircuit, NaturalGround
 from fitact.model.drive import Sampled
 from fitact.model_selection import omissions
-from fitact.model_selection.model_errors import Comparison, Reference
+from fitact.model_selection.model_errors import ReferenceModel
+from fitact.model_selection.omissions import drop_parameters
 from fitact.model_selection.partial_fractions import ROWS
 from fitact.scene.scene import Scene
-from fitact.units import engineering, percent
+from fitact.tables import align_row, join_lines
+from fitact.units import format_engineering, format_percent
 
-_NOT_OF_THE_CIRCUIT = ("sigma", "sigma_I")
-_QUANTILE = 0.95
 _TITLES = ("Vsc rms", "Vsc peak", "mean force", "peak force")
 LEGEND = "Relative errors at the nominal values; in brackets, what 95 % of the prior stay below."
 
 Values = Mapping[str, Float[np.ndarray, " draws"]]
 
 
-class Errors(NamedTuple):
+class RelativeErrors(NamedTuple):
     """Relative errors, against the full model."""
 
     Vsc_rms: float
@@ -38,7 +38,7 @@ class Errors(NamedTuple):
 
     @property
     def force(self) -> float:
-        """The larger of mean and peak force's."""
+        """The larger of the mean and the peak force's."""
         return max(self.force_mean, self.force_peak)
 
 
@@ -56,15 +56,15 @@ class Omission:
     """
 
     name: str
-    nominal: Errors
-    q95: Errors
+    nominal: RelativeErrors
+    q95: RelativeErrors
     speedup: float
     kept: bool
     because: str
 
     def to_dict(self) -> dict[str, Any]:
-        """An entry of `omissions` in `fitact plan --json`."""
-        errors = _named_errors(self.nominal, self.q95)
+        """Return an entry of `omissions` in `fitact plan --json`."""
+        errors = _errors_by_name(self.nominal, self.q95)
         return {"name": self.name} | errors | {"speedup": self.speedup, "kept": self.kept, "because": self.because}
 
 
@@ -84,8 +84,8 @@ class Plan:
     full: Scene
     scene: Scene
     omissions: tuple[Omission, ...]
-    nominal: Errors
-    q95: Errors
+    nominal: RelativeErrors
+    q95: RelativeErrors
     speedup: float
 
     @property
@@ -100,17 +100,18 @@ class Plan:
         if self.q95.force <= tolerance:
             return ()
         return (
-            f"over the prior the planned model errs by up to {percent(self.q95.force)} of the force (95 %), more than"
-            f" the tolerance of {percent(tolerance)}, which it keeps at the nominal values; narrow [prior], or lower"
-            " [tolerance] force",
+            f"over the prior the planned model errs by up to {format_percent(self.q95.force)} of the force (95 %),"
+            f" more than the tolerance of {format_percent(tolerance)}, which it keeps at the nominal values; narrow"
+            " [prior], or lower [tolerance] force",
         )
 
     def model(self) -> dict[str, Any]:
-        """The planned model, by name."""
+        """Describe the planned model, by name."""
         drive, circuit = self.scene.drive, self.scene.make_rc_circuit()
-        edges = {"square": "ideal", "trapezoid": engineering(drive.rise_time or 0.0, "s")}
+        natural = "natural" if isinstance(circuit, NaturalGround) else "direct"
+        edges = {"square": "ideal", "trapezoid": format_engineering(drive.rise_time or 0.0, "s")}
         return {
-            "circuit": _circuit(circuit),
+            "circuit": "final" if isinstance(circuit, FinalCircuit) else natural,
             "skin": self.scene.skin.level,
             "drive": drive.waveform,
             "edges": edges.get(drive.shape if drive.waveform == "burst" else drive.waveform, "none"),
@@ -119,35 +120,32 @@ class Plan:
             "response": "exact" if self.scene.skin.level == "constant" else "harmonics and time constants",
             "left_out": ", ".join(self.left_out),
             "tolerance": self.full.tolerance.force,
-            **_named_errors(self.nominal, self.q95),
+            **_errors_by_name(self.nominal, self.q95),
             "speedup": self.speedup,
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """What `fitact plan --json` prints."""
-        each = [omission.to_dict() for omission in self.omissions]
-        return {"omissions": each, "model": self.model(), "warnings": list(self.warnings)}
+        """Return what `fitact plan --json` prints."""
+        rows = [omission.to_dict() for omission in self.omissions]
+        return {"omissions": rows, "model": self.model(), "warnings": list(self.warnings)}
 
     def summary(self) -> str:
-        """The table for people, what is left out, and warnings."""
-        rows = [
-            f"{name:17}" + "".join(f"{error:>22}" for error in errors) + f"{speedup:>9}  {decision}".rstrip()
-            for name, *errors, speedup, decision in self.table
-        ]
-        return "\n".join([*rows, LEGEND, self.sentence, *(f"warning: {warning}" for warning in self.warnings)])
+        """Return the table for people, what is left out, and warnings."""
+        widths = (17, 22, 22, 22, 22, 9)
+        rows = [f"{align_row(cells, widths)}  {decision}".rstrip() for *cells, decision in self.table]
+        return join_lines([*rows, LEGEND, self.sentence], self.warnings)
 
     @property
     def table(self) -> tuple[tuple[str, ...], ...]:
         """Titles; then errors and speed of every omission and of the planned model, and why, for people."""
-        decisions = [f"{'kept' if each.kept else 'left out'}: {each.because}" for each in self.omissions]
-        return (
-            ("omission", *_TITLES, "speedup", "decision"),
-            *(
-                (*_cells(o.name, o.nominal, o.q95, o.speedup), why)
-                for o, why in zip(self.omissions, decisions, strict=True)
-            ),
-            (*_cells("planned model", self.nominal, self.q95, self.speedup), ""),
-        )
+
+        def cells(name: str, row: Omission | Plan, decision: str) -> tuple[str, ...]:
+            errors = zip(row.nominal, row.q95, strict=True)
+            shown = (f"{format_percent(nominal)} ({format_percent(q95)})" for nominal, q95 in errors)
+            return name, *shown, f"{row.speedup:.2f}x", decision
+
+        rows = [cells(o.name, o, f"{'kept' if o.kept else 'left out'}: {o.because}") for o in self.omissions]
+        return ("omission", *_TITLES, "speedup", "decision"), *rows, cells("planned model", self, "")
 
     @property
     def sentence(self) -> str:
@@ -155,23 +153,23 @@ class Plan:
         if not self.left_out:
             return "Nothing is left out."
         return (
-            f"Left out: {', '.join(self.left_out)}; that changes the peak of Vsc by {percent(self.nominal.Vsc_peak)},"
-            f" the mean force by {percent(self.nominal.force_mean)} and the peak force by"
-            f" {percent(self.nominal.force_peak)} (tolerance {percent(self.full.tolerance.force)}), and is"
-            f" {self.speedup:.2g} times faster."
-            " This is judged by the force; parameters are those of the smaller circuit."
+            f"Left out: {', '.join(self.left_out)}; that changes the peak of Vsc by"
+            f" {format_percent(self.nominal.Vsc_peak)}, the mean force by {format_percent(self.nominal.force_mean)} and"
+            f" the peak force by {format_percent(self.nominal.force_peak)} (tolerance"
+            f" {format_percent(self.full.tolerance.force)}), and is {self.speedup:.2g} times faster. This is judged"
+            " by the force; parameters are those of the smaller circuit."
         )
 
     __str__ = summary
 
 
 def plan(scene: Scene, measured: Sampled | None = None) -> Plan:
-    """The cheapest model of a scene that keeps `[tolerance] force`, among all combinations of omissions.
+    """Find the cheapest model of a scene that keeps `[tolerance] force`, among all combinations of omissions.
 
     The tolerance bounds the larger of mean and peak force's error at the scene's nominal values; where 95 % of the
     prior do not keep it, the plan warns. Errors are those over one period of the steady state, or over the scene's
     duration from rest, or over the samples of `measured`, a drive that takes the place of the scene's. Costs are those
-    of `fitact.model_selection.omissions.cost`. What saves nothing is kept.
+    of `fitact.model_selection.omissions.evaluation_cost`. What saves nothing is kept.
 
     Raises:
         InputError: the scene has no drive of its own (waveform = 'measured') and `measured` is not given, or asks for
@@ -179,98 +177,81 @@ def plan(scene: Scene, measured: Sampled | None = None) -> Plan:
     """
     scene.require_available()
     if measured is not None:
-        scene = omissions.driven(scene)
-    values = _values(scene)
-    nominal = {name: each[:1] for name, each in values.items()}
-    reference = Reference(scene, values, measured)
-    names = omissions.named(scene)
-    reasons = {name: omissions.required(scene, name) for name in names}
-    whole, tolerance = omissions.cost(scene, nominal), scene.tolerance.force
-    best = _cheapest(scene, nominal, reference, tuple(name for name in names if not reasons[name]), tolerance)
+        scene = omissions.with_measured_drive(scene)
+    values = _circuit_values(scene)
+    nominal = {name: draws[:1] for name, draws in values.items()}
+    reference = ReferenceModel(scene, values, measured)
+    names = omissions.applicable_omissions(scene)
+    reasons = {name: omissions.reason_to_keep(scene, name) for name in names}
+    whole, tolerance = omissions.evaluation_cost(scene, nominal), scene.tolerance.force
+    best = _cheapest_omissions(scene, nominal, reference, tuple(name for name in names if not reasons[name]), tolerance)
 
-    def judged(left_out: tuple[str, ...]) -> tuple[Errors, Errors, float]:
-        reduced = omissions.without(scene, left_out, prior=False)
-        errors = _errors(reference.compare(reduced, _left(values, left_out)))
-        return *errors, whole / omissions.cost(reduced, _left(nominal, left_out))
+    def evaluate_omissions(left_out: tuple[str, ...]) -> tuple[RelativeErrors, RelativeErrors, float]:
+        reduced = omissions.reduce_scene(scene, left_out, prior=False)
+        errors = _summarize_errors(reference.compare(reduced, drop_parameters(values, left_out)))
+        return *errors, whole / omissions.evaluation_cost(reduced, drop_parameters(nominal, left_out))
 
     rows = []
     for name in names:
-        at_nominal, q95, speedup = judged((name,))
-        because = reasons[name] or _because(name in best, at_nominal.force, tolerance, speedup)
+        at_nominal, q95, speedup = evaluate_omissions((name,))
+        because = reasons[name] or _decision_reason(name in best, at_nominal.force, tolerance, speedup)
         rows.append(Omission(name, at_nominal, q95, speedup, name not in best, because))
-    single = _errors(reference.compare(scene, values, np.float32))
-    rows.append(Omission("float64", *single, omissions.SINGLE_SPEEDUP, True, "fits and sampling need its derivatives"))
-    return Plan(scene, omissions.without(scene, best), tuple(rows), *judged(best))
+    single = _summarize_errors(reference.compare(scene, values, np.float32))
+    rows.append(Omission("float64", *single, omissions.FLOAT32_SPEEDUP, True, "fits and sampling need its derivatives"))
+    return Plan(scene, omissions.reduce_scene(scene, best), tuple(rows), *evaluate_omissions(best))
 
 
-def _cheapest(
-    scene: Scene, nominal: Values, reference: Reference, names: tuple[str, ...], tolerance: float
+def _cheapest_omissions(
+    scene: Scene, nominal: Values, reference: ReferenceModel, names: tuple[str, ...], tolerance: float
 ) -> tuple[str, ...]:
-    """The combination of least cost that keeps the tolerance; of several the one that leaves out, then errs, least."""
+    """Find the cheapest combination that keeps the tolerance; of several that which leaves out, then errs, least."""
     combinations = [c for size in range(len(names) + 1) for c in itertools.combinations(names, size)]
-    scenes = {c: omissions.without(scene, c, prior=False) for c in combinations}
-    rank = {c: (omissions.cost(reduced, _left(nominal, c)), len(c)) for c, reduced in scenes.items()}
-    for _, group in itertools.groupby(sorted(combinations, key=lambda c: rank[c]), key=lambda c: rank[c]):
-        force = {c: _errors(reference.compare(scenes[c], _left(nominal, c)))[0].force for c in group}
-        found = min(force, key=lambda c: force[c])
-        if force[found] <= tolerance:
-            return found
+    scenes = {c: omissions.reduce_scene(scene, c, prior=False) for c in combinations}
+    rank = {c: (omissions.evaluation_cost(scenes[c], drop_parameters(nominal, c)), len(c)) for c in combinations}
+
+    def force_error(c: tuple[str, ...]) -> float:
+        return _summarize_errors(reference.compare(scenes[c], drop_parameters(nominal, c)))[0].force
+
+    for _, group in itertools.groupby(sorted(combinations, key=rank.__getitem__), key=rank.__getitem__):
+        errors = {c: force_error(c) for c in group}
+        best = min(errors, key=errors.__getitem__)
+        if errors[best] <= tolerance:
+            return best
     return ()
 
 
-def _values(scene: Scene) -> dict[str, Float[np.ndarray, " draws"]]:
-    """The circuit's parameters: the scene's nominal ones, then draws spread evenly over its prior."""
+def _circuit_values(scene: Scene) -> dict[str, Float[np.ndarray, " draws"]]:
+    """Return the circuit's parameters: the scene's nominal ones, then draws spread evenly over its prior."""
     prior = scene.make_prior()
-    stated = {name: value for name, value in scene.nominal().items() if value is not None}
-    believed = {
+    stated = {name: value for name, value in scene.nominal_values().items() if value is not None}
+    values = {
         name: np.append(np.exp(marginal.log_mean), draws)
-        for (name, draws), marginal in zip(prior.spread(ROWS - 1).items(), prior.marginals, strict=True)
+        for (name, draws), marginal in zip(prior.sample_qmc(ROWS - 1).items(), prior.marginals, strict=True)
     }
-    believed |= {name: np.full(ROWS, value) for name, value in scene.fixed().items()}
-    believed |= {name: ratio * believed[other] for name, (other, ratio) in scene.prior.tied().items()}
-    return {
-        name: np.append(stated.get(name, each[0]), each[1:])
-        for name, each in believed.items()
-        if name not in _NOT_OF_THE_CIRCUIT
-    }
+    values |= {name: np.full(ROWS, value) for name, value in scene.fixed_values().items()}
+    values |= {name: ratio * values[other] for name, (other, ratio) in scene.prior.ties().items()}
+    for name in ("sigma", "sigma_I"):
+        values.pop(name, None)
+    return {name: np.append(stated.get(name, draws[0]), draws[1:]) for name, draws in values.items()}
 
 
-def _left(values: Values, names: tuple[str, ...]) -> dict[str, Float[np.ndarray, " draws"]]:
-    """Without the parameters that go with these omissions."""
-    gone = set().union(*(omissions.parameters(name) for name in names))
-    return {name: each for name, each in values.items() if name not in gone}
+def _summarize_errors(errors: Float[np.ndarray, "4 circuits"]) -> tuple[RelativeErrors, RelativeErrors]:
+    """Return those at the nominal values, which come first, and the 95 % quantiles of the others."""
+    q95 = np.quantile(errors[:, 1:], 0.95, axis=1) if errors.shape[1] > 1 else np.zeros(4)
+    return RelativeErrors(*errors[:, 0].tolist()), RelativeErrors(*q95.tolist())
 
 
-def _errors(comparison: Comparison) -> tuple[Errors, Errors]:
-    """Those at the nominal values, which come first, and the 95 % quantiles of the others."""
-    return (
-        Errors(*(float(each[0]) for each in comparison)),
-        Errors(*(float(np.quantile(each[1:], _QUANTILE)) if len(each) > 1 else 0.0 for each in comparison)),
-    )
-
-
-def _because(left_out: bool, error: float, tolerance: float, speedup: float) -> str:
+def _decision_reason(left_out: bool, error: float, tolerance: float, speedup: float) -> str:
     if left_out:
         return "keeps the tolerance"
     if error > tolerance:
-        return f"{percent(error)} of the force, more than {percent(tolerance)}"
+        return f"{format_percent(error)} of the force, more than {format_percent(tolerance)}"
     return "saves nothing" if speedup == 1.0 else "too much together with the others, or saves nothing then"
 
 
-def _circuit(circuit: Any) -> str:
-    if isinstance(circuit, FinalCircuit):
-        return "final"
-    return "natural" if isinstance(circuit, NaturalGround) else "direct"
-
-
-def _named_errors(nominal: Errors, q95: Errors) -> dict[str, float]:
+def _errors_by_name(nominal: RelativeErrors, q95: RelativeErrors) -> dict[str, float]:
     return {
         f"error_{name}{suffix}": getattr(errors, name)
         for suffix, errors in (("", nominal), ("_q95", q95))
-        for name in Errors._fields
+        for name in RelativeErrors._fields
     }
-
-
-def _cells(name: str, nominal: Errors, q95: Errors, speedup: float) -> tuple[str, ...]:
-    errors = (f"{percent(a)} ({percent(b)})" for a, b in zip(nominal, q95, strict=True))
-    return name, *errors, f"{speedup:.2f}x"

@@ -21,17 +21,17 @@ class Covariates:
     Attributes:
         names: of the covariates.
         mean, sd: over the fingers.
-        standard: less their mean, over their standard deviation.
+        z_scores: less their mean, over their standard deviation.
     """
 
     names: tuple[str, ...]
     mean: Float[np.ndarray, " covariates"]
     sd: Float[np.ndarray, " covariates"]
-    standard: Float[np.ndarray, "fingers covariates"]
+    z_scores: Float[np.ndarray, "fingers covariates"]
 
     @classmethod
-    def of(cls, values: Mapping[str, Sequence[float]], fingers: int) -> Self:
-        """From a number for each finger.
+    def from_values(cls, values: Mapping[str, Sequence[float]], fingers: int) -> Self:
+        """Standardise a number of each finger by every name.
 
         Raises:
             InputError: they are not as many, not finite, all the same, or follow from each other.
@@ -45,30 +45,30 @@ class Covariates:
                 raise InputError(f"covariate {name}: all fingers have the same value, which tells nothing; drop it")
         table = np.array([values[name] for name in values], dtype=float).reshape(len(values), fingers).T
         mean, sd = table.mean(axis=0), table.std(axis=0)
-        standard = (table - mean) / sd
-        if np.linalg.matrix_rank(np.column_stack([np.ones(fingers), standard])) <= len(values):
+        z_scores = (table - mean) / sd
+        if np.linalg.matrix_rank(np.column_stack([np.ones(fingers), z_scores])) <= len(values):
             raise InputError(
                 f"covariates {', '.join(values)}: one follows from the others over these {fingers} fingers; drop one,"
                 " or measure more fingers"
             )
-        return cls(tuple(values), mean, sd, standard)
+        return cls(tuple(values), mean, sd, z_scores)
 
-    def standardised(self, at: Mapping[str, float]) -> Float[np.ndarray, " covariates"]:
-        """Values in standard deviations from the mean; 0 where none is given.
+    def standardize(self, raw_values: Mapping[str, float]) -> Float[np.ndarray, " covariates"]:
+        """Express values in standard deviations from the mean; 0 where none is given.
 
         Raises:
             InputError: a name is none of the covariates.
         """
-        unknown = [name for name in at if name not in self.names]
+        unknown = [name for name in raw_values if name not in self.names]
         if unknown:
             known = ", ".join(self.names) or "none"
             raise InputError(f"covariate {unknown[0]}: is not among those of the records ({known}); check its name")
-        values = np.array([at.get(name, mean) for name, mean in zip(self.names, self.mean, strict=True)])
+        values = np.array([raw_values.get(name, mean) for name, mean in zip(self.names, self.mean, strict=True)])
         return (values - self.mean) / self.sd
 
 
 def read_covariates(path: Path, records: Sequence[Path]) -> dict[str, list[float]]:
-    """From a CSV with a column `record` (file names) and a numeric column a covariate, in the order of `records`.
+    """Read a CSV with a column `record` (file names) and a numeric column a covariate, in the order of `records`.
 
     Raises:
         InputError: it cannot be read, or lacks a record or a number.
@@ -81,20 +81,20 @@ def read_covariates(path: Path, records: Sequence[Path]) -> dict[str, list[float
     names = [name for name in (rows[0] if rows else {}) if name and name != _KEY]
     if not rows or _KEY not in rows[0] or not names:
         raise InputError(f"{path}: needs a column 'record' with file names, and a column for each covariate")
-    of_record: dict[str, dict[str, str]] = {}
+    rows_by_record: dict[str, dict[str, str]] = {}
     for line, row in enumerate(rows, 2):
         key = Path(str(row[_KEY]).strip()).name
-        if key in of_record:
+        if key in rows_by_record:
             raise InputError(f"{path}, line {line}: {key} has a row already; keep one")
-        of_record[key] = row
-    found: dict[str, list[float]] = {name: [] for name in names}
+        rows_by_record[key] = row
+    values: dict[str, list[float]] = {name: [] for name in names}
     for record in records:
-        if record.name not in of_record:
+        if record.name not in rows_by_record:
             raise InputError(f"{path}: has no row for {record.name}; add one, or leave the record out")
         for name in names:
-            text = of_record[record.name][name]
+            text = rows_by_record[record.name][name]
             try:
-                found[name].append(float(text))
+                values[name].append(float(text))
             except (TypeError, ValueError):
                 raise InputError(f"{path}: {name} of {record.name} is {text!r}, not a number; write one") from None
-    return found
+    return values

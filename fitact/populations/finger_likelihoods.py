@@ -19,19 +19,17 @@ import scipy.special
 import scipy.stats
 from jaxtyping import Array, Float
 
+from fitact.compiled import BatchEvaluator
 from fitact.errors import InputError
-from fitact.likelihood.likelihood import Batched, Likelihood
-from fitact.populations.finger import SHARED, SKIN, Finger
+from fitact.likelihood.likelihood import Likelihood
+from fitact.populations.finger import SHARED_PARAMETER, SKIN, Finger
 from fitact.prior.distributions import Distribution
-from fitact.sampling.proposal import DEGREES, Proposal
+from fitact.sampling.proposal import DEGREES_OF_FREEDOM, student_log_density
 
-REACH = 8.0  # standard deviations of log Ci that the tables hold
-_AREA = 1.0  # of an area's logarithm: the widest that the tables allow for
-_BATCH = 128  # points evaluated at a time
-_IMPOSSIBLE = -1e6  # log-weight of a draw that some nuisance's prior forbids, or a compression does not reach
+TABLE_HALF_WIDTH = 8.0  # standard deviations of log Ci that the tables hold
 
 
-class Law(NamedTuple):
+class PopulationParameters(NamedTuple):
     """How fingers of a population are distributed.
 
     Attributes:
@@ -50,47 +48,47 @@ class Law(NamedTuple):
     area: Float[Array, ""] | None = None
     slopes: Float[Array, "covariates 2"] | None = None
 
-    def at(self, covariates: Float[Array, "*shape covariates"]) -> Self:
-        """The law of fingers with those (standardised) covariates, its median of shape (*shape, 2)."""
+    def shift_medians(self, covariates: Float[Array, "*shape covariates"]) -> Self:
+        """Give the law of fingers with those (standardised) covariates, its median of shape (*shape, 2)."""
         return self if self.slopes is None else self._replace(median=self.median + covariates @ self.slopes)
 
     def log_density(self, skin: Float[Array, "*shape 2"]) -> Float[Array, "*shape"]:
-        """Of log Rsc and log Csc, at the median area, up to a constant."""
+        """Evaluate the density of log Rsc and log Csc, at the median area, up to a constant."""
         first, second = jnp.moveaxis((skin - self.median) / self.log_sd, -1, 0)
         rest = 1.0 - jnp.square(self.correlation)
         squares = jnp.square(first) + jnp.square(second - self.correlation * first) / rest
         return -0.5 * squares - jnp.sum(jnp.log(self.log_sd)) - 0.5 * jnp.log(rest)
 
 
-class Fingers(eqx.Module):
+class FingerLikelihoods(eqx.Module):
     """Weighted draws of several fingers, as tables in log Ci.
 
     Attributes:
         skin: log Rsc and log Csc of each draw at `center`.
         slope: how they move with log Ci.
-        center, reach: of the tables in log Ci.
+        center, half_width: of the tables in log Ci.
         weight: Chebyshev coefficients of the log-weights.
         precision: of log Ci, by each record alone.
-        pull: precision times how far the record wants log Ci from `center`.
-        deviate: standard normal numbers that draw the fingers' areas.
-        normal: log-weights of the draws under the normal likelihood, at `center`.
+        weighted_offset: precision times how far the record wants log Ci from `center`.
+        area_deviates: standard normal numbers that draw the fingers' areas.
+        normal_log_weight: log-weights of the draws under the normal likelihood, at `center`.
         mean, covariance: of log Rsc and log Csc by that.
     """
 
     skin: Float[Array, "fingers draws 2"]
     slope: Float[Array, "fingers 1 2"]
     center: Float[Array, "fingers 1"]
-    reach: Float[Array, "fingers 1"]
+    half_width: Float[Array, "fingers 1"]
     weight: Float[Array, "fingers draws terms"]
     precision: Float[Array, "fingers 1"]
-    pull: Float[Array, "fingers 1"]
-    deviate: Float[Array, "fingers draws"]
-    normal: Float[Array, "fingers draws"]
+    weighted_offset: Float[Array, "fingers 1"]
+    area_deviates: Float[Array, "fingers draws"]
+    normal_log_weight: Float[Array, "fingers draws"]
     mean: Float[Array, "fingers 2"]
     covariance: Float[Array, "fingers 2 2"]
 
     @classmethod
-    def tabulated(
+    def from_fingers(
         cls,
         fingers: Sequence[Finger],
         prior: Distribution,
@@ -99,122 +97,128 @@ class Fingers(eqx.Module):
         draws: int,
         terms: int,
         seed: Sequence[int],
+        max_log_sd_area: float = 1.0,
     ) -> Self:
-        """Tables of `terms`, wherever the records and the panel's `prior` allow log Ci to be."""
+        """Tabulate `terms`, wherever the records and the panel's `prior` allow log Ci to be.
+
+        `max_log_sd_area`: of an area's logarithm, the widest that the tables allow for.
+        """
         tables = []
-        center, reach = _weighed(fingers, prior.log_mean, prior.log_sd)
-        for each, child in zip(fingers, np.random.SeedSequence(seed).spawn(len(fingers)), strict=True):
+        center, half_width = _log_Ci_interval(fingers, prior.log_mean, prior.log_sd)
+        for finger, child in zip(fingers, np.random.SeedSequence(seed).spawn(len(fingers)), strict=True):
             if area_varies:
-                center, reach = _weighed([each], prior.log_mean, math.hypot(prior.log_sd, _AREA))
-            student = Proposal(np.zeros(each.place.size + area_varies), np.eye(each.place.size + area_varies))
-            tables.append(_table(each, center, reach, student, draws, terms, np.random.default_rng(child)))
+                log_sd = math.hypot(prior.log_sd, max_log_sd_area)
+                center, half_width = _log_Ci_interval([finger], prior.log_mean, log_sd)
+            size = finger.conditional_mean.size + area_varies
+            deviates = _sobol_student_t(size, draws, np.random.default_rng(child))
+            tables.append(_tabulate_finger(finger, center, half_width, deviates, terms))
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *tables)
 
-    def log_likelihood(self, law: Law) -> Float[Array, " fingers"]:
-        """Of each finger under a law, up to a constant; -inf beyond the tables.
+    def log_likelihood(self, parameters: PopulationParameters) -> Float[Array, " fingers"]:
+        """Evaluate the log-likelihood of each finger under a law, up to a constant; -inf beyond the tables.
 
         That of the normal likelihood is known in closed form; the draws say by what factor the exact one differs, which
         takes most of their noise away where a law is narrower than they are apart.
         """
-        log_Ci, value = jnp.broadcast_to(law.log_Ci, self.deviate.shape), jnp.zeros(())
-        if law.area is not None:
+        log_Ci, value = jnp.broadcast_to(parameters.log_Ci, self.area_deviates.shape), jnp.zeros(())
+        if parameters.area is not None:
             # given the law, log Ci of a finger is normal, but for what the tables correct
-            precision, middle = self._of_areas(law.log_Ci, law.area)
-            log_Ci = self.center + middle + self.deviate / jnp.sqrt(precision)
-            value = -0.5 * jnp.square((log_Ci - law.log_Ci) / law.area) - jnp.log(law.area) - 0.5 * jnp.log(precision)
+            precision, middle = self._log_Ci_moments(parameters.log_Ci, parameters.area)
+            log_Ci = self.center + middle + self.area_deviates / jnp.sqrt(precision)
+            value = (
+                -0.5 * jnp.square((log_Ci - parameters.log_Ci) / parameters.area)
+                - jnp.log(parameters.area)
+                - 0.5 * jnp.log(precision)
+            )
         off = log_Ci - self.center
-        own = self.skin + self.slope * off[..., None]
-        skin = own + jnp.array([1.0, -1.0]) * (log_Ci - law.log_Ci)[..., None]
-        value, at = value + law.log_density(skin), off / self.reach
-        exact = value + jnp.where(jnp.abs(at) <= 1.0, _series(self.weight, at), -jnp.inf)
-        normal = value + self.normal + self.pull * off - 0.5 * self.precision * jnp.square(off)
+        skin = self.skin + self.slope * off[..., None]
+        skin = skin + jnp.array([1.0, -1.0]) * (log_Ci - parameters.log_Ci)[..., None]
+        value, x = value + parameters.log_density(skin), off / self.half_width
+        exact = value + jnp.where(jnp.abs(x) <= 1.0, _chebyshev_series(self.weight, x), -jnp.inf)
+        normal = value + self.normal_log_weight + self.weighted_offset * off - 0.5 * self.precision * jnp.square(off)
         factor = jax.nn.logsumexp(exact, axis=1) - jax.nn.logsumexp(normal, axis=1)
-        return self._normal_log_likelihood(law) + factor
+        return self._normal_log_likelihood(parameters) + factor
 
-    def _of_areas(self, log_Ci: Array, area: Array) -> tuple[Float[Array, "fingers 1"], Float[Array, "fingers 1"]]:
-        """Precision of log Ci of each finger, and its mean from `center`, where areas differ by `area`."""
+    def _log_Ci_moments(
+        self, log_Ci: Array, area: Array
+    ) -> tuple[Float[Array, "fingers 1"], Float[Array, "fingers 1"]]:
+        """Compute each finger's precision of log Ci, and its mean from `center`, where areas differ by `area`."""
         precision = self.precision + area**-2
-        return precision, (self.pull + (log_Ci - self.center) * area**-2) / precision
+        return precision, (self.weighted_offset + (log_Ci - self.center) * area**-2) / precision
 
-    def _normal_log_likelihood(self, law: Law) -> Float[Array, " fingers"]:
-        """Of the normal likelihood under a law, up to a constant."""
-        off = law.log_Ci - self.center
-        between = jnp.outer(law.log_sd, law.log_sd) * jnp.where(jnp.eye(2) == 1.0, 1.0, law.correlation)
+    def _normal_log_likelihood(self, parameters: PopulationParameters) -> Float[Array, " fingers"]:
+        off = parameters.log_Ci - self.center
+        correlations = jnp.where(jnp.eye(2) == 1.0, 1.0, parameters.correlation)
+        between = jnp.outer(parameters.log_sd, parameters.log_sd) * correlations
         covariance, mean = self.covariance + between, self.mean + self.slope[:, 0] * off
-        value = self.pull * off - 0.5 * self.precision * jnp.square(off)
-        if law.area is not None:
-            precision, middle = self._of_areas(law.log_Ci, law.area)
+        value = self.weighted_offset * off - 0.5 * self.precision * jnp.square(off)
+        if parameters.area is not None:
+            precision, middle = self._log_Ci_moments(parameters.log_Ci, parameters.area)
             area = jnp.array([1.0, -1.0])
             along = self.slope[:, 0] + area
             covariance = covariance + along[:, :, None] * along[:, None, :] / precision[..., None]
             mean = self.mean + self.slope[:, 0] * middle + area * (middle - off)
-            value = 0.5 * precision * jnp.square(middle) - 0.5 * jnp.square(off / law.area)
-            value = value - jnp.log(law.area) - 0.5 * jnp.log(precision)
-        left = mean - law.median.reshape(-1, 2)
+            value = 0.5 * precision * jnp.square(middle) - 0.5 * jnp.square(off / parameters.area)
+            value = value - jnp.log(parameters.area) - 0.5 * jnp.log(precision)
+        first, second = (mean - parameters.median.reshape(-1, 2)).T
         (xx, xy), (_, yy) = jnp.moveaxis(covariance, 0, -1)
         determinant = xx * yy - jnp.square(xy)
-        squares = yy * left[:, 0] ** 2 - 2.0 * xy * left[:, 0] * left[:, 1] + xx * left[:, 1] ** 2
+        squares = yy * first**2 - 2.0 * xy * first * second + xx * second**2
         return value[:, 0] - 0.5 * (squares / determinant + jnp.log(determinant))
 
 
-def _spread_out(size: int, draws: int, random: np.random.Generator) -> Float[np.ndarray, "draws size"]:
-    """Draws of a `Proposal` of no mean and unit axes by Sobol's scrambled sequence: fewer hold an integral as well."""
+def _sobol_student_t(size: int, draws: int, random: np.random.Generator) -> Float[np.ndarray, "draws size"]:
+    """Draw a standard Student-t by Sobol's scrambled sequence: fewer draws hold an integral as well."""
     uniform = scipy.stats.qmc.Sobol(size + 1, rng=random).random(draws)
-    chi_square = scipy.stats.chi2.ppf(uniform[:, -1:], DEGREES)
-    return scipy.special.ndtri(uniform[:, :-1]) * np.sqrt(DEGREES / chi_square)
+    chi_square = scipy.stats.chi2.ppf(uniform[:, -1:], DEGREES_OF_FREEDOM)
+    return scipy.special.ndtri(uniform[:, :-1]) * np.sqrt(DEGREES_OF_FREEDOM / chi_square)
 
 
-def _series(weight: Float[Array, "fingers draws terms"], at: Float[Array, "fingers draws"]) -> Array:
-    """Chebyshev series, by Clenshaw's recurrence."""
-    later, latest = jnp.zeros_like(at), jnp.zeros_like(at)
+def _chebyshev_series(weight: Float[Array, "fingers draws terms"], x: Float[Array, "fingers draws"]) -> Array:
+    """Sum Chebyshev series, by Clenshaw's recurrence."""
+    later, latest = jnp.zeros_like(x), jnp.zeros_like(x)
     for k in range(weight.shape[-1] - 1, 0, -1):
-        latest, later = 2.0 * at * latest - later + weight[..., k], latest
-    return at * latest - later + weight[..., 0]
+        latest, later = 2.0 * x * latest - later + weight[..., k], latest
+    return x * latest - later + weight[..., 0]
 
 
-def _weighed(fingers: Sequence[Finger], mean: float, sd: float) -> tuple[float, float]:
-    """Where log Ci may lie by records and a normal prior, and how far from there."""
-    precision = sd**-2 + sum(each.precision for each in fingers)
-    pull = sum(each.pull + each.precision * (each.center - mean) for each in fingers)
-    return mean + pull / precision, REACH / math.sqrt(precision)
+def _log_Ci_interval(fingers: Sequence[Finger], mean: float, sd: float) -> tuple[float, float]:
+    """Find the middle and half of the width of where log Ci may lie by records and a normal prior."""
+    precision = sd**-2 + sum(finger.precision for finger in fingers)
+    offset = sum(finger.weighted_offset + finger.precision * (finger.center - mean) for finger in fingers)
+    return mean + offset / precision, TABLE_HALF_WIDTH / math.sqrt(precision)
 
 
-def _table(
-    finger: Finger,
-    center: float,
-    reach: float,
-    student: Proposal,
-    draws: int,
-    terms: int,
-    random: np.random.Generator,
-) -> Fingers:
-    """Of one finger, for log Ci within `reach` of `center`; a deviate beyond its own coordinates draws its area."""
-    own = finger.place.size
-    deviates = _spread_out(student.center.size, draws, random)
+def _tabulate_finger(
+    finger: Finger, center: float, half_width: float, deviates: Float[np.ndarray, "draws size"], terms: int
+) -> FingerLikelihoods:
+    """Tabulate a finger for log Ci within `half_width` of `center`; a deviate beyond its own draws its area."""
+    own, draws = finger.conditional_mean.size, len(deviates)
+    z, shared = deviates[:, :own], finger.names.index(SHARED_PARAMETER)
     nodes = np.cos(np.pi * (np.arange(terms) + 0.5) / terms)
-    points = np.stack([finger.at(center + reach * x, deviates[:, :own]) for x in nodes])
-    log_prob = Batched(Likelihood.log_prob, finger.likelihood, finger.likelihood.rows, _BATCH)
-    values = log_prob(points.reshape(-1, points.shape[-1]))
-    density = student.log_density(deviates)
-    values = values.reshape(terms, draws) - density
+    points = np.stack([finger.from_standard_normal(center + half_width * x, z) for x in nodes])
+    log_prob = BatchEvaluator(Likelihood.log_prob, finger.likelihood, finger.likelihood.rows, batch=128)
+    log_density = student_log_density(deviates)
+    values = log_prob(points.reshape(-1, points.shape[-1])).reshape(terms, draws) - log_density
     possible = np.isfinite(values).all(axis=0)
     if not possible.any():
         raise InputError(f"{finger.source}: the record leaves Rsc and Csc too open for a population; leave it out")
-    values = np.where(possible, values - np.max(values[:, possible]), _IMPOSSIBLE)
+    # some nuisance's prior forbids the others, or a compression does not reach them
+    values = np.where(possible, values - np.max(values[:, possible]), -1e6)
     skin = [finger.names.index(name) for name in SKIN]
-    at_center = finger.at(center, np.vstack([np.zeros(own), deviates[:, :own]]))[:, skin]
-    root = np.insert(finger.root, finger.names.index(SHARED), 0.0, axis=0)[skin]
+    at_center = finger.from_standard_normal(center, np.vstack([np.zeros(own), z]))[:, skin]
+    factor = np.insert(finger.covariance_factor, shared, 0.0, axis=0)[skin]
     off = center - finger.center
-    return Fingers(
+    return FingerLikelihoods(
         skin=jnp.asarray(at_center[1:]),
-        slope=jnp.asarray(np.insert(finger.slope, finger.names.index(SHARED), 1.0)[None, skin]),
+        slope=jnp.asarray(np.insert(finger.slope, shared, 1.0)[None, skin]),
         center=jnp.array([center]),
-        reach=jnp.array([reach]),
+        half_width=jnp.array([half_width]),
         weight=jnp.asarray(np.polynomial.chebyshev.chebfit(nodes, values, terms - 1).T),
         precision=jnp.array([finger.precision]),
-        pull=jnp.array([finger.pull - finger.precision * off]),
-        deviate=jnp.asarray(deviates[:, -1] if deviates.shape[1] > own else np.zeros(draws)),
-        normal=jnp.asarray(-0.5 * np.sum(np.square(deviates[:, :own]), axis=1) - density),
+        weighted_offset=jnp.array([finger.weighted_offset - finger.precision * off]),
+        area_deviates=jnp.asarray(deviates[:, -1] if deviates.shape[1] > own else np.zeros(draws)),
+        normal_log_weight=jnp.asarray(-0.5 * np.sum(np.square(z), axis=1) - log_density),
         mean=jnp.asarray(at_center[0]),
-        covariance=jnp.asarray(root @ root.T),
+        covariance=jnp.asarray(factor @ factor.T),
     )

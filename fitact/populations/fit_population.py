@@ -12,30 +12,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from fitact.compiled import BatchEvaluator
 from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.fitting.fit import fit
-from fitact.likelihood.likelihood import Batched
 from fitact.populations.covariates import Covariates
-from fitact.populations.finger import SHARED, SKIN, Finger
-from fitact.populations.finger_likelihoods import Fingers
+from fitact.populations.finger import SHARED_PARAMETER, SKIN, Finger
+from fitact.populations.finger_likelihoods import FingerLikelihoods
 from fitact.populations.hierarchy import Hierarchy, laplace
-from fitact.populations.next_finger import AREA, NewFinger
-from fitact.populations.population import OFF, Population, laws, log_medians
+from fitact.populations.next_finger import AREA, NewFingerModel
+from fitact.populations.population import MAX_INTEGRATION_ERROR, Population, evaluate_parameters, log_medians
 from fitact.prior.prior import Prior
-from fitact.progress import watched
+from fitact.progress import track_progress
 from fitact.sampling.convergence import Convergence
-from fitact.sampling.ensemble import Target, finite, run
+from fitact.sampling.ensemble import Target, reject_nonfinite, run_ensembles
 from fitact.sampling.proposal import Proposal
 from fitact.scene.scene import Scene
 
-_WALKERS, _ENSEMBLES = 128, 4
-_KEPT = 2500  # points per ensemble
-_DRAWS = {64: "chain.h5", 1024: "chain_1024.h5"}  # in the fingers' tables, and where so few turn out to be too few
-_LEAST_CHECKED = 256  # other draws that these are checked against
-_TERMS, _MORE_TERMS = 9, 13  # of the tables, and of those that they are checked against
-_CHECKED = 500  # points at which
-_NAMED = 5  # refused records, beside the first
+# in the fingers' tables, and where so few turn out to be too few
+_CHAIN_FILES = {64: "chain.h5", 1024: "chain_1024.h5"}
 
 
 def population(
@@ -75,111 +70,134 @@ def population(
     """
     scene = scene or Scene()
     medians = _prior(scene)
-    known = Covariates.of(covariates or {}, len(records))
-    next_at = known.standardised(at or {})
-    fingers, new = _fitted(records, scene, progress)
-    varies = scene.population.contact_area == "varies"
+    standardized = Covariates.from_values(covariates or {}, len(records))
+    next_at = standardized.standardize(at or {})
+    area_varies = scene.population.contact_area == "varies"
+    factors = (*SKIN, SHARED_PARAMETER, *((AREA,) if area_varies else ()), *scene.population.thickness_sd)
+    fingers, new_finger = _fit_fingers(records, scene, factors, progress)
     with jax.enable_x64(True):
 
         def hierarchy(draws: int, terms: int, purpose: int) -> Hierarchy:
-            tables = Fingers.tabulated(
-                fingers, medians[SHARED], area_varies=varies, draws=draws, terms=terms, seed=[seed, purpose]
+            tables = FingerLikelihoods.from_fingers(
+                fingers,
+                medians[SHARED_PARAMETER],
+                area_varies=area_varies,
+                draws=draws,
+                terms=terms,
+                seed=[seed, purpose],
             )
-            return Hierarchy(tables, medians, varies, jnp.asarray(known.standard))
+            return Hierarchy(tables, medians, area_varies, jnp.asarray(standardized.z_scores))
 
-        for draws, name in _DRAWS.items():
-            sampled = hierarchy(draws, _TERMS, 2)
+        for draws, name in _CHAIN_FILES.items():
+            sampled = hierarchy(draws, terms=9, purpose=2)
             chain_file = None if folder is None else Path(folder) / name
-            fingerprint = _fingerprint(fingers, known, scene, seed, draws)
-            points, convergence = _sampled(sampled, fingerprint, seed, max_steps, chain_file, progress)
-            off = _off(sampled, hierarchy(max(draws, _LEAST_CHECKED), _MORE_TERMS, 3), points)
-            if off <= OFF or not convergence.converged:
+            fingerprint = _fingerprint(fingers, standardized, scene, seed, draws)
+            points, convergence = _sample_hierarchy(sampled, fingerprint, seed, max_steps, chain_file, progress)
+            error = _integration_error(sampled, hierarchy(max(draws, 256), terms=13, purpose=3), points)
+            if error <= MAX_INTEGRATION_ERROR or not convergence.converged:
                 break
-    return Population(fingers, sampled, points, convergence, off, new, known, next_at, scene, seed)
+    return Population(fingers, sampled, points, convergence, error, new_finger, standardized, next_at, scene, seed)
 
 
-def forget(folder: str | os.PathLike[str]) -> None:
+def delete_chains(folder: str | os.PathLike[str]) -> None:
     """Remove the chains that `population` left in a folder."""
-    for name in _DRAWS.values():
+    for name in _CHAIN_FILES.values():
         (Path(folder) / name).unlink(missing_ok=True)
 
 
-def _sampled(
-    hierarchy: Hierarchy, fingerprint: str, seed: int, max_steps: int, chain_file: Path | None, progress: bool
+def _sample_hierarchy(
+    hierarchy: Hierarchy,
+    fingerprint: str,
+    seed: int,
+    max_steps: int,
+    chain_file: Path | None,
+    progress: bool,
+    walkers: int = 128,
+    ensembles: int = 4,
+    draws: int = 2500,
 ) -> tuple[np.ndarray, Convergence]:
-    """Points (ensembles, draws, coordinates), and how far they can be trusted."""
-    log_prob = finite(Batched(Hierarchy.log_prob, hierarchy, hierarchy.fingers.weight.size, _WALKERS // 2))
-    proposal = Proposal.around(*laplace(hierarchy), log_prob)
+    """Sample points (ensembles, some `draws`, coordinates), and say how far they can be trusted."""
+    rows = hierarchy.fingers.weight.size
+    log_prob = reject_nonfinite(BatchEvaluator(Hierarchy.log_prob, hierarchy, rows, walkers // 2))
     target = Target(
-        hierarchy.names, log_prob, proposal, lambda points, _: log_medians(laws(hierarchy, points)), fingerprint
+        hierarchy.names,
+        log_prob,
+        Proposal.from_laplace(*laplace(hierarchy), log_prob),
+        lambda points, _: log_medians(evaluate_parameters(hierarchy, points)),
+        fingerprint,
     )
-    chain, convergence = run(target, seed, _WALKERS, _ENSEMBLES, max_steps, chain_file, progress)
-    points = chain.points[:, chain.thinned(convergence.burn, _KEPT)]
-    return points.reshape(_ENSEMBLES, -1, len(hierarchy.names)), convergence
+    chain, convergence = run_ensembles(target, seed, walkers, ensembles, max_steps, chain_file, progress)
+    points = chain.points[:, chain.thinning_slice(convergence.burn, draws)]
+    return points.reshape(ensembles, -1, len(hierarchy.names)), convergence
 
 
 def _prior(scene: Scene) -> Prior:
-    """Of the medians and Ci."""
-    prior, names = scene.make_prior(), (*SKIN, SHARED)
+    """Make the prior of the medians and Ci."""
+    prior, names = scene.make_prior(), (*SKIN, SHARED_PARAMETER)
     if not set(names) <= set(prior.names):
         raise InputError("scene: [prior] holds or ties Rsc, Csc or Ci; a population needs a density of each")
-    if not {name for pair in (*prior.pairs, *prior.ordered) for name in pair[:2]} <= set(names):
+    if not {name for pair in (*prior.pairs, *prior.order_constraints) for name in pair[:2]} <= set(names):
         raise InputError("scene: [prior] correlates or orders Rsc, Csc or Ci with others; a population takes that not")
-    return Prior(names, tuple(prior[name] for name in names), prior.pairs, prior.ordered)
+    return Prior(names, tuple(prior[name] for name in names), prior.pairs, prior.order_constraints)
 
 
-def _fitted(records: Sequence[Record], scene: Scene, progress: bool) -> tuple[tuple[Finger, ...], NewFinger]:
-    """Each by itself, and the next under the first one's drive; where some are refused, the reason and their names."""
+def _fit_fingers(
+    records: Sequence[Record], scene: Scene, factors: tuple[str, ...], progress: bool
+) -> tuple[tuple[Finger, ...], NewFingerModel]:
+    """Fit each by itself; the next finger is under the first one's drive."""
     if len(records) < 2:
         raise InputError(f"{len(records)} records: a population needs one of each of two or more fingers")
     fingers: dict[str, Finger] = {}
-    refused: list[InputError] = []
-    new = None
+    refusals: list[InputError] = []
+    new_finger = None
     numbers = range(len(records))
-    for number in watched(numbers, "fitting the fingers", len(records)) if progress else numbers:
+    for number in track_progress(numbers, "fitting the fingers", len(records)) if progress else numbers:
         try:
             record = records[number]
-            twice = fingers.get(record.fingerprint)
-            if twice is None:
-                found = fit(record, scene)
+            twin = fingers.get(record.fingerprint)
+            if twin is None:
+                result = fit(record, scene)
         except InputError as error:
-            refused.append(error)
+            refusals.append(error)
             continue
-        if twice is not None:
+        if twin is not None:
             raise InputError(
-                f"{record.source} holds the same record as {twice.source}, whose finger would count twice; drop one"
+                f"{record.source} holds the same record as {twin.source}, whose finger would count twice; drop one"
             )
         with jax.enable_x64(True):
-            fingers[record.fingerprint] = Finger.of(found)
-            new = new or NewFinger.under_drive_of(found, _factors(scene))
-    if refused or new is None:
-        # an error begins with the record that it is about
-        others = [os.path.basename(str(error).partition(":")[0]) for error in refused[1:]]
-        more = [f"{len(others) - _NAMED} more"] if len(others) > _NAMED else []
-        also = f"; also refused: {', '.join(others[:_NAMED] + more)}" if others else ""
-        raise InputError(f"{refused[0]}{also}")
-    return tuple(fingers.values()), new
+            fingers[record.fingerprint] = Finger.from_fit(result)
+            new_finger = new_finger or NewFingerModel.from_fit(result, factors)
+    if refusals or new_finger is None:
+        raise _refusal(refusals)
+    return tuple(fingers.values()), new_finger
 
 
-def _factors(scene: Scene) -> tuple[str, ...]:
-    """What makes a new finger."""
-    area = (AREA,) if scene.population.contact_area == "varies" else ()
-    return (*SKIN, SHARED, *area, *scene.population.thickness_sd)
+def _refusal(errors: Sequence[InputError], max_named: int = 5) -> InputError:
+    """Make one error of several: the first, and the names of `max_named` other records."""
+    # an error begins with the record that it is about
+    names = [os.path.basename(str(error).partition(":")[0]) for error in errors[1:]]
+    if len(names) > max_named:
+        names[max_named:] = [f"{len(names) - max_named} more"]
+    return InputError(f"{errors[0]}; also refused: {', '.join(names)}" if names else str(errors[0]))
 
 
-def _off(sampled: Hierarchy, finer: Hierarchy, points: Float[np.ndarray, "ensembles draws n"]) -> float:
-    """How many of its standard deviations any mean shifts at most where finer tables take these tables' place.
+def _integration_error(
+    hierarchy: Hierarchy, finer: Hierarchy, points: Float[np.ndarray, "ensembles draws n"], count: int = 500
+) -> float:
+    """Estimate by how many of its standard deviations any mean shifts at most with finer tables, by `count` points.
 
     To first order a mean shifts by its covariance with the change of the log-posterior.
     """
     flat = points.reshape(-1, points.shape[-1])
-    flat = flat[np.linspace(0, len(flat) - 1, _CHECKED).astype(int)]
-    found = [Batched(Hierarchy.log_prob, each, each.fingers.weight.size)(flat) for each in (sampled, finer)]
-    return float(np.std(found[1] - found[0]))
+    flat = flat[np.linspace(0, len(flat) - 1, count).astype(int)]
+    coarse, fine = (
+        BatchEvaluator(Hierarchy.log_prob, tables, tables.fingers.weight.size)(flat) for tables in (hierarchy, finer)
+    )
+    return float(np.std(fine - coarse))
 
 
-def _fingerprint(fingers: Sequence[Finger], known: Covariates, scene: Scene, seed: int, draws: int) -> str:
-    """What a chain belongs to; any change of it makes another chain."""
-    each = [[finger.fingerprint, finger.center, finger.place.tolist()] for finger in fingers]
-    settings = [importlib.metadata.version("fitact"), each, known.standard.tolist(), scene.to_json(), seed, draws]
+def _fingerprint(fingers: Sequence[Finger], covariates: Covariates, scene: Scene, seed: int, draws: int) -> str:
+    """Hash what a chain belongs to; any change of it makes another chain."""
+    data = [[finger.fingerprint, finger.center, finger.conditional_mean.tolist()] for finger in fingers]
+    settings = [importlib.metadata.version("fitact"), data, covariates.z_scores.tolist(), scene.to_json(), seed, draws]
     return hashlib.sha256(json.dumps(settings).encode()).hexdigest()

@@ -11,23 +11,22 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact import summary
-from fitact.files import replacing
+from fitact.files import atomic_write
 from fitact.populations.covariates import Covariates
-from fitact.populations.finger import SHARED, SKIN, Finger
-from fitact.populations.finger_likelihoods import Law
+from fitact.populations.finger import SHARED_PARAMETER, SKIN, Finger
+from fitact.populations.finger_likelihoods import PopulationParameters
 from fitact.populations.hierarchy import Hierarchy
-from fitact.populations.next_finger import AREA, NAMES, NewFinger, Spread, draw_factors
-from fitact.populations.sobol import Shares, variance_shares
+from fitact.populations.next_finger import AREA, NAMES, NewFingerModel, VarianceDecomposition, draw_factors
+from fitact.populations.sobol import SobolIndices, variance_shares
 from fitact.sampling.convergence import Convergence
 from fitact.scene.scene import Scene
-from fitact.units import engineering, unit_of
+from fitact.tables import align_rows, join_lines
+from fitact.units import format_engineering, quantity_unit
 
-_LAWS, _FINGERS = 1000, 32  # that new fingers are drawn from, and of each
-_IN_TIME, _TIMES = 4000, 256  # new fingers whose force is followed in time, and times
-QUANTILES = (0.025, 0.05, 0.25, 0.5, 0.75, 0.95, 0.975)  # of it
-OFF = 0.1  # standard deviations of a mean that the fingers' tables may shift it by
-SHARED_OUT = ("force_mean", "force_peak")  # whose variance is
-SHARES = "factors: the share of the variance that goes once each is known (that stays if only it is not)"
+QUANTILES = tuple(summary.PROBABILITIES.values())  # of the force in time
+MAX_INTEGRATION_ERROR = 0.1  # standard deviations of a mean that the fingers' tables may shift it by
+VARIANCE_QUANTITIES = ("force_mean", "force_peak")  # whose variance is shared out
+SHARES_LEGEND = "factors: the share of the variance that goes once each is known (that stays if only it is not)"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +44,7 @@ class Population:
         at: those of the next finger, in standard deviations from the mean.
         scene: of all records.
         seed: of every random number here.
+        laws, fingers_per_law: that new fingers are drawn of.
     """
 
     fingers: tuple[Finger, ...]
@@ -52,112 +52,115 @@ class Population:
     points: Float[np.ndarray, "ensembles draws n"]
     convergence: Convergence
     off: float
-    finger: NewFinger
+    finger: NewFingerModel
     covariates: Covariates
     at: Float[np.ndarray, " covariates"]
     scene: Scene
     seed: int
+    laws: int = 1000
+    fingers_per_law: int = 32
 
     @property
     def trusted(self) -> bool:
         """Whether nothing stands against the answer; one finger's misfit is named among the warnings."""
-        return self.convergence.converged and self.off <= OFF
+        return self.convergence.converged and self.off <= MAX_INTEGRATION_ERROR
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences."""
-        found = [f"{each.source}: {each.message}" for each in self.fingers if each.result != "successful"]
+        sentences = [f"{finger.source}: {finger.message}" for finger in self.fingers if finger.result != "successful"]
         if self.convergence.warning:
-            found.append(self.convergence.warning)
-        if not self.off <= OFF:
-            found.append(
+            sentences.append(self.convergence.warning)
+        if not self.off <= MAX_INTEGRATION_ERROR:
+            sentences.append(
                 f"the integrals over the fingers may shift means by {self.off:.2g} standard deviations; leave out the"
                 " records that leave Rsc and Csc most open"
             )
         if self.hierarchy.area_varies and "I" not in self.scene.measurement.channels:
-            found.append("Vsc alone does not show the contact area, so its spread is the prior's; record I, too")
-        return tuple(found)
+            sentences.append("Vsc alone does not show the contact area, so its spread is the prior's; record I, too")
+        return tuple(sentences)
 
     def parameters(self) -> dict[str, Float[np.ndarray, "ensembles draws"]]:
         """Draws of the law: medians of Rsc (ohm) and Csc (F), Ci (F), log-standard deviations, correlation.
 
         Where there are covariates, also slopes: by how much log Rsc and log Csc change per unit of each.
         """
-        law = self._sampled
-        found = {f"log_sd_{name}": law.log_sd[..., i] for i, name in enumerate(SKIN)}
-        found |= {} if law.area is None else {"log_sd_area": law.area}
+        law = self._parameter_draws
+        draws = {f"log_sd_{name}": law.log_sd[..., i] for i, name in enumerate(SKIN)}
+        draws |= {} if law.area is None else {"log_sd_area": law.area}
         if law.slopes is not None:
             per_unit = law.slopes / self.covariates.sd[:, None]
             for i, name in enumerate(self.covariates.names):
-                found |= {f"slope_{skin}_{name}": per_unit[..., i, j] for j, skin in enumerate(SKIN)}
-        return found | {"correlation": law.correlation} | {k: np.exp(x) for k, x in log_medians(law).items()}
+                draws |= {f"slope_{skin}_{name}": per_unit[..., i, j] for j, skin in enumerate(SKIN)}
+        return draws | {"correlation": law.correlation} | {k: np.exp(x) for k, x in log_medians(law).items()}
 
     @functools.cached_property
-    def _sampled(self) -> Law:
-        return laws(self.hierarchy, self.points)
+    def _parameter_draws(self) -> PopulationParameters:
+        return evaluate_parameters(self.hierarchy, self.points)
 
     def new_fingers(self) -> dict[str, Float[np.ndarray, "laws fingers"]]:
         """Draws of fingers to come, some of each of many laws: Rsc, Csc, g, b, force and friction, SI units."""
-        return {name: self._new[..., i] for i, name in enumerate(self.finger.names)}
+        return {name: self._new_predictions[..., i] for i, name in enumerate(self.finger.names)}
 
     @functools.cached_property
     def factors(self) -> Float[np.ndarray, "laws fingers factors"]:
         """Logarithms of what makes the new fingers, in the order of `finger.factors`."""
-        random = np.random.default_rng([self.seed, 1])
-        return draw_factors(drawn_laws(self, _LAWS), self._thickness_sd, _FINGERS, random)
+        return self._draw_factors(np.random.default_rng([self.seed, 1]), draw_parameters(self, self.laws))
 
     @property
     def prior_factors(self) -> Float[np.ndarray, "laws fingers factors"]:
         """As `factors`, of fingers of laws that are believed before any record is seen."""
         random = np.random.default_rng([self.seed, 4])
-        return draw_factors(self.hierarchy.prior_laws(random, _LAWS).at(self.at), self._thickness_sd, _FINGERS, random)
+        laws = self.hierarchy.sample_prior(random, self.laws).shift_medians(self.at)
+        return self._draw_factors(random, laws)
 
-    @property
-    def _thickness_sd(self) -> dict[str, float]:
-        return self.scene.population.thickness_sd
-
-    @functools.cached_property
-    def _new(self) -> Float[np.ndarray, "laws fingers names"]:
-        return self.finger.each(self.factors)
+    def _draw_factors(
+        self, random: np.random.Generator, parameters: PopulationParameters
+    ) -> Float[np.ndarray, "laws fingers factors"]:
+        return draw_factors(parameters, self.scene.population.thickness_sd, self.fingers_per_law, random)
 
     @functools.cached_property
-    def _believed(self) -> Float[np.ndarray, "laws fingers names"]:
-        return self.finger.each(self.prior_factors)
+    def _new_predictions(self) -> Float[np.ndarray, "laws fingers names"]:
+        return self.finger.evaluate(self.factors)
 
     @functools.cached_property
-    def shares(self) -> Shares:
+    def _prior_predictions(self) -> Float[np.ndarray, "laws fingers names"]:
+        return self.finger.evaluate(self.prior_factors)
+
+    @functools.cached_property
+    def shares(self) -> SobolIndices:
         """Of each factor in the variance of the next finger's force; see `variance_shares`."""
-        return self._shares_of(self.factors)
+        return self._sobol_indices(self.factors)
 
     @functools.cached_property
-    def prior_shares(self) -> Shares:
+    def prior_shares(self) -> SobolIndices:
         """As `shares`, before any record is seen."""
-        return self._shares_of(self.prior_factors)
+        return self._sobol_indices(self.prior_factors)
 
-    def _shares_of(self, factors: Float[np.ndarray, "laws fingers factors"]) -> Shares:
-        return variance_shares(self.finger, factors.reshape(-1, factors.shape[-1]), SHARED_OUT, self.seed)
+    def _sobol_indices(self, factors: Float[np.ndarray, "laws fingers factors"]) -> SobolIndices:
+        return variance_shares(self.finger, factors.reshape(-1, factors.shape[-1]), VARIANCE_QUANTITIES, self.seed)
 
     def to_dict(self) -> dict[str, Any]:
         """What `fitact population --json` prints and population.json holds."""
         new: dict[str, dict[str, Any]] = {}
         for name, values in self.new_fingers().items():
-            spread = Spread.of(values)
-            shares = {"people": spread.share_of_people, "ignorance": 1.0 - spread.share_of_people}
-            new[name] = summary.of_draws(name, values) | {"variance": shares}
+            people = VarianceDecomposition.from_draws(values).between_finger_fraction
+            shares = {"people": people, "ignorance": 1.0 - people}
+            new[name] = summary.summarize_draws(name, values) | {"variance": shares}
         return {
-            "population": self._law(),
+            "population": self._parameter_summaries(),
             "new_finger": new,
             "variance_shares": self.shares,
             "variance_shares_prior": self.prior_shares,
             "fingers": [
                 {
-                    "record": each.source,
-                    "sha256": each.fingerprint,
-                    "result": each.result,
-                    "message": each.message,
-                    "parameters": each.parameters,
+                    "record": finger.source,
+                    "sha256": finger.fingerprint,
+                    "result": finger.result,
+                    "message": finger.message,
+                    "parameters": finger.parameters,
                 }
-                for each in self.fingers
+                for finger in self.fingers
             ],
             "convergence": dataclasses.asdict(self.convergence) | {"sentence": str(self.convergence)},
             "integrals_off": self.off,
@@ -168,22 +171,21 @@ class Population:
             "versions": summary.versions(),
         }
 
-    def _law(self) -> dict[str, Any]:
-        """Summaries of the law."""
+    def _parameter_summaries(self) -> dict[str, Any]:
         draws = self.parameters()
         law: dict[str, Any] = {
             name: {
-                "median": summary.of_draws(name, draws[name]),
-                "log_sd": summary.of_draws("log_sd", draws[f"log_sd_{name}"]),
+                "median": summary.summarize_draws(name, draws[name]),
+                "log_sd": summary.summarize_draws("log_sd", draws[f"log_sd_{name}"]),
             }
             for name in SKIN
         }
-        law |= {name: summary.of_draws(name, draws[name]) for name in (SHARED, "correlation")}
+        law |= {name: summary.summarize_draws(name, draws[name]) for name in (SHARED_PARAMETER, "correlation")}
         if self.hierarchy.area_varies:
-            law[AREA] = {"log_sd": summary.of_draws("log_sd", draws["log_sd_area"])}
+            law[AREA] = {"log_sd": summary.summarize_draws("log_sd", draws["log_sd_area"])}
         law["covariates"] = {
             name: {"mean": float(mean), "sd": float(sd), "next_finger": float(mean + at * sd)}
-            | {skin: {"slope": summary.of_draws("slope", draws[f"slope_{skin}_{name}"])} for skin in SKIN}
+            | {skin: {"slope": summary.summarize_draws("slope", draws[f"slope_{skin}_{name}"])} for skin in SKIN}
             for name, mean, sd, at in zip(
                 self.covariates.names, self.covariates.mean, self.covariates.sd, self.at, strict=True
             )
@@ -193,9 +195,9 @@ class Population:
     def summary(self) -> str:
         """A table for people, what the force's variance depends on, and warnings."""
         content = self.to_dict()
-        rows = [f"{name:26}{median:>12}{low:>14}{high:>12}" for name, median, low, high in table(content)]
-        rows += [*variance_sentences(content), SHARES, str(self.convergence)]
-        return "\n".join([*rows, *(f"warning: {warning}" for warning in self.warnings)])
+        rows = align_rows(population_table(content), (26, 12, 14, 12))
+        rows += [*variance_sentences(content), SHARES_LEGEND, str(self.convergence)]
+        return join_lines(rows, self.warnings)
 
     __str__ = summary
 
@@ -203,7 +205,8 @@ class Population:
     def force_in_time(self) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "quantiles times"]]:
         """Times (s) of a period (all of a drive without one), and `QUANTILES` of the next finger's force (N)."""
         factors = self.factors.reshape(-1, len(self.finger.factors))
-        time, force = self.finger.force_in_time(factors[:: max(1, len(factors) // _IN_TIME)], _TIMES)
+        some = factors[:: max(1, len(factors) // 4000)]  # enough for the outermost quantiles
+        time, force = self.finger.force_in_time(some, count=256)
         return time, np.quantile(force, QUANTILES, axis=0)
 
     def to_datatree(self) -> Any:
@@ -216,9 +219,9 @@ class Population:
         def dataset(draws: dict[str, np.ndarray], dims: tuple[str, str]) -> xr.Dataset:
             return xr.Dataset({name: (dims, values, {"units": _unit(name)}) for name, values in draws.items()})
 
-        drawn = dataset(self.new_fingers(), ("law", "finger"))
-        drawn["log_factors"] = ("law", "finger", "factor"), self.factors
-        prior = {name: self._believed[..., self.finger.names.index(name)] for name in SHARED_OUT}
+        new_fingers = dataset(self.new_fingers(), ("law", "finger"))
+        new_fingers["log_factors"] = ("law", "finger", "factor"), self.factors
+        prior = {name: self._prior_predictions[..., self.finger.names.index(name)] for name in VARIANCE_QUANTITIES}
         time, force = self.force_in_time
         friction = {
             "friction_coefficient": float(self.finger.derive.coefficient),
@@ -240,7 +243,7 @@ class Population:
             {
                 "/": xr.Dataset(attrs=about),
                 "posterior": dataset(self.parameters(), ("chain", "draw")),
-                "new_fingers": drawn.assign_coords(factor=list(self.finger.factors)),
+                "new_fingers": new_fingers.assign_coords(factor=list(self.finger.factors)),
                 "prior_new_fingers": dataset(prior, ("law", "finger")),
                 "force_in_time": in_time,
             }
@@ -248,53 +251,55 @@ class Population:
 
     def to_netcdf(self, path: str | os.PathLike[str]) -> None:
         """Write `to_datatree()` as NetCDF."""
-        with replacing(path) as temporary:
+        with atomic_write(path) as temporary:
             self.to_datatree().to_netcdf(temporary, engine="h5netcdf")
 
 
-def table(content: dict[str, Any]) -> tuple[tuple[str, ...], ...]:
-    """Titles; then the law and the next finger of what population.json holds, for people."""
+def population_table(content: dict[str, Any]) -> tuple[tuple[str, ...], ...]:
+    """Lay out titles, then the law and the next finger of what population.json holds, for people."""
     law, new = content["population"], content["new_finger"]
     shown = {f"{name}, {key}": s for name in SKIN for key, s in law[name].items()}
-    shown |= {name: law[name] for name in (SHARED, "correlation")}
+    shown |= {name: law[name] for name in (SHARED_PARAMETER, "correlation")}
     if AREA in law:
         shown["contact area, log_sd"] = law[AREA]["log_sd"]
-    shown |= {f"{skin}, slope in {name}": of[skin]["slope"] for name, of in law["covariates"].items() for skin in SKIN}
+    shown |= {f"{skin}, slope in {name}": x[skin]["slope"] for name, x in law["covariates"].items() for skin in SKIN}
     shown |= {f"next finger, {name}": new[name] for name in NAMES}
-    rows = ((name, *(engineering(s[q], s["unit"]) for q in ("q50", "q025", "q975"))) for name, s in shown.items())
+    rows = (
+        (name, *(format_engineering(s[q], s["unit"]) for q in ("q50", "q025", "q975"))) for name, s in shown.items()
+    )
     return (f"{len(content['fingers'])} fingers", "median", "2.5 %", "97.5 %"), *rows
 
 
 def variance_sentences(content: dict[str, Any]) -> tuple[str, ...]:
-    """What the variance of the next finger's force comes from, by what population.json holds."""
-    found = []
-    for name in SHARED_OUT:
+    """Say what the variance of the next finger's force comes from, by what population.json holds."""
+    sentences = []
+    for name in VARIANCE_QUANTITIES:
         people = 100.0 * content["new_finger"][name]["variance"]["people"]
         parts = (
             f"{factor} {100.0 * share['first']:.0f} % ({100.0 * share['total']:.0f} %)"
             for factor, share in content["variance_shares"][name].items()
         )
-        found.append(f"variance of {name}: {people:.0f} % people, the rest ignorance; {', '.join(parts)}")
-    return tuple(found)
+        sentences.append(f"variance of {name}: {people:.0f} % people, the rest ignorance; {', '.join(parts)}")
+    return tuple(sentences)
 
 
-def laws(hierarchy: Hierarchy, points: Float[np.ndarray, "chains draws n"]) -> Law:
-    """At many points."""
+def evaluate_parameters(hierarchy: Hierarchy, points: Float[np.ndarray, "chains draws n"]) -> PopulationParameters:
+    """Convert many points."""
     with jax.enable_x64(True):
-        return jax.tree.map(np.asarray, jax.jit(jax.vmap(jax.vmap(hierarchy.law)))(points))
+        return jax.tree.map(np.asarray, jax.jit(jax.vmap(jax.vmap(hierarchy.population_parameters)))(points))
 
 
-def drawn_laws(population: Population, count: int) -> Law:
-    """So many draws of the law that the next finger follows, spread over the chain; leaves (count, 1)."""
+def draw_parameters(population: Population, count: int) -> PopulationParameters:
+    """Take `count` draws of the law that the next finger follows, spread over the chain; leaves (count, 1)."""
     flat = population.points.reshape(-1, population.points.shape[-1])
-    drawn = flat[np.linspace(0, len(flat) - 1, count).astype(int), None]
-    return laws(population.hierarchy, drawn).at(population.at)
+    points = flat[np.linspace(0, len(flat) - 1, count).astype(int), None]
+    return evaluate_parameters(population.hierarchy, points).shift_medians(population.at)
 
 
-def log_medians(law: Law) -> dict[str, np.ndarray]:
+def log_medians(parameters: PopulationParameters) -> dict[str, np.ndarray]:
     """Logarithms of Rsc, Csc and Ci."""
-    return {"Rsc": law.median[..., 0], "Csc": law.median[..., 1], SHARED: law.log_Ci}
+    return {"Rsc": parameters.median[..., 0], "Csc": parameters.median[..., 1], SHARED_PARAMETER: parameters.log_Ci}
 
 
 def _unit(name: str) -> str:
-    return "1" if name.startswith(("log_sd", "slope")) else unit_of(name)
+    return "1" if name.startswith(("log_sd", "slope")) else quantity_unit(name)

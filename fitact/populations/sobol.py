@@ -10,140 +10,161 @@ import scipy.stats
 from jaxtyping import Float, Int
 from scipy.special import ndtri
 
-from fitact.populations.next_finger import NewFinger
+from fitact.populations.next_finger import NewFingerModel
 
-_BASE = 4096  # points of Sobol's sequence
-_SAVED = 100  # times fewer evaluations of the model than those points ask for
-_PER_TERM = 4  # evaluations that a coefficient has at least: with fewer, what lies in the tails runs away
-_WIDER = 1.25  # than the factors are the points evaluated, for the tails, where the largest of y lie
-_CLOSE = 5e-3  # as a share of a standard deviation, far below what Sobol's sequence leaves open
-_FOLDS = 4  # that the evaluations are held out in, one after the other
-_CHUNK = 1024  # points at which the polynomial is evaluated at a time, so that they stay in the processor's cache
-_EDGE = 1e-12  # nearest to 0 and 1 that a uniform number may be
-_ERRORS = ("S1_conf", "ST_conf")  # SALib's names
-
-Shares = dict[str, dict[str, dict[str, float]]]
+SobolIndices = dict[str, dict[str, dict[str, float]]]
 
 
 class Surrogate(NamedTuple):
     """Logarithms of quantities as polynomials of normal factors, by least squares; Hermite's, in whitened factors.
 
     Attributes:
-        mean, root: of the factors, and of their covariance.
+        mean: of the factors.
+        covariance_factor: of them.
+        tail_scale: how much wider than the factors the points evaluated are, for the tails, where the largest of y lie.
         powers: of each term.
         coefficients: of the terms.
-        seen: least and largest logarithm that the model gave.
-        off: of each quantity, sqrt(1 - r^2), where r is its correlation with the model's at points held out.
+        log_range: least and largest logarithm that the model gave.
+        cross_validation_error: of each quantity, sqrt(1 - r^2), where r is its correlation with the model's at points
+            held out.
         evaluations: of the model that this took.
     """
 
     mean: Float[np.ndarray, " factors"]
-    root: Float[np.ndarray, "factors factors"]
+    covariance_factor: Float[np.ndarray, "factors factors"]
+    tail_scale: float
     powers: Int[np.ndarray, "terms factors"]
     coefficients: Float[np.ndarray, "terms quantities"]
-    seen: Float[np.ndarray, "2 quantities"]
-    off: Float[np.ndarray, " quantities"]
+    log_range: Float[np.ndarray, "2 quantities"]
+    cross_validation_error: Float[np.ndarray, " quantities"]
     evaluations: int
 
     @classmethod
-    def of(cls, finger: NewFinger, factors: Float[np.ndarray, "fingers factors"], names: tuple[str, ...]) -> Self:
-        """Of the lowest degree that is close at points held out, or the one that is closest there."""
-        size = factors.shape[1]
-        mean, root = factors.mean(axis=0), np.linalg.cholesky(np.cov(factors.T))
-        count = _BASE * (size + 2) * size // _SAVED
-        uniform = scipy.stats.qmc.Halton(size, rng=np.random.default_rng(0)).random(count)
-        white = _WIDER * ndtri(np.clip(uniform, _EDGE, 1.0 - _EDGE))
-        columns = [finger.names.index(name) for name in names]
-        logs = np.log(finger.each(mean + white @ root.T)[:, columns])
-        seen = np.stack([logs.min(axis=0), logs.max(axis=0)])
-        found: list[Self] = []
-        degree = 1
-        while not found or (math.comb(size + degree, size) <= count / _PER_TERM and found[-1].off.max() > _CLOSE):
-            powers = _powers(size, degree)
-            terms = _hermite(white / _WIDER, powers)
-            found.append(cls(mean, root, powers, _least_squares(terms, logs), seen, _off(terms, logs, white), count))
-            degree += 1
-        return min(found, key=lambda each: float(each.off.max()))
+    def from_model(
+        cls,
+        finger: NewFingerModel,
+        factors: Float[np.ndarray, "fingers factors"],
+        names: tuple[str, ...],
+        *,
+        tail_scale: float = 1.25,
+        tolerance: float = 5e-3,
+        evaluations_per_term: int = 4,
+    ) -> Self:
+        """Fit the lowest degree that is close at points held out, or the one that is closest there.
 
-    def at(self, factors: Float[np.ndarray, "points factors"]) -> Float[np.ndarray, "points quantities"]:
-        """The quantities themselves."""
-        white = np.linalg.solve(_WIDER * self.root, (factors - self.mean).T).T
-        chunks = (white[i : i + _CHUNK] for i in range(0, len(white), _CHUNK))
-        logs = np.concatenate([_hermite(chunk, self.powers) @ self.coefficients for chunk in chunks])
-        return np.exp(_within(self.seen, logs))
+        Args:
+            tail_scale: as of the class.
+            tolerance: of the error, far below what Sobol's sequence leaves open.
+            evaluations_per_term: at least; with fewer, what lies in the tails runs away.
+        """
+        size = factors.shape[1]
+        mean, covariance_factor = factors.mean(axis=0), np.linalg.cholesky(np.cov(factors.T))
+        count = 4096 * (size + 2) * size // 100  # a hundredth of what `sobol_indices` asks for
+        z = _to_normal(scipy.stats.qmc.Halton(size, rng=np.random.default_rng(0)).random(count))
+        points = mean + tail_scale * z @ covariance_factor.T
+        logs = np.log(finger.evaluate(points)[:, [finger.names.index(name) for name in names]])
+        log_range = np.stack([logs.min(axis=0), logs.max(axis=0)])
+        weight = np.exp(-0.5 * (tail_scale**2 - 1.0) * np.sum(z**2, axis=1))  # the factors' density over the points'
+        surrogates: list[Self] = []
+        for degree in itertools.count(1):
+            powers = _powers(size, degree)
+            terms = _hermite(z, powers)
+            error = _cross_validation_error(terms, logs, weight)
+            coefficients = _least_squares(terms, logs)
+            surrogates.append(cls(mean, covariance_factor, tail_scale, powers, coefficients, log_range, error, count))
+            if error.max() <= tolerance or math.comb(size + degree + 1, size) > count / evaluations_per_term:
+                break
+        return min(surrogates, key=lambda surrogate: float(surrogate.cross_validation_error.max()))
+
+    def predict(
+        self, factors: Float[np.ndarray, "points factors"], chunk: int = 1024
+    ) -> Float[np.ndarray, "points quantities"]:
+        """Evaluate the quantities themselves, `chunk` points at a time, which stay in the processor's cache."""
+        z = np.linalg.solve(self.tail_scale * self.covariance_factor, (factors - self.mean).T).T
+        parts = (z[i : i + chunk] for i in range(0, len(z), chunk))
+        logs = np.concatenate([_hermite(part, self.powers) @ self.coefficients for part in parts])
+        return np.exp(_clip_to_range(self.log_range, logs))
+
+
+def _to_normal(uniform: np.ndarray) -> np.ndarray:
+    return ndtri(np.clip(uniform, 1e-12, 1.0 - 1e-12))  # no nearer to 0 and 1, where it is infinite
 
 
 def _least_squares(
     terms: Float[np.ndarray, "points terms"], logs: Float[np.ndarray, "points quantities"]
 ) -> np.ndarray:
-    """By the normal equations, which Hermite's polynomials leave well-conditioned."""
+    """Solve the normal equations, which Hermite's polynomials leave well-conditioned."""
     return np.linalg.solve(terms.T @ terms, terms.T @ logs)
 
 
-def _within(seen: Float[np.ndarray, "n quantities"], logs: Float[np.ndarray, "points quantities"]) -> np.ndarray:
-    """Logarithms no further out than what was seen: beyond, a polynomial soon runs away."""
-    return np.clip(logs, seen.min(axis=0), seen.max(axis=0))
+def _clip_to_range(
+    reference: Float[np.ndarray, "n quantities"], logs: Float[np.ndarray, "points quantities"]
+) -> np.ndarray:
+    """Clip logarithms to those of the reference: beyond, a polynomial soon runs away."""
+    return np.clip(logs, reference.min(axis=0), reference.max(axis=0))
 
 
-def _off(
+def _cross_validation_error(
     terms: Float[np.ndarray, "points terms"],
     logs: Float[np.ndarray, "points quantities"],
-    white: Float[np.ndarray, "points factors"],
+    weight: Float[np.ndarray, " points"],
+    folds: int = 4,
 ) -> Float[np.ndarray, " quantities"]:
     """How far each quantity is from a polynomial that has not seen it: sqrt(1 - r^2), over the factors' density."""
-    near = np.empty_like(logs)
-    for fold in range(_FOLDS):
-        out = np.arange(len(logs)) * _FOLDS // len(logs) == fold  # a stretch of Halton's sequence is spread evenly
-        near[out] = _within(logs, terms[out] @ _least_squares(terms[~out], logs[~out]))
-    weight = np.exp(-0.5 * (1.0 - _WIDER**-2) * np.sum(white**2, axis=1))
-    found = []
-    for exact, other in zip(logs.T, near.T, strict=True):
+    predictions = np.empty_like(logs)
+    for fold in range(folds):
+        is_out = np.arange(len(logs)) * folds // len(logs) == fold  # a stretch of Halton's sequence is spread evenly
+        coefficients = _least_squares(terms[~is_out], logs[~is_out])
+        predictions[is_out] = _clip_to_range(logs, terms[is_out] @ coefficients)
+    squares = []
+    for exact, other in zip(logs.T, predictions.T, strict=True):
         covariance = np.cov(np.exp([exact, other]), aweights=weight)
-        found.append(1.0 - covariance[0, 1] ** 2 / (covariance[0, 0] * covariance[1, 1]))
-    return np.sqrt(np.maximum(found, 0.0))
+        squares.append(1.0 - covariance[0, 1] ** 2 / (covariance[0, 0] * covariance[1, 1]))
+    return np.sqrt(np.maximum(squares, 0.0))
 
 
 def _powers(size: int, degree: int) -> Int[np.ndarray, "terms factors"]:
-    every = itertools.product(range(degree + 1), repeat=size)
-    return np.array([powers for powers in every if sum(powers) <= degree])
+    powers = itertools.product(range(degree + 1), repeat=size)
+    return np.array([term for term in powers if sum(term) <= degree])
 
 
-def _hermite(white: Float[np.ndarray, "points factors"], powers: Int[np.ndarray, "terms factors"]) -> np.ndarray:
+def _hermite(z: Float[np.ndarray, "points factors"], powers: Int[np.ndarray, "terms factors"]) -> np.ndarray:
     """Products of Hermite polynomials, of unit variance over normal factors."""
     degree = int(powers.max())
     norm = np.sqrt([float(math.factorial(n)) for n in range(degree + 1)])
-    single = np.polynomial.hermite_e.hermevander(white, degree) / norm
+    single = np.polynomial.hermite_e.hermevander(z, degree) / norm
     product = single[:, 0, powers[:, 0]]
-    for factor in range(1, white.shape[1]):
+    for factor in range(1, z.shape[1]):
         product = product * single[:, factor, powers[:, factor]]
     return product
 
 
 def variance_shares(
-    finger: NewFinger, factors: Float[np.ndarray, "fingers factors"], names: tuple[str, ...], seed: int
-) -> Shares:
-    """Shares of each factor in the variance of quantities `names`, as by `shares_of`, from a `Surrogate`.
+    finger: NewFingerModel, factors: Float[np.ndarray, "fingers factors"], names: tuple[str, ...], seed: int
+) -> SobolIndices:
+    """Compute `sobol_indices` of quantities `names`, from a `Surrogate`.
 
     Each share is the mean square of a projection of y over that of y, so a surrogate whose correlation with y is r
     shifts none by more than sqrt(1 - r^2); the errors include that.
     """
-    surrogate = Surrogate.of(finger, factors, names)
-    found = shares_of(surrogate.at, finger.factors, factors, names, seed)
-    for name, off in zip(names, surrogate.off.tolist(), strict=True):
-        for share in found[name].values():
+    surrogate = Surrogate.from_model(finger, factors, names)
+    indices = sobol_indices(surrogate.predict, finger.factors, factors, names, seed)
+    for name, error in zip(names, surrogate.cross_validation_error.tolist(), strict=True):
+        for shares in indices[name].values():
             for key, times in (("first_error", 1.0), ("total_error", 1.0), ("interaction_error", 2.0)):
-                share[key] += times * off
-    return found
+                shares[key] += times * error
+    return indices
 
 
-def shares_of(
+def sobol_indices(
     model: Callable[[np.ndarray], np.ndarray],
     factor_names: tuple[str, ...],
     factors: Float[np.ndarray, "fingers factors"],
     names: tuple[str, ...],
     seed: int,
-) -> Shares:
-    """First-order, total and interaction shares of each factor in the variance of quantities, with 95 % errors.
+    count: int = 4096,
+) -> SobolIndices:
+    """Compute first-order, total and interaction shares of each factor in the variance of quantities, with 95 % errors.
 
     The factors are taken as normal with the mean and covariance of `factors`. Where they depend on each other, first
     is Var(E[y | x]) and total E[Var(y | others)] over the variance of y (Kucherenko, Tarantola, Annoni 2012): Sobol's
@@ -153,28 +174,28 @@ def shares_of(
 
     Args:
         model: the quantities (points, quantities) of points (points, factors).
+        count: of points of Sobol's sequence.
     """
     import SALib.analyze.sobol
     import SALib.sample.sobol
 
     size = factors.shape[1]
     problem = {"num_vars": size, "names": list(factor_names), "bounds": [[0.0, 1.0]] * size}
-    uniform = SALib.sample.sobol.sample(problem, _BASE, calc_second_order=False, seed=seed)
-    white = ndtri(np.clip(uniform, _EDGE, 1.0 - _EDGE))
+    z = _to_normal(SALib.sample.sobol.sample(problem, count, calc_second_order=False, seed=seed))
     mean, covariance = factors.mean(axis=0), np.cov(factors.T)
-    found: Shares = {name: {factor: {} for factor in factor_names} for name in names}
+    shares: SobolIndices = {name: {factor: {} for factor in factor_names} for name in names}
     for turn in range(size):
         order = np.roll(np.arange(size), -turn)
-        points = np.empty_like(white)
-        points[:, order] = mean[order] + white @ np.linalg.cholesky(covariance[np.ix_(order, order)]).T
+        points = np.empty_like(z)
+        points[:, order] = mean[order] + z @ np.linalg.cholesky(covariance[np.ix_(order, order)]).T
         for name, y in zip(names, model(points).T, strict=True):
             indices = SALib.analyze.sobol.analyze(problem, y / np.std(y), calc_second_order=False, seed=seed)
-            (S1, ST), (S1_error, ST_error) = ([indices[key] for key in keys] for keys in (("S1", "ST"), _ERRORS))
-            found[name][factor_names[order[0]]] |= {"first": float(S1[0]), "first_error": float(S1_error[0])}
-            found[name][factor_names[order[-1]]] |= {
+            S1, S1_error, ST, ST_error = (indices[key] for key in ("S1", "S1_conf", "ST", "ST_conf"))
+            shares[name][factor_names[order[0]]] |= {"first": float(S1[0]), "first_error": float(S1_error[0])}
+            shares[name][factor_names[order[-1]]] |= {
                 "total": float(ST[-1]),
                 "total_error": float(ST_error[-1]),
                 "interaction": float(ST[-1] - S1[-1]),
                 "interaction_error": float(np.hypot(ST_error[-1], S1_error[-1])),
             }
-    return found
+    return shares

@@ -19,43 +19,44 @@ from jaxtyping import Array, Float
 from fitact.errors import InputError
 
 _Z95 = 1.959963984540054  # half-width, in standard deviations, of a central 95 % interval
-_LEAST = 1e-3  # share of a log-normal that its bounds must leave
-_TINY = 1e-300  # keeps the scores of what rounds to an edge finite
 
 
 class Distribution(eqx.Module):
     """A prior for one positive parameter."""
 
-    @property
     @abc.abstractmethod
-    def log_mean(self) -> float:
-        """Mean of log x."""
+    def _log_moments(self) -> tuple[float, float]: ...
 
     @property
-    @abc.abstractmethod
+    def log_mean(self) -> float:
+        """Mean of log x."""
+        return self._log_moments()[0]
+
+    @property
     def log_sd(self) -> float:
         """Standard deviation of log x."""
+        return self._log_moments()[1]
 
     @abc.abstractmethod
     def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """Log-density of u = log x, Jacobian included; -inf where x is impossible."""
 
     @abc.abstractmethod
-    def score(self, u: ArrayLike) -> Float[Array, "*shape"]:
+    def to_standard_normal(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """The standard normal number with as much probability below it as u has."""
 
     @abc.abstractmethod
-    def at_score(self, z: ArrayLike) -> Float[Array, "*shape"]:
-        """The inverse of `score`: log x."""
+    def from_standard_normal(self, z: ArrayLike) -> Float[Array, "*shape"]:
+        """The inverse of `to_standard_normal`: log x."""
 
-    def whitened(self, u: ArrayLike) -> Float[Array, "*shape"]:
+    def standardize(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """u less its mean, over its standard deviation."""
         return (jnp.asarray(u) - self.log_mean) / self.log_sd
 
     def sample(self, rng: np.random.Generator, size: int) -> Float[np.ndarray, " size"]:
         """Draws of x."""
         with jax.enable_x64(True):
-            return np.exp(np.asarray(self.at_score(rng.standard_normal(size))))
+            return np.exp(np.asarray(self.from_standard_normal(rng.standard_normal(size))))
 
 
 class LogNormal(Distribution):
@@ -84,30 +85,23 @@ class LogNormal(Distribution):
             raise InputError(f"relative_sd = {relative_sd:g} must be above 0")
         return cls(median, math.sqrt(math.log1p(relative_sd**2)))
 
-    @property
-    def log_mean(self) -> float:
-        """Mean of log x."""
-        return math.log(self.median)
+    def _log_moments(self) -> tuple[float, float]:
+        return math.log(self.median), float(self.spread)
 
-    @property
-    def log_sd(self) -> float:
-        """Standard deviation of log x."""
-        return float(self.spread)
+    def standardize(self, u: ArrayLike) -> Float[Array, "*shape"]:
+        """u less its mean, over its standard deviation, also where these are arrays."""
+        return self.to_standard_normal(u)
 
     def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """Normal in u."""
-        return -0.5 * self.score(u) ** 2 - _log(self.spread * math.sqrt(2.0 * math.pi))
+        return -0.5 * self.to_standard_normal(u) ** 2 - _log(self.spread * math.sqrt(2.0 * math.pi))
 
-    def score(self, u: ArrayLike) -> Float[Array, "*shape"]:
+    def to_standard_normal(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """(u - log median) / spread."""
         return (jnp.asarray(u) - _log(self.median)) / self.spread
 
-    def whitened(self, u: ArrayLike) -> Float[Array, "*shape"]:
-        """u less its mean, over its standard deviation: its score."""
-        return self.score(u)
-
-    def at_score(self, z: ArrayLike) -> Float[Array, "*shape"]:
-        """The inverse of `score`: log x."""
+    def from_standard_normal(self, z: ArrayLike) -> Float[Array, "*shape"]:
+        """The inverse of `to_standard_normal`: log x."""
         return _log(self.median) + self.spread * jnp.asarray(z)
 
 
@@ -118,28 +112,28 @@ class Bounded(Distribution):
     high: eqx.AbstractVar[float]
 
     @abc.abstractmethod
-    def share(self, u: ArrayLike) -> Float[Array, "*shape"]:
+    def cdf(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """The probability below u = log x inside the bounds."""
 
     @abc.abstractmethod
-    def at_share(self, p: ArrayLike) -> Float[Array, "*shape"]:
-        """The inverse of `share`: log x."""
+    def ppf(self, p: ArrayLike) -> Float[Array, "*shape"]:
+        """The inverse of `cdf`: log x."""
 
-    def inside(self, u: ArrayLike) -> Array:
+    def contains(self, u: ArrayLike) -> Array:
         """Whether u = log x lies within the bounds."""
         u = jnp.asarray(u)
         low = -math.inf if self.low == 0.0 else math.log(self.low)
         return (u >= low) & (u <= math.log(self.high))
 
-    def score(self, u: ArrayLike) -> Float[Array, "*shape"]:
+    def to_standard_normal(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """The standard normal number with as much probability below it as u has."""
-        u = jnp.where(self.inside(u), u, self.log_mean)  # any value inside: outside, the density says it all
-        share = self.share(u)
-        return ndtri(jnp.clip(share, _TINY, 1.0 - jnp.finfo(share.dtype).epsneg))
+        u = jnp.where(self.contains(u), u, self.log_mean)  # any value inside: outside, the density says it all
+        p = self.cdf(u)
+        return ndtri(jnp.clip(p, 1e-300, 1.0 - jnp.finfo(p.dtype).epsneg))  # finite where it rounds to an edge
 
-    def at_score(self, z: ArrayLike) -> Float[Array, "*shape"]:
-        """The inverse of `score`: log x."""
-        return self.at_share(ndtr(jnp.asarray(z, dtype=float)))
+    def from_standard_normal(self, z: ArrayLike) -> Float[Array, "*shape"]:
+        """The inverse of `to_standard_normal`: log x."""
+        return self.ppf(ndtr(jnp.asarray(z, dtype=float)))
 
 
 class Uniform(Bounded):
@@ -161,27 +155,22 @@ class Uniform(Bounded):
             raise InputError(f"tolerance = {tolerance:g} must lie between 0 and 1, such as 0.1 or '10 %'")
         return cls(nominal * (1.0 - tolerance), nominal * (1.0 + tolerance))
 
-    @property
-    def log_mean(self) -> float:
-        """Mean of log x."""
-        return (self.high * math.log(self.high) - self.low * math.log(self.low)) / (self.high - self.low) - 1.0
-
-    @property
-    def log_sd(self) -> float:
-        """Standard deviation of log x: sqrt(1 - q L^2 / (1 - q)^2) with L = log(high / low), q = low / high."""
+    def _log_moments(self) -> tuple[float, float]:
+        """The standard deviation is sqrt(1 - q L^2 / (1 - q)^2) with L = log(high / low), q = low / high."""
+        mean = (self.high * math.log(self.high) - self.low * math.log(self.low)) / (self.high - self.low) - 1.0
         q = self.low / self.high
-        return math.sqrt(max(1.0 - q * math.log(q) ** 2 / (1.0 - q) ** 2, 0.0))
+        return mean, math.sqrt(max(1.0 - q * math.log(q) ** 2 / (1.0 - q) ** 2, 0.0))
 
     def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """e^u / (high - low) inside."""
-        return jnp.where(self.inside(u), jnp.asarray(u) - math.log(self.high - self.low), -jnp.inf)
+        return jnp.where(self.contains(u), jnp.asarray(u) - math.log(self.high - self.low), -jnp.inf)
 
-    def share(self, u: ArrayLike) -> Float[Array, "*shape"]:
+    def cdf(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """(x - low) / (high - low)."""
         return self.low * jnp.expm1(jnp.asarray(u) - math.log(self.low)) / (self.high - self.low)
 
-    def at_share(self, p: ArrayLike) -> Float[Array, "*shape"]:
-        """The inverse of `share`: log x."""
+    def ppf(self, p: ArrayLike) -> Float[Array, "*shape"]:
+        """The inverse of `cdf`: log x."""
         return math.log(self.low) + jnp.log1p(jnp.asarray(p) * (self.high - self.low) / self.low)
 
 
@@ -198,26 +187,19 @@ class LogUniform(Bounded):
     def _length(self) -> float:
         return math.log(self.high / self.low)
 
-    @property
-    def log_mean(self) -> float:
-        """Mean of log x."""
-        return math.log(self.low) + 0.5 * self._length
-
-    @property
-    def log_sd(self) -> float:
-        """Standard deviation of log x."""
-        return self._length / math.sqrt(12.0)
+    def _log_moments(self) -> tuple[float, float]:
+        return math.log(self.low) + 0.5 * self._length, self._length / math.sqrt(12.0)
 
     def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """1 / log(high / low) inside."""
-        return jnp.where(self.inside(u), -math.log(self._length), -jnp.inf)
+        return jnp.where(self.contains(u), -math.log(self._length), -jnp.inf)
 
-    def share(self, u: ArrayLike) -> Float[Array, "*shape"]:
+    def cdf(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """log(x / low) / log(high / low)."""
         return (jnp.asarray(u) - math.log(self.low)) / self._length
 
-    def at_share(self, p: ArrayLike) -> Float[Array, "*shape"]:
-        """The inverse of `share`: log x."""
+    def ppf(self, p: ArrayLike) -> Float[Array, "*shape"]:
+        """The inverse of `cdf`: log x."""
         return math.log(self.low) + self._length * jnp.asarray(p)
 
 
@@ -236,14 +218,14 @@ class TruncatedLogNormal(Bounded):
     def __check_init__(self) -> None:
         if not 0.0 <= self.low < self.high:
             raise InputError(f"bounds of a prior need 0 <= low < high, not low = {self.low:g}, high = {self.high:g}")
-        if self._mass < _LEAST:
+        if self._mass < 1e-3:  # as stated above: the median is far outside
             raise InputError(
                 f"the bounds low = {self.low:g}, high = {self.high:g} leave almost nothing of a prior with median"
                 f" {self.median:g}; bring the median within them"
             )
 
     @property
-    def _whole(self) -> LogNormal:
+    def _parent(self) -> LogNormal:
         return LogNormal(self.median, self.spread)
 
     @property
@@ -253,25 +235,14 @@ class TruncatedLogNormal(Bounded):
         return low / self.spread, high / self.spread
 
     @property
-    def _below(self) -> float:
+    def _cdf_low(self) -> float:
         return _normal_cdf(self._limits[0])
 
     @property
     def _mass(self) -> float:
-        return _normal_cdf(self._limits[1]) - self._below
+        return _normal_cdf(self._limits[1]) - self._cdf_low
 
-    @property
-    def log_mean(self) -> float:
-        """Mean of log x."""
-        return self._moments[0]
-
-    @property
-    def log_sd(self) -> float:
-        """Standard deviation of log x."""
-        return self._moments[1]
-
-    @property
-    def _moments(self) -> tuple[float, float]:
+    def _log_moments(self) -> tuple[float, float]:
         """By quadrature: the closed form cancels where the bounds are close."""
         low, high = np.clip(self._limits, -10.0, 10.0)  # all but 1e-23 of it
         nodes, weights = np.polynomial.legendre.leggauss(128)
@@ -283,16 +254,16 @@ class TruncatedLogNormal(Bounded):
 
     def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """Normal in u, over the mass that the bounds leave."""
-        return jnp.where(self.inside(u), self._whole.log_density(u) - math.log(self._mass), -jnp.inf)
+        return jnp.where(self.contains(u), self._parent.log_density(u) - math.log(self._mass), -jnp.inf)
 
-    def share(self, u: ArrayLike) -> Float[Array, "*shape"]:
+    def cdf(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """The probability below u = log x inside the bounds."""
-        return (ndtr(self._whole.score(u)) - self._below) / self._mass
+        return (ndtr(self._parent.to_standard_normal(u)) - self._cdf_low) / self._mass
 
-    def at_share(self, p: ArrayLike) -> Float[Array, "*shape"]:
-        """The inverse of `share`: log x."""
-        z = ndtri(self._below + jnp.asarray(p) * self._mass)
-        return self._whole.at_score(jnp.clip(z, *self._limits))
+    def ppf(self, p: ArrayLike) -> Float[Array, "*shape"]:
+        """The inverse of `cdf`: log x."""
+        z = ndtri(self._cdf_low + jnp.asarray(p) * self._mass)
+        return self._parent.from_standard_normal(jnp.clip(z, *self._limits))
 
 
 def _log(x: Any) -> Any:

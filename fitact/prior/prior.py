@@ -16,10 +16,6 @@ from jaxtyping import Array, Float
 from fitact.errors import InputError
 from fitact.prior.distributions import Distribution
 
-_NODES, _TERMS = 96, 24  # of the quadrature and the series behind covariances
-_FIXED_POINT = 64  # steps towards a ratio, which converge by a factor of 2 or more each
-_TRIES = 1000  # rounds of draws, of which an order may leave one in as many
-
 
 class Prior(eqx.Module):
     """Priors of named parameters, independent or correlated; `Prior.of(Rsc=..., Csc=..., Ci=...)` makes one.
@@ -31,8 +27,8 @@ class Prior(eqx.Module):
         names: the parameters, in the order of the chain.
         marginals: what is believed of each alone.
         pairs: (name, other, correlation) of those that are correlated.
-        ordered: (lower, higher) of those that must come in that order. The density is then zero elsewhere, and as
-            it would be without where it is not; moments, covariance and residuals are those without, too.
+        order_constraints: (lower, higher) of those that must come in that order. The density is then zero elsewhere,
+            and as it would be without where it is not; moments, covariance and residuals are those without, too.
 
     Raises:
         InputError: a pair names no two parameters of it, or correlations or orders contradict each other.
@@ -41,10 +37,10 @@ class Prior(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     marginals: tuple[Distribution, ...]
     pairs: tuple[tuple[str, str, float], ...] = eqx.field(static=True, default=())
-    ordered: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
+    order_constraints: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
 
     def __check_init__(self) -> None:
-        for name, other, *_ in (*self.pairs, *self.ordered):
+        for name, other, *_ in (*self.pairs, *self.order_constraints):
             if name == other or not {name, other} <= set(self.names):
                 raise InputError(
                     f"[prior] cannot correlate or order {name} and {other}; name two of its free parameters,"
@@ -56,7 +52,7 @@ class Prior(eqx.Module):
 
     def _check_orders(self) -> None:
         sorter = graphlib.TopologicalSorter[str]()
-        for lower, higher in self.ordered:
+        for lower, higher in self.order_constraints:
             sorter.add(higher, lower)
         try:
             sorter.prepare()
@@ -77,23 +73,23 @@ class Prior(eqx.Module):
     def of(
         cls,
         correlation: Mapping[tuple[str, str], float] | None = None,
-        ordered: tuple[tuple[str, str], ...] = (),
+        order_constraints: tuple[tuple[str, str], ...] = (),
         /,
         **marginals: Distribution,
     ) -> "Prior":
         """The prior with these marginals, and the correlations of pairs such as ``{("Rsc", "Csc"): -0.6}``."""
         pairs = tuple((name, other, float(value)) for (name, other), value in (correlation or {}).items())
-        return cls(tuple(marginals), tuple(marginals.values()), pairs, ordered)
+        return cls(tuple(marginals), tuple(marginals.values()), pairs, order_constraints)
 
-    def including(self, **marginals: Distribution) -> "Prior":
+    def replace_marginals(self, **marginals: Distribution) -> "Prior":
         """With these marginals in place of, or after, its own."""
         merged = dict(zip(self.names, self.marginals, strict=True)) | marginals
-        return Prior(tuple(merged), tuple(merged.values()), self.pairs, self.ordered)
+        return Prior(tuple(merged), tuple(merged.values()), self.pairs, self.order_constraints)
 
-    def without(self, *names: str) -> "Prior":
+    def drop_marginals(self, *names: str) -> "Prior":
         """Without the marginals of these names."""
         kept = {n: m for n, m in zip(self.names, self.marginals, strict=True) if n not in names}
-        return Prior(tuple(kept), tuple(kept.values()), self.pairs, self.ordered)
+        return Prior(tuple(kept), tuple(kept.values()), self.pairs, self.order_constraints)
 
     def __getitem__(self, name: str) -> Distribution:
         return self.marginals[self.names.index(name)]
@@ -126,12 +122,12 @@ class Prior(eqx.Module):
         variance = np.diag(self.log_sd**2)
         if not self.pairs:
             return variance
-        z, weight = np.polynomial.hermite_e.hermegauss(_NODES)
-        powers = np.arange(1, _TERMS)
-        polynomials = np.polynomial.hermite_e.hermevander(z, _TERMS - 1)[:, 1:]
+        z, weight = np.polynomial.hermite_e.hermegauss(96)
+        powers = np.arange(1, 24)
+        polynomials = np.polynomial.hermite_e.hermevander(z, powers[-1])[:, 1:]
         polynomials = polynomials / np.sqrt(np.cumprod(powers, dtype=float))
         with jax.ensure_compile_time_eval(), jax.enable_x64(True):
-            logs = np.array([marginal.at_score(z) for marginal in self.marginals])
+            logs = np.array([marginal.from_standard_normal(z) for marginal in self.marginals])
         coefficients = logs @ (polynomials * (weight / math.sqrt(2.0 * math.pi))[:, None])
         joint = np.einsum("ik,jk,ijk->ij", coefficients, coefficients, self.correlation[..., None] ** powers)
         return np.where(np.eye(len(self.names)), variance, joint)
@@ -139,11 +135,11 @@ class Prior(eqx.Module):
     def log_density(self, u: Float[Array, " parameters"]) -> Float[Array, ""]:
         """Log-density of the log-parameters; -inf where one, or their order, is impossible."""
         value = sum((marginal.log_density(u[i]) for i, marginal in enumerate(self.marginals)), jnp.zeros(()))
-        for lower, higher in self.ordered:
+        for lower, higher in self.order_constraints:
             value = jnp.where(u[self.names.index(lower)] < u[self.names.index(higher)], value, -jnp.inf)
         if not self.pairs:
             return value
-        z = jnp.stack([marginal.score(u[i]) for i, marginal in enumerate(self.marginals)])
+        z = jnp.stack([marginal.to_standard_normal(u[i]) for i, marginal in enumerate(self.marginals)])
         root = np.linalg.cholesky(self.correlation)
         white = solve_triangular(root, z, lower=True)
         return value - 0.5 * (white @ white - z @ z) - np.log(np.diag(root)).sum()
@@ -151,7 +147,7 @@ class Prior(eqx.Module):
     def residuals(self, u: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         """The log-parameters whitened by mean and covariance: the normal prior with its moments, as residuals."""
         if not self.pairs:
-            return jnp.array([marginal.whitened(u[i]) for i, marginal in enumerate(self.marginals)])
+            return jnp.array([marginal.standardize(u[i]) for i, marginal in enumerate(self.marginals)])
         return solve_triangular(np.linalg.cholesky(self.covariance), u - self.log_mean, lower=True)
 
     def sample(self, rng: np.random.Generator, size: int) -> dict[str, Float[np.ndarray, " size"]]:
@@ -160,9 +156,9 @@ class Prior(eqx.Module):
         Raises:
             InputError: the marginals leave next to nothing in the order asked for.
         """
-        return self._in_given_order(lambda: rng.standard_normal((len(self.names), size)), size)
+        return self._sample_ordered(lambda: rng.standard_normal((len(self.names), size)), size)
 
-    def spread(self, size: int) -> dict[str, Float[np.ndarray, " size"]]:
+    def sample_qmc(self, size: int) -> dict[str, Float[np.ndarray, " size"]]:
         """As `sample`, but spread evenly over the prior, and always the same.
 
         The Kronecker sequence of the generalised golden ratio (M. Roberts, 2018), as normal scores.
@@ -172,7 +168,7 @@ class Prior(eqx.Module):
         """
         axes = np.arange(1, len(self.names) + 1)
         ratio = 2.0
-        for _ in range(_FIXED_POINT):
+        for _ in range(64):  # the fixed point; each step comes nearer by a factor of 2 or more
             ratio = (1.0 + ratio) ** (1.0 / (axes.size + 1))
         count = itertools.count()
 
@@ -181,32 +177,32 @@ class Prior(eqx.Module):
             share = (0.5 + number * ratio ** -axes[:, None].astype(float)) % 1.0
             return np.vectorize(statistics.NormalDist().inv_cdf, otypes=[float])(share)
 
-        return self._in_given_order(scores, size)
+        return self._sample_ordered(scores, size)
 
-    def _in_given_order(
-        self, scores: Callable[[], Float[np.ndarray, "parameters size"]], size: int
+    def _sample_ordered(
+        self, scores: Callable[[], Float[np.ndarray, "parameters size"]], size: int, max_rounds: int = 1000
     ) -> dict[str, Float[np.ndarray, " size"]]:
         """The first `size` of the parameters at `scores()` that are in the order asked for."""
-        drawn = self._at_scores(scores())
-        kept = {name: values[self._in_order(drawn)] for name, values in drawn.items()}
-        for _ in range(_TRIES):
+        kept = {name: np.zeros(0) for name in self.names}
+        for _ in range(1 + max_rounds):
+            draws = self._transform_scores(scores())
+            in_order = self._satisfies_order(draws)
+            kept = {name: np.append(kept[name], values[in_order]) for name, values in draws.items()}
             if all(values.size >= size for values in kept.values()):
                 return {name: values[:size] for name, values in kept.items()}
-            drawn = self._at_scores(scores())
-            kept = {name: np.append(kept[name], values[self._in_order(drawn)]) for name, values in drawn.items()}
-        stated = ", ".join(f"{lower} < {higher}" for lower, higher in self.ordered)
+        stated = ", ".join(f"{lower} < {higher}" for lower, higher in self.order_constraints)
         raise InputError(f"the priors leave next to nothing in the order {stated}; widen them, or leave it out")
 
-    def _at_scores(self, scores: Float[np.ndarray, "parameters size"]) -> dict[str, Float[np.ndarray, " size"]]:
+    def _transform_scores(self, scores: Float[np.ndarray, "parameters size"]) -> dict[str, Float[np.ndarray, " size"]]:
         """The parameters at independent normal scores."""
         z = np.linalg.cholesky(self.correlation) @ scores
         with jax.enable_x64(True):
             return {
-                name: np.exp(np.asarray(marginal.at_score(row)))
+                name: np.exp(np.asarray(marginal.from_standard_normal(row)))
                 for name, marginal, row in zip(self.names, self.marginals, z, strict=True)
             }
 
-    def _in_order(self, drawn: Mapping[str, np.ndarray]) -> np.ndarray:
+    def _satisfies_order(self, draws: Mapping[str, np.ndarray]) -> np.ndarray | slice:
         """Which draws are in the order asked for."""
-        size = len(next(iter(drawn.values()), ()))
-        return np.all([np.ones(size, dtype=bool), *(drawn[low] < drawn[high] for low, high in self.ordered)], axis=0)
+        in_order = [draws[low] < draws[high] for low, high in self.order_constraints]
+        return np.all(in_order, axis=0) if in_order else slice(None)

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple, TypeAlias
 from fitact.model.force import EPSILON_0, plate_capacitance, plate_resistance
 from fitact.prior.distributions import Distribution, LogNormal, Uniform
 
-Table: TypeAlias = Literal["gabriel-dry", "gabriel-wet", "paper"]
+PublishedTable: TypeAlias = Literal["gabriel-dry", "gabriel-wet", "paper"]
 
 _HIGH_FREQUENCY = 4.0  # relative permittivity
 # S. Gabriel, R. W. Lau, C. Gabriel, Phys. Med. Biol. 41 (1996) 2271, table 1:
@@ -18,9 +18,6 @@ _GABRIEL = {
         ((39.0, 7.958e-12, 0.1), (280.0, 79.577e-9, 0.0), (3e4, 1.592e-6, 0.16), (3e4, 1.592e-3, 0.2)),
     ),
 }
-# A finger's state is known less well than the tables': from the middle between dry and wet it is a factor
-# sqrt(40) in permittivity to either, so with this one each table reaches half-way to the other.
-_FACTOR = 6.0
 _PAPER_RESISTIVITY, _PAPER_PERMITTIVITY = (4e4, 1e5), (2e3, 1e4)  # ohm m, 1: its ranges over 10 to 1000 Hz
 
 
@@ -32,8 +29,12 @@ class Layer(NamedTuple):
     frequency: float
 
 
-def published(table: Table, name: str, layer: Layer) -> Distribution:
-    """The prior of a layer's resistance (`name` ends in Rsc) or capacitance by a published table, eqs. (3) and (4)."""
+def published_prior(table: PublishedTable, name: str, layer: Layer, factor: float = 6.0) -> Distribution:
+    """The prior of a layer's resistance (`name` ends in Rsc) or capacitance by a published table, eqs. (3) and (4).
+
+    A finger's state is known less well than the tables': from the middle between dry and wet it is a factor
+    sqrt(40) in permittivity to either, so with this `factor` each table reaches half-way to the other.
+    """
     of_resistance = name.endswith("Rsc")
     if table == "paper":
         if of_resistance:
@@ -42,8 +43,8 @@ def published(table: Table, name: str, layer: Layer) -> Distribution:
     permittivity = skin_permittivity(table, layer.frequency)
     if of_resistance:
         resistivity = -1.0 / (permittivity.imag * EPSILON_0 * 2.0 * math.pi * layer.frequency)
-        return LogNormal.within_factor(plate_resistance(resistivity, layer.area, layer.thickness), _FACTOR)
-    return LogNormal.within_factor(plate_capacitance(permittivity.real, layer.area, layer.thickness), _FACTOR)
+        return LogNormal.within_factor(plate_resistance(resistivity, layer.area, layer.thickness), factor)
+    return LogNormal.within_factor(plate_capacitance(permittivity.real, layer.area, layer.thickness), factor)
 
 
 def skin_permittivity(table: Literal["gabriel-dry", "gabriel-wet"], frequency: float) -> complex:

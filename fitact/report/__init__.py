@@ -1,5 +1,8 @@
-"""What people look at: self-contained pages, and pictures."""
+"""How is an answer shown?
 
-from fitact.report.page import read_results, write_report
+Takes results; gives self-contained HTML pages and figures, each imported when it is first used.
+"""
 
-__all__ = ["read_results", "write_report"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -4,14 +4,12 @@ import os
 from pathlib import Path
 
 from fitact.batch.fit_many import Fits
-from fitact.report.frame import Answer, Frame, Origin, write_page
-from fitact.units import engineering
-
-_SHOWN = 2_000  # rows on the page; the tables have all
+from fitact.report.frame import Answer, PageSummary, Provenance, write_page
+from fitact.units import format_engineering
 
 
-def write_campaign(folder: str | os.PathLike[str], fits: Fits, origin: Origin) -> Path:
-    """Write results.parquet, failures.csv and index.html into a folder; gives the page.
+def write_campaign(folder: str | os.PathLike[str], fits: Fits, origin: Provenance, max_rows: int = 2000) -> Path:
+    """Write results.parquet, failures.csv and index.html, with no more than `max_rows` of each; gives the page.
 
     Raises:
         InputError: the place cannot be written.
@@ -20,7 +18,7 @@ def write_campaign(folder: str | os.PathLike[str], fits: Fits, origin: Origin) -
     answered.to_parquet(place / "results.parquet")
     failures.to_csv(place / "failures.csv", ("record", "result", "message"))
     trusted = sum(bool(row["trusted"]) for row in fits)
-    frame = Frame(
+    frame = PageSummary(
         title="Campaign",
         subject=f"{len(fits):,} records, each fitted by itself.",
         trusted=True,
@@ -32,16 +30,16 @@ def write_campaign(folder: str | os.PathLike[str], fits: Fits, origin: Origin) -
             Answer("without an answer", f"{len(failures):,}", "records; failures.csv has the reasons"),
         ),
         warnings=(),
-        reserved=trusted < len(fits),
+        has_reservation=trusted < len(fits),
     )
     write_page(
         place / "index.html",
         "campaign.html",
         frame,
         origin,
-        answers=answered[:_SHOWN],
-        failures=[(row["record"], row["result"], row["message"]) for row in failures[:_SHOWN]],
+        answers=answered[:max_rows],
+        failures=[(row["record"], row["result"], row["message"]) for row in failures[:max_rows]],
         count=len(answered),
-        engineering=engineering,
+        engineering=format_engineering,
     )
     return place / "index.html"

@@ -9,22 +9,21 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from fitact.charts import interactive as charts
-from fitact.charts.figure import log_ticks, write_svg
+from fitact.charts import interactive
+from fitact.charts.figure import ALERT, DATA, GREEN, MODEL, ORANGE, PINK, PRIOR, SKY, log_ticks, write_figure
 from fitact.charts.interactive import Axis
 from fitact.design.drive import LEGEND, DriveDesign
-from fitact.design.drive_option import PEOPLE, DriveOption, quantile, shown
-from fitact.report.frame import Answer, Frame, Origin, image, write_page
-from fitact.units import engineering
+from fitact.design.drive_option import FINGER_QUANTILES, DriveOption, format_quantity, quantile
+from fitact.report.frame import Answer, PageSummary, Provenance, image, write_page
+from fitact.units import format_engineering
 
 _COLORS = {
-    "sine": "#0072B2",
-    "triangle": "#009E73",
-    "square": "#CC79A7",
-    "trapezoid": "#333333",
-    "multitone": "#56B4E9",
+    "sine": MODEL,
+    "triangle": GREEN,
+    "square": PINK,
+    "trapezoid": DATA,
+    "multitone": SKY,
 }
-_LIMIT, _CURRENT = "#D55E00", "#E69F00"
 
 
 def write_drive_design(path: str | os.PathLike[str], design: DriveDesign) -> None:
@@ -33,7 +32,7 @@ def write_drive_design(path: str | os.PathLike[str], design: DriveDesign) -> Non
     Raises:
         InputError: the place cannot be written.
     """
-    write_svg(path, lambda: _figure(design))
+    write_figure(path, lambda: _figure(design))
 
 
 def _figure(design: DriveDesign) -> Figure:
@@ -64,47 +63,47 @@ def _draw_both_insulators(thicknesses: Axes, permittivities: Axes, design: Drive
     permittivities.set_xlabel("insulator's relative permittivity")
 
 
-def _own_first(design: DriveDesign) -> list[str]:
+def _order_waveforms(design: DriveDesign) -> list[str]:
     return sorted(design.options, key=lambda name: name != design.own)
 
 
-def _width(design: DriveDesign, name: str) -> float:
+def _line_width(design: DriveDesign, name: str) -> float:
     """So that another wave on top of the scene's own hides it not."""
     return 3.0 if name == design.own else 1.3
 
 
 def _draw_curves(axes: Axes, design: DriveDesign) -> None:
-    for name in _own_first(design):
+    for name in _order_waveforms(design):
         curve = design.curve(name)
         title = f"{name}, the scene's" if name == design.own else name
-        axes.plot(curve["peak_to_peak"], curve["q50"], color=_COLORS[name], lw=_width(design, name), label=title)
+        axes.plot(curve["peak_to_peak"], curve["q50"], color=_COLORS[name], lw=_line_width(design, name), label=title)
         axes.fill_between(curve["peak_to_peak"], curve["q05"], curve["q95"], color=_COLORS[name], alpha=0.2, lw=0)
-    axes.axhline(design.share, color=_LIMIT, lw=1.0, ls="--")
+    axes.axhline(design.share, color=ALERT, lw=1.0, ls="--")
     axes.set_xscale("log")
     log_ticks(axes.xaxis, "V")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.set_xlabel("peak-to-peak amplitude")
-    axes.set_ylabel("people who feel it" + (" (band: 90 %)" if design.people.separated else ""))
+    axes.set_ylabel("people who feel it" + (" (band: 90 %)" if design.people.has_separate_uncertainty else ""))
     axes.legend(fontsize=9)
 
 
 def _draw_frequencies(axes: Axes, design: DriveDesign) -> None:
-    for name in _own_first(design):
+    for name in _order_waveforms(design):
         options = design.by_frequency[name]
         frequency = [option.frequency for option in options]
         if name == design.own:
-            people = np.stack([_drawn(option.people) for option in options])
+            people = np.stack([_mask_infinite(option.people) for option in options])
             for low, high, label in ((0, 4, f"90 % of people, {name}"), (1, 3, f"50 %, {name}")):
                 axes.fill_between(
                     frequency, people[:, low], people[:, high], color=_COLORS[name], alpha=0.18, lw=0, label=label
                 )
         median = [float(quantile(option.amplitude, 0.5)) for option in options]
         title = f"{100.0 * design.share:g} %, {name}"
-        axes.plot(frequency, _drawn(median), color=_COLORS[name], lw=_width(design, name), label=title)
+        axes.plot(frequency, _mask_infinite(median), color=_COLORS[name], lw=_line_width(design, name), label=title)
     axes.set_xscale("log")
     axes.set_xlim(8.0, 1250.0)
     log_ticks(axes.xaxis, "Hz")
-    _volts(axes)
+    _format_volts(axes)
     axes.set_xlabel("frequency of the drive")
     axes.set_ylabel("peak-to-peak amplitude needed")
     axes.legend(fontsize=9)
@@ -114,37 +113,34 @@ def _draw_insulators(
     axes: Axes, design: DriveDesign, options: Sequence[DriveOption], place: Callable[[DriveOption], float]
 ) -> None:
     at, color = [place(option) for option in options], _COLORS[design.own]
-    low, median, high = (_drawn([float(quantile(o.amplitude, q)) for o in options]) for q in (0.05, 0.5, 0.95))
+    low, median, high = (_mask_infinite([float(quantile(o.amplitude, q)) for o in options]) for q in (0.05, 0.5, 0.95))
     axes.fill_between(at, low, high, color=color, alpha=0.25, lw=0)
     axes.plot(at, median, ".-", color=color, label=f"{100.0 * design.share:g} % need")
-    for what, limit, shade in (
-        ("the insulator breaks down", [_allowed(o, "insulator_peak", o.breakdown_voltage) for o in options], _LIMIT),
-        ("rms current's limit", [_allowed(o, "current_rms", o.device.current_limit_rms) for o in options], _CURRENT),
-        (
-            "peak current's limit",
-            [_allowed(o, "current_peak", o.device.current_limit_peak) for o in options],
-            "#999999",
-        ),
+    for what, quantity, limit, shade in (
+        ("the insulator breaks down", "insulator_peak", lambda o: o.breakdown_voltage, ALERT),
+        ("rms current's limit", "current_rms", lambda o: o.device.current_limit_rms, ORANGE),
+        ("peak current's limit", "current_peak", lambda o: o.device.current_limit_peak, PRIOR),
     ):
-        if np.any(np.isfinite(limit)):
-            axes.plot(at, limit, color=shade, lw=1.5, ls="--", label=what)
-    _volts(axes)
+        amplitude = [_limit_amplitude(option, quantity, limit(option)) for option in options]
+        if np.any(np.isfinite(amplitude)):
+            axes.plot(at, amplitude, color=shade, lw=1.5, ls="--", label=what)
+    _format_volts(axes)
     axes.set_ylabel(f"peak-to-peak amplitude, {design.own}")
 
 
-def _allowed(option: DriveOption, what: str, limit: float | None) -> float:
+def _limit_amplitude(option: DriveOption, quantity: str, limit: float | None) -> float:
     """The amplitude at which a limit is met, V: all are linear in it."""
-    reached = float(getattr(option.at_assured, what))
+    reached = float(getattr(option.at_assured, quantity))
     return np.nan if limit is None or not np.isfinite(reached) else option.assured * limit / reached
 
 
-def _drawn(amplitude: Sequence[float] | Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def _mask_infinite(amplitude: Sequence[float] | Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """With a gap where it is infinite."""
     values = np.asarray(amplitude, dtype=float)
     return np.where(np.isfinite(values), values, np.nan)
 
 
-def _volts(axes: Axes) -> None:
+def _format_volts(axes: Axes) -> None:
     if not any(np.isfinite(np.asarray(line.get_ydata(), dtype=float)).any() for line in axes.lines):
         axes.set_yticks([])
         axes.text(0.5, 0.5, "too few feel it at any amplitude", transform=axes.transAxes, ha="center")
@@ -153,14 +149,16 @@ def _volts(axes: Axes) -> None:
     log_ticks(axes.yaxis, "V")
 
 
-def write_drive_design_page(path: str | os.PathLike[str], design: DriveDesign, origin: Origin) -> None:
+def write_drive_design_page(path: str | os.PathLike[str], design: DriveDesign, origin: Provenance) -> None:
     """Write a drive's design as a page.
 
     Raises:
         InputError: the place cannot be written.
     """
-    people = [("waveform", *(f"{100.0 * share:g} %" for share in PEOPLE))]
-    people += [(name, *(shown(each, "V") for each in option.people)) for name, option in design.options.items()]
+    people = [("waveform", *(f"{100.0 * share:g} %" for share in FINGER_QUANTILES))]
+    people += [
+        (name, *(format_quantity(each, "V") for each in option.people)) for name, option in design.options.items()
+    ]
     write_page(
         path,
         "drive.html",
@@ -169,40 +167,40 @@ def write_drive_design_page(path: str | os.PathLike[str], design: DriveDesign, o
         table=design.table,
         legend=LEGEND,
         excluded=design.excluded,
-        separated=design.people.separated,
+        separated=design.people.has_separate_uncertainty,
         people=people,
         limits=_limits(design),
         curves=_curve_chart(design),
-        curves_image=image(lambda: _alone(_draw_curves, design)),
+        curves_image=image(lambda: _single_figure(_draw_curves, design)),
         frequencies=_frequency_chart(design),
-        frequencies_image=image(lambda: _alone(_draw_frequencies, design)),
+        frequencies_image=image(lambda: _single_figure(_draw_frequencies, design)),
         insulators=image(lambda: _insulator_figure(design)),
     )
 
 
-def _frame(design: DriveDesign) -> Frame:
+def _frame(design: DriveDesign) -> PageSummary:
     least, *others = (sentence.split(": ", 1) for sentence in design.sentences)
     kept = design.smallest()["peak_to_peak"] is not None
     verdict = f"The {least[0]} within the limits: {least[1]}" if kept else "No waveform keeps the limits"
     findings = {"Who is to feel what": f"{design.question}."}
     findings |= {f"{what[0].upper()}{what[1:]}": f"{answer}." for what, answer in (others if kept else others[2:])}
-    return Frame(
+    return PageSummary(
         title=f"The smallest drive that {100.0 * design.share:g} % of people feel",
         subject=f"Peak-to-peak amplitude, power, current and the insulator's voltage by waveform at"
-        f" {engineering(design.options[design.own].frequency, 'Hz', 3)}, by frequency and by insulator.",
+        f" {format_engineering(design.options[design.own].frequency, 'Hz', 3)}, by frequency and by insulator.",
         trusted=design.trusted,
         verdict=verdict if design.trusted else f"{'; '.join(design.warnings)}.",
         findings=findings,
         answers=[
             Answer(
                 name,
-                shown(option.assured, "V", option.assured_error),
+                format_quantity(option.assured, "V", option.assured_error),
                 "excluded" if option.violations else "keeps the limits stated",
             )
             for name, option in design.options.items()
         ],
         warnings=design.warnings,
-        reserved=not kept,
+        has_reservation=not kept,
     )
 
 
@@ -213,50 +211,50 @@ def _limits(design: DriveDesign) -> tuple[tuple[str, str], ...]:
         ("rms current", device.current_limit_rms, "A"),
         ("peak current", device.current_limit_peak, "A"),
     )
-    return tuple((name, "not stated" if x is None else engineering(x, unit)) for name, x, unit in stated)
+    return tuple((name, "not stated" if x is None else format_engineering(x, unit)) for name, x, unit in stated)
 
 
-def _alone(draw: Callable[[Axes, DriveDesign], None], design: DriveDesign) -> Figure:
+def _single_figure(draw: Callable[[Axes, DriveDesign], None], design: DriveDesign) -> Figure:
     figure = Figure(figsize=(9.0, 4.6), layout="constrained")
     draw(figure.add_subplot(), design)
     return figure
 
 
-def _curve_chart(design: DriveDesign) -> charts.Chart:
+def _curve_chart(design: DriveDesign) -> interactive.Chart:
     curves = {name: design.curve(name) for name in design.options}
-    x = Axis.of("peak-to-peak amplitude", "V", curves[design.own]["peak_to_peak"], log=True)
+    x = Axis.from_values("peak-to-peak amplitude", "V", curves[design.own]["peak_to_peak"], log=True)
     y = Axis("people who feel it", "%", 0.01)
     traces = []
-    for name in _own_first(design):
+    for name in _order_waveforms(design):
         curve, color = curves[name], _COLORS[name]
         at = curve["peak_to_peak"]
-        if design.people.separated:
+        if design.people.has_separate_uncertainty:
             edges = (f"{name}, 5 %", f"{name}, 95 %", f"{name}, 90 % band")
-            band = charts.band(x, y, at, curve["q05"], curve["q95"], edges, color)
+            band = interactive.band(x, y, at, curve["q05"], curve["q95"], edges, color)
             traces += [each | {"showlegend": False} for each in band]
-        traces.append(charts.line(x, y, at, curve["q50"], name, color, width=_width(design, name)))
+        traces.append(interactive.line(x, y, at, curve["q50"], name, color, width=_line_width(design, name)))
     at = curves[design.own]["peak_to_peak"][[0, -1]]
-    traces.append(charts.line(x, y, at, [design.share] * 2, "asked for", _LIMIT, dash="dash"))
-    plot = charts.plot(x, (y, traces), size=420)
+    traces.append(interactive.line(x, y, at, [design.share] * 2, "asked for", ALERT, dash="dash"))
+    plot = interactive.plot(x, (y, traces), size=420)
     plot["layout"]["legend"]["traceorder"] = "normal"  # bands would turn it over
-    return charts.chart(plot, controls=[charts.logarithmic([plot])])
+    return interactive.chart(plot, controls=[interactive.log_axis_button([plot])])
 
 
-def _frequency_chart(design: DriveDesign) -> charts.Chart:
+def _frequency_chart(design: DriveDesign) -> interactive.Chart:
     needed = {
         name: [float(quantile(option.amplitude, 0.5)) for option in options]
         for name, options in design.by_frequency.items()
     }
-    x = Axis.of(
+    x = Axis.from_values(
         "frequency of the drive", "Hz", [option.frequency for option in design.by_frequency[design.own]], log=True
     )
-    y = Axis.of("peak-to-peak amplitude needed", "V", needed[design.own], log=True)
+    y = Axis.from_values("peak-to-peak amplitude needed", "V", needed[design.own], log=True)
     traces = [
-        charts.line(
-            x, y, [option.frequency for option in design.by_frequency[name]], _drawn(needed[name]), name, _COLORS[name],
-            width=_width(design, name),
+        interactive.line(
+            x, y, [option.frequency for option in design.by_frequency[name]], _mask_infinite(needed[name]), name,
+            _COLORS[name], width=_line_width(design, name),
         )
-        for name in _own_first(design)
+        for name in _order_waveforms(design)
     ]  # fmt: skip
-    plot = charts.plot(x, (y, traces), size=420)
-    return charts.chart(plot, controls=[charts.logarithmic([plot], "xy", "logarithmic axes")])
+    plot = interactive.plot(x, (y, traces), size=420)
+    return interactive.chart(plot, controls=[interactive.log_axis_button([plot], "xy", "logarithmic axes")])

@@ -6,19 +6,21 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
+import jinja2
 import matplotlib as mpl
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from fitact.charts import figure as plots
+from fitact.charts import figure
 from fitact.data.record import Record
+from fitact.files import atomic_write
 from fitact.populations.finger import Finger
-from fitact.report.html import write_html
 from fitact.scene.scene import Scene
 from fitact.summary import versions
 
 
 @dataclasses.dataclass(frozen=True)
-class Origin:
+class Provenance:
     """How a result came about.
 
     Attributes:
@@ -32,7 +34,7 @@ class Origin:
     records: Mapping[str, str]
 
     @classmethod
-    def of(cls, command: str, scene: Scene | None, records: Sequence[Record | Finger] = ()) -> Self:
+    def from_inputs(cls, command: str, scene: Scene | None, records: Sequence[Record | Finger] = ()) -> Self:
         """From what the command was given."""
         stated = {} if scene is None else scene.model_dump(mode="json", exclude_unset=True)
         return cls(command, stated, {os.path.basename(each.source): each.fingerprint for each in records})
@@ -52,7 +54,7 @@ class Answer(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Frame:
+class PageSummary:
     """What stands at the top of every page.
 
     Attributes:
@@ -62,7 +64,7 @@ class Frame:
         findings: sentences, by what they answer.
         answers: the few numbers.
         warnings: sentences.
-        reserved: whether a trusted answer is not the one that was hoped for, as the verdict says.
+        has_reservation: whether a trusted answer is not the one that was hoped for, as the verdict says.
     """
 
     title: str
@@ -72,10 +74,12 @@ class Frame:
     findings: Mapping[str, str]
     answers: Sequence[Answer]
     warnings: Sequence[str]
-    reserved: bool = False
+    has_reservation: bool = False
 
 
-def write_page(path: str | os.PathLike[str], template: str, frame: Frame, origin: Origin, **content: Any) -> None:
+def write_page(
+    path: str | os.PathLike[str], template: str, frame: PageSummary, origin: Provenance, **content: Any
+) -> None:
     """Write a page: `frame`, what `template` makes of `content`, and `origin`.
 
     Raises:
@@ -84,7 +88,22 @@ def write_page(path: str | os.PathLike[str], template: str, frame: Frame, origin
     write_html(path, template, frame=frame, origin=origin, versions=versions(), **content)
 
 
+def write_html(path: str | os.PathLike[str], template: str, **content: Any) -> None:
+    """Write what a template makes of `content`.
+
+    Raises:
+        InputError: the place cannot be written.
+        jinja2.UndefinedError: the template wants more than there is.
+    """
+    loader = jinja2.PackageLoader("fitact.report")
+    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    environment.globals["verbatim"] = lambda name: Markup(loader.get_source(environment, name)[0])  # scripts of ours
+    page = environment.get_template(template).render(**content)
+    with atomic_write(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
 def image(draw: Callable[[], Figure], **settings: Any) -> str:
     """A figure in the shared style, as the source of an image."""
-    with mpl.rc_context(plots.style() | settings):
-        return plots.source(plots.svg(draw()))
+    with mpl.rc_context(figure.style() | settings):
+        return figure.svg_data_uri(figure.svg(draw()))

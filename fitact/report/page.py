@@ -11,13 +11,12 @@ from typing import Any
 import jinja2
 import matplotlib as mpl
 
-from fitact.charts import figure as plots
+from fitact.charts import figure
 from fitact.errors import InputError
-from fitact.report import posterior_charts
-from fitact.report.html import write_html
-from fitact.report.posterior_charts import CHANNELS
-from fitact.summary import BY_FORCE, load, width
-from fitact.units import engineering
+from fitact.report.frame import write_html
+from fitact.report.posterior import CHANNELS, make_charts, make_figures
+from fitact.summary import FORCE_DESCRIPTIONS, format_sd, load
+from fitact.units import format_engineering
 
 _LABELS = {
     "Rsc": "skin resistance Rsc",
@@ -53,8 +52,6 @@ _LABELS = {
     "force_rms": "electrostatic force, rms",
     "friction_mean": "friction, mean",
 }
-
-
 _CIRCUITS = {
     "final": "the paper's final circuit",
     "direct": "direct ground with more than the paper's final circuit",
@@ -77,19 +74,19 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
 
 
 def _content(tree: Any, summary: dict[str, Any]) -> dict[str, Any]:
-    with mpl.rc_context(plots.style()):
-        figures = _figures(tree)
+    with mpl.rc_context(figure.style()):
+        figures = {name: figure.svg_data_uri(svg) for name, svg in make_figures(tree).items()}
     return {
         "summary": summary,
         "figures": figures,
-        "charts": posterior_charts.charts(tree),
+        "charts": make_charts(tree),
         "label": _label,
         "channels": CHANNELS,
-        "force": BY_FORCE[summary["model"].get("force", "paper")],
+        "force": FORCE_DESCRIPTIONS[summary["model"].get("force", "paper")],
         "circuits": _CIRCUITS,
-        "engineering": engineering,
-        "quantity": _quantity,
-        "width": width,
+        "engineering": format_engineering,
+        "quantity": _format_quantity,
+        "width": format_sd,
         "command": _command(summary),
         "scene": json.dumps(summary["scene"], indent=2, ensure_ascii=False),
     }
@@ -113,31 +110,11 @@ def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]
         ) from error
 
 
-def _figures(tree: Any) -> dict[str, str]:
-    posterior = {str(name): values.values.ravel() for name, values in tree["posterior"].data_vars.items()}
-    prior = {str(name): values.values.ravel() for name, values in tree["prior"].data_vars.items()}
-    units = {str(name): values.attrs["units"] for name, values in tree["posterior"].data_vars.items()}
-    figures = {"corner": plots.corner_figure(posterior, prior, units), "force": plots.force_figure(posterior)}
-    for number, (name, observed) in enumerate(tree["observed_data"].data_vars.items()):
-        (axis,) = observed.dims
-        predicted = tree["posterior_predictive"][name]
-        figures[f"trace_{number}"] = plots.record_figure(
-            observed[axis].values,
-            observed.values,
-            tree["constant_data"][f"{name}_fit"].values,
-            predicted[axis].values,
-            predicted.values.reshape(-1, predicted.sizes[axis]),
-            CHANNELS[str(name).partition("_")[0]],
-            observed.attrs["units"],
-        )
-    return {name: plots.source(svg) for name, svg in figures.items()}
-
-
-def _quantity(summary: dict[str, Any], key: str = "q50", digits: int = 4) -> str:
+def _format_quantity(summary: dict[str, Any], key: str = "q50", digits: int = 4) -> str:
     """A number of a summary, with at least as many digits as tell its quantiles apart."""
     spread = summary["sd"] / abs(summary["mean"]) if summary["mean"] else 1.0
     needed = 1 + math.ceil(-math.log10(spread)) if 0.0 < spread < 1.0 else digits
-    return engineering(summary[key], summary["unit"], min(max(digits, needed), 8))
+    return format_engineering(summary[key], summary["unit"], min(max(digits, needed), 8))
 
 
 def _label(name: str) -> str:

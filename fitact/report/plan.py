@@ -6,13 +6,10 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from fitact.charts.figure import write_svg
+from fitact.charts.figure import ALERT, DATA, MODEL, PRIOR, write_figure
 from fitact.model_selection.plan import LEGEND, Plan
-from fitact.report.frame import Answer, Frame, Origin, image, write_page
-from fitact.units import percent
-
-_KEPT, _LEFT_OUT, _LIMIT = "#999999", "#0072B2", "#D55E00"
-_LEAST = 1e-8  # an error drawn on a logarithmic axis
+from fitact.report.frame import Answer, PageSummary, Provenance, image, write_page
+from fitact.units import format_percent
 
 
 def write_plan(path: str | os.PathLike[str], plan: Plan) -> None:
@@ -21,7 +18,7 @@ def write_plan(path: str | os.PathLike[str], plan: Plan) -> None:
     Raises:
         InputError: the place cannot be written.
     """
-    write_svg(path, lambda: _figure(plan))
+    write_figure(path, lambda: _figure(plan))
 
 
 def _figure(plan: Plan) -> Figure:
@@ -29,33 +26,37 @@ def _figure(plan: Plan) -> Figure:
     if plan.left_out:
         bars.append(("planned model", plan.nominal.force, plan.q95.force, False, plan.speedup))
     names, nominal, q95, kept, speedup = zip(*reversed(bars), strict=True)
-    place, shown = np.arange(len(bars)), np.maximum(nominal, _LEAST)
+    least = 1e-8  # of what a logarithmic axis shows: less is nothing to anybody
+    place, shown = np.arange(len(bars)), np.maximum(nominal, least)
     figure = Figure(figsize=(9.0, 1.6 + 0.45 * len(bars)), layout="constrained")
     axes = figure.add_subplot()
-    axes.barh(place, shown, left=0.0, color=[_KEPT if each else _LEFT_OUT for each in kept], height=0.6)
-    axes.plot(np.maximum(q95, _LEAST), place, "|", color="#333333", ms=14, mew=2, label="95 % of the prior")
-    axes.axvline(plan.full.tolerance.force, color=_LIMIT, label="tolerance")
+    axes.barh(place, shown, left=0.0, color=[PRIOR if each else MODEL for each in kept], height=0.6)
+    axes.plot(np.maximum(q95, least), place, "|", color=DATA, ms=14, mew=2, label="95 % of the prior")
+    axes.axvline(plan.full.tolerance.force, color=ALERT, label="tolerance")
     for at, error, faster in zip(place, np.maximum(nominal, q95), speedup, strict=True):
-        axes.annotate(f"{faster:.3g}×", (max(error, _LEAST), at), (8, 0), textcoords="offset points", va="center")
+        axes.annotate(f"{faster:.3g}×", (max(error, least), at), (8, 0), textcoords="offset points", va="center")
     axes.set_xscale("log")
     axes.set_xlim(0.3 * min(shown), 5.0 * max(*nominal, *q95, plan.full.tolerance.force))
     axes.set_yticks(place, names)
     axes.grid(axis="y", visible=False)
     axes.set_xlabel("relative error of the force, mean or peak, and how many times faster the model is")
-    handles = [mpl.patches.Patch(color=_LEFT_OUT, label="left out"), mpl.patches.Patch(color=_KEPT, label="kept")]
+    handles = [
+        mpl.patches.Patch(color=MODEL, label="left out"),
+        mpl.patches.Patch(color=PRIOR, label="kept"),
+    ]
     figure.legend(handles=[*handles, *axes.get_legend_handles_labels()[0]], loc="outside upper center", ncols=4)
     return figure
 
 
-def write_plan_page(path: str | os.PathLike[str], plan: Plan, origin: Origin) -> None:
+def write_plan_page(path: str | os.PathLike[str], plan: Plan, origin: Provenance) -> None:
     """Write a plan's page.
 
     Raises:
         InputError: the place cannot be written.
     """
-    tolerance = percent(plan.full.tolerance.force)
+    tolerance = format_percent(plan.full.tolerance.force)
     kept = "" if not plan.warnings else " at the nominal values, but not over the prior"
-    frame = Frame(
+    frame = PageSummary(
         title="Which model the scene requires",
         subject="What everything that the scene names changes in Vsc and force, and the cheapest model that keeps"
         f" [tolerance] force = {tolerance}.",
@@ -63,17 +64,18 @@ def write_plan_page(path: str | os.PathLike[str], plan: Plan, origin: Origin) ->
         verdict=f"The planned model keeps the tolerance of {tolerance} of the force{kept}",
         findings={"What is left out": plan.sentence},
         answers=[
-            Answer(
-                "mean force", percent(plan.nominal.force_mean), f"95 % of the prior: {percent(plan.q95.force_mean)}"
+            *(
+                Answer(title, format_percent(nominal), f"95 % of the prior: {format_percent(q95)}")
+                for title, nominal, q95 in (
+                    ("mean force", plan.nominal.force_mean, plan.q95.force_mean),
+                    ("peak force", plan.nominal.force_peak, plan.q95.force_peak),
+                    ("peak of Vsc", plan.nominal.Vsc_peak, plan.q95.Vsc_peak),
+                )
             ),
-            Answer(
-                "peak force", percent(plan.nominal.force_peak), f"95 % of the prior: {percent(plan.q95.force_peak)}"
-            ),
-            Answer("peak of Vsc", percent(plan.nominal.Vsc_peak), f"95 % of the prior: {percent(plan.q95.Vsc_peak)}"),
             Answer("speed", f"{plan.speedup:.3g}×", "of the full model"),
         ],
         warnings=plan.warnings,
-        reserved=bool(plan.warnings),
+        has_reservation=bool(plan.warnings),
     )
     picture = image(lambda: _figure(plan))
     write_page(path, "plan.html", frame, origin, table=plan.table, legend=LEGEND, model=plan.model(), picture=picture)

@@ -13,18 +13,30 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from fitact.charts import interactive as charts
+from fitact.charts import interactive
 from fitact.charts.figure import DATA, MODEL, PRIOR
 from fitact.charts.interactive import Axis
 from fitact.errors import InputError
-from fitact.populations.population import OFF, SHARED_OUT, SHARES, table, variance_sentences
-from fitact.report.frame import Answer, Frame, Origin, image, write_page
-from fitact.report.population import NOT_DRAWN, SETTINGS, draw_force, draw_shares, draw_skin, draw_time, drawable
-from fitact.summary import width
-from fitact.units import engineering, percent
+from fitact.populations.population import (
+    MAX_INTEGRATION_ERROR,
+    SHARES_LEGEND,
+    VARIANCE_QUANTITIES,
+    population_table,
+    variance_sentences,
+)
+from fitact.report.frame import Answer, PageSummary, Provenance, image, write_page
+from fitact.report.population import (
+    FONT_SETTINGS,
+    NOT_DRAWN_MESSAGE,
+    draw_force,
+    draw_shares,
+    draw_skin,
+    draw_time,
+    is_drawable,
+)
+from fitact.summary import format_sd
+from fitact.units import format_engineering, format_percent
 
-_SHOWN = 1500  # fingers to come
-_ROUNDING = 1e-12  # of the mean force: less is none
 _QUANTILES = {
     "q025": "2.5 %",
     "q05": "5 %",
@@ -58,7 +70,7 @@ _NUMERIC = (
     "convergence",
     "integrals_off",
 )
-_TO_COME, _BEFORE, _AFTER = "fingers to come", "before the records", "next finger"
+_NEW_LABEL, _PRIOR_LABEL, _POSTERIOR_LABEL = "fingers to come", "before the records", "next finger"
 
 
 def write_population_page(path: str | os.PathLike[str], tree: Any, content: dict[str, Any]) -> None:
@@ -67,20 +79,20 @@ def write_population_page(path: str | os.PathLike[str], tree: Any, content: dict
     Raises:
         InputError: the place cannot be written.
     """
-    content = content | {name: _numbers(content[name]) for name in _NUMERIC}
+    content = content | {name: _null_to_nan(content[name]) for name in _NUMERIC}
     write_page(
         path,
         "population.html",
         _frame(content),
         _origin(content),
         content=content,
-        **(_figures(tree, content) if drawable(tree) else {"panels": None, "not_drawn": NOT_DRAWN}),
-        law=[row for row in table(content) if not row[0].startswith("next finger")],
+        **(_figures(tree, content) if is_drawable(tree) else {"panels": None, "not_drawn": NOT_DRAWN_MESSAGE}),
+        law=[row for row in population_table(content) if not row[0].startswith("next finger")],
         fingers=tuple(_finger_rows(content)),
         new=tuple(_new_rows(content)),
-        shares={name: tuple(_share_rows(content, name)) for name in SHARED_OUT},
-        legend=SHARES,
-        engineering=engineering,
+        shares={name: tuple(_share_rows(content, name)) for name in VARIANCE_QUANTITIES},
+        legend=SHARES_LEGEND,
+        engineering=format_engineering,
     )
 
 
@@ -105,42 +117,43 @@ def read_population(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, A
         ) from error
 
 
-def _numbers(content: Any) -> Any:
+def _null_to_nan(content: Any) -> Any:
     """With NaN for whatever is not finite, which JSON has as null."""
     if isinstance(content, dict):
-        return {name: _numbers(value) for name, value in content.items()}
+        return {name: _null_to_nan(value) for name, value in content.items()}
     if isinstance(content, list | tuple):
-        return [_numbers(value) for value in content]
+        return [_null_to_nan(value) for value in content]
     infinite = isinstance(content, float) and not math.isfinite(content)
     return math.nan if content is None or infinite else content
 
 
 def _figures(tree: Any, content: dict[str, Any]) -> dict[str, Any]:
-    panels = {name: image(_panel(draw, tree, content), **SETTINGS) for name, draw in _PANELS.items()}
+    panels = {name: image(_panel(draw, tree, content), **FONT_SETTINGS) for name, draw in _PANELS.items()}
     return {
-        "panels": panels | {"densities": image(lambda: _densities(tree), **SETTINGS)},
+        "panels": panels | {"densities": image(lambda: _densities(tree), **FONT_SETTINGS)},
         "skin": _skin_chart(tree, content),
         "force": _force_chart(tree),
     }
 
 
-def _frame(content: dict[str, Any]) -> Frame:
+def _frame(content: dict[str, Any]) -> PageSummary:
     law, new, count = content["population"], content["new_finger"], len(content["fingers"])
     force, friction = new["force_mean"], new["friction_mean"]
     off = f"{content['integrals_off']:.2g} standard deviations"
     certificate = f"integrals over the fingers shift no mean by more than {off}"
-    return Frame(
+    return PageSummary(
         title=f"How people differ: {count} fingers",
         subject=f"What {count} fingers on one panel, a record of each, tell of people: how skins differ, what force the"
         " next finger feels, and what that depends on.",
         trusted=content["trusted"],
         verdict=f"Trusted: the chain has converged, and {certificate}"
         if content["trusted"]
-        else f"{content['convergence']['sentence']}; {certificate} ({OFF:g} are trusted).",
+        else f"{content['convergence']['sentence']}; {certificate} ({MAX_INTEGRATION_ERROR:g} are trusted).",
         findings={
-            "What the next finger feels": f"A mean electrostatic force of {_range(force)}, and a mean friction of"
-            f" {_range(friction)}; 95 % lie between.",
-            "What makes it differ": "; ".join(variance_sentences(content)) + f" ({SHARES}).",
+            "What the next finger feels": f"A mean electrostatic force of {_format_range(force)}, and a mean"
+            " friction of"
+            f" {_format_range(friction)}; 95 % lie between.",
+            "What makes it differ": "; ".join(variance_sentences(content)) + f" ({SHARES_LEGEND}).",
         },
         answers=[
             _answer("Rsc, median of people", law["Rsc"]["median"]),
@@ -152,38 +165,39 @@ def _frame(content: dict[str, Any]) -> Frame:
     )
 
 
-def _range(s: dict[str, Any]) -> str:
-    median, low, high = (engineering(s[key], s["unit"]) for key in ("q50", "q025", "q975"))
+def _format_range(s: dict[str, Any]) -> str:
+    median, low, high = (format_engineering(s[key], s["unit"]) for key in ("q50", "q025", "q975"))
     return f"{median} ({low} to {high})"
 
 
 def _answer(title: str, s: dict[str, Any]) -> Answer:
-    median, low, high = (engineering(s[key], s["unit"], 3) for key in ("q50", "q025", "q975"))
+    median, low, high = (format_engineering(s[key], s["unit"], 3) for key in ("q50", "q025", "q975"))
     return Answer(title, median, f"95 %: {low} to {high}")
 
 
-def _origin(content: dict[str, Any]) -> Origin:
+def _origin(content: dict[str, Any]) -> Provenance:
     records = {each["record"]: each["sha256"] for each in content["fingers"]}
     command = ["fitact population", *map(shlex.quote, records)]
     command += ["--scene SCENE.toml"] if content["scene"] else []
     command += ["--covariates COVARIATES.csv"] if content["population"]["covariates"] else []
-    return Origin(" ".join([*command, f"--seed {content['seed']}"]), content["scene"], records)
+    return Provenance(" ".join([*command, f"--seed {content['seed']}"]), content["scene"], records)
 
 
 def _finger_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
     yield ("finger", "Rsc", "± 1 sd", "Csc", "± 1 sd", "Ci", "± 1 sd", "fit")
     for each in content["fingers"]:
         own = [each["parameters"][name] for name in ("Rsc", "Csc", "Ci")]
-        cells = (cell for s in own for cell in (engineering(s["q50"], s["unit"]), width(s)))
+        cells = (cell for s in own for cell in (format_engineering(s["q50"], s["unit"]), format_sd(s)))
         yield (each["record"], *cells, each["result"])
 
 
 def _new_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
     yield ("next finger", *_QUANTILES.values(), "people", "ignorance")
-    none = _ROUNDING * content["new_finger"]["force_mean"]["q50"]
+    none = 1e-12 * content["new_finger"]["force_mean"]["q50"]  # rounding
     for name, s in content["new_finger"].items():
         values = (
-            engineering(s[key] if s["unit"] != "N" or s["q975"] > none else 0.0, s["unit"], 3) for key in _QUANTILES
+            format_engineering(s[key] if s["unit"] != "N" or s["q975"] > none else 0.0, s["unit"], 3)
+            for key in _QUANTILES
         )
         yield (_NAMES[name], *values, *(f"{100.0 * s['variance'][key]:.0f} %" for key in ("people", "ignorance")))
 
@@ -193,7 +207,7 @@ def _share_rows(content: dict[str, Any], name: str) -> Iterator[tuple[str, ...]]
     before = content["variance_shares_prior"][name]
     for factor, share in content["variance_shares"][name].items():
         cells = (
-            f"{percent(of[key])} ± {percent(of[f'{key}_error'])}"
+            f"{format_percent(of[key])} ± {format_percent(of[f'{key}_error'])}"
             for of in (share, before[factor])
             for key in ("first", "total")
         )
@@ -203,20 +217,23 @@ def _share_rows(content: dict[str, Any], name: str) -> Iterator[tuple[str, ...]]
 def _panel(
     draw: Callable[[Axes, Any, dict[str, Any]], None], tree: Any, content: dict[str, Any]
 ) -> Callable[[], Figure]:
-    def drawn() -> Figure:
+    def draw_panel() -> Figure:
         figure = Figure(figsize=(9.0, 4.6), layout="constrained")
         axes = figure.add_subplot()
         draw(axes, tree, content)
         axes.set_title("")
         return figure
 
-    return drawn
+    return draw_panel
 
 
 def _densities(tree: Any) -> Figure:
     figure = Figure(figsize=(9.0, 3.4), layout="constrained")
     for axes, (name, title) in zip(figure.subplots(1, 2), _FORCES.items(), strict=True):
-        for group, label, color in (("prior_new_fingers", _BEFORE, PRIOR), ("new_fingers", _AFTER, MODEL)):
+        for group, label, color in (
+            ("prior_new_fingers", _PRIOR_LABEL, PRIOR),
+            ("new_fingers", _POSTERIOR_LABEL, MODEL),
+        ):
             counts, edges = np.histogram(np.log(tree[group][name].values), 80)
             axes.stairs(counts / counts.max(), np.exp(edges), fill=True, color=color, alpha=0.6, label=label)
         axes.set_xscale("log")
@@ -235,41 +252,56 @@ _PANELS = {
 }
 
 
-def _skin_chart(tree: Any, content: dict[str, Any]) -> charts.Chart:
+def _skin_chart(tree: Any, content: dict[str, Any], max_fingers: int = 1500) -> interactive.Chart:
     """Fingers by name, among those to come."""
-    Rsc, Csc = (tree["new_fingers"][name].values.ravel()[:_SHOWN] for name in ("Rsc", "Csc"))
-    x, y = Axis.of("Rsc", "ohm", np.median(Rsc), log=True), Axis.of("Csc", "F", np.median(Csc), log=True)
+    Rsc, Csc = (tree["new_fingers"][name].values.ravel()[:max_fingers] for name in ("Rsc", "Csc"))
+    x, y = (
+        Axis.from_values("Rsc", "ohm", np.median(Rsc), log=True),
+        Axis.from_values("Csc", "F", np.median(Csc), log=True),
+    )
     own = [each["parameters"] for each in content["fingers"]]
     names = [each["record"] for each in content["fingers"]]
     at, values = ([finger[name]["q50"] for finger in own] for name in ("Rsc", "Csc"))
-    drawn = charts.plot(
+    drawn = interactive.plot(
         x,
         (
             y,
             [
-                charts.points(x, y, Rsc, Csc, _TO_COME, MODEL, size=3.0, opacity=0.35),
-                charts.points(x, y, at, values, "fingers", DATA, size=9.0, names=names),
+                interactive.points(x, y, Rsc, Csc, _NEW_LABEL, MODEL, size=3.0, opacity=0.35),
+                interactive.points(x, y, at, values, "fingers", DATA, size=9.0, names=names),
             ],
         ),
         size=420,
     )
-    return charts.chart(drawn, controls=[charts.logarithmic([drawn], "xy"), charts.toggle(_TO_COME, [drawn], _TO_COME)])
+    return interactive.chart(
+        drawn,
+        controls=[
+            interactive.log_axis_button([drawn], "xy"),
+            interactive.visibility_button(_NEW_LABEL, [drawn], _NEW_LABEL),
+        ],
+    )
 
 
-def _force_chart(tree: Any) -> charts.Chart:
+def _force_chart(tree: Any) -> interactive.Chart:
     """Mean and peak force of the next finger, and what was believed before."""
     plots = []
     for name, title in _FORCES.items():
         after, before = (tree[group][name].values for group in ("new_fingers", "prior_new_fingers"))
-        x = Axis.of(title, "N", np.median(after), log=True)
+        x = Axis.from_values(title, "N", np.median(after), log=True)
         plots.append(
-            charts.plot(
+            interactive.plot(
                 x,
                 (
-                    Axis("density", bare=True),
-                    [charts.density(x, before, _BEFORE, PRIOR), charts.density(x, after, _AFTER)],
+                    Axis("density", hides_numbers=True),
+                    [
+                        interactive.density(x, before, _PRIOR_LABEL, PRIOR),
+                        interactive.density(x, after, _POSTERIOR_LABEL),
+                    ],
                 ),
                 size=320,
             )
         )
-    return charts.chart(*plots, controls=[charts.logarithmic(plots), charts.toggle(_BEFORE, plots, _BEFORE)])
+    return interactive.chart(
+        *plots,
+        controls=[interactive.log_axis_button(plots), interactive.visibility_button(_PRIOR_LABEL, plots, _PRIOR_LABEL)],
+    )

@@ -8,13 +8,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from fitact.charts.figure import save, style, svg
+from fitact.charts.figure import DATA, MODEL, style, svg, write_figure
 from fitact.errors import InputError
-from fitact.files import replacing
+from fitact.files import atomic_write
 from fitact.scene.prior_predictive import PriorPredictive
 
 _FORMATS = (".html", ".svg", ".png")
-_COLOR, _LINE = "#0072B2", "#333333"
 
 
 def write_prior(path: Path, predicted: PriorPredictive) -> None:
@@ -25,12 +24,11 @@ def write_prior(path: Path, predicted: PriorPredictive) -> None:
     """
     if path.suffix not in _FORMATS:
         raise InputError(f"{path}: the figure is written as {', '.join(_FORMATS)}; choose one of these endings")
-    with mpl.rc_context(style()), replacing(path) as temporary:
-        figure = _figure(predicted)
-        if path.suffix == ".html":
-            temporary.write_text(_page(figure, predicted), encoding="utf-8")
-        else:
-            save(figure, temporary, path.suffix)
+    if path.suffix != ".html":
+        write_figure(path, lambda: _figure(predicted), dpi=150)
+    else:
+        with mpl.rc_context(style()), atomic_write(path) as temporary:
+            temporary.write_text(_page(_figure(predicted), predicted), encoding="utf-8")
 
 
 def _figure(predicted: PriorPredictive) -> Figure:
@@ -40,8 +38,8 @@ def _figure(predicted: PriorPredictive) -> Figure:
     for outer, alpha in ((0.05, 0.25), (0.25, 0.35)):
         low, high = np.quantile(predicted.Vsc, [outer, 1.0 - outer], axis=0)
         label = f"{100.0 * (1.0 - 2.0 * outer):.0f} % of fingers"
-        above.fill_between(predicted.time, low, high, color=_COLOR, alpha=alpha, lw=0, label=label)
-    above.plot(predicted.time, np.median(predicted.Vsc, axis=0), color=_LINE, lw=1.2, label="median")
+        above.fill_between(predicted.time, low, high, color=MODEL, alpha=alpha, lw=0, label=label)
+    above.plot(predicted.time, np.median(predicted.Vsc, axis=0), color=DATA, lw=1.2, label="median")
     above.xaxis.set_major_formatter(EngFormatter("s"))
     above.yaxis.set_major_formatter(EngFormatter("V"))
     above.set_xlim(predicted.time[0], predicted.time[-1])
@@ -52,8 +50,8 @@ def _figure(predicted: PriorPredictive) -> Figure:
         force = predicted.derived[name]
         low, high = np.quantile(force, [0.002, 0.998])
         below = figure.add_subplot(grid[1, column])
-        below.hist(force, bins=np.geomspace(0.98 * low, 1.02 * high, 50).tolist(), color=_COLOR, alpha=0.75)
-        below.axvline(float(np.median(force)), color=_LINE)
+        below.hist(force, bins=np.geomspace(0.98 * low, 1.02 * high, 50).tolist(), color=MODEL, alpha=0.75)
+        below.axvline(float(np.median(force)), color=DATA)
         below.set_xscale("log")
         below.xaxis.set_major_formatter(EngFormatter("N"))
         below.set_yticks([])

@@ -3,20 +3,15 @@
 import os
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from fitact.charts.figure import save, style
-from fitact.data.clipping import clipped
+from fitact.charts.figure import ALERT, DATA, write_figure
+from fitact.data.clipping import clipping_mask
 from fitact.data.inspection import Channel, Inspection
 from fitact.errors import InputError
-from fitact.files import replacing
-
-_COLOR, _RAIL = "#333333", "#D55E00"
-_COLUMNS = 2000  # beyond twice as many samples, the extremes of so many stretches are drawn
 
 
 def write_record(path: str | os.PathLike[str], inspection: Inspection) -> None:
@@ -28,8 +23,7 @@ def write_record(path: str | os.PathLike[str], inspection: Inspection) -> None:
     path = Path(path)
     if path.suffix not in (".svg", ".png"):
         raise InputError(f"{path}: the drawing is written as .svg or .png; choose one of these endings")
-    with mpl.rc_context(style()), replacing(path) as temporary:
-        save(_figure(inspection), temporary, path.suffix)
+    write_figure(path, lambda: _figure(inspection), dpi=150)
 
 
 def _figure(inspection: Inspection) -> Figure:
@@ -46,15 +40,16 @@ def _figure(inspection: Inspection) -> Figure:
     return figure
 
 
-def _draw(axes: Axes, time: np.ndarray, channel: Channel) -> None:
+def _draw(axes: Axes, time: np.ndarray, channel: Channel, columns: int = 2000) -> None:
+    """Draw each sample, or the extremes of `columns` stretches where there are more than twice as many samples."""
     values = channel.values
-    if values.size > 2 * _COLUMNS:
-        starts = np.linspace(0, values.size, _COLUMNS, endpoint=False).astype(int)
+    if values.size > 2 * columns:
+        starts = np.linspace(0, values.size, columns, endpoint=False).astype(int)
         low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
-        axes.fill_between(time[starts], low, high, color=_COLOR, lw=0.6)
+        axes.fill_between(time[starts], low, high, color=DATA, lw=0.6)
     else:
-        axes.plot(time, values, ".-", color=_COLOR, ms=2.0, lw=0.6)
+        axes.plot(time, values, ".-", color=DATA, ms=2.0, lw=0.6)
     if channel.clipped:
-        railed = np.flatnonzero(clipped(values))[:: max(1, channel.clipped // _COLUMNS)]
-        axes.plot(time[railed], values[railed], ".", color=_RAIL, ms=3.0, label="clipped")
+        railed = np.flatnonzero(clipping_mask(values))[:: max(1, channel.clipped // columns)]
+        axes.plot(time[railed], values[railed], ".", color=ALERT, ms=3.0, label="clipped")
         axes.legend(loc="upper right")

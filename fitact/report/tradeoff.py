@@ -6,7 +6,6 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -14,13 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, NullLocator
 from matplotlib.transforms import Bbox
 
-from fitact.charts import interactive as charts
-from fitact.charts.figure import PRIOR, save, style
+from fitact.charts import interactive
+from fitact.charts.figure import ALERT, DATA, MODEL, PRIOR, write_figure
 from fitact.charts.interactive import Axis
-from fitact.files import replacing
-from fitact.report.frame import Answer, Frame, Origin, image, write_page
-from fitact.tradeoff.tradeoff import COLUMNS, KINDS, Kind, Level, Tradeoff
-from fitact.units import engineering
+from fitact.report.frame import Answer, PageSummary, Provenance, image, write_page
+from fitact.tradeoff.tradeoff import COLUMNS, KINDS, BenchmarkedMethod, Kind, Tradeoff
+from fitact.units import format_engineering
 
 _TITLES: dict[Kind, tuple[str, str, str]] = {
     "response": ("response", "one evaluation", "error of Vsc, relative rms"),
@@ -28,9 +26,7 @@ _TITLES: dict[Kind, tuple[str, str, str]] = {
     "uncertainty": ("uncertainty", "one effective draw", "error, posterior standard deviations"),
 }
 _STYLE = {"axes.grid": False}
-_FRONT, _DOMINATED = "#0072B2", "#D55E00"
-_BELOW = 30.0  # times below the least error is where an error of 0 is drawn
-_SIDES = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1)]
+_ZERO_RATIO = 30.0  # times below the least error is where an error of 0 is drawn
 
 
 def write_tradeoff(path: Path, tradeoff: Tradeoff) -> None:
@@ -39,45 +35,49 @@ def write_tradeoff(path: Path, tradeoff: Tradeoff) -> None:
     Raises:
         InputError: the place cannot be written.
     """
-    with mpl.rc_context(style() | _STYLE), replacing(path) as temporary:
-        save(draw(tradeoff), temporary, path.suffix)
+    write_figure(path, lambda: tradeoff_figure(tradeoff), dpi=150, **_STYLE)
 
 
-def draw(tradeoff: Tradeoff, kinds: Sequence[Kind] = tuple(_TITLES)) -> Figure:
+def tradeoff_figure(tradeoff: Tradeoff, kinds: Sequence[Kind] = tuple(_TITLES)) -> Figure:
     """The picture of some kinds of level."""
     figure = Figure(figsize=(13.0 if len(kinds) > 1 else 9.0, 4.8), layout="constrained")
     canvas = FigureCanvasAgg(figure)
     panels = dict(zip(kinds, figure.subplots(1, len(kinds), squeeze=False)[0], strict=True))
     for kind, axes in panels.items():
-        _draw(axes, kind, tradeoff)
+        _draw_panel(axes, kind, tradeoff)
     canvas.draw()  # so that it is known where everything is
     figure.set_layout_engine("none")  # and stays there
     for kind, axes in panels.items():
-        _name(axes, tradeoff.of(kind), canvas)
+        _annotate_names(axes, tradeoff.of(kind), canvas)
     return figure
 
 
-def _heights(levels: tuple[Level, ...]) -> dict[str, float]:
+def _heights(levels: tuple[BenchmarkedMethod, ...]) -> dict[str, float]:
     """Where errors are drawn: as they are, and 0 below the least of the others."""
-    zero = min((level.error for level in levels if level.error > 0.0), default=1.0) / _BELOW
+    zero = min((level.error for level in levels if level.error > 0.0), default=1.0) / _ZERO_RATIO
     return {level.name: level.error or zero for level in levels}
 
 
-def _draw(axes: Axes, kind: Kind, tradeoff: Tradeoff) -> None:
+def _draw_panel(axes: Axes, kind: Kind, tradeoff: Tradeoff) -> None:
     levels, front = tradeoff.of(kind), tradeoff.front(kind)
     height = _heights(levels)
     title, cost, error = _TITLES[kind]
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.plot([x.seconds for x in front], [height[x.name] for x in front], "o-", color=_FRONT, ms=7, lw=1.2)
+    axes.plot([x.seconds for x in front], [height[x.name] for x in front], "o-", color=MODEL, ms=7, lw=1.2)
     dominated = [x for x in levels if x.dominated_by]
     axes.plot(
-        [x.seconds for x in dominated], [height[x.name] for x in dominated], "o", color=_DOMINATED, ms=7, mfc="none"
+        [x.seconds for x in dominated],
+        [height[x.name] for x in dominated],
+        "o",
+        color=ALERT,
+        ms=7,
+        mfc="none",
     )
     zero = min(height.values())
-    axes.axhline(zero, color="#333333", lw=0.8, ls=":")
+    axes.axhline(zero, color=DATA, lw=0.8, ls=":")
     if kind == "uncertainty":
-        axes.axhspan(zero / _BELOW, tradeoff.resolution, color="#999999", alpha=0.2, lw=0)
+        axes.axhspan(zero / _ZERO_RATIO, tradeoff.resolution, color=PRIOR, alpha=0.2, lw=0)
     axes.set_ylim(zero / 6.0, 10.0 * max(height.values()))
     low, high = min(x.seconds for x in levels), max(x.seconds for x in levels)
     margin = (high / low) ** 0.25 * 1.5
@@ -100,22 +100,25 @@ def _draw(axes: Axes, kind: Kind, tradeoff: Tradeoff) -> None:
     axes.set_ylabel(error)
 
 
-def _along(places: dict[str, np.ndarray], levels: tuple[Level, ...]) -> list[np.ndarray]:
+def _front_points(places: dict[str, np.ndarray], levels: tuple[BenchmarkedMethod, ...]) -> list[np.ndarray]:
     """Points along the line of the front."""
     front = sorted((x for x in levels if not x.dominated_by), key=lambda x: x.seconds)
     pairs = itertools.pairwise(places[x.name] for x in front)
     return [end + share * (start - end) for start, end in pairs for share in np.linspace(0.0, 1.0, 40)]
 
 
-def _name(axes: Axes, levels: tuple[Level, ...], canvas: FigureCanvasAgg) -> None:
+def _annotate_names(axes: Axes, levels: tuple[BenchmarkedMethod, ...], canvas: FigureCanvasAgg) -> None:
     """The levels' names, each on the nearest side of its point where it hides nothing."""
     height = _heights(levels)
     places = {x.name: axes.transData.transform((x.seconds, height[x.name])) for x in levels}
-    taken = [Bbox.from_extents(x - 8, y - 8, x + 8, y + 8) for x, y in [*places.values(), *_along(places, levels)]]
+    taken = [
+        Bbox.from_extents(x - 8, y - 8, x + 8, y + 8) for x, y in [*places.values(), *_front_points(places, levels)]
+    ]
     inside = axes.get_window_extent()
+    sides = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1)]  # the nearest to read first
     for level in levels:
-        color = _DOMINATED if level.dominated_by else _FRONT
-        for distance, (right, up) in itertools.product((9, 18, 30, 44), _SIDES):
+        color = ALERT if level.dominated_by else MODEL
+        for distance, (right, up) in itertools.product((9, 18, 30, 44), sides):
             text = axes.annotate(
                 level.name,
                 (level.seconds, height[level.name]),
@@ -136,7 +139,7 @@ def _name(axes: Axes, levels: tuple[Level, ...], canvas: FigureCanvasAgg) -> Non
         taken.append(box)
 
 
-def write_tradeoff_page(path: str | os.PathLike[str], tradeoff: Tradeoff, origin: Origin) -> None:
+def write_tradeoff_page(path: str | os.PathLike[str], tradeoff: Tradeoff, origin: Provenance) -> None:
     """Write its page.
 
     Raises:
@@ -144,8 +147,8 @@ def write_tradeoff_page(path: str | os.PathLike[str], tradeoff: Tradeoff, origin
     """
     cheapest = {kind: tradeoff.front(kind)[0] for kind in KINDS}
     names = ", ".join(f"{level.name} ({kind})" for kind, level in cheapest.items())
-    front = {kind: "; ".join(map(_told, tradeoff.front(kind))) for kind in KINDS}
-    frame = Frame(
+    front = {kind: "; ".join(map(_describe_level, tradeoff.front(kind))) for kind in KINDS}
+    frame = PageSummary(
         title="Speed against accuracy",
         subject=f"Measured on {tradeoff.record}; {tradeoff.machine['cpu']}, {tradeoff.machine['cores']} cores.",
         trusted=tradeoff.trusted,
@@ -156,7 +159,9 @@ def write_tradeoff_page(path: str | os.PathLike[str], tradeoff: Tradeoff, origin
         }
         | {f"Front of {kind}, cheapest first": f"{levels}." for kind, levels in front.items()},
         answers=[
-            Answer(f"{kind}, cheapest", engineering(level.seconds, "s", 3), f"{level.name}, error {level.error:.2g}")
+            Answer(
+                f"{kind}, cheapest", format_engineering(level.seconds, "s", 3), f"{level.name}, error {level.error:.2g}"
+            )
             for kind, level in cheapest.items()
         ],
         warnings=tradeoff.notes,
@@ -168,7 +173,7 @@ def write_tradeoff_page(path: str | os.PathLike[str], tradeoff: Tradeoff, origin
         origin,
         kinds=KINDS,
         charts={kind: _chart(tradeoff, kind) for kind in KINDS},
-        pictures={kind: image(functools.partial(draw, tradeoff, (kind,)), **_STYLE) for kind in KINDS},
+        pictures={kind: image(functools.partial(tradeoff_figure, tradeoff, (kind,)), **_STYLE) for kind in KINDS},
         tables={
             kind: [(*COLUMNS, "dominated by"), *((*each.cells, each.dominated_by) for each in tradeoff.of(kind))]
             for kind in KINDS
@@ -178,25 +183,25 @@ def write_tradeoff_page(path: str | os.PathLike[str], tradeoff: Tradeoff, origin
     )
 
 
-def _told(level: Level) -> str:
-    return f"{level.name}, {engineering(level.seconds, 's', 3)}, error {level.error:.2g}"
+def _describe_level(level: BenchmarkedMethod) -> str:
+    return f"{level.name}, {format_engineering(level.seconds, 's', 3)}, error {level.error:.2g}"
 
 
-def _chart(tradeoff: Tradeoff, kind: Kind) -> charts.Chart:
+def _chart(tradeoff: Tradeoff, kind: Kind) -> interactive.Chart:
     """Levels by name."""
     levels, height = tradeoff.of(kind), _heights(tradeoff.of(kind))
     _, cost, error = _TITLES[kind]
     seconds = [level.seconds for level in levels]
-    x, y = Axis.of(f"time of {cost}", "s", seconds, log=True), Axis(error, log=True)
+    x, y = Axis.from_values(f"time of {cost}", "s", seconds, log=True), Axis(error, log=True)
     middle = (min(seconds) * max(seconds)) ** 0.5
     traces = []
     for name, some, color in (
-        ("front", tradeoff.front(kind), _FRONT),
-        ("dominated", tuple(level for level in levels if level.dominated_by), _DOMINATED),
+        ("front", tradeoff.front(kind), MODEL),
+        ("dominated", tuple(level for level in levels if level.dominated_by), ALERT),
     ):
         at = [level.seconds for level in some]
         heights = [height[level.name] for level in some]
-        trace = charts.points(x, y, at, heights, name, color, size=9.0, hollow=name == "dominated")
+        trace = interactive.points(x, y, at, heights, name, color, size=9.0, hollow=name == "dominated")
         traces.append(
             trace
             | {
@@ -204,11 +209,11 @@ def _chart(tradeoff: Tradeoff, kind: Kind) -> charts.Chart:
                 "line": {"color": color, "width": 1.2},
                 "text": [level.name for level in some],
                 "textposition": ["top right" if each < middle else "top left" for each in at],
-                "customdata": [_told(level) for level in some],
+                "customdata": [_describe_level(level) for level in some],
                 "hovertemplate": "%{customdata}<extra></extra>",  # a height is not always the error
             }
         )
     if kind == "uncertainty":
         ends, least = (min(seconds), max(seconds)), (tradeoff.resolution, tradeoff.resolution)
-        traces.append(charts.line(x, y, ends, least, "cannot be told from 0 below", PRIOR, dash="dash"))
-    return charts.chart(charts.plot(x, (y, traces), size=400))
+        traces.append(interactive.line(x, y, ends, least, "cannot be told from 0 below", PRIOR, dash="dash"))
+    return interactive.chart(interactive.plot(x, (y, traces), size=400))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fitact.errors import InputError
-from fitact.files import replacing
+from fitact.files import atomic_write
 
 
 @dataclasses.dataclass
@@ -47,23 +47,23 @@ class Chain:
         """Steps taken by each ensemble."""
         return self.points.shape[1]
 
-    def thinned(self, burn: int, most: int) -> slice:
-        """Steps after the burn-in, evenly apart up to the last, at which an ensemble has some `most` points."""
+    def thinning_slice(self, burn: int, n_points: int) -> slice:
+        """Steps after the burn-in, evenly apart up to the last, at which an ensemble has some `n_points` points."""
         kept = self.steps - burn
-        apart = max(1, -(-kept * self.points.shape[2] // most))
+        apart = max(1, -(-kept * self.points.shape[2] // n_points))
         return slice(burn + (kept - 1) % apart, None, apart)
 
-    def extend(self, done: list[tuple[np.ndarray, np.ndarray, emcee.State, np.ndarray]]) -> None:
+    def extend(self, new_steps: list[tuple[np.ndarray, np.ndarray, emcee.State, np.ndarray]]) -> None:
         """Add steps of every ensemble: points, log-probabilities, last state, moves accepted."""
-        points, log_prob, states, accepted = zip(*done, strict=True)
-        self.points = _appended(self.points, np.stack(points))
-        self.log_prob = _appended(self.log_prob, np.stack(log_prob))
+        points, log_prob, states, accepted = zip(*new_steps, strict=True)
+        self.points = _append_steps(self.points, np.stack(points))
+        self.log_prob = _append_steps(self.log_prob, np.stack(log_prob))
         self.accepted = self.accepted + np.stack(accepted).astype(int)
         self.states = states
 
     def save(self, path: Path) -> None:
         """Write the chain; `emcee.backends.HDFBackend(path, name="ensemble_0")` opens an ensemble."""
-        with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+        with atomic_write(path) as temporary, h5py.File(temporary, "w") as file:
             file.attrs["fingerprint"] = self.fingerprint
             file.attrs["names"] = list(self.names)
             file.attrs["seconds"] = self.seconds
@@ -115,11 +115,11 @@ class Chain:
             raise InputError(f"{path}: is not a chain of fitact ({error}); remove the file") from error
 
 
-def _appended(steps: Float[np.ndarray, "ensembles steps ..."], more: np.ndarray) -> np.ndarray:
+def _append_steps(steps: Float[np.ndarray, "ensembles steps ..."], new_steps: np.ndarray) -> np.ndarray:
     """Both, along the steps; a view into room kept for steps to come, so that few calls copy the chain."""
-    count, room = steps.shape[1] + more.shape[1], steps.base
+    count, room = steps.shape[1] + new_steps.shape[1], steps.base
     if room is None or room.shape[0] != steps.shape[0] or room.shape[1] < count:
         room = np.empty((steps.shape[0], 2 * count, *steps.shape[2:]))
         room[:, : steps.shape[1]] = steps
-    room[:, steps.shape[1] : count] = more
+    room[:, steps.shape[1] : count] = new_steps
     return room[:, :count]

@@ -3,52 +3,52 @@
 import numpy as np
 from jaxtyping import Float
 
+from fitact.fitting import derived
 from fitact.fitting.fit import Fit
-from fitact.sampling.convergence import Convergence, judge_weights, smoothed
+from fitact.sampling.convergence import diagnose_weights, pareto_smooth
 from fitact.sampling.posterior import Posterior
 from fitact.sampling.proposal import LogProb, Proposal
 
-_DRAWS = 10_000  # kept
-_OVERSAMPLED = 2  # so many weighted draws for one that is kept, so that duplicates are few
-_FOLLOWED = 2000  # whose derived quantities are looked at, which cost more than the draws
 
+def draw_around_fit(
+    fit: Fit, level: str, log_prob: LogProb, seed: int, *, draws: int = 10_000, oversampling: int = 2
+) -> Posterior:
+    """Draw by level "laplace" or "psis", and judge the draws.
 
-def draw(fit: Fit, level: str, log_prob: LogProb, seed: int) -> Posterior:
-    """Draws, by level "laplace" or "psis", and what is wrong with them."""
+    Args:
+        draws: how many are kept.
+        oversampling: weighted draws for one that is kept, so that duplicates are few.
+    """
     rng = np.random.default_rng([seed, 4])
-    points, log_density = _normal(fit, rng) if level == "laplace" else _student(fit, log_prob, rng)
+    if level == "laplace":
+        white = rng.standard_normal((draws, fit.point.size))
+        points, log_density = fit.point + white @ fit.point_root.T, -0.5 * np.sum(white**2, axis=1)
+    else:
+        proposal = Proposal.from_laplace(fit.point, fit.point_root, log_prob)
+        points = proposal.draw(rng, oversampling * draws)
+        log_density = proposal.log_density(points)
     values = log_prob(points)
-    weighted = smoothed(values - log_density)
-    derived = {name: x[0] for name, x in followed(fit, points[None, :_FOLLOWED], seed).items()}
-    seen = dict(zip(fit.point_names, points.T, strict=True)) | derived
-    convergence = judge_weights(level, weighted, seen, _DRAWS)
+    weighted = pareto_smooth(values - log_density)
+    # some will do for the derived quantities, which cost more than the draws
+    derived = {name: x[0] for name, x in tracked_quantities(fit, points[None, :2000], seed).items()}
+    quantities = dict(zip(fit.point_names, points.T, strict=True)) | derived
+    convergence = diagnose_weights(level, weighted, quantities, draws)
     if level == "psis":
-        kept = rng.permutation(systematic(weighted.weights, _DRAWS, float(rng.uniform())))
+        kept = rng.permutation(systematic_resample(weighted.weights, draws, float(rng.uniform())))
         points, values = points[kept], values[kept]
     return Posterior.from_draws(fit, points, values, convergence, seed)
 
 
-def followed(fit: Fit, points: Float[np.ndarray, "chains draws n"], seed: int) -> dict[str, np.ndarray]:
+def tracked_quantities(fit: Fit, points: Float[np.ndarray, "chains draws n"], seed: int) -> dict[str, np.ndarray]:
     """Divider, time constant and mean force of points, as far as the circuit has them: (chains, draws)."""
-    derived = Posterior(fit, points, np.zeros(points.shape[:2]), Convergence(), seed).derived()
-    return {name: derived[name] for name in ("g", "b", "force_mean") if name in derived}
+    values = derived.draw_derived(fit.derive, fit.likelihood, points, seed)
+    return {name: values[..., derived.DERIVED_NAMES.index(name)] for name in ("g", "b", "force_mean")}
 
 
-def systematic(weights: Float[np.ndarray, " draws"], count: int, start: float) -> np.ndarray:
-    """Indices of `count` equally likely draws: of each, `count` times its weight, rounded up or down.
+def systematic_resample(weights: Float[np.ndarray, " draws"], count: int, start: float) -> np.ndarray:
+    """Return indices of `count` equally likely draws: of each, `count` times its weight, rounded up or down.
 
     `start`, uniform in [0, 1), is the one random number (Kitagawa 1996).
     """
     total = np.cumsum(weights)
     return np.searchsorted(total / total[-1], (np.arange(count) + start) / count, side="right")
-
-
-def _normal(fit: Fit, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    white = rng.standard_normal((_DRAWS, fit.point.size))
-    return fit.point + white @ fit.point_root.T, -0.5 * np.sum(white**2, axis=1)
-
-
-def _student(fit: Fit, log_prob: LogProb, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    proposal = Proposal.around(fit.point, fit.point_root, log_prob)
-    points = proposal.draw(rng, _OVERSAMPLED * _DRAWS)
-    return points, proposal.log_density(points)

@@ -17,17 +17,12 @@ Random = np.random.RandomState | np.random.Generator
 
 SHARES = (0.7, 0.3)  # of moves that draw from here, and of stretch moves
 OVERDISPERSION = 1.5  # of the walkers' start, so that ensembles that agree have had to find each other
-DEGREES = 8.0  # of freedom: tails above any posterior's seen here
-_SAFE = 0.1  # share drawn from the Student-t even where there are tables, so that no place is out of reach
+DEGREES_OF_FREEDOM = 8.0  # of the Student-t: tails above any posterior's met so far
 PROBES = np.array([-2.5, -1.0, 0.0, 1.0, 2.5])  # standard deviations along an axis, at which it is compared
-_NORMAL = 0.3  # departure from the normal's log-density there, above which an axis is tabulated
-_FAR = 40.0  # standard deviations that are searched either way
-_CELLS = 256
-_NEGLIGIBLE = 25.0  # below the highest log-density, from where a table holds nothing
 
 
 @dataclasses.dataclass(frozen=True)
-class Table:
+class TabulatedMarginal:
     """A density of one coordinate, constant within cells of one width."""
 
     low: float
@@ -35,13 +30,13 @@ class Table:
     mass: Float[np.ndarray, " cells"]
 
     @classmethod
-    def of(cls, low: float, width: float, log_density: Float[np.ndarray, " edges"]) -> Self:
-        """Each cell as high as the higher of its ends, so that it never falls short where the density ends within."""
+    def from_log_density(cls, low: float, width: float, log_density: Float[np.ndarray, " edges"]) -> Self:
+        """Make each cell as high as the higher of its ends, so it never falls short where the density ends within."""
         height = np.exp(np.maximum(log_density[1:], log_density[:-1]) - np.max(log_density))
         return cls(low, width, height / height.sum())
 
-    def widened(self, factor: float) -> Self:
-        """With the log-density divided by the square of `factor`, which widens a normal by `factor`."""
+    def scale_width(self, factor: float) -> Self:
+        """Divide the log-density by the square of `factor`, which widens a normal by `factor`."""
         mass = self.mass ** (factor**-2)
         return dataclasses.replace(self, mass=mass / mass.sum())
 
@@ -70,40 +65,43 @@ class Proposal:
         center: of the Student-t.
         axes: its principal axes as columns, a standard deviation long.
         tables: densities along some axes, in standard deviations from the center.
+        student_share: drawn from the Student-t even where there are tables, so that no place is out of reach.
     """
 
     center: Float[np.ndarray, " n"]
     axes: Float[np.ndarray, "n n"]
-    tables: dict[int, Table] = dataclasses.field(default_factory=dict)
+    tables: dict[int, TabulatedMarginal] = dataclasses.field(default_factory=dict)
+    student_share: float = 0.1
 
     @classmethod
-    def around(cls, point: Float[np.ndarray, " n"], root: Float[np.ndarray, "n n"], log_prob: LogProb) -> Self:
-        """A Laplace approximation, with tables along the axes on which `log_prob` is not normal."""
-        vectors, lengths, _ = np.linalg.svd(root)
+    def from_laplace(
+        cls, point: Float[np.ndarray, " n"], covariance_factor: Float[np.ndarray, "n n"], log_prob: LogProb
+    ) -> Self:
+        """Take a Laplace approximation, with tables along the axes on which `log_prob` is not normal."""
+        vectors, lengths, _ = np.linalg.svd(covariance_factor)
         axes, center, tables = vectors * lengths, np.array(point, dtype=float), {}
         for i, axis in enumerate(axes.T):
-            table = _along(center, axis, log_prob)
+            table = _tabulate_axis(center, axis, log_prob)
             if table is not None:
                 center = center + table.median * axis
                 tables[i] = dataclasses.replace(table, low=table.low - table.median)
         return cls(center, axes, tables)
 
-    def widened(self, factor: float) -> Self:
-        """Wider by `factor` where it is normal, as far as its limits allow where it is not."""
-        tables = {i: table.widened(factor) for i, table in self.tables.items()}
+    def scale_width(self, factor: float) -> Self:
+        """Widen by `factor` where it is normal, as far as its limits allow where it is not."""
+        tables = {i: table.scale_width(factor) for i, table in self.tables.items()}
         longer = np.array([1.0 if i in tables else factor for i in range(self.center.size)])
         return dataclasses.replace(self, axes=self.axes * longer, tables=tables)
 
     def draw(self, random: Random, count: int) -> Float[np.ndarray, "count n"]:
-        """Points."""
-        white = student(random, count, self.center.size)
-        tabulated = random.uniform(size=count) >= _SAFE
+        white = draw_student_t(random, count, self.center.size)
+        tabulated = random.uniform(size=count) >= self.student_share
         for i, table in self.tables.items():
             white[:, i] = np.where(tabulated, table.draw(random, count), white[:, i])
         return self.center + white @ self.axes.T
 
     def log_density(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, " count"]:
-        """Up to a constant."""
+        """Return the logarithm of the density, up to a constant."""
         white = np.linalg.solve(self.axes, (points - self.center).T).T
         if not self.tables:
             return student_log_density(white)
@@ -111,49 +109,63 @@ class Proposal:
         tabulated = student_log_density(white[:, others])
         for i, table in self.tables.items():
             tabulated = tabulated + table.log_density(white[:, i])
-        return np.logaddexp(np.log(1.0 - _SAFE) + tabulated, np.log(_SAFE) + student_log_density(white))
+        share = self.student_share
+        return np.logaddexp(np.log(1.0 - share) + tabulated, np.log(share) + student_log_density(white))
 
     def move(
         self, points: Float[np.ndarray, "count n"], random: np.random.RandomState
     ) -> tuple[Float[np.ndarray, "count n"], Float[np.ndarray, " count"]]:
-        """emcee's proposal function: new points, and log q(old) - log q(new)."""
+        """Propose as emcee asks it: new points, and log q(old) - log q(new)."""
         proposed = self.draw(random, len(points))
         return proposed, self.log_density(points) - self.log_density(proposed)
 
 
-def student(random: Random, count: int, size: int) -> Float[np.ndarray, "count size"]:
-    """Draws around 0, a standard deviation of the normal that it stands over being 1."""
-    return random.standard_normal((count, size)) * np.sqrt(DEGREES / random.chisquare(DEGREES, (count, 1)))
+def draw_student_t(random: Random, count: int, size: int) -> Float[np.ndarray, "count size"]:
+    """Draw around 0, a standard deviation of the normal that it stands over being 1."""
+    white = random.standard_normal((count, size))
+    return white * np.sqrt(DEGREES_OF_FREEDOM / random.chisquare(DEGREES_OF_FREEDOM, (count, 1)))
 
 
-def student_log_density(white: Float[np.ndarray, "*shape size"]) -> Float[np.ndarray, "*shape"]:
-    """Of such draws."""
-    size = white.shape[-1]
-    scale = math.lgamma(0.5 * (DEGREES + size)) - math.lgamma(0.5 * DEGREES) - 0.5 * size * math.log(math.pi * DEGREES)
-    return scale - 0.5 * (DEGREES + size) * np.log1p(np.sum(white**2, axis=-1) / DEGREES)
+def student_log_density(z: Float[np.ndarray, "*shape size"]) -> Float[np.ndarray, "*shape"]:
+    dof, size = DEGREES_OF_FREEDOM, z.shape[-1]
+    log_norm = math.lgamma(0.5 * (dof + size)) - math.lgamma(0.5 * dof) - 0.5 * size * math.log(math.pi * dof)
+    return log_norm - 0.5 * (dof + size) * np.log1p(np.sum(z**2, axis=-1) / dof)
 
 
-def is_normal(probed: Float[np.ndarray, "*shape probes"]) -> Bool[np.ndarray, "*shape"]:
-    """Whether log-densities at `PROBES` along an axis are those of a normal, or nearly so."""
+def is_normal(log_densities: Float[np.ndarray, "*shape probes"], tolerance: float = 0.3) -> Bool[np.ndarray, "*shape"]:
+    """Whether log-densities at `PROBES` along an axis are, within `tolerance`, those of a normal."""
     with np.errstate(invalid="ignore"):  # the center itself may be impossible
-        departure = probed - probed[..., 2:3] + 0.5 * PROBES**2
-    return np.all(np.abs(departure) < _NORMAL, axis=-1)
+        departure = log_densities - log_densities[..., 2:3] + 0.5 * PROBES**2
+    return np.all(np.abs(departure) < tolerance, axis=-1)
 
 
-def _along(center: Float[np.ndarray, " n"], axis: Float[np.ndarray, " n"], log_prob: LogProb) -> Table | None:
-    """The density on a line, in lengths of `axis`; None where it is normal, or nothing is found."""
+def _tabulate_axis(
+    center: Float[np.ndarray, " n"],
+    axis: Float[np.ndarray, " n"],
+    log_prob: LogProb,
+    search_range: float = 40.0,
+    cells: int = 256,
+    log_density_range: float = 25.0,
+) -> TabulatedMarginal | None:
+    """Tabulate the density on a line, in lengths of `axis`; None where it is normal, or nothing is found.
 
-    def on_line(places: np.ndarray) -> np.ndarray:
+    Args:
+        search_range: lengths that are searched either way.
+        cells: of the table, and of the search.
+        log_density_range: below the highest log-density, from where the table holds nothing.
+    """
+
+    def line_log_prob(places: np.ndarray) -> np.ndarray:
         return log_prob(center + places[:, None] * axis)
 
-    probed = on_line(PROBES)
-    if is_normal(probed):
+    if is_normal(line_log_prob(PROBES)):
         return None
-    reach = np.arcsinh(_FAR)
-    places = np.sinh(np.linspace(-reach, reach, _CELLS + 1))  # dense where it is likely
-    values = on_line(places)
+    reach = np.arcsinh(search_range)
+    places = np.sinh(np.linspace(-reach, reach, cells + 1))  # dense where it is likely
+    values = line_log_prob(places)
     if not np.isfinite(values).any():
         return None
-    held = np.flatnonzero(values > np.max(values) - _NEGLIGIBLE)
-    low, high = places[max(held[0] - 1, 0)], places[min(held[-1] + 1, _CELLS)]
-    return Table.of(low, (high - low) / _CELLS, on_line(np.linspace(low, high, _CELLS + 1)))
+    likely = np.flatnonzero(values > np.max(values) - log_density_range)
+    low, high = places[max(likely[0] - 1, 0)], places[min(likely[-1] + 1, cells)]
+    edges = np.linspace(low, high, cells + 1)
+    return TabulatedMarginal.from_log_density(low, (high - low) / cells, line_log_prob(edges))

@@ -1,6 +1,7 @@
 """What a scene's prior means for the skin voltage and the force, before any data."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -14,37 +15,24 @@ from fitact.model.drive import Drive, Periodic, PiecewiseLinear
 from fitact.model.force import electrostatic_force, mean_force, peak_force
 from fitact.model.response import response
 from fitact.scene.scene import Scene
-from fitact.units import engineering
-
-_NOT_OF_THE_CIRCUIT = ("sigma", "sigma_I")
-_DERIVED = ("g", "b", "Vsc_peak_to_peak", "force_mean", "force_peak")
-_TIMES = 801
-_BATCH = 100  # draws at a time, which bounds memory where each takes many harmonics
+from fitact.units import format_engineering
 
 
 @dataclasses.dataclass(frozen=True)
 class PriorPredictive:
-    """Draws of the prior and what follows from each.
+    """Draws of the prior and what follows from each."""
 
-    Attributes:
-        parameters: free, fixed and tied, SI, by name.
-        derived: g, b (s) of the final circuit; Vsc_peak_to_peak (V), force_mean, force_peak (N).
-        time: two periods of the steady state, or the scene's duration, s.
-        Vsc: skin voltage, V.
-        seed: of the draws.
-    """
-
-    parameters: dict[str, Float[np.ndarray, " draws"]]
-    derived: dict[str, Float[np.ndarray, " draws"]]
-    time: Float[np.ndarray, " times"]
+    parameters: dict[str, Float[np.ndarray, " draws"]]  # free, fixed and tied, SI, by name
+    derived: dict[str, Float[np.ndarray, " draws"]]  # g, b of the final circuit; Vsc_peak_to_peak, force_mean, ..., SI
+    time: Float[np.ndarray, " times"]  # two periods of the steady state, or the scene's duration, s
     Vsc: Float[np.ndarray, "draws times"]
-    seed: int
+    seed: int  # of the draws
 
     def to_dict(self) -> dict[str, Any]:
         """What `fitact prior --json` prints."""
         return {
-            "parameters": {name: summary.of_draws(name, draws) for name, draws in self.parameters.items()},
-            "derived": {name: summary.of_draws(name, draws) for name, draws in self.derived.items()},
+            "parameters": {name: summary.summarize_draws(name, draws) for name, draws in self.parameters.items()},
+            "derived": {name: summary.summarize_draws(name, draws) for name, draws in self.derived.items()},
             "draws": len(self.Vsc),
             "seed": self.seed,
         }
@@ -54,7 +42,9 @@ class PriorPredictive:
         rows = [f"{'':18}" + "".join(f"{title:>12}" for title in ("5 %", "25 %", "median", "75 %", "95 %"))]
         content = self.to_dict()
         for name, s in (content["parameters"] | content["derived"]).items():
-            values = (engineering(float(s[key]), str(s["unit"]), 3) for key in ("q05", "q25", "q50", "q75", "q95"))
+            values = (
+                format_engineering(float(s[key]), str(s["unit"]), 3) for key in ("q05", "q25", "q50", "q75", "q95")
+            )
             rows.append(f"{name:18}" + "".join(f"{value:>12}" for value in values))
         return "\n".join(rows)
 
@@ -67,45 +57,44 @@ def prior_predictive(scene: Scene, draws: int = 2000, seed: int = 0) -> PriorPre
     Raises:
         InputError: the scene's drive is a measured one, or its prior leaves nothing to draw.
     """
-    parameters = believed(scene, np.random.default_rng(seed), draws)
+    parameters = sample_prior(scene, np.random.default_rng(seed), draws)
     drive = scene.make_drive()
     repeats = isinstance(drive, Periodic) and scene.drive.steady_state
     with jax.enable_x64(True):
         time = jnp.asarray(_times(drive, scene.measurement.duration, repeats))
-        of_circuit = {name: jnp.asarray(x) for name, x in parameters.items() if name not in _NOT_OF_THE_CIRCUIT}
+        circuits = {name: jnp.asarray(x) for name, x in parameters.items() if name not in ("sigma", "sigma_I")}
+        predict = functools.partial(_predict_draw, scene, drive, repeats, time)
+        # so many draws at a time bound the memory where each takes many harmonics
+        vsc, derived = jax.jit(lambda rows: jax.lax.map(predict, rows, batch_size=100))(circuits)
+    order = [name for name in ("g", "b", "Vsc_peak_to_peak", "force_mean", "force_peak") if name in derived]
+    derived = {name: np.asarray(derived[name]) for name in order}
+    return PriorPredictive(parameters, derived, np.asarray(time), np.asarray(vsc), seed)
 
-        def one(values: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
-            return _of_one(scene, drive, repeats, time, values)
 
-        vsc, derived = jax.jit(lambda rows: jax.lax.map(one, rows, batch_size=_BATCH))(of_circuit)
-    found = {name: np.asarray(derived[name]) for name in _DERIVED if name in derived}
-    return PriorPredictive(parameters, found, np.asarray(time), np.asarray(vsc), seed)
-
-
-def _times(drive: Drive, duration: float, repeats: bool) -> Float[np.ndarray, " times"]:
+def _times(drive: Drive, duration: float, repeats: bool, count: int = 801) -> Float[np.ndarray, " times"]:
     """Two periods, just after each corner included since peaks sit there; or from rest for the `duration` (s)."""
     if not (repeats and isinstance(drive, Periodic)):
-        return np.linspace(0.0, duration, _TIMES)
+        return np.linspace(0.0, duration, count)
     period = float(drive.period)
-    times = np.linspace(0.0, 2.0 * period, _TIMES)
+    times = np.linspace(0.0, 2.0 * period, count)
     if not isinstance(drive, PiecewiseLinear):
         return times
-    corners = (np.asarray(drive.pieces().knots) - float(drive.lead) + 1e-9 * period) % period
+    corners = (np.asarray(drive.pieces().knots) - float(drive.phase_time) + 1e-9 * period) % period
     return np.union1d(times, corners)
 
 
-def believed(scene: Scene, rng: np.random.Generator, size: int) -> dict[str, Float[np.ndarray, " size"]]:
+def sample_prior(scene: Scene, rng: np.random.Generator, size: int) -> dict[str, Float[np.ndarray, " size"]]:
     """Draws of all that a scene has a belief of, SI: free parameters, fixed and tied ones.
 
     Raises:
         InputError: the prior leaves nothing to draw.
     """
     drawn = scene.make_prior().sample(rng, size)
-    drawn |= {name: np.full(size, value) for name, value in scene.fixed().items()}
-    return drawn | {name: ratio * drawn[other] for name, (other, ratio) in scene.prior.tied().items()}
+    drawn |= {name: np.full(size, value) for name, value in scene.fixed_values().items()}
+    return drawn | {name: ratio * drawn[other] for name, (other, ratio) in scene.prior.ties().items()}
 
 
-def _of_one(
+def _predict_draw(
     scene: Scene, drive: Drive, repeats: bool, time: Float[Array, " times"], values: dict[str, Array]
 ) -> tuple[Float[Array, " times"], dict[str, Array]]:
     """Vsc in time, and what it amounts to, of one draw."""

@@ -1,15 +1,15 @@
 """The section [prior] of a scene file: what is believed of each parameter, and of them together."""
 
 import math
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from fitact import units
 from fitact.errors import InputError
 from fitact.prior.distributions import Distribution, LogNormal, LogUniform, TruncatedLogNormal, Uniform
 from fitact.prior.prior import Prior
-from fitact.prior.published import Layer, Table, published
+from fitact.prior.published import Layer, PublishedTable, published_prior
 from fitact.scene.sections import Section, Unit
 
 _FORMS: tuple[tuple[set[str], set[str]], ...] = (  # keys that a form needs, and keys that it can take
@@ -21,12 +21,12 @@ _FORMS: tuple[tuple[set[str], set[str]], ...] = (  # keys that a form needs, and
     ({"fixed"}, set()),
     ({"tied"}, {"ratio"}),
 )
-_ORDER = {"above", "below"}
-QUANTITIES = ("median", "low", "high", "nominal", "fixed")  # keys in the unit of the parameter
-_SKIN = ("Rsc", "Csc", "grounding_Rsc", "grounding_Csc")  # what the tables have
+_ORDER_KEYS = {"above", "below"}
+QUANTITY_KEYS = ("median", "low", "high", "nominal", "fixed")  # keys in the unit of the parameter
+_SKIN_PARAMETERS = ("Rsc", "Csc", "grounding_Rsc", "grounding_Csc")  # what the tables have
 
 
-class Belief(Section):
+class PriorSpec(Section):
     """What is believed of one parameter; docs/priors.md lists the forms."""
 
     median: float | None = Field(default=None, gt=0)
@@ -37,7 +37,7 @@ class Belief(Section):
     scale: Literal["linear", "log"] = "linear"
     nominal: float | None = Field(default=None, gt=0)
     tolerance: float | None = Field(default=None, gt=0, lt=1)
-    table: Table | None = None
+    table: PublishedTable | None = None
     fixed: bool | float | None = None
     tied: str | None = None
     ratio: float = Field(default=1.0, gt=0)
@@ -45,15 +45,15 @@ class Belief(Section):
     below: str | None = None
 
     @model_validator(mode="after")
-    def _one_form(self) -> Self:
-        given, ordered = self.model_fields_set - _ORDER, self.model_fields_set & _ORDER
-        known = any(needs <= given <= needs | takes for needs, takes in _FORMS)
-        if not known and not (ordered and not given):
+    def _check_form(self) -> Self:
+        keys, ordered = self.model_fields_set - _ORDER_KEYS, self.model_fields_set & _ORDER_KEYS
+        known = any(needs <= keys <= needs | takes for needs, takes in _FORMS)
+        if not known and not (ordered and not keys):
             raise ValueError(
                 "write {median, factor}, {median, relative_sd}, {low, high}, {nominal, tolerance}, {table}, {fixed}"
                 " or {tied}"
             )
-        if ordered and not self.free:
+        if ordered and not self.is_free:
             raise ValueError("above and below order free parameters; leave them out of a fixed or tied one")
         if self.fixed is False or (self.fixed is not True and self.fixed is not None and self.fixed <= 0.0):
             raise ValueError("fixed is a value above 0, or true for the scene's")
@@ -62,12 +62,12 @@ class Belief(Section):
         return self
 
     @property
-    def free(self) -> bool:
+    def is_free(self) -> bool:
         """Whether it is a density, rather than fixed or tied."""
         return self.fixed is None and self.tied is None
 
     @property
-    def highest(self) -> float:
+    def upper_bound(self) -> float:
         """Above which it allows no value, so far as it says so itself."""
         if self.tolerance is not None:
             return (self.nominal or 0.0) * (1.0 + self.tolerance)
@@ -82,14 +82,14 @@ class Belief(Section):
             InputError: it needs a nominal value and the scene has none, or its bounds exclude its median by far.
         """
         if self.table is not None:
-            return published(self.table, name, layer)
+            return published_prior(self.table, name, layer)
         if self.tolerance is not None:
-            return Uniform.with_tolerance(_given(name, "nominal", self.nominal, nominal), self.tolerance)
+            return Uniform.with_tolerance(_require_value(name, "nominal", self.nominal, nominal), self.tolerance)
         if self.factor is None and self.relative_sd is None:
-            assert self.low is not None  # _one_form leaves nothing else
+            assert self.low is not None  # _check_form leaves nothing else
             assert self.high is not None
             return (LogUniform if self.scale == "log" else Uniform)(self.low, self.high)
-        median = _given(name, "median", self.median, nominal)
+        median = _require_value(name, "median", self.median, nominal)
         if self.factor is not None:
             whole = LogNormal.within_factor(median, self.factor)
         else:
@@ -103,35 +103,31 @@ class Belief(Section):
             raise InputError(f"[prior] {name}: {error}") from None
 
 
-def _given(name: str, key: str, stated: float | None, nominal: float | None) -> float:
+def _require_value(name: str, key: str, stated: float | None, nominal: float | None) -> float:
     if not (stated or nominal):
         raise InputError(f"[prior] {name} needs a {key}, since the scene has no {name} of its own")
     return float(stated or nominal or 0.0)
 
 
-def _belief(unit: str) -> Any:
-    of = dict.fromkeys(QUANTITIES, unit) | {"tolerance": "", "ratio": ""}
+class SpecUnit(Unit):
+    """The SI unit of a parameter in which its beliefs are stated."""
 
-    def parse(value: object) -> object:
+    def parse(self, value: Any) -> Any:
+        """The keys of a belief with their quantities in SI."""
         if not isinstance(value, dict):
             return value
-        return {k: units.parse(v, of[k]) if k in of and not isinstance(v, bool) else v for k, v in value.items()}
+        key_units = dict.fromkeys(QUANTITY_KEYS, self.name) | {"tolerance": "", "ratio": ""}
+        return {
+            key: units.parse_quantity(x, key_units[key]) if key in key_units and not isinstance(x, bool) else x
+            for key, x in value.items()
+        }
 
-    return Annotated[Belief, Unit(unit), BeforeValidator(parse)]
 
-
-if TYPE_CHECKING:
-    BeliefPlain: TypeAlias = Belief
-    BeliefOhm: TypeAlias = Belief
-    BeliefFarad: TypeAlias = Belief
-    BeliefVolt: TypeAlias = Belief
-    BeliefAmpere: TypeAlias = Belief
-else:
-    BeliefPlain = _belief("")
-    BeliefOhm = _belief("ohm")
-    BeliefFarad = _belief("F")
-    BeliefVolt = _belief("V")
-    BeliefAmpere = _belief("A")
+PlainPriorSpec = Annotated[PriorSpec, SpecUnit("")]
+OhmPriorSpec = Annotated[PriorSpec, SpecUnit("ohm")]
+FaradPriorSpec = Annotated[PriorSpec, SpecUnit("F")]
+VoltPriorSpec = Annotated[PriorSpec, SpecUnit("V")]
+AmperePriorSpec = Annotated[PriorSpec, SpecUnit("A")]
 
 
 class PriorSection(Section):
@@ -142,79 +138,76 @@ class PriorSection(Section):
     the noise's standard deviations (`sigma` of Vsc, `sigma_I` of I) are flat in their logarithm.
     """
 
-    Rsc: BeliefOhm = Belief(factor=50.0)
-    Csc: BeliefFarad = Belief(factor=20.0)
-    Ci: BeliefFarad = Belief(relative_sd=0.05)
-    R_H: BeliefOhm | None = None
-    grounding_Rsc: BeliefOhm | None = None
-    grounding_Csc: BeliefFarad | None = None
-    Z: BeliefOhm | None = None
-    Z_capacitance: BeliefFarad | None = None
-    series_resistor: BeliefOhm | None = None
-    Rgap: BeliefOhm | None = None
-    Cgap: BeliefFarad | None = None
-    alpha: BeliefPlain | None = None
-    sigma: BeliefVolt | None = None
-    sigma_I: BeliefAmpere | None = None
+    Rsc: OhmPriorSpec = PriorSpec(factor=50.0)
+    Csc: FaradPriorSpec = PriorSpec(factor=20.0)
+    Ci: FaradPriorSpec = PriorSpec(relative_sd=0.05)
+    R_H: OhmPriorSpec | None = None
+    grounding_Rsc: OhmPriorSpec | None = None
+    grounding_Csc: FaradPriorSpec | None = None
+    Z: OhmPriorSpec | None = None
+    Z_capacitance: FaradPriorSpec | None = None
+    series_resistor: OhmPriorSpec | None = None
+    Rgap: OhmPriorSpec | None = None
+    Cgap: FaradPriorSpec | None = None
+    alpha: PlainPriorSpec | None = None
+    sigma: VoltPriorSpec | None = None
+    sigma_I: AmperePriorSpec | None = None
     correlation: dict[str, Annotated[float, Field(gt=-1, lt=1)]] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _possible(self) -> Self:
-        beliefs = self.beliefs()
+    def _check_specs(self) -> Self:
+        beliefs = self.specs()
         for name, belief in beliefs.items():
-            if belief.table is not None and name not in _SKIN:
-                raise ValueError(f"[prior] {name}: a table has the skin's parameters only: {', '.join(_SKIN)}")
-            if name == "alpha" and belief.highest > 1.0:
+            if belief.table is not None and name not in _SKIN_PARAMETERS:
+                raise ValueError(
+                    f"[prior] {name}: a table has the skin's parameters only: {', '.join(_SKIN_PARAMETERS)}"
+                )
+            if name == "alpha" and belief.upper_bound > 1.0:
                 raise ValueError("[prior] alpha is an exponent of at most 1; give high = 1 or less beside the rest")
             for key in ("tied", "above", "below"):
                 other = getattr(belief, key)
                 if other is not None:
                     self._check_pair(name, key, other)
-        free = [name for name, belief in beliefs.items() if belief.free]
-        Prior.of(self.correlations(), self.ordered(), **dict.fromkeys(free, LogNormal(1.0, 1.0)))
+        free = [name for name, belief in beliefs.items() if belief.is_free]
+        Prior.of(self.correlations(), self.order_constraints(), **dict.fromkeys(free, LogNormal(1.0, 1.0)))
         return self
 
     def _check_pair(self, name: str, key: str, other: str) -> None:
-        beliefs = self.beliefs()
+        beliefs = self.specs()
         place = f"[prior] {name}: {key} = '{other}'"
         if other == name or other not in beliefs:
             raise ValueError(f"{place} is no other parameter with a prior; name one of {', '.join(beliefs)}")
-        if units.unit_of(name) != units.unit_of(other):
-            raise ValueError(
-                f"{place} compares {units.unit_of(name)} with {units.unit_of(other)}; name one of its own unit"
-            )
+        unit, other_unit = units.quantity_unit(name), units.quantity_unit(other)
+        if unit != other_unit:
+            raise ValueError(f"{place} compares {unit} with {other_unit}; name one of its own unit")
         if key == "tied" and beliefs[other].tied is not None:
             raise ValueError(f"{place} is tied itself; name what {other} is tied to")
 
-    def beliefs(self) -> dict[str, Belief]:
+    def specs(self) -> dict[str, PriorSpec]:
         """The beliefs that the section holds, by parameter; one that only orders keeps the default's density.
 
         Raises:
             InputError: one only orders a parameter that has no default.
         """
-        found = {}
-        for name in BELIEFS:
-            belief = getattr(self, name)
-            if belief is None:
-                continue
-            if not belief.model_fields_set - _ORDER:
+        beliefs = {name: belief for name, belief in self if isinstance(belief, PriorSpec)}
+        for name, belief in beliefs.items():
+            if not belief.model_fields_set - _ORDER_KEYS:
                 default = PriorSection.model_fields[name].default
                 if default is None:
                     raise InputError(
                         f"[prior] {name}: give a density beside above or below, such as {{median, factor}}"
                     )
-                belief = default.model_copy(update=belief.model_dump(exclude_unset=True))
-            found[name] = belief
-        return found
+                beliefs[name] = default.model_copy(update=belief.model_dump(exclude_unset=True))
+        return beliefs
 
-    def tied(self) -> dict[str, tuple[str, float]]:
+    def ties(self) -> dict[str, tuple[str, float]]:
         """Parameters that follow another: name -> (the other, ratio to it)."""
-        return {name: (b.tied, b.ratio) for name, b in self.beliefs().items() if b.tied is not None}
+        return {name: (b.tied, b.ratio) for name, b in self.specs().items() if b.tied is not None}
 
-    def ordered(self) -> tuple[tuple[str, str], ...]:
+    def order_constraints(self) -> tuple[tuple[str, str], ...]:
         """Pairs (lower, higher) of parameters that come in that order."""
-        above = [(b.above, name) for name, b in self.beliefs().items() if b.above is not None]
-        return (*above, *((name, b.below) for name, b in self.beliefs().items() if b.below is not None))
+        above = [(b.above, name) for name, b in self.specs().items() if b.above is not None]
+        return (*above, *((name, b.below) for name, b in self.specs().items() if b.below is not None))
 
     def correlations(self) -> dict[tuple[str, str], float]:
         """Correlations by pair of parameters.
@@ -222,13 +215,10 @@ class PriorSection(Section):
         Raises:
             InputError: a key does not read name-name, or names a pair twice.
         """
-        found: dict[tuple[str, str], float] = {}
+        by_pair: dict[tuple[str, str], float] = {}
         for key, value in self.correlation.items():
             pair = tuple(key.split("-"))
-            if len(pair) != 2 or pair[::-1] in found:
+            if len(pair) != 2 or pair[::-1] in by_pair:
                 raise InputError(f"correlation '{key}' must name each pair once, as in Rsc-Csc = -0.6")
-            found[pair[0], pair[1]] = value
-        return found
-
-
-BELIEFS = tuple(name for name in PriorSection.model_fields if name != "correlation")
+            by_pair[pair[0], pair[1]] = value
+        return by_pair

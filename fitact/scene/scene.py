@@ -24,43 +24,28 @@ from fitact.model.force import Geometry, plate_capacitance
 from fitact.model.skin import Dispersive, Fractional, WithSkin
 from fitact.prior.prior import Prior
 from fitact.prior.published import Layer
-from fitact.scene import toml as scene_file
+from fitact.scene import sections, toml
 from fitact.scene.prior_section import PriorSection
-from fitact.scene.sections import (
-    Device,
-    DriveSection,
-    ForceSection,
-    Friction,
-    Gap,
-    Grounding,
-    Measurement,
-    Perception,
-    PopulationSection,
-    Section,
-    Skin,
-    Tolerance,
-    section_of,
-)
 
-_DIRECT = ("R_H", "grounding_Rsc", "grounding_Csc")  # what only one way of grounding has
-_NATURAL = ("Z", "Z_capacitance")
+_DIRECT_GROUND_KEYS = ("R_H", "grounding_Rsc", "grounding_Csc")  # what only one way of grounding has
+_NATURAL_GROUND_KEYS = ("Z", "Z_capacitance")
 
 
-class Scene(Section):
+class Scene(sections.Section):
     """One case: see the sections. Raises `fitact.InputError` for what it does not understand."""
 
-    device: Device = Device()
-    skin: Skin = Skin()
-    grounding: Grounding = Grounding()
-    gap: Gap = Gap()
-    drive: DriveSection = DriveSection()
-    measurement: Measurement = Measurement()
-    friction: Friction = Friction()
+    device: sections.Device = sections.Device()
+    skin: sections.SkinSection = sections.SkinSection()
+    grounding: sections.Grounding = sections.Grounding()
+    gap: sections.Gap = sections.Gap()
+    drive: sections.DriveSection = sections.DriveSection()
+    measurement: sections.Measurement = sections.Measurement()
+    friction: sections.Friction = sections.Friction()
     prior: PriorSection = PriorSection()
-    force: ForceSection = ForceSection()
-    perception: Perception = Perception()
-    population: PopulationSection = PopulationSection()
-    tolerance: Tolerance = Tolerance()
+    force: sections.ForceSection = sections.ForceSection()
+    perception: sections.Perception = sections.Perception()
+    population: sections.PopulationSection = sections.PopulationSection()
+    tolerance: sections.Tolerance = sections.Tolerance()
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -69,7 +54,7 @@ class Scene(Section):
         Raises:
             InputError: naming the file, the line, the section, the key and the remedy.
         """
-        text = scene_file.read(path)
+        text = toml.read_scene_text(path)
         try:
             content = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
@@ -78,7 +63,7 @@ class Scene(Section):
             return cls.model_validate(content)
         except pydantic.ValidationError as error:
             sentence = _sentence(error.errors()[0])
-            line = scene_file.line_of(text, sentence)
+            line = toml.find_line(text, sentence)
             raise InputError(f"{path}{f', line {line}' if line else ''}: {sentence}") from None
 
     @classmethod
@@ -91,12 +76,12 @@ class Scene(Section):
 
     def __str__(self) -> str:
         """The scene as a file: every key, with its unit; what was not given, as a comment. Loads to an equal scene."""
-        return scene_file.to_toml(self)
+        return toml.to_toml(self)
 
     def to_json(self) -> str:
         """What was given, in SI units; `from_json` reads it back."""
-        given = self.model_dump(mode="json", exclude_unset=True)
-        return json.dumps({name: section for name, section in given.items() if section}, sort_keys=True)
+        stated = self.model_dump(mode="json", exclude_unset=True)
+        return json.dumps({name: section for name, section in stated.items() if section}, sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> Self:
@@ -114,29 +99,28 @@ class Scene(Section):
     def require_available(self, *, fit: bool = False) -> None:
         """Refuse what this version cannot model (or, with `fit`, cannot fit), rather than leave it out in silence."""
         follows = ("constant", "fractional") if fit else ("constant",)  # the skins whose transients are computed
-        unavailable = {
-            f"[skin] level = '{self.skin.level}' with [drive] steady_state = false": (
-                self.skin.level not in follows and not self.drive.steady_state
-            ),
-        }
-        for what, asked in unavailable.items():
-            if asked:
-                raise InputError(
-                    f"scene: {what} is not available in this version, which does not model it;"
-                    " leave it out of the scene to go on without it"
-                )
+        if self.skin.level not in follows and not self.drive.steady_state:
+            raise InputError(
+                f"scene: [skin] level = '{self.skin.level}' with [drive] steady_state = false is not available in this"
+                " version, which does not model it; leave it out of the scene to go on without it"
+            )
 
-    def nominal(self) -> dict[str, float | None]:
+    def nominal_values(self) -> dict[str, float | None]:
         """The scene's own values of all that can have a prior, SI; None: it has none."""
         ground, measured = self.grounding, self.measurement
-        grounding = {name: getattr(ground, name) for name in (*_DIRECT, *_NATURAL)}
-        grounding["Z"] = ground.Z or None  # 0: the body is at earth
-        series = {"series_resistor": measured.series_resistor or None}
-        series["alpha"] = self.skin.alpha if self.skin.level == "fractional" else None
-        noise = {"sigma": measured.noise_Vsc or None, "sigma_I": measured.noise_I or None}
-        gap = {"Rgap": self.gap.resistance, "Cgap": self._gap_capacitance()}
-        skin = {"Rsc": self.skin.Rsc, "Csc": self.skin.Csc, "Ci": self.device.Ci}
-        return {**skin, **grounding, **series, **gap, **noise}
+        return {
+            "Rsc": self.skin.Rsc,
+            "Csc": self.skin.Csc,
+            "Ci": self.device.Ci,
+            **{name: getattr(ground, name) for name in (*_DIRECT_GROUND_KEYS, *_NATURAL_GROUND_KEYS)},
+            "Z": ground.Z or None,  # 0: the body is at earth
+            "series_resistor": measured.series_resistor or None,
+            "alpha": self.skin.alpha if self.skin.level == "fractional" else None,
+            "Rgap": self.gap.resistance,
+            "Cgap": self._gap_capacitance(),
+            "sigma": measured.noise_Vsc or None,
+            "sigma_I": measured.noise_I or None,
+        }
 
     def _gap_capacitance(self) -> float | None:
         """As stated, or of air of the stated thickness, eq. (3)."""
@@ -171,12 +155,12 @@ class Scene(Section):
     def make_rc_circuit(self, values: Mapping[str, ArrayLike] | None = None) -> RC:
         """As `make_circuit`, with the skins constant."""
         self.require_available(fit=True)
-        of: dict[str, Any] = self.nominal() | dict(values or {})
-        skin, names = (of["Rsc"], of["Csc"], of["Ci"]), ("series_resistor", "Rgap", "Cgap")
-        common = {name: of[name] for name in names} | {"probe": self._probe()}
+        at: dict[str, Any] = self.nominal_values() | dict(values or {})
+        skin, names = (at["Rsc"], at["Csc"], at["Ci"]), ("series_resistor", "Rgap", "Cgap")
+        common = {name: at[name] for name in names} | {"probe": self._probe()}
         if self.grounding.connection == "natural":
-            return NaturalGround(*skin, of["Z"], of["Z_capacitance"], **common)
-        extras = common | {name: of[name] for name in _DIRECT}
+            return NaturalGround(*skin, at["Z"], at["Z_capacitance"], **common)
+        extras = common | {name: at[name] for name in _DIRECT_GROUND_KEYS}
         if all(extra is None for extra in extras.values()):
             return FinalCircuit(*skin)
         return DirectGround(*skin, **extras)
@@ -197,51 +181,51 @@ class Scene(Section):
 
     def make_prior(self) -> Prior:
         """The prior of the parameters that the scene frees, but for gains."""
-        layer = Layer(self.device.contact_area, self.skin.thickness, self.drive.slowest)
-        nominal = self.nominal()
+        layer = Layer(self.device.contact_area, self.skin.thickness, self.drive.lowest_frequency)
+        nominal = self.nominal_values()
         marginals = {
             name: belief.distribution(name, nominal[name], layer)
-            for name, belief in self.prior.beliefs().items()
-            if belief.free
+            for name, belief in self.prior.specs().items()
+            if belief.is_free
         }
-        return Prior.of(self.prior.correlations(), self.prior.ordered(), **marginals)
+        return Prior.of(self.prior.correlations(), self.prior.order_constraints(), **marginals)
 
-    def fixed(self) -> dict[str, float]:
+    def fixed_values(self) -> dict[str, float]:
         """Parameters that the scene holds, and their values, SI.
 
         Raises:
             InputError: one is held at a value that the scene does not have.
         """
-        nominal, found = self.nominal(), {}
-        for name, belief in self.prior.beliefs().items():
+        nominal, fixed = self.nominal_values(), {}
+        for name, belief in self.prior.specs().items():
             if belief.fixed is None:
                 continue
             value = nominal[name] if belief.fixed is True else belief.fixed
             if value is None:
                 raise InputError(f"[prior] {name} is fixed, but the scene has no {name}; write fixed = its value")
-            found[name] = float(value)
-        return found
+            fixed[name] = float(value)
+        return fixed
 
     @model_validator(mode="after")
-    def _prior_of_what_there_is(self) -> Self:
-        absent = dict.fromkeys(_DIRECT, "[grounding] connection = 'direct'")
+    def _check_prior(self) -> Self:
+        absent = dict.fromkeys(_DIRECT_GROUND_KEYS, "[grounding] connection = 'direct'")
         if self.grounding.connection == "direct":
-            absent = dict.fromkeys(_NATURAL, "[grounding] connection = 'natural'")
+            absent = dict.fromkeys(_NATURAL_GROUND_KEYS, "[grounding] connection = 'natural'")
         if self.skin.level != "fractional":
             absent["alpha"] = "[skin] level = 'fractional'"
         for name, channel in {"sigma": "Vsc", "sigma_I": "I"}.items():
             if channel not in self.measurement.channels:
                 absent[name] = f"'{channel}' among [measurement] channels"
-        for name in self.prior.beliefs():
+        for name in self.prior.specs():
             if name in absent:
                 raise InputError(f"[prior] {name} needs {absent[name]}; leave it out of [prior] otherwise")
         self._check_gap()
         self.make_prior()
-        self.fixed()
+        self.fixed_values()
         return self
 
     def _check_gap(self) -> None:
-        has = {name for name, value in self.nominal().items() if value is not None} | set(self.prior.beliefs())
+        has = {name for name, value in self.nominal_values().items() if value is not None} | set(self.prior.specs())
         if "Rgap" in has and "Cgap" not in has:
             raise InputError(
                 "[gap] resistance needs what lies in parallel with it; give capacitance, or the thickness of air, too"
@@ -257,16 +241,16 @@ def _sentence(error: Any) -> str:
     where = [str(part) for part in error["loc"] if part not in ("function-before", "constrained-float")]
     place = f"[{where[0]}] {'.'.join(where[1:])}".strip() if where else "the scene"
     if error["type"] == "extra_forbidden":
-        model: type[Section] = Scene
+        model: type[sections.Section] = Scene
         for name in where[:-1]:
-            model = section_of(model.model_fields[name])
-        return f"{place} is not a key of a scene; {_nearest(where[-1], list(model.model_fields))}"
+            model = sections.field_section(model.model_fields[name])
+        return f"{place} is not a key of a scene; {_suggest_key(where[-1], list(model.model_fields))}"
     message = str(error["msg"]).removeprefix("Value error, ")
     if error["type"] == "model_type":
         message = "not a table; write its keys in one"
     if error["type"] == "literal_error":
         known = re.findall("'([^']+)'", error["ctx"]["expected"])
-        message = f"not a choice; {_nearest(str(error['input']), known)}"
+        message = f"not a choice; {_suggest_key(str(error['input']), known)}"
     if message.startswith("["):  # it names its place itself
         return message
     value = error["input"]
@@ -274,6 +258,6 @@ def _sentence(error: Any) -> str:
     return f"{place}{shown}: {message[0].lower()}{message[1:]}"
 
 
-def _nearest(word: str, known: list[str]) -> str:
+def _suggest_key(word: str, known: list[str]) -> str:
     near = difflib.get_close_matches(word, known, n=1)
     return (f"did you mean '{near[0]}'? " if near else "") + f"known: {', '.join(known)}"

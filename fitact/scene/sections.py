@@ -4,89 +4,72 @@ import dataclasses
 import math
 from collections.abc import Iterator
 from fractions import Fraction
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias, get_args
+from typing import Annotated, Any, Literal, Self, get_args
 
 import pydantic
-from pydantic import BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, GetCoreSchemaHandler, model_validator
 from pydantic.fields import FieldInfo
+from pydantic_core import CoreSchema
 
 from fitact import units
 from fitact.errors import InputError
 from fitact.model.chirp import Chirp
-from fitact.model.drive import Burst, Drive, Periodic, Sine, Square, Trapezoid, Triangle
+from fitact.model.drive import Burst, Drive, Multitone, Periodic, Sine, Square, Trapezoid, Triangle
 from fitact.model.force import plate_capacitance
-from fitact.model.multitone import HIGHEST, Multitone
 
 
 @dataclasses.dataclass(frozen=True)
 class Unit:
-    """The SI unit of a field, among its annotations; "" for a ratio."""
+    """The SI unit of a field, among its annotations; "" for a ratio. Text with units is accepted; inside, it is SI."""
 
     name: str
 
+    def parse(self, value: Any) -> Any:
+        """The value in the unit."""
+        return units.parse_quantity(value, self.name)
 
-def unit_of(field: FieldInfo) -> str | None:
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return BeforeValidator(self.parse).__get_pydantic_core_schema__(source, handler)
+
+
+Ohm = Annotated[float, Unit("ohm"), Field(gt=0)]
+AnyOhm = Annotated[float, Unit("ohm"), Field(ge=0)]
+Farad = Annotated[float, Unit("F"), Field(gt=0)]
+Meter = Annotated[float, Unit("m"), Field(gt=0)]
+SquareMeter = Annotated[float, Unit("m^2"), Field(gt=0)]
+Second = Annotated[float, Unit("s"), Field(gt=0)]
+AnySecond = Annotated[float, Unit("s")]
+Hertz = Annotated[float, Unit("Hz"), Field(gt=0)]
+Permittivity = Annotated[float, Unit(""), Field(ge=1)]
+Volt = Annotated[float, Unit("V"), Field(gt=0)]
+AnyVolt = Annotated[float, Unit("V")]
+NoiseVolt = Annotated[float, Unit("V"), Field(ge=0)]
+NoiseAmpere = Annotated[float, Unit("A"), Field(ge=0)]
+Ampere = Annotated[float, Unit("A"), Field(gt=0)]
+Angle = Annotated[float, Unit("rad")]
+Newton = Annotated[float, Unit("N"), Field(ge=0)]
+Threshold = Annotated[float, Unit("N"), Field(gt=0)]
+VoltPerMeter = Annotated[float, Unit("V/m"), Field(gt=0)]
+Share = Annotated[float, Field(gt=0, lt=1)]
+RelativeSD = Annotated[float, Field(ge=0, lt=1)]
+
+
+def field_unit(field: FieldInfo) -> str | None:
     """The SI unit of a section's field; None: it is no quantity."""
-    return next((found.name for found in _annotations(field) if isinstance(found, Unit)), None)
+    parts = _walk_annotations(*field.metadata, field.annotation)
+    return next((part.name for part in parts if isinstance(part, Unit)), None)
 
 
-def section_of(field: FieldInfo) -> type["Section"]:
+def field_section(field: FieldInfo) -> type["Section"]:
     """The section that a field holds."""
-    return next(found for found in _annotations(field) if isinstance(found, type) and issubclass(found, Section))
+    parts = _walk_annotations(*field.metadata, field.annotation)
+    return next(part for part in parts if isinstance(part, type) and issubclass(part, Section))
 
 
-def _annotations(field: FieldInfo) -> Iterator[Any]:
-    def within(annotations: tuple[Any, ...]) -> Iterator[Any]:
-        for annotation in annotations:
-            yield annotation
-            yield from within(get_args(annotation))
-
-    return within((*field.metadata, field.annotation))
-
-
-def _quantity(unit: str, **bounds: Any) -> Any:
-    """The type of a field in `unit`: SI floats inside, text with units accepted."""
-    return Annotated[float, Unit(unit), BeforeValidator(lambda value: units.parse(value, unit)), Field(**bounds)]
-
-
-if TYPE_CHECKING:
-    Ohm: TypeAlias = float
-    Farad: TypeAlias = float
-    Meter: TypeAlias = float
-    SquareMeter: TypeAlias = float
-    Second: TypeAlias = float
-    Hertz: TypeAlias = float
-    Permittivity: TypeAlias = float
-    Volt: TypeAlias = float
-    Angle: TypeAlias = float
-    AnyVolt: TypeAlias = float
-    AnyOhm: TypeAlias = float
-    NoiseVolt: TypeAlias = float
-    NoiseAmpere: TypeAlias = float
-    AnySecond: TypeAlias = float
-    Newton: TypeAlias = float
-    Threshold: TypeAlias = float
-    VoltPerMeter: TypeAlias = float
-    Ampere: TypeAlias = float
-else:
-    Ohm = _quantity("ohm", gt=0)
-    Farad = _quantity("F", gt=0)
-    Meter = _quantity("m", gt=0)
-    SquareMeter = _quantity("m^2", gt=0)
-    Second = _quantity("s", gt=0)
-    Hertz = _quantity("Hz", gt=0)
-    Permittivity = _quantity("", ge=1)
-    Volt = _quantity("V", gt=0)
-    Angle = _quantity("rad")
-    AnyVolt = _quantity("V")
-    AnyOhm = _quantity("ohm", ge=0)
-    NoiseVolt = _quantity("V", ge=0)
-    NoiseAmpere = _quantity("A", ge=0)
-    AnySecond = _quantity("s")
-    Newton = _quantity("N", ge=0)
-    Threshold = _quantity("N", gt=0)
-    VoltPerMeter = _quantity("V/m", gt=0)
-    Ampere = _quantity("A", gt=0)
+def _walk_annotations(*annotations: Any) -> Iterator[Any]:
+    for annotation in annotations:
+        yield annotation
+        yield from _walk_annotations(*get_args(annotation))
 
 
 class Section(pydantic.BaseModel):
@@ -107,15 +90,15 @@ class Device(Section):
     current_limit_peak: Ampere | None = None
 
     @model_validator(mode="after")
-    def _capacitance_of_the_layer(self) -> Self:
-        given = self.model_fields_set
-        if "Ci" not in given and {"insulator_thickness", "insulator_permittivity"} <= given:
+    def _derive_Ci(self) -> Self:
+        stated = self.model_fields_set
+        if "Ci" not in stated and {"insulator_thickness", "insulator_permittivity"} <= stated:
             Ci = plate_capacitance(self.insulator_permittivity, self.contact_area, self.insulator_thickness)
             object.__setattr__(self, "Ci", Ci)  # eq. (3); the model is frozen from here on
         return self
 
 
-class Skin(Section):
+class SkinSection(Section):
     """One skin layer; `alpha` is the exponent of a fractional one (see `fitact.Fractional`)."""
 
     Rsc: Ohm = 160e3
@@ -125,7 +108,7 @@ class Skin(Section):
     alpha: Annotated[float, Field(gt=0, le=1)] = 0.8
 
     @model_validator(mode="after")
-    def _alpha_of_a_fractional_skin(self) -> Self:
+    def _check_alpha(self) -> Self:
         if "alpha" in self.model_fields_set and self.level != "fractional":
             raise ValueError(f"alpha belongs to level = 'fractional', not to '{self.level}'")
         return self
@@ -142,7 +125,7 @@ class Grounding(Section):
     Z_capacitance: Farad | None = None
 
     @model_validator(mode="after")
-    def _Z_of_natural_ground(self) -> Self:
+    def _check_Z(self) -> Self:
         if self.Z == 0.0 and self.Z_capacitance is not None:
             raise ValueError("Z = 0 shorts Z_capacitance; leave one of them out")
         if self.connection == "natural" and self.Z is None:
@@ -158,12 +141,12 @@ class Gap(Section):
     thickness: Meter | None = None
 
 
-_WAVES = ("sine", "triangle", "square", "trapezoid")
-_WAVEFORMS_OF = {  # the keys of [drive] that only some waveforms have
-    "peak_to_peak": (*_WAVES, "burst", "chirp", "measured"),
-    "frequency": (*_WAVES, "burst", "measured"),
+_PERIODIC_WAVEFORMS = ("sine", "triangle", "square", "trapezoid")
+_KEY_WAVEFORMS = {  # the keys of [drive] that only some waveforms have
+    "peak_to_peak": (*_PERIODIC_WAVEFORMS, "burst", "chirp", "measured"),
+    "frequency": (*_PERIODIC_WAVEFORMS, "burst", "measured"),
     "duty": ("square", "trapezoid", "burst"),
-    "phase": (*_WAVES, "burst", "chirp"),
+    "phase": (*_PERIODIC_WAVEFORMS, "burst", "chirp"),
     "shape": ("burst",),
     "cycles": ("burst",),
     "start_frequency": ("chirp",),
@@ -183,7 +166,7 @@ class DriveSection(Section):
     peak_to_peak: Volt = 360.0
     frequency: Hertz = 100.0
     rise_time: Second | None = None
-    duty: Annotated[float, Field(gt=0, lt=1)] = 0.5
+    duty: Share = 0.5
     offset: AnyVolt = 0.0
     phase: Angle = 0.0
     shape: Literal["square", "sine", "triangle"] = "square"
@@ -198,13 +181,13 @@ class DriveSection(Section):
     steady_state: bool = True
 
     @model_validator(mode="after")
-    def _keys_of_the_waveform(self) -> Self:
+    def _check_waveform_keys(self) -> Self:
         if (self.waveform == "trapezoid") != (self.rise_time is not None):
             raise ValueError(
                 "rise_time belongs to waveform = 'trapezoid', which needs it"
                 f" (here: waveform = '{self.waveform}', rise_time {'absent' if self.rise_time is None else 'given'})"
             )
-        for key, waveforms in _WAVEFORMS_OF.items():
+        for key, waveforms in _KEY_WAVEFORMS.items():
             if key in self.model_fields_set and self.waveform not in waveforms:
                 raise ValueError(f"{key} belongs to the waveforms {', '.join(waveforms)}, not to '{self.waveform}'")
         if "duty" in self.model_fields_set and self.waveform == "burst" and self.shape != "square":
@@ -216,7 +199,7 @@ class DriveSection(Section):
         return self
 
     @model_validator(mode="after")
-    def _from_rest(self) -> Self:
+    def _start_from_rest(self) -> Self:
         if self.waveform in ("burst", "chirp"):
             if "steady_state" in self.model_fields_set and self.steady_state:
                 raise ValueError(f"a {self.waveform} has no steady state; leave steady_state out, or make it false")
@@ -224,25 +207,26 @@ class DriveSection(Section):
         return self
 
     @model_validator(mode="after")
-    def _tones(self) -> Self:
+    def _check_tones(self) -> Self:
         if self.waveform != "multitone":
             return self
         if self.frequencies is None or self.amplitudes is None:
             raise ValueError("waveform = 'multitone' needs frequencies and amplitudes, a list of each")
         for key in ("amplitudes", "phases"):
-            given = getattr(self, key)
-            if given is not None and len(given) != len(self.frequencies):
-                raise ValueError(f"{key} has {len(given)} values for {len(self.frequencies)} frequencies")
+            values = getattr(self, key)
+            if values is not None and len(values) != len(self.frequencies):
+                raise ValueError(f"{key} has {len(values)} values for {len(self.frequencies)} frequencies")
         if len(set(self.frequencies)) < len(self.frequencies):
             raise ValueError("frequencies must differ; add the amplitudes of one tone up")
-        if max(self.frequencies) / self.slowest > HIGHEST:
+        if max(self.frequencies) / self.lowest_frequency > Multitone.max_order:
             raise ValueError(
-                f"frequencies must be multiples, up to {HIGHEST}, of one frequency (these: of {self.slowest:.6g} Hz)"
+                f"frequencies must be multiples, up to {Multitone.max_order}, of one frequency (these: of"
+                f" {self.lowest_frequency:.6g} Hz)"
             )
         return self
 
     @property
-    def slowest(self) -> float:
+    def lowest_frequency(self) -> float:
         """The lowest frequency in it, Hz; of several tones that at which they repeat."""
         if self.frequencies is not None:
             tones = [Fraction(repr(tone)) for tone in self.frequencies]
@@ -265,16 +249,14 @@ class DriveSection(Section):
         if self.waveform == "multitone":
             assert self.frequencies is not None  # checked when the section was read
             assert self.amplitudes is not None
-            orders = tuple(round(tone / self.slowest) for tone in self.frequencies)
-            return Multitone(self.slowest, orders, self.amplitudes, self.phases or (), self.offset)
+            orders = tuple(round(tone / self.lowest_frequency) for tone in self.frequencies)
+            return Multitone(self.lowest_frequency, orders, self.amplitudes, self.phases or (), self.offset)
         return self._wave(self.waveform)
 
     def _wave(self, shape: str) -> Periodic:
         height, offset, phase = (self.peak_to_peak, self.frequency), self.offset, self.phase
-        if shape == "sine":
-            return Sine(*height, offset, phase)
-        if shape == "triangle":
-            return Triangle(*height, offset, phase)
+        if shape in ("sine", "triangle"):
+            return (Sine if shape == "sine" else Triangle)(*height, offset, phase)
         if shape == "square":
             return Square(*height, self.duty, offset, phase)
         if shape == "trapezoid":
@@ -297,13 +279,13 @@ class Measurement(Section):
     duration: Second = 20e-3
     noise_Vsc: NoiseVolt = 0.1
     noise_I: NoiseAmpere = 20e-9
-    gain_relative_sd: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    gain_I_relative_sd: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    gain_relative_sd: RelativeSD = 0.0
+    gain_I_relative_sd: RelativeSD = 0.0
     noise_model: Literal["white", "student", "ar1", "spectrum"] = "white"
     quiet: tuple[AnySecond, AnySecond] | None = None
 
     @model_validator(mode="after")
-    def _quiet_for_a_spectrum(self) -> Self:
+    def _check_quiet(self) -> Self:
         if (self.noise_model == "spectrum") != (self.quiet is not None):
             raise ValueError(
                 '[measurement] noise_model = \'spectrum\' and quiet = ["0 ms", "5 ms"], the stretch in which the drive'
@@ -338,20 +320,17 @@ class PopulationSection(Section):
     """What fingers on one panel share, and how the next one's layers differ from the stated ones."""
 
     contact_area: Literal["common", "varies"] = "common"
-    skin_thickness_relative_sd: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    insulator_thickness_relative_sd: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    skin_thickness_relative_sd: RelativeSD = 0.0
+    insulator_thickness_relative_sd: RelativeSD = 0.0
 
     @property
     def thickness_sd(self) -> dict[str, float]:
         """Log-standard deviations of the thicknesses that vary."""
-        stated = {
-            "skin_thickness": self.skin_thickness_relative_sd,
-            "insulator_thickness": self.insulator_thickness_relative_sd,
-        }
+        stated = {name: getattr(self, f"{name}_relative_sd") for name in ("skin_thickness", "insulator_thickness")}
         return {name: math.sqrt(math.log1p(sd**2)) for name, sd in stated.items() if sd > 0.0}
 
 
 class Tolerance(Section):
     """The relative error the user accepts."""
 
-    force: Annotated[float, Field(gt=0, lt=1)] = 0.01
+    force: Share = 0.01

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from fitact.errors import InputError
-from fitact.scene.prior_section import QUANTITIES, Belief
-from fitact.scene.sections import Section, unit_of
-from fitact.units import written
+from fitact.scene.prior_section import QUANTITY_KEYS, PriorSpec
+from fitact.scene.sections import Section, field_unit
+from fitact.units import format_exact
 
 _HEADER = re.compile(r"\s*\[([^\[\]]+)\]\s*(#.*)?$")
 _KEY = re.compile(r"\s*([\w.\"'-]+)\s*=")
@@ -20,13 +20,13 @@ _INLINE = re.compile(r"[{,]\s*([\w-]+)\s*=")
 
 
 @functools.cache
-def shipped() -> dict[str, str]:
+def shipped_scenes() -> dict[str, str]:
     """The scenes that come with fitact: name -> text."""
     folder = importlib.resources.files("fitact") / "scenes"
     return {file.name.removesuffix(".toml"): file.read_text(encoding="utf-8") for file in folder.iterdir()}
 
 
-def read(path: str | Path) -> str:
+def read_scene_text(path: str | Path) -> str:
     """The text of a scene file, or of a shipped scene where there is no such file.
 
     Raises:
@@ -36,17 +36,23 @@ def read(path: str | Path) -> str:
     try:
         return Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        if isinstance(error, FileNotFoundError) and name in shipped():
-            return shipped()[name]
+        if isinstance(error, FileNotFoundError) and name in shipped_scenes():
+            return shipped_scenes()[name]
         reason = (error.strerror or str(error)).lower() if isinstance(error, OSError) else "not UTF-8 text"
-        raise InputError(f"{name}: the scene cannot be read ({reason}); give a TOML file{_or_shipped(name)}") from error
+        raise InputError(
+            f"{name}: the scene cannot be read ({reason}); give a TOML file{_suggest_shipped(name)}"
+        ) from error
 
 
-def _or_shipped(name: str) -> str:
+def _suggest_shipped(name: str) -> str:
     if "." in name or "/" in name:
         return ""
-    near = difflib.get_close_matches(name, shipped(), n=1)
-    return f", or the shipped scene '{near[0]}'" if near else f", or a shipped scene: {', '.join(sorted(shipped()))}"
+    near = difflib.get_close_matches(name, shipped_scenes(), n=1)
+    return (
+        f", or the shipped scene '{near[0]}'"
+        if near
+        else f", or a shipped scene: {', '.join(sorted(shipped_scenes()))}"
+    )
 
 
 def to_toml(scene: Section) -> str:
@@ -59,35 +65,35 @@ def _lines(scene: Section) -> Iterator[str]:
         yield f"[{name}]"
         for key, field in type(section).model_fields.items():
             value = getattr(section, key)
-            line = f"{key}: absent" if value is None else f"{key} = {value_text(value, unit_of(field))}"
+            line = f"{key}: absent" if value is None else f"{key} = {value_text(value, field_unit(field))}"
             yield line if key in section.model_fields_set and value is not None else f"# {line}"
         yield ""
 
 
 def value_text(value: Any, unit: str | None) -> str:
     """A value as TOML; `unit` is that of numbers, None for plain ones."""
-    if isinstance(value, Belief):
-        given = {key: getattr(value, key) for key in type(value).model_fields if key in value.model_fields_set}
-        return _table({key: value_text(x, unit if key in QUANTITIES else None) for key, x in given.items()})
+    if isinstance(value, PriorSpec):
+        stated = {key: x for key, x in value if key in value.model_fields_set}
+        return _inline_table({key: value_text(x, unit if key in QUANTITY_KEYS else None) for key, x in stated.items()})
     if isinstance(value, dict):
-        return _table({key: value_text(x, unit) for key, x in value.items()})
+        return _inline_table({key: value_text(x, unit) for key, x in value.items()})
     if isinstance(value, tuple):
         return f"[{', '.join(value_text(x, unit) for x in value)}]"
     if isinstance(value, float) and unit:
-        return f'"{written(value, unit)}"'
+        return f'"{format_exact(value, unit)}"'
     return json.dumps(value, ensure_ascii=False)
 
 
-def _table(items: dict[str, str]) -> str:
+def _inline_table(items: dict[str, str]) -> str:
     return f"{{{', '.join(f'{key} = {text}' for key, text in items.items())}}}"
 
 
-def line_of(text: str, sentence: str) -> int | None:
+def find_line(text: str, sentence: str) -> int | None:
     """The line of a scene file that a sentence such as "[drive] duty = 2: ..." is about; None if there is none."""
     place = re.match(r"\[(\w+)\](.*)", sentence)
     if place is None:
         return None
-    section, lines = place[1], _places(text)
+    section, lines = place[1], _key_lines(text)
     words = re.findall(r"[\w-]+", place[2])
     for index, word in enumerate(words):
         for path in lines:
@@ -97,24 +103,24 @@ def line_of(text: str, sentence: str) -> int | None:
     return lines.get((section,))
 
 
-def _places(text: str) -> dict[tuple[str, ...], int]:
+def _key_lines(text: str) -> dict[tuple[str, ...], int]:
     """The first line of every table and key, by its path."""
-    found: dict[tuple[str, ...], int] = {}
+    lines: dict[tuple[str, ...], int] = {}
     table: tuple[str, ...] = ()
     for number, line in enumerate(text.splitlines(), 1):
         header, key = _HEADER.match(line), _KEY.match(line)
         if header:
-            table = _parts(header[1])
-            found.setdefault(table[:1], number)
-            found.setdefault(table, number)
+            table = _split_key(header[1])
+            lines.setdefault(table[:1], number)
+            lines.setdefault(table, number)
         elif key:
-            path = table + _parts(key[1])
+            path = table + _split_key(key[1])
             for end in range(1, len(path) + 1):
-                found.setdefault(path[:end], number)
+                lines.setdefault(path[:end], number)
             for inner in _INLINE.finditer(line):
-                found.setdefault((*path, inner[1]), number)
-    return found
+                lines.setdefault((*path, inner[1]), number)
+    return lines
 
 
-def _parts(dotted: str) -> tuple[str, ...]:
+def _split_key(dotted: str) -> tuple[str, ...]:
     return tuple(part.strip(" \"'") for part in dotted.split("."))

@@ -4,7 +4,7 @@ import dataclasses
 import os
 import platform
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -16,16 +16,15 @@ from fitact.data.simulate import simulate
 from fitact.errors import InputError
 from fitact.fitting.fit import Fit, fit
 from fitact.scene.scene import Scene
-from fitact.tradeoff import timings as levels
-from fitact.tradeoff.timings import Measured
-from fitact.units import engineering
+from fitact.tables import align_row
+from fitact.tradeoff import timings
+from fitact.tradeoff.timings import BenchmarkResult
+from fitact.units import format_engineering
 
 Kind: TypeAlias = Literal["response", "likelihood", "uncertainty"]
 
-_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # of the compressed log-likelihood
-_DEFAULT = 1e-3
-_WIDTHS = (10, 11, 9, 11, 10, 11)
-_EXACT = 1e-12  # of Vsc: what docs/numerics.md guarantees; less counts as this on the front
+_DEFAULT_TOLERANCE = 1e-3  # of `fitact.fit`, on which the levels of uncertainty stand
+_WIDTHS = [24, 10, 11, 9, 11, 10, 11]
 COLUMNS = ("level", "error", "time", "ratio", "gradient", "compile", "memory")
 KINDS: dict[Kind, str] = {
     "response": "error of Vsc, relative rms; time of one evaluation",
@@ -35,7 +34,7 @@ KINDS: dict[Kind, str] = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Level:
+class BenchmarkedMethod:
     """One level as measured.
 
     Attributes:
@@ -64,19 +63,20 @@ class Level:
 
     @property
     def cells(self) -> tuple[str, ...]:
-        """Of a table of `COLUMNS`, for people."""
+        """A row of a table of `COLUMNS`, for people."""
         return (
             self.name,
             f"{self.error:.2g}",
-            engineering(self.seconds, "s", 3),
+            format_engineering(self.seconds, "s", 3),
             f"{self.ratio:.3g}",
-            "" if self.gradient_seconds is None else engineering(self.gradient_seconds, "s", 3),
+            "" if self.gradient_seconds is None else format_engineering(self.gradient_seconds, "s", 3),
             f"{self.compile_seconds:.2f} s" if self.compile_seconds > 0.0 else "",
-            "" if self.memory is None else engineering(self.memory, "B", 3),
+            "" if self.memory is None else format_engineering(self.memory, "B", 3),
         )
 
     def __str__(self) -> str:
-        return _row(self.cells) + (f"  dominated by {self.dominated_by}" if self.dominated_by else "")
+        row = align_row(self.cells, _WIDTHS)
+        return f"{row:{sum(_WIDTHS)}}  dominated by {self.dominated_by}" if self.dominated_by else row
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,29 +97,29 @@ class Tradeoff:
         notes: sentences.
     """
 
-    levels: tuple[Level, ...]
+    levels: tuple[BenchmarkedMethod, ...]
     record: str
     resolution: float
     trusted: bool
     machine: dict[str, Any]
     notes: tuple[str, ...]
 
-    def of(self, kind: Kind) -> tuple[Level, ...]:
-        """The levels of one kind."""
+    def of(self, kind: Kind) -> tuple[BenchmarkedMethod, ...]:
+        """Return the levels of one kind."""
         return tuple(level for level in self.levels if level.kind == kind)
 
-    def front(self, kind: Kind) -> tuple[Level, ...]:
-        """The Pareto front of one kind, cheapest first."""
+    def front(self, kind: Kind) -> tuple[BenchmarkedMethod, ...]:
+        """Return the Pareto front of one kind, cheapest first."""
         return tuple(sorted((level for level in self.of(kind) if not level.dominated_by), key=lambda x: x.seconds))
 
     def to_dict(self) -> dict[str, Any]:
-        """What `fitact tradeoff --json` prints and tradeoff.json holds."""
+        """Return what `fitact tradeoff --json` prints and tradeoff.json holds."""
         return dataclasses.asdict(self)
 
     def __str__(self) -> str:
         rows = [f"{self.record}; {self.machine['cpu']}, {self.machine['cores']} cores", ""]
         for kind, title in KINDS.items():
-            rows += [f"{kind}: {title}", _row(COLUMNS), *map(str, self.of(kind)), ""]
+            rows += [f"{kind}: {title}", align_row(COLUMNS, _WIDTHS), *map(str, self.of(kind)), ""]
         return "\n".join([*rows, self.resolved, *self.notes])
 
     @property
@@ -128,10 +128,24 @@ class Tradeoff:
         return f"errors of uncertainty below {self.resolution:.2g} cannot be told from 0"
 
 
-def measure_tradeoff(record: Record | None = None, scene: Scene | None = None, *, progress: bool = True) -> Tradeoff:
+def measure_tradeoff(
+    record: Record | None = None,
+    scene: Scene | None = None,
+    *,
+    progress: bool = True,
+    tolerances: Sequence[float] = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6),
+    runs: int = 3,
+) -> Tradeoff:
     """Measure every level's error and cost on a record (V and Vsc), or on one simulated from the scene.
 
-    Times are medians of interleaved rounds; `progress` is told on standard error. Takes a minute or two.
+    Times are medians of interleaved rounds. Takes a minute or two.
+
+    Args:
+        record: None: simulated.
+        scene: None: the paper's.
+        progress: tell it on standard error.
+        tolerances: of the compressed log-likelihood; 1e-3 must be among them.
+        runs: of each level of uncertainty, after one that compiles.
 
     Raises:
         InputError: the record or the scene cannot be fitted, or the scene does not measure Vsc.
@@ -144,66 +158,54 @@ def measure_tradeoff(record: Record | None = None, scene: Scene | None = None, *
             f"scene: [skin] level = '{stated.skin.level}': the levels are those of a constant skin; leave it out"
         )
     stated.require_available(fit=True)
-    say = _teller(progress)
+
+    def say(text: str) -> None:
+        if progress:
+            print(f"tradeoff: {text}", file=sys.stderr)
+
     measured = record or simulate(stated)
-    say(f"fitting {measured.source} at {len(_TOLERANCES)} tolerances and without compression")
-    fits = {tolerance: fit(measured, scene if record else stated, tolerance=tolerance) for tolerance in _TOLERANCES}
+    say(f"fitting {measured.source} at {len(tolerances)} tolerances and without compression")
+    fits = {tolerance: fit(measured, scene if record else stated, tolerance=tolerance) for tolerance in tolerances}
     full = fit(measured, scene if record else stated, tolerance=0.0)
     with jax.enable_x64(True):
         say("responses")
-        responses = levels.responses(full)
+        responses = timings.benchmark_responses(full)
         say("likelihoods")
-        likelihoods = levels.likelihoods(full, fits)
+        likelihoods = timings.benchmark_likelihoods(full, fits)
     say("uncertainties")
-    draws, resolution, converged = levels.uncertainties(full, fits[_DEFAULT], say)
+    draws, resolution, converged = timings.benchmark_uncertainties(full, fits[_DEFAULT_TOLERANCE], say, runs)
     return Tradeoff(
         levels=(
-            *_judged("response", responses, _EXACT),
-            *_judged("likelihood", likelihoods, 0.0),
-            *_judged("uncertainty", draws, resolution),
+            *_rank_results("response", responses, 1e-12),  # what docs/numerics.md guarantees of Vsc
+            *_rank_results("likelihood", likelihoods, 0.0),
+            *_rank_results("uncertainty", draws, resolution),
         ),
         record=f"{os.path.basename(measured.source)}: {len(measured):,} samples, drive {full.choice.name}",
         resolution=resolution,
         trusted=full.trusted and converged,
-        machine=machine(),
+        machine=describe_machine(),
         notes=_notes(full, fits, converged),
     )
 
 
-def _row(cells: Sequence[str]) -> str:
-    name, *others = cells
-    return f"{name:24}" + "".join(f"{x:>{width}}" for x, width in zip(others, _WIDTHS, strict=True))
-
-
-def _judged(kind: Kind, rows: Sequence[Measured], resolution: float) -> list[Level]:
-    """With ratios to the reference, which comes first, and who dominates whom; errors below `resolution` are alike."""
-    errors = [max(row.error, resolution) for row in rows]
-    by = dominators([row.seconds for row in rows], errors)
+def _rank_results(kind: Kind, rows: Sequence[BenchmarkResult], resolution: float) -> list[BenchmarkedMethod]:
+    """Add ratios to the reference, which comes first, and who dominates whom; errors below `resolution` are alike."""
+    better = dominators([row.seconds for row in rows], [max(row.error, resolution) for row in rows])
+    names = ["" if j is None else rows[j].name for j in better]
     return [
-        Level(
-            kind,
-            row.name,
-            row.error,
-            row.seconds,
-            row.seconds / rows[0].seconds,
-            row.gradient_seconds,
-            row.compile_seconds,
-            row.memory,
-            "" if j is None else rows[j].name,
-            row.details,
-        )
-        for row, j in zip(rows, by, strict=True)
+        BenchmarkedMethod(kind=kind, ratio=row.seconds / rows[0].seconds, dominated_by=name, **vars(row))
+        for row, name in zip(rows, names, strict=True)
     ]
 
 
 def dominators(costs: Sequence[float], errors: Sequence[float]) -> list[int | None]:
-    """For each level the one on the Pareto front that dominates it, the cheapest of several; None: it is on the front.
+    """Return for each level the one on the Pareto front that dominates it, the cheapest of several; None: it is on it.
 
     One dominates another when neither its cost nor its error is larger, and one of both is smaller. Of equal
     levels none dominates the other.
     """
     order = sorted(range(len(costs)), key=lambda i: (costs[i], errors[i]))
-    found: list[int | None] = [None] * len(costs)
+    dominator: list[int | None] = [None] * len(costs)
     front: list[int] = []
     for i in order:
         same = [j for j in front if (costs[j], errors[j]) == (costs[i], errors[i])]
@@ -211,8 +213,8 @@ def dominators(costs: Sequence[float], errors: Sequence[float]) -> list[int | No
         if same or not better:
             front.append(i)
         else:
-            found[i] = better[0]
-    return found
+            dominator[i] = better[0]
+    return dominator
 
 
 def _notes(full: Fit, fits: dict[float, Fit], converged: bool) -> tuple[str, ...]:
@@ -221,14 +223,14 @@ def _notes(full: Fit, fits: dict[float, Fit], converged: bool) -> tuple[str, ...
         notes.append(f"the fit that the levels stand on must not be trusted: {full.message}")
     if not converged:
         notes.append("emcee on the full sum, the reference of the uncertainties, has not converged")
-    for tolerance, each in fits.items():
-        if each.compression_error is None:
-            notes.append(f"not compressed at {levels.short(tolerance)}, since {each.full_because}")
+    for tolerance, fitted in fits.items():
+        if fitted.compression_error is None:
+            notes.append(f"not compressed at {timings.format_tolerance(tolerance)}, since {fitted.full_because}")
     return tuple(notes)
 
 
-def machine() -> dict[str, Any]:
-    """What a result was measured on, so that runs can be compared."""
+def describe_machine() -> dict[str, Any]:
+    """Describe what a result was measured on, so that runs can be compared."""
     return {
         "cpu": _cpu(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
@@ -246,7 +248,3 @@ def _cpu() -> str:
     except OSError:
         return platform.processor() or platform.machine()
     return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
-
-
-def _teller(on: bool) -> Callable[[str], None]:
-    return lambda text: print(f"tradeoff: {text}", file=sys.stderr) if on else None

@@ -16,15 +16,16 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import lazy_loader
 import numpy as np
 
 from fitact.data.readers import layouts
-from fitact.data.readers.capture import Capture, Pick, Trace
+from fitact.data.readers.capture import Capture, FileChannel, Pick
 from fitact.data.readers.matlab import read_mat
 from fitact.errors import InputError
 
-_PACKED = 1032  # times that deflate can shrink what it packs; a header that announces more is broken
-_LEAST = 1_000_000  # bytes that any file may unfold to
+h5py, scipy = lazy_loader.load("h5py"), lazy_loader.load("scipy")
+
 _SCOPE = re.compile(
     rb"\A(?:AG(?:01|03|10)|RG0\d|\xa5\xa5|\xa1\xa5\0\0|\x01\xff\xff\xff|[\x0f\xf0]{2}.:WFM#|.{0,3}LLWFM|<\?xml)"
     rb"|WAVEDESC|:CURVE? #|NR_PT:",
@@ -40,21 +41,21 @@ class _Contents:
     format: str
     arrays: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
     units: dict[str, str] = dataclasses.field(default_factory=dict)
-    stated: dict[str, Any] = dataclasses.field(default_factory=dict)  # under layouts.key(name)
+    metadata: dict[str, Any] = dataclasses.field(default_factory=dict)  # under layouts.normalize_key(name)
 
     def add(self, name: str, value: Any, unit: Any = "") -> None:
         """Sort a value in; what is neither an array of one axis, a number nor a word is passed over."""
         array = np.squeeze(np.asarray(value))
         if array.ndim == 0 and array.dtype.kind in "iufSU":
-            self.stated[layouts.key(name.rpartition("/")[2])] = array.item()
+            self.metadata[layouts.normalize_key(name.rpartition("/")[2])] = array.item()
         elif array.ndim == 1 and array.dtype.kind in "iufc":
             self.arrays[name] = array
-            self.units[name] = _word(unit)
+            self.units[name] = _to_text(unit)
 
 
 def is_known_binary(head: bytes, suffix: str) -> bool:
     """Whether a file that begins so goes to `read_binary`, though it may look like text."""
-    return _reader(head, "" if suffix.lower() in (".csv", ".txt") else suffix) is not None
+    return _find_reader(head, "" if suffix.lower() in (".csv", ".txt") else suffix) is not None
 
 
 def read_binary(path: Path, source: str, head: bytes, pick: Pick) -> Capture:
@@ -63,7 +64,7 @@ def read_binary(path: Path, source: str, head: bytes, pick: Pick) -> Capture:
     Raises:
         InputError: it is of no known kind, is broken, or what reads it is not installed.
     """
-    reader = _reader(head, path.suffix)
+    reader = _find_reader(head, path.suffix)
     if reader is None:
         raise InputError(f"{source}: is not a text file, nor of a known binary kind; export the record as CSV")
     printed = io.StringIO()
@@ -78,7 +79,7 @@ def read_binary(path: Path, source: str, head: bytes, pick: Pick) -> Capture:
         raise InputError(f"{source}: cannot be read ({reason}); export the record again, or as CSV") from error
 
 
-def _reader(head: bytes, suffix: str) -> Callable[[Path, str, Pick], Capture] | None:
+def _find_reader(head: bytes, suffix: str) -> Callable[[Path, str, Pick], Capture] | None:
     for starts, reader in (
         (b"\x89HDF\r\n\x1a\n", _read_hdf5),
         (b"CDF", _read_netcdf3),
@@ -95,36 +96,36 @@ def _reader(head: bytes, suffix: str) -> Callable[[Path, str, Pick], Capture] | 
 
 
 def _read_scope(path: Path, source: str, pick: Pick) -> Capture:
-    wfm = _import("RigolWFM.wfm", "scope", source).Wfm.from_file(str(path))
+    wfm = _import_extra("RigolWFM.wfm", "scope", source).Wfm.from_file(str(path))
     if not wfm.channels:
         raise InputError(f"{source}: holds no analogue channel; export one")
     names = [str(channel.name) for channel in wfm.channels]
     wanted = set(pick(names, ""))
-    unit = {"v": "V", "a": "A"}
-    traces = [
-        Trace(
-            name,
+    units = {"v": "V", "a": "A"}
+    chosen = [channel for channel in wfm.channels if str(channel.name) in wanted]
+    channels = tuple(
+        FileChannel(
+            str(channel.name),
             np.asarray(channel.volts, dtype=float),
-            unit.get(channel.unit.name, ""),
-            unit.get(channel.unit.name, channel.unit.name),
+            units.get(channel.unit.name, ""),
+            units.get(channel.unit.name, channel.unit.name),
             float(channel.probe_value) if channel.probe_value != 1.0 else None,  # 1 is also what is not known
         )
-        for name, channel in zip(names, wfm.channels, strict=True)
-        if name in wanted
-    ]
-    times = [np.asarray(c.times, dtype=float) for name, c in zip(names, wfm.channels, strict=True) if name in wanted]
-    _check_one_grid(times, [trace.name for trace in traces], source)
+        for channel in chosen
+    )
+    times = [np.asarray(channel.times, dtype=float) for channel in chosen]
+    _check_one_grid(times, [channel.name for channel in channels], source)
     maker = str(wfm.header_name) or "oscilloscope"
-    return Capture(source, maker, times[0], tuple(traces), others=tuple(n for n in names if n not in wanted))
+    return Capture(source, maker, times[0], channels, unread_columns=tuple(n for n in names if n not in wanted))
 
 
 def _read_tdms(path: Path, source: str, pick: Pick) -> Capture:
-    nptdms = _import("nptdms", "tdms", source)
-    with _complaints("nptdms") as said, nptdms.TdmsFile.open(path) as file:
-        channels = {channel.name: channel for group in file.groups() for channel in group.channels()}
-        many = [f"{group.name}/{channel.name}" for group in file.groups() for channel in group.channels()]
-        if len(many) > len(channels):  # one name in several groups
-            channels = {f"{group.name}/{c.name}": c for group in file.groups() for c in group.channels()}
+    nptdms = _import_extra("nptdms", "tdms", source)
+    with _capture_log("nptdms") as said, nptdms.TdmsFile.open(path) as file:
+        pairs = [(group, channel) for group in file.groups() for channel in group.channels()]
+        channels = {channel.name: channel for _, channel in pairs}
+        if len(channels) < len(pairs):  # one name in several groups
+            channels = {f"{group.name}/{channel.name}": channel for group, channel in pairs}
         _check_size(sum(8 * len(channel) for channel in channels.values()), path, source)
         contents = _Contents("TDMS")
         times = []
@@ -137,14 +138,14 @@ def _read_tdms(path: Path, source: str, pick: Pick) -> Capture:
             contents.add("time", times[0], "s")
     if said:  # of a cut file nptdms reads what is left
         raise InputError(f"{source}: was cut or is broken ({said[0][:120]}); export the record again")
-    return _capture(contents, source, pick)
+    return _make_capture(contents, source, pick)
 
 
 def _read_mat(path: Path, source: str, pick: Pick) -> Capture:
     contents = _Contents("MATLAB")
-    for name, value in read_mat(path.read_bytes(), _most(path)):
+    for name, value in read_mat(path.read_bytes(), _size_limit(path)):
         contents.add(name, value)
-    return _capture(contents, source, pick)
+    return _make_capture(contents, source, pick)
 
 
 def _read_npz(path: Path, source: str, pick: Pick) -> Capture:
@@ -155,23 +156,19 @@ def _read_npz(path: Path, source: str, pick: Pick) -> Capture:
         _check_size(sum(part.file_size for part in file.zip.infolist()), path, source)
         for name in file.files:
             contents.add(name, file[name])
-    return _capture(contents, source, pick)
+    return _make_capture(contents, source, pick)
 
 
 def _read_netcdf3(path: Path, source: str, pick: Pick) -> Capture:
-    import scipy.io
-
     contents = _Contents("NetCDF")
     with scipy.io.netcdf_file(path, mmap=False) as file:
         for name, variable in file.variables.items():
             _check_size(8 * int(np.prod(variable.shape)), path, source)
             contents.add(name, variable[...].copy(), getattr(variable, "units", ""))
-    return _capture(contents, source, pick)
+    return _make_capture(contents, source, pick)
 
 
 def _read_hdf5(path: Path, source: str, pick: Pick) -> Capture:
-    import h5py
-
     contents = _Contents("HDF5")
     with h5py.File(path, "r") as file:
 
@@ -186,15 +183,15 @@ def _read_hdf5(path: Path, source: str, pick: Pick) -> Capture:
 
         visit("", file)
         file.visititems(visit)
-    return _capture(contents, source, pick)
+    return _make_capture(contents, source, pick)
 
 
-def _capture(contents: _Contents, source: str, pick: Pick) -> Capture:
+def _make_capture(contents: _Contents, source: str, pick: Pick) -> Capture:
     """Find the time among named arrays, or the numbers that make it, and part the channels from the rest."""
     arrays = contents.arrays
     if any(array.dtype.kind == "c" for array in arrays.values()):
         raise InputError(f"{source}: holds complex numbers (IQ data), not voltages in time; export those")
-    last = {name: layouts.name_and_unit(name.rpartition("/")[2]) for name in arrays}
+    last = {name: layouts.split_name_and_unit(name.rpartition("/")[2]) for name in arrays}
     times = ("time", *sorted(layouts.TIME_NAMES))
     timed = [name for wanted in times for name in arrays if last[name][0].lower() == wanted]
     others = [name for name in arrays if not timed or name != timed[0]]
@@ -202,38 +199,40 @@ def _capture(contents: _Contents, source: str, pick: Pick) -> Capture:
     names = others if len(set(short)) < len(short) else short
     wanted = set(pick(names, ""))
     chosen = [(name, other) for name, other in zip(names, others, strict=True) if name in wanted]
-    if "yinc" in contents.stated and any(arrays[other].dtype.kind in "iu" for _, other in chosen):
+    if "yinc" in contents.metadata and any(arrays[other].dtype.kind in "iu" for _, other in chosen):
         raise InputError(f"{source}: holds a converter's counts under its maker's scale (YInc); export volts, or CSV")
     if not chosen:
         raise InputError(f"{source}: holds no array of one axis besides the time; store V, Vsc or I in it")
     if timed:
-        time, notes = _seconds(arrays[timed[0]], last[timed[0]][1] or contents.units[timed[0]], source)
+        time, notes = _convert_time(arrays[timed[0]], last[timed[0]][1] or contents.units[timed[0]], source)
     else:
-        time, notes = _grid(contents, arrays[chosen[0][1]].size, source)
+        time, notes = _time_grid(contents, arrays[chosen[0][1]].size, source)
     for name, other in chosen:
         if arrays[other].size != time.size:
             raise InputError(
                 f"{source}: '{name}' has {arrays[other].size:,} samples and the time {time.size:,}; store channels of"
                 " one length, or name those wanted with --channel"
             )
-    stated = next((_word(contents.stated[key]) for key in layouts.UNIT_KEYS if key in contents.stated), "")
-    traces = [_trace(name, arrays[other], last[other][1] or contents.units[other] or stated) for name, other in chosen]
+    stated = next((_to_text(contents.metadata[key]) for key in layouts.UNIT_KEYS if key in contents.metadata), "")
+    channels = tuple(
+        FileChannel.from_file(name, arrays[other].astype(float), last[other][1] or contents.units[other] or stated)
+        for name, other in chosen
+    )
     unread = tuple(name for name in names if name not in wanted)
-    return Capture(source, contents.format, time, tuple(traces), notes=tuple(notes), others=unread)
+    return Capture(source, contents.format, time, channels, notes=tuple(notes), unread_columns=unread)
 
 
-def _seconds(time: np.ndarray, written: str, source: str) -> tuple[np.ndarray, list[str]]:
-    unit = layouts.unit(written)
-    if written and (unit is None or unit[0] != "s"):
-        raise InputError(f"{source}: '{written}' is no unit of time; store seconds")
-    notes = [] if written else [f"{source}: the file states no unit of time; seconds were assumed"]
+def _convert_time(time: np.ndarray, unit_text: str, source: str) -> tuple[np.ndarray, list[str]]:
+    unit = layouts.parse_unit(unit_text)
+    if unit_text and (unit is None or unit[0] != "s"):
+        raise InputError(f"{source}: '{unit_text}' is no unit of time; store seconds")
+    notes = [] if unit_text else [f"{source}: the file states no unit of time; seconds were assumed"]
     return time.astype(float) * (unit[1] if unit else 1.0), notes
 
 
-def _grid(contents: _Contents, count: int, source: str) -> tuple[np.ndarray, list[str]]:
+def _time_grid(contents: _Contents, count: int, source: str) -> tuple[np.ndarray, list[str]]:
     def find(keys: Sequence[str]) -> float | None:
-        found = [contents.stated[key] for key in keys if isinstance(contents.stated.get(key), int | float)]
-        return float(found[0]) if found else None
+        return next((float(x) for x in map(contents.metadata.get, keys) if isinstance(x, int | float)), None)
 
     step, rate, start = (find(keys) for keys in (layouts.STEP_KEYS, layouts.RATE_KEYS, layouts.START_KEYS))
     zero = find(("zeroindex",))  # Tektronix
@@ -244,15 +243,8 @@ def _grid(contents: _Contents, count: int, source: str) -> tuple[np.ndarray, lis
     return step * (np.arange(count) - (zero or 0.0)) + (start or 0.0), notes
 
 
-def _trace(name: str, values: np.ndarray, written: str) -> Trace:
-    unit = layouts.unit(written)
-    values = values.astype(float)
-    return Trace(name, values * unit[1] if unit else values, unit[0] if unit else "", written)
-
-
 @contextlib.contextmanager
-def _complaints(library: str) -> Iterator[list[str]]:
-    """What a library would log."""
+def _capture_log(library: str) -> Iterator[list[str]]:
     said: list[str] = []
     handler = logging.Handler()
     handler.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
@@ -277,21 +269,21 @@ def _check_one_grid(times: Sequence[np.ndarray], names: Sequence[str], source: s
             )
 
 
-def _most(path: Path) -> int:
-    """Bytes that the file may unfold to."""
-    return _LEAST + _PACKED * path.stat().st_size
+def _size_limit(path: Path) -> int:
+    """Bytes that the file may unfold to; a header that announces more is broken: deflate shrinks 1032 times at most."""
+    return 1_000_000 + 1032 * path.stat().st_size
 
 
 def _check_size(size: int, path: Path, source: str) -> None:
-    if size > _most(path):
+    if size > _size_limit(path):
         raise InputError(f"{source}: announces {size:,} bytes of numbers, more than it can hold; export it again")
 
 
-def _word(value: Any) -> str:
+def _to_text(value: Any) -> str:
     return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
 
 
-def _import(module: str, extra: str, source: str) -> types.ModuleType:
+def _import_extra(module: str, extra: str, source: str) -> types.ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -8,27 +8,40 @@ from collections.abc import Callable, Iterable, Mapping
 import numpy as np
 from jaxtyping import Float
 
-from fitact.data.readers.layouts import same_channel
+from fitact.data.readers.layouts import is_same_channel, parse_unit
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.errors import InputError
-from fitact.units import engineering
+from fitact.units import format_engineering
 
 Pick = Callable[[list[str], str], Iterable[str]]  # of the names found, and their place, those that are wanted
 
 
 @dataclasses.dataclass(frozen=True)
-class Trace:
+class FileChannel:
     """One channel as the file has it, in the SI unit `unit` (V, A; "" where the file states none).
 
-    `written` is the unit in the file's words, `attenuation` the probe's as the file states it, already applied.
+    `unit_text` is the unit in the file's words, `attenuation` the probe's as the file states it, already applied.
     """
 
     name: str
     values: Float[np.ndarray, " samples"]
     unit: str = ""
-    written: str = ""
+    unit_text: str = ""
     attenuation: float | None = None
-    place: str = ""  # of its name, for messages
+    location: str = ""  # of its name, for messages
+
+    @classmethod
+    def from_file(
+        cls,
+        name: str,
+        values: Float[np.ndarray, " samples"],
+        unit_text: str,
+        attenuation: float | None = None,
+        location: str = "",
+    ) -> "FileChannel":
+        """Convert values in the file's unit."""
+        unit, factor = parse_unit(unit_text) or ("", 1.0)
+        return cls(name, values * factor if unit else values, unit, unit_text, attenuation, location)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,21 +50,21 @@ class Capture:
 
     Attributes:
         format: who wrote it, as "Keysight CSV".
-        where: what a sample's number is called in messages, as "line 12".
+        row_label: what a sample's number is called in messages, as "line 12".
         notes: what was assumed in reading, in sentences.
-        others: columns that hold no numbers.
+        unread_columns: those not wanted, or without numbers.
     """
 
     source: str
     format: str
     time: Float[np.ndarray, " samples"]
-    traces: tuple[Trace, ...]
-    where: Callable[[int], str] = lambda row: f"sample {row}"
+    channels: tuple[FileChannel, ...]
+    row_label: Callable[[int], str] = lambda row: f"sample {row}"
     notes: tuple[str, ...] = ()
-    others: tuple[str, ...] = ()
+    unread_columns: tuple[str, ...] = ()
 
 
-def resolve(names: list[str], channels: Mapping[str, str], source: str, place: str = "") -> dict[str, str]:
+def resolve_channels(names: list[str], channels: Mapping[str, str], source: str, location: str = "") -> dict[str, str]:
     """For each of V, Vsc and I that is known, the name it has in the file: stated, or by the name itself.
 
     Raises:
@@ -61,48 +74,43 @@ def resolve(names: list[str], channels: Mapping[str, str], source: str, place: s
     for channel in CHANNEL_UNITS:
         own = [name for name in names if name.lower() == channel.lower()]
         if channel not in channels and len(own) > 1:
-            raise InputError(f"{source}{place}: two columns are named {channel}; keep one")
+            raise InputError(f"{source}{location}: two columns are named {channel}; keep one")
         if own and channel not in channels:
             known[channel] = own[0]
     for channel, asked in channels.items():
         if channel not in CHANNEL_UNITS:
             raise InputError(f"{source}: '{channel}' is no channel of fitact; map to {', '.join(CHANNEL_UNITS)}")
-        known[channel] = named(asked, names, source)
+        known[channel] = find_channel(asked, names, source)
     if len(set(known.values())) < len(known):
-        raise InputError(f"{source}: one column is to be two channels ({_pairs(known)}); name another for one of them")
+        pairs = ", ".join(f"{channel}={name}" for channel, name in known.items())
+        raise InputError(f"{source}: one column is to be two channels ({pairs}); name another for one of them")
     if not known:
+        examples = zip(("V", "Vsc"), names[-2:] if len(names) > 1 else ["NAME", *names], strict=False)
+        example = " ".join(f"--channel {shlex.quote(f'{channel}={name}')}" for channel, name in examples)
         raise InputError(
-            f"{source}{place}: no column is named time_s, V_V, Vsc_V or I_A, and which is which is not guessed"
-            f" (found: {_listed(names)}); say it, as {_options(names)}"
-            " (in Python: channels={'Vsc': ...})"
+            f"{source}{location}: no column is named time_s, V_V, Vsc_V or I_A, and which is which is not guessed"
+            f" (found: {_join_names(names)}); say it, as {example} (in Python: channels={{'Vsc': ...}})"
         )
     return known
 
 
-def _options(names: list[str]) -> str:
-    """What to type, by way of example."""
-    given = zip(("V", "Vsc"), names[-2:] if len(names) > 1 else ["NAME", *names], strict=False)
-    return " ".join(f"--channel {shlex.quote(f'{channel}={name}')}" for channel, name in given)
-
-
-def named(asked: str, names: list[str], source: str) -> str:
+def find_channel(requested: str, names: list[str], source: str) -> str:
     """The name in the file of the channel that is asked for, as "CH2" for "Channel 2".
 
     Raises:
         InputError: there is none, or several.
     """
-    exact = [name for name in names if name.strip().lower() == asked.strip().lower()]
-    alike = exact or [name for name in names if same_channel(asked, name)]
+    exact = [name for name in names if name.strip().lower() == requested.strip().lower()]
+    alike = exact or [name for name in names if is_same_channel(requested, name)]
     if len(alike) != 1:
         what = f"there are {len(alike)} columns" if alike else "there is no column"
-        raise InputError(f"{source}: {what} '{asked}'; the file has {_listed(names)}")
+        raise InputError(f"{source}: {what} '{requested}'; the file has {_join_names(names)}")
     return alike[0]
 
 
-def is_mapped(capture: Capture) -> bool:
-    """Whether the file's own names say which channel is which."""
+def has_standard_names(capture: Capture) -> bool:
     known = [name.lower() for name in CHANNEL_UNITS]
-    return any(trace.name.lower() in known for trace in capture.traces)
+    return any(trace.name.lower() in known for trace in capture.channels)
 
 
 def to_record(capture: Capture, channels: Mapping[str, str], scale: Mapping[str, float]) -> Record:
@@ -118,50 +126,51 @@ def to_record(capture: Capture, channels: Mapping[str, str], scale: Mapping[str,
             raise InputError(
                 f"{capture.source}: the scale {factor} of {channel} is no factor; give a number such as 10"
             )
-    names = [trace.name for trace in capture.traces]
-    known = resolve(names, channels, capture.source, capture.traces[0].place if capture.traces else "")
+    names = [trace.name for trace in capture.channels]
+    known = resolve_channels(names, channels, capture.source, capture.channels[0].location if capture.channels else "")
     unused = sorted(set(scale) - set(known))
     if unused:
         raise InputError(f"{capture.source}: {unused[0]} is scaled but not there; name its column with --channel")
     arrays, notes = {}, list(capture.notes)
     for channel, name in known.items():
-        trace = capture.traces[names.index(name)]
+        trace = capture.channels[names.index(name)]
         _check_unit(trace, channel, channel in scale, capture.source)
         arrays[channel] = trace.values * scale.get(channel, 1.0)
         if channels or scale:
-            notes.append(f"{capture.source}: {_assumed(trace, channel, scale.get(channel, 1.0))}")
+            notes.append(f"{capture.source}: {_describe_conversion(trace, channel, scale.get(channel, 1.0))}")
     if channels or scale:
-        first = engineering(float(capture.time[0]), "s") if capture.time.size else "nowhere"
+        first = format_engineering(float(capture.time[0]), "s") if capture.time.size else "nowhere"
         notes.append(f"{capture.source}: the time is the file's own ({capture.format}), from {first}")
-    unread = [*(name for name in names if name not in known.values()), *capture.others]
+    unread = [*(name for name in names if name not in known.values()), *capture.unread_columns]
     if unread:
         notes.append(f"{capture.source}: not used: {', '.join(unread)}")
-    return Record.from_arrays(capture.time, **arrays, source=capture.source, notes=tuple(notes), where=capture.where)
+    return Record.from_arrays(
+        capture.time, **arrays, source=capture.source, notes=tuple(notes), where=capture.row_label
+    )
 
 
-def _check_unit(trace: Trace, channel: str, scaled: bool, source: str) -> None:
+def _check_unit(file_channel: FileChannel, channel: str, scaled: bool, source: str) -> None:
     wanted = CHANNEL_UNITS[channel]
-    if trace.written and not trace.unit:
+    if file_channel.unit_text and not file_channel.unit:
         raise InputError(
-            f"{source}{trace.place}: '{trace.written}' is no unit of {channel}; write a multiple of {wanted}"
+            f"{source}{file_channel.location}: '{file_channel.unit_text}' is no unit of {channel}; write a multiple"
+            f" of {wanted}"
         )
-    if trace.unit and trace.unit != wanted and not scaled:
+    if file_channel.unit and file_channel.unit != wanted and not scaled:
         raise InputError(
-            f"{source}{trace.place}: {trace.name} is in {trace.unit} and {channel} in {wanted}; give the factor between"
-            f" them, as --scale {channel}=0.001 for {wanted} per {trace.unit}"
+            f"{source}{file_channel.location}: {file_channel.name} is in {file_channel.unit} and {channel} in {wanted};"
+            f" give the factor between them, as --scale {channel}=0.001 for {wanted} per {file_channel.unit}"
         )
 
 
-def _assumed(trace: Trace, channel: str, factor: float) -> str:
-    """What stands behind the numbers of a channel, in a sentence."""
-    unit = f"in {trace.written}" if trace.written else f"no unit stated, {CHANNEL_UNITS[channel]} assumed"
-    probe = "no attenuation stated" if trace.attenuation is None else f"attenuation {trace.attenuation:g} as stated"
-    return f"{channel} is '{trace.name}' ({unit}; {probe}) times {factor:g}"
+def _describe_conversion(file_channel: FileChannel, channel: str, factor: float) -> str:
+    stated = file_channel.unit_text
+    unit = f"in {stated}" if stated else f"no unit stated, {CHANNEL_UNITS[channel]} assumed"
+    probe = "no attenuation stated"
+    if file_channel.attenuation is not None:
+        probe = f"attenuation {file_channel.attenuation:g} as stated"
+    return f"{channel} is '{file_channel.name}' ({unit}; {probe}) times {factor:g}"
 
 
-def _pairs(known: Mapping[str, str]) -> str:
-    return ", ".join(f"{channel}={name}" for channel, name in known.items())
-
-
-def _listed(names: list[str]) -> str:
+def _join_names(names: list[str]) -> str:
     return (", ".join(names) or "nothing")[:200]

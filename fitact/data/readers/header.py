@@ -10,16 +10,12 @@ from fitact.data.readers import layouts
 from fitact.errors import InputError
 
 _EXAMPLE = "time_s,V_V,Vsc_V,I_A"
-_SHORT = 4096  # characters of which a header mostly is a small part: to part lines into cells takes longest
-_ENOUGH = 64  # rows that show what the rows are
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 _QUANTITY = re.compile(r"(?:analog:)?\s*([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*([a-zµμ]*)", re.IGNORECASE)
-_MOST_ROWS = 1e12  # that a header can mean
-_HERTZ = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
 
 
 @dataclasses.dataclass(frozen=True)
-class Line:
+class TextRow:
     """Its number, from 1, and its cells."""
 
     number: int
@@ -30,7 +26,7 @@ class Line:
 class Column:
     """One column of numbers; `unit` as written, "" where none is, `attenuation` as the header states it."""
 
-    place: int
+    index: int
     name: str
     unit: str
     attenuation: float | None = None
@@ -45,9 +41,9 @@ class Header:
         width: cells of a row.
         time: column of the time; None where `start` and `step` (s) make it.
         index: column that counts samples; None where there is none.
-        others: names of the columns that hold no numbers.
+        non_numeric_columns: names of the columns that hold no numbers.
         count: rows that the header announces.
-        place: of the names, for messages.
+        location: of the names, for messages.
     """
 
     maker: str
@@ -58,34 +54,35 @@ class Header:
     time: Column | None
     index: int | None
     columns: tuple[Column, ...]
-    others: tuple[str, ...]
+    non_numeric_columns: tuple[str, ...]
     start: float | None
     step: float | None
     count: int | None
-    place: str
+    location: str
 
 
-def read_header(text: str, source: str, companion: str = "") -> Header:
-    """The header of a file that begins with `text`; `companion` is one kept in a file of its own, as `key:value` lines.
+def read_header(text: str, source: str, sidecar_text: str = "") -> Header:
+    """The header of a file that begins with `text`; `sidecar_text`: one in a file of its own, as `key:value` lines.
 
     Raises:
         InputError: there are no numbers, no time, or several segments.
     """
-    sheet = _Sheet.of(text[:_SHORT].rpartition("\n")[0], companion, source)
+    head = text[:4096]  # of which a header mostly is a small part: to part lines into cells takes longest
+    sheet = _HeaderParser.from_text(head.rpartition("\n")[0], sidecar_text, source)
     if not sheet.is_plain:
-        sheet = _Sheet.of(text, companion, source)
+        sheet = _HeaderParser.from_text(text, sidecar_text, source)
     if not sheet.numeric:
         raise InputError(
             f"{source}: there are no rows of numbers; expected a header such as {_EXAMPLE}, and rows of numbers"
         )
-    sheet = dataclasses.replace(sheet, numeric=sheet.numeric | sheet.contracted())
-    segments = sheet.values(layouts.SEGMENT_KEYS)[:1]
-    if segments and (number(segments[0], sheet.decimal_comma) or 1.0) > 1.0:
+    sheet = dataclasses.replace(sheet, numeric=sheet.numeric | sheet.standard_columns())
+    segments = sheet.find_values(layouts.SEGMENT_KEYS)[:1]
+    if segments and (parse_number(segments[0], sheet.decimal_comma) or 1.0) > 1.0:
         raise InputError(f"{source}: holds {segments[0]} segments; export one of them")
-    top = sheet.names or sheet.units or sheet.below[0]
-    start, step = sheet.grid()
+    top = sheet.names or sheet.units or sheet.data_rows[0]
+    start, step = sheet.time_grid()
     columns = sheet.columns()
-    time = sheet.time(columns)
+    time = sheet.find_time_column(columns)
     if time is None and step is None:
         found = ", ".join(sheet.names.cells) if sheet.names else "no header"
         raise InputError(
@@ -93,36 +90,36 @@ def read_header(text: str, source: str, companion: str = "") -> Header:
             f" columns as in {_EXAMPLE}, or export the time as well (Rohde & Schwarz keep that of NAME.Wfm.csv in"
             " NAME.csv beside it)"
         )
-    index = next((c.place for c in columns if sheet.is_index(c)), None)
-    values = sheet.completed([c for c in columns if c.place not in (index, time.place if time else None)])
+    index = next((c.index for c in columns if sheet.is_index(c)), None)
+    values = sheet.complete_columns([c for c in columns if c.index not in (index, time.index if time else None)])
     if not values:
         raise InputError(
             f"{source}, line {top.number}: there is no column of numbers besides the time; export channels"
         )
     return Header(
-        maker=next((maker for maker, mark in layouts.MAKERS if mark.search(text[:4096])), "text"),
+        maker=next((maker for maker, mark in layouts.MAKERS if mark.search(head)), "text"),
         delimiter=sheet.delimiter,
         decimal_comma=sheet.decimal_comma,
-        first=sheet.below[0].number,
+        first=sheet.data_rows[0].number,
         width=sheet.width,
         time=time,
         index=index,
         columns=values,
-        others=sheet.others(),
+        non_numeric_columns=sheet.non_numeric_columns(),
         start=start,
         step=step,
         count=sheet.count(),
-        place=f", line {top.number}",
+        location=f", line {top.number}",
     )
 
 
-def cells_of(line: str, delimiter: str) -> list[str]:
+def split_cells(line: str, delimiter: str) -> list[str]:
     """The cells of a line, without quotes and blanks around them."""
     parts = line.split() if delimiter == " " else line.split(delimiter)
     return [cell.strip().strip('"').strip() for cell in parts]
 
 
-def number(cell: str, decimal_comma: bool) -> float | None:
+def parse_number(cell: str, decimal_comma: bool) -> float | None:
     """The cell as a number, or None; infinity is how some makers write that a value is out of range."""
     if "_" in cell:  # Python would read 1_000
         return None
@@ -133,25 +130,26 @@ def number(cell: str, decimal_comma: bool) -> float | None:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Sheet:
+class _HeaderParser:
     """The first lines of a file, parted into those above the numbers and those with them."""
 
     delimiter: str
     decimal_comma: bool
-    comments: list[Line]
-    above: list[Line]
-    below: list[Line]
+    comments: list[TextRow]
+    header_rows: list[TextRow]
+    data_rows: list[TextRow]
     numeric: frozenset[int]  # the columns of numbers
     source: str
 
     @classmethod
-    def of(cls, text: str, companion: str, source: str) -> "_Sheet":
+    def from_text(cls, text: str, sidecar_text: str, source: str) -> "_HeaderParser":
         lines = [(n, line.strip(" \r\f\v")) for n, line in enumerate(text.split("\n"), start=1)]
-        delimiter, decimal_comma = _delimiter([line for _, line in lines if line and not line.startswith("#")])
-        rows = [Line(n, cells_of(line, delimiter)) for n, line in lines if line.strip(delimiter + " ")]
+        delimiter, decimal_comma = _detect_delimiter([line for _, line in lines if line and not line.startswith("#")])
+        rows = [TextRow(n, split_cells(line, delimiter)) for n, line in lines if line.strip(delimiter + " ")]
         data = [row for row in rows if not row.cells[0].startswith("#")]
         places = [
-            frozenset(i for i, cell in enumerate(row.cells) if number(cell, decimal_comma) is not None) for row in data
+            frozenset(i for i, cell in enumerate(row.cells) if parse_number(cell, decimal_comma) is not None)
+            for row in data
         ]
         # the pattern that most lines show, from the middle on: above, a header may state numbers
         patterns = collections.Counter(p for p in places[len(places) // 2 :] if p)
@@ -164,92 +162,93 @@ class _Sheet:
             first -= 1
         end = data[first].number if first < len(data) else len(lines)
         comments = [row for row in rows if row.cells[0].startswith("#") and row.number < end]
-        comments += [Line(0, line.split(":")) for line in companion.splitlines()]
+        comments += [TextRow(0, line.split(":")) for line in sidecar_text.splitlines()]
         return cls(delimiter, decimal_comma, comments, data[:first], data[first:], numeric, source)
 
     @property
     def is_plain(self) -> bool:
         """Whether further rows have nothing to tell: enough of them, only numbers, and the decimal mark seen."""
-        cells = [cell for row in self.below for cell in row.cells]
-        enough = len(self.below) >= max(_ENOUGH, 2 * len(self.above))
+        cells = [cell for row in self.data_rows for cell in row.cells]
+        enough = len(self.data_rows) >= max(64, 2 * len(self.header_rows))
         marked = self.delimiter == "," or any("," in cell or "." in cell for cell in cells)
-        return enough and marked and all(number(cell, self.decimal_comma) is not None for cell in cells)
+        return enough and marked and all(parse_number(cell, self.decimal_comma) is not None for cell in cells)
 
     @functools.cached_property
     def width(self) -> int:
-        widths = (len(row.cells) for row in self.below if len(row.cells) > max(self.numeric))
+        widths = (len(row.cells) for row in self.data_rows if len(row.cells) > max(self.numeric))
         return collections.Counter(widths).most_common(1)[0][0]
 
     @functools.cached_property
-    def stated(self) -> dict[str, list[str]]:
+    def metadata(self) -> dict[str, list[str]]:
         """Each word of the header, with the cells after it."""
-        beside = [Line(row.number, row.cells[: min(self.numeric)]) for row in self.below if min(self.numeric) > 1]
+        beside = [
+            TextRow(row.number, row.cells[: min(self.numeric)]) for row in self.data_rows if min(self.numeric) > 1
+        ]
         known: dict[str, list[str]] = {}
-        for row in (*self.comments, *self.above, *beside):
+        for row in (*self.comments, *self.header_rows, *beside):
             for i, cell in enumerate(row.cells):
                 word, _, value = cell.partition("=" if "=" in cell.rstrip("= ") else ":")
                 following = [value.strip()] * bool(value.strip()) + [c for c in row.cells[i + 1 :] if c]
-                if following and layouts.key(word) and number(cell, self.decimal_comma) is None:
-                    known.setdefault(layouts.key(word), following)
+                if following and layouts.normalize_key(word) and parse_number(cell, self.decimal_comma) is None:
+                    known.setdefault(layouts.normalize_key(word), following)
         return known
 
-    def values(self, keys: Sequence[str]) -> list[str]:
+    def find_values(self, keys: Sequence[str]) -> list[str]:
         """What the header states under the first of the keys that it has."""
-        return next((self.stated[key] for key in keys if key in self.stated), [])
+        return next((self.metadata[key] for key in keys if key in self.metadata), [])
 
-    def quantity(self, keys: Sequence[str]) -> float | None:
+    def find_quantity(self, keys: Sequence[str]) -> float | None:
         """The largest number that it states there, in SI units: they may differ between channels."""
-        found = (self._quantity(text) for text in self.values(keys))
+        found = (self._parse_quantity(text) for text in self.find_values(keys))
         return max((value for value in found if value is not None), default=None)
 
-    def _quantity(self, text: str) -> float | None:
+    def _parse_quantity(self, text: str) -> float | None:
         match = _QUANTITY.fullmatch(text.strip())
-        value = number(match[1], self.decimal_comma) if match else None
+        value = parse_number(match[1], self.decimal_comma) if match else None
         if match is None or value is None:
             return None
-        unit = layouts.unit(match[2])
-        return value * (unit[1] if unit else _HERTZ.get(match[2].lower(), 1.0))
+        unit = layouts.parse_unit(match[2])
+        return value * (unit[1] if unit else {"khz": 1e3, "mhz": 1e6, "ghz": 1e9}.get(match[2].lower(), 1.0))
 
     @functools.cached_property
-    def names(self) -> Line | None:
+    def names(self) -> TextRow | None:
         """The row of names, above that of units where there is one; numpy.savetxt writes it as a comment."""
-        rows = [row for row in self.above if len(row.cells) > max(self.numeric) and row is not self.units]
+        rows = [row for row in self.header_rows if len(row.cells) > max(self.numeric) and row is not self.units]
         if rows and self._is_names(rows[-1]):
             return rows[-1]
         if self.comments and self.comments[-1].number and not self.units:
-            cells = cells_of(self.delimiter.join(self.comments[-1].cells).lstrip("# "), self.delimiter)
-            row = Line(self.comments[-1].number, cells)
+            cells = split_cells(self.delimiter.join(self.comments[-1].cells).lstrip("# "), self.delimiter)
+            row = TextRow(self.comments[-1].number, cells)
             if len(cells) == self.width and self._is_names(row):
                 return row
         return None
 
-    def _is_names(self, row: Line) -> bool:
+    def _is_names(self, row: TextRow) -> bool:
         here = [row.cells[i] for i in sorted(self.numeric)]
-        if any(layouts.name_and_unit(cell)[0].lower() in layouts.TIME_NAMES for cell in here if cell):
+        if any(layouts.split_name_and_unit(cell)[0].lower() in layouts.TIME_NAMES for cell in here if cell):
             return True  # although the others may be numbers, as Keysight's are
-        return any(here) and all(number(cell, self.decimal_comma) is None for cell in here)
+        return any(here) and all(parse_number(cell, self.decimal_comma) is None for cell in here)
 
     @functools.cached_property
-    def units(self) -> Line | None:
-        """The row of units right above the numbers."""
-        row = self.above[-1] if self.above else None
+    def units(self) -> TextRow | None:
+        row = self.header_rows[-1] if self.header_rows else None
         if row is None or len(row.cells) <= max(self.numeric):
             return None
         here = [row.cells[i] for i in sorted(self.numeric)]
-        known = [bool(layouts.unit(cell)) or cell[:1] + cell[-1:] in ("()", "[]") for cell in here]
+        known = [bool(layouts.parse_unit(cell)) or cell[:1] + cell[-1:] in ("()", "[]") for cell in here]
         rest = [cell.lower() in layouts.NOT_UNITS for cell in here]
         return row if any(known) and all(a or b for a, b in zip(known, rest, strict=True)) else None
 
-    def grid(self) -> tuple[float | None, float | None]:
+    def time_grid(self) -> tuple[float | None, float | None]:
         """Start and step of the time, s: below the words Start and Increment, or beside words of that meaning."""
         below = {}
         if self.names and self.units:
             pairs = zip(self.names.cells, self.units.cells, strict=False)
-            below = {layouts.key(word): number(text, self.decimal_comma) for word, text in pairs}
+            below = {layouts.normalize_key(word): parse_number(text, self.decimal_comma) for word, text in pairs}
 
         def find(keys: Sequence[str]) -> float | None:
-            found = [below[key] for key in keys if below.get(key) is not None]
-            return found[0] if found else self.quantity(keys)
+            values = [below[key] for key in keys if below.get(key) is not None]
+            return values[0] if values else self.find_quantity(keys)
 
         step, rate = find(layouts.STEP_KEYS), find(layouts.RATE_KEYS)
         if step is None and rate:
@@ -257,23 +256,22 @@ class _Sheet:
         return find(layouts.START_KEYS), step if step is not None and 0.0 < step < float("inf") else None
 
     def columns(self) -> list[Column]:
-        """Those of numbers, with the names and units above them."""
         made = []
         for place in sorted(self.numeric):
             cell, below = (row.cells[place] if row else "" for row in (self.names, self.units))
-            made.append(Column(place, layouts.name_and_unit(cell)[0], self._unit(cell, below)))
+            made.append(Column(place, layouts.split_name_and_unit(cell)[0], self._column_unit(cell, below)))
         return made
 
-    def completed(self, columns: Sequence[Column]) -> tuple[Column, ...]:
+    def complete_columns(self, columns: Sequence[Column]) -> tuple[Column, ...]:
         """Columns of values, with the names and units that the header states elsewhere."""
         names = [column.name for column in columns]
-        if "" in names or (len(set(names)) < len(names) and not any(layouts.is_contract(name) for name in names)):
-            names = self._names_elsewhere(len(names)) or [f"column {column.place + 1}" for column in columns]
-        units = [re.sub(r".*:", "", text) for text in self.values(layouts.UNIT_KEYS)] or [""]
-        probes = [self._quantity(text) for text in self.values(layouts.ATTENUATION_KEYS)]
+        if "" in names or (len(set(names)) < len(names) and not any(layouts.is_standard_name(name) for name in names)):
+            names = self._find_names(len(names)) or [f"column {column.index + 1}" for column in columns]
+        units = [re.sub(r".*:", "", text) for text in self.find_values(layouts.UNIT_KEYS)] or [""]
+        probes = [self._parse_quantity(text) for text in self.find_values(layouts.ATTENUATION_KEYS)]
         return tuple(
             Column(
-                column.place,
+                column.index,
                 names[i],
                 column.unit or units[min(i, len(units) - 1)],
                 probes[i] if i < len(probes) else None,
@@ -281,78 +279,69 @@ class _Sheet:
             for i, column in enumerate(columns)
         )
 
-    def _unit(self, cell: str, below: str) -> str:
+    def _column_unit(self, cell: str, unit_cell: str) -> str:
         """In the name, or in the row of units."""
-        written = layouts.name_and_unit(cell)[1]
-        below = "" if below.lower() in layouts.NOT_UNITS else below.strip("()[] ")
-        if written and below and layouts.unit(written) != layouts.unit(below):
+        written = layouts.split_name_and_unit(cell)[1]
+        unit_cell = "" if unit_cell.lower() in layouts.NOT_UNITS else unit_cell.strip("()[] ")
+        if written and unit_cell and layouts.parse_unit(written) != layouts.parse_unit(unit_cell):
             raise InputError(
-                f"{self.source}, line {self.units.number if self.units else 0}: the unit of {cell} is {below} here;"
+                f"{self.source}, line {self.units.number if self.units else 0}: the unit of {cell} is {unit_cell} here;"
                 " keep one of the two"
             )
-        return written or below
+        return written or unit_cell
 
-    def contracted(self) -> frozenset[int]:
+    def standard_columns(self) -> frozenset[int]:
         """Columns under fitact's own names, which must hold numbers whether they do or not."""
-        parts = [layouts.name_and_unit(cell) for cell in (self.names.cells[: self.width] if self.names else [])]
+        parts = [layouts.split_name_and_unit(cell) for cell in (self.names.cells[: self.width] if self.names else [])]
         return frozenset(
-            i for i, (name, unit) in enumerate(parts) if layouts.is_contract(name) and (not unit or layouts.unit(unit))
+            i
+            for i, (name, unit) in enumerate(parts)
+            if layouts.is_standard_name(name) and (not unit or layouts.parse_unit(unit))
         )
 
-    def others(self) -> tuple[str, ...]:
-        """Names of the columns that hold no numbers."""
+    def non_numeric_columns(self) -> tuple[str, ...]:
         named = self.names.cells[: self.width] if self.names else []
-        words = [layouts.key(cell.partition("=")[0]) for cell in named]
+        words = [layouts.normalize_key(cell.partition("=")[0]) for cell in named]
         return tuple(c for i, c in enumerate(named) if i not in self.numeric and words[i] not in layouts.GRID_KEYS)
 
     def count(self) -> int | None:
-        """The rows that the header announces."""
-        count = self.quantity(layouts.COUNT_KEYS)
-        return int(count) if count is not None and count < _MOST_ROWS else None
+        count = self.find_quantity(layouts.COUNT_KEYS)
+        return int(count) if count is not None and count < 1e12 else None  # beyond, it means something else
 
-    def _names_elsewhere(self, count: int) -> list[str]:
+    def _find_names(self, count: int) -> list[str]:
         """As "Source,CH1" or "Vertical Scale,CH1:0.05 CH2:0.10" state them."""
-        named = self.values(layouts.NAME_KEYS)
+        named = self.find_values(layouts.NAME_KEYS)
         if len(named) < count:
-            named = re.findall(r"([A-Za-z]+\d+)\s*:", " ".join(self.values(("verticalunits", "verticalscale"))))
+            named = re.findall(r"([A-Za-z]+\d+)\s*:", " ".join(self.find_values(("verticalunits", "verticalscale"))))
         return named[:count] if len(set(named[:count])) == count else []
 
     def is_index(self, column: Column) -> bool:
-        """Whether the column counts samples."""
-        below = self.units.cells[column.place] if self.units else ""
+        below = self.units.cells[column.index] if self.units else ""
         return below.lower() in layouts.INDEX_NAMES or column.name.lower() in layouts.INDEX_NAMES
 
-    def time(self, columns: Sequence[Column]) -> Column | None:
+    def find_time_column(self, columns: Sequence[Column]) -> Column | None:
         """By name, by unit, or because it stands first beside a header."""
-        able = [c for c in columns if not self.is_index(c)]
-        for fits in (
-            lambda c: c.name.lower() == "time",
-            lambda c: (layouts.unit(c.unit) or ("",))[0] == "s",
-            lambda c: c.name.lower() in layouts.TIME_NAMES,
-        ):
-            found = [c for c in able if fits(c)]
-            if found:
-                return self._timed(found[0])
-        beside = not self.names and not self.units and min(self.numeric) > 1 and self.values(layouts.TIME_UNIT_KEYS)
-        return self._timed(able[0]) if beside and len(able) > 1 else None
-
-    def _timed(self, column: Column) -> Column:
-        """With the unit that the header states elsewhere."""
-        elsewhere = next(iter(self.values(layouts.TIME_UNIT_KEYS)), "")
-        return dataclasses.replace(column, unit=column.unit or elsewhere)
+        candidates = [c for c in columns if not self.is_index(c)]
+        times = [c for c in candidates if c.name.lower() == "time"]
+        times += [c for c in candidates if (layouts.parse_unit(c.unit) or ("",))[0] == "s"]
+        times += [c for c in candidates if c.name.lower() in layouts.TIME_NAMES]
+        stated = self.find_values(layouts.TIME_UNIT_KEYS)
+        if not self.names and not self.units and min(self.numeric) > 1 and stated and len(candidates) > 1:
+            times += candidates[:1]
+        return dataclasses.replace(times[0], unit=times[0].unit or next(iter(stated), "")) if times else None
 
 
-def _is_unfilled(row: Line, numbers: frozenset[int]) -> bool:
+def _is_unfilled(row: TextRow, numbers: frozenset[int]) -> bool:
     """Whether all that the row holds are numbers, in some columns of numbers: a time without values yet."""
     return bool(numbers) and all(i in numbers for i, cell in enumerate(row.cells) if cell)
 
 
-def _delimiter(lines: Sequence[str]) -> tuple[str, bool]:
+def _detect_delimiter(lines: Sequence[str]) -> tuple[str, bool]:
     """What parts most lines, from the middle on, into two numbers or more, and whether a comma marks the decimals."""
     lines = lines[len(lines) // 2 :]
     for delimiter in (";", "\t", ",", " "):
-        rows = [cells_of(line, delimiter) for line in lines]
+        rows = [split_cells(line, delimiter) for line in lines]
         comma = delimiter in ";\t" and any(_DECIMAL_COMMA.fullmatch(cell) for cells in rows for cell in cells)
-        if sum(sum(number(cell, comma) is not None for cell in cells) >= 2 for cells in rows) > len(rows) / 2:
+        if sum(sum(parse_number(cell, comma) is not None for cell in cells) >= 2 for cells in rows) > len(rows) / 2:
             return delimiter, comma
     return ",", False

@@ -2,6 +2,8 @@
 
 import re
 
+from fitact.units import PREFIX_FACTORS
+
 # who wrote a file, by what its first lines show; the first that matches
 MAKERS: tuple[tuple[str, re.Pattern[str]], ...] = tuple(
     (maker, re.compile(mark, re.IGNORECASE | re.MULTILINE))
@@ -46,29 +48,27 @@ TIME_UNIT_KEYS = ("horizontalunits",)
 ATTENUATION_KEYS = ("probeatten", "probeattenuation", "attenuation")
 SEGMENT_KEYS = ("segments",)
 
-_PREFIXES = {
-    "": 1.0, "f": 1e-15, "p": 1e-12, "n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6,
-}  # fmt: skip
-_QUANTITIES = {
+_PREFIXES = ("", *"fpnuµμmkM")
+_UNIT_SYMBOLS = {
     "s": "s", "S": "s", "sec": "s", "second": "s", "seconds": "s",
     "V": "V", "v": "V", "volt": "V", "volts": "V",
     "A": "A", "amp": "A", "amps": "A", "ampere": "A", "amperes": "A",
 }  # fmt: skip
 
 
-def key(text: str) -> str:
-    """A header's key as the tables above spell it: ``key("Number of Data points =") == "numberofdatapoints"``."""
+def normalize_key(text: str) -> str:
+    """A header's key as the tables above spell it: "numberofdatapoints" for "Number of Data points ="."""
     return re.sub(r"[^0-9a-zµμ]", "", text.lower())
 
 
-def unit(text: str) -> tuple[str, float] | None:
-    """SI unit (s, V or A) and factor of a unit as makers spell it: ``unit("(ms)") == ("s", 1e-3)``; None: no unit."""
+def parse_unit(text: str) -> tuple[str, float] | None:
+    """SI unit (s, V or A) and factor of a unit as makers spell it: ("s", 1e-3) for "(ms)"; or None."""
     bare = text.strip().strip("()[]").strip()
     for length in (0, 1):
         prefix, symbol = bare[:length], bare[length:]
-        found = _QUANTITIES.get(symbol) or (_QUANTITIES.get(symbol.lower()) if len(symbol) > 2 else None)
-        if found and prefix in _PREFIXES:
-            return found, _PREFIXES[prefix]
+        unit = _UNIT_SYMBOLS.get(symbol) or (_UNIT_SYMBOLS.get(symbol.lower()) if len(symbol) > 2 else None)
+        if unit and prefix in _PREFIXES:
+            return unit, PREFIX_FACTORS[prefix]
     return None
 
 
@@ -78,31 +78,30 @@ _NAME_AND_UNIT = (
     re.compile(r"^(?P<name>.*\S)\s+/\s+(?P<unit>\S+)$"),  # Time / s
     re.compile(r"^(?P<name>.*)_(?P<unit>[^_]+)$"),  # time_ms
 )
-_CONTRACT = re.compile(r"^(?P<name>time|V|Vsc|I)(?:_(?P<unit>.+))?$", re.IGNORECASE)
+_STANDARD_NAME = re.compile(r"^(?P<name>time|V|Vsc|I)(?:_(?P<unit>.+))?$", re.IGNORECASE)
 
 
-def name_and_unit(cell: str) -> tuple[str, str]:
+def split_name_and_unit(cell: str) -> tuple[str, str]:
     """A column's name and its unit as written, "" where none is."""
-    contract = _CONTRACT.match(cell)
+    contract = _STANDARD_NAME.match(cell)
     if contract:
         return contract["name"], contract["unit"] or ""
     for pattern in _NAME_AND_UNIT:
         match = pattern.match(cell)
-        if match and unit(match["unit"]):
+        if match and parse_unit(match["unit"]):
             return match["name"].strip(), match["unit"]
     return cell, ""
 
 
-def same_channel(asked: str, name: str) -> bool:
+def is_same_channel(requested: str, name: str) -> bool:
     """Whether both mean one channel: "CH2", "Channel 2", "Chan 2" and Keysight's "2" do."""
-    return _channel(asked) == _channel(name)
+    return _normalize_channel(requested) == _normalize_channel(name)
 
 
-def is_contract(name: str) -> bool:
-    """Whether a column's name is fitact's own."""
-    return _CONTRACT.fullmatch(name) is not None
+def is_standard_name(name: str) -> bool:
+    return _STANDARD_NAME.fullmatch(name) is not None
 
 
-def _channel(name: str) -> str:
+def _normalize_channel(name: str) -> str:
     bare = re.sub(r"[\s_.-]", "", name.lower())
     return re.sub(r"^(channel|chan|ch|kanal|canal|ampl|c)(?=[0-9]+$|[a-z]$)", "", bare)

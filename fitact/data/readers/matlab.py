@@ -9,28 +9,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-_HEADER = 128  # bytes
 _MATRIX, _COMPRESSED = 14, 15
 _NUMBERS = {
-    1: "i1",
-    2: "u1",
-    3: "i2",
-    4: "u2",
-    5: "i4",
-    6: "u4",
-    7: "f4",
-    9: "f8",
-    12: "i8",
-    13: "u8",
-    16: "u1",
-    17: "u2",
-}
+    1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8", 16: "u1", 17: "u2",
+}  # fmt: skip
 _CHAR, _CLASSES = 4, range(6, 16)  # of arrays: words; double, single and the integers
 _COMPLEX = 0x0800
 
 
-def read_mat(content: bytes, most: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Name and array of each variable of numbers or words; what unfolds to more than `most` bytes is an error.
+def read_mat(content: bytes, max_bytes: int) -> Iterator[tuple[str, np.ndarray]]:
+    """Name and array of each variable of numbers or words; what unfolds to more than `max_bytes` bytes is an error.
 
     Raises:
         ValueError: the file is broken.
@@ -38,18 +26,18 @@ def read_mat(content: bytes, most: int) -> Iterator[tuple[str, np.ndarray]]:
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:
         raise ValueError("no byte order in the header")
-    for kind, data in _elements(content[_HEADER:], order):
+    for kind, data in _elements(content[128:], order):  # after the header
         if kind == _COMPRESSED:
-            unpacked = _unpacked(data, most)
+            unpacked = _decompress(data, max_bytes)
             kind, data = next(_elements(unpacked, order), (0, b""))
         if kind == _MATRIX:
-            yield from _matrix(data, order)
+            yield from _read_matrix(data, order)
 
 
-def _unpacked(data: bytes, most: int) -> bytes:
+def _decompress(data: bytes, max_bytes: int) -> bytes:
     stream = zlib.decompressobj()
     try:
-        unpacked = stream.decompress(data, most)
+        unpacked = stream.decompress(data, max_bytes)
     except zlib.error as error:
         raise ValueError(f"a compressed part is broken: {error}") from error
     if not stream.eof:
@@ -73,7 +61,7 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
             at = -(-at // 8) * 8  # padded
 
 
-def _matrix(data: bytes, order: str) -> Iterator[tuple[str, np.ndarray]]:
+def _read_matrix(data: bytes, order: str) -> Iterator[tuple[str, np.ndarray]]:
     parts = list(_elements(data, order))
     if len(parts) < 4 or len(parts[0][1]) < 8:
         return  # an array of no elements, or an object

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fitact.data.readers.binary import is_known_binary, read_binary
-from fitact.data.readers.capture import Capture, Pick, named, resolve, to_record
+from fitact.data.readers.capture import Capture, Pick, find_channel, resolve_channels, to_record
 from fitact.data.readers.text import is_binary, read_text
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.data.spectrum import is_spectrum
 from fitact.errors import InputError
-from fitact.files import replacing, unreadable
+from fitact.files import atomic_write, read_error
 
 if TYPE_CHECKING:
     from fitact.scene.scene import Scene  # which brings JAX along
@@ -39,14 +39,14 @@ def read(
         InputError: the file cannot be read, or holds what cannot be used; names the line and the remedy.
     """
     source, channels = os.fspath(path), channels or {}
-    own = {channel: asked for channel, asked in channels.items() if _elsewhere(path, asked) is None}
-    capture = read_capture(path, lambda names, place: resolve(names, own, source, place).values())
-    capture = with_other_files(capture, path, channels)
+    own = {channel: asked for channel, asked in channels.items() if _locate_file_column(path, asked) is None}
+    capture = read_capture(path, lambda names, place: resolve_channels(names, own, source, place).values())
+    capture = merge_other_files(capture, path, channels)
     record = to_record(capture, channels, scale or {})
     for channel in scene.measurement.channels if scene else ("Vsc",):
         record[channel]  # refused where missing
     if "V" not in record and (scene is None or scene.drive.waveform == "measured"):
-        place = capture.traces[0].place
+        place = capture.channels[0].location
         raise InputError(
             f"{source}{place}: the column V_V is missing and no scene gives the drive;"
             " record the drive, or name its waveform under [drive] in a scene file"
@@ -67,7 +67,7 @@ def read_capture(path: str | os.PathLike[str], pick: Pick = lambda names, place:
         with path.open("rb") as file:
             head = file.read(4096)
     except OSError as error:
-        raise unreadable(source, error) from error
+        raise read_error(source, error) from error
     if not head.strip():
         raise InputError(f"{source}: the file holds no data; expected a header such as time_s,V_V,Vsc_V,I_A")
     if head[:2] == b"\x1f\x8b":
@@ -79,36 +79,36 @@ def read_capture(path: str | os.PathLike[str], pick: Pick = lambda names, place:
     return read_text(path, source, pick)
 
 
-def with_other_files(capture: Capture, path: str | os.PathLike[str], channels: Mapping[str, str]) -> Capture:
+def merge_other_files(capture: Capture, path: str | os.PathLike[str], channels: Mapping[str, str]) -> Capture:
     """The capture, and the columns of other files that `channels` names as FILE:COLUMN.
 
     Raises:
         InputError: such a file cannot be read, or its times are others.
     """
-    traces = list(capture.traces)
+    traces = list(capture.channels)
     for asked in channels.values():
-        elsewhere = _elsewhere(path, asked)
+        elsewhere = _locate_file_column(path, asked)
         if elsewhere is None:
             continue
         file, column = elsewhere
-        other = _column(file, column)
+        other = _read_column(file, column)
         step = (capture.time[-1] - capture.time[0]) / max(capture.time.size - 1, 1)
         if other.time.size != capture.time.size or np.max(np.abs(other.time - capture.time)) > 0.01 * step:
             raise InputError(
                 f"{capture.source}: {file} has another length or other times, so it is not of one capture with this"
                 " file; export both anew"
             )
-        traces.append(dataclasses.replace(other.traces[0], name=asked))
-    return dataclasses.replace(capture, traces=tuple(traces))
+        traces.append(dataclasses.replace(other.channels[0], name=asked))
+    return dataclasses.replace(capture, channels=tuple(traces))
 
 
-def _column(file: Path, column: str) -> Capture:
-    return read_capture(file, lambda names, _: [named(column, names, str(file))])
+def _read_column(file: Path, column: str) -> Capture:
+    return read_capture(file, lambda names, _: [find_channel(column, names, str(file))])
 
 
-def _elsewhere(path: str | os.PathLike[str], asked: str) -> tuple[Path, str] | None:
+def _locate_file_column(path: str | os.PathLike[str], requested: str) -> tuple[Path, str] | None:
     """The file and the column where a channel is asked for as FILE:COLUMN, the file from here or beside `path`."""
-    file, colon, column = asked.rpartition(":")
+    file, colon, column = requested.rpartition(":")
     for found in (Path(path).parent / file, Path(file)):
         if colon and column and found.is_file():
             return found, column
@@ -122,7 +122,7 @@ def write_csv(path: str | os.PathLike[str], record: Record) -> None:
         InputError: the place cannot be written.
     """
     header = ["time_s", *(f"{name}_{CHANNEL_UNITS[name]}" for name in record.channels)]
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         table = np.stack([record.time, *record.channels.values()], axis=1)
         digits = ["%.17g", *["%.12g"] * len(record.channels)]
         np.savetxt(temporary, table, fmt=digits, delimiter=",", header=",".join(header), comments="")

@@ -13,16 +13,15 @@ from typing import IO, cast
 import numpy as np
 
 from fitact.data.readers import layouts
-from fitact.data.readers.capture import Capture, Pick, Trace
-from fitact.data.readers.header import Column, Header, cells_of, number, read_header
+from fitact.data.readers.capture import Capture, FileChannel, Pick
+from fitact.data.readers.header import Column, Header, parse_number, read_header, split_cells
 from fitact.errors import InputError
-from fitact.files import unreadable
-from fitact.progress import watched
+from fitact.files import read_error
+from fitact.progress import track_progress
 
-_HEAD = 32_768  # bytes that hold any header and some rows
+_HEAD_BYTES = 32_768  # bytes that hold any header and some rows
 _BLOCK = 8_388_608  # bytes parsed at a time
-_MOST = 4_294_967_296  # bytes of text, beyond which it is no record but what a broken gzip unfolds to
-_OFF = 2  # rows by which a header's count may be off
+_MAX_BYTES = 4_294_967_296  # bytes of text, beyond which it is no record but what a broken gzip unfolds to
 
 
 def read_text(path: Path, source: str, pick: Pick) -> Capture:
@@ -32,24 +31,24 @@ def read_text(path: Path, source: str, pick: Pick) -> Capture:
         InputError: it cannot be read, has no header or time, or a row is broken; names the line.
     """
     try:
-        with _opened(path) as (stream, file):
-            head = stream.read(_HEAD)
+        with _open_text(path) as (stream, file):
+            head = stream.read(_HEAD_BYTES)
             stream.seek(0)
-            text = _decoded(head, source)
-            header = read_header(text if len(head) < _HEAD else text.rpartition("\n")[0], source, _companion(path))
-            wanted = set(pick([column.name for column in header.columns], header.place))
+            text = _decode(head, source)
+            text = text if len(head) < _HEAD_BYTES else text.rpartition("\n")[0]
+            header = read_header(text, source, _read_sidecar(path))
+            names = [column.name for column in header.columns]
+            wanted = set(pick(names, header.location))
             size = path.stat().st_size
-            table = _Table(header, [column for column in header.columns if column.name in wanted], source, size)
-            blocks = watched(_blocks(stream, source), f"reading {source}", size, file.tell)
-            for block in blocks:
+            table = _TableParser(header, [column for column in header.columns if column.name in wanted], source, size)
+            for block in track_progress(_blocks(stream, source), f"reading {source}", size, file.tell):
                 table.add(block)
     except (OSError, EOFError, zlib.error) as error:
-        raise unreadable(source, error) from error
-    return table.capture([column.name for column in header.columns if column.name not in wanted])
+        raise read_error(source, error) from error
+    return table.to_capture([name for name in names if name not in wanted])
 
 
 def is_binary(head: bytes) -> bool:
-    """Whether bytes occur that text does not have."""
     return not _is_utf16(head) and re.search(rb"[\x00-\x08\x0e-\x1f]", head) is not None
 
 
@@ -58,22 +57,22 @@ def _is_utf16(head: bytes) -> bool:
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[tuple[IO[bytes], IO[bytes]]]:
+def _open_text(path: Path) -> Iterator[tuple[IO[bytes], IO[bytes]]]:
     """The bytes of the text, as UTF-8 or a superset of ASCII, with lines that end in a line feed; and the file."""
     with path.open("rb") as file:
         packed = file.read(2) == b"\x1f\x8b"
         file.seek(0)
         stream = cast(IO[bytes], gzip.GzipFile(fileobj=file) if packed else file)
-        head = stream.read(_HEAD)
+        head = stream.read(_HEAD_BYTES)
         stream.seek(0)
         old = b"\r" in head and b"\n" not in head
         if old or _is_utf16(head):
-            text = stream.read(_MOST).decode("utf-16" if _is_utf16(head) else "latin-1", errors="replace")
+            text = stream.read(_MAX_BYTES).decode("utf-16" if _is_utf16(head) else "latin-1", errors="replace")
             stream = io.BytesIO((text.replace("\r", "\n") if old else text).encode())
         yield stream, file
 
 
-def _companion(path: Path) -> str:
+def _read_sidecar(path: Path) -> str:
     """The header that Rohde & Schwarz keep in NAME.csv for the numbers in NAME.Wfm.csv, or nothing."""
     if not path.name.lower().endswith(".wfm.csv"):
         return ""
@@ -81,10 +80,10 @@ def _companion(path: Path) -> str:
     if not header.is_file():
         return ""
     with header.open("rb") as file:
-        return file.read(_HEAD).decode("latin-1")
+        return file.read(_HEAD_BYTES).decode("latin-1")
 
 
-def _decoded(head: bytes, source: str) -> str:
+def _decode(head: bytes, source: str) -> str:
     """Where it is not UTF-8: Windows' own encoding, in which some makers write µ."""
     if is_binary(head):
         raise InputError(f"{source}: is not a text file, nor of a known binary kind; export the record as CSV")
@@ -96,12 +95,11 @@ def _decoded(head: bytes, source: str) -> str:
 
 
 def _blocks(stream: IO[bytes], source: str) -> Iterator[bytes]:
-    """The bytes, in parts that end with a line."""
     rest, size = b"", 0
     while part := stream.read(_BLOCK):
         size += len(part)
-        if size > _MOST:
-            raise InputError(f"{source}: unfolds to more than {_MOST // 2**30} GB of text; cut the record")
+        if size > _MAX_BYTES:
+            raise InputError(f"{source}: unfolds to more than {_MAX_BYTES // 2**30} GB of text; cut the record")
         whole, newline, rest = (rest + part).rpartition(b"\n")
         if newline:
             yield whole
@@ -111,25 +109,21 @@ def _blocks(stream: IO[bytes], source: str) -> Iterator[bytes]:
         yield rest
 
 
-class _Table:
-    """The numbers of a file, as they come in."""
-
+class _TableParser:
     def __init__(self, header: Header, columns: Sequence[Column], source: str, size: int) -> None:
-        self._header, self._columns, self._source = header, columns, source
-        self._size = size  # of the file, bytes
-        known = [header.time.place] if header.time else [header.index] if header.index is not None else []
+        self._header, self._columns, self._source, self._file_size = header, columns, source, size
+        known = [header.time.index] if header.time else [header.index] if header.index is not None else []
         self._has_time = bool(known)  # or a count of samples, in the first place
-        self._places = [*known, *(column.place for column in columns)]
-        self._numbers = np.empty((len(self._places), 0))  # of each column; longer than there are rows
+        self._column_indices = [*known, *(column.index for column in columns)]
+        self._numbers = np.empty((len(self._column_indices), 0))  # of each column; longer than there are rows
         self._lines: list[Sequence[int]] = []  # their numbers, part by part
         self._starts = [0]  # rows before each part
-        self._blank: list[int] = []  # rows with a time and no values
-        self._next = 1  # line
+        self._blank_rows: list[int] = []  # rows with a time and no values
+        self._next_line = 1  # line
 
     def add(self, block: bytes) -> None:
-        """Parse some more lines."""
-        length, first, skipped = len(block), self._next, max(0, self._header.first - self._next)
-        self._next += block.count(b"\n") + 1
+        length, first, skipped = len(block), self._next_line, max(0, self._header.first - self._next_line)
+        self._next_line += block.count(b"\n") + 1
         if skipped:
             parts = block.split(b"\n", skipped)
             if len(parts) <= skipped:
@@ -138,23 +132,24 @@ class _Table:
         block = block.replace(b"\r", b"").replace(b'"', b"")
         if self._header.delimiter == " ":
             block = re.sub(rb"(?m)^ +| +$", b"", re.sub(rb"[ \t]+", b" ", block))
-        numbers = self._fast(block)
+        numbers = self._parse_fast(block)
         lines: Sequence[int] = range(first, first + len(numbers)) if numbers is not None else []
         if numbers is None:
-            numbers, lines = self._careful(block, first)
+            numbers, lines = self._parse_line_by_line(block, first)
         if len(numbers):
             first_row, rows = self._starts[-1], self._starts[-1] + len(numbers)
             if rows > self._numbers.shape[1]:
                 # memory that is not written to is not taken
-                room = np.empty((len(self._places), max(2 * rows, int(1.1 * len(numbers) * self._size / length))))
-                room[:, :first_row] = self._numbers[:, :first_row]
-                self._numbers = room
+                room = max(2 * rows, int(1.1 * len(numbers) * self._file_size / length))
+                grown = np.empty((len(self._column_indices), room))
+                grown[:, :first_row] = self._numbers[:, :first_row]
+                self._numbers = grown
             self._numbers[:, first_row:rows] = numbers.T
             self._lines.append(lines)
             self._starts.append(rows)
 
-    def _fast(self, block: bytes) -> np.ndarray | None:
-        """By numpy's parser; None where a line is not as the others."""
+    def _parse_fast(self, block: bytes) -> np.ndarray | None:
+        """The rows by numpy's parser; None where a line is not as the others."""
         delimiter = self._header.delimiter
         if b"#" in block or not block:
             return None
@@ -169,106 +164,101 @@ class _Table:
             block = block.replace(b",", b".")
         try:
             return np.loadtxt(
-                io.BytesIO(block), delimiter=delimiter, ndmin=2, comments=None, usecols=self._places, encoding="latin-1"
-            )
+                io.BytesIO(block), delimiter=delimiter, ndmin=2, comments=None, usecols=self._column_indices,
+                encoding="latin-1",
+            )  # fmt: skip
         except ValueError:
             return None
 
-    def _careful(self, block: bytes, first: int) -> tuple[np.ndarray, list[int]]:
-        """Line by line, to find the offending cell or to pass over lines that hold nothing."""
+    def _parse_line_by_line(self, block: bytes, first: int) -> tuple[np.ndarray, list[int]]:
+        """The rows line by line, to find the offending cell or to pass over lines that hold nothing."""
         rows: list[list[float]] = []
         lines: list[int] = []
         delimiter = self._header.delimiter
         for line, text in enumerate(block.decode("utf-8", errors="replace").split("\n"), start=first):
             if not text.strip(delimiter + " ") or text.startswith("#"):
                 continue
-            cells = cells_of(text, delimiter)
+            cells = split_cells(text, delimiter)
             if len(cells) != self._header.width:
                 raise InputError(
                     f"{self._source}, line {line}: {len(cells)} values where the rows have {self._header.width};"
                     " mend or remove the row"
                 )
-            here = [cells[place] for place in self._places]
+            here = [cells[place] for place in self._column_indices]
             if self._has_time and here[0] and here[1:] and not any(here[1:]):
-                self._blank.append(self._starts[-1] + len(rows))
+                self._blank_rows.append(self._starts[-1] + len(rows))
                 here[1:] = ["nan"] * len(here[1:])
-            rows.append([self._number(cell, line, place) for cell, place in zip(here, self._places, strict=True)])
+            rows.append(
+                [self._parse_cell(cell, line, place) for cell, place in zip(here, self._column_indices, strict=True)]
+            )
             lines.append(line)
-        return np.array(rows).reshape(len(rows), len(self._places)), lines
+        return np.array(rows).reshape(len(rows), len(self._column_indices)), lines
 
-    def _number(self, cell: str, line: int, place: int) -> float:
-        value = number(cell, self._header.decimal_comma)
+    def _parse_cell(self, cell: str, line: int, place: int) -> float:
+        value = parse_number(cell, self._header.decimal_comma)
         if value is None:
             what = f"'{cell[:40]}' is not a number" if cell else "the cell is empty"
             raise InputError(f"{self._source}, line {line}, column {place + 1}: {what}; mend or remove the row")
         return value
 
-    def _line(self, row: int) -> str:
+    def _line_label(self, row: int) -> str:
         part = bisect.bisect_right(self._starts, row) - 1
         return f"line {self._lines[part][row - self._starts[part]]}"
 
-    def capture(self, unread: Sequence[str]) -> Capture:
-        """What was read; `unread` are columns that were not wanted."""
+    def to_capture(self, unread_columns: Sequence[str]) -> Capture:
+        """What was read; `unread_columns` are columns that were not wanted."""
         header, rows = self._header, self._starts[-1]
-        if header.count is not None and rows < header.count - _OFF:
+        if header.count is not None and rows < header.count - 2:  # by which some makers' counts are off
             raise InputError(
                 f"{self._source}: the header announces {header.count:,} rows and {rows:,} are there, so the file"
                 " was cut; export it again"
             )
-        kept, notes = self._filled(rows)
+        kept, notes = self._trim_blank_rows(rows)
         columns = [column[:rows][kept] for column in self._numbers]
         if self._has_time:
             time, *values = columns
         else:
             time, values = np.arange(rows, dtype=float)[kept], columns
-        time, timing = self._timed(time)
+        time, timing = self._time_in_seconds(time)
         return Capture(
             source=self._source,
             format=header.maker,
             time=time,
-            traces=tuple(self._trace(*pair) for pair in zip(self._columns, values, strict=True)),
-            where=lambda row: self._line(row + (kept.start or 0)),
+            channels=tuple(
+                FileChannel.from_file(column.name, array, column.unit, column.attenuation, header.location)
+                for column, array in zip(self._columns, values, strict=True)
+            ),
+            row_label=lambda row: self._line_label(row + (kept.start or 0)),
             notes=(*timing, *notes),
-            others=(*unread, *header.others),
+            unread_columns=(*unread_columns, *header.non_numeric_columns),
         )
 
-    def _filled(self, rows: int) -> tuple[slice, list[str]]:
+    def _trim_blank_rows(self, rows: int) -> tuple[slice, list[str]]:
         """All rows but those without values at either end."""
-        blank = set(self._blank)
+        blank = set(self._blank_rows)
         first = next((row for row in range(rows) if row not in blank), rows)
-        last = next((row for row in range(rows - 1, -1, -1) if row not in blank), first - 1)
-        inside = [row for row in self._blank if first < row < last]
+        last = next((row for row in reversed(range(rows)) if row not in blank), first - 1)
+        inside = [row for row in self._blank_rows if first < row < last]
         if inside or first == rows:
-            where = self._line(inside[0]) if inside else "all rows"
+            where = self._line_label(inside[0]) if inside else "all rows"
             raise InputError(f"{self._source}, {where}: the cells of the channels are empty; mend or remove the row")
         left = rows - (last + 1 - first)
         notes = [f"{self._source}: rows without values at the ends were passed over ({left:,})"] if left else []
         return slice(first, last + 1), notes
 
-    def _timed(self, time: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    def _time_in_seconds(self, time: np.ndarray) -> tuple[np.ndarray, list[str]]:
         """Seconds, and what was assumed of them."""
         header = self._header
         if header.time:
-            unit = layouts.unit(header.time.unit)
+            unit = layouts.parse_unit(header.time.unit)
             if header.time.unit and (unit is None or unit[0] != "s"):
                 raise InputError(
-                    f"{self._source}{header.place}: '{header.time.unit}' is no unit of time; write a multiple of s"
+                    f"{self._source}{header.location}: '{header.time.unit}' is no unit of time; write a multiple of s"
                 )
             stated = header.time.unit or (header.time.name.lower() == "time" and header.maker == "fitact")
             notes = [] if stated else [f"{self._source}: the file states no unit of time; seconds were assumed"]
             return time * (unit[1] if unit else 1.0), notes
         if header.step is None:
-            raise InputError(f"{self._source}{header.place}: no time, and no step of it; export the time as well")
+            raise InputError(f"{self._source}{header.location}: no time, and no step of it; export the time as well")
         notes = [] if header.start is not None else [f"{self._source}: the time was taken to start at 0"]
         return (header.start or 0.0) + header.step * time, notes
-
-    def _trace(self, column: Column, values: np.ndarray) -> Trace:
-        unit = layouts.unit(column.unit)
-        return Trace(
-            name=column.name,
-            values=values * unit[1] if unit else values,
-            unit=unit[0] if unit else "",
-            written=column.unit,
-            attenuation=column.attenuation,
-            place=self._header.place,
-        )

@@ -1,0 +1,21 @@
+"""What commands call that is not public: each is imported when it is first used, so that `fitact --help` is quick."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    "fitact",
+    submodules={"summary"},
+    submod_attrs={
+        "compiled": ["use_compilation_cache"],
+        "data.readers.read": ["write_csv"],
+        "data.simulate": ["simulate"],
+        "data.spectrum": ["is_spectrum"],
+        "design.drive": ["require_designable"],
+        "fitting.profile": ["table"],
+        "model_selection.fit_planned": ["fit_planned", "plan_for_record"],
+        "paper": ["reproduce"],
+        "populations.covariates": ["read_covariates"],
+        "populations.fit_population": ["delete_chains"],
+        "scene.prior_predictive": ["prior_predictive"],
+    },
+)

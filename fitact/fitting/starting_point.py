@@ -1,0 +1,154 @@
+"""Where a fit starts: what a record says of the circuit by linear fits, else the best of draws from the prior."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, TypeAlias
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from fitact.compiled import BatchEvaluator
+from fitact.data.record import Record
+from fitact.errors import InputError
+from fitact.fitting.current import CurrentEstimate
+from fitact.fitting.drive_choice import DriveModel, has_ideal_edges
+from fitact.likelihood.likelihood import Likelihood
+from fitact.model.skin import WithSkin, circuit_parameters
+
+
+class VscEstimate(NamedTuple):
+    """The divider g = a / b and the time constant b (s), by a linear fit."""
+
+    g: float
+    b: float
+
+
+Estimate: TypeAlias = VscEstimate | CurrentEstimate
+
+
+def estimate_from_vsc(
+    record: Record, choice: DriveModel, max_divider: float = 0.5, part_size: int = 1 << 20
+) -> VscEstimate:
+    """g (below `max_divider`) and b from  Vsc = g V - (1/b) ∫ Vsc dt + line,  the circuit's equation integrated once.
+
+    Samples are taken `part_size` at a time, which bounds memory.
+
+    Raises:
+        InputError: g is not between 0 and `max_divider` (1/2, or a little more with a free gain), so not this
+            circuit's.
+    """
+    time, vsc, voltage = record.time, record["Vsc"], choice.voltage
+    integral = np.concatenate([[0.0], np.cumsum(0.5 * np.diff(time) * (vsc[1:] + vsc[:-1]))])
+    if has_ideal_edges(choice.drive):  # the trapezoid rule misreads the samples beside an ideal edge
+        inside = np.abs(np.diff(voltage, prepend=voltage[0])) < 1e-9 * np.ptp(voltage)
+    else:
+        inside = np.ones(time.size, dtype=bool)
+    span = time[-1] - time[0]
+    R = np.zeros((0, 5))
+    for first in range(0, time.size, part_size):
+        part = slice(first, first + part_size)
+        line = (time[part] - time[0]) / span
+        rows = np.stack([voltage[part], integral[part] / span, np.ones_like(line), line, vsc[part]], axis=1)
+        R = np.asarray(np.linalg.qr(np.vstack([R, rows[inside[part]]]), mode="r"))
+    (g, slope, _, _), *_ = np.linalg.lstsq(R[:, :4], R[:, 4], rcond=None)
+    if g >= max_divider:
+        raise InputError(
+            f"{record.source}: Vsc is {g:.3g} times V at a step, but this circuit cannot give 1/2 or more;"
+            " check for swapped columns or a wrong unit of V_V or Vsc_V"
+        )
+    if g <= 0.0:
+        raise InputError(
+            f"{record.source}: Vsc steps against V (divider {g:.3g}); check the polarity of the probes"
+            " and that V_V and Vsc_V belong to one recording"
+        )
+    return VscEstimate(float(g), float(span / -slope) if slope < 0.0 else float("inf"))
+
+
+def start_from_estimates(
+    likelihood: Likelihood, estimates: Sequence[Estimate | None]
+) -> Float[np.ndarray, " circuit_parameters"]:
+    """Start from the linear fits, where these hold for the circuit; else from the best of draws from the prior."""
+    vsc = next((estimate for estimate in estimates if isinstance(estimate, VscEstimate)), None)
+    current = next((estimate for estimate in estimates if isinstance(estimate, CurrentEstimate)), None)
+    theta = np.concatenate([likelihood.prior.log_mean, np.zeros(len(likelihood.names) - len(likelihood.prior.names))])
+    if current is not None and not current.capacitance > 0.0 and isinstance(likelihood.template, WithSkin):
+        current = None  # of one frequency, what a constant skin makes of such a current need be no skin
+    if vsc is None and current is None:
+        return _best_prior_draw(likelihood, theta)
+    mean, sd = prior_skin_moments(likelihood)
+    skin, logs = _estimate_skin(vsc, current), mean
+    if skin is not None:
+        logs = np.log(skin)
+    elif vsc is not None:
+        logs = most_probable_skin(np.asarray(vsc.g), np.asarray(vsc.b), mean, sd)
+    for name, value in zip(("Rsc", "Csc", "Ci"), logs, strict=True):
+        if name in likelihood.prior.names:
+            theta[likelihood.prior.names.index(name)] = value
+    return theta
+
+
+def _estimate_skin(vsc: VscEstimate | None, current: CurrentEstimate | None) -> tuple[float, float, float] | None:
+    """Rsc, Csc and Ci of a final circuit from what Vsc and I show of it, if those are of one."""
+    if current is None or not current.weight > 0.0:
+        return None
+    if vsc is not None and math.isfinite(vsc.b):
+        g, b = vsc
+    elif vsc is None and current.capacitance > 0.0:
+        # weight = 2 g^2 / Rsc, capacitance = g Csc = b g (1 - 2 g) / Rsc
+        ratio = current.weight * current.b / current.capacitance
+        g, b = 0.5 * ratio / (1.0 + ratio), current.b
+    else:
+        return None
+    Rsc = 2.0 * g * g / current.weight
+    return (Rsc, (1.0 - 2.0 * g) * b / Rsc, g * b / Rsc) if g < 0.5 else None
+
+
+def prior_skin_moments(likelihood: Likelihood) -> tuple[np.ndarray, np.ndarray]:
+    """Means and standard deviations of log Rsc, log Csc and log Ci; a parameter that is held has next to none."""
+    prior, known = likelihood.prior, circuit_parameters(likelihood.template)
+    pairs = [
+        (prior[name].log_mean, prior[name].log_sd) if name in prior.names else (math.log(float(known[name])), 1e-6)
+        for name in ("Rsc", "Csc", "Ci")
+    ]
+    mean, sd = np.array(pairs).T
+    return mean, sd
+
+
+def most_probable_skin(
+    g: Float[np.ndarray, "*n"], b: Float[np.ndarray, "*n"], mean: np.ndarray, sd: np.ndarray
+) -> Float[np.ndarray, "*n 3"]:
+    """The most probable points, by the prior, among those with that divider and time constant (s; infinite: unknown).
+
+    They are the line (log Rsc, log Csc, log Ci) = point + t (-1, 1, 1).
+    """
+    g = np.clip(g, 1e-9, 0.4999)
+    b = np.where(np.isfinite(b), b, math.exp(mean[0] + mean[1]))
+    ci = math.exp(mean[2])
+    point = np.stack([np.log(g * b / ci), np.log((1.0 / g - 2.0) * ci), np.full_like(g, math.log(ci))], axis=-1)
+    along, weight = np.array([-1.0, 1.0, 1.0]), sd**-2.0
+    return point + along * np.sum(weight * along * (mean - point), axis=-1, keepdims=True) / np.sum(weight)
+
+
+def _best_prior_draw(
+    likelihood: Likelihood, theta: np.ndarray, count: int = 256
+) -> Float[np.ndarray, " circuit_parameters"]:
+    """The one of `count` draws of the prior that leaves least of the channels, whatever their noise."""
+    points = np.vstack([theta, likelihood.sample_prior(theta, count - 1)])
+    return points[int(np.argmin(residual_objective(likelihood, points)))]
+
+
+def residual_objective(likelihood: Likelihood, points: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, " n"]:
+    """What points leave of the channels, whatever their noise: for comparing one with another."""
+    return BatchEvaluator(_residual_objective, likelihood, likelihood.rows)(points)
+
+
+def _residual_objective(
+    likelihood: Likelihood, theta: Float[np.ndarray, " circuit_parameters"]
+) -> Float[np.ndarray, ""]:
+    """The sum of the logarithms of the residuals' squares, each for its samples."""
+    parts = [
+        trace.count * jnp.log(jnp.sum(jnp.square(trace.fit_nuisances(seen, 1e-3 * jnp.ptp(trace.observed))[0])))
+        for trace, seen in likelihood.channels_and_inputs(theta)
+    ]
+    return 0.5 * sum(parts, jnp.zeros(()))

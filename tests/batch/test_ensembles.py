@@ -1,0 +1,68 @@
+"""Ensembles side by side on normals that are known, neighbours of other widths and places: to 1 %, and apart."""
+
+import emcee
+import numpy as np
+import pytest
+
+from fitact.batch import moves
+from fitact.batch.moves import GaussianApproximations, sample_posteriors
+
+COUNT, SIZE, STEPS, BURN = 48, 3, 800, 200
+SCALES = 10.0 ** np.resize([0.0, 2.0, -1.0], COUNT)  # of neighbours
+
+
+def targets() -> tuple[np.ndarray, np.ndarray]:
+    """Centers and covariances."""
+    rng = np.random.default_rng(5)
+    centers = 30.0 * SCALES[:, None] * rng.standard_normal((COUNT, SIZE))
+    mixed = np.eye(SIZE) + 0.5 * rng.standard_normal((COUNT, SIZE, SIZE))
+    return centers, SCALES[:, None, None] ** 2 * mixed @ np.swapaxes(mixed, 1, 2)
+
+
+def whitened(seeds: range) -> np.ndarray:
+    """What was drawn, in each normal's own standard deviations: (posteriors, ensembles, steps, walkers, n).
+
+    The approximations that it starts from are off by half a standard deviation, in width by a fifth.
+    """
+    centers, covariances = (each[seeds] for each in targets())
+    precisions, roots = np.linalg.inv(covariances), np.linalg.cholesky(covariances)
+
+    def log_probs(points: np.ndarray) -> np.ndarray:
+        off = points - centers[:, None]
+        return -0.5 * np.einsum("kni,kij,knj->kn", off, precisions, off)
+
+    near = GaussianApproximations.from_covariance_factors(centers + 0.5 * roots.sum(axis=2), 1.2 * roots)
+    drawn = sample_posteriors(log_probs, near, STEPS, [[n] for n in seeds], 3).points
+    return np.einsum("kij,keswj->keswi", np.linalg.inv(roots), drawn - centers[:, None, None, None])
+
+
+def off_by(white: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What means and second moments of standard normals are off by, and its standard error by the ensembles' own."""
+    kept = white[:, :, BURN:].reshape(white.shape[0] * white.shape[1], -1, SIZE)
+    second = np.einsum("eni,enj->eij", kept, kept) / kept.shape[1] - np.eye(SIZE)
+    each = np.concatenate([kept.mean(axis=1), second.reshape(len(kept), -1)], axis=1)
+    return each.mean(axis=0), each.std(axis=0) / np.sqrt(len(each))
+
+
+@pytest.mark.parametrize("shares", [(0.7, 0.3), (0.0, 1.0)], ids=["mixture", "stretch"])
+def test_moves_give_known_normals(shares, monkeypatch):
+    """To 1 % in the mixture; the stretch move alone, whose draws are fewer by their autocorrelation, to 4.5 errors.
+
+    The 192 ensembles are independent, so that their own scatter gives the standard error.
+    """
+    monkeypatch.setattr(moves, "SHARES", shares)
+    off, error = off_by(whitened(range(COUNT)))
+    assert np.all(error < 0.0075)
+    assert np.all(np.abs(off) < (0.01 if shares[0] else 4.5 * error))
+
+
+def test_walkers_of_neighbours_would_be_seen(monkeypatch):
+    """emcee's own stretch move over the same walkers: any anchor leaves a normal alone, but few moves are accepted."""
+    monkeypatch.setattr(moves, "SHARES", (0.0, 1.0))
+    monkeypatch.setattr(moves, "Stretch", lambda shape, generators: emcee.moves.StretchMove())
+    _, error = off_by(whitened(range(8)))
+    assert np.all(error > 0.012)  # of 32 ensembles; 0.0075 of 192 would be 0.018
+
+
+def test_draws_do_not_depend_on_neighbours():
+    np.testing.assert_allclose(whitened(range(4, 6)), whitened(range(3, 8))[1:3], rtol=1e-9, atol=1e-12)

@@ -1,0 +1,208 @@
+import gzip
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fitact
+from fitact.data.readers.read import write_csv
+from fitact.data.record import white_noise_sd
+
+Rows = list[list[str]]
+
+
+@pytest.fixture(scope="module")
+def rows(finger_path: Path) -> Rows:
+    return [line.split(",") for line in finger_path.read_text().splitlines()]
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[[Rows], Path]:
+    def write(rows: Rows) -> Path:
+        path = tmp_path / "record.csv"
+        path.write_text("\n".join(map(",".join, rows)) + "\n")
+        return path
+
+    return write
+
+
+def test_values_are_read_as_written(finger_path: Path, rows: Rows):
+    record = fitact.read(finger_path)
+    table = np.array(rows[1:], dtype=float)
+    for column, values in enumerate([record.time, record["V"], record["Vsc"]]):
+        np.testing.assert_array_equal(values, table[:, column])
+    assert record.notes == ()
+
+
+def test_order_comments_gzip_and_extra_columns(tmp_path: Path, finger_path: Path, rows: Rows):
+    path = tmp_path / "record.csv.gz"
+    lines = ["# a comment", "Vsc_V, note ,Time_s,V_V,", "", *(f"{c},ok,{a},{b}," for a, b, c in rows[1:]), ""]
+    path.write_bytes(gzip.compress("\r\n".join(lines).encode("utf-8-sig")))
+    record = fitact.read(path)
+    assert record.fingerprint == fitact.read(finger_path).fingerprint
+    assert len(record.notes) == 1
+    assert "note" in record.notes[0]
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        [["time", "V", "Vsc"], ["ms", "kV", "mV"]],
+        [["time", "V", "Vsc"], ["(ms)", "(kV)", "(mV)"]],
+        [["time_ms", "V_kV", "Vsc_mV"]],
+        [["time_ms", "V_kV", "Vsc_mV"], ["ms", "kV", "mV"]],
+    ],
+)
+def test_units_in_the_name_or_in_a_row(write, finger_path: Path, rows: Rows, head: Rows):
+    scaled = [[repr(1e3 * float(a)), repr(1e-3 * float(b)), repr(1e3 * float(c))] for a, b, c in rows[1:]]
+    record, plain = fitact.read(write(head + scaled)), fitact.read(finger_path)
+    np.testing.assert_allclose(record.time, plain.time, rtol=1e-12)
+    for channel in ("V", "Vsc"):
+        np.testing.assert_allclose(record[channel], plain[channel], rtol=1e-12)
+
+
+def test_uneven_times_are_kept_and_named(write, rows: Rows):
+    record = fitact.read(write([rows[0]] + [row for i, row in enumerate(rows[1:]) if i % 7]))
+    assert any("not uniform" in note for note in record.notes)
+
+
+def edited(row: int, column: int, text: str) -> Callable[[Rows], Rows]:
+    def edit(rows: Rows) -> Rows:
+        rows = [list(r) for r in rows]
+        rows[row][column] = text
+        return rows
+
+    return edit
+
+
+BAD = {
+    "text cell": (edited(101, 1, "abc"), ["line 102", "column 2", "abc"]),
+    "empty cell": (edited(101, 1, ""), ["line 102", "column 2", "empty"]),
+    "nan": (edited(101, 2, "NaN"), ["line 102", "Vsc", "nan"]),
+    "inf": (edited(101, 1, "-inf"), ["line 102", "V", "inf"]),
+    "ragged row": (lambda rows: [*rows[:101], rows[101][:2], *rows[102:]], ["line 102", "2 values", "3"]),
+    "long row": (lambda rows: [*rows[:101], rows[101] + ["1"], *rows[102:]], ["line 102", "4 values", "3"]),
+    "repeated time": (lambda rows: rows[:101] + rows[100:], ["line 102", "repeats"]),
+    "time goes back": (lambda rows: rows[:101] + rows[50:], ["line 102", "goes back"]),
+    "no time": (lambda rows: [r[1:] for r in rows], ["line 1", "time_s"]),
+    "no Vsc": (lambda rows: [r[:2] for r in rows], ["Vsc_V", "missing"]),
+    "no V": (lambda rows: [[r[0], r[2]] for r in rows], ["V_V", "missing", "scene"]),
+    "no header": (lambda rows: rows[1:], ["line 1", "time_s"]),
+    "two headers of one name": (edited(0, 1, "Vsc_V"), ["line 1", "Vsc"]),
+    "unknown unit": (edited(0, 1, "V_ohm"), ["line 1", "ohm", "V"]),
+    "units disagree": (lambda rows: [rows[0], ["ms", "V", "V"], *rows[1:]], ["line 2", "time", "ms"]),
+    "header only": (lambda rows: rows[:1], ["no rows"]),
+    "too few samples": (lambda rows: rows[:20], ["19 samples"]),
+    "constant": (lambda rows: [rows[0]] + [[a, "180", c] for a, _, c in rows[1:]], ["V is constant at 180"]),
+    "zero": (lambda rows: [rows[0]] + [[a, b, "0"] for a, b, _ in rows[1:]], ["Vsc is zero"]),
+    "plateau": (lambda rows: rows[:1] + rows[300:700], ["V holds nothing but noise"]),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_files_are_refused_with_the_place(write, rows: Rows, name: str):
+    make, words = BAD[name]
+    with pytest.raises(fitact.InputError) as error:
+        fitact.read(write(make(rows)))
+    message = str(error.value)
+    assert "record.csv" in message
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+
+
+def test_pure_noise_is_refused_and_a_single_edge_is_not():
+    time, rng = np.arange(400) * 5e-6, np.random.default_rng(3)
+    noise = rng.normal(size=400)  # any seed: the test's level is 1e-4
+    with pytest.raises(fitact.InputError, match="nothing but noise"):
+        fitact.Record.from_arrays(time, V=np.sin(time * 1e3), Vsc=noise)
+    edge = np.where(np.arange(400) < 3, -180.0, 180.0) + 0.4 * noise
+    assert "V" in fitact.Record.from_arrays(time, V=edge, Vsc=np.sin(time * 1e3))
+
+
+@pytest.mark.parametrize("content", [b"", b"\n\n", bytes(range(256)) * 50, b"\x1f\x8b broken", b"\x00" * 500])
+def test_not_a_csv(tmp_path: Path, content: bytes):
+    path = tmp_path / "record.csv"
+    path.write_bytes(content)
+    with pytest.raises(fitact.InputError, match=r"record\.csv"):
+        fitact.read(path)
+
+
+def test_directory_and_missing_file(tmp_path: Path):
+    with pytest.raises(fitact.InputError, match="is a directory"):
+        fitact.read(tmp_path)
+    with pytest.raises(fitact.InputError, match="no such file"):
+        fitact.read(tmp_path / "nothing.csv")
+
+
+def test_what_is_written_is_read_again(tmp_path: Path):
+    """Times to the last bit, values to the 12 digits that are written."""
+    rng = np.random.default_rng(0)  # any
+    time = np.cumsum(rng.uniform(0.9e-5, 1.1e-5, 500)) - 1e-3
+    waves = {"V": 360.0 * np.sin(2e3 * time), "Vsc": 15.0 * np.cos(2e3 * time), "I": 1e-6 * np.cos(2e3 * time)}
+    write_csv(tmp_path / "record.csv", fitact.Record.from_arrays(time, **waves))
+    record = fitact.read(tmp_path / "record.csv")
+    np.testing.assert_array_equal(record.time, time)
+    for name, values in waves.items():
+        np.testing.assert_allclose(record[name], values, rtol=6e-12)
+
+
+def test_noise_and_frequency_are_judged_without_a_model(finger_path: Path, finger_truth: dict[str, float]):
+    record = fitact.read(finger_path)
+    assert record.noise("V") == pytest.approx(finger_truth["noise_V"], rel=0.05)
+    assert record.noise("Vsc") == pytest.approx(finger_truth["noise_Vsc"], rel=0.05)
+    assert record.frequency() == pytest.approx(100.0, rel=1e-4)
+
+
+@pytest.mark.parametrize("wave", [np.sin, lambda x: np.sign(np.sin(x)), lambda x: np.sin(x) + 0.8 * np.sin(2 * x)])
+@pytest.mark.parametrize("periods", [1.6, 2.0, 3.7, 25.3])
+def test_frequency(wave, periods: float):
+    time = np.arange(5000) * 1e-5
+    values = wave(2.0 * np.pi * periods / 0.05 * time + 0.3) + 0.02 * np.random.default_rng(0).normal(size=5000)
+    record = fitact.Record.from_arrays(time, Vsc=values)
+    assert record.frequency("Vsc") == pytest.approx(periods / 0.05, rel=3e-3)
+
+
+def test_no_frequency_in_a_part_of_a_period():
+    time = np.arange(500) * 1e-5
+    assert fitact.Record.from_arrays(time, Vsc=np.exp(-time / 1e-3)).frequency("Vsc") is None
+
+
+def test_the_callers_arrays_are_left_alone():
+    time = np.arange(100) * 1e-5
+    vsc = np.sin(time * 1e4)
+    record = fitact.Record.from_arrays(time, Vsc=vsc)
+    vsc[0] = 5.0
+    assert record["Vsc"][0] == 0.0
+    with pytest.raises(ValueError, match="read-only"):
+        record["Vsc"][0] = 1.0
+
+
+@pytest.mark.parametrize("spacing", ["linear", "logarithmic"])
+def test_a_sweep_is_no_noise(spacing: str):
+    """Its spectrum has no line, but it is smooth."""
+    time = np.arange(20_000) / 20e3
+    phase = {
+        "linear": 100.0 * time + 0.5 * 900.0 * time**2,
+        "logarithmic": 100.0 * (10.0**time - 1.0) / np.log(10.0),
+    }[spacing]
+    sweep = 180.0 * np.sin(2.0 * np.pi * phase)
+    assert len(fitact.Record.from_arrays(time, V=sweep, Vsc=0.05 * sweep)) == time.size
+
+
+def test_what_shows_only_further_down_is_read(tmp_path: Path):
+    """A channel that begins late, and a decimal comma that comes late."""
+    values = np.sin(0.01 * np.arange(1000)) + (np.arange(1000) > 700)
+    late = ["time_s,V_V,Vsc_V", *(f"{1e-5 * i:.6f},{v:.4f}," + f"{v:.3f}" * (i >= 500) for i, v in enumerate(values))]
+    (tmp_path / "late.csv").write_text("\n".join(late))
+    with pytest.raises(fitact.InputError, match="line 2, column 3: the cell is empty"):  # not: there is no Vsc
+        fitact.read(tmp_path / "late.csv")
+    shown = ["0" if i < 700 else f"{v:.4f}".replace(".", ",") for i, v in enumerate(values)]
+    comma = ["time_us;V_V;Vsc_V", *(f"{10 * i};{v};{v}" for i, v in enumerate(shown))]
+    (tmp_path / "comma.csv").write_text("\n".join(comma))
+    np.testing.assert_allclose(fitact.read(tmp_path / "comma.csv")["Vsc"][700:], values[700:], atol=5e-5)
+
+
+def test_nothing_shows_no_noise():
+    assert np.isnan(white_noise_sd(np.zeros(3)))

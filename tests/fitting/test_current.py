@@ -1,0 +1,85 @@
+"""Fits of the trunk current, alone and with Vsc, on records that ngspice made, against their truth."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+import fitact
+from tests.conftest import RECORDS
+
+FINGERS = RECORDS / "fingers"
+TRUTH = json.loads((FINGERS / "truth.json").read_text())
+
+
+def scene(channels: list[str], **drive: object) -> fitact.Scene:
+    return fitact.Scene.from_dict({"measurement": {"channels": channels}, "drive": drive or {"waveform": "measured"}})
+
+
+def fit(number: int, given: fitact.Scene) -> fitact.Fit:
+    return fitact.fit(fitact.read(FINGERS / f"finger{number:02}.csv.gz", given), given)
+
+
+@pytest.mark.parametrize("channels", [pytest.param(["I"], marks=pytest.mark.slow), ["Vsc", "I"]], ids="+".join)
+@pytest.mark.parametrize("number", [0, *(pytest.param(n, marks=pytest.mark.thorough) for n in range(1, 8))])
+def test_current_fixes_all_three(number: int, channels: list[str]):
+    found, truth = fit(number, scene(channels)), TRUTH[number]
+    assert found.result == "successful"
+    assert found.identifiability.verdict == "identified"
+    error = found.theta[:3] - np.log([truth["Rsc"], truth["Csc"], truth["Ci"]])
+    np.testing.assert_allclose(error, 0.0, atol=2e-3)
+    assert np.all(np.abs(error) < 4.0 * found.sd[:3])
+    noise = {"Vsc": truth["noise_Vsc"], "I": truth["noise_I"]}
+    for trace in found.traces:
+        assert trace.sigma == pytest.approx(noise[trace.channel], rel=0.05)
+    assert any("38 of 4,000 samples" in warning for warning in found.warnings)
+
+
+@pytest.mark.thorough
+def test_named_waveform_gives_the_same():
+    measured, named = (
+        fit(3, scene(["Vsc", "I"], **drive)) for drive in ({}, {"waveform": "trapezoid", "rise_time": 50e-6})
+    )
+    np.testing.assert_array_less(np.abs(measured.theta - named.theta), 2.0 * named.sd)
+
+
+def test_skin_voltage_alone_leaves_the_contact_area_open():
+    found, truth = fit(4, scene(["Vsc"])), TRUTH[4]
+    assert found.result == "successful"
+    assert found.identifiability.verdict == "prior-limited"
+    total = 2.0 * truth["Ci"] + truth["Csc"]
+    assert found.derived()["g"]["q50"] == pytest.approx(truth["Ci"] / total, rel=1e-2)
+    assert found.derived()["b"]["q50"] == pytest.approx(truth["Rsc"] * total, rel=1e-2)
+
+
+def test_current_is_taken_where_there_is_no_skin_voltage():
+    record = fitact.read(FINGERS / "finger00.csv.gz")
+    channels = {name: values for name, values in record.channels.items() if name != "Vsc"}
+    found = fitact.fit(dataclasses.replace(record, channels=channels))
+    assert [trace.channel for trace in found.traces] == ["I"]
+    assert found.names == ("Rsc", "Csc", "Ci")
+    assert found.point_names[-1] == "sigma_I"
+    assert found.derived()["force_mean"]["q50"] == pytest.approx(
+        fit(0, scene(["Vsc", "I"])).derived()["force_mean"]["q50"], rel=3e-3
+    )
+
+
+@pytest.mark.parametrize(("noise", "trusted"), [(0.05, True), pytest.param(0.4, False, marks=pytest.mark.thorough)])
+def test_noise_of_the_drive_is_not_taken_for_that_of_the_current(noise: float, trusted: bool):
+    """It reaches the current through its derivative; where that drowns the current's own, the answer is not trusted."""
+    record, truth = fitact.read(FINGERS / "finger00.csv.gz"), TRUTH[0]
+    noisy = record["V"] + noise * np.random.default_rng(1).standard_normal(len(record))
+    found = fitact.fit(dataclasses.replace(record, channels={**record.channels, "V": noisy}), scene(["Vsc", "I"]))
+    assert found.trusted == trusted
+    assert any("name the waveform" in warning for warning in found.warnings) != trusted
+    if trusted:
+        error = found.theta[:3] - np.log([truth["Rsc"], truth["Csc"], truth["Ci"]])
+        assert np.all(np.abs(error) < 4.0 * found.sd[:3])
+
+
+def test_current_without_a_recorded_or_known_drive_is_refused():
+    record = fitact.read(FINGERS / "finger00.csv.gz")
+    alone = dataclasses.replace(record, channels={"I": record["I"]})
+    with pytest.raises(fitact.InputError, match="V"):
+        fitact.fit(alone, scene(["I"], waveform="trapezoid", rise_time=50e-6))

@@ -1,0 +1,48 @@
+"""Remarks on a channel, from its figures alone: each where it belongs and nowhere else."""
+
+import pytest
+
+import fitact
+from fitact.fitting.remarks import channel_warnings
+from fitact.fitting.starting_point import DriveModel
+from tests.conftest import square_record
+
+QUIET = {"interpolation_error": 0.0, "rms_residual": 0.1, "rounding_noise": 0.0, "outliers": 0}
+SQUARE = fitact.Square(360.0, 100.0)
+
+
+def remarks(record: fitact.Record, drive: fitact.Square | fitact.Burst = SQUARE, **figures: float) -> list[str]:
+    choice = DriveModel(drive, record["V"], True, False, 0.0, "square", ())
+    return channel_warnings(record, choice, "Vsc", QUIET | figures)
+
+
+def test_a_record_that_shows_its_drive_is_not_remarked_upon():
+    assert remarks(square_record()) == []
+
+
+def test_a_part_of_a_wave():
+    whole = square_record()
+    part = fitact.Record.from_arrays(whole.time[:1400], V=whole["V"][:1400], Vsc=whole["Vsc"][:1400])
+    (found,) = remarks(part)
+    assert "(6.995 ms) does not show its drive repeating" in found
+    assert "1.5 periods" in found
+    assert remarks(part, fitact.Burst(SQUARE, 2)) == []  # which repeats nothing
+
+
+@pytest.mark.parametrize(
+    ("figures", "words"),
+    [
+        ({"interpolation_error": 0.1}, ["too coarsely", "100 mV", "name the waveform"]),
+        ({"rounding_noise": 0.2}, ["Vsc is rounded", "may be off by half"]),
+        ({"quiet_noise": 0.31}, ["quiet holds more than noise", "310 mV", "100 mV"]),
+        ({"outliers": 3, "first_outlier": 2e-3}, ["3 samples of Vsc", "2 ms", "'student'"]),
+    ],
+)
+def test_each_figure_has_its_remark(figures: dict[str, float], words: list[str]):
+    (found,) = remarks(square_record(), **figures)
+    for word in words:
+        assert word in found
+
+
+def test_what_lies_within_the_noise_has_none():
+    assert remarks(square_record(), quiet_noise=0.29, interpolation_error=1e-3) == []

@@ -1,0 +1,77 @@
+"""Recorders whose clock is not the generator's, against closed forms."""
+
+import jax
+import numpy as np
+import pytest
+
+import fitact
+from fitact.fitting.drive_choice import choose_drive
+
+RSC, CSC, CI = 130e3, 18e-9, 1.35e-9
+G, B = CI / (2.0 * CI + CSC), RSC * (2.0 * CI + CSC)
+
+
+def record(waveform: str, frequency: float, periods: int, per_period: int) -> fitact.Record:
+    """Vsc alone, steady, at 360 Vpp; the trigger comes 0.37 steps before the first sample."""
+    time = (np.arange(periods * per_period) + 0.37) * 0.01 / per_period
+    if waveform == "sine":
+        s = 2j * np.pi * frequency
+        vsc = 180.0 * np.imag(s * RSC * CI / (1.0 + s * B) * np.exp(s * time))
+    else:
+        half = 0.5 / frequency
+        sign = np.where(time // half % 2 == 0, 1.0, -1.0)
+        vsc = 360.0 * G * sign * np.exp(-(time % half) / B) / (1.0 + np.exp(-half / B))
+    return fitact.Record.from_arrays(time, Vsc=vsc + 0.1 * np.random.default_rng(0).standard_normal(time.size))
+
+
+def fitted(waveform: str, off: float, periods: int, per_period: int) -> fitact.Fit:
+    scene = fitact.Scene.from_dict({"drive": {"waveform": waveform}})
+    return fitact.fit(record(waveform, 100.0 * (1.0 + off), periods, per_period), scene)
+
+
+@pytest.mark.parametrize(
+    ("waveform", "off", "periods", "per_period"),
+    [
+        pytest.param("sine", 1e-5, 50, 400, marks=pytest.mark.slow),
+        pytest.param("square", 3e-5, 50, 400, marks=pytest.mark.thorough),  # no edge has passed a sample
+        pytest.param("square", 3e-4, 5, 2000, marks=pytest.mark.thorough),  # edges have
+        pytest.param("square", 5e-4, 2, 25_000, marks=pytest.mark.thorough),  # by many
+    ],
+)
+def test_a_clock_is_found(waveform: str, off: float, periods: int, per_period: int):
+    """A hundred-thousandth, unnoticed over 50 periods, biases b (sine) or g (square) by 13 standard errors or more."""
+    fit = fitted(waveform, off, periods, per_period)
+    assert fit.result == "successful"
+    clock = fit.parameters()["clock"]
+    frequency = float(fit.likelihood.channels[0].drive.frequency) * (1.0 + clock["q50"])
+    assert abs(frequency / 100.0 - 1.0 - off) < 4.0 * clock["sd"]
+    for name, truth in (("g", G), ("b", B)):
+        assert abs(fit.derived()[name]["q50"] - truth) < 4.0 * fit.derived()[name]["sd"]
+
+
+def test_no_clock_where_there_is_none():
+    fit = fitted("square", 0.0, 50, 400)
+    assert fit.trusted
+    assert fit.names == ("Rsc", "Csc", "Ci")
+
+
+@pytest.mark.parametrize("periods", [2, 5])
+@pytest.mark.parametrize("samples", [10_000, 50_000, pytest.param(400_000, marks=pytest.mark.slow)])
+def test_a_fine_record_is_not_of_another_frequency(samples: int, periods: int):
+    """The correlation that shows the frequency peaks beside the period, by many of its small steps."""
+    found = record("square", 100.0, periods, samples // periods)
+    with jax.enable_x64(True):
+        choice = choose_drive(found, fitact.Scene.from_dict({"drive": {"waveform": "square"}}))
+    assert float(choice.drive.frequency) == 100.0
+    assert choice.notes == ()
+
+
+@pytest.mark.thorough
+def test_a_clock_is_sampled():
+    fit = fitted("sine", 1e-5, 50, 400)
+    posterior = fitact.sample(fit, seed=0, progress=False)
+    assert posterior.trusted
+    clock = posterior.parameters()["clock"]
+    assert np.std(clock) == pytest.approx(fit.parameters()["clock"]["sd"], rel=0.1)
+    low, high = (fit.profile("clock").low, fit.profile("clock").high)
+    np.testing.assert_allclose(np.quantile(clock, [0.025, 0.975]), [low, high], atol=0.2 * np.std(clock))

@@ -1,0 +1,398 @@
+"""Populations: against scipy's densities and quadrature, laws in closed form, NUTS, and ngspice's eight fingers."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.special
+import scipy.stats
+from arviz_stats.base import array_stats
+
+import fitact
+from fitact.populations.covariates import Covariates, read_covariates
+from fitact.populations.finger import Finger
+from fitact.populations.finger_likelihoods import FingerLikelihoods, PopulationParameters
+from fitact.populations.hierarchy import Hierarchy
+from fitact.populations.next_finger import FACTORS, NewFingerModel, VarianceDecomposition
+from fitact.populations.sobol import Surrogate, sobol_indices, variance_shares
+from fitact.prior.prior import Prior
+from tests.population_calibration import FREQUENCY, simulate, steady, vsc, wave
+
+NUTS_CHAINS, NUTS_STEPS = 4, 3000
+FINGERS = Path(__file__).parents[2] / "data_synth" / "records" / "fingers"
+SCALES = {"Rsc": (11.8, 0.4), "Csc": (-17.7, 0.5), "Ci": (-20.4, 0.1)}  # of logarithms: mean, standard deviation
+PRIOR = Prior.of(**{name: fitact.LogNormal(float(np.exp(mean)), sd) for name, (mean, sd) in SCALES.items()})
+
+
+def known(skins: np.ndarray, log_Ci: np.ndarray, precision: float) -> FingerLikelihoods:
+    """Fingers whose Rsc and Csc are known, and whose Ci is normal with that precision."""
+    count, one, reach = len(skins), np.ones((len(skins), 1)), 0.5
+    deviate = np.random.default_rng(0).standard_normal((count, 4))
+    # -precision x^2 / 2 with x = reach t and t^2 = (T_0 + T_2) / 2, over the deviates' density
+    series = -0.25 * precision * reach**2 * np.array([1.0, 0.0, 1.0]) + np.zeros((count, 4, 1))
+    series[..., 0] += 0.5 * deviate**2
+    skin = np.repeat(skins[:, None], 4, axis=1)
+    parts = (skin, np.zeros((count, 1, 2)), log_Ci[:, None], reach * one, series, precision * one, 0.0 * one, deviate)
+    parts += (0.5 * deviate**2, skins, np.zeros((count, 2, 2)))
+    return FingerLikelihoods(*map(jnp.asarray, parts))
+
+
+@pytest.mark.parametrize(("varies", "known_of_each"), [(False, 0), (True, 0), (False, 2)])
+def test_log_posterior_of_known_fingers_is_scipys(varies: bool, known_of_each: int):
+    """Of Rsc and Csc; of Ci too where each finger's area scales all three; and with covariates."""
+    rng = np.random.default_rng(1)
+    with jax.enable_x64(True):
+        skins = rng.normal([11.8, -17.7], 0.3, (5, 2))
+        log_Ci = -20.4 + (0.2 * rng.standard_normal(5) if varies else np.zeros(5))
+        covariates = Covariates.from_values(
+            {f"x{i}": rng.uniform(3.0, 7.0, 5) for i in range(known_of_each)}, 5
+        ).z_scores
+        fingers = known(skins, log_Ci, 1e10 if varies else 0.0)
+        hierarchy = Hierarchy(fingers, PRIOR, varies, jnp.asarray(covariates))
+
+        def natural(point: jax.Array) -> jax.Array:
+            law = hierarchy.population_parameters(point)
+            slopes = jnp.ravel(law.slopes) if known_of_each else []
+            area = [law.area] if varies else []
+            return jnp.array([*law.median, law.log_Ci, *law.log_sd, law.correlation, *area, *slopes])
+
+        def expected(values: np.ndarray) -> float:
+            """The stated densities."""
+            mean, sd, r, area = values[:3], values[3:5], values[5], values[6] if varies else 0.0
+            slopes = values[6 + varies :].reshape(-1, 2)
+            covariance = area**2 * np.outer([-1.0, 1.0, 1.0], [-1.0, 1.0, 1.0])
+            covariance[:2, :2] += np.outer(sd, sd) * [[1.0, r], [r, 1.0]]
+            seen = slice(3 if varies else 2)
+            of_fingers = scipy.stats.multivariate_normal(mean[seen], covariance[seen, seen])
+            at_mean = np.column_stack([skins - covariates @ slopes, log_Ci])
+            spreads = [*sd, area] if varies else sd
+            return (
+                np.sum(of_fingers.logpdf(at_mean[:, seen]))
+                + np.sum(scipy.stats.norm(*np.transpose(list(SCALES.values()))).logpdf(mean))
+                + np.sum(scipy.stats.norm(scale=0.5).logpdf(slopes))
+                + np.sum(scipy.stats.halfnorm(scale=0.5).logpdf(spreads))
+                + scipy.stats.beta(2.0, 2.0, loc=-1.0, scale=2.0).logpdf(r)
+            )
+
+        far = np.array([2.0, 2.0, 0.1, 0.3, 0.3, 0.5, *[0.3] * varies, *[2.0] * (2 * known_of_each)])
+        points = hierarchy.start() + far * rng.standard_normal((6, far.size))
+        each = jax.jit(jax.vmap(lambda x: (hierarchy.log_prob(x), natural(x), jax.jacfwd(natural)(x))))
+        found, at, jacobian = map(np.asarray, each(points))
+    volume = np.linalg.slogdet(jacobian)[1]
+    difference = found - volume - [expected(values) for values in at]
+    assert np.ptp(found) > 3.0
+    np.testing.assert_allclose(difference, difference[0], atol=2e-3 if varies else 1e-9)
+
+
+@pytest.mark.thorough
+def test_integral_over_a_finger_is_that_of_quadrature():
+    """A finger from scipy's state space, so noisy that it is known no better than fingers differ; noise integrated."""
+    noise = 8.0
+    simulated = simulate(5, 0, fingers=1, noise=noise)
+    record, scene = simulated.records[0], simulated.scene
+    fit = fitact.fit(record, scene)
+    assert fit.names == ("Rsc", "Csc", "Ci")
+    assert not fit.linear
+    log_Ci = np.log(simulated.truth["Ci"]) + np.array([-0.1, 0.1, 0.1, 0.1])
+    spreads = np.array([[0.1, 0.1], [0.1, 0.3], [0.3, 0.2], [0.05, 0.05]])
+    correlations = np.array([0.0, 0.5, -0.8, 0.3])
+    medians = fit.theta[:2] + np.array([[0.2, -0.3], [0.0, 0.1], [-0.3, 0.4], [0.1, 0.1]])
+
+    g_0, b_0 = (float(fit.derived()[name]["q50"]) for name in ("g", "b"))
+    g = g_0 * np.exp(np.linspace(-1.0, 0.9, 400))
+    g = g[g < 0.5]
+    b = b_0 * np.exp(np.linspace(-1.5, 1.5, 161))
+    units = [np.tile(steady("triangle", FREQUENCY, wave("triangle", np.random.default_rng()), 1.0, x), 2) for x in b]
+    y, u = record["Vsc"], np.array(units)
+    left = y @ y - 2.0 * g[:, None] * (u @ y) + np.square(g)[:, None] * np.sum(u**2, axis=1)
+    log_likelihood = -0.5 * y.size * np.log(left / np.min(left))
+
+    with jax.enable_x64(True):
+        finger = Finger.from_fit(fit)
+        prior = scene.make_prior()["Ci"]
+        tables = FingerLikelihoods.from_fingers([finger], prior, area_varies=False, draws=2**14, terms=9, seed=[1])
+        law = PopulationParameters(*map(jnp.asarray, (medians, spreads, correlations, log_Ci)))
+        found = jax.jit(jax.vmap(tables.log_likelihood))(law)[:, 0]
+    expected = []
+    for median, sd, r, c in zip(medians, spreads, correlations, log_Ci, strict=True):
+        skin = np.broadcast_arrays(np.log(g)[:, None] + np.log(b) - c, np.log(1.0 / g - 2.0)[:, None] + c)
+        covariance = np.outer(sd, sd) * np.array([[1.0, r], [r, 1.0]])
+        density = scipy.stats.multivariate_normal(median, covariance).logpdf(np.stack(skin, axis=-1))
+        # d(log Rsc, log Csc) = d(log g, log b) / (1 - 2 g)
+        expected.append(scipy.special.logsumexp(log_likelihood + density - np.log(1.0 - 2.0 * g)[:, None]))
+    assert np.ptp(expected) > 1.0
+    np.testing.assert_allclose(np.diff(found), np.diff(expected), atol=0.05)
+
+
+@pytest.mark.slow
+def test_force_of_a_new_finger_is_that_of_scipys_response():
+    """Mean, and amplitudes at f and 2 f, of a finger with its own area and thicknesses: eqs. (2), (3), (4) and (22)."""
+    simulated = simulate(5, 0, fingers=1)
+    finger = NewFingerModel.from_fit(fitact.fit(simulated.records[0], simulated.scene), FACTORS)
+    Rsc, Csc, Ci, area, skin, insulator = 150e3, 18e-9, 1.2e-9, 1.4, 1.2, 0.7
+    found = dict(zip(finger.names, finger.evaluate(np.log([[Rsc, Csc, Ci, area, skin, insulator]]))[0], strict=True))
+    Csc, Ci = area * Csc, area * Ci / insulator
+    voltage = vsc(Rsc / area, Csc, Ci, np.random.default_rng())
+    force = voltage**2 * (Ci * Csc / (Ci + Csc)) / (2.0 * (200e-6 * skin + 1e-6 * insulator))
+    tones = 2.0 * np.abs(np.fft.rfft(force)) / force.size
+    assert found["Rsc"] == pytest.approx(Rsc / area)
+    assert found["Csc"] == pytest.approx(Csc)
+    assert found["force_mean"] == pytest.approx(np.mean(force), rel=1e-4)
+    assert found["force_at_2f"] == pytest.approx(tones[2], rel=1e-4)
+    assert found["friction_at_2f"] == pytest.approx(0.5 * tones[2], rel=1e-4)
+    assert found["force_at_f"] == pytest.approx(0.0, abs=1e-9 * tones[2])
+    time, traced = finger.force_in_time(np.log([[150e3, 18e-9, 1.2e-9, area, skin, insulator]]), force.size)
+    assert time[-1] == pytest.approx((1.0 - 1.0 / force.size) / FREQUENCY)
+    np.testing.assert_allclose(traced[0], force, rtol=1e-9, atol=1e-9 * np.max(force))
+
+
+def test_spread_of_the_next_finger_is_people_and_ignorance():
+    """Of means with a variance of 4, and fingers with one of 9 about them."""
+    rng = np.random.default_rng(2)
+    spread = VarianceDecomposition.from_draws(
+        2.0 * rng.standard_normal((20_000, 1)) + 3.0 * rng.standard_normal((20_000, 8))
+    )
+    assert spread.between_finger == pytest.approx(
+        9.0, rel=0.02
+    )  # four standard errors, sqrt(2 / 140,000) and sqrt(2 / 20,000)
+    assert spread.parameter_uncertainty == pytest.approx(4.0, rel=0.05)
+
+
+def test_variance_shares_of_correlated_factors_are_those_of_the_closed_form():
+    """y = x . slope of normal x: first (cov(x_i, y))^2 / var(x_i), total slope_i^2 var(x_i | others), over var(y)."""
+    slope = np.array([1.0, -2.0, 0.5])
+    covariance = np.array([[1.0, 0.6, 0.0], [0.6, 0.8, -0.2], [0.0, -0.2, 0.5]])
+    white = np.random.default_rng(3).standard_normal((4000, 3))
+    white = (white - white.mean(axis=0)) @ np.linalg.inv(np.linalg.cholesky(np.cov(white.T))).T
+    factors = white @ np.linalg.cholesky(covariance).T
+    found = sobol_indices(lambda x: (x @ slope)[:, None], FACTORS[:3], factors, ("force_mean",), seed=0)["force_mean"]
+    variance = slope @ covariance @ slope
+    for i, name in enumerate(FACTORS[:3]):
+        first = (covariance[i] @ slope) ** 2 / covariance[i, i] / variance
+        total = slope[i] ** 2 / np.linalg.inv(covariance)[i, i] / variance
+        assert found[name]["first"] == pytest.approx(first, abs=2.0 * found[name]["first_error"])  # 95 % each
+        assert found[name]["total"] == pytest.approx(total, abs=2.0 * found[name]["total_error"])
+        assert found[name]["interaction"] == pytest.approx(0.0, abs=2.0 * found[name]["interaction_error"])
+        assert found[name]["first_error"] < 0.1
+
+
+@dataclasses.dataclass
+class Known:
+    """A finger of one quantity; counts how often it is asked."""
+
+    quantity: Callable[[np.ndarray], np.ndarray]
+    factors: tuple[str, ...]
+    names: tuple[str, ...] = ("force_mean",)
+    evaluations: int = 0
+
+    def evaluate(self, factors: np.ndarray) -> np.ndarray:
+        self.evaluations += len(factors)
+        return self.quantity(factors)[:, None]
+
+
+def test_variance_shares_of_a_product_are_those_of_the_closed_form():
+    """y = exp(x . slope), x independent, s = slope sd: first (e^(s_i^2) - 1) over e^(sum s^2) - 1, total likewise."""
+    s = np.array([0.3, 0.5, 0.4])
+    factors = np.random.default_rng(4).standard_normal((4000, 3))
+    factors = (factors - factors.mean(axis=0)) @ np.linalg.inv(np.linalg.cholesky(np.cov(factors.T))).T
+    finger = Known(lambda x: np.exp(x @ s), FACTORS[:3])
+    found = variance_shares(finger, factors, finger.names, seed=0)["force_mean"]
+    assert finger.evaluations <= 4096 * 3 * 5 // 100
+    whole = np.expm1(s @ s)
+    for name, square in zip(FACTORS[:3], s**2, strict=True):
+        first, total = np.expm1(square) / whole, np.expm1(square) * np.exp(s @ s - square) / whole
+        for key, value in {"first": first, "total": total, "interaction": total - first}.items():
+            assert found[name][key] == pytest.approx(value, abs=2.0 * found[name][f"{key}_error"])
+            assert found[name][f"{key}_error"] < 0.12
+
+
+def test_a_surrogate_that_is_off_says_by_how_much():
+    """Of a quantity with a kink, which no polynomial has: the correlation at 100,000 other points."""
+    finger = Known(lambda x: np.exp(np.abs(x[:, 0] - 0.5) + 0.3 * x[:, 1]), FACTORS[:2])
+    surrogate = Surrogate.from_model(finger, np.random.default_rng(5).standard_normal((4000, 2)), finger.names)
+    points = surrogate.mean + np.random.default_rng(6).standard_normal((100_000, 2)) @ surrogate.covariance_factor.T
+    r = np.corrcoef(finger.evaluate(points)[:, 0], surrogate.predict(points)[:, 0])[0, 1]
+    assert np.sqrt(1.0 - r**2) > 0.05
+    assert surrogate.cross_validation_error[0] == pytest.approx(np.sqrt(1.0 - r**2), rel=0.5)
+
+
+def test_what_makes_no_population_is_refused():
+    simulated = simulate(1, 0, fingers=3)
+    first, *others = simulated.records
+    with pytest.raises(fitact.InputError, match="two or more fingers"):
+        fitact.population([first])
+    with pytest.raises(fitact.InputError, match=r"finger 0 .* same record as finger 0"):
+        fitact.population([first, first])
+    held = fitact.Scene.from_dict({"prior": {"Ci": {"fixed": True}}})
+    with pytest.raises(fitact.InputError, match="holds or ties"):
+        fitact.population([first, *others], held)
+    correlated = {"R_H": {"median": "500 ohm", "factor": 2}, "correlation": {"R_H-Csc": 0.5}}
+    with pytest.raises(fitact.InputError, match="with others"):
+        fitact.population([first, *others], fitact.Scene.from_dict({"prior": correlated, "grounding": {"R_H": 500.0}}))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("file,moisture\na.csv,1\n", "needs a column 'record'"),
+        ("record,moisture\na.csv,1\n", "no row for b.csv"),
+        ("record,moisture\na.csv,1\nb.csv,dry\n", "moisture of b.csv is 'dry'"),
+        ("record,moisture\na.csv,1\nb.csv,2\na.csv,1\n", "line 4: a.csv has a row already"),
+    ],
+)
+def test_covariates_that_cannot_be_used_are_refused(tmp_path, text: str, said: str):
+    path = tmp_path / "people.csv"
+    path.write_text(text)
+    with pytest.raises(fitact.InputError, match=said):
+        read_covariates(path, [Path("a.csv"), Path("b.csv")])
+
+
+def test_covariates_are_those_of_the_records_in_their_order(tmp_path):
+    path = tmp_path / "people.csv"
+    path.write_text("record,moisture,age\nb.csv,0.5,30\nc.csv,9,9\na.csv,0.1,50\n")
+    found = read_covariates(path, [Path("x/a.csv"), Path("b.csv")])
+    assert found == {"moisture": [0.1, 0.5], "age": [50.0, 30.0]}
+    for values, said in (
+        ({"moisture": [1.0, 2.0]}, "2 values for 3 records"),
+        ({"moisture": [2.0, 2.0, 2.0]}, "same value"),
+        ({"a": [1.0, 2.0, 4.0], "b": [2.0, 4.0, 8.0]}, "one follows from the others"),
+    ):
+        with pytest.raises(fitact.InputError, match=said):
+            Covariates.from_values(values, 3)
+    known = Covariates.from_values({"moisture": [1.0, 2.0, 3.0]}, 3)
+    assert known.standardize({"moisture": 3.0}) == pytest.approx(np.sqrt(1.5))
+    with pytest.raises(fitact.InputError, match="not among those of the records"):
+        known.standardize({"age": 3.0})
+
+
+def test_refused_records_are_named(tmp_path):
+    simulated = simulate(1, 0, fingers=3)
+    swapped = [dataclasses.replace(r, channels={"V": r["Vsc"], "Vsc": r["V"]}) for r in simulated.records]
+    with pytest.raises(fitact.InputError, match=r"^finger 0.*also refused: finger 2 of population 0$"):
+        fitact.population([swapped[0], simulated.records[1], swapped[2]], simulated.scene)
+
+
+def nuts(fits: list[fitact.Fit], prior: Prior) -> dict[str, np.ndarray]:
+    """Draws of the law by blackjax, with all that is the fingers' own sampled along, not integrated out."""
+    import blackjax
+
+    count = len(fits)
+    arrays, (static, *_) = zip(
+        *(eqx.partition(fit.likelihood.without_compression(), eqx.is_array) for fit in fits), strict=True
+    )
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *arrays)
+
+    def log_prob(x: dict[str, jax.Array]) -> jax.Array:
+        sd, r, logpdf = jnp.exp(x["log_sd"]), jnp.tanh(x["atanh_r"]), jax.scipy.stats.norm.logpdf
+        points = jnp.column_stack([x["skin"], jnp.full(count, x["log_Ci"]), x["log_sigma"]])
+        each = jax.vmap(lambda finger, point: eqx.combine(finger, static).log_likelihood(point))(stacked, points)
+        first, second = ((x["skin"] - x["median"]) / sd).T
+        of_fingers = logpdf(first) + logpdf(second, r * first, jnp.sqrt(1.0 - r**2)) - jnp.sum(x["log_sd"])
+        law = logpdf(jnp.append(x["median"], x["log_Ci"]), prior.log_mean, prior.log_sd).sum()
+        law += jnp.sum(x["log_sd"] - 0.5 * (sd / 0.5) ** 2) + 2.0 * jnp.log1p(-(r**2))
+        return jnp.sum(each) + jnp.sum(of_fingers) + law
+
+    skin = np.array([fit.theta[:2] for fit in fits])
+    start = {"median": skin.mean(axis=0), "log_sd": np.log(skin.std(axis=0) + 0.1), "log_Ci": prior.log_mean[2]}
+    start |= {"skin": skin, "atanh_r": 0.0, "log_sigma": np.log([fit.sigma for fit in fits])}
+    start = jax.tree.map(jnp.asarray, start)
+    keys = jax.random.split(jax.random.key(0), NUTS_CHAINS)
+
+    def chain(key: jax.Array) -> dict[str, jax.Array]:
+        warm = blackjax.window_adaptation(blackjax.nuts, log_prob, is_mass_matrix_diagonal=False)
+        (state, parameters), _ = warm.run(key, start, 1500)
+        step = blackjax.nuts(log_prob, **parameters).step
+
+        def one(state, key):
+            state, _ = step(key, state)
+            return state, state.position
+
+        return jax.lax.scan(one, state, jax.random.split(key, NUTS_STEPS))[1]
+
+    drawn = jax.tree.map(np.asarray, jax.jit(jax.vmap(chain))(keys))
+    found = {"log_Ci": drawn["log_Ci"], "atanh_r": drawn["atanh_r"]}
+    for i, name in enumerate(("Rsc", "Csc")):
+        found |= {f"log_{name}": drawn["median"][..., i], f"log_sd_{name}": drawn["log_sd"][..., i]}
+    return found
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("count", [3, 6])
+def test_law_is_that_of_nuts_over_all_parameters(count: int):
+    """Of fingers known no better than they differ; within four standard errors of means, and 5 % in width."""
+    simulated = simulate(5, 1, fingers=count, noise=4.0)
+    found = fitact.population(simulated.records, simulated.scene, seed=1, progress=False)
+    assert found.trusted
+    draws = found.parameters()
+    seen = {f"log_{name}": np.log(draws[name]) for name in ("Rsc", "Csc", "Ci")}
+    seen |= {f"log_sd_{name}": np.log(draws[f"log_sd_{name}"]) for name in ("Rsc", "Csc")}
+    seen |= {"atanh_r": np.arctanh(draws["correlation"])}
+    with jax.enable_x64(True):
+        expected = nuts([fitact.fit(each, simulated.scene) for each in simulated.records], found.hierarchy.prior)
+    for name, reference in expected.items():
+        assert array_stats.rhat(reference, chain_axis=0, draw_axis=1) < 1.01, name
+        effective = float(array_stats.ess(reference, chain_axis=0, draw_axis=1))
+        error = np.std(reference) * np.sqrt(1.0 / effective + 1.0 / found.convergence.ess_min)
+        shift, wider = np.mean(seen[name]) - np.mean(reference), np.std(seen[name]) / np.std(reference) - 1.0
+        off = shift / np.std(reference)
+        print(f"{count} fingers, {name}: off by {off:+.3f} sd, {wider:+.1%} wider, {effective:,.0f} effective draws")
+        assert abs(shift) < 4.0 * error + found.off * np.std(reference), name
+        assert wider == pytest.approx(0.0, abs=0.05), name
+
+
+@pytest.mark.thorough
+def test_a_misfit_is_named_and_the_population_stays_trusted():
+    simulated = simulate(1, 0, fingers=4)
+    first, *others = simulated.records
+    bent = dataclasses.replace(first, channels={**first.channels, "Vsc": first["Vsc"] + 0.005 * first["Vsc"] ** 2})
+    found = fitact.population([bent, *others], simulated.scene, seed=1, progress=False)
+    assert [finger.result for finger in found.fingers] == ["misfit", *["successful"] * 3]
+    assert [warning.partition(":")[0] for warning in found.warnings] == ["finger 0 of population 0"]
+    assert found.trusted
+
+
+@pytest.fixture(scope="module")
+def eight(tmp_path_factory) -> dict:
+    """What the command prints for ngspice's eight fingers, with V, Vsc and I."""
+    folder = tmp_path_factory.mktemp("population")
+    scene = folder / "scene.toml"
+    scene.write_text(
+        '[device]\nCi = "1.35 nF"\n[drive]\nwaveform = "trapezoid"\nrise_time = "50 us"\n'
+        '[measurement]\nchannels = ["Vsc", "I"]\n[prior]\nCi = {relative_sd = 0.1}\n'
+    )
+    command = [sys.executable, "-c", "from fitact.cli import main; main()", "population"]
+    command += [*map(str, sorted(FINGERS.glob("*.csv.gz"))), "--scene", str(scene), "--seed", "1", "--json"]
+    done = subprocess.run([*command, "--out", str(folder / "out")], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in (folder / "out").iterdir()} == {
+        "population.json",
+        "population.nc",
+        "population.svg",
+        "report.html",
+        "chain.h5",
+    }
+    assert json.loads((folder / "out" / "population.json").read_text()) == json.loads(done.stdout)
+    return json.loads(done.stdout)
+
+
+@pytest.mark.thorough
+def test_eight_fingers_and_their_panel(eight):
+    truth = json.loads((FINGERS / "truth.json").read_text())
+    for name in ("Rsc", "Csc"):
+        logs = np.log([finger[name] for finger in truth])
+        law = eight["population"][name]
+        assert law["median"]["q025"] < np.exp(np.mean(logs)) < law["median"]["q975"]
+        assert law["log_sd"]["q025"] < np.std(logs, ddof=1) < law["log_sd"]["q975"]
+    assert eight["population"]["Ci"]["mean"] == pytest.approx(1.42e-9, rel=5e-3)
+    assert eight["population"]["Ci"]["sd"] < 1e-5 * 1.42e-9
+    assert set(eight["variance_shares"]["force_mean"]) == {"Rsc", "Csc", "Ci"}
+    assert set(eight["new_finger"]["force_mean"]["variance"]) == {"people", "ignorance"}
+    assert eight["warnings"] == []

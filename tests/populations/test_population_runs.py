@@ -1,0 +1,140 @@
+"""Runs of populations as labs make them: interrupted and resumed, long records, areas that vary, covariates."""
+
+import weakref
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fitact
+from tests.calibration import AMPLITUDE, PER_PERIOD, wave
+from tests.population_calibration import FREQUENCY, NOISE, simulate, vsc
+
+SEED = 3
+
+
+@pytest.fixture(scope="module")
+def few() -> Any:
+    return simulate(SEED, 0, fingers=6)
+
+
+@pytest.mark.thorough
+def test_a_population_goes_on_where_it_stopped(few, tmp_path):
+    """To the draws of an undisturbed run; a chain of another seed is refused."""
+    undisturbed = fitact.population(few.records, few.scene, seed=1, progress=False)
+    stopped = fitact.population(few.records, few.scene, seed=1, folder=tmp_path, max_steps=30, progress=False)
+    assert not stopped.trusted
+    again = fitact.population(few.records, few.scene, seed=1, folder=tmp_path, progress=False)
+    assert again.trusted
+    np.testing.assert_array_equal(again.points, undisturbed.points)
+    with pytest.raises(fitact.InputError, match="belongs to another"):
+        fitact.population(few.records, few.scene, seed=2, folder=tmp_path, progress=False)
+
+
+class Counted(Sequence[fitact.Record]):
+    """Records made when they are asked for, `times` their samples; how many of them are held at once."""
+
+    def __init__(self, records: Sequence[fitact.Record], times: int) -> None:
+        self._records, self._times = records, times
+        self._made: list[weakref.ref[fitact.Record]] = []
+        self.most = 0
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    def __getitem__(self, index: Any) -> Any:
+        short = self._records[index]
+        channels = {name: np.tile(short[name], self._times) for name in short.channels}
+        rng = np.random.default_rng(index)
+        channels["Vsc"] = channels["Vsc"] + 0.3 * rng.standard_normal(channels["Vsc"].size)
+        time = np.arange(channels["V"].size) * (short.time[1] - short.time[0])
+        record = fitact.Record.from_arrays(time, **channels, source=short.source)
+        self._made.append(weakref.ref(record))
+        self.most = max(self.most, sum(each() is not None for each in self._made))
+        return record
+
+
+@pytest.mark.thorough
+def test_records_are_not_held(few):
+    """Two at most, the one at hand and the one before; and none of what is left has as many numbers as a record."""
+    records = Counted(simulate(SEED, 0, fingers=6, noise=0.0).records, 10)
+    found = fitact.population(records, few.scene, seed=1, progress=False)
+    assert records.most <= 2
+    sizes = [array.size for finger in found.fingers for array in arrays_of(finger.likelihood)]
+    assert max(sizes) < 1000 < len(records[0])
+
+
+def arrays_of(tree: Any) -> list[np.ndarray]:
+    import jax
+
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+
+
+@pytest.mark.thorough
+def test_slopes_of_a_covariate_and_fingers_at_one_are_covered():
+    """Log Rsc falls by 0.15 and log Csc rises by 0.05 with each unit of moisture; and stays easy to sample."""
+    rng = np.random.default_rng(11)
+    moisture, slopes, spread = rng.uniform(2.0, 8.0, 30), np.array([-0.15, 0.05]), np.array([0.15, 0.2])
+    skins = np.log([130e3, 20e-9]) + (moisture - 5.0)[:, None] * slopes + spread * rng.standard_normal((30, 2))
+    scene = simulate(SEED, 0, fingers=2).scene
+    records = [record(np.exp(skin), 1.35e-9, i, rng) for i, skin in enumerate(skins)]
+    found = fitact.population(
+        records, scene, covariates={"moisture": moisture}, at={"moisture": 8.0}, seed=1, progress=False
+    )
+    assert found.trusted
+    assert found.convergence.tau_max < 6.0
+    draws, new = found.parameters(), found.new_fingers()
+    for name, slope, sd in zip(("Rsc", "Csc"), slopes, spread, strict=True):
+        low, high = np.quantile(draws[f"slope_{name}_moisture"], [0.005, 0.995])
+        assert low < slope < high
+        assert high - low < 0.15
+        low, high = np.quantile(draws[f"log_sd_{name}"], [0.005, 0.995])
+        assert low < sd < high  # what moisture makes is not in it
+    expected = np.log(130e3) - 0.45
+    assert np.mean(np.log(new["Rsc"])) == pytest.approx(expected, abs=0.25)  # 0.45 less than at the mean
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("channels", [("I",), ("Vsc", "I")])
+def test_areas_are_seen_by_the_current(channels: tuple[str, ...]):
+    """Ten fingers whose areas differ by a factor of two and more: their spread and Ci, each within its 99 %."""
+    rng = np.random.default_rng(12)
+    spread, area_sd, Ci = np.array([0.15, 0.25]), 0.7, 1.35e-9
+    areas = np.exp(area_sd * rng.standard_normal(10))
+    skins = np.exp(np.log([130e3, 20e-9]) + spread * rng.standard_normal((10, 2)))
+    records = [
+        record(skin * [1.0 / area, area], area * Ci, i, rng, current=True)
+        for i, (skin, area) in enumerate(zip(skins, areas, strict=True))
+    ]
+    few = simulate(SEED, 0, fingers=2)
+    scene = few.scene.model_dump(exclude_unset=True) | {
+        "measurement": {"channels": channels},
+        "population": {"contact_area": "varies"},
+    }
+    found = fitact.population(records, fitact.Scene.from_dict(scene), seed=1, progress=False)
+    assert found.trusted
+    draws = found.parameters()
+    known = {"log_sd_area": area_sd, "log_sd_Rsc": spread[0], "log_sd_Csc": spread[1], "Ci": Ci}
+    for name, value in known.items():
+        low, high = np.quantile(draws[name], [0.005, 0.995])
+        assert low < value < high, name
+    low, high = np.quantile(draws["log_sd_area"], [0.025, 0.975])
+    assert high / low < 3.5  # ten fingers of known area: chi-square's 95 % are a factor of 2.7 apart
+
+
+def record(skin: np.ndarray, Ci: float, number: int, rng: np.random.Generator, current: bool = False) -> fitact.Record:
+    """Two settled periods of a triangle; I = Vsc / Rsc + Csc dVsc/dt, with b Vsc' = a V' - Vsc."""
+    settled = vsc(*skin, Ci, rng)
+    channels = {"Vsc": np.tile(settled, 2) + NOISE * rng.standard_normal(2 * PER_PERIOD)}
+    if current:
+        (Rsc, Csc), phase = skin, np.arange(PER_PERIOD) / PER_PERIOD
+        slope = 4.0 * AMPLITUDE * FREQUENCY * np.where((phase < 0.25) | (phase >= 0.75), 1.0, -1.0)
+        flow = settled / Rsc + Csc * (Rsc * Ci * slope - settled) / (Rsc * (2.0 * Ci + Csc))
+        channels["I"] = np.tile(flow, 2) + 1e-6 * rng.standard_normal(2 * PER_PERIOD)
+    return fitact.Record.from_arrays(
+        np.arange(2 * PER_PERIOD) / (PER_PERIOD * FREQUENCY),
+        V=np.tile(wave("triangle", rng), 2),
+        **channels,
+        source=f"finger {number}",
+    )

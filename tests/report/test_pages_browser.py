@@ -1,0 +1,46 @@
+"""The pages of test_pages.py in a real Chromium, as test_browser.py has the report."""
+
+import itertools
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("selenium.webdriver", reason="selenium is not installed (pip install fitact[test])")
+from tests.report.test_browser import CONTRASTS, Browser, browser, pytestmark
+from tests.report.test_pages import WRITE
+
+__all__ = ["browser"]  # a fixture
+pytestmark = [pytestmark, pytest.mark.slow]
+CHARTS = {"plan": 0, "tradeoff": 3, "measurement": 1, "drive": 2, "population": 2}
+
+
+@pytest.fixture(params=WRITE)
+def page(request, tmp_path: Path) -> Path:
+    path = tmp_path / f"{request.param}.html"
+    WRITE[request.param](path, True)
+    return path
+
+
+def test_it_opens_alone_draws_its_charts_and_fits_its_window(browser: Browser, page: Path):
+    browser.open(page, 400)
+    browser.whole()
+    assert len(browser.all("figure.live")) == CHARTS[page.stem]
+    assert browser.ask("document.documentElement.scrollWidth") == 400
+    for button in browser.all(".live button[aria-pressed]"):
+        before = button.get_attribute("aria-pressed")
+        button.click()
+        assert button.get_attribute("aria-pressed") != before
+    browser.check_alone(page)
+
+
+def test_it_reads_aloud_and_is_legible(browser: Browser, page: Path):
+    browser.open(page)
+    browser.whole()
+    assert all(button.accessible_name for button in browser.all("button"))
+    levels = [int(heading.tag_name[1]) for heading in browser.all("h1, h2, h3, h4")]
+    assert levels[0] == 1
+    assert levels.count(1) == 1
+    assert all(after - before <= 1 for before, after in itertools.pairwise(levels))
+    contrasts = browser.ask(CONTRASTS)
+    assert len(contrasts) > 30
+    assert [each for each in contrasts if each[1] < 4.5] == []

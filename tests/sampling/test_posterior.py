@@ -1,0 +1,139 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import fitact
+from fitact.files import to_json
+from fitact.summary import format_sd, summarize_log_normal
+
+
+@pytest.fixture(scope="module")
+def netcdf(finger_posterior: fitact.Posterior, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("posterior") / "posterior.nc"
+    finger_posterior.to_netcdf(path)
+    return path
+
+
+def test_force_of_a_draw_by_hand(finger_posterior: fitact.Posterior):
+    """Eq. (22) with eps_i = Ci Ti / (eps0 A), eps_sc = Csc Tsc / (eps0 A), on Vsc that scipy would give."""
+    fit = finger_posterior.fit
+    draws, force = finger_posterior.parameters(), finger_posterior.force()
+    record = fit.record
+    for draw in (0, 1000):
+        Rsc, Csc, Ci, charge = (draws[name][1, draw] for name in ("Rsc", "Csc", "Ci", "charge"))
+        with jax.enable_x64(True):
+            vsc = fitact.response(fitact.FinalCircuit(Rsc, Csc, Ci), fit.choice.drive, record.time, steady_state=False)
+        vsc = np.asarray(vsc) + charge * np.exp(-record.time / (Rsc * (2.0 * Ci + Csc)))
+        fe = vsc**2 / (2.0 * (1.0 / Ci + 1.0 / Csc) * (1e-6 + 200e-6))
+        assert force["force_mean"][1, draw] == pytest.approx(fe.mean(), rel=1e-6)
+        assert force["force_rms"][1, draw] == pytest.approx(np.sqrt(np.mean(fe**2)), rel=1e-6)
+        assert force["force_peak"][1, draw] == pytest.approx(fe.max(), rel=1e-9)
+        assert force["friction_mean"][1, draw] == pytest.approx(0.5 * (fe.mean() + 0.5), rel=1e-9)
+
+
+def test_scene_drives_force_is_that_of_one_steady_period():
+    """Mean square of Vsc for a square wave: 4 V0^2 g^2 tanh(x/4) / x, x = T / b."""
+    from fitact.fitting.derived import DERIVED_NAMES
+    from tests.conftest import square_record
+
+    fit = fitact.fit(square_record(), fitact.Scene())
+    values = {name: s["q50"] for name, s in fit.derived().items()}
+    assert set(values) == set(DERIVED_NAMES)
+    Csc, Ci = (fit.parameters()[name]["q50"] for name in ("Csc", "Ci"))
+    x = 0.01 / values["b"]
+    squared = 4.0 * 180.0**2 * values["g"] ** 2 * np.tanh(x / 4.0) / x
+    assert values["force_mean"] == pytest.approx(squared / (2.0 * (1.0 / Ci + 1.0 / Csc) * 201e-6), rel=1e-9)
+    peak = (360.0 * values["g"] / (1.0 + np.exp(-x / 2.0))) ** 2
+    assert values["force_peak"] == pytest.approx(peak / (2.0 * (1.0 / Ci + 1.0 / Csc) * 201e-6), rel=1e-9)
+
+
+def test_summary_has_what_other_programs_read(finger_posterior: fitact.Posterior):
+    summary = json.loads(to_json(finger_posterior.summary()))
+    numbers = {"unit", "mean", "sd", "q025", "q05", "q25", "q50", "q75", "q95", "q975"}
+    for section, names in {
+        "parameters": ("Rsc", "Csc", "Ci", "sigma", "offset"),
+        "derived": ("g", "b", "force_mean", "force_peak", "friction_mean"),
+    }.items():
+        for name in names:
+            assert numbers <= set(summary[section][name])
+    assert {"Rsc", "Csc", "Ci"} == {n for n, s in summary["parameters"].items() if "contraction" in s}
+    assert [summary["parameters"][name]["unit"] for name in ("Rsc", "Csc", "Ci")] == ["ohm", "F", "F"]
+    assert {"verdict", "blind_direction", "remedy", "eigenvalues", "force_from_prior"} <= set(
+        summary["identifiability"]
+    )
+    assert {"converged", "tau_max", "ess_min", "rhat_max", "steps", "walkers"} <= set(summary["convergence"])
+    assert {"result", "chi2_reduced", "rms_residual", "misfit"} <= set(summary["fit"])
+    assert {"circuit", "skin", "response", "likelihood", "compression_error"} <= set(summary["model"])
+    assert summary["seed"] == 1
+    assert {"fitact", "jax", "optimistix", "emcee", "numpy"} <= set(summary["versions"])
+    assert isinstance(summary["warnings"], list)
+
+
+def test_netcdf_has_arviz_groups_with_units(netcdf: Path, finger_posterior: fitact.Posterior):
+    import xarray as xr
+
+    with xr.open_datatree(netcdf, engine="h5netcdf") as tree:
+        groups = {
+            "posterior",
+            "sample_stats",
+            "posterior_predictive",
+            "observed_data",
+            "prior",
+            "constant_data",
+        }
+        assert groups == set(tree.children)
+        posterior = tree["posterior"]
+        np.testing.assert_array_equal(posterior["Rsc"], finger_posterior.parameters()["Rsc"])
+        assert posterior["Rsc"].attrs["units"] == "ohm"
+        assert posterior["force_mean"].attrs["units"] == "N"
+        assert tree["posterior_predictive"]["Vsc"].dims == ("chain", "draw", "time")
+        assert tree.attrs["record_sha256"] == finger_posterior.fit.record.fingerprint
+
+
+def test_predicted_records_cover_the_record(netcdf: Path):
+    import xarray as xr
+
+    with xr.open_datatree(netcdf, engine="h5netcdf") as tree:
+        predicted, observed = tree["posterior_predictive"]["Vsc"].values, tree["observed_data"]["Vsc"].values
+    low, high = np.quantile(predicted.reshape(-1, observed.size), [0.05, 0.95], axis=0)
+    # 90 % but for the finite number of predictions; binomial sd of the share is 0.5 %
+    assert np.mean((low < observed) & (observed < high)) == pytest.approx(0.9, abs=0.025)
+
+
+def test_same_seed_same_file(netcdf: Path, finger_fit: fitact.Fit, tmp_path):
+    fitact.sample(finger_fit, seed=1, progress=False).to_netcdf(tmp_path / "again.nc")
+    assert (tmp_path / "again.nc").read_bytes() == netcdf.read_bytes()
+
+
+def test_prior_draws_are_the_prior(netcdf: Path, finger_fit: fitact.Fit):
+    import xarray as xr
+
+    with xr.open_datatree(netcdf, engine="h5netcdf") as tree:
+        logs = np.log(tree["prior"]["Ci"].values)
+    assert logs.std() == pytest.approx(finger_fit.likelihood.prior["Ci"].log_sd, rel=0.05)
+
+
+def test_import_is_light():
+    heavy = ["jax", "optimistix", "emcee", "matplotlib", "arviz", "arviz_stats", "xarray", "pint", "scipy"]
+    code = f"import sys, fitact; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_every_public_name_is_there():
+    for name in fitact.__all__:
+        assert getattr(fitact, name) is not None
+    with pytest.raises(AttributeError):
+        fitact.nonsense  # noqa: B018
+
+
+def test_a_spread_beyond_numbers_is_open():
+    s = summarize_log_normal("b", 1.0, 40.0)
+    assert s["q50"] == 1.0
+    assert s["sd"] == np.inf
+    assert format_sd(s) == "open"
