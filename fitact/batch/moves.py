@@ -12,7 +12,7 @@ import emcee
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fitact.sampling.proposal import OVERDISPERSION, SHARES, draw_student_t, student_log_density
+from fitact.sampling.proposal import OVERDISPERSION, SHARES, draw_student_t, principal_axes, student_log_density
 
 ENSEMBLES = 4
 WALKERS = 16  # of each ensemble: posteriors side by side keep emcee busy, few walkers make steps cheap
@@ -38,8 +38,7 @@ class GaussianApproximations(NamedTuple):
     @classmethod
     def from_covariance_factors(cls, centers: np.ndarray, covariance_factors: np.ndarray) -> Self:
         """Take roots whose columns are principal axes, a standard deviation long."""
-        vectors, lengths, _ = np.linalg.svd(covariance_factors)
-        return cls(centers, vectors * lengths[:, None])
+        return cls(centers, principal_axes(covariance_factors))
 
     def from_standard_normal(self, z: Float[np.ndarray, "posteriors any n"]) -> Float[np.ndarray, "posteriors any n"]:
         return self.centers[:, None] + z @ np.swapaxes(self.covariance_factors, 1, 2)

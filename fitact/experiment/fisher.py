@@ -102,10 +102,12 @@ def covariance_factor(
     """A matrix whose product with its transpose is the Laplace approximation's covariance.
 
     `jacobian` is that of the whitened residuals, `prior_factor` a root of the prior's covariance. From singular
-    values: their squares span more digits than a number has.
+    values: their squares span more digits than a number has. Of all such matrices it is the lower triangular one with a
+    positive diagonal, since rounding decides which way singular vectors point, and seeded draws would follow it.
     """
     _, sizes, directions = np.linalg.svd(jacobian @ prior_factor, full_matrices=False)
-    return prior_factor @ directions.T / np.hypot(1.0, sizes)
+    _, triangle = np.linalg.qr((prior_factor @ directions.T / np.hypot(1.0, sizes)).T)
+    return triangle.T * np.sign(np.diagonal(triangle))
 
 
 def _derivatives(

@@ -78,8 +78,7 @@ class Proposal:
         cls, point: Float[np.ndarray, " n"], covariance_factor: Float[np.ndarray, "n n"], log_prob: LogProb
     ) -> Self:
         """Take a Laplace approximation, with tables along the axes on which `log_prob` is not normal."""
-        vectors, lengths, _ = np.linalg.svd(covariance_factor)
-        axes, center, tables = vectors * lengths, np.array(point, dtype=float), {}
+        axes, center, tables = principal_axes(covariance_factor), np.array(point, dtype=float), {}
         for i, axis in enumerate(axes.T):
             table = _tabulate_axis(center, axis, log_prob)
             if table is not None:
@@ -118,6 +117,18 @@ class Proposal:
         """Propose as emcee asks it: new points, and log q(old) - log q(new)."""
         proposed = self.draw(random, len(points))
         return proposed, self.log_density(points) - self.log_density(proposed)
+
+
+def principal_axes(covariance_factors: Float[np.ndarray, "*any n n"]) -> Float[np.ndarray, "*any n n"]:
+    """Return the axes of roots of covariances as columns, a standard deviation long.
+
+    Rounding decides which way an axis points; it is turned so that the same draws follow from the same random numbers
+    on every machine. (The first component that is not small is positive: the largest may be one of several alike.)
+    """
+    vectors, lengths, _ = np.linalg.svd(covariance_factors)
+    sizes = np.abs(vectors)
+    first = np.argmax(sizes > 0.5 * sizes.max(axis=-2, keepdims=True), axis=-2, keepdims=True)
+    return vectors * np.sign(np.take_along_axis(vectors, first, axis=-2)) * lengths[..., None, :]
 
 
 def draw_student_t(random: Random, count: int, size: int) -> Float[np.ndarray, "count size"]:

@@ -9,7 +9,7 @@ import scipy.signal
 
 import fitact
 from fitact.experiment.experiment import CandidateDesign, DesignOption, evaluate_design
-from fitact.experiment.fisher import Experiment, force_gradient
+from fitact.experiment.fisher import Experiment, covariance_factor, force_gradient
 
 VALUES = {"Rsc": 160e3, "Csc": 22e-9, "Ci": 1.35e-9}
 PRIOR_SD = np.array([0.3, 0.3, 0.05])
@@ -161,3 +161,14 @@ def test_noise_of_a_measured_drive_tells_nothing():
 def test_the_beginning_of_a_long_measured_drive_stands_for_all():
     long, short = (expected_sd(measured(0.0, periods)).force_sd for periods in (16, 4))
     assert long == pytest.approx(0.5 * short, rel=0.05)
+
+
+def test_a_root_of_the_covariance_is_the_same_however_rounding_turns_the_singular_vectors():
+    """As it would be on another machine: residuals in another order, two directions that nothing is known of."""
+    random = np.random.default_rng(1)
+    jacobian = random.standard_normal((50, 2)) @ random.standard_normal((2, 4)) * 1e4
+    prior_factor = np.linalg.cholesky(np.cov(random.standard_normal((4, 40))))
+    root = covariance_factor(jacobian, prior_factor)
+    expected = np.linalg.inv(jacobian.T @ jacobian + np.linalg.inv(prior_factor @ prior_factor.T))
+    np.testing.assert_allclose(root @ root.T, expected, rtol=1e-5)
+    np.testing.assert_allclose(covariance_factor(-jacobian[::-1], prior_factor), root, atol=1e-9 * root.max())

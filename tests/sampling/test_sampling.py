@@ -12,6 +12,7 @@ import fitact
 from fitact.likelihood import certificate
 from fitact.sampling import ensemble
 from fitact.sampling.convergence import Criteria
+from fitact.sampling.proposal import principal_axes
 from tests.conftest import square_record
 
 
@@ -71,6 +72,15 @@ def test_same_seed_same_chain(finger_fit: fitact.Fit):
     assert not np.array_equal(first.points, other.points)
     np.random.seed(0)  # noqa: NPY002  (emcee's global state must not matter)
     np.testing.assert_array_equal(short(finger_fit, 3).points, first.points)
+
+
+def test_axes_point_where_they_would_on_another_machine():
+    factors = np.array([[[-0.5, 0.0, 0.0], [0.5, 0.1, 0.0], [0.5, -0.1, 0.01]], np.diag([1.0, 2.0, 3.0])])
+    axes = principal_axes(factors)
+    np.testing.assert_allclose(axes @ np.swapaxes(axes, 1, 2), factors @ np.swapaxes(factors, 1, 2), atol=1e-15)
+    for other in (-factors, factors[:, :, ::-1]):
+        np.testing.assert_allclose(principal_axes(other), axes, atol=1e-14)
+    assert axes[0, 0, 0] > 0.0
 
 
 def test_resumed_chain_is_the_undisturbed_one(finger_fit: fitact.Fit, tmp_path, endless):
