@@ -1,30 +1,14 @@
 """Commands on one finger: fit, sample, report."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 import fitact
 from fitact import report as reporting
-from fitact.cli import internal
+from fitact.cli import internal, options
 from fitact.cli.app import app
-from fitact.cli.options import (
-    Channels,
-    Columns,
-    Fresh,
-    Json,
-    Level,
-    Model,
-    Out,
-    RecordFiles,
-    Results,
-    Scales,
-    SceneFiles,
-    Seed,
-    Tolerance,
-    column_options,
-)
 from fitact.cli.terminal import command_line, print_stderr, show
 from fitact.files import write_json
 
@@ -34,41 +18,53 @@ if TYPE_CHECKING:
 
 @app.command()
 def run(
-    records: RecordFiles,
-    scene: SceneFiles = None,
-    channel: Channels = None,
-    scale: Scales = None,
-    out: Out = None,
-    level: Level = "emcee",
-    model: Model = "planned",
-    seed: Seed = 0,
-    tolerance: Tolerance = 1e-3,
-    fresh: Fresh = False,
-    json: Json = False,
+    context: typer.Context,
+    records: options.RecordFiles,
+    scene: options.SceneFiles = None,
+    channel: options.Channels = None,
+    scale: options.Scales = None,
+    out: options.Out = None,
+    level: options.Level = "emcee",
+    model: options.Model = "planned",
+    seed: options.Seed = 0,
+    tolerance: options.Tolerance = 1e-3,
+    fresh: options.Fresh = False,
+    json: options.Json = False,
 ) -> None:
     """Fit, sample and report: everything, into one folder.
 
     Writes fit.json, summary.json, posterior.nc (opens with ArviZ), chain.h5 (for going on) and report.html.
     """
-    folder = out or _folder(records[0])
-    posterior, content = _sample_posterior(
-        records, scene, (channel, scale), folder, level, model, seed, tolerance, fresh
-    )
-    page = folder / "report.html"
-    print_stderr("writing the report")
-    reporting.write_report(page, posterior.to_datatree(), content)
-    show(f"{posterior}\nopen {page}", content, json, posterior.trusted)
+    folder = out or Path(f"{records[0].name.removesuffix('.gz').removesuffix('.csv')}-fitact")
+    planned = _fit_records(records, scene, (channel, scale), model, tolerance)
+    print_stderr(planned.sentence)
+    chain = folder / "chain.h5"
+    if fresh:
+        chain.unlink(missing_ok=True)
+    # which refuses a chain that belongs elsewhere, before anything is written
+    posterior = fitact.sample(planned.fit, level=level, seed=seed, chain_file=chain)
+    write_json(folder / "fit.json", planned.fit.to_dict() | {"plan": planned.to_dict()})
+    posterior.to_netcdf(folder / "posterior.nc")
+    content = posterior.summary() | {"plan": planned.to_dict(), "command": command_line()}
+    write_json(folder / "summary.json", content)
+    if context.command.name == "sample":
+        end = f"wrote {folder}; for a report: fitact report {folder}"
+    else:
+        print_stderr("writing the report")
+        reporting.write_report(folder / "report.html", posterior.to_datatree(), content)
+        end = f"open {folder / 'report.html'}"
+    show(f"{posterior}\n{end}", content, json, posterior.trusted)
 
 
 @app.command()
 def fit(
-    records: RecordFiles,
-    scene: SceneFiles = None,
-    channel: Channels = None,
-    scale: Scales = None,
-    out: Out = None,
-    model: Model = "planned",
-    tolerance: Tolerance = 1e-3,
+    records: options.RecordFiles,
+    scene: options.SceneFiles = None,
+    channel: options.Channels = None,
+    scale: options.Scales = None,
+    out: options.Out = None,
+    model: options.Model = "planned",
+    tolerance: options.Tolerance = 1e-3,
     starts: Annotated[
         int, typer.Option("--starts", min=1, help="Starts: the record's own, and draws of the prior.")
     ] = 1,
@@ -76,7 +72,7 @@ def fit(
         bool,
         typer.Option("--intervals", help="Add 95 % profile-likelihood intervals, with and without the prior."),
     ] = False,
-    json: Json = False,
+    json: options.Json = False,
 ) -> None:
     """Least squares only: parameters with errors, and the verdict, in seconds; of an impedance spectrum, too."""
     if len(records) == 1 and internal.is_spectrum(records[0]):
@@ -107,37 +103,18 @@ def _fit_spectrum(path: Path, scenes: list[Path] | None, out: Path | None, json:
     show(str(fitted), fitted.to_dict(), json, fitted.trusted)
 
 
-@app.command()
-def sample(
-    records: RecordFiles,
-    scene: SceneFiles = None,
-    channel: Channels = None,
-    scale: Scales = None,
-    out: Out = None,
-    level: Level = "emcee",
-    model: Model = "planned",
-    seed: Seed = 0,
-    tolerance: Tolerance = 1e-3,
-    fresh: Fresh = False,
-    json: Json = False,
-) -> None:
-    """Fit, then sample the posterior until it has converged; as `run`, without the report."""
-    folder = out or _folder(records[0])
-    posterior, content = _sample_posterior(
-        records, scene, (channel, scale), folder, level, model, seed, tolerance, fresh
-    )
-    show(f"{posterior}\nwrote {folder}; for a report: fitact report {folder}", content, json, posterior.trusted)
+app.command("sample", help="Fit, then sample the posterior until it has converged; as `run`, without the report.")(run)
 
 
 @app.command()
-def summary(directory: Results, json: Json = False) -> None:
+def summary(directory: options.Results, json: options.Json = False) -> None:
     """Print the table of a folder of results again."""
     content = internal.summary.load(directory)
     show(internal.summary.table(content), content, json, internal.summary.is_trusted(content))
 
 
 @app.command()
-def report(directory: Results, json: Json = False) -> None:
+def report(directory: options.Results, json: options.Json = False) -> None:
     """Write the report of a folder of results again; of a population's, too."""
     page = directory / "report.html"
     if (directory / "population.json").exists():
@@ -151,15 +128,11 @@ def report(directory: Results, json: Json = False) -> None:
     show(f"open {page}", {"report": str(page), "trusted": trusted}, json, trusted)
 
 
-def _folder(record: Path) -> Path:
-    return Path(f"{record.name.removesuffix('.gz').removesuffix('.csv')}-fitact")
-
-
 def _fit_records(
     records: list[Path],
     scenes: list[Path] | None,
-    columns: Columns,
-    model: Model,
+    columns: options.Columns,
+    model: options.Model,
     tolerance: float,
     starts: int = 1,
 ) -> "PlannedFit":
@@ -167,35 +140,10 @@ def _fit_records(
     for scene in stated:
         scene.require_available(fit=model == "full")
     paired = stated if len(stated) == len(records) else [stated[0] if stated else None] * len(records)
-    options = column_options(columns)
+    known = options.column_options(columns)
     # refused before the slow imports
-    measured = [fitact.read(path, scene, **options) for path, scene in zip(records, paired, strict=True)]
+    measured = [fitact.read(path, scene, **known) for path, scene in zip(records, paired, strict=True)]
     internal.use_compilation_cache()
     for path, record in zip(records, measured, strict=True):
         print_stderr(f"fitting {path} ({len(record):,} samples)")
     return internal.fit_planned(measured, stated, model, starts=starts, tolerance=tolerance)
-
-
-def _sample_posterior(
-    records: list[Path],
-    scene: list[Path] | None,
-    columns: Columns,
-    folder: Path,
-    level: Level,
-    model: Model,
-    seed: int,
-    tolerance: float,
-    fresh: bool,
-) -> "tuple[fitact.Posterior, dict[str, Any]]":
-    """Fit and sample, and write all but the report, once the chain is known to belong there."""
-    planned = _fit_records(records, scene, columns, model, tolerance)
-    print_stderr(planned.sentence)
-    chain = folder / "chain.h5"
-    if fresh:
-        chain.unlink(missing_ok=True)
-    posterior = fitact.sample(planned.fit, level=level, seed=seed, chain_file=chain)
-    write_json(folder / "fit.json", planned.fit.to_dict() | {"plan": planned.to_dict()})
-    posterior.to_netcdf(folder / "posterior.nc")
-    content = posterior.summary() | {"plan": planned.to_dict(), "command": command_line()}
-    write_json(folder / "summary.json", content)
-    return posterior, content

@@ -7,22 +7,8 @@ import typer
 
 import fitact
 from fitact import report
-from fitact.cli import internal
+from fitact.cli import internal, options
 from fitact.cli.app import app
-from fitact.cli.options import (
-    Channels,
-    CommonScene,
-    Fresh,
-    Json,
-    LazyRecords,
-    Out,
-    RecordFiles,
-    Scales,
-    Seed,
-    column_options,
-    load_scene,
-    parse_numbers,
-)
 from fitact.cli.terminal import command_line, print_stderr, show
 from fitact.files import write_json
 
@@ -30,17 +16,17 @@ from fitact.files import write_json
 @app.command()
 def inspect(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A record, or any file of an oscilloscope.")],
-    channel: Channels = None,
-    scale: Scales = None,
+    channel: options.Channels = None,
+    scale: options.Scales = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Drawing to write: .svg or .png.")] = None,
-    json: Json = False,
+    json: options.Json = False,
 ) -> None:
     """Look at a file before fitting it: channels, rate, units, noise, clipping, frequency, and what is doubtful."""
     if internal.is_spectrum(file):
         spectrum = fitact.read_spectrum(file)
         show(str(spectrum), spectrum.to_dict(), json)
         return
-    inspection = fitact.inspect(file, **column_options((channel, scale)))
+    inspection = fitact.inspect(file, **options.column_options((channel, scale)))
     if out is not None:
         report.write_record(out, inspection)
     show(str(inspection), inspection.to_dict(), json)
@@ -48,20 +34,20 @@ def inspect(
 
 @app.command()
 def compare(
-    records: RecordFiles,
+    records: options.RecordFiles,
     scenes: Annotated[
         list[Path], typer.Option("--scene", metavar="FILE", help="Scene (TOML) of one model; give two or more.")
     ],
-    channel: Channels = None,
-    scale: Scales = None,
-    json: Json = False,
+    channel: options.Channels = None,
+    scale: options.Scales = None,
+    json: options.Json = False,
 ) -> None:
     """Fit the model of each scene to the same records, in full, and say which the data prefer."""
     alike = len({path.stem for path in scenes}) < len(scenes)
     models = {str(path) if alike else path.stem: fitact.Scene.load(path) for path in scenes}
     for model in models.values():
         model.require_available(fit=True)
-    measured = list(LazyRecords(records, next(iter(models.values())), (channel, scale)))
+    measured = list(options.LazyRecords(records, next(iter(models.values())), (channel, scale)))
     internal.use_compilation_cache()
     comparison = fitact.compare(measured, models)
     show(str(comparison), comparison.to_dict(), json, comparison.trusted)
@@ -70,9 +56,9 @@ def compare(
 @app.command()
 def population(
     records: Annotated[list[Path], typer.Argument(metavar="RECORD...", help="One of each finger, on one panel.")],
-    scene: CommonScene = None,
-    channel: Channels = None,
-    scale: Scales = None,
+    scene: options.CommonScene = None,
+    channel: options.Channels = None,
+    scale: options.Scales = None,
     covariates: Annotated[
         Path | None,
         typer.Option("--covariates", metavar="FILE", help="CSV: a column 'record', and one for each covariate."),
@@ -80,24 +66,24 @@ def population(
     at: Annotated[
         list[str] | None, typer.Option("--at", metavar="NAME=VALUE", help="A covariate of the next finger.")
     ] = None,
-    out: Out = None,
-    seed: Seed = 0,
-    fresh: Fresh = False,
-    json: Json = False,
+    out: options.Out = None,
+    seed: options.Seed = 0,
+    fresh: options.Fresh = False,
+    json: options.Json = False,
 ) -> None:
     """From one finger to people: how fingers differ, what force the next one will feel, and why.
 
     Into DIR it writes report.html, population.json, population.nc (the draws), population.svg, and chain.h5 (for
     going on).
     """
-    stated = load_scene(scene)
+    stated = options.load_scene(scene)
     known = {} if covariates is None else internal.read_covariates(covariates, records)
     internal.use_compilation_cache()
     if fresh and out is not None:
         internal.delete_chains(out)
     people = fitact.population(
-        LazyRecords(records, stated, (channel, scale)), stated, covariates=known,
-        at=parse_numbers("--at moisture=0.4", at), folder=out, seed=seed,
+        options.LazyRecords(records, stated, (channel, scale)), stated, covariates=known,
+        at=options.parse_numbers("--at moisture=0.4", at), folder=out, seed=seed,
     )  # fmt: skip
     content = people.to_dict()
     if out is not None:
@@ -117,17 +103,17 @@ def tradeoff(
     scene: Annotated[
         Path | None, typer.Option("--scene", metavar="FILE", help="Scene (TOML); absent: the paper's device.")
     ] = None,
-    channel: Channels = None,
-    scale: Scales = None,
-    out: Out = None,
-    json: Json = False,
+    channel: options.Channels = None,
+    scale: options.Scales = None,
+    out: options.Out = None,
+    json: options.Json = False,
 ) -> None:
     """Measure what each level of response, likelihood and uncertainty costs and is off by, on this machine.
 
     Takes a minute or two. With --out writes report.html, tradeoff.json and tradeoff.svg.
     """
-    stated = load_scene(scene)
-    measured = None if record is None else fitact.read(record, stated, **column_options((channel, scale)))
+    stated = options.load_scene(scene)
+    measured = None if record is None else fitact.read(record, stated, **options.column_options((channel, scale)))
     try:
         costs = fitact.measure_tradeoff(measured, stated)
     except KeyboardInterrupt:

@@ -79,14 +79,8 @@ def simulate(
     record = internal.simulate(stated, seed)
     internal.write_csv(out, record)
     truth = {"Rsc": stated.skin.Rsc, "Csc": stated.skin.Csc, "Ci": stated.device.Ci}
-    content = {
-        "file": str(out),
-        "samples": len(record),
-        "channels": list(record.channels),
-        "seed": seed,
-        "truth": truth,
-    }
-    show(f"wrote {out}: {len(record):,} samples of {', '.join(record.channels)}", content, json)
+    content = {"file": str(out), "samples": len(record), "channels": list(record.channels), "seed": seed}
+    show(f"wrote {out}: {len(record):,} samples of {', '.join(record.channels)}", content | {"truth": truth}, json)
 
 
 @app.command()
