@@ -59,11 +59,7 @@ def is_known_binary(head: bytes, suffix: str) -> bool:
 
 
 def read_binary(path: Path, source: str, head: bytes, pick: Pick) -> Capture:
-    """The channels of a binary file that `pick` names, in SI units.
-
-    Raises:
-        InputError: it is of no known kind, is broken, or what reads it is not installed.
-    """
+    """The channels of a binary file that `pick` names, in SI units."""
     reader = _find_reader(head, path.suffix)
     if reader is None:
         raise InputError(f"{source}: is not a text file, nor of a known binary kind; export the record as CSV")
@@ -80,19 +76,12 @@ def read_binary(path: Path, source: str, head: bytes, pick: Pick) -> Capture:
 
 
 def _find_reader(head: bytes, suffix: str) -> Callable[[Path, str, Pick], Capture] | None:
-    for starts, reader in (
-        (b"\x89HDF\r\n\x1a\n", _read_hdf5),
-        (b"CDF", _read_netcdf3),
-        (b"TDSm", _read_tdms),
-        (b"PK\x03\x04", _read_npz),
-    ):
-        if head.startswith(starts):
-            return reader
-    if head.startswith(b"MATLAB"):
-        return _read_hdf5 if b"MATLAB 7.3" in head[:128] else _read_mat
-    if _SCOPE.search(head) or suffix.lower() in _SCOPE_SUFFIXES:
-        return _read_scope
-    return None
+    readers = {
+        b"\x89HDF\r\n\x1a\n": _read_hdf5, b"CDF": _read_netcdf3, b"TDSm": _read_tdms, b"PK\x03\x04": _read_npz,
+        b"MATLAB 7.3": _read_hdf5, b"MATLAB": _read_mat,
+    }  # fmt: skip
+    scope = _read_scope if _SCOPE.search(head) or suffix.lower() in _SCOPE_SUFFIXES else None
+    return next((reader for start, reader in readers.items() if head.startswith(start)), scope)
 
 
 def _read_scope(path: Path, source: str, pick: Pick) -> Capture:
@@ -102,21 +91,17 @@ def _read_scope(path: Path, source: str, pick: Pick) -> Capture:
     names = [str(channel.name) for channel in wfm.channels]
     wanted = set(pick(names, ""))
     units = {"v": "V", "a": "A"}
-    chosen = [channel for channel in wfm.channels if str(channel.name) in wanted]
-    channels = tuple(
-        FileChannel(
-            str(channel.name),
-            np.asarray(channel.volts, dtype=float),
-            units.get(channel.unit.name, ""),
-            units.get(channel.unit.name, channel.unit.name),
-            float(channel.probe_value) if channel.probe_value != 1.0 else None,  # 1 is also what is not known
-        )
-        for channel in chosen
-    )
-    times = [np.asarray(channel.times, dtype=float) for channel in chosen]
+    channels, times = [], []
+    for name, channel in zip(names, wfm.channels, strict=True):
+        if name in wanted:
+            unit = channel.unit.name
+            attenuation = float(channel.probe_value) if channel.probe_value != 1.0 else None  # 1: or not known
+            values = np.asarray(channel.volts, dtype=float)
+            channels.append(FileChannel(name, values, units.get(unit, ""), units.get(unit, unit), attenuation))
+            times.append(np.asarray(channel.times, dtype=float))
     _check_one_grid(times, [channel.name for channel in channels], source)
-    maker = str(wfm.header_name) or "oscilloscope"
-    return Capture(source, maker, times[0], channels, unread_columns=tuple(n for n in names if n not in wanted))
+    maker, unread = str(wfm.header_name) or "oscilloscope", tuple(name for name in names if name not in wanted)
+    return Capture(source, maker, times[0], tuple(channels), unread_columns=unread)
 
 
 def _read_tdms(path: Path, source: str, pick: Pick) -> Capture:
@@ -204,7 +189,9 @@ def _make_capture(contents: _Contents, source: str, pick: Pick) -> Capture:
     if not chosen:
         raise InputError(f"{source}: holds no array of one axis besides the time; store V, Vsc or I in it")
     if timed:
-        time, notes = _convert_time(arrays[timed[0]], last[timed[0]][1] or contents.units[timed[0]], source)
+        unit = last[timed[0]][1] or contents.units[timed[0]]
+        time = layouts.convert_time(arrays[timed[0]].astype(float), unit, source, "store seconds")
+        notes = [] if unit else [f"{source}: the file states no unit of time; seconds were assumed"]
     else:
         time, notes = _time_grid(contents, arrays[chosen[0][1]].size, source)
     for name, other in chosen:
@@ -220,14 +207,6 @@ def _make_capture(contents: _Contents, source: str, pick: Pick) -> Capture:
     )
     unread = tuple(name for name in names if name not in wanted)
     return Capture(source, contents.format, time, channels, notes=tuple(notes), unread_columns=unread)
-
-
-def _convert_time(time: np.ndarray, unit_text: str, source: str) -> tuple[np.ndarray, list[str]]:
-    unit = layouts.parse_unit(unit_text)
-    if unit_text and (unit is None or unit[0] != "s"):
-        raise InputError(f"{source}: '{unit_text}' is no unit of time; store seconds")
-    notes = [] if unit_text else [f"{source}: the file states no unit of time; seconds were assumed"]
-    return time.astype(float) * (unit[1] if unit else 1.0), notes
 
 
 def _time_grid(contents: _Contents, count: int, source: str) -> tuple[np.ndarray, list[str]]:
@@ -261,8 +240,7 @@ def _capture_log(library: str) -> Iterator[list[str]]:
 
 def _check_one_grid(times: Sequence[np.ndarray], names: Sequence[str], source: str) -> None:
     for time, name in zip(times, names, strict=True):
-        step = abs(time[-1] - time[0]) / max(time.size - 1, 1)
-        if time.size != times[0].size or np.max(np.abs(time - times[0])) > 0.01 * step:
+        if not layouts.is_same_grid(time, times[0]):
             raise InputError(
                 f"{source}: '{name}' has another length or other times than '{names[0]}'; export channels of one"
                 " time base"

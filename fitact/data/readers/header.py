@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import re
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from fitact.data.readers import layouts
 from fitact.errors import InputError
@@ -14,103 +15,51 @@ _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 _QUANTITY = re.compile(r"(?:analog:)?\s*([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*([a-zµμ]*)", re.IGNORECASE)
 
 
-@dataclasses.dataclass(frozen=True)
-class TextRow:
+class TextRow(NamedTuple):
     """Its number, from 1, and its cells."""
 
     number: int
     cells: list[str]
 
 
-@dataclasses.dataclass(frozen=True)
-class Column:
+class Column(NamedTuple):
     """One column of numbers; `unit` as written, "" where none is, `attenuation` as the header states it."""
 
-    index: int
+    place: int
     name: str
     unit: str
     attenuation: float | None = None
 
 
-@dataclasses.dataclass(frozen=True)
-class Header:
-    """What stands above the rows of numbers, or beside them.
-
-    Attributes:
-        first: number of the first line of numbers, from 1.
-        width: cells of a row.
-        time: column of the time; None where `start` and `step` (s) make it.
-        index: column that counts samples; None where there is none.
-        non_numeric_columns: names of the columns that hold no numbers.
-        count: rows that the header announces.
-        location: of the names, for messages.
-    """
-
-    maker: str
-    delimiter: str
-    decimal_comma: bool
-    first: int
-    width: int
-    time: Column | None
-    index: int | None
-    columns: tuple[Column, ...]
-    non_numeric_columns: tuple[str, ...]
-    start: float | None
-    step: float | None
-    count: int | None
-    location: str
-
-
-def read_header(text: str, source: str, sidecar_text: str = "") -> Header:
+def read_header(text: str, source: str, sidecar_text: str = "") -> "Header":
     """The header of a file that begins with `text`; `sidecar_text`: one in a file of its own, as `key:value` lines.
 
     Raises:
         InputError: there are no numbers, no time, or several segments.
     """
     head = text[:4096]  # of which a header mostly is a small part: to part lines into cells takes longest
-    sheet = _HeaderParser.from_text(head.rpartition("\n")[0], sidecar_text, source)
-    if not sheet.is_plain:
-        sheet = _HeaderParser.from_text(text, sidecar_text, source)
-    if not sheet.numeric:
+    header = Header.from_text(head.rpartition("\n")[0], sidecar_text, source)
+    if not header.is_plain:
+        header = Header.from_text(text, sidecar_text, source)
+    if not header.numeric:
         raise InputError(
             f"{source}: there are no rows of numbers; expected a header such as {_EXAMPLE}, and rows of numbers"
         )
-    sheet = dataclasses.replace(sheet, numeric=sheet.numeric | sheet.standard_columns())
-    segments = sheet.find_values(layouts.SEGMENT_KEYS)[:1]
-    if segments and (parse_number(segments[0], sheet.decimal_comma) or 1.0) > 1.0:
+    maker = next((maker for maker, mark in layouts.MAKERS if mark.search(head)), "text")
+    header = dataclasses.replace(header, numeric=header.numeric | header.standard_columns(), maker=maker)
+    segments = header.find_values(layouts.SEGMENT_KEYS)[:1]
+    if segments and (parse_number(segments[0], header.decimal_comma) or 1.0) > 1.0:
         raise InputError(f"{source}: holds {segments[0]} segments; export one of them")
-    top = sheet.names or sheet.units or sheet.data_rows[0]
-    start, step = sheet.time_grid()
-    columns = sheet.columns()
-    time = sheet.find_time_column(columns)
-    if time is None and step is None:
-        found = ", ".join(sheet.names.cells) if sheet.names else "no header"
+    if header.time is None and header.time_grid[1] is None:
+        found = ", ".join(header.names.cells) if header.names else "no header"
         raise InputError(
-            f"{source}, line {top.number}: no column time_s, nor another of time (found: {found[:200]}); name the"
+            f"{source}{header.location}: no column time_s, nor another of time (found: {found[:200]}); name the"
             f" columns as in {_EXAMPLE}, or export the time as well (Rohde & Schwarz keep that of NAME.Wfm.csv in"
             " NAME.csv beside it)"
         )
-    index = next((c.index for c in columns if sheet.is_index(c)), None)
-    values = sheet.complete_columns([c for c in columns if c.index not in (index, time.index if time else None)])
-    if not values:
-        raise InputError(
-            f"{source}, line {top.number}: there is no column of numbers besides the time; export channels"
-        )
-    return Header(
-        maker=next((maker for maker, mark in layouts.MAKERS if mark.search(head)), "text"),
-        delimiter=sheet.delimiter,
-        decimal_comma=sheet.decimal_comma,
-        first=sheet.data_rows[0].number,
-        width=sheet.width,
-        time=time,
-        index=index,
-        columns=values,
-        non_numeric_columns=sheet.non_numeric_columns(),
-        start=start,
-        step=step,
-        count=sheet.count(),
-        location=f", line {top.number}",
-    )
+    if not header.channels:
+        raise InputError(f"{source}{header.location}: there is no column of numbers besides the time; export channels")
+    return header
 
 
 def split_cells(line: str, delimiter: str) -> list[str]:
@@ -130,8 +79,8 @@ def parse_number(cell: str, decimal_comma: bool) -> float | None:
 
 
 @dataclasses.dataclass(frozen=True)
-class _HeaderParser:
-    """The first lines of a file, parted into those above the numbers and those with them."""
+class Header:
+    """The first lines of a file, parted into those above the numbers and those with them, and what they say."""
 
     delimiter: str
     decimal_comma: bool
@@ -140,9 +89,10 @@ class _HeaderParser:
     data_rows: list[TextRow]
     numeric: frozenset[int]  # the columns of numbers
     source: str
+    maker: str = "text"
 
     @classmethod
-    def from_text(cls, text: str, sidecar_text: str, source: str) -> "_HeaderParser":
+    def from_text(cls, text: str, sidecar_text: str, source: str) -> "Header":
         lines = [(n, line.strip(" \r\f\v")) for n, line in enumerate(text.split("\n"), start=1)]
         delimiter, decimal_comma = _detect_delimiter([line for _, line in lines if line and not line.startswith("#")])
         rows = [TextRow(n, split_cells(line, delimiter)) for n, line in lines if line.strip(delimiter + " ")]
@@ -173,8 +123,14 @@ class _HeaderParser:
         marked = self.delimiter == "," or any("," in cell or "." in cell for cell in cells)
         return enough and marked and all(parse_number(cell, self.decimal_comma) is not None for cell in cells)
 
+    @property
+    def location(self) -> str:
+        """Of the names, for messages."""
+        return f", line {(self.names or self.units or self.data_rows[0]).number}"
+
     @functools.cached_property
     def width(self) -> int:
+        """Cells of a row."""
         widths = (len(row.cells) for row in self.data_rows if len(row.cells) > max(self.numeric))
         return collections.Counter(widths).most_common(1)[0][0]
 
@@ -239,6 +195,7 @@ class _HeaderParser:
         rest = [cell.lower() in layouts.NOT_UNITS for cell in here]
         return row if any(known) and all(a or b for a, b in zip(known, rest, strict=True)) else None
 
+    @functools.cached_property
     def time_grid(self) -> tuple[float | None, float | None]:
         """Start and step of the time, s: below the words Start and Increment, or beside words of that meaning."""
         below = {}
@@ -255,40 +212,35 @@ class _HeaderParser:
             step = 1.0 / rate
         return find(layouts.START_KEYS), step if step is not None and 0.0 < step < float("inf") else None
 
-    def columns(self) -> list[Column]:
+    @functools.cached_property
+    def _columns(self) -> list[Column]:
+        """The columns of numbers, with the unit in their name, or in the row of units."""
         made = []
         for place in sorted(self.numeric):
             cell, below = (row.cells[place] if row else "" for row in (self.names, self.units))
-            made.append(Column(place, layouts.split_name_and_unit(cell)[0], self._column_unit(cell, below)))
+            name, unit = layouts.split_name_and_unit(cell)
+            below = "" if below.lower() in layouts.NOT_UNITS else below.strip("()[] ")
+            if unit and below and layouts.parse_unit(unit) != layouts.parse_unit(below):
+                raise InputError(
+                    f"{self.source}, line {self.units.number if self.units else 0}: the unit of {cell} is {below} here;"
+                    " keep one of the two"
+                )
+            made.append(Column(place, name, unit or below))
         return made
 
-    def complete_columns(self, columns: Sequence[Column]) -> tuple[Column, ...]:
-        """Columns of values, with the names and units that the header states elsewhere."""
+    @functools.cached_property
+    def channels(self) -> list[Column]:
+        """The columns of values, with the names and units that the header states elsewhere."""
+        columns = [c for c in self._columns if c.place not in (self.index, self.time.place if self.time else None)]
         names = [column.name for column in columns]
         if "" in names or (len(set(names)) < len(names) and not any(layouts.is_standard_name(name) for name in names)):
-            names = self._find_names(len(names)) or [f"column {column.index + 1}" for column in columns]
+            names = self._find_names(len(names)) or [f"column {column.place + 1}" for column in columns]
         units = [re.sub(r".*:", "", text) for text in self.find_values(layouts.UNIT_KEYS)] or [""]
         probes = [self._parse_quantity(text) for text in self.find_values(layouts.ATTENUATION_KEYS)]
-        return tuple(
-            Column(
-                column.index,
-                names[i],
-                column.unit or units[min(i, len(units) - 1)],
-                probes[i] if i < len(probes) else None,
-            )
-            for i, column in enumerate(columns)
-        )
-
-    def _column_unit(self, cell: str, unit_cell: str) -> str:
-        """In the name, or in the row of units."""
-        written = layouts.split_name_and_unit(cell)[1]
-        unit_cell = "" if unit_cell.lower() in layouts.NOT_UNITS else unit_cell.strip("()[] ")
-        if written and unit_cell and layouts.parse_unit(written) != layouts.parse_unit(unit_cell):
-            raise InputError(
-                f"{self.source}, line {self.units.number if self.units else 0}: the unit of {cell} is {unit_cell} here;"
-                " keep one of the two"
-            )
-        return written or unit_cell
+        return [
+            Column(c.place, names[i], c.unit or units[min(i, len(units) - 1)], probes[i] if i < len(probes) else None)
+            for i, c in enumerate(columns)
+        ]
 
     def standard_columns(self) -> frozenset[int]:
         """Columns under fitact's own names, which must hold numbers whether they do or not."""
@@ -299,12 +251,14 @@ class _HeaderParser:
             if layouts.is_standard_name(name) and (not unit or layouts.parse_unit(unit))
         )
 
-    def non_numeric_columns(self) -> tuple[str, ...]:
+    def non_numeric_columns(self) -> list[str]:
+        """Names of the columns that hold no numbers."""
         named = self.names.cells[: self.width] if self.names else []
         words = [layouts.normalize_key(cell.partition("=")[0]) for cell in named]
-        return tuple(c for i, c in enumerate(named) if i not in self.numeric and words[i] not in layouts.GRID_KEYS)
+        return [c for i, c in enumerate(named) if i not in self.numeric and words[i] not in layouts.GRID_KEYS]
 
-    def count(self) -> int | None:
+    def count_rows(self) -> int | None:
+        """Rows that the header announces."""
         count = self.find_quantity(layouts.COUNT_KEYS)
         return int(count) if count is not None and count < 1e12 else None  # beyond, it means something else
 
@@ -315,20 +269,26 @@ class _HeaderParser:
             named = re.findall(r"([A-Za-z]+\d+)\s*:", " ".join(self.find_values(("verticalunits", "verticalscale"))))
         return named[:count] if len(set(named[:count])) == count else []
 
-    def is_index(self, column: Column) -> bool:
-        below = self.units.cells[column.index] if self.units else ""
-        return below.lower() in layouts.INDEX_NAMES or column.name.lower() in layouts.INDEX_NAMES
+    @functools.cached_property
+    def index(self) -> int | None:
+        """The column that counts samples; None where there is none."""
+        return next((c.place for c in self._columns if self._is_index(c)), None)
 
-    def find_time_column(self, columns: Sequence[Column]) -> Column | None:
-        """By name, by unit, or because it stands first beside a header."""
-        candidates = [c for c in columns if not self.is_index(c)]
+    def _is_index(self, column: Column) -> bool:
+        below = self.units.cells[column.place] if self.units else ""
+        return not layouts.INDEX_NAMES.isdisjoint((below.lower(), column.name.lower()))
+
+    @functools.cached_property
+    def time(self) -> Column | None:
+        """By name, by unit, or because it stands first beside a header; None where `time_grid` makes the time."""
+        candidates = [c for c in self._columns if not self._is_index(c)]
         times = [c for c in candidates if c.name.lower() == "time"]
         times += [c for c in candidates if (layouts.parse_unit(c.unit) or ("",))[0] == "s"]
         times += [c for c in candidates if c.name.lower() in layouts.TIME_NAMES]
         stated = self.find_values(layouts.TIME_UNIT_KEYS)
         if not self.names and not self.units and min(self.numeric) > 1 and stated and len(candidates) > 1:
             times += candidates[:1]
-        return dataclasses.replace(times[0], unit=times[0].unit or next(iter(stated), "")) if times else None
+        return times[0]._replace(unit=times[0].unit or next(iter(stated), "")) if times else None
 
 
 def _is_unfilled(row: TextRow, numbers: frozenset[int]) -> bool:

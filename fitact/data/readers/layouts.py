@@ -2,6 +2,9 @@
 
 import re
 
+import numpy as np
+
+from fitact.errors import InputError
 from fitact.units import PREFIX_FACTORS
 
 # who wrote a file, by what its first lines show; the first that matches
@@ -36,11 +39,11 @@ NOT_UNITS = frozenset((
 # keys of a header, in small letters without blanks or punctuation
 COUNT_KEYS = ("signalhardwarerecordlength", "recordlength", "numberofdatapoints", "segmentsize", "samples")
 STEP_KEYS = (
-    *("sampleinterval", "increment", "tinc", "timestep", "dt", "tinterval", "xinc", "xincrement", "wfincrement"),
-    *("signalresolution", "resolution"),
-)
+    "sampleinterval", "increment", "tinc", "timestep", "dt", "tinterval", "xinc", "xincrement", "wfincrement",
+    "signalresolution", "resolution",
+)  # fmt: skip
 RATE_KEYS = ("samplerate", "samplingrate", "fs", "rate", "samplefrequency", "samplingfrequency")
-START_KEYS = (*("start", "t0", "tstart", "xorg", "xorigin", "starttime", "wfstartoffset", "hardwarexstart", "xstart"),)
+START_KEYS = ("start", "t0", "tstart", "xorg", "xorigin", "starttime", "wfstartoffset", "hardwarexstart", "xstart")
 GRID_KEYS = frozenset(("", *START_KEYS, *STEP_KEYS))
 NAME_KEYS = ("multichannelsource", "source", "channeldata", "label")
 UNIT_KEYS = ("verticalunits", "verticalunit")
@@ -70,6 +73,20 @@ def parse_unit(text: str) -> tuple[str, float] | None:
         if unit and prefix in _PREFIXES:
             return unit, PREFIX_FACTORS[prefix]
     return None
+
+
+def convert_time(time: np.ndarray, unit_text: str, place: str, remedy: str) -> np.ndarray:
+    """Seconds; where no unit is stated, they are."""
+    unit = parse_unit(unit_text)
+    if unit_text and (unit is None or unit[0] != "s"):
+        raise InputError(f"{place}: '{unit_text}' is no unit of time; {remedy}")
+    return time * (unit[1] if unit else 1.0)
+
+
+def is_same_grid(time: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two channels were sampled at the same times, to a hundredth of a step."""
+    step = abs(time[-1] - time[0]) / max(time.size - 1, 1)
+    return time.size == other.size and not np.max(np.abs(time - other)) > 0.01 * step
 
 
 _NAME_AND_UNIT = (

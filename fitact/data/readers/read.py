@@ -10,6 +10,7 @@ import numpy as np
 
 from fitact.data.readers.binary import is_known_binary, read_binary
 from fitact.data.readers.capture import Capture, Pick, find_channel, resolve_channels, to_record
+from fitact.data.readers.layouts import is_same_grid
 from fitact.data.readers.text import is_binary, read_text
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.data.spectrum import is_spectrum
@@ -55,11 +56,7 @@ def read(
 
 
 def read_capture(path: str | os.PathLike[str], pick: Pick = lambda names, place: names) -> Capture:
-    """Time and channels of a file under its own names, of which `pick` may choose.
-
-    Raises:
-        InputError: the file cannot be read, or is of no known layout.
-    """
+    """Time and channels of a file under its own names, of which `pick` may choose."""
     source, path = os.fspath(path), Path(path)
     if path.is_dir():
         raise InputError(f"{source}: is a directory; give the path of a file")
@@ -80,25 +77,17 @@ def read_capture(path: str | os.PathLike[str], pick: Pick = lambda names, place:
 
 
 def merge_other_files(capture: Capture, path: str | os.PathLike[str], channels: Mapping[str, str]) -> Capture:
-    """The capture, and the columns of other files that `channels` names as FILE:COLUMN.
-
-    Raises:
-        InputError: such a file cannot be read, or its times are others.
-    """
+    """The capture, and the columns of other files that `channels` names as FILE:COLUMN."""
     traces = list(capture.channels)
     for asked in channels.values():
-        elsewhere = _locate_file_column(path, asked)
-        if elsewhere is None:
-            continue
-        file, column = elsewhere
-        other = _read_column(file, column)
-        step = (capture.time[-1] - capture.time[0]) / max(capture.time.size - 1, 1)
-        if other.time.size != capture.time.size or np.max(np.abs(other.time - capture.time)) > 0.01 * step:
-            raise InputError(
-                f"{capture.source}: {file} has another length or other times, so it is not of one capture with this"
-                " file; export both anew"
-            )
-        traces.append(dataclasses.replace(other.channels[0], name=asked))
+        if found := _locate_file_column(path, asked):
+            other = _read_column(*found)
+            if not is_same_grid(capture.time, other.time):
+                raise InputError(
+                    f"{capture.source}: {found[0]} has another length or other times, so it is not of one capture with"
+                    " this file; export both anew"
+                )
+            traces.append(dataclasses.replace(other.channels[0], name=asked))
     return dataclasses.replace(capture, channels=tuple(traces))
 
 
@@ -109,18 +98,12 @@ def _read_column(file: Path, column: str) -> Capture:
 def _locate_file_column(path: str | os.PathLike[str], requested: str) -> tuple[Path, str] | None:
     """The file and the column where a channel is asked for as FILE:COLUMN, the file from here or beside `path`."""
     file, colon, column = requested.rpartition(":")
-    for found in (Path(path).parent / file, Path(file)):
-        if colon and column and found.is_file():
-            return found, column
-    return None
+    found = [place for place in (Path(path).parent / file, Path(file)) if colon and column and place.is_file()]
+    return (found[0], column) if found else None
 
 
 def write_csv(path: str | os.PathLike[str], record: Record) -> None:
-    """Write a record as `read` reads it, to 12 digits; times to the last bit, which tells on which side of an edge.
-
-    Raises:
-        InputError: the place cannot be written.
-    """
+    """Write a record as `read` reads it, to 12 digits; times to the last bit, which tells on which side of an edge."""
     header = ["time_s", *(f"{name}_{CHANNEL_UNITS[name]}" for name in record.channels)]
     with atomic_write(path) as temporary:
         table = np.stack([record.time, *record.channels.values()], axis=1)

@@ -37,15 +37,15 @@ def read_text(path: Path, source: str, pick: Pick) -> Capture:
             text = _decode(head, source)
             text = text if len(head) < _HEAD_BYTES else text.rpartition("\n")[0]
             header = read_header(text, source, _read_sidecar(path))
-            names = [column.name for column in header.columns]
+            names = [column.name for column in header.channels]
             wanted = set(pick(names, header.location))
-            size = path.stat().st_size
-            table = _TableParser(header, [column for column in header.columns if column.name in wanted], source, size)
-            for block in track_progress(_blocks(stream, source), f"reading {source}", size, file.tell):
+            table = _TableParser(header, [column for column in header.channels if column.name in wanted], source)
+            blocks = _blocks(stream, source)
+            for block in track_progress(blocks, f"reading {source}", path.stat().st_size, file.tell):
                 table.add(block)
     except (OSError, EOFError, zlib.error) as error:
         raise read_error(source, error) from error
-    return table.to_capture([name for name in names if name not in wanted])
+    return table.to_capture([*(name for name in names if name not in wanted), *header.non_numeric_columns()])
 
 
 def is_binary(head: bytes) -> bool:
@@ -110,19 +110,19 @@ def _blocks(stream: IO[bytes], source: str) -> Iterator[bytes]:
 
 
 class _TableParser:
-    def __init__(self, header: Header, columns: Sequence[Column], source: str, size: int) -> None:
-        self._header, self._columns, self._source, self._file_size = header, columns, source, size
-        known = [header.time.index] if header.time else [header.index] if header.index is not None else []
+    def __init__(self, header: Header, columns: Sequence[Column], source: str) -> None:
+        self._header, self._columns, self._source = header, columns, source
+        known = [header.time.place] if header.time else [header.index] if header.index is not None else []
         self._has_time = bool(known)  # or a count of samples, in the first place
-        self._column_indices = [*known, *(column.index for column in columns)]
-        self._numbers = np.empty((len(self._column_indices), 0))  # of each column; longer than there are rows
-        self._lines: list[Sequence[int]] = []  # their numbers, part by part
+        self._column_indices = [*known, *(column.place for column in columns)]
+        self._parts: list[np.ndarray] = []  # rows of numbers
+        self._lines: list[Sequence[int]] = []  # the lines of each part's rows
         self._starts = [0]  # rows before each part
         self._blank_rows: list[int] = []  # rows with a time and no values
-        self._next_line = 1  # line
+        self._next_line = 1
 
     def add(self, block: bytes) -> None:
-        length, first, skipped = len(block), self._next_line, max(0, self._header.first - self._next_line)
+        first, skipped = self._next_line, max(0, self._header.data_rows[0].number - self._next_line)
         self._next_line += block.count(b"\n") + 1
         if skipped:
             parts = block.split(b"\n", skipped)
@@ -132,21 +132,13 @@ class _TableParser:
         block = block.replace(b"\r", b"").replace(b'"', b"")
         if self._header.delimiter == " ":
             block = re.sub(rb"(?m)^ +| +$", b"", re.sub(rb"[ \t]+", b" ", block))
-        numbers = self._parse_fast(block)
-        lines: Sequence[int] = range(first, first + len(numbers)) if numbers is not None else []
+        numbers, lines = self._parse_fast(block), None
         if numbers is None:
             numbers, lines = self._parse_line_by_line(block, first)
         if len(numbers):
-            first_row, rows = self._starts[-1], self._starts[-1] + len(numbers)
-            if rows > self._numbers.shape[1]:
-                # memory that is not written to is not taken
-                room = max(2 * rows, int(1.1 * len(numbers) * self._file_size / length))
-                grown = np.empty((len(self._column_indices), room))
-                grown[:, :first_row] = self._numbers[:, :first_row]
-                self._numbers = grown
-            self._numbers[:, first_row:rows] = numbers.T
-            self._lines.append(lines)
-            self._starts.append(rows)
+            self._parts.append(numbers)
+            self._lines.append(lines or range(first, first + len(numbers)))
+            self._starts.append(self._starts[-1] + len(numbers))
 
     def _parse_fast(self, block: bytes) -> np.ndarray | None:
         """The rows by numpy's parser; None where a line is not as the others."""
@@ -206,15 +198,16 @@ class _TableParser:
         return f"line {self._lines[part][row - self._starts[part]]}"
 
     def to_capture(self, unread_columns: Sequence[str]) -> Capture:
-        """What was read; `unread_columns` are columns that were not wanted."""
-        header, rows = self._header, self._starts[-1]
-        if header.count is not None and rows < header.count - 2:  # by which some makers' counts are off
+        """What was read; `unread_columns` are columns that were not wanted, or hold no numbers."""
+        header, rows, announced = self._header, self._starts[-1], self._header.count_rows()
+        if announced is not None and rows < announced - 2:  # by which some makers' counts are off
             raise InputError(
-                f"{self._source}: the header announces {header.count:,} rows and {rows:,} are there, so the file"
+                f"{self._source}: the header announces {announced:,} rows and {rows:,} are there, so the file"
                 " was cut; export it again"
             )
         kept, notes = self._trim_blank_rows(rows)
-        columns = [column[:rows][kept] for column in self._numbers]
+        columns = [np.concatenate([part[:, i] for part in self._parts])[kept] for i in range(len(self._column_indices))]
+        self._parts.clear()  # `row_label` keeps the parser
         if self._has_time:
             time, *values = columns
         else:
@@ -230,7 +223,7 @@ class _TableParser:
             ),
             row_label=lambda row: self._line_label(row + (kept.start or 0)),
             notes=(*timing, *notes),
-            unread_columns=(*unread_columns, *header.non_numeric_columns),
+            unread_columns=tuple(unread_columns),
         )
 
     def _trim_blank_rows(self, rows: int) -> tuple[slice, list[str]]:
@@ -248,17 +241,13 @@ class _TableParser:
 
     def _time_in_seconds(self, time: np.ndarray) -> tuple[np.ndarray, list[str]]:
         """Seconds, and what was assumed of them."""
-        header = self._header
+        header, place = self._header, f"{self._source}{self._header.location}"
         if header.time:
-            unit = layouts.parse_unit(header.time.unit)
-            if header.time.unit and (unit is None or unit[0] != "s"):
-                raise InputError(
-                    f"{self._source}{header.location}: '{header.time.unit}' is no unit of time; write a multiple of s"
-                )
             stated = header.time.unit or (header.time.name.lower() == "time" and header.maker == "fitact")
             notes = [] if stated else [f"{self._source}: the file states no unit of time; seconds were assumed"]
-            return time * (unit[1] if unit else 1.0), notes
-        if header.step is None:
-            raise InputError(f"{self._source}{header.location}: no time, and no step of it; export the time as well")
-        notes = [] if header.start is not None else [f"{self._source}: the time was taken to start at 0"]
-        return (header.start or 0.0) + header.step * time, notes
+            return layouts.convert_time(time, header.time.unit, place, "write a multiple of s"), notes
+        start, step = header.time_grid
+        if step is None:
+            raise InputError(f"{place}: no time, and no step of it; export the time as well")
+        notes = [] if start is not None else [f"{self._source}: the time was taken to start at 0"]
+        return (start or 0.0) + step * time, notes
