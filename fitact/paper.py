@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fitact.model.circuit import DirectGround, FinalCircuit, NaturalGround
+from fitact.model.circuit import Circuit, DirectGround, FinalCircuit, NaturalGround
 from fitact.model.drive import Drive, Sine, Square, Triangle
 from fitact.model.force import Contact, mean_force, plate_capacitance, plate_resistance
 from fitact.model.skin import quality_factor, series_equivalent
@@ -61,15 +61,15 @@ class Claim:
     reason: str
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the claim as in reproduction.json."""
+        """The claim as in reproduction.json."""
         return dataclasses.asdict(self)
 
 
 def reproduce() -> tuple[Claim, ...]:
     """Compute and judge all claims, in the paper's order."""
     parts = (
-        _plate_claims, _impedance_claims, _grounding_claims, _grounding_finger_claims, _equivalent_claims,
-        _body_claims, _insulator_claims, _frequency_claims, _waveform_claims, _equation_claims,
+        _element_claims, _grounding_claims, _grounding_finger_claims, _equivalent_claims, _insulator_claims,
+        _frequency_claims, _waveform_claims, _equation_claims,
     )  # fmt: skip
     with jax.enable_x64(True):
         return tuple(claim for part in parts for claim in part())
@@ -91,7 +91,7 @@ def _map_insulators(function: Callable[[float], Any]) -> dict[str, float]:
     return {name: float(function(Ci)) for name, Ci in INSULATORS.items()}
 
 
-def _plate_claims() -> Iterator[Claim]:
+def _element_claims() -> Iterator[Claim]:
     yield _make_claim(
         "eq3_Ci", "Ci of 1 um, permittivity 3.9 and 1 cm^2 is 1.35 nF", CI, INSULATORS["3.45 nF"], "F",
         "eq. (3) with the paper's own values gives 3.45 nF; 1.35 nF would need 2.56 um, a permittivity of 1.53 or"
@@ -112,9 +112,6 @@ def _plate_claims() -> Iterator[Claim]:
             f"eq4_Rsc_{suffix}", f"Rsc at {frequency}", Rsc, float(plate_resistance(resistivity, AREA, SKIN)), "ohm",
             f"resistivity {resistivity:g} ohm m: {why}",
         )  # fmt: skip
-
-
-def _impedance_claims() -> Iterator[Claim]:
     yield _make_claim(
         "eq7_ZCi_100Hz", "|1 / (j w Ci)| at 100 Hz is 2.3 Mohm", 2.3e6, _map_insulators(lambda Ci: 1.0 / (_OMEGA * Ci)),
         "ohm", "1.35 nF gives 1.18 Mohm; 2.3 Mohm is that of 0.69 nF",
@@ -126,23 +123,20 @@ def _impedance_claims() -> Iterator[Claim]:
 
 
 def _grounding_claims() -> Iterator[Claim]:
-    def gain(circuit: DirectGround | NaturalGround) -> Any:
+    def ratio(measure: Callable[[Circuit], Any], Ci: float = CI) -> float:
+        """Under direct ground, over that under natural ground."""
+        return float(measure(DirectGround(RSC, CSC, Ci, R_H=R_H)) / measure(NaturalGround(RSC, CSC, Ci, Z)))
+
+    def gain(circuit: Circuit) -> Any:
         return jnp.abs(circuit.transfer_function(_OMEGA))
 
-    def direct(Ci: float) -> DirectGround:
-        return DirectGround(RSC, CSC, Ci, R_H=R_H)
-
-    def natural(Ci: float) -> NaturalGround:
-        return NaturalGround(RSC, CSC, Ci, Z)
-
-    of_square = float(peak(direct(CI), _SQUARE) / peak(natural(CI), _SQUARE))
     yield _make_claim(
         "fig4_ratio", "Vsc under direct ground is six times that under natural ground (sine, 100 Hz)", 6.0,
-        _map_insulators(lambda Ci: gain(direct(Ci)) / gain(natural(Ci))), "1",
-        f"six times needs the 0.69 nF of the paper's |Z_Ci|; with 1.35 nF a square's peaks are {of_square:.1f} times",
-        0.02,
+        _map_insulators(lambda Ci: ratio(gain, Ci)), "1",
+        "six times needs the 0.69 nF of the paper's |Z_Ci|; with 1.35 nF a square's peaks are"
+        f" {ratio(lambda circuit: peak(circuit, _SQUARE)):.1f} times", 0.02,
     )  # fmt: skip
-    total = abs(1.0 / complex(direct(CI).admittance(_OMEGA))) / abs(1.0 / complex(natural(CI).admittance(_OMEGA)))
+    total = ratio(lambda circuit: 1.0 / abs(complex(circuit.admittance(_OMEGA))))
     yield Claim(
         "text_Ztotal", "Z_dir-total is much larger than Z_nat-total (their ratio at 100 Hz)", None, total, "1",
         "differs", "it is much smaller, which is why Vsc is larger under direct ground: a slip of the pen",
@@ -190,8 +184,6 @@ def _equivalent_claims() -> Iterator[Claim]:
         "R_H / (Rx' + R_H) = 0.912 %; the paper took it from rounded numbers",
     )  # fmt: skip
 
-
-def _body_claims() -> Iterator[Claim]:
     def relative_change(Ci: float) -> Any:
         return 1.0 - peak(DirectGround(RSC, CSC, Ci, R_H=R_H), _SQUARE) / peak(FinalCircuit(RSC, CSC, Ci), _SQUARE)
 
@@ -203,7 +195,7 @@ def _body_claims() -> Iterator[Claim]:
 
 
 def force_over(permittivity: float, thickness: float) -> float:
-    """Return the mean force (N) of Fig. 12 under a 360 Vpp square, Ci following from the insulator by eq. (3)."""
+    """The mean force (N) of Fig. 12 under a 360 Vpp square, Ci following from the insulator by eq. (3)."""
     Ci = plate_capacitance(permittivity, AREA, thickness)
     contact = Contact(AREA, thickness, permittivity, SKIN, float(CSC * SKIN / plate_capacitance(1.0, AREA, 1.0)))
     return float(mean_force(FinalCircuit(RSC, CSC, Ci), _SQUARE, contact))
@@ -228,30 +220,20 @@ def _insulator_claims() -> Iterator[Claim]:
 
 
 def _frequency_claims() -> Iterator[Claim]:
-    def corner_frequency(Ci: float) -> float:
-        return 1.0 / (2.0 * math.pi * float(FinalCircuit(RSC, CSC, Ci).b))
-
-    def steady_frequency(Ci: float) -> float:
-        return corner_frequency(Ci) * 0.99 / math.sqrt(1.0 - 0.99**2)
-
-    yield _make_claim(
-        "fig14_amplitude_knee", "the amplitude's knee is at about 40 Hz", 40.0, _map_insulators(corner_frequency), "Hz",
-        "the corner 1 / (2 pi b) of the first-order high-pass", 0.02,
-    )  # fmt: skip
-    yield _make_claim(
-        "fig14_amplitude_steady", "the amplitude is steady from about 300 Hz", 300.0,
-        _map_insulators(steady_frequency), "Hz",
-        "where it has 99 % of its limit; the paper does not say what steady means", 0.1,
-    )  # fmt: skip
-    yield _make_claim(
-        "fig14_phase_knee", "the phase's knee is at about 90 Hz", 90.0, _map_insulators(corner_frequency), "Hz",
-        "a first-order high-pass has one corner, of amplitude and phase alike; at 90 Hz the lead is still 24 degrees",
-        0.1,
-    )  # fmt: skip
-    yield _make_claim(
-        "fig14_phase_steady", "the phase is steady from about 270 Hz", 270.0, _map_insulators(steady_frequency), "Hz",
-        "where the lead is 8.1 degrees, which is where the amplitude has 99 % of its limit", 0.1,
-    )  # fmt: skip
+    corner = _map_insulators(lambda Ci: 1.0 / (2.0 * math.pi * FinalCircuit(RSC, CSC, Ci).b))
+    steady = {name: frequency * 0.99 / math.sqrt(1.0 - 0.99**2) for name, frequency in corner.items()}
+    for id, claim, frequency, ours, reason, tolerance in (
+        ("amplitude_knee", "the amplitude's knee is at about 40 Hz", 40.0, corner,
+         "the corner 1 / (2 pi b) of the first-order high-pass", 0.02),
+        ("amplitude_steady", "the amplitude is steady from about 300 Hz", 300.0, steady,
+         "where it has 99 % of its limit; the paper does not say what steady means", 0.1),
+        ("phase_knee", "the phase's knee is at about 90 Hz", 90.0, corner,
+         "a first-order high-pass has one corner, of amplitude and phase alike; at 90 Hz the lead is still 24 degrees",
+         0.1),
+        ("phase_steady", "the phase is steady from about 270 Hz", 270.0, steady,
+         "where the lead is 8.1 degrees, which is where the amplitude has 99 % of its limit", 0.1),
+    ):  # fmt: skip
+        yield _make_claim(f"fig14_{id}", claim, frequency, ours, "Hz", reason, tolerance)
 
 
 def waveforms(peak_to_peak: float) -> dict[str, Drive]:
@@ -266,75 +248,53 @@ def _waveform_claims() -> Iterator[Claim]:
 
     larger = waveforms(PEAK_TO_PEAK)
     for name, drive in waveforms(30.0).items():
-        at_360 = 2.0 * float(peak(FinalCircuit(RSC, CSC, CI), larger[name]))
+        printed = 30.0 if name == "square" else 15.0
         yield _make_claim(
-            f"fig15_{name}", f"a {name} of 30 Vpp and 100 Hz gives Vsc of about {30 if name == 'square' else 15} Vpp",
-            30.0 if name == "square" else 15.0,
+            f"fig15_{name}", f"a {name} of 30 Vpp and 100 Hz gives Vsc of about {printed:g} Vpp", printed,
             peak_to_peak(drive), "V",
             f"no divider gives half or all of the drive; the ordinate is that of a drive near 300 to 360 Vpp"
-            f" ({at_360:.1f} Vpp at 360 Vpp)",
-            0.1,
+            f" ({peak_to_peak(larger[name])[TEXT_CI]:.1f} Vpp at 360 Vpp)", 0.1,
         )  # fmt: skip
 
 
 def _equation_claims() -> Iterator[Claim]:
     """The formulas without a number: the paper's as printed, in complex arithmetic, against fitact's."""
-    for id, (claim, off, reason) in _formulas().items():
+    frequency = np.geomspace(10.0, 1000.0, 41)
+    w = 2.0 * np.pi * frequency
+    final, direct, natural = (
+        FinalCircuit(RSC, CSC, CI), DirectGround(RSC, CSC, CI, R_H=R_H), NaturalGround(RSC, CSC, CI, Z)
+    )  # fmt: skip
+    skin, insulator, X = RSC / (1.0 + 1j * w * RSC * CSC), 1.0 / (1j * w * CI), 1.0 / (w * CSC)
+    series = series_equivalent(RSC, CSC, frequency)
+    both = np.asarray(series.Rx) + 1j / (w * np.asarray(series.Cx))
+    a, b = RSC * CI, 2.0 * RSC * CI + RSC * CSC
+    H, admittance = final.transfer_function(w), final.admittance(w)
+    same = "the same, to rounding"
+    for id, claim, printed, ours, reason in (
+        ("eq5", "Vsc under direct ground", skin / (2 * skin + insulator + R_H), direct.transfer_function(w), same),
+        ("eq6", "Vsc under natural ground", skin / (skin + insulator + Z), natural.transfer_function(w), same),
+        ("eq10", "the series equivalent, resistance and reactance",
+         (RSC * (1j * X) ** 2 + 1j * RSC**2 * X) / (RSC**2 + X**2), both,
+         "as printed its real part is negative: (jX)^2 = -X^2; eqs. (11) to (13), which follow, are right"),
+        ("eq12", "Xx", w * CSC * RSC**2 / (1 + (w * CSC * RSC) ** 2), both.imag, same),
+        ("eq15", "Q, series and parallel", RSC / X, both.imag / both.real, same),
+        ("eq18", "V over I", 2 * skin + insulator, 1 / admittance, same),
+        ("eq19", "Vsc over I", skin, H / admittance, same),
+        ("eq21", "H, eqs. (20) and (21)", 1j * w * a / (1j * w * b + 1.0), H, same),
+        ("eq24", "real and imaginary part of H, eqs. (23) and (24)",
+         a * w / (1 + (b * w) ** 2) * (b * w + 1j), H, same),
+        ("eq25", "|H|", np.sqrt(a**2 * w**2 / (1 + b**2 * w**2)), final.amplitude(w), same),
+        ("eq26", "the phase of H", np.arctan(1 / (b * w)), final.phase(w),
+         "the formula is right; the text calls it the arctangent of Re over Im"),
+        ("eq22", "mean force over mean Vsc^2", *_force_law(), same),
+    ):  # fmt: skip
+        off = float(np.max(np.abs(np.asarray(ours) / printed - 1.0)))
         yield _make_claim(id, f"{claim} (largest relative difference, 10 to 1000 Hz)", 0.0, off, "1", reason, 1e-9)
 
 
-def _formulas() -> dict[str, tuple[str, float, str]]:
-    frequency = np.geomspace(10.0, 1000.0, 41)
-    omega = 2.0 * np.pi * frequency
-    Ci, final, direct = CI, FinalCircuit(RSC, CSC, CI), DirectGround(RSC, CSC, CI, R_H=R_H)
-    natural = NaturalGround(RSC, CSC, Ci, Z)
-
-    def max_error(printed: Callable[[float], complex], ours: Any) -> float:
-        return float(np.max(np.abs(np.asarray(ours) / np.array([printed(w) for w in omega]) - 1.0)))
-
-    def skin(w: float) -> complex:
-        return RSC / (1.0 + 1j * w * RSC * CSC)
-
-    def insulator(w: float) -> complex:
-        return 1.0 / (1j * w * Ci)
-
-    def X(w: float) -> float:
-        return 1.0 / (w * CSC)
-
-    def printed10(w: float) -> complex:
-        return (RSC * (1j * X(w)) ** 2 + 1j * RSC**2 * X(w)) / (RSC**2 + X(w) ** 2)
-
-    series = [series_equivalent(RSC, CSC, f) for f in frequency]
-    both = [complex(float(s.Rx), 1.0 / (w * float(s.Cx))) for s, w in zip(series, omega, strict=True)]
-    a, b = RSC * Ci, 2.0 * RSC * Ci + RSC * CSC
-    H = final.transfer_function(omega)
-    same = "the same, to rounding"
-    return {
-        "eq5": ("Vsc under direct ground", max_error(lambda w: skin(w) / (2 * skin(w) + insulator(w) + R_H),
-                direct.transfer_function(omega)), same),
-        "eq6": ("Vsc under natural ground", max_error(lambda w: skin(w) / (skin(w) + insulator(w) + Z),
-                natural.transfer_function(omega)), same),
-        "eq10": ("the series equivalent, resistance and reactance", max_error(printed10, both),
-                 "as printed its real part is negative: (jX)^2 = -X^2; eqs. (11) to (13), which follow, are right"),
-        "eq12": ("Xx",
-                 max_error(lambda w: w * CSC * RSC**2 / (1 + (w * CSC * RSC) ** 2), [z.imag for z in both]), same),
-        "eq15": ("Q, series and parallel", max_error(lambda w: RSC / X(w), [z.imag / z.real for z in both]),
-                 same),
-        "eq18": ("V over I", max_error(lambda w: 2 * skin(w) + insulator(w), 1 / final.admittance(omega)), same),
-        "eq19": ("Vsc over I", max_error(skin, H / final.admittance(omega)), same),
-        "eq21": ("H, eqs. (20) and (21)", max_error(lambda w: 1j * w * a / (1j * w * b + 1.0), H), same),
-        "eq24": ("real and imaginary part of H, eqs. (23) and (24)",
-                 max_error(lambda w: a * w / (1 + (b * w) ** 2) * (b * w + 1j), H), same),
-        "eq25": ("|H|", max_error(lambda w: math.sqrt(a**2 * w**2 / (1 + b**2 * w**2)), final.amplitude(omega)), same),
-        "eq26": ("the phase of H", max_error(lambda w: math.atan(1 / (b * w)), final.phase(omega)),
-                 "the formula is right; the text calls it the arctangent of Re over Im"),
-        "eq22": ("mean force over mean Vsc^2", _force_law_error(), same),
-    }  # fmt: skip
-
-
-def _force_law_error() -> float:
-    """Eq. (22) as printed against the mean force; with v = Vsc it is eq. (1)."""
+def _force_law() -> tuple[float, float]:
+    """Eq. (22) as printed, and the mean force over the mean square of Vsc; with v = Vsc it is eq. (1)."""
     contact = Contact(AREA, INSULATOR, PERMITTIVITY, SKIN, 5e3)
     circuit = FinalCircuit(RSC, CSC, CI)
     printed = 8.85e-12 * AREA / (2 * (INSULATOR / PERMITTIVITY + SKIN / 5e3) * (INSULATOR + SKIN))
-    return abs(float(mean_force(circuit, _SQUARE, contact) / mean_square(circuit, _SQUARE)) / printed - 1.0)
+    return printed, float(mean_force(circuit, _SQUARE, contact) / mean_square(circuit, _SQUARE))
