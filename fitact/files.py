@@ -13,11 +13,7 @@ from fitact.errors import InputError
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary name beside `path`, which takes its place when the block ends well, and goes when it does not.
-
-    Raises:
-        InputError: the place cannot be written.
-    """
+    """A temporary name beside `path`, which takes its place when the block ends well, and goes when it does not."""
     path = Path(path)
     temporary = _temporary_path(path)
     try:
@@ -46,14 +42,9 @@ def read_error(source: str, error: Exception) -> InputError:
     return InputError(f"{source}: cannot be read ({reason.lower()}); check the path and the file")
 
 
-def to_json(content: Any) -> str:
-    """Plain JSON, with null for what is not finite; keys in the order given."""
-    return json.dumps(_to_plain(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def to_json_line(content: Any) -> str:
-    """The same on one line."""
-    return json.dumps(_to_plain(content), ensure_ascii=False, allow_nan=False) + "\n"
+def to_json(content: Any, indent: int | None = 2) -> str:
+    """Plain JSON, with null for what is not finite; keys in the order given; without `indent` on one line."""
+    return json.dumps(_to_plain(content), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def _to_plain(content: Any) -> Any:

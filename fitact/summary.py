@@ -5,6 +5,7 @@ import json
 import math
 import os
 import platform
+import statistics
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,8 @@ from fitact.units import format_engineering, quantity_unit
 
 _PACKAGES = ("fitact", "jax", "equinox", "optimistix", "emcee", "numpy", "xarray")
 _SECTIONS = {"parameters", "derived", "identifiability", "convergence", "fit", "model", "warnings", "record"}
-# standard normal quantiles of the summary's probabilities
-_NORMAL = {
-    "q025": -1.959963984540054, "q05": -1.6448536269514722, "q25": -0.6744897501960817, "q50": 0.0,
-    "q75": 0.6744897501960817, "q95": 1.6448536269514722, "q975": 1.959963984540054,
-}  # fmt: skip
-
-PROBABILITIES = {key: float(f"0.{key[1:]}") for key in _NORMAL}  # of the quantiles
+PROBABILITIES = {f"q{digits}": float(f"0.{digits}") for digits in ("025", "05", "25", "50", "75", "95", "975")}
+_NORMAL = {key: statistics.NormalDist().inv_cdf(p) for key, p in PROBABILITIES.items()}  # standard normal quantiles
 
 Summary = dict[str, float | str]
 FORCE_DESCRIPTIONS = {  # what makes the force, by the name of its model
@@ -33,13 +29,9 @@ FORCE_DESCRIPTIONS = {  # what makes the force, by the name of its model
 
 def summarize_draws(name: str, draws: Float[np.ndarray, "*shape"]) -> Summary:
     """Summary of draws of the quantity `name`, in its SI unit."""
-    quantiles = np.quantile(draws, list(PROBABILITIES.values()))
-    summary: Summary = {
-        "unit": quantity_unit(name),
-        "mean": float(np.mean(draws)),
-        "sd": float(np.std(draws, ddof=1)),
-    }
-    return summary | {key: float(value) for key, value in zip(PROBABILITIES, quantiles, strict=True)}
+    quantiles = np.quantile(draws, list(PROBABILITIES.values())).tolist()
+    summary: Summary = {"unit": quantity_unit(name), "mean": float(np.mean(draws)), "sd": float(np.std(draws, ddof=1))}
+    return summary | dict(zip(PROBABILITIES, quantiles, strict=True))
 
 
 def summarize_log_normal(name: str, median: float, log_sd: float) -> Summary:
@@ -47,11 +39,8 @@ def summarize_log_normal(name: str, median: float, log_sd: float) -> Summary:
     with np.errstate(over="ignore"):
         mean = median * np.exp(0.5 * log_sd**2)
         quantiles = median * np.exp(log_sd * np.array(list(_NORMAL.values())))
-        summary: Summary = {
-            "unit": quantity_unit(name),
-            "mean": float(mean),
-            "sd": float(mean * np.sqrt(np.expm1(log_sd**2))),
-        }
+        sd = mean * np.sqrt(np.expm1(log_sd**2))
+    summary: Summary = {"unit": quantity_unit(name), "mean": float(mean), "sd": float(sd)}
     return summary | dict(zip(_NORMAL, quantiles.tolist(), strict=True))
 
 
@@ -72,11 +61,7 @@ def format_sd(summary: Summary) -> str:
 
 
 def load(directory: str | os.PathLike[str]) -> dict[str, Any]:
-    """What summary.json holds, in a folder that `fitact sample` or `fitact run` wrote.
-
-    Raises:
-        InputError: there is none, or it is not fitact's.
-    """
+    """The content of summary.json, in a folder that `fitact sample` or `fitact run` wrote."""
     try:
         content = json.loads((Path(directory) / "summary.json").read_text(encoding="utf-8"))
         if not (isinstance(content, dict) and set(content) >= _SECTIONS):
@@ -89,12 +74,12 @@ def load(directory: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def table(content: dict[str, Any]) -> str:
-    """What summary.json holds, for people."""
+    """The content of summary.json, for people."""
     rows = [f"{'':14}{'median':>12}{'5 %':>14}{'95 %':>12}"]
     for name, s in (content["parameters"] | content["derived"]).items():
         median, low, high = (format_engineering(float(s[q]), str(s["unit"])) for q in ("q50", "q05", "q95"))
         rows.append(f"{name:14}{median:>12}{low:>14}{high:>12}")
-    rows += [f"force: {FORCE_DESCRIPTIONS[content['model'].get('force', 'paper')]}."]
+    rows.append(f"force: {FORCE_DESCRIPTIONS[content['model'].get('force', 'paper')]}.")
     rows += [content[section]["sentence"] for section in ("convergence", "identifiability")]
     return "\n".join([*rows, *(f"warning: {warning}" for warning in content["warnings"])])
 

@@ -36,30 +36,22 @@ def _registry() -> Any:
 
 
 def parse_quantity(value: object, unit: str) -> float:
-    """A quantity such as ``"160 kohm"`` as a float in the SI unit `unit`; a bare number is in `unit` already.
-
-    Raises:
-        InputError: the text is no quantity, or of another dimension.
-    """
+    """A quantity such as ``"160 kohm"`` as a float in the SI unit `unit`; a bare number is in `unit` already."""
+    remedy = f"write a number with a unit, such as '1 {unit}'"
     if isinstance(value, bool) or not isinstance(value, int | float | str):
-        raise InputError(f"{value!r} is not a quantity; write a number with a unit, such as '1 {unit}'")
+        raise InputError(f"{value!r} is not a quantity; {remedy}")
     if isinstance(value, str):
         try:
             quantity = _registry().Quantity(value)
             value = float(quantity.to("" if quantity.unitless else unit).magnitude)  # "10 %" is 0.1
         except pint.DimensionalityError as error:
-            remedy = f"in a unit of {unit}; write it as a multiple of {unit}" if unit else "a plain number; write one"
-            raise InputError(f"'{value}' is not {remedy}") from error
+            wanted = f"in a unit of {unit}; write it as a multiple of {unit}" if unit else "a plain number; write one"
+            raise InputError(f"'{value}' is not {wanted}") from error
         except Exception as error:  # pint raises a dozen kinds, tokenize errors among them
-            raise InputError(f"'{value}' is not a quantity; write a number with a unit, such as '1 {unit}'") from error
+            raise InputError(f"'{value}' is not a quantity; {remedy}") from error
     if not math.isfinite(value):
-        raise InputError(f"{value} is not finite; write a number with a unit, such as '1 {unit}'")
+        raise InputError(f"{value} is not finite; {remedy}")
     return float(f"{value:.15g}")  # 200 um is 2e-4 m, not 1.9999999999999998e-4
-
-
-def unit_factor(text: str, unit: str) -> float:
-    """How many `unit` one `text` is: ``unit_factor("ms", "s") == 1e-3``."""
-    return parse_quantity(f"1 {text}", unit)
 
 
 def format_exact(value: float, unit: str) -> str:

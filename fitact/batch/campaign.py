@@ -25,7 +25,7 @@ from fitact.batch.fit_many import Fits, Row, fit_many
 from fitact.batch.sample_many import add_posterior, sample_many
 from fitact.data.readers.read import read
 from fitact.errors import InputError
-from fitact.files import to_json_line
+from fitact.files import to_json
 from fitact.fitting.fit import fit
 from fitact.sampling.ensemble import sample
 from fitact.scene.scene import Scene
@@ -127,7 +127,7 @@ class Journal:
     def add(self, rows: Mapping[str, Row]) -> None:
         """Add the rows of a batch, which are on disk when this returns."""
         self.rows |= rows
-        self._file.write(to_json_line(rows).encode())
+        self._file.write(to_json(rows, indent=None).encode())
         self._file.flush()
         os.fsync(self._file.fileno())
 

@@ -23,9 +23,12 @@ from fitact.data.record import (
     white_noise_sd,
 )
 from fitact.errors import InputError
+from fitact.tables import join_lines
 from fitact.units import format_engineering
 
 Samples = Float[np.ndarray, " samples"]
+
+_MOST = {"V": 5e3, "A": 0.1}  # that drives a display
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,10 +42,9 @@ class Channel:
     clipped: int
 
     def to_dict(self) -> dict[str, Any]:
-        low, high = float(self.values.min()), float(self.values.max())
         return {
-            "name": self.name, "unit": self.unit, "min": low, "max": high, "noise": self.noise,
-            "clipped": self.clipped > 0, "clipped_samples": self.clipped,
+            "name": self.name, "unit": self.unit, "min": float(self.values.min()), "max": float(self.values.max()),
+            "noise": self.noise, "clipped": self.clipped > 0, "clipped_samples": self.clipped,
         }  # fmt: skip
 
 
@@ -75,15 +77,11 @@ class Inspection:
 
     def __str__(self) -> str:
         step = float(np.median(np.diff(self.time)))
+        wave = f"repeats at {format_engineering(self.frequency, 'Hz')}" if self.frequency else "no whole wave seen"
         lines = [
             f"{self.source} ({self.format}): {self.time.size:,} samples, every {format_engineering(step, 's')}"
             f" ({format_engineering(1.0 / step, 'Hz')}), from {format_engineering(self.time[0], 's')} to"
-            f" {format_engineering(self.time[-1], 's')}; "
-            + (
-                "no whole wave seen"
-                if self.frequency is None
-                else f"repeats at {format_engineering(self.frequency, 'Hz')}"
-            )
+            f" {format_engineering(self.time[-1], 's')}; {wave}"
         ]
         width = max(len(channel.name) for channel in self.channels)
         for channel in self.channels:
@@ -92,9 +90,7 @@ class Inspection:
             )
             rail = f", {channel.clipped:,} samples clipped" if channel.clipped else ""
             lines.append(f"  {channel.name:<{width}}  {low} to {high}, noise {noise}{rail}")
-        lines += [f"note: {note}" for note in self.notes]
-        lines += [f"warning: {warning}" for warning in self.warnings]
-        return "\n".join(lines)
+        return join_lines([*lines, *(f"note: {note}" for note in self.notes)], self.warnings)
 
 
 def inspect(
@@ -113,36 +109,27 @@ def inspect(
         record = to_record(capture, channels or {}, scale or {})
         arrays = {name: (record[name], CHANNEL_UNITS[name]) for name in record.channels}
         return _inspect_channels(capture, record.time, arrays, record.notes)
-    _check_times(capture)
-    arrays = {trace.name: (trace.values, trace.unit) for trace in capture.channels}
-    names = ", ".join(arrays)
-    notes = (
-        *capture.notes,
-        *grid_notes(capture.time, capture.source),
-        f"{capture.source}: before a fit, say which of {names} is which, as --channel V=NAME --channel Vsc=NAME",
-    )
-    return _inspect_channels(capture, capture.time, arrays, notes)
-
-
-def _check_times(capture: Capture) -> None:
-    """Refuse times that no record could have; the channels may still be anything."""
     time = capture.time
     if time.size < 2 or not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0.0):
         raise InputError(
             f"{capture.source}: the times are not increasing, or fewer than two; sort the rows, drop repeated ones, and"
             " check which column is time"
         )
+    arrays = {trace.name: (trace.values, trace.unit) for trace in capture.channels}
+    names = ", ".join(arrays)
+    notes = (
+        *capture.notes,
+        *grid_notes(time, capture.source),
+        f"{capture.source}: before a fit, say which of {names} is which, as --channel V=NAME --channel Vsc=NAME",
+    )
+    return _inspect_channels(capture, time, arrays, notes)
 
 
 def _inspect_channels(
-    capture: Capture,
-    time: Samples,
-    arrays: Mapping[str, tuple[Samples, str]],
-    notes: tuple[str, ...],
+    capture: Capture, time: Samples, arrays: Mapping[str, tuple[Samples, str]], notes: tuple[str, ...]
 ) -> Inspection:
-    frequency = next(
-        (f for f in (_estimate_frequency(time, values) for values, _ in arrays.values()) if f is not None), None
-    )
+    frequencies = (_estimate_frequency(time, values) for values, _ in arrays.values())
+    frequency = next((f for f in frequencies if f is not None), None)
     warnings = check_time(time, frequency) if time.size > 3 else []
     for name, (values, unit) in arrays.items():
         warnings += check_channel(name, unit, time, values, frequency)
@@ -201,16 +188,8 @@ def check_time(time: Samples, frequency: float | None, min_samples_per_period: i
     return found
 
 
-def check_channel(
-    name: str,
-    unit: str,
-    time: Samples,
-    values: Samples,
-    frequency: float | None,
-    max_V: float = 5e3,
-    max_A: float = 0.1,
-) -> list[str]:
-    """What is doubtful about a channel; unit V, A or "" where none is known, and the most that drives a display."""
+def check_channel(name: str, unit: str, time: Samples, values: Samples, frequency: float | None) -> list[str]:
+    """Sentences on what is doubtful about a channel; unit V, A or "" where none is known."""
     bad = np.flatnonzero(~np.isfinite(values) | (np.abs(values) >= OVERFLOW))
     if bad.size:
         return [f"{name} is not finite, or a code for overflow, at {bad.size:,} samples; they will be refused"]
@@ -218,8 +197,7 @@ def check_channel(
     if spread == 0.0:
         return [f"{name} is constant at {values[0]:.6g}; is it connected?"]
     found = []
-    railed = int(np.count_nonzero(clipping_mask(values)))
-    if railed:
+    if railed := int(np.count_nonzero(clipping_mask(values))):
         found.append(
             f"{name} is clipped at {railed:,} samples ({values.min():.4g} to {values.max():.4g}): the oscilloscope's"
             " range or the amplifier is exceeded"
@@ -227,7 +205,7 @@ def check_channel(
     if rounding_noise_sd(values) > 0.0:
         found.append(f"{name} is rounded to steps wider than its noise; record with a finer range")
     largest = float(np.max(np.abs(values)))
-    if largest > {"V": max_V, "A": max_A}.get(unit, math.inf):
+    if largest > _MOST.get(unit, math.inf):
         found.append(
             f"{name} reaches {format_engineering(largest, unit)}, more than a touch display takes; is the unit right?"
         )
@@ -262,11 +240,8 @@ def _check_hum_and_drift(
 ) -> Iterator[str]:
     """Hum and drift beside a periodic signal: by a line of the spectrum, and by the means of the periods.
 
-    Args:
-        min_mains_periods: that a record must hold to tell mains hum from drift.
-        hum_fraction: hum worth a word, over the channel's range.
-        drift_fraction: drift over the record worth a word, over the channel's range.
-        min_significance: of a drift, in standard errors.
+    Both are worth a word from a fraction of the channel's range on, a drift of so many standard errors; a record must
+    hold `min_mains_periods` to tell mains hum from drift.
     """
     span = float(time[-1] - time[0])
     if frequency is None or not is_uniform(time) or span * frequency < 3.0:

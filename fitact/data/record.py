@@ -6,6 +6,7 @@ import hashlib
 import math
 import weakref
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -101,10 +102,10 @@ class Record:
 
     def noise(self, channel: str) -> float:
         """Standard deviation of the channel's noise, judged without a model: white noise and rounding."""
-        if channel not in self._noises:
+        if ("noise", channel) not in self._known:
             values = self[channel] if channel == "V" else self[channel][~clipping_mask(self[channel])]
-            self._noises[channel] = math.hypot(white_noise_sd(values), rounding_noise_sd(values))
-        return self._noises[channel]
+            self._known["noise", channel] = math.hypot(white_noise_sd(values), rounding_noise_sd(values))
+        return self._known["noise", channel]
 
     @property
     def leading(self) -> str:
@@ -114,31 +115,25 @@ class Record:
     def frequency(self, channel: str | None = None) -> float | None:
         """Fundamental frequency in Hz of a channel (of V, else Vsc); None unless the record shows 1.5 periods."""
         channel = channel or self.leading
-        if channel not in self._frequencies:
-            self._frequencies[channel] = fundamental_frequency(self.time, self[channel])
-        return self._frequencies[channel]
+        if ("frequency", channel) not in self._known:
+            self._known["frequency", channel] = fundamental_frequency(self.time, self[channel])
+        return self._known["frequency", channel]
 
     @functools.cached_property
-    def _noises(self) -> dict[str, float]:
-        """Those asked for so far, each of which takes a pass over the record."""
-        return {}
-
-    @functools.cached_property
-    def _frequencies(self) -> dict[str, float | None]:
-        """Those asked for so far, each of which takes a transform of the record."""
+    def _known(self) -> dict[tuple[str, str], Any]:
+        """Noises and frequencies asked for so far, each of which takes a pass over the record."""
         return {}
 
 
 def is_uniform(time: Float[np.ndarray, " samples"], tolerance: float = 1e-2, block: int = 65_536) -> bool:
     """Whether every sample lies on an even grid, to `tolerance` of a step; `block` samples are looked at at a time."""
     step = (time[-1] - time[0]) / (time.size - 1)
-
-    def is_on_grid(first: int) -> bool:
+    for first in range(0, time.size, block):
         part = time[first : first + block]
         grid = time[0] + step * np.arange(first, first + part.size)
-        return bool(np.all(np.abs(part - grid) <= tolerance * step))
-
-    return all(is_on_grid(first) for first in range(0, time.size, block))
+        if not np.all(np.abs(part - grid) <= tolerance * step):
+            return False
+    return True
 
 
 def grid_notes(time: Float[np.ndarray, " samples"], source: str) -> tuple[str, ...]:
@@ -153,10 +148,7 @@ def grid_notes(time: Float[np.ndarray, " samples"], source: str) -> tuple[str, .
 
 
 def white_noise_sd(values: Float[np.ndarray, " samples"]) -> float:
-    """Standard deviation of white noise under a smooth signal, from the median of third differences.
-
-    Edges, being rare, leave the median alone.
-    """
+    """Standard deviation of white noise under a smooth signal, by the median of third differences, without edges."""
     return float(white_noise_sds(values))
 
 
@@ -168,11 +160,7 @@ def white_noise_sds(values: Float[np.ndarray, "*records samples"]) -> Float[np.n
 
 
 def row_medians(values: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*rows"]:
-    """Of each row, which is left in another order.
-
-    NumPy's own takes eight times as long: it asks for two places at once, and only for one does the processor work on
-    several numbers at a time.
-    """
+    """The median of each row, which is left in another order; NumPy's own takes eight times as long."""
     half = values.shape[-1] // 2
     if not values.shape[-1]:
         return np.full(values.shape[:-1], np.nan)
@@ -307,18 +295,14 @@ def _check_shapes(time: np.ndarray, channels: Mapping[str, np.ndarray], source: 
 
 
 def _check_values(values: np.ndarray, name: str, source: str, where: _RowLabel) -> None:
-    bad = np.flatnonzero(~np.isfinite(values))
-    if bad.size:
-        raise InputError(
-            f"{source}, {where(int(bad[0]))}: {name} is {values[bad[0]]} ({bad.size} such values);"
-            " remove those rows or record again"
-        )
-    bad = np.flatnonzero(np.abs(values) >= OVERFLOW)
-    if bad.size:
-        raise InputError(
-            f"{source}, {where(int(bad[0]))}: {name} is {values[bad[0]]:.4g}, an oscilloscope's code for out of range"
-            f" ({bad.size} such values); record again within range"
-        )
+    for is_bad, digits, meaning, remedy in (
+        (~np.isfinite(values), "", "", "remove those rows or record again"),
+        (np.abs(values) >= OVERFLOW, ".4g", ", an oscilloscope's code for out of range", "record again within range"),
+    ):
+        bad = np.flatnonzero(is_bad)
+        if bad.size:
+            place, value = f"{source}, {where(int(bad[0]))}", f"{values[bad[0]]:{digits}}"
+            raise InputError(f"{place}: {name} is {value}{meaning} ({bad.size} such values); {remedy}")
 
 
 def _check_increasing(time: np.ndarray, source: str, where: _RowLabel) -> None:

@@ -11,16 +11,11 @@ from fitact.scene.scene import Scene
 
 
 def simulate(scene: Scene, seed: int = 0) -> Record:
-    """V, and the channels that the scene measures with its noise, at its sampling rate and for its duration.
-
-    Raises:
-        InputError: the scene asks for what is not modelled, or for a current that has impulses.
-    """
+    """V, and the channels that the scene measures with its noise, at its sampling rate and for its duration."""
     circuit, drive, measured, time = scene.make_circuit(), scene.make_drive(), scene.measurement, sample_times(scene)
     rng = np.random.default_rng(seed)
-    channels = {}
     with jax.enable_x64(True):
-        channels["V"] = np.asarray(drive.value(time))
+        channels = {"V": np.asarray(drive.value(time))}
         for channel in measured.channels:
             clean = np.asarray(response(circuit, drive, time, steady_state=scene.drive.steady_state, channel=channel))
             noise = measured.noise_Vsc if channel == "Vsc" else measured.noise_I
@@ -34,11 +29,7 @@ def simulate(scene: Scene, seed: int = 0) -> Record:
 
 
 def sample_times(scene: Scene, max_samples: int = 100_000_000) -> Float[np.ndarray, " samples"]:
-    """When the scene's measurement samples, s.
-
-    Raises:
-        InputError: that is too few times to fit, or too many to hold.
-    """
+    """When the scene's measurement samples, s; refused where that is too few times to fit, or too many to hold."""
     measured = scene.measurement
     count = round(measured.duration * measured.sampling_rate)
     if not MINIMUM_SAMPLES <= count <= max_samples:

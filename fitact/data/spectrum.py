@@ -21,7 +21,7 @@ _REAL = re.compile(r"^-?(re\s*\(?z|z?\s*_?re(al)?\b|zre|z_re|z')(?!')", re.IGNOR
 _IMAGINARY = re.compile(r"""^-?(im\s*\(?z|z?\s*_?im(ag)?\b|zim|z_im|z''|z")""", re.IGNORECASE)
 _MAGNITUDE = re.compile(r"^(\|z\||z\s*_?mod|abs\s*\(?z|z_abs|z_magnitude|magnitude)", re.IGNORECASE)
 _PHASE = re.compile(r"^(-?phase|z\s*_?ph(z|ase)?\b|theta|arg\s*\(?z)", re.IGNORECASE)
-_PREFIX = re.compile(r"[(/_\[\s]([kKMGm]?)\s*(?:(?i:ohms?)|Ω|Ω)")
+_OHM = re.compile(r"[(/_\[\s]([kKMGm]?)\s*(?:(?i:ohms?)|Ω|Ω)")
 _HERTZ = re.compile(r"[(/_\[\s]([kKM]?)(?i:hz)")
 
 
@@ -176,25 +176,18 @@ def _find_columns(names: list[str]) -> _Columns | None:
     def find_first(pattern: re.Pattern[str]) -> int | None:
         return next((place for place, name in enumerate(names) if pattern.search(name)), None)
 
-    frequency, real, imaginary = find_first(_FREQUENCY), find_first(_REAL), find_first(_IMAGINARY)
-    size, phase = find_first(_MAGNITUDE), find_first(_PHASE)
-    if frequency is None:
-        return None
-    hertz = _HERTZ.search(names[frequency])
-    hertz_factor = PREFIX_FACTORS[hertz[1]] if hertz else 1.0
-    if real is not None and imaginary is not None:
-        sign = -1.0 if names[imaginary].startswith("-") else 1.0
-        return _Columns(frequency, real, imaginary, hertz_factor, _ohm_factor(names[real]), sign, 0.0)
-    if size is None or phase is None:
-        return None
-    sign = -1.0 if names[phase].startswith("-") else 1.0
-    radian = 1.0 if "rad" in names[phase].lower() else np.pi / 180.0
-    return _Columns(frequency, size, phase, hertz_factor, _ohm_factor(names[size]), sign, radian)
+    def find_factor(pattern: re.Pattern[str], name: str) -> float:
+        prefix = pattern.search(name)
+        return PREFIX_FACTORS[prefix[1]] if prefix else 1.0
 
-
-def _ohm_factor(name: str) -> float:
-    prefix = _PREFIX.search(name)
-    return PREFIX_FACTORS[prefix[1]] if prefix else 1.0
+    frequency, first, second, radian = find_first(_FREQUENCY), find_first(_REAL), find_first(_IMAGINARY), 0.0
+    if first is None or second is None:
+        first, second = find_first(_MAGNITUDE), find_first(_PHASE)
+        radian = 1.0 if second is not None and "rad" in names[second].lower() else np.pi / 180.0
+    if frequency is None or first is None or second is None:
+        return None
+    hertz, ohm = find_factor(_HERTZ, names[frequency]), find_factor(_OHM, names[first])
+    return _Columns(frequency, first, second, hertz, ohm, -1.0 if names[second].startswith("-") else 1.0, radian)
 
 
 def _headerless_columns(lines: list[str], source: str) -> tuple[int, str, _Columns]:

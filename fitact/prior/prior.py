@@ -151,20 +151,13 @@ class Prior(eqx.Module):
         return solve_triangular(np.linalg.cholesky(self.covariance), u - self.log_mean, lower=True)
 
     def sample(self, rng: np.random.Generator, size: int) -> dict[str, Float[np.ndarray, " size"]]:
-        """Draws of the parameters, by name.
-
-        Raises:
-            InputError: the marginals leave next to nothing in the order asked for.
-        """
+        """Draws of the parameters, by name; refused where next to none are in the order asked for."""
         return self._sample_ordered(lambda: rng.standard_normal((len(self.names), size)), size)
 
     def sample_qmc(self, size: int) -> dict[str, Float[np.ndarray, " size"]]:
-        """As `sample`, but spread evenly over the prior, and always the same.
+        """Like `sample`, but spread evenly over the prior, and always the same.
 
         The Kronecker sequence of the generalised golden ratio (M. Roberts, 2018), as normal scores.
-
-        Raises:
-            InputError: the marginals leave next to nothing in the order asked for.
         """
         axes = np.arange(1, len(self.names) + 1)
         ratio = 2.0
@@ -183,26 +176,16 @@ class Prior(eqx.Module):
         self, scores: Callable[[], Float[np.ndarray, "parameters size"]], size: int, max_rounds: int = 1000
     ) -> dict[str, Float[np.ndarray, " size"]]:
         """The first `size` of the parameters at `scores()` that are in the order asked for."""
-        kept = {name: np.zeros(0) for name in self.names}
+        kept, root = {name: np.zeros(0) for name in self.names}, np.linalg.cholesky(self.correlation)
         for _ in range(1 + max_rounds):
-            draws = self._transform_scores(scores())
-            in_order = self._satisfies_order(draws)
+            pairs = zip(self.names, self.marginals, root @ scores(), strict=True)
+            with jax.enable_x64(True):
+                draws = {name: np.exp(np.asarray(marginal.from_standard_normal(z))) for name, marginal, z in pairs}
+            in_order = np.ones(size, dtype=bool)
+            for low, high in self.order_constraints:
+                in_order &= draws[low] < draws[high]
             kept = {name: np.append(kept[name], values[in_order]) for name, values in draws.items()}
             if all(values.size >= size for values in kept.values()):
                 return {name: values[:size] for name, values in kept.items()}
         stated = ", ".join(f"{lower} < {higher}" for lower, higher in self.order_constraints)
         raise InputError(f"the priors leave next to nothing in the order {stated}; widen them, or leave it out")
-
-    def _transform_scores(self, scores: Float[np.ndarray, "parameters size"]) -> dict[str, Float[np.ndarray, " size"]]:
-        """The parameters at independent normal scores."""
-        z = np.linalg.cholesky(self.correlation) @ scores
-        with jax.enable_x64(True):
-            return {
-                name: np.exp(np.asarray(marginal.from_standard_normal(row)))
-                for name, marginal, row in zip(self.names, self.marginals, z, strict=True)
-            }
-
-    def _satisfies_order(self, draws: Mapping[str, np.ndarray]) -> np.ndarray | slice:
-        """Which draws are in the order asked for."""
-        in_order = [draws[low] < draws[high] for low, high in self.order_constraints]
-        return np.all(in_order, axis=0) if in_order else slice(None)

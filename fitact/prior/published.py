@@ -36,15 +36,14 @@ def published_prior(table: PublishedTable, name: str, layer: Layer, factor: floa
     sqrt(40) in permittivity to either, so with this `factor` each table reaches half-way to the other.
     """
     of_resistance = name.endswith("Rsc")
+    plate = plate_resistance if of_resistance else plate_capacitance
     if table == "paper":
-        if of_resistance:
-            return Uniform(*(plate_resistance(rho, layer.area, layer.thickness) for rho in _PAPER_RESISTIVITY))
-        return Uniform(*(plate_capacitance(eps, layer.area, layer.thickness) for eps in _PAPER_PERMITTIVITY))
+        ends = _PAPER_RESISTIVITY if of_resistance else _PAPER_PERMITTIVITY
+        return Uniform(*(plate(end, layer.area, layer.thickness) for end in ends))
     permittivity = skin_permittivity(table, layer.frequency)
-    if of_resistance:
-        resistivity = -1.0 / (permittivity.imag * EPSILON_0 * 2.0 * math.pi * layer.frequency)
-        return LogNormal.within_factor(plate_resistance(resistivity, layer.area, layer.thickness), factor)
-    return LogNormal.within_factor(plate_capacitance(permittivity.real, layer.area, layer.thickness), factor)
+    resistivity = -1.0 / (permittivity.imag * EPSILON_0 * 2.0 * math.pi * layer.frequency)
+    middle = resistivity if of_resistance else permittivity.real
+    return LogNormal.within_factor(plate(middle, layer.area, layer.thickness), factor)
 
 
 def skin_permittivity(table: Literal["gabriel-dry", "gabriel-wet"], frequency: float) -> complex:

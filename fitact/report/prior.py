@@ -63,5 +63,5 @@ def _page(figure: Figure, predicted: PriorPredictive) -> str:
     return (
         '<!doctype html><html lang="en"><meta charset="utf-8"><title>fitact: the prior</title>'
         f"<h1>What the prior means, before any data</h1>{svg(figure)}"
-        f"<pre>{html.escape(predicted.summary())}</pre></html>\n"
+        f"<pre>{html.escape(str(predicted))}</pre></html>\n"
     )

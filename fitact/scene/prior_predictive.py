@@ -15,6 +15,7 @@ from fitact.model.drive import Drive, Periodic, PiecewiseLinear
 from fitact.model.force import electrostatic_force, mean_force, peak_force
 from fitact.model.response import response
 from fitact.scene.scene import Scene
+from fitact.tables import align_rows
 from fitact.units import format_engineering
 
 
@@ -29,7 +30,7 @@ class PriorPredictive:
     seed: int  # of the draws
 
     def to_dict(self) -> dict[str, Any]:
-        """What `fitact prior --json` prints."""
+        """The JSON of `fitact prior`."""
         return {
             "parameters": {name: summary.summarize_draws(name, draws) for name, draws in self.parameters.items()},
             "derived": {name: summary.summarize_draws(name, draws) for name, draws in self.derived.items()},
@@ -37,26 +38,18 @@ class PriorPredictive:
             "seed": self.seed,
         }
 
-    def summary(self) -> str:
+    def __str__(self) -> str:
         """A table for people: quantiles of each parameter and of what follows from them."""
-        rows = [f"{'':18}" + "".join(f"{title:>12}" for title in ("5 %", "25 %", "median", "75 %", "95 %"))]
+        rows = [["", "5 %", "25 %", "median", "75 %", "95 %"]]
         content = self.to_dict()
         for name, s in (content["parameters"] | content["derived"]).items():
-            values = (
-                format_engineering(float(s[key]), str(s["unit"]), 3) for key in ("q05", "q25", "q50", "q75", "q95")
-            )
-            rows.append(f"{name:18}" + "".join(f"{value:>12}" for value in values))
-        return "\n".join(rows)
-
-    __str__ = summary
+            quantiles = (float(s[key]) for key in ("q05", "q25", "q50", "q75", "q95"))
+            rows.append([name, *(format_engineering(x, str(s["unit"]), 3) for x in quantiles)])
+        return "\n".join(align_rows(rows, [18] + 5 * [12]))
 
 
 def prior_predictive(scene: Scene, draws: int = 2000, seed: int = 0) -> PriorPredictive:
-    """Vsc and force of `draws` fingers of a scene's prior, without noise.
-
-    Raises:
-        InputError: the scene's drive is a measured one, or its prior leaves nothing to draw.
-    """
+    """Vsc and force of `draws` fingers of a scene's prior, without noise."""
     parameters = sample_prior(scene, np.random.default_rng(seed), draws)
     drive = scene.make_drive()
     repeats = isinstance(drive, Periodic) and scene.drive.steady_state
@@ -66,8 +59,8 @@ def prior_predictive(scene: Scene, draws: int = 2000, seed: int = 0) -> PriorPre
         predict = functools.partial(_predict_draw, scene, drive, repeats, time)
         # so many draws at a time bound the memory where each takes many harmonics
         vsc, derived = jax.jit(lambda rows: jax.lax.map(predict, rows, batch_size=100))(circuits)
-    order = [name for name in ("g", "b", "Vsc_peak_to_peak", "force_mean", "force_peak") if name in derived]
-    derived = {name: np.asarray(derived[name]) for name in order}
+    order = ("g", "b", "Vsc_peak_to_peak", "force_mean", "force_peak")
+    derived = {name: np.asarray(derived[name]) for name in order if name in derived}
     return PriorPredictive(parameters, derived, np.asarray(time), np.asarray(vsc), seed)
 
 
@@ -84,11 +77,7 @@ def _times(drive: Drive, duration: float, repeats: bool, count: int = 801) -> Fl
 
 
 def sample_prior(scene: Scene, rng: np.random.Generator, size: int) -> dict[str, Float[np.ndarray, " size"]]:
-    """Draws of all that a scene has a belief of, SI: free parameters, fixed and tied ones.
-
-    Raises:
-        InputError: the prior leaves nothing to draw.
-    """
+    """Draws of all that a scene has a belief of, SI: free parameters, fixed and tied ones."""
     drawn = scene.make_prior().sample(rng, size)
     drawn |= {name: np.full(size, value) for name, value in scene.fixed_values().items()}
     return drawn | {name: ratio * drawn[other] for name, (other, ratio) in scene.prior.ties().items()}

@@ -76,29 +76,23 @@ class PriorSpec(Section):
         return math.inf if self.high is None else self.high
 
     def distribution(self, name: str, nominal: float | None, layer: Layer) -> Distribution:
-        """The density of the parameter `name`, around its `nominal` value in the scene where it states no other.
-
-        Raises:
-            InputError: it needs a nominal value and the scene has none, or its bounds exclude its median by far.
-        """
+        """The density of the parameter `name`, around its `nominal` value in the scene where it states no other."""
         if self.table is not None:
             return published_prior(self.table, name, layer)
         if self.tolerance is not None:
             return Uniform.with_tolerance(_require_value(name, "nominal", self.nominal, nominal), self.tolerance)
-        if self.factor is None and self.relative_sd is None:
-            assert self.low is not None  # _check_form leaves nothing else
-            assert self.high is not None
-            return (LogUniform if self.scale == "log" else Uniform)(self.low, self.high)
+        low, high = self.low or 0.0, self.high or math.inf
+        if self.factor is None and self.relative_sd is None:  # both bounds are stated, by _check_form
+            return (LogUniform if self.scale == "log" else Uniform)(low, high)
         median = _require_value(name, "median", self.median, nominal)
         if self.factor is not None:
             whole = LogNormal.within_factor(median, self.factor)
         else:
-            assert self.relative_sd is not None
-            whole = LogNormal.with_relative_sd(median, self.relative_sd)
+            whole = LogNormal.with_relative_sd(median, self.relative_sd or 0.0)
         if self.low is None and self.high is None:
             return whole
         try:
-            return TruncatedLogNormal(whole.median, whole.spread, self.low or 0.0, self.high or math.inf)
+            return TruncatedLogNormal(whole.median, whole.spread, low, high)
         except InputError as error:
             raise InputError(f"[prior] {name}: {error}") from None
 
@@ -184,11 +178,7 @@ class PriorSection(Section):
             raise ValueError(f"{place} is tied itself; name what {other} is tied to")
 
     def specs(self) -> dict[str, PriorSpec]:
-        """The beliefs that the section holds, by parameter; one that only orders keeps the default's density.
-
-        Raises:
-            InputError: one only orders a parameter that has no default.
-        """
+        """The beliefs that the section holds, by parameter; one that only orders keeps the default's density."""
         beliefs = {name: belief for name, belief in self if isinstance(belief, PriorSpec)}
         for name, belief in beliefs.items():
             if not belief.model_fields_set - _ORDER_KEYS:
@@ -206,15 +196,12 @@ class PriorSection(Section):
 
     def order_constraints(self) -> tuple[tuple[str, str], ...]:
         """Pairs (lower, higher) of parameters that come in that order."""
-        above = [(b.above, name) for name, b in self.specs().items() if b.above is not None]
-        return (*above, *((name, b.below) for name, b in self.specs().items() if b.below is not None))
+        beliefs = self.specs().items()
+        above = [(b.above, name) for name, b in beliefs if b.above is not None]
+        return (*above, *((name, b.below) for name, b in beliefs if b.below is not None))
 
     def correlations(self) -> dict[tuple[str, str], float]:
-        """Correlations by pair of parameters.
-
-        Raises:
-            InputError: a key does not read name-name, or names a pair twice.
-        """
+        """Correlations by pair of parameters."""
         by_pair: dict[tuple[str, str], float] = {}
         for key, value in self.correlation.items():
             pair = tuple(key.split("-"))

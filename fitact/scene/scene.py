@@ -56,11 +56,9 @@ class Scene(sections.Section):
         """
         text = toml.read_scene_text(path)
         try:
-            content = tomllib.loads(text)
+            return cls.model_validate(tomllib.loads(text))
         except tomllib.TOMLDecodeError as error:
             raise InputError(f"{path}: not valid TOML: {error}") from error
-        try:
-            return cls.model_validate(content)
         except pydantic.ValidationError as error:
             sentence = _sentence(error.errors()[0])
             line = toml.find_line(text, sentence)
@@ -132,13 +130,8 @@ class Scene(sections.Section):
     def geometry(self) -> Geometry:
         """What the force needs beside the circuit; a gap's thickness follows Cgap unless both are stated."""
         both = self.gap.capacitance is not None and self.gap.thickness is not None
-        return Geometry(
-            self.device.contact_area,
-            self.device.insulator_thickness,
-            self.skin.thickness,
-            self.gap.thickness if both else None,
-            self.force.model,
-        )
+        panel, gap = self.device, self.gap.thickness if both else None
+        return Geometry(panel.contact_area, panel.insulator_thickness, self.skin.thickness, gap, self.force.model)
 
     def make_circuit(self, values: Mapping[str, ArrayLike] | None = None) -> Circuit:
         """The circuit at the scene's nominal values, or at others by name (ohm, F).
@@ -172,22 +165,14 @@ class Scene(sections.Section):
         return Probe(math.inf if resistance is None else resistance, capacitance or 0.0)
 
     def make_drive(self) -> Drive:
-        """The scene's drive.
-
-        Raises:
-            InputError: the waveform is 'measured', so only a record has it.
-        """
+        """The scene's drive; refused where the waveform is 'measured', so only a record has it."""
         return self.drive.make()
 
     def make_prior(self) -> Prior:
         """The prior of the parameters that the scene frees, but for gains."""
         layer = Layer(self.device.contact_area, self.skin.thickness, self.drive.lowest_frequency)
-        nominal = self.nominal_values()
-        marginals = {
-            name: belief.distribution(name, nominal[name], layer)
-            for name, belief in self.prior.specs().items()
-            if belief.is_free
-        }
+        nominal, beliefs = self.nominal_values(), self.prior.specs().items()
+        marginals = {name: b.distribution(name, nominal[name], layer) for name, b in beliefs if b.is_free}
         return Prior.of(self.prior.correlations(), self.prior.order_constraints(), **marginals)
 
     def fixed_values(self) -> dict[str, float]:
@@ -198,12 +183,11 @@ class Scene(sections.Section):
         """
         nominal, fixed = self.nominal_values(), {}
         for name, belief in self.prior.specs().items():
-            if belief.fixed is None:
-                continue
-            value = nominal[name] if belief.fixed is True else belief.fixed
-            if value is None:
-                raise InputError(f"[prior] {name} is fixed, but the scene has no {name}; write fixed = its value")
-            fixed[name] = float(value)
+            if belief.fixed is not None:
+                value = nominal[name] if belief.fixed is True else belief.fixed
+                if value is None:
+                    raise InputError(f"[prior] {name} is fixed, but the scene has no {name}; write fixed = its value")
+                fixed[name] = float(value)
         return fixed
 
     @model_validator(mode="after")
@@ -219,12 +203,6 @@ class Scene(sections.Section):
         for name in self.prior.specs():
             if name in absent:
                 raise InputError(f"[prior] {name} needs {absent[name]}; leave it out of [prior] otherwise")
-        self._check_gap()
-        self.make_prior()
-        self.fixed_values()
-        return self
-
-    def _check_gap(self) -> None:
         has = {name for name, value in self.nominal_values().items() if value is not None} | set(self.prior.specs())
         if "Rgap" in has and "Cgap" not in has:
             raise InputError(
@@ -234,6 +212,9 @@ class Scene(sections.Section):
             raise InputError(
                 "[force] model = 'gap' needs a gap; give [gap] thickness or capacitance, or take model = 'paper'"
             )
+        self.make_prior()
+        self.fixed_values()
+        return self
 
 
 def _sentence(error: Any) -> str:

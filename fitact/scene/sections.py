@@ -147,15 +147,9 @@ _KEY_WAVEFORMS = {  # the keys of [drive] that only some waveforms have
     "frequency": (*_PERIODIC_WAVEFORMS, "burst", "measured"),
     "duty": ("square", "trapezoid", "burst"),
     "phase": (*_PERIODIC_WAVEFORMS, "burst", "chirp"),
-    "shape": ("burst",),
-    "cycles": ("burst",),
-    "start_frequency": ("chirp",),
-    "end_frequency": ("chirp",),
-    "sweep_time": ("chirp",),
-    "spacing": ("chirp",),
-    "frequencies": ("multitone",),
-    "amplitudes": ("multitone",),
-    "phases": ("multitone",),
+    **dict.fromkeys(("shape", "cycles"), ("burst",)),
+    **dict.fromkeys(("start_frequency", "end_frequency", "sweep_time", "spacing"), ("chirp",)),
+    **dict.fromkeys(("frequencies", "amplitudes", "phases"), ("multitone",)),
 }
 
 
@@ -235,15 +229,10 @@ class DriveSection(Section):
         return min(self.start_frequency or self.frequency, self.end_frequency or self.frequency)
 
     def make(self) -> Drive:
-        """The drive.
-
-        Raises:
-            InputError: the waveform is 'measured', so only a record has it.
-        """
+        """The drive; refused where the waveform is 'measured', so only a record has it."""
         if self.waveform == "chirp":
-            start, end, duration = self.start_frequency, self.end_frequency, self.sweep_time
-            assert None not in (start, end, duration)  # checked when the section was read
-            return Chirp(self.peak_to_peak, start, end, duration, self.spacing, self.offset, self.phase)
+            sweep = self.start_frequency, self.end_frequency, self.sweep_time
+            return Chirp(self.peak_to_peak, *sweep, self.spacing, self.offset, self.phase)
         if self.waveform == "burst":
             return Burst(self._wave(self.shape), self.cycles)
         if self.waveform == "multitone":

@@ -27,11 +27,7 @@ def shipped_scenes() -> dict[str, str]:
 
 
 def read_scene_text(path: str | Path) -> str:
-    """The text of a scene file, or of a shipped scene where there is no such file.
-
-    Raises:
-        InputError: there is neither, or it cannot be read.
-    """
+    """The text of a scene file, or of a shipped scene where there is no such file."""
     name = str(path)
     try:
         return Path(path).read_text(encoding="utf-8")
@@ -47,12 +43,9 @@ def read_scene_text(path: str | Path) -> str:
 def _suggest_shipped(name: str) -> str:
     if "." in name or "/" in name:
         return ""
-    near = difflib.get_close_matches(name, shipped_scenes(), n=1)
-    return (
-        f", or the shipped scene '{near[0]}'"
-        if near
-        else f", or a shipped scene: {', '.join(sorted(shipped_scenes()))}"
-    )
+    if near := difflib.get_close_matches(name, shipped_scenes(), n=1):
+        return f", or the shipped scene '{near[0]}'"
+    return f", or a shipped scene: {', '.join(sorted(shipped_scenes()))}"
 
 
 def to_toml(scene: Section) -> str:

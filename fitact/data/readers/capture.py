@@ -65,17 +65,13 @@ class Capture:
 
 
 def resolve_channels(names: list[str], channels: Mapping[str, str], source: str, location: str = "") -> dict[str, str]:
-    """For each of V, Vsc and I that is known, the name it has in the file: stated, or by the name itself.
-
-    Raises:
-        InputError: none is known, a name stated is not there, or one name is stated twice.
-    """
+    """For each of V, Vsc and I that is known, the name it has in the file: stated, or by the name itself."""
     known: dict[str, str] = {}
     for channel in CHANNEL_UNITS:
         own = [name for name in names if name.lower() == channel.lower()]
-        if channel not in channels and len(own) > 1:
-            raise InputError(f"{source}{location}: two columns are named {channel}; keep one")
         if own and channel not in channels:
+            if len(own) > 1:
+                raise InputError(f"{source}{location}: two columns are named {channel}; keep one")
             known[channel] = own[0]
     for channel, asked in channels.items():
         if channel not in CHANNEL_UNITS:
@@ -95,11 +91,7 @@ def resolve_channels(names: list[str], channels: Mapping[str, str], source: str,
 
 
 def find_channel(requested: str, names: list[str], source: str) -> str:
-    """The name in the file of the channel that is asked for, as "CH2" for "Channel 2".
-
-    Raises:
-        InputError: there is none, or several.
-    """
+    """The name in the file of the channel that is asked for, as "CH2" for "Channel 2"."""
     exact = [name for name in names if name.strip().lower() == requested.strip().lower()]
     alike = exact or [name for name in names if is_same_channel(requested, name)]
     if len(alike) != 1:
@@ -114,11 +106,7 @@ def has_standard_names(capture: Capture) -> bool:
 
 
 def to_record(capture: Capture, channels: Mapping[str, str], scale: Mapping[str, float]) -> Record:
-    """The record that the stated channels and factors make of a capture.
-
-    Raises:
-        InputError: a channel is missing, its unit is of another kind, or the numbers are no measurement.
-    """
+    """The record that the stated channels and factors make of a capture."""
     for channel, factor in scale.items():
         if channel not in CHANNEL_UNITS:
             raise InputError(f"{capture.source}: '{channel}' is no channel of fitact; scale {', '.join(CHANNEL_UNITS)}")
@@ -128,8 +116,7 @@ def to_record(capture: Capture, channels: Mapping[str, str], scale: Mapping[str,
             )
     names = [trace.name for trace in capture.channels]
     known = resolve_channels(names, channels, capture.source, capture.channels[0].location if capture.channels else "")
-    unused = sorted(set(scale) - set(known))
-    if unused:
+    if unused := sorted(set(scale) - set(known)):
         raise InputError(f"{capture.source}: {unused[0]} is scaled but not there; name its column with --channel")
     arrays, notes = {}, list(capture.notes)
     for channel, name in known.items():
@@ -166,10 +153,9 @@ def _check_unit(file_channel: FileChannel, channel: str, scaled: bool, source: s
 def _describe_conversion(file_channel: FileChannel, channel: str, factor: float) -> str:
     stated = file_channel.unit_text
     unit = f"in {stated}" if stated else f"no unit stated, {CHANNEL_UNITS[channel]} assumed"
-    probe = "no attenuation stated"
-    if file_channel.attenuation is not None:
-        probe = f"attenuation {file_channel.attenuation:g} as stated"
-    return f"{channel} is '{file_channel.name}' ({unit}; {probe}) times {factor:g}"
+    probe = file_channel.attenuation
+    said = "no attenuation stated" if probe is None else f"attenuation {probe:g} as stated"
+    return f"{channel} is '{file_channel.name}' ({unit}; {said}) times {factor:g}"
 
 
 def _join_names(names: list[str]) -> str:
