@@ -1,4 +1,4 @@
-"""What fitact raises when it refuses input."""
+"""The exception that fitact raises when it refuses input."""
 
 
 class InputError(ValueError):

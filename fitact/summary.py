@@ -85,7 +85,7 @@ def table(content: dict[str, Any]) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Of Python and of what results depend on."""
+    """Versions of Python and of the packages that results depend on."""
     return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in _PACKAGES}
 
 

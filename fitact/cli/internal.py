@@ -1,4 +1,4 @@
-"""What commands call that is not public: each is imported when it is first used, so that `fitact --help` is quick."""
+"""Functions that commands call but are not public, imported when first used, so that `fitact --help` is quick."""
 
 import lazy_loader
 

@@ -75,32 +75,26 @@ def fit(
     json: options.Json = False,
 ) -> None:
     """Least squares only: parameters with errors, and the verdict, in seconds; of an impedance spectrum, too."""
+    fitted: fitact.SpectrumFit | fitact.Fit
     if len(records) == 1 and internal.is_spectrum(records[0]):
-        _fit_spectrum(records[0], scene, out, json)
-        return
-    planned = _fit_records(records, scene, (channel, scale), model, tolerance, starts)
-    fitted = planned.fit
-    text, content = f"{fitted}\n{planned.sentence}", fitted.to_dict() | {"plan": planned.to_dict()}
-    if intervals:
-        with_prior, without = fitted.intervals(), fitted.intervals(prior=False)
-        text = f"{text}\n{internal.table(with_prior, without)}"
-        content["intervals"] = {
-            name: {"with_prior": interval.to_dict(), "without_prior": without[name].to_dict()}
-            for name, interval in with_prior.items()
-        }
+        stated, spectrum = options.load_scene(scene[0] if scene else None), fitact.read_spectrum(records[0])
+        internal.use_compilation_cache()
+        fitted = fitact.fit_spectrum(spectrum, stated)
+        text, content = str(fitted), fitted.to_dict()
+    else:
+        planned = _fit_records(records, scene, (channel, scale), model, tolerance, starts)
+        fitted = planned.fit
+        text, content = f"{fitted}\n{planned.sentence}", fitted.to_dict() | {"plan": planned.to_dict()}
+        if intervals:
+            with_prior, without = fitted.intervals(), fitted.intervals(prior=False)
+            text = f"{text}\n{internal.table(with_prior, without)}"
+            content["intervals"] = {
+                name: {"with_prior": interval.to_dict(), "without_prior": without[name].to_dict()}
+                for name, interval in with_prior.items()
+            }
     if out is not None:
         write_json(out / "fit.json", content)
     show(text, content, json, fitted.trusted)
-
-
-def _fit_spectrum(path: Path, scenes: list[Path] | None, out: Path | None, json: bool) -> None:
-    stated = fitact.Scene.load(scenes[0]) if scenes else None
-    spectrum = fitact.read_spectrum(path)
-    internal.use_compilation_cache()
-    fitted = fitact.fit_spectrum(spectrum, stated)
-    if out is not None:
-        write_json(out / "fit.json", fitted.to_dict())
-    show(str(fitted), fitted.to_dict(), json, fitted.trusted)
 
 
 app.command("sample", help="Fit, then sample the posterior until it has converged; as `run`, without the report.")(run)

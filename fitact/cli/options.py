@@ -1,4 +1,4 @@
-"""What several commands ask for, and what they make of it."""
+"""Arguments and options that several commands have, and how they are read."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -82,12 +82,12 @@ class LazyRecords(Sequence["fitact.Record"]):
 
 
 def load_scene(path: Path | str | None) -> "fitact.Scene | None":
-    """What is stated; None: nothing."""
+    """The scene that is stated; None: none."""
     return None if path is None else fitact.Scene.load(path)
 
 
 def column_options(columns: Columns) -> dict[str, Any]:
-    """What --channel and --scale say, as `fitact.read` takes it."""
+    """The values of --channel and --scale, as `fitact.read` takes them."""
     channels, scale = columns
     return {"channels": parse_pairs("--channel Vsc=CH2", channels), "scale": parse_numbers("--scale Vsc=10", scale)}
 

@@ -1,4 +1,4 @@
-"""What every command does with its answer."""
+"""How every command gives its answer."""
 
 import shlex
 import sys

@@ -14,13 +14,11 @@ def clipping_mask(
     a drive whose tops are meant to be flat cannot be told from a clipped one.
     """
     railed = np.zeros(values.size, dtype=bool)
-    for extreme, beyond in ((values.max(), values < values.max()), (values.min(), values > values.min())):
-        is_extreme = values == extreme
-        if longest_run(is_extreme) < min_run or not beyond.any():
-            continue
-        next_level = values[beyond].max() if extreme == values.max() else values[beyond].min()
-        if np.count_nonzero(is_extreme) > min_count_ratio * np.count_nonzero(values == next_level):
-            railed |= is_extreme
+    for upward in (values, -values):
+        is_extreme = upward == upward.max()
+        others = upward[~is_extreme]
+        if longest_run(is_extreme) >= min_run and others.size:
+            railed |= is_extreme & (is_extreme.sum() > min_count_ratio * np.count_nonzero(others == others.max()))
     if not railed.any():
         return railed
     return np.convolve(railed, np.ones(2 * margin + 1), mode="same") > 0.5

@@ -1,4 +1,4 @@
-"""What a file holds, before it is fitted: channels, rate, noise, and what is doubtful about it."""
+"""A look at a file before it is fitted: channels, rate, noise, and what is doubtful about it."""
 
 import dataclasses
 import math
@@ -61,7 +61,7 @@ class Inspection:
     warnings: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """As `fitact inspect --json` prints it."""
+        """The JSON of `fitact inspect`."""
         return {
             "source": self.source,
             "format": self.format,
@@ -164,7 +164,7 @@ def _estimate_frequency(time: Samples, values: Samples, max_samples: int = 2_097
 
 
 def check_time(time: Samples, frequency: float | None, min_samples_per_period: int = 20) -> list[str]:
-    """What is doubtful about the times, s, and the rate that they make for a signal of `frequency`.
+    """Doubts about the times, s, and the rate that they make for a signal of `frequency`.
 
     With fewer samples than `min_samples_per_period`, edges and bends are lost.
     """
@@ -213,9 +213,7 @@ def check_channel(name: str, unit: str, time: Samples, values: Samples, frequenc
 
 
 def check_divider(channels: Mapping[str, Samples], low: float = 2e-2, high: float = 0.5) -> list[str]:
-    """What is doubtful about Vsc over V: below `low` a probe's attenuation may be missing, from `high` on no circuit
-    does it.
-    """
+    """Doubts about Vsc over V: a probe's attenuation may be missing below `low`; no circuit gives `high` or more."""
     if not {"V", "Vsc"} <= set(channels) or np.ptp(channels["V"]) == 0.0:
         return []
     ratio = float(np.ptp(channels["Vsc"]) / np.ptp(channels["V"]))

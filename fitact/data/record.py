@@ -153,7 +153,7 @@ def white_noise_sd(values: Float[np.ndarray, " samples"]) -> float:
 
 
 def white_noise_sds(values: Float[np.ndarray, "*records samples"]) -> Float[np.ndarray, "*records"]:
-    """As `white_noise_sd`, of each record; of differences in single precision, whose median takes half the time."""
+    """The same for each record; from differences in single precision, whose median takes half the time."""
     third = np.diff(np.diff(values).astype(np.float32), 2)
     np.abs(third, out=third)
     return row_medians(third).astype(float) / 0.6744897501960817 / math.sqrt(20.0)

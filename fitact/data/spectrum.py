@@ -85,7 +85,7 @@ class Spectrum:
         return self.frequency.size
 
     def to_dict(self) -> dict[str, Any]:
-        """As `fitact inspect --json` prints it; Hz and ohm."""
+        """The JSON of `fitact inspect`; Hz and ohm."""
         size = np.abs(self.impedance)
         return {
             "source": self.source,
@@ -118,11 +118,9 @@ class _Columns(NamedTuple):
 def is_spectrum(path: str | os.PathLike[str]) -> bool:
     """Whether a file's header names a frequency and an impedance."""
     try:
-        with Path(path).open("rb") as file:
-            head = _decode(file.read(16_384))  # which holds any header
+        return next(_find_headers(_read_lines(path, 16_384)), None) is not None  # bytes that hold any header
     except OSError:
         return False
-    return next(_find_headers(head.splitlines()), None) is not None
 
 
 def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
@@ -137,8 +135,7 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
     """
     source = os.fspath(path)
     try:
-        with Path(path).open("rb") as file:
-            lines = _decode(file.read(2**26)).splitlines()  # more than any spectrum has
+        lines = _read_lines(path, 2**26)  # bytes, more than any spectrum has
     except OSError as error:
         raise read_error(source, error) from error
     place, delimiter, columns = next(_find_headers(lines), None) or _headerless_columns(lines, source)
@@ -148,11 +145,13 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
     return Spectrum.from_arrays(columns.hertz * rows[:, 0], z, source)
 
 
-def _decode(content: bytes) -> str:
+def _read_lines(path: str | os.PathLike[str], size: int) -> list[str]:
+    with Path(path).open("rb") as file:
+        content = file.read(size)
     try:
-        return content.decode("utf-8-sig")
+        return content.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
-        return content.decode("latin-1")
+        return content.decode("latin-1").splitlines()
 
 
 def _find_headers(lines: list[str]) -> Iterator[tuple[int, str, _Columns]]:

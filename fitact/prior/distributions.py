@@ -267,7 +267,7 @@ class TruncatedLogNormal(Bounded):
 
 
 def _log(x: Any) -> Any:
-    """Of a number, which loses nothing in single precision, or of an array."""
+    """The logarithm of an array, or of a number, which loses nothing in single precision."""
     return jnp.log(x) if isinstance(x, jax.Array) else math.log(x)
 
 

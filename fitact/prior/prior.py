@@ -1,4 +1,4 @@
-"""What is believed of the parameters together before the data, in their logarithms."""
+"""Beliefs of the parameters together, before the data, in their logarithms."""
 
 import graphlib
 import itertools
@@ -46,11 +46,6 @@ class Prior(eqx.Module):
                     f"[prior] cannot correlate or order {name} and {other}; name two of its free parameters,"
                     f" {', '.join(self.names)}"
                 )
-        self._check_orders()
-        if self.pairs:
-            self._check_correlation()
-
-    def _check_orders(self) -> None:
         sorter = graphlib.TopologicalSorter[str]()
         for lower, higher in self.order_constraints:
             sorter.add(higher, lower)
@@ -59,10 +54,8 @@ class Prior(eqx.Module):
         except graphlib.CycleError as error:
             stated = " < ".join(error.args[1])
             raise InputError(f"[prior] the order {stated} contradicts itself; leave one of them out") from None
-
-    def _check_correlation(self) -> None:
         # a bare sign test would pass what rounding leaves of a singular matrix
-        if not np.linalg.eigvalsh(self.correlation)[0] >= 1e-9:
+        if self.pairs and not np.linalg.eigvalsh(self.correlation)[0] >= 1e-9:
             stated = ", ".join(f"{name}-{other} {value:+g}" for name, other, value in self.pairs)
             raise InputError(
                 f"[prior] the correlations {stated} contradict each other (their matrix is not positive definite);"

@@ -1,4 +1,4 @@
-"""What a scene's prior means for the skin voltage and the force, before any data."""
+"""Consequences of a scene's prior for the skin voltage and the force, before any data."""
 
 import dataclasses
 import functools

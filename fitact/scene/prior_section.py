@@ -27,7 +27,7 @@ _SKIN_PARAMETERS = ("Rsc", "Csc", "grounding_Rsc", "grounding_Csc")  # what the 
 
 
 class PriorSpec(Section):
-    """What is believed of one parameter; docs/priors.md lists the forms."""
+    """A belief of one parameter; docs/priors.md lists the forms."""
 
     median: float | None = Field(default=None, gt=0)
     factor: float | None = Field(default=None, gt=1, le=1e6)

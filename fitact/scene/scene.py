@@ -77,7 +77,7 @@ class Scene(sections.Section):
         return toml.to_toml(self)
 
     def to_json(self) -> str:
-        """What was given, in SI units; `from_json` reads it back."""
+        """The keys that were given, in SI units; `from_json` reads it back."""
         stated = self.model_dump(mode="json", exclude_unset=True)
         return json.dumps({name: section for name, section in stated.items() if section}, sort_keys=True)
 
@@ -91,7 +91,7 @@ class Scene(sections.Section):
         return "waveform" in self.drive.model_fields_set
 
     def steady_state(self) -> bool | None:
-        """What the file says of the steady state; None where it is silent."""
+        """The steady state as the file has it; None where it is silent."""
         return self.drive.steady_state if "steady_state" in self.drive.model_fields_set else None
 
     def require_available(self, *, fit: bool = False) -> None:
@@ -121,14 +121,14 @@ class Scene(sections.Section):
         }
 
     def _gap_capacitance(self) -> float | None:
-        """As stated, or of air of the stated thickness, eq. (3)."""
+        """The stated one, or that of air of the stated thickness, eq. (3)."""
         thickness = self.gap.thickness
         if self.gap.capacitance is not None or thickness is None:
             return self.gap.capacitance
         return float(plate_capacitance(1.0, self.device.contact_area, thickness))
 
     def geometry(self) -> Geometry:
-        """What the force needs beside the circuit; a gap's thickness follows Cgap unless both are stated."""
+        """Sizes that the force needs beside the circuit; a gap's thickness follows Cgap unless both are stated."""
         both = self.gap.capacitance is not None and self.gap.thickness is not None
         panel, gap = self.device, self.gap.thickness if both else None
         return Geometry(panel.contact_area, panel.insulator_thickness, self.skin.thickness, gap, self.force.model)
@@ -146,7 +146,7 @@ class Scene(sections.Section):
         return WithSkin(circuit, Dispersive() if self.skin.level == "dispersive" else Fractional(alpha))
 
     def make_rc_circuit(self, values: Mapping[str, ArrayLike] | None = None) -> RC:
-        """As `make_circuit`, with the skins constant."""
+        """The circuit with the skins constant."""
         self.require_available(fit=True)
         at: dict[str, Any] = self.nominal_values() | dict(values or {})
         skin, names = (at["Rsc"], at["Csc"], at["Ci"]), ("series_resistor", "Rgap", "Cgap")

@@ -73,7 +73,7 @@ def _walk_annotations(*annotations: Any) -> Iterator[Any]:
 
 
 class Section(pydantic.BaseModel):
-    """What all sections are: frozen, and without keys they do not know."""
+    """A section of a scene: frozen, and without keys they do not know."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -236,10 +236,8 @@ class DriveSection(Section):
         if self.waveform == "burst":
             return Burst(self._wave(self.shape), self.cycles)
         if self.waveform == "multitone":
-            assert self.frequencies is not None  # checked when the section was read
-            assert self.amplitudes is not None
-            orders = tuple(round(tone / self.lowest_frequency) for tone in self.frequencies)
-            return Multitone(self.lowest_frequency, orders, self.amplitudes, self.phases or (), self.offset)
+            orders = tuple(round(tone / self.lowest_frequency) for tone in self.frequencies or ())
+            return Multitone(self.lowest_frequency, orders, self.amplitudes or (), self.phases or (), self.offset)
         return self._wave(self.waveform)
 
     def _wave(self, shape: str) -> Periodic:
@@ -249,7 +247,6 @@ class DriveSection(Section):
         if shape == "square":
             return Square(*height, self.duty, offset, phase)
         if shape == "trapezoid":
-            assert self.rise_time is not None  # checked when it was read
             return Trapezoid(*height, self.rise_time, self.duty, offset, phase)
         raise InputError(
             f"scene: [drive] waveform = '{shape}' gives no drive to compute; name sine, triangle, square, trapezoid,"
@@ -258,7 +255,7 @@ class DriveSection(Section):
 
 
 class Measurement(Section):
-    """What is recorded, and through what."""
+    """The channels that are recorded, and the means."""
 
     channels: tuple[Literal["Vsc", "I"], ...] = Field(default=("Vsc",), min_length=1)
     series_resistor: AnyOhm = 0.0
@@ -299,14 +296,14 @@ class ForceSection(Section):
 
 
 class Perception(Section):
-    """What counts as felt."""
+    """The least force that counts as felt."""
 
     threshold_force: Threshold | None = None
     friction_change: Annotated[float, Field(gt=0)] | None = None
 
 
 class PopulationSection(Section):
-    """What fingers on one panel share, and how the next one's layers differ from the stated ones."""
+    """Traits that fingers on one panel share, and how the next one's layers differ from the stated ones."""
 
     contact_area: Literal["common", "varies"] = "common"
     skin_thickness_relative_sd: RelativeSD = 0.0

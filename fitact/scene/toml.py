@@ -5,7 +5,6 @@ import functools
 import importlib.resources
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -50,17 +49,15 @@ def _suggest_shipped(name: str) -> str:
 
 def to_toml(scene: Section) -> str:
     """Every key with its unit; those that were not given, as comments. Read again it is the same scene."""
-    return "\n".join(_lines(scene)) + "\n"
-
-
-def _lines(scene: Section) -> Iterator[str]:
+    lines = []
     for name, section in scene:
-        yield f"[{name}]"
+        lines.append(f"[{name}]")
         for key, field in type(section).model_fields.items():
             value = getattr(section, key)
             line = f"{key}: absent" if value is None else f"{key} = {value_text(value, field_unit(field))}"
-            yield line if key in section.model_fields_set and value is not None else f"# {line}"
-        yield ""
+            lines.append(line if key in section.model_fields_set and value is not None else f"# {line}")
+        lines.append("")
+    return "\n".join(lines) + "\n"
 
 
 def value_text(value: Any, unit: str | None) -> str:

@@ -36,7 +36,7 @@ _SCOPE_SUFFIXES = (".wfm", ".bin", ".trc", ".isf")
 
 @dataclasses.dataclass
 class _Contents:
-    """What a file of named arrays holds: arrays, their units, and single numbers and words."""
+    """The contents of a file of named arrays: arrays, their units, and single numbers and words."""
 
     format: str
     arrays: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)

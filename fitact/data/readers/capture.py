@@ -1,4 +1,4 @@
-"""What a file holds before anything is said about it: time and channels under their maker's names."""
+"""The contents of a file before anything is said about it: time and channels under their maker's names."""
 
 import dataclasses
 import math
@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 import numpy as np
 from jaxtyping import Float
 
-from fitact.data.readers.layouts import is_same_channel, parse_unit
+from fitact.data.readers.layouts import normalize_channel, parse_unit
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.errors import InputError
 from fitact.units import format_engineering
@@ -93,7 +93,7 @@ def resolve_channels(names: list[str], channels: Mapping[str, str], source: str,
 def find_channel(requested: str, names: list[str], source: str) -> str:
     """The name in the file of the channel that is asked for, as "CH2" for "Channel 2"."""
     exact = [name for name in names if name.strip().lower() == requested.strip().lower()]
-    alike = exact or [name for name in names if is_same_channel(requested, name)]
+    alike = exact or [name for name in names if normalize_channel(name) == normalize_channel(requested)]
     if len(alike) != 1:
         what = f"there are {len(alike)} columns" if alike else "there is no column"
         raise InputError(f"{source}: {what} '{requested}'; the file has {_join_names(names)}")

@@ -32,11 +32,7 @@ class Column(NamedTuple):
 
 
 def read_header(text: str, source: str, sidecar_text: str = "") -> "Header":
-    """The header of a file that begins with `text`; `sidecar_text`: one in a file of its own, as `key:value` lines.
-
-    Raises:
-        InputError: there are no numbers, no time, or several segments.
-    """
+    """The header of a file that begins with `text`; `sidecar_text`: one in a file of its own, as `key:value` lines."""
     head = text[:4096]  # of which a header mostly is a small part: to part lines into cells takes longest
     header = Header.from_text(head.rpartition("\n")[0], sidecar_text, source)
     if not header.is_plain:
@@ -125,7 +121,7 @@ class Header:
 
     @property
     def location(self) -> str:
-        """Of the names, for messages."""
+        """The place of the names, for messages."""
         return f", line {(self.names or self.units or self.data_rows[0]).number}"
 
     @functools.cached_property
@@ -150,7 +146,7 @@ class Header:
         return known
 
     def find_values(self, keys: Sequence[str]) -> list[str]:
-        """What the header states under the first of the keys that it has."""
+        """Values that the header states under the first of the keys that it has."""
         return next((self.metadata[key] for key in keys if key in self.metadata), [])
 
     def find_quantity(self, keys: Sequence[str]) -> float | None:
@@ -244,12 +240,9 @@ class Header:
 
     def standard_columns(self) -> frozenset[int]:
         """Columns under fitact's own names, which must hold numbers whether they do or not."""
-        parts = [layouts.split_name_and_unit(cell) for cell in (self.names.cells[: self.width] if self.names else [])]
-        return frozenset(
-            i
-            for i, (name, unit) in enumerate(parts)
-            if layouts.is_standard_name(name) and (not unit or layouts.parse_unit(unit))
-        )
+        parts = map(layouts.split_name_and_unit, self.names.cells[: self.width] if self.names else [])
+        standard = (layouts.is_standard_name(name) and (not unit or layouts.parse_unit(unit)) for name, unit in parts)
+        return frozenset(i for i, is_standard in enumerate(standard) if is_standard)
 
     def non_numeric_columns(self) -> list[str]:
         """Names of the columns that hold no numbers."""
@@ -263,7 +256,7 @@ class Header:
         return int(count) if count is not None and count < 1e12 else None  # beyond, it means something else
 
     def _find_names(self, count: int) -> list[str]:
-        """As "Source,CH1" or "Vertical Scale,CH1:0.05 CH2:0.10" state them."""
+        """Names as in "Source,CH1" or "Vertical Scale,CH1:0.05 CH2:0.10"."""
         named = self.find_values(layouts.NAME_KEYS)
         if len(named) < count:
             named = re.findall(r"([A-Za-z]+\d+)\s*:", " ".join(self.find_values(("verticalunits", "verticalscale"))))
@@ -297,7 +290,7 @@ def _is_unfilled(row: TextRow, numbers: frozenset[int]) -> bool:
 
 
 def _detect_delimiter(lines: Sequence[str]) -> tuple[str, bool]:
-    """What parts most lines, from the middle on, into two numbers or more, and whether a comma marks the decimals."""
+    """The delimiter that parts most lines, from the middle on, into numbers, and whether a comma marks the decimals."""
     lines = lines[len(lines) // 2 :]
     for delimiter in (";", "\t", ",", " "):
         rows = [split_cells(line, delimiter) for line in lines]

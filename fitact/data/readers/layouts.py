@@ -1,4 +1,4 @@
-"""What the makers of oscilloscopes and DAQ programs write in a header: one table, so that one reader serves all."""
+"""Words that makers of oscilloscopes and DAQ programs write in a header: one table, so that one reader serves all."""
 
 import re
 
@@ -110,15 +110,11 @@ def split_name_and_unit(cell: str) -> tuple[str, str]:
     return cell, ""
 
 
-def is_same_channel(requested: str, name: str) -> bool:
-    """Whether both mean one channel: "CH2", "Channel 2", "Chan 2" and Keysight's "2" do."""
-    return _normalize_channel(requested) == _normalize_channel(name)
-
-
 def is_standard_name(name: str) -> bool:
     return _STANDARD_NAME.fullmatch(name) is not None
 
 
-def _normalize_channel(name: str) -> str:
+def normalize_channel(name: str) -> str:
+    """The name that "CH2", "Channel 2", "Chan 2" and Keysight's "2" have in common."""
     bare = re.sub(r"[\s_.-]", "", name.lower())
     return re.sub(r"^(channel|chan|ch|kanal|canal|ampl|c)(?=[0-9]+$|[a-z]$)", "", bare)

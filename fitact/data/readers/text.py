@@ -25,11 +25,7 @@ _MAX_BYTES = 4_294_967_296  # bytes of text, beyond which it is no record but wh
 
 
 def read_text(path: Path, source: str, pick: Pick) -> Capture:
-    """The columns of a text file (plain or gzip) that `pick` names, in SI units.
-
-    Raises:
-        InputError: it cannot be read, has no header or time, or a row is broken; names the line.
-    """
+    """The columns of a text file (plain or gzip) that `pick` names, in SI units."""
     try:
         with _open_text(path) as (stream, file):
             head = stream.read(_HEAD_BYTES)
@@ -74,10 +70,8 @@ def _open_text(path: Path) -> Iterator[tuple[IO[bytes], IO[bytes]]]:
 
 def _read_sidecar(path: Path) -> str:
     """The header that Rohde & Schwarz keep in NAME.csv for the numbers in NAME.Wfm.csv, or nothing."""
-    if not path.name.lower().endswith(".wfm.csv"):
-        return ""
     header = path.with_name(path.name[: -len(".wfm.csv")] + path.name[-4:])
-    if not header.is_file():
+    if not (path.name.lower().endswith(".wfm.csv") and header.is_file()):
         return ""
     with header.open("rb") as file:
         return file.read(_HEAD_BYTES).decode("latin-1")
@@ -198,7 +192,7 @@ class _TableParser:
         return f"line {self._lines[part][row - self._starts[part]]}"
 
     def to_capture(self, unread_columns: Sequence[str]) -> Capture:
-        """What was read; `unread_columns` are columns that were not wanted, or hold no numbers."""
+        """The columns that were read; `unread_columns` are columns that were not wanted, or hold no numbers."""
         header, rows, announced = self._header, self._starts[-1], self._header.count_rows()
         if announced is not None and rows < announced - 2:  # by which some makers' counts are off
             raise InputError(
@@ -233,8 +227,8 @@ class _TableParser:
         last = next((row for row in reversed(range(rows)) if row not in blank), first - 1)
         inside = [row for row in self._blank_rows if first < row < last]
         if inside or first == rows:
-            where = self._line_label(inside[0]) if inside else "all rows"
-            raise InputError(f"{self._source}, {where}: the cells of the channels are empty; mend or remove the row")
+            place = self._line_label(inside[0]) if inside else "all rows"
+            raise InputError(f"{self._source}, {place}: the cells of the channels are empty; mend or remove the row")
         left = rows - (last + 1 - first)
         notes = [f"{self._source}: rows without values at the ends were passed over ({left:,})"] if left else []
         return slice(first, last + 1), notes
