@@ -3,14 +3,13 @@
 import os
 
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, FigureBase
-from matplotlib.ticker import EngFormatter
+from matplotlib.figure import Figure
 
 from fitact.charts import interactive
 from fitact.charts.figure import ALERT, GREEN, MODEL, PRIOR, write_figure
 from fitact.charts.interactive import Axis
-from fitact.design.measurement import MeasurementDesign, SettingCurve
-from fitact.experiment.experiment import DesignOption
+from fitact.charts.picture import draw_plots
+from fitact.design.measurement import MeasurementDesign
 from fitact.report.frame import Answer, PageSummary, Provenance, image, write_page
 from fitact.units import format_percent
 
@@ -27,26 +26,18 @@ def write_design(path: str | os.PathLike[str], design: MeasurementDesign) -> Non
     Raises:
         InputError: the place cannot be written.
     """
-    write_figure(path, lambda: _figure(design))
+    write_figure(path, lambda: _figure(design, _chart(design)))
 
 
-def _figure(design: MeasurementDesign, *, bars: bool = True, curves: bool = True) -> Figure:
+def _figure(design: MeasurementDesign, chart: interactive.Chart | None) -> Figure:
     """Draw the bars of all options, above the curves along what can be set."""
-    heights = [0.6 + 0.34 * (2 + len(design.options))] * bars + [3.2] * (curves and bool(design.curves))
+    heights = [0.6 + 0.34 * (2 + len(design.options)), *([3.2] if chart else [])]
     figure = Figure(figsize=(9.0, sum(heights)), layout="constrained")
-    parts = [figure] if len(heights) == 1 else figure.subfigures(2, 1, squeeze=False, height_ratios=heights)[:, 0]
-    if bars:
-        _draw_bars(parts[0].add_subplot(), design)
-    if curves and design.curves:
-        _draw_curves(parts[-1], design)
+    parts = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
+    _draw_bars(parts[0].add_subplot(), design)
+    if chart:
+        draw_plots(parts[1], chart["plots"])
     return figure
-
-
-def _draw_curves(figure: FigureBase, design: MeasurementDesign) -> None:
-    panels = figure.subplots(1, len(design.curves), sharey=True, squeeze=False)[0]
-    for axes, curve in zip(panels, design.curves, strict=True):
-        _draw_curve(axes, curve, design)
-    panels[0].set_ylabel("error of the mean force, %")
 
 
 def _draw_bars(axes: Axes, design: MeasurementDesign) -> None:
@@ -65,25 +56,6 @@ def _draw_bars(axes: Axes, design: MeasurementDesign) -> None:
     axes.get_yticklabels()[-1].set_fontweight("bold")
     axes.grid(axis="y", visible=False)
     axes.set_xlabel("expected error of the mean force, %" + ("" if best is None else " (green: most for its effort)"))
-
-
-def _draw_curve(axes: Axes, curve: SettingCurve, design: MeasurementDesign) -> None:
-    axes.plot(curve.values, [100.0 * sd for sd in curve.force_sd], color=MODEL)
-    axes.axhline(100.0 * design.now.force_sd, color=PRIOR, ls="--")
-    for option in design.options:
-        if _is_single_setting(option, curve):
-            axes.plot(option.settings[curve.setting], 100.0 * option.force_sd, "o", color=ALERT)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter("")
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.set_xlabel(f"{_SETTINGS[curve.setting]}, {curve.unit}")
-
-
-def _is_single_setting(option: DesignOption, curve: SettingCurve) -> bool:
-    """Whether an option changes nothing but what a curve is along."""
-    return list(option.settings) == [curve.setting] and "+" not in option.name
 
 
 def write_design_page(path: str | os.PathLike[str], design: MeasurementDesign, origin: Provenance) -> None:
@@ -108,9 +80,8 @@ def write_design_page(path: str | os.PathLike[str], design: MeasurementDesign, o
             ),
         ],
         best=best,
-        curves=_chart(design) if design.curves else None,
-        bars=image(lambda: _figure(design, curves=False)),
-        along=image(lambda: _figure(design, bars=False)) if design.curves else None,
+        curves=_chart(design),
+        bars=image(lambda: _figure(design, None)),
     )
 
 
@@ -138,8 +109,10 @@ def _frame(design: MeasurementDesign) -> PageSummary:
     )
 
 
-def _chart(design: MeasurementDesign) -> interactive.Chart:
-    """The error along each setting, and the settings chosen."""
+def _chart(design: MeasurementDesign) -> interactive.Chart | None:
+    """The error along each setting, and the settings chosen; None: nothing can be set."""
+    if not design.curves:
+        return None
     plots: list[interactive.Plot] = []
     reached = [sd for curve in design.curves for sd in curve.force_sd]
     limits = (0.7 * min(reached), 1.4 * max(*reached, design.now.force_sd))
@@ -148,7 +121,8 @@ def _chart(design: MeasurementDesign) -> interactive.Chart:
         y = Axis("error of the mean force", "%", 0.01, log=True, limits=limits)
         ends = (curve.values[0], curve.values[-1])
         now = (design.now.force_sd, design.now.force_sd)
-        chosen = [option for option in design.options if _is_single_setting(option, curve)]
+        alone = [option for option in design.options if list(option.settings) == [curve.setting]]
+        chosen = [option for option in alone if "+" not in option.name]
         at, sds = [option.settings[curve.setting] for option in chosen], [option.force_sd for option in chosen]
         names = [option.text for option in chosen]
         traces = [

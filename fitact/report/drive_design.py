@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
 
 from fitact.charts import interactive
 from fitact.charts.figure import ALERT, DATA, GREEN, MODEL, ORANGE, PINK, PRIOR, SKY, log_ticks, write_figure
 from fitact.charts.interactive import Axis
+from fitact.charts.picture import draw_plot
 from fitact.design.drive import LEGEND, DriveDesign
 from fitact.design.drive_option import FINGER_QUANTILES, DriveOption, format_quantity, quantile
 from fitact.report.frame import Answer, PageSummary, Provenance, image, write_page
@@ -38,8 +38,9 @@ def write_drive_design(path: str | os.PathLike[str], design: DriveDesign) -> Non
 def _figure(design: DriveDesign) -> Figure:
     figure = Figure(figsize=(11.0, 8.0), layout="constrained")
     (curves, frequencies), (thicknesses, permittivities) = figure.subplots(2, 2)
-    _draw_curves(curves, design)
-    _draw_frequencies(frequencies, design)
+    draw_plot(_curve_plot(design), curves)
+    draw_plot(_frequency_plot(design), frequencies)
+    _note_if_empty(frequencies)
     _draw_both_insulators(thicknesses, permittivities, design)
     return figure
 
@@ -72,43 +73,6 @@ def _line_width(design: DriveDesign, name: str) -> float:
     return 3.0 if name == design.own else 1.3
 
 
-def _draw_curves(axes: Axes, design: DriveDesign) -> None:
-    for name in _order_waveforms(design):
-        curve = design.curve(name)
-        title = f"{name}, the scene's" if name == design.own else name
-        axes.plot(curve["peak_to_peak"], curve["q50"], color=_COLORS[name], lw=_line_width(design, name), label=title)
-        axes.fill_between(curve["peak_to_peak"], curve["q05"], curve["q95"], color=_COLORS[name], alpha=0.2, lw=0)
-    axes.axhline(design.share, color=ALERT, lw=1.0, ls="--")
-    axes.set_xscale("log")
-    log_ticks(axes.xaxis, "V")
-    axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-    axes.set_xlabel("peak-to-peak amplitude")
-    axes.set_ylabel("people who feel it" + (" (band: 90 %)" if design.people.has_separate_uncertainty else ""))
-    axes.legend(fontsize=9)
-
-
-def _draw_frequencies(axes: Axes, design: DriveDesign) -> None:
-    for name in _order_waveforms(design):
-        options = design.by_frequency[name]
-        frequency = [option.frequency for option in options]
-        if name == design.own:
-            people = np.stack([_mask_infinite(option.people) for option in options])
-            for low, high, label in ((0, 4, f"90 % of people, {name}"), (1, 3, f"50 %, {name}")):
-                axes.fill_between(
-                    frequency, people[:, low], people[:, high], color=_COLORS[name], alpha=0.18, lw=0, label=label
-                )
-        median = [float(quantile(option.amplitude, 0.5)) for option in options]
-        title = f"{100.0 * design.share:g} %, {name}"
-        axes.plot(frequency, _mask_infinite(median), color=_COLORS[name], lw=_line_width(design, name), label=title)
-    axes.set_xscale("log")
-    axes.set_xlim(8.0, 1250.0)
-    log_ticks(axes.xaxis, "Hz")
-    _format_volts(axes)
-    axes.set_xlabel("frequency of the drive")
-    axes.set_ylabel("peak-to-peak amplitude needed")
-    axes.legend(fontsize=9)
-
-
 def _draw_insulators(
     axes: Axes, design: DriveDesign, options: Sequence[DriveOption], place: Callable[[DriveOption], float]
 ) -> None:
@@ -124,7 +88,9 @@ def _draw_insulators(
         amplitude = [_limit_amplitude(option, quantity, limit(option)) for option in options]
         if np.any(np.isfinite(amplitude)):
             axes.plot(at, amplitude, color=shade, lw=1.5, ls="--", label=what)
-    _format_volts(axes)
+    axes.set_yscale("log")
+    log_ticks(axes.yaxis, "V")
+    _note_if_empty(axes)
     axes.set_ylabel(f"peak-to-peak amplitude, {design.own}")
 
 
@@ -140,13 +106,10 @@ def _mask_infinite(amplitude: Sequence[float] | Float[np.ndarray, " n"]) -> Floa
     return np.where(np.isfinite(values), values, np.nan)
 
 
-def _format_volts(axes: Axes) -> None:
+def _note_if_empty(axes: Axes) -> None:
     if not any(np.isfinite(np.asarray(line.get_ydata(), dtype=float)).any() for line in axes.lines):
         axes.set_yticks([])
         axes.text(0.5, 0.5, "too few feel it at any amplitude", transform=axes.transAxes, ha="center")
-        return
-    axes.set_yscale("log")
-    log_ticks(axes.yaxis, "V")
 
 
 def write_drive_design_page(path: str | os.PathLike[str], design: DriveDesign, origin: Provenance) -> None:
@@ -159,6 +122,8 @@ def write_drive_design_page(path: str | os.PathLike[str], design: DriveDesign, o
     people += [
         (name, *(format_quantity(each, "V") for each in option.people)) for name, option in design.options.items()
     ]
+    curves, frequencies = _curve_plot(design), _frequency_plot(design)
+    switch = interactive.log_axis_button([frequencies], "xy", "logarithmic axes")
     write_page(
         path,
         "drive.html",
@@ -170,10 +135,8 @@ def write_drive_design_page(path: str | os.PathLike[str], design: DriveDesign, o
         separated=design.people.has_separate_uncertainty,
         people=people,
         limits=_limits(design),
-        curves=_curve_chart(design),
-        curves_image=image(lambda: _single_figure(_draw_curves, design)),
-        frequencies=_frequency_chart(design),
-        frequencies_image=image(lambda: _single_figure(_draw_frequencies, design)),
+        curves=interactive.chart(curves, controls=[interactive.log_axis_button([curves])]),
+        frequencies=interactive.chart(frequencies, controls=[switch]),
         insulators=image(lambda: _insulator_figure(design)),
     )
 
@@ -214,20 +177,13 @@ def _limits(design: DriveDesign) -> tuple[tuple[str, str], ...]:
     return tuple((name, "not stated" if x is None else format_engineering(x, unit)) for name, x, unit in stated)
 
 
-def _single_figure(draw: Callable[[Axes, DriveDesign], None], design: DriveDesign) -> Figure:
-    figure = Figure(figsize=(9.0, 4.6), layout="constrained")
-    draw(figure.add_subplot(), design)
-    return figure
-
-
-def _curve_chart(design: DriveDesign) -> interactive.Chart:
-    curves = {name: design.curve(name) for name in design.options}
+def _curve_plot(design: DriveDesign) -> interactive.Plot:
+    curves = {name: design.curve(name) for name in _order_waveforms(design)}
     x = Axis.from_values("peak-to-peak amplitude", "V", curves[design.own]["peak_to_peak"], log=True)
     y = Axis("people who feel it", "%", 0.01)
     traces = []
-    for name in _order_waveforms(design):
-        curve, color = curves[name], _COLORS[name]
-        at = curve["peak_to_peak"]
+    for name, curve in curves.items():
+        at, color = curve["peak_to_peak"], _COLORS[name]
         if design.people.has_separate_uncertainty:
             edges = (f"{name}, 5 %", f"{name}, 95 %", f"{name}, 90 % band")
             band = interactive.band(x, y, at, curve["q05"], curve["q95"], edges, color)
@@ -237,24 +193,27 @@ def _curve_chart(design: DriveDesign) -> interactive.Chart:
     traces.append(interactive.line(x, y, at, [design.share] * 2, "asked for", ALERT, dash="dash"))
     plot = interactive.plot(x, (y, traces), size=420)
     plot["layout"]["legend"]["traceorder"] = "normal"  # bands would turn it over
-    return interactive.chart(plot, controls=[interactive.log_axis_button([plot])])
+    return plot
 
 
-def _frequency_chart(design: DriveDesign) -> interactive.Chart:
-    needed = {
-        name: [float(quantile(option.amplitude, 0.5)) for option in options]
+def _frequency_plot(design: DriveDesign) -> interactive.Plot:
+    medians = {
+        name: _mask_infinite([float(quantile(option.amplitude, 0.5)) for option in options])
         for name, options in design.by_frequency.items()
     }
-    x = Axis.from_values(
-        "frequency of the drive", "Hz", [option.frequency for option in design.by_frequency[design.own]], log=True
-    )
-    y = Axis.from_values("peak-to-peak amplitude needed", "V", needed[design.own], log=True)
-    traces = [
-        interactive.line(
-            x, y, [option.frequency for option in design.by_frequency[name]], _mask_infinite(needed[name]), name,
-            _COLORS[name], width=_line_width(design, name),
+    own = design.by_frequency[design.own]
+    frequency, people = np.array([option.frequency for option in own]), np.stack([option.people for option in own])
+    x = Axis.from_values("frequency of the drive", "Hz", frequency, log=True)
+    y = Axis.from_values("peak-to-peak amplitude needed", "V", medians[design.own], log=True)
+    traces = []
+    for low, high, share in ((0, 4, 90), (1, 3, 50)):
+        kept = np.isfinite(people[:, high])
+        edges = (f"{50 - share // 2} % of people", f"{50 + share // 2} %", f"{share} % of people, {design.own}")
+        traces += interactive.band(
+            x, y, frequency[kept], people[kept, low], people[kept, high], edges, _COLORS[design.own]
         )
-        for name in _order_waveforms(design)
-    ]  # fmt: skip
-    plot = interactive.plot(x, (y, traces), size=420)
-    return interactive.chart(plot, controls=[interactive.log_axis_button([plot], "xy", "logarithmic axes")])
+    for name in _order_waveforms(design):
+        at = [option.frequency for option in design.by_frequency[name]]
+        width = _line_width(design, name)
+        traces.append(interactive.line(x, y, at, medians[name], name, _COLORS[name], width=width))
+    return interactive.plot(x, (y, traces), size=420)

@@ -12,6 +12,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from fitact.charts import figure
+from fitact.charts.picture import draw_chart
 from fitact.data.record import Record
 from fitact.files import atomic_write
 from fitact.populations.finger import Finger
@@ -97,6 +98,7 @@ def write_html(path: str | os.PathLike[str], template: str, **content: Any) -> N
     """
     loader = jinja2.PackageLoader("fitact.report")
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    environment.filters["picture"] = lambda chart: image(lambda: draw_chart(chart))
     environment.globals["verbatim"] = lambda name: Markup(loader.get_source(environment, name)[0])  # scripts of ours
     page = environment.get_template(template).render(**content)
     with atomic_write(path) as temporary:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
 
 from fitact.charts import interactive
 from fitact.charts.figure import DATA, MODEL, PRIOR
@@ -128,9 +127,8 @@ def _null_to_nan(content: Any) -> Any:
 
 
 def _figures(tree: Any, content: dict[str, Any]) -> dict[str, Any]:
-    panels = {name: image(_panel(draw, tree, content), **FONT_SETTINGS) for name, draw in _PANELS.items()}
     return {
-        "panels": panels | {"densities": image(lambda: _densities(tree), **FONT_SETTINGS)},
+        "panels": {name: image(_panel(draw, tree, content), **FONT_SETTINGS) for name, draw in _PANELS.items()},
         "skin": _skin_chart(tree, content),
         "force": _force_chart(tree),
     }
@@ -225,23 +223,6 @@ def _panel(
         return figure
 
     return draw_panel
-
-
-def _densities(tree: Any) -> Figure:
-    figure = Figure(figsize=(9.0, 3.4), layout="constrained")
-    for axes, (name, title) in zip(figure.subplots(1, 2), _FORCES.items(), strict=True):
-        for group, label, color in (
-            ("prior_new_fingers", _PRIOR_LABEL, PRIOR),
-            ("new_fingers", _POSTERIOR_LABEL, MODEL),
-        ):
-            counts, edges = np.histogram(np.log(tree[group][name].values), 80)
-            axes.stairs(counts / counts.max(), np.exp(edges), fill=True, color=color, alpha=0.6, label=label)
-        axes.set_xscale("log")
-        axes.xaxis.set_major_formatter(EngFormatter("N"))
-        axes.set_yticks([])
-        axes.set_xlabel(title)
-        axes.legend()
-    return figure
 
 
 _PANELS = {

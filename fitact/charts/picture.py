@@ -1,0 +1,104 @@
+"""Charts on paper: what `interactive` describes for plotly.js, drawn by matplotlib."""
+
+import base64
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, FigureBase
+from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
+
+from fitact.charts.figure import MODEL
+from fitact.charts.interactive import Chart, Plot, PlotlyTrace
+
+_DASHES = {"solid": "-", "dash": "--", "dot": ":"}
+_POINTS_PER_PIXEL = 0.75
+
+
+def draw_chart(chart: Chart) -> Figure:
+    """Draw all plots of a chart."""
+    plots = chart["plots"]
+    heights = [max(plot["layout"]["height"] for plot in plots[first : first + 3]) for first in range(0, len(plots), 3)]
+    figure = Figure(figsize=(9.0, sum(heights) / 100.0), layout="constrained")
+    draw_plots(figure, plots, heights)
+    return figure
+
+
+def draw_plots(figure: FigureBase, plots: Sequence[Plot], heights: Sequence[float] = (1.0,)) -> None:
+    """Draw plots side by side, three in a line; `heights`: relative, of the lines."""
+    parts = figure.subfigures(len(heights), min(len(plots), 3), squeeze=False, height_ratios=heights).flat
+    for part, plot in zip(parts, plots, strict=False):
+        domains = [np.ptp(axis["domain"]) for name, axis in plot["layout"].items() if name.startswith("yaxis")]
+        draw_plot(plot, *part.subplots(len(domains), 1, sharex=True, squeeze=False, height_ratios=domains)[:, 0])
+
+
+def draw_plot(plot: Plot, *rows: Axes) -> None:
+    """Draw a plot on axes, one for each of its rows."""
+    layout = plot["layout"]
+    for number, axes in enumerate(rows, start=1):
+        suffix = "" if number == 1 else str(number)
+        below = np.zeros(())
+        for trace in plot["data"]:
+            if trace["yaxis"] == f"y{suffix}":
+                below = _draw_trace(axes, trace, below)
+        for shape in layout.get("shapes", ()):
+            if shape["x0"] == shape["x1"]:
+                axes.axvline(shape["x0"], color=shape["line"]["color"], lw=1.0, ls="--")
+            else:
+                axes.axvspan(shape["x0"], shape["x1"], color=MODEL, alpha=0.12, lw=0.0)
+        _format_axis(axes, "y", layout[f"yaxis{suffix}"])
+    _format_axis(rows[-1], "x", layout["xaxis"])
+    if layout["showlegend"]:
+        above: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "frameon": False}
+        rows[0].legend(**above, title=plot["title"], ncols=2, fontsize=9.0, columnspacing=1.0)
+    else:
+        rows[0].set_title(plot["title"], fontsize=10.0)
+
+
+def _draw_trace(axes: Axes, trace: PlotlyTrace, below: np.ndarray) -> np.ndarray:
+    """Draw a trace, where it asks for it filled down to the values of the trace before, which it gives of itself."""
+    x, y = (np.frombuffer(base64.b64decode(trace[k]["bdata"]), f"<{trace[k]['dtype']}") for k in ("x", "y"))
+    line, marker = trace.get("line", {}), trace.get("marker", {})
+    color, is_step = (line or marker)["color"], line.get("shape") == "hv"
+    label = trace["name"] if trace.get("showlegend", True) else None
+    if trace.get("fill"):
+        base = below if trace["fill"] == "tonexty" else 0.0
+        step: dict[str, Any] = {"step": "post"} if is_step else {}
+        axes.fill_between(x, base, y, color=color, alpha=0.35, lw=0.0, label=label, **step)
+    axes.plot(
+        x,
+        y,
+        color=color,
+        lw=_POINTS_PER_PIXEL * line.get("width", 0.0) * ("lines" in trace["mode"]),
+        ls=_DASHES[line.get("dash", "solid")],
+        drawstyle="steps-post" if is_step else "default",
+        marker="o" if marker else "",
+        ms=_POINTS_PER_PIXEL * marker.get("size", 0.0),
+        mfc="none" if marker.get("symbol") == "circle-open" else color,
+        alpha=marker.get("opacity"),
+        rasterized=x.size > 500,
+        label=None if trace.get("fill") else label,
+    )
+    return y
+
+
+def _format_axis(axes: Axes, letter: str, layout: dict[str, Any]) -> None:
+    is_log = layout["type"] == "log"
+    axes.set(**{f"{letter}scale": layout["type"], f"{letter}label": layout["title"]["text"]})
+    if "range" in layout:
+        axes.set(**{f"{letter}lim": np.power(10.0, layout["range"]) if is_log else layout["range"]})
+    axis = axes.xaxis if letter == "x" else axes.yaxis
+    if not layout.get("showticklabels", True):
+        axes.set(**{f"{letter}ticks": []})
+        axes.set_ylim(bottom=0.0)
+        return
+    if is_log:
+        low, high = axis.get_view_interval()
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 100.0 * low else (1.0,), numticks=8))
+        axis.set_minor_formatter(NullFormatter())
+    axis.set_major_formatter(_format_tick)
+
+
+def _format_tick(value: float, _: Any) -> str:
+    return f"{value:g}" if value == 0.0 or 1e-3 <= abs(value) < 1e4 else EngFormatter(sep="")(value)
