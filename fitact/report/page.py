@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
-import matplotlib as mpl
 
-from fitact.charts import figure
 from fitact.errors import InputError
 from fitact.report.frame import write_html
-from fitact.report.posterior import CHANNELS, make_charts, make_figures
+from fitact.report.posterior import CHANNELS, make_charts
 from fitact.summary import FORCE_DESCRIPTIONS, format_sd, load
 from fitact.units import format_engineering
 
@@ -74,11 +72,8 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
 
 
 def _content(tree: Any, summary: dict[str, Any]) -> dict[str, Any]:
-    with mpl.rc_context(figure.style()):
-        figures = {name: figure.svg_data_uri(svg) for name, svg in make_figures(tree).items()}
     return {
         "summary": summary,
-        "figures": figures,
         "charts": make_charts(tree),
         "label": _label,
         "channels": CHANNELS,
