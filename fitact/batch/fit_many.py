@@ -32,6 +32,10 @@ _BATCH_RECORDS = 256  # records; so many are stacked, whatever their number, and
 _UNTESTED_MESSAGE = (
     "The fit is at its optimum and leaves no more than noise; what it leaves was not tested for structure."
 )
+_FIT_COLUMNS = (
+    *("result", "trusted", "message", "samples", "noise", "chi2_reduced", "rms_residual", "verdict"),
+    *("force_from_prior", "freed"),
+)
 
 Input = Record | str | os.PathLike[str]
 Row = dict[str, Any]
@@ -324,18 +328,12 @@ def _fit_columns(problem: BatchProblem, result: BatchFit, message: str) -> dict[
     free, count, factor = problem.likelihood.names, len(result.theta), result.covariance_factor
     force = result.gradients[:, derived.DERIVED_NAMES.index("force_mean")]
     shares, _, along = information_directions(free, factor, problem.prior_factor, free)
-    table: dict[str, Any] = {
-        "result": ["successful"] * count,
-        "trusted": [True] * count,
-        "message": [message] * count,
-        "samples": [problem.samples] * count,
-        "noise": result.sigma,
-        "chi2_reduced": result.figures["chi2_reduced"],
-        "rms_residual": result.figures["rms_residual"],
-        "verdict": verdicts(shares, along),
-        "force_from_prior": prior_variance_fraction(factor, problem.prior_factor, force),
-        "freed": [""] * count,
-    }
+    values = (
+        *([value] * count for value in ("successful", True, message, problem.samples)),
+        *(result.sigma, result.figures["chi2_reduced"], result.figures["rms_residual"], verdicts(shares, along)),
+        *(prior_variance_fraction(factor, problem.prior_factor, force), [""] * count),
+    )
+    table: dict[str, Any] = dict(zip(_FIT_COLUMNS, values, strict=True))
     table |= _median_columns(free, np.exp(result.theta).T, np.linalg.norm(factor, axis=2).T)
     log_sds = np.linalg.norm(result.gradients @ factor, axis=2).T
     table |= _median_columns(derived.DERIVED_NAMES, np.exp(result.logs).T, log_sds)
@@ -360,19 +358,12 @@ def _fit_single(record: Record, scene: Scene | None) -> Row:
 def row_from_fit(fit: Fit) -> Row:
     free = [i for i, name in enumerate(fit.names) if name in fit.identifiability.blind_direction]
     logs, gradients = fit.derive.log_value_and_grad(fit.theta, np.array([trace.sigma for trace in fit.traces]))
-    row = {
-        "record": os.path.basename(fit.record.source),
-        "result": fit.result,
-        "trusted": fit.trusted,
-        "message": fit.message,
-        "samples": int(fit.figures["samples"]),
-        "noise": fit.sigma,
-        "chi2_reduced": fit.figures["chi2_reduced"],
-        "rms_residual": fit.figures["rms_residual"],
-        "verdict": fit.identifiability.verdict,
-        "force_from_prior": fit.identifiability.force_from_prior,
-        "freed": ", ".join(fit.model()["freed"]),
-    }
+    values = (
+        *(fit.result, fit.trusted, fit.message, int(fit.figures["samples"]), fit.sigma, fit.figures["chi2_reduced"]),
+        *(fit.figures["rms_residual"], fit.identifiability.verdict, fit.identifiability.force_from_prior),
+        ", ".join(fit.model()["freed"]),
+    )
+    row = {"record": os.path.basename(fit.record.source)} | dict(zip(_FIT_COLUMNS, values, strict=True))
     row |= _median_columns([fit.names[i] for i in free], np.exp(fit.theta[free]), fit.sd[free])
     row |= _median_columns(derived.DERIVED_NAMES, np.exp(logs), np.linalg.norm(gradients @ fit.covariance_root, axis=1))
     return {name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()}

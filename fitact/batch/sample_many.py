@@ -129,14 +129,7 @@ def _split_blocks(members: list[Member], targets: _Targets | None) -> Iterator[t
 
 
 def _make_targets(batch: Batch) -> _Targets | None:
-    """Set up those records of a batch whose fits are beyond doubt; None where there are none."""
-    try:
-        return _select_near_normal(batch)
-    except np.linalg.LinAlgError:  # one of them spoils what is computed for all
-        return None
-
-
-def _select_near_normal(batch: Batch) -> _Targets | None:
+    """Set up those records of a batch whose fits are beyond doubt and near normal; None where there are none."""
     (problem, members), (rows, optima) = batch, fit_batch(batch)
     places = [place for place, (number, _) in enumerate(members) if number in rows]
     if problem is None or optima is None or not places or not _has_tables(problem.likelihood, optima.theta[0]):
@@ -148,14 +141,17 @@ def _select_near_normal(batch: Batch) -> _Targets | None:
     reach = table_half_width(np.linalg.norm(np.einsum("ki,kij->kj", gradient, factor), axis=1))
     low = np.maximum(log_b - reach, middle - TABLE_HALF_WIDTH)
     high = np.minimum(log_b + reach, middle + TABLE_HALF_WIDTH)
-    tables = problem.basis.restrict(
-        optima.coordinates[places], 0.5 * (low + high), 0.5 * (high - low), table_precision(sigma)
-    )
-    approximations = _laplace_approximations(theta, sigma, factor, problem.samples)
-    fit_rows = [rows[number] for number, _ in members]
-    targets = _Targets(members, fit_rows, problem.likelihood, problem.derive, tables, approximations)
-    targets = targets._replace(approximations=approximations.refine(_probe_axes(targets)))
-    is_near = np.all(is_normal(_probe_axes(targets)), axis=1)
+    try:
+        tables = problem.basis.restrict(
+            optima.coordinates[places], 0.5 * (low + high), 0.5 * (high - low), table_precision(sigma)
+        )
+        approximations = _laplace_approximations(theta, sigma, factor, problem.samples)
+        fit_rows = [rows[number] for number, _ in members]
+        targets = _Targets(members, fit_rows, problem.likelihood, problem.derive, tables, approximations)
+        targets = targets._replace(approximations=approximations.refine(_probe_axes(targets)))
+        is_near = np.all(is_normal(_probe_axes(targets)), axis=1)
+    except np.linalg.LinAlgError:  # one of them spoils what is computed for all
+        return None
     return targets.subset(np.flatnonzero(is_near).tolist()) if is_near.any() else None
 
 
@@ -247,7 +243,7 @@ def _sample_block(
         convergence = diagnose_chain(names, sampled.points[i], sampled.accepted[i], tracked_draws, rhat_draws)
         if convergence.converged and not log_probs.outside_table[i]:
             draws = _draws_by_name(names, full.derive, sampled.points[i, :, convergence.burn :])
-            rows[number] = row | _quantiles(row, draws) | _convergence_row(convergence)
+            rows[number] = row | _posterior_columns(row, draws, convergence)
     return rows
 
 
@@ -279,19 +275,15 @@ def _derive_tracked(derive: DerivedQuantities, point: Array) -> Float[Array, " j
     return _derive_quantities(derive, point)[: len(_TRACKED)]
 
 
-def _quantiles(row: Row, draws: Mapping[str, np.ndarray]) -> Row:
-    """Tabulate the quantiles of what the row has a value of."""
-    quantiles: Row = {}
+def _posterior_columns(row: Row, draws: Mapping[str, np.ndarray], convergence: Convergence) -> Row:
+    """Tabulate the quantiles of what the row has a value of, and how far to trust them."""
+    columns: Row = {}
     for key in row:
         name = "sigma" if key == "noise" else key
         if name in draws:
             values = np.quantile(draws[name], list(PROBABILITIES.values()))
-            quantiles |= {f"{key}_{q}": float(value) for q, value in zip(PROBABILITIES, values, strict=True)}
-    return quantiles
-
-
-def _convergence_row(convergence: Convergence) -> Row:
-    return {name: getattr(convergence, name) for name in _CONVERGENCE_COLUMNS}
+            columns |= {f"{key}_{q}": float(value) for q, value in zip(PROBABILITIES, values, strict=True)}
+    return columns | {name: getattr(convergence, name) for name in _CONVERGENCE_COLUMNS}
 
 
 def _alone(record: Record, scene: Scene | None, seed: int) -> Row:
@@ -318,4 +310,4 @@ def add_posterior(row: Row, posterior: Posterior) -> Row:
     draws = parameters | {"sigma": parameters[sigma]} | posterior.derived()
     if row["trusted"] and not posterior.trusted:
         row = row | {"trusted": False, "message": posterior.convergence.warning}
-    return row | _quantiles(row, draws) | _convergence_row(posterior.convergence)
+    return row | _posterior_columns(row, draws, posterior.convergence)

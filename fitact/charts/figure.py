@@ -1,6 +1,5 @@
 """Figures for paper: the shared style and colours, axes, and SVG text that stands alone."""
 
-import base64
 import io
 import os
 from collections.abc import Callable
@@ -18,7 +17,7 @@ from fitact.files import atomic_write
 # told apart by the colour-blind, too (Okabe & Ito 2008)
 DATA, MODEL, PRIOR, ALERT = "#333333", "#0072B2", "#999999", "#D55E00"
 GREEN, PINK, SKY, ORANGE = "#009E73", "#CC79A7", "#56B4E9", "#E69F00"
-_STYLE = {
+STYLE: Any = {  # that all figures share; for `matplotlib.rc_context`
     "font.size": 11.0,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -29,11 +28,6 @@ _STYLE = {
     "savefig.bbox": "tight",
     "path.simplify_threshold": 0.5,
 }
-
-
-def style() -> Any:
-    """Settings that all figures share; use with `matplotlib.rc_context`."""
-    return dict(_STYLE)
 
 
 def robust_limits(values: np.ndarray) -> tuple[float, float]:
@@ -53,17 +47,15 @@ def log_ticks(axis: Axis, unit: str, subs: tuple[float, ...] = (1.0, 2.0, 5.0)) 
     axis.set_minor_formatter(NullFormatter())
 
 
-def write_figure(
-    path: str | os.PathLike[str], draw: Callable[[], Figure], *, dpi: float | None = None, **settings: Any
-) -> None:
-    """Write a figure as PNG or, at any other ending of `path`, as SVG, in the shared style and `settings` beside it.
+def write_figure(path: str | os.PathLike[str], draw: Callable[[], Figure], dpi: float | None = None) -> None:
+    """Write a figure in the shared style as PNG or, at any other ending of `path`, as SVG.
 
     Raises:
         InputError: the place cannot be written.
     """
     kind = "png" if Path(path).suffix == ".png" else "svg"
     metadata = {"Date": None} if kind == "svg" else {}
-    with mpl.rc_context(style() | settings), atomic_write(path) as temporary:
+    with mpl.rc_context(STYLE), atomic_write(path) as temporary:
         draw().savefig(temporary, format=kind, dpi=dpi, metadata=metadata)
 
 
@@ -73,8 +65,3 @@ def svg(figure: Figure) -> str:
     figure.savefig(buffer, format="svg", dpi=150, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     return text[text.index("<svg") :]
-
-
-def svg_data_uri(svg: str) -> str:
-    """A figure as the source of an image: it cannot clash with another's ids, and has its alt text."""
-    return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()

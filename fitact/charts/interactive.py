@@ -100,7 +100,8 @@ def points(
     marker = {"color": color, "size": size, "symbol": "circle-open" if hollow else "circle", "opacity": opacity}
     trace = _trace(x, y, x_values, values, name) | {"mode": "markers", "marker": marker}
     if names is not None:
-        trace |= {"text": list(names), "hovertemplate": f"%{{text}}<br>{_hover_pair(x, y)}<extra></extra>"}
+        place = f"{x.title}: {x.hover('x')}<br>{y.title}: {y.hover('y')}"
+        trace |= {"text": list(names), "hovertemplate": f"%{{text}}<br>{place}<extra></extra>"}
     return trace
 
 
@@ -158,13 +159,17 @@ def plot(
     Args:
         rows: each one's y axis and traces, from the top.
         heights: relative, of the rows.
-        title: above it.
         size: height in pixels.
-        legend: whether to show one.
         unified_hover: whether the pointer asks for the values of all traces at its x, or of the nearest point.
     """
     data: list[PlotlyTrace] = []
-    layout = _layout(x, size, legend, unified_hover)
+    layout: dict[str, Any] = {
+        "font": _FONT, "height": size, "paper_bgcolor": "#fff", "plot_bgcolor": "#fff",
+        "margin": {"l": 56, "r": 12, "t": 34 if legend else 12, "b": 44},
+        "hovermode": "x unified" if unified_hover else "closest", "hoversubplots": "axis", "showlegend": legend,
+        "legend": {"orientation": "h", "x": 0, "y": 1, "yanchor": "bottom"},
+        "xaxis": x.layout() | {"hoverformat": ".5~g", "unifiedhovertitle": {"text": x.hover("x")}},
+    }  # fmt: skip
     shares = np.cumsum([0.0, *heights[: len(rows)]])
     tops, gap = 1.0 - shares / shares[-1], 0.06 if len(rows) > 1 else 0.0
     for number, (y, traces) in enumerate(rows, start=1):
@@ -231,20 +236,6 @@ def _trace(x: Axis, y: Axis, x_values: ArrayLike, values: ArrayLike, name: str) 
     return {
         "type": "scatter", "x": x.encode(x_values, "f8"), "y": y.encode(values), "name": name,
         "hovertemplate": f"{name}: {y.hover('y')}<extra></extra>",
-    }  # fmt: skip
-
-
-def _hover_pair(x: Axis, y: Axis) -> str:
-    return f"{x.title}: {x.hover('x')}<br>{y.title}: {y.hover('y')}"
-
-
-def _layout(x: Axis, size: int, legend: bool, unified_hover: bool) -> dict[str, Any]:
-    return {
-        "font": _FONT, "height": size, "paper_bgcolor": "#fff", "plot_bgcolor": "#fff",
-        "margin": {"l": 56, "r": 12, "t": 34 if legend else 12, "b": 44},
-        "hovermode": "x unified" if unified_hover else "closest", "hoversubplots": "axis", "showlegend": legend,
-        "legend": {"orientation": "h", "x": 0, "y": 1, "yanchor": "bottom"},
-        "xaxis": x.layout() | {"hoverformat": ".5~g", "unifiedhovertitle": {"text": x.hover("x")}},
     }  # fmt: skip
 
 

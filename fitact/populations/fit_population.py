@@ -1,5 +1,6 @@
 """From one finger to people: the law that fingers follow, sampled."""
 
+import functools
 import hashlib
 import importlib.metadata
 import json
@@ -75,17 +76,13 @@ def population(
     area_varies = scene.population.contact_area == "varies"
     factors = (*SKIN, SHARED_PARAMETER, *((AREA,) if area_varies else ()), *scene.population.thickness_sd)
     fingers, new_finger = _fit_fingers(records, scene, factors, progress)
+    make_tables = functools.partial(
+        FingerLikelihoods.from_fingers, fingers, medians[SHARED_PARAMETER], area_varies=area_varies
+    )
     with jax.enable_x64(True):
 
         def hierarchy(draws: int, terms: int, purpose: int) -> Hierarchy:
-            tables = FingerLikelihoods.from_fingers(
-                fingers,
-                medians[SHARED_PARAMETER],
-                area_varies=area_varies,
-                draws=draws,
-                terms=terms,
-                seed=[seed, purpose],
-            )
+            tables = make_tables(draws=draws, terms=terms, seed=[seed, purpose])
             return Hierarchy(tables, medians, area_varies, jnp.asarray(standardized.z_scores))
 
         for draws, name in _CHAIN_FILES.items():

@@ -140,11 +140,5 @@ def _objective(hierarchy: Hierarchy, start: Array, scale: Array, z: Array) -> Ar
     return -hierarchy.log_prob(start + scale * z)
 
 
-@eqx.filter_jit
-def _value_and_gradient(objective: eqx.Partial, z: Array) -> tuple[Array, Array]:
-    return jax.value_and_grad(objective)(z)
-
-
-@eqx.filter_jit
-def _hessian(objective: eqx.Partial, z: Array) -> Array:
-    return jax.hessian(objective)(z)
+_value_and_gradient = eqx.filter_jit(lambda objective, z: jax.value_and_grad(objective)(z))
+_hessian = eqx.filter_jit(lambda objective, z: jax.hessian(objective)(z))

@@ -1,5 +1,6 @@
 """Which factor makes the spread of a quantity of the next finger: shares of its variance, on a certified polynomial."""
 
+import functools
 import itertools
 import math
 from collections.abc import Callable
@@ -19,11 +20,9 @@ class Surrogate(NamedTuple):
     """Logarithms of quantities as polynomials of normal factors, by least squares; Hermite's, in whitened factors.
 
     Attributes:
-        mean: of the factors.
-        covariance_factor: of them.
+        mean, covariance_factor: of the factors.
         tail_scale: how much wider than the factors the points evaluated are, for the tails, where the largest of y lie.
-        powers: of each term.
-        coefficients: of the terms.
+        powers, coefficients: of the terms.
         log_range: least and largest logarithm that the model gave.
         cross_validation_error: of each quantity, sqrt(1 - r^2), where r is its correlation with the model's at points
             held out.
@@ -53,7 +52,6 @@ class Surrogate(NamedTuple):
         """Fit the lowest degree that is close at points held out, or the one that is closest there.
 
         Args:
-            tail_scale: as of the class.
             tolerance: of the error, far below what Sobol's sequence leaves open.
             evaluations_per_term: at least; with fewer, what lies in the tails runs away.
         """
@@ -133,10 +131,7 @@ def _hermite(z: Float[np.ndarray, "points factors"], powers: Int[np.ndarray, "te
     degree = int(powers.max())
     norm = np.sqrt([float(math.factorial(n)) for n in range(degree + 1)])
     single = np.polynomial.hermite_e.hermevander(z, degree) / norm
-    product = single[:, 0, powers[:, 0]]
-    for factor in range(1, z.shape[1]):
-        product = product * single[:, factor, powers[:, factor]]
-    return product
+    return functools.reduce(np.multiply, (single[:, factor, column] for factor, column in enumerate(powers.T)))
 
 
 def variance_shares(

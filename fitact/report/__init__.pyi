@@ -2,8 +2,7 @@ from .campaign import write_campaign
 from .folder import write_folder
 from .frame import Provenance
 from .page import read_results, write_report
-from .population import write_population
-from .population_page import read_population, write_population_page
+from .population import read_population, write_population, write_population_page
 from .prior import write_prior
 from .record import write_record
 from .reproduction import write_reproduction

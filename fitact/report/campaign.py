@@ -35,8 +35,8 @@ def write_campaign(folder: str | os.PathLike[str], fits: Fits, origin: Provenanc
     write_page(
         place / "index.html",
         "campaign.html",
-        frame,
-        origin,
+        frame=frame,
+        origin=origin,
         answers=answered[:max_rows],
         failures=[(row["record"], row["result"], row["message"]) for row in failures[:max_rows]],
         count=len(answered),

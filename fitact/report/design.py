@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fitact.charts import interactive
-from fitact.charts.figure import ALERT, GREEN, MODEL, PRIOR, write_figure
+from fitact.charts.figure import ALERT, GREEN, MODEL, PRIOR
 from fitact.charts.interactive import Axis
 from fitact.charts.picture import draw_plots
 from fitact.design.measurement import MeasurementDesign
@@ -20,17 +20,9 @@ _SETTINGS = {
 }
 
 
-def write_design(path: str | os.PathLike[str], design: MeasurementDesign) -> None:
-    """Draw a design's expected errors of the mean force as SVG at `path`.
-
-    Raises:
-        InputError: the place cannot be written.
-    """
-    write_figure(path, lambda: _figure(design, _chart(design)))
-
-
-def _figure(design: MeasurementDesign, chart: interactive.Chart | None) -> Figure:
-    """Draw the bars of all options, above the curves along what can be set."""
+def draw_design(design: MeasurementDesign, has_curves: bool = True) -> Figure:
+    """Draw the bars of all options' expected errors, above the curves along what can be set."""
+    chart = _chart(design) if has_curves else None
     heights = [0.6 + 0.34 * (2 + len(design.options)), *([3.2] if chart else [])]
     figure = Figure(figsize=(9.0, sum(heights)), layout="constrained")
     parts = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
@@ -49,8 +41,7 @@ def _draw_bars(axes: Axes, design: MeasurementDesign) -> None:
         label = f"{100.0 * option.force_sd:.2g} %{effort}"
         axes.annotate(label, (100.0 * option.force_sd, place), (6, 0), textcoords="offset points", va="center")
     sizes = [100.0 * option.force_sd for option in shown]
-    axes.set_xscale("log")
-    axes.set_xlim(0.5 * min(sizes), 8.0 * max(sizes))
+    axes.set(xscale="log", xlim=(0.5 * min(sizes), 8.0 * max(sizes)))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.set_yticks(range(len(shown)), [option.name for option in shown])
     axes.get_yticklabels()[-1].set_fontweight("bold")
@@ -59,18 +50,14 @@ def _draw_bars(axes: Axes, design: MeasurementDesign) -> None:
 
 
 def write_design_page(path: str | os.PathLike[str], design: MeasurementDesign, origin: Provenance) -> None:
-    """Write a design's page.
-
-    Raises:
-        InputError: the place cannot be written.
-    """
+    """Write a design's page."""
     best, now = design.best_for_effort, design.now
     titles, *rows = design.table
     write_page(
         path,
         "design.html",
-        _frame(design),
-        origin,
+        frame=_frame(design),
+        origin=origin,
         table=[("what is measured", *titles[1:]), *rows],
         parameters=[
             ("what is measured", *now.sd),
@@ -81,7 +68,7 @@ def write_design_page(path: str | os.PathLike[str], design: MeasurementDesign, o
         ],
         best=best,
         curves=_chart(design),
-        bars=image(lambda: _figure(design, None)),
+        bars=image(lambda: draw_design(design, has_curves=False)),
     )
 
 

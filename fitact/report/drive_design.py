@@ -1,7 +1,7 @@
 """A drive's design as a picture and as a page: who feels it, at which frequency, on which insulator."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fitact.charts import interactive
-from fitact.charts.figure import ALERT, DATA, GREEN, MODEL, ORANGE, PINK, PRIOR, SKY, log_ticks, write_figure
+from fitact.charts.figure import ALERT, DATA, GREEN, MODEL, ORANGE, PINK, PRIOR, SKY, log_ticks
 from fitact.charts.interactive import Axis
 from fitact.charts.picture import draw_plot
 from fitact.design.drive import LEGEND, DriveDesign
@@ -17,25 +17,11 @@ from fitact.design.drive_option import FINGER_QUANTILES, DriveOption, format_qua
 from fitact.report.frame import Answer, PageSummary, Provenance, image, write_page
 from fitact.units import format_engineering
 
-_COLORS = {
-    "sine": MODEL,
-    "triangle": GREEN,
-    "square": PINK,
-    "trapezoid": DATA,
-    "multitone": SKY,
-}
+_COLORS = {"sine": MODEL, "triangle": GREEN, "square": PINK, "trapezoid": DATA, "multitone": SKY}
 
 
-def write_drive_design(path: str | os.PathLike[str], design: DriveDesign) -> None:
-    """Draw the drive curves and the amplitude that is needed, as SVG at `path`.
-
-    Raises:
-        InputError: the place cannot be written.
-    """
-    write_figure(path, lambda: _figure(design))
-
-
-def _figure(design: DriveDesign) -> Figure:
+def draw_drive_design(design: DriveDesign) -> Figure:
+    """Draw the drive curves and the amplitude that is needed."""
     figure = Figure(figsize=(11.0, 8.0), layout="constrained")
     (curves, frequencies), (thicknesses, permittivities) = figure.subplots(2, 2)
     draw_plot(_curve_plot(design), curves)
@@ -53,14 +39,13 @@ def _insulator_figure(design: DriveDesign) -> Figure:
 
 
 def _draw_both_insulators(thicknesses: Axes, permittivities: Axes, design: DriveDesign) -> None:
-    _draw_insulators(thicknesses, design, design.by_thickness, lambda o: o.device.insulator_thickness)
-    thicknesses.set_xscale("log")
     thickness = [option.device.insulator_thickness for option in design.by_thickness]
-    thicknesses.set_xlim(0.8 * thickness[0], 1.25 * thickness[-1])
-    thicknesses.set_xlabel("insulator thickness")
+    _draw_insulators(thicknesses, design, design.by_thickness, thickness)
+    thicknesses.set(xscale="log", xlim=(0.8 * thickness[0], 1.25 * thickness[-1]), xlabel="insulator thickness")
     log_ticks(thicknesses.xaxis, "m", (1.0,))
     thicknesses.legend(fontsize=9)
-    _draw_insulators(permittivities, design, design.by_permittivity, lambda o: o.device.insulator_permittivity)
+    permittivity = [option.device.insulator_permittivity for option in design.by_permittivity]
+    _draw_insulators(permittivities, design, design.by_permittivity, permittivity)
     permittivities.set_xlabel("insulator's relative permittivity")
 
 
@@ -73,10 +58,8 @@ def _line_width(design: DriveDesign, name: str) -> float:
     return 3.0 if name == design.own else 1.3
 
 
-def _draw_insulators(
-    axes: Axes, design: DriveDesign, options: Sequence[DriveOption], place: Callable[[DriveOption], float]
-) -> None:
-    at, color = [place(option) for option in options], _COLORS[design.own]
+def _draw_insulators(axes: Axes, design: DriveDesign, options: Sequence[DriveOption], at: Sequence[float]) -> None:
+    color = _COLORS[design.own]
     low, median, high = (_mask_infinite([float(quantile(o.amplitude, q)) for o in options]) for q in (0.05, 0.5, 0.95))
     axes.fill_between(at, low, high, color=color, alpha=0.25, lw=0)
     axes.plot(at, median, ".-", color=color, label=f"{100.0 * design.share:g} % need")
@@ -113,11 +96,7 @@ def _note_if_empty(axes: Axes) -> None:
 
 
 def write_drive_design_page(path: str | os.PathLike[str], design: DriveDesign, origin: Provenance) -> None:
-    """Write a drive's design as a page.
-
-    Raises:
-        InputError: the place cannot be written.
-    """
+    """Write a drive's design as a page."""
     people = [("waveform", *(f"{100.0 * share:g} %" for share in FINGER_QUANTILES))]
     people += [
         (name, *(format_quantity(each, "V") for each in option.people)) for name, option in design.options.items()
@@ -127,8 +106,8 @@ def write_drive_design_page(path: str | os.PathLike[str], design: DriveDesign, o
     write_page(
         path,
         "drive.html",
-        _frame(design),
-        origin,
+        frame=_frame(design),
+        origin=origin,
         table=design.table,
         legend=LEGEND,
         excluded=design.excluded,

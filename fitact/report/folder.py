@@ -4,26 +4,29 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
+from fitact.charts.figure import write_figure
 from fitact.data.record import Record
 from fitact.design.drive import DriveDesign
 from fitact.design.measurement import MeasurementDesign
 from fitact.files import write_json
 from fitact.model_selection.plan import Plan
 from fitact.populations.finger import Finger
-from fitact.report.design import write_design, write_design_page
-from fitact.report.drive_design import write_drive_design, write_drive_design_page
+from fitact.report.design import draw_design, write_design_page
+from fitact.report.drive_design import draw_drive_design, write_drive_design_page
 from fitact.report.frame import Provenance
-from fitact.report.plan import write_plan, write_plan_page
-from fitact.report.tradeoff import write_tradeoff, write_tradeoff_page
+from fitact.report.plan import draw_plan, write_plan_page
+from fitact.report.tradeoff import draw_tradeoff, write_tradeoff_page
 from fitact.scene.scene import Scene
 from fitact.tradeoff.tradeoff import Tradeoff
 
 # by class: the files' name, what draws the figure, and what writes the page
-_WRITERS: dict[type, tuple[str, Callable[..., None], Callable[..., None]]] = {
-    DriveDesign: ("drive", write_drive_design, write_drive_design_page),
-    MeasurementDesign: ("design", write_design, write_design_page),
-    Plan: ("plan", write_plan, write_plan_page),
-    Tradeoff: ("tradeoff", write_tradeoff, write_tradeoff_page),
+_WRITERS: dict[type, tuple[str, Callable[..., Figure], Callable[..., None]]] = {
+    DriveDesign: ("drive", draw_drive_design, write_drive_design_page),
+    MeasurementDesign: ("design", draw_design, write_design_page),
+    Plan: ("plan", draw_plan, write_plan_page),
+    Tradeoff: ("tradeoff", draw_tradeoff, write_tradeoff_page),
 }
 
 
@@ -37,5 +40,5 @@ def write_folder(
     """
     name, draw, write_page = _WRITERS[type(result)]
     write_json(folder / f"{name}.json", result.to_dict())
-    draw(folder / f"{name}.svg", result)
+    write_figure(folder / f"{name}.svg", lambda: draw(result))
     write_page(folder / "report.html", result, Provenance.from_inputs(command, scene, records))

@@ -1,5 +1,6 @@
 """The frame that pages of results share: what it is about, the verdict, the answers, and how to repeat it."""
 
+import base64
 import dataclasses
 import json
 import os
@@ -11,7 +12,7 @@ import matplotlib as mpl
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from fitact.charts import figure
+from fitact.charts.figure import STYLE, svg
 from fitact.charts.picture import draw_chart
 from fitact.data.record import Record
 from fitact.files import atomic_write
@@ -78,19 +79,8 @@ class PageSummary:
     has_reservation: bool = False
 
 
-def write_page(
-    path: str | os.PathLike[str], template: str, frame: PageSummary, origin: Provenance, **content: Any
-) -> None:
-    """Write a page: `frame`, what `template` makes of `content`, and `origin`.
-
-    Raises:
-        InputError: the place cannot be written.
-    """
-    write_html(path, template, frame=frame, origin=origin, versions=versions(), **content)
-
-
-def write_html(path: str | os.PathLike[str], template: str, **content: Any) -> None:
-    """Write what a template makes of `content`.
+def write_page(path: str | os.PathLike[str], template: str, **content: Any) -> None:
+    """Write what a template makes of `content`: mostly `frame` (a `PageSummary`), `origin` (a `Provenance`) and more.
 
     Raises:
         InputError: the place cannot be written.
@@ -100,12 +90,12 @@ def write_html(path: str | os.PathLike[str], template: str, **content: Any) -> N
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     environment.filters["picture"] = lambda chart: image(lambda: draw_chart(chart))
     environment.globals["verbatim"] = lambda name: Markup(loader.get_source(environment, name)[0])  # scripts of ours
-    page = environment.get_template(template).render(**content)
+    page = environment.get_template(template).render(content, versions=versions())
     with atomic_write(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
 
-def image(draw: Callable[[], Figure], **settings: Any) -> str:
-    """A figure in the shared style, as the source of an image."""
-    with mpl.rc_context(figure.style() | settings):
-        return figure.svg_data_uri(figure.svg(draw()))
+def image(draw: Callable[[], Figure]) -> str:
+    """Draw a figure in the shared style, as the source of an image: it cannot clash with another's ids."""
+    with mpl.rc_context(STYLE):
+        return "data:image/svg+xml;base64," + base64.b64encode(svg(draw()).encode()).decode()

@@ -11,7 +11,7 @@ from typing import Any
 import jinja2
 
 from fitact.errors import InputError
-from fitact.report.frame import write_html
+from fitact.report.frame import write_page
 from fitact.report.posterior import CHANNELS, make_charts
 from fitact.summary import FORCE_DESCRIPTIONS, format_sd, load
 from fitact.units import format_engineering
@@ -64,27 +64,25 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
         InputError: the place cannot be written, or the results are of another version.
     """
     try:
-        write_html(path, "report.html", **_content(tree, summary))
+        write_page(
+            path,
+            "report.html",
+            summary=summary,
+            charts=make_charts(tree),
+            label=_label,
+            channels=CHANNELS,
+            force=FORCE_DESCRIPTIONS[summary["model"].get("force", "paper")],
+            circuits=_CIRCUITS,
+            engineering=format_engineering,
+            quantity=_format_quantity,
+            width=format_sd,
+            command=_command(summary),
+            scene=json.dumps(summary["scene"], indent=2, ensure_ascii=False),
+        )
     except (KeyError, jinja2.UndefinedError) as error:
         raise InputError(
             f"{path}: its results lack {error}, as of another version of fitact; make them anew"
         ) from error
-
-
-def _content(tree: Any, summary: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "summary": summary,
-        "charts": make_charts(tree),
-        "label": _label,
-        "channels": CHANNELS,
-        "force": FORCE_DESCRIPTIONS[summary["model"].get("force", "paper")],
-        "circuits": _CIRCUITS,
-        "engineering": format_engineering,
-        "quantity": _format_quantity,
-        "width": format_sd,
-        "command": _command(summary),
-        "scene": json.dumps(summary["scene"], indent=2, ensure_ascii=False),
-    }
 
 
 def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]]:

@@ -6,22 +6,14 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from fitact.charts.figure import ALERT, DATA, MODEL, PRIOR, write_figure
+from fitact.charts.figure import ALERT, DATA, MODEL, PRIOR
 from fitact.model_selection.plan import LEGEND, Plan
 from fitact.report.frame import Answer, PageSummary, Provenance, image, write_page
 from fitact.units import format_percent
 
 
-def write_plan(path: str | os.PathLike[str], plan: Plan) -> None:
-    """Draw a plan's errors of the force as SVG at `path`.
-
-    Raises:
-        InputError: the place cannot be written.
-    """
-    write_figure(path, lambda: _figure(plan))
-
-
-def _figure(plan: Plan) -> Figure:
+def draw_plan(plan: Plan) -> Figure:
+    """Draw a plan's errors of the force."""
     bars = [(o.name, o.nominal.force, o.q95.force, o.kept, o.speedup) for o in plan.omissions]
     if plan.left_out:
         bars.append(("planned model", plan.nominal.force, plan.q95.force, False, plan.speedup))
@@ -35,25 +27,17 @@ def _figure(plan: Plan) -> Figure:
     axes.axvline(plan.full.tolerance.force, color=ALERT, label="tolerance")
     for at, error, faster in zip(place, np.maximum(nominal, q95), speedup, strict=True):
         axes.annotate(f"{faster:.3g}×", (max(error, least), at), (8, 0), textcoords="offset points", va="center")
-    axes.set_xscale("log")
-    axes.set_xlim(0.3 * min(shown), 5.0 * max(*nominal, *q95, plan.full.tolerance.force))
+    axes.set(xscale="log", xlim=(0.3 * min(shown), 5.0 * max(*nominal, *q95, plan.full.tolerance.force)))
     axes.set_yticks(place, names)
     axes.grid(axis="y", visible=False)
     axes.set_xlabel("relative error of the force, mean or peak, and how many times faster the model is")
-    handles = [
-        mpl.patches.Patch(color=MODEL, label="left out"),
-        mpl.patches.Patch(color=PRIOR, label="kept"),
-    ]
+    handles = [mpl.patches.Patch(color=MODEL, label="left out"), mpl.patches.Patch(color=PRIOR, label="kept")]
     figure.legend(handles=[*handles, *axes.get_legend_handles_labels()[0]], loc="outside upper center", ncols=4)
     return figure
 
 
 def write_plan_page(path: str | os.PathLike[str], plan: Plan, origin: Provenance) -> None:
-    """Write a plan's page.
-
-    Raises:
-        InputError: the place cannot be written.
-    """
+    """Write a plan's page."""
     tolerance = format_percent(plan.full.tolerance.force)
     kept = "" if not plan.warnings else " at the nominal values, but not over the prior"
     frame = PageSummary(
@@ -77,5 +61,5 @@ def write_plan_page(path: str | os.PathLike[str], plan: Plan, origin: Provenance
         warnings=plan.warnings,
         has_reservation=bool(plan.warnings),
     )
-    picture = image(lambda: _figure(plan))
-    write_page(path, "plan.html", frame, origin, table=plan.table, legend=LEGEND, model=plan.model(), picture=picture)
+    shown = {"table": plan.table, "legend": LEGEND, "model": plan.model(), "picture": image(lambda: draw_plan(plan))}
+    write_page(path, "plan.html", frame=frame, origin=origin, **shown)

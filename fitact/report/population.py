@@ -1,6 +1,12 @@
-"""A population as a picture: its fingers with its law, the force of the next one, and what that depends on."""
+"""A population as a picture and as a page: how people differ, what the next finger feels, and what that depends on."""
 
+import functools
+import json
+import math
 import os
+import shlex
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,63 +14,85 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from fitact.charts.figure import ALERT, DATA, MODEL, log_ticks, write_figure
+from fitact.charts import interactive
+from fitact.charts.figure import ALERT, DATA, MODEL, PRIOR, log_ticks, write_figure
+from fitact.charts.interactive import Axis
+from fitact.errors import InputError
+from fitact.populations.population import (
+    MAX_INTEGRATION_ERROR,
+    SHARES_LEGEND,
+    VARIANCE_QUANTITIES,
+    population_table,
+    variance_sentences,
+)
+from fitact.report.frame import Answer, PageSummary, Provenance, image, write_page
+from fitact.summary import PROBABILITIES, format_sd
+from fitact.units import format_engineering, format_percent
 
-NOT_DRAWN_MESSAGE = "Not drawn: some draws are not finite."
-FONT_SETTINGS = {"legend.fontsize": 9.0}
+_QUANTILES = {key: f"{100.0 * probability:g} %" for key, probability in PROBABILITIES.items()}
+_NAMES = {
+    "Rsc": "Rsc",
+    "Csc": "Csc",
+    "g": "divider g",
+    "b": "time constant b",
+    "force_mean": "force, mean",
+    "force_peak": "force, peak",
+    "force_rms": "force, rms",
+    "friction_mean": "friction, mean",
+    "force_at_f": "force at the drive's f",
+    "force_at_2f": "force at 2 f",
+    "friction_at_f": "friction at f",
+    "friction_at_2f": "friction at 2 f",
+}
+_NUMERIC = ("population", "new_finger", "variance_shares", "variance_shares_prior", "fingers", "convergence")
+_NEW_LABEL, _PRIOR_LABEL = "fingers to come", "before the records"
+_NOT_DRAWN_MESSAGE = "Not drawn: some draws are not finite."
 
 
 def write_population(path: str | os.PathLike[str], tree: Any, content: dict[str, Any]) -> None:
-    """Draw the fingers, those to come, their force, and what makes it differ, as SVG at `path`.
-
-    From the content of population.nc and population.json.
+    """Draw the content of population.nc and population.json as SVG at `path`.
 
     Raises:
         InputError: the place cannot be written.
     """
-    write_figure(path, lambda: _figure(tree, content), **FONT_SETTINGS)
+    write_figure(path, lambda: _figure(tree, content))
 
 
 def _figure(tree: Any, content: dict[str, Any]) -> Figure:
     figure = Figure(figsize=(11.0, 8.4), layout="constrained")
-    if not is_drawable(tree):
-        figure.text(0.5, 0.5, NOT_DRAWN_MESSAGE, ha="center")
+    if not _is_drawable(tree):
+        figure.text(0.5, 0.5, _NOT_DRAWN_MESSAGE, ha="center")
         return figure
-    for axes, draw in zip(figure.subplots(2, 2).flat, (draw_skin, draw_force, draw_time, draw_shares), strict=True):
+    for axes, draw in zip(figure.subplots(2, 2).flat, (_draw_skin, _draw_force, _draw_time, _draw_shares), strict=True):
         draw(axes, tree, content)
     return figure
 
 
-def is_drawable(tree: Any) -> bool:
+def _is_drawable(tree: Any) -> bool:
     """Whether every draw has a place on a logarithmic axis; a chain that was cut short may hold others."""
     drawn = (values.values for name in ("new_fingers", "prior_new_fingers") for values in tree[name].data_vars.values())
     return all(bool(np.all(np.isfinite(values))) for values in drawn)
 
 
-def draw_skin(axes: Axes, tree: Any, content: dict[str, Any], max_fingers: int = 4000) -> None:
+def _draw_skin(axes: Axes, tree: Any, content: dict[str, Any], max_fingers: int = 4000) -> None:
     """Rsc and Csc of the fingers, with 95 % intervals, and of fingers to come."""
     Rsc, Csc = (tree["new_fingers"][name].values.ravel()[:max_fingers] for name in ("Rsc", "Csc"))
     axes.plot(Rsc, Csc, ".", ms=2, color=MODEL, alpha=0.25, rasterized=True, label="fingers to come")
-    for number, finger in enumerate(content["fingers"]):
-        (x, y), (dx, dy) = (
-            [np.array([finger["parameters"][name][key] for key in keys], dtype=float) for name in ("Rsc", "Csc")]
-            for keys in (["q50"], ["q025", "q975"])
-        )
-        label = "fingers, 95 %" if number == 0 else None
-        errors = {"xerr": np.abs(dx - x)[:, None], "yerr": np.abs(dy - y)[:, None]}
-        axes.errorbar(x, y, **errors, fmt="o", ms=4, color=DATA, label=label)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    for axis, unit in ((axes.xaxis, "Ω"), (axes.yaxis, "F")):
-        log_ticks(axis, unit)
-    axes.set_xlabel("Rsc")
-    axes.set_ylabel("Csc")
-    axes.set_title("Fingers")
-    axes.legend(markerscale=2)
+    low_Rsc, Rsc, high_Rsc, low_Csc, Csc, high_Csc = (
+        np.array([finger["parameters"][name][key] for finger in content["fingers"]], dtype=float)
+        for name in ("Rsc", "Csc")
+        for key in ("q025", "q50", "q975")
+    )
+    widths_Rsc, widths_Csc = np.stack([Rsc - low_Rsc, high_Rsc - Rsc]), np.stack([Csc - low_Csc, high_Csc - Csc])
+    axes.errorbar(Rsc, Csc, widths_Csc, widths_Rsc, fmt="o", ms=4, color=DATA, label="fingers, 95 %")
+    axes.set(xscale="log", yscale="log", xlabel="Rsc", ylabel="Csc", title="Fingers")
+    log_ticks(axes.xaxis, "Ω")
+    log_ticks(axes.yaxis, "F")
+    axes.legend(markerscale=2, fontsize=9)
 
 
-def draw_force(axes: Axes, tree: Any, content: dict[str, Any], bins: int = 50) -> None:
-    """What the next finger may feel; and for each law that may be the true one, what its fingers feel."""
+def _draw_force(axes: Axes, tree: Any, content: dict[str, Any], bins: int = 50) -> None:
+    """The force that the next finger may feel; and by each law that may be the true one, that of its fingers."""
     logs = np.log(tree["new_fingers"]["force_mean"].values)
     least, largest = np.quantile(logs, [0.002, 0.998]).tolist()
     edges = np.linspace(least, largest, bins + 1)
@@ -81,12 +109,11 @@ def draw_force(axes: Axes, tree: Any, content: dict[str, Any], bins: int = 50) -
     log_ticks(axes.xaxis, "N", (1.0, 3.0))
     axes.set_ylim(0.0, 1.3 * float(np.max(high)))  # room for the legend
     axes.set_yticks([])
-    axes.set_xlabel("mean electrostatic force")
-    axes.set_title("Force across people")
-    axes.legend()
+    axes.set(xlabel="mean electrostatic force", title="Force across people")
+    axes.legend(fontsize=9)
 
 
-def draw_time(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
+def _draw_time(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
     """Bands of force in time over fingers to come; friction, by eq. (2), on the other side."""
     drawn = tree["force_in_time"]
     time, force = drawn["time"].values, dict(zip(drawn["quantile"].values.tolist(), drawn["force"].values, strict=True))
@@ -109,14 +136,13 @@ def draw_time(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
     right.yaxis.set_major_formatter(EngFormatter("N"))
     axes.set_xlim(time[0], time[-1])
     axes.set_ylim(0.0, 1.3 * float(max(force[high].max() for _, high in bands)))  # room for the legend
-    axes.set_xlabel("time in the period" if drawn.attrs["periodic"] else "time")
-    axes.set_ylabel("electrostatic force")
+    axes.set(xlabel="time in the period" if drawn.attrs["periodic"] else "time", ylabel="electrostatic force")
     right.set_ylabel("friction")
     axes.set_title("The next finger in time")
-    axes.legend(ncols=2)
+    axes.legend(ncols=2, fontsize=9)
 
 
-def draw_shares(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
+def _draw_shares(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
     """Each factor's share of the variance of the mean force, the largest on top; before the records, too."""
     after, before = (content[key]["force_mean"] for key in ("variance_shares", "variance_shares_prior"))
     order = sorted(after, key=lambda factor: after[factor]["total"])
@@ -141,6 +167,181 @@ def draw_shares(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
     axes.set_yticks(np.arange(len(order)), [factor.replace("_", " ") for factor in order])
     axes.set_xlim(left=0.0)
     axes.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
-    axes.set_xlabel("share of the variance of the mean force")
-    axes.set_title("What makes it differ")
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=len(rows) - 1, handlelength=1.2)
+    axes.set(xlabel="share of the variance of the mean force", title="What makes it differ")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=len(rows) - 1, handlelength=1.2, fontsize=9)
+
+
+_PANELS = {"skin": _draw_skin, "force": _draw_force, "time": _draw_time, "shares": _draw_shares}
+
+
+def write_population_page(path: str | os.PathLike[str], tree: Any, content: dict[str, Any]) -> None:
+    """Write the page from the content of population.nc and population.json.
+
+    Raises:
+        InputError: the place cannot be written.
+    """
+    content = content | {name: _null_to_nan(content[name]) for name in (*_NUMERIC, "integrals_off")}
+    write_page(
+        path,
+        "population.html",
+        frame=_frame(content),
+        origin=_origin(content),
+        content=content,
+        **(_figures(tree, content) if _is_drawable(tree) else {"panels": None, "not_drawn": _NOT_DRAWN_MESSAGE}),
+        law=[row for row in population_table(content) if not row[0].startswith("next finger")],
+        fingers=tuple(_finger_rows(content)),
+        new=tuple(_new_rows(content)),
+        shares={name: tuple(_share_rows(content, name)) for name in VARIANCE_QUANTITIES},
+        legend=SHARES_LEGEND,
+        engineering=format_engineering,
+    )
+
+
+def read_population(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]]:
+    """What `write_population_page` needs, from a folder that `fitact population` wrote.
+
+    Raises:
+        InputError: a file is missing or damaged.
+    """
+    import xarray as xr
+
+    try:
+        content = json.loads((Path(directory) / "population.json").read_text(encoding="utf-8"))
+        if not (isinstance(content, dict) and "trusted" in content):
+            raise ValueError("population.json is not this version's")
+        with xr.open_datatree(Path(directory) / "population.nc", engine="h5netcdf") as tree:
+            return tree.load(), content
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise InputError(
+            f"{directory}: holds no complete population ({error}); make it with: fitact population RECORD..."
+            f" --out {directory}"
+        ) from error
+
+
+def _null_to_nan(content: Any) -> Any:
+    """With NaN for whatever is not finite, which JSON has as null."""
+    if isinstance(content, dict):
+        return {name: _null_to_nan(value) for name, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_null_to_nan(value) for value in content]
+    infinite = isinstance(content, float) and not math.isfinite(content)
+    return math.nan if content is None or infinite else content
+
+
+def _figures(tree: Any, content: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "panels": {name: image(functools.partial(_draw_panel, draw, tree, content)) for name, draw in _PANELS.items()},
+        "skin": _skin_chart(tree, content),
+        "force": _force_chart(tree),
+    }
+
+
+def _frame(content: dict[str, Any]) -> PageSummary:
+    law, new, count = content["population"], content["new_finger"], len(content["fingers"])
+    force, friction = new["force_mean"], new["friction_mean"]
+    off = f"{content['integrals_off']:.2g} standard deviations"
+    certificate = f"integrals over the fingers shift no mean by more than {off}"
+    return PageSummary(
+        title=f"How people differ: {count} fingers",
+        subject=f"What {count} fingers on one panel, a record of each, tell of people: how skins differ, what force the"
+        " next finger feels, and what that depends on.",
+        trusted=content["trusted"],
+        verdict=f"Trusted: the chain has converged, and {certificate}"
+        if content["trusted"]
+        else f"{content['convergence']['sentence']}; {certificate} ({MAX_INTEGRATION_ERROR:g} are trusted).",
+        findings={
+            "What the next finger feels": f"A mean electrostatic force of {_format_range(force)}, and a mean friction"
+            f" of {_format_range(friction)}; 95 % lie between.",
+            "What makes it differ": "; ".join(variance_sentences(content)) + f" ({SHARES_LEGEND}).",
+        },
+        answers=[
+            _answer("Rsc, median of people", law["Rsc"]["median"]),
+            _answer("Csc, median of people", law["Csc"]["median"]),
+            _answer("Ci of the panel", law["Ci"]),
+            _answer("next finger's mean force", force),
+        ],
+        warnings=content["warnings"],
+    )
+
+
+def _format_range(s: dict[str, Any]) -> str:
+    median, low, high = (format_engineering(s[key], s["unit"]) for key in ("q50", "q025", "q975"))
+    return f"{median} ({low} to {high})"
+
+
+def _answer(title: str, s: dict[str, Any]) -> Answer:
+    median, low, high = (format_engineering(s[key], s["unit"], 3) for key in ("q50", "q025", "q975"))
+    return Answer(title, median, f"95 %: {low} to {high}")
+
+
+def _origin(content: dict[str, Any]) -> Provenance:
+    records = {each["record"]: each["sha256"] for each in content["fingers"]}
+    command = ["fitact population", *map(shlex.quote, records)]
+    command += ["--scene SCENE.toml"] if content["scene"] else []
+    command += ["--covariates COVARIATES.csv"] if content["population"]["covariates"] else []
+    return Provenance(" ".join([*command, f"--seed {content['seed']}"]), content["scene"], records)
+
+
+def _finger_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
+    yield ("finger", "Rsc", "± 1 sd", "Csc", "± 1 sd", "Ci", "± 1 sd", "fit")
+    for each in content["fingers"]:
+        own = [each["parameters"][name] for name in ("Rsc", "Csc", "Ci")]
+        cells = (cell for s in own for cell in (format_engineering(s["q50"], s["unit"]), format_sd(s)))
+        yield (each["record"], *cells, each["result"])
+
+
+def _new_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
+    yield ("next finger", *_QUANTILES.values(), "people", "ignorance")
+    none = 1e-12 * content["new_finger"]["force_mean"]["q50"]  # rounding
+    for name, s in content["new_finger"].items():
+        values = (
+            format_engineering(s[key] if s["unit"] != "N" or s["q975"] > none else 0.0, s["unit"], 3)
+            for key in _QUANTILES
+        )
+        yield (_NAMES[name], *values, *(f"{100.0 * s['variance'][key]:.0f} %" for key in ("people", "ignorance")))
+
+
+def _share_rows(content: dict[str, Any], name: str) -> Iterator[tuple[str, ...]]:
+    yield ("factor", "goes once it is known", "stays if only it is not", "before: goes", "before: stays")
+    before = content["variance_shares_prior"][name]
+    for factor, share in content["variance_shares"][name].items():
+        cells = (
+            f"{format_percent(of[key])} ± {format_percent(of[f'{key}_error'])}"
+            for of in (share, before[factor])
+            for key in ("first", "total")
+        )
+        yield (factor.replace("_", " "), *cells)
+
+
+def _draw_panel(draw: Callable[[Axes, Any, dict[str, Any]], None], tree: Any, content: dict[str, Any]) -> Figure:
+    figure = Figure(figsize=(9.0, 4.6), layout="constrained")
+    axes = figure.add_subplot()
+    draw(axes, tree, content)
+    axes.set_title("")
+    return figure
+
+
+def _skin_chart(tree: Any, content: dict[str, Any], max_fingers: int = 1500) -> interactive.Chart:
+    """Fingers by name, among those to come."""
+    Rsc, Csc = (tree["new_fingers"][name].values.ravel()[:max_fingers] for name in ("Rsc", "Csc"))
+    x = Axis.from_values("Rsc", "ohm", np.median(Rsc), log=True)
+    y = Axis.from_values("Csc", "F", np.median(Csc), log=True)
+    at, values = ([finger["parameters"][name]["q50"] for finger in content["fingers"]] for name in ("Rsc", "Csc"))
+    names = [finger["record"] for finger in content["fingers"]]
+    cloud = interactive.points(x, y, Rsc, Csc, _NEW_LABEL, MODEL, size=3.0, opacity=0.35)
+    fingers = interactive.points(x, y, at, values, "fingers", DATA, size=9.0, names=names)
+    drawn = interactive.plot(x, (y, [cloud, fingers]), size=420)
+    hide = interactive.visibility_button(_NEW_LABEL, [drawn], _NEW_LABEL)
+    return interactive.chart(drawn, controls=[interactive.log_axis_button([drawn], "xy"), hide])
+
+
+def _force_chart(tree: Any) -> interactive.Chart:
+    """Mean and peak force of the next finger, and what was believed before."""
+    plots, y = [], Axis("density", hides_numbers=True)
+    for name, title in {"force_mean": "mean force", "force_peak": "peak force"}.items():
+        after, before = (tree[group][name].values for group in ("new_fingers", "prior_new_fingers"))
+        x = Axis.from_values(title, "N", np.median(after), log=True)
+        known = interactive.density(x, after, "next finger")
+        plots.append(interactive.plot(x, (y, [interactive.density(x, before, _PRIOR_LABEL, PRIOR), known]), size=320))
+    hide = interactive.visibility_button(_PRIOR_LABEL, plots, _PRIOR_LABEL)
+    return interactive.chart(*plots, controls=[interactive.log_axis_button(plots), hide])

@@ -5,23 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from fitact.charts import interactive
 from fitact.charts.figure import ALERT, DATA, MODEL, PRIOR, robust_limits
-from fitact.charts.interactive import (
-    Axis,
-    Chart,
-    Plot,
-    PlotlyTrace,
-    band,
-    chart,
-    density,
-    extremes,
-    line,
-    log_axis_button,
-    plot,
-    points,
-    shade_interval,
-    visibility_button,
-)
+from fitact.charts.interactive import Axis, Chart, Plot, PlotlyTrace
 
 CHANNELS = {"Vsc": "skin voltage Vsc", "I": "trunk current I"}
 _FORCES = {"force_mean": "mean force", "force_rms": "rms force", "force_peak": "peak force"}
@@ -48,8 +34,8 @@ def _channel_chart(tree: Any, name: str, columns: int) -> Chart:
     expected = np.stack([predicted[axis].values, *ends])[:, np.isfinite(ends[0])]
     quantity, count = (CHANNELS[name.partition("_")[0]], observed.attrs["units"]), 2 * columns
     if np.count_nonzero(kept) <= count:
-        return chart(_time_plot(series, quantity, columns, expected))
-    return chart(
+        return interactive.chart(_time_plot(series, quantity, columns, expected))
+    return interactive.chart(
         _time_plot(series, quantity, columns, expected, f"all of it, by the extremes of {columns:,} stretches"),
         _time_plot(series[:, :count], quantity, columns, None, f"its first {count:,} samples"),
     )
@@ -72,14 +58,14 @@ def _time_plot(
     rest = Axis.from_values("record − fit", unit, residuals)
 
     def draw_extremes(y: Axis, values: np.ndarray, name: str, color: str) -> PlotlyTrace:
-        at = extremes(values, columns)
-        return line(x, y, time[at], values[at], name, color, width=1.0)
+        at = interactive.extremes(values, columns)
+        return interactive.line(x, y, time[at], values[at], name, color, width=1.0)
 
     edges = ("5 % of predicted records", "95 %", "90 % of predicted records")
-    above = [] if expected is None else band(x, y, expected[0], expected[1], expected[2], edges)
+    above = [] if expected is None else interactive.band(x, y, expected[0], expected[1], expected[2], edges)
     above += [draw_extremes(y, values, "record", DATA), draw_extremes(y, fitted, "fit", MODEL)]
     below = [draw_extremes(rest, residuals, "record − fit", ALERT) | {"showlegend": False}]
-    return plot(x, (y, above), (rest, below), heights=(2.2, 1.0), title=title, size=480, unified_hover=True)
+    return interactive.plot(x, (y, above), (rest, below), heights=(2.2, 1.0), title=title, size=480, unified_hover=True)
 
 
 def _corner_chart(tree: Any) -> Chart:
@@ -93,14 +79,16 @@ def _corner_chart(tree: Any) -> Chart:
     plots = [_marginal(axes[name], posterior[name].values, prior[name].values) for name in names]
     pairs = list(itertools.combinations([name for name in _PAIR_NAMES if name in names], 2))
     clouds = [_pair_plot((axes[a], axes[b]), [(each[a], each[b]) for each in (prior, posterior)]) for a, b in pairs]
-    switch = log_axis_button(plots, label="logarithmic axes")
-    switch["updates"] += log_axis_button(clouds, "xy")["updates"] if clouds else []
-    return chart(*plots, *clouds, controls=[visibility_button("prior", [*plots, *clouds], "prior"), switch])
+    switch = interactive.log_axis_button(plots, label="logarithmic axes")
+    switch["updates"] += interactive.log_axis_button(clouds, "xy")["updates"] if clouds else []
+    return interactive.chart(
+        *plots, *clouds, controls=[interactive.visibility_button("prior", [*plots, *clouds], "prior"), switch]
+    )
 
 
 def _marginal(x: Axis, posterior: np.ndarray, prior: np.ndarray) -> Plot:
-    traces = [density(x, prior, "prior", PRIOR), density(x, posterior, "posterior", MODEL)]
-    return plot(x, (_DENSITY, traces), size=230, unified_hover=True)
+    traces = [interactive.density(x, prior, "prior", PRIOR), interactive.density(x, posterior, "posterior", MODEL)]
+    return interactive.plot(x, (_DENSITY, traces), size=230, unified_hover=True)
 
 
 def _pair_plot(axes: tuple[Axis, Axis], clouds: list[tuple[Any, Any]]) -> Plot:
@@ -109,9 +97,11 @@ def _pair_plot(axes: tuple[Axis, Axis], clouds: list[tuple[Any, Any]]) -> Plot:
     traces = []
     for (a, b), name, color in zip(clouds, ("prior", "posterior"), (PRIOR, MODEL), strict=True):
         shown = slice(None, None, max(1, a.size // 300))  # so many are a cloud, and a light page
-        cloud = points(x, y, a.values.ravel()[shown], b.values.ravel()[shown], name, color, size=4.0, opacity=0.6)
+        cloud = interactive.points(
+            x, y, a.values.ravel()[shown], b.values.ravel()[shown], name, color, size=4.0, opacity=0.6
+        )
         traces.append(cloud | {"hovertemplate": hover})
-    return plot(x, (y, traces))
+    return interactive.plot(x, (y, traces))
 
 
 def _force_chart(tree: Any) -> Chart:
@@ -120,6 +110,8 @@ def _force_chart(tree: Any) -> Chart:
     for name, title in _FORCES.items():
         draws = posterior[name].values
         x, (low, high) = Axis.from_values(title, "N", np.median(draws)), np.quantile(draws, [0.05, 0.95])
-        distribution = plot(x, (_DENSITY, [density(x, draws, title)]), size=230, legend=False, unified_hover=True)
-        plots.append(shade_interval(distribution, x, float(low), float(high)))
-    return chart(*plots, controls=[log_axis_button(plots)])
+        distribution = interactive.plot(
+            x, (_DENSITY, [interactive.density(x, draws, title)]), size=230, legend=False, unified_hover=True
+        )
+        plots.append(interactive.shade_interval(distribution, x, float(low), float(high)))
+    return interactive.chart(*plots, controls=[interactive.log_axis_button(plots)])

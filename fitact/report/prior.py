@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from fitact.charts.figure import DATA, MODEL, style, svg, write_figure
+from fitact.charts.figure import DATA, MODEL, STYLE, svg, write_figure
 from fitact.errors import InputError
 from fitact.files import atomic_write
 from fitact.scene.prior_predictive import PriorPredictive
@@ -27,7 +27,7 @@ def write_prior(path: Path, predicted: PriorPredictive) -> None:
     if path.suffix != ".html":
         write_figure(path, lambda: _figure(predicted), dpi=150)
     else:
-        with mpl.rc_context(style()), atomic_write(path) as temporary:
+        with mpl.rc_context(STYLE), atomic_write(path) as temporary:
             temporary.write_text(_page(_figure(predicted), predicted), encoding="utf-8")
 
 
@@ -42,9 +42,7 @@ def _figure(predicted: PriorPredictive) -> Figure:
     above.plot(predicted.time, np.median(predicted.Vsc, axis=0), color=DATA, lw=1.2, label="median")
     above.xaxis.set_major_formatter(EngFormatter("s"))
     above.yaxis.set_major_formatter(EngFormatter("V"))
-    above.set_xlim(predicted.time[0], predicted.time[-1])
-    above.set_xlabel("time")
-    above.set_ylabel("skin voltage Vsc")
+    above.set(xlim=(predicted.time[0], predicted.time[-1]), xlabel="time", ylabel="skin voltage Vsc")
     above.legend(loc="upper right", framealpha=0.9)
     for column, (name, title) in enumerate({"force_mean": "mean force", "force_peak": "peak force"}.items()):
         force = predicted.derived[name]

@@ -18,7 +18,7 @@ from fitact.files import write_json
 from fitact.model.circuit import Circuit, DirectGround, FinalCircuit, NaturalGround
 from fitact.model.drive import Drive, Square
 from fitact.model.response import response
-from fitact.report.frame import write_html
+from fitact.report.frame import write_page
 from fitact.units import format_engineering
 
 _COLORS = ("#D55E00", "#009E73", "#CC79A7", "#8C564B", "#222222")  # in the order of the paper's figures
@@ -40,7 +40,7 @@ def write_reproduction(directory: str | os.PathLike[str], claims: tuple[paper.Cl
         figures = [(title, make_chart(), alt) for title, make_chart, alt in _FIGURES]
     counts = {verdict: sum(claim.verdict == verdict for claim in claims) for verdict in ("agrees", "differs")}
     write_json(directory / "reproduction.json", [claim.to_dict() for claim in claims])
-    write_html(page, "reproduction.html", claims=claims, figures=figures, value=_format_value, counts=counts)
+    write_page(page, "reproduction.html", claims=claims, figures=figures, value=_format_value, counts=counts)
     return page
 
 

@@ -4,18 +4,18 @@ import functools
 import itertools
 import os
 from collections.abc import Sequence
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, NullLocator
 from matplotlib.transforms import Bbox
 
 from fitact.charts import interactive
-from fitact.charts.figure import ALERT, DATA, MODEL, PRIOR, write_figure
+from fitact.charts.figure import ALERT, DATA, MODEL, PRIOR
 from fitact.charts.interactive import Axis
+from fitact.charts.picture import draw_plot
 from fitact.report.frame import Answer, PageSummary, Provenance, image, write_page
 from fitact.tradeoff.tradeoff import COLUMNS, KINDS, BenchmarkedMethod, Kind, Tradeoff
 from fitact.units import format_engineering
@@ -25,21 +25,11 @@ _TITLES: dict[Kind, tuple[str, str, str]] = {
     "likelihood": ("likelihood", "one evaluation, of many at once", "error of the log-likelihood"),
     "uncertainty": ("uncertainty", "one effective draw", "error, posterior standard deviations"),
 }
-_STYLE = {"axes.grid": False}
 _ZERO_RATIO = 30.0  # times below the least error is where an error of 0 is drawn
 
 
-def write_tradeoff(path: Path, tradeoff: Tradeoff) -> None:
-    """Draw at `path`: SVG or PNG by its ending.
-
-    Raises:
-        InputError: the place cannot be written.
-    """
-    write_figure(path, lambda: tradeoff_figure(tradeoff), dpi=150, **_STYLE)
-
-
-def tradeoff_figure(tradeoff: Tradeoff, kinds: Sequence[Kind] = tuple(_TITLES)) -> Figure:
-    """The picture of some kinds of level."""
+def draw_tradeoff(tradeoff: Tradeoff, kinds: Sequence[Kind] = tuple(_TITLES)) -> Figure:
+    """Draw some kinds of level."""
     figure = Figure(figsize=(13.0 if len(kinds) > 1 else 9.0, 4.8), layout="constrained")
     canvas = FigureCanvasAgg(figure)
     panels = dict(zip(kinds, figure.subplots(1, len(kinds), squeeze=False)[0], strict=True))
@@ -48,56 +38,28 @@ def tradeoff_figure(tradeoff: Tradeoff, kinds: Sequence[Kind] = tuple(_TITLES)) 
     canvas.draw()  # so that it is known where everything is
     figure.set_layout_engine("none")  # and stays there
     for kind, axes in panels.items():
-        _annotate_names(axes, tradeoff.of(kind), canvas)
+        _annotate_names(axes, tradeoff.of(kind), _plot(tradeoff, kind)[1], canvas)
     return figure
 
 
-def _heights(levels: tuple[BenchmarkedMethod, ...]) -> dict[str, float]:
+def _heights(levels: Sequence[BenchmarkedMethod]) -> dict[str, float]:
     """Where errors are drawn: as they are, and 0 below the least of the others."""
     zero = min((level.error for level in levels if level.error > 0.0), default=1.0) / _ZERO_RATIO
     return {level.name: level.error or zero for level in levels}
 
 
 def _draw_panel(axes: Axes, kind: Kind, tradeoff: Tradeoff) -> None:
-    levels, front = tradeoff.of(kind), tradeoff.front(kind)
-    height = _heights(levels)
-    title, cost, error = _TITLES[kind]
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.plot([x.seconds for x in front], [height[x.name] for x in front], "o-", color=MODEL, ms=7, lw=1.2)
-    dominated = [x for x in levels if x.dominated_by]
-    axes.plot(
-        [x.seconds for x in dominated],
-        [height[x.name] for x in dominated],
-        "o",
-        color=ALERT,
-        ms=7,
-        mfc="none",
-    )
-    zero = min(height.values())
+    plot, size = _plot(tradeoff, kind)
+    bare = plot["layout"] | {"showlegend": False}  # the names say it
+    draw_plot(plot | {"layout": bare, "title": _TITLES[kind][0]}, axes)
+    axes.grid(visible=False)
+    heights, seconds = _heights(tradeoff.of(kind)).values(), [level.seconds / size for level in tradeoff.of(kind)]
+    zero, margin = min(heights), 1.5 * (max(seconds) / min(seconds)) ** 0.25
     axes.axhline(zero, color=DATA, lw=0.8, ls=":")
-    if kind == "uncertainty":
-        axes.axhspan(zero / _ZERO_RATIO, tradeoff.resolution, color=PRIOR, alpha=0.2, lw=0)
-    axes.set_ylim(zero / 6.0, 10.0 * max(height.values()))
-    low, high = min(x.seconds for x in levels), max(x.seconds for x in levels)
-    margin = (high / low) ** 0.25 * 1.5
-    axes.set_xlim(low / margin, high * margin)
-    axes.xaxis.set_major_formatter(EngFormatter("s", places=0, sep=""))
-    axes.yaxis.set_major_locator(LogLocator(numticks=8))
-    axes.yaxis.set_minor_locator(NullLocator())
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0e}" if value > 2.0 * zero else ""))
-    axes.annotate(
-        "0",
-        (0.0, zero),
-        xycoords=("axes fraction", "data"),
-        xytext=(-6, 0),
-        textcoords="offset points",
-        ha="right",
-        va="center",
-    )
-    axes.set_title(title)
-    axes.set_xlabel(f"time of {cost}")
-    axes.set_ylabel(error)
+    axes.set(xlim=(min(seconds) / margin, max(seconds) * margin), ylim=(zero / 6.0, 10.0 * max(heights)))
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:.0e}" if value > 2.0 * zero else "")
+    zero_label: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
+    axes.annotate("0", (0.0, zero), (-6, 0), ha="right", va="center", **zero_label)
 
 
 def _front_points(places: dict[str, np.ndarray], levels: tuple[BenchmarkedMethod, ...]) -> list[np.ndarray]:
@@ -107,10 +69,10 @@ def _front_points(places: dict[str, np.ndarray], levels: tuple[BenchmarkedMethod
     return [end + share * (start - end) for start, end in pairs for share in np.linspace(0.0, 1.0, 40)]
 
 
-def _annotate_names(axes: Axes, levels: tuple[BenchmarkedMethod, ...], canvas: FigureCanvasAgg) -> None:
-    """The levels' names, each on the nearest side of its point where it hides nothing."""
-    height = _heights(levels)
-    places = {x.name: axes.transData.transform((x.seconds, height[x.name])) for x in levels}
+def _annotate_names(axes: Axes, levels: tuple[BenchmarkedMethod, ...], size: float, canvas: FigureCanvasAgg) -> None:
+    """Write the levels' names, each on the nearest side of its point where it hides nothing; `size`: of a unit of x."""
+    points = {x.name: (x.seconds / size, y) for x, y in zip(levels, _heights(levels).values(), strict=True)}
+    places = {name: axes.transData.transform(point) for name, point in points.items()}
     taken = [
         Bbox.from_extents(x - 8, y - 8, x + 8, y + 8) for x, y in [*places.values(), *_front_points(places, levels)]
     ]
@@ -121,7 +83,7 @@ def _annotate_names(axes: Axes, levels: tuple[BenchmarkedMethod, ...], canvas: F
         for distance, (right, up) in itertools.product((9, 18, 30, 44), sides):
             text = axes.annotate(
                 level.name,
-                (level.seconds, height[level.name]),
+                points[level.name],
                 xytext=(distance * right, distance * up),
                 textcoords="offset points",
                 ha={-1: "right", 0: "center", 1: "left"}[right],
@@ -140,11 +102,7 @@ def _annotate_names(axes: Axes, levels: tuple[BenchmarkedMethod, ...], canvas: F
 
 
 def write_tradeoff_page(path: str | os.PathLike[str], tradeoff: Tradeoff, origin: Provenance) -> None:
-    """Write its page.
-
-    Raises:
-        InputError: the place cannot be written.
-    """
+    """Write its page."""
     cheapest = {kind: tradeoff.front(kind)[0] for kind in KINDS}
     names = ", ".join(f"{level.name} ({kind})" for kind, level in cheapest.items())
     front = {kind: "; ".join(map(_describe_level, tradeoff.front(kind))) for kind in KINDS}
@@ -169,11 +127,11 @@ def write_tradeoff_page(path: str | os.PathLike[str], tradeoff: Tradeoff, origin
     write_page(
         path,
         "tradeoff.html",
-        frame,
-        origin,
+        frame=frame,
+        origin=origin,
         kinds=KINDS,
-        charts={kind: _chart(tradeoff, kind) for kind in KINDS},
-        pictures={kind: image(functools.partial(tradeoff_figure, tradeoff, (kind,)), **_STYLE) for kind in KINDS},
+        charts={kind: interactive.chart(_plot(tradeoff, kind)[0]) for kind in KINDS},
+        pictures={kind: image(functools.partial(draw_tradeoff, tradeoff, (kind,))) for kind in KINDS},
         tables={
             kind: [(*COLUMNS, "dominated by"), *((*each.cells, each.dominated_by) for each in tradeoff.of(kind))]
             for kind in KINDS
@@ -187,8 +145,8 @@ def _describe_level(level: BenchmarkedMethod) -> str:
     return f"{level.name}, {format_engineering(level.seconds, 's', 3)}, error {level.error:.2g}"
 
 
-def _chart(tradeoff: Tradeoff, kind: Kind) -> interactive.Chart:
-    """Levels by name."""
+def _plot(tradeoff: Tradeoff, kind: Kind) -> tuple[interactive.Plot, float]:
+    """Levels by name, and the unit of the seconds."""
     levels, height = tradeoff.of(kind), _heights(tradeoff.of(kind))
     _, cost, error = _TITLES[kind]
     seconds = [level.seconds for level in levels]
@@ -216,4 +174,4 @@ def _chart(tradeoff: Tradeoff, kind: Kind) -> interactive.Chart:
     if kind == "uncertainty":
         ends, least = (min(seconds), max(seconds)), (tradeoff.resolution, tradeoff.resolution)
         traces.append(interactive.line(x, y, ends, least, "cannot be told from 0 below", PRIOR, dash="dash"))
-    return interactive.chart(interactive.plot(x, (y, traces), size=400))
+    return interactive.plot(x, (y, traces), size=400), x.size

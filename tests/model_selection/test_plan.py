@@ -15,8 +15,9 @@ import scipy.signal
 import scipy.stats
 
 import fitact
+from fitact.charts.figure import write_figure
 from fitact.model_selection import omissions
-from fitact.report.plan import write_plan
+from fitact.report.plan import draw_plan
 from tests.model.test_ngspice import JUMP, simulate
 
 PAPER = {"grounding": {"R_H": "500 ohm"}}
@@ -394,7 +395,7 @@ def test_contract_and_picture(tmp_path: Path):
     assert json.loads(json.dumps(content)) == content
     assert len(content["warnings"]) == 1  # the default prior is wide
     assert "0.14 %" in str(plan)
-    write_plan(tmp_path / "plan.svg", plan)
+    write_figure(tmp_path / "plan.svg", lambda: draw_plan(plan))
     assert "<svg" in (tmp_path / "plan.svg").read_text()
 
 

@@ -27,7 +27,7 @@ from fitact.report.design import write_design_page
 from fitact.report.drive_design import write_drive_design_page
 from fitact.report.frame import Provenance
 from fitact.report.plan import write_plan_page
-from fitact.report.population_page import read_population, write_population_page
+from fitact.report.population import read_population, write_population_page
 from fitact.report.tradeoff import write_tradeoff_page
 from fitact.tradeoff.tradeoff import BenchmarkedMethod, Tradeoff
 from tests.report.test_report import Page

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import fitact
-from fitact.report.tradeoff import tradeoff_figure, write_tradeoff
+from fitact.charts.figure import write_figure
+from fitact.report.tradeoff import draw_tradeoff
 from fitact.tradeoff import timings, tradeoff
 from fitact.tradeoff.tradeoff import BenchmarkedMethod, Tradeoff, dominators
 from tests.conftest import skin_voltage, square_record
@@ -126,7 +127,7 @@ def made_up() -> Tradeoff:
 
 
 def test_labels_do_not_overlap(made_up: Tradeoff):
-    figure = tradeoff_figure(made_up)
+    figure = draw_tradeoff(made_up)
     renderer = FigureCanvasAgg(figure).get_renderer()
     for axes in figure.axes:
         names = [text for text in axes.texts if text.get_text() != "0"]
@@ -137,7 +138,7 @@ def test_labels_do_not_overlap(made_up: Tradeoff):
 
 
 def test_it_is_written_and_says_who_dominates(made_up: Tradeoff, tmp_path):
-    write_tradeoff(tmp_path / "tradeoff.svg", made_up)
+    write_figure(tmp_path / "tradeoff.svg", lambda: draw_tradeoff(made_up))
     assert (tmp_path / "tradeoff.svg").read_text().startswith("<?xml")
     text = str(made_up)
     for level in made_up.levels:
