@@ -48,7 +48,7 @@ Batch = tuple[tuple[str, str], ...]  # keys of the journal and paths
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """What a worker needs beside the records.
+    """All that a worker needs beside the records.
 
     Attributes:
         scene: as JSON; None: the paper's device.
@@ -326,7 +326,6 @@ def _open_client(
 
 
 def _connect_scheduler(scheduler: str, deadline: float) -> "Client":
-    """Wait for a scheduler until the deadline."""
     while True:
         try:
             return _import_distributed().Client(scheduler, timeout="5s")
@@ -352,7 +351,6 @@ class _Progress:
             print(f"campaign: {text}", file=sys.stderr, flush=True)
 
     def add(self, rows: Sequence[Row]) -> None:
-        """Count rows, and print a line now and then."""
         self.done += len(rows)
         self.failed += sum("samples" not in row for row in rows)
         now = time.monotonic()

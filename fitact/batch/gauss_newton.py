@@ -105,7 +105,7 @@ class GaussNewtonResult(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class BatchProblem:
-    """What records of one scene, drive and time grid share.
+    """All that records of one scene, drive and time grid share.
 
     Attributes:
         likelihood: in the coordinates of `basis`.

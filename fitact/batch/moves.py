@@ -5,6 +5,7 @@ order (posteriors, ensembles, walkers). Each posterior's random numbers come fro
 do not depend on what stands beside it.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Self
 
@@ -23,7 +24,7 @@ Generators = Sequence[np.random.Generator]
 
 
 class EnsembleDraws(NamedTuple):
-    """What was drawn: points, and which moves were accepted."""
+    """Points that were drawn, and which moves were accepted."""
 
     points: Float[np.ndarray, "posteriors ensembles steps walkers n"]
     accepted: Float[np.ndarray, "posteriors ensembles walkers"]
@@ -86,11 +87,12 @@ def sample_posteriors(
     return EnsembleDraws(np.moveaxis(points, 0, 2), sampler.backend.accepted.reshape(shape))
 
 
+@dataclasses.dataclass
 class _MultiPosteriorMove(emcee.moves.Move):
     """A move of the walkers of many posteriors, each with random numbers of its own."""
 
-    def __init__(self, shape: tuple[int, int, int], generators: Generators) -> None:
-        self.shape, self.generators = shape, generators
+    shape: tuple[int, int, int]
+    generators: Generators
 
     def accept(
         self,
@@ -109,14 +111,11 @@ class _MultiPosteriorMove(emcee.moves.Move):
         return self.update(state, emcee.State(proposed, log_prob=values), accepted, subset), accepted
 
 
+@dataclasses.dataclass
 class Independence(_MultiPosteriorMove):
     """Proposals from each posterior's own Student-t, wherever the walker is."""
 
-    def __init__(
-        self, shape: tuple[int, int, int], generators: Generators, approximations: GaussianApproximations
-    ) -> None:
-        super().__init__(shape, generators)
-        self.approximations = approximations
+    approximations: GaussianApproximations
 
     def propose(self, model: emcee.model.Model, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
         count, size = len(self.generators), state.coords.shape[1]

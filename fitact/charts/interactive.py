@@ -28,7 +28,7 @@ _AXIS = {
 
 @dataclasses.dataclass(frozen=True)
 class Axis:
-    """What runs along an axis.
+    """A quantity along an axis.
 
     Attributes:
         title: of the quantity.
@@ -66,7 +66,7 @@ class Axis:
         return {"dtype": dtype, "bdata": base64.b64encode(numbers.tobytes()).decode()}
 
     def layout(self) -> dict[str, Any]:
-        """What plotly.js calls an axis."""
+        """Describe the axis to plotly.js."""
         title = f"{self.title} / {self.symbol}" if self.symbol else self.title
         layout = _AXIS | {"title": {"text": title, "standoff": 6}, "type": "log" if self.log else "linear"}
         if self.hides_numbers:
@@ -194,7 +194,7 @@ def mark_position(plot: Plot, x: Axis, position: float, color: str) -> Plot:
 
 
 def chart(*plots: Plot, controls: Sequence[dict[str, Any]] = ()) -> Chart:
-    """What the macro `chart` of templates/figures.html shows."""
+    """Describe a chart for the macro `chart` of templates/figures.html."""
     return {"plots": list(plots), "controls": list(controls)}
 
 

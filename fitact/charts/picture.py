@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
-from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import EngFormatter
 
-from fitact.charts.figure import MODEL
+from fitact.charts.figure import MODEL, log_ticks
 from fitact.charts.interactive import Chart, Plot, PlotlyTrace
 
 _DASHES = {"solid": "-", "dash": "--", "dot": ":"}
@@ -95,8 +95,7 @@ def _format_axis(axes: Axes, letter: str, layout: dict[str, Any]) -> None:
         return
     if is_log:
         low, high = axis.get_view_interval()
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 100.0 * low else (1.0,), numticks=8))
-        axis.set_minor_formatter(NullFormatter())
+        log_ticks(axis, "", (1.0, 2.0, 5.0) if high < 100.0 * low else (1.0,))
     axis.set_major_formatter(_format_tick)
 
 

@@ -1,4 +1,4 @@
-"""What else is known of the people behind records, such as how moist their skin is."""
+"""All else that is known of the people behind records, such as how moist their skin is."""
 
 import csv
 import dataclasses

@@ -27,16 +27,13 @@ class Finger:
     """A fitted record, and its likelihood around the optimum: normal in the finger's own coordinates given log Ci.
 
     Attributes:
-        source: the record's file.
-        fingerprint: of the record.
-        result, message: of the fit, as in `Fit`.
-        parameters: of the fit by itself.
+        source, fingerprint: of the record.
+        result, message, parameters: of the fit by itself, as in `Fit`.
         likelihood: with priors of the nuisances alone; without samples where a compression stands for them.
         names: the coordinates of a point; its own are all but Ci.
         center: log Ci of the optimum.
-        conditional_mean: its own coordinates there.
-        slope: how these move with log Ci.
-        covariance_factor: of them, given log Ci.
+        conditional_mean, covariance_factor: of its own coordinates there, given log Ci.
+        slope: how the mean moves with log Ci.
         precision: of log Ci, from the record alone.
         weighted_offset: precision times how far the record wants log Ci from `center`.
     """

@@ -41,7 +41,6 @@ class Hierarchy(eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the coordinates."""
         return NAMES[: self._first_slope_index] + tuple(
             f"shift_{name}_{i + 1}" for i in range(self.covariates.shape[1]) for name in SKIN
         )
@@ -55,7 +54,6 @@ class Hierarchy(eqx.Module):
         return jnp.column_stack([jnp.ones(len(self.covariates)), self.covariates])
 
     def population_parameters(self, point: Float[Array, " coordinates"]) -> PopulationParameters:
-        """Convert a point."""
         log_sd, correlation = jnp.exp(point[3:5]), jnp.tanh(point[5])
         shifts = jnp.vstack([point[:2], point[self._first_slope_index :].reshape(-1, 2)])
         second = correlation * shifts[:, 0] + jnp.sqrt(1.0 - correlation**2) * shifts[:, 1]

@@ -26,7 +26,7 @@ HARMONICS = ("force_at_f", "force_at_2f", "friction_at_f", "friction_at_2f")
 
 
 class NewFingerModel(eqx.Module):
-    """What follows from the logarithms of a finger's `factors`: all of `names`, SI units.
+    """A model of what follows from the logarithms of a finger's `factors`: all of `names`, SI units.
 
     Attributes:
         derive: of a fit, without its record's charge.

@@ -1,4 +1,4 @@
-"""What is found of a population: draws of the law that fingers follow, the next finger, what its force depends on."""
+"""The answer for a population: draws of the law that fingers follow, the next finger, what its force depends on."""
 
 import dataclasses
 import functools
@@ -109,7 +109,7 @@ class Population:
 
     @property
     def prior_factors(self) -> Float[np.ndarray, "laws fingers factors"]:
-        """As `factors`, of fingers of laws that are believed before any record is seen."""
+        """Logarithms as in `factors`, of fingers of laws that are believed before any record is seen."""
         random = np.random.default_rng([self.seed, 4])
         laws = self.hierarchy.sample_prior(random, self.laws).shift_medians(self.at)
         return self._draw_factors(random, laws)
@@ -129,19 +129,19 @@ class Population:
 
     @functools.cached_property
     def shares(self) -> SobolIndices:
-        """Of each factor in the variance of the next finger's force; see `variance_shares`."""
+        """Shares of each factor in the variance of the next finger's force; see `variance_shares`."""
         return self._sobol_indices(self.factors)
 
     @functools.cached_property
     def prior_shares(self) -> SobolIndices:
-        """As `shares`, before any record is seen."""
+        """Shares as `shares` has them, before any record is seen."""
         return self._sobol_indices(self.prior_factors)
 
     def _sobol_indices(self, factors: Float[np.ndarray, "laws fingers factors"]) -> SobolIndices:
         return variance_shares(self.finger, factors.reshape(-1, factors.shape[-1]), VARIANCE_QUANTITIES, self.seed)
 
     def to_dict(self) -> dict[str, Any]:
-        """What `fitact population --json` prints and population.json holds."""
+        """Make the content of population.json, which `fitact population --json` prints."""
         new: dict[str, dict[str, Any]] = {}
         for name, values in self.new_fingers().items():
             people = VarianceDecomposition.from_draws(values).between_finger_fraction
@@ -284,7 +284,6 @@ def variance_sentences(content: dict[str, Any]) -> tuple[str, ...]:
 
 
 def evaluate_parameters(hierarchy: Hierarchy, points: Float[np.ndarray, "chains draws n"]) -> PopulationParameters:
-    """Convert many points."""
     with jax.enable_x64(True):
         return jax.tree.map(np.asarray, jax.jit(jax.vmap(jax.vmap(hierarchy.population_parameters)))(points))
 
@@ -297,7 +296,6 @@ def draw_parameters(population: Population, count: int) -> PopulationParameters:
 
 
 def log_medians(parameters: PopulationParameters) -> dict[str, np.ndarray]:
-    """Logarithms of Rsc, Csc and Ci."""
     return {"Rsc": parameters.median[..., 0], "Csc": parameters.median[..., 1], SHARED_PARAMETER: parameters.log_Ci}
 
 

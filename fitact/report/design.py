@@ -34,13 +34,11 @@ def draw_design(design: MeasurementDesign, has_curves: bool = True) -> Figure:
 
 def _draw_bars(axes: Axes, design: MeasurementDesign) -> None:
     best, shown = design.best_for_effort, [*reversed(design.options), design.now]
-    for place, option in enumerate(shown):
-        colour = PRIOR if option is design.now else GREEN if option == best else MODEL
-        axes.barh(place, 100.0 * option.force_sd, color=colour, height=0.65)
-        effort = f", effort {option.effort:g}" if option.effort else ""
-        label = f"{100.0 * option.force_sd:.2g} %{effort}"
-        axes.annotate(label, (100.0 * option.force_sd, place), (6, 0), textcoords="offset points", va="center")
+    colors = [PRIOR if option is design.now else GREEN if option == best else MODEL for option in shown]
+    efforts = [f", effort {option.effort:g}" if option.effort else "" for option in shown]
     sizes = [100.0 * option.force_sd for option in shown]
+    bars = axes.barh(range(len(shown)), sizes, color=colors, height=0.65)
+    axes.bar_label(bars, [f"{size:.2g} %{effort}" for size, effort in zip(sizes, efforts, strict=True)], padding=6)
     axes.set(xscale="log", xlim=(0.5 * min(sizes), 8.0 * max(sizes)))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.set_yticks(range(len(shown)), [option.name for option in shown])
@@ -50,7 +48,6 @@ def _draw_bars(axes: Axes, design: MeasurementDesign) -> None:
 
 
 def write_design_page(path: str | os.PathLike[str], design: MeasurementDesign, origin: Provenance) -> None:
-    """Write a design's page."""
     best, now = design.best_for_effort, design.now
     titles, *rows = design.table
     write_page(

@@ -96,11 +96,15 @@ def _note_if_empty(axes: Axes) -> None:
 
 
 def write_drive_design_page(path: str | os.PathLike[str], design: DriveDesign, origin: Provenance) -> None:
-    """Write a drive's design as a page."""
     people = [("waveform", *(f"{100.0 * share:g} %" for share in FINGER_QUANTILES))]
     people += [
         (name, *(format_quantity(each, "V") for each in option.people)) for name, option in design.options.items()
     ]
+    limits = (
+        ("the insulator breaks down", design.options[design.own].breakdown_voltage, "V"),
+        ("rms current", design.scene.device.current_limit_rms, "A"),
+        ("peak current", design.scene.device.current_limit_peak, "A"),
+    )
     curves, frequencies = _curve_plot(design), _frequency_plot(design)
     switch = interactive.log_axis_button([frequencies], "xy", "logarithmic axes")
     write_page(
@@ -113,7 +117,7 @@ def write_drive_design_page(path: str | os.PathLike[str], design: DriveDesign, o
         excluded=design.excluded,
         separated=design.people.has_separate_uncertainty,
         people=people,
-        limits=_limits(design),
+        limits=[(name, "not stated" if x is None else format_engineering(x, unit)) for name, x, unit in limits],
         curves=interactive.chart(curves, controls=[interactive.log_axis_button([curves])]),
         frequencies=interactive.chart(frequencies, controls=[switch]),
         insulators=image(lambda: _insulator_figure(design)),
@@ -144,16 +148,6 @@ def _frame(design: DriveDesign) -> PageSummary:
         warnings=design.warnings,
         has_reservation=not kept,
     )
-
-
-def _limits(design: DriveDesign) -> tuple[tuple[str, str], ...]:
-    device = design.scene.device
-    stated = (
-        ("the insulator breaks down", design.options[design.own].breakdown_voltage, "V"),
-        ("rms current", device.current_limit_rms, "A"),
-        ("peak current", device.current_limit_peak, "A"),
-    )
-    return tuple((name, "not stated" if x is None else format_engineering(x, unit)) for name, x, unit in stated)
 
 
 def _curve_plot(design: DriveDesign) -> interactive.Plot:

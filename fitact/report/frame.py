@@ -57,15 +57,14 @@ class Answer(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class PageSummary:
-    """What stands at the top of every page.
+    """The top of every page.
 
     Attributes:
-        title, subject: of the page, and what it is about.
+        subject: what the page is about.
         trusted: whether nothing stands against the answer.
         verdict: one sentence; of an untrusted answer, what stands against it.
         findings: sentences, by what they answer.
         answers: the few numbers.
-        warnings: sentences.
         has_reservation: whether a trusted answer is not the one that was hoped for, as the verdict says.
     """
 

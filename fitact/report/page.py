@@ -86,7 +86,7 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
 
 
 def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]]:
-    """What `write_report` needs, from a folder that `fitact sample` or `fitact run` wrote.
+    """Read what `write_report` needs from a folder that `fitact sample` or `fitact run` wrote.
 
     Raises:
         InputError: a file is missing or damaged.
@@ -119,7 +119,7 @@ def _label(name: str) -> str:
 
 
 def _command(summary: dict[str, Any]) -> str:
-    """As it was typed; what comes near it of results from Python."""
+    """The command as it was typed; what comes near it of results from Python."""
     if "command" in summary:
         return summary["command"]
     scene = " --scene SCENE.toml" if summary["scene"] else ""

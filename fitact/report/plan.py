@@ -37,7 +37,6 @@ def draw_plan(plan: Plan) -> Figure:
 
 
 def write_plan_page(path: str | os.PathLike[str], plan: Plan, origin: Provenance) -> None:
-    """Write a plan's page."""
     tolerance = format_percent(plan.full.tolerance.force)
     kept = "" if not plan.warnings else " at the nominal values, but not over the prior"
     frame = PageSummary(

@@ -101,9 +101,8 @@ def _draw_force(axes: Axes, tree: Any, content: dict[str, Any], bins: int = 50) 
     mean, sd = logs.mean(axis=1)[:, None], logs.std(axis=1, ddof=1)[:, None]
     of_laws = np.exp(-0.5 * np.square((np.log(middle) - mean) / sd)) / (sd * np.sqrt(2.0 * np.pi))
     low, high = np.quantile(of_laws, [0.025, 0.975], axis=0)
-    axes.fill_between(
-        middle, low, high, color=ALERT, alpha=0.3, lw=0, label="people, by 95 % of the laws that may be true"
-    )
+    of_people = "people, by 95 % of the laws that may be true"
+    axes.fill_between(middle, low, high, color=ALERT, alpha=0.3, lw=0, label=of_people)
     axes.plot(middle, next_one, color=MODEL, drawstyle="steps-mid", label="next finger: people and ignorance")
     axes.set_xscale("log")
     log_ticks(axes.xaxis, "N", (1.0, 3.0))
@@ -123,22 +122,15 @@ def _draw_time(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
         axes.fill_between(time, force[low], force[high], color=MODEL, alpha=opaque, lw=0, label=label)
     axes.plot(time, force[0.5], color=DATA, lw=1.0, label="median")
     coefficient, normal = drawn.attrs["friction_coefficient"], drawn.attrs["normal_force"]
-
-    def friction_from_force(force: Any) -> Any:
-        return coefficient * (np.asarray(force) + normal)
-
-    def force_from_friction(total_friction: Any) -> Any:
-        return np.asarray(total_friction) / coefficient - normal
-
-    right = axes.secondary_yaxis("right", functions=(friction_from_force, force_from_friction))
+    to_friction, to_force = lambda force: coefficient * (force + normal), lambda total: total / coefficient - normal
+    right = axes.secondary_yaxis("right", functions=(to_friction, to_force))
     axes.xaxis.set_major_formatter(EngFormatter("s"))
     axes.yaxis.set_major_formatter(EngFormatter("N"))
     right.yaxis.set_major_formatter(EngFormatter("N"))
-    axes.set_xlim(time[0], time[-1])
-    axes.set_ylim(0.0, 1.3 * float(max(force[high].max() for _, high in bands)))  # room for the legend
-    axes.set(xlabel="time in the period" if drawn.attrs["periodic"] else "time", ylabel="electrostatic force")
+    top = 1.3 * float(max(force[high].max() for _, high in bands))  # room for the legend
+    axes.set(xlim=(time[0], time[-1]), ylim=(0.0, top), ylabel="electrostatic force", title="The next finger in time")
+    axes.set_xlabel("time in the period" if drawn.attrs["periodic"] else "time")
     right.set_ylabel("friction")
-    axes.set_title("The next finger in time")
     axes.legend(ncols=2, fontsize=9)
 
 
@@ -198,7 +190,7 @@ def write_population_page(path: str | os.PathLike[str], tree: Any, content: dict
 
 
 def read_population(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]]:
-    """What `write_population_page` needs, from a folder that `fitact population` wrote.
+    """Read what `write_population_page` needs from a folder that `fitact population` wrote.
 
     Raises:
         InputError: a file is missing or damaged.
@@ -322,7 +314,6 @@ def _draw_panel(draw: Callable[[Axes, Any, dict[str, Any]], None], tree: Any, co
 
 
 def _skin_chart(tree: Any, content: dict[str, Any], max_fingers: int = 1500) -> interactive.Chart:
-    """Fingers by name, among those to come."""
     Rsc, Csc = (tree["new_fingers"][name].values.ravel()[:max_fingers] for name in ("Rsc", "Csc"))
     x = Axis.from_values("Rsc", "ohm", np.median(Rsc), log=True)
     y = Axis.from_values("Csc", "F", np.median(Csc), log=True)
@@ -336,7 +327,6 @@ def _skin_chart(tree: Any, content: dict[str, Any], max_fingers: int = 1500) -> 
 
 
 def _force_chart(tree: Any) -> interactive.Chart:
-    """Mean and peak force of the next finger, and what was believed before."""
     plots, y = [], Axis("density", hides_numbers=True)
     for name, title in {"force_mean": "mean force", "force_peak": "peak force"}.items():
         after, before = (tree[group][name].values for group in ("new_fingers", "prior_new_fingers"))

@@ -11,7 +11,6 @@ from fitact.charts.interactive import Axis, Chart, Plot, PlotlyTrace
 
 CHANNELS = {"Vsc": "skin voltage Vsc", "I": "trunk current I"}
 _FORCES = {"force_mean": "mean force", "force_rms": "rms force", "force_peak": "peak force"}
-_PAIR_NAMES = ("Rsc", "Csc", "Ci")
 _DENSITY = Axis("density", hides_numbers=True)  # each is scaled to its own peak
 
 
@@ -70,38 +69,30 @@ def _time_plot(
 
 def _corner_chart(tree: Any) -> Chart:
     """Each parameter's distribution, then Rsc, Csc and Ci in pairs."""
-    posterior, prior = tree["posterior"], tree["prior"]
-    names = [str(name) for name in posterior.data_vars if name in prior.data_vars]
+    posterior, prior = ({str(name): x.values.ravel() for name, x in tree[g].items()} for g in ("posterior", "prior"))
     axes = {
-        name: Axis.from_values(name, posterior[name].attrs["units"], np.median(posterior[name]), log=True)
-        for name in names
+        name: Axis.from_values(name, tree["posterior"][name].attrs["units"], np.median(draws), log=True)
+        for name, draws in posterior.items()
+        if name in prior
     }
-    plots = [_marginal(axes[name], posterior[name].values, prior[name].values) for name in names]
-    pairs = list(itertools.combinations([name for name in _PAIR_NAMES if name in names], 2))
-    clouds = [_pair_plot((axes[a], axes[b]), [(each[a], each[b]) for each in (prior, posterior)]) for a, b in pairs]
+    both = (prior, "prior", PRIOR), (posterior, "posterior", MODEL)
+    plots = []
+    for name, x in axes.items():
+        traces = [interactive.density(x, draws[name], label, color) for draws, label, color in both]
+        plots.append(interactive.plot(x, (_DENSITY, traces), size=230, unified_hover=True))
+    clouds = []
+    for a, b in itertools.combinations([name for name in ("Rsc", "Csc", "Ci") if name in axes], 2):
+        traces = []
+        for draws, label, color in both:
+            shown = slice(None, None, max(1, draws[a].size // 300))  # so many are a cloud, and a light page
+            at = draws[a][shown], draws[b][shown]
+            cloud = interactive.points(axes[a], axes[b], *at, label, color, size=4.0, opacity=0.6)
+            traces.append(cloud | {"hovertemplate": f"{axes[a].hover('x')}, {axes[b].hover('y')}<extra></extra>"})
+        clouds.append(interactive.plot(axes[a], (axes[b], traces)))
     switch = interactive.log_axis_button(plots, label="logarithmic axes")
     switch["updates"] += interactive.log_axis_button(clouds, "xy")["updates"] if clouds else []
-    return interactive.chart(
-        *plots, *clouds, controls=[interactive.visibility_button("prior", [*plots, *clouds], "prior"), switch]
-    )
-
-
-def _marginal(x: Axis, posterior: np.ndarray, prior: np.ndarray) -> Plot:
-    traces = [interactive.density(x, prior, "prior", PRIOR), interactive.density(x, posterior, "posterior", MODEL)]
-    return interactive.plot(x, (_DENSITY, traces), size=230, unified_hover=True)
-
-
-def _pair_plot(axes: tuple[Axis, Axis], clouds: list[tuple[Any, Any]]) -> Plot:
-    x, y = axes
-    hover = f"{x.hover('x')}, {y.hover('y')}<extra></extra>"
-    traces = []
-    for (a, b), name, color in zip(clouds, ("prior", "posterior"), (PRIOR, MODEL), strict=True):
-        shown = slice(None, None, max(1, a.size // 300))  # so many are a cloud, and a light page
-        cloud = interactive.points(
-            x, y, a.values.ravel()[shown], b.values.ravel()[shown], name, color, size=4.0, opacity=0.6
-        )
-        traces.append(cloud | {"hovertemplate": hover})
-    return interactive.plot(x, (y, traces))
+    hide = interactive.visibility_button("prior", [*plots, *clouds], "prior")
+    return interactive.chart(*plots, *clouds, controls=[hide, switch])
 
 
 def _force_chart(tree: Any) -> Chart:

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from fitact.charts.figure import ALERT, DATA, write_figure
+from fitact.charts.interactive import extremes
 from fitact.data.clipping import clipping_mask
 from fitact.data.inspection import Channel, Inspection
 from fitact.errors import InputError
@@ -43,12 +44,8 @@ def _figure(inspection: Inspection) -> Figure:
 def _draw(axes: Axes, time: np.ndarray, channel: Channel, columns: int = 2000) -> None:
     """Draw each sample, or the extremes of `columns` stretches where there are more than twice as many samples."""
     values = channel.values
-    if values.size > 2 * columns:
-        starts = np.linspace(0, values.size, columns, endpoint=False).astype(int)
-        low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
-        axes.fill_between(time[starts], low, high, color=DATA, lw=0.6)
-    else:
-        axes.plot(time, values, ".-", color=DATA, ms=2.0, lw=0.6)
+    at = extremes(values, columns)
+    axes.plot(time[at], values[at], ".-" if at.size == values.size else "-", color=DATA, ms=2.0, lw=0.6)
     if channel.clipped:
         railed = np.flatnonzero(clipping_mask(values))[:: max(1, channel.clipped // columns)]
         axes.plot(time[railed], values[railed], ".", color=ALERT, ms=3.0, label="clipped")

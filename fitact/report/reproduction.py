@@ -127,7 +127,6 @@ def _frequencies_chart(low: float, high: float, marks_corners: bool) -> Chart:
 
 
 def _waveforms_chart() -> Chart:
-    """V above Vsc, of each drive."""
     above, below, time = Axis("V", "V"), Axis("Vsc", "V", limits=(-2.8, 2.8)), _two_periods()
     plots = []
     for name, drive in paper.waveforms(30.0).items():

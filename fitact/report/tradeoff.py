@@ -63,7 +63,6 @@ def _draw_panel(axes: Axes, kind: Kind, tradeoff: Tradeoff) -> None:
 
 
 def _front_points(places: dict[str, np.ndarray], levels: tuple[BenchmarkedMethod, ...]) -> list[np.ndarray]:
-    """Points along the line of the front."""
     front = sorted((x for x in levels if not x.dominated_by), key=lambda x: x.seconds)
     pairs = itertools.pairwise(places[x.name] for x in front)
     return [end + share * (start - end) for start, end in pairs for share in np.linspace(0.0, 1.0, 40)]
@@ -102,7 +101,6 @@ def _annotate_names(axes: Axes, levels: tuple[BenchmarkedMethod, ...], size: flo
 
 
 def write_tradeoff_page(path: str | os.PathLike[str], tradeoff: Tradeoff, origin: Provenance) -> None:
-    """Write its page."""
     cheapest = {kind: tradeoff.front(kind)[0] for kind in KINDS}
     names = ", ".join(f"{level.name} ({kind})" for kind, level in cheapest.items())
     front = {kind: "; ".join(map(_describe_level, tradeoff.front(kind))) for kind in KINDS}
