@@ -87,7 +87,7 @@ def sample_posteriors(
     return EnsembleDraws(np.moveaxis(points, 0, 2), sampler.backend.accepted.reshape(shape))
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(eq=False)
 class _MultiPosteriorMove(emcee.moves.Move):
     """A move of the walkers of many posteriors, each with random numbers of its own."""
 
@@ -111,7 +111,7 @@ class _MultiPosteriorMove(emcee.moves.Move):
         return self.update(state, emcee.State(proposed, log_prob=values), accepted, subset), accepted
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(eq=False)
 class Independence(_MultiPosteriorMove):
     """Proposals from each posterior's own Student-t, wherever the walker is."""
 

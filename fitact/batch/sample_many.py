@@ -166,8 +166,7 @@ def _laplace_approximations(
 ) -> GaussianApproximations:
     """Compute `Fit.point` and `Fit.point_root` of each."""
     size = theta.shape[1]
-    roots = np.zeros((len(theta), size + 1, size + 1))
-    roots[:, :size, :size] = covariance_factor
+    roots = np.pad(covariance_factor, ((0, 0), (0, 1), (0, 1)))
     roots[:, size, size] = (scale_information("white") * (samples - size)) ** -0.5
     return GaussianApproximations.from_covariance_factors(np.column_stack([theta, np.log(sigma)]), roots)
 

@@ -68,8 +68,7 @@ class FingerLikelihoods(eqx.Module):
         slope: how they move with log Ci.
         center, half_width: of the tables in log Ci.
         weight: Chebyshev coefficients of the log-weights.
-        precision: of log Ci, by each record alone.
-        weighted_offset: precision times how far the record wants log Ci from `center`.
+        precision, weighted_offset: of log Ci, by each record alone, as of `Finger`.
         area_deviates: standard normal numbers that draw the fingers' areas.
         normal_log_weight: log-weights of the draws under the normal likelihood, at `center`.
         mean, covariance: of log Rsc and log Csc by that.

@@ -5,7 +5,6 @@ from pathlib import Path
 
 from fitact.batch.fit_many import Fits
 from fitact.report.frame import Answer, PageSummary, Provenance, write_page
-from fitact.units import format_engineering
 
 
 def write_campaign(folder: str | os.PathLike[str], fits: Fits, origin: Provenance, max_rows: int = 2000) -> Path:
@@ -40,6 +39,5 @@ def write_campaign(folder: str | os.PathLike[str], fits: Fits, origin: Provenanc
         answers=answered[:max_rows],
         failures=[(row["record"], row["result"], row["message"]) for row in failures[:max_rows]],
         count=len(answered),
-        engineering=format_engineering,
     )
     return place / "index.html"

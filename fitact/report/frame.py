@@ -19,6 +19,7 @@ from fitact.files import atomic_write
 from fitact.populations.finger import Finger
 from fitact.scene.scene import Scene
 from fitact.summary import versions
+from fitact.units import format_engineering
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,6 +88,7 @@ def write_page(path: str | os.PathLike[str], template: str, **content: Any) -> N
     """
     loader = jinja2.PackageLoader("fitact.report")
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    environment.globals["engineering"] = format_engineering
     environment.filters["picture"] = lambda chart: image(lambda: draw_chart(chart))
     environment.globals["verbatim"] = lambda name: Markup(loader.get_source(environment, name)[0])  # scripts of ours
     page = environment.get_template(template).render(content, versions=versions())

@@ -73,7 +73,6 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
             channels=CHANNELS,
             force=FORCE_DESCRIPTIONS[summary["model"].get("force", "paper")],
             circuits=_CIRCUITS,
-            engineering=format_engineering,
             quantity=_format_quantity,
             width=format_sd,
             command=_command(summary),

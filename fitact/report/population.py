@@ -185,7 +185,6 @@ def write_population_page(path: str | os.PathLike[str], tree: Any, content: dict
         new=tuple(_new_rows(content)),
         shares={name: tuple(_share_rows(content, name)) for name in VARIANCE_QUANTITIES},
         legend=SHARES_LEGEND,
-        engineering=format_engineering,
     )
 
 
