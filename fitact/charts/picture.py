@@ -18,15 +18,19 @@ _POINTS_PER_PIXEL = 0.75
 
 def draw_chart(chart: Chart) -> Figure:
     """Draw all plots of a chart."""
-    plots = chart["plots"]
-    heights = [max(plot["layout"]["height"] for plot in plots[first : first + 3]) for first in range(0, len(plots), 3)]
-    figure = Figure(figsize=(9.0, sum(heights) / 100.0), layout="constrained")
-    draw_plots(figure, plots, heights)
+    figure = Figure(figsize=(9.0, sum(_line_heights(chart["plots"]))), layout="constrained")
+    draw_plots(figure, chart["plots"])
     return figure
 
 
-def draw_plots(figure: FigureBase, plots: Sequence[Plot], heights: Sequence[float] = (1.0,)) -> None:
-    """Draw plots side by side, three in a line; `heights`: relative, of the lines."""
+def _line_heights(plots: Sequence[Plot]) -> list[float]:
+    sizes = [0.01 * plot["layout"]["height"] for plot in plots]
+    return [max(sizes[first : first + 3]) for first in range(0, len(sizes), 3)]
+
+
+def draw_plots(figure: FigureBase, plots: Sequence[Plot]) -> None:
+    """Draw plots side by side, three in a line."""
+    heights = _line_heights(plots)
     parts = figure.subfigures(len(heights), min(len(plots), 3), squeeze=False, height_ratios=heights).flat
     for part, plot in zip(parts, plots, strict=False):
         domains = [np.ptp(axis["domain"]) for name, axis in plot["layout"].items() if name.startswith("yaxis")]
