@@ -43,15 +43,15 @@ class HighpassTerms(NamedTuple):
 
     def stack(self) -> tuple[Array, Array]:
         """The weights, and the time constants, as arrays."""
-        return _stack(self.weight), _stack(self.tau)
-
-
-def _stack(values: tuple[ArrayLike, ...] | Array) -> Array:
-    return jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, values))) if isinstance(values, tuple) else values
+        weight, tau = (
+            jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, x))) if isinstance(x, tuple) else x
+            for x in (self.weight, self.tau)
+        )
+        return weight, tau
 
 
 class Circuit(eqx.Module):
-    """What every circuit offers: its high-pass terms, and from them the transfer function."""
+    """A circuit, by its high-pass terms, and from them the transfer function."""
 
     @property
     def g(self) -> ArrayLike:
@@ -80,12 +80,9 @@ class Circuit(eqx.Module):
         return self.channel_terms("I")
 
     def gap_terms(self) -> HighpassTerms:
-        """The high-pass terms of Vgap / V, the voltage across the gap between finger and panel.
+        """The high-pass terms of Vgap / V, the voltage across the gap between finger and panel; raises without one.
 
         A gap that does not conduct has one more than `terms`, so slow that it keeps the charge it had.
-
-        Raises:
-            InputError: there is no gap.
         """
         return self.channel_terms("Vgap")
 
@@ -177,7 +174,7 @@ class Element(NamedTuple):
 
 
 class _Modes(NamedTuple):
-    """What the elements' voltages and the current weigh of each time constant, and the current's rate (F)."""
+    """Weights of each time constant in the elements' voltages and the current, and the current's rate (F)."""
 
     tau: Array
     voltages: Float[Array, "elements modes"]
@@ -186,20 +183,14 @@ class _Modes(NamedTuple):
 
 
 class Loop(Circuit):
-    """The drive in series with Ci, perhaps a gap and a resistance, and parallel elements; Vsc is over the first.
+    """The drive in series with Ci, perhaps a gap and a resistance, and parallel elements; Vsc is over the first."""
 
-    Attributes:
-        Rsc, Csc: the touching skin, ohm and F.
-        Ci: the insulator, F.
-        Rgap: of the interface gap between finger and panel, ohm, which sliding raises; None: it does not conduct.
-        Cgap: in parallel with it, F; None: there is no gap. Source: Shultz, Peshkin, Colgate, Haptics Symposium 2018.
-    """
-
-    Rsc: ArrayLike
-    Csc: ArrayLike
-    Ci: ArrayLike
-    Rgap: ArrayLike | None = eqx.field(default=None, kw_only=True)
-    Cgap: ArrayLike | None = eqx.field(default=None, kw_only=True)
+    Rsc: ArrayLike  # the touching skin, ohm
+    Csc: ArrayLike  # F
+    Ci: ArrayLike  # the insulator, F
+    # the interface gap between finger and panel. Source: Shultz, Peshkin, Colgate, Haptics Symposium 2018
+    Rgap: ArrayLike | None = eqx.field(default=None, kw_only=True)  # ohm, which sliding raises; None: does not conduct
+    Cgap: ArrayLike | None = eqx.field(default=None, kw_only=True)  # in parallel with it, F; None: there is no gap
 
     def __check_init__(self) -> None:
         if self.Rgap is not None and self.Cgap is None:
@@ -250,7 +241,7 @@ class Loop(Circuit):
         return ratios if R0 is None else [*ratios, 1j * charging * R0]
 
     def channel_terms(self, channel: Channel) -> HighpassTerms:
-        """As many for each channel, but for a gap that does not conduct; I may also follow dV/dt."""
+        """The same number for each channel, but for a gap that does not conduct; I may also follow dV/dt."""
         tau, voltages, current, rate = self._modes()
         if channel == "I":
             return HighpassTerms(tuple(current), tuple(tau), rate)
@@ -263,7 +254,7 @@ class Loop(Circuit):
         return HighpassTerms((*(-share * others), share), (*tau, 1e15 * tau[0]))  # so slowly an open gap loses charge
 
     def _gap_fraction(self) -> ArrayLike:
-        """Of the voltage over Ci and a gap that does not conduct, the gap's; raises where there is no gap."""
+        """The gap's share of the voltage over Ci and a gap that does not conduct; raises where there is no gap."""
         if self.Cgap is None:
             raise self._gap_missing()
         return self.Ci / (self.Ci + jnp.asarray(self.Cgap))
@@ -326,7 +317,7 @@ def _gram_eigenmodes_jvp(
 
 
 class Probe(eqx.Module):
-    """What a voltage probe loads the touching skin with: R‖C (ohm, F; R may be infinite)."""
+    """The load of a voltage probe on the touching skin: R‖C (ohm, F; R may be infinite)."""
 
     R: ArrayLike
     C: ArrayLike

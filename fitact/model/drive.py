@@ -47,7 +47,7 @@ class LinearPieces(NamedTuple):
 
 
 class Drive(eqx.Module):
-    """What every drive offers: its value in time."""
+    """A voltage in time."""
 
     @property
     def start_time(self) -> ArrayLike:
@@ -85,15 +85,10 @@ class Periodic(Drive):
         return self.phase / (2.0 * np.pi) * self.period
 
     def cycle(self, time: ArrayLike) -> tuple[Array, Array]:
-        """Cycles since the last start of a period, in [0, 1), and the rounding error to allow for in it.
-
-        `time * frequency` is only good to a few ulp, which puts samples meant for an edge on its wrong
-        side; such a sample is moved onto the edge.
-        """
-        elapsed = jnp.asarray(time, dtype=float) * self.frequency
-        ahead = self.phase / (2.0 * np.pi)
-        # a phase that was read from text has 15 digits
-        slack = _rounding_error(elapsed) + _rounding_error(jnp.asarray(ahead, dtype=float), ulps=32.0)
+        """Cycles since the last start of a period, in [0, 1), and the rounding error to allow for in it."""
+        elapsed, ahead = _as_float(time) * self.frequency, self.phase / (2.0 * np.pi)
+        # which would put samples meant for an edge on its wrong side; a phase that was read from text has 15 digits
+        slack = _rounding_error(elapsed) + _rounding_error(_as_float(ahead), ulps=32.0)
         cycles = elapsed + ahead
         return jnp.maximum(cycles - lax.stop_gradient(jnp.floor(cycles + slack)), 0.0), slack
 
@@ -261,10 +256,9 @@ class Multitone(Periodic):
 
 
 class InterpolatedDrive(Drive):
-    """A drive through points, joined by straight lines; constant before the first and after the last.
+    """A drive through points, joined by straight lines; constant outside, or, with a period, repeated.
 
-    With a period it repeats, running on from the last point to the first one of the next period. Two
-    points at one time are a jump.
+    Two points at one time are a jump.
     """
 
     if TYPE_CHECKING:

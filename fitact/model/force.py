@@ -48,41 +48,27 @@ class Contact(eqx.Module):
 
 
 class AirGap(eqx.Module):
-    """The air between finger and panel, on whose faces the voltage across it acts; SI units.
+    """The air between finger and panel, on whose faces the voltage across it acts.
 
     Source: Shultz, Peshkin, Colgate, IEEE Trans. Haptics 11 (2018) 279; Ayyildiz et al., PNAS 115 (2018) 12668.
-
-    Attributes:
-        area: m^2.
-        thickness: m.
     """
 
-    area: ArrayLike
-    thickness: ArrayLike
+    area: ArrayLike  # m^2
+    thickness: ArrayLike  # m
     channel: ClassVar[Channel] = "Vgap"
 
 
 class Geometry(eqx.Module):
-    """What the force needs beside the circuit; SI units.
+    """Sizes that the force needs beside the circuit."""
 
-    Attributes:
-        area, insulator_thickness, skin_thickness: m^2, m, m.
-        gap_thickness: m; None: that of air of the circuit's Cgap, eps0 A / Cgap.
-        model: "paper": by Vsc, eq. (22); "gap": by the voltage across the gap.
-    """
-
-    area: ArrayLike = 1.0
-    insulator_thickness: ArrayLike = 1.0
-    skin_thickness: ArrayLike = 1.0
-    gap_thickness: ArrayLike | None = None
-    model: ForceModel = eqx.field(static=True, default="paper")
+    area: ArrayLike = 1.0  # m^2
+    insulator_thickness: ArrayLike = 1.0  # m
+    skin_thickness: ArrayLike = 1.0  # m
+    gap_thickness: ArrayLike | None = None  # m; None: that of air of the circuit's Cgap, eps0 A / Cgap
+    model: ForceModel = eqx.field(static=True, default="paper")  # by Vsc, eq. (22), or the voltage across the gap
 
     def contact(self, circuit: Circuit) -> "Contact | AirGap":
-        """Where the force acts; permittivities, and an unstated gap, follow the circuit's capacitances, eq. (3).
-
-        Raises:
-            InputError: the model is "gap" and the circuit has none.
-        """
+        """Where the force acts; permittivities, and an unstated gap, follow the circuit's capacitances, eq. (3)."""
         inner: Any = constant_skin_circuit(circuit)
         if self.model == "paper":
             layers = self.insulator_thickness, self.skin_thickness
@@ -110,10 +96,7 @@ def electrostatic_force(voltage: ArrayLike, contact: Contact | AirGap) -> Float[
 
 
 def force_constant(contact: Contact | AirGap) -> Array:
-    """The electrostatic force per square of the voltage, N/V^2; 0 where a permittivity is 0.
-
-    Of a contact eqs. (1) and (22); of a gap eps0 A / (2 d^2).
-    """
+    """Force over the voltage's square, N/V^2: of a contact eqs. (1) and (22); of a gap eps0 A / (2 d^2)."""
     if isinstance(contact, AirGap):
         thickness = jnp.asarray(contact.thickness)
         return EPSILON_0 * contact.area / 2.0 / thickness / thickness

@@ -33,7 +33,7 @@ def harmonic_response(
 
 
 def harmonic_error(circuit: Circuit, drive: Drive, harmonics: int, *, channel: Channel = "Vsc") -> Float[Array, ""]:
-    """What `harmonic_response` leaves out: its root mean square over that of the whole response.
+    """The rms of all that `harmonic_response` leaves out, over that of the whole response.
 
     By Parseval: the harmonics left out are summed up to 64 times those kept (4096 at least), and what lies
     beyond is taken as a geometric series of octaves from the last two.
@@ -68,11 +68,7 @@ def harmonic_sum(amplitude: Complex[Array, " harmonics"], drive: Drive, time: Ar
 
 
 def fourier_coefficients(drive: Drive, harmonics: int) -> Complex[Array, " harmonics"]:
-    """c_k (V) for k = 1 to `harmonics`: the drive is its mean plus 2 Re sum_k c_k e^{jkwt}.
-
-    Raises:
-        InputError: the drive has no period.
-    """
+    """c_k (V) for k = 1 to `harmonics`: the drive is its mean plus 2 Re sum_k c_k e^{jkwt}."""
     order = jnp.arange(1, harmonics + 1, dtype=float)
     if isinstance(drive, Sine):
         return jnp.where(order == 1.0, -0.25j * jnp.asarray(drive.peak_to_peak), 0.0)
@@ -80,7 +76,7 @@ def fourier_coefficients(drive: Drive, harmonics: int) -> Complex[Array, " harmo
         kept = np.flatnonzero(np.asarray(drive.orders) <= harmonics)
         places = np.asarray(drive.orders)[kept] - 1
         return jnp.zeros(harmonics, dtype=complex).at[places].set(-0.5j * drive.phasors()[kept])
-    angular_frequency(drive)
+    drive_frequency(drive)  # raises where there is none
     assert isinstance(drive, PiecewiseLinear | InterpolatedDrive)
     knots, start, end = drive.pieces()
     period = knots[-1] - knots[0]
@@ -96,16 +92,12 @@ def fourier_coefficients(drive: Drive, harmonics: int) -> Complex[Array, " harmo
 
 
 def angular_frequency(drive: Drive) -> Array:
-    """The angular frequency w of the drive's period, rad/s; raises as `drive_frequency`."""
+    """The angular frequency w of the drive's period, rad/s."""
     return 2.0 * np.pi * jnp.asarray(drive_frequency(drive), dtype=float)
 
 
 def drive_frequency(drive: Drive) -> ArrayLike:
-    """How often the drive repeats, Hz.
-
-    Raises:
-        InputError: the drive has no period.
-    """
+    """How often the drive repeats, Hz; raises where it does not."""
     if isinstance(drive, Periodic):
         return drive.frequency
     if isinstance(drive, InterpolatedDrive) and drive.period is not None:

@@ -78,7 +78,7 @@ def response(
 def response_and_rate(
     circuit: Circuit, drive: Drive, time: ArrayLike, *, steady_state: bool = True, channel: Channel = "Vsc"
 ) -> tuple[Float[Array, "*shape"], ArrayLike | None]:
-    """As `response` but for what follows dV/dt, and how much does (F); None: nothing."""
+    """The `response` without the part that follows dV/dt, and how much does (F); None: nothing."""
     if has_time_constants(circuit):
         terms = circuit.channel_terms(channel)
         return superpose_terms(terms, drive, time, steady_state=steady_state), terms.rate
@@ -120,11 +120,7 @@ class Harmonics(NamedTuple):
 
 
 def harmonic_decomposition(circuit: WithSkin, drive: Drive, channel: Channel) -> Harmonics:
-    """The harmonics in which the skin changes, and terms for those above.
-
-    Raises:
-        InputError: the drive has no period.
-    """
+    """The harmonics in which the skin changes, and terms for those above."""
     omega, terms = angular_frequency(drive), HighpassTerms((), ())
     if isinstance(drive, Sine | Multitone):
         count = max(drive.orders) if isinstance(drive, Multitone) else 1
@@ -182,7 +178,7 @@ def _require_steady_state(drive: Drive) -> None:
 def _initial_charge_decay(
     drive: Drive, time: ArrayLike, taus: Sequence[ArrayLike], initial: ArrayLike | Sequence[ArrayLike]
 ) -> Array:
-    """What is left at `time` of a charge that was there when the drive began."""
+    """The rest at `time` of a charge that was there when the drive began."""
     amplitudes = jnp.atleast_1d(jnp.asarray(initial, dtype=float))
     if amplitudes.shape != (len(taus),):
         raise InputError(

@@ -31,7 +31,7 @@ MAX_DISPERSION_FREQUENCY = float(_FREQUENCY[-1])  # Hz, above which a dispersive
 
 
 class SkinModel(eqx.Module):
-    """What every level offers."""
+    """A level: R(f) and C(f) of a skin, and how its steady state is split into harmonics and time constants."""
 
     def parallel_rc(self, skin: Element, frequency: ArrayLike) -> Element:
         """R(f) and C(f) of a skin whose constant values are `skin`, at `frequency` (Hz, >= 0)."""
@@ -170,10 +170,7 @@ class TimeConstantGrid(eqx.Module):
 
     @classmethod
     def from_frequency_range(cls, slowest: float, fastest: float, per_decade: int = 10, margin: float = 10.0) -> Self:
-        """For a gain between two angular frequencies (rad/s); the time constants reach `margin` times beyond them.
-
-        Call it in double precision.
-        """
+        """For a gain from `slowest` to `fastest` (rad/s), `margin` times beyond. Call it in double precision."""
         decades = np.log10(fastest / slowest * margin**2)
         tau = np.geomspace(1.0 / (margin * fastest), margin / slowest, 1 + int(np.ceil(per_decade * decades)))
         omega = np.geomspace(slowest, fastest, 2 * tau.size)
@@ -239,11 +236,7 @@ class WithSkin(Circuit):
         return dataclasses.replace(self.circuit, **changed)
 
     def channel_terms(self, channel: Channel) -> HighpassTerms:
-        """Those of the grid.
-
-        Raises:
-            InputError: there is none.
-        """
+        """Those of the grid; raises where there is none."""
         if self.grid is not None:
             return self.grid.terms(channel, limits_current(self.circuit), self.channel_gain(channel, self.grid.omega))
         raise InputError(
@@ -277,7 +270,7 @@ def has_time_constants(circuit: Circuit) -> bool:
 
 
 def circuit_parameters(circuit: Circuit) -> dict[str, Any]:
-    """What can be known or unknown of a circuit, by name: its fields, and the exponent of a fractional skin."""
+    """Parameters of a circuit, known or unknown, by name: its fields, and the exponent of a fractional skin."""
     inner = constant_skin_circuit(circuit)
     values = {field.name: getattr(inner, field.name) for field in dataclasses.fields(inner) if field.name != "probe"}
     if isinstance(circuit, WithSkin) and isinstance(circuit.skin, Fractional):

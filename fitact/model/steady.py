@@ -1,4 +1,4 @@
-"""What a steady state amounts to over a period, exactly: mean squares, peaks, and the current in the body.
+"""A steady state over a period, exactly: mean squares, peaks, and the current in the body.
 
 With u the response of one high-pass term s tau / (1 + s tau) and S(tau) its mean square, two terms have
 
@@ -141,7 +141,7 @@ def _largest_sum(
 
 
 def body_current(circuit: Circuit, drive: Drive) -> BodyCurrent:
-    """What flows through the body in the steady state: rms and peak of the trunk current in A, edges included.
+    """The current through the body in the steady state: rms and peak of the trunk current in A, edges included.
 
     The figure for electrical safety. At an ideal jump both are infinite where nothing resistive limits
     the current: give the drive a rise time, or the circuit an R_H or a series resistor.

@@ -22,26 +22,16 @@ HARMONICS = 4  # of the drive's frequency, at which the force is stated
 
 
 class PeriodQuantities(NamedTuple):
-    """What a drive does at one finger over a period of the steady state.
+    """Effects of a drive at one finger over a period of the steady state."""
 
-    Attributes:
-        force_mean: N.
-        force_alternating: amplitude of the alternating part, N: of the sine with the same root mean square.
-        force_harmonics: amplitudes at 1, 2, ... `HARMONICS` times the drive's frequency, N.
-        insulator_peak: the largest voltage over the insulator, V.
-        real_power: the mean of V I, W: what skins and resistances turn into heat.
-        apparent_power: rms V times rms I, VA; infinite where the current has impulses.
-        current_rms, current_peak: through the body, A; likewise.
-    """
-
-    force_mean: Array
-    force_alternating: Array
-    force_harmonics: Float[Array, " harmonics"]
-    insulator_peak: Array
-    real_power: Array
-    apparent_power: Array
-    current_rms: Array
-    current_peak: Array
+    force_mean: Array  # N
+    force_alternating: Array  # amplitude of the alternating part, N: of the sine with the same root mean square
+    force_harmonics: Float[Array, " harmonics"]  # amplitudes at 1, 2, ... `HARMONICS` times the drive's frequency, N
+    insulator_peak: Array  # the largest voltage over the insulator, V
+    real_power: Array  # the mean of V I, W: what skins and resistances turn into heat
+    apparent_power: Array  # rms V times rms I, VA; infinite where the current has impulses, as both currents
+    current_rms: Array  # through the body, A
+    current_peak: Array  # A
 
 
 def period_quantities(circuit: RC, drive: Periodic, contact: Contact | AirGap) -> PeriodQuantities:
@@ -86,27 +76,17 @@ def insulator_peak(circuit: RC, drive: Periodic) -> Float[Array, ""]:
 
 
 class PeriodGrid(eqx.Module):
-    """Points of one period of a drive, and weights that integrate over it.
+    """Points of one period of a drive, and weights that integrate over it."""
 
-    Attributes:
-        drive: of straight pieces, whose ends are among the points (with weight 0), or of sines.
-        local_time: from the start of each piece, s; of sines from that of the period.
-        cycles: from the start of the period, in periods.
-        weight: the share of the period.
-        voltage: of the drive, V.
-        slope: of the drive between its jumps, V/s.
-    """
-
-    drive: Periodic
-    local_time: Float[Array, "pieces nodes"]
-    cycles: Float[Array, " points"]
-    weight: Float[Array, " points"]
-    voltage: Float[Array, " points"]
-    slope: Float[Array, " points"]
+    drive: Periodic  # of straight pieces, whose ends are among the points (with weight 0), or of sines
+    local_time: Float[Array, "pieces nodes"]  # from the start of each piece, s; of sines from that of the period
+    cycles: Float[Array, " points"]  # from the start of the period, in periods
+    weight: Float[Array, " points"]  # the share of the period
+    voltage: Float[Array, " points"]  # of the drive, V
+    slope: Float[Array, " points"]  # of the drive between its jumps, V/s
 
     @classmethod
     def from_drive(cls, drive: Periodic) -> "PeriodGrid":
-        """Make the grid of a drive."""
         if not isinstance(drive, PiecewiseLinear):
             # points of the fastest sine's cycle: the mean of Vsc^4 is exact from 5 on
             count = 32 * (max(drive.orders) if isinstance(drive, Multitone) else 1)
@@ -154,10 +134,8 @@ class PeriodGrid(eqx.Module):
 
 
 def _quadrature_rule(nodes: int = 10, parts: int = 10) -> tuple[np.ndarray, np.ndarray]:
-    """Places and weights on a piece of length 1: Gauss and Legendre's `nodes` of each part.
-
-    The parts grow by 4 from the start of the piece, where transients of any length begin.
-    """
+    """Places and weights on a piece of length 1: Gauss and Legendre's `nodes` of each part."""
+    # the parts grow by 4 from the start of the piece, where transients of any length begin
     ends = 4.0 ** -np.arange(parts - 1.0, -1.0, -1.0)
     x, weights = np.polynomial.legendre.leggauss(nodes)
     length = np.diff(ends, prepend=0.0)[:, None]
