@@ -1,4 +1,4 @@
-"""What no record can tell: combinations of parameters that leave what the channels show as it is.
+"""Blind directions, which no record can tell: combinations of parameters that leave what the channels show as it is.
 
 Found from the model. A record without noise, of every frequency, shows each channel's gain over V as a function
 of frequency, and no more; a direction in the log-parameters along which none of these gains changes is seen by
@@ -75,9 +75,6 @@ def blind_directions(
 
     `free` names fields of the circuit, "gain" (of the channel Vsc) and "gain_I"; all else is known. A direction
     counts if it is blind at the circuit's values and at others around it, each up to a factor of 10 away.
-
-    Raises:
-        InputError: a name in `free` is no parameter of the circuit.
     """
     free, channels = tuple(free), tuple(channels)
     nominal = log_values(circuit, free, channels)
@@ -107,11 +104,7 @@ def gain_names(channels: Sequence[Channel]) -> dict[str, Channel]:
 def log_values(
     circuit: Circuit, free: Sequence[str], channels: Sequence[Channel]
 ) -> Float[np.ndarray, " circuit_parameters"]:
-    """Logarithms of the parameters `free`; a gain is 1.
-
-    Raises:
-        InputError: a name in `free` is no parameter of the circuit above zero, and no gain of these channels.
-    """
+    """Logarithms of the parameters `free`, those of the circuit and gains of these channels; a gain is 1."""
     gains = dict.fromkeys(gain_names(channels), 1.0)
     known = gains | {name: float(value) for name, value in circuit_parameters(circuit).items() if value is not None}
     for name in free:
@@ -134,7 +127,7 @@ def with_parameters(
 
 
 def name_direction(direction: dict[str, float]) -> str:
-    """What a direction in the log-parameters is, in words."""
+    """Describe a direction in the log-parameters."""
     area = {name: _area_power(name) for name in direction if not name.startswith("gain") and name != "alpha"}
     along = sum(power * direction[name] for name, power in area.items())
     if abs(along) > 0.99 * np.sqrt(len(area)) * np.linalg.norm(list(direction.values())):

@@ -16,7 +16,7 @@ from fitact.units import format_engineering
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """What can be set to any value within bounds."""
+    """A quantity that can be set to any value within bounds."""
 
     name: str  # its own in the candidate
     field: str  # of the circuit, or `FREQUENCY`
@@ -40,8 +40,7 @@ class CandidateDesign:
     def make_experiments(self, values: Sequence[float], *, keep_phase: bool = False) -> tuple[Experiment, ...]:
         """The experiments with their settings at `values`.
 
-        `keep_phase`: samples and edges keep their place in the period, so that what they tell changes smoothly with
-        the frequency.
+        `keep_phase`: samples and edges stay where they are in the period, so that no frequency makes them jump.
         """
         experiments = list(self.experiments)
         for setting, value in zip(self.settings, values, strict=True):
@@ -55,14 +54,14 @@ class CandidateDesign:
         return tuple(setting.start for setting in self.settings)
 
     def describe(self, values: Sequence[float]) -> str:
-        """What is done, in words."""
+        """The changes in words."""
         shown = [format_engineering(v, setting.unit) for v, setting in zip(values, self.settings, strict=True)]
         return " and ".join(self.texts).format(*shown)
 
 
 @dataclasses.dataclass(frozen=True)
 class DesignOption:
-    """What a candidate would tell."""
+    """A candidate at its best settings, and the errors to expect of it."""
 
     name: str  # of what is done
     text: str  # that in words
@@ -80,7 +79,7 @@ class DesignOption:
         return self.gain / self.effort if self.effort else 0.0
 
     def to_dict(self) -> dict[str, Any]:
-        """As in design.json."""
+        """An entry of design.json."""
         return dataclasses.asdict(self) | {"gain_per_effort": self.gain_per_effort}
 
 
@@ -90,13 +89,10 @@ def evaluate_design(
     gradient: Float[np.ndarray, " parameters"],
     baseline_sd: float | None = None,
 ) -> DesignOption:
-    """What a candidate would tell with its settings at `values`, rounded to three digits.
+    """A candidate with its settings at `values`, rounded; numpy.linalg.LinAlgError where no double holds its records.
 
     `gradient` is that of the logarithm of the force asked for, in the logarithms of the first experiment's free
     parameters; `baseline_sd` its standard deviation without any change.
-
-    Raises:
-        numpy.linalg.LinAlgError: no double holds what is recorded.
     """
     values = [float(f"{value:.3g}") for value in values]
     experiments = design.make_experiments(values)
@@ -120,7 +116,7 @@ def evaluate_design(
 def joint_jacobian(
     experiments: Sequence[Experiment], settings: Sequence[Setting] = ()
 ) -> Float[np.ndarray, "1+settings rows parameters"]:
-    """As `jacobian`, of experiments on one finger: the parameters of their own come after the shared ones."""
+    """The `jacobian` of experiments on one finger: the parameters of their own come after the shared ones."""
     free, blocks = experiments[0].free, []
     next_own = len(free)
     total = next_own + sum(len(e.own_parameters) for e in experiments)

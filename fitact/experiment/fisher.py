@@ -1,4 +1,4 @@
-"""What an experiment would tell: the errors to expect of parameters and force, before or after it is done.
+"""The errors to expect of parameters and force from an experiment, before or after it is done.
 
 From the Fisher information of the channels' noise and the prior, in the Laplace approximation, as a fit's own.
 Nothing else is taken to be unknown: no offset, drift, delay or charge at the start.
@@ -7,7 +7,7 @@ Nothing else is taken to be unknown: no offset, drift, delay or charge at the st
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -47,17 +47,11 @@ class Experiment:
 
 
 def force_gradient(experiment: Experiment) -> Float[np.ndarray, " circuit_parameters"]:
-    """The derivative of the logarithm of the mean force that an experiment makes, in its log-parameters.
-
-    Raises:
-        InputError: a name in `free` is no parameter of the circuit, or the drive has no steady state asked for.
-    """
-    e, theta = experiment, log_values(experiment.circuit, experiment.free, experiment.channels)
+    """The derivative of the logarithm of the mean force that an experiment makes, in its log-parameters."""
     with jax.enable_x64(True):
-        sampling = _sampling(e)
-        ((voltage, slope),) = _derivatives(e, e.free, theta, sampling, slice(-1, None), order=1)
-        circuit, geometry = jax.tree.map(jnp.asarray, (e.circuit, e.geometry))  # plain numbers would be compiled in
-        constant = _force_constant_slope(circuit, e.ties, e.free, e.channels, jnp.asarray(theta), geometry)
+        sampling, model = _sampling(experiment), _Model.from_experiment(experiment, experiment.free)
+        ((voltage, slope),) = _derivatives(model, sampling, slice(-1, None))
+        constant = _force_constant_slope(model, jax.tree.map(jnp.asarray, experiment.geometry))
     weight = sampling.force_weight * voltage
     return np.asarray(constant) + 2.0 * (weight @ slope) / (weight @ voltage)
 
@@ -67,16 +61,11 @@ def jacobian(experiment: Experiment, settings: Sequence[str] = ()) -> Float[np.n
 
     A setting is a field of the circuit, or `FREQUENCY`, in which each sample, and each edge, stays where it is in
     the period. Settings need a circuit with time constants.
-
-    Raises:
-        InputError: as `force_gradient`.
     """
     e, names = experiment, tuple(dict.fromkeys([*experiment.free, *sorted(settings, key=FREQUENCY.__eq__)]))
-    fields = [name for name in names if name != FREQUENCY]
-    theta = np.append(log_values(e.circuit, fields, e.channels), np.zeros(len(names) - len(fields)))
     with jax.enable_x64(True):
-        sampling = _sampling(e)
-        signals = _derivatives(e, names, theta, sampling, slice(-1), order=2 if settings else 1)
+        sampling, model = _sampling(e), _Model.from_experiment(e, names)
+        signals = _derivatives(model, sampling, slice(-1), order=2 if settings else 1)
     blocks = []
     for channel, (_, slope, *curvature) in zip(e.channels, signals, strict=True):
         follows_slope = channel == "I" and not limits_current(e.circuit)
@@ -87,13 +76,12 @@ def jacobian(experiment: Experiment, settings: Sequence[str] = ()) -> Float[np.n
 
 
 def signal_spans(experiment: Experiment) -> dict[Channel, float]:
-    """What each channel's samples reach over, V and A, but for a current within edges."""
-    e, theta = experiment, log_values(experiment.circuit, experiment.free, experiment.channels)
+    """The range of each channel's samples, V and A, but for a current within edges."""
     with jax.enable_x64(True):
-        sampling = _sampling(e)
-        signals = _derivatives(e, e.free, theta, sampling, slice(-1), order=1)
-    kept = sampling.off_edge_weight > 0.0
-    return {channel: float(np.ptp(value[kept])) for channel, (value, *_) in zip(e.channels, signals, strict=True)}
+        sampling, model = _sampling(experiment), _Model.from_experiment(experiment, experiment.free)
+        signals = _derivatives(model, sampling, slice(-1))
+    kept, channels = sampling.off_edge_weight > 0.0, experiment.channels
+    return {channel: float(np.ptp(value[kept])) for channel, (value, _) in zip(channels, signals, strict=True)}
 
 
 def covariance_factor(
@@ -110,33 +98,39 @@ def covariance_factor(
     return triangle.T * np.sign(np.diagonal(triangle))
 
 
-def _derivatives(
-    e: Experiment, names: tuple[str, ...], theta: np.ndarray, sampling: "_Sampling", selection: slice, order: int
-) -> list[list[np.ndarray]]:
-    """The signal, and its derivatives in the logarithms of `names` up to `order`, of each channel in `selection`.
+class _Model(eqx.Module):
+    """An experiment's circuit by the logarithms of parameters; what is tied follows."""
 
-    They are those recorded, and last that which makes the force.
-    """
-    circuit = jax.tree.map(jnp.asarray, e.circuit)
-    channels: tuple[Channel, ...] = (*e.channels, "Vsc" if e.geometry.model == "paper" else "Vgap")
-    if has_time_constants(circuit):
-        terms = _term_derivatives(circuit, e.ties, names, channels, jnp.asarray(theta), order)
-        return [
-            _signal_derivatives([_LogTauTerms(*map(np.asarray, part)) for part in orders], sampling)
-            for orders in terms[selection]
-        ]
-    times = jnp.asarray(sampling.time), jnp.asarray(sampling.slope), sampling.steady_state
-    values, slopes = _predicted_signals(circuit, e.ties, names, channels, jnp.asarray(theta), sampling.drive, *times)
+    circuit: Circuit
+    theta: Float[Array, " parameters"]  # at which it stands
+    names: tuple[str, ...] = eqx.field(static=True)  # of the parameters; if `FREQUENCY` is one, it comes last
+    channels: tuple[Channel, ...] = eqx.field(static=True)  # recorded, and last that which makes the force
+    ties: Ties = eqx.field(static=True)
+
+    @classmethod
+    def from_experiment(cls, e: Experiment, names: tuple[str, ...]) -> "_Model":
+        fields = [name for name in names if name != FREQUENCY]
+        theta = np.append(log_values(e.circuit, fields, e.channels), np.zeros(len(names) - len(fields)))
+        circuit = jax.tree.map(jnp.asarray, e.circuit)  # plain numbers would be compiled in
+        channels: tuple[Channel, ...] = (*e.channels, "Vsc" if e.geometry.model == "paper" else "Vgap")
+        return cls(circuit, jnp.asarray(theta), names, channels, e.ties)
+
+    def circuit_and_gains(self, theta: Array) -> tuple[Circuit, list[ArrayLike]]:
+        """The circuit, and the gain of each channel, at other values."""
+        fields = [name for name in self.names if name != FREQUENCY]
+        circuit, gains = with_parameters(self.circuit, fields, self.channels[:-1], theta[: len(fields)])
+        known = circuit_parameters(circuit)
+        return with_values(circuit, {name: ratio * known[other] for name, other, ratio in self.ties}), [*gains, 1.0]
+
+
+def _derivatives(model: _Model, sampling: "_Sampling", selection: slice, order: int = 1) -> list[list[np.ndarray]]:
+    """The signal, and its derivatives in the parameters up to `order`, of each channel in `selection`."""
+    if has_time_constants(model.circuit):
+        terms = jax.tree.map(np.asarray, _term_derivatives(model, order))
+        return [_signal_derivatives(orders, sampling) for orders in terms[selection]]
+    times = jnp.asarray(sampling.time), jnp.asarray(sampling.slope)
+    values, slopes = _predicted_signals(model, sampling.drive, *times, sampling.steady_state)
     return [[np.asarray(value), np.asarray(slope)] for value, slope in zip(values, slopes, strict=True)][selection]
-
-
-def _circuit_and_gains(
-    circuit: Circuit, ties: Ties, names: tuple[str, ...], channels: tuple[Channel, ...], theta: Array
-) -> tuple[Circuit, list[ArrayLike]]:
-    """As `with_parameters`; what is tied follows."""
-    there, gains = with_parameters(circuit, names, channels, theta)
-    known = circuit_parameters(there)
-    return with_values(there, {name: ratio * known[other] for name, other, ratio in ties}), gains
 
 
 class _LogTauTerms(NamedTuple):
@@ -148,45 +142,35 @@ class _LogTauTerms(NamedTuple):
 
 
 @eqx.filter_jit
-def _term_derivatives(
-    circuit: Circuit, ties: Ties, names: tuple[str, ...], channels: tuple[Channel, ...], theta: Array, order: int
-) -> tuple[Any, ...]:
-    """For each channel, the last being that which makes the force: terms and their derivatives."""
-    fields = tuple(name for name in names if name != FREQUENCY)
+def _term_derivatives(model: _Model, order: int) -> tuple[tuple[_LogTauTerms, ...], ...]:
+    """For each channel its terms and their derivatives."""
 
     def terms(theta: Array) -> list[_LogTauTerms]:
-        there, gains = _circuit_and_gains(circuit, ties, fields, channels[:-1], theta[: len(fields)])
+        circuit, gains = model.circuit_and_gains(theta)
         # at another frequency the same happens in the period as with all time constants so many times longer
-        faster = theta[names.index(FREQUENCY)] if FREQUENCY in names else jnp.zeros(())
+        faster = theta[-1] if FREQUENCY in model.names else jnp.zeros(())
         of_channels = []
-        for gain, channel in zip((*gains, 1.0), channels, strict=True):
-            weight, tau, rate = there.channel_terms(channel)
+        for gain, channel in zip(gains, model.channels, strict=True):
+            weight, tau, rate = circuit.channel_terms(channel)
             log_tau, rate = jnp.log(jnp.stack(tau)) + faster, jnp.asarray(0.0 if rate is None else rate)
             of_channels.append(_LogTauTerms(gain * jnp.stack(weight), log_tau, gain * rate * jnp.exp(faster)))
         return of_channels
 
-    orders, derivative = [terms(theta)], terms
+    orders, derivative = [terms(model.theta)], terms
     for _ in range(order):
         derivative = jax.jacfwd(derivative)
-        orders.append(derivative(theta))
+        orders.append(derivative(model.theta))
     return tuple(zip(*orders, strict=True))
 
 
 @eqx.filter_jit
-def _force_constant_slope(
-    circuit: Circuit,
-    ties: Ties,
-    free: tuple[str, ...],
-    channels: tuple[Channel, ...],
-    theta: Float[Array, " circuit_parameters"],
-    geometry: Geometry,
-) -> Float[Array, " circuit_parameters"]:
+def _force_constant_slope(model: _Model, geometry: Geometry) -> Float[Array, " parameters"]:
     """The derivative of the logarithm of force over the square of the voltage that makes it."""
 
     def log_force(theta: Array) -> Array:
-        return jnp.log(force_constant(geometry.contact(_circuit_and_gains(circuit, ties, free, channels, theta)[0])))
+        return jnp.log(force_constant(geometry.contact(model.circuit_and_gains(theta)[0])))
 
-    return jax.jacfwd(log_force)(theta)
+    return jax.jacfwd(log_force)(model.theta)
 
 
 class _Sampling(NamedTuple):
@@ -237,10 +221,8 @@ def _sampling(e: Experiment, max_samples: int = 4096, period_times: int = 1024, 
 
 
 def _pad_drive(drive: Drive, time: np.ndarray, samples: int = 8192) -> tuple[Drive, np.ndarray]:
-    """A measured drive with always as many samples, held after its end, and the times within them.
-
-    Of a long one the beginning stands for all, since its every sample costs.
-    """
+    """A measured drive with always as many samples, held after its end, and the times within them."""
+    # of a long one the beginning stands for all, since its every sample costs
     if not isinstance(drive, Sampled) or drive.period is not None:
         return drive, time
     knots, voltage = np.asarray(drive.time)[:samples], np.asarray(drive.samples)[:samples]
@@ -275,25 +257,17 @@ def _highpass_derivatives(
 
 @eqx.filter_jit
 def _predicted_signals(
-    circuit: Circuit,
-    ties: Ties,
-    free: tuple[str, ...],
-    channels: tuple[Channel, ...],
-    theta: Array,
-    drive: Drive,
-    time: Array,
-    drive_slope: Array,
-    steady_state: bool,
+    model: _Model, drive: Drive, time: Array, drive_slope: Array, steady_state: bool
 ) -> tuple[list[Array], list[Array]]:
     def signals(theta: Array) -> tuple[list[Array], list[Array]]:
-        there, gains = _circuit_and_gains(circuit, ties, free, channels[:-1], theta)
+        circuit, gains = model.circuit_and_gains(theta)
         of_channels = []
-        for gain, channel in zip((*gains, 1.0), channels, strict=True):
-            value, rate = response_and_rate(there, drive, time, steady_state=steady_state, channel=channel)
+        for gain, channel in zip(gains, model.channels, strict=True):
+            value, rate = response_and_rate(circuit, drive, time, steady_state=steady_state, channel=channel)
             of_channels.append(gain * (value if rate is None else value + rate * drive_slope))
         return of_channels, of_channels
 
-    slopes, values = jax.jacfwd(signals, has_aux=True)(theta)
+    slopes, values = jax.jacfwd(signals, has_aux=True)(model.theta)
     return values, slopes
 
 

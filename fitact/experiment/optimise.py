@@ -27,13 +27,8 @@ def optimise(
 ) -> Optimum:
     """The settings that tell most of a force, by its `gradient` in the logarithms of the free parameters.
 
-    A skin without time constants has no derivatives in the settings here: the best of the grid is taken.
-
-    Args:
-        design: whose settings are to be chosen.
-        gradient: of the logarithm of the force.
-        starts: how many of the grid's lowest points are followed downhill.
-        min_improvement: of the error: by so much, at least, it must fall for a setting to be moved.
+    So many `starts`, the grid's lowest points, are followed downhill; a skin without time constants has no derivatives
+    in the settings here. A setting is moved only if the error falls by `min_improvement` of it, at least.
     """
     bounds = [(setting.low, setting.high) for setting in design.settings]
     count = {1: 33, 2: 6}.get(len(bounds), 4)  # points of the grid along each of so many settings

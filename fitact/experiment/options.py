@@ -1,4 +1,4 @@
-"""What a user may change of a measurement, each change with its effort; and those that a fit's verdict names."""
+"""Changes that a user may make to a measurement, each with its effort; and those that a fit's verdict names."""
 
 import contextlib
 import dataclasses
@@ -15,6 +15,8 @@ from fitact.model.circuit import RC, Channel, DirectGround, FinalCircuit, Probe
 from fitact.model.drive import Multitone, Periodic, Trapezoid
 from fitact.model.skin import WithSkin, circuit_parameters, constant_skin_circuit, has_time_constants, with_values
 from fitact.units import format_engineering
+
+_UNITS = {"Vsc": "V", "I": "A"}
 
 
 class Change(NamedTuple):
@@ -35,6 +37,8 @@ class Change(NamedTuple):
 
 def changes(adc_steps: Mapping[Channel, float] | None = None) -> tuple[Change, ...]:
     """All changes; `adc_steps` are those of the converter in each channel, V and A, where they are known."""
+    lighter = "a probe of 10 times the impedance", lambda probe: Probe(10.0 * probe.R, probe.C / 10.0)
+    no_load = "a probe that does not load the skin", lambda probe: None
     return (
         Change("longer record", "length", 1.0, _longer_record),
         Change("higher sampling rate", "rate", 1.0, _higher_sampling_rate),
@@ -42,8 +46,8 @@ def changes(adc_steps: Mapping[Channel, float] | None = None) -> tuple[Change, .
         Change("two frequencies", "frequency", 2.0, lambda d: _frequencies(d, 2)),
         Change("three frequencies", "frequency", 3.0, lambda d: _frequencies(d, 3)),
         Change("series resistor", "series resistor", 2.0, _series_resistor),
-        Change("lighter probe", "probe", 3.0, _lighter_probe),
-        Change("no probe load", "probe", 4.0, _no_probe),
+        Change("lighter probe", "probe", 3.0, lambda d: _other_probe(d, *lighter)),
+        Change("no probe load", "probe", 4.0, lambda d: _other_probe(d, *no_load)),
         Change("better Ci", "Ci", 3.0, _better_Ci),
         Change("current", "current", 3.0, lambda d: _add_channel(d, "I", "the trunk current I", 20e-9)),
         Change("skin voltage", "skin voltage", 3.0, lambda d: _add_channel(d, "Vsc", "the skin voltage Vsc", 0.1)),
@@ -74,7 +78,6 @@ def suggest_measurements(
 def _apply_to_all(
     design: CandidateDesign, text: str, change: Callable[[Experiment], Experiment], *settings: Setting
 ) -> CandidateDesign:
-    """The candidate with the same change of all its experiments."""
     return dataclasses.replace(
         design,
         experiments=tuple(map(change, design.experiments)),
@@ -83,55 +86,41 @@ def _apply_to_all(
     )
 
 
-def _longer_record(design: CandidateDesign, factor: int = 4) -> CandidateDesign:
-    def repeat_record(e: Experiment) -> Experiment:
-        return dataclasses.replace(e, records=factor * e.records)
-
-    return _apply_to_all(design, f"{_count(factor)} times the record", repeat_record)
+def _longer_record(design: CandidateDesign) -> CandidateDesign:
+    return _apply_to_all(design, "four times the record", lambda e: dataclasses.replace(e, records=4 * e.records))
 
 
-def _higher_sampling_rate(design: CandidateDesign, factor: int = 4) -> CandidateDesign:
+def _higher_sampling_rate(design: CandidateDesign) -> CandidateDesign:
     def raise_rate(e: Experiment) -> Experiment:
-        at = np.arange(factor * len(e.time)) / factor
-        end = e.time[-1] + (e.time[-1] - e.time[-2])
-        return dataclasses.replace(e, time=np.interp(at, np.arange(len(e.time) + 1), np.append(e.time, end)))
+        places, end = np.arange(4 * len(e.time)) / 4, e.time[-1] + (e.time[-1] - e.time[-2])
+        return dataclasses.replace(e, time=np.interp(places, np.arange(len(e.time) + 1), np.append(e.time, end)))
 
-    text = f"{_count(factor)} times the sampling rate, with the same noise in each sample"
-    return _apply_to_all(design, text, raise_rate)
+    return _apply_to_all(design, "four times the sampling rate, with the same noise in each sample", raise_rate)
 
 
-def _count(number: int) -> str:
-    return {2: "two", 3: "three", 4: "four"}[number]
-
-
-def _frequencies(
-    design: CandidateDesign,
-    count: int,
-    *,
-    lowest: float = 1.0,
-    min_samples_per_period: float = 100.0,
-    min_rises: float = 4.0,
-) -> CandidateDesign | None:
+def _frequencies(design: CandidateDesign, count: int) -> CandidateDesign | None:
     """So many records in place of one, each with a frequency of its own, and as many samples as that one.
 
-    They lie between `lowest` (Hz) and where a period has too few samples, or half of one too few rises.
+    They lie between 1 Hz and where a period has fewer than 100 samples, or the shorter half of one than 4 rises.
     """
     first, *others = design.experiments
     drive = first.drive
     if others or not (isinstance(drive, Periodic) and first.steady_state and has_time_constants(first.circuit)):
         return None
-    low = min(lowest, float(drive.frequency))
-    high = 1.0 / (min_samples_per_period * float(np.median(np.diff(first.time))))
+    low = min(1.0, float(drive.frequency))
+    high = 1.0 / (100.0 * float(np.median(np.diff(first.time))))
     if isinstance(drive, Trapezoid):
-        high = min(high, float(min(drive.duty, 1.0 - drive.duty) / (min_rises * drive.rise_time)))
+        high = min(high, float(min(drive.duty, 1.0 - drive.duty) / (4.0 * drive.rise_time)))
     high /= max(drive.orders) if isinstance(drive, Multitone) else 1.0
     start = min(float(drive.frequency), high)
     numbers = [""] + [f"_{number}" for number in range(2, count + 1)]
     settings = (Setting(FREQUENCY + n, FREQUENCY, "Hz", start, low, high, (i,)) for i, n in enumerate(numbers))
-    several = f"{_count(count)} such records, " if count > 1 else ""
-    places = ", ".join(["{}"] * (count - 1)) + " and {}" if count > 1 else "{}"
-    replicated = _replicate_experiment(design, (first,) * count)
-    return _apply_to_all(replicated, f"{several}the drive at {places}", lambda e: e, *settings)
+    text = {
+        1: "the drive at {}",
+        2: "two such records, the drive at {} and {}",
+        3: "three such records, the drive at {}, {} and {}",
+    }[count]
+    return _apply_to_all(_replicate_experiment(design, (first,) * count), text, lambda e: e, *settings)
 
 
 def _replicate_experiment(design: CandidateDesign, experiments: tuple[Experiment, ...]) -> CandidateDesign:
@@ -141,13 +130,8 @@ def _replicate_experiment(design: CandidateDesign, experiments: tuple[Experiment
     return dataclasses.replace(design, experiments=experiments, settings=shared)
 
 
-def _series_resistor(
-    design: CandidateDesign, default: float = 100e3, low: float = 1e3, high: float = 1e8
-) -> CandidateDesign | None:
-    """A known resistor in series, or another one in place of a known one; it stands where it is, or at `default`.
-
-    One can buy those between `low` and `high` (ohm), and the cable's capacitance does not short them.
-    """
+def _series_resistor(design: CandidateDesign, default: float = 100e3) -> CandidateDesign | None:
+    """A known resistor in series, or another one in place of a known one; it stands where it is, or at `default`."""
     first = design.experiments[0]
     if "series_resistor" in first.free or not isinstance(constant_skin_circuit(first.circuit), RC):
         return None
@@ -163,7 +147,8 @@ def _series_resistor(
 
     stated = circuit_parameters(first.circuit).get("series_resistor")
     start, indices = default if stated is None else float(stated), tuple(range(len(design.experiments)))
-    where = Setting("series_resistor", "series_resistor", "ohm", start, low, high, indices)
+    # one can buy those from 1 kohm to 100 Mohm, and the cable's capacitance does not short them
+    where = Setting("series_resistor", "series_resistor", "ohm", start, 1e3, 1e8, indices)
     return _apply_to_all(design, "a known resistor of {} in series", insert_resistor, where)
 
 
@@ -172,23 +157,10 @@ def _with_fields(e: Experiment, **fields: Any) -> Experiment:
     return dataclasses.replace(e, circuit=with_values(e.circuit, fields))
 
 
-def _lighter_probe(design: CandidateDesign, factor: float = 10.0) -> CandidateDesign | None:
-    def lighten_probe(e: Experiment) -> Experiment:
-        probe: Any = _probe(e)
-        return _with_fields(e, probe=Probe(factor * probe.R, probe.C / factor))
-
-    text = f"a probe of {factor:g} times the impedance"
-    return _apply_to_all(design, text, lighten_probe) if _probe(design.experiments[0]) else None
-
-
-def _no_probe(design: CandidateDesign) -> CandidateDesign | None:
-    if _probe(design.experiments[0]) is None:
-        return None
-    return _apply_to_all(design, "a probe that does not load the skin", lambda e: _with_fields(e, probe=None))
-
-
-def _probe(e: Experiment) -> Probe | None:
-    return getattr(constant_skin_circuit(e.circuit), "probe", None)
+def _other_probe(design: CandidateDesign, text: str, change: Callable[[Probe], Probe | None]) -> CandidateDesign | None:
+    """The candidate with other probes, where its experiments have one."""
+    probe = getattr(constant_skin_circuit(design.experiments[0].circuit), "probe", None)
+    return None if probe is None else _apply_to_all(design, text, lambda e: _with_fields(e, probe=change(probe)))
 
 
 def _better_Ci(design: CandidateDesign) -> CandidateDesign | None:
@@ -208,26 +180,21 @@ def _add_channel(design: CandidateDesign, channel: Channel, what: str, default_n
     def record_channel(e: Experiment) -> Experiment:
         return dataclasses.replace(e, channels=(*e.channels, channel), noise={**e.noise, channel: noise})
 
-    shown = format_engineering(noise, "V" if channel == "Vsc" else "A")
+    shown = format_engineering(noise, _UNITS[channel])
     return _apply_to_all(design, f"{what} recorded to ± {shown}", record_channel)
 
 
-def _higher_adc_resolution(
-    design: CandidateDesign, adc_steps: Mapping[Channel, float], min_share: float = 0.01
-) -> CandidateDesign | None:
-    """The noise without that of the converters, where it is more than `min_share` of a channel's."""
+def _higher_adc_resolution(design: CandidateDesign, adc_steps: Mapping[Channel, float]) -> CandidateDesign | None:
+    """The noise without that of the converters, where it is more than 1 % of a channel's."""
     e = design.experiments[0]
     quieter: dict[str, float] = {}
     for channel in e.channels:
         noise = math.sqrt(max(e.noise[channel] ** 2 - adc_steps.get(channel, 0.0) ** 2 / 12.0, 0.0))
-        if 0.0 < noise < (1.0 - min_share) * e.noise[channel]:
+        if 0.0 < noise < 0.99 * e.noise[channel]:
             quieter[channel] = noise
     if not quieter:
         return None
-    unit = {"Vsc": "V", "I": "A"}
-    shown = ", ".join(
-        f"± {format_engineering(noise, unit[channel])} on {channel}" for channel, noise in quieter.items()
-    )
+    shown = ", ".join(f"± {format_engineering(noise, _UNITS[name])} on {name}" for name, noise in quieter.items())
 
     def lower_noise(e: Experiment) -> Experiment:
         return dataclasses.replace(e, noise={**e.noise, **quieter})
@@ -236,10 +203,7 @@ def _higher_adc_resolution(
 
 
 def _second_panel(design: CandidateDesign, max_ratio: float = 10.0) -> CandidateDesign | None:
-    """The same finger on another insulator, whose capacitance is known as well as the first's, and on its own.
-
-    It is at most `max_ratio` times larger or smaller than the first's.
-    """
+    """The same finger on another insulator, whose capacitance is known as well as the first's, and on its own."""
     first, *others = design.experiments
     if others or "Ci" not in first.free:
         return None
