@@ -4,7 +4,6 @@ Vsc is linear in the drive and the force quadratic, so one response at 1 Vpp giv
 """
 
 import dataclasses
-from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -36,7 +35,7 @@ LEGEND = (
 
 @dataclasses.dataclass(frozen=True)
 class DriveDesign:
-    """What it takes for a share of people to feel a panel.
+    """Drives by which a share of people feel a panel.
 
     Attributes:
         scene: of panel, drive and threshold.
@@ -88,23 +87,18 @@ class DriveDesign:
         return {"peak_to_peak": amplitude, "q05": low, "q50": median, "q95": high}
 
     def to_dict(self) -> dict[str, Any]:
-        """What `fitact design drive --json` prints and drive.json holds, in SI units."""
-
-        def to_dicts(options: Iterable[DriveOption]) -> list[dict[str, Any]]:
-            return [option.to_dict() for option in options]
-
+        """The content of drive.json and of what `fitact design drive --json` prints, in SI units."""
         laws, fingers = self.people.shape
-        threshold = self.scene.perception.model_dump(exclude_none=True)
         return {
             "share": self.share,
-            "threshold": threshold,
+            "threshold": self.scene.perception.model_dump(exclude_none=True),
             "people": {"source": self.people.source, "laws": laws, "fingers": fingers},
-            "options": to_dicts(self.options.values()),
+            "options": [option.to_dict() for option in self.options.values()],
             "smallest": self.smallest(),
             "curves": {name: {k: x.tolist() for k, x in self.curve(name).items()} for name in self.options},
-            "frequencies": to_dicts(option for options in self.by_frequency.values() for option in options),
-            "thicknesses": to_dicts(self.by_thickness),
-            "permittivities": to_dicts(self.by_permittivity),
+            "frequencies": [option.to_dict() for options in self.by_frequency.values() for option in options],
+            "thicknesses": [option.to_dict() for option in self.by_thickness],
+            "permittivities": [option.to_dict() for option in self.by_permittivity],
             "warnings": list(self.warnings),
             "seed": self.seed,
             "scene": self.scene.model_dump(mode="json", exclude_unset=True),
@@ -142,7 +136,12 @@ class DriveDesign:
     @property
     def question(self) -> str:
         """Who is to feel what."""
-        return f"{100.0 * self.share:g} % of people feel {_threshold(self.scene)}; people: {self.people.source}"
+        force, change = self.scene.perception.threshold_force, self.scene.perception.friction_change
+        if force is not None:
+            felt = f"an alternating force of {format_engineering(force, 'N')}"
+        else:
+            felt = f"friction that alternates by {change:.3g} of its mean"
+        return f"{100.0 * self.share:g} % of people feel {felt}; people: {self.people.source}"
 
     @property
     def table(self) -> tuple[tuple[str, ...], ...]:
@@ -173,30 +172,16 @@ class DriveDesign:
         return *sentences, f"{self.own}, {_thinnest_insulator(self.by_thickness)}"
 
 
-def _threshold(scene: Scene) -> str:
-    force, change = scene.perception.threshold_force, scene.perception.friction_change
-    if force is not None:
-        return f"an alternating force of {format_engineering(force, 'N')}"
-    return f"friction that alternates by {change:.3g} of its mean"
-
-
 def _cells(name: str, option: DriveOption, is_scene_waveform: bool) -> tuple[str, ...]:
     low, median, high = (format_quantity(quantile(option.amplitude, q), "V") for q in (0.05, 0.5, 0.95))
     between = f"{low} to {high}" if option.amplitude.size > 1 else ""
-    used = option.at_assured
-    quantities = (
-        (used.real_power, "W"),
-        (used.apparent_power, "VA"),
-        (used.current_rms, "A"),
-        (used.current_peak, "A"),
-        (used.insulator_peak, "V"),
-    )
+    drawn = {"real_power": "W", "apparent_power": "VA", "current_rms": "A", "current_peak": "A", "insulator_peak": "V"}
     return (
         name + (" *" if is_scene_waveform else ""),
         median,
         between,
         format_quantity(option.assured, "V", option.assured_error),
-        *(format_quantity(value, unit) for value, unit in quantities),
+        *(format_quantity(getattr(option.at_assured, quantity), unit) for quantity, unit in drawn.items()),
     )
 
 
@@ -290,9 +275,7 @@ class _DriveEvaluator:
     def has_room(self, waveform: str, frequency: float) -> bool:
         """Whether the period has room for both edges."""
         drive = self.scene.drive
-        if waveform != "trapezoid" or drive.rise_time is None:
-            return True
-        return drive.rise_time < min(drive.duty, 1.0 - drive.duty) / frequency
+        return waveform != "trapezoid" or (drive.rise_time or 0.0) < min(drive.duty, 1.0 - drive.duty) / frequency
 
     def _unit_quantities(self, drive: Periodic, thickness: float, ratio: float) -> PeriodQuantities:
         """Compute what 1 Vpp does at each finger, with its Ci times `ratio`: arrays (laws, fingers)."""
@@ -308,9 +291,8 @@ class _DriveEvaluator:
 def _normalize_drive(drive: DriveSection) -> DriveSection:
     """Scale to 1 V from trough to crest, its offset in proportion."""
     height = drive.peak_to_peak
-    if drive.amplitudes is not None:
-        points = 16_384  # 65 of the fastest cycle there is
-        time = np.linspace(0.0, 1.0 / drive.lowest_frequency, points, endpoint=False)
+    if drive.amplitudes is not None:  # 65 points of the fastest cycle there is
+        time = np.linspace(0.0, 1.0 / drive.lowest_frequency, 16_384, endpoint=False)
         with jax.enable_x64(True):
             height = float(np.ptp(drive.make().value(time)))
     amplitudes = drive.amplitudes and tuple(amplitude / height for amplitude in drive.amplitudes)

@@ -44,28 +44,17 @@ def format_quantity(value: ArrayLike, unit: str, error: float | None = None) -> 
 
 @dataclasses.dataclass(frozen=True)
 class DriveOption:
-    """A waveform at a frequency on an insulator.
-
-    Attributes:
-        waveform: its name.
-        frequency: Hz.
-        device: the panel, with its limits.
-        amplitude: peak-to-peak, V, that the share of people needs, under each law.
-        assured_error: of `assured`, V: the standard error that its draws, of laws or of a prior's fingers, leave.
-        people: peak-to-peak, V, up to which `FINGER_QUANTILES` of all fingers feel it.
-        at_assured: at the assured amplitude: forces and powers of the median finger, the voltage over the insulator
-            and the currents the largest of all fingers.
-    """
+    """A waveform at a frequency on an insulator."""
 
     CRITERIA: ClassVar[dict[str, str]] = {"peak_to_peak": "V", "real_power": "W", "apparent_power": "VA"}
 
     waveform: str
-    frequency: float
-    device: Device
-    amplitude: Float[np.ndarray, " laws"]
-    assured_error: float
-    people: Float[np.ndarray, " shares"]
-    at_assured: PeriodQuantities
+    frequency: float  # Hz
+    device: Device  # the panel, with its limits
+    amplitude: Float[np.ndarray, " laws"]  # peak-to-peak, V, that the share of people needs, under each law
+    assured_error: float  # of `assured`, V: the standard error that its draws, of laws or of a prior's fingers, leave
+    people: Float[np.ndarray, " shares"]  # peak-to-peak, V, up to which `FINGER_QUANTILES` of all fingers feel it
+    at_assured: PeriodQuantities  # there: forces and powers of the median finger, voltage and currents the largest
 
     @classmethod
     def from_amplitudes(
@@ -79,12 +68,11 @@ class DriveOption:
     ) -> Self:
         """Evaluate an option by the amplitude that each finger needs, and what a drive of 1 Vpp does at it."""
         amplitude = quantile(required_amplitudes, share, axis=1)
-        assured = float(quantile(amplitude, ASSURANCE))
-        error = quantile_error(amplitude, ASSURANCE)
-        if amplitude.size == 1:
-            error = quantile_error(required_amplitudes[0], share)
+        one_law = amplitude.size == 1
+        error = quantile_error(required_amplitudes[0], share) if one_law else quantile_error(amplitude, ASSURANCE)
         people = np.array([quantile(required_amplitudes, q) for q in FINGER_QUANTILES])
-        return cls(waveform, frequency, device, amplitude, error, people, _scale_to_amplitude(unit_quantities, assured))
+        used = _scale_to_amplitude(unit_quantities, float(quantile(amplitude, ASSURANCE)))
+        return cls(waveform, frequency, device, amplitude, error, people, used)
 
     @property
     def assured(self) -> float:
@@ -97,13 +85,13 @@ class DriveOption:
 
     @property
     def breakdown_voltage(self) -> float | None:
-        """What the insulator holds, V; None: its breakdown field is not stated."""
+        """The voltage that the insulator holds, V; None: its breakdown field is not stated."""
         field = self.device.breakdown_field
         return None if field is None else field * self.device.insulator_thickness
 
     @property
     def violations(self) -> tuple[str, ...]:
-        """What stands against it: the limits that it breaks at the assured amplitude, as phrases."""
+        """The limits that it breaks at the assured amplitude, as phrases."""
         if not math.isfinite(self.assured):
             return ("too few feel it at any amplitude",)
         checked = (

@@ -17,17 +17,13 @@ from fitact.scene.scene import Scene
 
 @dataclasses.dataclass(frozen=True)
 class FingerSample:
-    """Fingers under each of some laws that people may follow.
+    """Fingers under each of some laws that people may follow."""
 
-    Attributes:
-        values: what the fingers have, SI, by name: Rsc, Csc, Ci and whatever else is believed of the circuit.
-        source: where they come from, for people to read.
-        trusted: whether nothing stands against them.
-    """
-
-    values: dict[str, Float[np.ndarray, "laws fingers"]]
-    source: str
-    trusted: bool = True
+    values: dict[
+        str, Float[np.ndarray, "laws fingers"]
+    ]  # SI: Rsc, Csc, Ci and whatever else is believed of the circuit
+    source: str  # for people to read
+    trusted: bool = True  # whether nothing stands against them
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -62,11 +58,7 @@ class FingerSample:
 
     @classmethod
     def from_prior(cls, scene: Scene, seed: int = 0, fingers: int = 4096) -> Self:
-        """Draw fingers that the scene believes possible, which stand for people and for ignorance alike.
-
-        Raises:
-            InputError: the prior leaves nothing to draw.
-        """
+        """Draw fingers that the scene believes possible, which stand for people and for ignorance alike."""
         values = {name: x[None] for name, x in sample_prior(scene, np.random.default_rng(seed), fingers).items()}
         nominal = {name: np.full((1, fingers), scene.nominal_values()[name]) for name in (*SKIN, SHARED_PARAMETER)}
         return cls(_circuit_values(nominal | values), "the scene's prior")

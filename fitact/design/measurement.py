@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import math
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,7 +16,7 @@ from fitact.errors import InputError
 from fitact.experiment.blind_directions import gain_names
 from fitact.experiment.experiment import CandidateDesign, DesignOption, evaluate_design
 from fitact.experiment.fisher import Experiment, force_gradient, signal_spans
-from fitact.experiment.optimise import Optimum, optimise
+from fitact.experiment.optimise import optimise
 from fitact.experiment.options import Change, changes
 from fitact.fitting import derived
 from fitact.fitting.fit import Fit, fit
@@ -30,23 +31,17 @@ _MIN_GAIN = math.log(1.01)  # from which an option counts as telling more
 
 @dataclasses.dataclass(frozen=True)
 class SettingCurve:
-    """How well the mean force is known along one setting, samples and edges keeping their place in the period.
-
-    Attributes:
-        setting, unit: what is set, and the unit of its values.
-        values: SI.
-        force_sd: as in `DesignOption`.
-    """
+    """How well the mean force is known along one setting, samples and edges keeping their place in the period."""
 
     setting: str
-    unit: str
-    values: tuple[float, ...]
-    force_sd: tuple[float, ...]
+    unit: str  # of its values
+    values: tuple[float, ...]  # SI
+    force_sd: tuple[float, ...]  # as in `DesignOption`
 
 
 @dataclasses.dataclass(frozen=True)
 class MeasurementDesign:
-    """What might be measured, and how well the mean force would then be known.
+    """Measurements that might be made, and how well the mean force would then be known.
 
     Attributes:
         now: the measurement as it stands.
@@ -74,7 +69,7 @@ class MeasurementDesign:
         return tuple(option for option in self.options if option.gain > _MIN_GAIN)
 
     def to_dict(self) -> dict[str, Any]:
-        """As in design.json."""
+        """The content of design.json."""
         best = self.best_for_effort
         return {
             "now": self.now.to_dict(),
@@ -102,7 +97,7 @@ class MeasurementDesign:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What gives most for its effort, and what gives nothing."""
+        """The option that gives most for its effort, and those that give nothing."""
         best, others = self.best_for_effort, [o.name for o in self.options if o not in self._informative_options]
         sentences = []
         if best is not None:
@@ -155,11 +150,7 @@ def design_measurement(scene: Scene, records: Record | Sequence[Record] = ()) ->
 
 
 def experiment_from_scene(scene: Scene) -> Experiment:
-    """Make the measurement that a scene states, at its own values.
-
-    Raises:
-        InputError: it has no drive, no noise or nothing free, or its sampling is out of bounds.
-    """
+    """Make the measurement that a scene states, at its own values."""
     scene.require_available()
     measured, prior, nominal = scene.measurement, scene.make_prior(), scene.nominal_values()
     values = {name: math.exp(prior[name].log_mean) for name in prior.names if nominal[name] is None}
@@ -177,11 +168,12 @@ def experiment_from_scene(scene: Scene) -> Experiment:
     circuit = scene.make_circuit(values)
     if isinstance(circuit, WithSkin) and isinstance(circuit.skin, Dispersive):
         # counted now, since what is compiled has its frequency traced
-        circuit = dataclasses.replace(
-            circuit, skin=Dispersive(circuit.skin.harmonic_count(scene.drive.lowest_frequency))
-        )
+        skin = Dispersive(circuit.skin.harmonic_count(scene.drive.lowest_frequency))
+        circuit = dataclasses.replace(circuit, skin=skin)
     prior = prior.drop_marginals(*(name for name in prior.names if name not in circuit_parameters(circuit)))
-    prior = prior.replace_marginals(**_gain_priors(scene))
+    gain_sd = {"gain": measured.gain_relative_sd, "gain_I": measured.gain_I_relative_sd}
+    gains = [name for name in gain_names(measured.channels) if gain_sd[name] > 0.0]
+    prior = prior.replace_marginals(**{name: LogNormal.with_relative_sd(1.0, gain_sd[name]) for name in gains})
     return Experiment(
         circuit=circuit,
         free=prior.names,
@@ -194,16 +186,6 @@ def experiment_from_scene(scene: Scene) -> Experiment:
         geometry=scene.geometry(),
         ties=tied,
     )
-
-
-def _gain_priors(scene: Scene) -> dict[str, LogNormal]:
-    measured = scene.measurement
-    stated = {"gain": measured.gain_relative_sd, "gain_I": measured.gain_I_relative_sd}
-    return {
-        name: LogNormal.with_relative_sd(1.0, stated[name])
-        for name in gain_names(measured.channels)
-        if stated[name] > 0.0
-    }
 
 
 def _force_gradient(fit_result: Fit) -> Float[np.ndarray, " circuit_parameters"]:
@@ -228,18 +210,13 @@ def _rank_options(
     }
     curves = tuple(curve for _, curve in evaluated.values() if curve is not None)
     options = [option for option, _ in evaluated.values()]
-    by_name = {change.name: change for change in candidates}
-    best = [by_name[option.name] for option in sorted(options, key=_force_sd) if option.gain > _MIN_GAIN]
+    by_name, by_force_sd = {change.name: change for change in candidates}, operator.attrgetter("force_sd")
+    best = [by_name[option.name] for option in sorted(options, key=by_force_sd) if option.gain > _MIN_GAIN]
     partner = next((change for change in best[1:] if change.group != best[0].group), None)
-    both = None if partner is None else _combine_changes(trial, best[0], partner)
-    together = _evaluate_best_settings(both, gradient, baseline)
-    if together is not None and together[0].gain > max(option.gain for option in options) + _MIN_GAIN:
+    together = partner and _evaluate_best_settings(_combine_changes(trial, best[0], partner), gradient, baseline)
+    if together and together[0].gain > max(option.gain for option in options) + _MIN_GAIN:
         options.append(together[0])
-    return tuple(sorted(options, key=_force_sd)), curves
-
-
-def _force_sd(option: DesignOption) -> float:
-    return option.force_sd
+    return tuple(sorted(options, key=by_force_sd)), curves
 
 
 def _combine_changes(trial: CandidateDesign, first: Change, second: Change) -> CandidateDesign | None:
@@ -262,12 +239,9 @@ def _evaluate_best_settings(
         if not trial.settings:
             return evaluate_design(trial, (), gradient, baseline.force_sd), None
         optimum = optimise(trial, gradient)
-        return evaluate_design(trial, optimum.values, gradient, baseline.force_sd), _setting_curve(trial, optimum)
+        option, (setting, *others) = evaluate_design(trial, optimum.values, gradient, baseline.force_sd), trial.settings
+        if others:
+            return option, None
+        values, force_sd = tuple(optimum.grid[0].tolist()), tuple(optimum.force_sd.tolist())
+        return option, SettingCurve(setting.name, setting.unit, values, force_sd)
     return None
-
-
-def _setting_curve(trial: CandidateDesign, optimum: Optimum) -> SettingCurve | None:
-    if len(trial.settings) > 1:
-        return None
-    (setting,), (values,) = trial.settings, optimum.grid
-    return SettingCurve(setting.name, setting.unit, tuple(values.tolist()), tuple(optimum.force_sd.tolist()))

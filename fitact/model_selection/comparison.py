@@ -20,17 +20,11 @@ _CRITERIA = ("log_likelihood", "parameters_counted", "aic", "aicc", "bic")
 
 @dataclasses.dataclass(frozen=True)
 class ModelScore:
-    """One model.
+    """One model."""
 
-    Attributes:
-        name: of its scene.
-        fit: to all samples.
-        cross_validation: log densities of blocks left out.
-    """
-
-    name: str
-    fit: Fit
-    cross_validation: CrossValidation
+    name: str  # of its scene
+    fit: Fit  # to all samples
+    cross_validation: CrossValidation  # log densities of blocks left out
 
     @property
     def elpd(self) -> float:
@@ -127,10 +121,9 @@ class Comparison:
         rows = []
         for model in self.models:
             short, error = model.elpd_difference(best)
-            figures = {name: model.fit.figures[name] for name in _CRITERIA}
             rows.append(
-                {"name": model.name, **figures, "elpd": model.elpd, "elpd_se": model.elpd_se}
-                | {"elpd_below_best": short, "elpd_below_best_se": error}
+                {"name": model.name, **{name: model.fit.figures[name] for name in _CRITERIA}}
+                | {"elpd": model.elpd, "elpd_se": model.elpd_se, "elpd_below_best": short, "elpd_below_best_se": error}
                 | {"result": model.fit.result, "folds_failed": model.cross_validation.folds_failed}
             )
         return {
@@ -147,9 +140,8 @@ class Comparison:
     def summary(self) -> str:
         """Return a table for people."""
         best = self.models[0]
-        rows: list[Sequence[str]] = [
-            ("model", "log-lik.", "parameters", "AIC", "AICc", "BIC", "elpd", " below the best")
-        ]
+        titles = ("model", "log-lik.", "parameters", "AIC", "AICc", "BIC", "elpd", " below the best")
+        rows = []
         for model in self.models:
             criteria = [f"{model.fit.figures[name]:.{0 if name == 'parameters_counted' else 2}f}" for name in _CRITERIA]
             below = "" if model is best else _format_elpd_difference(model, best)
@@ -159,7 +151,7 @@ class Comparison:
             f"elpd: log predictive density of {best.cross_validation.log_density.size} blocks, in"
             f" {best.cross_validation.folds} folds left out; below the best: by how much, ± its standard error."
         )
-        return join_lines([*align_rows(rows, widths), legend, self.verdict], self.warnings)
+        return join_lines([*align_rows([titles, *rows], widths), legend, self.verdict], self.warnings)
 
     __str__ = summary
 
@@ -219,5 +211,5 @@ def _format_elpd_difference(worse: ModelScore, better: ModelScore) -> str:
 
 
 def _standard_error(values: Float[np.ndarray, " blocks"]) -> float:
-    """Return that of the sum of independent values."""
+    """That of the sum of independent values."""
     return math.sqrt(values.size) * float(np.std(values, ddof=1)) if values.size > 1 else math.inf

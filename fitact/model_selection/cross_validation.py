@@ -29,25 +29,17 @@ from fitact.likelihood.noise import STUDENT_DOF, student_curvature, student_weig
 
 
 class CrossValidation(NamedTuple):
-    """What a fit makes of the blocks left out.
+    """Prediction of the blocks left out."""
 
-    Attributes:
-        log_density: of each block, given all samples outside its fold.
-        folds: how many refits there were,
-        folds_failed: and how many of them did not reach an optimum.
-    """
-
-    log_density: Float[np.ndarray, " blocks"]
-    folds: int
-    folds_failed: int
+    log_density: Float[np.ndarray, " blocks"]  # of each, given all samples outside its fold
+    folds: int  # how many refits there were
+    folds_failed: int  # and how many of them did not reach an optimum
 
 
 def block_indices(record: Record, blocks: int = 40, min_periods: int = 20) -> Int[np.ndarray, " samples"]:
-    """Return the block of each sample: whole periods where there are many, else stretches of as many samples.
+    """Return the block of each sample: whole periods from `min_periods` on, else stretches of as many samples.
 
-    Args:
-        blocks: at most; 40 are enough for a standard error of their sum.
-        min_periods: whole ones, from which blocks consist of them.
+    At most 40 `blocks`, which are enough for a standard error of their sum.
     """
     frequency, since = record.frequency(), record.time - record.time[0]
     periods = 0 if frequency is None else math.floor((since[-1] + record.time_step) * frequency + 1e-6)
@@ -100,19 +92,12 @@ def _mask_samples(likelihood: Likelihood, masks: list[np.ndarray]) -> Likelihood
 
 
 class _LinearisedChannel(NamedTuple):
-    """A channel's samples about a refit, to first order, in coordinates that are standard normal by the prior.
+    """A channel's samples about a refit, to first order, in coordinates that are standard normal by the prior."""
 
-    Attributes:
-        z: residuals in standard deviations of the noise.
-        slope: their derivatives by the parameters and all channels' linear nuisances.
-        log_scale: of each sample, what the logarithm of its density has beside that of z.
-        is_student: whether z has Student's distribution.
-    """
-
-    z: np.ndarray
-    slope: np.ndarray
-    log_scale: np.ndarray
-    is_student: bool
+    z: np.ndarray  # residuals in standard deviations of the noise
+    slope: np.ndarray  # their derivatives by the parameters and all channels' linear nuisances
+    log_scale: np.ndarray  # of each sample, what the logarithm of its density has beside that of z
+    is_student: bool  # whether z has Student's distribution
 
 
 class _LinearisedModel(NamedTuple):

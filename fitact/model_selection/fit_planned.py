@@ -20,19 +20,12 @@ _FAILED_RESULTS = ("misfit", "not_at_optimum")  # how a fit ends whose model is 
 
 @dataclasses.dataclass(frozen=True)
 class PlannedFit:
-    """A fit, and how its model came about.
-
-    Attributes:
-        fit: of the model that is used.
-        model: which one that is.
-        sentence: why, and what that costs.
-        plan: None where there was nothing to plan.
-    """
+    """A fit, and how its model came about."""
 
     fit: Fit
-    model: Model
-    sentence: str
-    plan: Plan | None = None
+    model: Model  # which one is used
+    sentence: str  # why, and what that costs
+    plan: Plan | None = None  # None where there was nothing to plan
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry `plan` of fit.json and summary.json."""
@@ -43,22 +36,11 @@ class PlannedFit:
 def fit_planned(records: Sequence[Record], scenes: Sequence[Scene], model: Model, **options: Any) -> PlannedFit:
     """Fit with the planned model of a scene; where that does not describe the records and the full one does, with it.
 
-    Where the recorded V drives the fit, that is planned for, as it was recorded. Several scenes would each have their
-    own plan: they get the full model.
-
-    Args:
-        records: as in `fitact.fit`.
-        scenes: none, one for all, or one for each.
-        model: "full" asks for the full one from the first.
-        options: of `fitact.fit`.
-
-    Raises:
-        InputError: as `fitact.fit` and `fitact.plan`.
+    Where the recorded V drives the fit, that is planned for, as it was recorded. `scenes`: none, one for all, or one
+    for each; several would each have their own plan, and get the full model. `options` are those of `fitact.fit`.
     """
     records = tuple(records)
-    full: tuple[Scene | None, ...] = (
-        tuple(scenes) if len(scenes) > 1 else (scenes[0] if scenes else None,) * len(records)
-    )
+    full: tuple[Scene | None, ...] = tuple(scenes) if len(scenes) > 1 else (*scenes, None)[:1] * len(records)
     why = _reason_for_full_model(scenes, model)
     drives: tuple[DriveModel, ...] = ()
     if not why:  # only now is the record worth a look
@@ -84,11 +66,7 @@ def fit_planned(records: Sequence[Record], scenes: Sequence[Scene], model: Model
 
 
 def plan_for_record(record: Record, scene: Scene) -> Plan:
-    """Plan for a record: for its V, where that is what drives the fit, else for the scene's drive.
-
-    Raises:
-        InputError: as `fitact.plan`, or the record does not fit the scene's drive.
-    """
+    """Plan for a record: for its V, where that is what drives the fit, else for the scene's drive."""
     return plan(scene, _measured_part(record, choose_drive(record, scene)))
 
 

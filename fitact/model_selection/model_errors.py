@@ -18,13 +18,14 @@ import jax
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from fitact.compiled import pad_rows
 from fitact.model.chirp import Chirp
 from fitact.model.circuit import Channel
 from fitact.model.drive import Burst, Drive, LinearPieces, Multitone, Periodic, PiecewiseLinear, Sampled, Sine
 from fitact.model.force import force_constant
 from fitact.model.response import highpass, knot_values, steady_knot_values
 from fitact.model.skin import WithSkin
-from fitact.model_selection.partial_fractions import complete_circuit, pad_rows, partial_fractions
+from fitact.model_selection.partial_fractions import ROWS, complete_circuit, partial_fractions
 from fitact.scene.scene import Scene
 
 Rows: TypeAlias = Float[np.ndarray, "circuits times"]
@@ -77,23 +78,15 @@ class ComparisonGrid(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class CircuitResponses:
-    """A channel of circuits under one drive: weighted responses of time constants, and harmonics that a skin has more.
-
-    Attributes:
-        drive, steady_state: what drives them all, and whether for ever or from rest.
-        segments: one period of the drive, where it is straight.
-        weight, tau: of the high-pass terms; s.
-        knots: each term's steady state at the starts of the drive's pieces, V.
-        harmonics: amplitude that the terms miss, V.
-    """
+    """A channel of circuits under one drive: weighted responses of time constants, and a skin's harmonics besides."""
 
     drive: Drive
-    steady_state: bool
-    segments: LinearPieces | None
-    weight: Float[np.ndarray, "circuits terms"]
-    tau: Float[np.ndarray, "circuits terms"]
-    knots: Float[np.ndarray, "circuits terms pieces"]
-    harmonics: Complex[np.ndarray, "circuits harmonics"]
+    steady_state: bool  # or from rest
+    segments: LinearPieces | None  # one period of the drive, where it is straight
+    weight: Float[np.ndarray, "circuits terms"]  # of the high-pass terms
+    tau: Float[np.ndarray, "circuits terms"]  # s
+    knots: Float[np.ndarray, "circuits terms pieces"]  # each term's steady state at the starts of the drive's pieces, V
+    harmonics: Complex[np.ndarray, "circuits harmonics"]  # amplitude that the terms miss, V
 
     @classmethod
     def from_scene(
@@ -101,8 +94,11 @@ class CircuitResponses:
     ) -> "CircuitResponses":
         """Drive the scene's circuit at `values` (SI, by name; arrays of at most `ROWS`), in that precision."""
         count = max(np.size(value) for value in values.values())
+
+        def pad(values: Any) -> np.ndarray:
+            return pad_rows(np.atleast_1d(np.asarray(values, dtype=precision)), ROWS)
+
         with jax.enable_x64(precision is np.float64):
-            pad = functools.partial(pad_rows, precision=precision)
             circuit = scene.make_circuit(dict(values))
             # the skin's exponent may differ from circuit to circuit
             skin = jax.tree.map(lambda x: pad(x)[:, None], circuit.skin) if isinstance(circuit, WithSkin) else None
@@ -114,7 +110,9 @@ class CircuitResponses:
             if isinstance(wave, PiecewiseLinear | Sampled):
                 segments = _period_segments(wave)
                 settled = not isinstance(drive, Sampled) or drive.period is not None
-                knots = _knots(jax.tree.map(precision, segments), tau, settled)
+                rounded = jax.tree.map(precision, segments)
+                # column by column, so that one program serves any number of terms
+                knots = np.stack([np.asarray(_column_knots(rounded, column, settled)) for column in tau.T], axis=1)
         weight, tau, knots, harmonics = (
             x[:count] for x in (weight.astype(precision), tau.astype(precision), knots, harmonics)
         )
@@ -131,8 +129,7 @@ class CircuitResponses:
             u = self.knots
         elif isinstance(self.drive, Chirp):
             with jax.enable_x64(self.tau.dtype == np.float64):
-                u = np.asarray(_chirp_response(self.drive, elapsed[0], pad_rows(self.tau, self.tau.dtype)))
-                u = u[: len(self.tau)]
+                u = np.asarray(_chirp_response(self.drive, elapsed[0], pad_rows(self.tau, ROWS)))[: len(self.tau)]
         elif self.steady_state:
             u = self._steady_state_response(cycle)
         else:
@@ -314,13 +311,6 @@ def _tones(wave: Any) -> list[tuple[int, float, float]]:
     phases = wave.phases or (0.0,) * len(wave.orders)
     tones = zip(wave.orders, wave.amplitudes, phases, strict=True)
     return [(order, float(height), float(phase)) for order, height, phase in tones]
-
-
-def _knots(
-    segments: LinearPieces, tau: Float[np.ndarray, "circuits terms"], steady_state: bool
-) -> Float[np.ndarray, "circuits terms pieces"]:
-    """Compute column by column, so that one program serves any number of terms."""
-    return np.stack([np.asarray(_column_knots(segments, column, steady_state)) for column in tau.T], axis=1)
 
 
 @functools.partial(jax.jit, static_argnums=2)

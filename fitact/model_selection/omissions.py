@@ -1,4 +1,4 @@
-"""What a scene names that may be left out of its model, what is then left of the scene, and what its model costs."""
+"""Parts of a scene that may be left out of its model, the scene without them, and the cost of its model."""
 
 import dataclasses
 import json
@@ -36,26 +36,19 @@ class Costs:
 
     Measured by benchmarks/plan.py, once, so that a plan does not depend on what else a machine does; docs/plan.md has
     the table.
-
-    Attributes:
-        lookup: to find a time in the drive.
-        square, trapezoid, triangle, sine, measured, chirp: of each time constant, by the drive; a sine's of each tone.
-        transient, burst: more for each time constant, from rest.
-        harmonic: of each.
-        fractional_terms: time constants that a fractional skin counts as.
     """
 
-    lookup: float = 1.0
-    square: float = 1.0
+    lookup: float = 1.0  # to find a time in the drive
+    square: float = 1.0  # from here on of each time constant, by the drive
     trapezoid: float = 2.0
     triangle: float = 2.0
-    sine: float = 4.0
+    sine: float = 4.0  # of each tone
     measured: float = 25.0
     chirp: float = 15.0
-    transient: float = 0.5
-    burst: float = 1.0
+    transient: float = 0.5  # more for each time constant, from rest
+    burst: float = 1.0  # likewise
     harmonic: float = 10.0
-    fractional_terms: int = 81
+    fractional_terms: int = 81  # time constants that a fractional skin counts as
 
 
 _COSTS = Costs()
@@ -105,19 +98,14 @@ def reason_to_keep(scene: Scene, name: str) -> str:
 
 
 def with_measured_drive(scene: Scene) -> Scene:
-    """Let the scene be driven by what was recorded.
-
-    Raises:
-        InputError: its skin depends on the frequency.
-    """
+    """Let the scene be driven by what was recorded."""
     if scene.skin.level != "constant":
         raise InputError(
             f"scene: [skin] level = '{scene.skin.level}' has no plan with a measured drive;"
             " name the waveform in [drive]"
         )
     content = json.loads(scene.to_json())
-    stated = content.pop("drive", {})
-    kept = {key: stated[key] for key in ("steady_state",) if key in stated}
+    kept = {key: value for key, value in content.pop("drive", {}).items() if key == "steady_state"}
     return Scene.from_dict(content | {"drive": {"waveform": "measured"} | kept})
 
 

@@ -14,7 +14,6 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex
 
-from fitact import compiled
 from fitact.model.circuit import RC, Channel, DirectGround, Element, FinalCircuit, NaturalGround, Probe
 from fitact.model.drive import Drive, Multitone, Periodic, Sine
 from fitact.model.harmonic import fourier_coefficients
@@ -36,17 +35,10 @@ def complete_circuit(circuit: RC) -> DirectGround | NaturalGround:
     skin, probe = (circuit.Rsc, circuit.Csc, circuit.Ci), circuit.probe or Probe(math.inf, 0.0)
     gap, series = {"Rgap": circuit.Rgap, "Cgap": circuit.Cgap}, circuit.series_resistor
     if isinstance(circuit, DirectGround):
-        R = circuit.Rsc if circuit.grounding_Rsc is None else circuit.grounding_Rsc
-        C = circuit.Csc if circuit.grounding_Csc is None else circuit.grounding_Csc
-        return DirectGround(*skin, resistance(circuit.R_H, series), R, C, None, probe, **gap)
+        return DirectGround(*skin, resistance(circuit.R_H, series), *circuit.body()[1], None, probe, **gap)
     if circuit.Z_capacitance is None:
         return NaturalGround(*skin, absent, 0.0, resistance(circuit.Z, series), probe, **gap)
     return NaturalGround(*skin, circuit.Z, circuit.Z_capacitance, resistance(series), probe, **gap)
-
-
-def pad_rows(values: Any, precision: Any) -> np.ndarray:
-    """Fill up to as many rows as programs are compiled for."""
-    return compiled.pad_rows(np.atleast_1d(np.asarray(values, dtype=precision)), ROWS)
 
 
 def partial_fractions(
@@ -110,11 +102,9 @@ def _transfer_function(
         other = 1.0 / admittance(Element(circuit.Z, circuit.Z_capacitance))
     else:
         other = 1.0 / skin_admittance(circuit.grounding_Rsc, circuit.grounding_Csc)
-    gap = (
-        0.0
-        if circuit.Cgap is None
-        else 1.0 / admittance(Element(np.inf if circuit.Rgap is None else circuit.Rgap, circuit.Cgap))
-    )
+    gap: Any = 0.0
+    if circuit.Cgap is not None:
+        gap = 1.0 / admittance(Element(np.inf if circuit.Rgap is None else circuit.Rgap, circuit.Cgap))
     rest = np.asarray(circuit.resistance())[:, None] + 1.0 / (s * np.asarray(circuit.Ci)[:, None])
     return (touching if channel == "Vsc" else gap) / (touching + other + rest + gap)
 
@@ -140,7 +130,7 @@ def _evaluate_circuit(circuit: WithSkin, frequency: float) -> Any:
 
 
 def _constant_skin_terms(circuit: Any, channel: Channel) -> tuple[np.ndarray, np.ndarray]:
-    """Of constant skins. Z stands in the loop where a grounding skin does, so one program serves both."""
+    """Terms of constant skins. Z stands in the loop where a grounding skin does, so one program serves both."""
     if isinstance(circuit, NaturalGround):
         loop = circuit.series_resistor, circuit.Z, circuit.Z_capacitance
         gap = {"Rgap": circuit.Rgap, "Cgap": circuit.Cgap}

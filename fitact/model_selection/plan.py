@@ -44,23 +44,14 @@ class RelativeErrors(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Omission:
-    """Something that the model might do without.
-
-    Attributes:
-        name: what it is.
-        nominal: errors at the scene's nominal values.
-        q95: their 95 % quantiles over the scene's prior.
-        speedup: how many times faster the full model is without it.
-        kept: whether the planned model has it.
-        because: why, as a clause.
-    """
+    """Something that the model might do without."""
 
     name: str
-    nominal: RelativeErrors
-    q95: RelativeErrors
-    speedup: float
-    kept: bool
-    because: str
+    nominal: RelativeErrors  # at the scene's nominal values
+    q95: RelativeErrors  # their 95 % quantiles over the scene's prior
+    speedup: float  # how many times faster the full model is without it
+    kept: bool  # whether the planned model has it
+    because: str  # a clause
 
     def to_dict(self) -> dict[str, Any]:
         """Return an entry of `omissions` in `fitact plan --json`."""
@@ -70,7 +61,7 @@ class Omission:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """What a scene requires of its model.
+    """The model that a scene requires.
 
     Attributes:
         full: the scene as it was given.
@@ -149,7 +140,7 @@ class Plan:
 
     @property
     def sentence(self) -> str:
-        """What is left out and what that costs."""
+        """Name the parts left out, and what that costs."""
         if not self.left_out:
             return "Nothing is left out."
         return (

@@ -1,9 +1,11 @@
 """The levels themselves, timed: responses, likelihoods and uncertainties of one fit."""
 
 import dataclasses
+import functools
 import math
 import statistics
 import time
+import timeit
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -28,7 +30,7 @@ from fitact.sampling.posterior import Posterior
 
 @dataclasses.dataclass(frozen=True)
 class BenchmarkResult:
-    """What was measured of one level; see `fitact.tradeoff.tradeoff.BenchmarkedMethod`."""
+    """Figures of one level; see `fitact.tradeoff.tradeoff.BenchmarkedMethod`."""
 
     name: str
     error: float
@@ -95,33 +97,22 @@ def median_seconds(jobs: dict[str, Callable[[], Any]], rounds: int = 9) -> dict[
     seconds: dict[str, list[float]] = {name: [] for name in jobs}
     for name, job in jobs.items():
         job()
-        counts[name] = max(1, math.ceil(5e-3 / _seconds_per_call(job, 1)))
+        counts[name] = max(1, math.ceil(5e-3 / timeit.timeit(job, number=1)))
     for number in range(rounds):
         for name, job in jobs.items():
             if number < 3 or seconds[name][0] < 0.05:  # three rounds are enough for calls that take long
-                seconds[name].append(_seconds_per_call(job, counts[name]))
+                seconds[name].append(timeit.timeit(job, number=counts[name]) / counts[name])
     return {name: statistics.median(measured) for name, measured in seconds.items()}
 
 
-def _seconds_per_call(job: Callable[[], Any], count: int) -> float:
-    start = time.perf_counter()
-    for _ in range(count):
-        job()
-    return (time.perf_counter() - start) / count
-
-
 class _Case(NamedTuple):
-    """What is responded to: the fit's drive, or the whole periods that a measured one shows.
-
-    Attributes:
-        charges: for each time constant, what its high-pass response at the first time is beyond the drive, V.
-    """
+    """A circuit and its drive: that of a fit, or the whole periods that a measured one shows."""
 
     circuit: RC
     drive: Drive
     time: Float[np.ndarray, " times"]
     steady_state: bool
-    charges: Float[np.ndarray, " terms"]
+    charges: Float[np.ndarray, " terms"]  # what the high-pass response at the first time is beyond the drive, V
 
     @classmethod
     def from_fit(cls, fit: Fit) -> "_Case":
@@ -154,13 +145,8 @@ def benchmark_responses(fit: Fit, harmonics: Sequence[int] = (10, 100, 1000)) ->
     jobs = {"exact": _response_job(exact, case), "recurrence": _response_job(recurrence, case.with_sampled_drive())}
     with jax.enable_x64(False):
         jobs["float32"] = _response_job(exact, case)
-    if case.steady_state:
-        for n in harmonics:
-
-            def harmonic(circuit: RC, drive: Drive, time: Array, n: int = n) -> Array:
-                return harmonic_response(circuit, drive, time, n)
-
-            jobs[f"harmonic({n})"] = _response_job(harmonic, case)
+    for n in harmonics if case.steady_state else ():
+        jobs[f"harmonic({n})"] = _response_job(functools.partial(harmonic_response, harmonics=n), case)
     jobs["ODE (scipy)"] = _Job(_make_ode_solver(case.with_sampled_drive()))
     values = {name: np.asarray(job.call(), dtype=float) for name, job in jobs.items()}
     norm = np.linalg.norm(values["exact"])
@@ -195,11 +181,9 @@ def _make_ode_solver(case: _Case, rtol: float = 1e-6) -> Callable[[], np.ndarray
 def benchmark_likelihoods(
     full: Fit, compressed: dict[float, Fit], walkers: int = 128, batch_rows: int = 1_000_000
 ) -> list[BenchmarkResult]:
-    """Measure levels of the log-posterior around the optimum; the full sum first. Call it in double precision.
+    """Measure levels of the log-posterior at `walkers` points around the optimum; the full sum first.
 
-    Args:
-        walkers: points that are evaluated,
-        batch_rows: at a time as many of them as have so many samples together, which bounds memory.
+    Only as many at a time as have `batch_rows` samples together, which bounds memory. Call it in double precision.
     """
     models, details = {"full": full.likelihood.without_compression()}, {}
     for name, fit in _distinct_compressions(compressed).items():
@@ -256,11 +240,7 @@ def benchmark_uncertainties(
 ) -> UncertaintyBenchmark:
     """Draw by every level, in turn, and measure what is off from the draws of emcee on the full sum.
 
-    Args:
-        runs: of each level, after one that compiles.
-
-    Raises:
-        KeyboardInterrupt: also where it came while sampling.
+    There are so many `runs` of each level, after one that compiles. An interrupt while sampling is raised again.
     """
     jobs: dict[str, tuple[Fit, Level]] = {"emcee, full": (full, "emcee")}
     jobs |= {level: (compressed, level) for level in ("laplace", "psis", "emcee")}

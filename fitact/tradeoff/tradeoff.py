@@ -1,4 +1,4 @@
-"""What each level of the model costs and what it is off by, measured on one record, in one run, on this machine."""
+"""Cost and error of each level of the model, measured on one record, in one run, on this machine."""
 
 import dataclasses
 import os
@@ -35,31 +35,18 @@ KINDS: dict[Kind, str] = {
 
 @dataclasses.dataclass(frozen=True)
 class BenchmarkedMethod:
-    """One level as measured.
-
-    Attributes:
-        kind: what it is a level of: "response", "likelihood" or "uncertainty".
-        name: "exact", "harmonic(100)", "compressed(1e-3)", "psis", ...
-        error: against the kind's reference; see `Tradeoff`.
-        seconds: of one evaluation (of one walker in a batch), or of one effective draw of the mean force.
-        ratio: `seconds` over those of the exact level.
-        gradient_seconds: of one gradient; None: it has none.
-        compile_seconds: before the first evaluation, beyond its time.
-        memory: bytes that an evaluation takes, or that the draws do; None: not known.
-        dominated_by: a level that is off by no more and costs no more, one of both less; "": it is on the front.
-        details: figures of its own.
-    """
+    """One level as measured."""
 
     kind: Kind
-    name: str
-    error: float
-    seconds: float
-    ratio: float
-    gradient_seconds: float | None
-    compile_seconds: float
-    memory: int | None
-    dominated_by: str
-    details: dict[str, Any]
+    name: str  # "exact", "harmonic(100)", "compressed(1e-3)", "psis", ...
+    error: float  # against the kind's reference; see `Tradeoff`
+    seconds: float  # of one evaluation (of one walker in a batch), or of one effective draw of the mean force
+    ratio: float  # `seconds` over those of the exact level
+    gradient_seconds: float | None  # of one gradient; None: it has none
+    compile_seconds: float  # before the first evaluation, beyond its time
+    memory: int | None  # bytes that an evaluation takes, or that the draws do; None: not known
+    dominated_by: str  # a level that is off by no more and costs no more, one of both less; "": it is on the front
+    details: dict[str, Any]  # figures of its own
 
     @property
     def cells(self) -> tuple[str, ...]:
