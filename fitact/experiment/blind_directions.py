@@ -20,19 +20,7 @@ from fitact.errors import InputError
 from fitact.model.circuit import Channel, Circuit
 from fitact.model.skin import circuit_parameters, constant_skin_circuit, with_values
 
-
-@dataclasses.dataclass(frozen=True)
-class NullSpaceSettings:
-    """Where the gains' derivatives are taken, and which of their directions count as without effect."""
-
-    points: int = 8  # at random, beside the circuit as given, which may be special: two equal skins
-    spread: float = math.log(10.0)  # how far they lie from it, in logs
-    alpha_spread: float = 0.1  # likewise of a fractional skin's exponent, which 1 bounds
-    frequencies: int = 128
-    frequency_margin: float = 100.0  # the frequencies reach so many times beyond the circuit's own, at both ends
-    rounding: float = 1e-11  # of the largest singular value: what rounding leaves is 1e-15, what is real above 1e-5,
-    gap: float = 1e-3  # if they lie so far below the others; without that gap nothing is called structural
-    same_direction: float = 1e-6  # sine of the angle between directions that count as one
+_MIN_SINE = 1e-6  # of the angle between directions, below which they count as one
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,32 +54,28 @@ class StructuralIdentifiability:
 
 
 def blind_directions(
-    circuit: Circuit,
-    free: Sequence[str],
-    channels: Sequence[Channel],
-    settings: NullSpaceSettings = NullSpaceSettings(),
+    circuit: Circuit, free: Sequence[str], channels: Sequence[Channel], points: int = 8
 ) -> StructuralIdentifiability:
     """The directions in the logarithms of `free` that no record of `channels` can see.
 
     `free` names fields of the circuit, "gain" (of the channel Vsc) and "gain_I"; all else is known. A direction
-    counts if it is blind at the circuit's values and at others around it, each up to a factor of 10 away.
+    counts if it is blind at the circuit's values, which may be special (two equal skins), and at `points` at random
+    around it, each up to a factor of 10 away.
     """
     free, channels = tuple(free), tuple(channels)
-    nominal = log_values(circuit, free, channels)
-    spread = np.array([settings.alpha_spread if name == "alpha" else settings.spread for name in free])
-    offsets = spread * np.random.default_rng(0).uniform(-1.0, 1.0, (settings.points, len(free)))  # any points would do
-    points = nominal + np.vstack([np.zeros(len(free)), offsets])
+    spread = np.array([0.1 if name == "alpha" else math.log(10.0) for name in free])  # 1 bounds alpha
+    offsets = spread * np.random.default_rng(0).uniform(-1.0, 1.0, (points, len(free)))  # any points would do
+    thetas = log_values(circuit, free, channels) + np.vstack([np.zeros(len(free)), offsets])
     with jax.enable_x64(True):
-        sensitivities = _sensitivities(jax.tree.map(jnp.asarray, circuit), free, channels, points, settings)
-    null_spaces = [_null_space(sensitivity, settings) for sensitivity in sensitivities]
+        circuit = jax.tree.map(jnp.asarray, circuit)
+        slopes = np.asarray(_log_gain_slopes(circuit, jnp.asarray(thetas), free, channels))
+    null_spaces = [_null_space(np.concatenate([slope.real, slope.imag])) for slope in slopes]
     dimension = min(len(directions) for directions in null_spaces)
     generic = [directions for directions in null_spaces if len(directions) == dimension]
-    constant = dimension == 0 or all(
-        _subspace_distance(generic[0], other) < settings.same_direction for other in generic
-    )
+    constant = dimension == 0 or all(_subspace_distance(generic[0], other) < _MIN_SINE for other in generic)
     directions = _sparse_basis(generic[0])
     if "Ci" in free:
-        directions[directions[:, free.index("Ci")] < -settings.same_direction] *= -1.0
+        directions[directions[:, free.index("Ci")] < -_MIN_SINE] *= -1.0
     return StructuralIdentifiability(free, channels, directions, constant)
 
 
@@ -142,57 +126,47 @@ def _area_power(name: str) -> float:
     return 1.0 if name == "Ci" or name.endswith(("Csc", "capacitance", "Cgap")) else -1.0
 
 
-def _sensitivities(
-    circuit: Circuit,
-    free: tuple[str, ...],
-    channels: tuple[Channel, ...],
-    points: Float[np.ndarray, "n parameters"],
-    settings: NullSpaceSettings,
-) -> Float[np.ndarray, "n rows parameters"]:
-    """Derivatives of the logarithms of the channels' gains, at frequencies all around the circuit's own."""
-    tau = np.asarray(_time_constants(circuit, free, channels, jnp.asarray(points)))
-    margin = settings.frequency_margin
-    omega = np.geomspace(1.0 / (margin * tau.max(axis=1)), margin / tau.min(axis=1), settings.frequencies, axis=1)
-    slope = np.asarray(_log_gain_slopes(circuit, free, channels, jnp.asarray(points), jnp.asarray(omega)))
-    return np.concatenate([slope.real, slope.imag], axis=1)
-
-
-@eqx.filter_jit
-def _time_constants(circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], points: Array) -> Array:
-    def taus(theta: Array) -> Array:
-        return jnp.stack(constant_skin_circuit(with_parameters(circuit, free, channels, theta)[0]).terms().tau)
-
-    return jax.vmap(taus)(points)
-
-
 @eqx.filter_jit
 def _log_gain_slopes(
-    circuit: Circuit, free: tuple[str, ...], channels: tuple[Channel, ...], points: Array, omega: Array
+    circuit: Circuit,
+    thetas: Float[Array, "n parameters"],
+    free: tuple[str, ...],
+    channels: tuple[Channel, ...],
+    frequencies: int = 128,
+    margin: float = 100.0,
 ) -> Complex[Array, "n rows parameters"]:
-    def gain(theta: Array, omega: Array) -> tuple[Array, Array]:
-        there, gains = with_parameters(circuit, free, channels, theta)
-        value = jnp.concatenate(
-            [g * there.channel_gain(channel, omega) for g, channel in zip(gains, channels, strict=True)]
-        )
-        return value, value
+    """Derivatives of the channels' log gains, at frequencies `margin` times beyond the circuit's own at both ends."""
 
-    slope, value = jax.vmap(jax.jacfwd(gain, has_aux=True))(points, omega)
-    return slope / value[..., None]
+    def slopes(theta: Array) -> Array:
+        tau = jnp.stack(constant_skin_circuit(with_parameters(circuit, free, channels, theta)[0]).terms().tau)
+        omega = jnp.geomspace(1.0 / (margin * jnp.max(tau)), margin / jnp.min(tau), frequencies)
+
+        def gain(theta: Array) -> tuple[Array, Array]:
+            there, gains = with_parameters(circuit, free, channels, theta)
+            parts = [g * there.channel_gain(channel, omega) for g, channel in zip(gains, channels, strict=True)]
+            return jnp.concatenate(parts), jnp.concatenate(parts)
+
+        slope, value = jax.jacfwd(gain, has_aux=True)(theta)
+        return slope / value[:, None]
+
+    return jax.vmap(slopes)(thetas)
 
 
 def _null_space(
-    sensitivity: Float[np.ndarray, "rows parameters"], settings: NullSpaceSettings
+    sensitivity: Float[np.ndarray, "rows parameters"], rounding: float = 1e-11, gap: float = 1e-3
 ) -> Float[np.ndarray, "dimension parameters"]:
     """An orthonormal basis of the directions without effect.
 
-    The frequencies reach all corners of the circuit, so that even the smallest resistance has its effect at some;
-    what is left of the parameters' different sizes, the scaling to columns of one length takes out.
+    Of the largest singular value rounding leaves 1e-15, and what is real lies above 1e-5: those below `rounding` count
+    as 0 if they lie below `gap` times the others; without that gap nothing is called structural. The frequencies reach
+    all corners of the circuit, so that even the smallest resistance has its effect at some; what is left of the
+    parameters' different sizes, the scaling to columns of one length takes out.
     """
     scale = np.linalg.norm(sensitivity, axis=0)
     scale = np.where(scale > 0.0, scale, 1.0)
     _, sizes, directions = np.linalg.svd(sensitivity / scale, full_matrices=False)
-    null = sizes < settings.rounding * sizes[0]
-    if not null.any() or sizes[null].max() > settings.gap * sizes[~null].min():
+    null = sizes < rounding * sizes[0]
+    if not null.any() or sizes[null].max() > gap * sizes[~null].min():
         return np.zeros((0, scale.size))
     return np.linalg.qr((directions[null] / scale).T)[0].T
 

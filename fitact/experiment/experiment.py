@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 from jaxtyping import Float
 
 from fitact.experiment.fisher import FREQUENCY, Experiment, covariance_factor, jacobian
@@ -136,11 +137,8 @@ def joint_jacobian(
 
 def joint_prior_factor(experiments: Sequence[Experiment]) -> Float[np.ndarray, "parameters parameters"]:
     """A root of the prior's covariance; parameters of an experiment's own are independent of the others."""
-    first = experiments[0].prior_factor
-    own = [float(np.linalg.norm(e.prior_factor[e.free.index(name)])) for e in experiments for name in e.own_parameters]
-    root = np.diag([0.0] * len(first) + own)
-    root[: len(first), : len(first)] = first
-    return root
+    own = [np.linalg.norm(e.prior_factor[e.free.index(name)]) for e in experiments for name in e.own_parameters]
+    return scipy.linalg.block_diag(experiments[0].prior_factor, np.diag(own))
 
 
 def _apply_setting(e: Experiment, field: str, value: float, keep_phase: bool) -> Experiment:

@@ -37,10 +37,6 @@ class HighpassTerms(NamedTuple):
     tau: tuple[ArrayLike, ...] | Array  # s
     rate: ArrayLike | None = None  # s times the weight's unit; None: there is no such term
 
-    def are_many(self) -> bool:
-        """Whether they are looped over; few are written out one by one, which XLA fuses."""
-        return len(self.tau) > 8
-
     def stack(self) -> tuple[Array, Array]:
         """The weights, and the time constants, as arrays."""
         weight, tau = (

@@ -67,25 +67,13 @@ def mean_square(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Flo
 
 
 def _terms_mean_square(terms: HighpassTerms, drive: Drive) -> Float[Array, ""]:
-    """The mean square of what the terms put together."""
-    if terms.are_many():
-        weight, tau = terms.stack()
-        products = weight * jax.vmap(lambda t: highpass_mean_square(drive, t))(tau)
-        total = jnp.sum(2.0 * (weight[:, None] * tau[:, None] / (tau[:, None] + tau)) * products)
-        with_slope = jnp.sum(products / tau)
-    else:
-        pairs = list(zip(terms.weight, terms.tau, strict=True))
-        parts = [weight * highpass_mean_square(drive, tau) for weight, tau in pairs]
-        total = jnp.asarray(0.0)
-        for j, (weight, tau) in enumerate(pairs):
-            total = total + weight * parts[j]
-            for k, (other, other_tau) in enumerate(pairs[:j]):
-                both = tau + other_tau
-                total = total + 2.0 * (other * (other_tau / both) * parts[j] + weight * (tau / both) * parts[k])
-        with_slope = sum((part / tau for part, (_, tau) in zip(parts, pairs, strict=True)), jnp.zeros(()))
+    """The mean square of the terms' sum."""
+    weight, tau = terms.stack()
+    products = weight * jax.vmap(lambda t: highpass_mean_square(drive, t))(tau)
+    total = 2.0 * jnp.sum(weight[:, None] * (tau[:, None] / (tau[:, None] + tau)) * products)
     if terms.rate is None:
         return jnp.maximum(total, 0.0)  # terms of Vsc may cancel down to rounding
-    total = total + 2.0 * terms.rate * with_slope
+    total = total + 2.0 * terms.rate * jnp.sum(products / tau)
     return jnp.where(_has_impulses(drive, terms.rate), jnp.inf, total + terms.rate**2 * _slope_mean_square(drive))
 
 

@@ -273,16 +273,13 @@ def _pool_draws(posteriors: Sequence[Posterior]) -> dict[str, Float[np.ndarray, 
 
 def posterior_discrepancies(draws: dict[str, np.ndarray], reference: dict[str, np.ndarray]) -> dict[str, float]:
     """Return differences of mean, sd and quantiles, in standard deviations of the reference, by name."""
-    discrepancies = {}
-    for name, values in draws.items():
-        true = reference[name]
-        sd = float(np.std(true))
-        discrepancies[f"{name} mean"] = float(np.mean(values) - np.mean(true)) / sd
-        discrepancies[f"{name} sd"] = float(np.std(values)) / sd - 1.0
-        for q in (0.05, 0.5, 0.95):
-            difference = float(np.quantile(values, q) - np.quantile(true, q))
-            discrepancies[f"{name} q{round(100 * q):02}"] = difference / sd
-    return discrepancies
+    statistic: dict[str, Callable[[np.ndarray], Any]] = {"mean": np.mean, "sd": np.std}
+    statistic |= {f"q{round(100 * q):02}": functools.partial(np.quantile, q=q) for q in (0.05, 0.5, 0.95)}
+    return {
+        f"{name} {what}": float((compute(values) - compute(reference[name])) / np.std(reference[name]))
+        for name, values in draws.items()
+        for what, compute in statistic.items()
+    }
 
 
 def _summarize_runs(name: str, posteriors: Sequence[Posterior], discrepancies: dict[str, float]) -> BenchmarkResult:
