@@ -70,7 +70,9 @@ def _terms_mean_square(terms: HighpassTerms, drive: Drive) -> Float[Array, ""]:
     """The mean square of the terms' sum."""
     weight, tau = terms.stack()
     products = weight * jax.vmap(lambda t: highpass_mean_square(drive, t))(tau)
-    total = 2.0 * jnp.sum(weight[:, None] * (tau[:, None] / (tau[:, None] + tau)) * products)
+    # a term with itself: 1 / 2 to the last digit, and without a derivative
+    share = jnp.where(jnp.eye(tau.size, dtype=bool), 0.5, tau[:, None] / (tau[:, None] + tau))
+    total = 2.0 * jnp.sum(weight[:, None] * share * products)
     if terms.rate is None:
         return jnp.maximum(total, 0.0)  # terms of Vsc may cancel down to rounding
     total = total + 2.0 * terms.rate * jnp.sum(products / tau)

@@ -101,7 +101,7 @@ class CircuitResponses:
         with jax.enable_x64(precision is np.float64):
             circuit = scene.make_circuit(dict(values))
             # the skin's exponent may differ from circuit to circuit
-            skin = jax.tree.map(lambda x: pad(x)[:, None], circuit.skin) if isinstance(circuit, WithSkin) else None
+            skin = jax.tree.map(pad, circuit.skin) if isinstance(circuit, WithSkin) else None
             complete = jax.tree.map(pad, complete_circuit(scene.make_rc_circuit(dict(values))))
             weight, tau, harmonics = partial_fractions(complete, skin, drive, precision, channel)
             tau = np.maximum(tau, np.finfo(np.float32).tiny)  # single precision may lose that of an absent part

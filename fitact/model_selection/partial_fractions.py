@@ -11,16 +11,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Complex
 
-from fitact.model.circuit import RC, Channel, DirectGround, Element, FinalCircuit, NaturalGround, Probe
+from fitact.model.circuit import RC, Channel, DirectGround, FinalCircuit, NaturalGround, Probe
 from fitact.model.drive import Drive, Multitone, Periodic, Sine
 from fitact.model.harmonic import fourier_coefficients
 from fitact.model.skin import Fractional, SkinModel, WithSkin, high_frequency_basis
 
 ROWS = 128  # circuits side by side; fewer are filled up, so that each program is compiled once
 _BLOCK = 64  # frequencies in one program
+
+_fourier_coefficients = eqx.filter_jit(fourier_coefficients)
+_circuit_at_frequency = eqx.filter_jit(WithSkin.circuit_at_frequency)
 
 
 def complete_circuit(circuit: RC) -> DirectGround | NaturalGround:
@@ -50,7 +52,7 @@ def partial_fractions(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return weights, time constants, and amplitudes of the harmonics that they miss, each of `ROWS` circuits.
 
-    The gain at the harmonics is NumPy: a vmapped `harmonic_decomposition` takes 3 to 12 times as long to compile.
+    Gains are computed in blocks: a vmapped `harmonic_decomposition` takes 3 to 12 times as long to compile.
     """
     if skin is None:
         weight, tau = _constant_skin_terms(circuit, channel)
@@ -64,7 +66,7 @@ def partial_fractions(
         count = max(1, skin.harmonic_count(frequency))
     omega = 2.0 * np.pi * frequency * np.arange(1, count + 1)
     with jax.enable_x64(True):  # the drive's, whatever the precision of what follows
-        amplitude = np.asarray(_fourier(jax.tree.map(np.asarray, drive), _block_count(count) * _BLOCK))[:count]
+        amplitude = np.asarray(_fourier_coefficients(jax.tree.map(np.asarray, drive), count + -count % _BLOCK))[:count]
     gain = _transfer_function(circuit, skin, omega, channel)
     if smooth:
         return np.zeros((ROWS, 0)), np.zeros((ROWS, 0)), amplitude * gain
@@ -74,7 +76,7 @@ def partial_fractions(
         weight = np.concatenate([above.real, above.imag], axis=1) @ fitted.T
         tau = np.broadcast_to(tau / omega[-1], weight.shape)
     else:  # above 1000 Hz it is constant
-        weight, tau = _constant_skin_terms(_evaluate_circuit(WithSkin(circuit, skin), 1000.0), channel)
+        weight, tau = _constant_skin_terms(_circuit_at_frequency(WithSkin(circuit, skin), 1000.0), channel)
     x = 1j * omega * tau[..., None]
     return weight, tau, amplitude * (gain - np.einsum("rk,rkh->rh", weight, x / (1.0 + x)))
 
@@ -83,50 +85,16 @@ def _transfer_function(
     circuit: DirectGround | NaturalGround, skin: SkinModel, omega: np.ndarray, channel: Channel
 ) -> np.ndarray:
     """Vsc / V, or Vgap / V, of circuits whose skins follow a level."""
-    s = 1j * omega
-
-    def admittance(element: Element) -> np.ndarray:
-        R, C = (np.atleast_2d(np.asarray(x).T).T for x in element)
-        return 1.0 / R + s * C
-
-    def skin_admittance(R: ArrayLike, C: ArrayLike) -> np.ndarray:
-        missing = _block_count(omega.size) * _BLOCK - omega.size
-        blocks = np.pad(omega / (2.0 * np.pi), (0, missing), mode="edge").reshape(-1, _BLOCK)
-        constant = Element(*(jnp.asarray(x)[:, None] for x in (R, C)))
-        parts = [_evaluate_skin(skin, constant, block) for block in blocks]
-        return admittance(Element(*(np.concatenate(x, axis=1)[:, : omega.size] for x in zip(*parts, strict=True))))
-
-    assert circuit.probe is not None
-    touching = 1.0 / (skin_admittance(circuit.Rsc, circuit.Csc) + admittance(Element(circuit.probe.R, circuit.probe.C)))
-    if isinstance(circuit, NaturalGround):
-        other = 1.0 / admittance(Element(circuit.Z, circuit.Z_capacitance))
-    else:
-        other = 1.0 / skin_admittance(circuit.grounding_Rsc, circuit.grounding_Csc)
-    gap: Any = 0.0
-    if circuit.Cgap is not None:
-        gap = 1.0 / admittance(Element(np.inf if circuit.Rgap is None else circuit.Rgap, circuit.Cgap))
-    rest = np.asarray(circuit.resistance())[:, None] + 1.0 / (s * np.asarray(circuit.Ci)[:, None])
-    return (touching if channel == "Vsc" else gap) / (touching + other + rest + gap)
+    blocks = np.pad(omega, (0, -omega.size % _BLOCK), mode="edge").reshape(-1, _BLOCK)
+    with jax.enable_x64(True):  # for any precision, so that one program serves
+        circuits = jax.tree.map(np.float64, WithSkin(circuit, skin))
+        parts = [np.asarray(_channel_gain(circuits, block, channel)) for block in blocks]
+    return np.concatenate(parts, axis=1)[:, : omega.size]
 
 
-def _block_count(count: int) -> int:
-    """In how many blocks frequencies are computed, so that programs are compiled for one size."""
-    return -(-count // _BLOCK)
-
-
-@eqx.filter_jit
-def _fourier(drive: Drive, harmonics: int) -> Complex[Array, " harmonics"]:
-    return fourier_coefficients(drive, harmonics)
-
-
-@eqx.filter_jit
-def _evaluate_skin(skin: SkinModel, element: Element, frequency: Array) -> Element:
-    return skin.parallel_rc(element, frequency)
-
-
-@eqx.filter_jit
-def _evaluate_circuit(circuit: WithSkin, frequency: float) -> Any:
-    return circuit.circuit_at_frequency(frequency)
+@functools.partial(jax.jit, static_argnums=2)
+def _channel_gain(circuits: WithSkin, omega: Array, channel: Channel) -> Complex[Array, "circuits frequencies"]:
+    return jax.vmap(lambda circuit: circuit.channel_gain(channel, omega))(circuits)
 
 
 def _constant_skin_terms(circuit: Any, channel: Channel) -> tuple[np.ndarray, np.ndarray]:
