@@ -169,11 +169,9 @@ def particular_solution(
     coefficients: Float[Array, "degree pieces"], z: Float[Array, ""]
 ) -> tuple[Float[Array, "degree+1 pieces"], Float[Array, " pieces"]]:
     """p(s), lowest coefficient first, and p(1), for v = sum_n coefficients[n - 1] s^n on each piece."""
-    degree = coefficients.shape[0]
-    slopes = coefficients * jnp.arange(1.0, degree + 1.0)[:, None]  # of v', from s^0
-    zero = jnp.zeros_like(slopes[0])
-    near, far = jnp.minimum(z, 1.0), jnp.maximum(z, 1.0)
-    order = jnp.arange(1.0, degree + 1.0)
+    order = jnp.arange(1.0, coefficients.shape[0] + 1.0)
+    slopes = coefficients * order[:, None]  # of v', from s^0
+    zero, near, far = jnp.zeros_like(slopes[0]), jnp.minimum(z, 1.0), jnp.maximum(z, 1.0)
 
     def ascend(below: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
         n, slope = step

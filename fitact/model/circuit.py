@@ -318,9 +318,9 @@ class Probe(eqx.Module):
     R: ArrayLike
     C: ArrayLike
 
-    def load_skin(self, skin: Element) -> Element:
-        """The skin with the probe in parallel."""
-        return Element(1.0 / (1.0 / jnp.asarray(skin.R) + 1.0 / self.R), skin.C + jnp.asarray(self.C))
+    def load_skin(self, circuit: Loop) -> Element:
+        """The circuit's touching skin with the probe in parallel."""
+        return Element(1.0 / (1.0 / jnp.asarray(circuit.Rsc) + 1.0 / self.R), circuit.Csc + jnp.asarray(self.C))
 
 
 class DirectGround(Loop):
@@ -354,7 +354,7 @@ class DirectGround(Loop):
             self.Rsc if self.grounding_Rsc is None else self.grounding_Rsc,
             self.Csc if self.grounding_Csc is None else self.grounding_Csc,
         )
-        return _with_probe_load(Element(self.Rsc, self.Csc), self.probe), grounding
+        return Element(self.Rsc, self.Csc) if self.probe is None else self.probe.load_skin(self), grounding
 
 
 class NaturalGround(Loop):
@@ -381,15 +381,11 @@ class NaturalGround(Loop):
 
     def body(self) -> tuple[Element, ...]:
         """The touching skin (with the probe), and Z where it has a capacitance."""
-        touching = _with_probe_load(Element(self.Rsc, self.Csc), self.probe)
+        touching = Element(self.Rsc, self.Csc) if self.probe is None else self.probe.load_skin(self)
         return (touching,) if self.Z_capacitance is None else (touching, Element(self.Z, self.Z_capacitance))
 
 
 RC: TypeAlias = FinalCircuit | DirectGround | NaturalGround  # those with constant skins, which can be fitted
-
-
-def _with_probe_load(skin: Element, probe: Probe | None) -> Element:
-    return skin if probe is None else probe.load_skin(skin)
 
 
 def _series_resistance(*resistances: ArrayLike | None) -> ArrayLike | None:

@@ -20,7 +20,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
 from fitact.errors import InputError
-from fitact.model.circuit import RC, Channel, Circuit, Element, HighpassTerms, Loop
+from fitact.model.circuit import RC, Channel, Circuit, DirectGround, Element, HighpassTerms, Loop
 
 # section 3.1 of the paper, where Rsc, Csc are those at 100 Hz
 _FREQUENCY = np.array([10.0, 100.0, 1000.0])  # Hz
@@ -225,14 +225,12 @@ class WithSkin(Circuit):
 
     def circuit_at_frequency(self, frequency: ArrayLike) -> Circuit:
         """The circuit with R(f), C(f) of `frequency` (Hz), which at this frequency is this one."""
-        touching = Element(self.circuit.Rsc, self.circuit.Csc)
-        skin = self.skin.parallel_rc(touching, frequency)
+        skin = self.skin.parallel_rc(Element(self.circuit.Rsc, self.circuit.Csc), frequency)
         changed = {"Rsc": skin.R, "Csc": skin.C}
-        stated = [getattr(self.circuit, f"grounding_{name}", None) for name in ("Rsc", "Csc")]
-        if any(value is not None for value in stated):
-            R, C = (other if value is None else value for value, other in zip(stated, touching, strict=True))
-            grounding = self.skin.parallel_rc(Element(R, C), frequency)
-            changed |= {"grounding_Rsc": grounding.R, "grounding_Csc": grounding.C}
+        if isinstance(self.circuit, DirectGround):
+            _, grounding = self.circuit.body()
+            skin = self.skin.parallel_rc(grounding, frequency)
+            changed |= {"grounding_Rsc": skin.R, "grounding_Csc": skin.C}
         return dataclasses.replace(self.circuit, **changed)
 
     def channel_terms(self, channel: Channel) -> HighpassTerms:
