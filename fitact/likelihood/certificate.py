@@ -1,4 +1,4 @@
-"""When traces' compressions may stand for their samples: built before the fit, certified after it."""
+"""When channels' compressions may stand for their samples: built before the fit, certified after it."""
 
 import dataclasses
 from collections.abc import Callable
@@ -26,23 +26,18 @@ FEW_ROWS = 200  # numbers that an evaluation runs over, up to which the call cos
 
 
 class CertifiedLikelihood(NamedTuple):
-    """A likelihood to sample from.
+    """A likelihood to sample from."""
 
-    Attributes:
-        likelihood: with the compressions that hold.
-        error: largest error of the compressed log-likelihood near the optimum; None: some samples are summed.
-        reasons: why those of each trace are, as a clause; "" where they are not.
-    """
-
-    likelihood: Likelihood
+    likelihood: Likelihood  # with the compressions that hold
+    # largest error of the compressed log-likelihood near the optimum; None: some samples are summed
     error: float | None
-    reasons: tuple[str, ...]
+    reasons: tuple[str, ...]  # why those of each channel are, as a clause; "" where they are not
 
 
 def compress_channel(
     channel: ChannelLikelihood, circuit: Circuit, tau_identified: bool, tolerance: float
 ) -> tuple[ChannelLikelihood, str]:
-    """The trace with its record's compression, or as it is and the reason why.
+    """The channel with its record's compression, or as it is and the reason why.
 
     `circuit` nearly made it, and `tau_identified` says whether the record shows it.
     """
@@ -94,30 +89,29 @@ def certify(
     reasons: tuple[str, ...],
     theta: np.ndarray,
     covariance_factor: np.ndarray,
-    sigma: Float[np.ndarray, " traces"],
+    sigma: Float[np.ndarray, " channels"],
     tolerance: float,
     check_points: int = 8,
 ) -> CertifiedLikelihood:
     """The likelihood for sampling around the optimum `theta`, checked against the full sum.
 
-    `covariance_factor` is the root of theta's covariance. Each trace's compressed log-likelihood must agree to
+    `covariance_factor` is the root of theta's covariance. Each channel's compressed log-likelihood must agree to
     `tolerance` over their number at the optimum and `check_points` around it, and at as many points of the prior to a
     part in a million of how far they lie below it.
     """
-    free = (tuple(np.flatnonzero(np.asarray(trace.linear_sd)).tolist()) for trace in likelihood.channels)
+    free = [tuple(np.flatnonzero(np.asarray(channel.linear_sd)).tolist()) for channel in likelihood.channels]
+    pairs = zip(likelihood.channels, free, strict=True)
     likelihood = dataclasses.replace(
-        likelihood,
-        channels=tuple(dataclasses.replace(t, columns=c) for t, c in zip(likelihood.channels, free, strict=True)),
+        likelihood, channels=tuple(dataclasses.replace(channel, columns=columns) for channel, columns in pairs)
     )
-    if all(trace.compression is None for trace in likelihood.channels):
+    if all(channel.compression is None for channel in likelihood.channels):
         return CertifiedLikelihood(likelihood, None, tuple(r or _TIMING_REASON for r in reasons))
     light, optimum = likelihood.without_samples(), jnp.asarray(theta)
     log_b, slope = _log_b_and_slope(light, optimum)
     reach = float(table_half_width(np.linalg.norm(np.asarray(slope) @ covariance_factor)))
-    near = tuple(
-        _restrict_table(trace, inputs, float(log_b), reach, float(table_precision(noise, tolerance)))
-        for (trace, inputs), noise in zip(likelihood.channels_and_inputs(optimum), sigma, strict=True)
-    )
+    precisions = table_precision(sigma, tolerance).tolist()
+    optimal = zip(likelihood.channels_and_inputs(optimum), precisions, strict=True)
+    near = tuple(_restrict_table(*pair, float(log_b), reach, precision) for pair, precision in optimal)
     deviates = np.random.default_rng(0).standard_normal((check_points, theta.size))  # any will do
     around = np.vstack([theta, theta + 1.5 * deviates @ covariance_factor.T])
     points = np.vstack([around, _prior_points(light, theta, check_points)])
@@ -128,16 +122,12 @@ def certify(
     errors = np.max(np.abs(compressed - exact)[: len(around)], axis=0)
     # far from the optimum an error may grow with the distance below it, in log-likelihood
     excesses = np.nanmax(np.abs(tabulated - exact) - 1e-6 * np.abs(exact[0] - exact), axis=0, initial=-np.inf)
-    reasons = tuple(
-        reason
-        or (_TIMING_REASON if trace.compression is None else _compression_failure(error, excess, tolerance / len(near)))
-        for reason, trace, error, excess in zip(reasons, near, errors, excesses, strict=True)
-    )
-    channels = tuple(
-        trace.without_compression() if reason else trace for trace, reason in zip(near, reasons, strict=True)
-    )
-    error = None if any(reasons) else float(np.sum(errors))
-    return CertifiedLikelihood(dataclasses.replace(likelihood, channels=channels), error, reasons)
+    found = []
+    for i, channel in enumerate(near):
+        failure = _compression_failure(errors[i], excesses[i], tolerance / len(near))
+        found.append(reasons[i] or (_TIMING_REASON if channel.compression is None else failure))
+        likelihood = likelihood.replace_channel(i, channel.without_compression() if found[i] else channel)
+    return CertifiedLikelihood(likelihood, None if any(found) else float(np.sum(errors)), tuple(found))
 
 
 def table_half_width(
@@ -153,7 +143,7 @@ def table_precision(noise: ArrayLike, tolerance: float = TOLERANCE) -> Float[np.
 
 
 def _compression_failure(error: float, excess: float, tolerance: float) -> str:
-    """The case against the compression of a trace, by errors near the optimum and within the prior; "" if none."""
+    """The case against the compression of a channel, by errors near the optimum and within the prior; "" if none."""
     if np.isnan(error):
         return "the record leaves its time constant more open than the table is wide"
     if not error <= tolerance:
@@ -165,15 +155,14 @@ def _prior_points(likelihood: Likelihood, theta: np.ndarray, count: int) -> Floa
     """Points of the prior that the tables reach, the optimum where there are too few."""
     draws = likelihood.sample_prior(theta, 1000)
     tau = jnp.exp(_log_b_at_points(likelihood, jnp.asarray(draws)))
-    covered = [trace.compression.covers(tau) for trace in likelihood.channels if trace.compression is not None]
-    draws = draws[np.all(covered, axis=0)]
-    return np.vstack([draws, np.tile(theta, (count, 1))])[:count]
+    covered = [channel.compression.covers(tau) for channel in likelihood.channels if channel.compression is not None]
+    return np.vstack([draws[np.all(covered, axis=0)], np.tile(theta, (count, 1))])[:count]
 
 
 def _evaluate_log_likelihoods(
     likelihood: Likelihood, theta: Float[np.ndarray, "n parameters"], sigma: np.ndarray
 ) -> np.ndarray:
-    """Log-likelihoods of each trace at points of one sigma, (n, traces)."""
+    """Log-likelihoods of each channel at points of one sigma, (n, channels)."""
     points = np.column_stack([theta, np.tile(np.log(sigma), (len(theta), 1))])
     evaluate = BatchEvaluator(Likelihood.log_likelihoods, likelihood, likelihood.rows)
     return evaluate(points, description="checking the compression")
@@ -191,10 +180,9 @@ def batched_log_prob(likelihood: Likelihood, walkers: int) -> Callable[[np.ndarr
     summed = BatchEvaluator(Likelihood.log_prob, full, full.rows, batch=1)
 
     def values(points: Float[np.ndarray, "n coordinates"]) -> np.ndarray:
-        log_prob = tabulated(points)
+        log_prob = np.array(tabulated(points))
         beyond = np.isnan(log_prob)
         if beyond.any():
-            log_prob = np.array(log_prob)
             log_prob[beyond] = summed(points[beyond])
         return log_prob
 
@@ -212,25 +200,18 @@ def _restrict_table(
     if not isinstance(table, Compression) or not table.covers(np.exp(center)):
         return channel
     largest = float(jnp.sum(jnp.abs(jnp.stack(inputs.circuit.channel_terms(channel.channel).weight))) * inputs.gain)
-    charge = (
-        float(np.ptp(channel.observed)) / largest if max(channel.columns, default=0) >= len(BASELINE_NAMES) else 0.0
-    )
+    has_charge = max(channel.columns, default=0) >= len(BASELINE_NAMES)
+    charge = float(np.ptp(channel.observed)) / largest if has_charge else 0.0
     low, high = (float(table.center + side * table.half_width) for side in (-1.0, 1.0))
     low, high = max(center - half_width, low), min(center + half_width, high)
     narrow = table.restrict(0.5 * (low + high), 0.5 * (high - low), error / largest, charge=charge)
     return dataclasses.replace(channel, compression=narrow)
 
 
-@eqx.filter_jit
-def _log_b_and_slope(likelihood: Likelihood, theta: Array) -> tuple[Array, Array]:
-    return jax.value_and_grad(_log_b, argnums=1)(likelihood, theta)
-
-
-@eqx.filter_jit
-def _log_b_at_points(likelihood: Likelihood, theta: Float[Array, "n parameters"]) -> Float[Array, " n"]:
-    return jax.vmap(lambda each: _log_b(likelihood, each))(theta)
-
-
 def _log_b(likelihood: Likelihood, theta: Array) -> Array:
     """Logarithm of the slowest time constant, s."""
     return jnp.log(likelihood.circuit(theta).b)
+
+
+_log_b_and_slope = eqx.filter_jit(jax.value_and_grad(_log_b, argnums=1))
+_log_b_at_points = eqx.filter_jit(jax.vmap(_log_b, in_axes=(None, 0)))

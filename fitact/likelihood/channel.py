@@ -1,6 +1,6 @@
 """One channel of one record, against a circuit: noise, with the linear nuisances integrated out.
 
-The trace is  gain * response(t - delay) + A beta + noise,  where t runs by the drive's clock.
+The channel is  gain * response(t - delay) + A beta + noise,  where t runs by the drive's clock.
 The columns of A are an offset, a drift, mains hum and, for a measured drive, the decays of the unknown charges at
 the first sample. Their coefficients have wide normal priors and are integrated out exactly.
 
@@ -33,70 +33,46 @@ TIMING_NUISANCES = ("delay", "clock")
 
 
 class ChannelInputs(eqx.Module):
-    """What a trace needs of the parameters.
+    """What a channel needs of the parameters."""
 
-    Attributes:
-        circuit: at the parameters.
-        gain: of the channel.
-        delay: beyond the trace's `shift`, s.
-        clock: by what share the drive is faster than stated, by the recorder's clock; beyond the trace's own.
-    """
-
-    circuit: Circuit
-    gain: ArrayLike = 1.0
-    delay: ArrayLike = 0.0
+    circuit: Circuit  # at the parameters
+    gain: ArrayLike = 1.0  # of the channel
+    delay: ArrayLike = 0.0  # beyond the channel's `shift`, s
+    # by what share the drive is faster than stated, by the recorder's clock; beyond the channel's own
     clock: ArrayLike = 0.0
 
 
 class ChannelLikelihood(eqx.Module):
-    """One channel of one record, and what drives it, filled up as `fitact.compiled` does.
+    """One channel of one record, and what drives it, filled up as `fitact.compiled` does."""
 
-    Attributes:
-        time: s.
-        observed: V or A.
-        weight: of each sample: the inverse of its noise's standard deviation relative to the trace's; 0 leaves it
-            out. None: all are 1.
-        whitening: of coloured noise; None: the noise is white.
-        noise_floor: below which its standard deviation is not believed, in the channel's unit.
-        rate: dV/dt at the samples, V/s, for a current that follows it.
-        drive: what drives the circuit.
-        linear_sd: prior standard deviations of the `LINEAR_NUISANCES` nuisances, in the channel's unit (drift: over
-            half the record); 0 leaves one out.
-        shift: the drive starts this much later than the record's t = 0, s.
-        clock: by what share it is faster than stated.
-        time_step: s.
-        timing_sd: prior standard deviations of `TIMING_NUISANCES`, in time steps; a clock's are those in half a record.
-        compression: the record's projection; None: the samples are summed.
-        label: "" or what tells it from the other traces, as "I_2".
-        channel: "Vsc" or "I".
-        steady_state: or from rest.
-        timing: which of `TIMING_NUISANCES` are parameters, in that order.
-        noise: its model.
-        columns: which of `LINEAR_NUISANCES` are looked at; the others' linear_sd is 0.
-    """
-
-    time: Float[Array, " samples"]
-    observed: Float[Array, " samples"]
+    time: Float[Array, " samples"]  # s
+    observed: Float[Array, " samples"]  # V or A
+    # of each sample: the inverse of its noise's standard deviation relative to the channel's; 0 leaves it out.
+    # None: all are 1
     weight: Float[Array, " samples"] | None
-    whitening: Whitening | None
-    noise_floor: ArrayLike
-    rate: Float[Array, " samples"] | None
-    drive: Drive
+    whitening: Whitening | None  # of coloured noise; None: the noise is white
+    noise_floor: ArrayLike  # below which its standard deviation is not believed, in the channel's unit
+    rate: Float[Array, " samples"] | None  # dV/dt at the samples, V/s, for a current that follows it
+    drive: Drive  # what drives the circuit
+    # prior standard deviations of the `LINEAR_NUISANCES` nuisances, in the channel's unit (drift: over half the
+    # record); 0 leaves one out
     linear_sd: Float[Array, " 10"]
-    shift: ArrayLike
-    clock: ArrayLike
-    time_step: ArrayLike
+    shift: ArrayLike  # the drive starts this much later than the record's t = 0, s
+    clock: ArrayLike  # by what share it is faster than stated
+    time_step: ArrayLike  # s
+    # prior standard deviations of `TIMING_NUISANCES`, in time steps; a clock's are those in half a record
     timing_sd: Float[Array, "2"]
-    compression: Compression | GridCompression | None
-    label: str = eqx.field(static=True)
-    channel: Channel = eqx.field(static=True)
-    steady_state: bool = eqx.field(static=True)
-    timing: tuple[str, ...] = eqx.field(static=True)
-    noise: NoiseModel = eqx.field(static=True)
+    compression: Compression | GridCompression | None  # the record's projection; None: the samples are summed
+    label: str = eqx.field(static=True)  # "" or what tells it from the other channels, as "I_2"
+    channel: Channel = eqx.field(static=True)  # "Vsc" or "I"
+    steady_state: bool = eqx.field(static=True)  # or from rest
+    timing: tuple[str, ...] = eqx.field(static=True)  # which of `TIMING_NUISANCES` are parameters, in that order
+    noise: NoiseModel = eqx.field(static=True)  # its model
+    # which of `LINEAR_NUISANCES` are looked at; the others' linear_sd is 0
     columns: tuple[int, ...] = eqx.field(static=True)
 
     def qualified_name(self, name: str) -> str:
-        """A nuisance's name, with the trace's label where there are several traces."""
+        """A nuisance's name, with the channel's label where there are several channels."""
         return f"{name}_{self.label}" if self.label else name
 
     def timing_unit(self, name: str) -> ArrayLike:
@@ -152,7 +128,7 @@ class ChannelLikelihood(eqx.Module):
         """The channel as recorded, but for linear nuisances and noise; `extra_delay` (s) delays it further."""
         undelayed = not self.timing and isinstance(extra_delay, float) and extra_delay == 0.0
         if undelayed and isinstance(self.drive, Sampled) and self.drive.period is None:
-            time = self.drive.time  # V's samples, which are the trace's: `highpass` knows u there without a search
+            time = self.drive.time  # V's samples, which are the channel's: `highpass` knows u there without a search
         else:
             time = self.time - (self.shift + inputs.delay + extra_delay)
         if "clock" in self.timing:
@@ -181,7 +157,7 @@ class ChannelLikelihood(eqx.Module):
         return np.array(self.columns, dtype=int)
 
     def residuals_and_shapes(self, inputs: ChannelInputs) -> tuple[Float[Array, " rows"], Float[Array, "columns rows"]]:
-        """The trace less the signal, and the shapes of the `columns`, weighted, over samples or coordinates."""
+        """The channel less the signal, and the shapes of the `columns`, weighted, over samples or coordinates."""
         if self.compression is None:
             remainder, shapes = self.observed - self.signal(inputs), self.shapes(inputs)[self._column_indices]
             return self.apply_whitening(remainder), self.apply_whitening(shapes)
@@ -213,7 +189,7 @@ class ChannelLikelihood(eqx.Module):
     def fit_nuisances(
         self, inputs: ChannelInputs, sigma: ArrayLike
     ) -> tuple[Float[Array, " rows"], Float[Array, " columns"], Float[Array, "columns columns"]]:
-        """What is left of the trace, and the nuisances' posterior given all else.
+        """What is left of the channel, and the nuisances' posterior given all else.
 
         Gives the remainder (weighted) after the best nuisances, their coefficients in prior standard
         deviations, and the Cholesky factor of their posterior precision.

@@ -46,27 +46,18 @@ class Compression(eqx.Module):
     """A record in the coordinates of its response table.
 
     A vector of `rows` coordinates stands for one value a sample; lengths and angles are those over all samples.
-
-    Attributes:
-        center, half_width: the table holds log tau within `half_width` of `center` (tau in s).
-        signal: Chebyshev coefficients in log tau of the response to the drive (V), rows below its rank being 0.
-        decay: those of the decay of an unknown charge from 1 V.
-        baseline: the shapes of `BASELINE_NAMES`, of height 1.
-        rate: dV/dt, V/s, where the channel follows it, else 0.
-        slope: dV/dt, V/s, over two samples, so that a jump shows on both sides of it.
-        observed: the record, V or A.
-        samples: how many there are.
     """
 
-    center: Float[Array, ""]
+    center: Float[Array, ""]  # the table holds log tau within `half_width` of `center` (tau in s)
     half_width: Float[Array, ""]
+    # Chebyshev coefficients in log tau of the response to the drive (V), rows below its rank being 0
     signal: Float[Array, "rank terms"]
-    decay: Float[Array, "rows terms"]
-    baseline: Float[Array, "shapes rows"]
-    rate: Float[Array, " rows"]
-    slope: Float[Array, " rows"]
-    observed: Float[Array, " rows"]
-    samples: Float[Array, ""]
+    decay: Float[Array, "rows terms"]  # those of the decay of an unknown charge from 1 V
+    baseline: Float[Array, "shapes rows"]  # the shapes of `BASELINE_NAMES`, of height 1
+    rate: Float[Array, " rows"]  # dV/dt, V/s, where the channel follows it, else 0
+    slope: Float[Array, " rows"]  # dV/dt, V/s, over two samples, so that a jump shows on both sides of it
+    observed: Float[Array, " rows"]  # the record, V or A
+    samples: Float[Array, ""]  # how many there are
 
     def covers(self, tau: Array) -> Array:
         """Whether the table reaches the time constant (s)."""
@@ -143,18 +134,14 @@ def compress(
     One pass over the arrays, a chunk at a time (so they may be `numpy.memmap`); where a steady drive repeats on
     the record's own sampling grid, its periods are folded first, exactly. Call it in double precision.
 
-    Args:
-        drive: as in `fitact.response`; a `Sampled` one has the record's own times, and may be filled up.
-        time: s.
-        observed: Vsc or I, V or A.
-        steady_state: as in `fitact.response`.
-        expected_terms: one term whose response is near the record; it is taken off before and added after, so that the
-            record's noise keeps its digits.
-        weight: of the samples: what multiplies their differences from a model; 0 leaves one out. None: 1.
-        rate: dV/dt, V/s, for a channel that follows it.
+    A `Sampled` drive has the record's own times, and may be filled up. `expected_terms` is one term whose response is
+    near the record; it is taken off before and added after, so that the record's noise keeps its digits. `weight` is
+    what multiplies the samples' differences from a model (0 leaves one out; None: 1), `rate` dV/dt (V/s) for a channel
+    that follows it.
     """
     table = _ResponseTable.from_terms(expected_terms, time)
-    samples = _Samples(time, observed, weight, rate)
+    squares = np.broadcast_to(1.0 if weight is None else np.square(weight), time.size)
+    samples = _Samples(time, observed, squares, np.broadcast_to(0.0 if rate is None else rate, time.size))
     if isinstance(drive, Sampled):
         parts = _accumulate_measured(table, drive, samples)
     else:
@@ -163,9 +150,8 @@ def compress(
             parts = _accumulate_directly(table, drive, samples, steady_state)
         else:
             parts = _accumulate_folded(table, drive, samples, period)
-    count = time.size if weight is None else int(np.count_nonzero(weight))
     parts = track_progress(parts, "compressing the record", math.ceil(time.size / _chunk_length(time.size)))
-    return _assemble(table, sum(parts, np.zeros(())), isinstance(drive, Sampled), count)
+    return _assemble(table, sum(parts, np.zeros(())), isinstance(drive, Sampled), int(np.count_nonzero(squares)))
 
 
 class _ResponseTable(eqx.Module):
@@ -224,24 +210,20 @@ _baseline_functions = jax.jit(baseline_functions)
 
 
 class _Samples(NamedTuple):
-    """Arrays over the samples, which may be on disk."""
+    """Arrays over the samples, which may be on disk, or a chunk of them."""
 
     time: np.ndarray
     observed: np.ndarray
-    weight: np.ndarray | None
-    rate: np.ndarray | None
+    weight: np.ndarray  # of squares
+    rate: np.ndarray  # dV/dt
 
 
-def _chunks(samples: _Samples, length: int) -> Iterator[tuple[np.ndarray, ...]]:
-    """Times, record, squared weights and dV/dt of `length` samples at a time; the last are filled up with weight 0."""
-    time, observed, weight, rate = samples
-    for first in range(0, time.size, length):
-        part = slice(first, first + length)
-        t = np.asarray(time[part])
-        missing = (0, length - t.size)
-        w = np.ones(t.size) if weight is None else np.asarray(weight[part]) ** 2
-        slope = np.zeros(t.size) if rate is None else np.asarray(rate[part])
-        yield np.pad(t, missing, mode="edge"), *(np.pad(x, missing) for x in (np.asarray(observed[part]), w, slope))
+def _chunks(samples: _Samples, length: int) -> Iterator[_Samples]:
+    """`length` samples at a time; the last are filled up with weight 0."""
+    for first in range(0, samples.time.size, length):
+        time, *others = (np.asarray(x[first : first + length]) for x in samples)
+        missing = (0, length - time.size)
+        yield _Samples(np.pad(time, missing, mode="edge"), *(np.pad(x, missing) for x in others))
 
 
 def _chunk_length(samples: int, longest: int = 8_192) -> int:
@@ -254,22 +236,16 @@ def _accumulate_directly(
 ) -> Iterator[np.ndarray]:
     size = samples.time.size
     length = _chunk_length(size, 65_536) if isinstance(drive, Chirp) else _chunk_length(size)  # of few chirps
-    for t, y, weight, rate in _chunks(samples, length):
-        yield np.asarray(_chunk_products(table, drive, t, y, weight, rate, None, steady_state))
+    for chunk in _chunks(samples, length):
+        yield np.asarray(_chunk_products(table, drive, chunk, None, steady_state))
 
 
 @eqx.filter_jit
 def _chunk_products(
-    table: _ResponseTable,
-    drive: Drive,
-    time: Array,
-    observed: Array,
-    weight: Array,
-    rate: Array,
-    baseline: Array | None,
-    steady_state: bool,
+    table: _ResponseTable, drive: Drive, chunk: _Samples, baseline: Array | None, steady_state: bool
 ) -> Array:
     """Inner products where the response to the drive can be computed at any time."""
+    time = chunk.time
 
     def respond(tau: Array) -> Array:
         return highpass(drive, time, tau, steady_state=steady_state)
@@ -282,25 +258,19 @@ def _chunk_products(
 
     slope = (voltage(time + table.step) - voltage(time - table.step)) / (2.0 * table.step)
     baseline = baseline_functions(time, table.middle, table.half) if baseline is None else baseline
-    return _inner_products(table, u, None, baseline, slope, observed, weight, rate)
+    return _inner_products(table, [u], baseline, slope, chunk)
 
 
 def _inner_products(
-    table: _ResponseTable,
-    u: Array,
-    decays: Array | None,
-    baseline: Array,
-    slope: Array,
-    observed: Array,
-    weight: Array,
-    rate: Array,
+    table: _ResponseTable, responses: list[Array], baseline: Array, slope: Array, chunk: _Samples
 ) -> Array:
-    parts = [table.combinations.T @ u] + ([] if decays is None else [table.combinations.T @ decays])
-    rest = observed - table.expected_terms.weight[0] * u[NODES // 2]
+    """Those of the responses to the drive (and to unknown charges) at the nodes, the shapes and the record."""
+    rest = chunk.observed - table.expected_terms.weight[0] * responses[0][NODES // 2]
     if table.expected_terms.rate is not None:
-        rest = rest - table.expected_terms.rate * rate
-    rows = jnp.concatenate([*parts, baseline, rate[None], slope[None], rest[None]])
-    return (rows * weight) @ rows.T
+        rest = rest - table.expected_terms.rate * chunk.rate
+    parts = [table.combinations.T @ response for response in responses]
+    rows = jnp.concatenate([*parts, baseline, chunk.rate[None], slope[None], rest[None]])
+    return (rows * chunk.weight) @ rows.T
 
 
 def _accumulate_folded(table: _ResponseTable, drive: Drive, samples: _Samples, period: int) -> Iterator[np.ndarray]:
@@ -318,10 +288,10 @@ def _accumulate_folded(table: _ResponseTable, drive: Drive, samples: _Samples, p
         sums += weighted.reshape(len(z), periods, period).sum(axis=1)
         squares += weighted @ z.T
     means = sums / np.where(count > 0.0, count, 1.0)
-    rate = np.zeros(period) if samples.rate is None else np.asarray(samples.rate[:period])
-    time = np.asarray(samples.time[:period])
+    time, rate = (np.asarray(x[:period]) for x in (samples.time, samples.rate))
     time, mean, rate, baseline = map(pad_samples, (time, means[-1] + reference, rate, means[:-1]))
-    total = np.array(_chunk_products(table, drive, time, mean, pad_weight(count), rate, baseline, True))
+    folded = _Samples(time, mean, pad_weight(count), rate)
+    total = np.array(_chunk_products(table, drive, folded, baseline, True))
     # what the samples of one phase scatter about their mean
     kept = np.r_[_BASELINE, _OBSERVED]
     total[np.ix_(kept, kept)] += squares - means @ sums.T
@@ -356,26 +326,23 @@ def _accumulate_measured(table: _ResponseTable, drive: Sampled, samples: _Sample
     last = jnp.zeros(NODES), jnp.asarray(time[0]), jnp.zeros(())  # the first sample is a jump from 0
     if x is not None:
         last = first * jnp.exp(x), jnp.asarray(time[0] - step), jnp.asarray(first)
-    voltages = _chunks(_Samples(time, np.asarray(drive.samples)[: time.size], None, None), length)
-    for (t, y, weight, rate), (_, v, _, _) in zip(_chunks(samples, length), voltages, strict=True):
-        total, last = _advance_chunk(table, t, v, y, weight, rate, last, time[0], x)
+    voltages = _chunks(samples._replace(observed=np.asarray(drive.samples)[: time.size]), length)
+    for chunk, driven in zip(_chunks(samples, length), voltages, strict=True):
+        total, last = _advance_chunk(table, chunk, driven.observed, last, time[0], x)
         yield np.asarray(total)
 
 
 @eqx.filter_jit
 def _advance_chunk(
     table: _ResponseTable,
-    time: Array,
+    chunk: _Samples,
     voltage: Array,
-    observed: Array,
-    weight: Array,
-    rate: Array,
     last: tuple[Array, Array, Array],
     first: Array,
     x: Array | None,
 ) -> tuple[Array, tuple[Array, Array, Array]]:
     """Inner products along a chunk, and the response, time and drive at its end; `x`: even steps over the nodes."""
-    u, since, before = last
+    time, (u, since, before) = chunk.time, last
     step, rise = jnp.diff(time, prepend=since), jnp.diff(voltage, prepend=before)
     if x is None:
         ages = step / table.nodes[:, None]
@@ -387,7 +354,7 @@ def _advance_chunk(
     span = jnp.append(times[2:] - times[:-2], step[-1])
     slope = jnp.append(voltages[2:] - voltages[:-2], 0.0) / jnp.where(span > 0.0, span, 1.0)
     baseline = baseline_functions(time, table.middle, table.half)
-    return _inner_products(table, u, decays, baseline, slope, observed, weight, rate), (u[:, -1], time[-1], voltage[-1])
+    return _inner_products(table, [u, decays], baseline, slope, chunk), (u[:, -1], time[-1], voltage[-1])
 
 
 def _uniform_recurrence(

@@ -23,16 +23,10 @@ from fitact.model.skin import TimeConstantGrid
 
 
 class GridCompression(eqx.Module):
-    """A record in coordinates of the responses of a grid; as `fitact.likelihood.compression.Compression`.
+    """A record in coordinates of the responses of a grid; as `fitact.likelihood.compression.Compression`."""
 
-    Attributes:
-        signal: the response to the drive (V) of each time constant.
-        delay_slopes: how it changes with a delay, V/s, over two samples.
-        others: as there.
-    """
-
-    signal: Float[Array, "terms rows"]
-    delay_slopes: Float[Array, "terms rows"]
+    signal: Float[Array, "terms rows"]  # the response to the drive (V) of each time constant
+    delay_slopes: Float[Array, "terms rows"]  # how it changes with a delay, V/s, over two samples
     baseline: Float[Array, "shapes rows"]
     rate: Float[Array, " rows"]
     observed: Float[Array, " rows"]
@@ -73,25 +67,25 @@ def compress_on_grid(
     step = (time[-1] - time[0]) / (time.size - 1)
     around = np.array([0.0, -step, step])
     scale = max(float(np.max(np.abs(observed))), 1e-300)  # the record's column as long as the others, for rounding
-    triangle: Any = np.zeros((0, 0))
+    weight, rate = (
+        np.broadcast_to(value if given is None else given, time.shape) for given, value in ((weight, 1.0), (rate, 0.0))
+    )
+    size = grid.tau.size
+    triangle: Any = np.zeros((0, 2 * size + len(BASELINE_NAMES) + 2))
     middle, half = 0.5 * (time[0] + time[-1]), 0.5 * (time[-1] - time[0])
     for part, u in _responses(drive, grid.tau, time, around, steady_state):
         baseline = evaluate_baseline(time[part], middle, half)
-        slope = np.zeros(u.shape[-1]) if rate is None else np.asarray(rate[part])
-        rows = [u[0], baseline, slope[None], observed[part][None] / scale, (u[1] - u[2]) / (2.0 * step)]
-        columns = np.concatenate(rows).T
-        columns = columns if weight is None else columns * np.asarray(weight[part])[:, None]
-        triangle = np.linalg.qr(np.vstack([triangle, columns]) if triangle.size else columns, mode="r")
-    size = grid.tau.size
+        rows = [u[0], baseline, rate[part][None], observed[part][None] / scale, (u[1] - u[2]) / (2.0 * step)]
+        columns = (np.concatenate(rows) * weight[part]).T
+        triangle = np.linalg.qr(np.vstack([triangle, columns]), mode="r")
     parts = [jnp.asarray(x.T) for x in np.split(triangle, np.cumsum([size, len(BASELINE_NAMES), 1, 1]), axis=1)]
-    count = time.size if weight is None else int(np.count_nonzero(weight))
     return GridCompression(
         signal=parts[0],
         delay_slopes=parts[4],
         baseline=parts[1],
         rate=parts[2][0],
         observed=parts[3][0] * scale,
-        samples=jnp.asarray(float(count)),
+        samples=jnp.asarray(float(np.count_nonzero(weight))),
     )
 
 

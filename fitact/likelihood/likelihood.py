@@ -1,7 +1,7 @@
-"""The log-probability of one or several records: a circuit, and the traces that it made.
+"""The log-probability of one or several records: a circuit, and the channels that it made.
 
 The chain holds only the parameters that matter: the logarithms of the circuit's free parameters and of the
-channels' gains, the delays, and the logarithm of each trace's noise. What enters the traces linearly is
+channels' gains, the delays, and the logarithm of each channel's noise. What enters the channels linearly is
 integrated out (`fitact.likelihood.channel`).
 """
 
@@ -28,56 +28,47 @@ UNCONSTRAINED_SD = math.log(1e6)  # in a logarithm: what leaves more open than t
 class Likelihood(eqx.Module):
     """Traces, a circuit and the prior, as a function of the parameters.
 
-    A point theta holds, in the order of `names`, logarithms of positive parameters, and each trace's free delay and
+    A point theta holds, in the order of `names`, logarithms of positive parameters, and each channel's free delay and
     clock in its `timing_unit`. Built by `fitact.fitting.fit`.
-
-    Attributes:
-        channels: those of the records.
-        template: the circuit; what the prior does not name keeps its value there.
-        prior: of the circuit's free parameters and of free gains.
-        sigma_prior: of each trace's noise; None: flat in its logarithm.
-        tied: parameters that are a ratio times another: name, the other's, ratio.
-        use_prior: whether the prior of the circuit counts, beside those of gains and delays.
     """
 
-    channels: tuple[ChannelLikelihood, ...]
-    template: RC | WithSkin
-    prior: Prior
-    sigma_prior: tuple[Distribution | None, ...]
+    channels: tuple[ChannelLikelihood, ...]  # those of the records
+    template: RC | WithSkin  # the circuit; what the prior does not name keeps its value there
+    prior: Prior  # of the circuit's free parameters and of free gains
+    sigma_prior: tuple[Distribution | None, ...]  # of each channel's noise; None: flat in its logarithm
+    # parameters that are a ratio times another: name, the other's, ratio
     tied: tuple[tuple[str, str, float], ...] = eqx.field(static=True, default=())
+    # whether the prior of the circuit counts, beside those of gains and delays
     use_prior: bool = eqx.field(static=True, default=True)
 
     @property
     def names(self) -> tuple[str, ...]:
         """The coordinates of theta."""
-        return (*self.prior.names, *(trace.qualified_name(name) for trace, name in self._timing))
+        return (*self.prior.names, *(channel.qualified_name(name) for channel, name in self._timing))
 
     @property
     def _timing(self) -> list[tuple[ChannelLikelihood, str]]:
-        """Free delays and clocks: the trace, and which."""
-        return [(trace, name) for trace in self.channels for name in trace.timing]
+        """Free delays and clocks: the channel, and which."""
+        return [(channel, name) for channel in self.channels for name in channel.timing]
 
     @property
     def timing_sd(self) -> list[ArrayLike]:
         """Their standard deviations by the prior."""
-        return [trace.timing_sd[TIMING_NUISANCES.index(name)] for trace, name in self._timing]
+        return [channel.timing_sd[TIMING_NUISANCES.index(name)] for channel, name in self._timing]
 
     @property
     def timing(self) -> dict[str, tuple[float, float]]:
         """By name, what they are (s, or a share of 1) where their coordinate is 0, and what 1 of that adds."""
         with jax.enable_x64(True):
-            return {
-                trace.qualified_name(name): (
-                    float(trace.shift if name == "delay" else trace.clock),
-                    float(trace.timing_unit(name)),
-                )
-                for trace, name in self._timing
-            }
+            pairs = [
+                (channel, name, channel.shift if name == "delay" else channel.clock) for channel, name in self._timing
+            ]
+            return {t.qualified_name(name): (float(base), float(t.timing_unit(name))) for t, name, base in pairs}
 
     @property
     def sigma_names(self) -> tuple[str, ...]:
         """The coordinates of a posterior's point after theta."""
-        return tuple(trace.qualified_name("sigma") for trace in self.channels)
+        return tuple(channel.qualified_name("sigma") for channel in self.channels)
 
     @property
     def prior_factor(self) -> Float[np.ndarray, "parameters parameters"]:
@@ -98,22 +89,21 @@ class Likelihood(eqx.Module):
     @property
     def rows(self) -> int:
         """How many numbers an evaluation runs over."""
-        return sum(trace.rows for trace in self.channels)
+        return sum(channel.rows for channel in self.channels)
 
     @property
     def count(self) -> ArrayLike:
-        return sum(trace.count for trace in self.channels)
+        return sum(channel.count for channel in self.channels)
 
     def without_compression(self) -> "Likelihood":
-        return dataclasses.replace(self, channels=tuple(trace.without_compression() for trace in self.channels))
+        return dataclasses.replace(self, channels=tuple(channel.without_compression() for channel in self.channels))
 
     def without_samples(self) -> "Likelihood":
         """With no more of the samples than their ends, where a compression stands for them."""
-        return dataclasses.replace(self, channels=tuple(trace.without_samples() for trace in self.channels))
+        return dataclasses.replace(self, channels=tuple(channel.without_samples() for channel in self.channels))
 
     def replace_channel(self, index: int, channel: ChannelLikelihood) -> "Likelihood":
-        traces = (*self.channels[:index], channel, *self.channels[index + 1 :])
-        return dataclasses.replace(self, channels=traces)
+        return dataclasses.replace(self, channels=(*self.channels[:index], channel, *self.channels[index + 1 :]))
 
     def circuit(self, theta: Float[Array, " circuit_parameters"]) -> Circuit:
         """The circuit at theta; NaN where no double could hold what follows from it, so that no step leads there."""
@@ -126,32 +116,28 @@ class Likelihood(eqx.Module):
         return with_values(self.template, values)
 
     def channel_inputs(self, theta: Float[Array, " circuit_parameters"], index: int = 0) -> ChannelInputs:
-        """What the trace of that index needs of theta."""
+        """What the channel of that index needs of theta."""
         return self._make_inputs(self.circuit(theta), theta, self.channels[index])
 
     def _make_inputs(self, circuit: Circuit, theta: Array, channel: ChannelLikelihood) -> ChannelInputs:
-        gain, names = channel.qualified_name("gain"), self.names
-        timing = {
-            name: theta[names.index(channel.qualified_name(name))] * channel.timing_unit(name)
-            for name in channel.timing
-        }
-        return ChannelInputs(circuit, jnp.exp(theta[names.index(gain)]) if gain in names else 1.0, **timing)
+        places = {name: i for i, name in enumerate(self.names)}
+        timing = {n: theta[places[channel.qualified_name(n)]] * channel.timing_unit(n) for n in channel.timing}
+        gain = places.get(channel.qualified_name("gain"))
+        return ChannelInputs(circuit, 1.0 if gain is None else jnp.exp(theta[gain]), **timing)
 
     def channels_and_inputs(
         self, theta: Float[Array, " circuit_parameters"]
     ) -> Iterator[tuple[ChannelLikelihood, ChannelInputs]]:
-        """The traces, and what they need of theta."""
+        """The channels, and what they need of theta."""
         circuit = self.circuit(theta)
-        return ((trace, self._make_inputs(circuit, theta, trace)) for trace in self.channels)
+        return ((channel, self._make_inputs(circuit, theta, channel)) for channel in self.channels)
 
     def residuals(
         self, theta: Float[Array, " circuit_parameters"], sigma: Float[Array, " channels"]
     ) -> tuple[Float[Array, " rows"], ...]:
-        """Whitened residuals of each trace, nuisances' priors included: half their square is -log-likelihood."""
-        return tuple(
-            trace.residuals(inputs, s)
-            for (trace, inputs), s in zip(self.channels_and_inputs(theta), sigma, strict=True)
-        )
+        """Whitened residuals of each channel, nuisances' priors included: half their square is -log-likelihood."""
+        parts = zip(self.channels_and_inputs(theta), sigma, strict=True)
+        return tuple(channel.residuals(inputs, s) for (channel, inputs), s in parts)
 
     def prior_residuals(self, theta: Float[Array, " circuit_parameters"]) -> Float[Array, " circuit_parameters"]:
         """The prior as residuals: normal in theta, with the moments of the stated prior; 0 for what has none."""
@@ -167,10 +153,10 @@ class Likelihood(eqx.Module):
         return point[: -len(self.channels)], point[-len(self.channels) :]
 
     def log_likelihoods(self, point: Float[Array, " coordinates"]) -> Float[Array, " channels"]:
-        """Log-likelihood of each trace at (theta, log sigma), up to a constant; NaN where its compression ends."""
+        """Log-likelihood of each channel at (theta, log sigma), up to a constant; NaN where its compression ends."""
         theta, log_sigma = self.split(point)
         parts = zip(self.channels_and_inputs(theta), log_sigma, strict=True)
-        return jnp.stack([trace.log_likelihood(inputs, log) for (trace, inputs), log in parts])
+        return jnp.stack([channel.log_likelihood(inputs, log) for (channel, inputs), log in parts])
 
     def log_likelihood(self, point: Float[Array, " coordinates"]) -> Float[Array, ""]:
         """Log-likelihood of (theta, log sigma), up to a constant; NaN where a compression does not reach."""
@@ -193,7 +179,7 @@ class Likelihood(eqx.Module):
         Anything that is not finite counts as impossible, but it is NaN where a compression does not reach.
         """
         log_prior, value = self.log_prior(point), self.log_likelihood(point)
-        compressed = any(trace.compression is not None for trace in self.channels)
+        compressed = any(channel.compression is not None for channel in self.channels)
         beyond = jnp.isnan(value) & jnp.all(jnp.isfinite(point)) & jnp.isfinite(log_prior) & compressed
         value = value + log_prior
         return jnp.where(jnp.isfinite(value) | beyond, value, -jnp.inf)

@@ -41,15 +41,10 @@ def scale_information(model: NoiseModel) -> float:
 
 
 class Whitening(eqx.Module):
-    """A filter that leaves white noise as strong as what it was given.
+    """A filter that leaves white noise as strong as what it was given."""
 
-    Attributes:
-        taps: of this sample, the one before it and so on.
-        mask: 1 where a sample and all before it that the filter reaches count, else 0.
-    """
-
-    taps: Float[Array, " taps"]
-    mask: Float[Array, " samples"]
+    taps: Float[Array, " taps"]  # of this sample, the one before it and so on
+    mask: Float[Array, " samples"]  # 1 where a sample and all before it that the filter reaches count, else 0
 
     def __call__(self, values: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
         """The values filtered, and 0 where `mask` is."""
@@ -75,15 +70,10 @@ def draw_noise(
 
 
 class Autoregression(NamedTuple):
-    """x_t = sum_k coefficients_k x_(t-k) + innovation.
+    """x_t = sum_k coefficients_k x_(t-k) + innovation."""
 
-    Attributes:
-        coefficients: of the sample before, the one before that and so on.
-        innovation_ratio: standard deviation of the innovation over that of x.
-    """
-
-    coefficients: Float[np.ndarray, " order"]
-    innovation_ratio: float
+    coefficients: Float[np.ndarray, " order"]  # of the sample before, the one before that and so on
+    innovation_ratio: float  # standard deviation of the innovation over that of x
 
     def whitening(self, mask: Bool[np.ndarray, " samples"]) -> Whitening:
         """The filter, for a record of which those samples are `mask`."""
@@ -135,9 +125,6 @@ def estimate_quiet_noise(
 
     A spectrum can be told from `min_samples` on. The drive has noise of its own, and may move there by
     `max_drive_fraction` of its span.
-
-    Raises:
-        InputError: the stretch is too short, or not quiet.
     """
     inside = (record.time >= quiet[0]) & (record.time <= quiet[1])
     count = int(np.count_nonzero(inside))
