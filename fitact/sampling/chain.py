@@ -15,24 +15,15 @@ from fitact.files import atomic_write
 
 @dataclasses.dataclass
 class Chain:
-    """All steps of several ensembles.
+    """All steps of several ensembles."""
 
-    Attributes:
-        names: of the coordinates.
-        fingerprint: what the chain belongs to.
-        points, log_prob: every step of every walker.
-        accepted: moves accepted, per walker.
-        states: where each ensemble stands, its random numbers included.
-        seconds: that sampling has taken.
-    """
-
-    names: tuple[str, ...]
-    fingerprint: str
-    points: Float[np.ndarray, "ensembles steps walkers n"]
-    log_prob: Float[np.ndarray, "ensembles steps walkers"]
-    accepted: Int[np.ndarray, "ensembles walkers"]
-    states: tuple[emcee.State, ...]
-    seconds: float = 0.0
+    names: tuple[str, ...]  # of the coordinates
+    fingerprint: str  # what the chain belongs to
+    points: Float[np.ndarray, "ensembles steps walkers n"]  # every step of every walker
+    log_prob: Float[np.ndarray, "ensembles steps walkers"]  # of the points
+    accepted: Int[np.ndarray, "ensembles walkers"]  # moves accepted, per walker
+    states: tuple[emcee.State, ...]  # where each ensemble stands, its random numbers included
+    seconds: float = 0.0  # that sampling has taken
 
     @classmethod
     def empty(cls, names: tuple[str, ...], fingerprint: str, states: list[emcee.State]) -> Self:
@@ -85,11 +76,7 @@ class Chain:
 
     @classmethod
     def load(cls, path: Path, fingerprint: str) -> Self:
-        """Read a chain that belongs to `fingerprint`.
-
-        Raises:
-            InputError: it belongs to another record, scene, seed or version, or is no chain.
-        """
+        """Read a chain that belongs to `fingerprint`; any other is refused."""
         try:
             with h5py.File(path, "r") as file:
                 if file.attrs["fingerprint"] != fingerprint:

@@ -18,24 +18,15 @@ from fitact.units import format_percent
 
 @dataclasses.dataclass(frozen=True)
 class Criteria:
-    """When draws count as converged; see `fitact.sample`.
+    """When draws count as converged; see `fitact.sample`."""
 
-    Attributes:
-        autocorrelation_times: that each ensemble is long, at least.
-        rhat: what split-R-hat stays below.
-        stuck_steps, stuck_autocorrelation_times: in one place; above both a walker is stuck.
-        k_hat: above it importance weights have no mean worth the name (Vehtari et al. 2024).
-        laplace_error: standard deviations that a Laplace approximation may be off by, in mean or sd.
-        forbidden: share of its draws that the prior may forbid.
-    """
-
-    autocorrelation_times: float = 50.0
-    rhat: float = 1.01
-    stuck_steps: int = 100
+    autocorrelation_times: float = 50.0  # that each ensemble is long, at least
+    rhat: float = 1.01  # what split-R-hat stays below
+    stuck_steps: int = 100  # in one place; above this and the next a walker is stuck
     stuck_autocorrelation_times: float = 10.0
-    k_hat: float = 0.7
-    laplace_error: float = 0.1
-    forbidden: float = 0.01
+    k_hat: float = 0.7  # above it importance weights have no mean worth the name (Vehtari et al. 2024)
+    laplace_error: float = 0.1  # standard deviations that a Laplace approximation may be off by, in mean or sd
+    forbidden: float = 0.01  # share of its draws that the prior may forbid
 
 
 CRITERIA = Criteria()
@@ -43,43 +34,28 @@ CRITERIA = Criteria()
 
 @dataclasses.dataclass(frozen=True)
 class Convergence:
-    """How far the draws of a level of uncertainty can be trusted; see `fitact.sample`.
+    """How far the draws of a level of uncertainty can be trusted; see `fitact.sample`."""
 
-    Attributes:
-        level: "emcee", "psis" or "laplace".
-        converged: whether its own certificate holds.
-        seconds: that sampling took, resumed parts included.
-        ess_min, ess: effective number of draws, for the mean of every coordinate, of g, b and the mean force.
-        tau_max, tau: autocorrelation times of the same, in steps.
-        rhat_max: largest split-R-hat over the ensembles.
-        acceptance: share of the moves.
-        burn, steps: of each ensemble.
-        stuck_walkers: those that stayed in one place although others moved on.
-        k_hat: Pareto's shape of the importance weights' tail.
-        shift, widening: by importance weights, what a Laplace approximation's mean is off by, in standard
-            deviations, and its standard deviation, as a share.
-        forbidden: share of a Laplace approximation's draws that the prior forbids.
-    """
-
-    level: str = "emcee"
-    converged: bool = False
-    seconds: float = 0.0
-    ess_min: float = 0.0
+    level: str = "emcee"  # "emcee", "psis" or "laplace"
+    converged: bool = False  # whether its own certificate holds
+    seconds: float = 0.0  # that sampling took, resumed parts included
+    ess_min: float = 0.0  # effective number of draws, for the mean of every coordinate, of g, b and the mean force
     ess: dict[str, float] = dataclasses.field(default_factory=dict)
-    tau_max: float = float("nan")
+    tau_max: float = float("nan")  # autocorrelation times of the same, in steps
     tau: dict[str, float] = dataclasses.field(default_factory=dict)
-    rhat_max: float = float("nan")
-    acceptance: float = float("nan")
-    burn: int = 0
+    rhat_max: float = float("nan")  # largest split-R-hat over the ensembles
+    acceptance: float = float("nan")  # share of the moves
+    burn: int = 0  # of each ensemble
     steps: int = 0
     walkers: int = 0
     ensembles: int = 0
-    stuck_walkers: tuple[str, ...] = ()
+    stuck_walkers: tuple[str, ...] = ()  # those that stayed in one place although others moved on
     interrupted: bool = False
-    k_hat: float = float("nan")
+    k_hat: float = float("nan")  # Pareto's shape of the importance weights' tail
+    # by importance weights, what a Laplace approximation is off by in the mean, in sds, and in the sd, as a share
     shift: dict[str, float] = dataclasses.field(default_factory=dict)
     widening: dict[str, float] = dataclasses.field(default_factory=dict)
-    forbidden: float = 0.0
+    forbidden: float = 0.0  # share of a Laplace approximation's draws that the prior forbids
 
     @property
     def progress(self) -> float:
@@ -202,15 +178,10 @@ def _stuck_walkers(points: Float[np.ndarray, "ensembles steps walkers n"], patie
 
 
 class ImportanceWeights(NamedTuple):
-    """Pareto-smoothed importance weights.
+    """Pareto-smoothed importance weights."""
 
-    Attributes:
-        weights: their sum is 1.
-        k_hat: inf where too few draws have any weight.
-    """
-
-    weights: Float[np.ndarray, " draws"]
-    k_hat: float
+    weights: Float[np.ndarray, " draws"]  # their sum is 1
+    k_hat: float  # inf where too few draws have any weight
 
     def mean_sd(self, values: Float[np.ndarray, " some"]) -> tuple[float, float]:
         """Weighted mean and standard deviation; of the first draws, where `values` are fewer."""

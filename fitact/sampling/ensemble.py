@@ -106,21 +106,14 @@ def sample(
 
 
 class Target(NamedTuple):
-    """What ensembles sample.
+    """What ensembles sample."""
 
-    Attributes:
-        names: of the coordinates.
-        log_prob: of points, finite or -inf.
-        proposal: near to it.
-        track: quantities to be judged beside the coordinates, of points (ensembles, draws, n), with a seed.
-        fingerprint: what a chain belongs to; "" where none is kept.
-    """
-
-    names: tuple[str, ...]
-    log_prob: LogProb
-    proposal: Proposal
+    names: tuple[str, ...]  # of the coordinates
+    log_prob: LogProb  # of points, finite or -inf
+    proposal: Proposal  # near to it
+    # quantities to be judged beside the coordinates, of points (ensembles, draws, n), with a seed
     track: Callable[[Float[np.ndarray, "ensembles draws n"], int], dict[str, np.ndarray]]
-    fingerprint: str = ""
+    fingerprint: str = ""  # what a chain belongs to; "" where none is kept
 
 
 def run_ensembles(
@@ -316,15 +309,6 @@ def _draw_starting_points(
 
 def _fingerprint(fit: Fit, seed: int, walkers: int, ensembles: int) -> str:
     """What a chain belongs to; any change of it makes another chain."""
-    settings = [
-        [record.fingerprint for record in fit.records],
-        fit.scene.to_json(),
-        [trace.choice.name for trace in fit.traces],
-        fit.likelihood.rows,
-        fit.point_names,
-        fit.theta.tolist(),
-        seed,
-        walkers,
-        ensembles,
-    ]
-    return hashlib.sha256(json.dumps([importlib.metadata.version("fitact"), *settings]).encode()).hexdigest()
+    inputs = [[record.fingerprint for record in fit.records], fit.scene.to_json(), [t.choice.name for t in fit.traces]]
+    settings = [fit.likelihood.rows, fit.point_names, fit.theta.tolist(), seed, walkers, ensembles]
+    return hashlib.sha256(json.dumps([importlib.metadata.version("fitact"), *inputs, *settings]).encode()).hexdigest()

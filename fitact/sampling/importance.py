@@ -15,9 +15,7 @@ def draw_around_fit(
 ) -> Posterior:
     """Draw by level "laplace" or "psis", and judge the draws.
 
-    Args:
-        draws: how many are kept.
-        oversampling: weighted draws for one that is kept, so that duplicates are few.
+    There are `oversampling` weighted draws for each of the `draws` that are kept, so that duplicates are few.
     """
     rng = np.random.default_rng([seed, 4])
     if level == "laplace":

@@ -70,11 +70,11 @@ class Posterior:
         likelihood, size = self.fit.likelihood, self.fit.theta.size
         draws = likelihood.to_physical(self.points[..., :size])
         draws |= {name: np.exp(self.points[..., size + i]) for i, name in enumerate(likelihood.sigma_names)}
-        for trace, drawn in zip(likelihood.channels, np.moveaxis(self._linear_draws, -2, 0), strict=True):
-            for column in trace.columns:
-                draws[trace.qualified_name(LINEAR_NUISANCES[column])] = drawn[..., column] * float(
-                    trace.linear_sd[column]
-                )
+        for channel, drawn in zip(likelihood.channels, np.moveaxis(self._linear_draws, -2, 0), strict=True):
+            values = drawn * np.asarray(channel.linear_sd)
+            draws |= {
+                channel.qualified_name(LINEAR_NUISANCES[column]): values[..., column] for column in channel.columns
+            }
         return draws
 
     def force(self) -> dict[str, Float[np.ndarray, "ensembles draws"]]:
@@ -92,7 +92,7 @@ class Posterior:
 
     @functools.cached_property
     def _deviates(self) -> np.ndarray:
-        """Standard normal numbers that draw the linear nuisances of each trace."""
+        """Standard normal numbers that draw the linear nuisances of each channel."""
         return derived.nuisance_deviates(self.fit.likelihood, self.points, self.seed)
 
     @functools.cached_property
@@ -101,7 +101,7 @@ class Posterior:
 
     @functools.cached_property
     def _linear_draws(self) -> np.ndarray:
-        """Draws of the linear nuisances of each trace, in prior standard deviations."""
+        """Draws of the linear nuisances of each channel, in prior standard deviations."""
         likelihood = self.fit.likelihood
         return derived.evaluate_draws(_draw_linear_nuisances, likelihood, likelihood.rows, self.points, self._deviates)
 
@@ -159,27 +159,24 @@ class Posterior:
         import xarray as xr
 
         def dataset(draws: dict[str, np.ndarray]) -> xr.Dataset:
-            variables = {
-                name: xr.DataArray(values, dims=("chain", "draw"), attrs={"units": quantity_unit(name)})
-                for name, values in draws.items()
-            }
-            counts = next(iter(draws.values())).shape
-            return xr.Dataset(variables, coords={"chain": np.arange(counts[0]), "draw": np.arange(counts[1])})
+            dims, coords = ("chain", "draw"), {"chain": np.arange(ensembles), "draw": np.arange(count)}
+            variables = {name: (dims, values, {"units": quantity_unit(name)}) for name, values in draws.items()}
+            return xr.Dataset(variables, coords=coords)
 
         rng = np.random.default_rng([self.seed, 2])
         ensembles, count = self.points.shape[:2]
         prior_draws = self.fit.likelihood.prior.sample(rng, ensembles * count)
         prior = {name: draws.reshape(ensembles, count) for name, draws in prior_draws.items()}
         observed, constant = xr.Dataset(), xr.Dataset()
-        for trace in self.fit.traces:
-            time, name = _time_axis_name(trace), _variable_name(trace)
-            unit = {"units": CHANNEL_UNITS[trace.channel]}
-            coords = {time: (time, trace.record.time, {"units": "s"})}
-            values = trace.record[trace.channel]
+        for channel in self.fit.traces:
+            time, name = _time_axis_name(channel), _variable_name(channel)
+            unit = {"units": CHANNEL_UNITS[channel.channel]}
+            coords = {time: (time, channel.record.time, {"units": "s"})}
+            values = channel.record[channel.channel]
             observed = observed.merge(xr.Dataset({name: (time, values, unit)}, coords=coords))
-            counts = np.isfinite(_relative_noise_sd(trace))
-            fitted = {f"{name}_fit": (time, np.where(counts, values - trace.residuals, np.nan), unit)}
-            drive = {_variable_name(trace, "V"): (time, trace.choice.voltage, {"units": "V"})}
+            counts = np.isfinite(_relative_noise_sd(channel))
+            fitted = {f"{name}_fit": (time, np.where(counts, values - channel.residuals, np.nan), unit)}
+            drive = {_variable_name(channel, "V"): (time, channel.choice.voltage, {"units": "V"})}
             constant = constant.merge(xr.Dataset(fitted | drive, coords=coords))
         attributes = {
             "inference_library": "fitact",
@@ -212,17 +209,17 @@ class Posterior:
         draws = np.linspace(0, count - 1, min(50, count)).astype(int)
         rng = np.random.default_rng([self.seed, 3])
         predicted = xr.Dataset(coords={"chain": np.arange(ensembles), "draw": draws})
-        for i, (trace, model) in enumerate(zip(self.fit.traces, self.fit.likelihood.channels, strict=True)):
-            stride = -(-len(trace.record) // 4000)
+        for i, (channel, model) in enumerate(zip(self.fit.traces, self.fit.likelihood.channels, strict=True)):
+            stride = -(-len(channel.record) // 4000)
             signal = functools.partial(_predict_signal, i, stride)
-            time = trace.record.time[::stride]
+            time = channel.record.time[::stride]
             chosen = self.points[:, draws], self._deviates[:, draws]
             mean = derived.evaluate_draws(signal, self.fit.likelihood, model.time.size, *chosen)[..., : time.size]
             sigma = np.exp(self.points[:, draws, self.fit.theta.size + i, None])
             noise = draw_noise(rng, model.noise, model.whitening, mean.shape, stride)
-            noisy = mean + sigma * _relative_noise_sd(trace)[::stride] * noise
-            axis, unit = _time_axis_name(trace), {"units": CHANNEL_UNITS[trace.channel]}
-            predicted[_variable_name(trace)] = ("chain", "draw", axis), noisy.astype(np.float32), unit
+            noisy = mean + sigma * _relative_noise_sd(channel)[::stride] * noise
+            axis, unit = _time_axis_name(channel), {"units": CHANNEL_UNITS[channel.channel]}
+            predicted[_variable_name(channel)] = ("chain", "draw", axis), noisy.astype(np.float32), unit
             predicted = predicted.assign_coords({axis: (axis, time, {"units": "s"})})
         return predicted
 
@@ -242,16 +239,16 @@ class Posterior:
         write_report(path, self.to_datatree(), self.summary() | stated)
 
 
-def _relative_noise_sd(trace: ChannelFit) -> Float[np.ndarray, " samples"]:
+def _relative_noise_sd(channel: ChannelFit) -> Float[np.ndarray, " samples"]:
     """Standard deviation of each sample's noise over the channel's; NaN where one was left out."""
-    if trace.weight is None:
-        return np.ones(len(trace.record))
-    counts = trace.weight > 0.0
-    return np.where(counts, 1.0 / np.where(counts, trace.weight, 1.0), np.nan)
+    if channel.weight is None:
+        return np.ones(len(channel.record))
+    counts = channel.weight > 0.0
+    return np.where(counts, 1.0 / np.where(counts, channel.weight, 1.0), np.nan)
 
 
-def _time_axis_name(trace: ChannelFit) -> str:
-    number = trace.label.rpartition("_")[2]
+def _time_axis_name(channel: ChannelFit) -> str:
+    number = channel.label.rpartition("_")[2]
     return f"time_{number}" if number.isdigit() else "time"
 
 
@@ -263,11 +260,11 @@ def _variable_name(trace: ChannelFit, channel: str = "") -> str:
 def _draw_linear_nuisances(likelihood: Likelihood, point: Array, deviate: Array) -> Array:
     theta, log_sigma = likelihood.split(point)
     parts = zip(likelihood.channels_and_inputs(theta), jnp.exp(log_sigma), deviate, strict=True)
-    return jnp.stack([trace.sample_nuisances(seen, sigma, each) for (trace, seen), sigma, each in parts])
+    return jnp.stack([channel.sample_nuisances(inputs, sigma, each) for (channel, inputs), sigma, each in parts])
 
 
 def _predict_signal(index: int, stride: int, likelihood: Likelihood, point: Array, deviate: Array) -> Array:
     theta, log_sigma = likelihood.split(point)
-    trace, seen = likelihood.channels[index], likelihood.channel_inputs(theta, index)
-    beta = trace.sample_nuisances(seen, jnp.exp(log_sigma[index]), deviate[index])
-    return (trace.signal(seen) + (beta * trace.linear_sd) @ trace.shapes(seen))[::stride]
+    channel, inputs = likelihood.channels[index], likelihood.channel_inputs(theta, index)
+    beta = channel.sample_nuisances(inputs, jnp.exp(log_sigma[index]), deviate[index])
+    return (channel.signal(inputs) + (beta * channel.linear_sd) @ channel.shapes(inputs))[::stride]

@@ -10,11 +10,8 @@ class Reporter:
     """Progress on standard error: a bar where it is a terminal, else a line now and then."""
 
     def __init__(self, show: bool) -> None:
-        self._bar = None
-        self._show = show
-        self._lines = 0
-        if show and sys.stderr.isatty():
-            self._bar = open_bar("sampling", status="starting")
+        self._show, self._lines = show, 0
+        self._bar = open_bar("sampling", status="starting") if show and sys.stderr.isatty() else None
 
     def __call__(self, steps: int, convergence: Convergence) -> None:
         """Show the steps taken, and what the last look said of them."""

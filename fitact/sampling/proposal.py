@@ -59,19 +59,13 @@ class TabulatedMarginal:
 
 @dataclasses.dataclass(frozen=True)
 class Proposal:
-    """A density in the coordinates of the posterior, to draw from.
+    """A density in the coordinates of the posterior, to draw from."""
 
-    Attributes:
-        center: of the Student-t.
-        axes: its principal axes as columns, a standard deviation long.
-        tables: densities along some axes, in standard deviations from the center.
-        student_share: drawn from the Student-t even where there are tables, so that no place is out of reach.
-    """
-
-    center: Float[np.ndarray, " n"]
-    axes: Float[np.ndarray, "n n"]
+    center: Float[np.ndarray, " n"]  # of the Student-t
+    axes: Float[np.ndarray, "n n"]  # its principal axes as columns, a standard deviation long
+    # densities along some axes, in standard deviations from the center
     tables: dict[int, TabulatedMarginal] = dataclasses.field(default_factory=dict)
-    student_share: float = 0.1
+    student_share: float = 0.1  # drawn from the Student-t even where there are tables, so that no place is out of reach
 
     @classmethod
     def from_laplace(
@@ -160,10 +154,8 @@ def _tabulate_axis(
 ) -> TabulatedMarginal | None:
     """Tabulate the density on a line, in lengths of `axis`; None where it is normal, or nothing is found.
 
-    Args:
-        search_range: lengths that are searched either way.
-        cells: of the table, and of the search.
-        log_density_range: below the highest log-density, from where the table holds nothing.
+    `search_range` lengths are searched either way; from `log_density_range` below the highest log-density on the table
+    holds nothing.
     """
 
     def line_log_prob(places: np.ndarray) -> np.ndarray:
