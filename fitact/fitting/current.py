@@ -16,19 +16,12 @@ from fitact.units import format_percent
 
 
 class CurrentSamples(NamedTuple):
-    """What a likelihood needs of a current that follows dV/dt.
+    """What a likelihood needs of a current that follows dV/dt."""
 
-    Attributes:
-        weight: of the samples, as in `fitact.likelihood.channel.ChannelLikelihood`.
-        rate: dV/dt, V/s.
-        drive_noise_dominates: whether V's noise, differentiated, takes too much off what follows dV/dt.
-        notes: what was left out or is worth knowing, in sentences.
-    """
-
-    weight: Float[np.ndarray, " samples"]
-    rate: Float[np.ndarray, " samples"]
-    drive_noise_dominates: bool
-    notes: tuple[str, ...]
+    weight: Float[np.ndarray, " samples"]  # of the samples, as in `fitact.likelihood.channel.ChannelLikelihood`
+    rate: Float[np.ndarray, " samples"]  # dV/dt, V/s
+    drive_noise_dominates: bool  # whether V's noise, differentiated, takes too much off what follows dV/dt
+    notes: tuple[str, ...]  # what was left out or is worth knowing, in sentences
 
 
 def select_current_samples(record: Record, choice: DriveModel, max_attenuation: float = 1e-3) -> CurrentSamples:

@@ -27,25 +27,15 @@ _SMOOTH_WAVEFORMS = ("sine", "triangle", "multitone")
 
 @dataclasses.dataclass(frozen=True)
 class DriveModel:
-    """The drive of a fit.
+    """The drive of a fit."""
 
-    Attributes:
-        drive: the scene's waveform or the measured one, filled up as the samples of a channel are.
-        voltage: it, at the record's times, V.
-        steady_state: or from rest.
-        unknown_charge: whether the charge at the first sample must be left free.
-        shift: the drive starts this much later than the record's t = 0, s.
-        name: "measured" or the waveform's name.
-        notes: what was assumed, in sentences.
-    """
-
-    drive: Drive
-    voltage: Float[np.ndarray, " samples"]
-    steady_state: bool
-    unknown_charge: bool
-    shift: float
-    name: str
-    notes: tuple[str, ...]
+    drive: Drive  # the scene's waveform or the measured one, filled up as the samples of a channel are
+    voltage: Float[np.ndarray, " samples"]  # it, at the record's times, V
+    steady_state: bool  # or from rest
+    unknown_charge: bool  # whether the charge at the first sample must be left free
+    shift: float  # the drive starts this much later than the record's t = 0, s
+    name: str  # "measured" or the waveform's name
+    notes: tuple[str, ...]  # what was assumed, in sentences
 
     @property
     def periodic(self) -> bool:
@@ -67,16 +57,15 @@ def _choose_drive(record: Record, scene: Scene | None) -> DriveModel:
     if scene is None or scene.drive.waveform == "measured":
         return _measured_drive(record, scene.steady_state() if scene else None, ())
     drive, slowest = scene.make_drive(), scene.drive.lowest_frequency
-    notes: tuple[str, ...] = ()
+    notes: list[str] = []
     named = scene.states_waveform()
     if named and not isinstance(drive, Chirp):
         _check_frequency(record, slowest)
     if named and isinstance(drive, Periodic) and (frequency := _record_frequency(record, scene.drive)) is not None:
         stated, slowest = slowest, frequency
         drive = dataclasses.replace(drive, frequency=slowest)
-        notes = (
-            f"the record repeats at {slowest:.6g} Hz, not at the scene's {stated:.6g} Hz, and its own"
-            " frequency is used",
+        notes.append(
+            f"the record repeats at {slowest:.6g} Hz, not at the scene's {stated:.6g} Hz, and its own frequency is used"
         )
     drive = as_arrays(drive)
     shift = _align(record, drive, slowest, scene.drive.steady_state)
@@ -87,7 +76,7 @@ def _choose_drive(record: Record, scene: Scene | None) -> DriveModel:
         )
     voltage = _voltage(drive, record.time - shift, scene.drive.steady_state)
     if shift != 0.0:
-        notes = (*notes, f"the scene's drive was shifted by {shift:.4g} s to lie on the record")
+        notes.append(f"the scene's drive was shifted by {shift:.4g} s to lie on the record")
     if "V" in record:
         error = _mismatch(record, voltage)
         if named:
@@ -96,12 +85,11 @@ def _choose_drive(record: Record, scene: Scene | None) -> DriveModel:
             note = "the scene names no waveform and V_V is not its nominal square: the recorded V_V drives the fit"
             return _measured_drive(record, scene.steady_state(), (note,))
         if error > 0.02:
-            notes = (
-                *notes,
+            notes.append(
                 f"V_V differs from the scene's {scene.drive.waveform} by {format_percent(error)} rms;"
-                " [drive] waveform = 'measured' would use V_V as recorded",
+                " [drive] waveform = 'measured' would use V_V as recorded"
             )
-    return DriveModel(drive, voltage, scene.drive.steady_state, False, shift, scene.drive.waveform, notes)
+    return DriveModel(drive, voltage, scene.drive.steady_state, False, shift, scene.drive.waveform, tuple(notes))
 
 
 def _measured_drive(record: Record, steady_state: bool | None, notes: tuple[str, ...]) -> DriveModel:
@@ -152,7 +140,7 @@ def _record_frequency(record: Record, stated: DriveSection) -> float | None:
     """The record's frequency (Hz) where it differs from the stated one by more than it is seen without a model.
 
     A thousandth biases b by several standard errors: generator and recorder have clocks of their own. What is less
-    than this the fit finds, as a trace's clock.
+    than this the fit finds, as a channel's clock.
     """
     frequency = record.frequency()
     if frequency is None or not stated.steady_state:  # from rest, the transient shifts where it repeats
@@ -262,7 +250,9 @@ def drive_slope(choice: DriveModel, time: np.ndarray) -> Float[np.ndarray, " sam
 def unit_response(choice: DriveModel, time: np.ndarray, tau: float) -> Float[np.ndarray, " samples"]:
     """The drive's response of one time constant (s) at the record's times, V."""
     # tau as an array: for a number jit would compile anew
-    voltage = _highpass(choice.drive, pad_samples(time - choice.shift), jnp.asarray(tau), choice.steady_state)
+    voltage = _highpass(
+        choice.drive, pad_samples(time - choice.shift), jnp.asarray(tau), steady_state=choice.steady_state
+    )
     return np.asarray(voltage)[: time.size]
 
 
@@ -271,9 +261,7 @@ def _slope(drive: Drive, time: ArrayLike, steady_state: bool) -> Array:
     return drive.slope(time, steady_state=steady_state)
 
 
-@eqx.filter_jit
-def _highpass(drive: Drive, time: ArrayLike, tau: Array, steady_state: bool) -> Array:
-    return highpass(drive, time, tau, steady_state=steady_state)
+_highpass = eqx.filter_jit(highpass)
 
 
 def _align(

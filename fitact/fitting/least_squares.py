@@ -1,4 +1,4 @@
-"""The fit of one or several traces, and which nuisances they ask for."""
+"""The fit of one or several channels, and which nuisances they ask for."""
 
 import dataclasses
 import math
@@ -13,8 +13,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.fitting.levenberg_marquardt import minimise
-from fitact.fitting.timing import clock_r_squared, free_timing
-from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
+from fitact.fitting.timing import clock_r_squared, free_timing, orthonormal_basis
+from fitact.likelihood.channel import TIMING_NUISANCES, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import fit_ar1, student_curvature, student_weight
 
@@ -24,27 +24,18 @@ MIN_BIC_DECREASE = 10.0  # a nuisance is freed when it lowers the Bayesian infor
 
 
 class LeastSquaresResult(eqx.Module):
-    """Where a fit ended; by trace: rows are its samples, or their coordinates.
+    """Where a fit ended; by channel: rows are its samples, or their coordinates."""
 
-    Attributes:
-        likelihood: what was fitted.
-        theta, sigma: the optimum, and each trace's noise by what is left of it.
-        result: a member of `RESULTS`.
-        steps: trial steps taken, in all.
-        jacobian: of the whitened residuals in theta.
-        remainder, shapes, slope: of each trace: what is left of it, the shapes of its linear nuisances, and what a
-            further delay would change. Under Student's t these, and the Jacobian, are reweighted.
-    """
-
-    likelihood: Likelihood
-    theta: Float[Array, " parameters"]
-    sigma: Float[Array, " traces"]
-    result: Any
-    steps: Array
-    jacobian: tuple[Float[Array, "rows parameters"], ...]
+    likelihood: Likelihood  # what was fitted
+    theta: Float[Array, " parameters"]  # the optimum
+    sigma: Float[Array, " channels"]  # each channel's noise, by what is left of it
+    result: Any  # a member of `RESULTS`
+    steps: Array  # trial steps taken, in all
+    jacobian: tuple[Float[Array, "rows parameters"], ...]  # of the whitened residuals in theta
+    # under Student's t these, and the Jacobian, are reweighted
     residuals: tuple[Float[Array, " rows"], ...]
-    shapes: tuple[Float[Array, "columns rows"], ...]
-    slope: tuple[Float[Array, " rows"], ...]
+    shapes: tuple[Float[Array, "columns rows"], ...]  # those of the linear nuisances
+    slope: tuple[Float[Array, " rows"], ...]  # what a further delay would change
 
 
 def least_squares(
@@ -68,68 +59,54 @@ def least_squares(
 @eqx.filter_jit
 def _solve_round(likelihood: Likelihood, start: Array, sigma: Array) -> LeastSquaresResult:
     found = minimise(lambda theta: (likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)), start)
-    theta, parts = found.theta, list(likelihood.channels_and_inputs(found.theta))
-    sizes = [trace.rows + len(trace.columns) for trace, _ in parts]
-    of_traces = jnp.split(found.jacobian, np.cumsum(sizes))[:-1]
-    remainder = tuple(trace.fit_nuisances(seen, s)[0] for (trace, seen), s in zip(parts, sigma, strict=True))
-    root = [_root_weight(trace, left / s) for (trace, _), left, s in zip(parts, remainder, sigma, strict=True)]
-    if any(trace.noise == "student" for trace, _ in parts):
-        of_traces = _information_jacobian(likelihood, theta, sigma, remainder)
-    used = theta.size / likelihood.count  # of a trace's samples, by the parameters
-    return LeastSquaresResult(
-        likelihood=likelihood,
-        theta=theta,
-        sigma=jnp.stack(
-            [_noise(trace, left, used) for trace, left in zip(likelihood.channels, remainder, strict=True)]
-        ),
-        result=found.result,
-        steps=found.steps,
-        jacobian=tuple(of_traces),
-        residuals=tuple(w * left for w, left in zip(root, remainder, strict=True)),
-        shapes=tuple(w * trace.residuals_and_shapes(seen)[1] for w, (trace, seen) in zip(root, parts, strict=True)),
-        slope=tuple(w * trace.whitened_delay_derivative(seen) for w, (trace, seen) in zip(root, parts, strict=True)),
-    )
-
-
-def _root_weight(trace: ChannelLikelihood, z: Array) -> ArrayLike:
-    """Of the samples, in reweighted least squares."""
-    return jnp.sqrt(student_weight(z)) if trace.noise == "student" else 1.0
+    theta, used = found.theta, found.theta.size / likelihood.count  # of a channel's samples, by the parameters
+    parts = []
+    for (channel, inputs), s in zip(likelihood.channels_and_inputs(theta), sigma, strict=True):
+        left = channel.fit_nuisances(inputs, s)[0]
+        root = jnp.sqrt(student_weight(left / s)) if channel.noise == "student" else 1.0
+        shapes, slope = channel.residuals_and_shapes(inputs)[1], channel.whitened_delay_derivative(inputs)
+        parts.append((left, _noise(channel, left, used), root * left, root * shapes, root * slope))
+    remainders, noise, *weighted = zip(*parts, strict=True)
+    if any(channel.noise == "student" for channel in likelihood.channels):
+        jacobians = _information_jacobian(likelihood, theta, sigma, remainders)
+    else:
+        sizes = [channel.rows + len(channel.columns) for channel in likelihood.channels]
+        jacobians = tuple(jnp.split(found.jacobian, np.cumsum(sizes))[:-1])
+    return LeastSquaresResult(likelihood, theta, jnp.stack(noise), found.result, found.steps, jacobians, *weighted)
 
 
 def _information_jacobian(
     likelihood: Likelihood, theta: Array, sigma: Array, residuals: tuple[Array, ...]
-) -> list[Float[Array, "rows parameters"]]:
+) -> tuple[Float[Array, "rows parameters"], ...]:
     """The Jacobian whose square is the curvature of -log-likelihood: that of Student's residuals is steeper."""
 
     def whitened_residuals(theta: Array) -> list[Array]:
         parts = zip(likelihood.channels_and_inputs(theta), sigma, strict=True)
-        found = ((trace.fit_nuisances(seen, s), s) for (trace, seen), s in parts)
+        found = ((channel.fit_nuisances(inputs, s), s) for (channel, inputs), s in parts)
         return [jnp.concatenate([left / s, beta]) for (left, beta, _), s in found]
 
-    scaled = []
-    for trace, jacobian, left, s in zip(
-        likelihood.channels, jax.jacfwd(whitened_residuals)(theta), residuals, sigma, strict=True
-    ):
-        if trace.noise == "student":
+    scaled, jacobians = [], jax.jacfwd(whitened_residuals)(theta)
+    for channel, jacobian, left, s in zip(likelihood.channels, jacobians, residuals, sigma, strict=True):
+        if channel.noise == "student":
             z = left / s
             weight = student_weight(z)
-            weight = weight * trace.mean(student_curvature(z)) / trace.mean(weight)
-            jacobian = jacobian * jnp.pad(jnp.sqrt(weight), (0, len(trace.columns)), constant_values=1.0)[:, None]
+            weight = weight * channel.mean(student_curvature(z)) / channel.mean(weight)
+            jacobian = jacobian * jnp.pad(jnp.sqrt(weight), (0, len(channel.columns)), constant_values=1.0)[:, None]
         scaled.append(jacobian)
-    return scaled
+    return tuple(scaled)
 
 
-def _noise(trace: ChannelLikelihood, residuals: Array, parameter_fraction: Array) -> Array:
+def _noise(channel: ChannelLikelihood, residuals: Array, parameter_fraction: Array) -> Array:
     """Its standard deviation, or Student's scale, not below the least that is believed."""
-    counted = jnp.maximum(trace.count * (1.0 - parameter_fraction), 1)
+    counted = jnp.maximum(channel.count * (1.0 - parameter_fraction), 1)
     sigma = jnp.sqrt(jnp.sum(jnp.square(residuals)) / counted)
-    sigma = jnp.maximum(sigma, trace.noise_floor)
-    if trace.noise != "student":
+    sigma = jnp.maximum(sigma, channel.noise_floor)
+    if channel.noise != "student":
         return sigma
 
     def update_scale(_: int, sigma: Array) -> Array:
         squares = student_weight(residuals / sigma) * jnp.square(residuals)
-        return jnp.maximum(jnp.sqrt(jnp.sum(squares) / counted), trace.noise_floor)
+        return jnp.maximum(jnp.sqrt(jnp.sum(squares) / counted), channel.noise_floor)
 
     return lax.fori_loop(0, 40, update_scale, sigma)  # each step gains a quarter of a digit
 
@@ -137,7 +114,7 @@ def _noise(trace: ChannelLikelihood, residuals: Array, parameter_fraction: Array
 def solve(
     likelihood: Likelihood,
     start: Float[np.ndarray, " parameters"],
-    noise: Float[np.ndarray, " traces"],
+    noise: Float[np.ndarray, " channels"],
     optional_nuisances: tuple[tuple[str, ...], ...],
 ) -> LeastSquaresResult:
     """Fit, then free nuisances (`NUISANCES`, `TIMING_NUISANCES`) one at a time while one is asked for."""
@@ -153,41 +130,39 @@ def solve(
 
 
 def _solve_coloured_noise(likelihood: Likelihood, start: Array, noise: Array) -> LeastSquaresResult:
-    """Fit; where a trace's noise is AR(1), again with the coefficient that the residuals show.
+    """Fit; where a channel's noise is AR(1), again with the coefficient that the residuals show.
 
     It is then held: its error and the parameters' are uncorrelated in the limit of many samples (the information
     is block-diagonal), so that not knowing it exactly widens no parameter.
     """
     solved = least_squares(likelihood, start, noise)
-    for i, trace in enumerate(likelihood.channels):
-        if trace.noise == "ar1":
-            white = dataclasses.replace(trace, whitening=None)
-            left = np.asarray(_residuals(white, likelihood.channel_inputs(solved.theta, i), solved.sigma[i]))
-            counted = trace.weights > 0.0
-            whitening = fit_ar1(left, counted).whitening(counted)
-            likelihood = likelihood.replace_channel(i, dataclasses.replace(trace, whitening=whitening))
+    for i, channel in enumerate(likelihood.channels):
+        if channel.noise == "ar1":
+            white = dataclasses.replace(channel, whitening=None)
+            left, *_ = _fit_nuisances(white, likelihood.channel_inputs(solved.theta, i), solved.sigma[i])
+            counted = channel.weights > 0.0
+            whitening = fit_ar1(np.asarray(left), counted).whitening(counted)
+            likelihood = likelihood.replace_channel(i, dataclasses.replace(channel, whitening=whitening))
     if likelihood is solved.likelihood:
         return solved
     return least_squares(likelihood, solved.theta, solved.sigma)
 
 
-@eqx.filter_jit
-def _residuals(trace: ChannelLikelihood, inputs: ChannelInputs, sigma: Array) -> Array:
-    return trace.fit_nuisances(inputs, sigma)[0]
+_fit_nuisances = eqx.filter_jit(ChannelLikelihood.fit_nuisances)
 
 
 def _add_nuisance(solution: LeastSquaresResult, index: int, name: str) -> tuple[Likelihood, Array]:
-    """The likelihood with a nuisance of the trace `index` freed, and where to go on from."""
+    """The likelihood with a nuisance of the channel `index` freed, and where to go on from."""
     likelihood, theta = solution.likelihood, solution.theta
-    trace = likelihood.channels[index]
+    channel = likelihood.channels[index]
     if name in TIMING_NUISANCES:
-        trace = free_timing(trace, likelihood.channel_inputs(theta, index), name)
-        new, before = likelihood.replace_channel(index, trace).names, likelihood.names
+        channel = free_timing(channel, likelihood.channel_inputs(theta, index), name)
+        new, before = likelihood.replace_channel(index, channel).names, likelihood.names
         theta = jnp.array([theta[before.index(n)] if n in before else 0.0 for n in new])
     else:
-        sd = trace.linear_sd.at[np.array(NUISANCES[name])].set(10.0 * jnp.ptp(trace.observed))
-        trace = dataclasses.replace(trace, linear_sd=sd)
-    return likelihood.replace_channel(index, trace), theta
+        sd = channel.linear_sd.at[np.array(NUISANCES[name])].set(10.0 * jnp.ptp(channel.observed))
+        channel = dataclasses.replace(channel, linear_sd=sd)
+    return likelihood.replace_channel(index, channel), theta
 
 
 def _bic_decreases(
@@ -200,30 +175,24 @@ def _bic_decreases(
     columns = [np.concatenate([np.asarray(j)[: x.size] for j, x in zip(solution.jacobian, remainders, strict=True)])]
 
     def pad_columns(index: int, shapes: np.ndarray) -> np.ndarray:
-        """Columns of one trace, which are nothing in the others."""
+        """Columns of one channel, which are nothing in the others."""
         around = (starts[index], starts[-1] - starts[index + 1])
         return np.pad(np.atleast_2d(shapes) / sigma[index], ((0, 0), around)).T
 
-    candidates = {}
-    for i, trace in enumerate(likelihood.channels):
-        shapes, free = np.asarray(solution.shapes[i]), np.asarray(trace.linear_sd) > 0.0
-        columns.append(pad_columns(i, shapes[free[list(trace.columns)]]))
+    candidates, gains = {}, {}
+    for i, channel in enumerate(likelihood.channels):
+        shapes, free = np.asarray(solution.shapes[i]), np.asarray(channel.linear_sd) > 0.0
+        columns.append(pad_columns(i, shapes[free[list(channel.columns)]]))
+        if "clock" in optional_nuisances[i] and "clock" not in channel.timing:
+            share = clock_r_squared(channel, likelihood.channel_inputs(solution.theta, i), sigma[i])
+            gains[i, "clock"] = bic_decrease(share, float(channel.count), 1)
         for name in optional_nuisances[i]:
-            if name == "delay" and name not in trace.timing:
+            if name == "delay" and name not in channel.timing:
                 candidates[i, name] = pad_columns(i, np.asarray(solution.slope[i]))
             elif name in NUISANCES and not free[NUISANCES[name][0]]:
                 candidates[i, name] = pad_columns(i, shapes[list(NUISANCES[name])])
-    known = np.concatenate(columns, axis=1)
-    basis, values, _ = np.linalg.svd(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300), full_matrices=False)
-    basis = basis[:, values > 1e-9 * values[0]]
+    basis = orthonormal_basis(np.concatenate(columns, axis=1))
     remainder = np.concatenate(remainders)
-    gains = {
-        (i, "clock"): bic_decrease(
-            clock_r_squared(trace, likelihood.channel_inputs(solution.theta, i), sigma[i]), float(trace.count), 1
-        )
-        for i, trace in enumerate(likelihood.channels)
-        if "clock" in optional_nuisances[i] and "clock" not in trace.timing
-    }
     for (i, name), added in candidates.items():
         left = added - basis @ (basis.T @ added)
         modes, sizes, _ = np.linalg.svd(left, full_matrices=False)

@@ -51,21 +51,13 @@ def result_message(name: str) -> str:
 
 
 class Minimum(eqx.Module):
-    """Where Levenberg-Marquardt ended.
-
-    Attributes:
-        theta: the parameters.
-        cost: half the sum of squared residuals.
-        jacobian: of the residuals, stacked in the order of their pytree.
-        steps: trial steps taken.
-        result: a member of `RESULTS`.
-    """
+    """Where Levenberg-Marquardt ended."""
 
     theta: Float[Array, " parameters"]
-    cost: Float[Array, ""]
-    jacobian: Float[Array, "rows parameters"]
-    steps: Array
-    result: Any
+    cost: Float[Array, ""]  # half the sum of squared residuals
+    jacobian: Float[Array, "rows parameters"]  # of the residuals, stacked in the order of their pytree
+    steps: Array  # trial steps taken
+    result: Any  # a member of `RESULTS`
 
 
 def minimise(
@@ -101,19 +93,12 @@ def minimise(
 
 @dataclasses.dataclass(frozen=True)
 class Optima:
-    """The distinct optima that many starts led to.
+    """The distinct optima that many starts led to."""
 
-    Attributes:
-        minima: one for each, stacked, lowest first; where no start led to one, the lowest end.
-        start_counts: how many starts led to each.
-        n_failed: how many starts led to none.
-        result: of the lowest.
-    """
-
-    minima: Minimum
-    start_counts: Int[np.ndarray, " optima"]
-    n_failed: int
-    result: Any
+    minima: Minimum  # one for each, stacked, lowest first; where no start led to one, the lowest end
+    start_counts: Int[np.ndarray, " optima"]  # how many starts led to each
+    n_failed: int  # how many starts led to none
+    result: Any  # of the lowest
 
 
 def minimise_many(
@@ -124,12 +109,8 @@ def minimise_many(
 ) -> Optima:
     """All starts at once; residuals in units of their standard deviation, so that the cost is -log-probability.
 
-    Args:
-        residuals: as of `minimise`.
-        starts: a row each.
-        same_optimum: standard errors between ends that are one optimum: the residuals cannot tell them apart, as along
-            a ridge.
-        log_density_margin: in log-probability: an optimum lower by this still has a twentieth of the other's density.
+    Ends `same_optimum` standard errors apart are one: the residuals cannot tell them apart, as along a ridge. One
+    whose log-probability is lower by `log_density_margin` still has a twentieth of the other's density.
     """
     ends = _minimise_each(residuals, jnp.asarray(starts))
     theta, jacobian = np.asarray(ends.theta), np.asarray(ends.jacobian)
@@ -177,35 +158,19 @@ class _LinearProblem(eqx.Module):
 
 
 class _Descent(optx.AbstractDescent):
-    """Damped Gauss-Newton steps.
+    """Damped Gauss-Newton steps."""
 
-    Attributes:
-        rows: how many residuals there are.
-        damping: at the first step, of the largest curvature.
-        scale_decay: of the scale, from step to step: long enough to cross a plateau, short enough for a valley.
-        rank_tolerance: of the largest singular value of the scaled Jacobian: what is smaller is rounding.
-        rounding: units in the last place by which a parameter's rounding may move the residuals.
-    """
-
-    rows: int = eqx.field(static=True)
-    damping: float = 1e-2
+    rows: int = eqx.field(static=True)  # how many residuals there are
+    damping: float = 1e-2  # at the first step, of the largest curvature
+    # of the scale, from step to step: long enough to cross a plateau, short enough for a valley
     scale_decay: float = 0.9
-    rank_tolerance: float = 1e-13
-    rounding: float = 8.0
+    rank_tolerance: float = 1e-13  # of the largest singular value of the scaled Jacobian: what is smaller is rounding
+    rounding: float = 8.0  # units in the last place by which a parameter's rounding may move the residuals
 
     def init(self, y: Array, f_info_struct: Any) -> _LinearProblem:
-        size, zero = y.size, jnp.zeros_like(y)
-        return _LinearProblem(
-            y,
-            jnp.zeros(self.rows),
-            jnp.zeros((self.rows, size)),
-            zero,
-            zero,
-            jnp.eye(size),
-            zero,
-            jnp.array(jnp.inf),
-            jnp.array(0),
-        )
+        residuals, jacobian, zero = jnp.zeros(self.rows), jnp.zeros((self.rows, y.size)), jnp.zeros_like(y)
+        nowhere = jnp.array(jnp.inf), jnp.array(0)
+        return _LinearProblem(y, residuals, jacobian, zero, zero, jnp.eye(y.size), zero, *nowhere)
 
     def query(self, y: Array, f_info: Any, state: _LinearProblem) -> _LinearProblem:
         residuals, jacobian = f_info.residual, f_info.jac.as_matrix()
@@ -231,24 +196,17 @@ class _Descent(optx.AbstractDescent):
 
 
 class LevenbergMarquardt(optx.AbstractGaussNewton):
-    """Ends where the offset is small enough, or where steps change nothing any more.
-
-    Attributes:
-        rtol, atol: a step that changes nothing is the last.
-        offset_tolerance: standard errors from the optimum: what passes for it.
-        max_rejections: times in a row, near the optimum: the sum of squares changes by its rounding only.
-        min_step: of the first step's size: nothing moves any more.
-    """
+    """Ends where the offset is small enough, or where steps change nothing any more."""
 
     descent: _Descent
     search: optx.ClassicalTrustRegion
     norm: Callable[..., Array]
     verbose: Callable[..., None]
-    rtol: float = 0.0
+    rtol: float = 0.0  # a step that changes nothing is the last
     atol: float = 1e-300
-    offset_tolerance: float = 1e-4
-    max_rejections: int = 4
-    min_step: float = 1e-10
+    offset_tolerance: float = 1e-4  # standard errors from the optimum: what passes for it
+    max_rejections: int = 4  # times in a row, near the optimum: the sum of squares changes by its rounding only
+    min_step: float = 1e-10  # of the first step's size: nothing moves any more
 
     def terminate(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> tuple[Array, Any]:
         local: _LinearProblem = state.descent_state

@@ -21,9 +21,6 @@ def choose_start(problem: Problem, start: Mapping[str, float] | None) -> Float[n
 
     From far off it may make nothing of it, where the circuit gives no signal: an end that leaves more than the
     data's own start is no optimum, and that start is taken.
-
-    Raises:
-        InputError: one is no parameter of the fit, or not above zero.
     """
     theta, names = problem.start.copy(), problem.likelihood.prior.names
     if start is None:
@@ -47,14 +44,14 @@ def find_optima(solution: LeastSquaresResult, count: int, draws_per_start: int =
     likelihood = solution.likelihood.without_samples()
     draws = likelihood.sample_prior(np.asarray(solution.theta), draws_per_start * count)
     slowest = jax.vmap(lambda theta: likelihood.circuit(theta).b)(jnp.asarray(draws))
-    tables = [trace.compression for trace in likelihood.channels if trace.compression is not None]
+    tables = [channel.compression for channel in likelihood.channels if channel.compression is not None]
     within_tables = np.all([np.ones(len(draws), bool), *(table.covers(slowest) for table in tables)], axis=0)
     starts = np.vstack([solution.theta, draws[within_tables][: count - 1]])
     return minimise_many(jax.tree_util.Partial(_residuals, likelihood, solution.sigma), jnp.asarray(starts))
 
 
 def _residuals(
-    likelihood: Likelihood, sigma: Float[Array, " traces"], theta: Float[Array, " parameters"]
+    likelihood: Likelihood, sigma: Float[Array, " channels"], theta: Float[Array, " parameters"]
 ) -> tuple[tuple[Array, ...], Array]:
     return likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)
 

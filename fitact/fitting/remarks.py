@@ -22,9 +22,8 @@ def channel_warnings(record: Record, choice: DriveModel, channel: str, figures: 
     span = record.time[-1] - record.time[0]
     if record.frequency() is None and choice.periodic:
         found.append(
-            f"the record ({format_engineering(span, 's')}) does not show its drive repeating: it is shorter than"
-            f" 1.5 periods"
-            " or not periodic, so the answer rests on a part of a wave; record two periods or more"
+            f"the record ({format_engineering(span, 's')}) does not show its drive repeating: it is shorter than 1.5"
+            " periods or not periodic, so the answer rests on a part of a wave; record two periods or more"
         )
     if is_undersampled(figures):
         found.append(
@@ -38,9 +37,8 @@ def channel_warnings(record: Record, choice: DriveModel, channel: str, figures: 
             " may be off by half; record with a finer range"
         )
     if figures.get("quiet_noise", 0.0) > 3.0 * figures["rms_residual"]:  # more than noise can be
-        there, left = (
-            format_engineering(figures[name], CHANNEL_UNITS[channel]) for name in ("quiet_noise", "rms_residual")
-        )
+        unit = CHANNEL_UNITS[channel]
+        there, left = (format_engineering(figures[name], unit) for name in ("quiet_noise", "rms_residual"))
         found.append(
             f"[measurement] quiet holds more than noise: {channel} varies by {there} in it, and the fit leaves {left},"
             " so the errors stated are too wide; choose a stretch before the drive starts"
@@ -49,8 +47,7 @@ def channel_warnings(record: Record, choice: DriveModel, channel: str, figures: 
         found.append(
             f"{figures['outliers']:.0f} samples of {channel} lie further from the fit than normal noise would bring"
             f" them, the first at {format_engineering(figures['first_outlier'], 's')}; [measurement] noise_model ="
-            f" 'student'"
-            " lets outliers count less"
+            " 'student' lets outliers count less"
         )
     return found
 

@@ -12,7 +12,7 @@ from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
 from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.residual_tests import N_TESTS, PhaseBins, ResidualTestStatistics, p_values, runs_z
 
-_FALSE_ALARM = 1e-6  # of a trace that holds nothing but noise, by all tests of structure together
+_FALSE_ALARM = 1e-6  # of a channel that holds nothing but noise, by all tests of structure together
 _P_VALUES = ("folded_p", "spectrum_p", "line_p")
 
 
@@ -34,19 +34,14 @@ def channel_statistics(
     measured = choice.name == "measured"
     expected = math.hypot(noise, gain * record.noise("V") if measured else 0.0)
     repeats = record.frequency() if choice.periodic else None
-    of_time = PhaseBins.from_times(time, repeats)
-    square = residuals @ residuals
-    unit = math.sqrt(square / residuals.size) or 1.0
-    structure = ResidualTestStatistics.from_residuals(
-        (residuals / unit).astype(np.float32), of_time
-    )  # tests need no more than that
-    found = residual_statistics(
-        square, residuals.size, structure, np.asarray(expected), residuals.size - n_fitted, of_time
-    )
+    count, square, bins = residuals.size, residuals @ residuals, PhaseBins.from_times(time, repeats)
+    unit = math.sqrt(square / count) or 1.0
+    structure = ResidualTestStatistics.from_residuals((residuals / unit).astype(np.float32), bins)  # which is enough
+    found = residual_statistics(square, count, structure, np.asarray(expected), count - n_fitted, bins)
     return {name: float(value) for name, value in found.items()} | {
         "rounding_noise": rounding_noise_sd(record[channel]),
         "interpolation_error": gain * interpolation_error(record["V"]) if measured else 0.0,
-        "samples": residuals.size,
+        "samples": count,
     }
 
 
@@ -64,7 +59,7 @@ def residual_statistics(
     """
     tests = {}
     if test_statistics is not None:
-        tests = {"runs_z": runs_z(test_statistics, samples), **p_values(test_statistics, samples, phase_bins)}
+        tests = {"runs_z": runs_z(test_statistics, samples)} | p_values(test_statistics, samples, phase_bins)
     return {
         "chi2_reduced": square / (freedom * expected**2),
         "rms_residual": np.sqrt(square / samples),
@@ -80,18 +75,14 @@ def outliers(residuals: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"], 
     The noise is that of the middle half of them, or the one to expect where that is larger; `first_outlier` is in s.
     """
     core = float(np.median(np.abs(residuals[residuals != 0.0]))) / 0.6744897501960817 if residuals.any() else 0.0
-    beyond = np.abs(residuals) > outlier_threshold(residuals.size) * max(core, noise)
+    threshold = -NormalDist().inv_cdf(0.5e-3 / residuals.size)  # beyond which any lies with a probability of 1e-3
+    beyond = np.abs(residuals) > threshold * max(core, noise)
     count = int(np.count_nonzero(beyond))
     return {"outliers": count, **({"first_outlier": float(time[np.argmax(beyond)])} if count else {})}
 
 
-def outlier_threshold(count: int) -> float:
-    """Standard deviations beyond which one of that many normal numbers lies with a probability of 1e-3."""
-    return -NormalDist().inv_cdf(0.5e-3 / count)
-
-
 def pooled_statistics(figures: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Figures of merit of all traces; those with a unit are the first's."""
+    """Figures of merit of all channels; those with a unit are the first's."""
     freedom = np.array([each["degrees_of_freedom"] for each in figures])
     chi2 = np.array([each["chi2_reduced"] for each in figures])
     return figures[0] | {

@@ -15,28 +15,18 @@ N_TESTS = len(_PHASES) + 2  # whose probabilities are looked at
 
 
 class Fold(NamedTuple):
-    """Parts of a period whose means are compared.
+    """Parts of a period whose means are compared."""
 
-    Attributes:
-        weight: one over the samples in each part; 0 where there are none.
-        means_dof, scatter_dof: degrees of freedom of the means, and of what scatters about them.
-    """
-
-    weight: Float[np.ndarray, " parts"]
-    means_dof: int
-    scatter_dof: int
+    weight: Float[np.ndarray, " parts"]  # one over the samples in each part; 0 where there are none
+    means_dof: int  # degrees of freedom of the means
+    scatter_dof: int  # and of what scatters about them
 
 
 class PhaseBins(NamedTuple):
-    """Samples by their place in the drive's period.
+    """Samples by their place in the drive's period."""
 
-    Attributes:
-        bin_matrix: which are in each of the finest parts, as a matrix of ones.
-        folds: from the finest on.
-    """
-
-    bin_matrix: scipy.sparse.csr_array
-    folds: tuple[Fold, ...]
+    bin_matrix: scipy.sparse.csr_array  # which are in each of the finest parts, as a matrix of ones
+    folds: tuple[Fold, ...]  # from the finest on
 
     @classmethod
     def from_times(cls, time: Float[np.ndarray, " n"], frequency: float | None) -> "PhaseBins | None":
@@ -55,20 +45,13 @@ class PhaseBins(NamedTuple):
 
 
 class ResidualTestStatistics(NamedTuple):
-    """What the tests look at, of each record.
+    """What the tests look at, of each record."""
 
-    Attributes:
-        n_positive, n_runs: residuals above 0, and stretches of them on one side of it.
-        fold_fractions: share of the means over parts of a period in the sum of squares, for each of the folds.
-        distance: of the cumulative periodogram from that of white noise, times the root of the lines.
-        line_fraction: the share of the strongest line.
-    """
-
-    n_positive: Int[np.ndarray, "*records"]
-    n_runs: Int[np.ndarray, "*records"]
-    fold_fractions: Float[np.ndarray, "*records folds"]
-    distance: Float[np.ndarray, "*records"]
-    line_fraction: Float[np.ndarray, "*records"]
+    n_positive: Int[np.ndarray, "*records"]  # residuals above 0
+    n_runs: Int[np.ndarray, "*records"]  # stretches of them on one side of it
+    fold_fractions: Float[np.ndarray, "*records folds"]  # share of the means over parts of a period in the squares
+    distance: Float[np.ndarray, "*records"]  # of the periodogram's sum from white noise's, times the root of the lines
+    line_fraction: Float[np.ndarray, "*records"]  # the share of the strongest line
 
     @classmethod
     def from_residuals(
@@ -90,15 +73,15 @@ def count_true(mask: Bool[np.ndarray, "*rows n"]) -> Int[np.ndarray, "*rows"]:
 def _fold_fractions(
     residuals: Float[np.ndarray, "*records n"], phase_bins: PhaseBins | None
 ) -> Float[np.ndarray, "*records folds"]:
-    of = residuals.shape[:-1]
-    if phase_bins is None:
-        return np.empty((*of, 0))
+    records = residuals.shape[:-1]
+    if phase_bins is None or not phase_bins.folds:
+        return np.empty((*records, 0))
     square = np.vecdot(residuals, residuals)
     sums, found = phase_bins.bin_matrix @ residuals.reshape(-1, residuals.shape[-1]).T, []
     for weight, _, _ in phase_bins.folds:
         sums = sums.reshape(weight.size, len(sums) // weight.size, -1).sum(axis=1)
-        found.append((weight @ sums**2).reshape(of) / np.where(square > 0.0, square, 1.0))
-    return np.stack(found, axis=-1) if found else np.empty((*of, 0))
+        found.append((weight @ sums**2).reshape(records) / np.where(square > 0.0, square, 1.0))
+    return np.stack(found, axis=-1)
 
 
 def _periodogram_statistics(
@@ -128,12 +111,19 @@ def _periodogram_statistics(
 def p_values(
     statistics: ResidualTestStatistics, samples: int, phase_bins: PhaseBins | None
 ) -> dict[str, Float[np.ndarray, "*records"]]:
-    """Of white noise to show more of it than `statistics`, by test; uncorrected for their number."""
-    return {
-        "folded_p": _folded_p(statistics.fold_fractions, phase_bins),
-        "spectrum_p": _spectrum_p(statistics.distance, (samples - 1) // 2),
-        "line_p": _line_p(statistics.line_fraction, (samples - 1) // 2),
-    }
+    """Of white noise to show more of it than `statistics`, by test; uncorrected for their number.
+
+    Beside `_folded_p`: Bartlett's test of the cumulative periodogram, by Kolmogorov's law, low where noise is not
+    white; and Fisher's, low where one line of the periodogram, as of hum, is too strong for white noise.
+    """
+    lines = (samples - 1) // 2
+    spectrum_p = line_p = np.ones(statistics.distance.shape)
+    if lines >= _MIN_SAMPLES // 2:
+        spectrum_p = scipy.special.kolmogorov(statistics.distance)
+        log_p = math.log(lines) + (lines - 1) * np.log1p(-np.minimum(statistics.line_fraction, 1.0 - 1e-16))
+        line_p = np.exp(np.minimum(log_p, 0.0))
+    folded_p = _folded_p(statistics.fold_fractions, phase_bins)
+    return {"folded_p": folded_p, "spectrum_p": spectrum_p, "line_p": line_p}
 
 
 def runs_z(statistics: ResidualTestStatistics, samples: int) -> Float[np.ndarray, "*records"]:
@@ -158,21 +148,3 @@ def _folded_p(
         p = scipy.special.betainc(0.5 * fold.scatter_dof, 0.5 * fold.means_dof, np.maximum(1.0 - share, 0.0))
         least = np.minimum(least, p)
     return least
-
-
-def _spectrum_p(distance: Float[np.ndarray, "*records"], lines: int) -> Float[np.ndarray, "*records"]:
-    """Bartlett's test of the cumulative periodogram, by Kolmogorov's law: low where noise is not white."""
-    if lines < _MIN_SAMPLES // 2:
-        return np.ones(distance.shape)
-    k = np.arange(1, 31)
-    series = 2.0 * np.sum((-1.0) ** (k - 1) * np.exp(-2.0 * (k * distance[..., None]) ** 2), axis=-1)
-    # 1 where the series converges slowly
-    return np.where(distance < 0.2, 1.0, np.clip(series, 0.0, 1.0))
-
-
-def _line_p(line_fraction: Float[np.ndarray, "*records"], lines: int) -> Float[np.ndarray, "*records"]:
-    """Fisher's test: low where one line of the periodogram, as of hum, is too strong for white noise."""
-    if lines < _MIN_SAMPLES // 2:
-        return np.ones(line_fraction.shape)
-    log_p = math.log(lines) + (lines - 1) * np.log1p(-np.minimum(line_fraction, 1.0 - 1e-16))
-    return np.exp(np.minimum(log_p, 0.0))

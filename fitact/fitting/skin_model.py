@@ -42,11 +42,7 @@ def _lowest_omega(record: Record, scene: Scene) -> float:
 
 
 def require_skin_response(circuit: RC | WithSkin, record: Record, choice: DriveModel) -> None:
-    """Refuse a drive whose response the skin does not have.
-
-    Raises:
-        InputError: naming the record and the remedy.
-    """
+    """Refuse a drive whose response the skin does not have."""
     if not isinstance(circuit, WithSkin):
         return
     if circuit.grid is None and not (choice.steady_state and isinstance(choice.drive, Periodic)):

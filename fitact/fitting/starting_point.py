@@ -32,11 +32,8 @@ def estimate_from_vsc(
 ) -> VscEstimate:
     """g (below `max_divider`) and b from  Vsc = g V - (1/b) ∫ Vsc dt + line,  the circuit's equation integrated once.
 
-    Samples are taken `part_size` at a time, which bounds memory.
-
-    Raises:
-        InputError: g is not between 0 and `max_divider` (1/2, or a little more with a free gain), so not this
-            circuit's.
+    Samples are taken `part_size` at a time, which bounds memory. A g that is not between 0 and `max_divider` (1/2, or a
+    little more with a free gain) is not this circuit's, and refused.
     """
     time, vsc, voltage = record.time, record["Vsc"], choice.voltage
     integral = np.concatenate([[0.0], np.cumsum(0.5 * np.diff(time) * (vsc[1:] + vsc[:-1]))])
@@ -148,7 +145,7 @@ def _residual_objective(
 ) -> Float[np.ndarray, ""]:
     """The sum of the logarithms of the residuals' squares, each for its samples."""
     parts = [
-        trace.count * jnp.log(jnp.sum(jnp.square(trace.fit_nuisances(seen, 1e-3 * jnp.ptp(trace.observed))[0])))
-        for trace, seen in likelihood.channels_and_inputs(theta)
+        channel.count * jnp.log(jnp.sum(jnp.square(channel.fit_nuisances(inputs, 1e-3 * jnp.ptp(channel.observed))[0])))
+        for channel, inputs in likelihood.channels_and_inputs(theta)
     ]
     return 0.5 * sum(parts, jnp.zeros(()))

@@ -1,4 +1,4 @@
-"""When a trace's drive began and how fast it runs: the best of a grid, and what a clock of its own would change."""
+"""When a channel's drive began and how fast it runs: the best of a grid, and what a clock of its own would change."""
 
 import dataclasses
 
@@ -17,152 +17,146 @@ from fitact.model.skin import constant_skin_circuit
 
 
 def free_timing(
-    trace: ChannelLikelihood,
+    channel: ChannelLikelihood,
     inputs: ChannelInputs,
     name: str,
     step: float = 1 / 8,
     delay_half_width: float = 5.0,
     clock_half_width: float = 2.0,
 ) -> ChannelLikelihood:
-    """The trace with its delay or clock free, over its samples, since the response table holds none.
+    """The channel with its delay or clock free, over its samples, since the response table holds none.
 
     From the middle of the best of a grid, whose step and half widths are in units of the coordinates: across an ideal
     edge there is no slope to follow, and between two samples nothing that a gain could not do as well. Ideal edges tell
     a clock, and a delay with it, from the samples beside them only; what these leave open is the prior then, and they
     are left out.
     """
-    edges = _edge_mask(trace) if name == "clock" else np.zeros(trace.time.size, bool)
+    edges = _edge_mask(channel) if name == "clock" else np.zeros(channel.time.size, bool)
     names = TIMING_NUISANCES if edges.any() else (name,)
-    units = np.array([float(trace.timing_unit(n)) for n in names])
-    timing = tuple(n for n in TIMING_NUISANCES if n in names or n in trace.timing)
-    trace = dataclasses.replace(trace.without_compression(), timing=timing)
+    units = np.array([float(channel.timing_unit(n)) for n in names])
+    timing = tuple(n for n in TIMING_NUISANCES if n in names or n in channel.timing)
+    channel = dataclasses.replace(channel.without_compression(), timing=timing)
     half_widths = {"delay": 1.0 if len(names) > 1 else delay_half_width, "clock": clock_half_width}
     axes = [step * np.arange(-int(w / step), int(w / step) + 1) for w in map(half_widths.__getitem__, names)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(names))
-    if edges.any():
-        squares = _residual_sums_of_squares(_select_samples(trace, edges), inputs, names, grid * units)
-        # more than the least by less than a sample on the wrong side of an edge, which is off by most of the height
-        good = grid[squares < squares.min() + (0.1 * np.ptp(np.asarray(trace.observed))) ** 2]
-    else:
-        squares = _residual_sums_of_squares(trace, inputs, names, grid * units)
-        good = grid[squares < squares.min() * (1.0 + 25.0 / trace.n_samples)]
-    moved = dict(zip(names, good.mean(axis=0) * units, strict=True))
-    trace = dataclasses.replace(
-        trace, shift=trace.shift + moved.get("delay", 0.0), clock=trace.clock + moved.get("clock", 0.0)
+    kept = _select_samples(channel, edges) if edges.any() else channel
+    squares = _residual_sums_of_squares(kept, inputs, names, grid * units)
+    # more than the least by less than a sample on the wrong side of an edge, which is off by most of the height
+    margin = (
+        (0.1 * np.ptp(np.asarray(channel.observed))) ** 2 if edges.any() else squares.min() * 25.0 / channel.n_samples
     )
+    good = grid[squares < squares.min() + margin]
+    moved = {"delay": 0.0, "clock": 0.0} | dict(zip(names, good.mean(axis=0) * units, strict=True))
+    channel = dataclasses.replace(channel, shift=channel.shift + moved["delay"], clock=channel.clock + moved["clock"])
     if not edges.any():
-        return trace
+        return channel
     timing_sd = np.hypot(good.std(axis=0), step / np.sqrt(12.0))
-    weight = jnp.asarray(np.where(edges, 0.0, trace.weights))
-    return dataclasses.replace(trace, weight=weight, timing_sd=jnp.asarray(timing_sd))
+    weight = jnp.asarray(np.where(edges, 0.0, channel.weights))
+    return dataclasses.replace(channel, weight=weight, timing_sd=jnp.asarray(timing_sd))
 
 
-def _edge_mask(trace: ChannelLikelihood, margin: float = 3.0) -> np.ndarray:
+def _edge_mask(channel: ChannelLikelihood, margin: float = 3.0) -> np.ndarray:
     """Which samples lie within `margin` steps of an ideal edge, where its time shows."""
-    if not has_ideal_edges(trace.drive):
-        return np.zeros(trace.time.size, bool)
-    time, step = np.asarray(trace.time) - float(trace.shift), margin * float(trace.time_step)
-    return ideal_edge_mask(trace.drive, time, step)
+    if not has_ideal_edges(channel.drive):
+        return np.zeros(channel.time.size, bool)
+    time, step = np.asarray(channel.time) - float(channel.shift), margin * float(channel.time_step)
+    return ideal_edge_mask(channel.drive, time, step)
 
 
-def _select_samples(trace: ChannelLikelihood, mask: np.ndarray) -> ChannelLikelihood:
+def _select_samples(channel: ChannelLikelihood, mask: np.ndarray) -> ChannelLikelihood:
     """With some of its samples only."""
-    places, arrays = np.flatnonzero(mask), (trace.time, trace.observed)
+    places, arrays = np.flatnonzero(mask), (channel.time, channel.observed)
     time, observed = (jnp.asarray(pad_samples(np.asarray(x)[places])) for x in arrays)
-    weight = jnp.asarray(pad_weight(trace.weights[places]))
-    return dataclasses.replace(trace, time=time, observed=observed, weight=weight)
+    weight = jnp.asarray(pad_weight(channel.weights[places]))
+    return dataclasses.replace(channel, time=time, observed=observed, weight=weight)
 
 
 def _residual_sums_of_squares(
-    trace: ChannelLikelihood,
+    channel: ChannelLikelihood,
     inputs: ChannelInputs,
     names: tuple[str, ...],
     candidates: np.ndarray,
     batch: int = 27,
     max_numbers: int = 1 << 20,
 ) -> Float[np.ndarray, " places"]:
-    """What each of the places, in SI units, leaves of the trace with the best gain and linear nuisances.
+    """What each of the places, in SI units, leaves of the channel with the best gain and linear nuisances.
 
     The signals of a `batch` are computed side by side, where these are no more than `max_numbers`.
     """
-    weights, shapes = trace.weights, np.asarray(_shapes(trace, inputs))[np.asarray(trace.linear_sd) > 0.0]
-    basis = _orthonormal_basis(shapes * weights)
+    weights, shapes = channel.weights, np.asarray(_shapes(channel, inputs))[np.asarray(channel.linear_sd) > 0.0]
+    basis = orthonormal_basis((shapes * weights).T)
 
     def project_out(values: np.ndarray) -> np.ndarray:
         weighted = values * weights
         return weighted - (weighted @ basis) @ basis.T
 
-    observed, sums = project_out(np.asarray(trace.observed)), []
+    observed, sums = project_out(np.asarray(channel.observed)), []
     size = max(1, min(batch, max_numbers // weights.size))
     for first in range(0, len(candidates), size):
         some = candidates[first : first + size]
-        filled = pad_rows(some, size)
-        signals = project_out(np.asarray(_signals(trace, inputs, dict(zip(names, filled.T, strict=True)))))[: len(some)]
+        offsets = dict(zip(names, pad_rows(some, size).T, strict=True))
+        signals = project_out(np.asarray(_signals(channel, inputs, offsets))[: len(some)])
         gains = signals @ observed / np.maximum(np.vecdot(signals, signals), 1e-300)
         remainders = observed - gains[:, None] * signals
         sums.append(np.vecdot(remainders, remainders))
     return np.concatenate(sums)
 
 
+_shapes = eqx.filter_jit(ChannelLikelihood.shapes)
+
+
 @eqx.filter_jit
 def _signals(
-    trace: ChannelLikelihood, inputs: ChannelInputs, offsets: dict[str, Float[Array, " places"]]
+    channel: ChannelLikelihood, inputs: ChannelInputs, offsets: dict[str, Float[Array, " places"]]
 ) -> Float[Array, "places samples"]:
     def shifted_signal(offset: dict[str, Array]) -> Array:
-        return trace.signal(
-            dataclasses.replace(inputs, **{name: getattr(inputs, name) + offset[name] for name in offset})
-        )
+        moved = {name: getattr(inputs, name) + offset[name] for name in offset}
+        return channel.signal(dataclasses.replace(inputs, **moved))
 
     return jax.vmap(shifted_signal)(offsets)
 
 
-def _orthonormal_basis(rows: Float[np.ndarray, "n samples"]) -> Float[np.ndarray, "samples rank"]:
-    """Orthonormal functions over the samples that span the rows."""
-    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
-    q, r = np.linalg.qr((rows / np.where(lengths > 0.0, lengths, 1.0)).T)
+def orthonormal_basis(columns: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "rows rank"]:
+    """Orthonormal columns that span the same; what rounding leaves of dependent ones does not count."""
+    q, r = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))
     modes, sizes, _ = np.linalg.svd(r)
     return q @ modes[:, sizes > 1e-9 * np.max(sizes, initial=0.0)]
 
 
-@eqx.filter_jit
-def _shapes(trace: ChannelLikelihood, inputs: ChannelInputs) -> Array:
-    return trace.shapes(inputs)
-
-
-def clock_r_squared(trace: ChannelLikelihood, inputs: ChannelInputs, sigma: float) -> float:
+def clock_r_squared(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: float) -> float:
     """By what share a free clock would lower the sum of the squared residuals, to first order.
 
     Its shape is no combination of responses, so the response table does not hold it: from the samples.
     """
-    rows = np.asarray(_clock_regressors(trace.without_compression(), inputs, jnp.asarray(sigma)))
-    kept, edges = trace.weights > 0.0, _edge_mask(trace)
+    rows = np.asarray(_clock_regressors(channel.without_compression(), inputs, jnp.asarray(sigma)))
+    kept, edges = channel.weights > 0.0, _edge_mask(channel)
     drop = _r_squared(rows[:, kept])
     # an ideal edge shows a clock where it has passed a sample, and hides it where it has not
     return max(drop, _r_squared(rows[:, kept & ~edges])) if edges.any() else drop
 
 
 def _r_squared(rows: np.ndarray) -> float:
-    basis = _orthonormal_basis(rows[2:])
+    basis = orthonormal_basis(rows[2:].T)
     clock, remainder = (x - basis @ (basis.T @ x) for x in rows[:2])
     return float((clock @ remainder) ** 2 / max((clock @ clock) * (remainder @ remainder), 1e-300))
 
 
 @eqx.filter_jit
-def _clock_regressors(trace: ChannelLikelihood, inputs: ChannelInputs, sigma: Array) -> Float[Array, "n samples"]:
-    """What a clock changes, what is left of the trace, and all that the circuit and the linear nuisances can change."""
-    time = trace.time - (trace.shift + inputs.delay)
-    taus = jnp.stack(constant_skin_circuit(inputs.circuit).channel_terms(trace.channel).tau)
+def _clock_regressors(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: Array) -> Float[Array, "n samples"]:
+    """What a clock changes, what is left, and all that the circuit and the linear nuisances can change."""
+    time = channel.time - (channel.shift + inputs.delay)
+    taus = jnp.stack(constant_skin_circuit(inputs.circuit).channel_terms(channel.channel).tau)
 
     def response(log_tau: Array) -> Array:
-        return highpass(trace.drive, time, jnp.exp(log_tau), steady_state=trace.steady_state)
+        return highpass(channel.drive, time, jnp.exp(log_tau), steady_state=channel.steady_state)
 
     along, bent = jax.vmap(lambda x: jax.jvp(response, (x,), (jnp.ones_like(x),)))(jnp.log(taus))
-    slope = trace.delay_derivative(inputs)
-    shapes = jnp.where(trace.linear_sd[:, None] > 0.0, trace.shapes(inputs), 0.0)
+    slope = channel.delay_derivative(inputs)
+    shapes = jnp.where(channel.linear_sd[:, None] > 0.0, channel.shapes(inputs), 0.0)
     # a free delay changes the slope alone
-    delay = slope if "delay" in trace.timing else jnp.zeros_like(slope)
-    rows = jnp.stack([time * slope, trace.observed - trace.signal(inputs), *along, *bent, *shapes, delay])
-    rows = trace.apply_whitening(rows)
-    if trace.noise != "student":
+    delay = slope if "delay" in channel.timing else jnp.zeros_like(slope)
+    rows = jnp.stack([time * slope, channel.observed - channel.signal(inputs), *along, *bent, *shapes, delay])
+    rows = channel.apply_whitening(rows)
+    if channel.noise != "student":
         return rows
-    return rows * jnp.sqrt(student_weight(trace.fit_nuisances(inputs, sigma)[0] / sigma))
+    return rows * jnp.sqrt(student_weight(channel.fit_nuisances(inputs, sigma)[0] / sigma))
