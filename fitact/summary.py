@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.errors import InputError
+from fitact.tables import align_rows, join_lines
 from fitact.units import format_engineering, quantity_unit
 
 _PACKAGES = ("fitact", "jax", "equinox", "optimistix", "emcee", "numpy", "xarray")
@@ -75,13 +76,13 @@ def load(directory: str | os.PathLike[str]) -> dict[str, Any]:
 
 def table(content: dict[str, Any]) -> str:
     """The content of summary.json, for people."""
-    rows = [f"{'':14}{'median':>12}{'5 %':>14}{'95 %':>12}"]
+    cells = [("", "median", "5 %", "95 %")]
     for name, s in (content["parameters"] | content["derived"]).items():
-        median, low, high = (format_engineering(float(s[q]), str(s["unit"])) for q in ("q50", "q05", "q95"))
-        rows.append(f"{name:14}{median:>12}{low:>14}{high:>12}")
-    rows.append(f"force: {FORCE_DESCRIPTIONS[content['model'].get('force', 'paper')]}.")
+        cells.append((name, *(format_engineering(float(s[q]), str(s["unit"])) for q in ("q50", "q05", "q95"))))
+    rows = align_rows(cells, (14, 12, 14, 12))
+    rows += [f"force: {FORCE_DESCRIPTIONS[content['model'].get('force', 'paper')]}."]
     rows += [content[section]["sentence"] for section in ("convergence", "identifiability")]
-    return "\n".join([*rows, *(f"warning: {warning}" for warning in content["warnings"])])
+    return join_lines(rows, content["warnings"])
 
 
 def versions() -> dict[str, str]:

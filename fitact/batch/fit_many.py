@@ -22,8 +22,9 @@ from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.files import atomic_write
 from fitact.fitting import derived
-from fitact.fitting.fit import SUCCESS_MESSAGE, Fit, fit
+from fitact.fitting.fit import Fit, fit
 from fitact.fitting.identifiability import information_directions, prior_variance_fraction, verdicts
+from fitact.fitting.laplace import SUCCESS_MESSAGE
 from fitact.fitting.problem import build_problem
 from fitact.progress import track_progress
 from fitact.scene.scene import Scene
@@ -357,7 +358,6 @@ def _fit_single(record: Record, scene: Scene | None) -> Row:
 
 def row_from_fit(fit: Fit) -> Row:
     free = [i for i, name in enumerate(fit.names) if name in fit.identifiability.blind_direction]
-    logs, gradients = fit.derive.log_value_and_grad(fit.theta, np.array([trace.sigma for trace in fit.traces]))
     values = (
         *(fit.result, fit.trusted, fit.message, int(fit.figures["samples"]), fit.sigma, fit.figures["chi2_reduced"]),
         *(fit.figures["rms_residual"], fit.identifiability.verdict, fit.identifiability.force_from_prior),
@@ -365,7 +365,7 @@ def row_from_fit(fit: Fit) -> Row:
     )
     row = {"record": os.path.basename(fit.record.source)} | dict(zip(_FIT_COLUMNS, values, strict=True))
     row |= _median_columns([fit.names[i] for i in free], np.exp(fit.theta[free]), fit.sd[free])
-    row |= _median_columns(derived.DERIVED_NAMES, np.exp(logs), np.linalg.norm(gradients @ fit.covariance_root, axis=1))
+    row |= _median_columns(derived.DERIVED_NAMES, np.exp(fit.laplace.log_derived[0]), fit.laplace.derived_log_sd)
     return {name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()}
 
 

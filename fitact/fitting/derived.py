@@ -16,18 +16,8 @@ from fitact.errors import InputError
 from fitact.fitting.drive_choice import DriveModel, has_ideal_edges, whole_periods
 from fitact.likelihood.channel import CHARGES, LINEAR_NUISANCES
 from fitact.likelihood.likelihood import Likelihood
-from fitact.model.circuit import Circuit
 from fitact.model.drive import Drive, Multitone, Periodic, PiecewiseLinear, Sampled, Sine
-from fitact.model.force import (
-    AirGap,
-    Contact,
-    Geometry,
-    electrostatic_force,
-    friction,
-    mean_force,
-    peak_force,
-    summarize,
-)
+from fitact.model.force import Geometry, electrostatic_force, friction, mean_force, peak_force, summarize
 from fitact.model.response import response
 from fitact.model.skin import WithSkin
 from fitact.scene.scene import Scene
@@ -40,38 +30,30 @@ class DerivedQuantities(eqx.Module):
 
     Means are over one period of a scene's drive in the steady state, else over the largest whole number of
     periods that the record holds (the whole record where it holds none); of a long record with a measured
-    drive, over its last whole periods, of some thousand samples.
-
-    Attributes:
-        likelihood: names theta's coordinates.
-        drive: what makes the force: the likelihood's, or the last part of a long measured one, which begins so
-            early that its unknown charge is gone when the force is evaluated.
-        time: when the force is evaluated, s.
-        weight: the share of time each stands for; a weight of 0 counts for the peak only.
-        geometry: with the circuit, where the force acts.
-        coefficient, normal_force: of friction; 1, N.
+    drive, over its last whole periods, of some thousand samples. `drive` is the likelihood's, or the last part of a
+    long measured one, which begins so early that its unknown charge is gone when the force is evaluated.
     """
 
     likelihood: Likelihood
     drive: Drive
-    time: Float[Array, " times"]
-    weight: Float[Array, " times"]
-    geometry: Geometry
-    coefficient: ArrayLike
-    normal_force: ArrayLike
+    time: Float[Array, " times"]  # when the force is evaluated, s
+    weight: Float[Array, " times"]  # the share of time each stands for; a weight of 0 counts for the peak only
+    geometry: Geometry  # with the circuit, where the force acts
+    coefficient: ArrayLike  # of friction
+    normal_force: ArrayLike  # N
     steady_state: bool = eqx.field(static=True)
     charge: bool = eqx.field(static=True)  # whether the record's unknown one matters
 
     def force(
-        self, theta: Float[Array, " parameters"], sigma: Float[Array, " traces"], deviate: ArrayLike = 0.0
+        self, theta: Float[Array, " parameters"], sigma: Float[Array, " channels"], deviate: ArrayLike = 0.0
     ) -> Float[Array, " times"]:
         """Electrostatic force in time, N; see `fitact.model.force.Geometry`.
 
-        `deviate` holds standard normal numbers (traces, `LINEAR_NUISANCES`) that draw the charges from their
+        `deviate` holds standard normal numbers (channels, `LINEAR_NUISANCES`) that draw the charges from their
         posterior; 0: their mean.
         """
         circuit = self.likelihood.circuit(theta)
-        contact = self.contact(circuit)
+        contact = self.geometry.contact(circuit)
         voltage = response(circuit, self.drive, self.time, steady_state=self.steady_state, channel=contact.channel)
         if self.charge:
             voltage = voltage + self._charges(theta, sigma, deviate)
@@ -82,28 +64,24 @@ class DerivedQuantities(eqx.Module):
 
         Not what one that stays on a gap adds, which no channel shows.
         """
-        trace, seen = self.likelihood.channels[0], self.likelihood.channel_inputs(theta)
+        channel, inputs = self.likelihood.channels[0], self.likelihood.channel_inputs(theta)
         first = jnp.broadcast_to(deviate, (len(self.likelihood.channels), len(LINEAR_NUISANCES)))[0]
-        sizes = (trace.sample_nuisances(seen, sigma[0], first) * trace.linear_sd)[-len(CHARGES) :]
+        sizes = (channel.sample_nuisances(inputs, sigma[0], first) * channel.linear_sd)[-len(CHARGES) :]
         # a charge shows in each channel as the response to a drive does
-        acting = self.contact(seen.circuit).channel
-        there, here = (seen.circuit.channel_terms(channel).weight for channel in (acting, trace.channel))
+        acting = self.geometry.contact(inputs.circuit).channel
+        there, here = (inputs.circuit.channel_terms(name).weight for name in (acting, channel.channel))
         ratios = jnp.stack([v / jnp.where(w == 0.0, 1.0, w) for v, w in zip(there, here, strict=False)])
         ratios = jnp.pad(ratios, (0, len(CHARGES) - ratios.size))
-        return (sizes * ratios) @ trace.decays(seen.circuit, self.time) / seen.gain
-
-    def contact(self, circuit: Circuit) -> Contact | AirGap:
-        """Where the circuit's force acts."""
-        return self.geometry.contact(circuit)
+        return (sizes * ratios) @ channel.decays(inputs.circuit, self.time) / inputs.gain
 
     def __call__(
-        self, theta: Float[Array, " parameters"], sigma: Float[Array, " traces"], deviate: ArrayLike = 0.0
+        self, theta: Float[Array, " parameters"], sigma: Float[Array, " channels"], deviate: ArrayLike = 0.0
     ) -> Float[Array, " derived"]:
         """All of `DERIVED_NAMES`, in SI units."""
         circuit = self.likelihood.circuit(theta)
         force = summarize(self.force(theta, sigma, deviate), self.weight)
         if self.steady_state and isinstance(self.drive, Periodic):  # rms alone needs quadrature
-            exact = circuit, self.drive, self.contact(circuit)
+            exact = circuit, self.drive, self.geometry.contact(circuit)
             force = force._replace(mean=mean_force(*exact))
             if not isinstance(circuit, WithSkin) or isinstance(self.drive, Sine | Multitone):
                 force = force._replace(peak=peak_force(*exact))
@@ -111,7 +89,7 @@ class DerivedQuantities(eqx.Module):
         return jnp.stack([circuit.g, circuit.b, force.mean, force.peak, force.rms, felt])
 
     def log_value_and_grad(
-        self, theta: Float[np.ndarray, " parameters"], sigma: Float[np.ndarray, " traces"]
+        self, theta: Float[np.ndarray, " parameters"], sigma: Float[np.ndarray, " channels"]
     ) -> tuple[Float[np.ndarray, " derived"], Float[np.ndarray, "derived parameters"]]:
         """Logarithms of all of `DERIVED_NAMES`, and their gradients in theta."""
         with jax.enable_x64(True):
@@ -170,18 +148,15 @@ def derived_from_fit(
     last = None if isinstance(likelihood.template, WithSkin) else _last_periods(record, choice, b)
     # half a step after an ideal jump the peak of a skin that depends on the frequency is taken
     jump_delay = 0.5 * record.time_step if isinstance(likelihood.template, WithSkin) else 0.0
-    drive, (time, weight) = (choice.drive, _grid(record, choice, jump_delay)) if last is None else last
-    return DerivedQuantities(
-        likelihood.without_samples(),
-        drive,
-        jnp.asarray(time),
-        jnp.asarray(weight / weight.sum()),
-        scene.geometry(),
-        scene.friction.coefficient,
-        scene.friction.normal_force,
-        steady_state=choice.steady_state and last is None,
-        charge=choice.unknown_charge and last is None,
-    )
+    drive, grid = (choice.drive, _grid(record, choice, jump_delay)) if last is None else last
+    steady_state, charge = choice.steady_state and last is None, choice.unknown_charge and last is None
+    return DerivedQuantities(likelihood.without_samples(), drive, *_settings(scene, grid), steady_state, charge)
+
+
+def _settings(scene: Scene, grid: tuple[np.ndarray, np.ndarray]) -> tuple[Array, Array, Geometry, float, float]:
+    """When the force is evaluated, by times and their weights, and a scene's geometry and friction."""
+    time, weight = jnp.asarray(grid[0]), jnp.asarray(grid[1] / grid[1].sum())
+    return time, weight, scene.geometry(), scene.friction.coefficient, scene.friction.normal_force
 
 
 def _last_periods(
@@ -210,29 +185,15 @@ def _last_periods(
 
 
 def derived_from_scene(likelihood: Likelihood, scene: Scene) -> DerivedQuantities:
-    """The derived quantities under the scene's own drive, for a likelihood without records.
-
-    Raises:
-        InputError: the drive has no steady state.
-    """
+    """The derived quantities under the scene's own drive in its steady state, for a likelihood without records."""
     drive = scene.make_drive()
     if not (isinstance(drive, Periodic) and scene.drive.steady_state):
         raise InputError(
             f"scene: without a record the force is that of a periodic drive in its steady state, which a"
             f" {scene.drive.waveform} from rest has not; name another waveform in [drive]"
         )
-    time, weight = _period_grid(drive, 0.0)
-    return DerivedQuantities(
-        likelihood,
-        as_arrays(drive),
-        jnp.asarray(time),
-        jnp.asarray(weight / weight.sum()),
-        scene.geometry(),
-        scene.friction.coefficient,
-        scene.friction.normal_force,
-        steady_state=True,
-        charge=False,
-    )
+    settings = _settings(scene, _period_grid(drive, 0.0))
+    return DerivedQuantities(likelihood, as_arrays(drive), *settings, steady_state=True, charge=False)
 
 
 def _grid(record: Record, choice: DriveModel, jump_delay: float) -> tuple[np.ndarray, np.ndarray]:

@@ -21,7 +21,7 @@ from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.identifiability import assess_identifiability
 from fitact.fitting.laplace import FitResult, Laplace
 from fitact.fitting.least_squares import LeastSquaresResult, solve
-from fitact.fitting.levenberg_marquardt import Optima, result_message
+from fitact.fitting.levenberg_marquardt import Optima
 from fitact.fitting.multistart import choose_start, find_optima, lower_optimum
 from fitact.fitting.problem import Problem, build_problem
 from fitact.fitting.profile import PROFILE_QUANTITIES, Interval, profile_intervals
@@ -31,10 +31,9 @@ from fitact.likelihood import certificate
 from fitact.likelihood.noise import scale_information
 from fitact.model.skin import constant_skin_circuit
 from fitact.scene.scene import Scene
-from fitact.tables import align_rows, join_lines
+from fitact.tables import join_lines
 from fitact.units import format_engineering, quantity_unit
 
-SUCCESS_MESSAGE = "The fit is at its optimum and leaves only noise."
 _SKIN = ("Rsc", "Csc", "Ci")
 _RESPONSE = {
     "constant": "exact",
@@ -65,7 +64,7 @@ class Fit(FitResult):
     @property
     def records(self) -> tuple[Record, ...]:
         """All of them."""
-        return tuple({id(trace.record): trace.record for trace in self.traces}.values())
+        return tuple({id(channel.record): channel.record for channel in self.traces}.values())
 
     @property
     def choice(self) -> DriveModel:
@@ -74,45 +73,40 @@ class Fit(FitResult):
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of the first trace's noise, V or A, from the residuals."""
+        """Standard deviation of the first channel's noise, V or A, from the residuals."""
         return self.traces[0].sigma
 
     @property
     def residuals(self) -> Float[np.ndarray, " samples"]:
-        """Record minus fit of the first trace, V or A."""
+        """Record minus fit of the first channel, V or A."""
         return self.traces[0].residuals
 
     @property
     def linear(self) -> dict[str, float]:
         """What entered linearly and was freed, V or A, at the optimum."""
-        return {name: value for trace in self.traces for name, value in trace.linear.items()}
+        return {name: value for channel in self.traces for name, value in channel.linear.items()}
 
     @property
     def full_because(self) -> str:
         """Why samples are summed, as a clause; "" where none are."""
-        reasons = {f"{trace.label}: " * bool(trace.label) + trace.full_because: trace for trace in self.traces}
-        return "; ".join(reason for reason, trace in reasons.items() if trace.full_because)
-
-    @property
-    def message(self) -> str:
-        """The result as a sentence."""
-        return SUCCESS_MESSAGE if self.trusted else result_message(self.result)
+        reasons = [f"{c.label}: " * bool(c.label) + c.full_because for c in self.traces if c.full_because]
+        return "; ".join(dict.fromkeys(reasons))
 
     @property
     def point_names(self) -> tuple[str, ...]:
-        """Coordinates of the posterior: those of theta, and the logarithm of each trace's sigma."""
+        """Coordinates of the posterior: those of theta, and the logarithm of each channel's sigma."""
         return (*self.names, *self.likelihood.sigma_names)
 
     @property
     def point(self) -> Float[np.ndarray, " coordinates"]:
         """The optimum in the coordinates of the posterior."""
-        return np.append(self.theta, np.log(self.laplace.sigma))
+        return np.append(self.theta, np.log(self.laplace.sigmas))
 
     @property
     def point_root(self) -> Float[np.ndarray, "coordinates coordinates"]:
         """As `covariance_root`, in the coordinates of the posterior; sigma's by its Fisher information."""
-        freedom = np.array([trace.figures["degrees_of_freedom"] for trace in self.traces])
-        information = freedom * [scale_information(trace.noise) for trace in self.likelihood.channels]
+        freedom = np.array([channel.figures["degrees_of_freedom"] for channel in self.traces])
+        information = freedom * [scale_information(channel.noise) for channel in self.likelihood.channels]
         size = self.theta.size
         root = np.diag(np.append(np.zeros(size), information**-0.5))
         root[:size, :size] = self.covariance_root
@@ -127,7 +121,7 @@ class Fit(FitResult):
         Raises:
             InputError: there is no quantity of that name, or the level is not between 0 and 1.
         """
-        return profile_intervals(self.laplace, (name,), level, prior)[name]
+        return profile_intervals(self, (name,), level, prior)[name]
 
     def intervals(self, level: float = 0.95, *, prior: bool = True) -> dict[str, Interval]:
         """As `profile`, of all parameters, and of g, b and force_mean.
@@ -135,7 +129,7 @@ class Fit(FitResult):
         Raises:
             InputError: the level is not between 0 and 1.
         """
-        return profile_intervals(self.laplace, (*self.names, *PROFILE_QUANTITIES), level, prior)
+        return profile_intervals(self, (*self.names, *PROFILE_QUANTITIES), level, prior)
 
     def model(self) -> dict[str, Any]:
         """What was fitted, by name."""
@@ -146,7 +140,7 @@ class Fit(FitResult):
             "response": _RESPONSE[self.scene.skin.level],
             "drive": self.choice.name,
             "steady_state": self.choice.steady_state,
-            "channels": [trace.channel for trace in self.traces],
+            "channels": [channel.channel for channel in self.traces],
             "force": self.derive.geometry.model,
             "freed": [*self.linear, *(name for name in self.names if name not in _SKIN)],
             "likelihood": "full" if self.compression_error is None else "compressed",
@@ -160,44 +154,23 @@ class Fit(FitResult):
         return f"compressed to {self.likelihood.rows} numbers, off by {self.compression_error:.1g} at most"
 
     def judgement(self) -> dict[str, Any]:
-        """The result, and the figures of merit of all traces and of each."""
+        """The result, and the figures of merit of all channels and of each."""
         traces = [
             {"channel": t.channel, "record": os.path.basename(t.record.source), "label": t.label, **t.figures}
             for t in self.traces
         ]
-        judgement = {"result": self.result, "message": self.message, "misfit": self.result == "misfit"}
-        return judgement | self.figures | {"traces": traces}
-
-    def to_dict(self) -> dict[str, Any]:
-        """What `fitact fit --json` prints and fit.json holds."""
-        return {
-            "parameters": self.parameters(),
-            "derived": self.derived(),
-            "nuisances": {
-                name: {"unit": quantity_unit(name), "value": value} for name, value in self._nuisances().items()
-            },
-            "correlation": {"names": list(self.names), "matrix": self.correlation.tolist()},
-            "identifiability": self.identifiability.to_dict(),
-            "fit": self.judgement(),
-            "model": self.model(),
-            "warnings": list(self.warnings),
-        }
+        return super().judgement() | {"traces": traces}
 
     def _nuisances(self) -> dict[str, float]:
-        return dict(zip(self.likelihood.sigma_names, self.laplace.sigma.tolist(), strict=True)) | self.linear
+        return dict(zip(self.likelihood.sigma_names, self.laplace.sigmas.tolist(), strict=True)) | self.linear
 
     def summary(self) -> str:
         """A table for people: values with errors, correlations, the verdict."""
-        cells = [("", "median", "± 1 sd", "contraction")]
-        for name, s in (self.parameters() | self.derived()).items():
-            median = format_engineering(float(s["q50"]), str(s["unit"]))
-            contraction = f"{s['contraction']:.3f}" if "contraction" in s else ""
-            cells.append((name, median, summary.format_sd(s), contraction))
         names, correlation = self.names, self.correlation
         pairs = [f"{names[j]}-{names[i]} {correlation[i, j]:+.3f}" for i in range(len(names)) for j in range(i)]
         nuisances = [f"{name} {format_engineering(v, quantity_unit(name))}" for name, v in self._nuisances().items()]
         rows = [
-            *align_rows(cells, (14, 12, 12, 14)),
+            *self._align_table(14, 12, 12, 14),
             f"nuisances: {', '.join(nuisances)}",
             f"correlations of the logs: {', '.join(pairs)}",
             f"reduced chi-square {self.figures['chi2_reduced']:.3f}. {self.message}",
@@ -296,16 +269,13 @@ def _solve_problem(
         root = covariance_factor(np.concatenate(solved.jacobian), solved.likelihood.prior_factor)
         theta, sigma = np.asarray(solved.theta), np.asarray(solved.sigma)
         certified = certificate.certify(solved.likelihood, reasons, theta, root, sigma, tolerance)
-        failed = [
-            i
-            for i, (trace, reason) in enumerate(zip(solved.likelihood.channels, certified.reasons, strict=True))
-            if reason and trace.compression is not None
-        ]
-        if not failed:
+        pairs = zip(solved.likelihood.channels, certified.reasons, strict=True)
+        failed = [bool(reason) and channel.compression is not None for channel, reason in pairs]
+        if not any(failed):
             return solved, certified, root
-        for i in failed:
-            likelihood = likelihood.replace_channel(i, likelihood.channels[i].without_compression())
         reasons = certified.reasons
+        for i, channel in enumerate(likelihood.channels):
+            likelihood = likelihood.replace_channel(i, channel.without_compression() if failed[i] else channel)
 
 
 def _assemble_fit(
@@ -320,33 +290,28 @@ def _assemble_fit(
     first = problem.sources[0]
     b = float(likelihood.circuit(jnp.asarray(theta)).b)
     derive = derived.derived_from_fit(likelihood, first.record, first.choice, first.scene, b)
-    laplace = Laplace(theta, root, sigma, likelihood, derive)
+    laplace = Laplace(theta, root, sigma, likelihood, derive, derive.log_value_and_grad(theta, sigma))
     traces = tuple(
         ChannelFit.from_optimum(likelihood, i, theta, float(sigma[i]), source, certified.reasons[i])
         for i, source in enumerate(problem.sources)
     )
-    figures = (
-        pooled_statistics([trace.figures for trace in traces])
-        | {"steps": int(solution.steps)}
-        | information_criteria(theta.size, traces)
-    )
+    figures = pooled_statistics([channel.figures for channel in traces]) | {"steps": int(solution.steps)}
+    figures |= information_criteria(theta.size, traces)
     if optima is not None:
         figures |= {"optima": len(optima.start_counts), "starts_failed": optima.n_failed}
     warnings: list[str] = []
-    for source, trace in zip(problem.sources, traces, strict=True):
+    for source, channel in zip(problem.sources, traces, strict=True):
         warnings += source.notes
-        warnings += remarks.channel_warnings(source.record, source.choice, trace.channel, trace.figures)
+        warnings += remarks.channel_warnings(source.record, source.choice, channel.channel, channel.figures)
     warnings += misfit_warnings(traces)
     warnings += remarks.parameter_warnings(likelihood, theta, without_scene)
     experiment = problem.experiment(likelihood, theta, sigma)
-    force_gradient = laplace.log_gradient("force_mean")
+    gradient = laplace.log_gradient("force_mean")
     return Fit(
-        laplace=laplace,
+        laplace,
         result=diagnose_fit(solution, root, traces, problem.sources, optima),
         figures=figures,
-        identifiability=assess_identifiability(
-            likelihood.names, root, likelihood.prior_factor, force_gradient, experiment
-        ),
+        identifiability=assess_identifiability(likelihood.names, root, likelihood.prior_factor, gradient, experiment),
         scene=first.scene,
         warnings=tuple(dict.fromkeys(warnings)),
         traces=traces,

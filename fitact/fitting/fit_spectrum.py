@@ -12,18 +12,17 @@ import scipy.optimize
 from jaxtyping import Array, Complex, Float
 
 from fitact import summary
-from fitact.compiled import as_arrays
 from fitact.data.spectrum import Spectrum
 from fitact.experiment.fisher import covariance_factor
 from fitact.fitting import derived
-from fitact.fitting.identifiability import Identifiability, assess_parameters
+from fitact.fitting.identifiability import assess_parameters
 from fitact.fitting.laplace import FitResult, Laplace
-from fitact.fitting.levenberg_marquardt import Minimum, minimise, result_message, result_name
-from fitact.fitting.problem import circuit_values, prior_as_arrays
+from fitact.fitting.levenberg_marquardt import Minimum, minimise, result_name
+from fitact.fitting.problem import likelihood_without_channels
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.skin import circuit_parameters
 from fitact.scene.scene import Scene
-from fitact.tables import align_rows, join_lines
+from fitact.tables import join_lines
 from fitact.units import format_engineering, format_percent
 
 _MIN_NOISE = 1e-6  # of the impedance: no analyser is better
@@ -51,31 +50,21 @@ class SpectrumFit(FitResult):
                 "The circuit does not describe the spectrum: what is left is larger than its scatter or has structure;"
                 " try [skin] level = 'fractional', or leave out frequencies where the panel's own wiring shows."
             )
-        return "The fit is at its optimum and leaves only noise." if self.trusted else result_message(self.result)
+        return super().message
 
-    def to_dict(self) -> dict[str, Any]:
-        """What `fitact fit --json` prints for a spectrum, and fit.json holds."""
-        judgement = {"result": self.result, "message": self.message, "misfit": self.result == "misfit"}
-        return {
-            "parameters": self.parameters(),
-            "derived": self.derived(),
-            "nuisances": {"relative_noise": {"unit": "1", "value": self.noise}},
-            "correlation": {"names": list(self.names), "matrix": self.correlation.tolist()},
-            "identifiability": self.identifiability.to_dict(),
-            "fit": judgement | self.figures,
-            "model": {"skin": self.scene.skin.level, "channels": ["impedance"], "force": self.derive.geometry.model},
-            "warnings": list(self.warnings),
-        }
+    def model(self) -> dict[str, Any]:
+        """What was fitted, by name."""
+        return {"skin": self.scene.skin.level, "channels": ["impedance"], "force": self.derive.geometry.model}
+
+    def _nuisances(self) -> dict[str, float]:
+        return {"relative_noise": self.noise}
 
     def summary(self) -> str:
         """A table for people: values with errors, the verdict."""
         low, high = (format_engineering(float(f), "Hz") for f in self.spectrum.frequency[[0, -1]])
-        cells = [("", "median", "± 1 sd")]
-        for name, s in (self.parameters() | self.derived()).items():
-            cells.append((name, format_engineering(float(s["q50"]), str(s["unit"])), summary.format_sd(s)))
         rows = [
             f"{len(self.spectrum)} points, {low} to {high}",
-            *align_rows(cells, (14, 12, 12)),
+            *self._align_table(14, 12, 12),
             f"noise {format_percent(self.noise)} of |Z|. {self.message}",
             f"force: {summary.FORCE_DESCRIPTIONS[self.derive.geometry.model]}, under the scene's"
             f" {self.scene.drive.waveform}.",
@@ -104,27 +93,27 @@ def fit_spectrum(spectrum: Spectrum, scene: Scene | None = None) -> SpectrumFit:
     stated = scene or Scene()
     stated.require_available(fit=True)
     with jax.enable_x64(True):
-        likelihood = _build_likelihood(stated)
+        likelihood = likelihood_without_channels(stated, stated.make_prior(), stated.make_circuit)
         derive = derived.derived_from_scene(likelihood, stated)
         end, residuals, sigma = _solve(spectrum, likelihood)
         theta, jacobian = np.asarray(end.theta), np.asarray(end.jacobian)
-        laplace = Laplace(
-            theta,
-            covariance_factor(jacobian[: -theta.size], likelihood.prior_factor),
-            np.zeros(0),
-            likelihood,
-            derive,
-        )
+        root = covariance_factor(jacobian[: -theta.size], likelihood.prior_factor)
+        log_derived = derive.log_value_and_grad(theta, np.zeros(0))
+        laplace = Laplace(theta, root, np.zeros(0), likelihood, derive, log_derived)
         figures = _figures(residuals, sigma, theta.size) | {"steps": int(end.steps)}
+    gradient = laplace.log_gradient("force_mean")
+    free = [name for name in likelihood.names if name in circuit_parameters(likelihood.template)]
     result = result_name(end.result)
     if result == "successful" and figures["structure_z"] > 4.0:  # neighbouring residuals are alike by no chance
         result = "misfit"
     notes = ("no scene was given: the force is that of the paper's panel and drive; state yours in a scene file",)
     return SpectrumFit(
-        laplace=laplace,
+        laplace,
         result=result,
         figures=figures,
-        identifiability=_assess_spectrum(laplace),
+        identifiability=assess_parameters(
+            likelihood.names, root, likelihood.prior_factor, gradient, free, ("impedance",)
+        ),
         scene=stated,
         warnings=(*spectrum.notes, *(notes if scene is None else ())),
         spectrum=spectrum,
@@ -146,19 +135,6 @@ def _solve(
         if abs(float(noise) / before - 1.0) < noise_tolerance:
             break
     return end, np.asarray(residuals), float(noise)
-
-
-def _build_likelihood(scene: Scene) -> Likelihood:
-    """The scene's circuit and prior, without traces."""
-    prior, tied = scene.make_prior().drop_marginals("sigma", "sigma_I"), scene.prior.ties()
-    template: Any = scene.make_circuit(circuit_values(scene, prior, tied))
-    return Likelihood(
-        channels=(),
-        template=as_arrays(template),
-        prior=prior_as_arrays(prior),
-        sigma_prior=(),
-        tied=tuple((name, other, ratio) for name, (other, ratio) in tied.items()),
-    )
 
 
 def _start(
@@ -224,10 +200,3 @@ def _figures(residuals: Complex[np.ndarray, " points"], noise: float, n_fitted: 
         "samples": n,
         "degrees_of_freedom": 2 * n - n_fitted,
     }
-
-
-def _assess_spectrum(laplace: Laplace) -> Identifiability:
-    likelihood, fields = laplace.likelihood, circuit_parameters(laplace.likelihood.template)
-    free = [name for name in likelihood.names if name in fields]
-    root, gradient = laplace.covariance_root, laplace.log_gradient("force_mean")
-    return assess_parameters(likelihood.names, root, likelihood.prior_factor, gradient, free, ("impedance",))

@@ -19,48 +19,30 @@ from fitact.units import format_percent
 
 
 class NextMeasurement(NamedTuple):
-    """What to measure where not all is identified.
+    """The next measurement where not all is identified."""
 
-    Attributes:
-        structural: whether no record of these channels could tell what this one does not.
-        remedy: what to measure next.
-        remedies: that in figures, best first.
-    """
-
-    structural: bool = False
+    structural: bool = False  # whether no record of these channels could tell what this one does not
     remedy: str = ""
-    remedies: tuple[DesignOption, ...] = ()
+    remedies: tuple[DesignOption, ...] = ()  # the remedy in figures, best first
 
 
 @dataclasses.dataclass(frozen=True)
 class Identifiability:
-    """The verdict on a record.
+    """The verdict on a record."""
 
-    Attributes:
-        verdict: "identified", "prior-limited" or "unidentified".
-        eigenvalues: prior-whitened Fisher eigenvalues lambda / (1 + lambda), smallest first; 1 is known from
-            the data, 0 from the prior alone.
-        blind_direction: the direction the data see least, a unit vector in the log-parameters.
-        blind_name: what that direction is, in words.
-        prior_sd: standard deviation, by the prior, of the parameter that moves most along it, in its logarithm.
-        force_from_prior: share of the variance of the mean force that comes from the prior.
-        force_sd: standard deviation of the mean force, in its logarithm.
-        force_contraction: 1 - that over the prior's.
-        channels: what was recorded beside V.
-        experiment: the measurement that was done; None: a spectrum's.
-        force_gradient: that of the logarithm of the mean force in the parameters that are free in `experiment`.
-    """
-
-    verdict: str
+    verdict: str  # "identified", "prior-limited" or "unidentified"
+    # prior-whitened Fisher eigenvalues lambda / (1 + lambda), smallest first: 1 is known from data, 0 from the prior
     eigenvalues: tuple[float, ...]
-    blind_direction: dict[str, float]
-    blind_name: str
-    prior_sd: float
-    force_from_prior: float
-    force_sd: float
-    force_contraction: float
-    channels: tuple[str, ...]
+    blind_direction: dict[str, float]  # the direction the data see least, a unit vector in the log-parameters
+    blind_name: str  # what that direction is, in words
+    prior_sd: float  # standard deviation, by the prior, of the parameter that moves most along it, in its logarithm
+    force_from_prior: float  # share of the variance of the mean force that comes from the prior
+    force_sd: float  # standard deviation of the mean force, in its logarithm
+    force_contraction: float  # 1 - that over the prior's
+    channels: tuple[str, ...]  # what was recorded beside V
+    # the measurement that was done; None: a spectrum's
     experiment: Experiment | None = dataclasses.field(default=None, repr=False, compare=False)
+    # that of the logarithm of the mean force in the parameters that are free in `experiment`
     force_gradient: Float[np.ndarray, " free"] | None = dataclasses.field(default=None, repr=False, compare=False)
 
     @functools.cached_property
@@ -103,20 +85,12 @@ class Identifiability:
 
     def to_dict(self) -> dict[str, Any]:
         """As in fit.json and summary.json."""
-        return {
-            "verdict": self.verdict,
-            "eigenvalues": self.eigenvalues,
-            "blind_direction": self.blind_direction,
-            "blind_name": self.blind_name,
-            "structural": self.structural,
-            "prior_sd": self.prior_sd,
-            "force_from_prior": self.force_from_prior,
-            "force_sd": self.force_sd,
-            "force_contraction": self.force_contraction,
-            "remedy": self.remedy,
-            "remedies": [remedy.to_dict() for remedy in self.remedies],
-            "channels": self.channels,
-        }
+        names = (
+            "verdict", "eigenvalues", "blind_direction", "blind_name", "structural", "prior_sd", "force_from_prior",
+            "force_sd", "force_contraction", "remedy", "remedies", "channels",
+        )  # fmt: skip
+        values = {name: getattr(self, name) for name in names}
+        return values | {"remedies": [remedy.to_dict() for remedy in self.remedies]}
 
     def __str__(self) -> str:
         names = list(self.blind_direction)

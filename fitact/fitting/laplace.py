@@ -1,8 +1,9 @@
 """The normal approximation of a posterior at its optimum: parameters and what follows from them, with errors."""
 
+import abc
 import dataclasses
-import functools
 import math
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -10,8 +11,13 @@ from jaxtyping import Float
 from fitact import summary
 from fitact.fitting import derived
 from fitact.fitting.identifiability import Identifiability
+from fitact.fitting.levenberg_marquardt import result_message
 from fitact.likelihood.likelihood import Likelihood
 from fitact.scene.scene import Scene
+from fitact.tables import align_rows
+from fitact.units import format_engineering, quantity_unit
+
+SUCCESS_MESSAGE = "The fit is at its optimum and leaves only noise."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,17 +25,19 @@ class Laplace:
     """An optimum and its covariance.
 
     Attributes:
-        theta: the optimum, in the coordinates `names`.
+        theta: the optimum, in the likelihood's coordinates.
         covariance_root: its product with its transpose is `covariance`; keeps digits where that cannot.
-        sigma: the channels' noise.
-        likelihood, derive: what was fitted, what follows from it.
+        sigmas: standard deviation of each channel's noise.
+        likelihood, derive: what was fitted, and what follows from theta.
+        log_derived: logarithms of the derived quantities at the optimum, and their gradients in theta.
     """
 
     theta: Float[np.ndarray, " parameters"]
     covariance_root: Float[np.ndarray, "parameters parameters"]
-    sigma: Float[np.ndarray, " channels"]
+    sigmas: Float[np.ndarray, " channels"]
     likelihood: Likelihood
     derive: derived.DerivedQuantities
+    log_derived: tuple[Float[np.ndarray, " derived"], Float[np.ndarray, "derived parameters"]]
 
     @property
     def covariance(self) -> Float[np.ndarray, "parameters parameters"]:
@@ -46,47 +54,19 @@ class Laplace:
         """Correlations of theta."""
         return self.covariance / np.outer(self.sd, self.sd)
 
-    @functools.cached_property
-    def log_derived(self) -> tuple[Float[np.ndarray, " derived"], Float[np.ndarray, "derived parameters"]]:
-        """Logarithms of the derived quantities, and their gradients in theta."""
-        return self.derive.log_value_and_grad(self.theta, self.sigma)
-
-    def log_sd(self, name: str) -> float:
-        """Standard deviation of the logarithm of a derived quantity."""
-        return float(np.linalg.norm(self.log_gradient(name) @ self.covariance_root))
+    @property
+    def derived_log_sd(self) -> Float[np.ndarray, " derived"]:
+        """Standard deviations of the logarithms of the derived quantities."""
+        return np.linalg.norm(self.log_derived[1] @ self.covariance_root, axis=1)
 
     def log_gradient(self, name: str) -> Float[np.ndarray, " parameters"]:
         """Gradient of the logarithm of a derived quantity in theta."""
         return self.log_derived[1][derived.DERIVED_NAMES.index(name)]
 
-    def summarize_parameters(self) -> dict[str, summary.Summary]:
-        """Summaries of the parameters, with their contraction."""
-        values, prior_sd = self.likelihood.to_physical(self.theta), self.likelihood.prior.log_sd
-        timing, use_prior = self.likelihood.timing, self.likelihood.use_prior
-        summaries = {}
-        for i, name in enumerate(self.likelihood.names):
-            value, sd = float(values[name]), float(self.sd[i])
-            if name in timing:
-                summaries[name] = summary.summarize_normal(name, value, sd * timing[name][1])
-            else:
-                summaries[name] = summary.summarize_log_normal(name, value, sd)
-                if use_prior or name.startswith("gain"):
-                    summaries[name]["contraction"] = float(1.0 - sd / prior_sd[i])
-        return summaries
-
-    def summarize_derived(self) -> dict[str, summary.Summary]:
-        """Summaries of divider, time constant, force and friction."""
-        values, gradients = self.log_derived
-        sds = np.linalg.norm(gradients @ self.covariance_root, axis=1)
-        return {
-            name: summary.summarize_log_normal(name, math.exp(value), float(sd))
-            for name, value, sd in zip(derived.DERIVED_NAMES, values, sds, strict=True)
-        }
-
 
 @dataclasses.dataclass(frozen=True)
-class FitResult:
-    """What every fit comes to.
+class FitResult(abc.ABC):
+    """What every fit comes to: a Laplace approximation, and a judgement of it.
 
     Attributes:
         laplace: the best parameters with their errors, and what follows from them.
@@ -151,8 +131,59 @@ class FitResult:
 
     def parameters(self) -> dict[str, summary.Summary]:
         """Summaries of the parameters in the Laplace approximation, with their contraction."""
-        return self.laplace.summarize_parameters()
+        values, timing = self.likelihood.to_physical(self.theta), self.likelihood.timing
+        summaries = {}
+        for i, name in enumerate(self.names):
+            value, sd = float(values[name]), float(self.sd[i])
+            if name in timing:
+                summaries[name] = summary.summarize_normal(name, value, sd * timing[name][1])
+            else:
+                summaries[name] = summary.summarize_log_normal(name, value, sd)
+                if self.likelihood.use_prior or name.startswith("gain"):
+                    summaries[name]["contraction"] = float(1.0 - sd / self.likelihood.prior.log_sd[i])
+        return summaries
 
     def derived(self) -> dict[str, summary.Summary]:
         """Summaries of divider, time constant, force and friction in the Laplace approximation."""
-        return self.laplace.summarize_derived()
+        values = zip(derived.DERIVED_NAMES, self.laplace.log_derived[0], self.laplace.derived_log_sd, strict=True)
+        return {name: summary.summarize_log_normal(name, math.exp(log), float(sd)) for name, log, sd in values}
+
+    @property
+    def message(self) -> str:
+        """The result as a sentence."""
+        return SUCCESS_MESSAGE if self.trusted else result_message(self.result)
+
+    def judgement(self) -> dict[str, Any]:
+        """The result, and the figures of merit."""
+        return {"result": self.result, "message": self.message, "misfit": self.result == "misfit"} | self.figures
+
+    @abc.abstractmethod
+    def model(self) -> dict[str, Any]:
+        """What was fitted, by name."""
+
+    @abc.abstractmethod
+    def _nuisances(self) -> dict[str, float]:
+        """Noise, and what entered linearly, at the optimum."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `fitact fit --json` prints and fit.json holds."""
+        nuisances = {name: {"unit": quantity_unit(name), "value": value} for name, value in self._nuisances().items()}
+        return {
+            "parameters": self.parameters(),
+            "derived": self.derived(),
+            "nuisances": nuisances,
+            "correlation": {"names": list(self.names), "matrix": self.correlation.tolist()},
+            "identifiability": self.identifiability.to_dict(),
+            "fit": self.judgement(),
+            "model": self.model(),
+            "warnings": list(self.warnings),
+        }
+
+    def _align_table(self, *widths: int) -> list[str]:
+        """The first columns, as many as `widths`, of a table of parameters and derived quantities."""
+        cells = [("", "median", "± 1 sd", "contraction")]
+        for name, s in (self.parameters() | self.derived()).items():
+            median = format_engineering(float(s["q50"]), str(s["unit"]))
+            contraction = f"{s['contraction']:.3f}" if "contraction" in s else ""
+            cells.append((name, median, summary.format_sd(s), contraction))
+        return align_rows([row[: len(widths)] for row in cells], widths)

@@ -3,12 +3,12 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from fitact.compiled import MAX_PADDED_LENGTH, as_arrays, pad_samples, pad_weight, to_device
 from fitact.data.clipping import clipping_mask
@@ -22,7 +22,7 @@ from fitact.fitting.starting_point import Estimate, VscEstimate, estimate_from_v
 from fitact.likelihood import certificate
 from fitact.likelihood.channel import CHARGES, LINEAR_NUISANCES, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
-from fitact.likelihood.noise import Autoregression, NoiseModel, estimate_quiet_noise, require_uniform
+from fitact.likelihood.noise import Autoregression, estimate_quiet_noise, require_uniform
 from fitact.model.circuit import RC, Channel, FinalCircuit
 from fitact.model.skin import WithSkin, circuit_parameters, constant_skin_circuit, limits_current
 from fitact.prior.distributions import LogNormal
@@ -33,25 +33,16 @@ MIN_RELATIVE_NOISE = 1e-9  # of a channel's span: least noise assumed
 
 
 class Source(NamedTuple):
-    """Where a channel comes from.
-
-    Attributes:
-        record, scene, choice: the record, its scene and its drive.
-        noise: of the channel, judged without a model.
-        optional_nuisances: nuisances that the channel can ask for.
-        start: what a linear fit says of it; None: nothing.
-        notes: what was assumed, in sentences.
-        drive_noise_dominates: whether the drive's noise drowns the channel, which then biases the answer.
-    """
+    """Where a channel comes from."""
 
     record: Record
     scene: Scene
     choice: DriveModel
-    noise: float
-    optional_nuisances: tuple[str, ...]
-    start: Estimate | None
-    notes: tuple[str, ...]
-    drive_noise_dominates: bool
+    noise: float  # of the channel, judged without a model
+    optional_nuisances: tuple[str, ...]  # nuisances that the channel can ask for
+    start: Estimate | None  # what a linear fit says of it; None: nothing
+    notes: tuple[str, ...]  # what was assumed, in sentences
+    drive_noise_dominates: bool  # whether the drive's noise drowns the channel, which then biases the answer
 
 
 class Problem(NamedTuple):
@@ -64,12 +55,10 @@ class Problem(NamedTuple):
     def compress_likelihood(self, tolerance: float) -> tuple[Likelihood, tuple[str, ...]]:
         """Compress the channels where that can hold; the reasons where it cannot."""
         circuit = self.likelihood.circuit(jnp.asarray(self.start))
-        pairs = [
-            certificate.compress_channel(
-                channel, circuit, source.start is not None and math.isfinite(source.start.b), tolerance
-            )
-            for channel, source in zip(self.likelihood.channels, self.sources, strict=True)
-        ]
+        pairs = []
+        for channel, source in zip(self.likelihood.channels, self.sources, strict=True):
+            shows_tau = source.start is not None and math.isfinite(source.start.b)
+            pairs.append(certificate.compress_channel(channel, circuit, shows_tau, tolerance))
         channels, reasons = zip(*pairs, strict=True)
         return dataclasses.replace(self.likelihood, channels=channels), reasons
 
@@ -77,7 +66,7 @@ class Problem(NamedTuple):
         """The measurement that was done; of several records, the first as many times."""
         source, records = self.sources[0], len({id(source.record) for source in self.sources})
         pairs = zip(likelihood.channels, self.sources, strict=True)
-        channels = tuple(trace.channel for trace, other in pairs if other.record is source.record)
+        channels = tuple(channel.channel for channel, other in pairs if other.record is source.record)
         fields = circuit_parameters(likelihood.template)
         gains = ("gain", "gain_I") if records == 1 else ()
         free = tuple(name for name in likelihood.prior.names if name in fields or name in gains)
@@ -108,51 +97,45 @@ def build_problem(
     """One circuit and one prior, the first scene's; a drive and nuisances for each record.
 
     `drives`: those of the first records, where they have been chosen already.
-
-    Raises:
-        InputError: a record cannot come from this circuit, or lacks a channel that its scene asks for.
     """
     first = scenes[0] or Scene()
-    stated, tied = first.make_prior(), first.prior.ties()
+    stated = first.make_prior()
     noise = {name: stated[name] for name in ("sigma", "sigma_I") if name in stated.names}
-    prior = stated.drop_marginals(*noise)
-    template = apply_skin_model(first.make_rc_circuit(circuit_values(first, prior, tied)), records, scenes)
+    likelihood = likelihood_without_channels(
+        first, stated, lambda values: apply_skin_model(first.make_rc_circuit(values), records, scenes)
+    )
     parts = []
     for number, (record, scene, drive) in enumerate(itertools.zip_longest(records, scenes, drives), 1):
-        choice = drive or choose_drive(record, scene)
-        for channel in _channels(record, scene):
-            parts.append(_build_channel(record, scene, choice, channel, number if len(records) > 1 else None, template))
+        choice, suffix = drive or choose_drive(record, scene), str(number) * (len(records) > 1)
+        for name in _channels(record, scene):
+            parts.append(_build_channel(record, scene or Scene(), choice, name, suffix, likelihood.template))
     channels, sources, gains = zip(*parts, strict=True)
-    prior = prior.replace_marginals(
-        **{
-            channel.qualified_name("gain"): LogNormal(1.0, sd)
-            for channel, sd in zip(channels, gains, strict=True)
-            if sd > 0.0
-        }
-    )
-    likelihood = Likelihood(
+    free = zip(channels, gains, strict=True)
+    free_gains = {channel.qualified_name("gain"): LogNormal(1.0, sd) for channel, sd in free if sd > 0.0}
+    likelihood = dataclasses.replace(
+        likelihood,
         channels=channels,
-        template=as_arrays(template),
-        prior=prior_as_arrays(prior),
+        prior=_prior_as_arrays(likelihood.prior.replace_marginals(**free_gains)),
         sigma_prior=tuple(noise.get("sigma" if channel.channel == "Vsc" else "sigma_I") for channel in channels),
-        tied=tuple((name, other, ratio) for name, (other, ratio) in tied.items()),
         use_prior=use_prior,
     )
     return Problem(likelihood, sources, start_from_estimates(likelihood, [source.start for source in sources]))
 
 
-def circuit_values(scene: Scene, prior: Prior, tied: dict[str, tuple[str, float]]) -> dict[str, float]:
-    """All that is held, free or tied in the scene's circuit, by name."""
-    values = scene.fixed_values() | {name: math.exp(prior[name].log_mean) for name in prior.names}
+def likelihood_without_channels(scene: Scene, prior: Prior, make_circuit: Callable[..., Any]) -> Likelihood:
+    """What a scene and its prior say of the circuit, which `make_circuit` makes of its values by name."""
+    prior, tied, values = prior.drop_marginals("sigma", "sigma_I"), scene.prior.ties(), scene.fixed_values()
+    values |= {name: math.exp(prior[name].log_mean) for name in prior.names}
     for name, (other, ratio) in tied.items():
         value = values.get(other, scene.nominal_values()[other])
         if value is None:
             raise InputError(f"scene: [prior] {name} is tied to {other}, which the scene does not have; give it there")
         values[name] = ratio * value
-    return values
+    ties = tuple((name, other, ratio) for name, (other, ratio) in tied.items())
+    return Likelihood((), as_arrays(make_circuit(values)), _prior_as_arrays(prior), (), ties)
 
 
-def prior_as_arrays(prior: Prior) -> Prior:
+def _prior_as_arrays(prior: Prior) -> Prior:
     """The prior whose log-normal marginals are no constants of what is compiled, where none are correlated."""
     if prior.pairs:
         return prior
@@ -168,18 +151,12 @@ def _channels(record: Record, scene: Scene | None) -> tuple[Channel, ...]:
 
 
 def _build_channel(
-    record: Record,
-    scene: Scene | None,
-    choice: DriveModel,
-    channel: Channel,
-    number: int | None,
-    template: RC | WithSkin,
+    record: Record, scene: Scene, choice: DriveModel, channel: Channel, number: str, template: RC | WithSkin
 ) -> tuple[ChannelLikelihood, Source, float]:
     """A channel over its samples, its source, and the standard deviation of a gain's logarithm."""
-    scene = scene or Scene()
     _require_whole_drive(record, choice)
     require_skin_response(template, record, choice)
-    label = "_".join(([channel] if channel != "Vsc" else []) + ([str(number)] if number else []))
+    label = "_".join(filter(None, ("" if channel == "Vsc" else channel, number)))
     notes, optional = choice.notes, ("offset", "drift", *_hum(record, choice))
     start: Estimate | None = None
     samples: CurrentSamples | None = None
@@ -187,8 +164,10 @@ def _build_channel(
         gain, optional = _log_sd(scene.measurement.gain_relative_sd), (*optional, "delay")
         if choice.periodic and choice.steady_state and choice.name != "measured":
             optional = (*optional, "clock")
-        if _has_jumps(template, record):
-            start = estimate_from_vsc(record, choice, _max_divider(template) * math.exp(3.0 * gain))
+        plain = constant_skin_circuit(template)
+        if not limits_current(template) or float(plain.terms().tau[-1]) < record.time_step:  # Vsc jumps with V
+            max_divider = 0.5 if isinstance(plain, FinalCircuit) else 1.0
+            start = estimate_from_vsc(record, choice, max_divider * math.exp(3.0 * gain))
             gain = math.hypot(gain, _edge_gain_sd(record, choice, start))
     else:
         gain = _log_sd(scene.measurement.gain_I_relative_sd)
@@ -201,11 +180,25 @@ def _build_channel(
         weight = np.ones(len(record))
     weight = None if weight is None else pad_weight(weight)
     colour, noise = _noise(record, channel, scene)
-    likelihood = dataclasses.replace(
-        _initial_channel(record, choice, channel, label, template, scene.measurement.noise_model),
+    likelihood = ChannelLikelihood(
+        **_prior_of_nuisances(record, choice, channel, template),
+        time=to_device(pad_samples(record.time)),
+        observed=to_device(pad_samples(record[channel])),
         weight=None if weight is None else jnp.asarray(weight),
-        rate=None if samples is None else to_device(pad_samples(samples.rate)),
         whitening=colour and colour.whitening(np.ones(len(record), bool) if weight is None else weight > 0.0),
+        rate=None if samples is None else to_device(pad_samples(samples.rate)),
+        drive=choice.drive,
+        shift=jnp.asarray(choice.shift, dtype=float),
+        clock=jnp.zeros(()),
+        time_step=jnp.asarray(record.time_step, dtype=float),
+        compression=None,
+        label=label,
+        channel=channel,
+        steady_state=choice.steady_state,
+        # a shifted drive's edges are known to within a step only, which g feels; I's samples there are left out
+        timing=("delay",) if choice.shift != 0.0 and channel == "Vsc" else (),
+        noise=scene.measurement.noise_model,
+        columns=tuple(range(len(LINEAR_NUISANCES))),
     )
     dominates = samples is not None and samples.drive_noise_dominates
     notes = (*record.notes, *notes, *clipped, *at_jumps)
@@ -242,24 +235,22 @@ def _noise(record: Record, channel: str, scene: Scene) -> tuple[Autoregression |
     if model in ("white", "student"):
         return None, record.noise(channel)
     require_uniform(record, model)
-    return (
-        (Autoregression(np.zeros(1), 1.0), record.noise(channel))
-        if quiet is None
-        else estimate_quiet_noise(record, channel, quiet)
-    )
+    if quiet is None:
+        return Autoregression(np.zeros(1), 1.0), record.noise(channel)
+    return estimate_quiet_noise(record, channel, quiet)
 
 
 def _log_sd(relative_sd: float) -> float:
     return LogNormal.with_relative_sd(1.0, relative_sd).spread if relative_sd > 0.0 else 0.0
 
 
-def _initial_channel(
-    record: Record, choice: DriveModel, channel: Channel, label: str, template: RC | WithSkin, noise: NoiseModel
-) -> ChannelLikelihood:
+def _prior_of_nuisances(
+    record: Record, choice: DriveModel, channel: str, template: RC | WithSkin
+) -> dict[str, Float[Array, "..."]]:
+    """Least noise, and standard deviations of linear nuisances, delay and clock, by their names in a channel."""
     height = float(np.ptp(record[channel]))
-    charges = (
-        len(LINEAR_NUISANCES) - len(CHARGES) + np.arange(len(template.terms().tau) if choice.unknown_charge else 0)
-    )
+    n_charges = len(template.terms().tau) if choice.unknown_charge else 0
+    charges = len(LINEAR_NUISANCES) - len(CHARGES) + np.arange(n_charges)
     # a part of a wave cannot show an offset, so one within an oscilloscope's accuracy (2 %) is allowed for
     offset = 0.02 * height if record.frequency() is None and choice.periodic else 0.0
     # steps at the record's ends: the drive's frequency is known to one or two, or as well as `frequency_error` says
@@ -268,29 +259,11 @@ def _initial_channel(
         clock_sd = max(clock_sd, frequency_error(record, choice.name) * record.time.size)
     # beside an ideal edge the samples leave the delay open within one step, whose middle is the start
     delay_sd = math.sqrt(1.0 / 12.0) if has_ideal_edges(choice.drive) else 5.0
-    charge_sd = 10.0 * height  # it may be anything
-    return ChannelLikelihood(
-        time=to_device(pad_samples(record.time)),
-        observed=to_device(pad_samples(record[channel])),
-        weight=None,
-        whitening=None,
-        noise_floor=jnp.asarray(max(MIN_RELATIVE_NOISE * height, rounding_noise_sd(record[channel]))),
-        rate=None,
-        drive=choice.drive,
-        linear_sd=jnp.zeros(len(LINEAR_NUISANCES)).at[0].set(offset).at[charges].set(charge_sd),
-        shift=jnp.asarray(choice.shift, dtype=float),
-        time_step=jnp.asarray(record.time_step, dtype=float),
-        clock=jnp.zeros(()),
-        timing_sd=jnp.array([delay_sd, clock_sd]),
-        compression=None,
-        label=label,
-        channel=channel,
-        steady_state=choice.steady_state,
-        noise=noise,
-        columns=tuple(range(len(LINEAR_NUISANCES))),
-        # a shifted drive's edges are known to within a step only, which g feels; I's samples there are left out
-        timing=("delay",) if choice.shift != 0.0 and channel == "Vsc" else (),
-    )
+    return {
+        "noise_floor": jnp.asarray(max(MIN_RELATIVE_NOISE * height, rounding_noise_sd(record[channel]))),
+        "linear_sd": jnp.zeros(len(LINEAR_NUISANCES)).at[0].set(offset).at[charges].set(10.0 * height),  # anything
+        "timing_sd": jnp.array([delay_sd, clock_sd]),
+    }
 
 
 def _hum(record: Record, choice: DriveModel) -> list[str]:
@@ -310,13 +283,3 @@ def _edge_gain_sd(record: Record, choice: DriveModel, start: VscEstimate) -> flo
     if choice.name != "measured" or not has_unresolved_edge(choice.voltage) or not math.isfinite(start.b):
         return 0.0
     return record.time_step / math.sqrt(12.0) / start.b
-
-
-def _has_jumps(template: RC | WithSkin, record: Record) -> bool:
-    """Whether Vsc follows a jump of V, within the record's time step."""
-    return not limits_current(template) or float(constant_skin_circuit(template).terms().tau[-1]) < record.time_step
-
-
-def _max_divider(template: RC | WithSkin) -> float:
-    """The largest divider the circuit can have."""
-    return 0.5 if isinstance(constant_skin_circuit(template), FinalCircuit) else 1.0

@@ -19,9 +19,10 @@ from jaxtyping import Array, Float
 
 from fitact.errors import InputError
 from fitact.fitting.derived import DERIVED_NAMES, DerivedQuantities
-from fitact.fitting.laplace import Laplace
+from fitact.fitting.laplace import FitResult
 from fitact.fitting.levenberg_marquardt import minimise
 from fitact.likelihood.likelihood import UNCONSTRAINED_SD, Likelihood
+from fitact.tables import align_rows, join_lines
 from fitact.units import format_engineering, quantity_unit
 
 PROFILE_QUANTITIES = ("g", "b", "force_mean")
@@ -29,18 +30,12 @@ PROFILE_QUANTITIES = ("g", "b", "force_mean")
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """Where a quantity may lie, in its SI unit; an open side is 0 or infinite (a delay's or a clock's: infinite).
-
-    Attributes:
-        low, high: its ends.
-        level: its probability, by the chi-square law of one parameter.
-        prior: whether the circuit's prior speaks in it.
-    """
+    """Where a quantity may lie, in its SI unit; an open side is 0 or infinite (a delay's or a clock's: infinite)."""
 
     low: float
     high: float
-    level: float
-    prior: bool
+    level: float  # its probability, by the chi-square law of one parameter
+    prior: bool  # whether the circuit's prior speaks in it
 
     @property
     def open(self) -> str:
@@ -55,17 +50,11 @@ class Interval:
 
 
 class ConstrainedFit(eqx.Module):
-    """A fit whose quantities can be pinned: theta, or the logarithms of `PROFILE_QUANTITIES`.
+    """A fit whose quantities can be pinned: theta, or the logarithms of `PROFILE_QUANTITIES`."""
 
-    Attributes:
-        likelihood: with or without the circuit's prior.
-        sigma: the channels' noise, which is held.
-        derive: None: the quantities are theta itself.
-    """
-
-    likelihood: Likelihood
-    sigma: Float[Array, " traces"]
-    derive: DerivedQuantities | None
+    likelihood: Likelihood  # with or without the circuit's prior
+    sigma: Float[Array, " channels"]  # the channels' noise, which is held
+    derive: DerivedQuantities | None  # None: the quantities are theta itself
 
     def quantities(self, theta: Float[Array, " parameters"]) -> Float[Array, " quantities"]:
         """Their values at theta."""
@@ -94,31 +83,24 @@ def _fit_constrained(
     return jax.lax.map(lambda row: fit_row(*row), (indices, goal, weight, start))
 
 
-def profile_intervals(laplace: Laplace, names: Sequence[str], level: float, prior: bool) -> dict[str, Interval]:
-    """Profile-likelihood intervals of the quantities `names` around an optimum, at its noise.
-
-    Raises:
-        InputError: there is no quantity of that name, or the level is not between 0 and 1.
-    """
+def profile_intervals(fit: FitResult, names: Sequence[str], level: float, prior: bool) -> dict[str, Interval]:
+    """Profile-likelihood intervals of the quantities `names` around an optimum, at its noise."""
     if not 0.0 < level < 1.0:
         raise InputError(f"level = {level}: give a probability between 0 and 1, such as 0.95")
-    likelihood, timing = laplace.likelihood, laplace.likelihood.timing
+    likelihood, timing = fit.likelihood, fit.likelihood.timing
     for name in names:
         if name not in (available := (*likelihood.names, *PROFILE_QUANTITIES)):
             raise InputError(f"there is no interval of {name}; choose from {', '.join(available)}")
-    derived_sd = np.array([laplace.log_sd(name) for name in PROFILE_QUANTITIES])
+    derived_sd = fit.laplace.derived_log_sd[[DERIVED_NAMES.index(name) for name in PROFILE_QUANTITIES]]
     intervals = {}
     with jax.enable_x64(True):
         likelihood = dataclasses.replace(likelihood.without_samples(), use_prior=prior and likelihood.use_prior)
-        for kind, sd, derive in (
-            (likelihood.names, laplace.sd, None),
-            (PROFILE_QUANTITIES, derived_sd, laplace.derive),
-        ):
+        for kind, sd, derive in ((likelihood.names, fit.sd, None), (PROFILE_QUANTITIES, derived_sd, fit.derive)):
             chosen = [name for name in names if name in kind]
             if not chosen:
                 continue
-            model = ConstrainedFit(likelihood, jnp.asarray(laplace.sigma), derive)
-            sides = interval_bounds(model, laplace.theta, sd, [kind.index(name) for name in chosen], level)
+            model = ConstrainedFit(likelihood, jnp.asarray(fit.laplace.sigmas), derive)
+            sides = interval_bounds(model, fit.theta, sd, [kind.index(name) for name in chosen], level)
             for name, side in zip(chosen, sides, strict=True):
                 low, high = timing[name][0] + side * timing[name][1] if name in timing else np.exp(side)
                 intervals[name] = Interval(float(low), float(high), level, likelihood.use_prior)
@@ -137,17 +119,9 @@ def interval_bounds(
 ) -> Float[np.ndarray, "quantities 2"]:
     """The ends of the intervals of the quantities `indices`; not finite where a side is open.
 
-    All sides are sought at once, each between the last value that was too near and the last that was too far.
-
-    Args:
-        model: what is fitted.
-        theta: the optimum.
-        sd: the errors to expect of the quantities.
-        indices: of the quantities.
-        level: the intervals' probability.
-        pseudo_datum_sd: that of the pseudo-datum, of the expected error.
-        root_tolerance: relative, of the root of the deviance.
-        max_rounds: how often goals are tried.
+    All sides are sought at once, each between the last value that was too near and the last that was too far. `sd` are
+    the errors to expect, of which the pseudo-datum's is `pseudo_datum_sd`; `root_tolerance` is that of the root of the
+    deviance, relative.
     """
     z = NormalDist().inv_cdf(0.5 * (1.0 + level))
     lanes, side = np.repeat(np.asarray(indices), 2), np.tile([-1.0, 1.0], len(indices))
@@ -194,10 +168,8 @@ def table(with_prior: Mapping[str, Interval], without_prior: Mapping[str, Interv
         ]
         return f"{ends[0]} to {ends[1]}"
 
-    level = f"{100.0 * next(iter(with_prior.values())).level:g} %"
-    rows = [f"{level + ' interval':14}{'with the prior':>28}{'of the records alone':>28}"]
-    rows += [
-        f"{name:14}{format_interval(name, of):>28}{format_interval(name, without_prior[name]):>28}"
-        for name, of in with_prior.items()
-    ]
-    return "\n".join(rows)
+    level = next(iter(with_prior.values())).level
+    cells = [(f"{100.0 * level:g} % interval", "with the prior", "of the records alone")]
+    for name, interval in with_prior.items():
+        cells.append((name, format_interval(name, interval), format_interval(name, without_prior[name])))
+    return join_lines(align_rows(cells, (14, 28, 28)))

@@ -35,16 +35,14 @@ def diagnose_fit(
         return "on_bound"
     if optima is not None and result_name(optima.result) == "several_optima":
         return "several_optima"
-    doubtful = any(is_misfit(trace.figures) for trace in traces) or any(
-        source.drive_noise_dominates for source in sources
-    )
-    return "misfit" if doubtful else "successful"
+    noisy = any(source.drive_noise_dominates for source in sources)
+    return "misfit" if noisy or any(is_misfit(channel.figures) for channel in traces) else "successful"
 
 
 def is_out_of_bounds(
     likelihood: Likelihood,
     theta: Float[np.ndarray, " parameters"],
-    sigma: Float[np.ndarray, " traces"],
+    sigma: Float[np.ndarray, " channels"],
     covariance_factor: Float[np.ndarray, "parameters parameters"],
     half_width: float = 6.0,
 ) -> bool:
@@ -80,10 +78,10 @@ def _clip_exponent(likelihood: Likelihood, theta: np.ndarray, covariance_factor:
 
 
 def misfit_warnings(traces: Sequence[ChannelFit]) -> list[str]:
-    """Which of several traces the model does not describe, in sentences."""
+    """Which of several channels the model does not describe, in sentences."""
     return [
-        f"{trace.record.source}: {trace.channel} is not described by the model that all records share (reduced"
-        f" chi-square {trace.figures['chi2_reduced']:.3g}); fit it alone to see whether it belongs to this finger"
-        for trace in traces
-        if len(traces) > 1 and is_misfit(trace.figures)
+        f"{channel.record.source}: {channel.channel} is not described by the model that all records share (reduced"
+        f" chi-square {channel.figures['chi2_reduced']:.3g}); fit it alone to see whether it belongs to this finger"
+        for channel in traces
+        if len(traces) > 1 and is_misfit(channel.figures)
     ]

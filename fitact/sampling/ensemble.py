@@ -93,13 +93,9 @@ def sample(
             posterior = importance.draw_around_fit(fit, level, log_prob, seed)
             timed = dataclasses.replace(posterior.convergence, seconds=time.perf_counter() - start_time)
             return dataclasses.replace(posterior, convergence=timed)
-        target = Target(
-            fit.point_names,
-            log_prob,
-            Proposal.from_laplace(fit.point, fit.point_root, log_prob),
-            functools.partial(importance.tracked_quantities, fit),
-            _fingerprint(fit, seed, walkers, ensembles),
-        )
+        proposal = Proposal.from_laplace(fit.point, fit.point_root, log_prob)
+        track = functools.partial(importance.tracked_quantities, fit)
+        target = Target(fit.point_names, log_prob, proposal, track, _fingerprint(fit, seed, walkers, ensembles))
         path = None if chain_file is None else Path(chain_file)
         chain, convergence = run_ensembles(target, seed, walkers, ensembles, max_steps, path, progress)
         return Posterior.from_chain(fit, chain, convergence, seed)
