@@ -88,8 +88,9 @@ def _draw_trace(axes: Axes, trace: PlotlyTrace, below: np.ndarray) -> np.ndarray
 
 
 def _format_axis(axes: Axes, letter: str, layout: dict[str, Any]) -> None:
-    is_log = layout["type"] == "log"
-    axes.set(**{f"{letter}scale": layout["type"], f"{letter}label": layout["title"]["text"]})
+    reach = axes.dataLim.intervalx if letter == "x" else axes.dataLim.intervaly
+    is_log = layout["type"] == "log" and bool(np.all(np.isfinite(reach)))  # nothing to draw has no logarithm
+    axes.set(**{f"{letter}scale": "log" if is_log else "linear", f"{letter}label": layout["title"]["text"]})
     if "range" in layout:
         axes.set(**{f"{letter}lim": np.power(10.0, layout["range"]) if is_log else layout["range"]})
     axis = axes.xaxis if letter == "x" else axes.yaxis

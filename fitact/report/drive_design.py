@@ -91,7 +91,7 @@ def _mask_infinite(amplitude: Sequence[float] | Float[np.ndarray, " n"]) -> Floa
 
 def _note_if_empty(axes: Axes) -> None:
     if not any(np.isfinite(np.asarray(line.get_ydata(), dtype=float)).any() for line in axes.lines):
-        axes.set_yticks([])
+        axes.set(yscale="linear", yticks=[])
         axes.text(0.5, 0.5, "too few feel it at any amplitude", transform=axes.transAxes, ha="center")
 
 
