@@ -143,7 +143,7 @@ def optimum(made: fitact.Record, fit: fitact.Fit) -> np.ndarray:
 
 
 @pytest.mark.parametrize("tolerance", [1e-3, 0.0])
-@pytest.mark.parametrize("missing", [0, 33, 148])
+@pytest.mark.parametrize("missing", [pytest.param(0, marks=pytest.mark.slow), 33, 148])
 def test_an_answer_is_that_of_the_recorded_samples_alone(missing: int, tolerance: float):
     made = record("named", missing)
     fit = fitact.fit(made, scene("named"), tolerance=tolerance)

@@ -53,6 +53,7 @@ def test_skin_voltage_alone_leaves_the_contact_area_open():
     assert found.derived()["b"]["q50"] == pytest.approx(truth["Rsc"] * total, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_current_is_taken_where_there_is_no_skin_voltage():
     record = fitact.read(FINGERS / "finger00.csv.gz")
     channels = {name: values for name, values in record.channels.items() if name != "Vsc"}

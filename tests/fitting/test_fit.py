@@ -78,7 +78,7 @@ def test_errors_are_those_of_the_linear_theory(finger_fit: fitact.Fit):
         ({}, set()),
         pytest.param({"offset": 0.2}, {"offset"}, marks=pytest.mark.thorough),
         pytest.param({"offset": 0.2, "drift": 2.0}, {"offset", "drift"}, marks=pytest.mark.slow),
-        ({"delay_samples": 2}, {"delay"}),
+        pytest.param({"delay_samples": 2}, {"delay"}, marks=pytest.mark.slow),
     ],
 )
 def test_nuisances_are_freed_by_evidence_and_leave_g_and_b_unbiased(
@@ -94,6 +94,7 @@ def test_nuisances_are_freed_by_evidence_and_leave_g_and_b_unbiased(
         )  # the edge lies between two samples
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frequency", [50.0, pytest.param(60.0, marks=pytest.mark.thorough)])
 def test_hum_of_the_mains_is_modelled(frequency: float):
     """Left out, 1 V of it on this record would shift g and b by many of their errors."""

@@ -41,7 +41,9 @@ def brute_force(fit: fitact.Fit, level: float) -> tuple[float, float]:
     return low, high
 
 
-@pytest.mark.parametrize("level", [pytest.param(0.5, marks=pytest.mark.thorough), 0.95])
+@pytest.mark.parametrize(
+    "level", [pytest.param(0.5, marks=pytest.mark.thorough), pytest.param(0.95, marks=pytest.mark.slow)]
+)
 def test_interval_of_b_against_a_brute_force_profile(noisy: fitact.Fit, level: float):
     low, high = brute_force(noisy, level)
     found = noisy.profile("b", level, prior=False)

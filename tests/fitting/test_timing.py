@@ -49,6 +49,7 @@ def test_a_clock_is_found(waveform: str, off: float, periods: int, per_period: i
         assert abs(fit.derived()[name]["q50"] - truth) < 4.0 * fit.derived()[name]["sd"]
 
 
+@pytest.mark.slow
 def test_no_clock_where_there_is_none():
     fit = fitted("square", 0.0, 50, 400)
     assert fit.trusted

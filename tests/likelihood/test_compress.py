@@ -141,7 +141,7 @@ def test_points_beyond_the_table_are_summed_over_the_samples():
 @pytest.mark.parametrize(
     ("made", "tolerance", "reason"),
     [
-        ({"per_period": 200}, 1e-3, "shorter than 512 samples"),
+        pytest.param({"per_period": 200}, 1e-3, "shorter than 512 samples", marks=pytest.mark.slow),
         pytest.param({"delay_samples": 2}, 1e-3, "delay", marks=pytest.mark.slow),
         pytest.param({}, 1e-13, "off by .* near the optimum", marks=pytest.mark.slow),
     ],

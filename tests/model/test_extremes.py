@@ -15,7 +15,7 @@ from tests import extremes
     # `make extremes` takes all over the whole range
     [
         "transfer",
-        *(pytest.param(n, marks=[] if n in ("sine", "square") else pytest.mark.thorough) for n in extremes.DRIVES),
+        *(pytest.param(n, marks=[] if n == "sine" else pytest.mark.thorough) for n in extremes.DRIVES),
     ],
 )
 def test_accuracy(name: str, kind: type):

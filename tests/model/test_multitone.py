@@ -92,6 +92,7 @@ def test_mean_square_and_peak_by_brute_force(channel: str):
     assert float(fitact.peak(circuit, drive, channel)) == pytest.approx(-best.fun, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_peaks_are_the_largest_whatever_the_tones():
     rng = np.random.default_rng(0)
     time = np.arange(20000) * (PERIOD / 20000)

@@ -175,6 +175,7 @@ def test_sine_is_the_transfer_function(level: str):
     np.testing.assert_allclose(ours, np.imag(phasor * np.exp(1j * omega * TIME)), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_more_harmonics_change_no_more_than_the_stated_error():
     time = (np.arange(500) + 0.5) * 2e-5
     for circuit, channel, error in [
@@ -227,7 +228,12 @@ def test_exponent_is_differentiable_up_to_one():
 
 
 @pytest.mark.parametrize(
-    "level", ["dispersive", "fractional 0.8", pytest.param("fractional 0.5", marks=pytest.mark.thorough)]
+    "level",
+    [
+        "dispersive",
+        pytest.param("fractional 0.8", marks=pytest.mark.slow),
+        pytest.param("fractional 0.5", marks=pytest.mark.thorough),
+    ],
 )
 def test_single_precision(level: str):
     def vsc() -> np.ndarray:

@@ -273,6 +273,7 @@ def test_covariates_are_those_of_the_records_in_their_order(tmp_path):
         known.standardize({"age": 3.0})
 
 
+@pytest.mark.slow
 def test_refused_records_are_named(tmp_path):
     simulated = simulate(1, 0, fingers=3)
     swapped = [dataclasses.replace(r, channels={"V": r["Vsc"], "Vsc": r["V"]}) for r in simulated.records]

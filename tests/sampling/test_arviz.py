@@ -22,7 +22,7 @@ def arviz() -> Any:
         return pytest.importorskip("arviz")
 
 
-@pytest.fixture(scope="module", params=["emcee", "psis"])
+@pytest.fixture(scope="module", params=["emcee", pytest.param("psis", marks=pytest.mark.slow)])
 def data(request, arviz: Any, finger_fit: fitact.Fit, tmp_path_factory) -> Any:
     path: Path = tmp_path_factory.mktemp(request.param) / "posterior.nc"
     fitact.sample(finger_fit, level=request.param, seed=1, progress=False).to_netcdf(path)

@@ -84,6 +84,7 @@ def test_published_quantiles_of_the_inverse_square_law():
     np.testing.assert_allclose(np.quantile(posterior.parameters()["Rsc"], SHARES), [82e3, 114e3, 186e3], rtol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["laplace", "psis"])
 def test_levels_agree_with_emcee_where_the_posterior_is_normal(
     level: str, finger_fit: fitact.Fit, finger_posterior: fitact.Posterior

@@ -105,6 +105,7 @@ def test_predicted_records_cover_the_record(netcdf: Path):
     assert np.mean((low < observed) & (observed < high)) == pytest.approx(0.9, abs=0.025)
 
 
+@pytest.mark.slow
 def test_same_seed_same_file(netcdf: Path, finger_fit: fitact.Fit, tmp_path):
     fitact.sample(finger_fit, seed=1, progress=False).to_netcdf(tmp_path / "again.nc")
     assert (tmp_path / "again.nc").read_bytes() == netcdf.read_bytes()

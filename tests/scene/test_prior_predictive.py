@@ -75,7 +75,7 @@ def test_fixed_tied_and_ordered_parameters_are_drawn_so():
 @pytest.mark.parametrize(
     "drive",
     [
-        {"waveform": "trapezoid", "rise_time": "20 us"},
+        pytest.param({"waveform": "trapezoid", "rise_time": "20 us"}, marks=pytest.mark.slow),
         {"waveform": "burst", "cycles": 1},
         {"steady_state": False},
     ],
