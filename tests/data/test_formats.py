@@ -202,6 +202,9 @@ def test_what_shows_only_further_down_is_read(tmp_path: Path):
     comma = ["time_us;V_V;Vsc_V", *(f"{10 * i};{v};{v}" for i, v in enumerate(shown))]
     (tmp_path / "comma.csv").write_text("\n".join(comma))
     np.testing.assert_allclose(fitact.read(tmp_path / "comma.csv")["Vsc"][700:], values[700:], atol=5e-5)
+    comma.insert(900, "# a remark, so that its part is read line by line")
+    (tmp_path / "remark.csv").write_text("\n".join(comma))
+    np.testing.assert_allclose(fitact.read(tmp_path / "remark.csv")["Vsc"][700:], values[700:], atol=5e-5)
 
 
 def test_nothing_shows_no_noise():

@@ -99,6 +99,7 @@ def test_contact_area_is_named():
     assert found.contains({"Rsc": -0.58, "Csc": 0.58, "Ci": 0.57})
     assert not found.contains({"Rsc": 0.58, "Csc": 0.58, "Ci": 0.57})
     assert "can tell Rsc, Csc, Ci" in str(blind_directions(FINAL, SKIN, ("Vsc", "I")))
+    assert blind_directions(FINAL, ("Rsc", "Ci", "gain"), ("Vsc",)).directions[0, 1] > 0.0  # that of a larger Ci
 
 
 def test_free_gain_hides_behind_the_divider_along_a_curved_ridge():

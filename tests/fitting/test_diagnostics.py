@@ -134,3 +134,9 @@ def test_outliers_are_counted_and_placed():
     assert outliers(noise, time, 1.0) == {"outliers": 0}
     noise[[70, 500, 900]] += 20.0
     assert outliers(noise, time, 1.0) == {"outliers": 3, "first_outlier": pytest.approx(70e-5)}
+
+
+def test_runs_are_stretches_on_one_side():
+    found = ResidualTestStatistics.from_residuals(np.array([[1.0, 2.0, -1.0, 3.0], [1.0, 1.0, 1.0, 1.0]]), None)
+    np.testing.assert_array_equal(found.n_positive, [3, 4])
+    np.testing.assert_array_equal(found.n_runs, [3, 1])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
+import scipy.optimize
 import scipy.signal
 import scipy.stats
 
@@ -302,3 +303,24 @@ def test_records_that_do_not_show_their_noise_are_refused():
     holed = fitact.Record.from_arrays(record.time[uneven], V=record["V"][uneven], Vsc=record["Vsc"][uneven])
     with pytest.raises(fitact.InputError, match="even time steps"):
         fitact.fit(holed, scene(noise_model="ar1"))
+
+
+@pytest.mark.parametrize(("gain", "order"), [(1.5, 0), (3.0, 1)])
+def test_an_order_is_taken_where_akaike_gains_more_than_its_price(gain: float, order: int):
+    """Of n samples with a reflection r the criterion gains n r^2, and a coefficient costs 2."""
+    z = np.random.default_rng(0).standard_normal(1001)
+
+    def reflection(a: float) -> float:
+        x = z[1:] + a * z[:-1]
+        return float(2.0 * (x[1:] @ x[:-1]) / (x[1:] @ x[1:] + x[:-1] @ x[:-1]))
+
+    a = scipy.optimize.brentq(lambda a: reflection(a) - np.sqrt(gain / 1000), -0.5, 0.5)
+    assert fit_ar_burg(z[1:] + a * z[:-1], max_order=1).coefficients.size == order
+
+
+@pytest.mark.parametrize(("run", "clipped"), [(3, False), (4, True)])
+def test_a_rail_is_an_extreme_that_repeats_four_times_in_a_row(run: int, clipped: bool):
+    values = np.concatenate(
+        [np.concatenate([np.full(run, 1.0), np.linspace(0.99 - 0.001 * i, -1.0 - i, 20)]) for i in range(30)]
+    )
+    assert clipping_mask(values).any() == clipped

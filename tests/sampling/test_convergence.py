@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 from arviz_stats.base import array_stats
 
-from fitact.sampling.convergence import diagnose_chain, diagnose_weights, integrated_time, pareto_smooth
+from fitact.sampling.convergence import (
+    ImportanceWeights,
+    _split_rhat,
+    diagnose_chain,
+    diagnose_weights,
+    integrated_time,
+    pareto_smooth,
+)
 from fitact.sampling.ensemble import make_moves
 from fitact.sampling.importance import systematic_resample
 from fitact.sampling.proposal import Proposal, TabulatedMarginal
@@ -149,6 +156,12 @@ def test_pareto_shape_of_exponential_weights(rate: float, accepted: bool):
     assert ("level emcee" in c.warning) != accepted
 
 
+def test_draws_resampled_from_equal_weights_carry_the_variance_of_both():
+    x = np.random.default_rng(0).standard_normal(1000)
+    equal = ImportanceWeights(np.full(1000, 1e-3), 0.0)
+    assert diagnose_weights("psis", equal, {"x": x}, 500).ess["x"] == pytest.approx(1.0 / (1 / 1000 + 1 / 500))
+
+
 def test_weights_without_a_tail_are_refused():
     log_weights = np.full(10_000, -np.inf)
     log_weights[:5] = 0.0
@@ -175,3 +188,9 @@ def test_systematic_resampling_rounds_each_count():
     counts = np.bincount(systematic_resample(weights, 500, 0.37), minlength=1000)
     assert counts.sum() == 500
     assert np.all((counts == np.floor(500 * weights)) | (counts == np.ceil(500 * weights)))
+
+
+def test_rhat_of_few_draws_is_that_of_arviz():
+    draws = np.random.default_rng(0).standard_normal((4, 6, 1))
+    found = _split_rhat(draws, rhat_draws=10**9)
+    assert found == pytest.approx(array_stats.rhat(draws[..., 0], chain_axis=0, draw_axis=1), rel=1e-9)

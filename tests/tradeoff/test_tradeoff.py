@@ -144,6 +144,10 @@ def test_it_is_written_and_says_who_dominates(made_up: Tradeoff, tmp_path):
     for level in made_up.levels:
         row = next(line for line in text.splitlines() if line.startswith(level.name + " "))
         assert row.endswith(f"dominated by {level.dominated_by}") == bool(level.dominated_by)
+    for kind in ("response", "likelihood", "uncertainty"):
+        front = made_up.front(kind)
+        assert front
+        assert not any(level.dominated_by for level in front)
     content = json.loads(json.dumps(made_up.to_dict()))
     assert len(content["levels"]) == len(made_up.levels)
     assert {"cpu", "cores", "python", "jax", "platform"} <= set(content["machine"])
