@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import scipy.stats
 import xarray as xr
+from matplotlib.figure import Figure
 
 from fitact.charts import interactive
 from fitact.charts.interactive import Axis
+from fitact.charts.picture import draw_plot
 from fitact.report.posterior import make_charts
 
 FORCES = ("force_mean", "force_rms", "force_peak")
@@ -119,3 +121,12 @@ def test_nothing_in_a_name_becomes_markup():
 
     Scripts().feed(page)
     assert found.count("script") == 1
+
+
+def test_a_picture_reaches_as_far_as_its_chart():
+    x, y = Axis("a", "V", log=True, limits=(0.1, 200.0)), Axis("b", "V")
+    plot = interactive.plot(x, (y, [interactive.line(x, y, [1.0, 10.0], [1.0, 2.0], "line", "#000000")]))
+    axes = Figure().add_subplot()
+    draw_plot(plot, axes)
+    assert axes.get_xlim() == pytest.approx((0.1, 200.0))
+    assert axes.get_xscale() == "log"
