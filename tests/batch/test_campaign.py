@@ -323,6 +323,7 @@ def test_a_file_named_twice_is_refused(tmp_path: Path):
         fitact.run_campaign([tmp_path / "a.csv", tmp_path / "a.csv"], tmp_path)
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_is_not_there_is_refused(tmp_path: Path, port: int):
     (tmp_path / "a.csv").write_text("1")
     with pytest.raises(fitact.InputError, match="not to be reached"):

@@ -392,6 +392,7 @@ def command(*arguments: object) -> int:
     return _run_command(lambda: app([*map(str, arguments)], standalone_mode=False))
 
 
+@pytest.mark.slow
 def test_the_command_writes_what_it_prints(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     file = tmp_path / "scene.toml"
     file.write_text('[perception]\nthreshold_force = "0.1 mN"\n[prior]\nRsc = {factor = 2}\nCsc = {factor = 2}\n')

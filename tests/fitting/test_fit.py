@@ -326,6 +326,7 @@ def test_any_shift_is_found(shift: float):
     assert abs(deviation(fit, "b", 130e3 * 20.7e-9)) < 4.0
 
 
+@pytest.mark.slow
 def test_from_rest_with_what_was_recorded_before_the_trigger():
     """scipy starts at rest; the record begins half a period before the drive does."""
     time = np.arange(-1000, 4000) * 5e-6

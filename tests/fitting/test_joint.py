@@ -192,6 +192,7 @@ def known(fit: fitact.Fit, name: str) -> float:
     return fit.derived()[name]["sd"] / fit.derived()[name]["mean"]
 
 
+@pytest.mark.slow
 def test_two_equal_records_are_worth_twice_one(first: fitact.Record, alone: fitact.Fit):
     both = fitact.fit([first, record([SKIN, SKIN], seed=1)], scene())
     assert both.trusted

@@ -41,9 +41,7 @@ def brute_force(fit: fitact.Fit, level: float) -> tuple[float, float]:
     return low, high
 
 
-@pytest.mark.parametrize(
-    "level", [pytest.param(0.5, marks=pytest.mark.thorough), pytest.param(0.95, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("level", [pytest.param(0.5, marks=pytest.mark.thorough), 0.95])
 def test_interval_of_b_against_a_brute_force_profile(noisy: fitact.Fit, level: float):
     low, high = brute_force(noisy, level)
     found = noisy.profile("b", level, prior=False)
@@ -80,6 +78,7 @@ def test_what_has_no_interval_is_refused(fit: fitact.Fit, name: str, level: floa
         fit.profile(name, level)
 
 
+@pytest.mark.slow
 def test_without_the_prior_vsc_alone_is_rank_deficient(fit: fitact.Fit):
     alone = fitact.fit(fit.record, SQUARE, prior=False)
     assert alone.result == "rank_deficient"

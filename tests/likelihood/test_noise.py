@@ -233,6 +233,7 @@ def scattered(posterior: fitact.Posterior, channel: str) -> np.ndarray:
     return predicted - predicted.mean(axis=0)
 
 
+@pytest.mark.slow
 def test_clipped_samples_are_left_out():
     record = square_record(noise=0.05)
     rail = 0.8 * float(np.max(np.abs(record["Vsc"])))

@@ -191,6 +191,7 @@ def test_axes_turn_from_logarithmic_to_linear(browser: Browser, page: Path):
     assert max(browser.ask(heights, figure)) == 1.0
 
 
+@pytest.mark.slow
 def test_every_control_is_reached_and_pressed_by_keyboard(browser: Browser, page: Path):
     browser.open(page)
     browser.whole()
@@ -211,6 +212,7 @@ def test_every_control_is_reached_and_pressed_by_keyboard(browser: Browser, page
     assert prior.get_attribute("aria-pressed") == "false"
 
 
+@pytest.mark.slow
 def test_the_pointer_asks_for_values_with_units(browser: Browser, page: Path):
     browser.open(page)
     for number, units in ((0, ("ms", " V", " mV")), (1, ("kΩ", "%")), (2, ("µN", "%"))):

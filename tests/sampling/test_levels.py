@@ -102,6 +102,7 @@ def test_levels_agree_with_emcee_where_the_posterior_is_normal(
         assert np.std(draws) == pytest.approx(sd, rel=5.0 / np.sqrt(size)), name
 
 
+@pytest.mark.slow
 def test_independent_draws_repeat_and_hardly_any_twice(finger_fit: fitact.Fit):
     first, again, other = (fitact.sample(finger_fit, level="psis", seed=seed) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first.points, again.points)

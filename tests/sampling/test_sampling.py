@@ -67,8 +67,7 @@ def endless(monkeypatch):
 
 
 def test_same_seed_same_chain(finger_fit: fitact.Fit):
-    first, again, other = short(finger_fit, 3), short(finger_fit, 3), short(finger_fit, 4)
-    np.testing.assert_array_equal(first.points, again.points)
+    first, other = short(finger_fit, 3), short(finger_fit, 4)
     assert not np.array_equal(first.points, other.points)
     np.random.seed(0)  # noqa: NPY002  (emcee's global state must not matter)
     np.testing.assert_array_equal(short(finger_fit, 3).points, first.points)
@@ -86,13 +85,13 @@ def test_axes_point_where_they_would_on_another_machine():
 def test_resumed_chain_is_the_undisturbed_one(finger_fit: fitact.Fit, tmp_path, endless):
     path = tmp_path / "chain.h5"
     (tmp_path / ".chain.h5.tmp").write_text("what a kill left")
-    half = short(finger_fit, 3, max_steps=170, chain_file=path)
-    assert half.convergence.steps == 170
+    half = short(finger_fit, 3, max_steps=130, chain_file=path)
+    assert half.convergence.steps == 130
     assert list(tmp_path.iterdir()) == [path]
     assert not half.trusted
     assert any("converged" in warning for warning in half.warnings)
-    resumed = short(finger_fit, 3, max_steps=300, chain_file=path)
-    whole = short(finger_fit, 3, max_steps=300)
+    resumed = short(finger_fit, 3, max_steps=200, chain_file=path)
+    whole = short(finger_fit, 3, max_steps=200)
     np.testing.assert_array_equal(resumed.points, whole.points)
     backend = emcee.backends.HDFBackend(path, name="ensemble_2", read_only=True)
     assert backend.get_chain().shape == (resumed.convergence.steps, 16, 4)
@@ -119,19 +118,19 @@ def test_interrupted_sampling_keeps_what_there_is(finger_fit: fitact.Fit, tmp_pa
 
     def interrupted(self, *args, **kwargs):
         calls.append(1)
-        if len(calls) == 180:  # of some 360: three in ten of 300 steps of 4 ensembles
+        if len(calls) == 120:  # of some 240: three in ten of 200 steps of 4 ensembles
             signal.raise_signal(signal.SIGINT)
         return step(self, *args, **kwargs)
 
     monkeypatch.setattr(emcee.moves.StretchMove, "propose", interrupted)
-    posterior = short(finger_fit, 3, max_steps=300, chain_file=path)
+    posterior = short(finger_fit, 3, max_steps=200, chain_file=path)
     assert posterior.convergence.interrupted
-    assert 0 < posterior.convergence.steps < 300
+    assert 0 < posterior.convergence.steps < 200
     assert not posterior.trusted
     monkeypatch.setattr(emcee.moves.StretchMove, "propose", step)
     np.testing.assert_array_equal(
-        short(finger_fit, 3, max_steps=300, chain_file=path).points,
-        short(finger_fit, 3, max_steps=300).points,
+        short(finger_fit, 3, max_steps=200, chain_file=path).points,
+        short(finger_fit, 3, max_steps=200).points,
     )
 
 
