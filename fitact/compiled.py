@@ -103,6 +103,11 @@ class BatchEvaluator:
         ]
         return (parts[0] if len(parts) == 1 else np.concatenate(parts))[:count]
 
+    def map_over(self, shape: tuple[int, ...], *arrays: np.ndarray) -> np.ndarray:
+        """The values of rows that stand in a `shape`, in that shape."""
+        values = self(*(a.reshape(-1, *a.shape[len(shape) :]) for a in arrays))
+        return values.reshape(*shape, *values.shape[1:])
+
 
 class _StaticModel:
     """A function, and a model but for its arrays; equal where their compiled forms are."""

@@ -222,7 +222,7 @@ class BatchProblem:
 
     @functools.cached_property
     def prior_factor(self) -> Float[np.ndarray, "parameters parameters"]:
-        """That of the likelihood, worked out once for all records."""
+        """The likelihood's `prior_factor`, worked out once for all records."""
         return self.likelihood.prior_factor
 
     def _needs_nuisance(self, r_squared: Float[np.ndarray, "records nuisances"]) -> Bool[np.ndarray, " records"]:

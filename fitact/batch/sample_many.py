@@ -261,8 +261,7 @@ def _draws_by_name(
 def _evaluate_draws(
     function: Callable[..., Array], derive: DerivedQuantities, points: Float[np.ndarray, "*shape n"]
 ) -> Float[np.ndarray, "*shape some"]:
-    flat = points.reshape(-1, points.shape[-1])
-    return BatchEvaluator(function, derive, derive.time.size, batch=1024)(flat).reshape(*points.shape[:-1], -1)
+    return BatchEvaluator(function, derive, derive.time.size, batch=1024).map_over(points.shape[:-1], points)
 
 
 def _derive_quantities(derive: DerivedQuantities, point: Array) -> Float[Array, " derived"]:

@@ -18,7 +18,6 @@ from fitact.experiment.experiment import CandidateDesign, DesignOption, evaluate
 from fitact.experiment.fisher import Experiment, force_gradient, signal_spans
 from fitact.experiment.optimise import optimise
 from fitact.experiment.options import Change, changes
-from fitact.fitting import derived
 from fitact.fitting.fit import Fit, fit
 from fitact.model.skin import Dispersive, WithSkin, circuit_parameters
 from fitact.prior.distributions import LogNormal
@@ -190,10 +189,8 @@ def experiment_from_scene(scene: Scene) -> Experiment:
 
 def _force_gradient(fit_result: Fit) -> Float[np.ndarray, " circuit_parameters"]:
     """Differentiate the logarithm of a fit's mean force by the free parameters of its experiment."""
-    sigma = np.array([trace.sigma for trace in fit_result.traces])
-    _, gradients = fit_result.derive.log_value_and_grad(fit_result.theta, sigma)
     columns = [fit_result.names.index(name) for name in fit_result.experiment.free]
-    return gradients[derived.DERIVED_NAMES.index("force_mean"), columns]
+    return fit_result.laplace.log_gradient("force_mean")[columns]
 
 
 def _rank_options(

@@ -122,7 +122,7 @@ def name_direction(direction: dict[str, float]) -> str:
 
 
 def _area_power(name: str) -> float:
-    """With which power of the contact area a circuit's parameter goes: R ~ 1/A, C ~ A."""
+    """Return the power of the contact area that a circuit's parameter goes with: R ~ 1/A, C ~ A."""
     return 1.0 if name == "Ci" or name.endswith(("Csc", "capacitance", "Cgap")) else -1.0
 
 

@@ -57,7 +57,7 @@ def force_gradient(experiment: Experiment) -> Float[np.ndarray, " circuit_parame
 
 
 def jacobian(experiment: Experiment, settings: Sequence[str] = ()) -> Float[np.ndarray, "1+settings rows parameters"]:
-    """That of what is recorded over its noise, and behind it its derivatives in the logarithms of `settings`.
+    """Differentiate what is recorded, over its noise; then the result by the logarithms of `settings`.
 
     A setting is a field of the circuit, or `FREQUENCY`, in which each sample, and each edge, stays where it is in
     the period. Settings need a circuit with time constants.

@@ -129,11 +129,8 @@ def evaluate_draws(
     deviates: Float[np.ndarray, "*draws channels nuisances"],
 ) -> np.ndarray:
     """`function` of the model, each point and its deviates; `rows`: numbers that one evaluation runs over."""
-    draws = points.shape[:-1]
-    flat = points.reshape(-1, points.shape[-1]), deviates.reshape(-1, *deviates.shape[len(draws) :])
     with jax.enable_x64(True):
-        values = BatchEvaluator(function, model, rows)(*flat)
-    return values.reshape(*draws, *values.shape[1:])
+        return BatchEvaluator(function, model, rows).map_over(points.shape[:-1], points, deviates)
 
 
 def _derive_draw(derive: DerivedQuantities, point: Array, deviate: Array) -> Array:

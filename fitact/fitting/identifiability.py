@@ -84,7 +84,7 @@ class Identifiability:
         return self.next_measurement.remedies
 
     def to_dict(self) -> dict[str, Any]:
-        """As in fit.json and summary.json."""
+        """Return its part of fit.json and summary.json."""
         names = (
             "verdict", "eigenvalues", "blind_direction", "blind_name", "structural", "prior_sd", "force_from_prior",
             "force_sd", "force_contraction", "remedy", "remedies", "channels",

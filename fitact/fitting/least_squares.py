@@ -168,7 +168,7 @@ def _add_nuisance(solution: LeastSquaresResult, index: int, name: str) -> tuple[
 def _bic_decreases(
     solution: LeastSquaresResult, optional_nuisances: tuple[tuple[str, ...], ...]
 ) -> dict[tuple[int, str], float]:
-    """By how much freeing each nuisance would lower the Bayesian information criterion, to first order."""
+    """Return what freeing each nuisance would take off the Bayesian information criterion, to first order."""
     likelihood, sigma = solution.likelihood, np.asarray(solution.sigma)
     remainders = [np.asarray(x) / s for x, s in zip(solution.residuals, sigma, strict=True)]
     starts = np.cumsum([0, *(x.size for x in remainders)])
@@ -203,5 +203,5 @@ def _bic_decreases(
 
 
 def bic_decrease(fraction: ArrayLike, count: float, n_columns: int) -> Any:
-    """By how much the Bayesian information criterion falls with a share of `count` samples' sum of squares."""
+    """Return the fall of the Bayesian information criterion with a share of `count` samples' sum of squares."""
     return -count * np.log1p(-np.minimum(fraction, 1.0 - 1e-12)) - n_columns * math.log(count)

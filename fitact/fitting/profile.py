@@ -44,7 +44,7 @@ class Interval:
         return "both" if low and high else "low" * low + "high" * high
 
     def to_dict(self) -> dict[str, Any]:
-        """As in fit.json: an open end is None."""
+        """Return its part of fit.json, where an open end is None."""
         ends = {name: None if self.open in (name, "both") else getattr(self, name) for name in ("low", "high")}
         return ends | {"open": self.open, "level": self.level, "prior": self.prior}
 

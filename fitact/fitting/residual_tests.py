@@ -111,7 +111,7 @@ def _periodogram_statistics(
 def p_values(
     statistics: ResidualTestStatistics, samples: int, phase_bins: PhaseBins | None
 ) -> dict[str, Float[np.ndarray, "*records"]]:
-    """Of white noise to show more of it than `statistics`, by test; uncorrected for their number.
+    """Return probabilities that white noise shows more than `statistics`, by test; uncorrected for their number.
 
     Beside `_folded_p`: Bartlett's test of the cumulative periodogram, by Kolmogorov's law, low where noise is not
     white; and Fisher's, low where one line of the periodogram, as of hum, is too strong for white noise.

@@ -124,7 +124,7 @@ def orthonormal_basis(columns: Float[np.ndarray, "rows n"]) -> Float[np.ndarray,
 
 
 def clock_r_squared(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: float) -> float:
-    """By what share a free clock would lower the sum of the squared residuals, to first order.
+    """Return the share that a free clock would take off the sum of the squared residuals, to first order.
 
     Its shape is no combination of responses, so the response table does not hold it: from the samples.
     """

@@ -264,7 +264,7 @@ def _chunk_products(
 def _inner_products(
     table: _ResponseTable, responses: list[Array], baseline: Array, slope: Array, chunk: _Samples
 ) -> Array:
-    """Those of the responses to the drive (and to unknown charges) at the nodes, the shapes and the record."""
+    """Multiply the responses to the drive (and to unknown charges) at the nodes, the shapes and the record pairwise."""
     rest = chunk.observed - table.expected_terms.weight[0] * responses[0][NODES // 2]
     if table.expected_terms.rate is not None:
         rest = rest - table.expected_terms.rate * chunk.rate

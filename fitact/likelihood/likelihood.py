@@ -58,7 +58,7 @@ class Likelihood(eqx.Module):
 
     @property
     def timing(self) -> dict[str, tuple[float, float]]:
-        """By name, what they are (s, or a share of 1) where their coordinate is 0, and what 1 of that adds."""
+        """Delays (s) and clocks (a share of 1) by name: value where the coordinate is 0, and what 1 of that adds."""
         with jax.enable_x64(True):
             pairs = [
                 (channel, name, channel.shift if name == "delay" else channel.clock) for channel, name in self._timing

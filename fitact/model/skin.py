@@ -234,7 +234,7 @@ class WithSkin(Circuit):
         return dataclasses.replace(self.circuit, **changed)
 
     def channel_terms(self, channel: Channel) -> HighpassTerms:
-        """Those of the grid; raises where there is none."""
+        """The grid's time constants with their weights; raises where there is no grid."""
         if self.grid is not None:
             return self.grid.terms(channel, limits_current(self.circuit), self.channel_gain(channel, self.grid.omega))
         raise InputError(

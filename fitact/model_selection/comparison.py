@@ -211,5 +211,5 @@ def _format_elpd_difference(worse: ModelScore, better: ModelScore) -> str:
 
 
 def _standard_error(values: Float[np.ndarray, " blocks"]) -> float:
-    """That of the sum of independent values."""
+    """Return the standard error of the sum of independent values."""
     return math.sqrt(values.size) * float(np.std(values, ddof=1)) if values.size > 1 else math.inf

@@ -95,9 +95,8 @@ class NewFingerModel(eqx.Module):
     def evaluate(self, factors: Float[np.ndarray, "*shape factors"]) -> Float[np.ndarray, "*shape names"]:
         """Compute all of `names` of many fingers."""
         with jax.enable_x64(True):
-            flat = factors.reshape(-1, factors.shape[-1])
-            values = BatchEvaluator(NewFingerModel.__call__, self, self.derive.time.size, batch=512)(flat)
-        return values.reshape(*factors.shape[:-1], len(self.names))
+            evaluator = BatchEvaluator(NewFingerModel.__call__, self, self.derive.time.size, batch=512)
+            return evaluator.map_over(factors.shape[:-1], factors)
 
     def force_in_time(
         self, factors: Float[np.ndarray, "fingers factors"], count: int

@@ -273,7 +273,7 @@ class Header:
 
     @functools.cached_property
     def time(self) -> Column | None:
-        """By name, by unit, or because it stands first beside a header; None where `time_grid` makes the time."""
+        """Find it by name, by unit, or as the first beside a header; None where `time_grid` makes the time."""
         candidates = [c for c in self._columns if not self._is_index(c)]
         times = [c for c in candidates if c.name.lower() == "time"]
         times += [c for c in candidates if (layouts.parse_unit(c.unit) or ("",))[0] == "s"]
