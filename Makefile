@@ -66,12 +66,13 @@ calibration-quick: env
 fuzz: env
 	$(PY) -m tests.fuzz --count 20000
 
-# make check   style, types, and the order of the layers
+# make check   style, types, the order of the layers, and how docstrings begin
 check: env
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 	.venv/bin/lint-imports
+	$(PY) tools/check_prose.py fitact data_synth tests tools benchmarks notebooks
 
 # make lock   lock the newest versions of the dependencies
 lock: env
