@@ -1,10 +1,11 @@
-"""Summaries of one quantity: mean, sd and quantiles, from draws or from a Laplace approximation; and of them all."""
+"""Summaries of quantities: mean, sd and quantiles, from draws or from a Laplace approximation, and as text."""
 
 import importlib.metadata
 import json
 import math
 import os
 import platform
+import re
 import statistics
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.errors import InputError
-from fitact.tables import align_rows, join_lines
-from fitact.units import format_engineering, quantity_unit
+from fitact.tables import align_table, join_lines
+from fitact.units import choose_prefixed_unit, format_engineering, format_percent, quantity_unit
 
 _PACKAGES = ("fitact", "jax", "equinox", "optimistix", "emcee", "numpy", "xarray")
 _SECTIONS = {"parameters", "derived", "identifiability", "convergence", "fit", "model", "warnings", "record"}
@@ -22,21 +23,74 @@ PROBABILITIES = {f"q{digits}": float(f"0.{digits}") for digits in ("025", "05", 
 _NORMAL = {key: statistics.NormalDist().inv_cdf(p) for key, p in PROBABILITIES.items()}  # standard normal quantiles
 
 Summary = dict[str, float | str]
-FORCE_DESCRIPTIONS = {  # what makes the force, by the name of its model
-    "paper": "by Vsc, eq. (22)",
-    "gap": "by the voltage across the gap, eps0 A Vgap^2 / (2 d^2)",
+FORCE_LAWS = {  # by [force] model
+    "paper": "from Vsc with eq. (22) of the reference paper",
+    "gap": "from the voltage across the interface gap, eps0 A Vgap^2 / (2 d^2)",
+}
+_PARAMETERS = {
+    "Rsc": "skin resistance Rsc",
+    "Csc": "skin capacitance Csc",
+    "Ci": "insulator capacitance Ci",
+    "R_H": "body resistance R_H",
+    "grounding_Rsc": "resistance of the grounding skin",
+    "grounding_Csc": "capacitance of the grounding skin",
+    "Z": "resistance to earth Z",
+    "Z_capacitance": "capacitance to earth",
+    "series_resistor": "series resistor",
+    "Rgap": "gap resistance Rgap",
+    "Cgap": "gap capacitance Cgap",
+    "alpha": "exponent of the fractional skin",
+}
+_NUISANCES = {  # quantities of the measurement; {}: the channel
+    "gain": "gain of {}",
+    "delay": "delay of {} against V",
+    "clock": "relative deviation of the drive frequency from the stated one",
+    "sigma": "noise of {}, standard deviation",
+    "relative_noise": "noise of |Z|, relative standard deviation",
+    "offset": "constant offset of {}",
+    "drift": "drift of {} over half the record",
+    "hum_50Hz_cos": "50 Hz hum in {}, cosine part",
+    "hum_50Hz_sin": "50 Hz hum in {}, sine part",
+    "hum_60Hz_cos": "60 Hz hum in {}, cosine part",
+    "hum_60Hz_sin": "60 Hz hum in {}, sine part",
+    "charge": "transient in {} at the first sample, from the unknown initial charge",
+    "charge_2": "second transient in {} at the first sample",
+    "charge_3": "third transient in {} at the first sample",
+    "charge_4": "fourth transient in {} at the first sample",
+}
+_DERIVED = {
+    "g": "divider g = Ci / (2 Ci + Csc)",
+    "b": "time constant b = Rsc (2 Ci + Csc)",
+    "force_mean": "electrostatic force, mean",
+    "force_peak": "electrostatic force, peak",
+    "force_rms": "electrostatic force, rms",
+    "friction_mean": "friction mu (force + fN), mean",
 }
 
 
+def describe_quantity(name: str) -> str:
+    """Return the name of a quantity for people; a nuisance may end in the label of its channel, as "sigma_I_2"."""
+    labels = _PARAMETERS | _NUISANCES | _DERIVED
+    bare = name if name in labels else re.sub(r"_\d+$", "", name)
+    number = name[len(bare) + 1 :]
+    label = labels[bare.removesuffix("_I")].format("I" if bare.endswith("_I") else "Vsc")
+    return label + (f", record {number}" if number else "")
+
+
+def is_nuisance(name: str) -> bool:
+    """Return whether a quantity belongs to the measurement rather than to the circuit."""
+    return name not in _PARAMETERS | _DERIVED
+
+
 def summarize_draws(name: str, draws: Float[np.ndarray, "*shape"]) -> Summary:
-    """Summary of draws of the quantity `name`, in its SI unit."""
+    """Summarize draws of the quantity `name`, in its SI unit."""
     quantiles = np.quantile(draws, list(PROBABILITIES.values())).tolist()
     summary: Summary = {"unit": quantity_unit(name), "mean": float(np.mean(draws)), "sd": float(np.std(draws, ddof=1))}
     return summary | dict(zip(PROBABILITIES, quantiles, strict=True))
 
 
 def summarize_log_normal(name: str, median: float, log_sd: float) -> Summary:
-    """Summary of a quantity whose logarithm is normal; infinite where a number of that size overflows."""
+    """Summarize a quantity whose logarithm is normal; infinite where a number of that size overflows."""
     with np.errstate(over="ignore"):
         mean = median * np.exp(0.5 * log_sd**2)
         quantiles = median * np.exp(log_sd * np.array(list(_NORMAL.values())))
@@ -46,23 +100,102 @@ def summarize_log_normal(name: str, median: float, log_sd: float) -> Summary:
 
 
 def summarize_normal(name: str, mean: float, sd: float) -> Summary:
-    """Summary of a normal quantity."""
+    """Summarize a normal quantity."""
     summary: Summary = {"unit": quantity_unit(name), "mean": mean, "sd": sd}
     return summary | {key: mean + z * sd for key, z in _NORMAL.items()}
 
 
 def format_sd(summary: Summary) -> str:
-    """Its standard deviation for people: in per cent of the mean, or as it is where that says little."""
+    """Return the standard deviation for people: in per cent of the mean, or in the unit where that exceeds 50 %."""
     mean, sd = float(summary["mean"]), float(summary["sd"])
-    if not sd <= 1e6 * abs(mean) or math.isinf(sd):  # it says nothing
-        return "open"
+    if not sd <= 1e6 * abs(mean) or math.isinf(sd):
+        return "undetermined"
     if sd > 0.5 * abs(mean):
         return format_engineering(sd, str(summary["unit"]), 2)
     return f"{np.format_float_positional(100.0 * sd / abs(mean), 2, fractional=False, trim='-')} %"
 
 
+def format_estimate(summary: Summary) -> str:
+    """Return the median with its standard deviation to two digits, both to the same place: "160.1 ± 8.1 kΩ"."""
+    median, sd = float(summary["q50"]), float(summary["sd"])
+    size, symbol = choose_prefixed_unit(median, str(summary["unit"]))
+    if not 0.0 < sd <= abs(median):
+        spread = "" if sd == 0.0 else f" (sd {format_sd(summary)})"
+        return f"{median / size:.{2 if spread else 4}g} {symbol}".rstrip() + spread
+    places = _decimal_places(sd / size)
+    return f"{median / size:.{places}f} ± {sd / size:.{places}f} {symbol}".rstrip()
+
+
+def format_interval(summary: Summary, low: str = "q05", high: str = "q95") -> str:
+    """Return two quantiles, to the place of the standard deviation's second digit: "147.3 to 173.4 kΩ"."""
+    ends, sd = (float(summary[low]), float(summary[high])), float(summary["sd"])
+    unit = str(summary["unit"])
+    if not 0.0 < sd <= abs(float(summary["q50"])):
+        return " to ".join(format_engineering(end, unit, 2) for end in ends)
+    size, symbol = choose_prefixed_unit(float(summary["q50"]), unit)
+    places = _decimal_places(sd / size)
+    return f"{ends[0] / size:.{places}f} to {ends[1] / size:.{places}f} {symbol}".rstrip()
+
+
+def _decimal_places(sd: float) -> int:
+    """Return the decimal places of two significant digits of `sd`."""
+    return max(0, 1 - int(f"{sd:.1e}".partition("e")[2]))
+
+
+def quantity_table(content: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return rows of all quantities for people, the first of them titles; a row of one cell is a heading.
+
+    `content` is that of fit.json or summary.json. Cells: name, estimate with standard deviation, 90 % interval, the
+    fraction of the variance of the logarithm that comes from the prior, description.
+    """
+    summaries = content["parameters"] | content["derived"]
+    groups: dict[str, list[tuple[str, ...]]] = {"circuit": [], "computed, not measured": [], "measurement": []}
+    for name, s in summaries.items():
+        group = "measurement" if is_nuisance(name) else "circuit" if name not in _DERIVED or name in ("g", "b") else ""
+        groups[group or "computed, not measured"].append(_quantity_row(name, s, content["force_basis"]))
+    for name, s in content.get("nuisances", {}).items():
+        value = format_engineering(s["value"], s["unit"], 3)
+        groups["measurement"].append((name, value, "", "", describe_quantity(name)))
+    rows: list[tuple[str, ...]] = [("", "estimate ± 1 sd", "90 % interval", "from the prior")]
+    for heading, group_rows in groups.items():
+        rows += [(heading,), *group_rows] if group_rows else []
+    return rows
+
+
+def _quantity_row(name: str, summary: Summary, basis: dict[str, Any]) -> tuple[str, ...]:
+    remark = "" if name in _PARAMETERS else describe_quantity(name)
+    if name == "friction_mean" and (assumed := _list_assumptions(basis, ("friction",), "default")):
+        value = format_engineering(float(f"{summary['q50']:.2g}"), str(summary["unit"]))
+        return name, f"about {value}", "", "", f"{remark}; default {assumed}"
+    fraction = format_percent(round(float(summary["from_prior"]), 3)) if "from_prior" in summary else ""
+    return name, format_estimate(summary), format_interval(summary), fraction, remark
+
+
+def _list_assumptions(basis: dict[str, Any], affects: tuple[str, ...], origin: str = "") -> str:
+    """Return the assumed values of a kind as text, each with its origin unless one is asked for."""
+    items = [each for each in basis["assumptions"] if each["affects"] in affects and origin in ("", each["origin"])]
+    texts = [f"{each['symbol']} = {each['text']}" + ("" if origin else f" ({each['origin']})") for each in items]
+    return ", ".join(texts)
+
+
+def force_sentences(basis: dict[str, Any]) -> list[str]:
+    """Return what a force rests on, in sentences; `basis` is `force_basis` of fit.json or summary.json."""
+    sentences = [
+        f"Force: computed {FORCE_LAWS[basis['law']]}; it was not measured, and these data do not test that law."
+    ]
+    if values := _list_assumptions(basis, ("prior", "drive", "force", "friction")):
+        sentences.append(
+            f"Force and friction rest on {values}; default means that nobody stated it. The errors above do not include"
+            " an uncertainty of these values, except that of the prior."
+        )
+    if other := basis["other_law"]:
+        force = format_estimate(other["force_mean"])
+        sentences.append(f"Mean force by the other law ({FORCE_LAWS[other['law']]}): {force}, for the same data.")
+    return sentences
+
+
 def load(directory: str | os.PathLike[str]) -> dict[str, Any]:
-    """The content of summary.json, in a folder that `fitact sample` or `fitact run` wrote."""
+    """Read summary.json from a folder that `fitact sample` or `fitact run` wrote."""
     try:
         content = json.loads((Path(directory) / "summary.json").read_text(encoding="utf-8"))
         if not (isinstance(content, dict) and set(content) >= _SECTIONS):
@@ -74,22 +207,23 @@ def load(directory: str | os.PathLike[str]) -> dict[str, Any]:
         ) from error
 
 
+def format_table(content: dict[str, Any]) -> list[str]:
+    """Return the lines of `quantity_table`, and what the force rests on."""
+    return [*align_table(quantity_table(content)), *force_sentences(content["force_basis"])]
+
+
 def table(content: dict[str, Any]) -> str:
-    """The content of summary.json, for people."""
-    cells = [("", "median", "5 %", "95 %")]
-    for name, s in (content["parameters"] | content["derived"]).items():
-        cells.append((name, *(format_engineering(float(s[q]), str(s["unit"])) for q in ("q50", "q05", "q95"))))
-    rows = align_rows(cells, (14, 12, 14, 12))
-    rows += [f"force: {FORCE_DESCRIPTIONS[content['model'].get('force', 'paper')]}."]
+    """Return the content of summary.json for people."""
+    rows = format_table(content)
     rows += [content[section]["sentence"] for section in ("convergence", "identifiability")]
-    return join_lines(rows, content["warnings"])
+    return join_lines(rows, content["warnings"], content["notes"])
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that results depend on."""
+    """Return the versions of Python and of the packages that results depend on."""
     return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in _PACKAGES}
 
 
 def is_trusted(content: dict[str, Any]) -> bool:
-    """Whether nothing stands against the answer that summary.json holds."""
+    """Return whether the answer that summary.json holds is reliable."""
     return bool(content["convergence"]["converged"]) and content["fit"]["result"] == "successful"

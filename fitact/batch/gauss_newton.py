@@ -134,7 +134,9 @@ class BatchProblem:
             return None
         is_plain = trace.channel == "Vsc" and trace.noise == "white" and trace.equally_weighted and not trace.timing
         has_other_model = isinstance(likelihood.template, WithSkin) or isinstance(choice.drive, Chirp)
-        has_nuisances = bool(np.any(np.asarray(trace.linear_sd))) or bool(choice.notes) or choice.shift != 0.0
+        has_nuisances = (
+            bool(np.any(np.asarray(trace.linear_sd))) or bool(choice.notes or choice.warnings) or choice.shift != 0.0
+        )
         if not is_plain or has_other_model or has_nuisances or choice.name == "measured":
             return None
         time = source.record.time

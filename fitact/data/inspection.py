@@ -50,7 +50,7 @@ class Channel:
 
 @dataclasses.dataclass(frozen=True)
 class Inspection:
-    """A file's channels, time (s), dominant frequency (Hz, or None), what was assumed, and what is doubtful."""
+    """Channels of a file, time (s), dominant frequency (Hz, or None), notes and warnings."""
 
     source: str
     format: str
@@ -61,7 +61,7 @@ class Inspection:
     warnings: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """The JSON of `fitact inspect`."""
+        """Return the JSON content of `fitact inspect`."""
         return {
             "source": self.source,
             "format": self.format,
@@ -77,7 +77,9 @@ class Inspection:
 
     def __str__(self) -> str:
         step = float(np.median(np.diff(self.time)))
-        wave = f"repeats at {format_engineering(self.frequency, 'Hz')}" if self.frequency else "no whole wave seen"
+        wave = (
+            f"repeats at {format_engineering(self.frequency, 'Hz')}" if self.frequency else "no complete period found"
+        )
         lines = [
             f"{self.source} ({self.format}): {self.time.size:,} samples, every {format_engineering(step, 's')}"
             f" ({format_engineering(1.0 / step, 'Hz')}), from {format_engineering(self.time[0], 's')} to"
@@ -90,7 +92,7 @@ class Inspection:
             )
             rail = f", {channel.clipped:,} samples clipped" if channel.clipped else ""
             lines.append(f"  {channel.name:<{width}}  {low} to {high}, noise {noise}{rail}")
-        return join_lines([*lines, *(f"note: {note}" for note in self.notes)], self.warnings)
+        return join_lines(lines, self.warnings, self.notes)
 
 
 def inspect(
@@ -99,10 +101,10 @@ def inspect(
     channels: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
 ) -> Inspection:
-    """Look at a file without fitting it: as V, Vsc and I where they are known or named, else as the file has them.
+    """Inspect a file without fitting it; channels are V, Vsc and I if known or named, otherwise those of the file.
 
     Raises:
-        InputError: the file cannot be read, or what is known as V, Vsc or I could not be fitted.
+        InputError: the file cannot be read, or its V, Vsc or I could not be fitted.
     """
     capture = merge_other_files(read_capture(path), path, channels or {})
     if channels or scale or has_standard_names(capture):
@@ -120,7 +122,7 @@ def inspect(
     notes = (
         *capture.notes,
         *grid_notes(time, capture.source),
-        f"{capture.source}: before a fit, say which of {names} is which, as --channel V=NAME --channel Vsc=NAME",
+        f"{capture.source}: for a fit, assign the channels {names}, e.g. --channel V=NAME --channel Vsc=NAME",
     )
     return _inspect_channels(capture, time, arrays, notes)
 
@@ -130,12 +132,13 @@ def _inspect_channels(
 ) -> Inspection:
     frequencies = (_estimate_frequency(time, values) for values, _ in arrays.values())
     frequency = next((f for f in frequencies if f is not None), None)
-    warnings = check_time(time, frequency) if time.size > 3 else []
+    warnings = [*capture.warnings, *(check_time(time, frequency) if time.size > 3 else [])]
     for name, (values, unit) in arrays.items():
         warnings += check_channel(name, unit, time, values, frequency)
     warnings += check_divider({name: values for name, (values, _) in arrays.items()})
-    seen = tuple(_inspect_channel(name, unit, values) for name, (values, unit) in arrays.items())
-    return Inspection(capture.source, capture.format, time, seen, frequency, notes, tuple(warnings))
+    inspected = tuple(_inspect_channel(name, unit, values) for name, (values, unit) in arrays.items())
+    notes = (*notes, *describe_rounded_time(time))
+    return Inspection(capture.source, capture.format, time, inspected, frequency, notes, tuple(warnings))
 
 
 def _inspect_channel(name: str, unit: str, values: Samples) -> Channel:
@@ -148,12 +151,12 @@ def _inspect_channel(name: str, unit: str, values: Samples) -> Channel:
 
 
 def _is_signal(values: Samples) -> bool:
-    """Whether there is anything to judge: finite numbers that vary."""
+    """Return whether the values are finite and vary."""
     return bool(np.all(np.abs(values) < OVERFLOW) and np.ptp(values) > 0.0)
 
 
 def _estimate_frequency(time: Samples, values: Samples, max_samples: int = 2_097_152) -> float | None:
-    """From a part of a long record, or from each n-th sample of it."""
+    """Estimate the fundamental frequency (Hz) from a part of a long record, or from each n-th sample."""
     if time.size < MINIMUM_SAMPLES or not _is_signal(values):
         return None
     whole = fundamental_frequency(time[:max_samples], values[:max_samples])
@@ -164,56 +167,62 @@ def _estimate_frequency(time: Samples, values: Samples, max_samples: int = 2_097
 
 
 def check_time(time: Samples, frequency: float | None, min_samples_per_period: int = 20) -> list[str]:
-    """Doubts about the times, s, and the rate that they make for a signal of `frequency`.
+    """Describe doubts about the times (s), and about the sampling rate for a signal of `frequency` (Hz).
 
-    With fewer samples than `min_samples_per_period`, edges and bends are lost.
+    Edges and bends are lost with fewer than `min_samples_per_period` samples.
     """
     found = []
     step = (time[-1] - time[0]) / (time.size - 1)
-    off = float(np.max(np.abs(time - np.linspace(time[0], time[-1], time.size)))) / step
-    if off > 1e-6 and is_uniform(time):  # double precision is off by less
-        found.append(f"the time is rounded: off an even grid by {off:.2g} of a step, as float32 leaves it; harmless")
     if not time[0] <= 0.0 <= time[-1]:
         found.append(
             f"the trigger (0 s) lies outside of the record ({format_engineering(time[0], 's')} to"
-            f" {format_engineering(time[-1], 's')}); a drive that a scene states is found by its phase, not by the"
-            f" trigger"
+            f" {format_engineering(time[-1], 's')}); the fit aligns the drive of a scene by its phase, not by the"
+            " trigger"
         )
     if frequency is None:
-        found.append("no channel shows 1.5 periods of a wave; record two periods or more")
+        found.append("no channel contains 1.5 periods of a wave; record two periods or more")
     elif 1.0 / (frequency * step) < min_samples_per_period:
         found.append(
-            f"{1.0 / (frequency * step):.3g} samples a period: what changes faster is lost or aliased; record faster"
+            f"{1.0 / (frequency * step):.3g} samples per period: faster changes are lost or aliased; record faster"
         )
     return found
 
 
+def describe_rounded_time(time: Samples, tolerance: float = 1e-6) -> list[str]:
+    """Describe the deviation of uniform times from an even grid, above what double precision causes."""
+    step = (time[-1] - time[0]) / max(time.size - 1, 1)
+    off = float(np.max(np.abs(time - np.linspace(time[0], time[-1], time.size)))) / step
+    if off <= tolerance or not is_uniform(time):
+        return []
+    return [f"the times are rounded (by up to {off:.2g} of a sampling interval, as in float32); this does no harm"]
+
+
 def check_channel(name: str, unit: str, time: Samples, values: Samples, frequency: float | None) -> list[str]:
-    """Sentences on what is doubtful about a channel; unit V, A or "" where none is known."""
+    """Describe doubts about a channel, in sentences; `unit` is V, A or "" if unknown."""
     bad = np.flatnonzero(~np.isfinite(values) | (np.abs(values) >= OVERFLOW))
     if bad.size:
-        return [f"{name} is not finite, or a code for overflow, at {bad.size:,} samples; they will be refused"]
+        return [f"{name} is not finite, or an overflow code, at {bad.size:,} samples; a fit refuses them"]
     spread = float(np.ptp(values))
     if spread == 0.0:
         return [f"{name} is constant at {values[0]:.6g}; is it connected?"]
     found = []
     if railed := int(np.count_nonzero(clipping_mask(values))):
         found.append(
-            f"{name} is clipped at {railed:,} samples ({values.min():.4g} to {values.max():.4g}): the oscilloscope's"
-            " range or the amplifier is exceeded"
+            f"{name} is clipped at {railed:,} samples ({values.min():.4g} to {values.max():.4g}): it exceeds the range"
+            " of the oscilloscope or of the amplifier"
         )
     if rounding_noise_sd(values) > 0.0:
-        found.append(f"{name} is rounded to steps wider than its noise; record with a finer range")
+        found.append(f"{name} is rounded to steps larger than its noise; record with a smaller range")
     largest = float(np.max(np.abs(values)))
     if largest > _MOST.get(unit, math.inf):
         found.append(
-            f"{name} reaches {format_engineering(largest, unit)}, more than a touch display takes; is the unit right?"
+            f"{name} reaches {format_engineering(largest, unit)}, more than a touch display withstands; check the unit"
         )
-    return found + [f"{name} {sentence}" for sentence in _check_hum_and_drift(time, values, spread, frequency)]
+    return found + [f"{name} {sentence}" for sentence in _check_hum_and_drift(time, values, spread, frequency, unit)]
 
 
 def check_divider(channels: Mapping[str, Samples], low: float = 2e-2, high: float = 0.5) -> list[str]:
-    """Doubts about Vsc over V: a probe's attenuation may be missing below `low`; no circuit gives `high` or more."""
+    """Describe doubts about Vsc / V: an unstated probe attenuation below `low`, an impossible circuit above `high`."""
     if not {"V", "Vsc"} <= set(channels) or np.ptp(channels["V"]) == 0.0:
         return []
     ratio = float(np.ptp(channels["Vsc"]) / np.ptp(channels["V"]))
@@ -230,16 +239,17 @@ def _check_hum_and_drift(
     values: Samples,
     value_range: float,
     frequency: float | None,
+    unit: str,
     *,
     min_mains_periods: int = 4,
     hum_fraction: float = 0.01,
     drift_fraction: float = 0.02,
     min_significance: float = 6.0,
 ) -> Iterator[str]:
-    """Hum and drift beside a periodic signal: by a line of the spectrum, and by the means of the periods.
+    """Describe hum and drift of a periodic signal, found by a spectral line and by the means of the periods.
 
-    Both are worth a word from a fraction of the channel's range on, a drift of so many standard errors; a record must
-    hold `min_mains_periods` to tell mains hum from drift.
+    Both are reported above a fraction of the channel's range, a drift also only above `min_significance` standard
+    errors. A record shorter than `min_mains_periods` cannot distinguish mains hum from drift.
     """
     span = float(time[-1] - time[0])
     if frequency is None or not is_uniform(time) or span * frequency < 3.0:
@@ -251,13 +261,16 @@ def _check_hum_and_drift(
         line = _spectral_line(time, values, mains)
         beside = max(abs(_spectral_line(time, values, mains + away / span)) for away in (-3.0, 3.0))
         if abs(line) > max(hum_fraction * value_range, 3.0 * beside):
-            yield f"holds {mains:.0f} Hz of {abs(line):.3g}: mains hum; the fit frees it where the data ask for it"
+            yield (
+                f"contains mains hum ({mains:.0f} Hz, amplitude {abs(line):.3g} {unit}); the fit adds a"
+                f" {mains:.0f} Hz term if the BIC favours it"
+            )
             values = values - np.real(line * np.exp(2j * np.pi * mains * time))
     step = span / (time.size - 1)
     means, centres = _period_means(values, 1.0 / (frequency * step))
     slope, error = _fit_slope(centres * step, means)
     if abs(slope * span) > drift_fraction * value_range and abs(slope) > min_significance * error:
-        yield f"drifts by {slope * span:.3g} over the record; the fit frees a drift where the data ask for one"
+        yield f"drifts by {slope * span:.3g} {unit} over the record; the fit adds a drift if the BIC favours it"
 
 
 def _period_means(values: Samples, samples: float) -> tuple[np.ndarray, np.ndarray]:

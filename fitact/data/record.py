@@ -32,13 +32,15 @@ class Record:
         time: strictly increasing, s.
         channels: by name: V (drive), Vsc (over the skin), I (trunk current).
         source: where it came from, for messages.
-        notes: what was assumed or is worth knowing, in sentences.
+        notes: sentences for information.
+        warnings: sentences on what may change the result.
     """
 
     time: Float[np.ndarray, " samples"]
     channels: Mapping[str, Float[np.ndarray, " samples"]]
     source: str = "record"
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @classmethod
     def from_arrays(
@@ -50,6 +52,7 @@ class Record:
         I: Float[np.ndarray, " samples"] | None = None,  # noqa: E741  (the field's symbol for current)
         source: str = "record",
         notes: tuple[str, ...] = (),
+        warnings: tuple[str, ...] = (),
         where: _RowLabel = lambda row: f"sample {row}",
     ) -> "Record":
         """Check arrays (s, V, V, A; equal lengths) and make them a record; `where` names a row in errors.
@@ -69,7 +72,7 @@ class Record:
         notes = (*notes, *grid_notes(time, source))
         for array in (time, *channels.values()):
             array.flags.writeable = False
-        return cls(_share_times(time), channels, source, notes)
+        return cls(_share_times(time), channels, source, notes, warnings)
 
     def __getitem__(self, channel: str) -> Float[np.ndarray, " samples"]:
         try:

@@ -21,7 +21,8 @@ class CurrentSamples(NamedTuple):
     weight: Float[np.ndarray, " samples"]  # of the samples, as in `fitact.likelihood.channel.ChannelLikelihood`
     rate: Float[np.ndarray, " samples"]  # dV/dt, V/s
     drive_noise_dominates: bool  # whether V's noise, differentiated, takes too much off what follows dV/dt
-    notes: tuple[str, ...]  # what was left out or is worth knowing, in sentences
+    notes: tuple[str, ...]  # sentences for information
+    warnings: tuple[str, ...]  # sentences on what may change the result
 
 
 def select_current_samples(record: Record, choice: DriveModel, max_attenuation: float = 1e-3) -> CurrentSamples:
@@ -36,7 +37,7 @@ def select_current_samples(record: Record, choice: DriveModel, max_attenuation: 
         kept &= np.isfinite(slope)  # a record may begin at a jump
     note = f"I: {np.count_nonzero(~kept):,} of {kept.size:,} samples lie at an edge of the drive and are left out"
     if choice.name != "measured":
-        return CurrentSamples(kept.astype(float), np.where(kept, slope, 0.0), False, (note,))
+        return CurrentSamples(kept.astype(float), np.where(kept, slope, 0.0), False, (note,), ())
     rate = np.gradient(choice.voltage) / np.gradient(record.time)  # over two steps, which halves the noise
     capacitance = abs(float(record["I"][kept] @ rate[kept]) / max(float(rate[kept] @ rate[kept]), 1e-300))
     # a V that stays at one level has no noise there that a derivative could see
@@ -45,12 +46,12 @@ def select_current_samples(record: Record, choice: DriveModel, max_attenuation: 
     # what noise in a regressor takes off its coefficient
     attenuation = float(np.sum((weight * spread) ** 2) / max(float(np.sum((weight * rate) ** 2)), 1e-300))
     if attenuation <= max_attenuation:
-        return CurrentSamples(weight, rate, False, (note,))
+        return CurrentSamples(weight, rate, False, (note,), ())
     warning = (
         f"V_V's noise, differentiated, drowns I and takes {format_percent(attenuation)} off what follows dV/dt;"
         " name the waveform in the scene, or record V with less noise"
     )
-    return CurrentSamples(weight, rate, True, (note, warning))
+    return CurrentSamples(weight, rate, True, (note,), (warning,))
 
 
 def _edge_mask(

@@ -35,7 +35,8 @@ class DriveModel:
     unknown_charge: bool  # whether the charge at the first sample must be left free
     shift: float  # the drive starts this much later than the record's t = 0, s
     name: str  # "measured" or the waveform's name
-    notes: tuple[str, ...]  # what was assumed, in sentences
+    notes: tuple[str, ...] = ()  # sentences for information
+    warnings: tuple[str, ...] = ()  # sentences on what may change the result
 
     @property
     def periodic(self) -> bool:
@@ -58,13 +59,14 @@ def _choose_drive(record: Record, scene: Scene | None) -> DriveModel:
         return _measured_drive(record, scene.steady_state() if scene else None, ())
     drive, slowest = scene.make_drive(), scene.drive.lowest_frequency
     notes: list[str] = []
+    warnings: list[str] = []
     named = scene.states_waveform()
     if named and not isinstance(drive, Chirp):
         _check_frequency(record, slowest)
     if named and isinstance(drive, Periodic) and (frequency := _record_frequency(record, scene.drive)) is not None:
         stated, slowest = slowest, frequency
         drive = dataclasses.replace(drive, frequency=slowest)
-        notes.append(
+        warnings.append(
             f"the record repeats at {slowest:.6g} Hz, not at the scene's {stated:.6g} Hz, and its own frequency is used"
         )
     drive = as_arrays(drive)
@@ -85,24 +87,26 @@ def _choose_drive(record: Record, scene: Scene | None) -> DriveModel:
             note = "the scene names no waveform and V_V is not its nominal square: the recorded V_V drives the fit"
             return _measured_drive(record, scene.steady_state(), (note,))
         if error > 0.02:
-            notes.append(
+            warnings.append(
                 f"V_V differs from the scene's {scene.drive.waveform} by {format_percent(error)} rms;"
                 " [drive] waveform = 'measured' would use V_V as recorded"
             )
-    return DriveModel(drive, voltage, scene.drive.steady_state, False, shift, scene.drive.waveform, tuple(notes))
+    return DriveModel(
+        drive, voltage, scene.drive.steady_state, False, shift, scene.drive.waveform, tuple(notes), tuple(warnings)
+    )
 
 
 def _measured_drive(record: Record, steady_state: bool | None, notes: tuple[str, ...]) -> DriveModel:
     voltage = record["V"]
+    warnings: tuple[str, ...] = ()
     if has_unresolved_edge(voltage):
-        notes = (
-            *notes,
-            "V_V jumps within one sample step, so the time of its edges, and with it g, is known only to within a"
-            " step (freed as a gain); record faster, or name the waveform in a scene",
+        warnings = (
+            "V_V jumps within one sampling interval, so the times of its edges, and with them g, are uncertain by up to"
+            " one interval (a free gain accounts for it); record faster, or state the waveform in a scene",
         )
     if not steady_state:
         drive = Sampled(to_device(pad_samples(record.time)), to_device(pad_samples(voltage)))
-        return DriveModel(drive, voltage, False, steady_state is None, 0.0, "measured", notes)
+        return DriveModel(drive, voltage, False, steady_state is None, 0.0, "measured", notes, warnings)
     kept, period = whole_periods(record)
     if period is None:
         raise InputError(
@@ -111,7 +115,7 @@ def _measured_drive(record: Record, steady_state: bool | None, notes: tuple[str,
         )
     time, samples = (pad_samples(x[:kept], len(record)) for x in (record.time, voltage))
     drive = as_arrays(Sampled(time, samples, period))
-    return DriveModel(drive, voltage, True, False, 0.0, "measured", notes)
+    return DriveModel(drive, voltage, True, False, 0.0, "measured", notes, warnings)
 
 
 def whole_periods(record: Record) -> tuple[int, float | None]:

@@ -1,4 +1,4 @@
-"""Fit records: parameters, their covariance, and whether the answer may be trusted."""
+"""Fit records: parameters, their covariance, and whether the fit is reliable."""
 
 import dataclasses
 import math
@@ -18,7 +18,7 @@ from fitact.experiment.fisher import Experiment, covariance_factor
 from fitact.fitting import derived, remarks
 from fitact.fitting.channel_fit import ChannelFit, information_criteria
 from fitact.fitting.drive_choice import DriveModel
-from fitact.fitting.identifiability import assess_identifiability
+from fitact.fitting.identifiability import assess_identifiability, prior_variance_fraction
 from fitact.fitting.laplace import FitResult, Laplace
 from fitact.fitting.least_squares import LeastSquaresResult, solve
 from fitact.fitting.levenberg_marquardt import Optima
@@ -32,7 +32,6 @@ from fitact.likelihood.noise import scale_information
 from fitact.model.skin import constant_skin_circuit
 from fitact.scene.scene import Scene
 from fitact.tables import join_lines
-from fitact.units import format_engineering, quantity_unit
 
 _SKIN = ("Rsc", "Csc", "Ci")
 _RESPONSE = {
@@ -44,12 +43,12 @@ _RESPONSE = {
 
 @dataclasses.dataclass(frozen=True)
 class Fit(FitResult):
-    """The best parameters, their Laplace approximation, and a judgement.
+    """Fit of one circuit to records: best parameters, their Laplace approximation, and whether it is reliable.
 
     Attributes:
-        traces: the channels fitted, by record.
-        compression_error: of the compressed log-likelihood near the optimum; None: samples are summed.
-        experiment: the measurement that was done, at the optimum.
+        traces: the fitted channels of each record.
+        compression_error: error of the compressed log-likelihood near the optimum; None if all samples are summed.
+        experiment: the measurement at the optimum, for designs.
     """
 
     traces: tuple[ChannelFit, ...]
@@ -63,13 +62,18 @@ class Fit(FitResult):
 
     @property
     def records(self) -> tuple[Record, ...]:
-        """All of them."""
+        """All records."""
         return tuple({id(channel.record): channel.record for channel in self.traces}.values())
 
     @property
     def choice(self) -> DriveModel:
-        """The drive of `record`."""
+        """Drive of `record`."""
         return self.traces[0].choice
+
+    @property
+    def uses_stated_drive(self) -> bool:
+        """Whether the scene's drive was used, and not the recorded V."""
+        return self.choice.name != "measured"
 
     @property
     def sigma(self) -> float:
@@ -78,23 +82,23 @@ class Fit(FitResult):
 
     @property
     def residuals(self) -> Float[np.ndarray, " samples"]:
-        """Record minus fit of the first channel, V or A."""
+        """Residuals (data - fit) of the first channel, V or A."""
         return self.traces[0].residuals
 
     @property
     def linear(self) -> dict[str, float]:
-        """What entered linearly and was freed, V or A, at the optimum."""
+        """Linear nuisances that were fitted, V or A, at the optimum."""
         return {name: value for channel in self.traces for name, value in channel.linear.items()}
 
     @property
     def full_because(self) -> str:
-        """Why samples are summed, as a clause; "" where none are."""
+        """Reason why all samples are summed, as a clause; "" if the likelihood is compressed."""
         reasons = [f"{c.label}: " * bool(c.label) + c.full_because for c in self.traces if c.full_because]
         return "; ".join(dict.fromkeys(reasons))
 
     @property
     def point_names(self) -> tuple[str, ...]:
-        """Coordinates of the posterior: those of theta, and the logarithm of each channel's sigma."""
+        """Coordinates of the posterior: theta, then the logarithm of each channel's sigma."""
         return (*self.names, *self.likelihood.sigma_names)
 
     @property
@@ -104,7 +108,7 @@ class Fit(FitResult):
 
     @property
     def point_root(self) -> Float[np.ndarray, "coordinates coordinates"]:
-        """As `covariance_root`, in the coordinates of the posterior; sigma's by its Fisher information."""
+        """Factor of the covariance in the coordinates of the posterior; for sigma from its Fisher information."""
         freedom = np.array([channel.figures["degrees_of_freedom"] for channel in self.traces])
         information = freedom * [scale_information(channel.noise) for channel in self.likelihood.channels]
         size = self.theta.size
@@ -113,10 +117,10 @@ class Fit(FitResult):
         return root
 
     def profile(self, name: str, level: float = 0.95, *, prior: bool = True) -> Interval:
-        """The profile-likelihood interval of one parameter, or of g, b or force_mean.
+        """Return the profile-likelihood interval of one parameter, or of g, b or force_mean.
 
-        `prior`: whether the circuit's prior speaks in it (that of the posterior), or the records alone. The noise is
-        held at its estimate. A side that the records leave open, to a factor of a million, is 0 or infinite.
+        `prior`: whether to include the prior of the circuit. The noise is fixed at its estimate. A bound that the data
+        do not determine within a factor of a million is 0 or infinite.
 
         Raises:
             InputError: there is no quantity of that name, or the level is not between 0 and 1.
@@ -124,7 +128,7 @@ class Fit(FitResult):
         return profile_intervals(self, (name,), level, prior)[name]
 
     def intervals(self, level: float = 0.95, *, prior: bool = True) -> dict[str, Interval]:
-        """As `profile`, of all parameters, and of g, b and force_mean.
+        """Return the profile-likelihood intervals of all parameters, and of g, b and force_mean; see `profile`.
 
         Raises:
             InputError: the level is not between 0 and 1.
@@ -132,7 +136,7 @@ class Fit(FitResult):
         return profile_intervals(self, (*self.names, *PROFILE_QUANTITIES), level, prior)
 
     def model(self) -> dict[str, Any]:
-        """What was fitted, by name."""
+        """Return the fitted model by name."""
         circuit = type(constant_skin_circuit(self.likelihood.template)).__name__
         return {
             "circuit": {"FinalCircuit": "final", "DirectGround": "direct", "NaturalGround": "natural"}[circuit],
@@ -150,11 +154,14 @@ class Fit(FitResult):
 
     def _likelihood(self) -> str:
         if self.compression_error is None:
-            return f"summed over the samples each time, since {self.full_because}"
-        return f"compressed to {self.likelihood.rows} numbers, off by {self.compression_error:.1g} at most"
+            return f"summed over all samples in each evaluation, because {self.full_because}"
+        return (
+            f"computed from {self.likelihood.rows} projection coefficients of the data; error at most"
+            f" {self.compression_error:.1g}"
+        )
 
     def judgement(self) -> dict[str, Any]:
-        """The result, and the figures of merit of all channels and of each."""
+        """Return the result, and the figures of merit of all channels together and of each."""
         traces = [
             {"channel": t.channel, "record": os.path.basename(t.record.source), "label": t.label, **t.figures}
             for t in self.traces
@@ -165,20 +172,18 @@ class Fit(FitResult):
         return dict(zip(self.likelihood.sigma_names, self.laplace.sigmas.tolist(), strict=True)) | self.linear
 
     def summary(self) -> str:
-        """A table for people: values with errors, correlations, the verdict."""
+        """Return a table for people: estimates with errors, what the force rests on, and the verdict."""
         names, correlation = self.names, self.correlation
         pairs = [f"{names[j]}-{names[i]} {correlation[i, j]:+.3f}" for i in range(len(names)) for j in range(i)]
-        nuisances = [f"{name} {format_engineering(v, quantity_unit(name))}" for name, v in self._nuisances().items()]
+        chi_square = self.figures["chi2_reduced"]
         rows = [
-            *self._align_table(14, 12, 12, 14),
-            f"nuisances: {', '.join(nuisances)}",
-            f"correlations of the logs: {', '.join(pairs)}",
-            f"reduced chi-square {self.figures['chi2_reduced']:.3f}. {self.message}",
-            f"log-likelihood: {self._likelihood()}.",
-            f"force: {summary.FORCE_DESCRIPTIONS[self.derive.geometry.model]}.",
+            *summary.format_table(self.to_dict()),
+            f"Correlations of the log-parameters: {', '.join(pairs)}.",
+            f"Residual variance / model-free noise variance: {chi_square:.3f}. {self.message}",
+            f"Log-likelihood: {self._likelihood()}.",
             str(self.identifiability),
         ]
-        return join_lines(rows, self.warnings)
+        return join_lines(rows, self.warnings, self.notes)
 
     __str__ = summary
 
@@ -194,24 +199,25 @@ def fit(
 ) -> Fit:
     """Fit one circuit to a record, or to several jointly, by Levenberg-Marquardt in log-parameters with their prior.
 
-    The circuit, the prior and the device are the (first) scene's. Each record has the drive of its scene: the
-    recorded V where there is no scene or its waveform is "measured", else the scene's. Each of the scene's
-    channels has its own noise; offset, drift, hum of the mains and (Vsc) a delay and a clock are freed where it asks
-    for them, a gain only with the scene's prior. The start comes from the records. Runs in double precision whatever
-    JAX is set to, and leaves that setting alone.
+    The (first) scene gives the circuit, the prior and the device. The drive is the recorded V if there is no scene or
+    its waveform is "measured", otherwise the waveform of the record's scene. Each channel has its own noise. Offset,
+    drift, mains hum and (for Vsc) delay and clock error are added as free parameters if the BIC favours them; a gain
+    is free only with a prior in the scene. The start is estimated from the records. Computes in double precision and
+    leaves the setting of JAX unchanged.
 
     Args:
-        record: with the scene's channels, and V unless the scene has the drive.
-        scene: the device, and what is believed of it; one for all records, or one for each.
-        prior: False leaves the circuit's out, for least squares alone; gains, delays and clocks keep theirs.
-        start: values (SI) to start from in place of the records' own.
-        starts: how many; those after the first are draws of the prior, and tell whether there are other optima.
-        tolerance: error of the log-likelihood that compressing the records may cause; 0: sum over the samples
-            each time. Where compression does not hold, `Fit.full_because` says why.
+        record: record, or several, with the channels of the scene; V too, unless the scene states the drive.
+        scene: device, circuit and prior; one for all records, or one for each.
+        prior: whether to use the prior of the circuit; gains, delays and clocks always keep theirs.
+        start: parameter values (SI) to start from instead of the estimate from the data.
+        starts: number of starting points; the first is estimated from the data, the others are drawn from the prior
+            and reveal further optima.
+        tolerance: largest error of the log-likelihood from compression; 0 sums over all samples in each evaluation.
+            `Fit.full_because` gives the reason where compression is not accurate enough.
 
     Raises:
-        InputError: a record cannot come from this circuit, the scene asks for what is not available, a start is
-            none of its parameters, or the tolerance is no number of 0 or more.
+        InputError: a record is impossible for this circuit, the scene needs a model that is not available, `start`
+            names an unknown parameter, or the tolerance is negative or not a number.
     """
     records = (record,) if isinstance(record, Record) else tuple(record)
     scenes = (scene,) * len(records) if scene is None or isinstance(scene, Scene) else tuple(scene)
@@ -228,7 +234,7 @@ def fit_records(
     starts: int = 1,
     tolerance: float = certificate.TOLERANCE,
 ) -> Fit:
-    """Fit as `fit`; `drives` are those of the first records where they have been chosen already."""
+    """Fit records as `fit` does; `drives` are the drives of the first records if they were chosen already."""
     if not 0.0 <= tolerance < math.inf:
         raise InputError(f"tolerance = {tolerance}: give an error of the log-likelihood, 0.001 or so, or 0 for none")
     if starts < 1:
@@ -260,7 +266,7 @@ def fit_records(
 def _solve_problem(
     problem: Problem, tolerance: float, start: Mapping[str, float] | None
 ) -> tuple[LeastSquaresResult, certificate.CertifiedLikelihood, np.ndarray]:
-    """The fit, with compressions where they hold, and its covariance's root; again where they turn out not to."""
+    """Fit with compression, and again without it for channels where its error exceeds the tolerance."""
     (likelihood, reasons), theta_0 = problem.compress_likelihood(tolerance), choose_start(problem, start)
     noise = np.array([source.noise for source in problem.sources])
     freeable = tuple(source.optional_nuisances for source in problem.sources)
@@ -300,11 +306,19 @@ def _assemble_fit(
     if optima is not None:
         figures |= {"optima": len(optima.start_counts), "starts_failed": optima.n_failed}
     warnings: list[str] = []
+    notes = [
+        scene.description for scene in {id(s.scene): s.scene for s in problem.sources}.values() if scene.description
+    ]
     for source, channel in zip(problem.sources, traces, strict=True):
-        warnings += source.notes
+        warnings += source.warnings
+        notes += source.notes
         warnings += remarks.channel_warnings(source.record, source.choice, channel.channel, channel.figures)
     warnings += misfit_warnings(traces)
-    warnings += remarks.parameter_warnings(likelihood, theta, without_scene)
+    warnings += remarks.parameter_warnings(likelihood, theta)
+    from_prior = prior_variance_fraction(root, likelihood.prior_factor, np.eye(theta.size))
+    assumed = remarks.describe_assumed_Ci(None if without_scene else first.scene, likelihood, from_prior)
+    warnings += assumed.warnings
+    notes += assumed.notes
     experiment = problem.experiment(likelihood, theta, sigma)
     gradient = laplace.log_gradient("force_mean")
     return Fit(
@@ -314,6 +328,7 @@ def _assemble_fit(
         identifiability=assess_identifiability(likelihood.names, root, likelihood.prior_factor, gradient, experiment),
         scene=first.scene,
         warnings=tuple(dict.fromkeys(warnings)),
+        notes=tuple(dict.fromkeys(notes)),
         traces=traces,
         compression_error=certified.error,
         experiment=experiment,

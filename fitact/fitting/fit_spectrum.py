@@ -15,10 +15,11 @@ from fitact import summary
 from fitact.data.spectrum import Spectrum
 from fitact.experiment.fisher import covariance_factor
 from fitact.fitting import derived
-from fitact.fitting.identifiability import assess_parameters
+from fitact.fitting.identifiability import assess_parameters, prior_variance_fraction
 from fitact.fitting.laplace import FitResult, Laplace
 from fitact.fitting.levenberg_marquardt import Minimum, minimise, result_name
 from fitact.fitting.problem import likelihood_without_channels
+from fitact.fitting.remarks import describe_assumed_Ci
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.skin import circuit_parameters
 from fitact.scene.scene import Scene
@@ -30,12 +31,12 @@ _MIN_NOISE = 1e-6  # of the impedance: no analyser is better
 
 @dataclasses.dataclass(frozen=True)
 class SpectrumFit(FitResult):
-    """The parameters that an impedance spectrum shows, and a judgement.
+    """Fit of a circuit to an impedance spectrum.
 
     Attributes:
-        spectrum: what was fitted.
-        noise: standard deviation of the logarithm of |Z|, and of its phase (rad), by what is left.
-        residuals: log of measured over fitted impedance: relative size and, imaginary, phase (rad).
+        spectrum: the spectrum.
+        noise: standard deviation of log |Z|, and of the phase (rad), from the residuals.
+        residuals: log(measured / fitted impedance): real part relative size, imaginary part phase (rad).
     """
 
     spectrum: Spectrum
@@ -44,33 +45,36 @@ class SpectrumFit(FitResult):
 
     @property
     def message(self) -> str:
-        """The result as a sentence."""
+        """Sentence for the result."""
         if self.result == "misfit":
             return (
-                "The circuit does not describe the spectrum: what is left is larger than its scatter or has structure;"
-                " try [skin] level = 'fractional', or leave out frequencies where the panel's own wiring shows."
+                "Poor fit: the residuals of the spectrum are larger than its scatter or correlated; try [skin] level ="
+                " 'fractional', or leave out frequencies at which the wiring of the panel contributes."
             )
         return super().message
 
+    @property
+    def uses_stated_drive(self) -> bool:
+        """True: a spectrum has no drive, so the force is that of the scene's."""
+        return True
+
     def model(self) -> dict[str, Any]:
-        """What was fitted, by name."""
+        """Return the fitted model by name."""
         return {"skin": self.scene.skin.level, "channels": ["impedance"], "force": self.derive.geometry.model}
 
     def _nuisances(self) -> dict[str, float]:
         return {"relative_noise": self.noise}
 
     def summary(self) -> str:
-        """A table for people: values with errors, the verdict."""
+        """Return a table for people: estimates with errors, what the force rests on, and the verdict."""
         low, high = (format_engineering(float(f), "Hz") for f in self.spectrum.frequency[[0, -1]])
         rows = [
             f"{len(self.spectrum)} points, {low} to {high}",
-            *self._align_table(14, 12, 12),
-            f"noise {format_percent(self.noise)} of |Z|. {self.message}",
-            f"force: {summary.FORCE_DESCRIPTIONS[self.derive.geometry.model]}, under the scene's"
-            f" {self.scene.drive.waveform}.",
+            *summary.format_table(self.to_dict()),
+            f"Noise {format_percent(self.noise)} of |Z|. {self.message}",
             str(self.identifiability),
         ]
-        return join_lines(rows, self.warnings)
+        return join_lines(rows, self.warnings, self.notes)
 
     __str__ = summary
 
@@ -78,17 +82,17 @@ class SpectrumFit(FitResult):
 def fit_spectrum(spectrum: Spectrum, scene: Scene | None = None) -> SpectrumFit:
     """Fit a circuit to an impedance spectrum by Levenberg-Marquardt in log-parameters with their prior.
 
-    Z = 2 Rsc / (1 + j omega Rsc Csc) + 1 / (j omega Ci) for the paper's final circuit; any circuit and skin that a
-    scene states. Differences are those of log Z, of relative size and phase, with one noise for both, which is
-    found from what is left. The spectrum alone shows all three parameters where it reaches from below the skin's
-    corner 1 / (2 pi Rsc Csc) to above it.
+    Z = 2 Rsc / (1 + j omega Rsc Csc) + 1 / (j omega Ci) for equal fingers with direct ground; the scene may state any
+    other circuit and skin. Residuals are differences of log Z (relative size and phase) with one noise for both,
+    which is estimated from them. A spectrum determines all three parameters if it reaches from below the corner
+    frequency of the skin, 1 / (2 pi Rsc Csc), to above it.
 
     Args:
-        spectrum: as of `fitact.read_spectrum`.
-        scene: circuit, prior, and the drive that makes the force; absent: the paper's.
+        spectrum: impedance spectrum, e.g. from `fitact.read_spectrum`.
+        scene: circuit, prior, and the drive for the force; by default the device of the reference paper.
 
     Raises:
-        InputError: the scene's drive is no periodic one, or its prior frees what no spectrum has.
+        InputError: the drive of the scene is not periodic, or its prior frees a parameter that no spectrum has.
     """
     stated = scene or Scene()
     stated.require_available(fit=True)
@@ -104,9 +108,10 @@ def fit_spectrum(spectrum: Spectrum, scene: Scene | None = None) -> SpectrumFit:
     gradient = laplace.log_gradient("force_mean")
     free = [name for name in likelihood.names if name in circuit_parameters(likelihood.template)]
     result = result_name(end.result)
-    if result == "successful" and figures["structure_z"] > 4.0:  # neighbouring residuals are alike by no chance
+    if result == "successful" and figures["structure_z"] > 4.0:  # neighbouring residuals are correlated
         result = "misfit"
-    notes = ("no scene was given: the force is that of the paper's panel and drive; state yours in a scene file",)
+    from_prior = prior_variance_fraction(root, likelihood.prior_factor, np.eye(theta.size))
+    assumed = describe_assumed_Ci(scene, likelihood, from_prior)
     return SpectrumFit(
         laplace,
         result=result,
@@ -115,7 +120,8 @@ def fit_spectrum(spectrum: Spectrum, scene: Scene | None = None) -> SpectrumFit:
             likelihood.names, root, likelihood.prior_factor, gradient, free, ("impedance",)
         ),
         scene=stated,
-        warnings=(*spectrum.notes, *(notes if scene is None else ())),
+        warnings=assumed.warnings,
+        notes=(*spectrum.notes, *assumed.notes),
         spectrum=spectrum,
         noise=sigma,
         residuals=residuals,

@@ -1,4 +1,4 @@
-"""What a record can and cannot tell: the Fisher information against the prior, a verdict in words, and a remedy."""
+"""Identifiability: Fisher information of the data against the prior, a verdict, and suggested measurements."""
 
 import dataclasses
 import functools
@@ -19,72 +19,72 @@ from fitact.units import format_percent
 
 
 class NextMeasurement(NamedTuple):
-    """The next measurement where not all is identified."""
+    """Suggested next measurement if not all parameters are identified."""
 
-    structural: bool = False  # whether no record of these channels could tell what this one does not
+    structural: bool = False  # whether no record of these channels could determine the blind direction
     remedy: str = ""
-    remedies: tuple[DesignOption, ...] = ()  # the remedy in figures, best first
+    remedies: tuple[DesignOption, ...] = ()  # the suggested measurements, best first
 
 
 @dataclasses.dataclass(frozen=True)
 class Identifiability:
-    """The verdict on a record."""
+    """Verdict on the identifiability of the parameters from the data."""
 
     verdict: str  # "identified", "prior-limited" or "unidentified"
-    # prior-whitened Fisher eigenvalues lambda / (1 + lambda), smallest first: 1 is known from data, 0 from the prior
+    # prior-whitened Fisher eigenvalues lambda / (1 + lambda), smallest first: 1 determined by the data, 0 by the prior
     eigenvalues: tuple[float, ...]
-    blind_direction: dict[str, float]  # the direction the data see least, a unit vector in the log-parameters
-    blind_name: str  # what that direction is, in words
-    prior_sd: float  # standard deviation, by the prior, of the parameter that moves most along it, in its logarithm
-    force_from_prior: float  # share of the variance of the mean force that comes from the prior
+    blind_direction: dict[str, float]  # direction that the data determine least, a unit vector in the log-parameters
+    blind_name: str  # description of that direction
+    prior_sd: float  # prior sd of the logarithm of the parameter that changes most in that direction
+    force_from_prior: float  # fraction of the variance of the mean force that comes from the prior
     force_sd: float  # standard deviation of the mean force, in its logarithm
-    force_contraction: float  # 1 - that over the prior's
-    channels: tuple[str, ...]  # what was recorded beside V
-    # the measurement that was done; None: a spectrum's
+    force_contraction: float  # 1 - force_sd / prior sd of the same logarithm
+    channels: tuple[str, ...]  # channels recorded beside V
+    # the measurement of the data; None for a spectrum
     experiment: Experiment | None = dataclasses.field(default=None, repr=False, compare=False)
-    # that of the logarithm of the mean force in the parameters that are free in `experiment`
+    # gradient of the logarithm of the mean force in the free parameters of `experiment`
     force_gradient: Float[np.ndarray, " free"] | None = dataclasses.field(default=None, repr=False, compare=False)
 
     @functools.cached_property
     def next_measurement(self) -> NextMeasurement:
-        """What to measure next, worked out when it is first asked for."""
+        """Suggested next measurement, computed on first access."""
         if self.verdict == "identified":
             return NextMeasurement()
-        force = f"The mean force is known to ± {format_percent(self.force_sd)}"
+        force = f"Uncertainty of the mean force: ± {format_percent(self.force_sd)} now"
         experiment = self.experiment
         if experiment is None or self.force_gradient is None:
-            return NextMeasurement(remedy=f"{force}; measure from below the skin's corner to above it.")
+            return NextMeasurement(remedy=f"{force}; measure from below the corner frequency of the skin to above it.")
         with jax.enable_x64(True):
             structure = blind_directions(experiment.circuit, experiment.free, experiment.channels)
             options = suggest_measurements(experiment, self.force_gradient)
         figures = [f"± {format_percent(option.force_sd)} with {option.text}" for option in options]
-        remedy = f"{force}; to be expected is {', '.join(figures[:-1])}, and {figures[-1]}."
+        remedy = f"{force}. Expected after one change: {', '.join(figures)}. Calibration errors are not included."
         if self.verdict == "unidentified":
-            remedy = f"No prior covers that direction: state one for Ci, from the panel's data sheet. {remedy}"
-        gains = structure.directions[:, [name in gain_names(structure.channels) for name in structure.names]]
-        if np.any(np.abs(gains) > 0.1):  # a component of a unit vector from which it counts as part of a direction
-            remedy += (
-                " The free gain is confounded with the circuit: calibrate the probe, and resolve the drive's edges."
+            remedy = (
+                f"No prior constrains that direction; state one for Ci and this contact area under [prior]. {remedy}"
             )
+        gains = structure.directions[:, [name in gain_names(structure.channels) for name in structure.names]]
+        if np.any(np.abs(gains) > 0.1):  # components of a unit vector above this belong to a direction
+            remedy += " The free gain is confounded with the circuit; calibrate the probe and resolve the drive edges."
         return NextMeasurement(structure.contains(self.blind_direction), remedy, options)
 
     @property
     def structural(self) -> bool:
-        """Whether no record of these channels could tell the blind direction, rather than this record alone."""
+        """Whether no record of these channels, rather than this record alone, could determine the blind direction."""
         return self.next_measurement.structural
 
     @property
     def remedy(self) -> str:
-        """What to measure next, a sentence."""
+        """Suggested next measurement, a sentence."""
         return self.next_measurement.remedy
 
     @property
     def remedies(self) -> tuple[DesignOption, ...]:
-        """What to measure next in figures, best first; none where all is identified."""
+        """Suggested next measurements, best first; none if all parameters are identified."""
         return self.next_measurement.remedies
 
     def to_dict(self) -> dict[str, Any]:
-        """Return its part of fit.json and summary.json."""
+        """Return the section of fit.json and summary.json."""
         names = (
             "verdict", "eigenvalues", "blind_direction", "blind_name", "structural", "prior_sd", "force_from_prior",
             "force_sd", "force_contraction", "remedy", "remedies", "channels",
@@ -95,17 +95,25 @@ class Identifiability:
     def __str__(self) -> str:
         names = list(self.blind_direction)
         if self.verdict == "identified":
-            return f"identified: the record determines {', '.join(names[:-1])} and {names[-1]}."
+            return f"identified: the data determine {', '.join(names[:-1])} and {names[-1]}."
+        direction = ""
         if self.structural:
-            channels = " and ".join(self.channels) if len(self.channels) > 1 else f"{self.channels[0]} alone"
-            reason = f"no record of {channels} can tell {self.blind_name}"
-        else:
-            reason = f"this record is too short, too noisy or of too few frequencies to tell {self.blind_name}"
-        moves = ", ".join(f"{name} {value:+.2f}" for name, value in self.blind_direction.items())
+            moves = ", ".join(f"{name} {value:+.2f}" for name, value in self.blind_direction.items())
+            direction = f" (direction in log-parameters: {moves})"
         return (
-            f"{self.verdict}: {reason} (logs move together: {moves}); along it the prior speaks"
-            f" (± {format_percent(math.expm1(self.prior_sd))}), and {100.0 * self.force_from_prior:.3g} % of the"
-            f" force's variance comes from the prior. {self.remedy}"
+            f"{self.verdict}: {self.reason}{direction}. The prior sets this"
+            f" combination (± {format_percent(math.expm1(self.prior_sd))}) and contributes"
+            f" {100.0 * self.force_from_prior:.3g} % of the variance of the force. {self.remedy}"
+        )
+
+    @property
+    def reason(self) -> str:
+        """Reason why a direction is not identified, as a clause."""
+        if self.structural:
+            channels = " and ".join(self.channels) + (" alone" if len(self.channels) == 1 else "")
+            return f"{channels} cannot determine {self.blind_name}"
+        return (
+            f"this record does not constrain {self.blind_name}; it is too short, too noisy or has too few frequencies"
         )
 
 
@@ -116,10 +124,10 @@ def assess_identifiability(
     force_gradient: Float[np.ndarray, " parameters"],
     experiment: Experiment,
 ) -> Identifiability:
-    """Judge a fit by roots of theta's covariance (`covariance_root`) and of the prior's.
+    """Assess the identifiability of a fit, from factors of its covariance and of the prior covariance.
 
-    `names` are theta's coordinates; those free in `experiment` that are no gains are judged, the others are
-    nuisances with priors of their own. `force_gradient` is that of the log mean force in theta.
+    `names` are the coordinates of theta. The free parameters of `experiment` are assessed, except gains, which are
+    nuisances with priors of their own. `force_gradient`: gradient of the log mean force in theta.
     """
     free = [name for name in experiment.free if name not in gain_names(experiment.channels)]
     judgement = assess_parameters(names, covariance_factor, prior_factor, force_gradient, free, experiment.channels)
@@ -135,7 +143,7 @@ def assess_parameters(
     free: Sequence[str],
     channels: tuple[str, ...],
 ) -> Identifiability:
-    """Judge the parameters `free` among `names`, as `assess_identifiability`, by a measurement of another kind."""
+    """Assess the parameters `free` among `names`, without suggested measurements."""
     shares, blind, along = information_directions(names, covariance_factor, prior_factor, free)
     direction = dict(zip(free, map(float, blind), strict=True))
     force_sd = float(np.linalg.norm(covariance_factor.T @ force_gradient))
@@ -158,11 +166,11 @@ def information_directions(
     prior_factor: Float[np.ndarray, "parameters parameters"],
     free: Sequence[str],
 ) -> tuple[Float[np.ndarray, "*fits free"], Float[np.ndarray, "*fits free"], Float[np.ndarray, "*fits"]]:
-    """Eigenvalues, the blind direction and `prior_sd` of the parameters `free` among `names`, of one or many fits."""
+    """Return eigenvalues, blind direction and `prior_sd` of the parameters `free` among `names`, for each fit."""
     rows = [list(names).index(name) for name in free]
     prior_root = np.linalg.cholesky((prior_factor @ prior_factor.T)[np.ix_(rows, rows)])
     inverse = np.linalg.inv(prior_root)
-    # of the prior's spread in each direction, the share that the data leave
+    # singular values: posterior sd over prior sd in each direction
     axes, shares, _ = np.linalg.svd(inverse @ covariance_factor[..., rows, :])
     blind = axes[..., 0] @ prior_root.T
     against = blind[..., list(free).index("Ci")] < 0.0 if "Ci" in free else np.zeros(blind.shape[:-1], bool)
@@ -177,10 +185,10 @@ def verdicts(
     min_eigenvalue: float = 0.9,
     max_prior_factor: float = 10.0,
 ) -> np.ndarray:
-    """ "identified", "prior-limited" or "unidentified", by the eigenvalues and `prior_sd`.
+    """Return "identified", "prior-limited" or "unidentified", from the eigenvalues and `prior_sd`.
 
-    The data speak in every direction from a smallest prior-whitened eigenvalue of `min_eigenvalue`. A prior whose 95 %
-    span more than `max_prior_factor` either way says little.
+    All directions are identified if the smallest prior-whitened eigenvalue is at least `min_eigenvalue`. A prior is
+    informative if its 95 % interval reaches at most a factor of `max_prior_factor` either way.
     """
     narrow = prior_sd <= math.log(max_prior_factor) / NormalDist().inv_cdf(0.975)
     limited = np.where(narrow, "prior-limited", "unidentified")
@@ -192,7 +200,7 @@ def prior_variance_fraction(
     prior_factor: Float[np.ndarray, "n n"],
     gradient: Float[np.ndarray, "*fits n"],
 ) -> Float[np.ndarray, "*fits"]:
-    """The share of a quantity's variance that comes from the prior, by its gradient."""
-    along = np.einsum("...ij,...i->...j", covariance_factor, gradient)
-    moved = np.einsum("...ij,...j->...i", np.linalg.inv(prior_factor) @ covariance_factor, along)
-    return np.sum(moved**2, axis=-1) / np.sum(along**2, axis=-1)
+    """Return the fraction of the variance of a quantity that comes from the prior, from its gradient."""
+    scaled = np.einsum("...ij,...i->...j", covariance_factor, gradient)
+    moved = np.einsum("...ij,...j->...i", np.linalg.inv(prior_factor) @ covariance_factor, scaled)
+    return np.sum(moved**2, axis=-1) / np.sum(scaled**2, axis=-1)

@@ -1,7 +1,8 @@
-"""The normal approximation of a posterior at its optimum: parameters and what follows from them, with errors."""
+"""Gaussian (Laplace) approximation of a posterior at its optimum, for parameters and derived quantities."""
 
 import abc
 import dataclasses
+import functools
 import math
 from typing import Any
 
@@ -10,14 +11,16 @@ from jaxtyping import Float
 
 from fitact import summary
 from fitact.fitting import derived
-from fitact.fitting.identifiability import Identifiability
+from fitact.fitting.identifiability import Identifiability, prior_variance_fraction
 from fitact.fitting.levenberg_marquardt import result_message
 from fitact.likelihood.likelihood import Likelihood
+from fitact.model.force import ForceModel
+from fitact.model.skin import constant_skin_circuit
+from fitact.scene.assumptions import list_assumptions
 from fitact.scene.scene import Scene
-from fitact.tables import align_rows
-from fitact.units import format_engineering, quantity_unit
+from fitact.units import quantity_unit
 
-SUCCESS_MESSAGE = "The fit is at its optimum and leaves only noise."
+SUCCESS_MESSAGE = "The fit converged, and the residuals are consistent with the noise."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,9 +29,10 @@ class Laplace:
 
     Attributes:
         theta: the optimum, in the likelihood's coordinates.
-        covariance_root: its product with its transpose is `covariance`; keeps digits where that cannot.
+        covariance_root: factor of `covariance`, i.e. covariance = factor @ factor.T; the more accurate of the two.
         sigmas: standard deviation of each channel's noise.
-        likelihood, derive: what was fitted, and what follows from theta.
+        likelihood: the model that was fitted.
+        derive: the derived quantities as functions of theta.
         log_derived: logarithms of the derived quantities at the optimum, and their gradients in theta.
     """
 
@@ -66,15 +70,16 @@ class Laplace:
 
 @dataclasses.dataclass(frozen=True)
 class FitResult(abc.ABC):
-    """What every fit comes to: a Laplace approximation, and a judgement of it.
+    """Result of a fit: a Laplace approximation, and whether it is reliable.
 
     Attributes:
-        laplace: the best parameters with their errors, and what follows from them.
+        laplace: best parameters and derived quantities, with their covariance.
         result: name of a member of `RESULTS`; `message` is its sentence.
-        figures: chi2_reduced, steps and the like.
-        identifiability: what was measured can and cannot tell.
-        scene: whose circuit and prior were fitted; the first record's.
-        warnings: sentences.
+        figures: chi2_reduced, steps and other statistics.
+        identifiability: which parameters the data determine.
+        scene: scene of the first record, whose circuit and prior were fitted.
+        warnings: sentences on what may change the result.
+        notes: sentences for information.
     """
 
     laplace: Laplace
@@ -83,15 +88,16 @@ class FitResult(abc.ABC):
     identifiability: Identifiability
     scene: Scene
     warnings: tuple[str, ...]
+    notes: tuple[str, ...]
 
     @property
     def trusted(self) -> bool:
-        """Whether nothing stands against the answer."""
+        """Whether the fit is reliable."""
         return self.result == "successful"
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Coordinates of theta: logarithms, and delays and clocks in steps."""
+        """Coordinates of theta: logarithms of parameters; delays and clocks in time steps."""
         return self.likelihood.names
 
     @property
@@ -106,7 +112,7 @@ class FitResult(abc.ABC):
 
     @property
     def covariance_root(self) -> Float[np.ndarray, "parameters parameters"]:
-        """Its product with its transpose is `covariance`; keeps digits where that cannot."""
+        """Factor of `covariance`, i.e. covariance = factor @ factor.T; more accurate than the covariance."""
         return self.laplace.covariance_root
 
     @property
@@ -121,18 +127,22 @@ class FitResult(abc.ABC):
 
     @property
     def likelihood(self) -> Likelihood:
-        """What was fitted."""
+        """The likelihood that was fitted."""
         return self.laplace.likelihood
 
     @property
     def derive(self) -> derived.DerivedQuantities:
-        """What follows from theta."""
+        """The derived quantities as functions of theta."""
         return self.laplace.derive
 
     def parameters(self) -> dict[str, summary.Summary]:
-        """Summaries of the parameters in the Laplace approximation, with their contraction."""
+        """Summarize the parameters in the Laplace approximation.
+
+        `contraction` is 1 - posterior sd / prior sd of the logarithm; `from_prior` is the fraction of the variance of
+        the logarithm that comes from the prior.
+        """
         values, timing = self.likelihood.to_physical(self.theta), self.likelihood.timing
-        summaries = {}
+        summaries, from_prior = {}, self.variance_from_prior(np.eye(self.theta.size))
         for i, name in enumerate(self.names):
             value, sd = float(values[name]), float(self.sd[i])
             if name in timing:
@@ -141,32 +151,72 @@ class FitResult(abc.ABC):
                 summaries[name] = summary.summarize_log_normal(name, value, sd)
                 if self.likelihood.use_prior or name.startswith("gain"):
                     summaries[name]["contraction"] = float(1.0 - sd / self.likelihood.prior.log_sd[i])
+            summaries[name]["from_prior"] = float(from_prior[i])
         return summaries
 
     def derived(self) -> dict[str, summary.Summary]:
-        """Summaries of divider, time constant, force and friction in the Laplace approximation."""
-        values = zip(derived.DERIVED_NAMES, self.laplace.log_derived[0], self.laplace.derived_log_sd, strict=True)
-        return {name: summary.summarize_log_normal(name, math.exp(log), float(sd)) for name, log, sd in values}
+        """Summarize divider, time constant, force and friction in the Laplace approximation."""
+        logs, gradients = self.laplace.log_derived
+        columns = logs, self.laplace.derived_log_sd, self.variance_from_prior(gradients)
+        return {
+            name: summary.summarize_log_normal(name, math.exp(log), float(sd)) | {"from_prior": float(fraction)}
+            for name, log, sd, fraction in zip(derived.DERIVED_NAMES, *columns, strict=True)
+        }
+
+    def variance_from_prior(self, gradients: Float[np.ndarray, "quantities parameters"]) -> np.ndarray:
+        """Return the fraction of each quantity's variance that comes from the prior, by its gradient in theta."""
+        return prior_variance_fraction(self.covariance_root, self.likelihood.prior_factor, gradients)
+
+    @property
+    @abc.abstractmethod
+    def uses_stated_drive(self) -> bool:
+        """Whether the scene's drive was used, and not a recorded one."""
+
+    @functools.cached_property
+    def force_basis(self) -> dict[str, Any]:
+        """The law of the force, the values that it rests on, and the mean force by the other law if a gap is stated."""
+        law = self.derive.geometry.model
+        other_law: ForceModel = "gap" if law == "paper" else "paper"
+        assumptions = list_assumptions(
+            self.scene, law, prior=self.likelihood.use_prior, stated_drive=self.uses_stated_drive
+        )
+        other: dict[str, Any] | None = None
+        if getattr(constant_skin_circuit(self.likelihood.template), "Cgap", None) is not None:
+            geometry = dataclasses.replace(self.derive.geometry, model=other_law)
+            derive = dataclasses.replace(self.derive, geometry=geometry)
+            laplace = dataclasses.replace(
+                self.laplace, derive=derive, log_derived=derive.log_value_and_grad(self.theta, self.laplace.sigmas)
+            )
+            i = derived.DERIVED_NAMES.index("force_mean")
+            median, sd = math.exp(laplace.log_derived[0][i]), float(laplace.derived_log_sd[i])
+            other = {"law": other_law, "force_mean": summary.summarize_log_normal("force_mean", median, sd)}
+        return {
+            "law": law,
+            "measured": False,
+            "tested_by_data": False,
+            "other_law": other,
+            "assumptions": [each.to_dict() for each in assumptions],
+        }
 
     @property
     def message(self) -> str:
-        """The result as a sentence."""
+        """Sentence for the result."""
         return SUCCESS_MESSAGE if self.trusted else result_message(self.result)
 
     def judgement(self) -> dict[str, Any]:
-        """The result, and the figures of merit."""
+        """Return the result and the figures of merit."""
         return {"result": self.result, "message": self.message, "misfit": self.result == "misfit"} | self.figures
 
     @abc.abstractmethod
     def model(self) -> dict[str, Any]:
-        """What was fitted, by name."""
+        """Return the fitted model by name."""
 
     @abc.abstractmethod
     def _nuisances(self) -> dict[str, float]:
-        """Noise, and what entered linearly, at the optimum."""
+        """Return the noise and the linear nuisances at the optimum."""
 
     def to_dict(self) -> dict[str, Any]:
-        """What `fitact fit --json` prints and fit.json holds."""
+        """Return the content of fit.json, which `fitact fit --json` prints."""
         nuisances = {name: {"unit": quantity_unit(name), "value": value} for name, value in self._nuisances().items()}
         return {
             "parameters": self.parameters(),
@@ -176,14 +226,7 @@ class FitResult(abc.ABC):
             "identifiability": self.identifiability.to_dict(),
             "fit": self.judgement(),
             "model": self.model(),
+            "force_basis": self.force_basis,
             "warnings": list(self.warnings),
+            "notes": list(self.notes),
         }
-
-    def _align_table(self, *widths: int) -> list[str]:
-        """The first columns, as many as `widths`, of a table of parameters and derived quantities."""
-        cells = [("", "median", "± 1 sd", "contraction")]
-        for name, s in (self.parameters() | self.derived()).items():
-            median = format_engineering(float(s["q50"]), str(s["unit"]))
-            contraction = f"{s['contraction']:.3f}" if "contraction" in s else ""
-            cells.append((name, median, summary.format_sd(s), contraction))
-        return align_rows([row[: len(widths)] for row in cells], widths)

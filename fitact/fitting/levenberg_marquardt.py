@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt by optimistix, which never calls an answer successful that is none."""
+"""Levenberg-Marquardt by optimistix, with checks that a successful result is a minimum."""
 
 import dataclasses
 from collections.abc import Callable
@@ -14,23 +14,27 @@ from jaxtyping import Array, Float, Int, PyTree
 
 
 class RESULTS(optx.RESULTS):
-    """Why a fit ended: optimistix's results, and what else makes an answer untrustworthy."""
+    """Reasons why a fit ended: those of optimistix, and others that make a fit unreliable."""
 
     did_not_move = (
-        "The fit never left its start although the record asks for another answer; check the units of the record."
+        "The optimiser did not move from its starting point, which is not a minimum; check the units of the record."
     )
-    not_at_optimum = "The fit stopped before its optimum; check the units of the record, or give a nearer prior."
+    not_at_optimum = (
+        "The optimiser stopped before it reached a minimum; check the units of the record, or state a narrower prior."
+    )
     rank_deficient = (
-        "The record does not determine all parameters, and the answer is one of many;"
-        " give a prior, or measure another channel."
+        "The data do not determine all parameters, and many values fit equally well; state a prior, or record another"
+        " channel."
     )
-    on_bound = "The fit ended at a bound of its parameters; check the units of the record, or widen the bound."
+    on_bound = (
+        "The best fit violates a bound or an order that the prior states; check the units of the record, or widen it."
+    )
     several_optima = (
-        "The fit has several optima of like height; give a nearer prior, or sample the posterior from all of them."
+        "The fit has several optima that are almost equally good; state a narrower prior, or sample the posterior."
     )
     misfit = (
-        "The model does not describe the record: its residuals are larger than the noise or have structure;"
-        " look at them in the report, and use the drive as measured or a scene that has what is missing."
+        "Poor fit: the residuals are larger than the noise or correlated. Inspect them in the report, then fit with the"
+        " measured drive or add the missing circuit element (a gap, R_H, …) to the scene."
     )
 
 
@@ -41,17 +45,17 @@ _NAMES = (
 
 
 def result_name(result: Any) -> str:
-    """The name of a member of `RESULTS`; a linear solver's failure counts as "nonfinite"."""
+    """Return the name of a member of `RESULTS`; a failure of the linear solver counts as "nonfinite"."""
     return next((name for name in _NAMES if bool(result == getattr(RESULTS, name))), "nonfinite")
 
 
 def result_message(name: str) -> str:
-    """The sentence of a member of `RESULTS`, by its name."""
+    """Return the sentence of a member of `RESULTS`."""
     return str(RESULTS[getattr(RESULTS, name)])  # type: ignore[misc]  # equinox's enumerations look up by item
 
 
 class Minimum(eqx.Module):
-    """Where Levenberg-Marquardt ended."""
+    """Point at which Levenberg-Marquardt ended."""
 
     theta: Float[Array, " parameters"]
     cost: Float[Array, ""]  # half the sum of squared residuals

@@ -41,7 +41,8 @@ class Source(NamedTuple):
     noise: float  # of the channel, judged without a model
     optional_nuisances: tuple[str, ...]  # nuisances that the channel can ask for
     start: Estimate | None  # what a linear fit says of it; None: nothing
-    notes: tuple[str, ...]  # what was assumed, in sentences
+    notes: tuple[str, ...]  # sentences for information
+    warnings: tuple[str, ...]  # sentences on what may change the result
     drive_noise_dominates: bool  # whether the drive's noise drowns the channel, which then biases the answer
 
 
@@ -157,7 +158,8 @@ def _build_channel(
     _require_whole_drive(record, choice)
     require_skin_response(template, record, choice)
     label = "_".join(filter(None, ("" if channel == "Vsc" else channel, number)))
-    notes, optional = choice.notes, ("offset", "drift", *_hum(record, choice))
+    notes, warnings = (*record.notes, *choice.notes), (*record.warnings, *choice.warnings)
+    optional = ("offset", "drift", *_hum(record, choice))
     start: Estimate | None = None
     samples: CurrentSamples | None = None
     if channel == "Vsc":
@@ -173,7 +175,8 @@ def _build_channel(
         gain = _log_sd(scene.measurement.gain_I_relative_sd)
         if not limits_current(template):
             samples = select_current_samples(record, choice)
-            start, notes = estimate_from_current(record, choice, samples), (*notes, *samples.notes)
+            start = estimate_from_current(record, choice, samples)
+            notes, warnings = (*notes, *samples.notes), (*warnings, *samples.warnings)
     weight, clipped = _weight(record, channel, samples)
     weight, at_jumps = exclude_jumps(template, record, choice, weight)
     if weight is None and len(record) <= MAX_PADDED_LENGTH:
@@ -201,8 +204,8 @@ def _build_channel(
         columns=tuple(range(len(LINEAR_NUISANCES))),
     )
     dominates = samples is not None and samples.drive_noise_dominates
-    notes = (*record.notes, *notes, *clipped, *at_jumps)
-    return likelihood, Source(record, scene, choice, noise, optional, start, notes, dominates), gain
+    remarks = (*notes, *at_jumps), (*warnings, *clipped)
+    return likelihood, Source(record, scene, choice, noise, optional, start, *remarks, dominates), gain
 
 
 def _require_whole_drive(record: Record, choice: DriveModel) -> None:

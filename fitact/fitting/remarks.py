@@ -1,6 +1,8 @@
-"""What a user should know about an answer although nothing stands against it, in sentences."""
+"""Warnings and notes about a fit that is otherwise reliable, in sentences."""
 
 import dataclasses
+import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,67 +15,99 @@ from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.residual_statistics import is_undersampled
 from fitact.likelihood.likelihood import Likelihood
+from fitact.scene.assumptions import states_Ci
+from fitact.scene.scene import Scene
 from fitact.units import format_engineering, format_percent
 
 
 def channel_warnings(record: Record, choice: DriveModel, channel: str, figures: dict[str, float]) -> list[str]:
-    """Sentences about one channel; `figures` are those of `fitact.fitting.residual_statistics`."""
-    found = check_divider({name: record[name] for name in ("V", "Vsc")}) if "V" in record and channel == "Vsc" else []
+    """Return warnings about one channel; `figures` are from `fitact.fitting.residual_statistics`."""
+    warnings = (
+        check_divider({name: record[name] for name in ("V", "Vsc")}) if "V" in record and channel == "Vsc" else []
+    )
     span = record.time[-1] - record.time[0]
     if record.frequency() is None and choice.periodic:
-        found.append(
-            f"the record ({format_engineering(span, 's')}) does not show its drive repeating: it is shorter than 1.5"
-            " periods or not periodic, so the answer rests on a part of a wave; record two periods or more"
+        warnings.append(
+            f"the drive does not repeat within the record ({format_engineering(span, 's')}): the record is shorter than"
+            " 1.5 periods or not periodic, so the fit uses only a part of a wave; record two periods or more"
         )
     if is_undersampled(figures):
-        found.append(
-            "V_V is sampled too coarsely for straight lines between its samples (they err by"
-            f" {format_engineering(figures['interpolation_error'], 'V')} in Vsc); record faster, or name the"
-            " waveform in a scene"
+        warnings.append(
+            "V_V is sampled too coarsely for linear interpolation (its error in Vsc is"
+            f" {format_engineering(figures['interpolation_error'], 'V')}); record faster, or state the waveform in a"
+            " scene"
         )
     if figures["rounding_noise"] > 0.0:
-        found.append(
-            f"{channel} is rounded to steps wider than its noise, so its errors are not independent and those stated"
-            " may be off by half; record with a finer range"
+        warnings.append(
+            f"{channel} is rounded to steps larger than its noise, so the rounding errors are correlated and the stated"
+            " standard errors may be wrong by half; record with a smaller range"
         )
     if figures.get("quiet_noise", 0.0) > 3.0 * figures["rms_residual"]:  # more than noise can be
         unit = CHANNEL_UNITS[channel]
-        there, left = (format_engineering(figures[name], unit) for name in ("quiet_noise", "rms_residual"))
-        found.append(
-            f"[measurement] quiet holds more than noise: {channel} varies by {there} in it, and the fit leaves {left},"
-            " so the errors stated are too wide; choose a stretch before the drive starts"
+        quiet, residual = (format_engineering(figures[name], unit) for name in ("quiet_noise", "rms_residual"))
+        warnings.append(
+            f"[measurement] quiet contains more than noise: {channel} varies by {quiet} rms there, but the residuals"
+            f" are {residual} rms, so the stated errors are too large; choose an interval before the drive starts"
         )
     if figures["outliers"]:
-        found.append(
-            f"{figures['outliers']:.0f} samples of {channel} lie further from the fit than normal noise would bring"
-            f" them, the first at {format_engineering(figures['first_outlier'], 's')}; [measurement] noise_model ="
-            " 'student' lets outliers count less"
+        warnings.append(
+            f"{figures['outliers']:.0f} samples of {channel} are outliers for Gaussian noise, the first at"
+            f" {format_engineering(figures['first_outlier'], 's')}; [measurement] noise_model = 'student' reduces their"
+            " weight"
         )
-    return found
+    return warnings
 
 
 def parameter_warnings(
-    likelihood: Likelihood, theta: Float[np.ndarray, " parameters"], no_scene: bool, min_tail: float = 0.005
+    likelihood: Likelihood, theta: Float[np.ndarray, " parameters"], min_tail: float = 0.005
 ) -> list[str]:
-    """Sentences about the answer where less than `min_tail` of the prior lies further out."""
-    found = []
-    if no_scene:
-        found.append(
-            "no scene was given: the panel is taken to be the paper's (Ci 1.35 nF ± 5 %), and Rsc, Csc, Ci and the"
-            " force scale with that; state your panel's Ci under [device] in a scene file"
-        )
+    """Return warnings about g and b where less than `min_tail` of the prior probability lies further out."""
+    warnings = []
     for name, factor, tail in _plausibility(likelihood, theta):
         if tail < min_tail:
-            found.append(
-                f"{name} is {factor:.3g} times what the prior expects (less than {format_percent(min_tail)} of it"
-                " lies so far out); check the probe's attenuation (x10), the units of time and voltage, and peak"
-                " against peak-to-peak"
+            warnings.append(
+                f"{name} is {factor:.3g} times the prior median (prior tail probability below"
+                f" {format_percent(min_tail)}); check the probe attenuation (10x), the units of time and voltage, and"
+                " peak versus peak-to-peak"
             )
-    return found
+    return warnings
+
+
+class Remarks(NamedTuple):
+    """Sentences for information, and on what may change the result."""
+
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def describe_assumed_Ci(
+    scene: Scene | None,
+    likelihood: Likelihood,
+    from_prior: Float[np.ndarray, " parameters"],
+    min_fraction: float = 0.1,
+) -> Remarks:
+    """Describe a Ci that nobody stated: in a warning if its prior sets results, otherwise in a note.
+
+    `from_prior`: fraction of each parameter's variance that comes from the prior; it sets results above `min_fraction`.
+    """
+    if (scene is not None and states_Ci(scene)) or not likelihood.use_prior or "Ci" not in likelihood.names:
+        return Remarks()
+    prior, place = likelihood.prior["Ci"], likelihood.names.index("Ci")
+    value = f"{format_engineering(math.exp(prior.log_mean), 'F')} ± {format_percent(float(prior.log_sd))}"
+    subject = "no scene was given" if scene is None else "the scene does not state Ci"
+    assumed = f"{subject}, so the insulator of the reference paper is assumed (Ci = {value})"
+    if from_prior[place] < min_fraction:
+        return Remarks(notes=(f"{assumed}; the data determine Ci, so this assumption hardly matters",))
+    return Remarks(
+        warnings=(
+            f"{assumed}. Rsc, Csc, Ci and the force all depend on this assumption; state Ci and its uncertainty for"
+            " your panel and contact area under [prior]",
+        )
+    )
 
 
 def _plausibility(likelihood: Likelihood, theta: np.ndarray) -> list[tuple[str, float, float]]:
-    """For g and b, which the record knows: name, ratio to the prior's median, share of the prior further out."""
+    """Return for g and b the name, the ratio to the prior median, and the prior probability further out."""
     points = np.vstack([theta, likelihood.sample_prior(theta, 10_000)])
     g, b = (np.asarray(x) for x in _divider(dataclasses.replace(likelihood, channels=()), jnp.asarray(points)))
     return [

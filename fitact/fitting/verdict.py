@@ -1,4 +1,4 @@
-"""Whether a fit may be trusted, and what stands against it if not."""
+"""Whether a fit is reliable, and the first reason why it is not."""
 
 import math
 from collections.abc import Sequence
@@ -24,13 +24,13 @@ def diagnose_fit(
     sources: Sequence[Source],
     optima: Optima | None,
 ) -> str:
-    """The name of the first of the `RESULTS` that stands against the fit; "successful" if none does.
+    """Return the name of the first of the `RESULTS` that makes the fit unreliable; "successful" if none does.
 
-    `covariance_factor` is that of theta's covariance.
+    `covariance_factor`: factor of the covariance of theta.
     """
-    found = result_name(solution.result)
-    if found != "successful":
-        return found
+    name = result_name(solution.result)
+    if name != "successful":
+        return name
     if is_out_of_bounds(solution.likelihood, np.asarray(solution.theta), np.asarray(solution.sigma), covariance_factor):
         return "on_bound"
     if optima is not None and result_name(optima.result) == "several_optima":
@@ -46,12 +46,12 @@ def is_out_of_bounds(
     covariance_factor: Float[np.ndarray, "parameters parameters"],
     half_width: float = 6.0,
 ) -> bool:
-    """Whether the records put the parameters where a bounded or ordered prior forbids them.
+    """Return whether the data put the parameters where a bounded or ordered prior forbids them.
 
-    Least squares take a prior by its mean and covariance. Along what the records do not see it may end beyond an
-    edge, which the sampler mends; so what must be allowed is a point of that line, within `half_width` standard
-    deviations. An exponent of 1 is a constant skin, which the records may well have: where their noise alone puts it
-    beyond, the line goes through 1.
+    Least squares use the mean and covariance of a prior. In the direction that the data determine least the optimum
+    may therefore lie outside a bound, which the sampler corrects. The test passes if any point in that direction,
+    within `half_width` standard deviations, is allowed. An exponent of 1 is a constant skin: where noise alone
+    explains an exponent above 1, the line goes through 1.
     """
     axes, sizes, _ = np.linalg.svd(covariance_factor)
     along = np.linspace(-half_width, half_width, 241)[:, None] * (axes[:, 0] * sizes[0])
@@ -65,23 +65,24 @@ def _has_possible_point(likelihood: Likelihood, points: Float[Array, "n coordina
 
 
 def _clip_exponent(likelihood: Likelihood, theta: np.ndarray, covariance_factor: np.ndarray) -> np.ndarray:
-    """Theta, or the most probable point with a fractional skin's exponent at its bound, where noise explains that."""
+    """Return theta, or the most probable point with the fractional exponent at its bound if noise explains that."""
     if "alpha" not in likelihood.prior.names:
         return theta
     place, high = likelihood.prior.names.index("alpha"), getattr(likelihood.prior["alpha"], "high", 1.0)
     excess, spread = theta[place] - math.log(high), np.linalg.norm(covariance_factor[place])
-    if not 0.0 < excess < 4.0 * spread:  # as far as noise may put it
+    if not 0.0 < excess < 4.0 * spread:  # further than noise explains
         return theta
     moved = theta - covariance_factor @ covariance_factor[place] * (excess / spread**2)
-    moved[place] = math.log(high) * (1.0 + 1e-12) - 1e-12  # rounding must not leave it beyond
+    moved[place] = math.log(high) * (1.0 + 1e-12) - 1e-12  # rounding must not put it outside
     return moved
 
 
 def misfit_warnings(traces: Sequence[ChannelFit]) -> list[str]:
-    """Which of several channels the model does not describe, in sentences."""
+    """Return a warning for each of several channels with a poor fit."""
     return [
-        f"{channel.record.source}: {channel.channel} is not described by the model that all records share (reduced"
-        f" chi-square {channel.figures['chi2_reduced']:.3g}); fit it alone to see whether it belongs to this finger"
+        f"{channel.record.source}: the common model fits {channel.channel} poorly (residual variance"
+        f" {channel.figures['chi2_reduced']:.3g} times the noise variance); fit it alone to check that it belongs to"
+        " this finger"
         for channel in traces
         if len(traces) > 1 and is_misfit(channel.figures)
     ]

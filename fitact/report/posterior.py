@@ -9,13 +9,13 @@ from fitact.charts import interactive
 from fitact.charts.figure import ALERT, DATA, MODEL, PRIOR, robust_limits
 from fitact.charts.interactive import Axis, Chart, Plot, PlotlyTrace
 
-CHANNELS = {"Vsc": "skin voltage Vsc", "I": "trunk current I"}
+CHANNELS = {"Vsc": "skin voltage Vsc", "I": "loop current I"}
 _FORCES = {"force_mean": "mean force", "force_rms": "rms force", "force_peak": "peak force"}
 _DENSITY = Axis("density", hides_numbers=True)  # each is scaled to its own peak
 
 
 def make_charts(tree: Any, page_columns: int = 10_000) -> dict[str, Chart]:
-    """Make the charts of a posterior's DataTree, by name; `page_columns`: of all records of a page."""
+    """Make the charts of the DataTree of a posterior, by name; `page_columns`: columns for all records of a page."""
     records = [str(name) for name in tree["observed_data"].data_vars]
     columns = min(2000, page_columns // len(records))  # no screen shows more
     charts = {f"trace_{i}": _channel_chart(tree, name, columns) for i, name in enumerate(records)}
@@ -23,7 +23,7 @@ def make_charts(tree: Any, page_columns: int = 10_000) -> dict[str, Chart]:
 
 
 def _channel_chart(tree: Any, name: str, columns: int) -> Chart:
-    """A channel over time, where it was fitted; of a long one also its beginning, sample by sample."""
+    """Draw a fitted channel over time; for a long record also its beginning, sample by sample."""
     observed, predicted = tree["observed_data"][name], tree["posterior_predictive"][name]
     (axis,) = observed.dims
     fitted = tree["constant_data"][f"{name}_fit"].values
@@ -35,40 +35,40 @@ def _channel_chart(tree: Any, name: str, columns: int) -> Chart:
     if np.count_nonzero(kept) <= count:
         return interactive.chart(_time_plot(series, quantity, columns, expected))
     return interactive.chart(
-        _time_plot(series, quantity, columns, expected, f"all of it, by the extremes of {columns:,} stretches"),
-        _time_plot(series[:, :count], quantity, columns, None, f"its first {count:,} samples"),
+        _time_plot(series, quantity, columns, expected, f"whole record: minimum and maximum in {columns:,} intervals"),
+        _time_plot(series[:, :count], quantity, columns, None, f"first {count:,} samples"),
     )
 
 
 def _time_plot(
     series: np.ndarray, quantity: tuple[str, str], columns: int, expected: np.ndarray | None, title: str = ""
 ) -> Plot:
-    """Record and fit, and what is left below.
+    """Draw data and fit, with the residuals below.
 
     Args:
-        series: times, the record and its fit, SI.
-        quantity: the channel and its unit.
-        expected: times, and the ends of what 90 % of records keep to.
+        series: times, data and fit, SI.
+        quantity: channel and unit.
+        expected: times, and both ends of the 90 % posterior predictive interval.
     """
     (time, values, fitted), (channel, unit) = series, quantity
     residuals, limits = values - fitted, robust_limits(values)
     x = Axis.from_values("time", "s", time, limits=(time[0], time[-1]))
     y = Axis.from_values(channel, unit, limits, limits=limits)
-    rest = Axis.from_values("record − fit", unit, residuals)
+    rest = Axis.from_values("data − fit", unit, residuals)
 
     def draw_extremes(y: Axis, values: np.ndarray, name: str, color: str) -> PlotlyTrace:
         at = interactive.extremes(values, columns)
         return interactive.line(x, y, time[at], values[at], name, color, width=1.0)
 
-    edges = ("5 % of predicted records", "95 %", "90 % of predicted records")
+    edges = ("5 % predictive", "95 % predictive", "90 % predictive interval")
     above = [] if expected is None else interactive.band(x, y, expected[0], expected[1], expected[2], edges)
-    above += [draw_extremes(y, values, "record", DATA), draw_extremes(y, fitted, "fit", MODEL)]
-    below = [draw_extremes(rest, residuals, "record − fit", ALERT) | {"showlegend": False}]
+    above += [draw_extremes(y, values, "data", DATA), draw_extremes(y, fitted, "fit", MODEL)]
+    below = [draw_extremes(rest, residuals, "data − fit", ALERT) | {"showlegend": False}]
     return interactive.plot(x, (y, above), (rest, below), heights=(2.2, 1.0), title=title, size=480, unified_hover=True)
 
 
 def _corner_chart(tree: Any) -> Chart:
-    """Each parameter's distribution, then Rsc, Csc and Ci in pairs."""
+    """Draw the distribution of each parameter, then Rsc, Csc and Ci in pairs."""
     posterior, prior = ({str(name): x.values.ravel() for name, x in tree[g].items()} for g in ("posterior", "prior"))
     axes = {
         name: Axis.from_values(name, tree["posterior"][name].attrs["units"], np.median(draws), log=True)
@@ -84,7 +84,7 @@ def _corner_chart(tree: Any) -> Chart:
     for a, b in itertools.combinations([name for name in ("Rsc", "Csc", "Ci") if name in axes], 2):
         traces = []
         for draws, label, color in both:
-            shown = slice(None, None, max(1, draws[a].size // 300))  # so many are a cloud, and a light page
+            shown = slice(None, None, max(1, draws[a].size // 300))  # 300 points show the shape and keep the page small
             at = draws[a][shown], draws[b][shown]
             cloud = interactive.points(axes[a], axes[b], *at, label, color, size=4.0, opacity=0.6)
             traces.append(cloud | {"hovertemplate": f"{axes[a].hover('x')}, {axes[b].hover('y')}<extra></extra>"})

@@ -1,4 +1,4 @@
-"""Posterior: draws, summaries, force and friction, and the file that other programs open."""
+"""Posterior: draws, summaries, force and friction, and the NetCDF file."""
 
 import copy
 import dataclasses
@@ -28,14 +28,14 @@ from fitact.units import quantity_unit
 
 @dataclasses.dataclass(frozen=True)
 class Posterior:
-    """Draws of the parameters, and what follows from them.
+    """Draws of the parameters and of the derived quantities.
 
     Attributes:
-        fit: what the chain started from.
-        points: (ensembles, draws, coordinates): draws in the chain's coordinates, burn-in left out, thinned.
-        log_prob: of the points.
-        convergence: how far they can be trusted.
-        seed: of every random number here.
+        fit: the fit that was sampled.
+        points: (ensembles, draws, coordinates): draws in the coordinates of the chain, without burn-in, thinned.
+        log_prob: log-posterior of the points.
+        convergence: diagnostics of the sampler.
+        seed: seed of all random numbers.
     """
 
     fit: Fit
@@ -46,7 +46,7 @@ class Posterior:
 
     @classmethod
     def from_chain(cls, fit: Fit, chain: Chain, convergence: Convergence, seed: int, draws: int = 2500) -> Self:
-        """Leave out the burn-in and thin to `draws` of each ensemble, spread over its walkers and steps."""
+        """Discard the burn-in and thin to `draws` of each ensemble, from all walkers and steps."""
         chosen = chain.thinning_slice(convergence.burn, draws)
         size = chain.points.shape[-1]
         points = chain.points[:, chosen].reshape(convergence.ensembles, -1, size)
@@ -61,12 +61,12 @@ class Posterior:
         convergence: Convergence,
         seed: int,
     ) -> Self:
-        """Deal independent draws out to 4 chains, as many as `sample` has ensembles."""
+        """Split independent draws into 4 chains, as many as `sample` has ensembles."""
         points = points.reshape(4, -1, points.shape[1])
         return cls(fit, points, log_prob.reshape(points.shape[:2]), convergence, seed)
 
     def parameters(self) -> dict[str, Float[np.ndarray, "ensembles draws"]]:
-        """Return draws of what the fit left free, the nuisances included, in SI units."""
+        """Return draws of the free parameters, including nuisances, in SI units."""
         likelihood, size = self.fit.likelihood, self.fit.theta.size
         draws = likelihood.to_physical(self.points[..., :size])
         draws |= {name: np.exp(self.points[..., size + i]) for i, name in enumerate(likelihood.sigma_names)}
@@ -80,14 +80,14 @@ class Posterior:
     def force(self) -> dict[str, Float[np.ndarray, "ensembles draws"]]:
         """Return mean, peak and rms of the electrostatic force, and mean friction by eq. (2), of each draw, N.
 
-        By eq. (22), where the permittivities follow each draw's Csc and Ci through eq. (3); or, with the scene's
-        `[force] model = "gap"`, across the gap. Thicknesses, area and friction are the scene's. Means run over whole
-        periods of the drive.
+        The force is computed with eq. (22), with permittivities from Csc and Ci of each draw by eq. (3), or with the
+        interface-gap law for `[force] model = "gap"`. Thicknesses, area and friction are those of the scene. Means are
+        over whole periods of the drive.
         """
         return {name: values for name, values in self.derived().items() if name not in ("g", "b")}
 
     def derived(self) -> dict[str, Float[np.ndarray, "ensembles draws"]]:
-        """Draws of divider, time constant, force and friction, SI units."""
+        """Return draws of divider, time constant, force and friction, SI units."""
         return {name: self._derived_draws[..., i] for i, name in enumerate(derived.DERIVED_NAMES)}
 
     @functools.cached_property
@@ -107,35 +107,37 @@ class Posterior:
 
     @property
     def trusted(self) -> bool:
-        """Whether nothing stands against the answer."""
+        """Whether the fit is reliable and the sampler converged."""
         return self.fit.trusted and self.convergence.converged
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences."""
+        """Sentences on what may change the result."""
         message = "" if self.fit.trusted else self.fit.message
         return (*self.fit.warnings, *filter(None, (message, self.convergence.warning)))
 
     def summary(self) -> dict[str, Any]:
-        """Return what summary.json holds."""
+        """Return the content of summary.json."""
         return copy.deepcopy(self._summary)
 
     @functools.cached_property
     def _summary(self) -> dict[str, Any]:
-        prior_sd = dict(zip(self.fit.likelihood.prior.names, self.fit.likelihood.prior.log_sd, strict=True))
-        parameters = {}
-        for name, draws in self.parameters().items():
-            parameters[name] = summary.summarize_draws(name, draws)
-            if name in prior_sd:
-                parameters[name]["contraction"] = float(1.0 - np.std(np.log(draws), ddof=1) / prior_sd[name])
+        drawn, prior = self.parameters(), self.fit.likelihood.prior
+        summaries = {name: summary.summarize_draws(name, draws) for name, draws in (drawn | self.derived()).items()}
+        for name, fitted in (self.fit.parameters() | self.fit.derived()).items():
+            summaries[name]["from_prior"] = fitted["from_prior"]
+        for name, prior_sd in zip(prior.names, prior.log_sd, strict=True):
+            summaries[name]["contraction"] = float(1.0 - np.std(np.log(drawn[name]), ddof=1) / prior_sd)
         return {
-            "parameters": parameters,
-            "derived": {name: summary.summarize_draws(name, draws) for name, draws in self.derived().items()},
+            "parameters": {name: summaries[name] for name in drawn},
+            "derived": {name: summaries[name] for name in self.derived()},
             "identifiability": self.fit.identifiability.to_dict() | {"sentence": str(self.fit.identifiability)},
             "convergence": dataclasses.asdict(self.convergence) | {"sentence": str(self.convergence)},
             "fit": self.fit.judgement(),
             "model": self.fit.model(),
+            "force_basis": self.fit.force_basis,
             "warnings": list(self.warnings),
+            "notes": list(self.fit.notes),
             "seed": self.seed,
             "record": self._record(),
             "scene": self.fit.scene.model_dump(mode="json", exclude_unset=True),

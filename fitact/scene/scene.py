@@ -32,8 +32,16 @@ _NATURAL_GROUND_KEYS = ("Z", "Z_capacitance")
 
 
 class Scene(sections.Section):
-    """One case: see the sections. Raises `fitact.InputError` for what it does not understand."""
+    """Device, skin, grounding, drive, measurement and prior of one case; see the sections.
 
+    Attributes:
+        description: text for the user, which reports repeat.
+
+    Raises:
+        InputError: a key or a value is unknown.
+    """
+
+    description: str = ""
     device: sections.Device = sections.Device()
     skin: sections.SkinSection = sections.SkinSection()
     grounding: sections.Grounding = sections.Grounding()

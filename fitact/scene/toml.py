@@ -51,6 +51,10 @@ def to_toml(scene: Section) -> str:
     """Every key with its unit; those that were not given, as comments. Read again it is the same scene."""
     lines = []
     for name, section in scene:
+        if not isinstance(section, Section):
+            line = f"{name} = {value_text(section, None)}"
+            lines += [line if name in scene.model_fields_set else f"# {line}", ""]
+            continue
         lines.append(f"[{name}]")
         for key, field in type(section).model_fields.items():
             value = getattr(section, key)

@@ -22,9 +22,9 @@ TYPES: dict[str, tuple[type, ...]] = {
     "text": (str, type(None)),
     "true/false": (bool,),
     "list": (list,),
-    "object": (dict,),
+    "object": (dict, type(None)),
 }
-SUMMARY = ("unit", "mean", "sd", "q025", "q05", "q25", "q50", "q75", "q95", "q975", "contraction")
+SUMMARY = ("unit", "mean", "sd", "q025", "q05", "q25", "q50", "q75", "q95", "q975", "contraction", "from_prior")
 
 
 class Stated(NamedTuple):
@@ -49,7 +49,10 @@ def stated(command: str) -> list[Stated]:
         for key in re.findall(r"`(.+?)`", keys):
             always = not meaning.startswith("where ")
             if types == "summary":
-                found += [Stated(f"{key}.{name}", _part(name), always and name != "contraction") for name in SUMMARY]
+                found += [
+                    Stated(f"{key}.{name}", _part(name), always and name not in ("contraction", "from_prior"))
+                    for name in SUMMARY
+                ]
             else:
                 found.append(Stated(key, types, always))
     return found

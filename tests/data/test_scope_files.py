@@ -366,7 +366,10 @@ def test_the_mapping_is_asked_for_and_noted():
     table = np.loadtxt(path, delimiter=",", skiprows=2)
     np.testing.assert_array_equal(record["V"], table[:, 1])
     np.testing.assert_array_equal(record["Vsc"], -10.0 * table[:, 2])
-    assert f"{path}: Vsc is '2' (in Volt; no attenuation stated) times -10" in record.notes
+    assert (
+        f"{path}: Vsc read from column '2' (unit Volt), multiplied by -10; the file states no probe attenuation"
+        in record.notes
+    )
 
 
 @pytest.mark.parametrize(

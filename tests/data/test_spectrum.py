@@ -174,7 +174,7 @@ def test_another_skin_is_a_misfit_until_the_scene_has_it():
 def test_high_frequencies_alone_leave_the_resistance_to_the_prior():
     found = fitact.fit_spectrum(spectrum(frequency=np.geomspace(1e5, 1e6, FREQUENCY.size)))
     assert found.identifiability.verdict != "identified"
-    assert "skin's corner" in found.identifiability.remedy
+    assert "corner frequency of the skin" in found.identifiability.remedy
 
 
 def test_command_line(tmp_path: Path, capfd):

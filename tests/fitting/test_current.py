@@ -33,7 +33,7 @@ def test_current_fixes_all_three(number: int, channels: list[str]):
     noise = {"Vsc": truth["noise_Vsc"], "I": truth["noise_I"]}
     for trace in found.traces:
         assert trace.sigma == pytest.approx(noise[trace.channel], rel=0.05)
-    assert any("38 of 4,000 samples" in warning for warning in found.warnings)
+    assert any("38 of 4,000 samples" in note for note in found.notes)
 
 
 @pytest.mark.thorough

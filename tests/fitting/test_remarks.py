@@ -24,7 +24,7 @@ def test_a_part_of_a_wave():
     whole = square_record()
     part = fitact.Record.from_arrays(whole.time[:1400], V=whole["V"][:1400], Vsc=whole["Vsc"][:1400])
     (found,) = remarks(part)
-    assert "(6.995 ms) does not show its drive repeating" in found
+    assert "does not repeat within the record (6.995 ms)" in found
     assert "1.5 periods" in found
     assert remarks(part, fitact.Burst(SQUARE, 2)) == []  # which repeats nothing
 
@@ -32,9 +32,9 @@ def test_a_part_of_a_wave():
 @pytest.mark.parametrize(
     ("figures", "words"),
     [
-        ({"interpolation_error": 0.1}, ["too coarsely", "100 mV", "name the waveform"]),
-        ({"rounding_noise": 0.2}, ["Vsc is rounded", "may be off by half"]),
-        ({"quiet_noise": 0.31}, ["quiet holds more than noise", "310 mV", "100 mV"]),
+        ({"interpolation_error": 0.1}, ["too coarsely", "100 mV", "state the waveform"]),
+        ({"rounding_noise": 0.2}, ["Vsc is rounded", "may be wrong by half"]),
+        ({"quiet_noise": 0.31}, ["quiet contains more than noise", "310 mV", "100 mV"]),
         ({"outliers": 3, "first_outlier": 2e-3}, ["3 samples of Vsc", "2 ms", "'student'"]),
     ],
 )

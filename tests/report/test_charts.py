@@ -97,9 +97,9 @@ def test_a_long_record_is_drawn_whole_and_its_beginning_sample_by_sample():
     )
     found = make_charts(tree)
     whole, beginning = ({trace["name"]: trace for trace in each["data"]} for each in found["trace_0"]["plots"])
-    assert numbers(whole["record"]["y"]).max() == 40.0
-    np.testing.assert_allclose(numbers(beginning["record"]["x"]), 1e3 * time[:4000], rtol=1e-12)
-    np.testing.assert_array_equal(numbers(beginning["record"]["y"]), vsc[:4000].astype("f4"))
+    assert numbers(whole["data"]["y"]).max() == 40.0
+    np.testing.assert_allclose(numbers(beginning["data"]["x"]), 1e3 * time[:4000], rtol=1e-12)
+    np.testing.assert_array_equal(numbers(beginning["data"]["y"]), vsc[:4000].astype("f4"))
     assert len(json.dumps(found)) < 1e6
 
 

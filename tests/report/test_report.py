@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 import fitact
-from fitact.report.page import _label
 from fitact.scene.prior_section import PriorSection
+from fitact.summary import describe_quantity
 
 
 class Page(HTMLParser):
@@ -106,7 +106,7 @@ def test_nothing_in_a_record_becomes_markup(finger_posterior: fitact.Posterior, 
 
 def test_whatever_can_be_free_has_a_name_for_people():
     for name in set(PriorSection.model_fields) - {"correlation", "order"}:
-        assert _label(name) != name
+        assert describe_quantity(name) != name
 
 
 def test_results_of_another_version_are_refused(finger_posterior: fitact.Posterior, tmp_path):

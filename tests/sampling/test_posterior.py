@@ -137,4 +137,4 @@ def test_a_spread_beyond_numbers_is_open():
     s = summarize_log_normal("b", 1.0, 40.0)
     assert s["q50"] == 1.0
     assert s["sd"] == np.inf
-    assert format_sd(s) == "open"
+    assert format_sd(s) == "undetermined"

@@ -191,8 +191,10 @@ def _make_capture(contents: _Contents, source: str, pick: Pick) -> Capture:
     if timed:
         unit = last[timed[0]][1] or contents.units[timed[0]]
         time = layouts.convert_time(arrays[timed[0]].astype(float), unit, source, "store seconds")
-        notes = [] if unit else [f"{source}: the file states no unit of time; seconds were assumed"]
+        notes: list[str] = []
+        assumed = [] if unit else [f"{source}: the file states no unit of time; seconds were assumed"]
     else:
+        assumed = []
         time, notes = _time_grid(contents, arrays[chosen[0][1]].size, source)
     for name, other in chosen:
         if arrays[other].size != time.size:
@@ -206,7 +208,9 @@ def _make_capture(contents: _Contents, source: str, pick: Pick) -> Capture:
         for name, other in chosen
     )
     unread = tuple(name for name in names if name not in wanted)
-    return Capture(source, contents.format, time, channels, notes=tuple(notes), unread_columns=unread)
+    return Capture(
+        source, contents.format, time, channels, notes=tuple(notes), warnings=tuple(assumed), unread_columns=unread
+    )
 
 
 def _time_grid(contents: _Contents, count: int, source: str) -> tuple[np.ndarray, list[str]]:

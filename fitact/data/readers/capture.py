@@ -51,8 +51,9 @@ class Capture:
     Attributes:
         format: who wrote it, as "Keysight CSV".
         row_label: what a sample's number is called in messages, as "line 12".
-        notes: what was assumed in reading, in sentences.
-        unread_columns: those not wanted, or without numbers.
+        notes: sentences for information.
+        warnings: sentences on what was assumed and may change the result.
+        unread_columns: columns that were not requested, or without numbers.
     """
 
     source: str
@@ -61,6 +62,7 @@ class Capture:
     channels: tuple[FileChannel, ...]
     row_label: Callable[[int], str] = lambda row: f"sample {row}"
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     unread_columns: tuple[str, ...] = ()
 
 
@@ -127,12 +129,17 @@ def to_record(capture: Capture, channels: Mapping[str, str], scale: Mapping[str,
             notes.append(f"{capture.source}: {_describe_conversion(trace, channel, scale.get(channel, 1.0))}")
     if channels or scale:
         first = format_engineering(float(capture.time[0]), "s") if capture.time.size else "nowhere"
-        notes.append(f"{capture.source}: the time is the file's own ({capture.format}), from {first}")
+        notes.append(f"{capture.source}: time axis taken from the file (format: {capture.format}), starting at {first}")
     unread = [*(name for name in names if name not in known.values()), *capture.unread_columns]
     if unread:
         notes.append(f"{capture.source}: not used: {', '.join(unread)}")
     return Record.from_arrays(
-        capture.time, **arrays, source=capture.source, notes=tuple(notes), where=capture.row_label
+        capture.time,
+        **arrays,
+        source=capture.source,
+        notes=tuple(notes),
+        warnings=capture.warnings,
+        where=capture.row_label,
     )
 
 
@@ -152,10 +159,11 @@ def _check_unit(file_channel: FileChannel, channel: str, scaled: bool, source: s
 
 def _describe_conversion(file_channel: FileChannel, channel: str, factor: float) -> str:
     stated = file_channel.unit_text
-    unit = f"in {stated}" if stated else f"no unit stated, {CHANNEL_UNITS[channel]} assumed"
+    unit = f"unit {stated}" if stated else f"no unit stated, {CHANNEL_UNITS[channel]} assumed"
     probe = file_channel.attenuation
-    said = "no attenuation stated" if probe is None else f"attenuation {probe:g} as stated"
-    return f"{channel} is '{file_channel.name}' ({unit}; {said}) times {factor:g}"
+    attenuation = "states no probe attenuation" if probe is None else f"states a probe attenuation of {probe:g}"
+    scaled = "" if factor == 1.0 else f", multiplied by {factor:g}"
+    return f"{channel} read from column '{file_channel.name}' ({unit}){scaled}; the file {attenuation}"
 
 
 def _join_names(names: list[str]) -> str:

@@ -206,7 +206,7 @@ class _TableParser:
             time, *values = columns
         else:
             time, values = np.arange(rows, dtype=float)[kept], columns
-        time, timing = self._time_in_seconds(time)
+        time, timing, warnings = self._time_in_seconds(time)
         return Capture(
             source=self._source,
             format=header.maker,
@@ -217,6 +217,7 @@ class _TableParser:
             ),
             row_label=lambda row: self._line_label(row + (kept.start or 0)),
             notes=(*timing, *notes),
+            warnings=tuple(warnings),
             unread_columns=tuple(unread_columns),
         )
 
@@ -233,15 +234,15 @@ class _TableParser:
         notes = [f"{self._source}: rows without values at the ends were passed over ({left:,})"] if left else []
         return slice(first, last + 1), notes
 
-    def _time_in_seconds(self, time: np.ndarray) -> tuple[np.ndarray, list[str]]:
-        """Seconds, and what was assumed of them."""
+    def _time_in_seconds(self, time: np.ndarray) -> tuple[np.ndarray, list[str], list[str]]:
+        """Return the times in seconds, with notes and warnings on what was assumed."""
         header, place = self._header, f"{self._source}{self._header.location}"
         if header.time:
             stated = header.time.unit or (header.time.name.lower() == "time" and header.maker == "fitact")
-            notes = [] if stated else [f"{self._source}: the file states no unit of time; seconds were assumed"]
-            return layouts.convert_time(time, header.time.unit, place, "write a multiple of s"), notes
+            warnings = [] if stated else [f"{self._source}: the file states no unit of time; seconds were assumed"]
+            return layouts.convert_time(time, header.time.unit, place, "write a multiple of s"), [], warnings
         start, step = header.time_grid
         if step is None:
             raise InputError(f"{place}: no time, and no step of it; export the time as well")
         notes = [] if start is not None else [f"{self._source}: the time was taken to start at 0"]
-        return (start or 0.0) + step * time, notes
+        return (start or 0.0) + step * time, notes, []

@@ -1,0 +1,70 @@
+"""Values that a result rests on although no electrical record determines them, each stated or a default."""
+
+import math
+from typing import Any, NamedTuple
+
+from fitact.scene.scene import Scene
+from fitact.units import format_engineering, format_percent
+
+
+class Assumption(NamedTuple):
+    """One value that a computed force or friction rests on."""
+
+    symbol: str
+    key: str  # where the scene file states it
+    value: float | str
+    unit: str
+    stated: bool
+    affects: str  # "prior", "drive", "force" or "friction"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return an entry of `force_basis.assumptions` in fit.json and summary.json."""
+        text = self.value if isinstance(self.value, str) else format_engineering(self.value, self.unit)
+        if self.symbol.startswith("relative"):
+            text = format_percent(float(self.value))
+        return {
+            "symbol": self.symbol, "key": self.key, "value": self.value, "unit": self.unit, "text": text,
+            "origin": "scene" if self.stated else "default", "affects": self.affects,
+        }  # fmt: skip
+
+
+def list_assumptions(scene: Scene, law: str, *, prior: bool, stated_drive: bool) -> tuple[Assumption, ...]:
+    """List the values of a scene that its force (by `law`, eq. (22) or a gap's) and friction (eq. (2)) rest on.
+
+    `prior`: whether the prior of Ci was used; `stated_drive`: whether the scene's drive was, and not a recorded one.
+    """
+    wave = (
+        ("waveform", "drive", "waveform", ""),
+        ("Vpp", "drive", "peak_to_peak", "V"),
+        ("f", "drive", "frequency", "Hz"),
+    )
+    layers = ("Ti", "device", "insulator_thickness", "m"), ("Tsc", "skin", "thickness", "m")
+    gap = ("d", "gap", "thickness", "m"), ("Cgap", "gap", "capacitance", "F"), ("A", "device", "contact_area", "m^2")
+    friction = ("mu", "friction", "coefficient", ""), ("fN", "friction", "normal_force", "N")
+    groups = {"drive": wave if stated_drive else (), "force": gap if law == "gap" else layers, "friction": friction}
+    assumptions = [
+        Assumption(symbol, f"[{section}] {key}", value, unit, key in getattr(scene, section).model_fields_set, affects)
+        for affects, entries in groups.items()
+        for symbol, section, key, unit in entries
+        if (value := getattr(getattr(scene, section), key)) is not None
+    ]
+    return (*(_prior_assumptions(scene) if prior else ()), *assumptions)
+
+
+def _prior_assumptions(scene: Scene) -> tuple[Assumption, ...]:
+    spec = scene.prior.specs()["Ci"]
+    if not spec.is_free:
+        return ()
+    marginal, key = scene.make_prior()["Ci"], "[prior] Ci"
+    median = Assumption("Ci", key, math.exp(marginal.log_mean), "F", states_Ci(scene), "prior")
+    own_spread = "Ci" in scene.prior.model_fields_set and bool(
+        {"factor", "relative_sd", "low", "tolerance"} & scene.prior.Ci.model_fields_set
+    )
+    return median, Assumption("relative sd of Ci", key, float(marginal.log_sd), "", own_spread, "prior")
+
+
+def states_Ci(scene: Scene) -> bool:
+    """Return whether a scene states Ci: by a value, by area, thickness and permittivity, or by a prior of its own."""
+    device, spec = scene.device.model_fields_set, scene.prior.Ci
+    own_prior = bool({"median", "low", "nominal", "tied"} & spec.model_fields_set) or isinstance(spec.fixed, float)
+    return own_prior or "Ci" in device or {"insulator_thickness", "insulator_permittivity", "contact_area"} <= device
