@@ -26,7 +26,7 @@ MAX_PADDED_LENGTH = 1_048_576  # samples, above which a fit takes longer than co
 
 
 def padded_length(samples: int, per_octave: int = 8, min_step: int = 64) -> int:
-    """The length that a record of so many samples is filled up to.
+    """Return the length that a record of so many samples is filled up to.
 
     Lengths lie a `per_octave`-th apart at most, which is the most that is added, and `min_step` samples at least, since
     some more cost nothing in a short record.
@@ -40,18 +40,18 @@ def padded_length(samples: int, per_octave: int = 8, min_step: int = 64) -> int:
 def pad_samples(
     values: np.ndarray, samples: int | None = None, mode: Literal["edge", "constant"] = "edge"
 ) -> np.ndarray:
-    """One value a sample, the last one repeated; `samples`: how many the record has of which these are the first."""
+    """Return one value a sample, the last one repeated; `samples`: how many the record has of which these are the first."""
     missing = padded_length(samples or values.shape[-1]) - values.shape[-1]
     return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)], mode=mode) if missing else values
 
 
 def pad_weight(weight: np.ndarray, samples: int | None = None) -> np.ndarray:
-    """The weights of samples, with 0 for what is added."""
+    """Return the weights of samples, with 0 for what is added."""
     return pad_samples(weight, samples, mode="constant")
 
 
 def pad_rows(values: np.ndarray, size: int, axis: int = 0) -> np.ndarray:
-    """Rows filled up to a whole number of batches of `size`, by repeats of the last."""
+    """Return rows filled up to a whole number of batches of `size`, by repeats of the last."""
     missing = -values.shape[axis] % size
     if not missing:
         return values
@@ -59,13 +59,13 @@ def pad_rows(values: np.ndarray, size: int, axis: int = 0) -> np.ndarray:
 
 
 def as_arrays(module: _Module) -> _Module:
-    """The module with its numbers as arrays, so that what is compiled for one serves all others of its kind."""
+    """Return the module with its numbers as arrays, so that what is compiled for one serves all others of its kind."""
     with jax.enable_x64(True):
         return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, module)
 
 
 def to_device(values: Float[np.ndarray, " samples"]) -> Float[Array, " samples"]:
-    """A record's samples for JAX, in the memory that they are in."""
+    """Return a record's samples for JAX, in the memory that they are in."""
     with jax.enable_x64(True):
         return jax.device_put(values, may_alias=True)
 
@@ -93,7 +93,7 @@ class BatchEvaluator:
         self._batch = max(1, min(batch, max_numbers // rows))
 
     def __call__(self, *arrays: np.ndarray, description: str = "") -> np.ndarray:
-        """The values of the rows; with a `description`, progress is shown under it."""
+        """Return the values of the rows; with a `description`, progress is shown under it."""
         count, batch = len(arrays[0]), self._batch
         arrays = tuple(pad_rows(a, batch) for a in arrays)
         starts = range(0, count, batch)
@@ -104,7 +104,7 @@ class BatchEvaluator:
         return (parts[0] if len(parts) == 1 else np.concatenate(parts))[:count]
 
     def map_over(self, shape: tuple[int, ...], *arrays: np.ndarray) -> np.ndarray:
-        """The values of rows that stand in a `shape`, in that shape."""
+        """Return the values of rows that stand in a `shape`, in that shape."""
         values = self(*(a.reshape(-1, *a.shape[len(shape) :]) for a in arrays))
         return values.reshape(*shape, *values.shape[1:])
 

@@ -37,13 +37,13 @@ def _temporary_path(path: Path) -> Path:
 
 
 def read_error(source: str, error: Exception) -> InputError:
-    """The error to raise where a file cannot be read."""
+    """Return the error to raise where a file cannot be read."""
     reason = getattr(error, "strerror", None) or str(error)
     return InputError(f"{source}: cannot be read ({reason.lower()}); check the path and the file")
 
 
 def to_json(content: Any, indent: int | None = 2) -> str:
-    """Plain JSON, with null for what is not finite; keys in the order given; without `indent` on one line."""
+    """Return plain JSON, with null for what is not finite; keys in the order given; without `indent` on one line."""
     return json.dumps(_to_plain(content), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
 
 

@@ -61,7 +61,7 @@ class Claim:
     reason: str
 
     def to_dict(self) -> dict[str, Any]:
-        """The claim as in reproduction.json."""
+        """Return the claim as in reproduction.json."""
         return dataclasses.asdict(self)
 
 
@@ -144,7 +144,7 @@ def _grounding_claims() -> Iterator[Claim]:
 
 
 def peaks_over_grounding(Ci: float, name: str, values: tuple[float, ...]) -> np.ndarray:
-    """Peaks of Vsc (V) under Figs. 5 and 6's square, with the grounding finger's Rsc or Csc varied."""
+    """Return peaks of Vsc (V) under Figs. 5 and 6's square, with the grounding finger's Rsc or Csc varied."""
     skin: dict[str, Any] = {"grounding_Rsc": RSC, "grounding_Csc": CSC}
     circuits = [DirectGround(RSC, CSC, Ci, R_H=R_H, **(skin | {name: value})) for value in values]
     return np.array([float(peak(circuit, _SQUARE)) for circuit in circuits])
@@ -195,7 +195,7 @@ def _equivalent_claims() -> Iterator[Claim]:
 
 
 def force_over(permittivity: float, thickness: float) -> float:
-    """The mean force (N) of Fig. 12 under a 360 Vpp square, Ci following from the insulator by eq. (3)."""
+    """Return the mean force (N) of Fig. 12 under a 360 Vpp square, Ci following from the insulator by eq. (3)."""
     Ci = plate_capacitance(permittivity, AREA, thickness)
     contact = Contact(AREA, thickness, permittivity, SKIN, float(CSC * SKIN / plate_capacitance(1.0, AREA, 1.0)))
     return float(mean_force(FinalCircuit(RSC, CSC, Ci), _SQUARE, contact))
@@ -237,7 +237,7 @@ def _frequency_claims() -> Iterator[Claim]:
 
 
 def waveforms(peak_to_peak: float) -> dict[str, Drive]:
-    """The three drives of Fig. 15, by name."""
+    """Return the three drives of Fig. 15, by name."""
     kinds = {"sine": Sine, "triangle": Triangle, "square": Square}
     return {name: kind(peak_to_peak=peak_to_peak, frequency=FREQUENCY) for name, kind in kinds.items()}
 
@@ -293,7 +293,7 @@ def _equation_claims() -> Iterator[Claim]:
 
 
 def _force_law() -> tuple[float, float]:
-    """Eq. (22) as printed, and the mean force over the mean square of Vsc; with v = Vsc it is eq. (1)."""
+    """Return Eq. (22) as printed, and the mean force over the mean square of Vsc; with v = Vsc it is eq. (1)."""
     contact = Contact(AREA, INSULATOR, PERMITTIVITY, SKIN, 5e3)
     circuit = FinalCircuit(RSC, CSC, CI)
     printed = 8.85e-12 * AREA / (2 * (INSULATOR / PERMITTIVITY + SKIN / 5e3) * (INSULATOR + SKIN))

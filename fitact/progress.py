@@ -45,7 +45,7 @@ def track_progress(
 
 
 def open_bar(label: str, status: str = "") -> "Progress":
-    """A bar with one task, out of 1; it goes when stopped, unless it shows a `status` beside the share done."""
+    """Return a bar with one task, out of 1; it goes when stopped, unless it shows a `status` beside the share done."""
     from rich import console, markup, progress
 
     columns = [progress.TextColumn(markup.escape(label)), progress.BarColumn()]

@@ -36,7 +36,7 @@ def _registry() -> Any:
 
 
 def parse_quantity(value: object, unit: str) -> float:
-    """A quantity such as ``"160 kohm"`` as a float in the SI unit `unit`; a bare number is in `unit` already."""
+    """Return a quantity such as ``"160 kohm"`` as a float in the SI unit `unit`; a bare number is in `unit` already."""
     remedy = f"write a number with a unit, such as '1 {unit}'"
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise InputError(f"{value!r} is not a quantity; {remedy}")
@@ -55,7 +55,7 @@ def parse_quantity(value: object, unit: str) -> float:
 
 
 def format_exact(value: float, unit: str) -> str:
-    """`value` as text that `parse_quantity` reads back to its last digit, "1.35 nF" for 1.35e-9 and "F"."""
+    """Return `value` as text that `parse_quantity` reads back to its last digit, "1.35 nF" for 1.35e-9 and "F"."""
     # of a power a prefix would be raised to it
     exponent = _prefix_exponent(value) if value and unit and "^" not in unit else 0
     prefix = _PREFIXES[exponent].replace("µ", "u")
@@ -63,13 +63,13 @@ def format_exact(value: float, unit: str) -> str:
 
 
 def format_engineering(value: float, unit: str, digits: int = 4) -> str:
-    """`value` with an SI prefix, for people: ``format_engineering(1.35e-9, "F") == "1.35 nF"``."""
+    """Return `value` with an SI prefix, for people: ``format_engineering(1.35e-9, "F") == "1.35 nF"``."""
     size, symbol = choose_prefixed_unit(value, unit)
     return f"{value / size:.{digits}g} {symbol}".rstrip()
 
 
 def choose_prefixed_unit(value: float, unit: str) -> tuple[float, str]:
-    """The multiple of `unit` that suits `value`, and its symbol: (1e-9, "nF") for 1.35e-9 and "F"."""
+    """Return the multiple of `unit` that suits `value`, and its symbol: (1e-9, "nF") for 1.35e-9 and "F"."""
     symbol = _SYMBOLS.get(unit, unit)
     if not math.isfinite(value) or value == 0.0 or not symbol:
         return 1.0, symbol
@@ -82,12 +82,12 @@ def _prefix_exponent(value: float) -> int:
 
 
 def quantity_unit(name: str) -> str:
-    """The SI unit of a quantity; a nuisance's name may end in its trace's label, as "sigma_I_2"."""
+    """Return the SI unit of a quantity; a nuisance's name may end in its trace's label, as "sigma_I_2"."""
     bare = name if name in _UNITS else re.sub(r"_\d+$", "", name)
     unit = _UNITS[bare.removesuffix("_I")]
     return "A" if bare.endswith("_I") and unit == "V" else unit
 
 
 def format_percent(fraction: float) -> str:
-    """A share of 1, for people: ``format_percent(0.0123) == "1.2 %"``."""
+    """Return a share of 1, for people: ``format_percent(0.0123) == "1.2 %"``."""
     return f"{100.0 * fraction:.0f} %" if fraction >= 0.995 else f"{100.0 * fraction:.2g} %"

@@ -1,5 +1,4 @@
-"""What is the answer for thousands of records?
+"""Fits and posteriors of thousands of records.
 
-Takes many records or files; gives a table with a row for each, by the fits and posteriors of one record, side by
-side.
+Computes many records or files in batches, by the methods for one record, and returns a table with one row for each.
 """

@@ -213,7 +213,7 @@ def _journal_keys(paths: Sequence[str], task: Task) -> list[str]:
 
 
 def _pending_batches(keys: Sequence[str], paths: Sequence[str], journal: Journal) -> deque[Batch]:
-    """Batches of what is not done: always the same ones, whatever was interrupted."""
+    """Return batches of what is not done: always the same ones, whatever was interrupted."""
     pairs = list(zip(keys, paths, strict=True))
     parts = (pairs[first : first + BATCH] for first in range(0, len(pairs), BATCH))
     batches = (tuple(pair for pair in part if pair[0] not in journal.rows) for part in parts)

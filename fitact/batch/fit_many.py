@@ -253,7 +253,7 @@ class RecordGroup:
     voltage: np.ndarray | None = None
 
     def is_batchable(self, scene: Scene | None) -> bool:
-        """Whether they can be fitted together; learnt from some of them."""
+        """Return whether they can be fitted together; learnt from some of them."""
         if len(self.members) < self.min_records:
             return False
         for _, record in self.members[: self.tries]:
@@ -296,7 +296,7 @@ def _split_group(group: RecordGroup, scene: Scene | None) -> Iterator[Batch]:
 
 
 def _has_same_drive(record: Record, voltage: np.ndarray, tolerance: float = 0.01) -> bool:
-    """Whether the record has no V, or the scene's but for a relative rms difference of `tolerance`."""
+    """Return whether the record has no V, or the scene's but for a relative rms difference of `tolerance`."""
     if "Vsc" not in record:
         return False
     if "V" not in record:

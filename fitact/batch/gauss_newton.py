@@ -237,7 +237,7 @@ class BatchProblem:
         return np.max(gains, axis=0, initial=-math.inf) > MIN_BIC_DECREASE
 
     def _screen_records(self, observed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Noise and height of records, and whether they show neither a rail nor the steps of a converter."""
+        """Return noise and height of records, and whether they show neither a rail nor the steps of a converter."""
         noise, low, high = white_noise_sds(observed), observed.min(axis=1), observed.max(axis=1)
         steps = np.abs(np.diff(observed[:, : self.settings.adc_samples], axis=1))
         is_fine = np.any((steps > 0.0) & (steps <= noise[:, None]), axis=1)

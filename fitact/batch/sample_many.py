@@ -156,7 +156,7 @@ def _make_targets(batch: Batch) -> _Targets | None:
 
 
 def _has_tables(likelihood: Likelihood, theta: Float[np.ndarray, " parameters"]) -> bool:
-    """Whether one time constant makes the record, so that a table around it suffices, and walkers are enough."""
+    """Return whether one time constant makes the record, so that a table around it suffices, and walkers are enough."""
     taus = likelihood.circuit(jnp.asarray(theta)).channel_terms(likelihood.channels[0].channel).tau
     return len(taus) == 1 and 2 * (len(theta) + 1) <= WALKERS
 

@@ -107,7 +107,7 @@ class SharedBasis(NamedTuple):
         half_width: Float[np.ndarray, " records"],
         precision: Float[np.ndarray, " records"],
     ) -> RestrictedTables:
-        """Tables for log tau within `half_width` of each record's `center`, which cost less to evaluate.
+        """Return tables for log tau within `half_width` of each record's `center`, which cost less to evaluate.
 
         What is left out changes the response to the drive by no more than `precision` (V, root of the sum of squares).
         """

@@ -1,5 +1,4 @@
-"""How do numbers become a picture?
+"""Figures made from arrays, rows and names.
 
-Takes arrays, rows and names; gives figures for paper (`figure`, matplotlib) and for the screen (`interactive`, plotly).
-Knows no result class.
+Draws figures for print (`figure`, matplotlib) and for the screen (`interactive`, plotly), without any result class.
 """

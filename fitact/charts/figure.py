@@ -31,7 +31,7 @@ STYLE: Any = {  # that all figures share; for `matplotlib.rc_context`
 
 
 def robust_limits(values: np.ndarray) -> tuple[float, float]:
-    """Limits that show a channel, but not the few samples of a current at edges that would flatten all others."""
+    """Return limits that show a channel, but not the few samples of a current at edges that would flatten all others."""
     low, high = np.quantile(values, [0.02, 0.98])
     whole = float(values.min()), float(values.max())
     if whole[1] - whole[0] > 20.0 * (high - low):
@@ -60,7 +60,7 @@ def write_figure(path: str | os.PathLike[str], draw: Callable[[], Figure], dpi: 
 
 
 def svg(figure: Figure) -> str:
-    """A figure as an element of a page."""
+    """Return a figure as an element of a page."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", dpi=150, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()

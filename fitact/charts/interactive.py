@@ -61,7 +61,7 @@ class Axis:
         return cls(title, symbol, size, log, limits, has_tick_prefixes=wide)
 
     def encode(self, values: ArrayLike, dtype: str = "f4") -> dict[str, str]:
-        """`values` (SI) in the unit shown, as plotly.js reads numbers."""
+        """Return `values` (SI) in the unit shown, as plotly.js reads numbers."""
         numbers = (np.asarray(values, dtype=float) / self.size).astype(f"<{dtype}")
         return {"dtype": dtype, "bdata": base64.b64encode(numbers.tobytes()).decode()}
 
@@ -77,7 +77,7 @@ class Axis:
         return layout
 
     def hover(self, letter: str) -> str:
-        """The value under the pointer with its unit."""
+        """Return the value under the pointer with its unit."""
         if self.has_tick_prefixes:
             return f"%{{{letter}:.4~s}}{self.symbol}"
         return f"%{{{letter}:.5~g}} {self.symbol}".rstrip()
@@ -87,7 +87,7 @@ def line(
     x: Axis, y: Axis, x_values: ArrayLike, values: ArrayLike, name: str, color: str = MODEL, *, width: float = 1.8,
     dash: str = "solid",
 ) -> PlotlyTrace:  # fmt: skip
-    """A curve; `dash` as in SVG's and plotly's words: solid, dash, dot."""
+    """Return a curve; `dash` as in SVG's and plotly's words: solid, dash, dot."""
     style = {"color": color, "width": width, "dash": dash, "simplify": False}
     return _trace(x, y, x_values, values, name) | {"mode": "lines", "line": style}
 
@@ -109,7 +109,7 @@ def band(
     x: Axis, y: Axis, x_values: ArrayLike, low: ArrayLike, high: ArrayLike, names: tuple[str, str, str],
     color: str = MODEL,
 ) -> list[PlotlyTrace]:  # fmt: skip
-    """The area between two curves; `names`: of the lower and upper edge, and of the area."""
+    """Return the area between two curves; `names`: of the lower and upper edge, and of the area."""
     below, above, area = names
     edge = {"mode": "lines", "line": {"width": 0, "color": color}, "legendgroup": area}
     lower = _trace(x, y, x_values, low, below) | edge | {"showlegend": False}
@@ -118,7 +118,7 @@ def band(
 
 
 def density(x: Axis, draws: ArrayLike, name: str, color: str = MODEL, *, bins: int = 80) -> PlotlyTrace:
-    """The distribution of positive draws, its peak at 1; under the pointer, the share of them below.
+    """Return the distribution of positive draws, its peak at 1; under the pointer, the share of them below.
 
     Heights are densities over the axis as it is drawn: `log_axis_button` swaps those of the linear axis with those of
     the logarithmic one.
@@ -141,7 +141,7 @@ def density(x: Axis, draws: ArrayLike, name: str, color: str = MODEL, *, bins: i
 
 
 def extremes(values: ArrayLike, columns: int = 2000) -> np.ndarray:
-    """Indices at which a series looks as it does whole: the least and greatest of so many stretches, `columns`."""
+    """Return indices at which a series looks as it does whole: the least and greatest of so many stretches, `columns`."""
     numbers = np.asarray(values, dtype=float)
     if numbers.size <= 2 * columns:
         return np.arange(numbers.size)
@@ -154,7 +154,7 @@ def plot(
     x: Axis, *rows: tuple[Axis, Iterable[PlotlyTrace]], heights: Sequence[float] = (1.0,), title: str = "",
     size: int = 320, legend: bool = True, unified_hover: bool = False,
 ) -> Plot:  # fmt: skip
-    """Rows of traces above each other over one x axis.
+    """Return rows of traces above each other over one x axis.
 
     Args:
         rows: each one's y axis and traces, from the top.
@@ -199,12 +199,12 @@ def chart(*plots: Plot, controls: Sequence[dict[str, Any]] = ()) -> Chart:
 
 
 def visibility_button(label: str, plots: Sequence[Plot], name: str) -> dict[str, Any]:
-    """A button that shows and hides the traces called `name`."""
+    """Return a button that shows and hides the traces called `name`."""
     return {"label": label, "pressed": True, "updates": [_visibility_update(p, name) for p in plots]}
 
 
 def log_axis_button(plots: Sequence[Plot], axes: str = "x", label: str = "logarithmic axis") -> dict[str, Any]:
-    """A button between logarithmic and linear axes; `axes`: "x", "y" or "xy". All plots begin alike."""
+    """Return a button between logarithmic and linear axes; `axes`: "x", "y" or "xy". All plots begin alike."""
     states = {kind: [_axis_type_update(p, axes, kind) for p in plots] for kind in ("log", "linear")}
     updates = [{"on": on, "off": off} for on, off in zip(states["log"], states["linear"], strict=True)]
     pressed = plots[0]["layout"][f"{axes[0]}axis"]["type"] == "log"

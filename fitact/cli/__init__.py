@@ -1,4 +1,4 @@
-"""The command line: parses, calls, prints. Heavy imports wait until a command needs them."""
+"""Command line. Heavy imports are deferred until a command needs them."""
 
 import os
 import signal
@@ -16,16 +16,16 @@ from fitact.errors import InputError
 
 
 def main() -> None:
-    """Entry point: every error becomes one line and an exit code."""
+    """Run the command line; report every error in one line and by the exit status."""
     sys.unraisablehook = _resend_interrupt
     raise SystemExit(_run_command(lambda: app(standalone_mode=False)))
 
 
 def _resend_interrupt(unraisable: "sys.UnraisableHookArgs") -> None:
-    """A Ctrl-C that came where Python drops what is raised, as in a weak reference's callback, comes again."""
+    """Repeat a Ctrl-C that arrived where Python discards exceptions, e.g. in the callback of a weak reference."""
     if issubclass(unraisable.exc_type, KeyboardInterrupt):
         main = threading.main_thread().ident or 0
-        # 0.01 s later, to be out of the place where it was dropped
+        # 0.01 s later, when Python has left the place that discarded it
         threading.Timer(0.01, signal.pthread_kill, (main, signal.SIGINT)).start()
     else:
         sys.__unraisablehook__(unraisable)
@@ -38,11 +38,11 @@ def _run_command(command: Callable[[], Any]) -> int:
     except InputError as error:
         print_stderr(f"fitact: {error}")
         return 2
-    except typer.exceptions.TyperException as error:  # a wrong option or argument; it knows how to show itself
+    except typer.exceptions.TyperException as error:  # a wrong option or argument
         error.show()  # type: ignore[attr-defined]
         return 2
     except (KeyboardInterrupt, typer.Abort):
-        print_stderr("fitact: interrupted; the same command goes on from the last checkpoint")
+        print_stderr("fitact: interrupted; run the same command again to resume from the last checkpoint")
         return 130
     except BrokenPipeError:
         return 0

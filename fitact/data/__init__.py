@@ -1,4 +1,4 @@
-"""What was recorded?
+"""Measured data.
 
-Takes files and arrays; gives checked `Record`s and `Spectrum`s, with sentences on what looks wrong.
+Reads files and arrays into checked `Record`s and `Spectrum`s, with warnings on possible errors.
 """

@@ -104,7 +104,7 @@ class Record:
         return digest.hexdigest()
 
     def noise(self, channel: str) -> float:
-        """Standard deviation of the channel's noise, judged without a model: white noise and rounding."""
+        """Return standard deviation of the channel's noise, judged without a model: white noise and rounding."""
         if ("noise", channel) not in self._known:
             values = self[channel] if channel == "V" else self[channel][~clipping_mask(self[channel])]
             self._known["noise", channel] = math.hypot(white_noise_sd(values), rounding_noise_sd(values))
@@ -116,7 +116,7 @@ class Record:
         return "V" if "V" in self else "Vsc"
 
     def frequency(self, channel: str | None = None) -> float | None:
-        """Fundamental frequency in Hz of a channel (of V, else Vsc); None unless the record shows 1.5 periods."""
+        """Return fundamental frequency in Hz of a channel (of V, else Vsc); None unless the record shows 1.5 periods."""
         channel = channel or self.leading
         if ("frequency", channel) not in self._known:
             self._known["frequency", channel] = fundamental_frequency(self.time, self[channel])
@@ -129,7 +129,7 @@ class Record:
 
 
 def is_uniform(time: Float[np.ndarray, " samples"], tolerance: float = 1e-2, block: int = 65_536) -> bool:
-    """Whether every sample lies on an even grid, to `tolerance` of a step; `block` samples are looked at at a time."""
+    """Return whether every sample lies on an even grid, to `tolerance` of a step; `block` samples are looked at at a time."""
     step = (time[-1] - time[0]) / (time.size - 1)
     for first in range(0, time.size, block):
         part = time[first : first + block]
@@ -140,7 +140,7 @@ def is_uniform(time: Float[np.ndarray, " samples"], tolerance: float = 1e-2, blo
 
 
 def grid_notes(time: Float[np.ndarray, " samples"], source: str) -> tuple[str, ...]:
-    """A sentence where the time steps are not uniform."""
+    """Return a sentence where the time steps are not uniform."""
     if is_uniform(time):
         return ()
     steps = np.diff(time)
@@ -151,19 +151,19 @@ def grid_notes(time: Float[np.ndarray, " samples"], source: str) -> tuple[str, .
 
 
 def white_noise_sd(values: Float[np.ndarray, " samples"]) -> float:
-    """Standard deviation of white noise under a smooth signal, by the median of third differences, without edges."""
+    """Return standard deviation of white noise under a smooth signal, by the median of third differences, without edges."""
     return float(white_noise_sds(values))
 
 
 def white_noise_sds(values: Float[np.ndarray, "*records samples"]) -> Float[np.ndarray, "*records"]:
-    """The same for each record; from differences in single precision, whose median takes half the time."""
+    """Return the same for each record; from differences in single precision, whose median takes half the time."""
     third = np.diff(np.diff(values).astype(np.float32), 2)
     np.abs(third, out=third)
     return row_medians(third).astype(float) / 0.6744897501960817 / math.sqrt(20.0)
 
 
 def row_medians(values: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*rows"]:
-    """The median of each row, which is left in another order; NumPy's own takes eight times as long."""
+    """Return the median of each row, which is left in another order; NumPy's own takes eight times as long."""
     half = values.shape[-1] // 2
     if not values.shape[-1]:
         return np.full(values.shape[:-1], np.nan)
@@ -173,7 +173,7 @@ def row_medians(values: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*row
 
 
 def rounding_noise_sd(values: Float[np.ndarray, " samples"], min_levels: int = 12, some: int = 65_536) -> float:
-    """Standard deviation that the resolution of the samples alone brings about, where white noise does not hide it.
+    """Return standard deviation that the resolution of the samples alone brings about, where white noise does not hide it.
 
     Fewer levels than `min_levels` are an ideal wave's, not a converter's. Mostly the first `some` samples tell.
     """
@@ -194,7 +194,7 @@ def fundamental_frequency(
     peak_tolerance: float = 0.02,
     lag_tolerance: int = 4,
 ) -> float | None:
-    """Frequency (Hz) at which the signal repeats, from its correlation with itself, or None.
+    """Return frequency (Hz) at which the signal repeats, from its correlation with itself, or None.
 
     Args:
         min_correlation: of a signal that counts as repeating.
@@ -227,12 +227,12 @@ def fundamental_frequency(
 
 
 def resample_uniform(time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """The values on an even grid of as many times from the first to the last."""
+    """Return the values on an even grid of as many times from the first to the last."""
     return np.interp(np.linspace(time[0], time[-1], time.size), time, values)
 
 
 def _autocorrelation(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Correlation coefficient of x[:n - lag] and x[lag:] for each lag; 1 at a period, however few there are."""
+    """Return correlation coefficient of x[:n - lag] and x[lag:] for each lag; 1 at a period, however few there are."""
     x = x - x.mean()
     count = x.size
     power = np.abs(np.fft.rfft(x, 2 * count))
@@ -251,7 +251,7 @@ def _autocorrelation(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
 
 
 def _run_around(mask: np.ndarray, index: int) -> tuple[int, int]:
-    """The run of true values around `index`: its start and the first place after it."""
+    """Return the run of true values around `index`: its start and the first place after it."""
     outside = np.flatnonzero(~mask)
     place = int(np.searchsorted(outside, index))
     start = int(outside[place - 1]) + 1 if place > 0 else 0
@@ -278,7 +278,7 @@ def _aligned_copy(values: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " 
 
 
 def _share_times(time: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    """The times, or the same ones of a record that is still there."""
+    """Return the times, or the same ones of a record that is still there."""
     known = _SHARED_TIMES.setdefault((time.size, time[0], time[-1]), time)
     same = np.array_equal(known.view(np.int64), time.view(np.int64))  # to the last bit, as of a fingerprint
     return known if same else time

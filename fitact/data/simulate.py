@@ -11,7 +11,7 @@ from fitact.scene.scene import Scene
 
 
 def simulate(scene: Scene, seed: int = 0) -> Record:
-    """V, and the channels that the scene measures with its noise, at its sampling rate and for its duration."""
+    """Return V, and the channels that the scene measures with its noise, at its sampling rate and for its duration."""
     circuit, drive, measured, time = scene.make_circuit(), scene.make_drive(), scene.measurement, sample_times(scene)
     rng = np.random.default_rng(seed)
     with jax.enable_x64(True):

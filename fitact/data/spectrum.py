@@ -85,7 +85,7 @@ class Spectrum:
         return self.frequency.size
 
     def to_dict(self) -> dict[str, Any]:
-        """The JSON of `fitact inspect`; Hz and ohm."""
+        """Return the JSON of `fitact inspect`; Hz and ohm."""
         size = np.abs(self.impedance)
         return {
             "source": self.source,
@@ -116,7 +116,7 @@ class _Columns(NamedTuple):
 
 
 def is_spectrum(path: str | os.PathLike[str]) -> bool:
-    """Whether a file's header names a frequency and an impedance."""
+    """Return whether a file's header names a frequency and an impedance."""
     try:
         return next(_find_headers(_read_lines(path, 16_384)), None) is not None  # bytes that hold any header
     except OSError:

@@ -1,4 +1,4 @@
-"""What should be measured, and how should the display be driven?
+"""Design of measurements and of drives.
 
-Takes a scene, with records or without; gives measurements and drives, ranked by what they achieve.
+Ranks changes to the measurement, and drive waveforms, for a scene with or without records.
 """

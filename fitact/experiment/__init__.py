@@ -1,5 +1,5 @@
-"""What could a measurement tell, before there is data?
+"""Expected information of a measurement, before there are data.
 
-Takes a circuit, a drive and channels with their noise; gives the Fisher information, the directions that it lacks, and
-the changes to the measurement that would add them.
+Computes the Fisher information from a circuit, a drive and channels with their noise; finds the directions that are
+not identified, and the changes to the measurement that would identify them.
 """

@@ -1,5 +1,5 @@
-"""Which parameters fit best, and may one trust them?
+"""Least-squares fits, and whether they are reliable.
 
-Takes records or a spectrum and a scene; gives a `Fit`: the optimum, its covariance, tests of the residuals and a
+Fits records or a spectrum to a scene and returns a `Fit` with the optimum, its covariance, residual tests and a
 verdict.
 """

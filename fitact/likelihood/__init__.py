@@ -1,5 +1,5 @@
-"""How probable is a record at given parameters?
+"""Likelihood of records at given parameters.
 
-Takes records, a circuit and a prior; gives the log-likelihood, summed over the samples or compressed to a few numbers
-with a bound on the error.
+Computes the log-likelihood from records, a circuit and a prior, summed over the samples or compressed to a few
+numbers with a verified error.
 """

@@ -37,7 +37,7 @@ class CertifiedLikelihood(NamedTuple):
 def compress_channel(
     channel: ChannelLikelihood, circuit: Circuit, tau_identified: bool, tolerance: float
 ) -> tuple[ChannelLikelihood, str]:
-    """The channel with its record's compression, or as it is and the reason why.
+    """Return the channel with its record's compression, or as it is and the reason why.
 
     `circuit` nearly made it, and `tau_identified` says whether the record shows it.
     """
@@ -93,7 +93,7 @@ def certify(
     tolerance: float,
     check_points: int = 8,
 ) -> CertifiedLikelihood:
-    """The likelihood for sampling around the optimum `theta`, checked against the full sum.
+    """Return the likelihood for sampling around the optimum `theta`, checked against the full sum.
 
     `covariance_factor` is the root of theta's covariance. Each channel's compressed log-likelihood must agree to
     `tolerance` over their number at the optimum and `check_points` around it, and at as many points of the prior to a
@@ -133,17 +133,17 @@ def certify(
 def table_half_width(
     log_b_sd: ArrayLike, standard_deviations: float = 20.0, least: float = 0.05
 ) -> Float[np.ndarray, "*shape"]:
-    """The width of a table for sampling on either side of the optimum, in log b."""
+    """Return the width of a table for sampling on either side of the optimum, in log b."""
     return np.maximum(standard_deviations * np.asarray(log_b_sd), least)
 
 
 def table_precision(noise: ArrayLike, tolerance: float = TOLERANCE) -> Float[np.ndarray, "*shape"]:
-    """The error that a table for sampling may have, V or A (root of the sum of squares), under a noise, V or A."""
+    """Return the error that a table for sampling may have, V or A (root of the sum of squares), under a noise, V or A."""
     return 0.1 * tolerance * np.asarray(noise)
 
 
 def _compression_failure(error: float, excess: float, tolerance: float) -> str:
-    """The case against the compression of a channel, by errors near the optimum and within the prior; "" if none."""
+    """Return the case against the compression of a channel, by errors near the optimum and within the prior; "" if none."""
     if np.isnan(error):
         return "the record leaves its time constant more open than the table is wide"
     if not error <= tolerance:
@@ -152,7 +152,7 @@ def _compression_failure(error: float, excess: float, tolerance: float) -> str:
 
 
 def _prior_points(likelihood: Likelihood, theta: np.ndarray, count: int) -> Float[np.ndarray, "n parameters"]:
-    """Points of the prior that the tables reach, the optimum where there are too few."""
+    """Return points of the prior that the tables reach, the optimum where there are too few."""
     draws = likelihood.sample_prior(theta, 1000)
     tau = jnp.exp(_log_b_at_points(likelihood, jnp.asarray(draws)))
     covered = [channel.compression.covers(tau) for channel in likelihood.channels if channel.compression is not None]
@@ -162,14 +162,14 @@ def _prior_points(likelihood: Likelihood, theta: np.ndarray, count: int) -> Floa
 def _evaluate_log_likelihoods(
     likelihood: Likelihood, theta: Float[np.ndarray, "n parameters"], sigma: np.ndarray
 ) -> np.ndarray:
-    """Log-likelihoods of each channel at points of one sigma, (n, channels)."""
+    """Return log-likelihoods of each channel at points of one sigma, (n, channels)."""
     points = np.column_stack([theta, np.tile(np.log(sigma), (len(theta), 1))])
     evaluate = BatchEvaluator(Likelihood.log_likelihoods, likelihood, likelihood.rows)
     return evaluate(points, description="checking the compression")
 
 
 def batched_log_prob(likelihood: Likelihood, walkers: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Log-posteriors of points (theta, log sigma); where the compression does not reach, the samples are summed.
+    """Return log-posteriors of points (theta, log sigma); where the compression does not reach, the samples are summed.
 
     Fastest for all `walkers` of an ensemble at once, or half of them.
     """
@@ -209,7 +209,7 @@ def _restrict_table(
 
 
 def _log_b(likelihood: Likelihood, theta: Array) -> Array:
-    """Logarithm of the slowest time constant, s."""
+    """Return logarithm of the slowest time constant, s."""
     return jnp.log(likelihood.circuit(theta).b)
 
 

@@ -72,7 +72,7 @@ class ChannelLikelihood(eqx.Module):
     columns: tuple[int, ...] = eqx.field(static=True)
 
     def qualified_name(self, name: str) -> str:
-        """A nuisance's name, with the channel's label where there are several channels."""
+        """Return a nuisance's name, with the channel's label where there are several channels."""
         return f"{name}_{self.label}" if self.label else name
 
     def timing_unit(self, name: str) -> ArrayLike:
@@ -125,7 +125,7 @@ class ChannelLikelihood(eqx.Module):
         return dataclasses.replace(self, time=ends, observed=extremes, drive=drive, weight=None, rate=None)
 
     def signal(self, inputs: ChannelInputs, extra_delay: ArrayLike = 0.0) -> Float[Array, " samples"]:
-        """The channel as recorded, but for linear nuisances and noise; `extra_delay` (s) delays it further."""
+        """Return the channel as recorded, but for linear nuisances and noise; `extra_delay` (s) delays it further."""
         undelayed = not self.timing and isinstance(extra_delay, float) and extra_delay == 0.0
         if undelayed and isinstance(self.drive, Sampled) and self.drive.period is None:
             time = self.drive.time  # V's samples, which are the channel's: `highpass` knows u there without a search
@@ -140,12 +140,12 @@ class ChannelLikelihood(eqx.Module):
         return inputs.gain * total
 
     def shapes(self, inputs: ChannelInputs) -> Float[Array, "10 samples"]:
-        """The linear nuisances' shapes in time, each of height 1."""
+        """Return the linear nuisances' shapes in time, each of height 1."""
         middle, half = 0.5 * (self.time[0] + self.time[-1]), 0.5 * (self.time[-1] - self.time[0])
         return jnp.concatenate([baseline_functions(self.time, middle, half), self.decays(inputs.circuit, self.time)])
 
     def decays(self, circuit: Circuit, time: Float[Array, " times"]) -> Float[Array, "4 times"]:
-        """How unknown charges at the first sample decay; 0 beyond the time constants of constant skins."""
+        """Return how unknown charges at the first sample decay; 0 beyond the time constants of constant skins."""
         if isinstance(circuit, WithSkin):
             return jnp.zeros((len(CHARGES), time.size))
         since, taus = time - self.time[0], circuit.terms().tau
@@ -157,7 +157,7 @@ class ChannelLikelihood(eqx.Module):
         return np.array(self.columns, dtype=int)
 
     def residuals_and_shapes(self, inputs: ChannelInputs) -> tuple[Float[Array, " rows"], Float[Array, "columns rows"]]:
-        """The channel less the signal, and the shapes of the `columns`, weighted, over samples or coordinates."""
+        """Return the channel less the signal, and the shapes of the `columns`, weighted, over samples or coordinates."""
         if self.compression is None:
             remainder, shapes = self.observed - self.signal(inputs), self.shapes(inputs)[self._column_indices]
             return self.apply_whitening(remainder), self.apply_whitening(shapes)
@@ -176,12 +176,12 @@ class ChannelLikelihood(eqx.Module):
         return jnp.mean(values, where=None if self.weight is None else self.weight > 0.0)
 
     def delay_derivative(self, inputs: ChannelInputs) -> Float[Array, " samples"]:
-        """How a further delay changes the signal, per s: over two time steps, so that ideal edges count."""
+        """Return how a further delay changes the signal, per s: over two time steps, so that ideal edges count."""
         step = self.time_step
         return (self.signal(inputs, step) - self.signal(inputs, -step)) / (2.0 * step)
 
     def whitened_delay_derivative(self, inputs: ChannelInputs) -> Float[Array, " rows"]:
-        """The same weighted, over samples or coordinates."""
+        """Return the same weighted, over samples or coordinates."""
         if self.compression is None:
             return self.apply_whitening(self.delay_derivative(inputs))
         return inputs.gain * self.compression.delay_derivative(inputs.circuit.channel_terms(self.channel))
@@ -207,7 +207,7 @@ class ChannelLikelihood(eqx.Module):
     def _fit_nuisances_student(
         self, residuals: Array, A: Array, beta: Array, sigma: ArrayLike, steps: int = 12
     ) -> tuple[Float[Array, " rows"], Float[Array, " columns"], Float[Array, "columns columns"]]:
-        """`fit_nuisances` under Student's t, from the Gaussian's `beta`; in Laplace's approximation.
+        """Return `fit_nuisances` under Student's t, from the Gaussian's `beta`; in Laplace's approximation.
 
         Each of the `steps` of reweighting gains half a digit.
         """
@@ -225,7 +225,7 @@ class ChannelLikelihood(eqx.Module):
     def sample_nuisances(
         self, inputs: ChannelInputs, sigma: ArrayLike, deviate: ArrayLike = 0.0
     ) -> Float[Array, " 10"]:
-        """The nuisances' coefficients, in prior standard deviations, as ten standard normal numbers draw them.
+        """Return the nuisances' coefficients, in prior standard deviations, as ten standard normal numbers draw them.
 
         With a `deviate` of 0, their posterior mean.
         """
@@ -234,7 +234,7 @@ class ChannelLikelihood(eqx.Module):
         return jnp.zeros(len(LINEAR_NUISANCES)).at[self._column_indices].set(beta + solve_triangular(factor.T, deviate))
 
     def residuals(self, inputs: ChannelInputs, sigma: ArrayLike) -> Float[Array, " rows+columns"]:
-        """Whitened residuals, nuisances' priors included: half their square is -log-likelihood."""
+        """Return whitened residuals, nuisances' priors included: half their square is -log-likelihood."""
         remainder, beta, _ = self.fit_nuisances(inputs, sigma)
         whitened = remainder / sigma
         return jnp.concatenate([student_residual(whitened) if self.noise == "student" else whitened, beta])

@@ -60,11 +60,11 @@ class Compression(eqx.Module):
     samples: Float[Array, ""]  # how many there are
 
     def covers(self, tau: Array) -> Array:
-        """Whether the table reaches the time constant (s)."""
+        """Return whether the table reaches the time constant (s)."""
         return jnp.abs(jnp.log(tau) - self.center) <= self.half_width
 
     def response(self, terms: HighpassTerms) -> Float[Array, " rows"]:
-        """The response of a circuit, as `fitact.response` gives it in time."""
+        """Return the response of a circuit, as `fitact.response` gives it in time."""
         total = sum(
             weight * (self.signal @ self._series(tau)) for weight, tau in zip(terms.weight, terms.tau, strict=True)
         )
@@ -72,12 +72,12 @@ class Compression(eqx.Module):
         return total if terms.rate is None else total + terms.rate * self.rate
 
     def delay_derivative(self, terms: HighpassTerms) -> Float[Array, " rows"]:
-        """How a delay changes it, per s: u' = V' - u / tau."""
+        """Return how a delay changes it, per s: u' = V' - u / tau."""
         falling = HighpassTerms(tuple(w / t for w, t in zip(terms.weight, terms.tau, strict=True)), terms.tau)
         return self.response(falling) - sum(terms.weight) * self.slope
 
     def decays(self, tau: Array) -> Float[Array, " rows"]:
-        """e^{-(t - t0) / tau} from the first sample on."""
+        """Return e^{-(t - t0) / tau} from the first sample on."""
         return self.decay @ self._series(tau)
 
     def _series(self, tau: Array) -> Float[Array, " terms"]:
@@ -91,7 +91,7 @@ class Compression(eqx.Module):
         return lax.scan(step, (jnp.ones_like(x), x), None, length=terms, unroll=terms <= NODES // 2)[1]
 
     def restrict(self, center: float, half_width: float, precision: float, charge: float) -> "Compression":
-        """The same for log tau within `half_width` of `center` only, with fewer terms and rows.
+        """Return the same for log tau within `half_width` of `center` only, with fewer terms and rows.
 
         Left-out terms change no response to the drive, and no decay of a `charge` (V), by more than `precision`
         (V, root of the sum of squares); with no charge its decay is left out altogether.
@@ -115,7 +115,7 @@ class Compression(eqx.Module):
 
 
 def _baseline_and_record(rows: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The last of the columns, in the order of a `Compression`."""
+    """Return the last of the columns, in the order of a `Compression`."""
     return rows[:, _BASELINE].T, rows[:, _RATE], rows[:, _SLOPE], rows[:, _OBSERVED]
 
 
@@ -184,7 +184,7 @@ class _ResponseTable(eqx.Module):
 
 @functools.cache
 def _exponentials() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nodes of any table over its middle, their combinations that matter, and the series that give back a response."""
+    """Return nodes of any table over its middle, their combinations that matter, and the series that give back a response."""
     x, to_series = chebyshev(NODES)
     relative = np.exp(TABLE_HALF_WIDTH * x)
     ages = np.concatenate([[0.0], np.geomspace(1e-3 * relative.min(), 40.0 * relative.max(), 400)])
@@ -194,7 +194,7 @@ def _exponentials() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def baseline_functions(time: Float[Array, " n"], middle: Array, half: Array) -> Float[Array, "6 n"]:
-    """The shapes of `BASELINE_NAMES` in time: 1, a line from -1 to 1 over the record, and hum."""
+    """Return the shapes of `BASELINE_NAMES` in time: 1, a line from -1 to 1 over the record, and hum."""
     since = time - middle
     turns = 2.0 * np.pi * since
     waves = [wave(frequency * turns) for frequency in (50.0, 60.0) for wave in (jnp.cos, jnp.sin)]
@@ -202,7 +202,7 @@ def baseline_functions(time: Float[Array, " n"], middle: Array, half: Array) -> 
 
 
 def evaluate_baseline(time: np.ndarray, middle: ArrayLike, half: ArrayLike) -> Float[np.ndarray, "6 n"]:
-    """The same at however many times, for which nothing is compiled anew."""
+    """Return the same at however many times, for which nothing is compiled anew."""
     return np.asarray(_baseline_functions(pad_samples(time), middle, half))[:, : time.size]
 
 
@@ -227,7 +227,7 @@ def _chunks(samples: _Samples, length: int) -> Iterator[_Samples]:
 
 
 def _chunk_length(samples: int, longest: int = 8_192) -> int:
-    """How many samples are looked at at a time, which bounds memory."""
+    """Return how many samples are looked at at a time, which bounds memory."""
     return min(longest, 1 << (samples - 1).bit_length())
 
 
@@ -244,7 +244,7 @@ def _accumulate_directly(
 def _chunk_products(
     table: _ResponseTable, drive: Drive, chunk: _Samples, baseline: Array | None, steady_state: bool
 ) -> Array:
-    """Inner products where the response to the drive can be computed at any time."""
+    """Return inner products where the response to the drive can be computed at any time."""
     time = chunk.time
 
     def respond(tau: Array) -> Array:
@@ -301,7 +301,7 @@ def _accumulate_folded(table: _ResponseTable, drive: Drive, samples: _Samples, p
 def _samples_per_period(
     drive: Drive, time: np.ndarray, max_samples: int = 65_536, tolerance: float = 1e-9
 ) -> int | None:
-    """The samples after which drive and grid meet again, to `tolerance` of a step, if it is worth folding a record."""
+    """Return the samples after which drive and grid meet again, to `tolerance` of a step, if it is worth folding a record."""
     if not isinstance(drive, Periodic) or not _is_exactly_uniform(time):
         return None
     advance = (time[-1] - time[0]) / (time.size - 1) * float(drive.frequency)  # cycles a sample
@@ -312,7 +312,7 @@ def _samples_per_period(
 
 
 def _is_exactly_uniform(time: np.ndarray, tolerance: float = 1e-9) -> bool:
-    """Whether the samples lie on a grid, to `tolerance` of a step but for rounding."""
+    """Return whether the samples lie on a grid, to `tolerance` of a step but for rounding."""
     step = (time[-1] - time[0]) / (time.size - 1)
     rounding = 4.0 * np.finfo(float).eps * max(abs(time[0]), abs(time[-1]))
     return is_uniform(time, tolerance + rounding / step)
@@ -341,7 +341,7 @@ def _advance_chunk(
     first: Array,
     x: Array | None,
 ) -> tuple[Array, tuple[Array, Array, Array]]:
-    """Inner products along a chunk, and the response, time and drive at its end; `x`: even steps over the nodes."""
+    """Return inner products along a chunk, and the response, time and drive at its end; `x`: even steps over the nodes."""
     time, (u, since, before) = chunk.time, last
     step, rise = jnp.diff(time, prepend=since), jnp.diff(voltage, prepend=before)
     if x is None:
@@ -360,7 +360,7 @@ def _advance_chunk(
 def _uniform_recurrence(
     rise: Float[Array, " n"], u: Float[Array, " nodes"], x: Float[Array, " nodes"], block: int = 64
 ) -> Float[Array, "nodes n"]:
-    """u[k] = e^{-x} u[k - 1] + phi(x) rise[k]: `recurrence` for one step size, in blocks."""
+    """Return u[k] = e^{-x} u[k - 1] + phi(x) rise[k]: `recurrence` for one step size, in blocks."""
     width = math.gcd(rise.size, block)
     decay, gain = jnp.exp(-x)[:, None], phi(x)[:, None]
     blocks = rise.reshape(-1, width)
@@ -379,7 +379,7 @@ def _uniform_recurrence(
 
 
 def _assemble(table: _ResponseTable, total: np.ndarray, decays: bool, samples: int) -> Compression:
-    """Coordinates in which inner products are those that were added up."""
+    """Return coordinates in which inner products are those that were added up."""
     size, rank = len(total), table.series.shape[0]
     scale = np.sqrt(np.diagonal(total))
     scale[scale == 0.0] = 1.0
@@ -396,12 +396,12 @@ def _assemble(table: _ResponseTable, total: np.ndarray, decays: bool, samples: i
 
 
 def round_up_column_count(count: SupportsFloat, maximum: int) -> int:
-    """Columns to keep where `count` of `maximum` matter; in fours, so that most records share what is compiled."""
+    """Return columns to keep where `count` of `maximum` matter; in fours, so that most records share what is compiled."""
     return min(4 * max(1, math.ceil(float(count) / 4)), maximum)
 
 
 def chebyshev(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The nodes in [-1, 1], and the matrix from values there to a series' coefficients (terms, nodes)."""
+    """Return the nodes in [-1, 1], and the matrix from values there to a series' coefficients (terms, nodes)."""
     angle = np.pi * (np.arange(count) + 0.5) / count
     matrix = 2.0 / count * np.cos(np.arange(count)[:, None] * angle)
     matrix[0] *= 0.5

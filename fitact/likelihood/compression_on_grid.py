@@ -37,12 +37,12 @@ class GridCompression(eqx.Module):
         return jnp.ones_like(tau, dtype=bool)
 
     def response(self, terms: HighpassTerms) -> Float[Array, " rows"]:
-        """The response of a circuit, as `fitact.response` gives it in time."""
+        """Return the response of a circuit, as `fitact.response` gives it in time."""
         total = jnp.asarray(terms.weight) @ self.signal
         return total if terms.rate is None else total + terms.rate * self.rate
 
     def delay_derivative(self, terms: HighpassTerms) -> Float[Array, " rows"]:
-        """How a delay changes it, per s."""
+        """Return how a delay changes it, per s."""
         return jnp.asarray(terms.weight) @ self.delay_slopes
 
     def decays(self, tau: Array) -> Float[Array, " rows"]:

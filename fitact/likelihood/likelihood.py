@@ -106,7 +106,7 @@ class Likelihood(eqx.Module):
         return dataclasses.replace(self, channels=(*self.channels[:index], channel, *self.channels[index + 1 :]))
 
     def circuit(self, theta: Float[Array, " circuit_parameters"]) -> Circuit:
-        """The circuit at theta; NaN where no double could hold what follows from it, so that no step leads there."""
+        """Return the circuit at theta; NaN where no double could hold what follows from it, so that no step leads there."""
         # beyond 1e30 or below 1e-30 SI units is no finger, and products overflow
         theta = jnp.where(jnp.abs(theta) < 70.0, theta, jnp.nan)
         known = circuit_parameters(self.template)
@@ -135,12 +135,12 @@ class Likelihood(eqx.Module):
     def residuals(
         self, theta: Float[Array, " circuit_parameters"], sigma: Float[Array, " channels"]
     ) -> tuple[Float[Array, " rows"], ...]:
-        """Whitened residuals of each channel, nuisances' priors included: half their square is -log-likelihood."""
+        """Return whitened residuals of each channel, nuisances' priors included: half their square is -log-likelihood."""
         parts = zip(self.channels_and_inputs(theta), sigma, strict=True)
         return tuple(channel.residuals(inputs, s) for (channel, inputs), s in parts)
 
     def prior_residuals(self, theta: Float[Array, " circuit_parameters"]) -> Float[Array, " circuit_parameters"]:
-        """The prior as residuals: normal in theta, with the moments of the stated prior; 0 for what has none."""
+        """Return the prior as residuals: normal in theta, with the moments of the stated prior; 0 for what has none."""
         size = len(self.prior.names)
         scaled = self.prior.residuals(theta[:size])
         if self._timing:
@@ -153,17 +153,17 @@ class Likelihood(eqx.Module):
         return point[: -len(self.channels)], point[-len(self.channels) :]
 
     def log_likelihoods(self, point: Float[Array, " coordinates"]) -> Float[Array, " channels"]:
-        """Log-likelihood of each channel at (theta, log sigma), up to a constant; NaN where its compression ends."""
+        """Return log-likelihood of each channel at (theta, log sigma), up to a constant; NaN where its compression ends."""
         theta, log_sigma = self.split(point)
         parts = zip(self.channels_and_inputs(theta), log_sigma, strict=True)
         return jnp.stack([channel.log_likelihood(inputs, log) for (channel, inputs), log in parts])
 
     def log_likelihood(self, point: Float[Array, " coordinates"]) -> Float[Array, ""]:
-        """Log-likelihood of (theta, log sigma), up to a constant; NaN where a compression does not reach."""
+        """Return log-likelihood of (theta, log sigma), up to a constant; NaN where a compression does not reach."""
         return jnp.sum(self.log_likelihoods(point))
 
     def log_prior(self, point: Float[Array, " coordinates"]) -> Float[Array, ""]:
-        """Log-density of the prior, up to a constant: a noise is flat in its logarithm unless it has one."""
+        """Return log-density of the prior, up to a constant: a noise is flat in its logarithm unless it has one."""
         theta, log_sigma = self.split(point)
         size = len(self.prior.names)
         value = self.prior.log_density(theta[:size])
@@ -174,7 +174,7 @@ class Likelihood(eqx.Module):
         return value
 
     def log_prob(self, point: Float[Array, " coordinates"]) -> Float[Array, ""]:
-        """Log-posterior of (theta, log sigma), up to a constant.
+        """Return log-posterior of (theta, log sigma), up to a constant.
 
         Anything that is not finite counts as impossible, but it is NaN where a compression does not reach.
         """
@@ -187,14 +187,14 @@ class Likelihood(eqx.Module):
     def sample_prior(
         self, theta: Float[np.ndarray, " circuit_parameters"], count: int
     ) -> Float[np.ndarray, "count parameters"]:
-        """Points of the prior, always the same; delays and clocks are those of `theta`."""
+        """Return points of the prior, always the same; delays and clocks are those of `theta`."""
         points = np.tile(theta, (count, 1))
         draws = self.prior.sample(np.random.default_rng(0), count)
         points[:, : len(draws)] = np.log(list(draws.values())).T
         return points
 
     def to_physical(self, theta: Float[np.ndarray, "*shape parameters"]) -> dict[str, Float[np.ndarray, "*shape"]]:
-        """Points in SI units, by name; delays and clocks are those of the channel against the drive, in all."""
+        """Return points in SI units, by name; delays and clocks are those of the channel against the drive, in all."""
         values = {name: np.exp(theta[..., i]) for i, name in enumerate(self.prior.names)}
         for i, (name, (base, unit)) in enumerate(self.timing.items(), len(values)):
             values[name] = base + theta[..., i] * unit

@@ -18,7 +18,7 @@ STUDENT_DOF = 4.0  # of Student's t: Lange, Little, Taylor, J. Am. Stat. Assoc. 
 
 
 def student_residual(z: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Half its square is -log density of Student's t at z, up to a constant; smooth, and near 0 a multiple of z."""
+    """Return half its square is -log density of Student's t at z, up to a constant; smooth, and near 0 a multiple of z."""
     u = jnp.square(z) / STUDENT_DOF
     small = u < 1e-6  # where log(1 + u) / u is 1 - u / 2 in double precision
     ratio = jnp.where(small, 1.0 - 0.5 * u, jnp.log1p(u) / jnp.where(small, 1.0, u))
@@ -31,12 +31,12 @@ def student_weight(z: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 
 def student_curvature(z: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Second derivative of -log density."""
+    """Return second derivative of -log density."""
     return (STUDENT_DOF + 1.0) * (STUDENT_DOF - jnp.square(z)) / jnp.square(STUDENT_DOF + jnp.square(z))
 
 
 def scale_information(model: NoiseModel) -> float:
-    """Fisher's information on log `sigma` in one sample."""
+    """Return Fisher's information on log `sigma` in one sample."""
     return 2.0 * STUDENT_DOF / (STUDENT_DOF + 3.0) if model == "student" else 2.0
 
 
@@ -47,7 +47,7 @@ class Whitening(eqx.Module):
     mask: Float[Array, " samples"]  # 1 where a sample and all before it that the filter reaches count, else 0
 
     def __call__(self, values: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
-        """The values filtered, and 0 where `mask` is."""
+        """Return the values filtered, and 0 where `mask` is."""
         reach, size = self.taps.size - 1, values.shape[-1]
         padded = jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(reach, 0)])
         parts = [self.taps[lag] * padded[..., reach - lag : reach - lag + size] for lag in range(reach + 1)]
@@ -57,7 +57,7 @@ class Whitening(eqx.Module):
 def draw_noise(
     rng: np.random.Generator, model: NoiseModel, whitening: Whitening | None, shape: tuple[int, ...], stride: int = 1
 ) -> Float[np.ndarray, "*draws samples"]:
-    """Noise of a `sigma` of 1, of every `stride`-th sample of a record."""
+    """Return noise of a `sigma` of 1, of every `stride`-th sample of a record."""
     if model == "student":
         return rng.standard_t(STUDENT_DOF, shape)
     if whitening is None:
@@ -76,7 +76,7 @@ class Autoregression(NamedTuple):
     innovation_ratio: float  # standard deviation of the innovation over that of x
 
     def whitening(self, mask: Bool[np.ndarray, " samples"]) -> Whitening:
-        """The filter, for a record of which those samples are `mask`."""
+        """Return the filter, for a record of which those samples are `mask`."""
         kept = mask.copy()
         for lag in range(1, self.coefficients.size + 1):
             kept[lag:] &= mask[:-lag]
@@ -88,7 +88,7 @@ class Autoregression(NamedTuple):
 
 
 def fit_ar_burg(values: Float[np.ndarray, " n"], max_order: int = 40) -> Autoregression:
-    """Burg's autoregression, of the order that Akaike's criterion asks for; `values` have a mean of 0.
+    """Return Burg's autoregression, of the order that Akaike's criterion asks for; `values` have a mean of 0.
 
     Kay, Modern Spectral Estimation (1988), sections 7.4 and 7.7.
     """
@@ -107,7 +107,7 @@ def fit_ar_burg(values: Float[np.ndarray, " n"], max_order: int = 40) -> Autoreg
 
 
 def fit_ar1(residuals: Float[np.ndarray, " n"], mask: Bool[np.ndarray, " n"]) -> Autoregression:
-    """The autoregression of first order, by the correlation of neighbours that both count."""
+    """Return the autoregression of first order, by the correlation of neighbours that both count."""
     before, after = (residuals[part][mask[:-1] & mask[1:]] for part in (slice(None, -1), slice(1, None)))
     both = max(0.5 * float(before @ before + after @ after), 1e-300)
     coefficient = float(before @ after) / both
@@ -121,7 +121,7 @@ def estimate_quiet_noise(
     min_samples: int = 200,
     max_drive_fraction: float = 0.1,
 ) -> tuple[Autoregression, float]:
-    """A channel's noise where the drive rests, from and to `quiet` (s): its colour and its standard deviation.
+    """Return a channel's noise where the drive rests, from and to `quiet` (s): its colour and its standard deviation.
 
     A spectrum can be told from `min_samples` on. The drive has noise of its own, and may move there by
     `max_drive_fraction` of its span.

@@ -1,4 +1,4 @@
-"""What happens on the display?
+"""Physical model of the finger on the display.
 
-Takes a circuit, a drive and times; gives voltages, currents and forces. Pure JAX functions that know no data.
+Computes voltages, currents and forces from a circuit, a drive and times, by pure JAX functions without data.
 """

@@ -1,11 +1,11 @@
-"""Chirps: a sine whose frequency sweeps, and its Taylor series on short pieces of time.
+"""Chirps, i.e. sines whose frequency sweeps, and their Taylor series on short pieces of time.
 
-The response to a chirp has no elementary closed form, but that to a polynomial has. So time is cut into
-equal pieces of at most an eighth of a cycle, on which the series is exact to rounding.
-Along a piece, the response of a first-order high-pass, u' = v' - z u, has a polynomial solution: with s from 0 to 1
-along it and z its length in time constants, u = p(s) + (u0 - p(0)) e^{-z s}. For z <= 1 the solution with p(0) = 0
-is a series that converges as that of e^{-z}; for z > 1 the one of least degree is computed from its highest
-coefficient down, and nothing cancels either way.
+The response to a chirp has no elementary closed form, but the response to a polynomial has one. The sweep is
+therefore divided into equal pieces of at most an eighth of a cycle, on which the series is exact to rounding.
+On a piece, the response of a first-order high-pass satisfies u' = v' - z u, where s runs from 0 to 1 and z is the
+length of the piece in time constants. Its solution is u = p(s) + (u0 - p(0)) e^{-z s} with a polynomial p.
+For z <= 1 the solution with p(0) = 0 is a series that converges like the series of e^{-z}. For z > 1 the solution
+of lowest degree is computed from its highest coefficient down. Neither form suffers from cancellation.
 """
 
 import math
@@ -24,22 +24,22 @@ from fitact.model.drive import Drive, is_reached
 
 
 class Chirp(Drive):
-    """A sine around `offset` whose frequency runs from one value to another from t = 0; zero before and after.
+    """Sine plus `offset` whose frequency sweeps from one value to another from t = 0; zero before and after.
 
-    Its response is exact to 1e-12 of its height and the rounding of the phase (an ulp of the number of cycles),
-    while the pieces, counted when it is made, hold no more than an eighth of a cycle. After that, frequencies
-    and duration may be traced, mapped over and differentiated.
+    The error of its response is 1e-12 of the amplitude, plus the rounding of the phase (an ulp of the number of
+    cycles), as long as no piece exceeds an eighth of a cycle. The pieces are counted at construction; afterwards
+    frequencies and duration may be traced, mapped over and differentiated.
 
     Attributes:
-        peak_to_peak: V.
-        start_frequency, end_frequency: Hz.
-        duration: of the sweep, s.
-        spacing: the frequency is linear in time, or its logarithm is.
-        offset: V.
-        phase: at t = 0, rad.
+        peak_to_peak: peak-to-peak voltage, V.
+        start_frequency, end_frequency: frequencies at start and end, Hz.
+        duration: duration of the sweep, s.
+        spacing: sweep of the frequency, linear in time or logarithmic.
+        offset: mean, V.
+        phase: phase at t = 0, rad.
 
     Raises:
-        InputError: frequencies or duration are not positive, or not yet known (traced).
+        InputError: frequencies or duration are not positive, or are traced at construction.
     """
 
     peak_to_peak: ArrayLike
@@ -55,7 +55,7 @@ class Chirp(Drive):
         stated = (self.start_frequency, self.end_frequency, self.duration)
         if any(isinstance(value, Tracer) for value in stated):
             raise InputError(
-                "Chirp: its frequencies and duration must be known numbers when it is made; make it outside jit, grad"
+                "Chirp: frequencies and duration must be concrete numbers; construct the Chirp outside jit, grad"
                 " and vmap, and pass it in"
             )
         if not all(np.ndim(value) == 0 and 0.0 < float(value) < math.inf for value in stated):
@@ -63,7 +63,7 @@ class Chirp(Drive):
         if self.spacing not in ("linear", "logarithmic"):
             raise InputError(f"Chirp: spacing = '{self.spacing}'; give 'linear' or 'logarithmic'")
         first, last, duration = (float(value) for value in stated)
-        per_cycle, most = 8, 8_000_000  # pieces of a cycle, or an e-fold of the frequency; pieces that memory holds
+        per_cycle, most = 8, 8_000_000  # pieces in a cycle or an e-fold of the frequency; pieces that fit into memory
         self.pieces = math.ceil(per_cycle * max(max(first, last) * duration, abs(math.log(last / first)), 1.0))
         if self.pieces > most:
             raise InputError(
@@ -72,18 +72,18 @@ class Chirp(Drive):
             )
 
     def is_over(self, time: ArrayLike) -> Array:
-        """Whether the sweep has ended; a time on its end to within rounding counts as the end."""
+        """Return whether the sweep has ended; a time equal to the end within rounding counts as ended."""
         return is_reached(jnp.asarray(time, dtype=float), self.duration)
 
     def frequency(self, time: ArrayLike) -> Float[Array, "*shape"]:
-        """Hz, at `time` (s) during the sweep."""
+        """Return the frequency (Hz) at `time` (s) during the sweep."""
         share = jnp.asarray(time, dtype=float) / self.duration
         if self.spacing == "linear":
             return self.start_frequency + (self.end_frequency - jnp.asarray(self.start_frequency)) * share
         return self.start_frequency * jnp.exp(self._log_ratio() * share)
 
     def cycles(self, time: ArrayLike) -> Float[Array, "*shape"]:
-        """Cycles since t = 0, at `time` (s) during the sweep, and what `phase` adds."""
+        """Return the cycles since t = 0 at `time` (s) during the sweep, including `phase`."""
         time = jnp.asarray(time, dtype=float)
         if self.spacing == "linear":
             mean = 0.5 * (self.start_frequency + self.frequency(time))
@@ -92,16 +92,16 @@ class Chirp(Drive):
         return mean * time + self.phase / (2.0 * np.pi)
 
     def value(self, time: ArrayLike) -> Float[Array, "*shape"]:
-        """V at `time`."""
+        """Return V at `time`."""
         time = jnp.asarray(time, dtype=float)
         return jnp.where((time >= 0.0) & ~self.is_over(time), self.sweep(time), 0.0)
 
     def sweep(self, time: ArrayLike) -> Float[Array, "*shape"]:
-        """V at `time`, up to the very end of the sweep (s, within it)."""
+        """Return V at `time` (s) within the sweep, its end included."""
         return self.offset + 0.5 * jnp.asarray(self.peak_to_peak) * jnp.sin(self._angle(time))
 
     def slope(self, time: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
-        """dV/dt at `time`."""
+        """Return dV/dt at `time`."""
         time = jnp.asarray(time, dtype=float)
         during = (time >= 0.0) & ~self.is_over(time)
         slope = np.pi * jnp.asarray(self.peak_to_peak) * self.frequency(time) * jnp.cos(self._angle(time))
@@ -110,14 +110,14 @@ class Chirp(Drive):
         return jnp.where(jumps, jnp.nan, jnp.where(during, slope, 0.0))
 
     def taylor_coefficients(self, degree: int = 16) -> Float[Array, "degree pieces"]:
-        """Coefficients (V) of s^1, s^2, ... on each piece, s running from 0 to 1 along it.
+        """Return the coefficients (V) of s^1, s^2, ... on each piece, with s from 0 to 1.
 
-        (pi / 4)^17 / 17! = 5e-17 of the height is left out, of the frequency (1 / 8)^9 / 9! = 2e-14.
-        With v + j w for the wave's complex amplitude, (v + j w)' = j (angular frequency) (v + j w).
+        The truncation error is (pi / 4)^17 / 17! = 5e-17 of the amplitude, and (1 / 8)^9 / 9! = 2e-14 of the frequency.
+        The complex amplitude v + j w of the wave satisfies (v + j w)' = j (angular frequency) (v + j w).
         """
         length = jnp.asarray(self.duration, dtype=float) / self.pieces
         start = length * jnp.arange(self.pieces)
-        rate = 2.0 * np.pi * length * self.frequency(start)  # rad for each s
+        rate = 2.0 * np.pi * length * self.frequency(start)  # rad per unit of s
         if self.spacing == "linear":
             bend = 2.0 * np.pi * length * (self.end_frequency - jnp.asarray(self.start_frequency)) / self.pieces
             rates = jnp.stack([rate, jnp.broadcast_to(bend, rate.shape)])
@@ -129,7 +129,7 @@ class Chirp(Drive):
         first = tuple(jnp.concatenate([x[None], none]) for x in (jnp.sin(angle), jnp.cos(angle)))
 
         def next_order(latest: tuple[Array, Array], order: Array) -> tuple[tuple[Array, Array], Array]:
-            """From the coefficients so far, the latest first."""
+            """Return the next coefficient, given the previous ones, latest first."""
             v, w = latest
             new_v, new_w = jnp.sum(rates * w, axis=0) / order, -jnp.sum(rates * v, axis=0) / order
             return (jnp.concatenate([new_v[None], v[:-1]]), jnp.concatenate([new_w[None], w[:-1]])), new_v
@@ -137,7 +137,7 @@ class Chirp(Drive):
         return half * lax.scan(next_order, first, jnp.arange(1.0, degree + 1.0))[1]
 
     def locate(self, time: ArrayLike) -> tuple[Array, Array]:
-        """The piece that `time` falls in, and how far along it lies, from 0 to 1."""
+        """Return the piece that contains `time`, and the position within it, from 0 to 1."""
         place = jnp.clip(jnp.asarray(time, dtype=float) / self.duration, 0.0, 1.0) * self.pieces
         piece = jnp.clip(lax.stop_gradient(jnp.floor(place)), 0, self.pieces - 1)
         return piece.astype(int), place - piece
@@ -150,13 +150,15 @@ class Chirp(Drive):
         return 2.0 * np.pi * (cycles - lax.stop_gradient(jnp.floor(cycles)))
 
     def _is_nonzero(self, time: ArrayLike) -> Array:
-        """Whether the wave is not zero at `time`, so that starting or ending there is a jump."""
-        rounding = 64.0 * jnp.finfo(float).eps * (1.0 + jnp.abs(self.cycles(time)))  # which is no jump
+        """Return whether the wave is nonzero at `time`, so that a start or end there is a jump."""
+        rounding = (
+            64.0 * jnp.finfo(float).eps * (1.0 + jnp.abs(self.cycles(time)))
+        )  # a difference this small is no jump
         return jnp.abs(self.sweep(time)) > rounding * jnp.abs(jnp.asarray(self.peak_to_peak))
 
 
 def _mean_exponential(x: Array) -> Array:
-    """(e^x - 1) / x, with its derivative."""
+    """Return (e^x - 1) / x, differentiable at 0."""
     small = jnp.abs(x) < 0.03
     far, near = jnp.where(small, 1.0, x), jnp.where(small, x, 0.0)
     series = jnp.ones_like(x)
@@ -168,9 +170,9 @@ def _mean_exponential(x: Array) -> Array:
 def particular_solution(
     coefficients: Float[Array, "degree pieces"], z: Float[Array, ""]
 ) -> tuple[Float[Array, "degree+1 pieces"], Float[Array, " pieces"]]:
-    """p(s), lowest coefficient first, and p(1), for v = sum_n coefficients[n - 1] s^n on each piece."""
+    """Return p(s), lowest coefficient first, and p(1), for v = sum_n coefficients[n - 1] s^n on each piece."""
     order = jnp.arange(1.0, coefficients.shape[0] + 1.0)
-    slopes = coefficients * order[:, None]  # of v', from s^0
+    slopes = coefficients * order[:, None]  # coefficients of v', from s^0
     zero, near, far = jnp.zeros_like(slopes[0]), jnp.minimum(z, 1.0), jnp.maximum(z, 1.0)
 
     def ascend(below: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -192,7 +194,7 @@ def particular_solution(
 def evaluate_polynomials(
     coefficients: Float[Array, "degree+1 pieces"], piece: Array, s: Float[Array, "*shape"]
 ) -> Float[Array, "*shape"]:
-    """The pieces' polynomials, lowest coefficient first, at s; memory for one coefficient of each time only."""
+    """Return the polynomials of the pieces at s, lowest coefficient first, with little memory."""
 
     def horner(total: Array, row: Array) -> tuple[Array, None]:
         return total * s + row[piece], None

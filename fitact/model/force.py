@@ -1,4 +1,4 @@
-"""The electrostatic force on the finger and the friction that is felt."""
+"""Electrostatic force on the finger, and the resulting friction."""
 
 from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
@@ -13,20 +13,20 @@ from fitact.model.drive import Drive
 from fitact.model.skin import constant_skin_circuit
 from fitact.model.steady import mean_square, peak
 
-EPSILON_0 = 8.85e-12  # F/m, the paper's value
+EPSILON_0 = 8.85e-12  # F/m, as in the reference paper
 
 ForceModel: TypeAlias = Literal["paper", "gap"]
 
 
 class Contact(eqx.Module):
-    """The plate capacitor that finger and panel form, on which Vsc acts; SI units.
+    """Plate capacitor formed by finger and panel, on which Vsc acts; SI units.
 
     Attributes:
         area: contact area A, m^2.
         insulator_thickness: Ti, m.
-        insulator_permittivity: relative, eps_i.
+        insulator_permittivity: relative permittivity eps_i.
         skin_thickness: Tsc, m.
-        skin_permittivity: relative, eps_sc.
+        skin_permittivity: relative permittivity eps_sc.
     """
 
     area: ArrayLike
@@ -40,7 +40,7 @@ class Contact(eqx.Module):
     def from_capacitances(
         cls, Ci: ArrayLike, Csc: ArrayLike, area: ArrayLike, insulator_thickness: ArrayLike, skin_thickness: ArrayLike
     ) -> "Contact":
-        """The contact whose permittivities give the capacitances `Ci` and `Csc` (F) by eq. (3)."""
+        """Return the contact whose permittivities give the capacitances `Ci` and `Csc` (F) by eq. (3)."""
         unit = EPSILON_0 * jnp.asarray(area)
         return cls(
             area, insulator_thickness, Ci * insulator_thickness / unit, skin_thickness, Csc * skin_thickness / unit
@@ -48,7 +48,7 @@ class Contact(eqx.Module):
 
 
 class AirGap(eqx.Module):
-    """The air between finger and panel, on whose faces the voltage across it acts.
+    """Air gap between finger and panel; the force on its faces follows from the voltage across it.
 
     Source: Shultz, Peshkin, Colgate, IEEE Trans. Haptics 11 (2018) 279; Ayyildiz et al., PNAS 115 (2018) 12668.
     """
@@ -59,44 +59,46 @@ class AirGap(eqx.Module):
 
 
 class Geometry(eqx.Module):
-    """Sizes that the force needs beside the circuit."""
+    """Geometry that the force depends on in addition to the circuit."""
 
     area: ArrayLike = 1.0  # m^2
     insulator_thickness: ArrayLike = 1.0  # m
     skin_thickness: ArrayLike = 1.0  # m
-    gap_thickness: ArrayLike | None = None  # m; None: that of air of the circuit's Cgap, eps0 A / Cgap
-    model: ForceModel = eqx.field(static=True, default="paper")  # by Vsc, eq. (22), or the voltage across the gap
+    gap_thickness: ArrayLike | None = None  # m; None means eps0 A / Cgap
+    model: ForceModel = eqx.field(static=True, default="paper")  # from Vsc, eq. (22), or from Vgap
 
     def contact(self, circuit: Circuit) -> "Contact | AirGap":
-        """Where the force acts; permittivities, and an unstated gap, follow the circuit's capacitances, eq. (3)."""
+        """Return where the force acts; permittivities and a missing gap thickness follow from eq. (3)."""
         inner: Any = constant_skin_circuit(circuit)
         if self.model == "paper":
             layers = self.insulator_thickness, self.skin_thickness
             return Contact.from_capacitances(inner.Ci, inner.Csc, self.area, *layers)
         Cgap = getattr(inner, "Cgap", None)
         if Cgap is None:
-            raise InputError("the force across a gap needs a circuit with one; give it Cgap, or take the paper's force")
+            raise InputError(
+                "the force across a gap needs a circuit with a gap; give Cgap, or use the reference paper's force"
+            )
         return AirGap(self.area, EPSILON_0 * self.area / Cgap if self.gap_thickness is None else self.gap_thickness)
 
 
 def plate_capacitance(permittivity: ArrayLike, area: ArrayLike, thickness: ArrayLike) -> ArrayLike:
-    """C = eps0 eps_r A / T in F, eq. (3); `area` in m^2, `thickness` in m."""
+    """Return C = eps0 eps_r A / T in F, eq. (3); `area` in m^2, `thickness` in m."""
     return EPSILON_0 * permittivity * area / thickness
 
 
 def plate_resistance(resistivity: ArrayLike, area: ArrayLike, thickness: ArrayLike) -> ArrayLike:
-    """R = rho T / A in ohm, eq. (4); `resistivity` in ohm m, `area` in m^2, `thickness` in m."""
+    """Return R = rho T / A in ohm, eq. (4); `resistivity` in ohm m, `area` in m^2, `thickness` in m."""
     return resistivity * thickness / area
 
 
 def electrostatic_force(voltage: ArrayLike, contact: Contact | AirGap) -> Float[Array, "*shape"]:
-    """The electrostatic force in N for the `voltage` (V): Vsc on a contact, eqs. (1) and (22), Vgap across a gap."""
+    """Return the electrostatic force (N) of the `voltage` (V): Vsc for a contact, eqs. (1) and (22), Vgap for a gap."""
     voltage = jnp.asarray(voltage)
     return force_constant(contact) * voltage * voltage
 
 
 def force_constant(contact: Contact | AirGap) -> Array:
-    """Force over the voltage's square, N/V^2: of a contact eqs. (1) and (22); of a gap eps0 A / (2 d^2)."""
+    """Return force / voltage^2 (N/V^2): eqs. (1) and (22) for a contact, eps0 A / (2 d^2) for a gap."""
     if isinstance(contact, AirGap):
         thickness = jnp.asarray(contact.thickness)
         return EPSILON_0 * contact.area / 2.0 / thickness / thickness
@@ -107,25 +109,25 @@ def force_constant(contact: Contact | AirGap) -> Array:
 
 
 def mean_force(circuit: Circuit, drive: Drive, contact: Contact | AirGap) -> Float[Array, ""]:
-    """The electrostatic force in N, averaged over a period of the steady state: exact, eqs. (1) and (22).
+    """Return the exact mean electrostatic force (N) over a period of the steady state, eqs. (1) and (22).
 
     Raises:
-        InputError: the drive does not repeat, or `contact` is a gap and the circuit has none.
+        InputError: the drive is not periodic, or `contact` is a gap and the circuit has none.
     """
     return force_constant(contact) * mean_square(circuit, drive, contact.channel)
 
 
 def peak_force(circuit: Circuit, drive: Drive, contact: Contact | AirGap) -> Float[Array, ""]:
-    """The largest electrostatic force in N over a period of the steady state: exact, eqs. (1) and (22).
+    """Return the exact maximum electrostatic force (N) over a period of the steady state, eqs. (1) and (22).
 
     Raises:
-        InputError: the drive does not repeat, or `contact` is a gap and the circuit has none.
+        InputError: the drive is not periodic, or `contact` is a gap and the circuit has none.
     """
     return electrostatic_force(peak(circuit, drive, contact.channel), contact)
 
 
 def friction(force: ArrayLike, coefficient: ArrayLike, normal_force: ArrayLike) -> Float[Array, "*shape"]:
-    """Friction in N from the electrostatic `force` and the finger's `normal_force` (N), eq. (2)."""
+    """Return the friction (N) for the electrostatic `force` (N) and the finger's `normal_force` (N), eq. (2)."""
     return jnp.asarray(coefficient) * (jnp.asarray(force) + normal_force)
 
 
@@ -138,5 +140,5 @@ class ForceSummary(NamedTuple):
 
 
 def summarize(force: Float[Array, " samples"], weight: Float[Array, " samples"]) -> ForceSummary:
-    """Mean, peak and rms over samples that stand for the shares `weight` of the time (they add up to 1)."""
+    """Return mean, peak and rms of samples; `weight` is the fraction of the time that each represents (sum 1)."""
     return ForceSummary(jnp.sum(weight * force), jnp.max(force), jnp.sqrt(jnp.sum(weight * force**2)))

@@ -1,8 +1,8 @@
-"""The harmonic level: the steady state as a sum over the harmonics of a periodic drive.
+"""Steady state as a sum over the harmonics of a periodic drive.
 
-Cheap where few harmonics matter, and the only level for a skin without time constants. The Fourier
-coefficients come in closed form from the drive's straight pieces: with c_k = 1/T int V e^{-jkwt} dt,
-a jump J at t adds J e^{-jkwt} / (jkwT), and a straight piece its rise times the mean of e^{-jkwt} over it.
+The sum is cheap if few harmonics matter, and the only method for a skin without time constants. The Fourier
+coefficients c_k = 1/T int V e^{-jkwt} dt of linear pieces have a closed form. A jump J at t adds
+J e^{-jkwt} / (jkwT). A piece adds (its rise) x (the mean of e^{-jkwt} over it) / (jkwT).
 """
 
 import jax
@@ -20,33 +20,33 @@ from fitact.model.drive import Drive, InterpolatedDrive, Multitone, Periodic, Pi
 def harmonic_response(
     circuit: Circuit, drive: Drive, time: ArrayLike, harmonics: int, *, channel: Channel = "Vsc"
 ) -> Float[Array, "*shape"]:
-    """The steady state of Vsc (V) or I (A) at `time` (s) from the first `harmonics` of a periodic drive, eq. (20).
+    """Return the steady state of Vsc (V) or I (A) at `time` (s), summed over the first `harmonics`, eq. (20).
 
-    `harmonic_error` says what is left out. At a jump of the drive the sum tends to the mean of both sides
-    and overshoots beside it (Gibbs), however many harmonics are taken.
+    `harmonic_error` gives the truncation error. At a jump of the drive the sum converges to the mean of both sides,
+    and it overshoots near the jump for any number of harmonics (Gibbs phenomenon).
 
     Raises:
-        InputError: the drive has no period.
+        InputError: the drive is not periodic.
     """
     omega = angular_frequency(drive) * jnp.arange(1, harmonics + 1)
     return harmonic_sum(fourier_coefficients(drive, harmonics) * circuit.channel_gain(channel, omega), drive, time)
 
 
 def harmonic_error(circuit: Circuit, drive: Drive, harmonics: int, *, channel: Channel = "Vsc") -> Float[Array, ""]:
-    """The rms of all that `harmonic_response` leaves out, over that of the whole response.
+    """Return the rms of the harmonics that `harmonic_response` omits, over the rms of the whole response.
 
-    By Parseval: the harmonics left out are summed up to 64 times those kept (4096 at least), and what lies
-    beyond is taken as a geometric series of octaves from the last two.
+    The powers of the omitted harmonics are summed (Parseval) up to 64 times the number kept (at least 4096). The
+    sum beyond is extrapolated as a geometric series from the last two octaves.
 
     Raises:
-        InputError: the drive has no period.
+        InputError: the drive is not periodic.
     """
     last = max(64 * harmonics, 4096)
     omega = angular_frequency(drive) * jnp.arange(1, last + 1)
     amplitude = fourier_coefficients(drive, last) * circuit.channel_gain(channel, omega)
     power = amplitude.real**2 + amplitude.imag**2
     octave, before = jnp.sum(power[last // 2 :]), jnp.sum(power[last // 4 : last // 2])
-    # a bounded response to jumps, the slowest there is, loses half of its power from octave to octave
+    # the response to jumps converges most slowly, and loses half of its power per octave
     ratio = jnp.minimum(octave / jnp.where(before > 0.0, before, 1.0), 0.5)
     left_out = jnp.sum(power[harmonics:]) + octave * ratio / (1.0 - ratio)
     share = left_out / (jnp.sum(power[:harmonics]) + left_out)
@@ -54,7 +54,7 @@ def harmonic_error(circuit: Circuit, drive: Drive, harmonics: int, *, channel: C
 
 
 def harmonic_sum(amplitude: Complex[Array, " harmonics"], drive: Drive, time: ArrayLike) -> Float[Array, "*shape"]:
-    """2 Re sum_k amplitude[k - 1] e^{jkwt}, one harmonic at a time: the memory does not grow with them."""
+    """Return 2 Re sum_k amplitude[k - 1] e^{jkwt}, one harmonic at a time to save memory."""
     cycles = _cycles(drive, jnp.asarray(time, dtype=float))
 
     @jax.checkpoint
@@ -68,7 +68,7 @@ def harmonic_sum(amplitude: Complex[Array, " harmonics"], drive: Drive, time: Ar
 
 
 def fourier_coefficients(drive: Drive, harmonics: int) -> Complex[Array, " harmonics"]:
-    """c_k (V) for k = 1 to `harmonics`: the drive is its mean plus 2 Re sum_k c_k e^{jkwt}."""
+    """Return c_k (V) for k = 1 to `harmonics`, where the drive is its mean plus 2 Re sum_k c_k e^{jkwt}."""
     order = jnp.arange(1, harmonics + 1, dtype=float)
     if isinstance(drive, Sine):
         return jnp.where(order == 1.0, -0.25j * jnp.asarray(drive.peak_to_peak), 0.0)
@@ -76,7 +76,7 @@ def fourier_coefficients(drive: Drive, harmonics: int) -> Complex[Array, " harmo
         kept = np.flatnonzero(np.asarray(drive.orders) <= harmonics)
         places = np.asarray(drive.orders)[kept] - 1
         return jnp.zeros(harmonics, dtype=complex).at[places].set(-0.5j * drive.phasors()[kept])
-    drive_frequency(drive)  # raises where there is none
+    drive_frequency(drive)  # raises if the drive is not periodic
     assert isinstance(drive, PiecewiseLinear | InterpolatedDrive)
     knots, start, end = drive.pieces()
     period = knots[-1] - knots[0]
@@ -92,12 +92,12 @@ def fourier_coefficients(drive: Drive, harmonics: int) -> Complex[Array, " harmo
 
 
 def angular_frequency(drive: Drive) -> Array:
-    """The angular frequency w of the drive's period, rad/s."""
+    """Return the angular frequency w of the drive's period, rad/s."""
     return 2.0 * np.pi * jnp.asarray(drive_frequency(drive), dtype=float)
 
 
 def drive_frequency(drive: Drive) -> ArrayLike:
-    """How often the drive repeats, Hz; raises where it does not."""
+    """Return the repetition frequency of the drive, Hz, or raise InputError if it is not periodic."""
     if isinstance(drive, Periodic):
         return drive.frequency
     if isinstance(drive, InterpolatedDrive) and drive.period is not None:
@@ -108,7 +108,7 @@ def drive_frequency(drive: Drive) -> ArrayLike:
 
 
 def _cycles(drive: Drive, time: Array) -> Array:
-    """Cycles since the last start of a period, in [0, 1): their product with k keeps its digits."""
+    """Return the cycles since the last start of a period, in [0, 1), so that multiples of them keep their digits."""
     if isinstance(drive, InterpolatedDrive):
         return jnp.mod((time - drive.start_time) / drive.period, 1.0)
     assert isinstance(drive, Periodic)

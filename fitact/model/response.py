@@ -1,8 +1,8 @@
-"""The skin voltage in time, exactly: every circuit is a few first-order high-pass filters.
+"""Exact response in time: every circuit is a sum of a few first-order high-pass filters.
 
-One function serves all: the response u(t) of  s tau / (1 + s tau)  to the drive. Along a straight
-piece of slope m, u' = m - u / tau, so u decays by e^{-L/tau} and gains m L phi(L/tau) over a length
-L; at a jump u jumps along. Written so that nothing cancels or overflows at either end of tau.
+One function serves all circuits: the response u(t) of  s tau / (1 + s tau)  to the drive. On a linear piece of
+slope m, u' = m - u / tau. Over a length L, u decays by e^{-L/tau} and gains m L phi(L/tau). At a jump of the drive,
+u jumps by the same amount. The formulas neither cancel nor overflow for small or large tau.
 """
 
 import math
@@ -45,25 +45,25 @@ def response(
     channel: Channel = "Vsc",
     initial: ArrayLike | Sequence[ArrayLike] | None = None,
 ) -> Float[Array, "*shape"]:
-    """The skin voltage Vsc (V), the trunk current I (A) or the gap's voltage Vgap (V) at `time` (s), exact.
+    """Return the exact skin voltage Vsc (V), loop current I (A) or gap voltage Vgap (V) at `time` (s).
 
-    In the steady state, or, with ``steady_state=False``, from rest: no charge anywhere and no drive
-    before t = 0, or before the first point of a drive given by points (where that of a `Sampled` one is
-    held, since a measured drive was there before). Eqs. (18)-(21) in the time domain. Where nothing
-    resistive limits the current it follows dV/dt, and at an ideal jump it is NaN. A gap that does not
-    conduct has, in the steady state, none of the drive's mean across it, and from rest its share of it.
+    The response is the steady state or, with ``steady_state=False``, starts from rest: no charge and no drive
+    before t = 0, or before the first point of a drive given by points. (A `Sampled` drive holds its first value
+    before that, since a measured drive existed before the record.) Eqs. (18)-(21) in the time domain. If no
+    resistance limits the current, it follows dV/dt, and is NaN at an ideal jump. A non-conducting gap carries none
+    of the mean drive in the steady state; from rest it carries its capacitive fraction of it.
 
-    `initial` stands for a charge that was there when the drive began: one amplitude for each time constant
-    of the circuit, in the order of ``circuit.terms().tau`` and the channel's unit, that decays with it.
+    `initial` describes the charge at the start of the drive. It holds one amplitude, in the channel's unit, for each
+    time constant in ``circuit.terms().tau``, with which it decays.
 
-    A skin that depends on the frequency has its steady state harmonic by harmonic as far as it changes, and
-    above by time constants: exact for `Dispersive`; for `Fractional` within the error it states. One that is
-    followed by a grid of time constants is computed like any other circuit.
+    The steady state of a frequency-dependent skin is computed harmonic by harmonic up to the frequency where the skin
+    stops changing, and by time constants above. This is exact for `Dispersive`; `Fractional` documents its error.
+    A skin represented by a grid of time constants is computed like any other circuit.
 
     Raises:
-        InputError: the steady state was asked for of a drive that has none, or together with `initial`, or
-            `initial` has not one value for each time constant; or, with a skin that depends on the frequency,
-            anything but the steady state of a periodic drive; or Vgap of a circuit without a gap.
+        InputError: the drive has no steady state; `initial` is given for the steady state, or has a wrong number of
+            values; the skin depends on the frequency and the steady state of a periodic drive is not what is
+            requested; or Vgap is requested without a gap.
     """
     total, rate = response_and_rate(circuit, drive, time, steady_state=steady_state, channel=channel)
     if rate is not None:
@@ -71,21 +71,21 @@ def response(
     if initial is None:
         return total
     if steady_state:
-        raise InputError("an initial charge has decayed in the steady state: give steady_state=False with initial")
+        raise InputError("an initial charge has decayed in the steady state; set steady_state=False to use initial")
     return total + _initial_charge_decay(drive, time, circuit.channel_terms(channel).tau, initial)
 
 
 def response_and_rate(
     circuit: Circuit, drive: Drive, time: ArrayLike, *, steady_state: bool = True, channel: Channel = "Vsc"
 ) -> tuple[Float[Array, "*shape"], ArrayLike | None]:
-    """The `response` without the part that follows dV/dt, and how much does (F); None: nothing."""
+    """Return the `response` without the term in dV/dt, and the coefficient of this term (F), or None."""
     if has_time_constants(circuit):
         terms = circuit.channel_terms(channel)
         return superpose_terms(terms, drive, time, steady_state=steady_state), terms.rate
     assert isinstance(circuit, WithSkin)
     if not steady_state:
         raise InputError(
-            f"a {type(circuit.skin).__name__.lower()} skin is computed in the steady state only;"
+            f"a {type(circuit.skin).__name__.lower()} skin has a response in the steady state only;"
             " ask for steady_state=True, or take the constant skin level"
         )
     harmonics = harmonic_decomposition(circuit, drive, channel)
@@ -96,9 +96,9 @@ def response_and_rate(
 def superpose_terms(
     terms: HighpassTerms, drive: Drive, time: ArrayLike, *, steady_state: bool = True
 ) -> Float[Array, "*shape"]:
-    """The response of a circuit's `terms`, but for the one that follows dV/dt; arguments as in `response`."""
+    """Return the response of the `terms`, without the term in dV/dt; other arguments as in `response`."""
     time = jnp.asarray(time, dtype=float)
-    if len(terms.tau) <= 8:  # written out one by one, which XLA fuses
+    if len(terms.tau) <= 8:  # an unrolled sum, which XLA fuses
         total = jnp.zeros_like(time)
         for weight, tau in zip(terms.weight, terms.tau, strict=True):
             total = total + weight * highpass(drive, time, tau, steady_state=steady_state)
@@ -111,16 +111,16 @@ def superpose_terms(
 
 
 class Harmonics(NamedTuple):
-    """A circuit without time constants in the steady state: terms that stand for high frequencies, and the others."""
+    """Steady state of a circuit without time constants: single harmonics, and terms for higher frequencies."""
 
-    terms: HighpassTerms  # what they are exact or fitted for lies above the harmonics
-    drive: Complex[Array, " harmonics"]  # V, the harmonics' amplitudes
-    gain: Complex[Array, " harmonics"]  # the circuit's at each
-    missing_gain: Complex[Array, " harmonics"]  # of that, what the terms do not have
+    terms: HighpassTerms  # exact, or fitted, above the harmonics
+    drive: Complex[Array, " harmonics"]  # V, amplitudes of the harmonics
+    gain: Complex[Array, " harmonics"]  # gain of the circuit at each harmonic
+    missing_gain: Complex[Array, " harmonics"]  # gain minus the gain of the terms
 
 
 def harmonic_decomposition(circuit: WithSkin, drive: Drive, channel: Channel) -> Harmonics:
-    """The harmonics in which the skin changes, and terms for those above."""
+    """Return the harmonics up to which the skin changes, and terms for higher ones."""
     omega, terms = angular_frequency(drive), HighpassTerms((), ())
     if isinstance(drive, Sine | Multitone):
         count = max(drive.orders) if isinstance(drive, Multitone) else 1
@@ -133,7 +133,7 @@ def harmonic_decomposition(circuit: WithSkin, drive: Drive, channel: Channel) ->
 
 
 def highpass(drive: Drive, time: ArrayLike, tau: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
-    """The response of s tau / (1 + s tau) to `drive` at `time`; arguments as in `response`."""
+    """Return the response of s tau / (1 + s tau) to `drive` at `time`; arguments as in `response`."""
     time = jnp.asarray(time, dtype=float)
     wave = drive.wave if isinstance(drive, Burst) else drive
     if not isinstance(wave, Sine | Multitone | PiecewiseLinear | InterpolatedDrive | Chirp):
@@ -145,7 +145,7 @@ def highpass(drive: Drive, time: ArrayLike, tau: ArrayLike, *, steady_state: boo
     if isinstance(wave, InterpolatedDrive) and wave.period is None:
         pieces = wave.pieces()
         at_knots = knot_values(pieces, tau, pieces.start[0])
-        if isinstance(wave, Sampled) and time is wave.time:  # its own samples need no search
+        if isinstance(wave, Sampled) and time is wave.time:  # the samples of the drive itself need no search
             return at_knots
         u = _propagate(wave, time, tau, at_knots)
         return u if isinstance(wave, Sampled) else jnp.where(time >= wave.start_time, u, 0.0)
@@ -160,7 +160,7 @@ def highpass(drive: Drive, time: ArrayLike, tau: ArrayLike, *, steady_state: boo
     if not isinstance(drive, Burst):
         return u
     since = jnp.maximum(time - drive.duration, 0.0)
-    # the wave minus the same begun again at the end: of the two only the transients do not cancel
+    # the burst is the wave minus the same wave started at its end; after the end only the transients remain
     after = difference * jnp.expm1(-drive.duration / tau) * jnp.exp(-since / tau)
     return jnp.where(drive.is_over(time), after, u)
 
@@ -178,12 +178,12 @@ def _require_steady_state(drive: Drive) -> None:
 def _initial_charge_decay(
     drive: Drive, time: ArrayLike, taus: Sequence[ArrayLike], initial: ArrayLike | Sequence[ArrayLike]
 ) -> Array:
-    """The rest at `time` of a charge that was there when the drive began."""
+    """Return the contribution at `time` of the charge at the start of the drive."""
     amplitudes = jnp.atleast_1d(jnp.asarray(initial, dtype=float))
     if amplitudes.shape != (len(taus),):
         raise InputError(
             f"initial has shape {amplitudes.shape}, but the circuit has {len(taus)} time constants;"
-            " give one value for each"
+            " give one value for each time constant"
         )
     since = jnp.asarray(time, dtype=float) - drive.start_time
     decayed = sum(v * jnp.exp(-jnp.maximum(since, 0.0) / tau) for v, tau in zip(amplitudes, taus, strict=True))
@@ -193,7 +193,7 @@ def _initial_charge_decay(
 def _steady_response(
     drive: Sine | Multitone | PiecewiseLinear | InterpolatedDrive, tau: ArrayLike
 ) -> Callable[[Array], Array]:
-    """u(t) in the steady state."""
+    """Return a function that evaluates u(t) in the steady state."""
     if isinstance(drive, Sine):
         return partial(_sine, drive, tau)
     if isinstance(drive, Multitone):
@@ -203,13 +203,13 @@ def _steady_response(
 
 
 def knot_values(pieces: LinearPieces, tau: ArrayLike, first: ArrayLike, part: int = 262_144) -> Float[Array, " pieces"]:
-    """u just after the start of each piece, given u just after the first start.
+    """Return u just after the start of each piece, given u just after the first start.
 
-    More pieces than `part` are followed a part at a time: what they take in between would be several times the record.
+    More pieces than `part` are processed in parts, since intermediate arrays take several times the record's memory.
     """
 
     def propagate_part(before: Array, begin: ArrayLike, count: int) -> tuple[Array, Array]:
-        """Over so many pieces, the first of which begins with u `before`; the last one's u, and all."""
+        """Return the last u and all u of `count` pieces, given u `before` the first."""
         knots, start = (lax.dynamic_slice_in_dim(x, begin, count + 1) for x in (pieces.knots, pieces.start))
         end = lax.dynamic_slice_in_dim(pieces.end, begin, count)
         x = jnp.diff(knots) / tau
@@ -229,10 +229,10 @@ def knot_values(pieces: LinearPieces, tau: ArrayLike, first: ArrayLike, part: in
 
 @jax.jit
 def recurrence(decay: Float[Array, " n"], gain: Float[Array, " n"], first: Float[Array, ""]) -> Float[Array, " n"]:
-    """u[k] = decay[k] u[k - 1] + gain[k], from u[-1] = first.
+    """Return u[k] = decay[k] u[k - 1] + gain[k], from u[-1] = first.
 
-    In about sqrt(n) blocks side by side, then from block to block: two short loops over short vectors,
-    which run and compile several times faster than an associative scan.
+    About sqrt(n) blocks are computed in parallel and then joined one after another. These two short loops over
+    short vectors run and compile several times faster than an associative scan.
     """
     width = math.isqrt(max(decay.size - 1, 0)) + 1
     missing = -decay.size % width
@@ -253,7 +253,7 @@ def recurrence(decay: Float[Array, " n"], gain: Float[Array, " n"], first: Float
 
 
 def _propagate(drive: PiecewiseLinear | InterpolatedDrive, time: Array, tau: ArrayLike, u: Array) -> Array:
-    """u(t) from its values at the starts of the pieces."""
+    """Return u(t), given its values at the starts of the pieces."""
     piece, since = drive.locate(time)
     since = jnp.maximum(since, 0.0)
     decaying = _select_piece(u, piece) * jnp.exp(-since / tau)
@@ -263,7 +263,7 @@ def _propagate(drive: PiecewiseLinear | InterpolatedDrive, time: Array, tau: Arr
 
 
 def _select_piece(values: Array, piece: Array) -> Array:
-    """values[piece]; of up to 8 by comparison, which XLA fuses with the rest and a gather it does not."""
+    """Return values[piece]; up to 8 are selected by comparisons, which XLA fuses, unlike a gather."""
     if values.size > 8:
         return values[piece]
     selected = values[0]
@@ -273,18 +273,18 @@ def _select_piece(values: Array, piece: Array) -> Array:
 
 
 def steady_knot_values(pieces: LinearPieces, tau: ArrayLike) -> Float[Array, " pieces"]:
-    """u just after the start of each piece, in the steady state."""
+    """Return u just after the start of each piece, in the steady state."""
     return knot_values(pieces, tau, _steady_initial_value(pieces, tau))
 
 
 def _steady_initial_value(pieces: LinearPieces, tau: ArrayLike) -> Array:
-    """u just after the start of a period, in the steady state.
+    """Return u just after the start of a period, in the steady state.
 
-    u0 (1 - e^{-T/tau}) is the sum over a period of (increment) x (decay until its end). Where T/tau is
-    large that is how it is computed. Where it is small all decays are close to 1: the increments of a
-    period add up to nothing, so decay - 1 may stand for decay, and the quotient keeps its digits.
-    Fractions of the period, which do not depend on tau, keep those of its derivative; so does 1 - exp where
-    that is no loss, since the derivative of expm1 is computed as expm1 + 1.
+    u0 (1 - e^{-T/tau}) is the sum over a period of (increment) x (decay until the end of the period). If T/tau is
+    large, u0 is computed from this sum. If T/tau is small, all decays are close to 1. The increments of a period
+    add up to zero, so decay - 1 may replace decay, and the quotient keeps its digits. The derivative keeps its
+    digits because fractions of the period do not depend on tau, and because 1 - exp replaces expm1 where this is
+    exact enough (JAX computes the derivative of expm1 as expm1 + 1).
     """
     knots, start, end = pieces
     period = knots[-1] - knots[0]
@@ -306,13 +306,13 @@ def _sine(drive: Sine, tau: ArrayLike, time: Array) -> Array:
     return height * jnp.sin(2.0 * np.pi * drive.cycle(time)[0] + jnp.arctan2(1.0, x))
 
 
-@eqx.filter_jit  # loops are compiled anew at every call outside jit
+@eqx.filter_jit  # outside jit, each call would compile the loops again
 def _chirp(drive: Chirp, time: Array, tau: Array) -> Array:
-    """From rest: u at the pieces' starts, then along each as its polynomial and what decays."""
+    """Return u(t) from rest, as a polynomial plus a decay on each piece."""
     z = drive.duration / tau / drive.pieces
     series, v = drive.taylor_coefficients(), drive.sweep(drive.duration / drive.pieces * jnp.arange(drive.pieces + 1))
     p, p_end = particular_solution(series, z)
-    rounding = jnp.diff(v) - jnp.sum(series, axis=0)  # what would add up over many pieces
+    rounding = jnp.diff(v) - jnp.sum(series, axis=0)  # it would accumulate over many pieces
     decay = jnp.broadcast_to(jnp.exp(-z), p_end.shape)
     u = jnp.append(v[0], recurrence(decay, p_end - jnp.exp(-z) * p[0] + rounding, v[0]))
     piece, s = drive.locate(time)
@@ -324,7 +324,7 @@ def _chirp(drive: Chirp, time: Array, tau: Array) -> Array:
 
 @jax.custom_jvp
 def phi(x: ArrayLike) -> Array:
-    """(1 - e^{-x}) / x for x >= 0."""
+    """Return (1 - e^{-x}) / x for x >= 0."""
     x = jnp.asarray(x, dtype=float)
     return jnp.where(x == 0.0, 1.0, -jnp.expm1(-x) / jnp.where(x == 0.0, 1.0, x))
 
@@ -336,19 +336,19 @@ def _phi_jvp(primals: tuple[ArrayLike], tangents: tuple[Array]) -> tuple[Array, 
 
 
 def psi(x: ArrayLike) -> Array:
-    """(1 - phi(x)) / x = (e^{-x} - 1 + x) / x^2 for x >= 0."""
+    """Return (1 - phi(x)) / x = (e^{-x} - 1 + x) / x^2 for x >= 0."""
     return phi(x) * (0.5 + half_langevin(x))
 
 
 def log_phi_derivative(x: ArrayLike) -> Array:
-    """The derivative of log phi(x), for x >= 0: from -1/2 towards -1/x."""
+    """Return the derivative of log phi(x) for x >= 0; it goes from -1/2 towards -1/x."""
     x = jnp.asarray(x, dtype=float)
     large = jnp.where(x < 2.0, 2.0, x)
     return jnp.where(x < 2.0, half_langevin(x) - 0.5, jnp.exp(-large) / (1.0 - jnp.exp(-large)) - 1.0 / large)
 
 
 def half_langevin(x: ArrayLike) -> Array:
-    """1 / (e^x - 1) - 1/x + 1/2 for x >= 0: from x/12 towards 1/2."""
+    """Return 1 / (e^x - 1) - 1/x + 1/2 for x >= 0; it goes from x/12 towards 1/2."""
     x = jnp.asarray(x, dtype=float)
     small, large = jnp.where(x < 2.0, x, 0.0), jnp.where(x < 2.0, 2.0, x)
     direct = jnp.exp(-large) / (1.0 - jnp.exp(-large)) - 1.0 / large + 0.5
@@ -356,7 +356,7 @@ def half_langevin(x: ArrayLike) -> Array:
 
 
 def coth_fraction(z: ArrayLike) -> Array:
-    """3 + z / (5 + z / (7 + ...)) to double precision for 0 <= z <= 1; w coth w = 1 + w^2 / coth_fraction(w^2)."""
+    """Return 3 + z / (5 + z / (7 + ...)) for 0 <= z <= 1, so that w coth w = 1 + w^2 / coth_fraction(w^2)."""
     z = jnp.asarray(z, dtype=float)
     total = jnp.full_like(z, 21.0)
     for odd in range(19, 1, -2):

@@ -1,10 +1,10 @@
-"""Skin levels: how a skin layer's resistance and capacitance follow the frequency.
+"""Skin models: resistance and capacitance of a skin layer as functions of frequency.
 
-At each frequency any linear skin is a resistance and a capacitance in parallel, so a level is a map from
-the constant Rsc, Csc and the frequency to R(f), C(f). `WithSkin` puts a level into a circuit; a circuit
-without one has the constant level. Such a skin has no finite set of time constants, but a steady state,
-harmonic by harmonic. A fractional one is causal, so a grid of time constants can follow it in any drive.
-The paper's series equivalents of a constant skin, and their quality factor, stand at the end.
+At each frequency any linear skin is a resistance and a capacitance in parallel, so a skin model maps the constant
+Rsc, Csc and the frequency to R(f), C(f). `WithSkin` adds a skin model to a circuit; other circuits have a constant
+skin. A frequency-dependent skin has no finite set of time constants, so its steady state is computed harmonic by
+harmonic. A fractional skin is causal, so a grid of time constants can represent it for any drive.
+The last functions give the series equivalents of a constant skin, and their quality factor (reference paper).
 """
 
 import dataclasses
@@ -22,47 +22,46 @@ from jaxtyping import Array, Complex, Float
 from fitact.errors import InputError
 from fitact.model.circuit import RC, Channel, Circuit, DirectGround, Element, HighpassTerms, Loop
 
-# section 3.1 of the paper, where Rsc, Csc are those at 100 Hz
+# section 3.1 of the reference paper, with its Rsc, Csc at 100 Hz
 _FREQUENCY = np.array([10.0, 100.0, 1000.0])  # Hz
 _RESISTANCE = np.array([200.0, 160.0, 80.0]) / 160.0
 _CAPACITANCE = np.array([44.25, 22.0, 8.85]) / 22.0
 
-MAX_DISPERSION_FREQUENCY = float(_FREQUENCY[-1])  # Hz, above which a dispersive skin is constant
+MAX_DISPERSION_FREQUENCY = float(_FREQUENCY[-1])  # Hz; a dispersive skin is constant above
 
 
 class SkinModel(eqx.Module):
-    """A level: R(f) and C(f) of a skin, and how its steady state is split into harmonics and time constants."""
+    """A skin model: R(f) and C(f), and the division of the steady state into harmonics and time constants."""
 
     def parallel_rc(self, skin: Element, frequency: ArrayLike) -> Element:
-        """R(f) and C(f) of a skin whose constant values are `skin`, at `frequency` (Hz, >= 0)."""
+        """Return R(f) and C(f) at `frequency` (Hz, >= 0) of a skin with the constant values `skin`."""
         raise NotImplementedError
 
     def harmonic_count(self, frequency: ArrayLike) -> int:
-        """How many harmonics of `frequency` (Hz) are taken one by one; `high_frequency_terms` are the rest."""
+        """Return the number of single harmonics of `frequency` (Hz); `high_frequency_terms` cover higher ones."""
         raise NotImplementedError
 
     def high_frequency_terms(self, circuit: "WithSkin", omega: ArrayLike, channel: Channel) -> HighpassTerms:
-        """High-pass terms that stand for `circuit` at the angular frequency `omega` (rad/s) and above."""
+        """Return high-pass terms that represent `circuit` at and above the angular frequency `omega` (rad/s)."""
         raise NotImplementedError
 
 
 class Dispersive(SkinModel):
-    """The paper's skin (section 3.1): 200, 160, 80 kohm and 44.25, 22, 8.85 nF at 10, 100, 1000 Hz.
+    """Skin of the reference paper (section 3.1): 200, 160, 80 kohm and 44.25, 22, 8.85 nF at 10, 100, 1000 Hz.
 
-    Taken as factors on the circuit's Rsc and Csc, which are thus the values at 100 Hz. Between the three
-    frequencies straight lines in log-log, that is, powers of the frequency: monotone, and three points
-    speak for no curvature. Below 10 Hz and above 1000 Hz, where the paper gives nothing, the end values
-    are held.
+    The values are used as factors on Rsc and Csc of the circuit, which therefore apply at 100 Hz. Between the three
+    frequencies, R and C are powers of the frequency (linear in log-log, monotone; three points do not determine a
+    curvature). Below 10 Hz and above 1000 Hz, where the paper gives no values, R and C are constant.
 
     Attributes:
-        harmonics: how many harmonics lie below 1000 Hz; None: taken from the drive's frequency, which a
-            traced one does not allow. More than there are does no harm.
+        harmonics: number of harmonics below 1000 Hz, or more; None means that the drive's frequency gives it, which
+            fails if this frequency is traced.
     """
 
     harmonics: int | None = eqx.field(static=True, default=None)
 
     def parallel_rc(self, skin: Element, frequency: ArrayLike) -> Element:
-        """R(f), C(f)."""
+        """Return R(f) and C(f)."""
         where = jnp.log(jnp.clip(jnp.asarray(frequency, dtype=float), _FREQUENCY[0], _FREQUENCY[-1]))
         knots = np.log(_FREQUENCY)
         return Element(
@@ -71,7 +70,7 @@ class Dispersive(SkinModel):
         )
 
     def harmonic_count(self, frequency: ArrayLike) -> int:
-        """The harmonics below 1000 Hz."""
+        """Return the number of harmonics below 1000 Hz."""
         if self.harmonics is not None:
             return self.harmonics
         try:
@@ -79,56 +78,56 @@ class Dispersive(SkinModel):
         except jax.errors.ConcretizationTypeError:
             raise InputError(
                 "the drive's frequency is traced, so the harmonics below 1000 Hz cannot be counted;"
-                " state how many there are at most: Dispersive(harmonics=...)"
+                " give an upper limit: Dispersive(harmonics=...)"
             ) from None
 
     def high_frequency_terms(self, circuit: "WithSkin", omega: ArrayLike, channel: Channel) -> HighpassTerms:
-        """Exact: above 1000 Hz the skin is constant."""
+        """Return the terms of the constant skin above 1000 Hz, which are exact."""
         return circuit.circuit_at_frequency(_FREQUENCY[-1]).channel_terms(channel)
 
 
 class Fractional(SkinModel):
     """A constant-phase element in parallel with a resistance (Cole): Z = Rsc / (1 + (j w Rsc Csc)^alpha).
 
-    `alpha` = 1 is the constant skin. At zero frequency C(f) has no limit, but no effect either: the
-    constant value stands there.
+    `alpha` = 1 is the constant skin. At zero frequency C(f) has no limit, but also no effect, so the constant
+    value is used there.
 
-    A response takes `harmonics` one by one and fits time constants to the rest, up to 1e8 times higher.
-    Measured, 128 harmonics against 1024, root mean square over that of the response: Vsc 3e-8 at the
-    paper's values, a current limited by R_H = 500 ohm 1e-5; in float32 5e-5 of the peak. Exactly at an ideal
-    jump Vsc is what those highest frequencies make of it (at alpha = 1, within 5e-7 of the peak).
+    A response sums the first `harmonics` and fits time constants to the rest, up to frequencies 1e8 times higher.
+    Measured rms difference between 128 and 1024 harmonics, relative to the rms of the response: 3e-8 for Vsc with
+    the values of the reference paper, 1e-5 for a current limited by R_H = 500 ohm; 5e-5 of the peak in float32.
+    Exactly at an ideal jump, Vsc depends on the highest of these frequencies (at alpha = 1, within 5e-7 of the peak).
 
     Attributes:
-        alpha: 0 < alpha <= 1. The default is no measurement: take your skin's own.
-        harmonics: how many harmonics a response takes one by one.
+        alpha: exponent, 0 < alpha <= 1. The default is not a measured value; use the value of your skin.
+        harmonics: number of harmonics that a response sums.
     """
 
     alpha: ArrayLike = 0.8
     harmonics: int = eqx.field(static=True, default=128)
 
     def parallel_rc(self, skin: Element, frequency: ArrayLike) -> Element:
-        """R(f) = 1 / Re(1/Z), C(f) = Im(1/Z) / w."""
+        """Return R(f) = 1 / Re(1/Z), C(f) = Im(1/Z) / w."""
         x = 2.0 * np.pi * jnp.asarray(frequency, dtype=float) * (jnp.asarray(skin.R) * skin.C)
         alpha = jnp.asarray(self.alpha)
-        # from 2 on the impedance would turn its sign: no step of a fit is to lead there
+        # from 2 on the impedance would change its sign, so a fit must not step there
         alpha = jnp.where(alpha < 2.0, alpha, jnp.nan)
         power = jnp.where(x > 0.0, jnp.exp((alpha - 1.0) * jnp.log(jnp.where(x > 0.0, x, 1.0))), 1.0)
-        angle = 0.5 * np.pi * (1.0 - alpha)  # from the missing part of alpha: exactly 0 at 1
+        angle = 0.5 * np.pi * (1.0 - alpha)  # from 1 - alpha, so that it is exactly 0 at alpha = 1
         return Element(skin.R / (1.0 + x * power * jnp.sin(angle)), skin.C * power * jnp.cos(angle))
 
     def harmonic_count(self, frequency: ArrayLike) -> int:
-        """`harmonics`."""
+        """Return `harmonics`."""
         return self.harmonics
 
     def high_frequency_terms(self, circuit: "WithSkin", omega: ArrayLike, channel: Channel) -> HighpassTerms:
-        """Time constants spread evenly over the decades above `omega`, with weights fitted by least squares."""
+        """Return time constants on a logarithmic grid above `omega`, with weights fitted by least squares."""
         limited = channel != "I" or limits_current(circuit.circuit)
         omega = jnp.asarray(omega, dtype=float)
         tau, x, weights = high_frequency_basis(limited, omega.dtype == jnp.float64)
         gain = circuit.channel_gain(channel, omega * x)
         gain = gain if limited else gain / x
         weight = jnp.dot(weights, jnp.concatenate([gain.real, gain.imag]), precision="highest")
-        # an unlimited current still grows at the end of the fit: at a jump it has no value
+        # an unlimited current still grows at the highest fitted frequency, so it has no value at a jump
         return HighpassTerms(tuple(weight), tuple(tau / omega), None if limited else 0.0)
 
 
@@ -136,10 +135,10 @@ class Fractional(SkinModel):
 def high_frequency_basis(
     is_limited: bool, double: bool, decades: int = 8, per_decade: int = 6
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time constants, frequencies (over omega) and the least-squares map from the gain there to the weights.
+    """Return time constants, frequencies (over omega) and the least-squares map from the gain to the weights.
 
-    A gain that is limited is fitted as it is, one that grows with the frequency in proportion to it. What
-    the precision cannot tell apart is left out of the map, lest large weights cancel.
+    The fit minimises the absolute error of a limited gain, and the relative error of a gain that grows with the
+    frequency. The map omits singular values below the precision, which would produce large cancelling weights.
     """
     tau = np.logspace(-decades - 1.0, 1.0, per_decade * (decades + 2) + 1)
     x = np.logspace(0.0, decades, 4 * per_decade * decades + 1)
@@ -155,22 +154,22 @@ FactoredMap: TypeAlias = tuple[Float[Array, "rows modes"], Float[Array, "modes p
 class TimeConstantGrid(eqx.Module):
     """Time constants, and the least-squares map from a gain at the frequencies `omega` to their weights.
 
-    Of any network of resistances, capacitances and fractional skins the gain is an integral over high-pass terms
-    s tau / (1 + s tau), tau > 0 (its distribution of relaxation times). A sum over a grid of tau that is dense in the
-    logarithm stands for it in time as in frequency. The weights are linear in the gain, and the time constants depend
-    on no parameter. A map goes from real parts, then imaginary ones: the inner matrix's product with them goes into the
-    outer one. Multiplied out they would lose the digits that the singular values between them span.
+    The gain of any network of resistances, capacitances and fractional skins is an integral over high-pass terms
+    s tau / (1 + s tau), tau > 0 (its distribution of relaxation times). A sum over a grid of tau that is dense in
+    log tau approximates it, both in time and in frequency. The weights are linear in the gain, and the time constants
+    depend on no parameter. A map applies an inner and then an outer matrix to the real parts followed by the imaginary
+    parts. The product of the two matrices would lose the digits that the range of their singular values spans.
     """
 
     tau: Float[Array, " terms"]  # s
-    omega: Float[Array, " frequencies"]  # rad/s, at which the gain is asked for
+    omega: Float[Array, " frequencies"]  # rad/s, where the gain is evaluated
     voltage_map: FactoredMap  # for Vsc / V and Vgap / V
-    limited_current_map: FactoredMap  # for I / V where a resistance limits it: the misfit counts in proportion to omega
-    unlimited_current_map: FactoredMap  # where none does; with one row more, for the term that follows dV/dt
+    limited_current_map: FactoredMap  # for I / V limited by a resistance; minimises the misfit times omega
+    unlimited_current_map: FactoredMap  # for unlimited I / V; one more row for the term in dV/dt
 
     @classmethod
     def from_frequency_range(cls, slowest: float, fastest: float, per_decade: int = 10, margin: float = 10.0) -> Self:
-        """For a gain from `slowest` to `fastest` (rad/s), `margin` times beyond. Call it in double precision."""
+        """Return a grid from `slowest` to `fastest` (rad/s), extended by the factor `margin`. Use double precision."""
         decades = np.log10(fastest / slowest * margin**2)
         tau = np.geomspace(1.0 / (margin * fastest), margin / slowest, 1 + int(np.ceil(per_decade * decades)))
         omega = np.geomspace(slowest, fastest, 2 * tau.size)
@@ -182,7 +181,7 @@ class TimeConstantGrid(eqx.Module):
         return cls(*jax.tree.map(jnp.asarray, (tau, omega, voltage, limited, (outer, inner))))
 
     def terms(self, channel: Channel, is_limited: bool, gain: Complex[Array, " frequencies"]) -> HighpassTerms:
-        """The terms that stand for a channel's `gain` at `omega`; `is_limited`: whether a resistance limits I."""
+        """Return terms that represent the `gain` of a channel at `omega`; `is_limited`: a resistance limits I."""
         current_map = self.limited_current_map if is_limited else self.unlimited_current_map
         outer, inner = current_map if channel == "I" else self.voltage_map
         fitted, size = outer @ (inner @ jnp.concatenate([gain.real, gain.imag])), self.tau.size
@@ -190,9 +189,9 @@ class TimeConstantGrid(eqx.Module):
 
 
 def _pseudo_inverse(terms: np.ndarray, share: np.ndarray, cutoff: float = 1e-13) -> FactoredMap:
-    """The pseudo-inverse of what the terms are over `share`, in two factors, without small singular values.
+    """Return the pseudo-inverse of the terms over `share`, in two factors.
 
-    Those below `cutoff` of the largest are left out, lest large weights cancel.
+    Singular values below `cutoff` times the largest are omitted, since they would produce large cancelling weights.
     """
     scaled = terms / share
     modes, sizes, directions = np.linalg.svd(np.concatenate([scaled.real, scaled.imag]), full_matrices=False)
@@ -201,12 +200,12 @@ def _pseudo_inverse(terms: np.ndarray, share: np.ndarray, cutoff: float = 1e-13)
 
 
 class WithSkin(Circuit):
-    """A circuit whose skins, the touching and the grounding one, follow a level.
+    """A circuit whose touching and grounding skins follow a skin model.
 
     Attributes:
-        circuit: final, direct or natural ground, with the constant values that the level refers to.
+        circuit: final circuit, direct or natural ground, with the constant values that the skin model scales.
         skin: `Dispersive` or `Fractional`.
-        grid: time constants to follow a fractional skin by; None: it has harmonics only.
+        grid: time constants that represent a fractional skin; None means harmonics only.
     """
 
     circuit: RC
@@ -215,16 +214,16 @@ class WithSkin(Circuit):
 
     @property
     def g(self) -> ArrayLike:
-        """The divider that the constant values have."""
+        """Capacitive divider ratio of the constant values."""
         return self.circuit.g
 
     @property
     def b(self) -> ArrayLike:
-        """The slowest time constant that the constant values have, s."""
+        """Slowest time constant of the constant values, s."""
         return self.circuit.b
 
     def circuit_at_frequency(self, frequency: ArrayLike) -> Circuit:
-        """The circuit with R(f), C(f) of `frequency` (Hz), which at this frequency is this one."""
+        """Return the circuit with constant skins R(f), C(f), equivalent at `frequency` (Hz)."""
         skin = self.skin.parallel_rc(Element(self.circuit.Rsc, self.circuit.Csc), frequency)
         changed = {"Rsc": skin.R, "Csc": skin.C}
         if isinstance(self.circuit, DirectGround):
@@ -234,16 +233,16 @@ class WithSkin(Circuit):
         return dataclasses.replace(self.circuit, **changed)
 
     def channel_terms(self, channel: Channel) -> HighpassTerms:
-        """The grid's time constants with their weights; raises where there is no grid."""
+        """Return the time constants of the grid with their weights, or raise InputError without a grid."""
         if self.grid is not None:
             return self.grid.terms(channel, limits_current(self.circuit), self.channel_gain(channel, self.grid.omega))
         raise InputError(
-            f"a {type(self.skin).__name__.lower()} skin has no finite set of time constants; ask for the steady"
-            " state of a periodic drive (response) or for harmonics (harmonic_response)"
+            f"a {type(self.skin).__name__.lower()} skin has no finite set of time constants; use the steady"
+            " state of a periodic drive (response) or harmonics (harmonic_response)"
         )
 
     def channel_gain(self, channel: Channel, omega: ArrayLike) -> Complex[Array, "*shape"]:
-        """A channel over V at the angular frequency `omega` (rad/s, >= 0)."""
+        """Return the ratio of a channel to V at the angular frequency `omega` (rad/s, >= 0)."""
 
         def gain(w: Array) -> Array:
             return self.circuit_at_frequency(w / (2.0 * np.pi)).channel_gain(channel, w)
@@ -252,23 +251,23 @@ class WithSkin(Circuit):
 
 
 def constant_skin_circuit(circuit: Circuit) -> Circuit:
-    """The circuit with constant skins that a level refers to; one without a level, as it is."""
+    """Return the circuit with constant skins, without its skin model if it has one."""
     return circuit.circuit if isinstance(circuit, WithSkin) else circuit
 
 
 def limits_current(circuit: Circuit) -> bool:
-    """Whether a resistance is in series with the insulator; without one the current follows dV/dt."""
+    """Return whether a resistance is in series with the insulator; otherwise the current follows dV/dt."""
     inner = constant_skin_circuit(circuit)
     return isinstance(inner, Loop) and inner.resistance() is not None
 
 
 def has_time_constants(circuit: Circuit) -> bool:
-    """Whether finitely many stand for it, its own or a grid's."""
+    """Return whether the circuit has finitely many time constants, exact or of a grid."""
     return not isinstance(circuit, WithSkin) or circuit.grid is not None
 
 
 def circuit_parameters(circuit: Circuit) -> dict[str, Any]:
-    """Parameters of a circuit, known or unknown, by name: its fields, and the exponent of a fractional skin."""
+    """Return all parameters of a circuit by name: its fields, and the exponent of a fractional skin."""
     inner = constant_skin_circuit(circuit)
     values = {field.name: getattr(inner, field.name) for field in dataclasses.fields(inner) if field.name != "probe"}
     if isinstance(circuit, WithSkin) and isinstance(circuit.skin, Fractional):
@@ -277,7 +276,7 @@ def circuit_parameters(circuit: Circuit) -> dict[str, Any]:
 
 
 def with_values(circuit: Circuit, values: Mapping[str, ArrayLike]) -> Circuit:
-    """The circuit with other values of its `parameters`."""
+    """Return the circuit with some of its `circuit_parameters` replaced."""
     if not isinstance(circuit, WithSkin):
         return dataclasses.replace(circuit, **values)
     inner, skin = dict(values), circuit.skin
@@ -294,16 +293,16 @@ class SeriesElement(NamedTuple):
 
 
 def series_equivalent(Rsc: ArrayLike, Csc: ArrayLike, frequency: ArrayLike) -> SeriesElement:
-    """Rx (ohm) and Cx (F) that in series are Rsc‖Csc at `frequency` (Hz, > 0), eqs. (10)-(13).
+    """Return Rx (ohm) and Cx (F) in series that equal Rsc‖Csc at `frequency` (Hz, > 0), eqs. (10)-(13).
 
-    Of two equal skins in series Rx' = 2 Rx, eq. (14), and Cx' = Cx / 2.
+    Two equal skins in series have Rx' = 2 Rx, eq. (14), and Cx' = Cx / 2.
     """
     q = quality_factor(Rsc, Csc, frequency)
     below = q <= 1.0
     small, inverse = jnp.where(below, q, 1.0), 1.0 / jnp.where(below, 1.0, q)
-    # 1 / (1 + q^2) and 1 + q^-2, without the square of what is large
+    # 1 / (1 + q^2) and 1 + q^-2, without squaring a large number
     Rx = Rsc * jnp.where(below, 1.0 / (1.0 + small**2), inverse**2 / (1.0 + inverse**2))
-    # C (1 + q^-2), where q is small as 1 / (w^2 R^2 C) + C
+    # C (1 + q^-2), computed for small q as 1 / (w^2 R^2 C) + C
     wR = 2.0 * np.pi * jnp.asarray(frequency, dtype=float) * Rsc
     Cx = Csc + jnp.where(below, 1.0 / (jnp.where(below, wR, 1.0) * small), Csc * inverse**2)
     return SeriesElement(Rx, Cx)
@@ -312,9 +311,9 @@ def series_equivalent(Rsc: ArrayLike, Csc: ArrayLike, frequency: ArrayLike) -> S
 def quality_factor(
     Rsc: ArrayLike, Csc: ArrayLike, frequency: ArrayLike, R_H: ArrayLike = 0.0
 ) -> Float[Array, "*shape"]:
-    """Q of two equal skins in series with `R_H` (ohm) at `frequency` (Hz), eqs. (15)-(17).
+    """Return Q of two equal skins in series with `R_H` (ohm) at `frequency` (Hz), eqs. (15)-(17).
 
-    Without R_H it is that of one skin, w Rsc Csc; with it Xx' / (Rx' + R_H) = q / (1 + (1 + q^2) R_H / (2 Rsc)).
+    Without R_H it equals w Rsc Csc; with R_H it is Xx' / (Rx' + R_H) = q / (1 + (1 + q^2) R_H / (2 Rsc)).
     """
     q = 2.0 * np.pi * jnp.asarray(frequency, dtype=float) * (jnp.asarray(Rsc) * Csc)
     share = 0.5 * jnp.asarray(R_H) / Rsc

@@ -1,10 +1,10 @@
-"""A steady state over a period, exactly: mean squares, peaks, and the current in the body.
+"""Exact quantities of the steady state over a period: mean squares, peaks, and the body current.
 
-With u the response of one high-pass term s tau / (1 + s tau) and S(tau) its mean square, two terms have
+Let u be the response of one high-pass term s tau / (1 + s tau), and S(tau) its mean square. Two terms have
 
     mean(u_j u_k) = (tau_k S(tau_j) + tau_j S(tau_k)) / (tau_j + tau_k),   mean(u V') = S(tau) / tau,
 
-so S serves every circuit. Written so that neither it nor its derivative cancels at either end of tau.
+so S suffices for every circuit. The formulas avoid cancellation in S and its derivative for small and large tau.
 """
 
 import itertools
@@ -44,55 +44,55 @@ from fitact.model.skin import WithSkin
 
 
 class BodyCurrent(NamedTuple):
-    """The trunk current over a period of the steady state, A."""
+    """Loop current over a period of the steady state, A."""
 
     rms: Array
     peak: Array
 
 
 def mean_square(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Float[Array, ""]:
-    """The mean square over a period of Vsc or Vgap (V^2) or of the trunk current I (A^2), in the steady state.
+    """Return the exact mean square of Vsc or Vgap (V^2) or I (A^2) over a period of the steady state.
 
-    Exact. Where the current follows dV/dt and the drive jumps it is infinite.
+    It is infinite for a current that follows dV/dt if the drive jumps.
 
     Raises:
-        InputError: the drive does not repeat.
+        InputError: the drive is not periodic.
     """
     if isinstance(circuit, WithSkin) and circuit.grid is None:
         terms, tones, gain, missing_gain = harmonic_decomposition(circuit, drive, channel)
-        # by Parseval: what the terms have of the harmonics gives way to what the circuit has
+        # Parseval: at the single harmonics, the power of the circuit replaces the power of the terms
         instead = _power(tones * gain) - _power(tones * (gain - missing_gain))
         return instead + (_terms_mean_square(terms, drive) if terms.tau else 0.0)
     return _terms_mean_square(circuit.channel_terms(channel), drive)
 
 
 def _terms_mean_square(terms: HighpassTerms, drive: Drive) -> Float[Array, ""]:
-    """The mean square of the terms' sum."""
+    """Return the mean square of the sum of the terms."""
     weight, tau = terms.stack()
     products = weight * jax.vmap(lambda t: highpass_mean_square(drive, t))(tau)
-    # a term with itself: 1 / 2 to the last digit, and without a derivative
+    # for a term with itself this is exactly 1 / 2, with zero derivative
     share = jnp.where(jnp.eye(tau.size, dtype=bool), 0.5, tau[:, None] / (tau[:, None] + tau))
     total = 2.0 * jnp.sum(weight[:, None] * share * products)
     if terms.rate is None:
-        return jnp.maximum(total, 0.0)  # terms of Vsc may cancel down to rounding
+        return jnp.maximum(total, 0.0)  # the terms of Vsc may cancel to within rounding
     total = total + 2.0 * terms.rate * jnp.sum(products / tau)
     return jnp.where(_has_impulses(drive, terms.rate), jnp.inf, total + terms.rate**2 * _slope_mean_square(drive))
 
 
 def _power(amplitude: Array) -> Array:
-    """The mean square of 2 Re sum_k amplitude[k - 1] e^{jkwt}."""
+    """Return the mean square of 2 Re sum_k amplitude[k - 1] e^{jkwt}."""
     return 2.0 * jnp.sum(amplitude.real**2 + amplitude.imag**2)
 
 
 def peak(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Float[Array, ""]:
-    """The largest |Vsc| or |Vgap| (V) or |I| (A) over a period of the steady state, both sides of every jump included.
+    """Return the exact maximum of |Vsc| or |Vgap| (V) or |I| (A) over a period of the steady state, jumps included.
 
-    Exact: one time constant has its extremes at the ends of the straight pieces; of several, those in
-    between are bracketed and halved to the last bit, and a multi-tone's are found by Newton's method. Where
-    the current follows dV/dt and the drive jumps it is infinite.
+    With one time constant, the extremes lie at the ends of the linear pieces. With several, extremes in between are
+    bracketed and bisected to the last bit; extremes of a multi-tone are found by Newton's method. The maximum is
+    infinite for a current that follows dV/dt if the drive jumps.
 
     Raises:
-        InputError: the drive does not repeat.
+        InputError: the drive is not periodic.
     """
     if isinstance(drive, Sine):
         omega = 2.0 * np.pi * jnp.asarray(drive.frequency)
@@ -111,9 +111,9 @@ def peak(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Float[Arra
 def _largest_sum(
     phasors: Complex[Array, " tones"], orders: tuple[int, ...], points_per_cycle: int = 32, steps: int = 6
 ) -> Float[Array, ""]:
-    """The largest |Im sum_k phasors[k] e^{j orders[k] x}|: by Newton's method from many points.
+    """Return the maximum of |Im sum_k phasors[k] e^{j orders[k] x}| by Newton's method from many points.
 
-    Each of the steps doubles the digits. Where it lies is held fixed, which leaves first derivatives right.
+    Each step doubles the number of digits. The position is not differentiated, so only first derivatives are right.
     """
     order = jnp.asarray(orders, dtype=float)
     start = jnp.linspace(0.0, 2.0 * np.pi, points_per_cycle * max(orders), endpoint=False)
@@ -131,19 +131,19 @@ def _largest_sum(
 
 
 def body_current(circuit: Circuit, drive: Drive) -> BodyCurrent:
-    """The current through the body in the steady state: rms and peak of the trunk current in A, edges included.
+    """Return rms and peak (A) of the body current in the steady state, edges included; relevant to electrical safety.
 
-    The figure for electrical safety. At an ideal jump both are infinite where nothing resistive limits
-    the current: give the drive a rise time, or the circuit an R_H or a series resistor.
+    Both are infinite at an ideal jump if no resistance limits the current. In this case, give the drive a rise time,
+    or the circuit an R_H or a series resistor.
 
     Raises:
-        InputError: the drive does not repeat.
+        InputError: the drive is not periodic.
     """
     return BodyCurrent(jnp.sqrt(mean_square(circuit, drive, "I")), peak(circuit, drive, "I"))
 
 
 def highpass_mean_square(drive: Drive, tau: ArrayLike) -> Array:
-    """S(tau), the mean square over a period of the response of s tau / (1 + s tau) to `drive`, V^2."""
+    """Return S(tau), the mean square over a period of the response of s tau / (1 + s tau) to `drive`, V^2."""
     if isinstance(drive, Sine):
         omega = 2.0 * np.pi * jnp.asarray(drive.frequency)
         return 0.5 * jnp.square(0.5 * jnp.asarray(drive.peak_to_peak) * highpass_amplitude(omega * tau))
@@ -170,7 +170,7 @@ def _period_pieces(drive: Drive) -> LinearPieces:
 
 @jax.custom_jvp
 def _rectangle(duty: ArrayLike, x: ArrayLike) -> Array:
-    """S of a rectangular wave of peak-to-peak 1 that is high for `duty` of its period; x = T / tau."""
+    """Return S of a rectangular wave of peak-to-peak 1 that is high for `duty` of its period; x = T / tau."""
     duty = jnp.asarray(duty, dtype=float)
     return duty * phi(duty * x) * ((1.0 - duty) * phi((1.0 - duty) * x) / phi(x))
 
@@ -181,7 +181,7 @@ def _rectangle_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) 
     q = 1.0 - jnp.asarray(d, dtype=float)
     value = _rectangle(d, x)
     few, many = jnp.where(x < 2.0, x, 0.0), jnp.where(x < 2.0, 2.0, x)
-    # what is left once -d/2 - q/2 + 1/2 has gone
+    # the remainder after -d/2 - q/2 + 1/2 has cancelled
     slow = d * half_langevin(d * few) + q * half_langevin(q * few) - half_langevin(few)
     fast = d * log_phi_derivative(d * many) + q * log_phi_derivative(q * many) - log_phi_derivative(many)
     by_x = jnp.where(x < 2.0, slow, fast)
@@ -190,7 +190,7 @@ def _rectangle_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) 
 
 
 def _triangle(amplitude: Array, y: Array) -> Array:
-    """(1 - tanh(y) / y) / y^2 times the amplitude squared; y = T / (4 tau)."""
+    """Return (1 - tanh(y) / y) / y^2 times the amplitude squared; y = T / (4 tau)."""
     few, many = jnp.where(y < 1.0, y, 0.0), jnp.where(y < 1.0, 1.0, y)
     slow = 1.0 / (coth_fraction(few * few) + few * few)
     fast = jnp.square(amplitude / many) * (1.0 - jnp.tanh(many) / many)
@@ -198,10 +198,10 @@ def _triangle(amplitude: Array, y: Array) -> Array:
 
 
 def _unit_peak(drive: Square | Triangle, x: Array) -> Array:
-    """The highest |u| of one time constant for a peak-to-peak of 1; x = T / tau.
+    """Return the maximum of |u| for one time constant and a peak-to-peak value of 1; x = T / tau.
 
-    Of a triangle's crest the terms of first order cancel, and of a square's two edges the higher one may be
-    higher by less than rounding: neither the derivative's digits nor its edge come out of the pieces.
+    These closed forms are needed for the derivative. At the crest of a triangle the first-order terms cancel, and the
+    heights at the two edges of a square may differ by less than rounding, so the pieces would give neither.
     """
     if isinstance(drive, Triangle):
         y = 0.25 * x
@@ -216,10 +216,10 @@ def _unit_peak(drive: Square | Triangle, x: Array) -> Array:
 
 
 def _trapezoid(drive: Trapezoid, tau: ArrayLike, general: Array) -> Array:
-    """S of a trapezoid, with `general` where the rise is longer than tau.
+    """Return S of a trapezoid, or `general` if the rise is longer than tau.
 
-    A trapezoid is a rectangular wave averaged over the rise. That multiplies S by (sinh(z/2) / (z/2))^2,
-    z = rise / tau, except that the product of edges with themselves falls short.
+    A trapezoid is a rectangular wave averaged over the rise. With z = rise / tau, this multiplies S by
+    (sinh(z/2) / (z/2))^2, except for the products of edges with themselves, which are smaller.
     """
     x, rise = drive.period / tau, jnp.asarray(drive.rise_time) / drive.period
     z = jnp.where(rise * x < 1.0, rise * x, 0.0)
@@ -230,7 +230,7 @@ def _trapezoid(drive: Trapezoid, tau: ArrayLike, general: Array) -> Array:
 
 
 def _even_series(z: Array, first: int) -> Array:
-    """first! sum_n z^n / (2 n + first)! for 0 <= z <= 1."""
+    """Return first! sum_n z^n / (2 n + first)! for 0 <= z <= 1."""
     total = jnp.ones_like(z)
     for n in reversed(range(8)):
         total = 1.0 + z * total / ((2 * n + first + 1) * (2 * n + first + 2))
@@ -238,22 +238,22 @@ def _even_series(z: Array, first: int) -> Array:
 
 
 def _straight_pieces(pieces: LinearPieces, tau: ArrayLike) -> Array:
-    """S of any period of straight pieces."""
+    """Return S of any drive made of linear pieces."""
     length, rise = jnp.diff(pieces.knots), pieces.end - pieces.start
     u, lam = steady_knot_values(pieces, tau), length / tau
-    third = phi(lam) * (_half_langevin_ratio(lam) + 0.5 * psi(lam))  # of a rise from u = 0: (psi - phi^2 / 2) / lam
+    third = phi(lam) * (_half_langevin_ratio(lam) + 0.5 * psi(lam))  # for a rise from u = 0: (psi - phi^2 / 2) / lam
     inside = u * u * phi(2.0 * lam) + u * rise * jnp.square(phi(lam)) + rise * rise * third
     return jnp.sum(length / (pieces.knots[-1] - pieces.knots[0]) * inside)
 
 
 def _half_langevin_ratio(x: Array) -> Array:
-    """`half_langevin` of x over x, finite at 0."""
+    """Return `half_langevin(x) / x`, finite at 0."""
     few, many = jnp.where(x < 2.0, x, 0.0), jnp.where(x < 2.0, 2.0, x)
     return jnp.where(x < 2.0, 0.25 / coth_fraction(0.25 * few * few), half_langevin(many) / many)
 
 
 def _slope_mean_square(drive: Drive) -> Array:
-    """The mean square of dV/dt between jumps, V^2/s^2."""
+    """Return the mean square of dV/dt between jumps, V^2/s^2."""
     if isinstance(drive, Sine):
         return 0.5 * jnp.square(np.pi * jnp.asarray(drive.peak_to_peak) * drive.frequency)
     if isinstance(drive, Multitone):
@@ -263,7 +263,7 @@ def _slope_mean_square(drive: Drive) -> Array:
 
 
 def _has_impulses(drive: Drive, rate: ArrayLike) -> Array:
-    """Whether a current that follows dV/dt meets a jump."""
+    """Return whether the current follows dV/dt and the drive jumps."""
     if isinstance(drive, Sine | Multitone):
         return jnp.asarray(False)
     knots, start, end = _period_pieces(drive)
@@ -272,9 +272,9 @@ def _has_impulses(drive: Drive, rate: ArrayLike) -> Array:
 
 
 def _extremes(terms: HighpassTerms, pieces: LinearPieces) -> Array:
-    """The response at both ends of every piece and at the extremes in between.
+    """Return the response at both ends of every piece and at the extremes in between.
 
-    Of the latter the first derivatives are right, not the second: where an extreme lies is held fixed.
+    The positions of the extremes are not differentiated, so only first derivatives are right.
     """
     length, rise, slopes = jnp.diff(pieces.knots), pieces.end - pieces.start, pieces.slopes()
     weights, tau = terms.stack()
@@ -286,21 +286,21 @@ def _extremes(terms: HighpassTerms, pieces: LinearPieces) -> Array:
             total = total + weight * (first * jnp.exp(-since / t) + slopes * since * phi(since / t))
         return total
 
-    # the derivative is a sum of exponentials; to first order, a shift of an extreme does not change it
+    # the derivative is a sum of exponentials; a shift of an extreme changes its value only in second order
     fall = weights[:, None] * (slopes - u / tau[:, None])
     inside = _zeros(*lax.stop_gradient((fall, 1.0 / tau, length)))
     start, end = piece_response(jnp.zeros_like(length)), piece_response(length)
-    if len(terms.tau) == 1:  # a level only decays; to rounding its end may equal its start, but not in the derivative
+    if len(terms.tau) == 1:  # a constant piece only decays; rounding may make its ends equal, but not their derivatives
         end = jnp.where(rise == 0.0, 0.0, end)
     return jnp.stack([start, end, *map(piece_response, inside)])
 
 
 def _zeros(factor: Array, rate: Array, length: Array, bisections: int = 160) -> list[Array]:
-    """Where sum_k factor[k] e^{-rate[k] s} changes sign in 0 < s < length: one s fewer than terms (or an end).
+    """Return the sign changes of sum_k factor[k] e^{-rate[k] s} in 0 < s < length, one fewer than terms (or an end).
 
-    n exponentials have at most n - 1 zeros: times e^{rate[0] s} and differentiated they are n - 1
-    exponentials, and between two zeros of these the sum times e^{rate[0] s} is monotone. A bracket that begins at 0
-    is halved to the last bit of an extreme far closer to 0 than to the end.
+    A sum of n exponentials has at most n - 1 zeros: its product with e^{rate[0] s} has a derivative of n - 1
+    exponentials, and is monotone between two zeros of this derivative. A bracket that begins at 0 is bisected often
+    enough to resolve an extreme that is far closer to 0 than to the end.
     """
     if len(rate) == 1:
         return []

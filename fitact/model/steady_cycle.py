@@ -1,7 +1,7 @@
-"""One period of the steady state at a finger: the force that alternates, what the insulator holds, what is drawn.
+"""Quantities over one period of the steady state: AC force, insulator voltage, power and body current.
 
-The power follows from the high-pass responses u alone, since mean(V u) = mean(u^2): P = sum_k weight_k S(tau_k), with
-S their mean square and the weights those of the current. So it is finite also where the current has impulses.
+The power follows from the high-pass responses u alone, because mean(V u) = mean(u^2): P = sum_k weight_k S(tau_k),
+where S is the mean square and the weights belong to the current. So P is finite even if the current has impulses.
 """
 
 from typing import NamedTuple
@@ -18,24 +18,24 @@ from fitact.model.force import AirGap, Contact, electrostatic_force
 from fitact.model.response import highpass, phi, steady_knot_values
 from fitact.model.steady import highpass_mean_square, mean_square
 
-HARMONICS = 4  # of the drive's frequency, at which the force is stated
+HARMONICS = 4  # number of harmonics at which the force is computed
 
 
 class PeriodQuantities(NamedTuple):
     """Effects of a drive at one finger over a period of the steady state."""
 
     force_mean: Array  # N
-    force_alternating: Array  # amplitude of the alternating part, N: of the sine with the same root mean square
-    force_harmonics: Float[Array, " harmonics"]  # amplitudes at 1, 2, ... `HARMONICS` times the drive's frequency, N
-    insulator_peak: Array  # the largest voltage over the insulator, V
-    real_power: Array  # the mean of V I, W: what skins and resistances turn into heat
-    apparent_power: Array  # rms V times rms I, VA; infinite where the current has impulses, as both currents
+    force_alternating: Array  # AC amplitude, N: sqrt(2) times the rms about the mean
+    force_harmonics: Float[Array, " harmonics"]  # amplitudes at the harmonics of the drive's frequency, N
+    insulator_peak: Array  # maximum voltage across the insulator, V
+    real_power: Array  # mean of V I, dissipated in skins and resistances, W
+    apparent_power: Array  # rms V times rms I, VA; infinite, like both currents, if the current has impulses
     current_rms: Array  # through the body, A
     current_peak: Array  # A
 
 
 def period_quantities(circuit: RC, drive: Periodic, contact: Contact | AirGap) -> PeriodQuantities:
-    """Compute all of `PeriodQuantities`; the force acts on `contact`, eqs. (1) and (22)."""
+    """Compute all `PeriodQuantities`; the force acts on `contact`, eqs. (1) and (22)."""
     period, terms = PeriodGrid.from_drive(drive), circuit.channel_terms(contact.channel)
     force = electrostatic_force(period.response(terms), contact)
     mean = period.weight @ force
@@ -54,10 +54,10 @@ def period_quantities(circuit: RC, drive: Periodic, contact: Contact | AirGap) -
 
 
 def real_power(circuit: RC, drive: Periodic) -> Float[Array, ""]:
-    """The mean of V I in W: exact.
+    """Return the exact mean of V I, W.
 
-    An ideal jump without a resistance in the loop is the limit of ever shorter ramps, which lose nothing; any
-    resistance, however small, loses C (dV)^2 / 2 at each, with C that of the loop at high frequency.
+    Without a resistance in the loop, an ideal jump is the limit of ever shorter ramps, which dissipate no energy. Any
+    resistance, however small, dissipates C (dV)^2 / 2 per jump, where C is the loop's high-frequency capacitance.
     """
     terms = circuit.current_terms()
     parts = (weight * highpass_mean_square(drive, tau) for weight, tau in zip(terms.weight, terms.tau, strict=True))
@@ -65,30 +65,30 @@ def real_power(circuit: RC, drive: Periodic) -> Float[Array, ""]:
 
 
 def insulator_peak(circuit: RC, drive: Periodic) -> Float[Array, ""]:
-    """The largest |voltage| over the insulator in V, edges included; the drive's mean lies over it entirely."""
+    """Return the maximum |voltage| (V) across the insulator, edges included; it carries the whole mean of the drive."""
     period, (weight, tau, rate) = PeriodGrid.from_drive(drive), circuit.current_terms()
     mean = period.weight @ period.voltage
     alternating = period.voltage - mean
     charge = jnp.zeros_like(alternating) if rate is None else rate * alternating
-    for w, t in zip(weight, tau, strict=True):  # the integral of a high-pass response is what it leaves out
+    for w, t in zip(weight, tau, strict=True):  # tau times the low-pass response
         charge = charge + w * t * (alternating - period.highpass(t))
     return period.max_abs(mean + charge / circuit.Ci)
 
 
 class PeriodGrid(eqx.Module):
-    """Points of one period of a drive, and weights that integrate over it."""
+    """Points and quadrature weights over one period of a drive."""
 
-    drive: Periodic  # of straight pieces, whose ends are among the points (with weight 0), or of sines
-    local_time: Float[Array, "pieces nodes"]  # from the start of each piece, s; of sines from that of the period
+    drive: Periodic  # linear pieces, whose ends are points of weight 0, or sines
+    local_time: Float[Array, "pieces nodes"]  # from the start of each piece (for sines: of the period), s
     cycles: Float[Array, " points"]  # from the start of the period, in periods
-    weight: Float[Array, " points"]  # the share of the period
+    weight: Float[Array, " points"]  # fraction of the period
     voltage: Float[Array, " points"]  # of the drive, V
     slope: Float[Array, " points"]  # of the drive between its jumps, V/s
 
     @classmethod
     def from_drive(cls, drive: Periodic) -> "PeriodGrid":
         if not isinstance(drive, PiecewiseLinear):
-            # points of the fastest sine's cycle: the mean of Vsc^4 is exact from 5 on
+            # points per cycle of the fastest sine; the mean of Vsc^4 is exact from 5 on
             count = 32 * (max(drive.orders) if isinstance(drive, Multitone) else 1)
             cycles = jnp.arange(count) / count
             time = cycles * drive.period
@@ -104,7 +104,7 @@ class PeriodGrid(eqx.Module):
         return cls(drive, local_time, *(x.reshape(-1) for x in (cycles, weights, voltage, slope)))
 
     def highpass(self, tau: ArrayLike) -> Float[Array, " points"]:
-        """The response of s tau / (1 + s tau), V."""
+        """Return the response of s tau / (1 + s tau), V."""
         if not isinstance(self.drive, PiecewiseLinear):
             return highpass(self.drive, self.local_time[0], tau)
         pieces = self.drive.pieces()
@@ -112,21 +112,21 @@ class PeriodGrid(eqx.Module):
         return (decay + pieces.slopes()[:, None] * self.local_time * phi(self.local_time / tau)).reshape(-1)
 
     def response(self, terms: HighpassTerms) -> Float[Array, " points"]:
-        """The response of a circuit's terms, in their unit."""
+        """Return the response of the terms of a circuit, in their unit."""
         total = jnp.zeros_like(self.voltage) if terms.rate is None else terms.rate * self.slope
         for weight, tau in zip(terms.weight, terms.tau, strict=True):
             total = total + weight * self.highpass(tau)
         return total
 
     def max_abs(self, values: Float[Array, " points"]) -> Float[Array, ""]:
-        """The largest of |values|: exact at the ends of straight pieces and of a sine, elsewhere low by up to 1e-4."""
+        """Return max |values|; exact at ends of linear pieces and for a sine, elsewhere too small by up to 1e-4."""
         size = jnp.abs(values)
         if isinstance(self.drive, Sine):
             first = jnp.exp(-2j * np.pi * self.cycles)
             return jnp.abs(self.weight @ values) + 2.0 * jnp.abs((self.weight * first) @ values)
         if isinstance(self.drive, PiecewiseLinear):
             return jnp.max(size)
-        top = jnp.argmax(size)  # of the parabola through it and its neighbours
+        top = jnp.argmax(size)  # maximum of the parabola through this point and its neighbours
         before, highest, after = size[top - 1], size[top], size[(top + 1) % size.size]
         bend = before - 2.0 * highest + after
         rise = jnp.square(before - after) / (8.0 * jnp.where(bend < 0.0, bend, -1.0))
@@ -134,8 +134,8 @@ class PeriodGrid(eqx.Module):
 
 
 def _quadrature_rule(nodes: int = 10, parts: int = 10) -> tuple[np.ndarray, np.ndarray]:
-    """Places and weights on a piece of length 1: Gauss and Legendre's `nodes` of each part."""
-    # the parts grow by 4 from the start of the piece, where transients of any length begin
+    """Return nodes and weights on a piece of length 1: Gauss-Legendre with `nodes` points in each part."""
+    # the parts grow by a factor 4 from the start of the piece, where transients of any length begin
     ends = 4.0 ** -np.arange(parts - 1.0, -1.0, -1.0)
     x, weights = np.polynomial.legendre.leggauss(nodes)
     length = np.diff(ends, prepend=0.0)[:, None]

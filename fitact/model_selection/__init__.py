@@ -1,4 +1,4 @@
-"""How much model does the scene, or the record, need?
+"""Model selection for a scene or a record.
 
-Takes a scene, with records or without; gives the error and the cost of every simplification, and ranks rival models.
+Computes the error and the speed-up of each simplification of a scene, and ranks alternative models of a record.
 """

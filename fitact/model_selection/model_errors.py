@@ -153,7 +153,7 @@ class CircuitResponses:
         return np.where(since > end, after, u)
 
     def _initial_voltage(self) -> float:
-        """V at t = 0, from the right."""
+        """Return V at t = 0, from the right."""
         if self.segments is None:
             with jax.enable_x64(True):
                 return float(self.wave.value(0.0))
@@ -207,7 +207,7 @@ class ReferenceModel:
     def _evaluate(
         self, scene: Scene, values: Mapping[str, Any], precision: type[np.floating[Any]]
     ) -> tuple[tuple[Rows, np.ndarray], tuple[Rows, np.ndarray], Float[np.ndarray, " circuits"]]:
-        """Vsc and its peak; those of the voltage that makes the force; the force over its square, N/V^2."""
+        """Return Vsc and its peak; those of the voltage that makes the force; the force over its square, N/V^2."""
         drive = self.measured or scene.make_drive()
         vsc = acting = _voltages(self.grid, CircuitResponses.from_scene(scene, drive, values, precision, "Vsc"))
         if scene.force.model != "paper":
@@ -220,7 +220,7 @@ class ReferenceModel:
 def _voltages(
     grid: ComparisonGrid, responses: CircuitResponses, candidates: int = 4, points: int = 17, refinements: int = 3
 ) -> tuple[Rows, Float[np.ndarray, " circuits"]]:
-    """Voltages at the nodes, and the largest, between the nodes too.
+    """Return voltages at the nodes, and the largest, between the nodes too.
 
     The `candidates` highest stretches are looked at more closely: `refinements` times at so many `points`.
     """
@@ -276,7 +276,7 @@ def _representative_periods(periods: int, cycles: int, groups: int = 12) -> list
 
 
 def _phase_offset(wave: Any) -> float:
-    """How far into a period t = 0 lies, s."""
+    """Return how far into a period t = 0 lies, s."""
     return float(wave.phase / (2.0 * np.pi) % 1.0 / wave.frequency)
 
 
@@ -317,7 +317,7 @@ def _tones(wave: Any) -> list[tuple[int, float, float]]:
 def _column_knots(
     segments: LinearPieces, tau: Float[Array, " circuits"], steady_state: bool
 ) -> Float[Array, "circuits pieces"]:
-    """u just after the start of each piece, in the steady state or without charge before the first."""
+    """Return u just after the start of each piece, in the steady state or without charge before the first."""
     begin = functools.partial(knot_values, segments, first=segments.start[0])
     return jax.vmap(functools.partial(steady_knot_values, segments) if steady_state else begin)(tau)
 

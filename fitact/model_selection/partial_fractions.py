@@ -84,7 +84,7 @@ def partial_fractions(
 def _transfer_function(
     circuit: DirectGround | NaturalGround, skin: SkinModel, omega: np.ndarray, channel: Channel
 ) -> np.ndarray:
-    """Vsc / V, or Vgap / V, of circuits whose skins follow a level."""
+    """Return Vsc / V, or Vgap / V, of circuits whose skins follow a level."""
     blocks = np.pad(omega, (0, -omega.size % _BLOCK), mode="edge").reshape(-1, _BLOCK)
     with jax.enable_x64(True):  # for any precision, so that one program serves
         circuits = jax.tree.map(np.float64, WithSkin(circuit, skin))
@@ -98,7 +98,7 @@ def _channel_gain(circuits: WithSkin, omega: Array, channel: Channel) -> Complex
 
 
 def _constant_skin_terms(circuit: Any, channel: Channel) -> tuple[np.ndarray, np.ndarray]:
-    """Terms of constant skins. Z stands in the loop where a grounding skin does, so one program serves both."""
+    """Return terms of constant skins. Z stands in the loop where a grounding skin does, so one program serves both."""
     if isinstance(circuit, NaturalGround):
         loop = circuit.series_resistor, circuit.Z, circuit.Z_capacitance
         gap = {"Rgap": circuit.Rgap, "Cgap": circuit.Cgap}

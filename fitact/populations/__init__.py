@@ -1,4 +1,4 @@
-"""How do fingers differ, and what does the next one feel?
+"""Variability between fingers, and predictions for a new finger.
 
-Takes records of several fingers; gives the distribution over fingers, its uncertainty, and what it predicts.
+Estimates the distribution over fingers, its uncertainty and its predictions from records of several fingers.
 """

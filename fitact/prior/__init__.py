@@ -1,4 +1,4 @@
-"""What is believed before there is data?
+"""Prior distributions of the parameters.
 
-Takes medians, factors and published tables; gives distributions and their joint density in log-parameters.
+Makes distributions, and their joint density in log-parameters, from medians, factors and published tables.
 """

@@ -1,7 +1,7 @@
-"""Priors for one positive parameter x, as densities of u = log x.
+"""Priors for one positive parameter x, given as densities of u = log x.
 
-Everything is fitted and sampled in log-parameters, so each density includes the Jacobian of the change. Each
-distribution also gives its normal scores z = Phi^-1(F(u)), which correlate it with others and draw from it.
+Parameters are fitted and sampled as logarithms, so each density includes the Jacobian of the transformation. Each
+distribution also maps u to a standard normal z = Phi^-1(F(u)), which serves for correlations and for drawing.
 """
 
 import abc
@@ -22,7 +22,7 @@ _Z95 = 1.959963984540054  # half-width, in standard deviations, of a central 95 
 
 
 class Distribution(eqx.Module):
-    """A prior for one positive parameter."""
+    """Prior for one positive parameter."""
 
     @abc.abstractmethod
     def _log_moments(self) -> tuple[float, float]: ...
@@ -39,28 +39,28 @@ class Distribution(eqx.Module):
 
     @abc.abstractmethod
     def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
-        """Log-density of u = log x, Jacobian included; -inf where x is impossible."""
+        """Return the log-density of u = log x, Jacobian included; -inf outside the support."""
 
     @abc.abstractmethod
     def to_standard_normal(self, u: ArrayLike) -> Float[Array, "*shape"]:
-        """The standard normal number with as much probability below it as u has."""
+        """Return the standard normal z = Phi^-1(F(u))."""
 
     @abc.abstractmethod
     def from_standard_normal(self, z: ArrayLike) -> Float[Array, "*shape"]:
-        """The inverse of `to_standard_normal`: log x."""
+        """Return u = log x, the inverse of `to_standard_normal`."""
 
     def standardize(self, u: ArrayLike) -> Float[Array, "*shape"]:
-        """u less its mean, over its standard deviation."""
+        """Return (u - mean) / standard deviation."""
         return (jnp.asarray(u) - self.log_mean) / self.log_sd
 
     def sample(self, rng: np.random.Generator, size: int) -> Float[np.ndarray, " size"]:
-        """Draws of x."""
+        """Return draws of x."""
         with jax.enable_x64(True):
             return np.exp(np.asarray(self.from_standard_normal(rng.standard_normal(size))))
 
 
 class LogNormal(Distribution):
-    """log x is normal with the standard deviation `spread` around log `median`, which may be arrays."""
+    """Log-normal: log x has mean log `median` and standard deviation `spread`, which may be arrays."""
 
     median: ArrayLike
     spread: ArrayLike
@@ -68,19 +68,21 @@ class LogNormal(Distribution):
     def __check_init__(self) -> None:
         if not (self.median > 0.0 and self.spread > 0.0):
             raise InputError(
-                f"a log-normal prior needs a median and a spread above zero, not {self.median}, {self.spread}"
+                f"a log-normal prior needs a positive median and a positive spread, not {self.median}, {self.spread}"
             )
 
     @classmethod
     def within_factor(cls, median: float, factor: float) -> "LogNormal":
-        """95 % of the probability lies within `factor` (> 1) of the median, either way."""
+        """Return the log-normal with 95 % probability between median / `factor` and median * `factor` (> 1)."""
         if not factor > 1.0:
-            raise InputError(f"factor = {factor:g} must be above 1: 95 % of the prior lies within that factor")
+            raise InputError(
+                f"factor = {factor:g} must be above 1: 95 % of the prior lies within this factor of the median"
+            )
         return cls(median, math.log(factor) / _Z95)
 
     @classmethod
     def with_relative_sd(cls, median: float, relative_sd: float) -> "LogNormal":
-        """The standard deviation of x is `relative_sd` (> 0) times its mean."""
+        """Return the log-normal whose standard deviation is `relative_sd` (> 0) times its mean."""
         if not relative_sd > 0.0:
             raise InputError(f"relative_sd = {relative_sd:g} must be above 0")
         return cls(median, math.sqrt(math.log1p(relative_sd**2)))
@@ -89,55 +91,55 @@ class LogNormal(Distribution):
         return math.log(self.median), float(self.spread)
 
     def standardize(self, u: ArrayLike) -> Float[Array, "*shape"]:
-        """u less its mean, over its standard deviation, also where these are arrays."""
+        """Return (u - log median) / spread, also for arrays."""
         return self.to_standard_normal(u)
 
     def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
-        """Normal in u."""
+        """Return the normal log-density of u."""
         return -0.5 * self.to_standard_normal(u) ** 2 - _log(self.spread * math.sqrt(2.0 * math.pi))
 
     def to_standard_normal(self, u: ArrayLike) -> Float[Array, "*shape"]:
-        """(u - log median) / spread."""
+        """Return (u - log median) / spread."""
         return (jnp.asarray(u) - _log(self.median)) / self.spread
 
     def from_standard_normal(self, z: ArrayLike) -> Float[Array, "*shape"]:
-        """The inverse of `to_standard_normal`: log x."""
+        """Return u = log x, the inverse of `to_standard_normal`."""
         return _log(self.median) + self.spread * jnp.asarray(z)
 
 
 class Bounded(Distribution):
-    """A prior that is zero outside `low` < x < `high`."""
+    """Prior that is zero outside `low` < x < `high`."""
 
     low: eqx.AbstractVar[float]
     high: eqx.AbstractVar[float]
 
     @abc.abstractmethod
     def cdf(self, u: ArrayLike) -> Float[Array, "*shape"]:
-        """The probability below u = log x inside the bounds."""
+        """Return the cumulative probability of u = log x, within the bounds."""
 
     @abc.abstractmethod
     def ppf(self, p: ArrayLike) -> Float[Array, "*shape"]:
-        """The inverse of `cdf`: log x."""
+        """Return log x, the inverse of `cdf`."""
 
     def contains(self, u: ArrayLike) -> Array:
-        """Whether u = log x lies within the bounds."""
+        """Return whether u = log x lies within the bounds."""
         u = jnp.asarray(u)
         low = -math.inf if self.low == 0.0 else math.log(self.low)
         return (u >= low) & (u <= math.log(self.high))
 
     def to_standard_normal(self, u: ArrayLike) -> Float[Array, "*shape"]:
-        """The standard normal number with as much probability below it as u has."""
-        u = jnp.where(self.contains(u), u, self.log_mean)  # any value inside: outside, the density says it all
+        """Return the standard normal z = Phi^-1(F(u))."""
+        u = jnp.where(self.contains(u), u, self.log_mean)  # any value inside, since the density is zero outside
         p = self.cdf(u)
-        return ndtri(jnp.clip(p, 1e-300, 1.0 - jnp.finfo(p.dtype).epsneg))  # finite where it rounds to an edge
+        return ndtri(jnp.clip(p, 1e-300, 1.0 - jnp.finfo(p.dtype).epsneg))  # finite also if p rounds to 0 or 1
 
     def from_standard_normal(self, z: ArrayLike) -> Float[Array, "*shape"]:
-        """The inverse of `to_standard_normal`: log x."""
+        """Return u = log x, the inverse of `to_standard_normal`."""
         return self.ppf(ndtr(jnp.asarray(z, dtype=float)))
 
 
 class Uniform(Bounded):
-    """x is uniform between `low` and `high`, both above zero."""
+    """Uniform distribution of x between `low` and `high`, both above zero."""
 
     low: float
     high: float
@@ -147,35 +149,35 @@ class Uniform(Bounded):
 
     @classmethod
     def with_tolerance(cls, nominal: float, tolerance: float) -> "Uniform":
-        """Uniform within ± `tolerance` (relative, 0 to 1) of `nominal`: what a data sheet's limits say.
+        """Return the uniform distribution within ± `tolerance` (relative, 0 to 1) of `nominal`.
 
-        Limits without a distribution are rectangular (JCGM 100:2008, 4.3.7).
+        Limits stated without a distribution are taken as rectangular (JCGM 100:2008, 4.3.7).
         """
         if not 0.0 < tolerance < 1.0:
             raise InputError(f"tolerance = {tolerance:g} must lie between 0 and 1, such as 0.1 or '10 %'")
         return cls(nominal * (1.0 - tolerance), nominal * (1.0 + tolerance))
 
     def _log_moments(self) -> tuple[float, float]:
-        """The standard deviation is sqrt(1 - q L^2 / (1 - q)^2) with L = log(high / low), q = low / high."""
+        """Return mean and sd of u; the sd is sqrt(1 - q L^2 / (1 - q)^2) with L = log(high / low), q = low / high."""
         mean = (self.high * math.log(self.high) - self.low * math.log(self.low)) / (self.high - self.low) - 1.0
         q = self.low / self.high
         return mean, math.sqrt(max(1.0 - q * math.log(q) ** 2 / (1.0 - q) ** 2, 0.0))
 
     def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
-        """e^u / (high - low) inside."""
+        """Return log(e^u / (high - low)) within the bounds, -inf outside."""
         return jnp.where(self.contains(u), jnp.asarray(u) - math.log(self.high - self.low), -jnp.inf)
 
     def cdf(self, u: ArrayLike) -> Float[Array, "*shape"]:
-        """(x - low) / (high - low)."""
+        """Return (x - low) / (high - low)."""
         return self.low * jnp.expm1(jnp.asarray(u) - math.log(self.low)) / (self.high - self.low)
 
     def ppf(self, p: ArrayLike) -> Float[Array, "*shape"]:
-        """The inverse of `cdf`: log x."""
+        """Return log x, the inverse of `cdf`."""
         return math.log(self.low) + jnp.log1p(jnp.asarray(p) * (self.high - self.low) / self.low)
 
 
 class LogUniform(Bounded):
-    """log x is uniform between log `low` and log `high`: each decade counts the same."""
+    """Log-uniform distribution of x between `low` and `high`: all decades are equally probable."""
 
     low: float
     high: float
@@ -191,23 +193,23 @@ class LogUniform(Bounded):
         return math.log(self.low) + 0.5 * self._length, self._length / math.sqrt(12.0)
 
     def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
-        """1 / log(high / low) inside."""
+        """Return -log log(high / low) within the bounds, -inf outside."""
         return jnp.where(self.contains(u), -math.log(self._length), -jnp.inf)
 
     def cdf(self, u: ArrayLike) -> Float[Array, "*shape"]:
-        """log(x / low) / log(high / low)."""
+        """Return log(x / low) / log(high / low)."""
         return (jnp.asarray(u) - math.log(self.low)) / self._length
 
     def ppf(self, p: ArrayLike) -> Float[Array, "*shape"]:
-        """The inverse of `cdf`: log x."""
+        """Return log x, the inverse of `cdf`."""
         return math.log(self.low) + self._length * jnp.asarray(p)
 
 
 class TruncatedLogNormal(Bounded):
-    """A log-normal cut off outside `low` < x < `high` (0 and inf: no bound); `median` and `spread` are those before it.
+    """Log-normal truncated to `low` < x < `high` (0 and inf: no bound); `median` and `spread` are before truncation.
 
     Raises:
-        InputError: the bounds leave less than a thousandth of it.
+        InputError: the probability within the bounds is below 0.001.
     """
 
     median: float
@@ -218,9 +220,9 @@ class TruncatedLogNormal(Bounded):
     def __check_init__(self) -> None:
         if not 0.0 <= self.low < self.high:
             raise InputError(f"bounds of a prior need 0 <= low < high, not low = {self.low:g}, high = {self.high:g}")
-        if self._mass < 1e-3:  # as stated above: the median is far outside
+        if self._mass < 1e-3:  # see above; the median is far outside the bounds
             raise InputError(
-                f"the bounds low = {self.low:g}, high = {self.high:g} leave almost nothing of a prior with median"
+                f"the bounds low = {self.low:g}, high = {self.high:g} contain almost none of a prior with median"
                 f" {self.median:g}; bring the median within them"
             )
 
@@ -230,7 +232,7 @@ class TruncatedLogNormal(Bounded):
 
     @property
     def _limits(self) -> tuple[float, float]:
-        """The bounds in standard deviations before the cut."""
+        """Bounds in standard deviations before truncation."""
         low, high = ((math.log(x) if x > 0.0 else -math.inf) - math.log(self.median) for x in (self.low, self.high))
         return low / self.spread, high / self.spread
 
@@ -243,8 +245,8 @@ class TruncatedLogNormal(Bounded):
         return _normal_cdf(self._limits[1]) - self._cdf_low
 
     def _log_moments(self) -> tuple[float, float]:
-        """By quadrature: the closed form cancels where the bounds are close."""
-        low, high = np.clip(self._limits, -10.0, 10.0)  # all but 1e-23 of it
+        """Return mean and standard deviation of u by quadrature; the closed form cancels if the bounds are close."""
+        low, high = np.clip(self._limits, -10.0, 10.0)  # omits a probability of 1e-23
         nodes, weights = np.polynomial.legendre.leggauss(128)
         z = low + 0.5 * (high - low) * (nodes + 1.0)
         weights = weights * np.exp(-0.5 * (z**2 - np.min(z**2)))
@@ -253,21 +255,21 @@ class TruncatedLogNormal(Bounded):
         return math.log(self.median) + self.spread * mean, self.spread * math.sqrt(weights @ (z - mean) ** 2)
 
     def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
-        """Normal in u, over the mass that the bounds leave."""
+        """Return the normal log-density of u, normalised within the bounds."""
         return jnp.where(self.contains(u), self._parent.log_density(u) - math.log(self._mass), -jnp.inf)
 
     def cdf(self, u: ArrayLike) -> Float[Array, "*shape"]:
-        """The probability below u = log x inside the bounds."""
+        """Return the cumulative probability of u = log x, within the bounds."""
         return (ndtr(self._parent.to_standard_normal(u)) - self._cdf_low) / self._mass
 
     def ppf(self, p: ArrayLike) -> Float[Array, "*shape"]:
-        """The inverse of `cdf`: log x."""
+        """Return log x, the inverse of `cdf`."""
         z = ndtri(self._cdf_low + jnp.asarray(p) * self._mass)
         return self._parent.from_standard_normal(jnp.clip(z, *self._limits))
 
 
 def _log(x: Any) -> Any:
-    """The logarithm of an array, or of a number, which loses nothing in single precision."""
+    """Return the logarithm of an array, or of a number in double precision."""
     return jnp.log(x) if isinstance(x, jax.Array) else math.log(x)
 
 

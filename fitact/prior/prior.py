@@ -1,4 +1,4 @@
-"""Beliefs of the parameters together, before the data, in their logarithms."""
+"""Joint prior of the log-parameters."""
 
 import graphlib
 import itertools
@@ -18,20 +18,20 @@ from fitact.prior.distributions import Distribution
 
 
 class Prior(eqx.Module):
-    """Priors of named parameters, independent or correlated; `Prior.of(Rsc=..., Csc=..., Ci=...)` makes one.
+    """Joint prior of named parameters, independent or correlated; construct it by `Prior.of(Rsc=..., Csc=..., Ci=...)`.
 
-    Correlations are those of the normal scores (a Gaussian copula), so they leave every marginal as it is;
-    where all are log-normal, the logarithms are multivariate normal with these correlations.
+    Correlations apply to the standard normal z of each parameter (a Gaussian copula), so they do not change the
+    marginals. If all marginals are log-normal, the logarithms are multivariate normal with these correlations.
 
     Attributes:
-        names: the parameters, in the order of the chain.
-        marginals: what is believed of each alone.
-        pairs: (name, other, correlation) of those that are correlated.
-        order_constraints: (lower, higher) of those that must come in that order. The density is then zero elsewhere,
-            and as it would be without where it is not; moments, covariance and residuals are those without, too.
+        names: parameters, in the order of the chain.
+        marginals: marginal prior of each parameter.
+        pairs: (name, other, correlation) of correlated parameters.
+        order_constraints: (lower, higher) pairs of parameters whose values must be in this order. The density is zero
+            elsewhere and otherwise not renormalised; moments, covariance and residuals ignore the constraints.
 
     Raises:
-        InputError: a pair names no two parameters of it, or correlations or orders contradict each other.
+        InputError: a pair names unknown parameters, or correlations or order constraints contradict each other.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -53,8 +53,10 @@ class Prior(eqx.Module):
             sorter.prepare()
         except graphlib.CycleError as error:
             stated = " < ".join(error.args[1])
-            raise InputError(f"[prior] the order {stated} contradicts itself; leave one of them out") from None
-        # a bare sign test would pass what rounding leaves of a singular matrix
+            raise InputError(
+                f"[prior] the order {stated} contradicts itself; remove one of these constraints"
+            ) from None
+        # a sign test alone would accept a matrix that is singular within rounding
         if self.pairs and not np.linalg.eigvalsh(self.correlation)[0] >= 1e-9:
             stated = ", ".join(f"{name}-{other} {value:+g}" for name, other, value in self.pairs)
             raise InputError(
@@ -70,17 +72,17 @@ class Prior(eqx.Module):
         /,
         **marginals: Distribution,
     ) -> "Prior":
-        """The prior with these marginals, and the correlations of pairs such as ``{("Rsc", "Csc"): -0.6}``."""
+        """Return the prior with these marginals, and the correlations of pairs such as ``{("Rsc", "Csc"): -0.6}``."""
         pairs = tuple((name, other, float(value)) for (name, other), value in (correlation or {}).items())
         return cls(tuple(marginals), tuple(marginals.values()), pairs, order_constraints)
 
     def replace_marginals(self, **marginals: Distribution) -> "Prior":
-        """With these marginals in place of, or after, its own."""
+        """Return the prior with these marginals replaced or appended."""
         merged = dict(zip(self.names, self.marginals, strict=True)) | marginals
         return Prior(tuple(merged), tuple(merged.values()), self.pairs, self.order_constraints)
 
     def drop_marginals(self, *names: str) -> "Prior":
-        """Without the marginals of these names."""
+        """Return the prior without the parameters of these names."""
         kept = {n: m for n, m in zip(self.names, self.marginals, strict=True) if n not in names}
         return Prior(tuple(kept), tuple(kept.values()), self.pairs, self.order_constraints)
 
@@ -89,7 +91,7 @@ class Prior(eqx.Module):
 
     @property
     def correlation(self) -> Float[np.ndarray, "parameters parameters"]:
-        """Correlations of the normal scores."""
+        """Correlation matrix of the standard normal z."""
         matrix = np.eye(len(self.names))
         for name, other, value in self.pairs:
             i, j = self.names.index(name), self.names.index(other)
@@ -98,19 +100,19 @@ class Prior(eqx.Module):
 
     @property
     def log_mean(self) -> Float[np.ndarray, " parameters"]:
-        """Means of the log-parameters."""
+        """Mean of each log-parameter."""
         return np.array([marginal.log_mean for marginal in self.marginals])
 
     @property
     def log_sd(self) -> Float[np.ndarray, " parameters"]:
-        """Standard deviations of the log-parameters."""
+        """Standard deviation of each log-parameter."""
         return np.array([marginal.log_sd for marginal in self.marginals])
 
     @property
     def covariance(self) -> Float[np.ndarray, "parameters parameters"]:
         """Covariance of the log-parameters.
 
-        With u(z) = sum_k a_k He_k(z) / sqrt(k!), Mehler's formula gives cov(u_i, u_j) = sum_k a_ik a_jk r_ij^k.
+        For u(z) = sum_k a_k He_k(z) / sqrt(k!), Mehler's formula gives cov(u_i, u_j) = sum_k a_ik a_jk r_ij^k.
         """
         variance = np.diag(self.log_sd**2)
         if not self.pairs:
@@ -126,7 +128,7 @@ class Prior(eqx.Module):
         return np.where(np.eye(len(self.names)), variance, joint)
 
     def log_density(self, u: Float[Array, " parameters"]) -> Float[Array, ""]:
-        """Log-density of the log-parameters; -inf where one, or their order, is impossible."""
+        """Return the log-density of the log-parameters; -inf outside the bounds or the order constraints."""
         value = sum((marginal.log_density(u[i]) for i, marginal in enumerate(self.marginals)), jnp.zeros(()))
         for lower, higher in self.order_constraints:
             value = jnp.where(u[self.names.index(lower)] < u[self.names.index(higher)], value, -jnp.inf)
@@ -138,23 +140,20 @@ class Prior(eqx.Module):
         return value - 0.5 * (white @ white - z @ z) - np.log(np.diag(root)).sum()
 
     def residuals(self, u: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
-        """The log-parameters whitened by mean and covariance: the normal prior with its moments, as residuals."""
+        """Return the log-parameters whitened by mean and covariance (residuals of the normal prior)."""
         if not self.pairs:
             return jnp.array([marginal.standardize(u[i]) for i, marginal in enumerate(self.marginals)])
         return solve_triangular(np.linalg.cholesky(self.covariance), u - self.log_mean, lower=True)
 
     def sample(self, rng: np.random.Generator, size: int) -> dict[str, Float[np.ndarray, " size"]]:
-        """Draws of the parameters, by name; refused where next to none are in the order asked for."""
+        """Return draws of the parameters by name; raise InputError if almost none satisfy the order constraints."""
         return self._sample_ordered(lambda: rng.standard_normal((len(self.names), size)), size)
 
     def sample_qmc(self, size: int) -> dict[str, Float[np.ndarray, " size"]]:
-        """Like `sample`, but spread evenly over the prior, and always the same.
-
-        The Kronecker sequence of the generalised golden ratio (M. Roberts, 2018), as normal scores.
-        """
+        """Return a deterministic quasi-random sample (Kronecker sequence of M. Roberts, 2018, as standard normals)."""
         axes = np.arange(1, len(self.names) + 1)
         ratio = 2.0
-        for _ in range(64):  # the fixed point; each step comes nearer by a factor of 2 or more
+        for _ in range(64):  # fixed-point iteration; each step reduces the error by a factor of 2 or more
             ratio = (1.0 + ratio) ** (1.0 / (axes.size + 1))
         count = itertools.count()
 
@@ -168,7 +167,7 @@ class Prior(eqx.Module):
     def _sample_ordered(
         self, scores: Callable[[], Float[np.ndarray, "parameters size"]], size: int, max_rounds: int = 1000
     ) -> dict[str, Float[np.ndarray, " size"]]:
-        """The first `size` of the parameters at `scores()` that are in the order asked for."""
+        """Return the first `size` parameter sets at `scores()` that satisfy the order constraints."""
         kept, root = {name: np.zeros(0) for name in self.names}, np.linalg.cholesky(self.correlation)
         for _ in range(1 + max_rounds):
             pairs = zip(self.names, self.marginals, root @ scores(), strict=True)
@@ -181,4 +180,4 @@ class Prior(eqx.Module):
             if all(values.size >= size for values in kept.values()):
                 return {name: values[:size] for name, values in kept.items()}
         stated = ", ".join(f"{lower} < {higher}" for lower, higher in self.order_constraints)
-        raise InputError(f"the priors leave next to nothing in the order {stated}; widen them, or leave it out")
+        raise InputError(f"almost no prior draws satisfy the order {stated}; widen the priors, or remove a constraint")

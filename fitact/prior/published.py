@@ -1,4 +1,4 @@
-"""Published electrical properties of skin, as priors of the resistance and capacitance of one layer."""
+"""Priors of the resistance and capacitance of one skin layer, from published properties of skin."""
 
 import math
 from typing import Literal, NamedTuple, TypeAlias
@@ -10,7 +10,7 @@ PublishedTable: TypeAlias = Literal["gabriel-dry", "gabriel-wet", "paper"]
 
 _HIGH_FREQUENCY = 4.0  # relative permittivity
 # S. Gabriel, R. W. Lau, C. Gabriel, Phys. Med. Biol. 41 (1996) 2271, table 1:
-# conductivity (S/m) and dispersions (height, time constant in s, Cole-Cole exponent alpha)
+# conductivity (S/m) and dispersions (strength, time constant in s, Cole-Cole exponent alpha)
 _GABRIEL = {
     "gabriel-dry": (2e-4, ((32.0, 7.234e-12, 0.0), (1100.0, 32.481e-9, 0.2))),
     "gabriel-wet": (
@@ -18,11 +18,11 @@ _GABRIEL = {
         ((39.0, 7.958e-12, 0.1), (280.0, 79.577e-9, 0.0), (3e4, 1.592e-6, 0.16), (3e4, 1.592e-3, 0.2)),
     ),
 }
-_PAPER_RESISTIVITY, _PAPER_PERMITTIVITY = (4e4, 1e5), (2e3, 1e4)  # ohm m, 1: its ranges over 10 to 1000 Hz
+_PAPER_RESISTIVITY, _PAPER_PERMITTIVITY = (4e4, 1e5), (2e3, 1e4)  # ohm m, 1; ranges from 10 to 1000 Hz
 
 
 class Layer(NamedTuple):
-    """A layer of skin under a contact: m^2, m, and the frequency (Hz) at which it is wanted."""
+    """A skin layer under a contact: area (m^2), thickness (m), and frequency (Hz) of the properties."""
 
     area: float
     thickness: float
@@ -30,10 +30,10 @@ class Layer(NamedTuple):
 
 
 def published_prior(table: PublishedTable, name: str, layer: Layer, factor: float = 6.0) -> Distribution:
-    """The prior of a layer's resistance (`name` ends in Rsc) or capacitance by a published table, eqs. (3) and (4).
+    """Return the prior of a layer's resistance (`name` ends in Rsc) or capacitance from a table, eqs. (3) and (4).
 
-    A finger's state is known less well than the tables': from the middle between dry and wet it is a factor
-    sqrt(40) in permittivity to either, so with this `factor` each table reaches half-way to the other.
+    The state of a finger is less certain than the tables. Dry and wet skin each differ by a factor sqrt(40) in
+    permittivity from their geometric mean; with this `factor`, each prior extends half-way to the other table.
     """
     of_resistance = name.endswith("Rsc")
     plate = plate_resistance if of_resistance else plate_capacitance
@@ -47,7 +47,7 @@ def published_prior(table: PublishedTable, name: str, layer: Layer, factor: floa
 
 
 def skin_permittivity(table: Literal["gabriel-dry", "gabriel-wet"], frequency: float) -> complex:
-    """Relative complex permittivity of skin at `frequency` (Hz), conduction included: four Cole-Cole dispersions."""
+    """Return the relative complex permittivity of skin at `frequency` (Hz) (Cole-Cole), conduction included."""
     conductivity, dispersions = _GABRIEL[table]
     s = 2j * math.pi * frequency
     return (

@@ -1,6 +1,6 @@
-"""How is an answer shown?
+"""Reports of results.
 
-Takes results; gives self-contained HTML pages and figures, each imported when it is first used.
+Makes self-contained HTML pages and figures from results; each is imported at its first use.
 """
 
 import lazy_loader

@@ -51,7 +51,7 @@ def _format_value(value: float | None, unit: str) -> str:
 
 
 def _two_periods() -> np.ndarray:
-    """Times (s), both sides of each jump of a square among them."""
+    """Return times (s), both sides of each jump of a square among them."""
     period = 1.0 / paper.FREQUENCY
     edges = np.arange(4) * 0.5 * period
     inside = np.linspace(0.0, 2.0 * period, 2001)[:-1]
@@ -88,7 +88,7 @@ def _grounding_chart(name: str, values: Sequence[float], unit: str) -> Chart:
 
 
 def _insulator_chart() -> Chart:
-    """Mean force over each property of the insulator, its greatest at 1."""
+    """Return mean force over each property of the insulator, its greatest at 1."""
     permittivities, thicknesses = np.linspace(1.0, 10.0, 37), 1e-6 * np.geomspace(0.01, 10.0, 46)
     own, y, plots = paper.force_over(paper.PERMITTIVITY, paper.INSULATOR), Axis("mean force, normalised"), []
     for title, unit, here, values, forces in (
@@ -105,7 +105,7 @@ def _insulator_chart() -> Chart:
 
 
 def _frequencies_chart(low: float, high: float, marks_corners: bool) -> Chart:
-    """Amplitude and phase between two frequencies (Hz), by Ci."""
+    """Return amplitude and phase between two frequencies (Hz), by Ci."""
     frequency = np.geomspace(low, high, 400)
     omega, x = jnp.asarray(2.0 * np.pi * frequency), Axis("frequency", "Hz", log=True, has_tick_prefixes=True)
     circuits = {f"Ci = {name}": FinalCircuit(paper.RSC, paper.CSC, Ci) for name, Ci in paper.INSULATORS.items()}

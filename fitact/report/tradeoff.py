@@ -144,7 +144,7 @@ def _describe_level(level: BenchmarkedMethod) -> str:
 
 
 def _plot(tradeoff: Tradeoff, kind: Kind) -> tuple[interactive.Plot, float]:
-    """Levels by name, and the unit of the seconds."""
+    """Return levels by name, and the unit of the seconds."""
     levels, height = tradeoff.of(kind), _heights(tradeoff.of(kind))
     _, cost, error = _TITLES[kind]
     seconds = [level.seconds for level in levels]

@@ -1,4 +1,4 @@
-"""What is the posterior?
+"""Posterior sampling.
 
-Takes a `Fit`; gives draws by emcee until they have converged, or weighted draws around the optimum.
+Draws from the posterior of a `Fit` by emcee until convergence, or by importance sampling around the optimum.
 """

@@ -1,4 +1,4 @@
-"""What did the user say?
+"""Scenes, i.e. the user's description of device, skin, drive and measurement.
 
-Takes a scene file (TOML) or a dictionary; gives a checked `Scene` that makes the circuit, the drive and the prior.
+Reads a scene file (TOML) or a dictionary into a checked `Scene`, which constructs circuit, drive and prior.
 """

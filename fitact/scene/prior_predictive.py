@@ -30,7 +30,7 @@ class PriorPredictive:
     seed: int  # of the draws
 
     def to_dict(self) -> dict[str, Any]:
-        """The JSON of `fitact prior`."""
+        """Return the JSON of `fitact prior`."""
         return {
             "parameters": {name: summary.summarize_draws(name, draws) for name, draws in self.parameters.items()},
             "derived": {name: summary.summarize_draws(name, draws) for name, draws in self.derived.items()},
@@ -39,7 +39,7 @@ class PriorPredictive:
         }
 
     def __str__(self) -> str:
-        """A table for people: quantiles of each parameter and of what follows from them."""
+        """Return a table for people: quantiles of each parameter and of what follows from them."""
         rows = [["", "5 %", "25 %", "median", "75 %", "95 %"]]
         content = self.to_dict()
         for name, s in (content["parameters"] | content["derived"]).items():
@@ -49,7 +49,7 @@ class PriorPredictive:
 
 
 def prior_predictive(scene: Scene, draws: int = 2000, seed: int = 0) -> PriorPredictive:
-    """Vsc and force of `draws` fingers of a scene's prior, without noise."""
+    """Return Vsc and force of `draws` fingers of a scene's prior, without noise."""
     parameters = sample_prior(scene, np.random.default_rng(seed), draws)
     drive = scene.make_drive()
     repeats = isinstance(drive, Periodic) and scene.drive.steady_state
@@ -65,7 +65,7 @@ def prior_predictive(scene: Scene, draws: int = 2000, seed: int = 0) -> PriorPre
 
 
 def _times(drive: Drive, duration: float, repeats: bool, count: int = 801) -> Float[np.ndarray, " times"]:
-    """Two periods, just after each corner included since peaks sit there; or from rest for the `duration` (s)."""
+    """Return two periods, just after each corner included since peaks sit there; or from rest for the `duration` (s)."""
     if not (repeats and isinstance(drive, Periodic)):
         return np.linspace(0.0, duration, count)
     period = float(drive.period)
@@ -77,7 +77,7 @@ def _times(drive: Drive, duration: float, repeats: bool, count: int = 801) -> Fl
 
 
 def sample_prior(scene: Scene, rng: np.random.Generator, size: int) -> dict[str, Float[np.ndarray, " size"]]:
-    """Draws of all that a scene has a belief of, SI: free parameters, fixed and tied ones."""
+    """Return draws of all that a scene has a belief of, SI: free parameters, fixed and tied ones."""
     drawn = scene.make_prior().sample(rng, size)
     drawn |= {name: np.full(size, value) for name, value in scene.fixed_values().items()}
     return drawn | {name: ratio * drawn[other] for name, (other, ratio) in scene.prior.ties().items()}
@@ -86,7 +86,7 @@ def sample_prior(scene: Scene, rng: np.random.Generator, size: int) -> dict[str,
 def _predict_draw(
     scene: Scene, drive: Drive, repeats: bool, time: Float[Array, " times"], values: dict[str, Array]
 ) -> tuple[Float[Array, " times"], dict[str, Array]]:
-    """Vsc in time, and what it amounts to, of one draw."""
+    """Return Vsc in time, and what it amounts to, of one draw."""
     circuit = scene.make_circuit(values)
     vsc = response(circuit, drive, time, steady_state=repeats)
     contact = scene.geometry().contact(scene.make_rc_circuit(values))

@@ -76,7 +76,7 @@ class PriorSpec(Section):
         return math.inf if self.high is None else self.high
 
     def distribution(self, name: str, nominal: float | None, layer: Layer) -> Distribution:
-        """The density of the parameter `name`, around its `nominal` value in the scene where it states no other."""
+        """Return the density of the parameter `name`, around its `nominal` value in the scene where it states no other."""
         if self.table is not None:
             return published_prior(self.table, name, layer)
         if self.tolerance is not None:
@@ -107,7 +107,7 @@ class SpecUnit(Unit):
     """The SI unit of a parameter in which its beliefs are stated."""
 
     def parse(self, value: Any) -> Any:
-        """The keys of a belief with their quantities in SI."""
+        """Return the keys of a belief with their quantities in SI."""
         if not isinstance(value, dict):
             return value
         key_units = dict.fromkeys(QUANTITY_KEYS, self.name) | {"tolerance": "", "ratio": ""}
@@ -178,7 +178,7 @@ class PriorSection(Section):
             raise ValueError(f"{place} is tied itself; name what {other} is tied to")
 
     def specs(self) -> dict[str, PriorSpec]:
-        """The beliefs that the section holds, by parameter; one that only orders keeps the default's density."""
+        """Return the beliefs that the section holds, by parameter; one that only orders keeps the default's density."""
         beliefs = {name: belief for name, belief in self if isinstance(belief, PriorSpec)}
         for name, belief in beliefs.items():
             if not belief.model_fields_set - _ORDER_KEYS:
@@ -191,17 +191,17 @@ class PriorSection(Section):
         return beliefs
 
     def ties(self) -> dict[str, tuple[str, float]]:
-        """Parameters that follow another: name -> (the other, ratio to it)."""
+        """Return parameters that follow another: name -> (the other, ratio to it)."""
         return {name: (b.tied, b.ratio) for name, b in self.specs().items() if b.tied is not None}
 
     def order_constraints(self) -> tuple[tuple[str, str], ...]:
-        """Pairs (lower, higher) of parameters that come in that order."""
+        """Return pairs (lower, higher) of parameters that come in that order."""
         beliefs = self.specs().items()
         above = [(b.above, name) for name, b in beliefs if b.above is not None]
         return (*above, *((name, b.below) for name, b in beliefs if b.below is not None))
 
     def correlations(self) -> dict[tuple[str, str], float]:
-        """Correlations by pair of parameters."""
+        """Return correlations by pair of parameters."""
         by_pair: dict[tuple[str, str], float] = {}
         for key, value in self.correlation.items():
             pair = tuple(key.split("-"))

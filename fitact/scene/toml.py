@@ -20,13 +20,13 @@ _INLINE = re.compile(r"[{,]\s*([\w-]+)\s*=")
 
 @functools.cache
 def shipped_scenes() -> dict[str, str]:
-    """The scenes that come with fitact: name -> text."""
+    """Return the scenes that come with fitact: name -> text."""
     folder = importlib.resources.files("fitact") / "scenes"
     return {file.name.removesuffix(".toml"): file.read_text(encoding="utf-8") for file in folder.iterdir()}
 
 
 def read_scene_text(path: str | Path) -> str:
-    """The text of a scene file, or of a shipped scene where there is no such file."""
+    """Return the text of a scene file, or of a shipped scene where there is no such file."""
     name = str(path)
     try:
         return Path(path).read_text(encoding="utf-8")
@@ -65,7 +65,7 @@ def to_toml(scene: Section) -> str:
 
 
 def value_text(value: Any, unit: str | None) -> str:
-    """A value as TOML; `unit` is that of numbers, None for plain ones."""
+    """Return a value as TOML; `unit` is that of numbers, None for plain ones."""
     if isinstance(value, PriorSpec):
         stated = {key: x for key, x in value if key in value.model_fields_set}
         return _inline_table({key: value_text(x, unit if key in QUANTITY_KEYS else None) for key, x in stated.items()})
@@ -83,7 +83,7 @@ def _inline_table(items: dict[str, str]) -> str:
 
 
 def find_line(text: str, sentence: str) -> int | None:
-    """The line of a scene file that a sentence such as "[drive] duty = 2: ..." is about; None if there is none."""
+    """Return the line of a scene file that a sentence such as "[drive] duty = 2: ..." is about; None if there is none."""
     place = re.match(r"\[(\w+)\](.*)", sentence)
     if place is None:
         return None
@@ -98,7 +98,7 @@ def find_line(text: str, sentence: str) -> int | None:
 
 
 def _key_lines(text: str) -> dict[tuple[str, ...], int]:
-    """The first line of every table and key, by its path."""
+    """Return the first line of every table and key, by its path."""
     lines: dict[tuple[str, ...], int] = {}
     table: tuple[str, ...] = ()
     for number, line in enumerate(text.splitlines(), 1):

@@ -1,4 +1,4 @@
-"""What does accuracy cost?
+"""Accuracy and run time of each method.
 
-Takes a scene and a record; gives the error and the time of every method, measured on this machine.
+Measures the error and the run time of every method for a scene and a record, on this machine.
 """

@@ -107,9 +107,9 @@ def test_mean_and_peak_force_are_those_of_a_sine(gap: str):
 
 def test_a_circuit_without_a_gap_has_no_voltage_across_it():
     for circuit in (fitact.FinalCircuit(R, C, CI), fitact.DirectGround(R, C, CI)):
-        with pytest.raises(fitact.InputError, match="no gap between finger and panel; give it Cgap"):
+        with pytest.raises(fitact.InputError, match="no gap between finger and panel; Vgap needs Cgap"):
             fitact.response(circuit, fitact.Sine(1.0, 1.0), 0.0, channel="Vgap")
-    with pytest.raises(fitact.InputError, match="Rgap needs its Cgap"):
+    with pytest.raises(fitact.InputError, match="Rgap is given without Cgap"):
         fitact.DirectGround(R, C, CI, Rgap=1e6)
 
 

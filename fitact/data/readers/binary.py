@@ -54,12 +54,12 @@ class _Contents:
 
 
 def is_known_binary(head: bytes, suffix: str) -> bool:
-    """Whether a file that begins so goes to `read_binary`, though it may look like text."""
+    """Return whether a file that begins so goes to `read_binary`, though it may look like text."""
     return _find_reader(head, "" if suffix.lower() in (".csv", ".txt") else suffix) is not None
 
 
 def read_binary(path: Path, source: str, head: bytes, pick: Pick) -> Capture:
-    """The channels of a binary file that `pick` names, in SI units."""
+    """Return the channels of a binary file that `pick` names, in SI units."""
     reader = _find_reader(head, path.suffix)
     if reader is None:
         raise InputError(f"{source}: is not a text file, nor of a known binary kind; export the record as CSV")
@@ -252,7 +252,7 @@ def _check_one_grid(times: Sequence[np.ndarray], names: Sequence[str], source: s
 
 
 def _size_limit(path: Path) -> int:
-    """Bytes that the file may unfold to; a header that announces more is broken: deflate shrinks 1032 times at most."""
+    """Return bytes that the file may unfold to; a header that announces more is broken: deflate shrinks 1032 times at most."""
     return 1_000_000 + 1032 * path.stat().st_size
 
 

@@ -32,7 +32,7 @@ class Column(NamedTuple):
 
 
 def read_header(text: str, source: str, sidecar_text: str = "") -> "Header":
-    """The header of a file that begins with `text`; `sidecar_text`: one in a file of its own, as `key:value` lines."""
+    """Return the header of a file that begins with `text`; `sidecar_text`: one in a file of its own, as `key:value` lines."""
     head = text[:4096]  # of which a header mostly is a small part: to part lines into cells takes longest
     header = Header.from_text(head.rpartition("\n")[0], sidecar_text, source)
     if not header.is_plain:
@@ -59,13 +59,13 @@ def read_header(text: str, source: str, sidecar_text: str = "") -> "Header":
 
 
 def split_cells(line: str, delimiter: str) -> list[str]:
-    """The cells of a line, without quotes and blanks around them."""
+    """Return the cells of a line, without quotes and blanks around them."""
     parts = line.split() if delimiter == " " else line.split(delimiter)
     return [cell.strip().strip('"').strip() for cell in parts]
 
 
 def parse_number(cell: str, decimal_comma: bool) -> float | None:
-    """The cell as a number, or None; infinity is how some makers write that a value is out of range."""
+    """Return the cell as a number, or None; infinity is how some makers write that a value is out of range."""
     if "_" in cell:  # Python would read 1_000
         return None
     try:
@@ -146,11 +146,11 @@ class Header:
         return known
 
     def find_values(self, keys: Sequence[str]) -> list[str]:
-        """Values that the header states under the first of the keys that it has."""
+        """Return values that the header states under the first of the keys that it has."""
         return next((self.metadata[key] for key in keys if key in self.metadata), [])
 
     def find_quantity(self, keys: Sequence[str]) -> float | None:
-        """The largest number that it states there, in SI units: they may differ between channels."""
+        """Return the largest number that it states there, in SI units: they may differ between channels."""
         found = (self._parse_quantity(text) for text in self.find_values(keys))
         return max((value for value in found if value is not None), default=None)
 
@@ -239,24 +239,24 @@ class Header:
         ]
 
     def standard_columns(self) -> frozenset[int]:
-        """Columns under fitact's own names, which must hold numbers whether they do or not."""
+        """Return columns under fitact's own names, which must hold numbers whether they do or not."""
         parts = map(layouts.split_name_and_unit, self.names.cells[: self.width] if self.names else [])
         standard = (layouts.is_standard_name(name) and (not unit or layouts.parse_unit(unit)) for name, unit in parts)
         return frozenset(i for i, is_standard in enumerate(standard) if is_standard)
 
     def non_numeric_columns(self) -> list[str]:
-        """Names of the columns that hold no numbers."""
+        """Return names of the columns that hold no numbers."""
         named = self.names.cells[: self.width] if self.names else []
         words = [layouts.normalize_key(cell.partition("=")[0]) for cell in named]
         return [c for i, c in enumerate(named) if i not in self.numeric and words[i] not in layouts.GRID_KEYS]
 
     def count_rows(self) -> int | None:
-        """Rows that the header announces."""
+        """Return rows that the header announces."""
         count = self.find_quantity(layouts.COUNT_KEYS)
         return int(count) if count is not None and count < 1e12 else None  # beyond, it means something else
 
     def _find_names(self, count: int) -> list[str]:
-        """Names as in "Source,CH1" or "Vertical Scale,CH1:0.05 CH2:0.10"."""
+        """Return names as in "Source,CH1" or "Vertical Scale,CH1:0.05 CH2:0.10"."""
         named = self.find_values(layouts.NAME_KEYS)
         if len(named) < count:
             named = re.findall(r"([A-Za-z]+\d+)\s*:", " ".join(self.find_values(("verticalunits", "verticalscale"))))
@@ -285,12 +285,12 @@ class Header:
 
 
 def _is_unfilled(row: TextRow, numbers: frozenset[int]) -> bool:
-    """Whether all that the row holds are numbers, in some columns of numbers: a time without values yet."""
+    """Return whether all that the row holds are numbers, in some columns of numbers: a time without values yet."""
     return bool(numbers) and all(i in numbers for i, cell in enumerate(row.cells) if cell)
 
 
 def _detect_delimiter(lines: Sequence[str]) -> tuple[str, bool]:
-    """The delimiter that parts most lines, from the middle on, into numbers, and whether a comma marks the decimals."""
+    """Return the delimiter that parts most lines, from the middle on, into numbers, and whether a comma marks the decimals."""
     lines = lines[len(lines) // 2 :]
     for delimiter in (";", "\t", ",", " "):
         rows = [split_cells(line, delimiter) for line in lines]

@@ -60,12 +60,12 @@ _UNIT_SYMBOLS = {
 
 
 def normalize_key(text: str) -> str:
-    """A header's key as the tables above spell it: "numberofdatapoints" for "Number of Data points ="."""
+    """Return a header's key as the tables above spell it: "numberofdatapoints" for "Number of Data points ="."""
     return re.sub(r"[^0-9a-zµμ]", "", text.lower())
 
 
 def parse_unit(text: str) -> tuple[str, float] | None:
-    """SI unit (s, V or A) and factor of a unit as makers spell it: ("s", 1e-3) for "(ms)"; or None."""
+    """Return SI unit (s, V or A) and factor of a unit as makers spell it: ("s", 1e-3) for "(ms)"; or None."""
     bare = text.strip().strip("()[]").strip()
     for length in (0, 1):
         prefix, symbol = bare[:length], bare[length:]
@@ -76,7 +76,7 @@ def parse_unit(text: str) -> tuple[str, float] | None:
 
 
 def convert_time(time: np.ndarray, unit_text: str, place: str, remedy: str) -> np.ndarray:
-    """Seconds; where no unit is stated, they are."""
+    """Return seconds; where no unit is stated, they are."""
     unit = parse_unit(unit_text)
     if unit_text and (unit is None or unit[0] != "s"):
         raise InputError(f"{place}: '{unit_text}' is no unit of time; {remedy}")
@@ -84,7 +84,7 @@ def convert_time(time: np.ndarray, unit_text: str, place: str, remedy: str) -> n
 
 
 def is_same_grid(time: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two channels were sampled at the same times, to a hundredth of a step."""
+    """Return whether two channels were sampled at the same times, to a hundredth of a step."""
     step = abs(time[-1] - time[0]) / max(time.size - 1, 1)
     return time.size == other.size and not np.max(np.abs(time - other)) > 0.01 * step
 
@@ -99,7 +99,7 @@ _STANDARD_NAME = re.compile(r"^(?P<name>time|V|Vsc|I)(?:_(?P<unit>.+))?$", re.IG
 
 
 def split_name_and_unit(cell: str) -> tuple[str, str]:
-    """A column's name and its unit as written, "" where none is."""
+    """Return a column's name and its unit as written, "" where none is."""
     contract = _STANDARD_NAME.match(cell)
     if contract:
         return contract["name"], contract["unit"] or ""
@@ -115,6 +115,6 @@ def is_standard_name(name: str) -> bool:
 
 
 def normalize_channel(name: str) -> str:
-    """The name that "CH2", "Channel 2", "Chan 2" and Keysight's "2" have in common."""
+    """Return the name that "CH2", "Channel 2", "Chan 2" and Keysight's "2" have in common."""
     bare = re.sub(r"[\s_.-]", "", name.lower())
     return re.sub(r"^(channel|chan|ch|kanal|canal|ampl|c)(?=[0-9]+$|[a-z]$)", "", bare)

@@ -56,7 +56,7 @@ def read(
 
 
 def read_capture(path: str | os.PathLike[str], pick: Pick = lambda names, place: names) -> Capture:
-    """Time and channels of a file under its own names, of which `pick` may choose."""
+    """Return time and channels of a file under its own names, of which `pick` may choose."""
     source, path = os.fspath(path), Path(path)
     if path.is_dir():
         raise InputError(f"{source}: is a directory; give the path of a file")
@@ -77,7 +77,7 @@ def read_capture(path: str | os.PathLike[str], pick: Pick = lambda names, place:
 
 
 def merge_other_files(capture: Capture, path: str | os.PathLike[str], channels: Mapping[str, str]) -> Capture:
-    """The capture, and the columns of other files that `channels` names as FILE:COLUMN."""
+    """Return the capture, and the columns of other files that `channels` names as FILE:COLUMN."""
     traces = list(capture.channels)
     for asked in channels.values():
         if found := _locate_file_column(path, asked):
@@ -96,7 +96,7 @@ def _read_column(file: Path, column: str) -> Capture:
 
 
 def _locate_file_column(path: str | os.PathLike[str], requested: str) -> tuple[Path, str] | None:
-    """The file and the column where a channel is asked for as FILE:COLUMN, the file from here or beside `path`."""
+    """Return the file and the column where a channel is asked for as FILE:COLUMN, the file from here or beside `path`."""
     file, colon, column = requested.rpartition(":")
     found = [place for place in (Path(path).parent / file, Path(file)) if colon and column and place.is_file()]
     return (found[0], column) if found else None

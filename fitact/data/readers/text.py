@@ -25,7 +25,7 @@ _MAX_BYTES = 4_294_967_296  # bytes of text, beyond which it is no record but wh
 
 
 def read_text(path: Path, source: str, pick: Pick) -> Capture:
-    """The columns of a text file (plain or gzip) that `pick` names, in SI units."""
+    """Return the columns of a text file (plain or gzip) that `pick` names, in SI units."""
     try:
         with _open_text(path) as (stream, file):
             head = stream.read(_HEAD_BYTES)
@@ -69,7 +69,7 @@ def _open_text(path: Path) -> Iterator[tuple[IO[bytes], IO[bytes]]]:
 
 
 def _read_sidecar(path: Path) -> str:
-    """The header that Rohde & Schwarz keep in NAME.csv for the numbers in NAME.Wfm.csv, or nothing."""
+    """Return the header that Rohde & Schwarz keep in NAME.csv for the numbers in NAME.Wfm.csv, or nothing."""
     header = path.with_name(path.name[: -len(".wfm.csv")] + path.name[-4:])
     if not (path.name.lower().endswith(".wfm.csv") and header.is_file()):
         return ""
@@ -135,7 +135,7 @@ class _TableParser:
             self._starts.append(self._starts[-1] + len(numbers))
 
     def _parse_fast(self, block: bytes) -> np.ndarray | None:
-        """The rows by numpy's parser; None where a line is not as the others."""
+        """Return the rows by numpy's parser; None where a line is not as the others."""
         delimiter = self._header.delimiter
         if b"#" in block or not block:
             return None
@@ -157,7 +157,7 @@ class _TableParser:
             return None
 
     def _parse_line_by_line(self, block: bytes, first: int) -> tuple[np.ndarray, list[int]]:
-        """The rows line by line, to find the offending cell or to pass over lines that hold nothing."""
+        """Return the rows line by line, to find the offending cell or to pass over lines that hold nothing."""
         rows: list[list[float]] = []
         lines: list[int] = []
         delimiter = self._header.delimiter
@@ -192,7 +192,7 @@ class _TableParser:
         return f"line {self._lines[part][row - self._starts[part]]}"
 
     def to_capture(self, unread_columns: Sequence[str]) -> Capture:
-        """The columns that were read; `unread_columns` are columns that were not wanted, or hold no numbers."""
+        """Return the columns that were read; `unread_columns` are columns that were not wanted, or hold no numbers."""
         header, rows, announced = self._header, self._starts[-1], self._header.count_rows()
         if announced is not None and rows < announced - 2:  # by which some makers' counts are off
             raise InputError(
