@@ -1,4 +1,4 @@
-"""When channels' compressions may stand for their samples: built before the fit, certified after it."""
+"""Compression of channels: built before the fit, and verified against all samples after it."""
 
 import dataclasses
 from collections.abc import Callable
@@ -20,26 +20,26 @@ from fitact.model.circuit import Circuit
 from fitact.model.drive import Sampled
 from fitact.model.skin import WithSkin
 
-TOLERANCE = 1e-3  # in log-likelihood
-_TIMING_REASON = "a delay or a clock is free"
-FEW_ROWS = 200  # numbers that an evaluation runs over, up to which the call costs more than they do
+TOLERANCE = 1e-3  # error of the log-likelihood
+_TIMING_REASON = "a delay or a clock error is a free parameter"
+FEW_ROWS = 200  # numbers per evaluation, below which the overhead of the call dominates
 
 
 class CertifiedLikelihood(NamedTuple):
-    """A likelihood to sample from."""
+    """Likelihood for sampling, with the verified error of its compressions."""
 
-    likelihood: Likelihood  # with the compressions that hold
-    # largest error of the compressed log-likelihood near the optimum; None: some samples are summed
+    likelihood: Likelihood  # with those compressions that passed the check
+    # maximum error of the compressed log-likelihood near the optimum; None: a channel is not compressed
     error: float | None
-    reasons: tuple[str, ...]  # why those of each channel are, as a clause; "" where they are not
+    reasons: tuple[str, ...]  # why each channel is not compressed, as a clause; "" if it is
 
 
 def compress_channel(
     channel: ChannelLikelihood, circuit: Circuit, tau_identified: bool, tolerance: float
 ) -> tuple[ChannelLikelihood, str]:
-    """Return the channel with its record's compression, or as it is and the reason why.
+    """Return the channel with a compression and "", or the unchanged channel and the reason.
 
-    `circuit` nearly made it, and `tau_identified` says whether the record shows it.
+    `circuit` is close to the optimum; `tau_identified` states whether the record determines its time constant.
     """
     reason = _uncompressed_reason(channel, circuit, tau_identified, tolerance)
     if reason:
@@ -53,7 +53,7 @@ def compress_channel(
     }
     compression: Compression | GridCompression
     if isinstance(circuit, WithSkin):
-        assert circuit.grid is not None  # there would be a reason against it
+        assert circuit.grid is not None  # otherwise there is a reason against compression
         compression = compress_on_grid(*arrays, grid=circuit.grid, **how)
     else:
         compression = compress(*arrays, expected_terms=circuit.channel_terms(channel.channel), **how)
@@ -64,12 +64,12 @@ def _uncompressed_reason(
     channel: ChannelLikelihood, circuit: Circuit, tau_identified: bool, tolerance: float, min_samples: int = 512
 ) -> str:
     if tolerance == 0.0:
-        return "it was asked for"
+        return "the full sum was requested"
     if channel.noise == "student":
-        return "noise with outliers is more than lengths and angles"
+        return "the likelihood of Student-t noise does not follow from inner products"
     if channel.whitening is not None:
         return "the noise is coloured"
-    if channel.n_samples < min_samples:  # nothing would be gained
+    if channel.n_samples < min_samples:  # compression would save nothing
         return f"the record is shorter than {min_samples} samples"
     if channel.timing:
         return _TIMING_REASON
@@ -78,7 +78,7 @@ def _uncompressed_reason(
     if isinstance(channel.drive, Sampled) and channel.steady_state:
         return "the steady state of a measured drive is not tabulated"
     if not tau_identified:
-        return "the record does not show its time constant"
+        return "the record does not determine its time constant"
     if len(circuit.channel_terms(channel.channel).tau) > 1:
         return "the circuit has several time constants"
     return ""
@@ -95,9 +95,9 @@ def certify(
 ) -> CertifiedLikelihood:
     """Return the likelihood for sampling around the optimum `theta`, checked against the full sum.
 
-    `covariance_factor` is the root of theta's covariance. Each channel's compressed log-likelihood must agree to
-    `tolerance` over their number at the optimum and `check_points` around it, and at as many points of the prior to a
-    part in a million of how far they lie below it.
+    `covariance_factor` is a factor of the covariance of theta. The compressed log-likelihood of each channel must be
+    exact to `tolerance` / (number of channels) at the optimum and `check_points` points around it. At as many points
+    of the prior, an additional 1e-6 of the difference to the optimum is allowed.
     """
     free = [tuple(np.flatnonzero(np.asarray(channel.linear_sd)).tolist()) for channel in likelihood.channels]
     pairs = zip(likelihood.channels, free, strict=True)
@@ -112,7 +112,7 @@ def certify(
     precisions = table_precision(sigma, tolerance).tolist()
     optimal = zip(likelihood.channels_and_inputs(optimum), precisions, strict=True)
     near = tuple(_restrict_table(*pair, float(log_b), reach, precision) for pair, precision in optimal)
-    deviates = np.random.default_rng(0).standard_normal((check_points, theta.size))  # any will do
+    deviates = np.random.default_rng(0).standard_normal((check_points, theta.size))  # any reproducible points serve
     around = np.vstack([theta, theta + 1.5 * deviates @ covariance_factor.T])
     points = np.vstack([around, _prior_points(light, theta, check_points)])
     narrow = dataclasses.replace(likelihood, channels=near).without_samples()
@@ -120,7 +120,7 @@ def certify(
         _evaluate_log_likelihoods(model, points, sigma) for model in (likelihood.without_compression(), narrow, light)
     )
     errors = np.max(np.abs(compressed - exact)[: len(around)], axis=0)
-    # far from the optimum an error may grow with the distance below it, in log-likelihood
+    # far from the optimum, the error may grow with the difference in log-likelihood to the optimum
     excesses = np.nanmax(np.abs(tabulated - exact) - 1e-6 * np.abs(exact[0] - exact), axis=0, initial=-np.inf)
     found = []
     for i, channel in enumerate(near):
@@ -133,26 +133,26 @@ def certify(
 def table_half_width(
     log_b_sd: ArrayLike, standard_deviations: float = 20.0, least: float = 0.05
 ) -> Float[np.ndarray, "*shape"]:
-    """Return the width of a table for sampling on either side of the optimum, in log b."""
+    """Return the half-width in log b of a table for sampling."""
     return np.maximum(standard_deviations * np.asarray(log_b_sd), least)
 
 
 def table_precision(noise: ArrayLike, tolerance: float = TOLERANCE) -> Float[np.ndarray, "*shape"]:
-    """Return the error that a table for sampling may have, V or A (root of the sum of squares), under a noise, V or A."""
+    """Return the error that a table for sampling may have (root of the sum of squares), in the unit of `noise`."""
     return 0.1 * tolerance * np.asarray(noise)
 
 
 def _compression_failure(error: float, excess: float, tolerance: float) -> str:
-    """Return the case against the compression of a channel, by errors near the optimum and within the prior; "" if none."""
+    """Return why a compression fails, from its errors near the optimum and within the prior; "" if it passes."""
     if np.isnan(error):
-        return "the record leaves its time constant more open than the table is wide"
+        return "the uncertainty of its time constant exceeds the range of the table"
     if not error <= tolerance:
         return f"the compressed log-likelihood was off by {error:.2g} near the optimum"
     return f"the compressed log-likelihood was off by {excess:.2g} within the prior" if excess > tolerance else ""
 
 
 def _prior_points(likelihood: Likelihood, theta: np.ndarray, count: int) -> Float[np.ndarray, "n parameters"]:
-    """Return points of the prior that the tables reach, the optimum where there are too few."""
+    """Return draws from the prior that the tables cover, filled up with the optimum if there are too few."""
     draws = likelihood.sample_prior(theta, 1000)
     tau = jnp.exp(_log_b_at_points(likelihood, jnp.asarray(draws)))
     covered = [channel.compression.covers(tau) for channel in likelihood.channels if channel.compression is not None]
@@ -162,18 +162,18 @@ def _prior_points(likelihood: Likelihood, theta: np.ndarray, count: int) -> Floa
 def _evaluate_log_likelihoods(
     likelihood: Likelihood, theta: Float[np.ndarray, "n parameters"], sigma: np.ndarray
 ) -> np.ndarray:
-    """Return log-likelihoods of each channel at points of one sigma, (n, channels)."""
+    """Return the log-likelihood of each channel at points with common sigma, (n, channels)."""
     points = np.column_stack([theta, np.tile(np.log(sigma), (len(theta), 1))])
     evaluate = BatchEvaluator(Likelihood.log_likelihoods, likelihood, likelihood.rows)
     return evaluate(points, description="checking the compression")
 
 
 def batched_log_prob(likelihood: Likelihood, walkers: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Return log-posteriors of points (theta, log sigma); where the compression does not reach, the samples are summed.
+    """Return a function for the log-posteriors of points (theta, log sigma); outside the tables it sums all samples.
 
-    Fastest for all `walkers` of an ensemble at once, or half of them.
+    It is fastest for all `walkers` of an ensemble at once, or half of them.
     """
-    # halves are filled up where they cost no more, so that one size is compiled
+    # pad halves where this costs nothing, so that only one size is compiled
     batch = walkers if likelihood.rows <= FEW_ROWS else walkers // 2
     tabulated = BatchEvaluator(Likelihood.log_prob, likelihood.without_samples(), likelihood.rows, batch)
     full = likelihood.without_compression()
@@ -192,9 +192,9 @@ def batched_log_prob(likelihood: Likelihood, walkers: int) -> Callable[[np.ndarr
 def _restrict_table(
     channel: ChannelLikelihood, inputs: ChannelInputs, center: float, half_width: float, error: float
 ) -> ChannelLikelihood:
-    """With the part of the table that the posterior can want, where there is a table that holds the optimum.
+    """Return the channel with its table restricted to the posterior, if the table covers the optimum.
 
-    That is `half_width` around `center`, in log b, to an `error` of the signal (V or A).
+    The restricted table covers `center` ± `half_width` in log b, with an `error` of the signal (V or A).
     """
     table = channel.compression
     if not isinstance(table, Compression) or not table.covers(np.exp(center)):
@@ -209,7 +209,7 @@ def _restrict_table(
 
 
 def _log_b(likelihood: Likelihood, theta: Array) -> Array:
-    """Return logarithm of the slowest time constant, s."""
+    """Return the logarithm of the slowest time constant (s)."""
     return jnp.log(likelihood.circuit(theta).b)
 
 

@@ -1,11 +1,11 @@
-"""One channel of one record, against a circuit: noise, with the linear nuisances integrated out.
+"""Likelihood of one channel of one record, with the linear nuisances integrated out.
 
-The channel is  gain * response(t - delay) + A beta + noise,  where t runs by the drive's clock.
+The channel is  gain * response(t - delay) + A beta + noise,  where t is the time on the drive's clock.
 The columns of A are an offset, a drift, mains hum and, for a measured drive, the decays of the unknown charges at
 the first sample. Their coefficients have wide normal priors and are integrated out exactly.
 
-Of Gaussian noise all this asks of the samples is lengths and angles, so it reads the same in the coordinates of a
-`fitact.likelihood.compression.Compression`, where there is one, as over the samples themselves.
+For Gaussian noise the likelihood depends only on inner products over the samples. The same formulas therefore apply
+to the coordinates of a `fitact.likelihood.compression.Compression` and to the samples themselves.
 """
 
 import dataclasses
@@ -33,50 +33,51 @@ TIMING_NUISANCES = ("delay", "clock")
 
 
 class ChannelInputs(eqx.Module):
-    """What a channel needs of the parameters."""
+    """Quantities of a channel that depend on the parameters."""
 
     circuit: Circuit  # at the parameters
     gain: ArrayLike = 1.0  # of the channel
     delay: ArrayLike = 0.0  # beyond the channel's `shift`, s
-    # by what share the drive is faster than stated, by the recorder's clock; beyond the channel's own
+    # relative error of the drive's frequency on the recorder's clock; added to the channel's `clock`
     clock: ArrayLike = 0.0
 
 
 class ChannelLikelihood(eqx.Module):
-    """One channel of one record, and what drives it, filled up as `fitact.compiled` does."""
+    """One channel of one record and its drive, padded by `fitact.compiled`."""
 
     time: Float[Array, " samples"]  # s
     observed: Float[Array, " samples"]  # V or A
-    # of each sample: the inverse of its noise's standard deviation relative to the channel's; 0 leaves it out.
-    # None: all are 1
+    # inverse noise sd of each sample, relative to the channel's; 0 excludes a sample, None means equal weights
     weight: Float[Array, " samples"] | None
-    whitening: Whitening | None  # of coloured noise; None: the noise is white
-    noise_floor: ArrayLike  # below which its standard deviation is not believed, in the channel's unit
-    rate: Float[Array, " samples"] | None  # dV/dt at the samples, V/s, for a current that follows it
-    drive: Drive  # what drives the circuit
-    # prior standard deviations of the `LINEAR_NUISANCES` nuisances, in the channel's unit (drift: over half the
-    # record); 0 leaves one out
+    whitening: Whitening | None  # filter for coloured noise; None means white noise
+    noise_floor: ArrayLike  # lower bound of the noise sd, in the channel's unit
+    rate: Float[Array, " samples"] | None  # dV/dt at the samples, V/s, if the current follows it
+    drive: Drive  # V(t)
+    # prior standard deviations of the `LINEAR_NUISANCES`, in the channel's unit (drift: over half the record);
+    # 0 excludes a nuisance
     linear_sd: Float[Array, " 10"]
-    shift: ArrayLike  # the drive starts this much later than the record's t = 0, s
-    clock: ArrayLike  # by what share it is faster than stated
+    shift: ArrayLike  # start of the drive after the record's t = 0, s
+    clock: ArrayLike  # relative error of the drive's frequency
     time_step: ArrayLike  # s
-    # prior standard deviations of `TIMING_NUISANCES`, in time steps; a clock's are those in half a record
+    # prior standard deviations of `TIMING_NUISANCES`, in time steps (clock: over half the record)
     timing_sd: Float[Array, "2"]
-    compression: Compression | GridCompression | None  # the record's projection; None: the samples are summed
-    label: str = eqx.field(static=True)  # "" or what tells it from the other channels, as "I_2"
+    compression: (
+        Compression | GridCompression | None
+    )  # projection of the record; None means that all samples are summed
+    label: str = eqx.field(static=True)  # "", or a name that distinguishes it from other channels, e.g. "I_2"
     channel: Channel = eqx.field(static=True)  # "Vsc" or "I"
     steady_state: bool = eqx.field(static=True)  # or from rest
-    timing: tuple[str, ...] = eqx.field(static=True)  # which of `TIMING_NUISANCES` are parameters, in that order
-    noise: NoiseModel = eqx.field(static=True)  # its model
-    # which of `LINEAR_NUISANCES` are looked at; the others' linear_sd is 0
+    timing: tuple[str, ...] = eqx.field(static=True)  # the `TIMING_NUISANCES` that are parameters, in their order
+    noise: NoiseModel = eqx.field(static=True)  # noise model
+    # indices of the `LINEAR_NUISANCES` in use; `linear_sd` of the others is 0
     columns: tuple[int, ...] = eqx.field(static=True)
 
     def qualified_name(self, name: str) -> str:
-        """Return a nuisance's name, with the channel's label where there are several channels."""
+        """Return the name of a nuisance, followed by the channel's label if there are several channels."""
         return f"{name}_{self.label}" if self.label else name
 
     def timing_unit(self, name: str) -> ArrayLike:
-        """What 1 of a coordinate of `TIMING_NUISANCES` is: s, or a share of 1."""
+        """Return the unit of a coordinate of `TIMING_NUISANCES`: in s for a delay, relative for a clock."""
         return self.time_step if name == "delay" else 2.0 * self.time_step / (self.time[-1] - self.time[0])
 
     def without_compression(self) -> "ChannelLikelihood":
@@ -92,12 +93,12 @@ class ChannelLikelihood(eqx.Module):
 
     @property
     def rows(self) -> int:
-        """How many numbers an evaluation runs over."""
+        """Number of rows (samples or coordinates) in an evaluation."""
         return self.time.size if self.compression is None else self.compression.observed.size
 
     @property
     def n_samples(self) -> int:
-        """How many samples are the record's own, from the first on."""
+        """Number of samples without padding."""
         time = np.asarray(self.time)
         return 1 + int(np.searchsorted(time, time[-1]))
 
@@ -107,13 +108,13 @@ class ChannelLikelihood(eqx.Module):
 
     @property
     def equally_weighted(self) -> bool:
-        """Whether all of the record's own samples count, and equally."""
+        """Whether all samples of the record have equal, nonzero weight."""
         return self.weight is None or bool(np.all(self.weights[: self.n_samples] == 1.0))
 
     def without_samples(self) -> "ChannelLikelihood":
-        """With no more of the samples than their ends, where a compression stands for them.
+        """Return the channel with only two samples if it has a compression.
 
-        What is compiled for it serves records of any length.
+        Code compiled for it then serves records of any length.
         """
         if self.compression is None:
             return self
@@ -125,10 +126,10 @@ class ChannelLikelihood(eqx.Module):
         return dataclasses.replace(self, time=ends, observed=extremes, drive=drive, weight=None, rate=None)
 
     def signal(self, inputs: ChannelInputs, extra_delay: ArrayLike = 0.0) -> Float[Array, " samples"]:
-        """Return the channel as recorded, but for linear nuisances and noise; `extra_delay` (s) delays it further."""
+        """Return the modelled signal without linear nuisances and noise; `extra_delay` (s) is added to the delay."""
         undelayed = not self.timing and isinstance(extra_delay, float) and extra_delay == 0.0
         if undelayed and isinstance(self.drive, Sampled) and self.drive.period is None:
-            time = self.drive.time  # V's samples, which are the channel's: `highpass` knows u there without a search
+            time = self.drive.time  # identical to the samples of V, so that `highpass` needs no search
         else:
             time = self.time - (self.shift + inputs.delay + extra_delay)
         if "clock" in self.timing:
@@ -140,12 +141,12 @@ class ChannelLikelihood(eqx.Module):
         return inputs.gain * total
 
     def shapes(self, inputs: ChannelInputs) -> Float[Array, "10 samples"]:
-        """Return the linear nuisances' shapes in time, each of height 1."""
+        """Return the shapes in time of the linear nuisances, each of height 1."""
         middle, half = 0.5 * (self.time[0] + self.time[-1]), 0.5 * (self.time[-1] - self.time[0])
         return jnp.concatenate([baseline_functions(self.time, middle, half), self.decays(inputs.circuit, self.time)])
 
     def decays(self, circuit: Circuit, time: Float[Array, " times"]) -> Float[Array, "4 times"]:
-        """Return how unknown charges at the first sample decay; 0 beyond the time constants of constant skins."""
+        """Return the decays of unknown charges at the first sample, padded with 0 (constant skins only)."""
         if isinstance(circuit, WithSkin):
             return jnp.zeros((len(CHARGES), time.size))
         since, taus = time - self.time[0], circuit.terms().tau
@@ -157,7 +158,7 @@ class ChannelLikelihood(eqx.Module):
         return np.array(self.columns, dtype=int)
 
     def residuals_and_shapes(self, inputs: ChannelInputs) -> tuple[Float[Array, " rows"], Float[Array, "columns rows"]]:
-        """Return the channel less the signal, and the shapes of the `columns`, weighted, over samples or coordinates."""
+        """Return channel minus signal, and the shapes of the `columns`, both whitened, over samples or coordinates."""
         if self.compression is None:
             remainder, shapes = self.observed - self.signal(inputs), self.shapes(inputs)[self._column_indices]
             return self.apply_whitening(remainder), self.apply_whitening(shapes)
@@ -168,7 +169,7 @@ class ChannelLikelihood(eqx.Module):
         return remainder, shapes[self._column_indices]
 
     def apply_whitening(self, values: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
-        """What lies over the samples, in units of equal and independent noise; 0 where they do not count."""
+        """Return values over the samples in units of independent noise of equal sd; 0 for excluded samples."""
         values = values if self.weight is None else values * self.weight
         return values if self.whitening is None else self.whitening(values)
 
@@ -176,12 +177,12 @@ class ChannelLikelihood(eqx.Module):
         return jnp.mean(values, where=None if self.weight is None else self.weight > 0.0)
 
     def delay_derivative(self, inputs: ChannelInputs) -> Float[Array, " samples"]:
-        """Return how a further delay changes the signal, per s: over two time steps, so that ideal edges count."""
+        """Return the derivative of the signal with respect to a delay (per s), over two steps to include ideal edges."""
         step = self.time_step
         return (self.signal(inputs, step) - self.signal(inputs, -step)) / (2.0 * step)
 
     def whitened_delay_derivative(self, inputs: ChannelInputs) -> Float[Array, " rows"]:
-        """Return the same weighted, over samples or coordinates."""
+        """Return the whitened `delay_derivative`, over samples or coordinates."""
         if self.compression is None:
             return self.apply_whitening(self.delay_derivative(inputs))
         return inputs.gain * self.compression.delay_derivative(inputs.circuit.channel_terms(self.channel))
@@ -189,14 +190,14 @@ class ChannelLikelihood(eqx.Module):
     def fit_nuisances(
         self, inputs: ChannelInputs, sigma: ArrayLike
     ) -> tuple[Float[Array, " rows"], Float[Array, " columns"], Float[Array, "columns columns"]]:
-        """What is left of the channel, and the nuisances' posterior given all else.
+        """Fit the linear nuisances, given all other parameters.
 
-        Gives the remainder (weighted) after the best nuisances, their coefficients in prior standard
-        deviations, and the Cholesky factor of their posterior precision.
+        Returns the whitened residuals, the coefficients in prior standard deviations, and the Cholesky factor of
+        the posterior precision of the coefficients.
         """
         remainder, shapes = self.residuals_and_shapes(inputs)
         A = self.linear_sd[self._column_indices, None] * shapes
-        # keep XLA from computing both once per use
+        # keeps XLA from computing both again at each use
         remainder, A = lax.optimization_barrier((remainder, A))
         factor = jnp.linalg.cholesky(jnp.eye(len(A)) + A @ A.T / sigma**2)
         beta = cho_solve((factor, True), A @ remainder / sigma**2)
@@ -207,7 +208,7 @@ class ChannelLikelihood(eqx.Module):
     def _fit_nuisances_student(
         self, residuals: Array, A: Array, beta: Array, sigma: ArrayLike, steps: int = 12
     ) -> tuple[Float[Array, " rows"], Float[Array, " columns"], Float[Array, "columns columns"]]:
-        """Return `fit_nuisances` under Student's t, from the Gaussian's `beta`; in Laplace's approximation.
+        """Return `fit_nuisances` for Student-t noise in Laplace's approximation, starting from the Gaussian `beta`.
 
         Each of the `steps` of reweighting gains half a digit.
         """
@@ -225,22 +226,22 @@ class ChannelLikelihood(eqx.Module):
     def sample_nuisances(
         self, inputs: ChannelInputs, sigma: ArrayLike, deviate: ArrayLike = 0.0
     ) -> Float[Array, " 10"]:
-        """Return the nuisances' coefficients, in prior standard deviations, as ten standard normal numbers draw them.
+        """Return posterior draws of the nuisance coefficients, in prior standard deviations.
 
-        With a `deviate` of 0, their posterior mean.
+        `deviate` holds ten standard normal numbers; 0 gives the posterior mean.
         """
         _, beta, factor = self.fit_nuisances(inputs, sigma)
         deviate = jnp.broadcast_to(deviate, len(LINEAR_NUISANCES))[self._column_indices]
         return jnp.zeros(len(LINEAR_NUISANCES)).at[self._column_indices].set(beta + solve_triangular(factor.T, deviate))
 
     def residuals(self, inputs: ChannelInputs, sigma: ArrayLike) -> Float[Array, " rows+columns"]:
-        """Return whitened residuals, nuisances' priors included: half their square is -log-likelihood."""
+        """Return whitened residuals, priors of nuisances included; half their sum of squares is -log-likelihood."""
         remainder, beta, _ = self.fit_nuisances(inputs, sigma)
         whitened = remainder / sigma
         return jnp.concatenate([student_residual(whitened) if self.noise == "student" else whitened, beta])
 
     def log_likelihood(self, inputs: ChannelInputs, log_sigma: ArrayLike) -> Float[Array, ""]:
-        """Up to a constant; NaN where the compression does not reach."""
+        """Return the log-likelihood up to a constant; NaN outside the range of the compression."""
         remainder, beta, factor = self.fit_nuisances(inputs, jnp.exp(log_sigma))
         if self.noise == "student":
             misfit = jnp.sum(jnp.square(student_residual(remainder * jnp.exp(-log_sigma))))

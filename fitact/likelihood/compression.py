@@ -1,12 +1,11 @@
-"""A record's projection on the response table: after one pass, a likelihood costs the same for any length.
+"""Projection of a record on a table of responses, after which the cost of a likelihood is independent of its length.
 
-Under white Gaussian noise a likelihood needs from the record only its inner products with what the model
-can put together: the responses u(t; tau) to the drive of one time constant, the decays of an unknown
-charge, and a few slow shapes. Over a range of time constants all u(.; tau) lie, to rounding, in the span of
-some twenty functions, whatever the drive: they are convolutions of dV/dt with e^{-t/tau}, and those
-exponentials do. The pass adds up the inner products of these functions, the shapes and the record. Their
-root then holds coordinates in which the difference between record and model has the length it has over
-all samples, and as functions of log tau the coordinates are Chebyshev series.
+For white Gaussian noise, the likelihood depends on the record only through its inner products with the functions of
+the model: the responses u(t; tau) to the drive, the decays of an unknown charge, and a few slow shapes. Over a range
+of time constants, all u(.; tau) lie, to rounding, in the span of some twenty functions for any drive, since they are
+convolutions of dV/dt with e^{-t/tau}, and these exponentials do. One pass accumulates the inner products of these
+functions, the shapes and the record. A factor of this matrix gives coordinates in which the difference between record
+and model has the same length as over all samples. As functions of log tau, the coordinates are Chebyshev series.
 """
 
 import functools
@@ -33,38 +32,38 @@ from fitact.progress import track_progress
 
 BASELINE_NAMES = ("offset", "drift", "hum_50Hz_cos", "hum_50Hz_sin", "hum_60Hz_cos", "hum_60Hz_sin")
 
-# the last of the functions whose inner products are added up
+# indices of the last functions of the inner products
 _RATE, _SLOPE, _OBSERVED = -3, -2, -1
 _BASELINE = slice(_RATE - len(BASELINE_NAMES), _RATE)
 
 NODES = 41  # odd, so that the middle of the table is a node
-TABLE_HALF_WIDTH = math.log(9.0)  # half width of the table in log tau
-RANK_TOLERANCE = 1e-13  # singular values of what spans the responses, relative, that are left out
+TABLE_HALF_WIDTH = math.log(9.0)  # half-width of the table in log tau
+RANK_TOLERANCE = 1e-13  # relative size of the singular values that are omitted
 
 
 class Compression(eqx.Module):
-    """A record in the coordinates of its response table.
+    """A record in coordinates of its response table.
 
-    A vector of `rows` coordinates stands for one value a sample; lengths and angles are those over all samples.
+    A vector of `rows` coordinates represents one value per sample, with the same inner products as over all samples.
     """
 
-    center: Float[Array, ""]  # the table holds log tau within `half_width` of `center` (tau in s)
+    center: Float[Array, ""]  # the table covers log tau in `center` ± `half_width` (tau in s)
     half_width: Float[Array, ""]
-    # Chebyshev coefficients in log tau of the response to the drive (V), rows below its rank being 0
+    # Chebyshev coefficients in log tau of the response to the drive (V); rows beyond the rank are 0
     signal: Float[Array, "rank terms"]
-    decay: Float[Array, "rows terms"]  # those of the decay of an unknown charge from 1 V
+    decay: Float[Array, "rows terms"]  # the same for the decay of an unknown charge from 1 V
     baseline: Float[Array, "shapes rows"]  # the shapes of `BASELINE_NAMES`, of height 1
-    rate: Float[Array, " rows"]  # dV/dt, V/s, where the channel follows it, else 0
-    slope: Float[Array, " rows"]  # dV/dt, V/s, over two samples, so that a jump shows on both sides of it
+    rate: Float[Array, " rows"]  # dV/dt, V/s, if the channel follows it, else 0
+    slope: Float[Array, " rows"]  # dV/dt, V/s, over two samples, so that a jump appears on both sides
     observed: Float[Array, " rows"]  # the record, V or A
-    samples: Float[Array, ""]  # how many there are
+    samples: Float[Array, ""]  # number of samples
 
     def covers(self, tau: Array) -> Array:
-        """Return whether the table reaches the time constant (s)."""
+        """Return whether the table covers the time constant (s)."""
         return jnp.abs(jnp.log(tau) - self.center) <= self.half_width
 
     def response(self, terms: HighpassTerms) -> Float[Array, " rows"]:
-        """Return the response of a circuit, as `fitact.response` gives it in time."""
+        """Return the response of a circuit; compare `fitact.response`."""
         total = sum(
             weight * (self.signal @ self._series(tau)) for weight, tau in zip(terms.weight, terms.tau, strict=True)
         )
@@ -72,12 +71,12 @@ class Compression(eqx.Module):
         return total if terms.rate is None else total + terms.rate * self.rate
 
     def delay_derivative(self, terms: HighpassTerms) -> Float[Array, " rows"]:
-        """Return how a delay changes it, per s: u' = V' - u / tau."""
+        """Return the derivative of the response with respect to a delay (per s): u / tau - V' for each term."""
         falling = HighpassTerms(tuple(w / t for w, t in zip(terms.weight, terms.tau, strict=True)), terms.tau)
         return self.response(falling) - sum(terms.weight) * self.slope
 
     def decays(self, tau: Array) -> Float[Array, " rows"]:
-        """Return e^{-(t - t0) / tau} from the first sample on."""
+        """Return e^{-(t - t0) / tau}, where t0 is the first sample."""
         return self.decay @ self._series(tau)
 
     def _series(self, tau: Array) -> Float[Array, " terms"]:
@@ -87,23 +86,23 @@ class Compression(eqx.Module):
         def step(last: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
             return (last[1], 2.0 * x * last[1] - last[0]), last[0]
 
-        # a loop compiles sooner, but runs slower where the terms are few
+        # a loop compiles faster, but runs slower for few terms
         return lax.scan(step, (jnp.ones_like(x), x), None, length=terms, unroll=terms <= NODES // 2)[1]
 
     def restrict(self, center: float, half_width: float, precision: float, charge: float) -> "Compression":
-        """Return the same for log tau within `half_width` of `center` only, with fewer terms and rows.
+        """Return the compression for log tau in `center` ± `half_width` only, with fewer terms and rows.
 
-        Left-out terms change no response to the drive, and no decay of a `charge` (V), by more than `precision`
-        (V, root of the sum of squares); with no charge its decay is left out altogether.
+        Omitted terms change no response, and no decay of a `charge` (V), by more than `precision` (V, root of the
+        sum of squares). If `charge` is 0, the decay is omitted.
         """
         x, to_series = chebyshev(NODES)
-        # nodes of the narrow table, in the wide one; by NumPy, since JAX would compile its loop for every record
+        # nodes of the narrow table in the wide one, with NumPy because JAX would compile its loop for every record
         inside = (center + half_width * x - float(self.center)) / float(self.half_width)
         polynomials = np.polynomial.chebyshev.chebvander(inside, self.signal.shape[1] - 1).T
         signal = np.asarray(self.signal @ polynomials) @ to_series.T
         decay = np.asarray(self.decay @ polynomials) @ to_series.T
         sizes = np.linalg.norm(signal, axis=0) + charge * np.linalg.norm(decay, axis=0)
-        costs = np.cumsum(sizes[::-1])[::-1]  # of leaving out this term and all later ones
+        costs = np.cumsum(sizes[::-1])[::-1]  # error after omitting this and all later terms
         terms = round_up_column_count(np.count_nonzero(costs > precision), costs.size)
         signal = np.pad(signal[:, :terms], ((0, self.observed.size - signal.shape[0]), (0, 0)))
         others = [decay[:, :terms]] if charge > 0.0 else []
@@ -115,7 +114,7 @@ class Compression(eqx.Module):
 
 
 def _baseline_and_record(rows: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the last of the columns, in the order of a `Compression`."""
+    """Return the last columns, in the order of the fields of `Compression`."""
     return rows[:, _BASELINE].T, rows[:, _RATE], rows[:, _SLOPE], rows[:, _OBSERVED]
 
 
@@ -129,14 +128,14 @@ def compress(
     weight: Float[np.ndarray, " samples"] | None = None,
     rate: Float[np.ndarray, " samples"] | None = None,
 ) -> Compression:
-    """Project a record on the responses to `drive` of time constants within a factor 9 of that of `expected_terms`.
+    """Project a record on responses to `drive`, for time constants within a factor 9 of the one in `expected_terms`.
 
-    One pass over the arrays, a chunk at a time (so they may be `numpy.memmap`); where a steady drive repeats on
-    the record's own sampling grid, its periods are folded first, exactly. Call it in double precision.
+    This is one pass over the arrays in chunks, which may be `numpy.memmap`. If a steady drive repeats on the sampling
+    grid of the record, its periods are first folded exactly. Double precision is required.
 
-    A `Sampled` drive has the record's own times, and may be filled up. `expected_terms` is one term whose response is
-    near the record; it is taken off before and added after, so that the record's noise keeps its digits. `weight` is
-    what multiplies the samples' differences from a model (0 leaves one out; None: 1), `rate` dV/dt (V/s) for a channel
+    A `Sampled` drive has the times of the record, and may be padded. `expected_terms` is one term whose response is
+    close to the record; it is subtracted before and added after, so that the noise keeps its digits. `weight`
+    multiplies the residuals of the samples (0 excludes a sample, None means 1). `rate` is dV/dt (V/s) for a channel
     that follows it.
     """
     table = _ResponseTable.from_terms(expected_terms, time)
@@ -155,16 +154,16 @@ def compress(
 
 
 class _ResponseTable(eqx.Module):
-    """What the pass needs of the table: its nodes, and the few combinations of them that matter."""
+    """Response table during the pass: its nodes, and the few significant combinations of their responses."""
 
     center: Array
     nodes: Float[Array, " nodes"]  # s
     combinations: Float[Array, "nodes rank"]
-    series: np.ndarray  # coefficients (rank, terms) that give back any response from those combinations
+    series: np.ndarray  # coefficients (rank, terms) of any response in these combinations
     expected_terms: HighpassTerms
     middle: Array  # of the record, s
-    half: Array  # its length, s
-    step: Array  # between samples, on average, s
+    half: Array  # half the length of the record, s
+    step: Array  # mean time step, s
 
     @classmethod
     def from_terms(cls, expected_terms: HighpassTerms, time: np.ndarray) -> "_ResponseTable":
@@ -184,7 +183,7 @@ class _ResponseTable(eqx.Module):
 
 @functools.cache
 def _exponentials() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return nodes of any table over its middle, their combinations that matter, and the series that give back a response."""
+    """Return the nodes of a table relative to its centre, their significant combinations, and the series in these."""
     x, to_series = chebyshev(NODES)
     relative = np.exp(TABLE_HALF_WIDTH * x)
     ages = np.concatenate([[0.0], np.geomspace(1e-3 * relative.min(), 40.0 * relative.max(), 400)])
@@ -202,7 +201,7 @@ def baseline_functions(time: Float[Array, " n"], middle: Array, half: Array) -> 
 
 
 def evaluate_baseline(time: np.ndarray, middle: ArrayLike, half: ArrayLike) -> Float[np.ndarray, "6 n"]:
-    """Return the same at however many times, for which nothing is compiled anew."""
+    """Return `baseline_functions` at any number of times without compilation."""
     return np.asarray(_baseline_functions(pad_samples(time), middle, half))[:, : time.size]
 
 
@@ -210,16 +209,16 @@ _baseline_functions = jax.jit(baseline_functions)
 
 
 class _Samples(NamedTuple):
-    """Arrays over the samples, which may be on disk, or a chunk of them."""
+    """Arrays over all samples (possibly on disk) or over a chunk of them."""
 
     time: np.ndarray
     observed: np.ndarray
-    weight: np.ndarray  # of squares
+    weight: np.ndarray  # weight of the squares
     rate: np.ndarray  # dV/dt
 
 
 def _chunks(samples: _Samples, length: int) -> Iterator[_Samples]:
-    """`length` samples at a time; the last are filled up with weight 0."""
+    """Yield chunks of `length` samples; the last is padded with weight 0."""
     for first in range(0, samples.time.size, length):
         time, *others = (np.asarray(x[first : first + length]) for x in samples)
         missing = (0, length - time.size)
@@ -227,7 +226,7 @@ def _chunks(samples: _Samples, length: int) -> Iterator[_Samples]:
 
 
 def _chunk_length(samples: int, longest: int = 8_192) -> int:
-    """Return how many samples are looked at at a time, which bounds memory."""
+    """Return the number of samples in a chunk, which bounds the memory."""
     return min(longest, 1 << (samples - 1).bit_length())
 
 
@@ -244,13 +243,13 @@ def _accumulate_directly(
 def _chunk_products(
     table: _ResponseTable, drive: Drive, chunk: _Samples, baseline: Array | None, steady_state: bool
 ) -> Array:
-    """Return inner products where the response to the drive can be computed at any time."""
+    """Return the inner products of a chunk, for a drive whose response can be computed at any time."""
     time = chunk.time
 
     def respond(tau: Array) -> Array:
         return highpass(drive, time, tau, steady_state=steady_state)
 
-    # a chirp's many pieces are worked out for each: one after the other, not all side by side
+    # the many pieces of a chirp are computed anew for each node, one node at a time to save memory
     u = lax.map(respond, table.nodes) if isinstance(drive, Chirp) else jax.vmap(respond)(table.nodes)
 
     def voltage(time: Array) -> Array:
@@ -264,7 +263,7 @@ def _chunk_products(
 def _inner_products(
     table: _ResponseTable, responses: list[Array], baseline: Array, slope: Array, chunk: _Samples
 ) -> Array:
-    """Multiply the responses to the drive (and to unknown charges) at the nodes, the shapes and the record pairwise."""
+    """Return the inner products of the responses (and charge decays) at the nodes, the shapes and the record."""
     rest = chunk.observed - table.expected_terms.weight[0] * responses[0][NODES // 2]
     if table.expected_terms.rate is not None:
         rest = rest - table.expected_terms.rate * chunk.rate
@@ -274,7 +273,7 @@ def _inner_products(
 
 
 def _accumulate_folded(table: _ResponseTable, drive: Drive, samples: _Samples, period: int) -> Iterator[np.ndarray]:
-    """With the periods laid over each other: the response is computed for one, the rest are sums."""
+    """Yield the inner products from folded periods; the response is computed for one period only."""
     periods = max(1, _chunk_length(samples.time.size) // period)
     reference = np.asarray(samples.observed[:period])
     count = np.zeros(period)
@@ -292,7 +291,7 @@ def _accumulate_folded(table: _ResponseTable, drive: Drive, samples: _Samples, p
     time, mean, rate, baseline = map(pad_samples, (time, means[-1] + reference, rate, means[:-1]))
     folded = _Samples(time, mean, pad_weight(count), rate)
     total = np.array(_chunk_products(table, drive, folded, baseline, True))
-    # what the samples of one phase scatter about their mean
+    # scatter of the samples of one phase about their mean
     kept = np.r_[_BASELINE, _OBSERVED]
     total[np.ix_(kept, kept)] += squares - means @ sums.T
     yield total
@@ -301,25 +300,25 @@ def _accumulate_folded(table: _ResponseTable, drive: Drive, samples: _Samples, p
 def _samples_per_period(
     drive: Drive, time: np.ndarray, max_samples: int = 65_536, tolerance: float = 1e-9
 ) -> int | None:
-    """Return the samples after which drive and grid meet again, to `tolerance` of a step, if it is worth folding a record."""
+    """Return after how many samples drive and grid coincide (to `tolerance` steps), or None if folding is useless."""
     if not isinstance(drive, Periodic) or not _is_exactly_uniform(time):
         return None
-    advance = (time[-1] - time[0]) / (time.size - 1) * float(drive.frequency)  # cycles a sample
+    advance = (time[-1] - time[0]) / (time.size - 1) * float(drive.frequency)  # cycles per sample
     cycles = Fraction(advance).limit_denominator(max(1, min(time.size // 2, max_samples)))
     rounding = 4.0 * np.finfo(float).eps * time.size
-    error = abs(advance - cycles) * time.size / advance  # by the end of the record, in samples
+    error = abs(advance - cycles) * time.size / advance  # at the end of the record, in samples
     return cycles.denominator if cycles > 0 and error < tolerance + rounding else None
 
 
 def _is_exactly_uniform(time: np.ndarray, tolerance: float = 1e-9) -> bool:
-    """Return whether the samples lie on a grid, to `tolerance` of a step but for rounding."""
+    """Return whether the samples lie on a uniform grid, to `tolerance` of a step plus rounding."""
     step = (time[-1] - time[0]) / (time.size - 1)
     rounding = 4.0 * np.finfo(float).eps * max(abs(time[0]), abs(time[-1]))
     return is_uniform(time, tolerance + rounding / step)
 
 
 def _accumulate_measured(table: _ResponseTable, drive: Sampled, samples: _Samples) -> Iterator[np.ndarray]:
-    """Along a measured drive, from sample to sample."""
+    """Yield the inner products of each chunk for a measured drive."""
     time = samples.time
     length, step, first = _chunk_length(time.size), float(table.step), float(drive.samples[0])
     x = step / table.nodes if _is_exactly_uniform(time) and step < float(jnp.min(table.nodes)) else None
@@ -341,7 +340,7 @@ def _advance_chunk(
     first: Array,
     x: Array | None,
 ) -> tuple[Array, tuple[Array, Array, Array]]:
-    """Return inner products along a chunk, and the response, time and drive at its end; `x`: even steps over the nodes."""
+    """Return inner products of a chunk, and u, time and drive at its end; `x`: uniform step over the nodes."""
     time, (u, since, before) = chunk.time, last
     step, rise = jnp.diff(time, prepend=since), jnp.diff(voltage, prepend=before)
     if x is None:
@@ -360,7 +359,7 @@ def _advance_chunk(
 def _uniform_recurrence(
     rise: Float[Array, " n"], u: Float[Array, " nodes"], x: Float[Array, " nodes"], block: int = 64
 ) -> Float[Array, "nodes n"]:
-    """Return u[k] = e^{-x} u[k - 1] + phi(x) rise[k]: `recurrence` for one step size, in blocks."""
+    """Return u[k] = e^{-x} u[k - 1] + phi(x) rise[k], i.e. `recurrence` for a uniform step, in blocks."""
     width = math.gcd(rise.size, block)
     decay, gain = jnp.exp(-x)[:, None], phi(x)[:, None]
     blocks = rise.reshape(-1, width)
@@ -379,7 +378,7 @@ def _uniform_recurrence(
 
 
 def _assemble(table: _ResponseTable, total: np.ndarray, decays: bool, samples: int) -> Compression:
-    """Return coordinates in which inner products are those that were added up."""
+    """Return coordinates that have the accumulated inner products."""
     size, rank = len(total), table.series.shape[0]
     scale = np.sqrt(np.diagonal(total))
     scale[scale == 0.0] = 1.0
@@ -396,12 +395,12 @@ def _assemble(table: _ResponseTable, total: np.ndarray, decays: bool, samples: i
 
 
 def round_up_column_count(count: SupportsFloat, maximum: int) -> int:
-    """Return columns to keep where `count` of `maximum` matter; in fours, so that most records share what is compiled."""
+    """Return `count` rounded up to a multiple of 4, at most `maximum`, so that most records share compiled code."""
     return min(4 * max(1, math.ceil(float(count) / 4)), maximum)
 
 
 def chebyshev(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nodes in [-1, 1], and the matrix from values there to a series' coefficients (terms, nodes)."""
+    """Return Chebyshev nodes in [-1, 1], and the matrix from values there to series coefficients (terms, nodes)."""
     angle = np.pi * (np.arange(count) + 0.5) / count
     matrix = 2.0 / count * np.cos(np.arange(count)[:, None] * angle)
     matrix[0] *= 0.5

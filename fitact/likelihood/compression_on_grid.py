@@ -1,8 +1,8 @@
-"""A record's projection on responses of fixed time constants: for circuits that a grid of them follows.
+"""Projection of a record on the responses of a fixed grid of time constants, for circuits represented by such a grid.
 
-The model is linear in the weights of the grid, whose responses to the drive are computed once. The triangle R of
-their QR decomposition, with the slow shapes and the record as further columns, holds coordinates in which the
-difference between record and model has the length it has over all samples.
+The model is linear in the weights of the grid, whose responses to the drive are computed once. The QR decomposition
+of these responses, the slow shapes and the record gives the factor R. Its columns are coordinates in which the
+difference between record and model has the same length as over all samples.
 """
 
 from collections.abc import Iterator
@@ -23,30 +23,30 @@ from fitact.model.skin import TimeConstantGrid
 
 
 class GridCompression(eqx.Module):
-    """A record in coordinates of the responses of a grid; as `fitact.likelihood.compression.Compression`."""
+    """A record in coordinates of the responses of a grid; compare `fitact.likelihood.compression.Compression`."""
 
-    signal: Float[Array, "terms rows"]  # the response to the drive (V) of each time constant
-    delay_slopes: Float[Array, "terms rows"]  # how it changes with a delay, V/s, over two samples
+    signal: Float[Array, "terms rows"]  # response (V) of each time constant to the drive
+    delay_slopes: Float[Array, "terms rows"]  # derivative of `signal` with respect to a delay, V/s, over two samples
     baseline: Float[Array, "shapes rows"]
     rate: Float[Array, " rows"]
     observed: Float[Array, " rows"]
     samples: Float[Array, ""]
 
     def covers(self, tau: Array) -> Bool[Array, "*shape"]:
-        """Always: the grid is the circuit's own."""
+        """Return True, since the grid belongs to the circuit."""
         return jnp.ones_like(tau, dtype=bool)
 
     def response(self, terms: HighpassTerms) -> Float[Array, " rows"]:
-        """Return the response of a circuit, as `fitact.response` gives it in time."""
+        """Return the response of a circuit; compare `fitact.response`."""
         total = jnp.asarray(terms.weight) @ self.signal
         return total if terms.rate is None else total + terms.rate * self.rate
 
     def delay_derivative(self, terms: HighpassTerms) -> Float[Array, " rows"]:
-        """Return how a delay changes it, per s."""
+        """Return the derivative of the response with respect to a delay (per s)."""
         return jnp.asarray(terms.weight) @ self.delay_slopes
 
     def decays(self, tau: Array) -> Float[Array, " rows"]:
-        """Zeros: what such a circuit remembers is no one decay."""
+        """Return zeros, since an unknown charge of such a circuit does not decay exponentially."""
         return jnp.zeros_like(self.observed)
 
 
@@ -60,13 +60,15 @@ def compress_on_grid(
     weight: Float[np.ndarray, " samples"] | None = None,
     rate: Float[np.ndarray, " samples"] | None = None,
 ) -> GridCompression:
-    """Project a record on the responses to `drive` of the grid; arguments as those of `compression.compress`.
+    """Project a record on the responses of the grid to `drive`; other arguments as in `compression.compress`.
 
-    A chunk at a time, each in a QR decomposition together with the triangle so far, so that no digits are lost.
+    Each chunk is combined with the previous factor R by a QR decomposition, so that no digits are lost.
     """
     step = (time[-1] - time[0]) / (time.size - 1)
     around = np.array([0.0, -step, step])
-    scale = max(float(np.max(np.abs(observed))), 1e-300)  # the record's column as long as the others, for rounding
+    scale = max(
+        float(np.max(np.abs(observed))), 1e-300
+    )  # scales the record's column like the others, to limit rounding
     weight, rate = (
         np.broadcast_to(value if given is None else given, time.shape) for given, value in ((weight, 1.0), (rate, 0.0))
     )
@@ -92,8 +94,8 @@ def compress_on_grid(
 def _responses(
     drive: Drive, tau: Array, time: np.ndarray, offsets: np.ndarray, steady_state: bool, chunk: int = 8_192
 ) -> Iterator[tuple[slice, Float[np.ndarray, "around terms samples"]]]:
-    """Responses of each time constant at the samples' times and beside them, a `chunk` at a time to bound memory."""
-    length = time.size if isinstance(drive, Sampled) else chunk  # a long drive is gone through once
+    """Yield the responses at the sample times and at `offsets` from them, in chunks to bound the memory."""
+    length = time.size if isinstance(drive, Sampled) else chunk  # a long drive is traversed only once
     for first in range(0, time.size, length):
         part = slice(first, first + length)
         times = pad_samples(time[part], min(length, time.size))

@@ -1,8 +1,7 @@
-"""The log-probability of one or several records: a circuit, and the channels that it made.
+"""Log-probability of one or several records of one circuit.
 
-The chain holds only the parameters that matter: the logarithms of the circuit's free parameters and of the
-channels' gains, the delays, and the logarithm of each channel's noise. What enters the channels linearly is
-integrated out (`fitact.likelihood.channel`).
+The parameters are the logarithms of the circuit's free parameters and of the channels' gains, the delays, and the
+logarithm of each channel's noise. Linear nuisances are integrated out (`fitact.likelihood.channel`).
 """
 
 import dataclasses
@@ -22,43 +21,43 @@ from fitact.model.skin import WithSkin, circuit_parameters, with_values
 from fitact.prior.distributions import Distribution
 from fitact.prior.prior import Prior
 
-UNCONSTRAINED_SD = math.log(1e6)  # in a logarithm: what leaves more open than this leaves it open
+UNCONSTRAINED_SD = math.log(1e6)  # in a log-parameter; a larger sd counts as no constraint
 
 
 class Likelihood(eqx.Module):
-    """Traces, a circuit and the prior, as a function of the parameters.
+    """Likelihood and prior of channels and a circuit, as functions of the parameters.
 
-    A point theta holds, in the order of `names`, logarithms of positive parameters, and each channel's free delay and
-    clock in its `timing_unit`. Built by `fitact.fitting.fit`.
+    A point theta holds, in the order of `names`, the logarithms of positive parameters, and the free delay and clock
+    of each channel in its `timing_unit`. It is built by `fitact.fitting.fit`.
     """
 
-    channels: tuple[ChannelLikelihood, ...]  # those of the records
-    template: RC | WithSkin  # the circuit; what the prior does not name keeps its value there
-    prior: Prior  # of the circuit's free parameters and of free gains
-    sigma_prior: tuple[Distribution | None, ...]  # of each channel's noise; None: flat in its logarithm
-    # parameters that are a ratio times another: name, the other's, ratio
+    channels: tuple[ChannelLikelihood, ...]  # channels of all records
+    template: RC | WithSkin  # the circuit with the values of parameters that are not free
+    prior: Prior  # prior of the free circuit parameters and gains
+    sigma_prior: tuple[Distribution | None, ...]  # prior of each channel's noise; None means flat in its logarithm
+    # parameters proportional to another: (name, name of the other, ratio)
     tied: tuple[tuple[str, str, float], ...] = eqx.field(static=True, default=())
-    # whether the prior of the circuit counts, beside those of gains and delays
+    # whether the prior of the circuit applies, in addition to the priors of gains and delays
     use_prior: bool = eqx.field(static=True, default=True)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The coordinates of theta."""
+        """Names of the coordinates of theta."""
         return (*self.prior.names, *(channel.qualified_name(name) for channel, name in self._timing))
 
     @property
     def _timing(self) -> list[tuple[ChannelLikelihood, str]]:
-        """Free delays and clocks: the channel, and which."""
+        """Free delays and clocks, as (channel, nuisance)."""
         return [(channel, name) for channel in self.channels for name in channel.timing]
 
     @property
     def timing_sd(self) -> list[ArrayLike]:
-        """Their standard deviations by the prior."""
+        """Prior standard deviations of free delays and clocks."""
         return [channel.timing_sd[TIMING_NUISANCES.index(name)] for channel, name in self._timing]
 
     @property
     def timing(self) -> dict[str, tuple[float, float]]:
-        """Delays (s) and clocks (a share of 1) by name: value where the coordinate is 0, and what 1 of that adds."""
+        """Origin and unit of the coordinate of each free delay (s) and clock (relative), by name."""
         with jax.enable_x64(True):
             pairs = [
                 (channel, name, channel.shift if name == "delay" else channel.clock) for channel, name in self._timing
@@ -67,12 +66,12 @@ class Likelihood(eqx.Module):
 
     @property
     def sigma_names(self) -> tuple[str, ...]:
-        """The coordinates of a posterior's point after theta."""
+        """Names of the coordinates that follow theta in the posterior."""
         return tuple(channel.qualified_name("sigma") for channel in self.channels)
 
     @property
     def prior_factor(self) -> Float[np.ndarray, "parameters parameters"]:
-        """A root of theta's covariance by the prior; of a circuit without one, `UNCONSTRAINED_SD` in each direction."""
+        """Factor of the prior covariance of theta; `UNCONSTRAINED_SD` in each direction without a prior."""
         with jax.enable_x64(True):
             sd = np.append(self.prior.log_sd, np.array(self.timing_sd))
         size, root = len(self.prior.names), np.diag(sd)
@@ -83,12 +82,12 @@ class Likelihood(eqx.Module):
 
     @property
     def _circuit_mask(self) -> Bool[np.ndarray, " circuit_parameters"]:
-        """Which coordinates of theta are the circuit's."""
+        """Mask of the coordinates of theta that belong to the circuit."""
         return np.array([name in circuit_parameters(self.template) for name in self.names])
 
     @property
     def rows(self) -> int:
-        """How many numbers an evaluation runs over."""
+        """Number of rows (samples or coordinates) in an evaluation."""
         return sum(channel.rows for channel in self.channels)
 
     @property
@@ -99,15 +98,15 @@ class Likelihood(eqx.Module):
         return dataclasses.replace(self, channels=tuple(channel.without_compression() for channel in self.channels))
 
     def without_samples(self) -> "Likelihood":
-        """With no more of the samples than their ends, where a compression stands for them."""
+        """Return the likelihood with only two samples for each compressed channel."""
         return dataclasses.replace(self, channels=tuple(channel.without_samples() for channel in self.channels))
 
     def replace_channel(self, index: int, channel: ChannelLikelihood) -> "Likelihood":
         return dataclasses.replace(self, channels=(*self.channels[:index], channel, *self.channels[index + 1 :]))
 
     def circuit(self, theta: Float[Array, " circuit_parameters"]) -> Circuit:
-        """Return the circuit at theta; NaN where no double could hold what follows from it, so that no step leads there."""
-        # beyond 1e30 or below 1e-30 SI units is no finger, and products overflow
+        """Return the circuit at theta, with NaN for extreme values, so that no optimiser step leads there."""
+        # no finger exceeds 1e30 or falls below 1e-30 SI units, where products overflow
         theta = jnp.where(jnp.abs(theta) < 70.0, theta, jnp.nan)
         known = circuit_parameters(self.template)
         values = {name: jnp.exp(theta[i]) for i, name in enumerate(self.prior.names) if name in known}
@@ -116,7 +115,7 @@ class Likelihood(eqx.Module):
         return with_values(self.template, values)
 
     def channel_inputs(self, theta: Float[Array, " circuit_parameters"], index: int = 0) -> ChannelInputs:
-        """What the channel of that index needs of theta."""
+        """Return the inputs of the channel with this index at theta."""
         return self._make_inputs(self.circuit(theta), theta, self.channels[index])
 
     def _make_inputs(self, circuit: Circuit, theta: Array, channel: ChannelLikelihood) -> ChannelInputs:
@@ -128,19 +127,19 @@ class Likelihood(eqx.Module):
     def channels_and_inputs(
         self, theta: Float[Array, " circuit_parameters"]
     ) -> Iterator[tuple[ChannelLikelihood, ChannelInputs]]:
-        """The channels, and what they need of theta."""
+        """Yield each channel and its inputs at theta."""
         circuit = self.circuit(theta)
         return ((channel, self._make_inputs(circuit, theta, channel)) for channel in self.channels)
 
     def residuals(
         self, theta: Float[Array, " circuit_parameters"], sigma: Float[Array, " channels"]
     ) -> tuple[Float[Array, " rows"], ...]:
-        """Return whitened residuals of each channel, nuisances' priors included: half their square is -log-likelihood."""
+        """Return the residuals of each channel; half their sum of squares is -log-likelihood (see `channel`)."""
         parts = zip(self.channels_and_inputs(theta), sigma, strict=True)
         return tuple(channel.residuals(inputs, s) for (channel, inputs), s in parts)
 
     def prior_residuals(self, theta: Float[Array, " circuit_parameters"]) -> Float[Array, " circuit_parameters"]:
-        """Return the prior as residuals: normal in theta, with the moments of the stated prior; 0 for what has none."""
+        """Return the prior as residuals, normal in theta with the prior's moments; 0 for parameters without a prior."""
         size = len(self.prior.names)
         scaled = self.prior.residuals(theta[:size])
         if self._timing:
@@ -153,17 +152,17 @@ class Likelihood(eqx.Module):
         return point[: -len(self.channels)], point[-len(self.channels) :]
 
     def log_likelihoods(self, point: Float[Array, " coordinates"]) -> Float[Array, " channels"]:
-        """Return log-likelihood of each channel at (theta, log sigma), up to a constant; NaN where its compression ends."""
+        """Return each channel's log-likelihood at (theta, log sigma), up to a constant; NaN outside its compression."""
         theta, log_sigma = self.split(point)
         parts = zip(self.channels_and_inputs(theta), log_sigma, strict=True)
         return jnp.stack([channel.log_likelihood(inputs, log) for (channel, inputs), log in parts])
 
     def log_likelihood(self, point: Float[Array, " coordinates"]) -> Float[Array, ""]:
-        """Return log-likelihood of (theta, log sigma), up to a constant; NaN where a compression does not reach."""
+        """Return the log-likelihood of (theta, log sigma), up to a constant; NaN outside a compression."""
         return jnp.sum(self.log_likelihoods(point))
 
     def log_prior(self, point: Float[Array, " coordinates"]) -> Float[Array, ""]:
-        """Return log-density of the prior, up to a constant: a noise is flat in its logarithm unless it has one."""
+        """Return the log-density of the prior, up to a constant; noise without a prior is flat in its logarithm."""
         theta, log_sigma = self.split(point)
         size = len(self.prior.names)
         value = self.prior.log_density(theta[:size])
@@ -174,9 +173,9 @@ class Likelihood(eqx.Module):
         return value
 
     def log_prob(self, point: Float[Array, " coordinates"]) -> Float[Array, ""]:
-        """Return log-posterior of (theta, log sigma), up to a constant.
+        """Return the log-posterior of (theta, log sigma), up to a constant.
 
-        Anything that is not finite counts as impossible, but it is NaN where a compression does not reach.
+        A value that is not finite becomes -inf, but it is NaN outside a compression.
         """
         log_prior, value = self.log_prior(point), self.log_likelihood(point)
         compressed = any(channel.compression is not None for channel in self.channels)
@@ -187,14 +186,14 @@ class Likelihood(eqx.Module):
     def sample_prior(
         self, theta: Float[np.ndarray, " circuit_parameters"], count: int
     ) -> Float[np.ndarray, "count parameters"]:
-        """Return points of the prior, always the same; delays and clocks are those of `theta`."""
+        """Return deterministic draws from the prior, with the delays and clocks of `theta`."""
         points = np.tile(theta, (count, 1))
         draws = self.prior.sample(np.random.default_rng(0), count)
         points[:, : len(draws)] = np.log(list(draws.values())).T
         return points
 
     def to_physical(self, theta: Float[np.ndarray, "*shape parameters"]) -> dict[str, Float[np.ndarray, "*shape"]]:
-        """Return points in SI units, by name; delays and clocks are those of the channel against the drive, in all."""
+        """Return points in SI units by name; delays and clocks are the totals between channel and drive."""
         values = {name: np.exp(theta[..., i]) for i, name in enumerate(self.prior.names)}
         for i, (name, (base, unit)) in enumerate(self.timing.items(), len(values)):
             values[name] = base + theta[..., i] * unit

@@ -1,4 +1,4 @@
-"""Noise that is not white and Gaussian: Student-t tails, and colour that a filter takes away."""
+"""Noise models other than white Gaussian noise: Student-t noise, and coloured noise with a whitening filter."""
 
 import math
 from typing import Literal, NamedTuple, TypeAlias
@@ -14,40 +14,40 @@ from fitact.errors import InputError
 
 NoiseModel: TypeAlias = Literal["white", "student", "ar1", "spectrum"]
 
-STUDENT_DOF = 4.0  # of Student's t: Lange, Little, Taylor, J. Am. Stat. Assoc. 84 (1989) 881
+STUDENT_DOF = 4.0  # degrees of freedom; Lange, Little, Taylor, J. Am. Stat. Assoc. 84 (1989) 881
 
 
 def student_residual(z: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Return half its square is -log density of Student's t at z, up to a constant; smooth, and near 0 a multiple of z."""
+    """Return r(z), smooth at 0, such that r^2 / 2 is the negative log-density of Student's t up to a constant."""
     u = jnp.square(z) / STUDENT_DOF
-    small = u < 1e-6  # where log(1 + u) / u is 1 - u / 2 in double precision
+    small = u < 1e-6  # here log(1 + u) / u equals 1 - u / 2 in double precision
     ratio = jnp.where(small, 1.0 - 0.5 * u, jnp.log1p(u) / jnp.where(small, 1.0, u))
     return z * jnp.sqrt((STUDENT_DOF + 1.0) / STUDENT_DOF * ratio)
 
 
 def student_weight(z: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """What a squared residual counts in reweighted least squares; averages 1."""
+    """Return the weight of a squared residual in reweighted least squares; its mean is 1."""
     return (STUDENT_DOF + 1.0) / (STUDENT_DOF + jnp.square(z))
 
 
 def student_curvature(z: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Return second derivative of -log density."""
+    """Return the second derivative of the negative log-density."""
     return (STUDENT_DOF + 1.0) * (STUDENT_DOF - jnp.square(z)) / jnp.square(STUDENT_DOF + jnp.square(z))
 
 
 def scale_information(model: NoiseModel) -> float:
-    """Return Fisher's information on log `sigma` in one sample."""
+    """Return the Fisher information of one sample on log sigma."""
     return 2.0 * STUDENT_DOF / (STUDENT_DOF + 3.0) if model == "student" else 2.0
 
 
 class Whitening(eqx.Module):
-    """A filter that leaves white noise as strong as what it was given."""
+    """A whitening filter that preserves the standard deviation of the noise."""
 
-    taps: Float[Array, " taps"]  # of this sample, the one before it and so on
-    mask: Float[Array, " samples"]  # 1 where a sample and all before it that the filter reaches count, else 0
+    taps: Float[Array, " taps"]  # for the sample itself, the one before it, and so on
+    mask: Float[Array, " samples"]  # 1 if a sample and all earlier samples within the filter are valid, else 0
 
     def __call__(self, values: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
-        """Return the values filtered, and 0 where `mask` is."""
+        """Return the filtered values, with 0 where `mask` is 0."""
         reach, size = self.taps.size - 1, values.shape[-1]
         padded = jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(reach, 0)])
         parts = [self.taps[lag] * padded[..., reach - lag : reach - lag + size] for lag in range(reach + 1)]
@@ -57,14 +57,14 @@ class Whitening(eqx.Module):
 def draw_noise(
     rng: np.random.Generator, model: NoiseModel, whitening: Whitening | None, shape: tuple[int, ...], stride: int = 1
 ) -> Float[np.ndarray, "*draws samples"]:
-    """Return noise of a `sigma` of 1, of every `stride`-th sample of a record."""
+    """Return noise with sigma = 1, at every `stride`-th sample of a record."""
     if model == "student":
         return rng.standard_t(STUDENT_DOF, shape)
     if whitening is None:
         return rng.standard_normal(shape)
-    around = 4 * shape[-1]  # a circle on which it is drawn, of which it must not see the other side
+    around = 4 * shape[-1]  # noise is drawn on a circle that is longer than its correlations
     power = np.abs(np.fft.fft(np.asarray(whitening.taps), around * stride)) ** -2.0
-    power = power.reshape(stride, around).mean(axis=0)  # of the samples between those drawn, the spectrum is folded
+    power = power.reshape(stride, around).mean(axis=0)  # subsampling folds the spectrum
     lines = np.fft.fft(rng.standard_normal((*shape[:-1], around))) * np.sqrt(power)
     return np.fft.ifft(lines).real[..., : shape[-1]]
 
@@ -72,23 +72,23 @@ def draw_noise(
 class Autoregression(NamedTuple):
     """x_t = sum_k coefficients_k x_(t-k) + innovation."""
 
-    coefficients: Float[np.ndarray, " order"]  # of the sample before, the one before that and so on
-    innovation_ratio: float  # standard deviation of the innovation over that of x
+    coefficients: Float[np.ndarray, " order"]  # for the previous sample, the one before it, and so on
+    innovation_ratio: float  # sd of the innovation over the sd of x
 
     def whitening(self, mask: Bool[np.ndarray, " samples"]) -> Whitening:
-        """Return the filter, for a record of which those samples are `mask`."""
+        """Return the whitening filter for a record whose valid samples are `mask`."""
         kept = mask.copy()
         for lag in range(1, self.coefficients.size + 1):
             kept[lag:] &= mask[:-lag]
         kept[: self.coefficients.size] = False
-        # filled up with zeros, so that most orders share what is compiled for another
+        # padded with zeros, so that most orders share compiled code
         fill = 2 ** math.ceil(math.log2(max(self.coefficients.size, 1))) - self.coefficients.size
         taps = np.concatenate([[1.0], -self.coefficients, np.zeros(fill)]) / self.innovation_ratio
         return Whitening(jnp.asarray(taps), jnp.asarray(kept, dtype=float))
 
 
 def fit_ar_burg(values: Float[np.ndarray, " n"], max_order: int = 40) -> Autoregression:
-    """Return Burg's autoregression, of the order that Akaike's criterion asks for; `values` have a mean of 0.
+    """Fit an autoregression by Burg's method, with its order selected by AIC; `values` have zero mean.
 
     Kay, Modern Spectral Estimation (1988), sections 7.4 and 7.7.
     """
@@ -107,7 +107,7 @@ def fit_ar_burg(values: Float[np.ndarray, " n"], max_order: int = 40) -> Autoreg
 
 
 def fit_ar1(residuals: Float[np.ndarray, " n"], mask: Bool[np.ndarray, " n"]) -> Autoregression:
-    """Return the autoregression of first order, by the correlation of neighbours that both count."""
+    """Fit a first-order autoregression by the correlation of neighbouring valid samples."""
     before, after = (residuals[part][mask[:-1] & mask[1:]] for part in (slice(None, -1), slice(1, None)))
     both = max(0.5 * float(before @ before + after @ after), 1e-300)
     coefficient = float(before @ after) / both
@@ -121,29 +121,28 @@ def estimate_quiet_noise(
     min_samples: int = 200,
     max_drive_fraction: float = 0.1,
 ) -> tuple[Autoregression, float]:
-    """Return a channel's noise where the drive rests, from and to `quiet` (s): its colour and its standard deviation.
+    """Return autoregression and standard deviation of a channel's noise in the interval `quiet` (s) without drive.
 
-    A spectrum can be told from `min_samples` on. The drive has noise of its own, and may move there by
-    `max_drive_fraction` of its span.
+    The interval must hold `min_samples`. The noise of V may reach `max_drive_fraction` of its span there.
     """
     inside = (record.time >= quiet[0]) & (record.time <= quiet[1])
     count = int(np.count_nonzero(inside))
     place = f"{record.source}: [measurement] quiet = {quiet[0]:.4g} s to {quiet[1]:.4g} s"
     if count < min_samples:
-        raise InputError(f"{place} holds {count} samples of the record; choose a stretch of {min_samples} or more")
+        raise InputError(f"{place} holds {count} samples of the record; choose an interval with at least {min_samples}")
     if "V" in record and np.ptp(record["V"][inside]) > max_drive_fraction * np.ptp(record["V"]):
-        raise InputError(f"{place}: V_V moves there; choose a stretch in which the drive rests")
+        raise InputError(f"{place}: V_V varies there; choose an interval in which the drive is constant")
     values = record[channel][inside]
     values = values - values.mean()
     if longest_run(values == values[0]) == count:
-        raise InputError(f"{place} shows no noise of {channel}; leave noise_model = 'spectrum' out")
+        raise InputError(f"{place}: {channel} has no noise; remove noise_model = 'spectrum'")
     return fit_ar_burg(values), float(np.std(values))
 
 
 def require_uniform(record: Record, model: NoiseModel) -> None:
-    """Refuse colour of noise, which is known from sample to sample, where these are not equally far apart."""
+    """Raise InputError for a model of coloured noise if the time steps are not uniform."""
     if not is_uniform(record.time):
         raise InputError(
-            f"{record.source}: [measurement] noise_model = '{model}' needs even time steps; resample the record, or"
-            " leave noise_model out"
+            f"{record.source}: [measurement] noise_model = '{model}' needs uniform time steps; resample the record, or"
+            " remove noise_model"
         )

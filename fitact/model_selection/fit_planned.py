@@ -73,7 +73,7 @@ def plan_for_record(record: Record, scene: Scene) -> Plan:
 def _reason_for_full_model(scenes: Sequence[Scene], model: Model) -> str:
     """Say why the full model is fitted from the first, as a clause; "" where there is a plan."""
     if model == "full":
-        return "it was asked for"
+        return "it was requested"
     if not scenes:
         return "without a scene it is the paper's final circuit, which has nothing to leave out"
     if len(scenes) > 1:

@@ -378,7 +378,7 @@ fitact.cli.main()
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment, timeout=50)
     assert done.returncode == 130
-    assert done.stderr == "fitact: interrupted; the same command goes on from the last checkpoint\n"
+    assert done.stderr == "fitact: interrupted; run the same command again to resume from the last checkpoint\n"
 
 
 @pytest.mark.slow

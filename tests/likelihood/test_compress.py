@@ -106,7 +106,7 @@ def test_fit_and_log_probabilities_are_those_of_the_samples(scene):
     ours, full = (fitact.fit(record, scene, tolerance=tolerance) for tolerance in (1e-3, 0.0))
     assert ours.model()["likelihood"] == "compressed"
     assert full.model()["likelihood"] == "full"
-    assert full.full_because == "it was asked for"
+    assert full.full_because == "the full sum was requested"
     assert ours.compression_error < 1e-3
     np.testing.assert_allclose(ours.theta, full.theta, atol=1e-4 * full.sd.min())
     np.testing.assert_allclose(ours.sd, full.sd, rtol=1e-6)
@@ -161,7 +161,7 @@ def test_samples_are_summed_where_compression_does_not_hold(made: dict[str, int]
         (0.9e-3, 0.9e-3, "^$"),
         (1.1e-3, 0.0, "off by 0.0011 near the optimum"),
         (0.0, 0.01, "off by 0.01 within the prior"),
-        (math.nan, 0.0, "time constant more open than the table is wide"),
+        (math.nan, 0.0, "time constant exceeds the range of the table"),
     ],
 )
 def test_what_speaks_against_a_compression(error: float, excess: float, reason: str):

@@ -130,7 +130,7 @@ def test_where_nothing_is_planned_the_full_model_is_fitted(monkeypatch):
     scene = fitact.Scene.from_dict(SCENE)
     measured = fitact.Scene.from_dict({"skin": {"level": "dispersive"}, "drive": {"waveform": "measured"}})
     for scenes, model, reason in [
-        ([scene], "full", "asked for"),
+        ([scene], "full", "requested"),
         ([], "planned", "without a scene"),
         ([scene, scene], "planned", "several scenes"),
         ([measured], "planned", "no plan with a measured drive"),
