@@ -1,8 +1,8 @@
-"""How JAX compiles: few shapes for all records and batches, numbers as arrays, and a cache that outlives a process.
+"""Compilation by JAX: few shapes for all records and batches, numbers as arrays, and a persistent cache.
 
-JAX compiles for every length anew. So records are filled up to one of a few lengths: the last sample is repeated, with
-a weight of 0, so that times still never decrease, a drive stays where it ended, and the ends, the least and the largest
-of a record remain its own. Batches are filled up to one size.
+JAX compiles code for each array length. Records are therefore padded to one of a few lengths by repeating the last
+sample with weight 0. Times then never decrease, a drive keeps its last value, and the ends, the minimum and the
+maximum of a record do not change. Batches are padded to one size.
 """
 
 import functools
@@ -22,14 +22,14 @@ from fitact.progress import track_progress
 
 _Module = TypeVar("_Module", bound=eqx.Module)
 
-MAX_PADDED_LENGTH = 1_048_576  # samples, above which a fit takes longer than compiling
+MAX_PADDED_LENGTH = 1_048_576  # samples; a fit of more takes longer than the compilation
 
 
 def padded_length(samples: int, per_octave: int = 8, min_step: int = 64) -> int:
-    """Return the length that a record of so many samples is filled up to.
+    """Return the length to which a record of `samples` is padded.
 
-    Lengths lie a `per_octave`-th apart at most, which is the most that is added, and `min_step` samples at least, since
-    some more cost nothing in a short record.
+    Lengths differ by at least `min_step` samples, since a few more cost nothing in a short record, and otherwise by at
+    most the fraction 1 / `per_octave`.
     """
     if samples > MAX_PADDED_LENGTH:
         return samples
@@ -40,18 +40,18 @@ def padded_length(samples: int, per_octave: int = 8, min_step: int = 64) -> int:
 def pad_samples(
     values: np.ndarray, samples: int | None = None, mode: Literal["edge", "constant"] = "edge"
 ) -> np.ndarray:
-    """Return one value a sample, the last one repeated; `samples`: how many the record has of which these are the first."""
+    """Return values padded along the samples by the last one; `samples` is the length of the whole record."""
     missing = padded_length(samples or values.shape[-1]) - values.shape[-1]
     return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)], mode=mode) if missing else values
 
 
 def pad_weight(weight: np.ndarray, samples: int | None = None) -> np.ndarray:
-    """Return the weights of samples, with 0 for what is added."""
+    """Return the weights of samples, padded with 0."""
     return pad_samples(weight, samples, mode="constant")
 
 
 def pad_rows(values: np.ndarray, size: int, axis: int = 0) -> np.ndarray:
-    """Return rows filled up to a whole number of batches of `size`, by repeats of the last."""
+    """Return rows padded to an integer number of batches of `size` by repeating the last."""
     missing = -values.shape[axis] % size
     if not missing:
         return values
@@ -59,24 +59,23 @@ def pad_rows(values: np.ndarray, size: int, axis: int = 0) -> np.ndarray:
 
 
 def as_arrays(module: _Module) -> _Module:
-    """Return the module with its numbers as arrays, so that what is compiled for one serves all others of its kind."""
+    """Return the module with its numbers as arrays, so that all modules of its type share compiled code."""
     with jax.enable_x64(True):
         return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, module)
 
 
 def to_device(values: Float[np.ndarray, " samples"]) -> Float[Array, " samples"]:
-    """Return a record's samples for JAX, in the memory that they are in."""
+    """Return the samples of a record as a JAX array, without a copy if possible."""
     with jax.enable_x64(True):
         return jax.device_put(values, may_alias=True)
 
 
 class BatchEvaluator:
-    """`function(model, *rows)` over the rows of arrays of one length, a batch at a time.
+    """Evaluation of `function(model, *rows)` over the rows of arrays of equal length, in batches.
 
-    Batches have one size, filled up where rows are missing, so that they compile once; it shrinks where `rows`,
-    the numbers that one evaluation runs over, are many, so that a batch runs over no more than `max_numbers`, which
-    bounds memory. What jit needs of the model is sorted out here once, since a call may take less time than that. Call
-    it in double precision.
+    Batches are padded to one size, so that they compile once. The size is limited such that size x `rows` (numbers per
+    evaluation) does not exceed `max_numbers`, which bounds the memory. The model is partitioned for jit only once,
+    since a call may take less time than that. Double precision is required.
     """
 
     def __init__(
@@ -93,7 +92,7 @@ class BatchEvaluator:
         self._batch = max(1, min(batch, max_numbers // rows))
 
     def __call__(self, *arrays: np.ndarray, description: str = "") -> np.ndarray:
-        """Return the values of the rows; with a `description`, progress is shown under it."""
+        """Return the values of the rows; a `description` shows the progress."""
         count, batch = len(arrays[0]), self._batch
         arrays = tuple(pad_rows(a, batch) for a in arrays)
         starts = range(0, count, batch)
@@ -104,13 +103,13 @@ class BatchEvaluator:
         return (parts[0] if len(parts) == 1 else np.concatenate(parts))[:count]
 
     def map_over(self, shape: tuple[int, ...], *arrays: np.ndarray) -> np.ndarray:
-        """Return the values of rows that stand in a `shape`, in that shape."""
+        """Return the values of rows that are arranged in `shape`, in this shape."""
         values = self(*(a.reshape(-1, *a.shape[len(shape) :]) for a in arrays))
         return values.reshape(*shape, *values.shape[1:])
 
 
 class _StaticModel:
-    """A function, and a model but for its arrays; equal where their compiled forms are."""
+    """A function and a model without its arrays; equal if their compiled code is the same."""
 
     def __init__(self, function: Callable[..., Array], model: eqx.Module, arrays: Any) -> None:
         self.function, self.model, self.arrays = function, model, arrays
@@ -132,9 +131,9 @@ def _evaluate(static: _StaticModel, dynamic: list[Array], rows: tuple[Array, ...
 
 
 def use_compilation_cache() -> None:
-    """Keep what JAX compiles between calls, of this process and its children, in the user's cache.
+    """Store code compiled by JAX, in this process and its children, in a cache folder of the user.
 
-    A place that cannot be written is passed over, and an environment that names a cache of its own is left alone.
+    Nothing happens if the folder is not writable, or if an environment variable already names a cache.
     """
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
@@ -142,9 +141,9 @@ def use_compilation_cache() -> None:
         root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         folder = root / "fitact" / f"jax-{jax.__version__}-{platform.node()}"
         folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError):  # no home, or one that cannot be written
+    except (OSError, RuntimeError):  # no home folder, or not writable
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # the many small ones take a second
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # many small functions add up to a second
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"

@@ -1,8 +1,8 @@
-"""The exception that fitact raises when it refuses input."""
+"""Exception for invalid input."""
 
 
 class InputError(ValueError):
-    """Input that cannot be used: one sentence naming the file, the line or field, and the remedy.
+    """Invalid input; the message is one sentence that names the file, the line or field, and a remedy.
 
-    On the command line it becomes that sentence on standard error and exit code 2.
+    The command line prints this sentence to standard error and exits with status 2.
     """

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Atomic writing of files, JSON, and errors of reading."""
 
 import contextlib
 import json
@@ -13,7 +13,7 @@ from fitact.errors import InputError
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary name beside `path`, which takes its place when the block ends well, and goes when it does not."""
+    """Yield a temporary path that replaces `path` after the block, or is deleted after an exception."""
     path = Path(path)
     temporary = _temporary_path(path)
     try:
@@ -21,29 +21,29 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from error
+        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another path") from error
     finally:
         remove_temporary(path)
 
 
 def remove_temporary(path: str | os.PathLike[str]) -> None:
-    """Remove what a killed program left of `atomic_write(path)`."""
+    """Remove the temporary file of an `atomic_write(path)` that was killed."""
     with contextlib.suppress(OSError):
         _temporary_path(Path(path)).unlink()
 
 
 def _temporary_path(path: Path) -> Path:
-    return path.with_name(f".{path.name}.tmp")  # one name, so that what a kill leaves is overwritten
+    return path.with_name(f".{path.name}.tmp")  # a fixed name, so that the file of a killed run is overwritten
 
 
 def read_error(source: str, error: Exception) -> InputError:
-    """Return the error to raise where a file cannot be read."""
+    """Return the error for a file that cannot be read."""
     reason = getattr(error, "strerror", None) or str(error)
     return InputError(f"{source}: cannot be read ({reason.lower()}); check the path and the file")
 
 
 def to_json(content: Any, indent: int | None = 2) -> str:
-    """Return plain JSON, with null for what is not finite; keys in the order given; without `indent` on one line."""
+    """Return standard JSON, with null for values that are not finite; without `indent`, on one line."""
     return json.dumps(_to_plain(content), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
 
 
@@ -58,6 +58,6 @@ def _to_plain(content: Any) -> Any:
 
 
 def write_json(path: str | os.PathLike[str], content: Any) -> None:
-    """`content` as JSON at `path`."""
+    """Write `content` as JSON to `path`."""
     with atomic_write(path) as temporary:
         temporary.write_text(to_json(content), encoding="utf-8")

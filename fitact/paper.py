@@ -1,7 +1,7 @@
-"""Every numeric claim of the paper, computed and judged.
+"""Numeric claims of the reference paper, recomputed and compared.
 
-The paper: Electrostatic Tactile System Analyzing and Modelling (2018). Its own numbers imply three values of Ci, which
-are carried side by side; a verdict is that of the 1.35 nF that its text states, unless the claim says otherwise.
+The reference paper is "Electrostatic Tactile System Analyzing and Modelling" (2018). Its numbers imply three values of
+Ci, and results are given for each. Verdicts apply to 1.35 nF, the value in its text, unless the claim says otherwise.
 """
 
 import dataclasses
@@ -21,12 +21,12 @@ from fitact.model.steady import mean_square, peak
 
 Value = float | dict[str, float]
 
-RSC, CSC = 160e3, 22e-9  # ohm, F: of one layer at 100 Hz
+RSC, CSC = 160e3, 22e-9  # ohm, F; one layer at 100 Hz
 R_H, Z = 500.0, 14.5e6  # ohm
 AREA, INSULATOR, SKIN, PERMITTIVITY = 1e-4, 1e-6, 200e-6, 3.9  # m^2, m, m, 1
 FREQUENCY, PEAK_TO_PEAK = 100.0, 360.0  # Hz, V
-GROUNDING_RSC = (80e3, 110e3, 140e3, 170e3, 200e3)  # of Fig. 5
-GROUNDING_CSC = (8.85e-9, 17.7e-9, 26.5e-9, 35.4e-9, 44.2e-9)  # of Fig. 6
+GROUNDING_RSC = (80e3, 110e3, 140e3, 170e3, 200e3)  # ohm, Fig. 5
+GROUNDING_CSC = (8.85e-9, 17.7e-9, 26.5e-9, 35.4e-9, 44.2e-9)  # F, Fig. 6
 SKIN_AT = {"10Hz": (1e4, 1e5), "100Hz": (5e3, 8e4), "1kHz": (2e3, 4e4)}  # permittivity, resistivity (ohm m)
 TEXT_CI, CI = "1.35 nF", 1.35e-9  # F
 _OMEGA = 2.0 * math.pi * FREQUENCY
@@ -34,22 +34,22 @@ INSULATORS = {
     TEXT_CI: CI,
     "3.45 nF": float(plate_capacitance(PERMITTIVITY, AREA, INSULATOR)),
     "0.69 nF": 1.0 / (_OMEGA * 2.3e6),
-}  # F: the text's, that of eq. (3), and that of |Z_Ci| = 2.3 Mohm
+}  # F; from the text, from eq. (3), and from |Z_Ci| = 2.3 Mohm
 _SQUARE = Square(peak_to_peak=PEAK_TO_PEAK, frequency=FREQUENCY)
 
 
 @dataclasses.dataclass(frozen=True)
 class Claim:
-    """One statement of the paper beside what it comes to here.
+    """A statement of the reference paper, compared with the value computed by fitact.
 
     Attributes:
-        id: of the equation or figure.
-        claim: what the paper says.
-        paper: its number, in `unit`; None: it gives none.
-        ours: the same by fitact; where it depends on Ci, by its value.
-        unit: SI.
+        id: identifier of the equation or figure.
+        claim: statement of the reference paper.
+        paper: number in the reference paper, in `unit`, or None.
+        ours: value computed by fitact, or values by Ci if it depends on Ci.
+        unit: SI unit.
         verdict: "agrees", "differs" or "qualitative".
-        reason: for it, and what would make it agree where something would.
+        reason: reason for the verdict, and what would make the numbers agree.
     """
 
     id: str
@@ -61,12 +61,12 @@ class Claim:
     reason: str
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the claim as in reproduction.json."""
+        """Return the claim in the form of reproduction.json."""
         return dataclasses.asdict(self)
 
 
 def reproduce() -> tuple[Claim, ...]:
-    """Compute and judge all claims, in the paper's order."""
+    """Compute and compare all claims, in the order of the reference paper."""
     parts = (
         _element_claims, _grounding_claims, _grounding_finger_claims, _equivalent_claims, _insulator_claims,
         _frequency_claims, _waveform_claims, _equation_claims,
@@ -78,9 +78,9 @@ def reproduce() -> tuple[Claim, ...]:
 def _make_claim(
     id: str, claim: str, paper: float, ours: Value, unit: str, reason: str, tolerance: float = 0.005
 ) -> Claim:
-    """Judge by the relative difference, or the absolute one of what is claimed to be nothing.
+    """Return the claim with its verdict, by the relative difference (or the absolute one if the paper claims 0).
 
-    `tolerance`: half a per cent for rounding to the paper's digits, 1 % is nothing, and a tenth where it says "about".
+    `tolerance` is 0.5 % for the paper's rounding, 1 % for a claimed 0, and 10 % if the paper says "about".
     """
     value = ours[TEXT_CI] if isinstance(ours, dict) else ours
     off = abs(value / paper - 1.0) if paper else abs(value)
@@ -98,7 +98,7 @@ def _element_claims() -> Iterator[Claim]:
         " 0.39 cm^2",
     )  # fmt: skip
     end = "the end of the range that the paper gives"
-    middle = "the paper gives none for 100 Hz: this one, within its range, is what its value comes to"
+    middle = "the paper states no value for 100 Hz; this one, within its range, gives the paper's result"
     for frequency, Csc, Rsc, why in (
         ("10 Hz", 44.25e-9, 200e3, end), ("100 Hz", 22e-9, 160e3, middle), ("1 kHz", 8.85e-9, 80e3, end)
     ):  # fmt: skip
@@ -114,17 +114,17 @@ def _element_claims() -> Iterator[Claim]:
         )  # fmt: skip
     yield _make_claim(
         "eq7_ZCi_100Hz", "|1 / (j w Ci)| at 100 Hz is 2.3 Mohm", 2.3e6, _map_insulators(lambda Ci: 1.0 / (_OMEGA * Ci)),
-        "ohm", "1.35 nF gives 1.18 Mohm; 2.3 Mohm is that of 0.69 nF",
+        "ohm", "1.35 nF gives 1.18 Mohm; 2.3 Mohm corresponds to 0.69 nF",
     )  # fmt: skip
     yield _make_claim(
         "eq8_Zsc_100Hz", "|Zsc| at 100 Hz is 65.7 kohm", 65.7e3, abs(RSC / (1.0 + 1j * _OMEGA * RSC * CSC)), "ohm",
-        "65.9 kohm with 22 nF; 65.7 kohm is that of 22.1 nF",
+        "65.9 kohm with 22 nF; 65.7 kohm corresponds to 22.1 nF",
     )  # fmt: skip
 
 
 def _grounding_claims() -> Iterator[Claim]:
     def ratio(measure: Callable[[Circuit], Any], Ci: float = CI) -> float:
-        """Under direct ground, over that under natural ground."""
+        """Return the measure under direct ground over the measure under natural ground."""
         return float(measure(DirectGround(RSC, CSC, Ci, R_H=R_H)) / measure(NaturalGround(RSC, CSC, Ci, Z)))
 
     def gain(circuit: Circuit) -> Any:
@@ -139,12 +139,12 @@ def _grounding_claims() -> Iterator[Claim]:
     total = ratio(lambda circuit: 1.0 / abs(complex(circuit.admittance(_OMEGA))))
     yield Claim(
         "text_Ztotal", "Z_dir-total is much larger than Z_nat-total (their ratio at 100 Hz)", None, total, "1",
-        "differs", "it is much smaller, which is why Vsc is larger under direct ground: a slip of the pen",
+        "differs", "it is much smaller, so that Vsc is larger under direct ground; probably a misprint",
     )  # fmt: skip
 
 
 def peaks_over_grounding(Ci: float, name: str, values: tuple[float, ...]) -> np.ndarray:
-    """Return peaks of Vsc (V) under Figs. 5 and 6's square, with the grounding finger's Rsc or Csc varied."""
+    """Return peaks of Vsc (V) for the square of Figs. 5 and 6, varying Rsc or Csc of the grounding finger."""
     skin: dict[str, Any] = {"grounding_Rsc": RSC, "grounding_Csc": CSC}
     circuits = [DirectGround(RSC, CSC, Ci, R_H=R_H, **(skin | {name: value})) for value in values]
     return np.array([float(peak(circuit, _SQUARE)) for circuit in circuits])
@@ -157,7 +157,7 @@ def _grounding_finger_claims() -> Iterator[Claim]:
 
     yield _make_claim(
         "fig5_peak_spread", "the grounding finger's Rsc does not change the peak of Vsc (spread over 80 to 200 kohm)",
-        0.0, _map_insulators(spread), "1", "less than 1 % with 1.35 nF; it shows in the decay, as the paper says",
+        0.0, _map_insulators(spread), "1", "less than 1 % with 1.35 nF; the effect is in the decay, as the paper says",
         0.01,
     )  # fmt: skip
 
@@ -195,7 +195,7 @@ def _equivalent_claims() -> Iterator[Claim]:
 
 
 def force_over(permittivity: float, thickness: float) -> float:
-    """Return the mean force (N) of Fig. 12 under a 360 Vpp square, Ci following from the insulator by eq. (3)."""
+    """Return the mean force (N) of Fig. 12 for a 360 Vpp square, with Ci from the insulator by eq. (3)."""
     Ci = plate_capacitance(permittivity, AREA, thickness)
     contact = Contact(AREA, thickness, permittivity, SKIN, float(CSC * SKIN / plate_capacitance(1.0, AREA, 1.0)))
     return float(mean_force(FinalCircuit(RSC, CSC, Ci), _SQUARE, contact))
@@ -207,14 +207,14 @@ def _insulator_claims() -> Iterator[Claim]:
     exponent = float(np.polyfit(np.log(values), np.log(forces), 1)[0])
     yield _make_claim(
         "fig12_eps", "the force grows about linearly with the permittivity (its exponent, 1 to 10)", 1.0, exponent, "1",
-        "it grows faster, since Vsc grows with Ci as well; at a fixed voltage over the finger eq. (1) is nearly linear",
+        "it grows faster, since Vsc grows with Ci, too; at a fixed voltage across the finger eq. (1) is nearly linear",
         0.1,
     )  # fmt: skip
     remainder = force_over(PERMITTIVITY, 0.2e-6) / force_over(PERMITTIVITY, 0.01e-6)
     yield _make_claim(
         "fig12_T", "the force falls with the thickness, to almost nothing at 0.2 um (of that at 0.01 um)", 0.0,
         remainder, "1",
-        f"it falls throughout; {100 * remainder:.0f} % is left at 0.2 um and 1 % at 0.9 um (the paper's text also says"
+        f"it falls throughout; {100 * remainder:.0f} % remains at 0.2 um and 1 % at 0.9 um (the paper's text also says"
         " that it falls until 1 um)", 0.01,
     )  # fmt: skip
 
@@ -226,12 +226,12 @@ def _frequency_claims() -> Iterator[Claim]:
         ("amplitude_knee", "the amplitude's knee is at about 40 Hz", 40.0, corner,
          "the corner 1 / (2 pi b) of the first-order high-pass", 0.02),
         ("amplitude_steady", "the amplitude is steady from about 300 Hz", 300.0, steady,
-         "where it has 99 % of its limit; the paper does not say what steady means", 0.1),
+         "frequency at 99 % of the limit; the paper does not define 'steady'", 0.1),
         ("phase_knee", "the phase's knee is at about 90 Hz", 90.0, corner,
          "a first-order high-pass has one corner, of amplitude and phase alike; at 90 Hz the lead is still 24 degrees",
          0.1),
         ("phase_steady", "the phase is steady from about 270 Hz", 270.0, steady,
-         "where the lead is 8.1 degrees, which is where the amplitude has 99 % of its limit", 0.1),
+         "frequency at which the lead is 8.1 degrees and the amplitude 99 % of its limit", 0.1),
     ):  # fmt: skip
         yield _make_claim(f"fig14_{id}", claim, frequency, ours, "Hz", reason, tolerance)
 
@@ -252,13 +252,13 @@ def _waveform_claims() -> Iterator[Claim]:
         yield _make_claim(
             f"fig15_{name}", f"a {name} of 30 Vpp and 100 Hz gives Vsc of about {printed:g} Vpp", printed,
             peak_to_peak(drive), "V",
-            f"no divider gives half or all of the drive; the ordinate is that of a drive near 300 to 360 Vpp"
+            f"no divider gives half or all of the drive; the ordinate corresponds to a drive of 300 to 360 Vpp"
             f" ({peak_to_peak(larger[name])[TEXT_CI]:.1f} Vpp at 360 Vpp)", 0.1,
         )  # fmt: skip
 
 
 def _equation_claims() -> Iterator[Claim]:
-    """The formulas without a number: the paper's as printed, in complex arithmetic, against fitact's."""
+    """Yield the formulas without a number: as printed in the paper, in complex arithmetic, against fitact."""
     frequency = np.geomspace(10.0, 1000.0, 41)
     w = 2.0 * np.pi * frequency
     final, direct, natural = (
@@ -269,13 +269,13 @@ def _equation_claims() -> Iterator[Claim]:
     both = np.asarray(series.Rx) + 1j / (w * np.asarray(series.Cx))
     a, b = RSC * CI, 2.0 * RSC * CI + RSC * CSC
     H, admittance = final.transfer_function(w), final.admittance(w)
-    same = "the same, to rounding"
+    same = "equal within rounding"
     for id, claim, printed, ours, reason in (
         ("eq5", "Vsc under direct ground", skin / (2 * skin + insulator + R_H), direct.transfer_function(w), same),
         ("eq6", "Vsc under natural ground", skin / (skin + insulator + Z), natural.transfer_function(w), same),
         ("eq10", "the series equivalent, resistance and reactance",
          (RSC * (1j * X) ** 2 + 1j * RSC**2 * X) / (RSC**2 + X**2), both,
-         "as printed its real part is negative: (jX)^2 = -X^2; eqs. (11) to (13), which follow, are right"),
+         "as printed, its real part is negative, since (jX)^2 = -X^2; the subsequent eqs. (11) to (13) are right"),
         ("eq12", "Xx", w * CSC * RSC**2 / (1 + (w * CSC * RSC) ** 2), both.imag, same),
         ("eq15", "Q, series and parallel", RSC / X, both.imag / both.real, same),
         ("eq18", "V over I", 2 * skin + insulator, 1 / admittance, same),
@@ -293,7 +293,7 @@ def _equation_claims() -> Iterator[Claim]:
 
 
 def _force_law() -> tuple[float, float]:
-    """Return Eq. (22) as printed, and the mean force over the mean square of Vsc; with v = Vsc it is eq. (1)."""
+    """Return eq. (22) as printed, and the mean force over the mean square of Vsc (eq. (1) with v = Vsc)."""
     contact = Contact(AREA, INSULATOR, PERMITTIVITY, SKIN, 5e3)
     circuit = FinalCircuit(RSC, CSC, CI)
     printed = 8.85e-12 * AREA / (2 * (INSULATOR / PERMITTIVITY + SKIN / 5e3) * (INSULATOR + SKIN))

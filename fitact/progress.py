@@ -1,4 +1,4 @@
-"""How far long work is, on standard error."""
+"""Progress of long computations, on standard error."""
 
 import sys
 import time
@@ -21,10 +21,10 @@ def track_progress(
     line_interval: float = 10.0,
     bar_interval: float = 0.1,
 ) -> Iterator[_Item]:
-    """The items; once they take a while, `description` is said to be under way, and how much of `total` is done.
+    """Yield the items, and show `description` and the completed fraction of `total`.
 
-    That is how many items there were, unless `completed` tells it. A bar where standard error is a terminal, else
-    lines. Nothing is said within `patience`, then no sooner than a `line_interval` or `bar_interval` apart, s.
+    The number of items counts as completed, unless `completed` returns another number. A bar is shown on a terminal,
+    lines elsewhere: first after `patience`, then every `line_interval` or `bar_interval`, s.
     """
     terminal, bar, next_look = sys.stderr.isatty(), None, time.monotonic() + patience
     try:
@@ -45,7 +45,7 @@ def track_progress(
 
 
 def open_bar(label: str, status: str = "") -> "Progress":
-    """Return a bar with one task, out of 1; it goes when stopped, unless it shows a `status` beside the share done."""
+    """Return a bar with one task of size 1; it disappears when stopped, unless it shows a `status`."""
     from rich import console, markup, progress
 
     columns = [progress.TextColumn(markup.escape(label)), progress.BarColumn()]

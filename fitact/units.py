@@ -1,4 +1,4 @@
-"""Quantities with units, at the border only: inside, every number is a plain float in SI units."""
+"""Quantities with units, for input and output only; internally all numbers are floats in SI units."""
 
 import functools
 import math
@@ -9,10 +9,10 @@ import lazy_loader
 
 from fitact.errors import InputError
 
-pint = lazy_loader.load("pint")  # 0.4 s, and only needed where text is read
+pint = lazy_loader.load("pint")  # its import takes 0.4 s, and only text input needs it
 
 _PREFIXES = {-15: "f", -12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
-# as they are read, with the spellings of them that keyboards have
+# accepted units, including spellings in ASCII
 PREFIX_FACTORS = {symbol: float(f"1e{n}") for n, symbol in (*_PREFIXES.items(), (-6, "u"), (-6, "μ"), (3, "K"))}
 _SYMBOLS = {"ohm": "Ω", "1": ""}
 
@@ -36,7 +36,7 @@ def _registry() -> Any:
 
 
 def parse_quantity(value: object, unit: str) -> float:
-    """Return a quantity such as ``"160 kohm"`` as a float in the SI unit `unit`; a bare number is in `unit` already."""
+    """Return a quantity such as ``"160 kohm"`` as a float in the SI unit `unit`; a bare number is in `unit`."""
     remedy = f"write a number with a unit, such as '1 {unit}'"
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise InputError(f"{value!r} is not a quantity; {remedy}")
@@ -47,7 +47,7 @@ def parse_quantity(value: object, unit: str) -> float:
         except pint.DimensionalityError as error:
             wanted = f"in a unit of {unit}; write it as a multiple of {unit}" if unit else "a plain number; write one"
             raise InputError(f"'{value}' is not {wanted}") from error
-        except Exception as error:  # pint raises a dozen kinds, tokenize errors among them
+        except Exception as error:  # pint raises a dozen exceptions, including errors of tokenize
             raise InputError(f"'{value}' is not a quantity; {remedy}") from error
     if not math.isfinite(value):
         raise InputError(f"{value} is not finite; {remedy}")
@@ -55,21 +55,21 @@ def parse_quantity(value: object, unit: str) -> float:
 
 
 def format_exact(value: float, unit: str) -> str:
-    """Return `value` as text that `parse_quantity` reads back to its last digit, "1.35 nF" for 1.35e-9 and "F"."""
-    # of a power a prefix would be raised to it
+    """Return `value` as text that `parse_quantity` reads back exactly, e.g. "1.35 nF" for 1.35e-9 and "F"."""
+    # the prefix of a power would be raised, too
     exponent = _prefix_exponent(value) if value and unit and "^" not in unit else 0
     prefix = _PREFIXES[exponent].replace("µ", "u")
     return f"{value / 10.0**exponent:.15g} {prefix}{unit}".rstrip()
 
 
 def format_engineering(value: float, unit: str, digits: int = 4) -> str:
-    """Return `value` with an SI prefix, for people: ``format_engineering(1.35e-9, "F") == "1.35 nF"``."""
+    """Return `value` as text with an SI prefix: ``format_engineering(1.35e-9, "F") == "1.35 nF"``."""
     size, symbol = choose_prefixed_unit(value, unit)
     return f"{value / size:.{digits}g} {symbol}".rstrip()
 
 
 def choose_prefixed_unit(value: float, unit: str) -> tuple[float, str]:
-    """Return the multiple of `unit` that suits `value`, and its symbol: (1e-9, "nF") for 1.35e-9 and "F"."""
+    """Return size and symbol of the prefixed `unit` for `value`, e.g. (1e-9, "nF") for 1.35e-9 and "F"."""
     symbol = _SYMBOLS.get(unit, unit)
     if not math.isfinite(value) or value == 0.0 or not symbol:
         return 1.0, symbol
@@ -82,12 +82,12 @@ def _prefix_exponent(value: float) -> int:
 
 
 def quantity_unit(name: str) -> str:
-    """Return the SI unit of a quantity; a nuisance's name may end in its trace's label, as "sigma_I_2"."""
+    """Return the SI unit of a quantity; the name of a nuisance may end in a channel label, e.g. "sigma_I_2"."""
     bare = name if name in _UNITS else re.sub(r"_\d+$", "", name)
     unit = _UNITS[bare.removesuffix("_I")]
     return "A" if bare.endswith("_I") and unit == "V" else unit
 
 
 def format_percent(fraction: float) -> str:
-    """Return a share of 1, for people: ``format_percent(0.0123) == "1.2 %"``."""
+    """Return a fraction as text: ``format_percent(0.0123) == "1.2 %"``."""
     return f"{100.0 * fraction:.0f} %" if fraction >= 0.995 else f"{100.0 * fraction:.2g} %"

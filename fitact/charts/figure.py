@@ -1,4 +1,4 @@
-"""Figures for paper: the shared style and colours, axes, and SVG text that stands alone."""
+"""Figures for print: shared style and colours, axes, and self-contained SVG."""
 
 import io
 import os
@@ -14,10 +14,10 @@ from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
 from fitact.files import atomic_write
 
-# told apart by the colour-blind, too (Okabe & Ito 2008)
+# distinguishable by the colour-blind (Okabe & Ito 2008)
 DATA, MODEL, PRIOR, ALERT = "#333333", "#0072B2", "#999999", "#D55E00"
 GREEN, PINK, SKY, ORANGE = "#009E73", "#CC79A7", "#56B4E9", "#E69F00"
-STYLE: Any = {  # that all figures share; for `matplotlib.rc_context`
+STYLE: Any = {  # style of all figures, for `matplotlib.rc_context`
     "font.size": 11.0,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -31,7 +31,7 @@ STYLE: Any = {  # that all figures share; for `matplotlib.rc_context`
 
 
 def robust_limits(values: np.ndarray) -> tuple[float, float]:
-    """Return limits that show a channel, but not the few samples of a current at edges that would flatten all others."""
+    """Return axis limits that exclude a few extreme samples, such as current spikes at edges."""
     low, high = np.quantile(values, [0.02, 0.98])
     whole = float(values.min()), float(values.max())
     if whole[1] - whole[0] > 20.0 * (high - low):
@@ -41,17 +41,17 @@ def robust_limits(values: np.ndarray) -> tuple[float, float]:
 
 
 def log_ticks(axis: Axis, unit: str, subs: tuple[float, ...] = (1.0, 2.0, 5.0)) -> None:
-    """Ticks of a logarithmic axis at so many of each power of ten, with prefixes of the unit."""
+    """Set ticks of a logarithmic axis at the multiples `subs` of powers of ten, with prefixed units."""
     axis.set_major_locator(LogLocator(subs=subs))
     axis.set_major_formatter(EngFormatter(unit))
     axis.set_minor_formatter(NullFormatter())
 
 
 def write_figure(path: str | os.PathLike[str], draw: Callable[[], Figure], dpi: float | None = None) -> None:
-    """Write a figure in the shared style as PNG or, at any other ending of `path`, as SVG.
+    """Write a figure in the shared style as PNG or, for any other suffix of `path`, as SVG.
 
     Raises:
-        InputError: the place cannot be written.
+        InputError: the path cannot be written.
     """
     kind = "png" if Path(path).suffix == ".png" else "svg"
     metadata = {"Date": None} if kind == "svg" else {}
@@ -60,7 +60,7 @@ def write_figure(path: str | os.PathLike[str], draw: Callable[[], Figure], dpi: 
 
 
 def svg(figure: Figure) -> str:
-    """Return a figure as an element of a page."""
+    """Return a figure as an SVG element of a page."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", dpi=150, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()

@@ -1,7 +1,7 @@
-"""Charts that a reader can zoom and ask for values: what plotly.js draws, as plain dictionaries.
+"""Interactive charts for plotly.js, as plain dictionaries.
 
-A chart is one or more plots beside each other under common controls. Numbers go into the page as floats in base64, in
-the units that the axes show: along x with 64 bits, so that two samples late in a record differ.
+A chart is one or more plots side by side under common controls. The page holds the numbers as floats in base64, in the
+units of the axes; x has 64 bits, so that late samples of a record remain distinct.
 """
 
 import base64
@@ -31,13 +31,13 @@ class Axis:
     """A quantity along an axis.
 
     Attributes:
-        title: of the quantity.
-        symbol: of the unit that is shown, its prefix included.
-        size: of that unit, SI.
-        log: whether the axis is logarithmic to begin with.
-        limits: shown to begin with, SI; None: all there is.
-        hides_numbers: starts at 0, without numbers.
-        has_tick_prefixes: over so many decades that each tick has a prefix of its own.
+        title: name of the quantity.
+        symbol: displayed unit, with its prefix.
+        size: size of the displayed unit, SI.
+        log: whether the axis is initially logarithmic.
+        limits: initial limits, SI; None means all data.
+        hides_numbers: whether the axis starts at 0 and has no numbers.
+        has_tick_prefixes: whether each tick has its own prefix (for many decades).
     """
 
     title: str
@@ -52,21 +52,21 @@ class Axis:
     def from_values(
         cls, title: str, unit: str, values: ArrayLike, *, log: bool = False, limits: tuple[float, float] | None = None
     ) -> Self:
-        """With the prefix of `unit` (SI) that suits `values`."""
+        """Make an axis with a suitable prefix of `unit` (SI) for `values`."""
         sizes = np.abs(np.asarray(values, dtype=float))
         sizes = sizes[np.isfinite(sizes) & (sizes > 0.0)]
-        # over four decades no single prefix reads well
+        # beyond four decades no single prefix is readable
         wide = log and sizes.size > 0 and bool(np.log10(sizes.max() / sizes.min()) > 4.0)
         size, symbol = choose_prefixed_unit(float(sizes.max()) if sizes.size and not wide else 0.0, unit)
         return cls(title, symbol, size, log, limits, has_tick_prefixes=wide)
 
     def encode(self, values: ArrayLike, dtype: str = "f4") -> dict[str, str]:
-        """Return `values` (SI) in the unit shown, as plotly.js reads numbers."""
+        """Return `values` (SI) in the displayed unit, encoded for plotly.js."""
         numbers = (np.asarray(values, dtype=float) / self.size).astype(f"<{dtype}")
         return {"dtype": dtype, "bdata": base64.b64encode(numbers.tobytes()).decode()}
 
     def layout(self) -> dict[str, Any]:
-        """Describe the axis to plotly.js."""
+        """Return the axis layout for plotly.js."""
         title = f"{self.title} / {self.symbol}" if self.symbol else self.title
         layout = _AXIS | {"title": {"text": title, "standoff": 6}, "type": "log" if self.log else "linear"}
         if self.hides_numbers:
@@ -77,7 +77,7 @@ class Axis:
         return layout
 
     def hover(self, letter: str) -> str:
-        """Return the value under the pointer with its unit."""
+        """Return the hover template of a value with its unit."""
         if self.has_tick_prefixes:
             return f"%{{{letter}:.4~s}}{self.symbol}"
         return f"%{{{letter}:.5~g}} {self.symbol}".rstrip()
@@ -87,7 +87,7 @@ def line(
     x: Axis, y: Axis, x_values: ArrayLike, values: ArrayLike, name: str, color: str = MODEL, *, width: float = 1.8,
     dash: str = "solid",
 ) -> PlotlyTrace:  # fmt: skip
-    """Return a curve; `dash` as in SVG's and plotly's words: solid, dash, dot."""
+    """Return a curve; `dash` is a line style of plotly (solid, dash, dot)."""
     style = {"color": color, "width": width, "dash": dash, "simplify": False}
     return _trace(x, y, x_values, values, name) | {"mode": "lines", "line": style}
 
@@ -96,7 +96,7 @@ def points(
     x: Axis, y: Axis, x_values: ArrayLike, values: ArrayLike, name: str, color: str = DATA, *, size: float = 6.0,
     hollow: bool = False, names: Sequence[str] | None = None, opacity: float = 1.0,
 ) -> PlotlyTrace:  # fmt: skip
-    """Markers; `names`: of each, shown under the pointer."""
+    """Return markers; `names` are shown on hover."""
     marker = {"color": color, "size": size, "symbol": "circle-open" if hollow else "circle", "opacity": opacity}
     trace = _trace(x, y, x_values, values, name) | {"mode": "markers", "marker": marker}
     if names is not None:
@@ -109,7 +109,7 @@ def band(
     x: Axis, y: Axis, x_values: ArrayLike, low: ArrayLike, high: ArrayLike, names: tuple[str, str, str],
     color: str = MODEL,
 ) -> list[PlotlyTrace]:  # fmt: skip
-    """Return the area between two curves; `names`: of the lower and upper edge, and of the area."""
+    """Return the area between two curves; `names` holds the names of lower edge, upper edge and area."""
     below, above, area = names
     edge = {"mode": "lines", "line": {"width": 0, "color": color}, "legendgroup": area}
     lower = _trace(x, y, x_values, low, below) | edge | {"showlegend": False}
@@ -118,10 +118,10 @@ def band(
 
 
 def density(x: Axis, draws: ArrayLike, name: str, color: str = MODEL, *, bins: int = 80) -> PlotlyTrace:
-    """Return the distribution of positive draws, its peak at 1; under the pointer, the share of them below.
+    """Return the density of positive draws, scaled to a peak of 1; hovering shows the fraction of draws below.
 
-    Heights are densities over the axis as it is drawn: `log_axis_button` swaps those of the linear axis with those of
-    the logarithmic one.
+    The density refers to the axis as it is drawn: `log_axis_button` exchanges the densities of the linear and of the
+    logarithmic axis.
     """
     values = np.asarray(draws, dtype=float).ravel()
     edges = np.geomspace(values.min(), values.max() * (1.0 + 1e-9), bins + 1)
@@ -141,7 +141,7 @@ def density(x: Axis, draws: ArrayLike, name: str, color: str = MODEL, *, bins: i
 
 
 def extremes(values: ArrayLike, columns: int = 2000) -> np.ndarray:
-    """Return indices at which a series looks as it does whole: the least and greatest of so many stretches, `columns`."""
+    """Return indices of minimum and maximum in each of `columns` intervals, which suffice to draw a series."""
     numbers = np.asarray(values, dtype=float)
     if numbers.size <= 2 * columns:
         return np.arange(numbers.size)
@@ -154,13 +154,13 @@ def plot(
     x: Axis, *rows: tuple[Axis, Iterable[PlotlyTrace]], heights: Sequence[float] = (1.0,), title: str = "",
     size: int = 320, legend: bool = True, unified_hover: bool = False,
 ) -> Plot:  # fmt: skip
-    """Return rows of traces above each other over one x axis.
+    """Return a plot of several rows of traces over one x axis.
 
     Args:
-        rows: each one's y axis and traces, from the top.
-        heights: relative, of the rows.
+        rows: y axis and traces of each row, from the top.
+        heights: relative heights of the rows.
         size: height in pixels.
-        unified_hover: whether the pointer asks for the values of all traces at its x, or of the nearest point.
+        unified_hover: whether hovering shows all traces at this x, or only the nearest point.
     """
     data: list[PlotlyTrace] = []
     layout: dict[str, Any] = {
@@ -183,28 +183,28 @@ def plot(
 
 
 def shade_interval(plot: Plot, x: Axis, low: float, high: float) -> Plot:
-    """With an interval of x marked."""
+    """Return the plot with an interval of x shaded."""
     return _with_shape(plot, low / x.size, high / x.size, {"line": {"width": 0}, "fillcolor": _rgba(MODEL, 0.12)})
 
 
 def mark_position(plot: Plot, x: Axis, position: float, color: str) -> Plot:
-    """With a dashed line upwards at one x."""
+    """Return the plot with a dashed vertical line at one x."""
     at = position / x.size
     return _with_shape(plot, at, at, {"line": {"width": 1.2, "color": color, "dash": "dash"}})
 
 
 def chart(*plots: Plot, controls: Sequence[dict[str, Any]] = ()) -> Chart:
-    """Describe a chart for the macro `chart` of templates/figures.html."""
+    """Return a chart for the macro `chart` of templates/figures.html."""
     return {"plots": list(plots), "controls": list(controls)}
 
 
 def visibility_button(label: str, plots: Sequence[Plot], name: str) -> dict[str, Any]:
-    """Return a button that shows and hides the traces called `name`."""
+    """Return a button that shows or hides the traces named `name`."""
     return {"label": label, "pressed": True, "updates": [_visibility_update(p, name) for p in plots]}
 
 
 def log_axis_button(plots: Sequence[Plot], axes: str = "x", label: str = "logarithmic axis") -> dict[str, Any]:
-    """Return a button between logarithmic and linear axes; `axes`: "x", "y" or "xy". All plots begin alike."""
+    """Return a button that toggles logarithmic `axes` ("x", "y" or "xy"); all plots must start the same."""
     states = {kind: [_axis_type_update(p, axes, kind) for p in plots] for kind in ("log", "linear")}
     updates = [{"on": on, "off": off} for on, off in zip(states["log"], states["linear"], strict=True)]
     pressed = plots[0]["layout"][f"{axes[0]}axis"]["type"] == "log"
@@ -240,6 +240,6 @@ def _trace(x: Axis, y: Axis, x_values: ArrayLike, values: ArrayLike, name: str) 
 
 
 def _rgba(color: str, opacity: float = 0.35) -> str:
-    """With most of the white behind it showing through."""
+    """Return the colour as rgba with this opacity."""
     red, green, blue = (int(color[i : i + 2], 16) for i in (1, 3, 5))
     return f"rgba({red},{green},{blue},{opacity})"

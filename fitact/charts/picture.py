@@ -1,4 +1,4 @@
-"""Charts on paper: what `interactive` describes for plotly.js, drawn by matplotlib."""
+"""Static pictures of the charts of `interactive`, drawn by matplotlib."""
 
 import base64
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ def draw_plots(figure: FigureBase, plots: Sequence[Plot]) -> None:
 
 
 def draw_plot(plot: Plot, *rows: Axes) -> None:
-    """Draw a plot on axes, one for each of its rows."""
+    """Draw a plot on the axes of its rows."""
     layout = plot["layout"]
     for number, axes in enumerate(rows, start=1):
         suffix = "" if number == 1 else str(number)
@@ -61,7 +61,7 @@ def draw_plot(plot: Plot, *rows: Axes) -> None:
 
 
 def _draw_trace(axes: Axes, trace: PlotlyTrace, below: np.ndarray) -> np.ndarray:
-    """Draw a trace, where it asks for it filled down to the values of the trace before, which it gives of itself."""
+    """Draw a trace, if requested filled down to the previous trace `below`, and return its values."""
     x, y = (np.frombuffer(base64.b64decode(trace[k]["bdata"]), f"<{trace[k]['dtype']}") for k in ("x", "y"))
     line, marker = trace.get("line", {}), trace.get("marker", {})
     color, is_step = (line or marker)["color"], line.get("shape") == "hv"
@@ -89,7 +89,7 @@ def _draw_trace(axes: Axes, trace: PlotlyTrace, below: np.ndarray) -> np.ndarray
 
 def _format_axis(axes: Axes, letter: str, layout: dict[str, Any]) -> None:
     reach = axes.dataLim.intervalx if letter == "x" else axes.dataLim.intervaly
-    is_log = layout["type"] == "log" and bool(np.all(np.isfinite(reach)))  # nothing to draw has no logarithm
+    is_log = layout["type"] == "log" and bool(np.all(np.isfinite(reach)))  # an empty plot has no logarithmic limits
     axes.set(**{f"{letter}scale": "log" if is_log else "linear", f"{letter}label": layout["title"]["text"]})
     if "range" in layout:
         axes.set(**{f"{letter}lim": np.power(10.0, layout["range"]) if is_log else layout["range"]})

@@ -1,4 +1,4 @@
-"""Samples at a converter's or an amplifier's rail, which say no more than that the signal was beyond it."""
+"""Clipped samples, where an ADC or an amplifier was saturated, so that only a bound on the signal is known."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -7,11 +7,11 @@ from jaxtyping import Bool, Float
 def clipping_mask(
     values: Float[np.ndarray, " samples"], *, min_run: int = 4, min_count_ratio: float = 8.0, margin: int = 2
 ) -> Bool[np.ndarray, " samples"]:
-    """Which samples lie at a rail, or within `margin` samples of one that does.
+    """Return a mask of the samples in saturation, or within `margin` samples of saturation.
 
-    A rail is an extreme that repeats `min_run` times in a row, and `min_count_ratio` times as often as the level next
-    to it; a rounded smooth peak does so 2.4 times at most. A signal of a few levels only, as an ideal square, has none;
-    a drive whose tops are meant to be flat cannot be told from a clipped one.
+    A saturation level is an extreme value that occurs `min_run` times in a row, and `min_count_ratio` times as often
+    as the adjacent level; at a rounded smooth peak this ratio is at most 2.4. A signal with few levels, such as an
+    ideal square, has no saturation level. A drive with flat tops cannot be distinguished from a clipped one.
     """
     railed = np.zeros(values.size, dtype=bool)
     for upward in (values, -values):

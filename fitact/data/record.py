@@ -1,4 +1,4 @@
-"""Record: one measurement in time, checked on the way in."""
+"""Records, i.e. measurements in time, with checks of the data."""
 
 import dataclasses
 import functools
@@ -15,10 +15,10 @@ from fitact.data.clipping import clipping_mask
 from fitact.errors import InputError
 
 MINIMUM_SAMPLES = 20
-OVERFLOW = 9e36  # what oscilloscopes write for a value out of range is 9.9E+37 or more
+OVERFLOW = 9e36  # oscilloscopes write 9.9E+37 or more for a value out of range
 CHANNEL_UNITS = {"V": "V", "Vsc": "V", "I": "A"}
 
-# of records that are there, so that many of one grid hold them once
+# times of existing records, so that records on the same grid share one array
 _SHARED_TIMES: weakref.WeakValueDictionary[tuple[float, ...], np.ndarray] = weakref.WeakValueDictionary()
 
 _RowLabel = Callable[[int], str]
@@ -26,7 +26,7 @@ _RowLabel = Callable[[int], str]
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """Time and channels of one measurement, SI units.
+    """Time and channels of one measurement, in SI units.
 
     Attributes:
         time: strictly increasing, s.
@@ -55,10 +55,10 @@ class Record:
         warnings: tuple[str, ...] = (),
         where: _RowLabel = lambda row: f"sample {row}",
     ) -> "Record":
-        """Check arrays (s, V, V, A; equal lengths) and make them a record; `where` names a row in errors.
+        """Make a record from arrays of equal length (s, V, V, A) after checks; `where` names a row in errors.
 
         Raises:
-            InputError: too few samples, not finite, not increasing, or a channel that holds no signal.
+            InputError: the samples are too few, not finite or not increasing in time, or a channel has no signal.
         """
         time = _aligned_copy(time)
         given = {"V": V, "Vsc": Vsc, "I": I}
@@ -92,19 +92,19 @@ class Record:
 
     @functools.cached_property
     def time_step(self) -> float:
-        """Median step, s."""
+        """Median time step, s."""
         return float(np.median(np.diff(self.time)))
 
     @functools.cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of the numbers, so that results can name the data they belong to."""
+        """SHA-256 of the numbers, by which results identify their data."""
         digest = hashlib.sha256(np.ascontiguousarray(self.time).tobytes())
         for name in sorted(self.channels):
             digest.update(name.encode() + np.ascontiguousarray(self.channels[name]).tobytes())
         return digest.hexdigest()
 
     def noise(self, channel: str) -> float:
-        """Return standard deviation of the channel's noise, judged without a model: white noise and rounding."""
+        """Return a model-free estimate of the channel's noise sd: white noise and rounding."""
         if ("noise", channel) not in self._known:
             values = self[channel] if channel == "V" else self[channel][~clipping_mask(self[channel])]
             self._known["noise", channel] = math.hypot(white_noise_sd(values), rounding_noise_sd(values))
@@ -112,11 +112,11 @@ class Record:
 
     @property
     def leading(self) -> str:
-        """The channel that shows the drive best: V, or without it Vsc."""
+        """Name of the channel that best represents the drive: V, or else Vsc."""
         return "V" if "V" in self else "Vsc"
 
     def frequency(self, channel: str | None = None) -> float | None:
-        """Return fundamental frequency in Hz of a channel (of V, else Vsc); None unless the record shows 1.5 periods."""
+        """Return the fundamental frequency (Hz) of a channel (default V, else Vsc), or None below 1.5 periods."""
         channel = channel or self.leading
         if ("frequency", channel) not in self._known:
             self._known["frequency", channel] = fundamental_frequency(self.time, self[channel])
@@ -124,12 +124,12 @@ class Record:
 
     @functools.cached_property
     def _known(self) -> dict[tuple[str, str], Any]:
-        """Noises and frequencies asked for so far, each of which takes a pass over the record."""
+        """Cache of noise estimates and frequencies, since each takes a pass over the record."""
         return {}
 
 
 def is_uniform(time: Float[np.ndarray, " samples"], tolerance: float = 1e-2, block: int = 65_536) -> bool:
-    """Return whether every sample lies on an even grid, to `tolerance` of a step; `block` samples are looked at at a time."""
+    """Return whether all samples lie on a uniform grid, to `tolerance` steps; checks `block` samples at a time."""
     step = (time[-1] - time[0]) / (time.size - 1)
     for first in range(0, time.size, block):
         part = time[first : first + block]
@@ -140,7 +140,7 @@ def is_uniform(time: Float[np.ndarray, " samples"], tolerance: float = 1e-2, blo
 
 
 def grid_notes(time: Float[np.ndarray, " samples"], source: str) -> tuple[str, ...]:
-    """Return a sentence where the time steps are not uniform."""
+    """Return a note if the time steps are not uniform."""
     if is_uniform(time):
         return ()
     steps = np.diff(time)
@@ -151,19 +151,19 @@ def grid_notes(time: Float[np.ndarray, " samples"], source: str) -> tuple[str, .
 
 
 def white_noise_sd(values: Float[np.ndarray, " samples"]) -> float:
-    """Return standard deviation of white noise under a smooth signal, by the median of third differences, without edges."""
+    """Return the sd of white noise on a smooth signal, from the median of third differences (robust to edges)."""
     return float(white_noise_sds(values))
 
 
 def white_noise_sds(values: Float[np.ndarray, "*records samples"]) -> Float[np.ndarray, "*records"]:
-    """Return the same for each record; from differences in single precision, whose median takes half the time."""
+    """Return `white_noise_sd` of each record; the differences are in single precision, which halves the time."""
     third = np.diff(np.diff(values).astype(np.float32), 2)
     np.abs(third, out=third)
     return row_medians(third).astype(float) / 0.6744897501960817 / math.sqrt(20.0)
 
 
 def row_medians(values: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*rows"]:
-    """Return the median of each row, which is left in another order; NumPy's own takes eight times as long."""
+    """Return the median of each row, and reorder each row in place; eight times as fast as `numpy.median`."""
     half = values.shape[-1] // 2
     if not values.shape[-1]:
         return np.full(values.shape[:-1], np.nan)
@@ -173,9 +173,9 @@ def row_medians(values: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*row
 
 
 def rounding_noise_sd(values: Float[np.ndarray, " samples"], min_levels: int = 12, some: int = 65_536) -> float:
-    """Return standard deviation that the resolution of the samples alone brings about, where white noise does not hide it.
+    """Return the sd due to the resolution (LSB) of the samples, or 0 if white noise exceeds it.
 
-    Fewer levels than `min_levels` are an ideal wave's, not a converter's. Mostly the first `some` samples tell.
+    Fewer levels than `min_levels` indicate an ideal wave, not an ADC. The first `some` samples usually suffice.
     """
     noise, step = white_noise_sd(values), math.inf
     for part in (values[:some], values)[values.size <= some :]:
@@ -194,17 +194,17 @@ def fundamental_frequency(
     peak_tolerance: float = 0.02,
     lag_tolerance: int = 4,
 ) -> float | None:
-    """Return frequency (Hz) at which the signal repeats, from its correlation with itself, or None.
+    """Return the fundamental frequency (Hz) of a signal from its autocorrelation, or None if it is not periodic.
 
     Args:
-        min_correlation: of a signal that counts as repeating.
-        peak_tolerance: correlation by which the first period's peak may be lower than a later one's.
-        lag_tolerance: samples within which twice a period is known once one is.
+        min_correlation: minimum autocorrelation of a periodic signal.
+        peak_tolerance: amount by which the first peak may be lower than a later one.
+        lag_tolerance: error, in samples, of twice a period that is estimated from one.
     """
     count = time.size
     correlation = _autocorrelation(resample_uniform(time, values))
     below = np.flatnonzero(correlation < 0.5)
-    last = (2 * count) // 3  # a lag of one period must leave half a period of overlap
+    last = (2 * count) // 3  # after a lag of one period, half a period must overlap
     if below.size == 0 or below[0] >= last - 2:
         return None
     window = correlation[below[0] : last]
@@ -213,37 +213,37 @@ def fundamental_frequency(
         return None
     high = window >= best - peak_tolerance
     start, stop = _run_around(high, int(np.argmax(high)))
-    top = start + int(np.argmax(window[start:stop]))  # of the first period, not of a later one
+    top = start + int(np.argmax(window[start:stop]))  # peak of the first period, not of a later one
     lag, periods = below[0] + _peak_position(window, top), 1
     reach = min(lag_tolerance, int(lag) // 4)
-    while 2.0 * lag < last - reach:  # twice as many periods show one twice as well
+    while 2.0 * lag < last - reach:  # twice as many periods halve the error
         near = round(2.0 * lag) - below[0] - reach
         top = near + int(np.argmax(window[near : near + 2 * reach + 1]))
         further = below[0] + _peak_position(window, top)
-        if further <= lag:  # repeats at two or three samples, whose peaks run into each other
+        if further <= lag:  # a period of two or three samples, whose peaks merge
             return None
         lag, periods = further, 2 * periods
     return periods * (count - 1) / (lag * float(time[-1] - time[0]))
 
 
 def resample_uniform(time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return the values on an even grid of as many times from the first to the last."""
+    """Return the values interpolated to a uniform grid with the same number of times."""
     return np.interp(np.linspace(time[0], time[-1], time.size), time, values)
 
 
 def _autocorrelation(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return correlation coefficient of x[:n - lag] and x[lag:] for each lag; 1 at a period, however few there are."""
+    """Return the correlation of x[:n - lag] and x[lag:] for each lag; it is 1 at a period, also for few periods."""
     x = x - x.mean()
     count = x.size
     power = np.abs(np.fft.rfft(x, 2 * count))
     power *= power
-    correlation = np.fft.irfft(power, 2 * count)[:count].copy()  # frees the other half
+    correlation = np.fft.irfft(power, 2 * count)[:count].copy()  # the copy frees the other half
     del power
     overlap = np.arange(count, 0, -1)
     head, tail = np.cumsum(x)[::-1], np.cumsum(x[::-1])[::-1]  # sums over x[:n - lag] and x[lag:]
     correlation -= head * tail / overlap
     spread = np.cumsum(x**2)[::-1]
-    floor = 1e-12 * spread[0] ** 2  # parts without variation correlate with nothing
+    floor = 1e-12 * spread[0] ** 2  # constant parts have no correlation
     spread = (spread - head**2 / overlap) * (np.cumsum(x[::-1] ** 2)[::-1] - tail**2 / overlap)
     correlation /= np.sqrt(np.maximum(spread, floor))
     correlation[spread <= floor] = 0.0
@@ -251,7 +251,7 @@ def _autocorrelation(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
 
 
 def _run_around(mask: np.ndarray, index: int) -> tuple[int, int]:
-    """Return the run of true values around `index`: its start and the first place after it."""
+    """Return the start and the end (exclusive) of the run of true values around `index`."""
     outside = np.flatnonzero(~mask)
     place = int(np.searchsorted(outside, index))
     start = int(outside[place - 1]) + 1 if place > 0 else 0
@@ -259,7 +259,7 @@ def _run_around(mask: np.ndarray, index: int) -> tuple[int, int]:
 
 
 def _peak_position(curve: Float[np.ndarray, " n"], top: int) -> float:
-    """Where the curve peaks around its largest value, at `top`, by a parabola through what is little lower."""
+    """Return the position of the peak near the maximum at `top`, by a parabola through slightly lower points."""
     start, stop = _run_around(curve >= curve[top] - 0.002 - 0.3 * (1.0 - curve[top]), top)
     if stop - start < 5:
         return float(top)
@@ -268,7 +268,7 @@ def _peak_position(curve: Float[np.ndarray, " n"], top: int) -> float:
 
 
 def _aligned_copy(values: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    """In double precision, and where JAX can use it without one of its own: from a multiple of 64 bytes on."""
+    """Return a copy in double precision, aligned to 64 bytes so that JAX can use it without another copy."""
     values = np.asarray(values, dtype=float)
     memory = np.empty(values.size + 8)
     first = -memory.ctypes.data % 64 // 8
@@ -278,9 +278,9 @@ def _aligned_copy(values: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " 
 
 
 def _share_times(time: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    """Return the times, or the same ones of a record that is still there."""
+    """Return the times, or the identical array of an existing record."""
     known = _SHARED_TIMES.setdefault((time.size, time[0], time[-1]), time)
-    same = np.array_equal(known.view(np.int64), time.view(np.int64))  # to the last bit, as of a fingerprint
+    same = np.array_equal(known.view(np.int64), time.view(np.int64))  # bitwise, as the fingerprint requires
     return known if same else time
 
 
@@ -320,17 +320,17 @@ def _check_increasing(time: np.ndarray, source: str, where: _RowLabel) -> None:
 
 
 def _check_signal(values: np.ndarray, name: str, source: str) -> None:
-    """Refuse a channel that is constant, or constant but for white noise."""
+    """Raise InputError if a channel is constant apart from white noise."""
     if values.min() == values.max():
         what = "zero" if values[0] == 0.0 else f"constant at {values[0]:.6g}"
         raise InputError(f"{source}: {name} is {what} throughout; check the probe and the channel")
     middle = np.median(values)
     if np.max(np.abs(values - middle)) > 7.0 * np.median(np.abs(values - middle)) / 0.6744897501960817:
-        return  # an edge, however short
+        return  # the channel has an edge
     if white_noise_sd(values) < 0.3 * np.std(values):
-        return  # a smooth signal, though a sweep has no spectral line
+        return  # a smooth signal, e.g. a sweep, which has no spectral line
     power = np.abs(np.fft.rfft(values - values.mean())[1:]) ** 2
-    # Fisher's test: the share of the largest of m spectral lines of white noise exceeds x with p < m (1 - x)^(m - 1)
+    # Fisher's test: for white noise, the power fraction of the largest of m lines exceeds x with p < m (1 - x)^(m - 1)
     share, lines = power.max() / power.sum(), power.size
     if math.log(lines) + (lines - 1) * math.log1p(-min(share, 1.0 - 1e-16)) > math.log(1e-4):
         raise InputError(

@@ -1,4 +1,4 @@
-"""Simulated records of a scene, for trying things out; data for tests come from `data_synth` instead."""
+"""Simulated records of a scene, for trials by the user; `data_synth` makes the data of the tests independently."""
 
 import jax
 import numpy as np
@@ -11,7 +11,7 @@ from fitact.scene.scene import Scene
 
 
 def simulate(scene: Scene, seed: int = 0) -> Record:
-    """Return V, and the channels that the scene measures with its noise, at its sampling rate and for its duration."""
+    """Return a simulated record of V and the measured channels, with noise, by the scene's [measurement]."""
     circuit, drive, measured, time = scene.make_circuit(), scene.make_drive(), scene.measurement, sample_times(scene)
     rng = np.random.default_rng(seed)
     with jax.enable_x64(True):
@@ -29,7 +29,7 @@ def simulate(scene: Scene, seed: int = 0) -> Record:
 
 
 def sample_times(scene: Scene, max_samples: int = 100_000_000) -> Float[np.ndarray, " samples"]:
-    """When the scene's measurement samples, s; refused where that is too few times to fit, or too many to hold."""
+    """Return the sampling times (s) of the scene; raise InputError if they are too few or too many."""
     measured = scene.measurement
     count = round(measured.duration * measured.sampling_rate)
     if not MINIMUM_SAMPLES <= count <= max_samples:

@@ -1,4 +1,4 @@
-"""Impedance spectra: frequency and complex impedance, from the text files of impedance analysers."""
+"""Impedance spectra (frequency and complex impedance) from text files of impedance analysers."""
 
 import dataclasses
 import os
@@ -27,13 +27,13 @@ _HERTZ = re.compile(r"[(/_\[\s]([kKM]?)(?i:hz)")
 
 @dataclasses.dataclass(frozen=True)
 class Spectrum:
-    """The impedance V / I of finger and panel, from the drive's electrode to ground.
+    """Impedance V / I of finger and panel, between the drive electrode and ground.
 
     Attributes:
-        frequency: increasing, Hz.
-        impedance: ohm; that of a capacitance has a negative imaginary part.
-        source: where it came from, for messages.
-        notes: what was assumed, in sentences.
+        frequency: increasing frequencies, Hz.
+        impedance: complex impedance, ohm; a capacitance has a negative imaginary part.
+        source: origin of the data, for messages.
+        notes: assumptions, as sentences.
     """
 
     frequency: Float[np.ndarray, " points"]
@@ -49,15 +49,17 @@ class Spectrum:
         source: str = "spectrum",
         notes: tuple[str, ...] = (),
     ) -> "Spectrum":
-        """Check arrays (Hz, ohm; equal lengths, any order) and make them a spectrum.
+        """Make a spectrum from arrays of equal length (Hz, ohm; any order) after checks.
 
         Raises:
-            InputError: too few points, not finite, a frequency that is not positive or comes twice, or an impedance
-                that no finger on a panel has.
+            InputError: the points are too few or not finite, a frequency is not positive or occurs twice, or the
+                impedance is zero or inductive.
         """
         f, z = np.array(frequency, dtype=float), np.array(impedance, dtype=complex)
         if f.ndim != 1 or f.shape != z.shape:
-            raise InputError(f"{source}: frequency has shape {f.shape}, impedance {z.shape}; give one of each a point")
+            raise InputError(
+                f"{source}: frequency has shape {f.shape}, impedance {z.shape}; give one of each for every point"
+            )
         if f.size < MINIMUM_POINTS:
             raise InputError(f"{source}: {f.size} points are too few to fit; measure {MINIMUM_POINTS} or more")
         if not (np.isfinite(f).all() and np.isfinite(z).all()):
@@ -68,7 +70,7 @@ class Spectrum:
             raise InputError(f"{source}: holds the frequency {f[0]:g} Hz; remove points at 0 Hz and below")
         if np.any(np.diff(f) == 0.0):
             raise InputError(
-                f"{source}: {f[:-1][np.diff(f) == 0.0][0]:g} Hz comes twice; keep one sweep, or average them"
+                f"{source}: {f[:-1][np.diff(f) == 0.0][0]:g} Hz occurs twice; keep one sweep, or average the sweeps"
             )
         if np.any(np.abs(z) == 0.0):
             raise InputError(f"{source}: the impedance is 0 at {f[np.abs(z) == 0.0][0]:g} Hz; remove that point")
@@ -85,7 +87,7 @@ class Spectrum:
         return self.frequency.size
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the JSON of `fitact inspect`; Hz and ohm."""
+        """Return the JSON output of `fitact inspect`, in Hz and ohm."""
         size = np.abs(self.impedance)
         return {
             "source": self.source,
@@ -104,21 +106,21 @@ class Spectrum:
 
 
 class _Columns(NamedTuple):
-    """Where the numbers stand; `second` is that of the imaginary part, or of the phase."""
+    """Indices of the columns; `second` holds the imaginary part or the phase."""
 
     frequency: int
     first: int
     second: int
     hertz: float
     ohm: float
-    sign: float  # of `second`
-    radian: float  # of one unit of the phase; 0: `first` and `second` are real and imaginary part
+    sign: float  # sign of `second`
+    radian: float  # size of the unit of the phase, rad; 0 means that the columns hold real and imaginary part
 
 
 def is_spectrum(path: str | os.PathLike[str]) -> bool:
     """Return whether a file's header names a frequency and an impedance."""
     try:
-        return next(_find_headers(_read_lines(path, 16_384)), None) is not None  # bytes that hold any header
+        return next(_find_headers(_read_lines(path, 16_384)), None) is not None  # more bytes than any header has
     except OSError:
         return False
 
@@ -126,12 +128,13 @@ def is_spectrum(path: str | os.PathLike[str]) -> bool:
 def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
     """Read an impedance spectrum: a CSV file with frequency_Hz, Z_real_ohm and Z_imag_ohm, or an analyser's text.
 
-    Any table whose header names a frequency and an impedance, by parts or by size and phase, is read: those of Gamry
-    (.DTA), BioLogic (.mpt), Autolab, ZPlot (.z), VersaStudio (.par), CH Instruments and others. A leading minus in a
-    column's name, as -Im(Z)/Ohm, is heeded. Three columns without a header are frequency, real and imaginary part.
+    The header of the table must name a frequency and an impedance, in parts or as magnitude and phase. Examples are
+    files of Gamry (.DTA), BioLogic (.mpt), Autolab, ZPlot (.z), VersaStudio (.par) and CH Instruments. A leading
+    minus in a column's name, as in -Im(Z)/Ohm, changes the sign. Three columns without a header are read as
+    frequency, real and imaginary part.
 
     Raises:
-        InputError: the file cannot be read, or holds no spectrum; names the line and the remedy.
+        InputError: the file cannot be read, or holds no spectrum; the message names the line and a remedy.
     """
     source = os.fspath(path)
     try:
@@ -155,7 +158,7 @@ def _read_lines(path: str | os.PathLike[str], size: int) -> list[str]:
 
 
 def _find_headers(lines: list[str]) -> Iterator[tuple[int, str, _Columns]]:
-    """Lines that name the columns: the first line after each, its delimiter, its columns."""
+    """Yield each header line as (index of the next line, delimiter, columns)."""
     for place, line in enumerate(lines):
         if "req" not in line.lower() and not line.lower().startswith("f"):
             continue
@@ -204,10 +207,10 @@ def _headerless_columns(lines: list[str], source: str) -> tuple[int, str, _Colum
 def _parse_rows(
     lines: list[str], place: int, delimiter: str, columns: _Columns, source: str, max_unit_lines: int = 2
 ) -> Iterator[tuple[float, ...]]:
-    """Numbers below the header and lines of units, as far as they go."""
+    """Yield the rows of numbers below the header and the lines of units."""
     begun, comma = False, delimiter in ("\t", ";")
     for line, text in enumerate(lines[place:], place + 1):
-        # names apart by blanks stand above numbers apart by anything
+        # names separated by blanks may precede numbers with another delimiter
         cells = re.split(r"[\s,;]+", text.strip()) if delimiter == " " else split_cells(text, delimiter)
         places = columns.frequency, columns.first, columns.second
         numbers = [parse_number(cells[i], comma) if i < len(cells) else None for i in places]
@@ -215,6 +218,8 @@ def _parse_rows(
             begun = True
             yield tuple(number or 0.0 for number in numbers)
         elif begun and (not text.strip() or text.lstrip()[0] not in "0123456789+-."):
-            return  # what follows the table
+            return  # the table has ended
         elif begun or line - place > max_unit_lines + 1:
-            raise InputError(f"{source}, line {line}: '{text.strip()[:40]}' is no row of numbers; mend or remove it")
+            raise InputError(
+                f"{source}, line {line}: '{text.strip()[:40]}' is not a row of numbers; correct or remove it"
+            )

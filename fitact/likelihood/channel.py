@@ -177,7 +177,7 @@ class ChannelLikelihood(eqx.Module):
         return jnp.mean(values, where=None if self.weight is None else self.weight > 0.0)
 
     def delay_derivative(self, inputs: ChannelInputs) -> Float[Array, " samples"]:
-        """Return the derivative of the signal with respect to a delay (per s), over two steps to include ideal edges."""
+        """Return the derivative of the signal with respect to a delay (per s) over two steps, for ideal edges."""
         step = self.time_step
         return (self.signal(inputs, step) - self.signal(inputs, -step)) / (2.0 * step)
 

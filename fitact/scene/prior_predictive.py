@@ -1,4 +1,4 @@
-"""Consequences of a scene's prior for the skin voltage and the force, before any data."""
+"""Prior predictive distribution of skin voltage and force for a scene, before any data."""
 
 import dataclasses
 import functools
@@ -21,16 +21,16 @@ from fitact.units import format_engineering
 
 @dataclasses.dataclass(frozen=True)
 class PriorPredictive:
-    """Draws of the prior and what follows from each."""
+    """Draws from the prior, and the predictions of each draw."""
 
-    parameters: dict[str, Float[np.ndarray, " draws"]]  # free, fixed and tied, SI, by name
+    parameters: dict[str, Float[np.ndarray, " draws"]]  # free, fixed and tied parameters by name, SI
     derived: dict[str, Float[np.ndarray, " draws"]]  # g, b of the final circuit; Vsc_peak_to_peak, force_mean, ..., SI
     time: Float[np.ndarray, " times"]  # two periods of the steady state, or the scene's duration, s
     Vsc: Float[np.ndarray, "draws times"]
-    seed: int  # of the draws
+    seed: int  # seed of the draws
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the JSON of `fitact prior`."""
+        """Return the JSON output of `fitact prior`."""
         return {
             "parameters": {name: summary.summarize_draws(name, draws) for name, draws in self.parameters.items()},
             "derived": {name: summary.summarize_draws(name, draws) for name, draws in self.derived.items()},
@@ -39,7 +39,7 @@ class PriorPredictive:
         }
 
     def __str__(self) -> str:
-        """Return a table for people: quantiles of each parameter and of what follows from them."""
+        """Return a text table with quantiles of each parameter and derived quantity."""
         rows = [["", "5 %", "25 %", "median", "75 %", "95 %"]]
         content = self.to_dict()
         for name, s in (content["parameters"] | content["derived"]).items():
@@ -49,7 +49,7 @@ class PriorPredictive:
 
 
 def prior_predictive(scene: Scene, draws: int = 2000, seed: int = 0) -> PriorPredictive:
-    """Return Vsc and force of `draws` fingers of a scene's prior, without noise."""
+    """Return Vsc and force for `draws` parameter sets from the scene's prior, without noise."""
     parameters = sample_prior(scene, np.random.default_rng(seed), draws)
     drive = scene.make_drive()
     repeats = isinstance(drive, Periodic) and scene.drive.steady_state
@@ -57,7 +57,7 @@ def prior_predictive(scene: Scene, draws: int = 2000, seed: int = 0) -> PriorPre
         time = jnp.asarray(_times(drive, scene.measurement.duration, repeats))
         circuits = {name: jnp.asarray(x) for name, x in parameters.items() if name not in ("sigma", "sigma_I")}
         predict = functools.partial(_predict_draw, scene, drive, repeats, time)
-        # so many draws at a time bound the memory where each takes many harmonics
+        # this batch size bounds the memory for draws with many harmonics
         vsc, derived = jax.jit(lambda rows: jax.lax.map(predict, rows, batch_size=100))(circuits)
     order = ("g", "b", "Vsc_peak_to_peak", "force_mean", "force_peak")
     derived = {name: np.asarray(derived[name]) for name in order if name in derived}
@@ -65,7 +65,7 @@ def prior_predictive(scene: Scene, draws: int = 2000, seed: int = 0) -> PriorPre
 
 
 def _times(drive: Drive, duration: float, repeats: bool, count: int = 801) -> Float[np.ndarray, " times"]:
-    """Return two periods, just after each corner included since peaks sit there; or from rest for the `duration` (s)."""
+    """Return times over two periods, including corners, where peaks lie; or from rest over the `duration` (s)."""
     if not (repeats and isinstance(drive, Periodic)):
         return np.linspace(0.0, duration, count)
     period = float(drive.period)
@@ -77,7 +77,7 @@ def _times(drive: Drive, duration: float, repeats: bool, count: int = 801) -> Fl
 
 
 def sample_prior(scene: Scene, rng: np.random.Generator, size: int) -> dict[str, Float[np.ndarray, " size"]]:
-    """Return draws of all that a scene has a belief of, SI: free parameters, fixed and tied ones."""
+    """Return prior draws of all free, fixed and tied parameters of the scene, SI."""
     drawn = scene.make_prior().sample(rng, size)
     drawn |= {name: np.full(size, value) for name, value in scene.fixed_values().items()}
     return drawn | {name: ratio * drawn[other] for name, (other, ratio) in scene.prior.ties().items()}
@@ -86,7 +86,7 @@ def sample_prior(scene: Scene, rng: np.random.Generator, size: int) -> dict[str,
 def _predict_draw(
     scene: Scene, drive: Drive, repeats: bool, time: Float[Array, " times"], values: dict[str, Array]
 ) -> tuple[Float[Array, " times"], dict[str, Array]]:
-    """Return Vsc in time, and what it amounts to, of one draw."""
+    """Return Vsc over time, and derived quantities, for one draw."""
     circuit = scene.make_circuit(values)
     vsc = response(circuit, drive, time, steady_state=repeats)
     contact = scene.geometry().contact(scene.make_rc_circuit(values))

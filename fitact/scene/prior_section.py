@@ -1,4 +1,4 @@
-"""The section [prior] of a scene file: what is believed of each parameter, and of them together."""
+"""Section [prior] of a scene file: the prior of each parameter, correlations and order constraints."""
 
 import math
 from typing import Annotated, Any, Literal, Self
@@ -12,7 +12,7 @@ from fitact.prior.prior import Prior
 from fitact.prior.published import Layer, PublishedTable, published_prior
 from fitact.scene.sections import Section, Unit
 
-_FORMS: tuple[tuple[set[str], set[str]], ...] = (  # keys that a form needs, and keys that it can take
+_FORMS: tuple[tuple[set[str], set[str]], ...] = (  # required and optional keys of each form
     ({"factor"}, {"median", "low", "high"}),
     ({"relative_sd"}, {"median", "low", "high"}),
     ({"low", "high"}, {"scale"}),
@@ -23,11 +23,11 @@ _FORMS: tuple[tuple[set[str], set[str]], ...] = (  # keys that a form needs, and
 )
 _ORDER_KEYS = {"above", "below"}
 QUANTITY_KEYS = ("median", "low", "high", "nominal", "fixed")  # keys in the unit of the parameter
-_SKIN_PARAMETERS = ("Rsc", "Csc", "grounding_Rsc", "grounding_Csc")  # what the tables have
+_SKIN_PARAMETERS = ("Rsc", "Csc", "grounding_Rsc", "grounding_Csc")  # parameters in the published tables
 
 
 class PriorSpec(Section):
-    """A belief of one parameter; docs/priors.md lists the forms."""
+    """Prior specification of one parameter; docs/priors.md lists the forms."""
 
     median: float | None = Field(default=None, gt=0)
     factor: float | None = Field(default=None, gt=1, le=1e6)
@@ -54,7 +54,7 @@ class PriorSpec(Section):
                 " or {tied}"
             )
         if ordered and not self.is_free:
-            raise ValueError("above and below order free parameters; leave them out of a fixed or tied one")
+            raise ValueError("above and below apply to free parameters only; remove them from a fixed or tied one")
         if self.fixed is False or (self.fixed is not True and self.fixed is not None and self.fixed <= 0.0):
             raise ValueError("fixed is a value above 0, or true for the scene's")
         if self.low is not None and self.high is not None and not self.low < self.high:
@@ -63,12 +63,12 @@ class PriorSpec(Section):
 
     @property
     def is_free(self) -> bool:
-        """Whether it is a density, rather than fixed or tied."""
+        """Whether the parameter has a density, and is not fixed or tied."""
         return self.fixed is None and self.tied is None
 
     @property
     def upper_bound(self) -> float:
-        """Above which it allows no value, so far as it says so itself."""
+        """Upper bound of the values by the specification, infinity if there is none."""
         if self.tolerance is not None:
             return (self.nominal or 0.0) * (1.0 + self.tolerance)
         if self.fixed is not None:
@@ -76,13 +76,13 @@ class PriorSpec(Section):
         return math.inf if self.high is None else self.high
 
     def distribution(self, name: str, nominal: float | None, layer: Layer) -> Distribution:
-        """Return the density of the parameter `name`, around its `nominal` value in the scene where it states no other."""
+        """Return the density of the parameter `name`; its default median is the `nominal` value of the scene."""
         if self.table is not None:
             return published_prior(self.table, name, layer)
         if self.tolerance is not None:
             return Uniform.with_tolerance(_require_value(name, "nominal", self.nominal, nominal), self.tolerance)
         low, high = self.low or 0.0, self.high or math.inf
-        if self.factor is None and self.relative_sd is None:  # both bounds are stated, by _check_form
+        if self.factor is None and self.relative_sd is None:  # _check_form ensures both bounds
             return (LogUniform if self.scale == "log" else Uniform)(low, high)
         median = _require_value(name, "median", self.median, nominal)
         if self.factor is not None:
@@ -99,15 +99,15 @@ class PriorSpec(Section):
 
 def _require_value(name: str, key: str, stated: float | None, nominal: float | None) -> float:
     if not (stated or nominal):
-        raise InputError(f"[prior] {name} needs a {key}, since the scene has no {name} of its own")
+        raise InputError(f"[prior] {name} needs a {key}, since the scene states no value of {name}")
     return float(stated or nominal or 0.0)
 
 
 class SpecUnit(Unit):
-    """The SI unit of a parameter in which its beliefs are stated."""
+    """SI unit of the quantities in a prior specification."""
 
     def parse(self, value: Any) -> Any:
-        """Return the keys of a belief with their quantities in SI."""
+        """Return the keys of a prior specification with quantities in SI units."""
         if not isinstance(value, dict):
             return value
         key_units = dict.fromkeys(QUANTITY_KEYS, self.name) | {"tolerance": "", "ratio": ""}
@@ -125,11 +125,11 @@ AmperePriorSpec = Annotated[PriorSpec, SpecUnit("A")]
 
 
 class PriorSection(Section):
-    """Beliefs; where one is silent on the median, the scene's value is it. An absent parameter is not free.
+    """Prior specifications; the default median is the scene's value, and an absent parameter is not free.
 
-    The skin's defaults reach, within their 95 %, from the paper's values to published whole-skin ones
-    (10 kohm and 5 nF dry, 4.3 kohm and 200 nF wet); the insulator's is a data sheet's 5 %. Without a belief
-    the noise's standard deviations (`sigma` of Vsc, `sigma_I` of I) are flat in their logarithm.
+    The 95 % intervals of the default skin priors extend from the values of the reference paper to published values of
+    whole skin (10 kohm and 5 nF dry, 4.3 kohm and 200 nF wet). The default of the insulator, ± 5 %, is an assumption.
+    Noise standard deviations (`sigma` of Vsc, `sigma_I` of I) have priors flat in their logarithm unless specified.
     """
 
     Rsc: OhmPriorSpec = PriorSpec(factor=50.0)
@@ -154,10 +154,10 @@ class PriorSection(Section):
         for name, belief in beliefs.items():
             if belief.table is not None and name not in _SKIN_PARAMETERS:
                 raise ValueError(
-                    f"[prior] {name}: a table has the skin's parameters only: {', '.join(_SKIN_PARAMETERS)}"
+                    f"[prior] {name}: a table applies to skin parameters only: {', '.join(_SKIN_PARAMETERS)}"
                 )
             if name == "alpha" and belief.upper_bound > 1.0:
-                raise ValueError("[prior] alpha is an exponent of at most 1; give high = 1 or less beside the rest")
+                raise ValueError("[prior] alpha is an exponent of at most 1; add high = 1 or less")
             for key in ("tied", "above", "below"):
                 other = getattr(belief, key)
                 if other is not None:
@@ -170,38 +170,38 @@ class PriorSection(Section):
         beliefs = self.specs()
         place = f"[prior] {name}: {key} = '{other}'"
         if other == name or other not in beliefs:
-            raise ValueError(f"{place} is no other parameter with a prior; name one of {', '.join(beliefs)}")
+            raise ValueError(f"{place} is not another parameter with a prior; name one of {', '.join(beliefs)}")
         unit, other_unit = units.quantity_unit(name), units.quantity_unit(other)
         if unit != other_unit:
-            raise ValueError(f"{place} compares {unit} with {other_unit}; name one of its own unit")
+            raise ValueError(f"{place} compares {unit} with {other_unit}; name a parameter with the same unit")
         if key == "tied" and beliefs[other].tied is not None:
-            raise ValueError(f"{place} is tied itself; name what {other} is tied to")
+            raise ValueError(f"{place} is tied itself; name the parameter that {other} is tied to")
 
     def specs(self) -> dict[str, PriorSpec]:
-        """Return the beliefs that the section holds, by parameter; one that only orders keeps the default's density."""
+        """Return the specifications by parameter; an order constraint alone keeps the default density."""
         beliefs = {name: belief for name, belief in self if isinstance(belief, PriorSpec)}
         for name, belief in beliefs.items():
             if not belief.model_fields_set - _ORDER_KEYS:
                 default = PriorSection.model_fields[name].default
                 if default is None:
                     raise InputError(
-                        f"[prior] {name}: give a density beside above or below, such as {{median, factor}}"
+                        f"[prior] {name}: give a density in addition to above or below, such as {{median, factor}}"
                     )
                 beliefs[name] = default.model_copy(update=belief.model_dump(exclude_unset=True))
         return beliefs
 
     def ties(self) -> dict[str, tuple[str, float]]:
-        """Return parameters that follow another: name -> (the other, ratio to it)."""
+        """Return tied parameters: name -> (the other parameter, ratio to it)."""
         return {name: (b.tied, b.ratio) for name, b in self.specs().items() if b.tied is not None}
 
     def order_constraints(self) -> tuple[tuple[str, str], ...]:
-        """Return pairs (lower, higher) of parameters that come in that order."""
+        """Return order constraints as pairs of parameters (lower, higher)."""
         beliefs = self.specs().items()
         above = [(b.above, name) for name, b in beliefs if b.above is not None]
         return (*above, *((name, b.below) for name, b in beliefs if b.below is not None))
 
     def correlations(self) -> dict[tuple[str, str], float]:
-        """Return correlations by pair of parameters."""
+        """Return the correlation of each pair of parameters."""
         by_pair: dict[tuple[str, str], float] = {}
         for key, value in self.correlation.items():
             pair = tuple(key.split("-"))

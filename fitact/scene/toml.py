@@ -1,4 +1,4 @@
-"""Scene files as text: where they are, how a scene is written as one, and which line an error is on."""
+"""Text of scene files: locate and read them, write a scene, and find the line of an error."""
 
 import difflib
 import functools
@@ -20,13 +20,13 @@ _INLINE = re.compile(r"[{,]\s*([\w-]+)\s*=")
 
 @functools.cache
 def shipped_scenes() -> dict[str, str]:
-    """Return the scenes that come with fitact: name -> text."""
+    """Return the scenes shipped with fitact: name -> text."""
     folder = importlib.resources.files("fitact") / "scenes"
     return {file.name.removesuffix(".toml"): file.read_text(encoding="utf-8") for file in folder.iterdir()}
 
 
 def read_scene_text(path: str | Path) -> str:
-    """Return the text of a scene file, or of a shipped scene where there is no such file."""
+    """Return the text of a scene file, or of a shipped scene if there is no such file."""
     name = str(path)
     try:
         return Path(path).read_text(encoding="utf-8")
@@ -48,7 +48,7 @@ def _suggest_shipped(name: str) -> str:
 
 
 def to_toml(scene: Section) -> str:
-    """Every key with its unit; those that were not given, as comments. Read again it is the same scene."""
+    """Return the scene as TOML that reads back as the same scene; keys that were not given are comments."""
     lines = []
     for name, section in scene:
         if not isinstance(section, Section):
@@ -65,7 +65,7 @@ def to_toml(scene: Section) -> str:
 
 
 def value_text(value: Any, unit: str | None) -> str:
-    """Return a value as TOML; `unit` is that of numbers, None for plain ones."""
+    """Return a value as TOML; `unit` is the unit of numbers, or None."""
     if isinstance(value, PriorSpec):
         stated = {key: x for key, x in value if key in value.model_fields_set}
         return _inline_table({key: value_text(x, unit if key in QUANTITY_KEYS else None) for key, x in stated.items()})
@@ -83,7 +83,7 @@ def _inline_table(items: dict[str, str]) -> str:
 
 
 def find_line(text: str, sentence: str) -> int | None:
-    """Return the line of a scene file that a sentence such as "[drive] duty = 2: ..." is about; None if there is none."""
+    """Return the line of a scene file for a message such as "[drive] duty = 2: ...", or None."""
     place = re.match(r"\[(\w+)\](.*)", sentence)
     if place is None:
         return None
@@ -98,7 +98,7 @@ def find_line(text: str, sentence: str) -> int | None:
 
 
 def _key_lines(text: str) -> dict[tuple[str, ...], int]:
-    """Return the first line of every table and key, by its path."""
+    """Return the first line of each table and key, by path."""
     lines: dict[tuple[str, ...], int] = {}
     table: tuple[str, ...] = ()
     for number, line in enumerate(text.splitlines(), 1):

@@ -209,7 +209,7 @@ def test_rigol_binary_against_the_csv_of_the_same_capture():
 
 
 REFUSED = {
-    "tek_analog_waveform_first100lines.csv": "announces 50,000 rows and 86 are there",
+    "tek_analog_waveform_first100lines.csv": "states 50,000 rows, but the file has 86",
     "tek_invalid_csv.csv": "no column time_s",
     "tek_invalid_record_length.csv": "no column time_s",
     "rs_rtp_01.Wfm.csv": "no column time_s",

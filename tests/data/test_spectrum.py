@@ -105,9 +105,9 @@ GOOD = [f"{f},1e5,-1e5" for f in (1, 10, 100, 1000, 10000)]
 NAMES = "frequency_Hz,Z_real_ohm,Z_imag_ohm"
 BROKEN = {
     "too few": ([NAMES, *GOOD[:4]], "4 points are too few"),
-    "a cell": ([NAMES, *GOOD[:2], "7,x,-1", *GOOD[2:]], "line 4: '7,x,-1' is no row of numbers"),
+    "a cell": ([NAMES, *GOOD[:2], "7,x,-1", *GOOD[2:]], "line 4: '7,x,-1' is not a row of numbers"),
     "not finite": ([NAMES, *GOOD, "7,nan,-1"], "not finite"),
-    "twice": ([NAMES, *GOOD, "10,1e5,-1e5"], "10 Hz comes twice"),
+    "twice": ([NAMES, *GOOD, "10,1e5,-1e5"], "10 Hz occurs twice"),
     "at 0 Hz": ([NAMES, *GOOD, "0,1e5,-1e5"], "the frequency 0 Hz"),
     "a coil": ([NAMES, *(row.replace("-", "") for row in GOOD)], "leading minus"),
     "zero": ([NAMES, *GOOD, "7,0,0"], "the impedance is 0 at 7 Hz"),

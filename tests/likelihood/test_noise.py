@@ -302,7 +302,7 @@ def test_records_that_do_not_show_their_noise_are_refused():
         fitact.fit(burst_record(), scene("measured", noise_model="spectrum", quiet=["-20 ms", "0.8 ms"]))
     uneven = np.delete(np.arange(len(record)), [700])
     holed = fitact.Record.from_arrays(record.time[uneven], V=record["V"][uneven], Vsc=record["Vsc"][uneven])
-    with pytest.raises(fitact.InputError, match="even time steps"):
+    with pytest.raises(fitact.InputError, match="uniform time steps"):
         fitact.fit(holed, scene(noise_model="ar1"))
 
 

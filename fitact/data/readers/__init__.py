@@ -1,5 +1,4 @@
-"""Which numbers does a file hold?
+"""Readers of files of oscilloscopes, DAQ programs and fitact.
 
-Takes text, binary and MATLAB files of oscilloscopes and of fitact; gives channels with units, never guessing which is
-which.
+Read text, binary and MATLAB files into channels with units, without guessing which channel is V, Vsc or I.
 """

@@ -1,7 +1,6 @@
-"""Binary files: of oscilloscopes (by RigolWFM), of LabVIEW (TDMS), MATLAB, HDF5, NetCDF and NumPy.
+"""Binary files of oscilloscopes (read by RigolWFM), LabVIEW (TDMS), MATLAB, HDF5, NetCDF and NumPy.
 
-What an extra of fitact reads is imported where it is used. Whatever a foreign parser raises at a broken file
-becomes one sentence.
+Optional parsers are imported where they are used. Any error of a parser becomes one sentence.
 """
 
 import contextlib
@@ -36,15 +35,15 @@ _SCOPE_SUFFIXES = (".wfm", ".bin", ".trc", ".isf")
 
 @dataclasses.dataclass
 class _Contents:
-    """The contents of a file of named arrays: arrays, their units, and single numbers and words."""
+    """Contents of a file: named arrays, their units, and scalar numbers and strings."""
 
     format: str
     arrays: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
     units: dict[str, str] = dataclasses.field(default_factory=dict)
-    metadata: dict[str, Any] = dataclasses.field(default_factory=dict)  # under layouts.normalize_key(name)
+    metadata: dict[str, Any] = dataclasses.field(default_factory=dict)  # by layouts.normalize_key(name)
 
     def add(self, name: str, value: Any, unit: Any = "") -> None:
-        """Sort a value in; what is neither an array of one axis, a number nor a word is passed over."""
+        """Add a value; values that are neither one-dimensional arrays, numbers nor strings are ignored."""
         array = np.squeeze(np.asarray(value))
         if array.ndim == 0 and array.dtype.kind in "iufSU":
             self.metadata[layouts.normalize_key(name.rpartition("/")[2])] = array.item()
@@ -54,23 +53,23 @@ class _Contents:
 
 
 def is_known_binary(head: bytes, suffix: str) -> bool:
-    """Return whether a file that begins so goes to `read_binary`, though it may look like text."""
+    """Return whether `read_binary` should read a file with this beginning, even if it resembles text."""
     return _find_reader(head, "" if suffix.lower() in (".csv", ".txt") else suffix) is not None
 
 
 def read_binary(path: Path, source: str, head: bytes, pick: Pick) -> Capture:
-    """Return the channels of a binary file that `pick` names, in SI units."""
+    """Return the channels of a binary file that `pick` selects, in SI units."""
     reader = _find_reader(head, path.suffix)
     if reader is None:
-        raise InputError(f"{source}: is not a text file, nor of a known binary kind; export the record as CSV")
+        raise InputError(f"{source}: is neither a text file nor a known binary format; export the record as CSV")
     printed = io.StringIO()
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of parsers that read on
+            warnings.simplefilter("ignore")  # from parsers that continue after a problem
             return reader(path, source, pick)
     except InputError:
         raise
-    except Exception as error:  # a dozen parsers, each with its own
+    except Exception as error:  # a dozen parsers with exceptions of their own
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputError(f"{source}: cannot be read ({reason}); export the record again, or as CSV") from error
 
@@ -95,7 +94,7 @@ def _read_scope(path: Path, source: str, pick: Pick) -> Capture:
     for name, channel in zip(names, wfm.channels, strict=True):
         if name in wanted:
             unit = channel.unit.name
-            attenuation = float(channel.probe_value) if channel.probe_value != 1.0 else None  # 1: or not known
+            attenuation = float(channel.probe_value) if channel.probe_value != 1.0 else None  # 1 may also mean unknown
             values = np.asarray(channel.volts, dtype=float)
             channels.append(FileChannel(name, values, units.get(unit, ""), units.get(unit, unit), attenuation))
             times.append(np.asarray(channel.times, dtype=float))
@@ -109,7 +108,7 @@ def _read_tdms(path: Path, source: str, pick: Pick) -> Capture:
     with _capture_log("nptdms") as said, nptdms.TdmsFile.open(path) as file:
         pairs = [(group, channel) for group in file.groups() for channel in group.channels()]
         channels = {channel.name: channel for _, channel in pairs}
-        if len(channels) < len(pairs):  # one name in several groups
+        if len(channels) < len(pairs):  # the same name in several groups
             channels = {f"{group.name}/{channel.name}": channel for group, channel in pairs}
         _check_size(sum(8 * len(channel) for channel in channels.values()), path, source)
         contents = _Contents("TDMS")
@@ -121,8 +120,8 @@ def _read_tdms(path: Path, source: str, pick: Pick) -> Capture:
         if len(times) == len(contents.arrays) and times:
             _check_one_grid(times, list(contents.arrays), source)
             contents.add("time", times[0], "s")
-    if said:  # of a cut file nptdms reads what is left
-        raise InputError(f"{source}: was cut or is broken ({said[0][:120]}); export the record again")
+    if said:  # nptdms reads a truncated file without an error
+        raise InputError(f"{source}: is truncated or damaged ({said[0][:120]}); export the record again")
     return _make_capture(contents, source, pick)
 
 
@@ -137,7 +136,7 @@ def _read_npz(path: Path, source: str, pick: Pick) -> Capture:
     contents = _Contents("NumPy")
     with np.load(path, allow_pickle=False) as file:
         if isinstance(file, np.ndarray) or not all(name.endswith(".npy") for name in file.zip.namelist()):
-            raise InputError(f"{source}: is a zip archive but not of NumPy; save the record as CSV")
+            raise InputError(f"{source}: is a zip archive, but not from NumPy; save the record as CSV")
         _check_size(sum(part.file_size for part in file.zip.infolist()), path, source)
         for name in file.files:
             contents.add(name, file[name])
@@ -172,7 +171,7 @@ def _read_hdf5(path: Path, source: str, pick: Pick) -> Capture:
 
 
 def _make_capture(contents: _Contents, source: str, pick: Pick) -> Capture:
-    """Find the time among named arrays, or the numbers that make it, and part the channels from the rest."""
+    """Make a capture: find the time, or start and step of the time, among the named arrays, and the channels."""
     arrays = contents.arrays
     if any(array.dtype.kind == "c" for array in arrays.values()):
         raise InputError(f"{source}: holds complex numbers (IQ data), not voltages in time; export those")
@@ -252,7 +251,7 @@ def _check_one_grid(times: Sequence[np.ndarray], names: Sequence[str], source: s
 
 
 def _size_limit(path: Path) -> int:
-    """Return bytes that the file may unfold to; a header that announces more is broken: deflate shrinks 1032 times at most."""
+    """Return the maximum uncompressed size of the file, in bytes; deflate compresses by at most a factor 1032."""
     return 1_000_000 + 1032 * path.stat().st_size
 
 

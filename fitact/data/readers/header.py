@@ -1,4 +1,4 @@
-"""The header of a text file: where the numbers begin, what the columns are, and what its maker says of them."""
+"""Header of a text file: first row of numbers, columns, and metadata of the manufacturer."""
 
 import collections
 import dataclasses
@@ -16,14 +16,14 @@ _QUANTITY = re.compile(r"(?:analog:)?\s*([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*([a-zµμ
 
 
 class TextRow(NamedTuple):
-    """Its number, from 1, and its cells."""
+    """Number of a row, from 1, and its cells."""
 
     number: int
     cells: list[str]
 
 
 class Column(NamedTuple):
-    """One column of numbers; `unit` as written, "" where none is, `attenuation` as the header states it."""
+    """One column of numbers; `unit` as written or "", and `attenuation` as stated in the header."""
 
     place: int
     name: str
@@ -32,8 +32,8 @@ class Column(NamedTuple):
 
 
 def read_header(text: str, source: str, sidecar_text: str = "") -> "Header":
-    """Return the header of a file that begins with `text`; `sidecar_text`: one in a file of its own, as `key:value` lines."""
-    head = text[:4096]  # of which a header mostly is a small part: to part lines into cells takes longest
+    """Return the header of a file that begins with `text`; `sidecar_text` holds `key:value` lines of another file."""
+    head = text[:4096]  # enough for most headers; splitting lines into cells dominates the time
     header = Header.from_text(head.rpartition("\n")[0], sidecar_text, source)
     if not header.is_plain:
         header = Header.from_text(text, sidecar_text, source)
@@ -49,7 +49,7 @@ def read_header(text: str, source: str, sidecar_text: str = "") -> "Header":
     if header.time is None and header.time_grid[1] is None:
         found = ", ".join(header.names.cells) if header.names else "no header"
         raise InputError(
-            f"{source}{header.location}: no column time_s, nor another of time (found: {found[:200]}); name the"
+            f"{source}{header.location}: no column time_s, and no other time column (found: {found[:200]}); name the"
             f" columns as in {_EXAMPLE}, or export the time as well (Rohde & Schwarz keep that of NAME.Wfm.csv in"
             " NAME.csv beside it)"
         )
@@ -59,13 +59,13 @@ def read_header(text: str, source: str, sidecar_text: str = "") -> "Header":
 
 
 def split_cells(line: str, delimiter: str) -> list[str]:
-    """Return the cells of a line, without quotes and blanks around them."""
+    """Return the cells of a line, without surrounding quotes and blanks."""
     parts = line.split() if delimiter == " " else line.split(delimiter)
     return [cell.strip().strip('"').strip() for cell in parts]
 
 
 def parse_number(cell: str, decimal_comma: bool) -> float | None:
-    """Return the cell as a number, or None; infinity is how some makers write that a value is out of range."""
+    """Return the cell as a number, or None; some manufacturers write infinity for a value out of range."""
     if "_" in cell:  # Python would read 1_000
         return None
     try:
@@ -76,14 +76,14 @@ def parse_number(cell: str, decimal_comma: bool) -> float | None:
 
 @dataclasses.dataclass(frozen=True)
 class Header:
-    """The first lines of a file, parted into those above the numbers and those with them, and what they say."""
+    """First lines of a file, divided into the lines above the numbers and the rows of numbers."""
 
     delimiter: str
     decimal_comma: bool
     comments: list[TextRow]
     header_rows: list[TextRow]
     data_rows: list[TextRow]
-    numeric: frozenset[int]  # the columns of numbers
+    numeric: frozenset[int]  # indices of the columns of numbers
     source: str
     maker: str = "text"
 
@@ -97,12 +97,12 @@ class Header:
             frozenset(i for i, cell in enumerate(row.cells) if parse_number(cell, decimal_comma) is not None)
             for row in data
         ]
-        # the pattern that most lines show, from the middle on: above, a header may state numbers
+        # the most frequent pattern from the middle on, since a header may hold numbers, too
         patterns = collections.Counter(p for p in places[len(places) // 2 :] if p)
         numeric = patterns.most_common(1)[0][0] if patterns else frozenset()
         full = [numeric <= p for p in places]
         first = next((i for i, here in enumerate(full) if here and all(full[i : i + 2])), None)
-        if first is None:  # not two in a row
+        if first is None:  # no two such rows in succession
             first = full.index(True) if numeric else len(full)
         while first and _is_unfilled(data[first - 1], places[first - 1] & numeric):
             first -= 1
@@ -113,7 +113,7 @@ class Header:
 
     @property
     def is_plain(self) -> bool:
-        """Whether further rows have nothing to tell: enough of them, only numbers, and the decimal mark seen."""
+        """Whether further rows are redundant: enough rows of numbers only, with a known decimal mark."""
         cells = [cell for row in self.data_rows for cell in row.cells]
         enough = len(self.data_rows) >= max(64, 2 * len(self.header_rows))
         marked = self.delimiter == "," or any("," in cell or "." in cell for cell in cells)
@@ -121,18 +121,18 @@ class Header:
 
     @property
     def location(self) -> str:
-        """The place of the names, for messages."""
+        """Location of the column names, for messages."""
         return f", line {(self.names or self.units or self.data_rows[0]).number}"
 
     @functools.cached_property
     def width(self) -> int:
-        """Cells of a row."""
+        """Number of cells in a row."""
         widths = (len(row.cells) for row in self.data_rows if len(row.cells) > max(self.numeric))
         return collections.Counter(widths).most_common(1)[0][0]
 
     @functools.cached_property
     def metadata(self) -> dict[str, list[str]]:
-        """Each word of the header, with the cells after it."""
+        """Each key of the header with the cells after it."""
         beside = [
             TextRow(row.number, row.cells[: min(self.numeric)]) for row in self.data_rows if min(self.numeric) > 1
         ]
@@ -146,11 +146,11 @@ class Header:
         return known
 
     def find_values(self, keys: Sequence[str]) -> list[str]:
-        """Return values that the header states under the first of the keys that it has."""
+        """Return the values of the first of the keys that the header contains."""
         return next((self.metadata[key] for key in keys if key in self.metadata), [])
 
     def find_quantity(self, keys: Sequence[str]) -> float | None:
-        """Return the largest number that it states there, in SI units: they may differ between channels."""
+        """Return the largest of these values in SI units, since values may differ between channels."""
         found = (self._parse_quantity(text) for text in self.find_values(keys))
         return max((value for value in found if value is not None), default=None)
 
@@ -164,7 +164,7 @@ class Header:
 
     @functools.cached_property
     def names(self) -> TextRow | None:
-        """The row of names, above that of units where there is one; numpy.savetxt writes it as a comment."""
+        """Row of names, above the row of units if there is one; numpy.savetxt writes it as a comment."""
         rows = [row for row in self.header_rows if len(row.cells) > max(self.numeric) and row is not self.units]
         if rows and self._is_names(rows[-1]):
             return rows[-1]
@@ -178,7 +178,7 @@ class Header:
     def _is_names(self, row: TextRow) -> bool:
         here = [row.cells[i] for i in sorted(self.numeric)]
         if any(layouts.split_name_and_unit(cell)[0].lower() in layouts.TIME_NAMES for cell in here if cell):
-            return True  # although the others may be numbers, as Keysight's are
+            return True  # although the other cells may be numbers (Keysight)
         return any(here) and all(parse_number(cell, self.decimal_comma) is None for cell in here)
 
     @functools.cached_property
@@ -193,7 +193,7 @@ class Header:
 
     @functools.cached_property
     def time_grid(self) -> tuple[float | None, float | None]:
-        """Start and step of the time, s: below the words Start and Increment, or beside words of that meaning."""
+        """Start and step of the time, s, below the words Start and Increment, or beside equivalent keys."""
         below = {}
         if self.names and self.units:
             pairs = zip(self.names.cells, self.units.cells, strict=False)
@@ -210,7 +210,7 @@ class Header:
 
     @functools.cached_property
     def _columns(self) -> list[Column]:
-        """The columns of numbers, with the unit in their name, or in the row of units."""
+        """Columns of numbers, with the unit from their name or from the row of units."""
         made = []
         for place in sorted(self.numeric):
             cell, below = (row.cells[place] if row else "" for row in (self.names, self.units))
@@ -226,7 +226,7 @@ class Header:
 
     @functools.cached_property
     def channels(self) -> list[Column]:
-        """The columns of values, with the names and units that the header states elsewhere."""
+        """Columns of values, with names and units that the header states elsewhere."""
         columns = [c for c in self._columns if c.place not in (self.index, self.time.place if self.time else None)]
         names = [column.name for column in columns]
         if "" in names or (len(set(names)) < len(names) and not any(layouts.is_standard_name(name) for name in names)):
@@ -239,24 +239,24 @@ class Header:
         ]
 
     def standard_columns(self) -> frozenset[int]:
-        """Return columns under fitact's own names, which must hold numbers whether they do or not."""
+        """Return the columns with fitact's own names, which must hold numbers."""
         parts = map(layouts.split_name_and_unit, self.names.cells[: self.width] if self.names else [])
         standard = (layouts.is_standard_name(name) and (not unit or layouts.parse_unit(unit)) for name, unit in parts)
         return frozenset(i for i, is_standard in enumerate(standard) if is_standard)
 
     def non_numeric_columns(self) -> list[str]:
-        """Return names of the columns that hold no numbers."""
+        """Return the names of the columns without numbers."""
         named = self.names.cells[: self.width] if self.names else []
         words = [layouts.normalize_key(cell.partition("=")[0]) for cell in named]
         return [c for i, c in enumerate(named) if i not in self.numeric and words[i] not in layouts.GRID_KEYS]
 
     def count_rows(self) -> int | None:
-        """Return rows that the header announces."""
+        """Return the number of rows that the header states, or None."""
         count = self.find_quantity(layouts.COUNT_KEYS)
-        return int(count) if count is not None and count < 1e12 else None  # beyond, it means something else
+        return int(count) if count is not None and count < 1e12 else None  # a larger number has another meaning
 
     def _find_names(self, count: int) -> list[str]:
-        """Return names as in "Source,CH1" or "Vertical Scale,CH1:0.05 CH2:0.10"."""
+        """Return channel names from lines such as "Source,CH1" or "Vertical Scale,CH1:0.05 CH2:0.10"."""
         named = self.find_values(layouts.NAME_KEYS)
         if len(named) < count:
             named = re.findall(r"([A-Za-z]+\d+)\s*:", " ".join(self.find_values(("verticalunits", "verticalscale"))))
@@ -264,7 +264,7 @@ class Header:
 
     @functools.cached_property
     def index(self) -> int | None:
-        """The column that counts samples; None where there is none."""
+        """Column that counts the samples, or None."""
         return next((c.place for c in self._columns if self._is_index(c)), None)
 
     def _is_index(self, column: Column) -> bool:
@@ -273,7 +273,7 @@ class Header:
 
     @functools.cached_property
     def time(self) -> Column | None:
-        """Find it by name, by unit, or as the first beside a header; None where `time_grid` makes the time."""
+        """Time column, found by name, by unit, or as the first under a header; None if `time_grid` gives the time."""
         candidates = [c for c in self._columns if not self._is_index(c)]
         times = [c for c in candidates if c.name.lower() == "time"]
         times += [c for c in candidates if (layouts.parse_unit(c.unit) or ("",))[0] == "s"]
@@ -285,12 +285,12 @@ class Header:
 
 
 def _is_unfilled(row: TextRow, numbers: frozenset[int]) -> bool:
-    """Return whether all that the row holds are numbers, in some columns of numbers: a time without values yet."""
+    """Return whether a row holds only numbers, but not in all columns of numbers (a time without values)."""
     return bool(numbers) and all(i in numbers for i, cell in enumerate(row.cells) if cell)
 
 
 def _detect_delimiter(lines: Sequence[str]) -> tuple[str, bool]:
-    """Return the delimiter that parts most lines, from the middle on, into numbers, and whether a comma marks the decimals."""
+    """Return the delimiter that fits most lines from the middle on, and whether the decimal mark is a comma."""
     lines = lines[len(lines) // 2 :]
     for delimiter in (";", "\t", ",", " "):
         rows = [split_cells(line, delimiter) for line in lines]

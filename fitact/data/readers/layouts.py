@@ -1,4 +1,4 @@
-"""Words that makers of oscilloscopes and DAQ programs write in a header: one table, so that one reader serves all."""
+"""Keywords in headers of oscilloscopes and DAQ programs, in one table, so that one reader serves all formats."""
 
 import re
 
@@ -7,7 +7,7 @@ import numpy as np
 from fitact.errors import InputError
 from fitact.units import PREFIX_FACTORS
 
-# who wrote a file, by what its first lines show; the first that matches
+# manufacturer of a file, from its first lines; the first match counts
 MAKERS: tuple[tuple[str, re.Pattern[str]], ...] = tuple(
     (maker, re.compile(mark, re.IGNORECASE | re.MULTILINE))
     for maker, mark in (
@@ -30,13 +30,13 @@ TIME_NAMES = frozenset((
     "zeit", "temps", "tiempo", "tempo", "tijd", "czas",
 ))  # fmt: skip
 INDEX_NAMES = frozenset(["sample", "samples", "index", "sequence", "nr", "no", "n", "point", "row"])
-# what stands in a row of units although it is none, or one of another kind
+# entries in a row of units that are no units, or other units
 NOT_UNITS = frozenset((
     "", "sequence", "value", "none", "unknown", "ohm", "w", "watt", "hz", "khz", "db", "dbm", "pa", "n", "%", "°c",
     "deg", "u",
 ))  # fmt: skip
 
-# keys of a header, in small letters without blanks or punctuation
+# keys of a header, in lower case without blanks or punctuation
 COUNT_KEYS = ("signalhardwarerecordlength", "recordlength", "numberofdatapoints", "segmentsize", "samples")
 STEP_KEYS = (
     "sampleinterval", "increment", "tinc", "timestep", "dt", "tinterval", "xinc", "xincrement", "wfincrement",
@@ -60,12 +60,12 @@ _UNIT_SYMBOLS = {
 
 
 def normalize_key(text: str) -> str:
-    """Return a header's key as the tables above spell it: "numberofdatapoints" for "Number of Data points ="."""
+    """Return a normalized key of a header, e.g. "numberofdatapoints" for "Number of Data points ="."""
     return re.sub(r"[^0-9a-zµμ]", "", text.lower())
 
 
 def parse_unit(text: str) -> tuple[str, float] | None:
-    """Return SI unit (s, V or A) and factor of a unit as makers spell it: ("s", 1e-3) for "(ms)"; or None."""
+    """Return the SI unit (s, V or A) and the factor of a unit as written, e.g. ("s", 1e-3) for "(ms)", or None."""
     bare = text.strip().strip("()[]").strip()
     for length in (0, 1):
         prefix, symbol = bare[:length], bare[length:]
@@ -76,15 +76,15 @@ def parse_unit(text: str) -> tuple[str, float] | None:
 
 
 def convert_time(time: np.ndarray, unit_text: str, place: str, remedy: str) -> np.ndarray:
-    """Return seconds; where no unit is stated, they are."""
+    """Return the time in seconds; no stated unit means seconds."""
     unit = parse_unit(unit_text)
     if unit_text and (unit is None or unit[0] != "s"):
-        raise InputError(f"{place}: '{unit_text}' is no unit of time; {remedy}")
+        raise InputError(f"{place}: '{unit_text}' is not a unit of time; {remedy}")
     return time * (unit[1] if unit else 1.0)
 
 
 def is_same_grid(time: np.ndarray, other: np.ndarray) -> bool:
-    """Return whether two channels were sampled at the same times, to a hundredth of a step."""
+    """Return whether two channels have the same sampling times, to a hundredth of a step."""
     step = abs(time[-1] - time[0]) / max(time.size - 1, 1)
     return time.size == other.size and not np.max(np.abs(time - other)) > 0.01 * step
 
@@ -99,7 +99,7 @@ _STANDARD_NAME = re.compile(r"^(?P<name>time|V|Vsc|I)(?:_(?P<unit>.+))?$", re.IG
 
 
 def split_name_and_unit(cell: str) -> tuple[str, str]:
-    """Return a column's name and its unit as written, "" where none is."""
+    """Return the name of a column, and its unit as written or ""."""
     contract = _STANDARD_NAME.match(cell)
     if contract:
         return contract["name"], contract["unit"] or ""
@@ -115,6 +115,6 @@ def is_standard_name(name: str) -> bool:
 
 
 def normalize_channel(name: str) -> str:
-    """Return the name that "CH2", "Channel 2", "Chan 2" and Keysight's "2" have in common."""
+    """Return the common form of the names "CH2", "Channel 2", "Chan 2" and "2" (Keysight)."""
     bare = re.sub(r"[\s_.-]", "", name.lower())
     return re.sub(r"^(channel|chan|ch|kanal|canal|ampl|c)(?=[0-9]+$|[a-z]$)", "", bare)

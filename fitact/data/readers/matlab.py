@@ -1,6 +1,6 @@
-"""MATLAB's .mat files of version 5 to 7, as MathWorks document them: arrays of numbers and words at the top level.
+"""MATLAB .mat files of versions 5 to 7 (format documented by MathWorks): arrays of numbers and strings at top level.
 
-SciPy reads more of them, but its compiled reader ends the process at some broken files.
+SciPy reads more kinds of arrays, but its compiled reader crashes the process on some damaged files.
 """
 
 import struct
@@ -13,15 +13,15 @@ _MATRIX, _COMPRESSED = 14, 15
 _NUMBERS = {
     1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8", 16: "u1", 17: "u2",
 }  # fmt: skip
-_CHAR, _CLASSES = 4, range(6, 16)  # of arrays: words; double, single and the integers
+_CHAR, _CLASSES = 4, range(6, 16)  # classes of arrays: strings; double, single and integers
 _COMPLEX = 0x0800
 
 
 def read_mat(content: bytes, max_bytes: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Name and array of each variable of numbers or words; what unfolds to more than `max_bytes` bytes is an error.
+    """Yield name and array of each numeric or string variable of at most `max_bytes` bytes.
 
     Raises:
-        ValueError: the file is broken.
+        ValueError: the file is damaged, or a variable is larger.
     """
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:
@@ -39,14 +39,14 @@ def _decompress(data: bytes, max_bytes: int) -> bytes:
     try:
         unpacked = stream.decompress(data, max_bytes)
     except zlib.error as error:
-        raise ValueError(f"a compressed part is broken: {error}") from error
+        raise ValueError(f"a compressed part is damaged: {error}") from error
     if not stream.eof:
-        raise ValueError("a compressed part is cut or too large")
+        raise ValueError("a compressed part is truncated or too large")
     return unpacked
 
 
 def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
-    """Type and content of each element; a small one keeps its size in the upper half of its type."""
+    """Yield type and content of each element; a small element stores its size in the upper half of its type."""
     at = 0
     while at + 8 <= len(data):
         kind, size = struct.unpack_from(order + "II", data, at)
@@ -64,7 +64,7 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
 def _read_matrix(data: bytes, order: str) -> Iterator[tuple[str, np.ndarray]]:
     parts = list(_elements(data, order))
     if len(parts) < 4 or len(parts[0][1]) < 8:
-        return  # an array of no elements, or an object
+        return  # an empty array, or an object
     flags = struct.unpack_from(order + "I", parts[0][1])[0]
     name = parts[2][1].decode("ascii", errors="replace")
     values = [
@@ -74,7 +74,7 @@ def _read_matrix(data: bytes, order: str) -> Iterator[tuple[str, np.ndarray]]:
     ]
     shape = np.frombuffer(parts[1][1], order + "i4").astype(int)
     if not values or np.prod(shape.astype(float)) != values[0].size:
-        return  # a cell or a structure, whose parts are no numbers
+        return  # a cell or a structure, whose parts are not numbers
     if flags & 0xFF == _CHAR:
         yield name, np.array("".join(map(chr, values[0])))
     elif flags & 0xFF in _CLASSES:

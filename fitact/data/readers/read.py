@@ -1,4 +1,4 @@
-"""Files to records: text and binary files of oscilloscopes and DAQ programs, and fitact's own CSV."""
+"""Records from files: text and binary files of oscilloscopes and DAQ programs, and fitact's own CSV."""
 
 import dataclasses
 import os
@@ -18,7 +18,7 @@ from fitact.errors import InputError
 from fitact.files import atomic_write, read_error
 
 if TYPE_CHECKING:
-    from fitact.scene.scene import Scene  # which brings JAX along
+    from fitact.scene.scene import Scene  # would import JAX
 
 
 def read(
@@ -30,14 +30,14 @@ def read(
 ) -> Record:
     """Read a record: a CSV file with the columns time_s, V_V, Vsc_V and I_A, or a file of an oscilloscope.
 
-    `channels` says which of a file's own names is which, {"Vsc": "CH2"}; names V, Vsc and I need no word. Where each
-    channel has a file of its own, {"Vsc": "CH2", "V": "C1.trc:CH1"} fetches V from beside this one. `scale` multiplies,
-    {"Vsc": 10} for a 10x probe that the oscilloscope did not know of. Units in the header are heeded; what had to be
-    assumed is in the record's notes. With a `scene`, the channels that it measures must be there; V
-    may be absent only where a scene gives the drive. The layouts are listed in docs/input.md.
+    `channels` assigns the names in the file, e.g. {"Vsc": "CH2"}; it is not needed for the names V, Vsc and I. If each
+    channel has its own file, {"Vsc": "CH2", "V": "C1.trc:CH1"} reads V from another file in the same folder. `scale`
+    multiplies a channel, e.g. {"Vsc": 10} for a 10x probe that was not set on the oscilloscope. Units in the header are
+    applied, and assumptions are listed in the record's notes. With a `scene`, its measured channels are required, and V
+    may be absent if the scene states the drive. docs/input.md lists the layouts.
 
     Raises:
-        InputError: the file cannot be read, or holds what cannot be used; names the line and the remedy.
+        InputError: the file cannot be read, or its data are invalid; the message names the line and a remedy.
     """
     source, channels = os.fspath(path), channels or {}
     own = {channel: asked for channel, asked in channels.items() if _locate_file_column(path, asked) is None}
@@ -45,7 +45,7 @@ def read(
     capture = merge_other_files(capture, path, channels)
     record = to_record(capture, channels, scale or {})
     for channel in scene.measurement.channels if scene else ("Vsc",):
-        record[channel]  # refused where missing
+        record[channel]  # raises InputError if missing
     if "V" not in record and (scene is None or scene.drive.waveform == "measured"):
         place = capture.channels[0].location
         raise InputError(
@@ -56,7 +56,7 @@ def read(
 
 
 def read_capture(path: str | os.PathLike[str], pick: Pick = lambda names, place: names) -> Capture:
-    """Return time and channels of a file under its own names, of which `pick` may choose."""
+    """Return time and channels of a file, by the names in the file; `pick` may select some of them."""
     source, path = os.fspath(path), Path(path)
     if path.is_dir():
         raise InputError(f"{source}: is a directory; give the path of a file")
@@ -77,7 +77,7 @@ def read_capture(path: str | os.PathLike[str], pick: Pick = lambda names, place:
 
 
 def merge_other_files(capture: Capture, path: str | os.PathLike[str], channels: Mapping[str, str]) -> Capture:
-    """Return the capture, and the columns of other files that `channels` names as FILE:COLUMN."""
+    """Return the capture with the columns of other files that `channels` names as FILE:COLUMN added."""
     traces = list(capture.channels)
     for asked in channels.values():
         if found := _locate_file_column(path, asked):
@@ -96,14 +96,14 @@ def _read_column(file: Path, column: str) -> Capture:
 
 
 def _locate_file_column(path: str | os.PathLike[str], requested: str) -> tuple[Path, str] | None:
-    """Return the file and the column where a channel is asked for as FILE:COLUMN, the file from here or beside `path`."""
+    """Return file and column of a channel given as FILE:COLUMN, relative to the current folder or to `path`."""
     file, colon, column = requested.rpartition(":")
     found = [place for place in (Path(path).parent / file, Path(file)) if colon and column and place.is_file()]
     return (found[0], column) if found else None
 
 
 def write_csv(path: str | os.PathLike[str], record: Record) -> None:
-    """Write a record as `read` reads it, to 12 digits; times to the last bit, which tells on which side of an edge."""
+    """Write a record for `read`, with 12 digits; times are exact, so that samples stay on their side of an edge."""
     header = ["time_s", *(f"{name}_{CHANNEL_UNITS[name]}" for name in record.channels)]
     with atomic_write(path) as temporary:
         table = np.stack([record.time, *record.channels.values()], axis=1)

@@ -1,4 +1,4 @@
-"""Text files: a header in its maker's words, then rows of numbers, read a block at a time."""
+"""Text files: a header of the manufacturer, followed by rows of numbers, read in blocks."""
 
 import bisect
 import contextlib
@@ -19,13 +19,13 @@ from fitact.errors import InputError
 from fitact.files import read_error
 from fitact.progress import track_progress
 
-_HEAD_BYTES = 32_768  # bytes that hold any header and some rows
-_BLOCK = 8_388_608  # bytes parsed at a time
-_MAX_BYTES = 4_294_967_296  # bytes of text, beyond which it is no record but what a broken gzip unfolds to
+_HEAD_BYTES = 32_768  # bytes; enough for any header and some rows
+_BLOCK = 8_388_608  # bytes parsed in one block
+_MAX_BYTES = 4_294_967_296  # bytes; more text indicates a damaged gzip file
 
 
 def read_text(path: Path, source: str, pick: Pick) -> Capture:
-    """Return the columns of a text file (plain or gzip) that `pick` names, in SI units."""
+    """Return the columns of a text file (plain or gzip) that `pick` selects, in SI units."""
     try:
         with _open_text(path) as (stream, file):
             head = stream.read(_HEAD_BYTES)
@@ -54,7 +54,7 @@ def _is_utf16(head: bytes) -> bool:
 
 @contextlib.contextmanager
 def _open_text(path: Path) -> Iterator[tuple[IO[bytes], IO[bytes]]]:
-    """The bytes of the text, as UTF-8 or a superset of ASCII, with lines that end in a line feed; and the file."""
+    """Open a text file and yield its bytes (UTF-8 or a superset of ASCII, lines ending in a line feed) and the file."""
     with path.open("rb") as file:
         packed = file.read(2) == b"\x1f\x8b"
         file.seek(0)
@@ -69,7 +69,7 @@ def _open_text(path: Path) -> Iterator[tuple[IO[bytes], IO[bytes]]]:
 
 
 def _read_sidecar(path: Path) -> str:
-    """Return the header that Rohde & Schwarz keep in NAME.csv for the numbers in NAME.Wfm.csv, or nothing."""
+    """Return the header in NAME.csv for the numbers in NAME.Wfm.csv (Rohde & Schwarz), or ""."""
     header = path.with_name(path.name[: -len(".wfm.csv")] + path.name[-4:])
     if not (path.name.lower().endswith(".wfm.csv") and header.is_file()):
         return ""
@@ -78,13 +78,13 @@ def _read_sidecar(path: Path) -> str:
 
 
 def _decode(head: bytes, source: str) -> str:
-    """Where it is not UTF-8: Windows' own encoding, in which some makers write µ."""
+    """Decode UTF-8 or else the Windows encoding, in which some manufacturers write µ."""
     if is_binary(head):
-        raise InputError(f"{source}: is not a text file, nor of a known binary kind; export the record as CSV")
+        raise InputError(f"{source}: is neither a text file nor a known binary format; export the record as CSV")
     try:
         return head.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        cut = error.start > len(head) - 4  # in the middle of a character
+        cut = error.start > len(head) - 4  # the head ends within a character
         return head[: error.start].decode("utf-8-sig") if cut else head.decode("cp1252", errors="replace")
 
 
@@ -93,7 +93,9 @@ def _blocks(stream: IO[bytes], source: str) -> Iterator[bytes]:
     while part := stream.read(_BLOCK):
         size += len(part)
         if size > _MAX_BYTES:
-            raise InputError(f"{source}: unfolds to more than {_MAX_BYTES // 2**30} GB of text; cut the record")
+            raise InputError(
+                f"{source}: contains more than {_MAX_BYTES // 2**30} GB of uncompressed text; shorten the record"
+            )
         whole, newline, rest = (rest + part).rpartition(b"\n")
         if newline:
             yield whole
@@ -107,12 +109,12 @@ class _TableParser:
     def __init__(self, header: Header, columns: Sequence[Column], source: str) -> None:
         self._header, self._columns, self._source = header, columns, source
         known = [header.time.place] if header.time else [header.index] if header.index is not None else []
-        self._has_time = bool(known)  # or a count of samples, in the first place
+        self._has_time = bool(known)  # or a count of samples in the first column
         self._column_indices = [*known, *(column.place for column in columns)]
         self._parts: list[np.ndarray] = []  # rows of numbers
-        self._lines: list[Sequence[int]] = []  # the lines of each part's rows
-        self._starts = [0]  # rows before each part
-        self._blank_rows: list[int] = []  # rows with a time and no values
+        self._lines: list[Sequence[int]] = []  # line numbers of the rows of each part
+        self._starts = [0]  # number of rows before each part
+        self._blank_rows: list[int] = []  # rows with a time but no values
         self._next_line = 1
 
     def add(self, block: bytes) -> None:
@@ -135,7 +137,7 @@ class _TableParser:
             self._starts.append(self._starts[-1] + len(numbers))
 
     def _parse_fast(self, block: bytes) -> np.ndarray | None:
-        """Return the rows by numpy's parser; None where a line is not as the others."""
+        """Return the rows, parsed by NumPy, or None if a line has another form."""
         delimiter = self._header.delimiter
         if b"#" in block or not block:
             return None
@@ -157,7 +159,7 @@ class _TableParser:
             return None
 
     def _parse_line_by_line(self, block: bytes, first: int) -> tuple[np.ndarray, list[int]]:
-        """Return the rows line by line, to find the offending cell or to pass over lines that hold nothing."""
+        """Return the rows, parsed line by line to locate an invalid cell or to skip empty lines."""
         rows: list[list[float]] = []
         lines: list[int] = []
         delimiter = self._header.delimiter
@@ -167,8 +169,8 @@ class _TableParser:
             cells = split_cells(text, delimiter)
             if len(cells) != self._header.width:
                 raise InputError(
-                    f"{self._source}, line {line}: {len(cells)} values where the rows have {self._header.width};"
-                    " mend or remove the row"
+                    f"{self._source}, line {line}: {len(cells)} values, but other rows have {self._header.width};"
+                    " correct or remove the row"
                 )
             here = [cells[place] for place in self._column_indices]
             if self._has_time and here[0] and here[1:] and not any(here[1:]):
@@ -184,7 +186,7 @@ class _TableParser:
         value = parse_number(cell, self._header.decimal_comma)
         if value is None:
             what = f"'{cell[:40]}' is not a number" if cell else "the cell is empty"
-            raise InputError(f"{self._source}, line {line}, column {place + 1}: {what}; mend or remove the row")
+            raise InputError(f"{self._source}, line {line}, column {place + 1}: {what}; correct or remove the row")
         return value
 
     def _line_label(self, row: int) -> str:
@@ -192,16 +194,16 @@ class _TableParser:
         return f"line {self._lines[part][row - self._starts[part]]}"
 
     def to_capture(self, unread_columns: Sequence[str]) -> Capture:
-        """Return the columns that were read; `unread_columns` are columns that were not wanted, or hold no numbers."""
+        """Return the columns that were read; `unread_columns` were not selected, or hold no numbers."""
         header, rows, announced = self._header, self._starts[-1], self._header.count_rows()
-        if announced is not None and rows < announced - 2:  # by which some makers' counts are off
+        if announced is not None and rows < announced - 2:  # some manufacturers' counts are off by 2
             raise InputError(
-                f"{self._source}: the header announces {announced:,} rows and {rows:,} are there, so the file"
-                " was cut; export it again"
+                f"{self._source}: the header states {announced:,} rows, but the file has {rows:,}, so it is"
+                " truncated; export it again"
             )
         kept, notes = self._trim_blank_rows(rows)
         columns = [np.concatenate([part[:, i] for part in self._parts])[kept] for i in range(len(self._column_indices))]
-        self._parts.clear()  # `row_label` keeps the parser
+        self._parts.clear()  # `row_label` keeps a reference to the parser
         if self._has_time:
             time, *values = columns
         else:
@@ -222,16 +224,16 @@ class _TableParser:
         )
 
     def _trim_blank_rows(self, rows: int) -> tuple[slice, list[str]]:
-        """All rows but those without values at either end."""
+        """Return the rows without empty rows at either end, and a note on these."""
         blank = set(self._blank_rows)
         first = next((row for row in range(rows) if row not in blank), rows)
         last = next((row for row in reversed(range(rows)) if row not in blank), first - 1)
         inside = [row for row in self._blank_rows if first < row < last]
         if inside or first == rows:
             place = self._line_label(inside[0]) if inside else "all rows"
-            raise InputError(f"{self._source}, {place}: the cells of the channels are empty; mend or remove the row")
+            raise InputError(f"{self._source}, {place}: the cells of the channels are empty; correct or remove the row")
         left = rows - (last + 1 - first)
-        notes = [f"{self._source}: rows without values at the ends were passed over ({left:,})"] if left else []
+        notes = [f"{self._source}: rows without values at the ends were ignored ({left:,})"] if left else []
         return slice(first, last + 1), notes
 
     def _time_in_seconds(self, time: np.ndarray) -> tuple[np.ndarray, list[str], list[str]]:
@@ -243,6 +245,6 @@ class _TableParser:
             return layouts.convert_time(time, header.time.unit, place, "write a multiple of s"), [], warnings
         start, step = header.time_grid
         if step is None:
-            raise InputError(f"{place}: no time, and no step of it; export the time as well")
+            raise InputError(f"{place}: the file has neither times nor a time step; export the time as well")
         notes = [] if start is not None else [f"{self._source}: the time was taken to start at 0"]
         return (start or 0.0) + step * time, notes, []
