@@ -9,10 +9,15 @@ from typing import Any
 
 import typer
 
-from fitact.cli import campaigns, designs, one_finger, records, scenes  # noqa: F401  (their commands)
 from fitact.cli.app import app
 from fitact.cli.terminal import print_stderr
 from fitact.errors import InputError
+
+# `fitact --help` lists the commands in the order of this import
+# isort: off
+from fitact.cli import one_finger, records, scenes, campaigns, designs  # noqa: F401
+
+# isort: on
 
 
 def main() -> None:
@@ -50,6 +55,7 @@ def _run_command(command: Callable[[], Any]) -> int:
         if os.environ.get("FITACT_DEBUG"):
             raise
         print_stderr(
-            f"fitact: internal error ({type(error).__name__}: {error}); please report it, with FITACT_DEBUG=1 set"
+            f"fitact: internal error ({type(error).__name__}: {error}); run the command again with FITACT_DEBUG=1"
+            " and report the traceback"
         )
         return 3

@@ -1,4 +1,4 @@
-"""The program that commands belong to."""
+"""Typer application to which the commands are added."""
 
 import typer
 
@@ -9,16 +9,18 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
     help="""
-Skin and insulator parameters, and the electrostatic force, of an electrovibration display.
+Estimate the circuit of a finger on an electrovibration display, and the electrostatic force, from recorded voltages.
 
-Start with a CSV of your oscilloscope whose header reads `time_s,V_V,Vsc_V` (drive and skin voltage):
+Start with a CSV file whose header reads `time_s,V_V,Vsc_V` (time in s, drive and skin voltage in V). Describe the
+panel, the finger and the drive in a scene file:
 
-    fitact run finger.csv
+    fitact scene > scene.toml
+    fitact run finger.csv --scene scene.toml --out results
 
-It fits the circuit, samples the posterior and writes a report to open in a browser. Say what you know of
-the panel, the finger and the drive in a scene file (TOML) and add `--scene scene.toml`. With any other file of an
-oscilloscope start with `fitact inspect FILE`.
-
-Exit code 0: an answer. 1: an answer that must not be trusted (the files say why). 2: input was refused.
+The first command writes a template to edit. The second fits the circuit, samples the posterior and writes
+`results/report.html`, to be opened in a browser. Without a scene, fitact assumes the device of the reference paper.
+For any other oscilloscope file, start with `fitact inspect FILE`.
 """,
+    epilog="Exit status: 0, success; 1, results written but unreliable (see `warnings` in the "
+    "results); 2, invalid input; 3, internal error; 130, interrupted.",
 )

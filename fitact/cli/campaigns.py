@@ -1,4 +1,4 @@
-"""The command on many records."""
+"""Command that fits many records: campaign."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,32 +15,33 @@ from fitact.cli.terminal import command_line, show
 
 @app.command()
 def campaign(
-    records: Annotated[list[Path], typer.Argument(metavar="RECORD...", help="One of each finger or condition.")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results; the same one goes on.")],
+    records: Annotated[list[Path], typer.Argument(metavar="RECORD...", help="Records, each fitted independently.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results, also to resume.")],
     scene: CommonScene = None,
     channel: Channels = None,
     scale: Scales = None,
     scheduler: Annotated[
         str | None,
-        typer.Option("--scheduler", metavar="ADDRESS", help="Of a Dask scheduler, as tcp://host:8786."),
+        typer.Option("--scheduler", metavar="ADDRESS", help="Address of a Dask scheduler, e.g. tcp://host:8786."),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option("--workers", min=1, help="Workers of this machine; absent: one for each core.")
+        int | None, typer.Option("--workers", min=1, help="Number of local workers.", show_default="one per core")
     ] = None,
-    memory: Annotated[str, typer.Option("--memory", help="What each of these may take.")] = "2 GiB",
+    memory: Annotated[str, typer.Option("--memory", help="Memory limit of each local worker.")] = "2 GiB",
     posteriors: Annotated[
-        bool, typer.Option("--posteriors", help="Sample the posterior of each, alike records together.")
+        bool,
+        typer.Option("--posteriors", help="Sample every posterior; similar records are sampled together."),
     ] = False,
     reports: Annotated[
-        bool, typer.Option("--reports", help="Sample the posterior of each by itself, and write its report.")
+        bool, typer.Option("--reports", help="Sample every posterior separately, and write a report for each record.")
     ] = False,
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
-    """Fit many records, each by itself, on this machine's cores or any Dask cluster; nothing is lost or done twice.
+    """Fit many records independently, on the cores of this machine or on a Dask cluster.
 
-    Into DIR it writes results.parquet, failures.csv and index.html. The same command goes on after any interruption.
-    Exit code 0: every record has an answer or a reason why not.
+    Writes results.parquet, failures.csv and index.html into DIR. After an interruption, run the same command again:
+    finished records are kept. Exit status 0 means that every record has a result or a reason for its failure.
     """
     stated = load_scene(scene)
     internal.use_compilation_cache()

@@ -1,4 +1,4 @@
-"""Functions that commands call but are not public, imported when first used, so that `fitact --help` is quick."""
+"""Private functions that commands call; lazy imports keep `fitact --help` fast."""
 
 import lazy_loader
 

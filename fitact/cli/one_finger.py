@@ -1,4 +1,4 @@
-"""Commands on one finger: fit, sample, report."""
+"""Commands that analyse one finger: run, fit, sample, summary, report."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -23,7 +23,7 @@ def run(
     scene: options.SceneFiles = None,
     channel: options.Channels = None,
     scale: options.Scales = None,
-    out: options.Out = None,
+    out: options.RecordOut = None,
     level: options.Level = "emcee",
     model: options.Model = "planned",
     seed: options.Seed = 0,
@@ -31,9 +31,10 @@ def run(
     fresh: options.Fresh = False,
     json: options.Json = False,
 ) -> None:
-    """Fit, sample and report: everything, into one folder.
+    """Fit records, sample the posterior and write a report, all into one folder.
 
-    Writes fit.json, summary.json, posterior.nc (opens with ArviZ), chain.h5 (for going on) and report.html.
+    Writes fit.json, summary.json, posterior.nc (for ArviZ), chain.h5 (to resume sampling) and report.html into DIR.
+    Several records are fitted jointly.
     """
     folder = out or Path(f"{records[0].name.removesuffix('.gz').removesuffix('.csv')}-fitact")
     planned = _fit_records(records, scene, (channel, scale), model, tolerance)
@@ -41,14 +42,14 @@ def run(
     chain = folder / "chain.h5"
     if fresh:
         chain.unlink(missing_ok=True)
-    # which refuses a chain that belongs elsewhere, before anything is written
+    # sampling comes before any file is written because it refuses a chain that belongs to another fit
     posterior = fitact.sample(planned.fit, level=level, seed=seed, chain_file=chain)
     write_json(folder / "fit.json", planned.fit.to_dict() | {"plan": planned.to_dict()})
     posterior.to_netcdf(folder / "posterior.nc")
     content = posterior.summary() | {"plan": planned.to_dict(), "command": command_line()}
     write_json(folder / "summary.json", content)
     if context.command.name == "sample":
-        end = f"wrote {folder}; for a report: fitact report {folder}"
+        end = f"wrote {folder}; to write the report, run: fitact report {folder}"
     else:
         print_stderr("writing the report")
         reporting.write_report(folder / "report.html", posterior.to_datatree(), content)
@@ -66,7 +67,12 @@ def fit(
     model: options.Model = "planned",
     tolerance: options.Tolerance = 1e-3,
     starts: Annotated[
-        int, typer.Option("--starts", min=1, help="Starts: the record's own, and draws of the prior.")
+        int,
+        typer.Option(
+            "--starts",
+            min=1,
+            help="Number of starting points: one estimated from the data, the others drawn from the prior.",
+        ),
     ] = 1,
     intervals: Annotated[
         bool,
@@ -74,7 +80,10 @@ def fit(
     ] = False,
     json: options.Json = False,
 ) -> None:
-    """Least squares only: parameters with errors, and the verdict, in seconds; of an impedance spectrum, too."""
+    """Fit records, or an impedance spectrum, by least squares; print parameters, standard errors and identifiability.
+
+    With --out, writes fit.json into DIR. Several records are fitted jointly.
+    """
     fitted: fitact.SpectrumFit | fitact.Fit
     if len(records) == 1 and internal.is_spectrum(records[0]):
         stated, spectrum = options.load_scene(scene[0] if scene else None), fitact.read_spectrum(records[0])
@@ -97,19 +106,19 @@ def fit(
     show(text, content, json, fitted.trusted)
 
 
-app.command("sample", help="Fit, then sample the posterior until it has converged; as `run`, without the report.")(run)
+app.command("sample", help="Fit records and sample the posterior: the same as `run`, without the report.")(run)
 
 
 @app.command()
 def summary(directory: options.Results, json: options.Json = False) -> None:
-    """Print the table of a folder of results again."""
+    """Print the table of results that `run` or `sample` wrote into DIR."""
     content = internal.summary.load(directory)
     show(internal.summary.table(content), content, json, internal.summary.is_trusted(content))
 
 
 @app.command()
 def report(directory: options.Results, json: options.Json = False) -> None:
-    """Write the report of a folder of results again; of a population's, too."""
+    """Write report.html from the results that `run`, `sample` or `population` wrote into DIR."""
     page = directory / "report.html"
     if (directory / "population.json").exists():
         tree, content = reporting.read_population(directory)
@@ -134,9 +143,9 @@ def _fit_records(
     for scene in stated:
         scene.require_available(fit=model == "full")
     paired = stated if len(stated) == len(records) else [stated[0] if stated else None] * len(records)
-    known = options.column_options(columns)
-    # refused before the slow imports
-    measured = [fitact.read(path, scene, **known) for path, scene in zip(records, paired, strict=True)]
+    column_kwargs = options.column_options(columns)
+    # invalid files are refused before the slow imports
+    measured = [fitact.read(path, scene, **column_kwargs) for path, scene in zip(records, paired, strict=True)]
     internal.use_compilation_cache()
     for path, record in zip(records, measured, strict=True):
         print_stderr(f"fitting {path} ({len(record):,} samples)")

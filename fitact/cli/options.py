@@ -1,4 +1,4 @@
-"""Arguments and options that several commands have, and how they are read."""
+"""Arguments and options that several commands share, and the functions that parse them."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,63 +13,80 @@ RecordFiles = Annotated[
     list[Path],
     typer.Argument(
         metavar="RECORD...",
-        help="CSV with time_s, V_V, Vsc_V, I_A, or an oscilloscope's file with --channel. Several: fitted jointly.",
+        help="CSV with columns time_s, V_V, Vsc_V, I_A, or an oscilloscope file (assign its columns with --channel).",
     ),
 ]
-SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene (TOML).")]
+_PAPER = "nominal device of the reference paper"
+SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (TOML), or the name of a shipped scene.")]
 CommonScene = Annotated[
-    Path | None, typer.Option("--scene", metavar="FILE", help="Scene (TOML) of all; absent: the paper's device.")
+    Path | None,
+    typer.Option("--scene", metavar="FILE", help="Scene file (TOML).", show_default=_PAPER),
 ]
 Channels = Annotated[
     list[str] | None,
     typer.Option(
         "--channel",
         metavar="NAME=COLUMN",
-        help="Which of the file's channels V, Vsc or I is: Vsc=CH2, V=OTHERFILE:CH1.",
+        help="Column that holds V, Vsc or I, e.g. Vsc=CH2; in a second file, V=OTHERFILE:CH1. May be repeated.",
     ),
 ]
 Scales = Annotated[
     list[str] | None,
-    typer.Option("--scale", metavar="NAME=FACTOR", help="What to multiply V, Vsc or I by, as for a probe: Vsc=10."),
+    typer.Option(
+        "--scale", metavar="NAME=FACTOR", help="Factor for V, Vsc or I, e.g. Vsc=10 for a 10x probe. May be repeated."
+    ),
 ]
 SceneFiles = Annotated[
     list[Path] | None,
     typer.Option(
-        "--scene", metavar="FILE", help="Scene (TOML); absent: the paper's device. Once for all records, or once each."
+        "--scene",
+        metavar="FILE",
+        help="Scene file (TOML). Give one for all records, or one for each.",
+        show_default=_PAPER,
     ),
 ]
-Out = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for the results.")]
-Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Same seed, same draws.")]
-Json = Annotated[
-    bool, typer.Option("--json", help="Print the result as JSON on standard output, and nothing else there.")
+Out = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="Folder for the results.", show_default="write no files")
 ]
+RecordOut = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="Folder for the results.", show_default="RECORD-fitact")
+]
+Seed = Annotated[
+    int,
+    typer.Option("--seed", min=0, max=2**63 - 1, help="Random seed; equal seeds give equal draws."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print only the result, as JSON, on standard output.")]
 Tolerance = Annotated[
     float,
     typer.Option(
-        "--tolerance", min=0.0, help="Error that compressing the record may cause in its log-likelihood; 0: none."
+        "--tolerance",
+        min=0.0,
+        help="Largest error of the log-likelihood that compressing the record may cause; 0 turns compression off.",
     ),
 ]
 Level = Annotated[
     Literal["emcee", "psis", "laplace"],
     typer.Option(
         "--level",
-        help="How uncertainty is found: sampled until converged; by importance weights (certified or refused); or by"
-        " the fit's normal approximation (fast; says what it is off by).",
+        help="Posterior method: emcee (MCMC run to convergence), psis (Pareto-smoothed importance sampling) or laplace"
+        " (Gaussian approximation; fastest). Each reports its own diagnostics.",
     ),
 ]
 Model = Annotated[
     Literal["planned", "full"],
     typer.Option(
-        "--model", help="What the scene's tolerance requires (see `plan`), or everything that the scene names."
+        "--model",
+        help="planned: drop the elements whose effect on the force is below the tolerance of the scene (see `fitact"
+        " plan`); full: keep every element of the scene.",
     ),
 ]
 Columns = tuple[list[str] | None, list[str] | None]  # --channel and --scale as given
-Results = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `run` or `sample` wrote.")]
-Fresh = Annotated[bool, typer.Option("--fresh", help="Start the chain anew instead of going on from one in DIR.")]
+Results = Annotated[Path, typer.Argument(metavar="DIR", help="Folder with the results.")]
+Fresh = Annotated[bool, typer.Option("--fresh", help="Start a new chain instead of resuming the one in DIR.")]
 
 
 class LazyRecords(Sequence["fitact.Record"]):
-    """Records of one scene, each read when it is asked for, with what --channel and --scale say of their columns."""
+    """Records of one scene, each read on access, with the columns that --channel and --scale assign."""
 
     def __init__(self, paths: Sequence[Path] | None, scene: "fitact.Scene | None", columns: Columns) -> None:
         self._paths, self._scene, self._columns = paths or (), scene, column_options(columns)
@@ -82,30 +99,31 @@ class LazyRecords(Sequence["fitact.Record"]):
 
 
 def load_scene(path: Path | str | None) -> "fitact.Scene | None":
-    """The scene that is stated; None: none."""
+    """Load the scene of --scene; return None if the option is absent."""
     return None if path is None else fitact.Scene.load(path)
 
 
 def column_options(columns: Columns) -> dict[str, Any]:
-    """The values of --channel and --scale, as `fitact.read` takes them."""
+    """Return the values of --channel and --scale as keyword arguments of `fitact.read`."""
     channels, scale = columns
     return {"channels": parse_pairs("--channel Vsc=CH2", channels), "scale": parse_numbers("--scale Vsc=10", scale)}
 
 
 def parse_numbers(example: str, texts: list[str] | None) -> dict[str, float]:
-    """Pairs of a name and a number, as the option's `example` has them."""
+    """Parse NAME=NUMBER texts; an error message quotes `example`, which begins with the option."""
     given = parse_pairs(example, texts)
     try:
         return {name: float(value) for name, value in given.items()}
     except ValueError as error:
-        raise InputError(f"{example.split()[0]}: {error}; write a number, as {example}") from error
+        raise InputError(f"{example.split()[0]}: {error}; write a number, e.g. {example}") from error
 
 
 def parse_pairs(example: str, texts: list[str] | None) -> dict[str, str]:
-    """Pairs of a name and a value, as the option's `example` has them."""
-    found = {}
-    for name, _, value in (text.partition("=") for text in texts or []):
+    """Parse NAME=VALUE texts; an error message quotes `example`, which begins with the option."""
+    pairs = {}
+    for text in texts or []:
+        name, _, value = text.partition("=")
         if not name or not value:
-            raise InputError(f"'{name}{value}' after {example.split()[0]} lacks a side; write {example}")
-        found[name.strip()] = value.strip()
-    return found
+            raise InputError(f"{example.split()[0]} {text}: write NAME=VALUE, e.g. {example}")
+        pairs[name.strip()] = value.strip()
+    return pairs

@@ -1,4 +1,4 @@
-"""Commands on records: what they hold, which model they prefer, what people they come from, what accuracy costs."""
+"""Commands on records: inspect, compare, population, tradeoff."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,13 +15,13 @@ from fitact.files import write_json
 
 @app.command()
 def inspect(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A record, or any file of an oscilloscope.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Record, impedance spectrum or oscilloscope file.")],
     channel: options.Channels = None,
     scale: options.Scales = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Drawing to write: .svg or .png.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Plot to write (.svg or .png).")] = None,
     json: options.Json = False,
 ) -> None:
-    """Look at a file before fitting it: channels, rate, units, noise, clipping, frequency, and what is doubtful."""
+    """Show the channels, units, sampling rate, noise, clipping and frequency of a file, and list possible problems."""
     if internal.is_spectrum(file):
         spectrum = fitact.read_spectrum(file)
         show(str(spectrum), spectrum.to_dict(), json)
@@ -36,15 +36,16 @@ def inspect(
 def compare(
     records: options.RecordFiles,
     scenes: Annotated[
-        list[Path], typer.Option("--scene", metavar="FILE", help="Scene (TOML) of one model; give two or more.")
+        list[Path],
+        typer.Option("--scene", metavar="FILE", help="Scene file (TOML) of one model; give two or more."),
     ],
     channel: options.Channels = None,
     scale: options.Scales = None,
     json: options.Json = False,
 ) -> None:
-    """Fit the model of each scene to the same records, in full, and say which the data prefer."""
-    alike = len({path.stem for path in scenes}) < len(scenes)
-    models = {str(path) if alike else path.stem: fitact.Scene.load(path) for path in scenes}
+    """Fit the full model of each scene to the same records, and report which model predicts the data best."""
+    same_stems = len({path.stem for path in scenes}) < len(scenes)
+    models = {str(path) if same_stems else path.stem: fitact.Scene.load(path) for path in scenes}
     for model in models.values():
         model.require_available(fit=True)
     measured = list(options.LazyRecords(records, next(iter(models.values())), (channel, scale)))
@@ -55,62 +56,64 @@ def compare(
 
 @app.command()
 def population(
-    records: Annotated[list[Path], typer.Argument(metavar="RECORD...", help="One of each finger, on one panel.")],
+    records: Annotated[list[Path], typer.Argument(metavar="RECORD...", help="Records on one panel, one per finger.")],
     scene: options.CommonScene = None,
     channel: options.Channels = None,
     scale: options.Scales = None,
     covariates: Annotated[
         Path | None,
-        typer.Option("--covariates", metavar="FILE", help="CSV: a column 'record', and one for each covariate."),
+        typer.Option("--covariates", metavar="FILE", help="CSV with a column 'record' and a column per covariate."),
     ] = None,
     at: Annotated[
-        list[str] | None, typer.Option("--at", metavar="NAME=VALUE", help="A covariate of the next finger.")
+        list[str] | None,
+        typer.Option(
+            "--at", metavar="NAME=VALUE", help="Covariate of the predicted finger.", show_default="mean of the fingers"
+        ),
     ] = None,
     out: options.Out = None,
     seed: options.Seed = 0,
     fresh: options.Fresh = False,
     json: options.Json = False,
 ) -> None:
-    """From one finger to people: how fingers differ, what force the next one will feel, and why.
+    """Estimate how fingers vary from records of several fingers, and predict the force on a new finger.
 
-    Into DIR it writes report.html, population.json, population.nc (the draws), population.svg, and chain.h5 (for
-    going on).
+    With --out, writes report.html, population.json, population.nc (the draws), population.svg and chain.h5 (to resume
+    sampling) into DIR.
     """
     stated = options.load_scene(scene)
-    known = {} if covariates is None else internal.read_covariates(covariates, records)
+    covariate_values = {} if covariates is None else internal.read_covariates(covariates, records)
     internal.use_compilation_cache()
     if fresh and out is not None:
         internal.delete_chains(out)
-    people = fitact.population(
-        options.LazyRecords(records, stated, (channel, scale)), stated, covariates=known,
+    fitted = fitact.population(
+        options.LazyRecords(records, stated, (channel, scale)), stated, covariates=covariate_values,
         at=options.parse_numbers("--at moisture=0.4", at), folder=out, seed=seed,
     )  # fmt: skip
-    content = people.to_dict()
+    content = fitted.to_dict()
     if out is not None:
-        tree = people.to_datatree()
+        tree = fitted.to_datatree()
         write_json(out / "population.json", content)
-        people.to_netcdf(out / "population.nc")
+        fitted.to_netcdf(out / "population.nc")
         report.write_population(out / "population.svg", tree, content)
         report.write_population_page(out / "report.html", tree, content)
-    show(str(people), content, json, people.trusted)
+    show(str(fitted), content, json, fitted.trusted)
 
 
 @app.command()
 def tradeoff(
     record: Annotated[
-        Path | None, typer.Argument(metavar="[RECORD]", help="CSV with V and Vsc; absent: simulated from the scene.")
+        Path | None,
+        typer.Argument(metavar="[RECORD]", help="Record with V and Vsc.", show_default="simulated"),
     ] = None,
-    scene: Annotated[
-        Path | None, typer.Option("--scene", metavar="FILE", help="Scene (TOML); absent: the paper's device.")
-    ] = None,
+    scene: options.CommonScene = None,
     channel: options.Channels = None,
     scale: options.Scales = None,
     out: options.Out = None,
     json: options.Json = False,
 ) -> None:
-    """Measure what each level of response, likelihood and uncertainty costs and is off by, on this machine.
+    """Benchmark the error and run time of each response, likelihood and posterior method on this machine.
 
-    Takes a minute or two. With --out writes report.html, tradeoff.json and tradeoff.svg.
+    Takes one or two minutes. With --out, writes report.html, tradeoff.json and tradeoff.svg into DIR.
     """
     stated = options.load_scene(scene)
     measured = None if record is None else fitact.read(record, stated, **options.column_options((channel, scale)))

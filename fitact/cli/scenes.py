@@ -1,4 +1,4 @@
-"""Commands on a scene: what it says, what it believes, what it requires, and records of it."""
+"""Commands on a scene: scene, prior, plan, simulate, reproduce."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,10 +15,15 @@ from fitact.cli.terminal import command_line, show
 
 @app.command()
 def scene(
-    file: Annotated[str, typer.Argument(metavar="[SCENE]", help="Scene (TOML), or the name of a shipped one.")] = "",
+    file: Annotated[
+        str,
+        typer.Argument(
+            metavar="[SCENE]", help="Scene file (TOML), or the name of a shipped scene.", show_default="a template"
+        ),
+    ] = "",
     json: Json = False,
 ) -> None:
-    """Print a scene with every key, its unit and, as comments, the defaults; without one: a template to fill in."""
+    """Print a scene with all keys and units; keys at their defaults are commented out."""
     stated = fitact.Scene.load(file) if file else fitact.Scene()
     show(str(stated).rstrip(), stated.model_dump(mode="json"), json)
 
@@ -27,13 +32,13 @@ def scene(
 def prior(
     scene: SceneFile,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="Figure to write: .html, .svg or .png.")
+        Path | None, typer.Option("--out", metavar="FILE", help="Figure to write (.html, .svg or .png).")
     ] = None,
-    draws: Annotated[int, typer.Option("--draws", min=100, max=100_000, help="Fingers to draw.")] = 2000,
+    draws: Annotated[int, typer.Option("--draws", min=100, max=100_000, help="Number of fingers to draw.")] = 2000,
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
-    """What a scene's prior means for Vsc and force, before any data."""
+    """Predict Vsc and the force from the prior of a scene alone, before any data."""
     stated = fitact.Scene.load(scene)
     internal.use_compilation_cache()
     predicted = internal.prior_predictive(stated, draws, seed)
@@ -47,16 +52,17 @@ def plan(
     scene: SceneFile,
     record: Annotated[
         Path | None,
-        typer.Option("--record", metavar="RECORD", help="Plan for this record: for its V where that drives the fit."),
+        typer.Option("--record", metavar="RECORD", help="Record to fit; its V is used if it drives the fit."),
     ] = None,
     channel: Channels = None,
     scale: Scales = None,
     out: Out = None,
     json: Json = False,
 ) -> None:
-    """What a scene requires of its model: what may be left out, what that changes, and what it saves.
+    """Find the simplest model that meets the force tolerance of a scene.
 
-    Into DIR it writes report.html, plan.json and plan.svg.
+    Lists the error and the speed-up of each simplification. With --out, writes report.html, plan.json and plan.svg into
+    DIR.
     """
     stated = fitact.Scene.load(scene)
     measured = None if record is None else fitact.read(record, stated, **column_options((channel, scale)))
@@ -70,11 +76,11 @@ def plan(
 @app.command()
 def simulate(
     scene: SceneFile,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="CSV to write.")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="CSV file to write.")],
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
-    """Simulate a record of a scene: V and what it measures (Vsc, I), with noise, as CSV."""
+    """Simulate a record of a scene, with noise, and write V and the measured channels to a CSV file."""
     stated = fitact.Scene.load(scene)
     record = internal.simulate(stated, seed)
     internal.write_csv(out, record)
@@ -84,13 +90,16 @@ def simulate(
 
 
 @app.command()
-def reproduce(out: Out = Path("reproduction"), json: Json = False) -> None:
-    """Every equation, figure and number of the paper, computed and judged.
+def reproduce(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")] = Path("reproduction"),
+    json: Json = False,
+) -> None:
+    """Compute the equations, figures and numbers of the reference paper, and compare each with the printed value.
 
-    Into DIR it writes reproduction.json and reproduction.html.
+    Writes reproduction.json and reproduction.html into DIR.
     """
     internal.use_compilation_cache()
     claims = internal.reproduce()
-    page = report.write_reproduction(out or Path(), claims)
+    page = report.write_reproduction(out, claims)
     lines = [f"{claim.verdict:8} {claim.id:24} {claim.claim}" for claim in claims]
     show("\n".join([*lines, f"open {page}"]), {"claims": [claim.to_dict() for claim in claims]}, json)

@@ -1,4 +1,4 @@
-"""How every command gives its answer."""
+"""Output that all commands share: results on standard output, messages on standard error."""
 
 import shlex
 import sys
@@ -10,16 +10,16 @@ from fitact.files import to_json
 
 
 def command_line() -> str:
-    """The command as it was typed."""
+    """Return the command line as the user typed it."""
     return shlex.join(["fitact", *sys.argv[1:]])
 
 
 def show(text: str, content: dict[str, Any], as_json: bool, trusted: bool = True) -> None:
-    """Print an answer as text or JSON; one that is not to be trusted ends the command with exit code 1."""
+    """Print a result as text or JSON; an unreliable result ends the command with exit status 1."""
     sys.stdout.write(to_json(content) if as_json else text + "\n")
     sys.stdout.flush()
     if not trusted:
-        print_stderr("fitact: this answer must not be trusted; see the warnings")
+        print_stderr("fitact: the results are unreliable; see the warnings")
         raise typer.Exit(1)
 
 

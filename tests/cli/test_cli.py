@@ -171,7 +171,7 @@ def test_misfit_is_exit_code_1_with_an_answer(fitact_command, finger_path, tmp_p
     assert done.returncode == 1
     assert json.loads(done.stdout)["fit"]["misfit"] is True
     assert json.loads((tmp_path / "saturating" / "fit.json").read_text())["fit"]["result"] == "misfit"
-    assert "must not be trusted" in done.stderr
+    assert "the results are unreliable" in done.stderr
 
 
 @pytest.mark.thorough
@@ -352,7 +352,7 @@ def test_help_is_a_page_to_start_from(fitact_process):
         "sample",
         "simulate",
         "report",
-        "Exit code",
+        "Exit status",
     ):
         assert word in done.stdout
     assert fitact_process().stdout.split() == done.stdout.split()

@@ -89,8 +89,8 @@ def test_a_long_and_clipped_record_is_drawn(tmp_path: Path):
     ("options", "words"),
     [
         ((), "not guessed (found: 1, 2)"),
-        (("--channel", "Vsc"), "write --channel Vsc=CH2"),
-        (("--channel", "Vsc=2", "--scale", "Vsc=ten"), "write a number, as --scale Vsc=10"),
+        (("--channel", "Vsc"), "write NAME=VALUE, e.g. --channel Vsc=CH2"),
+        (("--channel", "Vsc=2", "--scale", "Vsc=ten"), "write a number, e.g. --scale Vsc=10"),
     ],
 )
 def test_it_must_be_said_which_is_which(command, options: tuple[str, ...], words: str):
