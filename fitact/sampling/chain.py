@@ -1,4 +1,4 @@
-"""The chain on disk: what sampling needs to go on, in the layout of emcee's HDF5 backend."""
+"""Chain on disk, from which sampling resumes, in the layout of emcee's HDF5 backend."""
 
 import dataclasses
 from pathlib import Path
@@ -17,17 +17,17 @@ from fitact.files import atomic_write
 class Chain:
     """All steps of several ensembles."""
 
-    names: tuple[str, ...]  # of the coordinates
-    fingerprint: str  # what the chain belongs to
-    points: Float[np.ndarray, "ensembles steps walkers n"]  # every step of every walker
-    log_prob: Float[np.ndarray, "ensembles steps walkers"]  # of the points
-    accepted: Int[np.ndarray, "ensembles walkers"]  # moves accepted, per walker
-    states: tuple[emcee.State, ...]  # where each ensemble stands, its random numbers included
-    seconds: float = 0.0  # that sampling has taken
+    names: tuple[str, ...]  # names of the coordinates
+    fingerprint: str  # hash of the inputs that the chain belongs to
+    points: Float[np.ndarray, "ensembles steps walkers n"]  # positions of every walker at every step
+    log_prob: Float[np.ndarray, "ensembles steps walkers"]  # log-probabilities of the points
+    accepted: Int[np.ndarray, "ensembles walkers"]  # number of accepted moves of each walker
+    states: tuple[emcee.State, ...]  # last state of each ensemble, including its random number generator
+    seconds: float = 0.0  # run time of the sampling so far
 
     @classmethod
     def empty(cls, names: tuple[str, ...], fingerprint: str, states: list[emcee.State]) -> Self:
-        """No step taken yet."""
+        """Return a chain without steps."""
         walkers, size = states[0].coords.shape
         points = np.empty((len(states), 0, walkers, size))
         accepted = np.zeros((len(states), walkers), dtype=int)
@@ -35,17 +35,17 @@ class Chain:
 
     @property
     def steps(self) -> int:
-        """Steps taken by each ensemble."""
+        """Number of steps of each ensemble."""
         return self.points.shape[1]
 
     def thinning_slice(self, burn: int, n_points: int) -> slice:
-        """Steps after the burn-in, evenly apart up to the last, at which an ensemble has some `n_points` points."""
-        kept = self.steps - burn
-        apart = max(1, -(-kept * self.points.shape[2] // n_points))
-        return slice(burn + (kept - 1) % apart, None, apart)
+        """Return equally spaced steps from the burn-in to the last, with about `n_points` points per ensemble."""
+        n_steps = self.steps - burn
+        spacing = max(1, -(-n_steps * self.points.shape[2] // n_points))
+        return slice(burn + (n_steps - 1) % spacing, None, spacing)
 
     def extend(self, new_steps: list[tuple[np.ndarray, np.ndarray, emcee.State, np.ndarray]]) -> None:
-        """Add steps of every ensemble: points, log-probabilities, last state, moves accepted."""
+        """Append the points, log-probabilities, last state and accepted moves of every ensemble."""
         points, log_prob, states, accepted = zip(*new_steps, strict=True)
         self.points = _append_steps(self.points, np.stack(points))
         self.log_prob = _append_steps(self.log_prob, np.stack(log_prob))
@@ -53,7 +53,7 @@ class Chain:
         self.states = states
 
     def save(self, path: Path) -> None:
-        """Write the chain; `emcee.backends.HDFBackend(path, name="ensemble_0")` opens an ensemble."""
+        """Write the chain; `emcee.backends.HDFBackend(path, name="ensemble_0")` opens its first ensemble."""
         with atomic_write(path) as temporary, h5py.File(temporary, "w") as file:
             file.attrs["fingerprint"] = self.fingerprint
             file.attrs["names"] = list(self.names)
@@ -76,7 +76,11 @@ class Chain:
 
     @classmethod
     def load(cls, path: Path, fingerprint: str) -> Self:
-        """Read a chain that belongs to `fingerprint`; any other is refused."""
+        """Read the chain of `fingerprint`.
+
+        Raises:
+            InputError: the chain belongs to other inputs, or the file is not a chain.
+        """
         try:
             with h5py.File(path, "r") as file:
                 if file.attrs["fingerprint"] != fingerprint:
@@ -99,14 +103,14 @@ class Chain:
                     float(file.attrs["seconds"]),
                 )
         except (OSError, KeyError) as error:
-            raise InputError(f"{path}: is not a chain of fitact ({error}); remove the file") from error
+            raise InputError(f"{path}: not a chain written by fitact ({error}); remove the file") from error
 
 
 def _append_steps(steps: Float[np.ndarray, "ensembles steps ..."], new_steps: np.ndarray) -> np.ndarray:
-    """Both, along the steps; a view into room kept for steps to come, so that few calls copy the chain."""
-    count, room = steps.shape[1] + new_steps.shape[1], steps.base
-    if room is None or room.shape[0] != steps.shape[0] or room.shape[1] < count:
-        room = np.empty((steps.shape[0], 2 * count, *steps.shape[2:]))
-        room[:, : steps.shape[1]] = steps
-    room[:, steps.shape[1] : count] = new_steps
-    return room[:, :count]
+    """Concatenate along the steps; the result is a view of a larger buffer, so that few calls copy the chain."""
+    count, buffer = steps.shape[1] + new_steps.shape[1], steps.base
+    if buffer is None or buffer.shape[0] != steps.shape[0] or buffer.shape[1] < count:
+        buffer = np.empty((steps.shape[0], 2 * count, *steps.shape[2:]))
+        buffer[:, : steps.shape[1]] = steps
+    buffer[:, steps.shape[1] : count] = new_steps
+    return buffer[:, :count]

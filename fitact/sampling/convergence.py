@@ -1,7 +1,7 @@
-"""How far draws can be trusted: autocorrelation, agreement of ensembles, stuck walkers, importance weights.
+"""Convergence diagnostics: autocorrelation time, split-R-hat, stuck walkers and importance weights.
 
-Autocorrelation time and R-hat are those of emcee and ArviZ, written out for all walkers at once: the look at a chain
-of 1,500 steps takes 2.6 and 1.4 times as long by theirs, and R-hat in a batch of short chains up to 3 times.
+Autocorrelation time and R-hat follow emcee and ArviZ, but treat all walkers at once. For a chain of 1,500 steps the
+functions of emcee and ArviZ take 2.6 and 1.4 times as long, and R-hat of a batch of short chains up to 3 times.
 """
 
 import dataclasses
@@ -18,15 +18,15 @@ from fitact.units import format_percent
 
 @dataclasses.dataclass(frozen=True)
 class Criteria:
-    """When draws count as converged; see `fitact.sample`."""
+    """Criteria of convergence; see `fitact.sample`."""
 
-    autocorrelation_times: float = 50.0  # that each ensemble is long, at least
-    rhat: float = 1.01  # what split-R-hat stays below
-    stuck_steps: int = 100  # in one place; above this and the next a walker is stuck
+    autocorrelation_times: float = 50.0  # minimum length of each ensemble, in autocorrelation times
+    rhat: float = 1.01  # upper bound of split-R-hat
+    stuck_steps: int = 100  # a walker is stuck if it stays in one place for more steps than this and the next bound
     stuck_autocorrelation_times: float = 10.0
-    k_hat: float = 0.7  # above it importance weights have no mean worth the name (Vehtari et al. 2024)
-    laplace_error: float = 0.1  # standard deviations that a Laplace approximation may be off by, in mean or sd
-    forbidden: float = 0.01  # share of its draws that the prior may forbid
+    k_hat: float = 0.7  # above it, means over importance weights are unreliable (Vehtari et al. 2024)
+    laplace_error: float = 0.1  # largest error of a Laplace approximation: of the mean in sd, of the sd relative
+    forbidden: float = 0.01  # largest fraction of its draws outside the prior
 
 
 CRITERIA = Criteria()
@@ -34,67 +34,67 @@ CRITERIA = Criteria()
 
 @dataclasses.dataclass(frozen=True)
 class Convergence:
-    """How far the draws of a level of uncertainty can be trusted; see `fitact.sample`."""
+    """Diagnostics of the draws of one posterior method; see `fitact.sample`."""
 
     level: str = "emcee"  # "emcee", "psis" or "laplace"
-    converged: bool = False  # whether its own certificate holds
-    seconds: float = 0.0  # that sampling took, resumed parts included
-    ess_min: float = 0.0  # effective number of draws, for the mean of every coordinate, of g, b and the mean force
+    converged: bool = False  # whether the criteria of the method are met
+    seconds: float = 0.0  # run time of the sampling, including resumed parts
+    ess_min: float = 0.0  # smallest effective number of draws, over all coordinates, g, b and the mean force
     ess: dict[str, float] = dataclasses.field(default_factory=dict)
-    tau_max: float = float("nan")  # autocorrelation times of the same, in steps
+    tau_max: float = float("nan")  # largest autocorrelation time of the same quantities, in steps
     tau: dict[str, float] = dataclasses.field(default_factory=dict)
     rhat_max: float = float("nan")  # largest split-R-hat over the ensembles
-    acceptance: float = float("nan")  # share of the moves
-    burn: int = 0  # of each ensemble
+    acceptance: float = float("nan")  # fraction of accepted moves
+    burn: int = 0  # burn-in steps of each ensemble
     steps: int = 0
     walkers: int = 0
     ensembles: int = 0
-    stuck_walkers: tuple[str, ...] = ()  # those that stayed in one place although others moved on
+    stuck_walkers: tuple[str, ...] = ()  # walkers that stayed in one place
     interrupted: bool = False
-    k_hat: float = float("nan")  # Pareto's shape of the importance weights' tail
-    # by importance weights, what a Laplace approximation is off by in the mean, in sds, and in the sd, as a share
+    k_hat: float = float("nan")  # Pareto shape parameter of the tail of the importance weights
+    # errors of a Laplace approximation, estimated with importance weights: of the mean in sd, and of the sd relative
     shift: dict[str, float] = dataclasses.field(default_factory=dict)
     widening: dict[str, float] = dataclasses.field(default_factory=dict)
-    forbidden: float = 0.0  # share of a Laplace approximation's draws that the prior forbids
+    forbidden: float = 0.0  # fraction of the draws of a Laplace approximation that lie outside the prior
 
     @property
     def progress(self) -> float:
-        """Share of the steps that its autocorrelation time asks for."""
+        """Fraction of the steps that the autocorrelation time requires."""
         goal = CRITERIA.autocorrelation_times * self.tau_max
         return min((self.steps - self.burn) / goal, 1.0) if goal > 0.0 else 0.0
 
     @property
     def warning(self) -> str:
-        """What stands against the draws, as a sentence; "": nothing."""
+        """Reason why the draws are unreliable, or an empty string."""
         if self.converged:
             return ""
         if self.level != "emcee":
-            return f"{self}; sample with level emcee"
+            return f"{self}; sample with level emcee instead"
         if self.interrupted:
-            return "sampling was interrupted before it had converged; run the same command again to go on"
+            return "sampling was interrupted before it converged; run the same command again to resume"
         stuck = f"; stuck: {', '.join(self.stuck_walkers)}" if self.stuck_walkers else ""
-        return f"the chain has not converged; allow more steps ({self}{stuck})"
+        return f"the chain has not converged ({self}{stuck}); allow more steps"
 
     def __str__(self) -> str:
         if self.level == "emcee":
             verdict = "converged" if self.converged else "interrupted" if self.interrupted else "NOT converged"
             return (
-                f"{verdict}: {self.ensembles} ensembles of {self.walkers} walkers, {self.steps} steps ({self.burn} of"
-                f" them burn-in), autocorrelation time {self.tau_max:.2f}, effective draws {self.ess_min:,.0f},"
+                f"{verdict}: {self.ensembles} ensembles of {self.walkers} walkers, {self.steps} steps (burn-in"
+                f" {self.burn}), autocorrelation time {self.tau_max:.2f}, effective draws {self.ess_min:,.0f},"
                 f" split-R-hat {self.rhat_max:.4f}, accepted {100.0 * self.acceptance:.0f} %"
             )
         limit = CRITERIA.k_hat
-        refused = f"; above {limit} the weights cannot be relied on" if not self.k_hat <= limit else ""
+        refused = f" (above {limit} the weights are unreliable)" if not self.k_hat <= limit else ""
         weights = f"Pareto k-hat {self.k_hat:.2f}{refused}"
         if self.level == "psis":
-            verdict = "certified" if self.converged else "REFUSED"
-            return f"{verdict}: importance-weighted draws of the fit, {weights}, effective draws {self.ess_min:,.0f}"
+            verdict = "accepted" if self.converged else "REFUSED"
+            return f"{verdict}: Pareto-smoothed importance sampling, {weights}, effective draws {self.ess_min:,.0f}"
         verdict = "Laplace approximation" if self.converged else "REFUSED: Laplace approximation"
         shifted, widened = (max(errors, key=lambda name: abs(errors[name])) for errors in (self.shift, self.widening))
         return (
-            f"{verdict}, by importance weights ({weights}) off by {abs(self.shift[shifted]):.2g} sd in the mean"
-            f" ({shifted}) and {format_percent(abs(self.widening[widened]))} in the sd ({widened}) at most;"
-            f" the prior forbids {format_percent(self.forbidden)} of its draws"
+            f"{verdict}, largest error of a mean {abs(self.shift[shifted]):.2g} sd ({shifted}), of an sd"
+            f" {format_percent(abs(self.widening[widened]))} ({widened}), from importance weights with {weights};"
+            f" {format_percent(self.forbidden)} of the draws lie outside the prior"
         )
 
 
@@ -106,12 +106,18 @@ def diagnose_chain(
     rhat_draws: int = 4000,
     criteria: Criteria = CRITERIA,
 ) -> Convergence:
-    """Return autocorrelation times, effective sizes and split-R-hat of ensembles, and of `derived` for some walkers.
+    """Return autocorrelation times, effective sizes and split-R-hat of all coordinates and `derived` quantities.
 
-    R-hat is that of `rhat_draws` draws of each ensemble.
+    Args:
+        names: names of the coordinates.
+        points: coordinates of every walker at every step.
+        accepted: number of accepted moves of each walker.
+        derived: other quantities, for some of the walkers.
+        rhat_draws: draws of each ensemble that R-hat uses.
+        criteria: criteria of convergence.
     """
     ensembles, steps, walkers, _ = points.shape
-    if steps < 100:  # of which nothing can be said
+    if steps < 100:  # too few for any diagnostic
         return Convergence(steps=steps, walkers=walkers, ensembles=ensembles)
     quantities = {name: points[..., i] for i, name in enumerate(names)} | derived
     tau = {name: _autocorrelation_time(values[:, steps // 5 :]) for name, values in quantities.items()}
@@ -139,22 +145,22 @@ def diagnose_chain(
 
 
 def _autocorrelation_time(values: Float[np.ndarray, "ensembles steps walkers"]) -> float:
-    """Return the mean over ensembles, each of the walkers that move; the length where none does."""
+    """Return the mean over ensembles, from the walkers that move; the number of steps where none moves."""
     moving = (ensemble[:, np.ptp(ensemble, axis=0) > 0.0] for ensemble in values)
     return float(np.mean([integrated_time(walkers) if walkers.size else values.shape[1] for walkers in moving]))
 
 
 def integrated_time(values: Float[np.ndarray, "steps walkers"]) -> float:
-    """The autocorrelation time in steps, as `emcee.autocorr` finds it, but of all walkers in one transform."""
+    """Return the autocorrelation time in steps, as `emcee.autocorr` does, with one transform for all walkers."""
     series = (values - values.mean(axis=0)).T
     spectrum = np.fft.rfft(series, n=2 * len(values))
     correlation = np.fft.irfft(np.square(np.abs(spectrum)), n=2 * len(values))[:, : len(values)]
     taus = 2.0 * np.cumsum(np.mean(correlation / correlation[:, :1], axis=0)) - 1.0
-    return float(taus[emcee.autocorr.auto_window(taus, 5.0)])  # Sokal's window: so many autocorrelation times
+    return float(taus[emcee.autocorr.auto_window(taus, 5.0)])  # Sokal's window of 5 autocorrelation times
 
 
 def _split_rhat(values: Float[np.ndarray, "ensembles steps walkers"], rhat_draws: int) -> float:
-    """Rank-normalised split-R-hat (Vehtari et al. 2021); of long ensembles, of steps evenly apart."""
+    """Return rank-normalised split-R-hat (Vehtari et al. 2021), from equally spaced steps of a long ensemble."""
     draws = values[:, :: max(1, values[0].size // rhat_draws)].reshape(len(values), -1)
     halves = draws[:, : draws.shape[1] // 2 * 2].reshape(2 * len(draws), -1)
     return max(_normal_score_rhat(halves), _normal_score_rhat(np.abs(halves - np.median(halves))))
@@ -169,7 +175,7 @@ def _normal_score_rhat(draws: Float[np.ndarray, "chains draws"]) -> float:
 
 
 def _stuck_walkers(points: Float[np.ndarray, "ensembles steps walkers n"], patience: float) -> tuple[str, ...]:
-    """Name the walkers that stayed in one place for more than `patience` steps."""
+    """Return the names of walkers that stayed in one place for more than `patience` steps."""
     moved = np.any(points[:, 1:] != points[:, :-1], axis=-1)
     step = np.arange(moved.shape[1])[:, None]
     last = np.maximum.accumulate(np.where(moved, step, -1), axis=1)
@@ -181,16 +187,16 @@ class ImportanceWeights(NamedTuple):
     """Pareto-smoothed importance weights."""
 
     weights: Float[np.ndarray, " draws"]  # their sum is 1
-    k_hat: float  # inf where too few draws have any weight
+    k_hat: float  # inf where too few draws have a nonzero weight
 
     def mean_sd(self, values: Float[np.ndarray, " some"]) -> tuple[float, float]:
-        """Weighted mean and standard deviation; of the first draws, where `values` are fewer."""
+        """Return the weighted mean and standard deviation of `values`, which belong to the first draws."""
         weights = self._first_weights(values.size)
         mean = float(weights @ values)
         return mean, float(np.sqrt(weights @ (values - mean) ** 2))
 
     def effective_size(self, values: Float[np.ndarray, " some"]) -> float:
-        """Effective number of all draws for the mean of `values`, by the first draws where those are fewer."""
+        """Return the effective number of all draws for the mean of `values`, which belong to the first draws."""
         weights = self._first_weights(values.size)
         from_mean = (values - weights @ values) ** 2
         return float(weights @ from_mean / (weights**2 @ from_mean)) * self.weights.size / values.size
@@ -200,10 +206,10 @@ class ImportanceWeights(NamedTuple):
 
 
 def pareto_smooth(log_weights: Float[np.ndarray, " draws"]) -> ImportanceWeights:
-    """Smooth weights by Pareto's law (Vehtari et al. 2024), with ArviZ."""
+    """Smooth the largest weights with a generalised Pareto distribution (Vehtari et al. 2024), as ArviZ does."""
     possible = np.isfinite(log_weights)
     count = np.count_nonzero(possible)
-    if count <= 3.0 * np.sqrt(log_weights.size):  # so many draws has the tail that is fitted
+    if count <= 3.0 * np.sqrt(log_weights.size):  # size of the tail that is fitted
         return ImportanceWeights(possible / max(count, 1), float("inf"))
     values, k_hat = array_stats.psislw(-log_weights)
     weights = np.exp(values - np.max(values))
@@ -217,9 +223,9 @@ def diagnose_weights(
     n_resampled: int,
     criteria: Criteria = CRITERIA,
 ) -> Convergence:
-    """Return effective sizes of `n_resampled` draws that stand for weighted ones; for Laplace, what it is off by."""
+    """Return the effective sizes of `n_resampled` draws, and for "laplace" the errors of the approximation."""
     shift, widening = {}, {}
-    if level == "psis":  # resampled draws carry the variance of both
+    if level == "psis":  # the variances of weighting and of resampling add up
         effective = {name: importance.effective_size(values) for name, values in quantities.items()}
         ess = {name: 1.0 / (1.0 / size + 1.0 / n_resampled) for name, size in effective.items()}
     else:
@@ -227,9 +233,9 @@ def diagnose_weights(
         corrected = {name: importance.mean_sd(values) for name, values in quantities.items()}
         shift = {name: (float(np.mean(quantities[name])) - mean) / sd for name, (mean, sd) in corrected.items()}
         widening = {name: float(np.std(quantities[name])) / sd - 1.0 for name, (_, sd) in corrected.items()}
-    off = max(map(abs, (*shift.values(), *widening.values())), default=0.0)
+    largest_error = max(map(abs, (*shift.values(), *widening.values())), default=0.0)
     forbidden = float(np.mean(importance.weights == 0.0)) if level == "laplace" else 0.0
-    accurate = off <= criteria.laplace_error and forbidden <= criteria.forbidden
+    accurate = largest_error <= criteria.laplace_error and forbidden <= criteria.forbidden
     return Convergence(
         level=level,
         converged=bool(importance.k_hat <= criteria.k_hat and accurate),

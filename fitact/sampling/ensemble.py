@@ -1,4 +1,4 @@
-"""Posterior draws at a level of uncertainty; by emcee until converged: independent ensembles, checkpoints, resume."""
+"""Sampling of the posterior: independent emcee ensembles with checkpoints, run until they have converged."""
 
 import contextlib
 import dataclasses
@@ -32,7 +32,7 @@ from fitact.sampling.proposal import OVERDISPERSION, SHARES, LogProb, Proposal
 
 Level = Literal["emcee", "psis", "laplace"]
 
-TRACKED_WALKERS = 4  # walkers per ensemble whose derived quantities are looked at
+TRACKED_WALKERS = 4  # walkers of each ensemble whose derived quantities are diagnosed
 
 
 def sample(
@@ -46,46 +46,50 @@ def sample(
     chain_file: str | os.PathLike[str] | None = None,
     progress: bool = True,
 ) -> Posterior:
-    """Draw from the posterior around `fit`, and judge the draws.
+    """Draw from the posterior around `fit`, and diagnose the draws.
 
-    Coordinates are the log-parameters of the fit and log sigma. The levels, fastest first:
+    The coordinates are the log-parameters of the fit and log sigma. The methods, fastest first:
 
-    - "laplace": independent draws from the fit's normal approximation. Importance weights say what it is off by;
-      refused above a tenth of a standard deviation.
-    - "psis": draws from a Student-t over the fit, importance-weighted (Pareto-smoothed), resampled systematically
-      to equal weights. Refused where Pareto's k-hat is above 0.7.
-    - "emcee": sampled until converged. Seven moves in ten propose from that Student-t, three are stretch moves,
-      which keep the mixture safe where the shape is another. Converged: each ensemble is longer than 50
-      autocorrelation times, split-R-hat over the ensembles is below 1.01, in every coordinate and in g, b and the
-      mean force, and no walker is stuck.
+    - "laplace": independent draws from the Gaussian approximation of the fit. Importance weights estimate its error;
+      it is refused above a tenth of a standard deviation.
+    - "psis": draws from a Student-t around the fit, with Pareto-smoothed importance weights, resampled systematically
+      to equal weights. It is refused where Pareto k-hat is above 0.7.
+    - "emcee": MCMC, run until converged. Seven moves in ten propose from the same Student-t. The other three are
+      stretch moves, which sample posteriors of any other shape. The chain has converged when each ensemble is longer
+      than 50 autocorrelation times and split-R-hat over the ensembles is below 1.01, for every coordinate, g, b and
+      the mean force, and no walker is stuck.
 
-    Along what a bounded prior limits, the density itself is tabulated and takes the Student-t's place.
+    Along directions that a bounded prior limits, a tabulated density replaces the Student-t.
 
     Args:
-        fit: from `fitact.fit`.
-        level: of uncertainty; those below concern "emcee" alone.
-        seed: the same seed gives the same draws, whether or not sampling was interrupted.
-        walkers: per ensemble; even, at least twice the parameters. None: 128, or 64 where samples are summed.
-        ensembles: independent ones, at least two.
-        max_steps: per ensemble, after which the answer is marked as not converged.
-        chain_file: where to keep the chain (HDF5, emcee's layout); if it exists, sampling goes on from it.
-        progress: report on standard error.
+        fit: result of `fitact.fit`.
+        level: posterior method; the arguments from `walkers` on apply only to "emcee".
+        seed: random seed; equal seeds give equal draws, whether or not sampling was interrupted.
+        walkers: walkers per ensemble, an even number of at least twice the parameters. None means 128, or 64 if the
+            likelihood is a sum over the samples.
+        ensembles: number of independent ensembles, at least 2.
+        max_steps: steps per ensemble after which the result is marked as not converged.
+        chain_file: HDF5 file for the chain, in emcee's layout. If it exists, sampling resumes from it.
+        progress: whether to report progress on standard error.
 
-    Ctrl-C ends sampling with what there is, marked as not converged.
+    Ctrl-C ends sampling; the draws so far are returned and marked as not converged.
 
     Raises:
-        InputError: the chain file belongs to another record, scene or seed; the fit was made without its prior, or
-            the prior forbids every start.
+        InputError: the chain file belongs to another record, scene or seed; the fit was made without its prior; or
+            the prior excludes every starting point.
     """
     if level not in get_args(Level):
         raise InputError(f"level = {level!r}: choose one of {', '.join(get_args(Level))}")
     if not fit.likelihood.use_prior:
-        raise InputError("a fit with prior=False has no posterior to draw from; fit with the prior, then sample")
+        raise InputError("a fit with prior=False has no posterior; fit with the prior before sampling")
     size = len(fit.point_names)
-    if walkers is None:  # a few numbers cost less than a step of emcee's, whose own time hardly grows with walkers
+    if walkers is None:  # a compressed likelihood costs less than emcee itself, whose time hardly grows with walkers
         walkers = max(128 if fit.likelihood.rows <= certificate.FEW_ROWS else 64, 2 * size)
     if walkers % 2 or walkers < 2 * size or ensembles < 2:
-        raise InputError(f"walkers = {walkers}, ensembles = {ensembles}: at least {2 * size}, even; and at least 2")
+        raise InputError(
+            f"walkers = {walkers}, ensembles = {ensembles}: give an even number of at least {2 * size} walkers, and at"
+            " least 2 ensembles"
+        )
     start_time = time.perf_counter()
     with jax.enable_x64(True):
         log_prob = reject_nonfinite(certificate.batched_log_prob(fit.likelihood, walkers))
@@ -102,32 +106,32 @@ def sample(
 
 
 class Target(NamedTuple):
-    """What ensembles sample."""
+    """Density that ensembles sample, with a proposal."""
 
-    names: tuple[str, ...]  # of the coordinates
-    log_prob: LogProb  # of points, finite or -inf
-    proposal: Proposal  # near to it
-    # quantities to be judged beside the coordinates, of points (ensembles, draws, n), with a seed
+    names: tuple[str, ...]  # names of the coordinates
+    log_prob: LogProb  # log-density of points, finite or -inf
+    proposal: Proposal  # approximation of the density
+    # function of points (ensembles, draws, n) and a seed: derived quantities to diagnose with the coordinates
     track: Callable[[Float[np.ndarray, "ensembles draws n"], int], dict[str, np.ndarray]]
-    fingerprint: str = ""  # what a chain belongs to; "" where none is kept
+    fingerprint: str = ""  # hash of the inputs that the chain belongs to; "" if no chain is saved
 
 
 def run_ensembles(
     target: Target, seed: int, walkers: int, ensembles: int, max_steps: int, path: Path | None, progress: bool
 ) -> tuple[Chain, Convergence]:
-    """Sample until converged; arguments as in `sample`. Call it in double precision."""
+    """Sample until converged, in double precision; the arguments are those of `sample`."""
     run = _Run.start_or_resume(target, seed, walkers, ensembles, path)
     convergence = run.sample_until_converged(max_steps, Reporter(progress))
     return run.chain, convergence
 
 
 def make_moves(proposal: Proposal) -> list[tuple[emcee.moves.Move, float]]:
-    """What emcee's walkers do, and how often."""
+    """Return emcee's moves with their weights."""
     return list(zip((emcee.moves.MHMove(proposal.move), emcee.moves.StretchMove()), SHARES, strict=True))
 
 
 def reject_nonfinite(log_prob: LogProb) -> LogProb:
-    """Make what is not finite impossible: emcee would end at NaN, and a walker stick at +inf."""
+    """Replace non-finite values by -inf, because emcee stops at NaN and a walker would be stuck at +inf."""
 
     def finite_log_prob(points: np.ndarray) -> np.ndarray:
         values = log_prob(points)
@@ -138,24 +142,24 @@ def reject_nonfinite(log_prob: LogProb) -> LogProb:
 
 @dataclasses.dataclass
 class _Run:
-    """The ensembles of one posterior, which take their steps in turn."""
+    """Ensembles of one posterior, which take their steps in turn."""
 
     target: Target
     chain: Chain
     samplers: list[emcee.EnsembleSampler]
     path: Path | None
     start_time: float
-    turn_seconds: tuple[float, float] = (1.0, 4.0)  # that all turns together take, or else their steps are changed
-    checkpoint_seconds: float = 2.0  # between checkpoints, at least,
-    checkpoint_ratio: float = 20.0  # and so many times what writing one takes
+    turn_seconds: tuple[float, float] = (1.0, 4.0)  # bounds on the duration of a turn, beyond which its steps change
+    checkpoint_seconds: float = 2.0  # shortest time between checkpoints
+    checkpoint_ratio: float = 20.0  # shortest time between checkpoints, in units of the time that one takes
     steps_per_turn: int = 1
     save_time: float = 0.0  # when the last checkpoint was written
-    save_seconds: float = 0.0  # that it took
+    save_seconds: float = 0.0  # time that the last checkpoint took
     derived: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
     @classmethod
     def start_or_resume(cls, target: Target, seed: int, walkers: int, ensembles: int, path: Path | None) -> "_Run":
-        """Go on from the chain file where there is one, else begin at draws of a wider proposal."""
+        """Resume from the chain file if it exists; otherwise start at draws of a widened proposal."""
         start_time = time.perf_counter()
         names, log_prob, proposal = target.names, target.log_prob, target.proposal
         samplers = [
@@ -174,7 +178,7 @@ class _Run:
         return cls(target, Chain.empty(names, target.fingerprint, states), samplers, path, start_time)
 
     def sample_until_converged(self, max_steps: int, report: Reporter) -> Convergence:
-        """Sample, judge and save in turn."""
+        """Sample, diagnose and save in turn."""
         steps = self.chain.steps
         is_due = steps == _next_diagnostic_step(steps - 1) or steps >= max_steps
         convergence = self.judge() if is_due else Convergence()
@@ -198,7 +202,7 @@ class _Run:
         return convergence
 
     def advance(self, steps: int, check: Callable[[], None]) -> None:
-        """Take `steps` with every ensemble, calling `check` after each; where it raises, nothing has changed."""
+        """Take `steps` with every ensemble and call `check` after each; if it raises, the chain is unchanged."""
         start_time, new_steps = time.perf_counter(), []
         for sampler, last in zip(self.samplers, self.chain.states, strict=True):
             sampler.reset()
@@ -209,7 +213,7 @@ class _Run:
         self.chain.extend(new_steps)
         seconds = time.perf_counter() - start_time
         if seconds < self.turn_seconds[0]:
-            self.steps_per_turn = min(2 * self.steps_per_turn, 100)  # the least between two looks
+            self.steps_per_turn = min(2 * self.steps_per_turn, 100)  # shortest interval between two diagnoses
         elif seconds > self.turn_seconds[1]:
             self.steps_per_turn = max(self.steps_per_turn // 2, 1)
         pause = max(self.checkpoint_seconds, self.checkpoint_ratio * self.save_seconds)
@@ -217,7 +221,7 @@ class _Run:
             self.save()
 
     def save(self) -> None:
-        """Checkpoint, where there is a file for it."""
+        """Write a checkpoint if there is a chain file."""
         now = time.perf_counter()
         self.chain.seconds, self.start_time = self.chain.seconds + now - self.start_time, now
         if self.path is not None and self.chain.steps:
@@ -226,41 +230,41 @@ class _Run:
             self.save_seconds = self.save_time - now
 
     def judge(self) -> Convergence:
-        """How far the chain can be trusted so far."""
+        """Return the diagnostics of the chain so far."""
         chain = self.chain
         self._update_tracked()
         convergence = diagnose_chain(chain.names, chain.points, chain.accepted, self.derived)
         return dataclasses.replace(convergence, seconds=chain.seconds + time.perf_counter() - self.start_time)
 
     def _update_tracked(self) -> None:
-        """Derived quantities of some walkers, for the steps that lack them."""
-        known = next(iter(self.derived.values())).shape[1] if self.derived else 0
-        points = self.chain.points[:, known:, :TRACKED_WALKERS]
+        """Compute the derived quantities of some walkers for the new steps."""
+        done = next(iter(self.derived.values())).shape[1] if self.derived else 0
+        points = self.chain.points[:, done:, :TRACKED_WALKERS]
         if not points.size:
             return
         ensembles, *_, size = points.shape
-        for name, values in self.target.track(points.reshape(ensembles, -1, size), known).items():
+        for name, values in self.target.track(points.reshape(ensembles, -1, size), done).items():
             values = values.reshape(points.shape[:-1])
-            self.derived[name] = np.concatenate([self.derived[name], values], axis=1) if known else values
+            self.derived[name] = np.concatenate([self.derived[name], values], axis=1) if done else values
 
 
 def _next_diagnostic_step(steps: int, interval: int = 100, growth: float = 1.1) -> int:
-    """Return when to judge next: multiples of `interval`, ever further apart, so that sampling outweighs judging.
+    """Return the step of the next diagnosis, a multiple of `interval`; the distance grows, so that diagnosing is cheap.
 
-    It depends on the steps alone, so that a resumed chain ends where an undisturbed one does.
+    The result depends only on `steps`, so a resumed chain ends at the same step as an uninterrupted one.
     """
-    look = interval
-    while look <= steps:
-        look = int(np.ceil(growth * look / interval)) * interval
-    return look
+    step = interval
+    while step <= steps:
+        step = int(np.ceil(growth * step / interval)) * interval
+    return step
 
 
 @contextlib.contextmanager
 def _defer_interrupts() -> Iterator[Callable[[], None]]:
-    """Hold Ctrl-C back until the function it gives is called, or until it comes a second time.
+    """Defer Ctrl-C until the yielded function is called, or until a second Ctrl-C.
 
-    Inside a step emcee prints a traceback for any error, and Python drops what is raised in a weak reference's
-    callback, of which JAX has many.
+    Within a step, emcee prints a traceback for any error, and Python drops exceptions in callbacks of weak references,
+    of which JAX has many.
     """
     pending: list[int] = []
 
@@ -288,7 +292,7 @@ def _defer_interrupts() -> Iterator[Callable[[], None]]:
 def _draw_starting_points(
     proposal: Proposal, log_prob: LogProb, walkers: int, random: np.random.RandomState
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw what the posterior allows, with its log-probability."""
+    """Draw starting points at which the posterior is positive; return them with their log-probabilities."""
     points, values = np.empty((0, proposal.center.size)), np.empty(0)
     for _ in range(100):
         drawn = proposal.draw(random, walkers)
@@ -298,13 +302,13 @@ def _draw_starting_points(
         if len(points) >= walkers:
             return points[:walkers], values[:walkers]
     raise InputError(
-        "scene: [prior] leaves no room where the record puts the parameters: its bounds exclude the record's"
-        " g and b, or nearly so; widen them, or check the record's units"
+        "scene: the bounds of [prior] exclude, or nearly exclude, the g and b of the record; widen them, or check the"
+        " units of the record"
     )
 
 
 def _fingerprint(fit: Fit, seed: int, walkers: int, ensembles: int) -> str:
-    """What a chain belongs to; any change of it makes another chain."""
+    """Return a hash of all inputs that determine a chain."""
     inputs = [[record.fingerprint for record in fit.records], fit.scene.to_json(), [t.choice.name for t in fit.traces]]
     settings = [fit.likelihood.rows, fit.point_names, fit.theta.tolist(), seed, walkers, ensembles]
     return hashlib.sha256(json.dumps([importlib.metadata.version("fitact"), *inputs, *settings]).encode()).hexdigest()

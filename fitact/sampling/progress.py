@@ -1,4 +1,4 @@
-"""How far sampling is, on standard error."""
+"""Progress of the sampling, on standard error."""
 
 import sys
 
@@ -7,14 +7,14 @@ from fitact.sampling.convergence import Convergence
 
 
 class Reporter:
-    """Progress on standard error: a bar where it is a terminal, else a line now and then."""
+    """Progress on standard error: a bar on a terminal, otherwise occasional lines."""
 
     def __init__(self, show: bool) -> None:
         self._show, self._lines = show, 0
         self._bar = open_bar("sampling", status="starting") if show and sys.stderr.isatty() else None
 
     def __call__(self, steps: int, convergence: Convergence) -> None:
-        """Show the steps taken, and what the last look said of them."""
+        """Show the number of steps and the latest diagnostics."""
         if not self._show:
             return
         diagnosis = f", tau {convergence.tau_max:.1f}, R-hat {convergence.rhat_max:.4f}" if convergence.ess else ""
