@@ -1,4 +1,4 @@
-"""One channel of one record, fitted: its residuals, nuisances and figures of merit."""
+"""Result of a fit for one channel of one record: residuals, nuisances and figures of merit."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -22,45 +22,47 @@ from fitact.model.skin import WithSkin
 
 @dataclasses.dataclass(frozen=True)
 class ChannelFit:
-    """One channel of one record, fitted."""
+    """Result of a fit for one channel of one record."""
 
-    label: str  # "" or what tells it from the other channels, as "I_2"
+    label: str  # name among the channels of the fit, e.g. "I_2"; "" for Vsc of a single record
     channel: str  # "Vsc" or "I"
     record: Record
     choice: DriveModel
-    sigma: float  # standard deviation of its noise, V or A, from the residuals
-    linear: dict[str, float]  # the offset, drift, hum and charge that were freed, V or A, at the optimum
-    residuals: Float[np.ndarray, " samples"]  # record minus fit, V or A
-    weight: Float[np.ndarray, " samples"] | None  # of the samples; 0 where one was left out. None: all are 1
-    log_likelihood: float  # of its samples, all constants included
-    figures: dict[str, float]  # chi2_reduced, rms_residual, noise_expected, runs_z and the like
-    full_because: str  # why its samples are summed, as a clause; "" where they are not
+    sigma: float  # standard deviation of the noise, estimated from the residuals, V or A
+    linear: dict[str, float]  # free offset, drift, hum and charge at the optimum, V or A
+    residuals: Float[np.ndarray, " samples"]  # data minus fit, V or A
+    weight: (
+        Float[np.ndarray, " samples"] | None
+    )  # relative inverse noise sd of the samples; 0 excludes one, None means 1
+    log_likelihood: float  # log-likelihood of the samples, including all constants
+    figures: dict[str, float]  # figures of merit: chi2_reduced, rms_residual, noise_expected, runs_z, ...
+    full_because: str  # reason why the likelihood is not compressed, as a clause; "" if it is
 
     @classmethod
     def from_optimum(
         cls, likelihood: Likelihood, index: int, theta: np.ndarray, sigma: float, source: Source, reason: str
     ) -> "ChannelFit":
-        """The channel of that index at the optimum `theta` with the noise `sigma`."""
+        """Return the result for channel `index` at the optimum `theta` with noise `sigma`."""
         channel = likelihood.channels[index].without_compression()
         inputs = likelihood.channel_inputs(jnp.asarray(theta), index)
-        # the noise as an array: a float would be compiled in, anew for every record
-        left, even, beta = (np.asarray(x) for x in _sample_residuals(channel, inputs, jnp.asarray(sigma)))
-        own = slice(channel.n_samples)
-        left, weight = left[own], None if channel.equally_weighted else channel.weights[own]
+        # the noise is passed as an array, because jit would compile again for every new number
+        residuals, white, beta = (np.asarray(x) for x in _sample_residuals(channel, inputs, jnp.asarray(sigma)))
+        unpadded = slice(channel.n_samples)
+        residuals, weight = residuals[unpadded], None if channel.equally_weighted else channel.weights[unpadded]
         names = [channel.qualified_name(LINEAR_NUISANCES[column]) for column in channel.columns]
         linear = dict(zip(names, (beta * np.asarray(channel.linear_sd)[list(channel.columns)]).tolist(), strict=True))
-        counted = (channel.weights if channel.whitening is None else np.asarray(channel.whitening.mask))[own] > 0.0
-        kept = even[own][counted]
-        used = theta.size * kept.size / float(likelihood.count) + len(linear)
+        counted = (channel.weights if channel.whitening is None else np.asarray(channel.whitening.mask))[unpadded] > 0.0
+        white = white[unpadded][counted]
+        n_fitted = theta.size * white.size / float(likelihood.count) + len(linear)
         gain = _gain(inputs.circuit, channel)
-        noise = sigma if channel.noise == "ar1" else source.noise  # coloured, only the residuals show it
+        noise = sigma if channel.noise == "ar1" else source.noise  # AR(1) noise is estimated only from the residuals
         time = source.record.time[counted]
-        figures = channel_statistics(kept, time, noise, used, gain, source.record, channel.channel, source.choice)
-        # below a weight of 0.7 a sample's noise is mostly that of the drive's slope, which is not white
+        figures = channel_statistics(white, time, noise, n_fitted, gain, source.record, channel.channel, source.choice)
+        # samples with weights below 0.7 have mostly noise from the drive's slope, which is not white
         if weight is not None and np.mean((weight > 0.0) & (weight < 0.7)) > 0.01:
             figures |= {"spectrum_p": 1.0, "line_p": 1.0}
-        weighted = left if weight is None else left * weight
-        if channel.whitening is not None:  # as a user sees them, before the filter
+        weighted = residuals if weight is None else residuals * weight
+        if channel.whitening is not None:  # rms of the residuals before the whitening filter
             figures["rms_residual"] = float(np.sqrt(np.mean(weighted[counted] ** 2)))
         if channel.noise == "spectrum":
             figures["quiet_noise"] = source.noise
@@ -72,17 +74,17 @@ class ChannelFit:
             choice=source.choice,
             sigma=sigma,
             linear=linear,
-            residuals=left,
+            residuals=residuals,
             weight=weight,
-            log_likelihood=_log_likelihood(channel, left, kept, sigma),
+            log_likelihood=_log_likelihood(channel, residuals, white, sigma),
             figures=figures,
             full_because=reason,
         )
 
 
 def _gain(circuit: Circuit, channel: ChannelLikelihood) -> float:
-    """What makes the channel's noise of a measured drive's."""
-    if isinstance(circuit, WithSkin):  # it falls with the frequency, and noise is mostly fast
+    """Return the factor by which noise of a measured drive enters the channel."""
+    if isinstance(circuit, WithSkin):  # the gain falls with frequency, and most of the noise is fast
         return float(jnp.abs(circuit.channel_gain(channel.channel, 1.0 / channel.time_step)))
     return abs(sum(float(w) for w in circuit.channel_terms(channel.channel).weight))
 
@@ -90,31 +92,34 @@ def _gain(circuit: Circuit, channel: ChannelLikelihood) -> float:
 def _log_likelihood(
     channel: ChannelLikelihood, residuals: np.ndarray, white_residuals: np.ndarray, sigma: float
 ) -> float:
-    """At the noise that makes it largest; under Student's t, at `sigma`."""
+    """Return the log-likelihood at its maximum over the noise sd; under Student's t, at scale `sigma`."""
     if channel.whitening is None:
         weights = channel.weights[: residuals.size]
         if channel.noise == "student":
             return student_log_likelihood(residuals, weights, sigma)
         return gaussian_log_likelihood(residuals, weights)
-    kept = np.asarray(channel.whitening.mask) > 0.0
+    used = np.asarray(channel.whitening.mask) > 0.0
     innovations = white_residuals / float(channel.whitening.taps[0])
-    return gaussian_log_likelihood(innovations, None) + float(np.sum(np.log(channel.weights[kept])))
+    return gaussian_log_likelihood(innovations, None) + float(np.sum(np.log(channel.weights[used])))
 
 
 @eqx.filter_jit
 def _sample_residuals(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: Array) -> tuple[Array, Array, Array]:
-    """What is left of the samples; that with noise independent and equal; and the linear nuisances in prior sds."""
+    """Return the residuals, the whitened residuals, and the linear nuisances in units of their prior sd."""
     _, beta, _ = channel.fit_nuisances(inputs, sigma)
-    remainder, shapes = dataclasses.replace(channel, weight=None, whitening=None).residuals_and_shapes(inputs)
-    left = remainder - beta @ (channel.linear_sd[np.array(channel.columns, dtype=int), None] * shapes)
-    even = channel.apply_whitening(left)
+    residuals, shapes = dataclasses.replace(channel, weight=None, whitening=None).residuals_and_shapes(inputs)
+    residuals = residuals - beta @ (channel.linear_sd[np.array(channel.columns, dtype=int), None] * shapes)
+    white = channel.apply_whitening(residuals)
     if channel.noise == "student":
-        even = even * jnp.sqrt(student_weight(even / sigma))
-    return left, even, beta
+        white = white * jnp.sqrt(student_weight(white / sigma))
+    return residuals, white, beta
 
 
 def information_criteria(parameters: int, traces: Sequence[ChannelFit]) -> dict[str, float]:
-    """Information criteria of a fit with so many `parameters` beside each channel's linear nuisances and noise."""
-    counted = parameters + sum(1 + len(channel.linear) for channel in traces)
+    """Return the information criteria of a fit.
+
+    `parameters` counts the free parameters without the linear nuisances and the noise of each channel.
+    """
+    n_parameters = parameters + sum(1 + len(channel.linear) for channel in traces)
     samples = sum(int(channel.figures["samples"]) for channel in traces)
-    return criteria(sum(channel.log_likelihood for channel in traces), counted, samples)
+    return criteria(sum(channel.log_likelihood for channel in traces), n_parameters, samples)

@@ -1,7 +1,7 @@
-"""The trunk current: which of its samples can be compared with a model, and what it says before any fit.
+"""Loop current I: selection of the samples that a model can predict, and estimates of the circuit before any fit.
 
-Where nothing resistive limits it, I follows dV/dt. At an edge of the drive it jumps, and a sample there says
-little; elsewhere dV/dt of a recorded V carries V's noise, many times over.
+If no resistance limits it, I follows dV/dt. I jumps at an edge of the drive, so a sample there carries little
+information. Elsewhere, differentiating a recorded V amplifies its noise.
 """
 
 import math
@@ -16,9 +16,11 @@ from fitact.units import format_percent
 
 
 class CurrentSamples(NamedTuple):
-    """What a likelihood needs of a current that follows dV/dt."""
+    """Samples of a current that follows dV/dt, as a likelihood uses them."""
 
-    weight: Float[np.ndarray, " samples"]  # of the samples, as in `fitact.likelihood.channel.ChannelLikelihood`
+    weight: Float[
+        np.ndarray, " samples"
+    ]  # relative inverse noise sd, 0 at edges; see `fitact.likelihood.channel.ChannelLikelihood`
     rate: Float[np.ndarray, " samples"]  # dV/dt, V/s
     drive_noise_dominates: bool  # whether V's noise, differentiated, takes too much off what follows dV/dt
     notes: tuple[str, ...]  # sentences for information
@@ -26,16 +28,16 @@ class CurrentSamples(NamedTuple):
 
 
 def select_current_samples(record: Record, choice: DriveModel, max_attenuation: float = 1e-3) -> CurrentSamples:
-    """Leave out the samples at edges, and weigh those between them by the noise that dV/dt brings in.
+    """Exclude the samples at edges, and weight the others by their noise, including that of dV/dt.
 
-    `max_attenuation`: the relative error of what follows dV/dt, by V's noise, that is still trusted.
+    `max_attenuation` is the largest acceptable relative bias of the capacitive current due to noise of V.
     """
     noise = record.noise("V") if choice.name == "measured" else 0.0
-    kept = ~_edge_mask(choice.voltage, noise)
+    used = ~_edge_mask(choice.voltage, noise)
     if choice.name != "measured":
         slope = drive_slope(choice, record.time)
-        kept &= np.isfinite(slope)  # a record may begin at a jump
-    note = f"I: {np.count_nonzero(~kept):,} of {kept.size:,} samples lie at an edge of the drive and are left out"
+        used &= np.isfinite(slope)  # a record may begin at a jump
+    note = f"I: {np.count_nonzero(~used):,} of {used.size:,} samples lie at an edge of the drive and are excluded"
     if choice.name != "measured":
         return CurrentSamples(kept.astype(float), np.where(kept, slope, 0.0), False, (note,), ())
     rate = np.gradient(choice.voltage) / np.gradient(record.time)  # over two steps, which halves the noise
@@ -48,8 +50,8 @@ def select_current_samples(record: Record, choice: DriveModel, max_attenuation: 
     if attenuation <= max_attenuation:
         return CurrentSamples(weight, rate, False, (note,), ())
     warning = (
-        f"V_V's noise, differentiated, drowns I and takes {format_percent(attenuation)} off what follows dV/dt;"
-        " name the waveform in the scene, or record V with less noise"
+        "noise of V_V, amplified by differentiation, lowers the estimated capacitive part of I by"
+        f" {format_percent(attenuation)}; name the waveform in the scene, or record V with less noise"
     )
     return CurrentSamples(weight, rate, True, (note,), (warning,))
 
@@ -57,20 +59,20 @@ def select_current_samples(record: Record, choice: DriveModel, max_attenuation: 
 def _edge_mask(
     voltage: Float[np.ndarray, " samples"], noise: float, threshold: float = 8.0, margin: int = 2, block: int = 64
 ) -> Bool[np.ndarray, " samples"]:
-    """Samples within `margin` steps of where the drive's slope changes suddenly.
+    """Return which samples lie within `margin` steps of a sudden change of the drive's slope.
 
-    That is by `threshold` times its usual bend over a `block` of samples, or what noise makes of it.
+    A change is sudden if it exceeds `threshold` times the median over a `block` of samples, or the effect of noise.
     """
     bend = np.abs(np.diff(voltage, 2, prepend=voltage[0], append=voltage[-1]))
     blocks = np.pad(bend, (0, -bend.size % block), mode="edge").reshape(-1, block)
-    usual = np.repeat(np.median(blocks, axis=1), block)[: bend.size]
+    median = np.repeat(np.median(blocks, axis=1), block)[: bend.size]
     floor = math.sqrt(6.0) * noise + 1e-9 * float(np.ptp(voltage))
-    edges = bend > threshold * np.maximum(usual, floor)
+    edges = bend > threshold * np.maximum(median, floor)
     return np.convolve(edges, np.ones(2 * margin + 1), mode="same") > 0.5
 
 
 class CurrentEstimate(NamedTuple):
-    """I = weight s b / (1 + s b) V + capacitance dV/dt, by linear fits."""
+    """Coefficients of I = weight s b / (1 + s b) V + capacitance dV/dt from linear fits."""
 
     weight: float  # S
     b: float  # s
@@ -78,7 +80,7 @@ class CurrentEstimate(NamedTuple):
 
 
 def estimate_from_current(record: Record, choice: DriveModel, samples: CurrentSamples) -> CurrentEstimate:
-    """Linear fits over a range of time constants."""
+    """Estimate the coefficients of I by linear fits on a grid of time constants."""
     weight, rate = samples.weight, samples.rate
     span = float(record.time[-1] - record.time[0])
     taus = np.geomspace(2.0 * record.time_step, 10.0 * span, 60)
@@ -91,8 +93,8 @@ def estimate_from_current(record: Record, choice: DriveModel, samples: CurrentSa
         sizes = np.linalg.norm(design, axis=0)
         sizes = np.where(sizes > 0.0, sizes, 1.0)
         amplitudes = np.linalg.lstsq(design / sizes, record["I"] * weight, rcond=None)[0] / sizes
-        remainder = record["I"] * weight - design @ amplitudes
-        return float(remainder @ remainder), float(amplitudes[0]), float(amplitudes[1])
+        residuals = record["I"] * weight - design @ amplitudes
+        return float(residuals @ residuals), float(amplitudes[0]), float(amplitudes[1])
 
     best = min(range(taus.size), key=lambda k: fit_at_tau(float(taus[k]))[0])
     if 0 < best < taus.size - 1:

@@ -1,4 +1,4 @@
-"""The fit of one or several channels, and which nuisances they ask for."""
+"""Least-squares fit of one or several channels, and the selection of nuisance parameters by the BIC."""
 
 import dataclasses
 import math
@@ -18,37 +18,37 @@ from fitact.likelihood.channel import TIMING_NUISANCES, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import fit_ar1, student_curvature, student_weight
 
-# by name, the columns of `LINEAR_NUISANCES` that a fit may free; beside these there are `TIMING_NUISANCES`
+# columns of `LINEAR_NUISANCES` that a fit may add as free parameters, by name; it may also add `TIMING_NUISANCES`
 NUISANCES = {"offset": (0,), "drift": (1,), "hum_50Hz": (2, 3), "hum_60Hz": (4, 5)}
-MIN_BIC_DECREASE = 10.0  # a nuisance is freed when it lowers the Bayesian information criterion by this much
+MIN_BIC_DECREASE = 10.0  # least decrease of the BIC for which a nuisance is added as a free parameter
 
 
 class LeastSquaresResult(eqx.Module):
-    """Where a fit ended; by channel: rows are its samples, or their coordinates."""
+    """End point of a fit. The rows of a channel are its samples, or their coordinates if it is compressed."""
 
-    likelihood: Likelihood  # what was fitted
+    likelihood: Likelihood  # likelihood with the selected nuisances
     theta: Float[Array, " parameters"]  # the optimum
-    sigma: Float[Array, " channels"]  # each channel's noise, by what is left of it
-    result: Any  # a member of `RESULTS`
-    steps: Array  # trial steps taken, in all
-    jacobian: tuple[Float[Array, "rows parameters"], ...]  # of the whitened residuals in theta
-    # under Student's t these, and the Jacobian, are reweighted
+    sigma: Float[Array, " channels"]  # noise sd of each channel, from its residuals
+    result: Any  # member of `RESULTS`
+    steps: Array  # total number of trial steps
+    jacobian: tuple[Float[Array, "rows parameters"], ...]  # Jacobian of the whitened residuals
+    # under Student's t, the residuals, the shapes, the slopes and the Jacobian are reweighted
     residuals: tuple[Float[Array, " rows"], ...]
-    shapes: tuple[Float[Array, "columns rows"], ...]  # those of the linear nuisances
-    slope: tuple[Float[Array, " rows"], ...]  # what a further delay would change
+    shapes: tuple[Float[Array, "columns rows"], ...]  # regressors of the linear nuisances
+    slope: tuple[Float[Array, " rows"], ...]  # derivative of the signal with respect to the delay
 
 
 def least_squares(
     likelihood: Likelihood, start: Array, noise: Array, noise_tolerance: float = 0.01, max_rounds: int = 6
 ) -> LeastSquaresResult:
-    """Fit in rounds: with the noise as given, then with that of the residuals, until it has settled.
+    """Fit in rounds, first with the given noise, then with that of the residuals, until the noise has converged.
 
-    It has where it changes by less than `noise_tolerance` of itself: no further round changes what follows.
+    It has converged when its relative change is below `noise_tolerance`; further rounds do not change the result.
     """
-    needed, steps = likelihood.without_samples(), jnp.zeros((), dtype=int)
+    reduced, steps = likelihood.without_samples(), jnp.zeros((), dtype=int)
     theta, sigma = start, noise
     for _ in range(max_rounds):
-        solved = _solve_round(needed, theta, sigma)
+        solved = _solve_round(reduced, theta, sigma)
         change = float(jnp.max(jnp.abs(solved.sigma / sigma - 1.0)))
         theta, sigma, steps = solved.theta, solved.sigma, steps + solved.steps
         if not change > noise_tolerance:
@@ -58,37 +58,38 @@ def least_squares(
 
 @eqx.filter_jit
 def _solve_round(likelihood: Likelihood, start: Array, sigma: Array) -> LeastSquaresResult:
-    found = minimise(lambda theta: (likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)), start)
-    theta, used = found.theta, found.theta.size / likelihood.count  # of a channel's samples, by the parameters
+    minimum = minimise(lambda theta: (likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)), start)
+    theta, fraction = minimum.theta, minimum.theta.size / likelihood.count  # parameters per sample
     parts = []
     for (channel, inputs), s in zip(likelihood.channels_and_inputs(theta), sigma, strict=True):
-        left = channel.fit_nuisances(inputs, s)[0]
-        root = jnp.sqrt(student_weight(left / s)) if channel.noise == "student" else 1.0
+        residuals = channel.fit_nuisances(inputs, s)[0]
+        factor = jnp.sqrt(student_weight(residuals / s)) if channel.noise == "student" else 1.0
         shapes, slope = channel.residuals_and_shapes(inputs)[1], channel.whitened_delay_derivative(inputs)
-        parts.append((left, _noise(channel, left, used), root * left, root * shapes, root * slope))
-    remainders, noise, *weighted = zip(*parts, strict=True)
+        sigma_new = _noise(channel, residuals, fraction)
+        parts.append((residuals, sigma_new, factor * residuals, factor * shapes, factor * slope))
+    unweighted, noise, *weighted = zip(*parts, strict=True)
     if any(channel.noise == "student" for channel in likelihood.channels):
-        jacobians = _information_jacobian(likelihood, theta, sigma, remainders)
+        jacobians = _information_jacobian(likelihood, theta, sigma, unweighted)
     else:
         sizes = [channel.rows + len(channel.columns) for channel in likelihood.channels]
-        jacobians = tuple(jnp.split(found.jacobian, np.cumsum(sizes))[:-1])
-    return LeastSquaresResult(likelihood, theta, jnp.stack(noise), found.result, found.steps, jacobians, *weighted)
+        jacobians = tuple(jnp.split(minimum.jacobian, np.cumsum(sizes))[:-1])
+    return LeastSquaresResult(likelihood, theta, jnp.stack(noise), minimum.result, minimum.steps, jacobians, *weighted)
 
 
 def _information_jacobian(
     likelihood: Likelihood, theta: Array, sigma: Array, residuals: tuple[Array, ...]
 ) -> tuple[Float[Array, "rows parameters"], ...]:
-    """The Jacobian whose square is the curvature of -log-likelihood: that of Student's residuals is steeper."""
+    """Return the Jacobian J for which J^T J is the curvature of -log-likelihood, also under Student's t."""
 
     def whitened_residuals(theta: Array) -> list[Array]:
         parts = zip(likelihood.channels_and_inputs(theta), sigma, strict=True)
-        found = ((channel.fit_nuisances(inputs, s), s) for (channel, inputs), s in parts)
-        return [jnp.concatenate([left / s, beta]) for (left, beta, _), s in found]
+        fits = ((channel.fit_nuisances(inputs, s), s) for (channel, inputs), s in parts)
+        return [jnp.concatenate([residuals / s, beta]) for (residuals, beta, _), s in fits]
 
     scaled, jacobians = [], jax.jacfwd(whitened_residuals)(theta)
-    for channel, jacobian, left, s in zip(likelihood.channels, jacobians, residuals, sigma, strict=True):
+    for channel, jacobian, residual, s in zip(likelihood.channels, jacobians, residuals, sigma, strict=True):
         if channel.noise == "student":
-            z = left / s
+            z = residual / s
             weight = student_weight(z)
             weight = weight * channel.mean(student_curvature(z)) / channel.mean(weight)
             jacobian = jacobian * jnp.pad(jnp.sqrt(weight), (0, len(channel.columns)), constant_values=1.0)[:, None]
@@ -97,7 +98,7 @@ def _information_jacobian(
 
 
 def _noise(channel: ChannelLikelihood, residuals: Array, parameter_fraction: Array) -> Array:
-    """Its standard deviation, or Student's scale, not below the least that is believed."""
+    """Return the noise sd, or Student's scale, but at least the noise floor of the channel."""
     counted = jnp.maximum(channel.count * (1.0 - parameter_fraction), 1)
     sigma = jnp.sqrt(jnp.sum(jnp.square(residuals)) / counted)
     sigma = jnp.maximum(sigma, channel.noise_floor)
@@ -108,7 +109,7 @@ def _noise(channel: ChannelLikelihood, residuals: Array, parameter_fraction: Arr
         squares = student_weight(residuals / sigma) * jnp.square(residuals)
         return jnp.maximum(jnp.sqrt(jnp.sum(squares) / counted), channel.noise_floor)
 
-    return lax.fori_loop(0, 40, update_scale, sigma)  # each step gains a quarter of a digit
+    return lax.fori_loop(0, 40, update_scale, sigma)  # each step adds a quarter of a digit
 
 
 def solve(
@@ -117,7 +118,7 @@ def solve(
     noise: Float[np.ndarray, " channels"],
     optional_nuisances: tuple[tuple[str, ...], ...],
 ) -> LeastSquaresResult:
-    """Fit, then free nuisances (`NUISANCES`, `TIMING_NUISANCES`) one at a time while one is asked for."""
+    """Fit, then add nuisances (`NUISANCES`, `TIMING_NUISANCES`) one by one while the BIC favours one."""
     solved = _solve_coloured_noise(likelihood, jnp.asarray(start), jnp.asarray(noise, dtype=float))
     for _ in range(sum(map(len, optional_nuisances))):
         gains = _bic_decreases(solved, optional_nuisances)
@@ -130,18 +131,18 @@ def solve(
 
 
 def _solve_coloured_noise(likelihood: Likelihood, start: Array, noise: Array) -> LeastSquaresResult:
-    """Fit; where a channel's noise is AR(1), again with the coefficient that the residuals show.
+    """Fit; if the noise of a channel is AR(1), fit again with the coefficient estimated from the residuals.
 
-    It is then held: its error and the parameters' are uncorrelated in the limit of many samples (the information
-    is block-diagonal), so that not knowing it exactly widens no parameter.
+    The coefficient is then fixed. For many samples its error is uncorrelated with those of the parameters (the
+    information matrix is block-diagonal), so it does not widen them.
     """
     solved = least_squares(likelihood, start, noise)
     for i, channel in enumerate(likelihood.channels):
         if channel.noise == "ar1":
             white = dataclasses.replace(channel, whitening=None)
-            left, *_ = _fit_nuisances(white, likelihood.channel_inputs(solved.theta, i), solved.sigma[i])
+            residuals, *_ = _fit_nuisances(white, likelihood.channel_inputs(solved.theta, i), solved.sigma[i])
             counted = channel.weights > 0.0
-            whitening = fit_ar1(np.asarray(left), counted).whitening(counted)
+            whitening = fit_ar1(np.asarray(residuals), counted).whitening(counted)
             likelihood = likelihood.replace_channel(i, dataclasses.replace(channel, whitening=whitening))
     if likelihood is solved.likelihood:
         return solved
@@ -152,7 +153,7 @@ _fit_nuisances = eqx.filter_jit(ChannelLikelihood.fit_nuisances)
 
 
 def _add_nuisance(solution: LeastSquaresResult, index: int, name: str) -> tuple[Likelihood, Array]:
-    """The likelihood with a nuisance of the channel `index` freed, and where to go on from."""
+    """Return the likelihood with an added nuisance of channel `index`, and the theta from which to continue."""
     likelihood, theta = solution.likelihood, solution.theta
     channel = likelihood.channels[index]
     if name in TIMING_NUISANCES:
@@ -168,14 +169,14 @@ def _add_nuisance(solution: LeastSquaresResult, index: int, name: str) -> tuple[
 def _bic_decreases(
     solution: LeastSquaresResult, optional_nuisances: tuple[tuple[str, ...], ...]
 ) -> dict[tuple[int, str], float]:
-    """Return what freeing each nuisance would take off the Bayesian information criterion, to first order."""
+    """Return the decrease of the BIC that adding each nuisance would cause, to first order."""
     likelihood, sigma = solution.likelihood, np.asarray(solution.sigma)
-    remainders = [np.asarray(x) / s for x, s in zip(solution.residuals, sigma, strict=True)]
-    starts = np.cumsum([0, *(x.size for x in remainders)])
-    columns = [np.concatenate([np.asarray(j)[: x.size] for j, x in zip(solution.jacobian, remainders, strict=True)])]
+    residuals = [np.asarray(x) / s for x, s in zip(solution.residuals, sigma, strict=True)]
+    starts = np.cumsum([0, *(x.size for x in residuals)])
+    columns = [np.concatenate([np.asarray(j)[: x.size] for j, x in zip(solution.jacobian, residuals, strict=True)])]
 
     def pad_columns(index: int, shapes: np.ndarray) -> np.ndarray:
-        """Columns of one channel, which are nothing in the others."""
+        """Return the columns of one channel, padded with zeros for the others."""
         around = (starts[index], starts[-1] - starts[index + 1])
         return np.pad(np.atleast_2d(shapes) / sigma[index], ((0, 0), around)).T
 
@@ -184,24 +185,23 @@ def _bic_decreases(
         shapes, free = np.asarray(solution.shapes[i]), np.asarray(channel.linear_sd) > 0.0
         columns.append(pad_columns(i, shapes[free[list(channel.columns)]]))
         if "clock" in optional_nuisances[i] and "clock" not in channel.timing:
-            share = clock_r_squared(channel, likelihood.channel_inputs(solution.theta, i), sigma[i])
-            gains[i, "clock"] = bic_decrease(share, float(channel.count), 1)
+            fraction = clock_r_squared(channel, likelihood.channel_inputs(solution.theta, i), sigma[i])
+            gains[i, "clock"] = bic_decrease(fraction, float(channel.count), 1)
         for name in optional_nuisances[i]:
             if name == "delay" and name not in channel.timing:
                 candidates[i, name] = pad_columns(i, np.asarray(solution.slope[i]))
             elif name in NUISANCES and not free[NUISANCES[name][0]]:
                 candidates[i, name] = pad_columns(i, shapes[list(NUISANCES[name])])
     basis = orthonormal_basis(np.concatenate(columns, axis=1))
-    remainder = np.concatenate(remainders)
+    all_residuals = np.concatenate(residuals)
     for (i, name), added in candidates.items():
-        left = added - basis @ (basis.T @ added)
-        modes, sizes, _ = np.linalg.svd(left, full_matrices=False)
+        modes, sizes, _ = np.linalg.svd(added - basis @ (basis.T @ added), full_matrices=False)
         modes = modes[:, sizes > 1e-9 * max(float(np.linalg.norm(added)), 1e-300)]
-        share = float(np.sum((modes.T @ remainder) ** 2)) / float(remainders[i] @ remainders[i])
-        gains[i, name] = bic_decrease(share, float(likelihood.channels[i].count), added.shape[1])
+        fraction = float(np.sum((modes.T @ all_residuals) ** 2)) / float(residuals[i] @ residuals[i])
+        gains[i, name] = bic_decrease(fraction, float(likelihood.channels[i].count), added.shape[1])
     return gains
 
 
 def bic_decrease(fraction: ArrayLike, count: float, n_columns: int) -> Any:
-    """Return the fall of the Bayesian information criterion with a share of `count` samples' sum of squares."""
+    """Return the decrease of the BIC if `n_columns` explain a `fraction` of the sum of squares of `count` samples."""
     return -count * np.log1p(-np.minimum(fraction, 1.0 - 1e-12)) - n_columns * math.log(count)

@@ -1,4 +1,4 @@
-"""Where least squares start from beside the data's own start, and whether they have other optima than the one found."""
+"""Least squares from several starting points, which shows whether there are other optima."""
 
 import math
 from collections.abc import Mapping
@@ -17,29 +17,33 @@ from fitact.likelihood.likelihood import Likelihood
 
 
 def choose_start(problem: Problem, start: Mapping[str, float] | None) -> Float[np.ndarray, " parameters"]:
-    """The data's start, or what summing the samples makes of another (SI), since a table holds little but the data's.
+    """Return the starting point estimated from the data, or one fitted to the samples from `start` (SI units).
 
-    From far off it may make nothing of it, where the circuit gives no signal: an end that leaves more than the
-    data's own start is no optimum, and that start is taken.
+    The response table covers only the neighbourhood of the data's start, so another start is first fitted to the
+    samples. Far from the data the circuit gives no signal and that fit fails; if it ends above the data's start, the
+    latter is returned.
+
+    Raises:
+        InputError: a name is not a free parameter, or a value is not positive and finite.
     """
     theta, names = problem.start.copy(), problem.likelihood.prior.names
     if start is None:
         return theta
     for name, value in start.items():
         if name not in names or not 0.0 < value < math.inf:
-            raise InputError(f"start {name} = {value}: give values above zero, in SI units, of {', '.join(names)}")
+            raise InputError(f"start {name} = {value}: give positive values in SI units for any of {', '.join(names)}")
         theta[names.index(name)] = math.log(value)
     noise = np.array([source.noise for source in problem.sources])
     end = np.asarray(solve(problem.likelihood, theta, noise, ((),) * noise.size).theta)
-    left_of_end, left_of_start = residual_objective(problem.likelihood, np.stack([end, problem.start]))
-    return end if left_of_end < left_of_start else problem.start
+    objective_end, objective_start = residual_objective(problem.likelihood, np.stack([end, problem.start]))
+    return end if objective_end < objective_start else problem.start
 
 
 def find_optima(solution: LeastSquaresResult, count: int, draws_per_start: int = 100) -> Optima:
-    """The optima that the one found and `count` - 1 draws of the prior lead to, at the noise found.
+    """Return the optima reached from the solution and `count` - 1 draws of the prior, at the noise of the solution.
 
-    Where the record is compressed, it shows its time constant, and only draws within the table's reach are taken, which
-    may be few of the `draws_per_start`.
+    If the record is compressed, only draws with a time constant within its table are used. These may be few, so
+    `draws_per_start` draws are made for each start.
     """
     likelihood = solution.likelihood.without_samples()
     draws = likelihood.sample_prior(np.asarray(solution.theta), draws_per_start * count)
@@ -57,9 +61,9 @@ def _residuals(
 
 
 def lower_optimum(optima: Optima, solution: LeastSquaresResult, min_separation: float = 0.5) -> dict[str, float] | None:
-    """The parameters (SI) of a lower optimum, `min_separation` standard errors from the one found; None: none is."""
+    """Return the parameters (SI) of a lower optimum at least `min_separation` standard errors away, or None."""
     lowest = np.asarray(optima.minima.theta[0])
-    apart = np.linalg.norm(np.asarray(optima.minima.jacobian[0]) @ (np.asarray(solution.theta) - lowest))
-    if not apart > min_separation:
+    separation = np.linalg.norm(np.asarray(optima.minima.jacobian[0]) @ (np.asarray(solution.theta) - lowest))
+    if not separation > min_separation:
         return None
     return {name: math.exp(lowest[i]) for i, name in enumerate(solution.likelihood.prior.names)}

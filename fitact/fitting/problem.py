@@ -1,4 +1,4 @@
-"""What is fitted to what: the likelihood of records and their scenes, and where the fit starts."""
+"""Construction of the likelihood of records and their scenes, and of the starting point of the fit."""
 
 import dataclasses
 import itertools
@@ -29,11 +29,11 @@ from fitact.prior.distributions import LogNormal
 from fitact.prior.prior import Prior
 from fitact.scene.scene import Scene
 
-MIN_RELATIVE_NOISE = 1e-9  # of a channel's span: least noise assumed
+MIN_RELATIVE_NOISE = 1e-9  # least noise sd assumed, relative to the range of the channel
 
 
 class Source(NamedTuple):
-    """Where a channel comes from."""
+    """Record, scene and drive of a channel, with estimates made before the fit."""
 
     record: Record
     scene: Scene
@@ -47,14 +47,14 @@ class Source(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """A likelihood over the samples, where its channels come from, and where to start."""
+    """Likelihood over the samples, sources of its channels, and starting point."""
 
     likelihood: Likelihood
     sources: tuple[Source, ...]
     start: Float[np.ndarray, " circuit_parameters"]
 
     def compress_likelihood(self, tolerance: float) -> tuple[Likelihood, tuple[str, ...]]:
-        """Compress the channels where that can hold; the reasons where it cannot."""
+        """Return the likelihood with compressed channels, and for each channel the reason if it is not compressed."""
         circuit = self.likelihood.circuit(jnp.asarray(self.start))
         pairs = []
         for channel, source in zip(self.likelihood.channels, self.sources, strict=True):
@@ -64,7 +64,7 @@ class Problem(NamedTuple):
         return dataclasses.replace(self.likelihood, channels=channels), reasons
 
     def experiment(self, likelihood: Likelihood, theta: np.ndarray, sigma: np.ndarray) -> Experiment:
-        """The measurement that was done; of several records, the first as many times."""
+        """Return the measurement as an experiment; several records count as repetitions of the first."""
         source, records = self.sources[0], len({id(source.record) for source in self.sources})
         pairs = zip(likelihood.channels, self.sources, strict=True)
         channels = tuple(channel.channel for channel, other in pairs if other.record is source.record)
@@ -72,12 +72,12 @@ class Problem(NamedTuple):
         gains = ("gain", "gain_I") if records == 1 else ()
         free = tuple(name for name in likelihood.prior.names if name in fields or name in gains)
         rows = [likelihood.prior.names.index(name) for name in free]
-        root, measured = likelihood.prior_factor, source.scene.measurement
-        noise = {"Vsc": measured.noise_Vsc, "I": measured.noise_I}
+        factor, measurement = likelihood.prior_factor, source.scene.measurement
+        noise = {"Vsc": measurement.noise_Vsc, "I": measurement.noise_I}
         return Experiment(
             circuit=likelihood.circuit(jnp.asarray(theta)),
             free=free,
-            prior_factor=np.linalg.cholesky((root @ root.T)[np.ix_(rows, rows)]),
+            prior_factor=np.linalg.cholesky((factor @ factor.T)[np.ix_(rows, rows)]),
             drive=source.choice.drive,
             time=source.record.time - source.choice.shift,
             channels=channels,
@@ -95,15 +95,15 @@ def build_problem(
     use_prior: bool = True,
     drives: Sequence[DriveModel | None] = (),
 ) -> Problem:
-    """One circuit and one prior, the first scene's; a drive and nuisances for each record.
+    """Build the problem with the circuit and prior of the first scene, and a drive and nuisances for each record.
 
-    `drives`: those of the first records, where they have been chosen already.
+    `drives` holds the drives of the first records, if they are already chosen.
     """
     first = scenes[0] or Scene()
-    stated = first.make_prior()
-    noise = {name: stated[name] for name in ("sigma", "sigma_I") if name in stated.names}
+    prior = first.make_prior()
+    noise = {name: prior[name] for name in ("sigma", "sigma_I") if name in prior.names}
     likelihood = likelihood_without_channels(
-        first, stated, lambda values: apply_skin_model(first.make_rc_circuit(values), records, scenes)
+        first, prior, lambda values: apply_skin_model(first.make_rc_circuit(values), records, scenes)
     )
     parts = []
     for number, (record, scene, drive) in enumerate(itertools.zip_longest(records, scenes, drives), 1):
@@ -111,8 +111,8 @@ def build_problem(
         for name in _channels(record, scene):
             parts.append(_build_channel(record, scene or Scene(), choice, name, suffix, likelihood.template))
     channels, sources, gains = zip(*parts, strict=True)
-    free = zip(channels, gains, strict=True)
-    free_gains = {channel.qualified_name("gain"): LogNormal(1.0, sd) for channel, sd in free if sd > 0.0}
+    pairs = zip(channels, gains, strict=True)
+    free_gains = {channel.qualified_name("gain"): LogNormal(1.0, sd) for channel, sd in pairs if sd > 0.0}
     likelihood = dataclasses.replace(
         likelihood,
         channels=channels,
@@ -124,20 +124,20 @@ def build_problem(
 
 
 def likelihood_without_channels(scene: Scene, prior: Prior, make_circuit: Callable[..., Any]) -> Likelihood:
-    """What a scene and its prior say of the circuit, which `make_circuit` makes of its values by name."""
+    """Return the likelihood of a scene before any record; `make_circuit` builds the circuit from values by name."""
     prior, tied, values = prior.drop_marginals("sigma", "sigma_I"), scene.prior.ties(), scene.fixed_values()
     values |= {name: math.exp(prior[name].log_mean) for name in prior.names}
     for name, (other, ratio) in tied.items():
         value = values.get(other, scene.nominal_values()[other])
         if value is None:
-            raise InputError(f"scene: [prior] {name} is tied to {other}, which the scene does not have; give it there")
+            raise InputError(f"scene: [prior] {name} is tied to {other}, which the scene does not define; define it")
         values[name] = ratio * value
     ties = tuple((name, other, ratio) for name, (other, ratio) in tied.items())
     return Likelihood((), as_arrays(make_circuit(values)), _prior_as_arrays(prior), (), ties)
 
 
 def _prior_as_arrays(prior: Prior) -> Prior:
-    """The prior whose log-normal marginals are no constants of what is compiled, where none are correlated."""
+    """Return the prior with log-normal marginals as arrays, so that compiled functions serve any; unless correlated."""
     if prior.pairs:
         return prior
     marginals = (as_arrays(m) if isinstance(m, LogNormal) else m for m in prior.marginals)
@@ -145,7 +145,7 @@ def _prior_as_arrays(prior: Prior) -> Prior:
 
 
 def _channels(record: Record, scene: Scene | None) -> tuple[Channel, ...]:
-    """What is fitted: the scene's channels, or without a scene Vsc, and I where there is no Vsc."""
+    """Return the channels to fit: those of the scene; without a scene Vsc, or I if there is no Vsc."""
     if scene is None:
         return ("I",) if "I" in record and "Vsc" not in record else ("Vsc",)
     return tuple(channel for channel in ("Vsc", "I") if channel in scene.measurement.channels)
@@ -154,7 +154,7 @@ def _channels(record: Record, scene: Scene | None) -> tuple[Channel, ...]:
 def _build_channel(
     record: Record, scene: Scene, choice: DriveModel, channel: Channel, number: str, template: RC | WithSkin
 ) -> tuple[ChannelLikelihood, Source, float]:
-    """A channel over its samples, its source, and the standard deviation of a gain's logarithm."""
+    """Return the likelihood of a channel over its samples, its source, and the sd of log(gain)."""
     _require_whole_drive(record, choice)
     require_skin_response(template, record, choice)
     label = "_".join(filter(None, ("" if channel == "Vsc" else channel, number)))
@@ -198,7 +198,7 @@ def _build_channel(
         label=label,
         channel=channel,
         steady_state=choice.steady_state,
-        # a shifted drive's edges are known to within a step only, which g feels; I's samples there are left out
+        # edges of a shifted drive are known only to within a step, which affects g; samples of I there are excluded
         timing=("delay",) if choice.shift != 0.0 and channel == "Vsc" else (),
         noise=scene.measurement.noise_model,
         columns=tuple(range(len(LINEAR_NUISANCES))),
@@ -209,31 +209,31 @@ def _build_channel(
 
 
 def _require_whole_drive(record: Record, choice: DriveModel) -> None:
-    """Refuse a measured drive that was clipped; one whose flat tops carry no noise is taken to be flat."""
+    """Refuse a clipped measured drive; flat tops without noise are not regarded as clipping."""
     if choice.name != "measured" or white_noise_sd(record["V"]) == 0.0 or rounding_noise_sd(record["V"]) > 0.0:
         return
     count = np.count_nonzero(clipping_mask(record["V"]))
     if count:
         raise InputError(
-            f"{record.source}: V_V is clipped at {count:,} of {len(record):,} samples, so what drove the finger is not"
-            " known; record it within range, or name the waveform in a scene"
+            f"{record.source}: V_V is clipped at {count:,} of {len(record):,} samples, so the drive is not known;"
+            " record it within range, or name the waveform in a scene"
         )
 
 
 def _weight(record: Record, channel: str, samples: CurrentSamples | None) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """The samples' weights, 0 where they were clipped, and a sentence about those."""
-    out, weight = clipping_mask(record[channel]), None if samples is None else samples.weight
-    if not out.any():
+    """Return the weights of the samples, 0 where they are clipped, and a sentence on these."""
+    clipped, weight = clipping_mask(record[channel]), None if samples is None else samples.weight
+    if not clipped.any():
         return weight, ()
     note = (
-        f"{channel} is clipped: {np.count_nonzero(out):,} of {out.size:,} samples lie at its extremes or within two"
-        " samples of one that does, and are left out; record with a wider range"
+        f"{channel} is clipped: {np.count_nonzero(clipped):,} of {clipped.size:,} samples (at an extreme, or within two"
+        " samples of one) are excluded; record with a wider range"
     )
-    return np.where(out, 0.0, 1.0 if weight is None else weight), (note,)
+    return np.where(clipped, 0.0, 1.0 if weight is None else weight), (note,)
 
 
 def _noise(record: Record, channel: str, scene: Scene) -> tuple[Autoregression | None, float]:
-    """The noise's colour, which the fit has still to find where it is AR(1), and its standard deviation."""
+    """Return the noise model (AR(1) with coefficients not yet fitted; None if white) and the noise sd."""
     model, quiet = scene.measurement.noise_model, scene.measurement.quiet
     if model in ("white", "student"):
         return None, record.noise(channel)
@@ -250,27 +250,27 @@ def _log_sd(relative_sd: float) -> float:
 def _prior_of_nuisances(
     record: Record, choice: DriveModel, channel: str, template: RC | WithSkin
 ) -> dict[str, Float[Array, "..."]]:
-    """Least noise, and standard deviations of linear nuisances, delay and clock, by their names in a channel."""
-    height = float(np.ptp(record[channel]))
+    """Return the noise floor and the prior sds of linear nuisances, delay and clock, by their field in a channel."""
+    peak_to_peak = float(np.ptp(record[channel]))
     n_charges = len(template.terms().tau) if choice.unknown_charge else 0
     charges = len(LINEAR_NUISANCES) - len(CHARGES) + np.arange(n_charges)
-    # a part of a wave cannot show an offset, so one within an oscilloscope's accuracy (2 %) is allowed for
-    offset = 0.02 * height if record.frequency() is None and choice.periodic else 0.0
-    # steps at the record's ends: the drive's frequency is known to one or two, or as well as `frequency_error` says
+    # a fraction of a period cannot determine an offset, so its prior is the accuracy of an oscilloscope (2 %)
+    offset = 0.02 * peak_to_peak if record.frequency() is None and choice.periodic else 0.0
+    # in time steps at the ends of the record; the frequency of the drive is known to one or two steps
     clock_sd = 5.0
     if channel == "Vsc" and choice.name != "measured":
         clock_sd = max(clock_sd, frequency_error(record, choice.name) * record.time.size)
-    # beside an ideal edge the samples leave the delay open within one step, whose middle is the start
+    # samples near an ideal edge determine the delay only to within one step, in the middle of which it starts
     delay_sd = math.sqrt(1.0 / 12.0) if has_ideal_edges(choice.drive) else 5.0
     return {
-        "noise_floor": jnp.asarray(max(MIN_RELATIVE_NOISE * height, rounding_noise_sd(record[channel]))),
-        "linear_sd": jnp.zeros(len(LINEAR_NUISANCES)).at[0].set(offset).at[charges].set(10.0 * height),  # anything
+        "noise_floor": jnp.asarray(max(MIN_RELATIVE_NOISE * peak_to_peak, rounding_noise_sd(record[channel]))),
+        "linear_sd": jnp.zeros(len(LINEAR_NUISANCES)).at[0].set(offset).at[charges].set(10.0 * peak_to_peak),  # wide
         "timing_sd": jnp.array([delay_sd, clock_sd]),
     }
 
 
 def _hum(record: Record, choice: DriveModel) -> list[str]:
-    """The mains hums that the record can tell from its drive's harmonics, or from a part of a wave."""
+    """Return the mains hums that are distinguishable from harmonics of the drive, or from a fraction of its period."""
     span, frequency = float(record.time[-1] - record.time[0]), record.frequency()
 
     def is_distinguishable(hum: float) -> bool:
@@ -282,7 +282,7 @@ def _hum(record: Record, choice: DriveModel) -> list[str]:
 
 
 def _edge_gain_sd(record: Record, choice: DriveModel, start: VscEstimate) -> float:
-    """Where a measured drive jumps within a step, its edge's time is uncertain within it, which acts as a gain."""
+    """Return the sd of log(gain) that stands for unresolved edges of a measured drive: their time is uncertain."""
     if choice.name != "measured" or not has_unresolved_edge(choice.voltage) or not math.isfinite(start.b):
         return 0.0
     return record.time_step / math.sqrt(12.0) / start.b

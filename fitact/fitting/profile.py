@@ -1,8 +1,8 @@
-"""Profile-likelihood intervals: how far a quantity may move before the best of all else fits too badly.
+"""Profile-likelihood intervals.
 
-A pseudo-datum of the quantity drags the least squares along. Wherever it comes to rest, all else is at its best
-for the value that the quantity has there, so each end is an exact point of the profile, and what is sought is
-the value at which the deviance has risen by a quantile of chi-square (Wilks, Ann. Math. Statist. 9 (1938) 60).
+A pseudo-datum of the quantity shifts the least-squares optimum. At the shifted optimum all other parameters are optimal
+for the value of the quantity there, so it is an exact point of the profile. An interval ends where the deviance has
+risen by a quantile of chi-square (Wilks, Ann. Math. Statist. 9 (1938) 60).
 """
 
 import dataclasses
@@ -30,34 +30,34 @@ PROFILE_QUANTITIES = ("g", "b", "force_mean")
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """Where a quantity may lie, in its SI unit; an open side is 0 or infinite (a delay's or a clock's: infinite)."""
+    """Interval of a quantity in its SI unit; an open end is 0 or infinite (for a delay or clock error, infinite)."""
 
     low: float
     high: float
-    level: float  # its probability, by the chi-square law of one parameter
-    prior: bool  # whether the circuit's prior speaks in it
+    level: float  # confidence level, from chi-square with one degree of freedom
+    prior: bool  # whether it includes the prior of the circuit
 
     @property
     def open(self) -> str:
-        """Which sides are open, to a factor of a million at least: "", "low", "high" or "both"."""
+        """Open ends (open by a factor of a million or more): "", "low", "high" or "both"."""
         low, high = self.low in (0.0, -math.inf), self.high == math.inf
         return "both" if low and high else "low" * low + "high" * high
 
     def to_dict(self) -> dict[str, Any]:
-        """Return its part of fit.json, where an open end is None."""
+        """Return the entry of fit.json, in which an open end is None."""
         ends = {name: None if self.open in (name, "both") else getattr(self, name) for name in ("low", "high")}
         return ends | {"open": self.open, "level": self.level, "prior": self.prior}
 
 
 class ConstrainedFit(eqx.Module):
-    """A fit whose quantities can be pinned: theta, or the logarithms of `PROFILE_QUANTITIES`."""
+    """Fit with a constrained quantity: an element of theta, or the logarithm of one of `PROFILE_QUANTITIES`."""
 
-    likelihood: Likelihood  # with or without the circuit's prior
-    sigma: Float[Array, " channels"]  # the channels' noise, which is held
-    derive: DerivedQuantities | None  # None: the quantities are theta itself
+    likelihood: Likelihood  # likelihood with or without the prior of the circuit
+    sigma: Float[Array, " channels"]  # noise sd of the channels, fixed
+    derive: DerivedQuantities | None  # None means that the quantities are theta
 
     def quantities(self, theta: Float[Array, " parameters"]) -> Float[Array, " quantities"]:
-        """Their values at theta."""
+        """Return the values of the quantities at theta."""
         if self.derive is None:
             return theta
         values = self.derive(theta, self.sigma)
@@ -68,29 +68,33 @@ class ConstrainedFit(eqx.Module):
 def _fit_constrained(
     model: ConstrainedFit, indices: Array, goal: Array, weight: Array, start: Array
 ) -> tuple[Array, Array, Array]:
-    """For each row: theta, the quantity and the deviance where a pseudo-datum `goal` of that weight drags them."""
+    """Return, for each row, theta, the quantity and the deviance at the optimum with a pseudo-datum `goal`."""
 
     def fit_row(index: Array, goal: Array, weight: Array, start: Array) -> tuple[Array, Array, Array]:
         def residuals(theta: Array) -> tuple[Any, ...]:
             pull = weight * (model.quantities(theta)[index] - goal)
             return model.likelihood.residuals(theta, model.sigma), model.likelihood.prior_residuals(theta), pull
 
-        found = minimise(residuals, start, max_steps=200)
-        value = model.quantities(found.theta)[index]
-        return found.theta, value, 2.0 * found.cost - jnp.square(weight * (value - goal))
+        minimum = minimise(residuals, start, max_steps=200)
+        value = model.quantities(minimum.theta)[index]
+        return minimum.theta, value, 2.0 * minimum.cost - jnp.square(weight * (value - goal))
 
-    # one after the other: side by side, long records would want much memory
+    # rows are evaluated one after the other, because long records would need much memory in parallel
     return jax.lax.map(lambda row: fit_row(*row), (indices, goal, weight, start))
 
 
 def profile_intervals(fit: FitResult, names: Sequence[str], level: float, prior: bool) -> dict[str, Interval]:
-    """Profile-likelihood intervals of the quantities `names` around an optimum, at its noise."""
+    """Return profile-likelihood intervals of the quantities `names`, at the noise of the fit.
+
+    Raises:
+        InputError: `level` is not between 0 and 1, or a name is unknown.
+    """
     if not 0.0 < level < 1.0:
         raise InputError(f"level = {level}: give a probability between 0 and 1, such as 0.95")
     likelihood, timing = fit.likelihood, fit.likelihood.timing
     for name in names:
         if name not in (available := (*likelihood.names, *PROFILE_QUANTITIES)):
-            raise InputError(f"there is no interval of {name}; choose from {', '.join(available)}")
+            raise InputError(f"no interval is available for {name}; choose from {', '.join(available)}")
     derived_sd = fit.laplace.derived_log_sd[[DERIVED_NAMES.index(name) for name in PROFILE_QUANTITIES]]
     intervals = {}
     with jax.enable_x64(True):
@@ -117,49 +121,57 @@ def interval_bounds(
     root_tolerance: float = 1e-4,
     max_rounds: int = 30,
 ) -> Float[np.ndarray, "quantities 2"]:
-    """The ends of the intervals of the quantities `indices`; not finite where a side is open.
+    """Return the bounds of the intervals of the quantities `indices`; an open bound is not finite.
 
-    All sides are sought at once, each between the last value that was too near and the last that was too far. `sd` are
-    the errors to expect, of which the pseudo-datum's is `pseudo_datum_sd`; `root_tolerance` is that of the root of the
-    deviance, relative.
+    All bounds are searched in parallel, each between the last value that was too near and the last that was too far.
+
+    Args:
+        model: constrained fit.
+        theta: optimum.
+        sd: expected standard errors of the quantities.
+        indices: indices of the quantities in the model.
+        level: confidence level.
+        pseudo_datum_sd: sd of the pseudo-datum, relative to `sd`.
+        root_tolerance: relative tolerance of the square root of the deviance.
+        max_rounds: maximum number of search steps.
     """
     z = NormalDist().inv_cdf(0.5 * (1.0 + level))
-    lanes, side = np.repeat(np.asarray(indices), 2), np.tile([-1.0, 1.0], len(indices))
-    expected = np.minimum(sd[lanes], UNCONSTRAINED_SD / z)
+    rows, side = np.repeat(np.asarray(indices), 2), np.tile([-1.0, 1.0], len(indices))
+    expected = np.minimum(sd[rows], UNCONSTRAINED_SD / z)
     weight = 1.0 / (pseudo_datum_sd * expected)
-    points = np.tile(theta, (lanes.size, 1))
-    points, middle, least = map(np.asarray, _fit_constrained(model, lanes, np.zeros(lanes.size), 0.0 * weight, points))
-    # the goals last found too near and too far, of which a quantity falls a little short, and the deviance's root there
-    near, far = np.zeros((2, lanes.size)), np.full((2, lanes.size), np.inf)
-    goal, found, within = z * expected, np.full(lanes.size, np.nan), np.zeros(lanes.size)
+    points, zeros = np.tile(theta, (rows.size, 1)), np.zeros(rows.size)
+    points, optimum, minimum = map(np.asarray, _fit_constrained(model, rows, zeros, 0.0 * weight, points))
+    # last goals that were too near and too far, with the root of the deviance; quantities stay slightly short of goals
+    inner, outer = np.zeros((2, rows.size)), np.full((2, rows.size), np.inf)
+    goal, bound, inside = z * expected, np.full(rows.size, np.nan), np.zeros(rows.size)
     for _ in range(max_rounds):
-        there, value, deviance = map(np.asarray, _fit_constrained(model, lanes, middle + side * goal, weight, points))
-        out, root = side * (value - middle), np.sqrt(np.maximum(deviance - least, 0.0))
-        short = root < z  # false where it is not finite
-        near, far = np.where(short, [goal, root], near), np.where(short, far, [goal, root])
-        within = np.where(short, out, within)
-        points = np.where(np.isfinite(there) & short[:, None], there, points)
-        done = np.isnan(found) & (np.abs(root - z) < root_tolerance * z)
-        found = np.where(done, out, np.where(np.isnan(found) & short & (goal >= UNCONSTRAINED_SD), np.inf, found))
-        if not np.isnan(found).any():
+        new, value, deviance = map(np.asarray, _fit_constrained(model, rows, optimum + side * goal, weight, points))
+        distance, root = side * (value - optimum), np.sqrt(np.maximum(deviance - minimum, 0.0))
+        short = root < z  # false if it is not finite
+        inner, outer = np.where(short, [goal, root], inner), np.where(short, outer, [goal, root])
+        inside = np.where(short, distance, inside)
+        points = np.where(np.isfinite(new) & short[:, None], new, points)
+        done = np.isnan(bound) & (np.abs(root - z) < root_tolerance * z)
+        bound = np.where(done, distance, np.where(np.isnan(bound) & short & (goal >= UNCONSTRAINED_SD), np.inf, bound))
+        if not np.isnan(bound).any():
             break
-        goal = np.where(np.isnan(found), _next_goal(near, far, z), goal)
-    found = np.where(np.isnan(found), within, found)
-    return (middle + side * found).reshape(-1, 2)
+        goal = np.where(np.isnan(bound), _next_goal(inner, outer, z), goal)
+    bound = np.where(np.isnan(bound), inside, bound)
+    return (optimum + side * bound).reshape(-1, 2)
 
 
 def _next_goal(inner: np.ndarray, outer: np.ndarray, z: float) -> np.ndarray:
-    """Where to look next: by a line through what is known, kept away from the ends of what is left."""
+    """Return the next goals by linear interpolation, kept away from the ends of the bracket."""
     with np.errstate(divide="ignore", invalid="ignore"):
         line = inner[0] + (outer[0] - inner[0]) * (z - inner[1]) / (outer[1] - inner[1])
-        ahead = inner[0] * np.clip(z / inner[1], 1.1, 4.0)
+        extrapolated = inner[0] * np.clip(z / inner[1], 1.1, 4.0)
     inside = np.clip(line, 0.95 * inner[0] + 0.05 * outer[0], 0.05 * inner[0] + 0.95 * outer[0])
     inside = np.where(np.isfinite(inside), inside, 0.5 * (inner[0] + outer[0]))
-    return np.minimum(np.where(np.isinf(outer[0]), ahead, inside), UNCONSTRAINED_SD)
+    return np.minimum(np.where(np.isinf(outer[0]), extrapolated, inside), UNCONSTRAINED_SD)
 
 
 def table(with_prior: Mapping[str, Interval], without_prior: Mapping[str, Interval]) -> str:
-    """Both kinds of intervals, for people."""
+    """Return a text table of the intervals with and without the prior."""
 
     def format_interval(name: str, interval: Interval) -> str:
         ends = [
@@ -169,7 +181,7 @@ def table(with_prior: Mapping[str, Interval], without_prior: Mapping[str, Interv
         return f"{ends[0]} to {ends[1]}"
 
     level = next(iter(with_prior.values())).level
-    cells = [(f"{100.0 * level:g} % interval", "with the prior", "of the records alone")]
+    cells = [(f"{100.0 * level:g} % interval", "with prior", "data only")]
     for name, interval in with_prior.items():
         cells.append((name, format_interval(name, interval), format_interval(name, without_prior[name])))
     return join_lines(align_rows(cells, (14, 28, 28)))

@@ -1,4 +1,4 @@
-"""Do the residuals look like the noise that the record itself shows?"""
+"""Comparison of the residuals with the model-free noise estimate of the record."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
 from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.residual_tests import N_TESTS, PhaseBins, ResidualTestStatistics, p_values, runs_z
 
-_FALSE_ALARM = 1e-6  # of a channel that holds nothing but noise, by all tests of structure together
+_FALSE_ALARM = 1e-6  # false-alarm probability of all residual tests of a channel together, for pure noise
 _P_VALUES = ("folded_p", "spectrum_p", "line_p")
 
 
@@ -26,19 +26,21 @@ def channel_statistics(
     channel: str,
     choice: DriveModel,
 ) -> dict[str, float]:
-    """Figures of merit of a channel's residuals (weighted, in its unit) after `n_fitted` parameters were fitted.
+    """Return figures of merit of the weighted residuals of a channel (in its unit) after fitting `n_fitted` parameters.
 
-    `noise` is what to expect of the channel, judged without the model; a measured drive adds its own, which
-    reaches the channel through `gain` (its unit per V).
+    `noise` is the model-free noise estimate of the channel. The noise of a measured drive adds to it, multiplied by
+    `gain` (unit of the channel per V).
     """
     measured = choice.name == "measured"
     expected = math.hypot(noise, gain * record.noise("V") if measured else 0.0)
     repeats = record.frequency() if choice.periodic else None
     count, square, bins = residuals.size, residuals @ residuals, PhaseBins.from_times(time, repeats)
     unit = math.sqrt(square / count) or 1.0
-    structure = ResidualTestStatistics.from_residuals((residuals / unit).astype(np.float32), bins)  # which is enough
-    found = residual_statistics(square, count, structure, np.asarray(expected), count - n_fitted, bins)
-    return {name: float(value) for name, value in found.items()} | {
+    structure = ResidualTestStatistics.from_residuals(
+        (residuals / unit).astype(np.float32), bins
+    )  # single precision suffices
+    figures = residual_statistics(square, count, structure, np.asarray(expected), count - n_fitted, bins)
+    return {name: float(value) for name, value in figures.items()} | {
         "rounding_noise": rounding_noise_sd(record[channel]),
         "interpolation_error": gain * interpolation_error(record["V"]) if measured else 0.0,
         "samples": count,
@@ -53,9 +55,15 @@ def residual_statistics(
     freedom: float,
     phase_bins: PhaseBins | None,
 ) -> dict[str, Float[np.ndarray, "*records"]]:
-    """The part of `statistics` that needs no more than what residuals come to, of each record.
+    """Return the figures of merit of each record that follow from sums over its residuals.
 
-    That is the sum of their squares, and their `test_statistics`, if tested; `expected` is their standard deviation.
+    Args:
+        square: sum of the squared residuals.
+        samples: number of residuals.
+        test_statistics: statistics of the residual tests, or None if they are not tested.
+        expected: expected standard deviation of the residuals.
+        freedom: degrees of freedom.
+        phase_bins: samples by phase of the drive.
     """
     tests = {}
     if test_statistics is not None:
@@ -70,19 +78,20 @@ def residual_statistics(
 
 
 def outliers(residuals: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"], noise: float) -> dict[str, float]:
-    """How many residuals lie further out than normal noise puts one in a thousand such records, and where the first.
+    """Return the number of outliers and the time of the first, `first_outlier` (s).
 
-    The noise is that of the middle half of them, or the one to expect where that is larger; `first_outlier` is in s.
+    Normal noise has a residual beyond the threshold in one of a thousand records. Its sd is estimated from the median
+    absolute residual, or is the expected `noise` if that is larger.
     """
     core = float(np.median(np.abs(residuals[residuals != 0.0]))) / 0.6744897501960817 if residuals.any() else 0.0
-    threshold = -NormalDist().inv_cdf(0.5e-3 / residuals.size)  # beyond which any lies with a probability of 1e-3
-    beyond = np.abs(residuals) > threshold * max(core, noise)
-    count = int(np.count_nonzero(beyond))
-    return {"outliers": count, **({"first_outlier": float(time[np.argmax(beyond)])} if count else {})}
+    threshold = -NormalDist().inv_cdf(0.5e-3 / residuals.size)  # exceeded by any residual with probability 1e-3
+    mask = np.abs(residuals) > threshold * max(core, noise)
+    count = int(np.count_nonzero(mask))
+    return {"outliers": count, **({"first_outlier": float(time[np.argmax(mask)])} if count else {})}
 
 
 def pooled_statistics(figures: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Figures of merit of all channels; those with a unit are the first's."""
+    """Return pooled figures of merit of all channels; figures with a unit are those of the first channel."""
     freedom = np.array([each["degrees_of_freedom"] for each in figures])
     chi2 = np.array([each["chi2_reduced"] for each in figures])
     return figures[0] | {
@@ -94,22 +103,23 @@ def pooled_statistics(figures: Sequence[dict[str, float]]) -> dict[str, float]:
 
 
 def is_misfit(figures: Mapping[str, ArrayLike], max_excess: float = 0.1) -> Bool[np.ndarray, "*records"]:
-    """Whether the residuals are larger than the noise, or have structure.
+    """Return whether the residuals are larger than the noise, or have structure.
 
-    `max_excess`: of the residual variance over the noise's; more counts if it is also significant.
+    `max_excess` is the largest acceptable relative excess of the residual variance over that of the noise; a larger
+    excess must also be significant.
     """
-    # sd of the log of residual variance over `white_noise_sd`'s, times the root of the samples, by simulation
+    # sd of log(residual variance / variance of `white_noise_sd`), times sqrt(samples), from simulations
     log_ratio_sd = 2.66
     significance = -NormalDist().inv_cdf(_FALSE_ALARM)
     significant = np.expm1(significance * log_ratio_sd / np.sqrt(np.asarray(figures["degrees_of_freedom"])))
-    # a rounded channel's residuals come in stretches that repeat, and its noise is known less well
+    # rounding correlates the residuals and makes the noise estimate less accurate
     rounded = np.asarray(figures["rounding_noise"]) > 0.0
     excess = np.asarray(figures["chi2_reduced"]) > 1.0 + np.maximum(np.where(rounded, 1.0, max_excess), significant)
     return excess | (is_structured(figures) & ~rounded) | is_undersampled(figures)
 
 
 def is_structured(figures: Mapping[str, ArrayLike], min_runs_z: float = -6.0) -> Bool[np.ndarray, "*records"]:
-    """Whether any test tells the residuals from white noise; what was not tested is not told from it."""
+    """Return whether any test rejects white noise; False for residuals that were not tested."""
     if "runs_z" not in figures:
         return np.zeros(np.shape(figures["chi2_reduced"]), bool)
     least = np.minimum.reduce([np.asarray(figures[name]) for name in _P_VALUES])
@@ -117,13 +127,13 @@ def is_structured(figures: Mapping[str, ArrayLike], min_runs_z: float = -6.0) ->
 
 
 def is_undersampled(figures: Mapping[str, ArrayLike]) -> Bool[np.ndarray, "*records"]:
-    """Whether the straight lines between the drive's samples err by more than the noise hides."""
-    # from a fifth of the residuals' rms g and b are off by several sd
+    """Return whether linear interpolation between samples of the drive causes a significant error."""
+    # above a fifth of the rms of the residuals, g and b are biased by several sd
     return np.asarray(figures["interpolation_error"]) > 0.2 * np.asarray(figures["rms_residual"])
 
 
 def interpolation_error(voltage: Float[np.ndarray, " samples"]) -> float:
-    """How far a smooth drive lies from the lines between its samples (V): its bend over a step, beyond the noise's."""
+    """Return the error (V) of linear interpolation of a smooth drive, from its second differences less their noise."""
     bend = float(np.median(np.abs(np.diff(voltage, 2))))
     noise = 0.6744897501960817 * math.sqrt(6.0) * white_noise_sd(voltage)
     return math.sqrt(max(bend**2 - 1.5 * noise**2, 0.0)) / 8.0

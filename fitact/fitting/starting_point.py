@@ -1,4 +1,4 @@
-"""Where a fit starts: what a record says of the circuit by linear fits, else the best of draws from the prior."""
+"""Starting point of a fit: estimates from linear fits to the record, otherwise the best of draws from the prior."""
 
 import math
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from fitact.model.skin import WithSkin, circuit_parameters
 
 
 class VscEstimate(NamedTuple):
-    """The divider g = a / b and the time constant b (s), by a linear fit."""
+    """Divider g and time constant b (s) from a linear fit."""
 
     g: float
     b: float
@@ -30,14 +30,17 @@ Estimate: TypeAlias = VscEstimate | CurrentEstimate
 def estimate_from_vsc(
     record: Record, choice: DriveModel, max_divider: float = 0.5, part_size: int = 1 << 20
 ) -> VscEstimate:
-    """g (below `max_divider`) and b from  Vsc = g V - (1/b) ∫ Vsc dt + line,  the circuit's equation integrated once.
+    """Estimate g and b from Vsc = g V - (1/b) ∫ Vsc dt + line, the circuit's equation integrated once.
 
-    Samples are taken `part_size` at a time, which bounds memory. A g that is not between 0 and `max_divider` (1/2, or a
-    little more with a free gain) is not this circuit's, and refused.
+    Samples are processed in parts of `part_size`, which limits memory.
+
+    Raises:
+        InputError: g is not between 0 and `max_divider` (1/2, or slightly more with a free gain), which this circuit
+            cannot give.
     """
     time, vsc, voltage = record.time, record["Vsc"], choice.voltage
     integral = np.concatenate([[0.0], np.cumsum(0.5 * np.diff(time) * (vsc[1:] + vsc[:-1]))])
-    if has_ideal_edges(choice.drive):  # the trapezoid rule misreads the samples beside an ideal edge
+    if has_ideal_edges(choice.drive):  # the trapezoid rule fails at samples next to an ideal edge
         inside = np.abs(np.diff(voltage, prepend=voltage[0])) < 1e-9 * np.ptp(voltage)
     else:
         inside = np.ones(time.size, dtype=bool)
@@ -51,13 +54,13 @@ def estimate_from_vsc(
     (g, slope, _, _), *_ = np.linalg.lstsq(R[:, :4], R[:, 4], rcond=None)
     if g >= max_divider:
         raise InputError(
-            f"{record.source}: Vsc is {g:.3g} times V at a step, but this circuit cannot give 1/2 or more;"
+            f"{record.source}: Vsc is {g:.3g} times V at a step, but this circuit excludes 1/2 or more;"
             " check for swapped columns or a wrong unit of V_V or Vsc_V"
         )
     if g <= 0.0:
         raise InputError(
-            f"{record.source}: Vsc steps against V (divider {g:.3g}); check the polarity of the probes"
-            " and that V_V and Vsc_V belong to one recording"
+            f"{record.source}: Vsc steps against V (divider g = {g:.3g}); check the polarity of the probes, and that"
+            " V_V and Vsc_V belong to the same record"
         )
     return VscEstimate(float(g), float(span / -slope) if slope < 0.0 else float("inf"))
 
@@ -65,12 +68,12 @@ def estimate_from_vsc(
 def start_from_estimates(
     likelihood: Likelihood, estimates: Sequence[Estimate | None]
 ) -> Float[np.ndarray, " circuit_parameters"]:
-    """Start from the linear fits, where these hold for the circuit; else from the best of draws from the prior."""
+    """Return the starting point: from the linear fits if they apply to the circuit, else the best draw of the prior."""
     vsc = next((estimate for estimate in estimates if isinstance(estimate, VscEstimate)), None)
     current = next((estimate for estimate in estimates if isinstance(estimate, CurrentEstimate)), None)
     theta = np.concatenate([likelihood.prior.log_mean, np.zeros(len(likelihood.names) - len(likelihood.prior.names))])
     if current is not None and not current.capacitance > 0.0 and isinstance(likelihood.template, WithSkin):
-        current = None  # of one frequency, what a constant skin makes of such a current need be no skin
+        current = None  # at one frequency, the constant skin that fits such a current can be unphysical
     if vsc is None and current is None:
         return _best_prior_draw(likelihood, theta)
     mean, sd = prior_skin_moments(likelihood)
@@ -86,7 +89,7 @@ def start_from_estimates(
 
 
 def _estimate_skin(vsc: VscEstimate | None, current: CurrentEstimate | None) -> tuple[float, float, float] | None:
-    """Rsc, Csc and Ci of a final circuit from what Vsc and I show of it, if those are of one."""
+    """Return Rsc, Csc and Ci of the circuit from the estimates of Vsc and I, or None if these do not determine them."""
     if current is None or not current.weight > 0.0:
         return None
     if vsc is not None and math.isfinite(vsc.b):
@@ -102,7 +105,7 @@ def _estimate_skin(vsc: VscEstimate | None, current: CurrentEstimate | None) -> 
 
 
 def prior_skin_moments(likelihood: Likelihood) -> tuple[np.ndarray, np.ndarray]:
-    """Means and standard deviations of log Rsc, log Csc and log Ci; a parameter that is held has next to none."""
+    """Return the prior means and sds of log Rsc, log Csc and log Ci; the sd of a fixed parameter is 1e-6."""
     prior, known = likelihood.prior, circuit_parameters(likelihood.template)
     pairs = [
         (prior[name].log_mean, prior[name].log_sd) if name in prior.names else (math.log(float(known[name])), 1e-6)
@@ -115,35 +118,35 @@ def prior_skin_moments(likelihood: Likelihood) -> tuple[np.ndarray, np.ndarray]:
 def most_probable_skin(
     g: Float[np.ndarray, "*n"], b: Float[np.ndarray, "*n"], mean: np.ndarray, sd: np.ndarray
 ) -> Float[np.ndarray, "*n 3"]:
-    """The most probable points, by the prior, among those with that divider and time constant (s; infinite: unknown).
+    """Return the points of highest prior density with divider `g` and time constant `b` (s; infinite if unknown).
 
-    They are the line (log Rsc, log Csc, log Ci) = point + t (-1, 1, 1).
+    Points with equal g and b lie on the line (log Rsc, log Csc, log Ci) = point + t (-1, 1, 1).
     """
     g = np.clip(g, 1e-9, 0.4999)
     b = np.where(np.isfinite(b), b, math.exp(mean[0] + mean[1]))
     ci = math.exp(mean[2])
     point = np.stack([np.log(g * b / ci), np.log((1.0 / g - 2.0) * ci), np.full_like(g, math.log(ci))], axis=-1)
-    along, weight = np.array([-1.0, 1.0, 1.0]), sd**-2.0
-    return point + along * np.sum(weight * along * (mean - point), axis=-1, keepdims=True) / np.sum(weight)
+    direction, weight = np.array([-1.0, 1.0, 1.0]), sd**-2.0
+    return point + direction * np.sum(weight * direction * (mean - point), axis=-1, keepdims=True) / np.sum(weight)
 
 
 def _best_prior_draw(
     likelihood: Likelihood, theta: np.ndarray, count: int = 256
 ) -> Float[np.ndarray, " circuit_parameters"]:
-    """The one of `count` draws of the prior that leaves least of the channels, whatever their noise."""
+    """Return the draw of the prior, of `count`, with the lowest residual objective."""
     points = np.vstack([theta, likelihood.sample_prior(theta, count - 1)])
     return points[int(np.argmin(residual_objective(likelihood, points)))]
 
 
 def residual_objective(likelihood: Likelihood, points: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, " n"]:
-    """What points leave of the channels, whatever their noise: for comparing one with another."""
+    """Return the residual objective of each point, which compares points without knowledge of the noise."""
     return BatchEvaluator(_residual_objective, likelihood, likelihood.rows)(points)
 
 
 def _residual_objective(
     likelihood: Likelihood, theta: Float[np.ndarray, " circuit_parameters"]
 ) -> Float[np.ndarray, ""]:
-    """The sum of the logarithms of the residuals' squares, each for its samples."""
+    """Return half the sum over channels of samples times log(sum of squared residuals)."""
     parts = [
         channel.count * jnp.log(jnp.sum(jnp.square(channel.fit_nuisances(inputs, 1e-3 * jnp.ptp(channel.observed))[0])))
         for channel, inputs in likelihood.channels_and_inputs(theta)

@@ -1,4 +1,4 @@
-"""When a channel's drive began and how fast it runs: the best of a grid, and what a clock of its own would change."""
+"""Delay and clock error of a channel: their best value on a grid, and the gain from fitting a clock error."""
 
 import dataclasses
 
@@ -24,12 +24,11 @@ def free_timing(
     delay_half_width: float = 5.0,
     clock_half_width: float = 2.0,
 ) -> ChannelLikelihood:
-    """The channel with its delay or clock free, over its samples, since the response table holds none.
+    """Return the channel with a free delay or clock error (`name`), over its samples; tables cannot represent either.
 
-    From the middle of the best of a grid, whose step and half widths are in units of the coordinates: across an ideal
-    edge there is no slope to follow, and between two samples nothing that a gain could not do as well. Ideal edges tell
-    a clock, and a delay with it, from the samples beside them only; what these leave open is the prior then, and they
-    are left out.
+    The start is the center of the best points of a grid, because an ideal edge has no slope to follow. `step` and the
+    half widths of the grid are in units of the coordinates. With ideal edges, only the samples next to them determine a
+    clock error, and a delay with it. These samples bound both by a prior, and are then excluded from the fit.
     """
     edges = _edge_mask(channel) if name == "clock" else np.zeros(channel.time.size, bool)
     names = TIMING_NUISANCES if edges.any() else (name,)
@@ -39,15 +38,15 @@ def free_timing(
     half_widths = {"delay": 1.0 if len(names) > 1 else delay_half_width, "clock": clock_half_width}
     axes = [step * np.arange(-int(w / step), int(w / step) + 1) for w in map(half_widths.__getitem__, names)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(names))
-    kept = _select_samples(channel, edges) if edges.any() else channel
-    squares = _residual_sums_of_squares(kept, inputs, names, grid * units)
-    # more than the least by less than a sample on the wrong side of an edge, which is off by most of the height
+    used = _select_samples(channel, edges) if edges.any() else channel
+    squares = _residual_sums_of_squares(used, inputs, names, grid * units)
+    # less than the effect of one sample on the wrong side of an edge, whose error is most of the height
     margin = (
         (0.1 * np.ptp(np.asarray(channel.observed))) ** 2 if edges.any() else squares.min() * 25.0 / channel.n_samples
     )
     good = grid[squares < squares.min() + margin]
-    moved = {"delay": 0.0, "clock": 0.0} | dict(zip(names, good.mean(axis=0) * units, strict=True))
-    channel = dataclasses.replace(channel, shift=channel.shift + moved["delay"], clock=channel.clock + moved["clock"])
+    change = {"delay": 0.0, "clock": 0.0} | dict(zip(names, good.mean(axis=0) * units, strict=True))
+    channel = dataclasses.replace(channel, shift=channel.shift + change["delay"], clock=channel.clock + change["clock"])
     if not edges.any():
         return channel
     timing_sd = np.hypot(good.std(axis=0), step / np.sqrt(12.0))
@@ -56,7 +55,7 @@ def free_timing(
 
 
 def _edge_mask(channel: ChannelLikelihood, margin: float = 3.0) -> np.ndarray:
-    """Which samples lie within `margin` steps of an ideal edge, where its time shows."""
+    """Return which samples lie within `margin` steps of an ideal edge and thus determine its time."""
     if not has_ideal_edges(channel.drive):
         return np.zeros(channel.time.size, bool)
     time, step = np.asarray(channel.time) - float(channel.shift), margin * float(channel.time_step)
@@ -64,10 +63,10 @@ def _edge_mask(channel: ChannelLikelihood, margin: float = 3.0) -> np.ndarray:
 
 
 def _select_samples(channel: ChannelLikelihood, mask: np.ndarray) -> ChannelLikelihood:
-    """With some of its samples only."""
-    places, arrays = np.flatnonzero(mask), (channel.time, channel.observed)
-    time, observed = (jnp.asarray(pad_samples(np.asarray(x)[places])) for x in arrays)
-    weight = jnp.asarray(pad_weight(channel.weights[places]))
+    """Return the channel with only the samples of the mask."""
+    indices, arrays = np.flatnonzero(mask), (channel.time, channel.observed)
+    time, observed = (jnp.asarray(pad_samples(np.asarray(x)[indices])) for x in arrays)
+    weight = jnp.asarray(pad_weight(channel.weights[indices]))
     return dataclasses.replace(channel, time=time, observed=observed, weight=weight)
 
 
@@ -78,10 +77,10 @@ def _residual_sums_of_squares(
     candidates: np.ndarray,
     batch: int = 27,
     max_numbers: int = 1 << 20,
-) -> Float[np.ndarray, " places"]:
-    """What each of the places, in SI units, leaves of the channel with the best gain and linear nuisances.
+) -> Float[np.ndarray, " candidates"]:
+    """Return the residual sum of squares at each candidate (SI units), with the best gain and linear nuisances.
 
-    The signals of a `batch` are computed side by side, where these are no more than `max_numbers`.
+    The signals of a `batch` are computed in parallel, but not more than `max_numbers` values at once.
     """
     weights, shapes = channel.weights, np.asarray(_shapes(channel, inputs))[np.asarray(channel.linear_sd) > 0.0]
     basis = orthonormal_basis((shapes * weights).T)
@@ -97,8 +96,8 @@ def _residual_sums_of_squares(
         offsets = dict(zip(names, pad_rows(some, size).T, strict=True))
         signals = project_out(np.asarray(_signals(channel, inputs, offsets))[: len(some)])
         gains = signals @ observed / np.maximum(np.vecdot(signals, signals), 1e-300)
-        remainders = observed - gains[:, None] * signals
-        sums.append(np.vecdot(remainders, remainders))
+        residuals = observed - gains[:, None] * signals
+        sums.append(np.vecdot(residuals, residuals))
     return np.concatenate(sums)
 
 
@@ -110,52 +109,52 @@ def _signals(
     channel: ChannelLikelihood, inputs: ChannelInputs, offsets: dict[str, Float[Array, " places"]]
 ) -> Float[Array, "places samples"]:
     def shifted_signal(offset: dict[str, Array]) -> Array:
-        moved = {name: getattr(inputs, name) + offset[name] for name in offset}
-        return channel.signal(dataclasses.replace(inputs, **moved))
+        shifted = {name: getattr(inputs, name) + offset[name] for name in offset}
+        return channel.signal(dataclasses.replace(inputs, **shifted))
 
     return jax.vmap(shifted_signal)(offsets)
 
 
 def orthonormal_basis(columns: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "rows rank"]:
-    """Orthonormal columns that span the same; what rounding leaves of dependent ones does not count."""
+    """Return an orthonormal basis of the column space; dependent columns are dropped up to rounding."""
     q, r = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))
     modes, sizes, _ = np.linalg.svd(r)
     return q @ modes[:, sizes > 1e-9 * np.max(sizes, initial=0.0)]
 
 
 def clock_r_squared(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: float) -> float:
-    """Return the share that a free clock would take off the sum of the squared residuals, to first order.
+    """Return the fraction of the residual sum of squares that a free clock error would explain, to first order.
 
-    Its shape is no combination of responses, so the response table does not hold it: from the samples.
+    It is computed from the samples, because the response table cannot represent the effect of a clock error.
     """
     rows = np.asarray(_clock_regressors(channel.without_compression(), inputs, jnp.asarray(sigma)))
-    kept, edges = channel.weights > 0.0, _edge_mask(channel)
-    drop = _r_squared(rows[:, kept])
-    # an ideal edge shows a clock where it has passed a sample, and hides it where it has not
-    return max(drop, _r_squared(rows[:, kept & ~edges])) if edges.any() else drop
+    used, edges = channel.weights > 0.0, _edge_mask(channel)
+    r_squared = _r_squared(rows[:, used])
+    # a clock error shows at an ideal edge only if the edge has passed a sample; otherwise samples there hide it
+    return max(r_squared, _r_squared(rows[:, used & ~edges])) if edges.any() else r_squared
 
 
 def _r_squared(rows: np.ndarray) -> float:
     basis = orthonormal_basis(rows[2:].T)
-    clock, remainder = (x - basis @ (basis.T @ x) for x in rows[:2])
-    return float((clock @ remainder) ** 2 / max((clock @ clock) * (remainder @ remainder), 1e-300))
+    clock, residuals = (x - basis @ (basis.T @ x) for x in rows[:2])
+    return float((clock @ residuals) ** 2 / max((clock @ clock) * (residuals @ residuals), 1e-300))
 
 
 @eqx.filter_jit
 def _clock_regressors(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: Array) -> Float[Array, "n samples"]:
-    """What a clock changes, what is left, and all that the circuit and the linear nuisances can change."""
+    """Return the effect of a clock error, the residuals, and the effects of all circuit and linear parameters."""
     time = channel.time - (channel.shift + inputs.delay)
     taus = jnp.stack(constant_skin_circuit(inputs.circuit).channel_terms(channel.channel).tau)
 
     def response(log_tau: Array) -> Array:
         return highpass(channel.drive, time, jnp.exp(log_tau), steady_state=channel.steady_state)
 
-    along, bent = jax.vmap(lambda x: jax.jvp(response, (x,), (jnp.ones_like(x),)))(jnp.log(taus))
+    responses, tau_slopes = jax.vmap(lambda x: jax.jvp(response, (x,), (jnp.ones_like(x),)))(jnp.log(taus))
     slope = channel.delay_derivative(inputs)
     shapes = jnp.where(channel.linear_sd[:, None] > 0.0, channel.shapes(inputs), 0.0)
-    # a free delay changes the slope alone
+    # a free delay adds only the slope as a regressor
     delay = slope if "delay" in channel.timing else jnp.zeros_like(slope)
-    rows = jnp.stack([time * slope, channel.observed - channel.signal(inputs), *along, *bent, *shapes, delay])
+    rows = jnp.stack([time * slope, channel.observed - channel.signal(inputs), *responses, *tau_slopes, *shapes, delay])
     rows = channel.apply_whitening(rows)
     if channel.noise != "student":
         return rows

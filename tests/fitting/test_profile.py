@@ -72,7 +72,9 @@ def test_the_records_alone_leave_the_contact_area_open(fit: fitact.Fit):
         assert found[name].low < fit.derived()[name]["q50"] < found[name].high
 
 
-@pytest.mark.parametrize(("name", "level", "words"), [("Z", 0.95, "no interval of Z"), ("Ci", 1.0, "between 0 and 1")])
+@pytest.mark.parametrize(
+    ("name", "level", "words"), [("Z", 0.95, "no interval is available for Z"), ("Ci", 1.0, "between 0 and 1")]
+)
 def test_what_has_no_interval_is_refused(fit: fitact.Fit, name: str, level: float, words: str):
     with pytest.raises(fitact.InputError, match=words):
         fit.profile(name, level)
