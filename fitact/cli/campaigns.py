@@ -43,13 +43,13 @@ def campaign(
     Writes results.parquet, failures.csv and index.html into DIR. After an interruption, run the same command again:
     finished records are kept. Exit status 0 means that every record has a result or a reason for its failure.
     """
-    stated = load_scene(scene)
+    loaded = load_scene(scene)
     internal.use_compilation_cache()
     fits = fitact.run_campaign(
-        records, out, stated, **column_options((channel, scale)),
+        records, out, loaded, **column_options((channel, scale)),
         scheduler=scheduler, workers=workers, memory=memory, posteriors=posteriors,
         reports=reports, seed=seed,
     )  # fmt: skip
-    page = report.write_campaign(out, fits, report.Provenance.from_inputs(command_line(), stated))
+    page = report.write_campaign(out, fits, report.Provenance.from_inputs(command_line(), loaded))
     counts = {"records": len(fits), "answers": len(fits.answered), "failures": len(fits.failures)}
     show(f"{fits}\nopen {page}", counts | {"page": str(page)}, json)

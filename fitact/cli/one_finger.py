@@ -86,9 +86,9 @@ def fit(
     """
     fitted: fitact.SpectrumFit | fitact.Fit
     if len(records) == 1 and internal.is_spectrum(records[0]):
-        stated, spectrum = options.load_scene(scene[0] if scene else None), fitact.read_spectrum(records[0])
+        loaded, spectrum = options.load_scene(scene[0] if scene else None), fitact.read_spectrum(records[0])
         internal.use_compilation_cache()
-        fitted = fitact.fit_spectrum(spectrum, stated)
+        fitted = fitact.fit_spectrum(spectrum, loaded)
         text, content = str(fitted), fitted.to_dict()
     else:
         planned = _fit_records(records, scene, (channel, scale), model, tolerance, starts)
@@ -139,14 +139,14 @@ def _fit_records(
     tolerance: float,
     starts: int = 1,
 ) -> "PlannedFit":
-    stated = [fitact.Scene.load(path) for path in scenes or []]
-    for scene in stated:
+    loaded = [fitact.Scene.load(path) for path in scenes or []]
+    for scene in loaded:
         scene.require_available(fit=model == "full")
-    paired = stated if len(stated) == len(records) else [stated[0] if stated else None] * len(records)
+    paired = loaded if len(loaded) == len(records) else [loaded[0] if loaded else None] * len(records)
     column_kwargs = options.column_options(columns)
     # invalid files are refused before the slow imports
     measured = [fitact.read(path, scene, **column_kwargs) for path, scene in zip(records, paired, strict=True)]
     internal.use_compilation_cache()
     for path, record in zip(records, measured, strict=True):
         print_stderr(f"fitting {path} ({len(record):,} samples)")
-    return internal.fit_planned(measured, stated, model, starts=starts, tolerance=tolerance)
+    return internal.fit_planned(measured, loaded, model, starts=starts, tolerance=tolerance)

@@ -80,13 +80,13 @@ def population(
     With --out, writes report.html, population.json, population.nc (the draws), population.svg and chain.h5 (to resume
     sampling) into DIR.
     """
-    stated = options.load_scene(scene)
+    loaded = options.load_scene(scene)
     covariate_values = {} if covariates is None else internal.read_covariates(covariates, records)
     internal.use_compilation_cache()
     if fresh and out is not None:
         internal.delete_chains(out)
     fitted = fitact.population(
-        options.LazyRecords(records, stated, (channel, scale)), stated, covariates=covariate_values,
+        options.LazyRecords(records, loaded, (channel, scale)), loaded, covariates=covariate_values,
         at=options.parse_numbers("--at moisture=0.4", at), folder=out, seed=seed,
     )  # fmt: skip
     content = fitted.to_dict()
@@ -115,13 +115,13 @@ def tradeoff(
 
     Takes one or two minutes. With --out, writes report.html, tradeoff.json and tradeoff.svg into DIR.
     """
-    stated = options.load_scene(scene)
-    measured = None if record is None else fitact.read(record, stated, **options.column_options((channel, scale)))
+    loaded = options.load_scene(scene)
+    measured = None if record is None else fitact.read(record, loaded, **options.column_options((channel, scale)))
     try:
-        costs = fitact.measure_tradeoff(measured, stated)
+        costs = fitact.measure_tradeoff(measured, loaded)
     except KeyboardInterrupt:
         print_stderr("fitact: interrupted; nothing was written")
         raise typer.Exit(130) from None
     if out is not None:
-        report.write_folder(out, costs, command_line(), stated, [measured] if measured else [])
+        report.write_folder(out, costs, command_line(), loaded, [measured] if measured else [])
     show(str(costs), costs.to_dict(), json, costs.trusted)

@@ -24,8 +24,8 @@ def scene(
     json: Json = False,
 ) -> None:
     """Print a scene with all keys and units; keys at their defaults are commented out."""
-    stated = fitact.Scene.load(file) if file else fitact.Scene()
-    show(str(stated).rstrip(), stated.model_dump(mode="json"), json)
+    loaded = fitact.Scene.load(file) if file else fitact.Scene()
+    show(str(loaded).rstrip(), loaded.model_dump(mode="json"), json)
 
 
 @app.command()
@@ -39,9 +39,9 @@ def prior(
     json: Json = False,
 ) -> None:
     """Predict Vsc and the force from the prior of a scene alone, before any data."""
-    stated = fitact.Scene.load(scene)
+    loaded = fitact.Scene.load(scene)
     internal.use_compilation_cache()
-    predicted = internal.prior_predictive(stated, draws, seed)
+    predicted = internal.prior_predictive(loaded, draws, seed)
     if out is not None:
         report.write_prior(out, predicted)
     show(str(predicted), predicted.to_dict(), json)
@@ -64,12 +64,12 @@ def plan(
     Lists the error and the speed-up of each simplification. With --out, writes report.html, plan.json and plan.svg into
     DIR.
     """
-    stated = fitact.Scene.load(scene)
-    measured = None if record is None else fitact.read(record, stated, **column_options((channel, scale)))
+    loaded = fitact.Scene.load(scene)
+    measured = None if record is None else fitact.read(record, loaded, **column_options((channel, scale)))
     internal.use_compilation_cache()
-    planned = fitact.plan(stated) if measured is None else internal.plan_for_record(measured, stated)
+    planned = fitact.plan(loaded) if measured is None else internal.plan_for_record(measured, loaded)
     if out is not None:
-        report.write_folder(out, planned, command_line(), stated, [measured] if measured else [])
+        report.write_folder(out, planned, command_line(), loaded, [measured] if measured else [])
     show(str(planned), planned.to_dict(), json)
 
 
@@ -81,10 +81,10 @@ def simulate(
     json: Json = False,
 ) -> None:
     """Simulate a record of a scene, with noise, and write V and the measured channels to a CSV file."""
-    stated = fitact.Scene.load(scene)
-    record = internal.simulate(stated, seed)
+    loaded = fitact.Scene.load(scene)
+    record = internal.simulate(loaded, seed)
     internal.write_csv(out, record)
-    truth = {"Rsc": stated.skin.Rsc, "Csc": stated.skin.Csc, "Ci": stated.device.Ci}
+    truth = {"Rsc": loaded.skin.Rsc, "Csc": loaded.skin.Csc, "Ci": loaded.device.Ci}
     content = {"file": str(out), "samples": len(record), "channels": list(record.channels), "seed": seed}
     show(f"wrote {out}: {len(record):,} samples of {', '.join(record.channels)}", content | {"truth": truth}, json)
 

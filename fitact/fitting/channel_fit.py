@@ -31,9 +31,7 @@ class ChannelFit:
     sigma: float  # standard deviation of the noise, estimated from the residuals, V or A
     linear: dict[str, float]  # free offset, drift, hum and charge at the optimum, V or A
     residuals: Float[np.ndarray, " samples"]  # data minus fit, V or A
-    weight: (
-        Float[np.ndarray, " samples"] | None
-    )  # relative inverse noise sd of the samples; 0 excludes one, None means 1
+    weight: Float[np.ndarray, " samples"] | None  # relative inverse noise sd; 0 excludes a sample, None means 1
     log_likelihood: float  # log-likelihood of the samples, including all constants
     figures: dict[str, float]  # figures of merit: chi2_reduced, rms_residual, noise_expected, runs_z, ...
     full_because: str  # reason why the likelihood is not compressed, as a clause; "" if it is

@@ -18,9 +18,7 @@ from fitact.units import format_percent
 class CurrentSamples(NamedTuple):
     """Samples of a current that follows dV/dt, as a likelihood uses them."""
 
-    weight: Float[
-        np.ndarray, " samples"
-    ]  # relative inverse noise sd, 0 at edges; see `fitact.likelihood.channel.ChannelLikelihood`
+    weight: Float[np.ndarray, " samples"]  # relative inverse noise sd, 0 at edges; see `ChannelLikelihood`
     rate: Float[np.ndarray, " samples"]  # dV/dt, V/s
     drive_noise_dominates: bool  # whether V's noise, differentiated, takes too much off what follows dV/dt
     notes: tuple[str, ...]  # sentences for information

@@ -17,8 +17,8 @@ _P_VALUES = ("folded_p", "spectrum_p", "line_p")
 
 
 def channel_statistics(
-    residuals: Float[np.ndarray, " kept"],
-    time: Float[np.ndarray, " kept"],
+    residuals: Float[np.ndarray, " used"],
+    time: Float[np.ndarray, " used"],
     noise: float,
     n_fitted: float,
     gain: float,
@@ -36,9 +36,8 @@ def channel_statistics(
     repeats = record.frequency() if choice.periodic else None
     count, square, bins = residuals.size, residuals @ residuals, PhaseBins.from_times(time, repeats)
     unit = math.sqrt(square / count) or 1.0
-    structure = ResidualTestStatistics.from_residuals(
-        (residuals / unit).astype(np.float32), bins
-    )  # single precision suffices
+    # single precision suffices for the tests
+    structure = ResidualTestStatistics.from_residuals((residuals / unit).astype(np.float32), bins)
     figures = residual_statistics(square, count, structure, np.asarray(expected), count - n_fitted, bins)
     return {name: float(value) for name, value in figures.items()} | {
         "rounding_noise": rounding_noise_sd(record[channel]),

@@ -106,8 +106,8 @@ _shapes = eqx.filter_jit(ChannelLikelihood.shapes)
 
 @eqx.filter_jit
 def _signals(
-    channel: ChannelLikelihood, inputs: ChannelInputs, offsets: dict[str, Float[Array, " places"]]
-) -> Float[Array, "places samples"]:
+    channel: ChannelLikelihood, inputs: ChannelInputs, offsets: dict[str, Float[Array, " candidates"]]
+) -> Float[Array, "candidates samples"]:
     def shifted_signal(offset: dict[str, Array]) -> Array:
         shifted = {name: getattr(inputs, name) + offset[name] for name in offset}
         return channel.signal(dataclasses.replace(inputs, **shifted))

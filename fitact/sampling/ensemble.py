@@ -181,7 +181,7 @@ class _Run:
         """Sample, diagnose and save in turn."""
         steps = self.chain.steps
         is_due = steps == _next_diagnostic_step(steps - 1) or steps >= max_steps
-        convergence = self.judge() if is_due else Convergence()
+        convergence = self.diagnose() if is_due else Convergence()
         with _defer_interrupts() as check:
             try:
                 while not convergence.converged and self.chain.steps < max_steps:
@@ -189,13 +189,13 @@ class _Run:
                     while self.chain.steps < goal:
                         self.advance(min(self.steps_per_turn, goal - self.chain.steps), check)
                         report(self.chain.steps, convergence)
-                    convergence = self.judge()
+                    convergence = self.diagnose()
                     report(self.chain.steps, convergence)
                     check()
             except KeyboardInterrupt:
                 if self.chain.steps == 0:
                     raise
-                convergence = dataclasses.replace(self.judge(), converged=False, interrupted=True)
+                convergence = dataclasses.replace(self.diagnose(), converged=False, interrupted=True)
             finally:
                 report.close()
                 self.save()
@@ -229,7 +229,7 @@ class _Run:
             self.save_time = time.perf_counter()
             self.save_seconds = self.save_time - now
 
-    def judge(self) -> Convergence:
+    def diagnose(self) -> Convergence:
         """Return the diagnostics of the chain so far."""
         chain = self.chain
         self._update_tracked()

@@ -18,9 +18,7 @@ Random = np.random.RandomState | np.random.Generator
 SHARES = (0.7, 0.3)  # fractions of moves that draw from the proposal, and of stretch moves
 OVERDISPERSION = 1.5  # factor on the width of the starting points: ensembles must agree in spite of it
 DEGREES_OF_FREEDOM = 8.0  # Student-t with heavier tails than any posterior met so far
-PROBES = np.array(
-    [-2.5, -1.0, 0.0, 1.0, 2.5]
-)  # points along an axis, in standard deviations, at which normality is tested
+PROBES = np.array([-2.5, -1.0, 0.0, 1.0, 2.5])  # points along an axis, in sd, at which normality is tested
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,8 +102,8 @@ class Proposal:
         tabulated = student_log_density(z[:, others])
         for i, table in self.tables.items():
             tabulated = tabulated + table.log_density(z[:, i])
-        share = self.student_share
-        return np.logaddexp(np.log(1.0 - share) + tabulated, np.log(share) + student_log_density(z))
+        fraction = self.student_share
+        return np.logaddexp(np.log(1.0 - fraction) + tabulated, np.log(fraction) + student_log_density(z))
 
     def move(
         self, points: Float[np.ndarray, "count n"], random: np.random.RandomState
