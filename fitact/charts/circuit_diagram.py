@@ -1,0 +1,256 @@
+"""Draw the circuit, and the wiring on the bench, as SVG that takes the page's colour and font.
+
+The current runs down one column: insulator, gap, touching finger, body, and the way back to the source. What is drawn
+follows from which values there are, so a part that a scene lacks is not in the picture.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Mapping
+from html import escape
+from typing import Any, Literal, TypeAlias
+
+import lazy_loader
+
+schemdraw = lazy_loader.load("schemdraw")  # not loaded by `import fitact`
+
+Grounding: TypeAlias = Literal["direct", "natural"]
+Point: TypeAlias = tuple[float, float]
+
+_PIXELS = 36.0  # of one unit of length
+_FONT, _SMALL = 13.0, 11.0  # px, at the drawing's own width
+_SOURCE, _CAPTION, _COLUMN, _LEFT, _RIGHT = 0.0, 0.75, 4.75, 4.1, 5.4  # x of what stands above each other
+
+
+@dataclasses.dataclass
+class Diagram:
+    """A drawing, and what is connected to what in it.
+
+    Attributes:
+        parts: the two ends of each part by its name in a scene; `source` is V, its second end the positive one.
+        wires: the two ends of each straight wire.
+        terminals: the points that Vsc is measured between, "Vsc+" and "Vsc-".
+    """
+
+    parts: dict[str, tuple[Point, Point]] = dataclasses.field(default_factory=dict)
+    wires: list[tuple[Point, Point]] = dataclasses.field(default_factory=list)
+    terminals: dict[str, Point] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        style = {"color": "currentColor", "lw": 1.5, "fontsize": _FONT, "margin": 0.25, "inches_per_unit": _PIXELS / 72}
+        self._drawing: Any = schemdraw.Drawing(canvas="svg", show=False, font="inherit")
+        self._drawing.config(**style)
+
+    def add(self, element: Any) -> Any:
+        """Add an element of schemdraw; return it."""
+        return self._drawing.add(element)
+
+    def part(self, name: str, kind: Any, start: Point, end: Point, label: str = "", side: str = "right") -> None:
+        """Add a part between two points, its label right or left of it, or above ("top") or below ("bottom")."""
+        self.add(kind.endpoints(start, end))
+        self.parts[name] = start, end
+        (x, y), (dx, dy) = ((a + b) / 2 for a, b in zip(start, end, strict=True)), {
+            "right": (0.36, 0.0), "left": (-0.36, 0.0), "top": (0.0, 0.34), "bottom": (0.0, -0.34)
+        }[side]  # fmt: skip
+        self.text(label, (x + dx, y + dy), side)
+
+    def wire(self, *points: Point) -> None:
+        """Connect points by straight wires."""
+        for start, end in itertools.pairwise(points):
+            self.add(schemdraw.elements.Line().endpoints(start, end))
+            self.wires.append((start, end))
+
+    def text(self, text: str, at: Point, side: str = "right", size: float = _FONT) -> None:
+        """Write `text`, which may have several lines, to one side of a point, or over it (side "center")."""
+        across = {"right": "left", "left": "right"}.get(side, "center")
+        along = {"top": "bottom", "bottom": "top"}.get(side, "center")
+        if text:
+            element = schemdraw.elements.Element().at(at).theta(0)  # it would turn with what was drawn before
+            element.segments.append(schemdraw.SegmentText((0, 0), text, align=(across, along), fontsize=size))
+            self.add(element)
+
+    def svg(self, title: str) -> str:
+        """The drawing as an `svg` element with a title, as wide as its place and never much enlarged."""
+        mode = schemdraw.svgconfig.text
+        schemdraw.svgconfig.text = "text"  # so that the page's font applies
+        try:
+            figure = self._drawing.draw(show=False)
+            content = figure.getimage().decode()
+        finally:
+            schemdraw.svgconfig.text = mode
+        body = content[content.index(">", content.index("<svg")) + 1 :]
+        left, top = figure.bbox.xmin * _PIXELS, -figure.bbox.ymax * _PIXELS
+        width, height = figure.pxwidth, figure.pxheight
+        return (
+            f'<svg xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{escape(title)}" fill="currentColor"'
+            f' viewBox="{left:.1f} {top:.1f} {width:.1f} {height:.1f}" class="circuit"'
+            f' style="width:100%;max-width:{1.2 * width:.0f}px;height:auto"><title>{escape(title)}</title>{body}'
+        )
+
+
+def draw_circuit(
+    values: Mapping[str, str], grounding: Grounding = "direct", current: bool = False, title: str = "The circuit"
+) -> str:
+    """Draw the circuit of `lay_out_circuit` as an SVG element."""
+    return lay_out_circuit(values, grounding, current).svg(title)
+
+
+def draw_wiring(grounding: Grounding = "direct", title: str = "The wiring") -> str:
+    """Draw what is connected to what on the bench: V on channel 1, Vsc on 2, and a shunt for I on 3."""
+    diagram, elements, direct = Diagram(), schemdraw.elements, grounding == "direct"
+    hand, electrode = ("other hand", "ground electrode") if direct else ("shoes, chair", "earth")
+    for corner, opposite, text in (
+        ((0.0, 0.2), (2.3, -2.4), "amplifier"),
+        ((5.4, -0.25), (9.4, -0.8), "electrode"),
+        ((5.4, 0.25), (9.4, -0.25), "insulator"),
+        ((6.2, 1.5), (8.6, 0.25), "finger"),
+        ((6.4, -2.1), (9.4, -2.9), hand),
+        ((6.4, -2.9), (9.4, -3.4), electrode),
+    ):
+        diagram.add(elements.Rect(corner, opposite).at((0.0, 0.0)).theta(0))
+        diagram.text(text, ((corner[0] + opposite[0]) / 2, (corner[1] + opposite[1]) / 2), "center", _SMALL)
+    diagram.wire((8.6, 0.9), (9.9, 0.9), (9.9, -2.5), (9.4, -2.5))
+    diagram.text("body", (10.0, -0.8), size=_SMALL)
+    shunt = ((6.4, -3.15), (4.2, -3.15)) if direct else ((2.9, -0.5), (4.9, -0.5))
+    diagram.part("shunt", elements.ResistorIEC(), *shunt, "shunt", "top" if direct else "bottom")
+    diagram.wire((2.3, -0.5), (5.4, -0.5) if direct else (2.9, -0.5))
+    diagram.wire((4.2, -3.15) if direct else (6.4, -3.15), (3.0, -3.15), (3.0, -1.9), (2.3, -1.9))
+    if not direct:
+        diagram.wire((4.9, -0.5), (5.4, -0.5))
+    diagram.add(elements.Ground().at((3.0, -3.15)))
+    diagram.text("common\nground", (2.65, -3.6), "left", _SMALL)
+    taps = [
+        ((2.9, -0.5), (2.9, 0.7), "1: V" if direct else "1: V\n3 +: I × shunt", "top"),
+        ((6.2, 0.4), (5.5, 1.1), "2 +: Vsc", "left"),
+        ((7.4, 1.5), (7.4, 2.1), "2 −: Vsc", "top"),
+        ((6.1, -3.15), (6.1, -4.0), "3: I × shunt", "bottom")
+        if direct
+        else ((4.9, -0.5), (4.9, -1.3), "3 −", "bottom"),
+    ]
+    for start, end, text, side in taps:
+        diagram.wire(start, end)
+        diagram.add(elements.Dot(open=True, radius=0.09).at(end))
+        reach = {"top": (0.0, 0.14), "bottom": (0.0, -0.14), "left": (-0.16, 0.0)}[side]
+        diagram.text(text, (end[0] + reach[0], end[1] + reach[1]), side)
+    return diagram.svg(title)
+
+
+def lay_out_circuit(values: Mapping[str, str], grounding: Grounding = "direct", current: bool = False) -> Diagram:
+    """Place the parts of the circuit that a scene describes.
+
+    Args:
+        values: text for each part by its name in a scene ("Rsc", "Csc", "Ci", "R_H", "grounding_Rsc", "grounding_Csc",
+            "Z", "Z_capacitance", "series_resistor", "Rgap", "Cgap", "alpha", "probe_resistance",
+            "probe_capacitance"). A part without a value is left out. The grounding skin is equal to the touching one
+            where its own values are absent.
+        grounding: how the body returns the current.
+        current: whether the current is recorded, so that there is a shunt.
+    """
+    diagram = Diagram()
+    bottom = _add_column(diagram, values, grounding)
+    source = (_SOURCE, bottom / 2 - 0.6), (_SOURCE, bottom / 2 + 0.6)
+    diagram.part("source", schemdraw.elements.SourceV(), *source)
+    diagram.text("V", (_SOURCE - 0.6, bottom / 2), "left")
+    diagram.wire(source[1], (_SOURCE, 0.0), (1.1, 0.0))
+    in_lead = current and grounding == "natural"  # a shunt to earth would be bypassed by the mains earth
+    measured = "\nI = its voltage / R" if in_lead else ""
+    if "series_resistor" in values:
+        label = f"series resistor\n{values['series_resistor']}{measured}"
+        diagram.part("series_resistor", schemdraw.elements.ResistorIEC(), (1.1, 0.0), (2.9, 0.0), label, "top")
+    elif in_lead:
+        diagram.part("shunt", schemdraw.elements.ResistorIEC(), (1.1, 0.0), (2.9, 0.0), f"shunt R{measured}", "top")
+    else:
+        diagram.wire((1.1, 0.0), (2.9, 0.0))
+    diagram.wire((2.9, 0.0), (_COLUMN, 0.0))
+    diagram.add(schemdraw.elements.Arrowhead(headwidth=0.26, headlength=0.3).at((4.3, 0.0)).theta(0))
+    diagram.text("I", (4.2, 0.2), "top")
+    _add_return(diagram, bottom, grounding, current)
+    return diagram
+
+
+def _add_column(diagram: Diagram, values: Mapping[str, str], grounding: Grounding) -> float:
+    """Draw from the insulator down to the body's last part; return the height at which the column ends."""
+    y = _add_single(diagram, "Ci", schemdraw.elements.Capacitor(), values, 0.0, "insulator")
+    if "Cgap" in values:
+        y = _add_layer(diagram, ("Rgap", "Cgap"), values, y, "gap")
+    y = _add_touching_skin(diagram, values, y)
+    if grounding == "natural":
+        if "Z" in values:
+            y = _add_layer(diagram, ("Z", "Z_capacitance"), values, y, "shoes,\nchair")
+        return y
+    if "R_H" in values:
+        y = _add_single(diagram, "R_H", schemdraw.elements.ResistorIEC(), values, y, "body")
+    equal = not {"grounding_Rsc", "grounding_Csc"} & set(values)
+    skin = {f"grounding_{name}": values[name] for name in ("Rsc", "Csc")} | dict(values)
+    caption = "grounding\nhand" + (",\nequal" if equal else "")
+    return _add_layer(diagram, ("grounding_Rsc", "grounding_Csc"), skin, y, caption)
+
+
+def _add_single(diagram: Diagram, name: str, kind: Any, values: Mapping[str, str], y: float, caption: str) -> float:
+    """Draw a part alone in the column from the height `y` on; return the height at which it ends."""
+    end = y - 1.5
+    diagram.part(name, kind, (_COLUMN, y), (_COLUMN, end), f"{name} {values[name]}".strip())
+    diagram.text(caption, (_CAPTION, (y + end) / 2), size=_SMALL)
+    return end
+
+
+def _add_layer(
+    diagram: Diagram, names: tuple[str, str], values: Mapping[str, str], y: float, caption: str, height: float = 2.0
+) -> float:
+    """Draw a resistance and a capacitance in parallel, or the one of them that has a value."""
+    end = y - height
+    present = [name for name in names if name in values]
+    for name in present:
+        left = name == names[0]
+        x = _COLUMN if len(present) == 1 else _LEFT if left else _RIGHT
+        short = {"Z_capacitance": "C"}.get(name, name.removeprefix("grounding_"))
+        separator = " " if len(present) == 1 else "\n"
+        side = "left" if left and len(present) == 2 else "right"
+        kind = schemdraw.elements.ResistorIEC() if left else schemdraw.elements.Capacitor()
+        diagram.part(name, kind, (x, y), (x, end), f"{short}{separator}{values[name]}".strip(), side)
+    if len(present) == 2:
+        diagram.wire((_LEFT, y), (_COLUMN, y), (_RIGHT, y))
+        diagram.wire((_LEFT, end), (_COLUMN, end), (_RIGHT, end))
+    diagram.text(caption, (_CAPTION, (y + end) / 2), size=_SMALL)
+    diagram.wire((_COLUMN, end), (_COLUMN, end - 0.4))
+    return end - 0.4
+
+
+def _add_touching_skin(diagram: Diagram, values: Mapping[str, str], y: float) -> float:
+    """Draw the skin that touches the panel with the points that Vsc is measured between, and the probe across it."""
+    shown = dict(values)
+    if "alpha" in values:
+        shown["Csc"] += f"\nalpha {values['alpha']}"
+    below = _add_layer(diagram, ("Rsc", "Csc"), shown, y, "touching\nfinger", height=2.4)
+    end, x = y - 2.4, 7.2
+    probe = [name for name in ("probe_resistance", "probe_capacitance") if name in values]
+    for name in probe:
+        kind = schemdraw.elements.ResistorIEC() if name == "probe_resistance" else schemdraw.elements.Capacitor()
+        diagram.part(name, kind, (x, y), (x, end))
+        x += 0.75
+    if probe:
+        diagram.text("\n".join(["probe", *(values[name] for name in probe)]), (x - 0.4, (y + end) / 2))
+        x += 1.0
+    for name, at, place, side in (("Vsc+", y, "skin's surface", "top"), ("Vsc-", end, "inside the finger", "bottom")):
+        diagram.wire((_RIGHT, at), (x, at))
+        diagram.add(schemdraw.elements.Dot(open=True, radius=0.09).at((x, at)))
+        diagram.terminals[name] = x, at
+        diagram.text("+" if name == "Vsc+" else "−", (x + 0.2, at))
+        diagram.text(place, ((_RIGHT + 7.2) / 2 + 0.1, at + (0.12 if side == "top" else -0.12)), side, _SMALL)
+    diagram.text("Vsc", (x + 0.1, (y + end) / 2))
+    return below
+
+
+def _add_return(diagram: Diagram, bottom: float, grounding: Grounding, current: bool) -> None:
+    """Draw the way from the column's end back to the source, with the shunt in it."""
+    base = bottom - 0.3
+    diagram.wire((_COLUMN, bottom), (_COLUMN, base), (3.4, base))
+    if current and grounding == "direct":
+        diagram.part("shunt", schemdraw.elements.ResistorIEC(), (3.4, base), (1.6, base), "shunt R", "top")
+        diagram.text("I = its voltage / R", (2.5, base - 0.4), "bottom", _SMALL)
+    else:
+        diagram.wire((3.4, base), (1.6, base))
+    diagram.wire((1.6, base), (_SOURCE, base), (_SOURCE, bottom / 2 - 0.6))
+    ground = (_COLUMN, "earth") if grounding == "natural" else (_SOURCE, "ground electrode")
+    diagram.add(schemdraw.elements.Ground().at((ground[0], base)))
+    diagram.text(ground[1], (_COLUMN + 0.35, base - (0.3 if grounding == "natural" else 0.0)), size=_SMALL)

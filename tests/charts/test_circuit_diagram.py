@@ -1,0 +1,149 @@
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+
+from fitact.charts.circuit_diagram import Diagram, draw_wiring, lay_out_circuit
+from fitact.report.circuit import _describe_parts, scene_circuit
+from fitact.scene.scene import Scene
+
+MEASURED = {"series_resistor": "100 kohm", "probe_resistance": "10 Mohm", "probe_capacitance": "10 pF"}
+SCENES = {
+    "final": {},
+    "unequal": {"grounding": {"R_H": 500.0, "grounding_Rsc": "80 kohm", "grounding_Csc": "44 nF"}},
+    "natural": {"grounding": {"connection": "natural", "Z": "14.5 Mohm"}, "measurement": {"channels": ["Vsc", "I"]}},
+    "open gap": {"gap": {"thickness": "2 um"}, "measurement": {"channels": ["I"]}},
+    "all": {
+        "grounding": {"connection": "natural", "Z": "14.5 Mohm", "Z_capacitance": "100 pF"},
+        "gap": {"resistance": "1.2 Mohm", "capacitance": "500 pF"},
+        "measurement": MEASURED,
+    },
+    "all direct": {
+        "grounding": {"R_H": 500.0},
+        "gap": {"resistance": "1.2 Mohm", "thickness": "2 um"},
+        "measurement": MEASURED,
+    },
+}
+SHUNT = 1e-2  # ohm, so small that it changes nothing
+
+
+def lay_out(scene: Scene) -> Diagram:
+    current = "I" in scene.measurement.channels
+    return lay_out_circuit(_describe_parts(scene, {}), scene.grounding.connection, current)
+
+
+def texts(svg: str) -> list[str]:
+    root = ET.fromstring(svg)
+    return [
+        "\n".join("".join(line.itertext()) for line in text) for text in root.iter("{http://www.w3.org/2000/svg}text")
+    ]
+
+
+def admittances(scene: Scene, omega: float) -> dict[str, complex]:
+    measured = scene.measurement
+    values = {name: value for name, value in scene.nominal_values().items() if value is not None}
+    values |= {"grounding_Rsc": values["Rsc"], "grounding_Csc": values["Csc"]} | values
+    values |= {"shunt": SHUNT, "probe_resistance": measured.probe_resistance}
+    values |= {"probe_capacitance": measured.probe_capacitance}
+    resistances = {"Rsc", "grounding_Rsc", "R_H", "Z", "series_resistor", "Rgap", "shunt", "probe_resistance"}
+    return {n: 1 / v if n in resistances else 1j * omega * v for n, v in values.items() if v is not None}
+
+
+def find_nodes(diagram: Diagram) -> dict[tuple[float, float], int]:
+    """Return the node of each end of a part or wire; those on one wire are one node."""
+    points = [p for ends in (*diagram.parts.values(), *diagram.wires) for p in ends] + list(diagram.terminals.values())
+    node = {point: number for number, point in enumerate(dict.fromkeys(points))}
+    for start, end in diagram.wires:
+        for point in node:
+            (ax, ay), (bx, by) = np.subtract(point, start), np.subtract(end, start)
+            if abs(ax * by - ay * bx) < 1e-9 and -1e-9 <= ax * bx + ay * by <= bx**2 + by**2 + 1e-9:
+                kept, gone = node[start], node[point]
+                node = {p: kept if number == gone else number for p, number in node.items()}
+    return node
+
+
+def solve(diagram: Diagram, of: dict[str, complex]) -> tuple[complex, complex]:
+    """Return Vsc / V and I / V of what is drawn, by nodal analysis."""
+    node = find_nodes(diagram)
+    numbers = sorted(set(node.values()))
+    ends = {name: [numbers.index(node[p]) for p in pair] for name, pair in diagram.parts.items()}
+    low, high = ends.pop("source")
+    matrix = np.zeros((len(numbers) + 1,) * 2, dtype=complex)
+    for name, (a, b) in ends.items():
+        matrix[[a, b], [a, b]] += of[name]
+        matrix[[a, b], [b, a]] -= of[name]
+    matrix[high, -1], matrix[low, -1] = -1.0, 1.0
+    matrix[-1, high], matrix[-1, low] = 1.0, -1.0
+    matrix[low, low] += 1.0  # where the ground is
+    solution = np.linalg.solve(matrix, np.eye(len(matrix))[-1])
+    plus, minus = (solution[numbers.index(node[diagram.terminals[name]])] for name in ("Vsc+", "Vsc-"))
+    return plus - minus, solution[-1]
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_drawing_is_the_circuit_that_is_fitted(name: str):
+    scene = Scene.from_dict(SCENES[name])
+    circuit, diagram = scene.make_circuit(), lay_out(scene)
+    for frequency in (1.0, 100.0, 1e4):
+        omega = 2 * np.pi * frequency
+        Vsc, current = solve(diagram, admittances(scene, omega))
+        assert np.isclose(Vsc, complex(circuit.transfer_function(omega)), rtol=1e-5)
+        assert np.isclose(current, complex(circuit.admittance(omega)), rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_parts_have_their_values_and_no_others_are_drawn(name: str):
+    scene = Scene.from_dict(SCENES[name])
+    shown = texts(scene_circuit(scene, {"Rsc": 123456.0}))
+    expected = {"Ci 1.35 nF", "Rsc\n123 kΩ", "Csc\n22 nF", "V", "Vsc", "I", "+", "−"}
+    assert expected <= set(shown)
+    everything = " ".join(shown)
+    natural = scene.grounding.connection == "natural"
+    for part, present in {
+        "R_H 500 Ω": scene.grounding.R_H is not None,
+        "Rsc\n80 kΩ": scene.grounding.grounding_Rsc is not None,
+        "Csc\n44 nF": scene.grounding.grounding_Csc is not None,
+        "Z": natural,
+        "14.5 MΩ": natural,
+        "100 pF": scene.grounding.Z_capacitance is not None,
+        "ground electrode": not natural,
+        "earth": natural,
+        "gap": scene.nominal_values()["Cgap"] is not None,
+        "1.2 MΩ": scene.gap.resistance is not None,
+        "series resistor\n100 kΩ": scene.measurement.series_resistor > 0.0,
+        "probe\n10 MΩ\n10 pF": scene.measurement.probe_resistance is not None,
+        "shunt": "I" in scene.measurement.channels,
+    }.items():
+        assert (part in everything) == present, part
+
+
+def test_tied_and_fixed_parts_have_the_values_that_the_fit_gives_them():
+    prior = {"grounding_Rsc": {"tied": "Rsc", "ratio": 2.0}, "R_H": {"fixed": 700.0}, "Rgap": {"low": 1e5, "high": 1e6}}
+    parts = _describe_parts(Scene.from_dict({"prior": prior, "gap": {"thickness": "2 um"}}), {"Rsc": 100e3})
+    assert (parts["grounding_Rsc"], parts["R_H"], parts["Rgap"]) == ("200 kΩ", "700 Ω", "")
+
+
+@pytest.mark.parametrize("grounding", ["direct", "natural"])
+def test_wiring_names_what_is_connected(grounding: str):
+    svg = draw_wiring(grounding)
+    shown = set(texts(svg))
+    assert {"amplifier", "electrode", "insulator", "finger", "shunt", "2 +: Vsc", "2 −: Vsc"} <= shown
+    assert ("ground electrode" in shown) == (grounding == "direct")
+    assert ("earth" in shown) == (grounding == "natural")
+
+
+def test_drawing_takes_the_colour_of_its_page_and_has_a_title():
+    svg = scene_circuit(Scene())
+    root = ET.fromstring(svg)
+    assert root.get("role") == "img"
+    assert root[0].tag.endswith("title")
+    assert root[0].text == "The circuit with direct ground"
+    assert "currentColor" in svg
+    assert "black" not in svg
+
+
+def test_importing_the_module_does_not_load_schemdraw():
+    code = "import sys, fitact.charts.circuit_diagram; assert 'schemdraw.elements' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
