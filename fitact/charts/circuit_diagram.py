@@ -6,7 +6,7 @@ follows from which values there are, so a part that a scene lacks is not in the 
 
 import dataclasses
 import itertools
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from html import escape
 from typing import Any, Literal, TypeAlias
 
@@ -69,8 +69,8 @@ class Diagram:
             element.segments.append(schemdraw.SegmentText((0, 0), text, align=(across, along), fontsize=size))
             self.add(element)
 
-    def svg(self, title: str) -> str:
-        """The drawing as an `svg` element with a title, as wide as its place and never much enlarged."""
+    def svg(self, title: str, *, is_file: bool = False) -> str:
+        """Return an `svg` element with a title: as wide as its place in a page, or a file of dark lines on white."""
         mode = schemdraw.svgconfig.text
         schemdraw.svgconfig.text = "text"  # so that the page's font applies
         try:
@@ -81,58 +81,15 @@ class Diagram:
         body = content[content.index(">", content.index("<svg")) + 1 :]
         left, top = figure.bbox.xmin * _PIXELS, -figure.bbox.ymax * _PIXELS
         width, height = figure.pxwidth, figure.pxheight
+        if is_file:
+            look = f'width="{width:.0f}" height="{height:.0f}" color="#1c2733" font-family="system-ui, sans-serif"'
+            body = f'<rect x="{left:.1f}" y="{top:.1f}" width="100%" height="100%" fill="#fff"/>{body}'
+        else:
+            look = f'style="width:100%;max-width:{1.2 * width:.0f}px;height:auto"'
         return (
-            f'<svg xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{escape(title)}" fill="currentColor"'
-            f' viewBox="{left:.1f} {top:.1f} {width:.1f} {height:.1f}" class="circuit"'
-            f' style="width:100%;max-width:{1.2 * width:.0f}px;height:auto"><title>{escape(title)}</title>{body}'
+            f'<svg xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{escape(title)}"'
+            f' viewBox="{left:.1f} {top:.1f} {width:.1f} {height:.1f}" {look}><title>{escape(title)}</title>{body}'
         )
-
-
-def draw_circuit(
-    values: Mapping[str, str], grounding: Grounding = "direct", current: bool = False, title: str = "The circuit"
-) -> str:
-    """Draw the circuit of `lay_out_circuit` as an SVG element."""
-    return lay_out_circuit(values, grounding, current).svg(title)
-
-
-def draw_wiring(grounding: Grounding = "direct", title: str = "The wiring") -> str:
-    """Draw what is connected to what on the bench: V on channel 1, Vsc on 2, and a shunt for I on 3."""
-    diagram, elements, direct = Diagram(), schemdraw.elements, grounding == "direct"
-    hand, electrode = ("other hand", "ground electrode") if direct else ("shoes, chair", "earth")
-    for corner, opposite, text in (
-        ((0.0, 0.2), (2.3, -2.4), "amplifier"),
-        ((5.4, -0.25), (9.4, -0.8), "electrode"),
-        ((5.4, 0.25), (9.4, -0.25), "insulator"),
-        ((6.2, 1.5), (8.6, 0.25), "finger"),
-        ((6.4, -2.1), (9.4, -2.9), hand),
-        ((6.4, -2.9), (9.4, -3.4), electrode),
-    ):
-        diagram.add(elements.Rect(corner, opposite).at((0.0, 0.0)).theta(0))
-        diagram.text(text, ((corner[0] + opposite[0]) / 2, (corner[1] + opposite[1]) / 2), "center", _SMALL)
-    diagram.wire((8.6, 0.9), (9.9, 0.9), (9.9, -2.5), (9.4, -2.5))
-    diagram.text("body", (10.0, -0.8), size=_SMALL)
-    shunt = ((6.4, -3.15), (4.2, -3.15)) if direct else ((2.9, -0.5), (4.9, -0.5))
-    diagram.part("shunt", elements.ResistorIEC(), *shunt, "shunt", "top" if direct else "bottom")
-    diagram.wire((2.3, -0.5), (5.4, -0.5) if direct else (2.9, -0.5))
-    diagram.wire((4.2, -3.15) if direct else (6.4, -3.15), (3.0, -3.15), (3.0, -1.9), (2.3, -1.9))
-    if not direct:
-        diagram.wire((4.9, -0.5), (5.4, -0.5))
-    diagram.add(elements.Ground().at((3.0, -3.15)))
-    diagram.text("common\nground", (2.65, -3.6), "left", _SMALL)
-    taps = [
-        ((2.9, -0.5), (2.9, 0.7), "1: V" if direct else "1: V\n3 +: I × shunt", "top"),
-        ((6.2, 0.4), (5.5, 1.1), "2 +: Vsc", "left"),
-        ((7.4, 1.5), (7.4, 2.1), "2 −: Vsc", "top"),
-        ((6.1, -3.15), (6.1, -4.0), "3: I × shunt", "bottom")
-        if direct
-        else ((4.9, -0.5), (4.9, -1.3), "3 −", "bottom"),
-    ]
-    for start, end, text, side in taps:
-        diagram.wire(start, end)
-        diagram.add(elements.Dot(open=True, radius=0.09).at(end))
-        reach = {"top": (0.0, 0.14), "bottom": (0.0, -0.14), "left": (-0.16, 0.0)}[side]
-        diagram.text(text, (end[0] + reach[0], end[1] + reach[1]), side)
-    return diagram.svg(title)
 
 
 def lay_out_circuit(values: Mapping[str, str], grounding: Grounding = "direct", current: bool = False) -> Diagram:
@@ -212,8 +169,8 @@ def _add_layer(
         diagram.wire((_LEFT, y), (_COLUMN, y), (_RIGHT, y))
         diagram.wire((_LEFT, end), (_COLUMN, end), (_RIGHT, end))
     diagram.text(caption, (_CAPTION, (y + end) / 2), size=_SMALL)
-    diagram.wire((_COLUMN, end), (_COLUMN, end - 0.4))
-    return end - 0.4
+    diagram.wire((_COLUMN, end), (_COLUMN, end - 0.5))
+    return end - 0.5
 
 
 def _add_touching_skin(diagram: Diagram, values: Mapping[str, str], y: float) -> float:
@@ -254,3 +211,64 @@ def _add_return(diagram: Diagram, bottom: float, grounding: Grounding, current: 
     ground = (_COLUMN, "earth") if grounding == "natural" else (_SOURCE, "ground electrode")
     diagram.add(schemdraw.elements.Ground().at((ground[0], base)))
     diagram.text(ground[1], (_COLUMN + 0.35, base - (0.3 if grounding == "natural" else 0.0)), size=_SMALL)
+
+
+def lay_out_wiring(
+    grounding: Grounding, channels: Collection[str] = ("Vsc", "I"), series_resistor: bool = False
+) -> Diagram:
+    """Place what is connected on the bench, V on the oscilloscope's channel 1, Vsc on 2, and the current on 3.
+
+    Args:
+        grounding: how the body returns the current.
+        channels: what is recorded beside V: "Vsc", "I" or both.
+        series_resistor: whether a known resistor is in the lead to the electrode.
+    """
+    diagram, elements, direct = Diagram(), schemdraw.elements, grounding == "direct"
+    current = "I" in channels
+    for (x, y), (width, height), text in (
+        ((0.0, -2.4), (2.1, 2.6), "amplifier"),
+        ((5.6, -0.8), (3.8, 0.55), "electrode"),
+        ((5.6, -0.25), (3.8, 0.5), "insulator"),
+        ((6.4, 0.25), (2.4, 1.25), "finger"),
+        ((5.8, -2.9), (3.6, 0.8), "other hand" if direct else "shoes, chair"),
+        ((5.8, -3.4), (3.6, 0.5), "ground electrode" if direct else "earth"),
+    ):
+        diagram.add(elements.Rect((0.0, 0.0), (width, height)).at((x, y)).theta(0))
+        diagram.text(text, (x + width / 2, y + height / 2), "center")
+    diagram.wire((8.8, 0.9), (9.9, 0.9), (9.9, -2.5), (9.4, -2.5))
+    diagram.text("body", (10.0, -0.8))
+    in_lead = "series\nresistor" if series_resistor else "" if direct or not current else "shunt"
+    start, end = (2.9, -0.5), (4.9, -0.5)
+    diagram.wire((2.1, -0.5), start)
+    if in_lead:
+        diagram.part(in_lead, elements.ResistorIEC(), start, end, in_lead, "top")
+    else:
+        diagram.wire(start, end)
+    diagram.wire(end, (5.6, -0.5))
+    start, end = (5.8, -3.15), (3.8, -3.15)
+    if direct and current:
+        diagram.part("shunt", elements.ResistorIEC(), start, end, "shunt", "top")
+    else:
+        diagram.wire(start, end)
+    diagram.wire(end, (2.9, -3.15), (2.9, -1.9), (2.1, -1.9))
+    diagram.add(elements.Ground().at((2.9, -3.15)))
+    diagram.text("common\nground", (2.55, -3.6), "left")
+    taps = [((2.5, -0.5), 1.2, "1: V")]
+    if current and direct:
+        taps += [((5.45, -3.15), -0.8, "3: I × shunt")]
+    elif current:
+        taps += [((2.5, -0.5), -0.7, "3 +"), ((5.2, -0.5), -0.7, "3 −: I × resistance")]
+    for (x, y), length, text in taps:
+        _add_tap(diagram, (x, y), (x, y + length), text, "top" if length > 0.0 else "bottom")
+    if "Vsc" in channels:
+        _add_tap(diagram, (6.4, 0.4), (5.6, 1.1), "2 +: Vsc", "left")
+        _add_tap(diagram, (7.6, 1.5), (7.6, 2.1), "2 −: Vsc", "top")
+    return diagram
+
+
+def _add_tap(diagram: Diagram, start: Point, end: Point, text: str, side: str) -> None:
+    """Draw the lead of an oscilloscope's channel."""
+    diagram.wire(start, end)
+    diagram.add(schemdraw.elements.Dot(open=True, radius=0.09).at(end))
+    dx, dy = {"top": (0.0, 0.14), "bottom": (0.0, -0.14), "left": (-0.16, 0.0)}[side]
+    diagram.text(text, (end[0] + dx, end[1] + dy), side)

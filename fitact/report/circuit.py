@@ -4,32 +4,32 @@ from collections.abc import Mapping
 
 from markupsafe import Markup
 
-from fitact.charts.circuit_diagram import draw_circuit
+from fitact.charts.circuit_diagram import lay_out_circuit, lay_out_wiring
 from fitact.scene.scene import Scene
 from fitact.units import format_engineering, quantity_unit
 
 _NOT_PARTS = ("sigma", "sigma_I")
-_GROUNDS = {"direct": "direct ground", "natural": "natural ground"}
 
 
-def scene_circuit(scene: Scene, values: Mapping[str, float] | None = None) -> Markup:
-    """Draw a scene's circuit as an SVG element.
+def scene_circuit(scene: Scene, values: Mapping[str, float] | None = None, *, is_file: bool = False) -> Markup:
+    """Draw a scene's circuit as an SVG element, or as a file.
 
     Args:
         values: by name, SI, such as a posterior's medians; what is absent has the scene's value.
     """
+    grounding, current = scene.grounding.connection, "I" in scene.measurement.channels
+    diagram = lay_out_circuit(describe_parts(scene, values or {}), grounding, current)
+    return Markup(diagram.svg(f"The circuit with {grounding} ground", is_file=is_file))
+
+
+def scene_wiring(scene: Scene, *, is_file: bool = False) -> Markup:
+    """Draw how a scene's record is measured, as an SVG element, or as a file."""
     measured, grounding = scene.measurement, scene.grounding.connection
-    return Markup(
-        draw_circuit(
-            _describe_parts(scene, values or {}),
-            grounding,
-            current="I" in measured.channels,
-            title=f"The circuit with {_GROUNDS[grounding]}",
-        )
-    )
+    diagram = lay_out_wiring(grounding, measured.channels, measured.series_resistor > 0.0)
+    return Markup(diagram.svg(f"The wiring with {grounding} ground", is_file=is_file))
 
 
-def _describe_parts(scene: Scene, values: Mapping[str, float]) -> dict[str, str]:
+def describe_parts(scene: Scene, values: Mapping[str, float]) -> dict[str, str]:
     """Return each part's value with its unit, by name; "" where only a prior without a median describes it."""
     nominal, measured, specs = scene.nominal_values(), scene.measurement, scene.prior.specs()
     parts: dict[str, float | None] = {name: spec.median or spec.nominal for name, spec in specs.items()}

@@ -9,7 +9,7 @@ from typing import Any
 import jinja2
 
 from fitact.errors import InputError
-from fitact.report.circuit import scene_circuit
+from fitact.report.circuit import scene_circuit, scene_wiring
 from fitact.report.frame import write_page
 from fitact.report.posterior import CHANNELS, make_charts
 from fitact.summary import force_sentences, format_estimate, format_interval, load, quantity_table
@@ -28,6 +28,7 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
         InputError: the place cannot be written, or the results are of another version.
     """
     try:
+        scene = Scene.from_dict(summary["scene"])
         medians = {name: each["q50"] for name, each in summary["parameters"].items()}
         write_page(
             path,

@@ -1,14 +1,18 @@
+import runpy
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fitact.charts.circuit_diagram import Diagram, draw_wiring, lay_out_circuit
-from fitact.report.circuit import _describe_parts, scene_circuit
+from fitact.charts.circuit_diagram import Diagram, lay_out_circuit
+from fitact.report.circuit import describe_parts, scene_circuit, scene_wiring
 from fitact.scene.scene import Scene
 
+ROOT = Path(__file__).parents[2]
+DRAWINGS = runpy.run_path(str(ROOT / "tools" / "draw_circuits.py"))["DRAWINGS"]
 MEASURED = {"series_resistor": "100 kohm", "probe_resistance": "10 Mohm", "probe_capacitance": "10 pF"}
 SCENES = {
     "final": {},
@@ -31,7 +35,7 @@ SHUNT = 1e-2  # ohm, so small that it changes nothing
 
 def lay_out(scene: Scene) -> Diagram:
     current = "I" in scene.measurement.channels
-    return lay_out_circuit(_describe_parts(scene, {}), scene.grounding.connection, current)
+    return lay_out_circuit(describe_parts(scene, {}), scene.grounding.connection, current)
 
 
 def texts(svg: str) -> list[str]:
@@ -121,17 +125,20 @@ def test_parts_have_their_values_and_no_others_are_drawn(name: str):
 
 def test_tied_and_fixed_parts_have_the_values_that_the_fit_gives_them():
     prior = {"grounding_Rsc": {"tied": "Rsc", "ratio": 2.0}, "R_H": {"fixed": 700.0}, "Rgap": {"low": 1e5, "high": 1e6}}
-    parts = _describe_parts(Scene.from_dict({"prior": prior, "gap": {"thickness": "2 um"}}), {"Rsc": 100e3})
+    parts = describe_parts(Scene.from_dict({"prior": prior, "gap": {"thickness": "2 um"}}), {"Rsc": 100e3})
     assert (parts["grounding_Rsc"], parts["R_H"], parts["Rgap"]) == ("200 kΩ", "700 Ω", "")
 
 
-@pytest.mark.parametrize("grounding", ["direct", "natural"])
-def test_wiring_names_what_is_connected(grounding: str):
-    svg = draw_wiring(grounding)
-    shown = set(texts(svg))
-    assert {"amplifier", "electrode", "insulator", "finger", "shunt", "2 +: Vsc", "2 −: Vsc"} <= shown
-    assert ("ground electrode" in shown) == (grounding == "direct")
-    assert ("earth" in shown) == (grounding == "natural")
+@pytest.mark.parametrize("name", SCENES)
+def test_wiring_has_what_the_scene_measures(name: str):
+    scene = Scene.from_dict(SCENES[name])
+    shown = texts(scene_wiring(scene))
+    assert {"amplifier", "electrode", "insulator", "finger", "1: V"} <= set(shown)
+    assert ({"2 +: Vsc", "2 −: Vsc"} <= set(shown)) == ("Vsc" in scene.measurement.channels)
+    assert ("ground electrode" in shown) == (scene.grounding.connection == "direct")
+    assert ("earth" in shown) == (scene.grounding.connection == "natural")
+    assert any(text.startswith("3") for text in shown) == ("I" in scene.measurement.channels)
+    assert ("series\nresistor" in shown) == (scene.measurement.series_resistor > 0.0)
 
 
 def test_drawing_takes_the_colour_of_its_page_and_has_a_title():
@@ -147,3 +154,8 @@ def test_drawing_takes_the_colour_of_its_page_and_has_a_title():
 def test_importing_the_module_does_not_load_schemdraw():
     code = "import sys, fitact.charts.circuit_diagram; assert 'schemdraw.elements' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("name", DRAWINGS)
+def test_drawings_in_the_documentation_are_up_to_date(name: str):
+    assert (ROOT / "docs" / f"{name}.svg").read_text(encoding="utf-8") == DRAWINGS[name]()

@@ -1,0 +1,35 @@
+"""Draw the circuits and the wiring of docs/circuit.md and README.md: `python tools/draw_circuits.py`.
+
+Writes docs/circuit*.svg and docs/wiring*.svg; a test fails where these are older than the program that draws them.
+"""
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+
+from fitact.report.circuit import scene_circuit, scene_wiring
+from fitact.scene.scene import Scene
+
+ROOT = Path(__file__).parents[1]
+_BOTH = {"channels": ["Vsc", "I"]}
+_EQUAL = Scene.from_dict({"measurement": _BOTH})
+_UNEQUAL = Scene.from_dict({"grounding": {"R_H": "500 ohm", "grounding_Rsc": "80 kohm", "grounding_Csc": "44 nF"}})
+_NATURAL = Scene.from_dict({"grounding": {"connection": "natural", "Z": "14.5 Mohm"}, "measurement": _BOTH})
+_EVERYTHING = Scene.from_dict(
+    {
+        "gap": {"resistance": "1 Mohm", "thickness": "2 um"},
+        "measurement": {"series_resistor": "100 kohm", "probe_resistance": "10 Mohm", "probe_capacitance": "10 pF"},
+    }
+)
+DRAWINGS: dict[str, Callable[[], str]] = {
+    "circuit": functools.partial(scene_circuit, _EQUAL, is_file=True),
+    "circuit_unequal": functools.partial(scene_circuit, _UNEQUAL, is_file=True),
+    "circuit_natural": functools.partial(scene_circuit, _NATURAL, is_file=True),
+    "circuit_additions": functools.partial(scene_circuit, _EVERYTHING, is_file=True),
+    "wiring": functools.partial(scene_wiring, _EQUAL, is_file=True),
+    "wiring_natural": functools.partial(scene_wiring, _NATURAL, is_file=True),
+}
+
+if __name__ == "__main__":
+    for name, draw in DRAWINGS.items():
+        (ROOT / "docs" / f"{name}.svg").write_text(draw(), encoding="utf-8")
