@@ -37,12 +37,12 @@ def select_current_samples(record: Record, choice: DriveModel, max_attenuation: 
         used &= np.isfinite(slope)  # a record may begin at a jump
     note = f"I: {np.count_nonzero(~used):,} of {used.size:,} samples lie at an edge of the drive and are excluded"
     if choice.name != "measured":
-        return CurrentSamples(kept.astype(float), np.where(kept, slope, 0.0), False, (note,), ())
+        return CurrentSamples(used.astype(float), np.where(used, slope, 0.0), False, (note,), ())
     rate = np.gradient(choice.voltage) / np.gradient(record.time)  # over two steps, which halves the noise
-    capacitance = abs(float(record["I"][kept] @ rate[kept]) / max(float(rate[kept] @ rate[kept]), 1e-300))
+    capacitance = abs(float(record["I"][used] @ rate[used]) / max(float(rate[used] @ rate[used]), 1e-300))
     # a V that stays at one level has no noise there that a derivative could see
     spread = noise / (math.sqrt(2.0) * record.time_step) * (np.gradient(choice.voltage) != 0.0)
-    weight = kept / np.hypot(1.0, capacitance * spread / record.noise("I"))
+    weight = used / np.hypot(1.0, capacitance * spread / record.noise("I"))
     # what noise in a regressor takes off its coefficient
     attenuation = float(np.sum((weight * spread) ** 2) / max(float(np.sum((weight * rate) ** 2)), 1e-300))
     if attenuation <= max_attenuation:

@@ -107,7 +107,7 @@ def _measured_drive(record: Record, steady_state: bool | None, notes: tuple[str,
     if not steady_state:
         drive = Sampled(to_device(pad_samples(record.time)), to_device(pad_samples(voltage)))
         return DriveModel(drive, voltage, False, steady_state is None, 0.0, "measured", notes, warnings)
-    kept, period = whole_periods(record)
+    n_samples, period = whole_periods(record)
     if period is None:
         raise InputError(
             f"{record.source}: [drive] steady_state = true needs a record of at least 1.5 periods of V_V;"

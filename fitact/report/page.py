@@ -12,6 +12,7 @@ from fitact.errors import InputError
 from fitact.report.circuit import scene_circuit, scene_wiring
 from fitact.report.frame import write_page
 from fitact.report.posterior import CHANNELS, make_charts
+from fitact.scene.scene import Scene
 from fitact.summary import force_sentences, format_estimate, format_interval, load, quantity_table
 
 _CIRCUITS = {
@@ -35,6 +36,7 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
             "report.html",
             summary=summary,
             charts=make_charts(tree),
+            drawings=(scene_circuit(scene, medians), scene_wiring(scene)),
             table=quantity_table(summary),
             channels=CHANNELS,
             force=force_sentences(summary["force_basis"]),
