@@ -6,6 +6,7 @@ import math
 import os
 import platform
 import re
+import shlex
 import statistics
 from pathlib import Path
 from typing import Any
@@ -212,10 +213,27 @@ def format_table(content: dict[str, Any]) -> list[str]:
     return [*align_table(quantity_table(content)), *force_sentences(content["force_basis"])]
 
 
+def result_names(content: dict[str, Any]) -> list[str]:
+    """Return the names of results that need advice (see `fitact.what_now`); `content` is fit.json or summary.json."""
+    names = [] if content["fit"]["result"] == "successful" else [content["fit"]["result"]]
+    convergence = content.get("convergence", {"converged": True})
+    if not convergence["converged"]:
+        names += [{"psis": "k-hat", "laplace": "laplace"}.get(convergence["level"], "not converged")]
+    verdict = content["identifiability"]["verdict"]
+    return names + ([] if verdict == "identified" else [verdict])
+
+
+def advice_line(content: dict[str, Any]) -> list[str]:
+    """Return the line that names the advice for a result; none for an identified, reliable one."""
+    commands = [f"fitact explain {shlex.quote(name)}" for name in result_names(content)]
+    return [f"What to do now: {', '.join(commands)}"] if commands else []
+
+
 def table(content: dict[str, Any]) -> str:
     """Return the content of summary.json for people."""
     rows = format_table(content)
     rows += [content[section]["sentence"] for section in ("convergence", "identifiability")]
+    rows += advice_line(content)
     return join_lines(rows, content["warnings"], content["notes"])
 
 

@@ -22,5 +22,5 @@ The first command writes a template to edit. The second fits the circuit, sample
 For any other oscilloscope file, start with `fitact inspect FILE`.
 """,
     epilog="Exit status: 0, success; 1, results written but unreliable (see `warnings` in the "
-    "results); 2, invalid input; 3, internal error; 130, interrupted.",
+    "results); 2, invalid input; 3, internal error; 130, interrupted. `fitact explain NAME` says what to try first.",
 )

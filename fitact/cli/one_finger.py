@@ -7,6 +7,7 @@ import typer
 
 import fitact
 from fitact import report as reporting
+from fitact import what_now
 from fitact.cli import internal, options
 from fitact.cli.app import app
 from fitact.cli.terminal import command_line, print_stderr, show
@@ -129,6 +130,16 @@ def report(directory: options.Results, json: options.Json = False) -> None:
         reporting.write_report(page, tree, content)
         trusted = internal.summary.is_trusted(content)
     show(f"open {page}", {"report": str(page), "trusted": trusted}, json, trusted)
+
+
+@app.command()
+def explain(
+    name: Annotated[str, typer.Argument(help="Result name, e.g. misfit or prior-limited.", show_default=False)] = "",
+    json: options.Json = False,
+) -> None:
+    """Explain a result name and what to try first; without a name, list all."""
+    content = {name: what_now.explain(name)} if name else what_now.advice_sections()
+    show(content[name] if name else "\n".join(content), content, json)
 
 
 def _fit_records(

@@ -175,13 +175,14 @@ class Fit(FitResult):
         """Return a table for people: estimates with errors, what the force rests on, and the verdict."""
         names, correlation = self.names, self.correlation
         pairs = [f"{names[j]}-{names[i]} {correlation[i, j]:+.3f}" for i in range(len(names)) for j in range(i)]
-        chi_square = self.figures["chi2_reduced"]
+        chi_square, content = self.figures["chi2_reduced"], self.to_dict()
         rows = [
-            *summary.format_table(self.to_dict()),
+            *summary.format_table(content),
             f"Correlations of the log-parameters: {', '.join(pairs)}.",
             f"Residual variance / model-free noise variance: {chi_square:.3f}. {self.message}",
             f"Log-likelihood: {self._likelihood()}.",
             str(self.identifiability),
+            *summary.advice_line(content),
         ]
         return join_lines(rows, self.warnings, self.notes)
 

@@ -68,11 +68,13 @@ class SpectrumFit(FitResult):
     def summary(self) -> str:
         """Return a table for people: estimates with errors, what the force rests on, and the verdict."""
         low, high = (format_engineering(float(f), "Hz") for f in self.spectrum.frequency[[0, -1]])
+        content = self.to_dict()
         rows = [
             f"{len(self.spectrum)} points, {low} to {high}",
-            *summary.format_table(self.to_dict()),
+            *summary.format_table(content),
             f"Noise {format_percent(self.noise)} of |Z|. {self.message}",
             str(self.identifiability),
+            *summary.advice_line(content),
         ]
         return join_lines(rows, self.warnings, self.notes)
 

@@ -7,13 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+from markdown_it import MarkdownIt
+from markupsafe import Markup
 
 from fitact.errors import InputError
 from fitact.report.circuit import scene_circuit, scene_wiring
 from fitact.report.frame import write_page
 from fitact.report.posterior import CHANNELS, make_charts
 from fitact.scene.scene import Scene
-from fitact.summary import force_sentences, format_estimate, format_interval, load, quantity_table
+from fitact.summary import force_sentences, format_estimate, format_interval, load, quantity_table, result_names
+from fitact.what_now import explain
 
 _CIRCUITS = {
     "final": "equal fingers, grounded hand",
@@ -43,6 +46,7 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
             circuits=_CIRCUITS,
             estimate=format_estimate,
             interval=format_interval,
+            advice=[_render_advice(name) for name in result_names(summary)],
             command=_command(summary),
             scene=json.dumps(summary["scene"], indent=2, ensure_ascii=False),
         )
@@ -68,6 +72,11 @@ def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]
         raise InputError(
             f"{directory}: holds no complete results ({error}); make them with: fitact sample RECORD --out {directory}"
         ) from error
+
+
+def _render_advice(name: str) -> Markup:
+    """Return the advice for a result name as HTML."""
+    return Markup(MarkdownIt("js-default").render(explain(name)))
 
 
 def _command(summary: dict[str, Any]) -> str:
