@@ -8,6 +8,7 @@ import platform
 import re
 import shlex
 import statistics
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -123,8 +124,8 @@ def format_estimate(summary: Summary) -> str:
     if not 0.0 < sd <= abs(median):
         spread = "" if sd == 0.0 else f" (sd {format_sd(summary)})"
         return f"{median / size:.{2 if spread else 4}g} {symbol}".rstrip() + spread
-    places = _decimal_places(sd / size)
-    return f"{median / size:.{places}f} ± {sd / size:.{places}f} {symbol}".rstrip()
+    value, spread = _round_to_sd((median / size, sd / size), sd / size)
+    return f"{value} ± {spread} {symbol}".rstrip()
 
 
 def format_interval(summary: Summary, low: str = "q05", high: str = "q95") -> str:
@@ -134,13 +135,13 @@ def format_interval(summary: Summary, low: str = "q05", high: str = "q95") -> st
     if not 0.0 < sd <= abs(float(summary["q50"])):
         return " to ".join(format_engineering(end, unit, 2) for end in ends)
     size, symbol = choose_prefixed_unit(float(summary["q50"]), unit)
-    places = _decimal_places(sd / size)
-    return f"{ends[0] / size:.{places}f} to {ends[1] / size:.{places}f} {symbol}".rstrip()
+    return f"{' to '.join(_round_to_sd((ends[0] / size, ends[1] / size), sd / size))} {symbol}".rstrip()
 
 
-def _decimal_places(sd: float) -> int:
-    """Return the decimal places of two significant digits of `sd`."""
-    return max(0, 1 - int(f"{sd:.1e}".partition("e")[2]))
+def _round_to_sd(values: Iterable[float], sd: float) -> list[str]:
+    """Return numbers rounded to the place of the second significant digit of `sd`."""
+    places = 1 - int(f"{sd:.1e}".partition("e")[2])
+    return [f"{round(value, places):.{max(places, 0)}f}" for value in values]
 
 
 def quantity_table(content: dict[str, Any]) -> list[tuple[str, ...]]:

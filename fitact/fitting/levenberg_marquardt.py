@@ -38,7 +38,7 @@ class RESULTS(optx.RESULTS):
     )
 
 
-_NAMES = (
+RESULT_NAMES = (
     "successful", "did_not_move", "not_at_optimum", "rank_deficient", "on_bound", "several_optima", "misfit",
     "nonfinite", "nonlinear_max_steps_reached", "nonlinear_divergence",
 )  # fmt: skip
@@ -46,7 +46,7 @@ _NAMES = (
 
 def result_name(result: Any) -> str:
     """Return the name of a member of `RESULTS`; a failure of the linear solver counts as "nonfinite"."""
-    return next((name for name in _NAMES if bool(result == getattr(RESULTS, name))), "nonfinite")
+    return next((name for name in RESULT_NAMES if bool(result == getattr(RESULTS, name))), "nonfinite")
 
 
 def result_message(name: str) -> str:
