@@ -1,4 +1,4 @@
-"""A look at a file before it is fitted: channels, rate, noise, and what is doubtful about it."""
+"""Inspection of a file before a fit: channels, sampling rate, noise, notes and warnings."""
 
 import dataclasses
 import math
@@ -28,12 +28,12 @@ from fitact.units import format_engineering
 
 Samples = Float[np.ndarray, " samples"]
 
-_MOST = {"V": 5e3, "A": 0.1}  # that drives a display
+_MOST = {"V": 5e3, "A": 0.1}  # largest value on a touch display
 
 
 @dataclasses.dataclass(frozen=True)
 class Channel:
-    """One channel in its SI unit ("" where none is stated), the standard deviation of its noise, samples clipped."""
+    """One channel in its SI unit ("" if none is stated), the sd of its noise, and its number of clipped samples."""
 
     name: str
     unit: str
@@ -257,7 +257,7 @@ def _check_hum_and_drift(
     for mains in (50.0, 60.0):  # Hz
         harmonic = abs(mains / frequency - round(mains / frequency)) * frequency * span < 2.0
         if span * mains < min_mains_periods or harmonic:
-            continue  # too short to tell, or of the signal itself
+            continue  # the record is too short, or the line is a harmonic of the signal
         line = _spectral_line(time, values, mains)
         beside = max(abs(_spectral_line(time, values, mains + away / span)) for away in (-3.0, 3.0))
         if abs(line) > max(hum_fraction * value_range, 3.0 * beside):
@@ -274,14 +274,14 @@ def _check_hum_and_drift(
 
 
 def _period_means(values: Samples, samples: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean over each whole period, and its middle in samples."""
+    """Return the mean of each whole period, and the centre of the period in samples."""
     edges = np.round(np.arange(int(values.size / samples) + 1) * samples).astype(int)
     sums = np.concatenate([[0.0], np.cumsum(values)])
     return np.diff(sums[edges]) / np.diff(edges), 0.5 * (edges[1:] + edges[:-1])
 
 
 def _fit_slope(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """The slope of a straight line, and its standard error."""
+    """Return the slope of a fitted straight line, and its standard error."""
     x = x - x.mean()
     slope = float(x @ y / (x @ x))
     rest = y - y.mean() - slope * x
@@ -289,7 +289,7 @@ def _fit_slope(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 
 
 def _spectral_line(time: Samples, values: Samples, frequency: float) -> complex:
-    """One line of the spectrum under a Hann window: amplitude and phase."""
+    """Return the complex amplitude of one spectral line, with a Hann window."""
     window = np.hanning(values.size)
     wave = np.exp(-2j * np.pi * frequency * time)
     return complex(2.0 * np.sum(window * wave * (values - values.mean())) / window.sum())

@@ -1,4 +1,4 @@
-"""Fit an impedance spectrum: the same circuit, seen between the drive's electrode and ground."""
+"""Fit an impedance spectrum: the same circuit, between the drive electrode and ground."""
 
 import dataclasses
 import math
@@ -26,7 +26,7 @@ from fitact.scene.scene import Scene
 from fitact.tables import join_lines
 from fitact.units import format_engineering, format_percent
 
-_MIN_NOISE = 1e-6  # of the impedance: no analyser is better
+_MIN_NOISE = 1e-6  # smallest relative noise of the impedance; no analyser is better
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,7 +133,7 @@ def fit_spectrum(spectrum: Spectrum, scene: Scene | None = None) -> SpectrumFit:
 def _solve(
     spectrum: Spectrum, likelihood: Likelihood, noise_tolerance: float = 1e-3, max_rounds: int = 20
 ) -> tuple[Minimum, Complex[np.ndarray, " points"], float]:
-    """The optimum, its residuals and their noise, in rounds until that changes by less than `noise_tolerance`."""
+    """Return optimum, residuals and noise; iterates until the noise changes by less than `noise_tolerance`."""
     omega, log_z = jnp.asarray(2.0 * np.pi * spectrum.frequency), jnp.asarray(np.log(spectrum.impedance))
     start, noise = jnp.asarray(_start(spectrum, likelihood)), jnp.asarray(1.0)
     for _ in range(max_rounds):
@@ -148,7 +148,7 @@ def _solve(
 def _start(
     spectrum: Spectrum, likelihood: Likelihood, n_time_constants: int = 400
 ) -> Float[np.ndarray, " circuit_parameters"]:
-    """Rsc, Csc and Ci from linear fits of 2 Rsc and 1 / Ci at many Rsc Csc, of which the best; the others' prior."""
+    """Estimate Rsc, Csc and Ci from the best linear fit of 2 Rsc and 1/Ci over many Rsc Csc; others from the prior."""
     omega, z = 2.0 * np.pi * spectrum.frequency, spectrum.impedance
     parts = [np.real, np.imag]
     observed = np.concatenate([part(z / np.abs(z)) for part in parts])
@@ -156,7 +156,7 @@ def _start(
     for tau in np.geomspace(0.1 / omega[-1], 10.0 / omega[0], n_time_constants):
         columns = [1.0 / (1.0 + 1j * omega * tau), 1.0 / (1j * omega)]
         design = np.stack([np.concatenate([part(c / np.abs(z)) for part in parts]) for c in columns], axis=1)
-        # columns of like size, so that neither's rounding is the other's
+        # equal column norms limit rounding errors
         size = np.linalg.norm(design, axis=0)
         values, miss = scipy.optimize.nnls(design / size, observed)
         best = min(best, (float(miss), values / size, float(tau)), key=lambda fit: fit[0])
@@ -174,7 +174,7 @@ def _start(
 def _solve_round(
     likelihood: Likelihood, omega: Array, log_z: Array, noise: Array, start: Array
 ) -> tuple[Minimum, Complex[Array, " points"], Array]:
-    """The optimum under a noise, what is left there, and the noise that this shows."""
+    """Return the optimum for a given noise, its residuals, and the noise estimated from them."""
 
     def log_ratio(theta: Array) -> Array:
         ratio = jnp.exp(log_z) * likelihood.circuit(theta).admittance(omega)
@@ -191,15 +191,15 @@ def _solve_round(
 
 
 def _figures(residuals: Complex[np.ndarray, " points"], noise: float, n_fitted: int) -> dict[str, float]:
-    """Against the scatter of neighbouring points, which no model made.
+    """Compare the residuals with the scatter of neighbouring points, which is independent of the model.
 
-    `structure_z` is von Neumann's ratio of the mean square successive difference to the mean square, in standard
-    deviations of that of white noise (variance (n - 2) / (n^2 - 1) of half of it), of both parts together.
+    `structure_z`: von Neumann ratio (mean square successive difference over mean square) of real and imaginary parts
+    together, as a z-score for white noise, whose variance is (n - 2) / (n^2 - 1) for half of the ratio.
     """
     n, square = residuals.size, float(np.mean(np.abs(residuals) ** 2))
     successive = 0.5 * float(np.mean(np.abs(np.diff(residuals)) ** 2))
     expected = max(math.sqrt(0.5 * successive), _MIN_NOISE)
-    ratio = 1.0 - successive / square if square > (2.0 * _MIN_NOISE) ** 2 else 0.0  # else it is rounding
+    ratio = 1.0 - successive / square if square > (2.0 * _MIN_NOISE) ** 2 else 0.0  # smaller residuals are rounding
     return {
         "chi2_reduced": (noise / expected) ** 2,
         "rms_residual": math.sqrt(0.5 * square),

@@ -174,7 +174,7 @@ class FitResult(abc.ABC):
 
     @functools.cached_property
     def force_basis(self) -> dict[str, Any]:
-        """The law of the force, the values that it rests on, and the mean force by the other law if a gap is stated."""
+        """Force law, values that the force rests on, and the mean force by the other law if a gap is stated."""
         law = self.derive.geometry.model
         other_law: ForceModel = "gap" if law == "paper" else "paper"
         assumptions = list_assumptions(

@@ -58,8 +58,8 @@ class Minimum(eqx.Module):
     """Point at which Levenberg-Marquardt ended."""
 
     theta: Float[Array, " parameters"]
-    cost: Float[Array, ""]  # half the sum of squared residuals
-    jacobian: Float[Array, "rows parameters"]  # of the residuals, stacked in the order of their pytree
+    cost: Float[Array, ""]  # half of the sum of squared residuals
+    jacobian: Float[Array, "rows parameters"]  # Jacobian of the residuals, in the order of their pytree
     steps: Array  # trial steps taken
     result: Any  # a member of `RESULTS`
 
@@ -69,7 +69,7 @@ def minimise(
     start: Float[Array, " parameters"],
     max_steps: int = 1000,
 ) -> Minimum:
-    """The least squares nearest `start`; pure, for use within jit and vmap, in double precision.
+    """Find the least-squares optimum nearest to `start`; pure, for use within jit and vmap, in double precision.
 
     Steps are damped in units of the Jacobian's columns (Marquardt 1963).
     """
@@ -97,12 +97,12 @@ def minimise(
 
 @dataclasses.dataclass(frozen=True)
 class Optima:
-    """The distinct optima that many starts led to."""
+    """Distinct optima from many starting points."""
 
-    minima: Minimum  # one for each, stacked, lowest first; where no start led to one, the lowest end
-    start_counts: Int[np.ndarray, " optima"]  # how many starts led to each
-    n_failed: int  # how many starts led to none
-    result: Any  # of the lowest
+    minima: Minimum  # stacked, lowest cost first; if no start converged, the lowest end point
+    start_counts: Int[np.ndarray, " optima"]  # number of starts that ended in each
+    n_failed: int  # number of starts that did not converge
+    result: Any  # result of the lowest
 
 
 def minimise_many(
@@ -111,10 +111,10 @@ def minimise_many(
     same_optimum: float = 0.1,
     log_density_margin: float = 3.0,
 ) -> Optima:
-    """All starts at once; residuals in units of their standard deviation, so that the cost is -log-probability.
+    """Minimise from all starts at once; with residuals in units of their sd, the cost is -log(probability).
 
-    Ends `same_optimum` standard errors apart are one: the residuals cannot tell them apart, as along a ridge. One
-    whose log-probability is lower by `log_density_margin` still has a twentieth of the other's density.
+    End points less than `same_optimum` standard errors apart count as one optimum. An optimum whose log-probability
+    is lower by less than `log_density_margin` (a twentieth of the density) counts as competing.
     """
     ends = _minimise_each(residuals, jnp.asarray(starts))
     theta, jacobian = np.asarray(ends.theta), np.asarray(ends.jacobian)
@@ -131,7 +131,7 @@ def minimise_many(
             firsts.append(i)
             counts.append(1)
     lowest = order[0]
-    # an end below all optima is none, so there is a better one still
+    # an end point below all optima has not converged, so a better optimum exists
     if not firsts or cost[lowest] < cost[firsts[0]] - 0.5 * same_optimum**2:
         firsts, counts = [lowest, *firsts], [0, *counts]
     minima = jax.tree.map(lambda leaf: leaf[np.array(firsts)], ends)
@@ -148,15 +148,15 @@ def _minimise_each(residuals: Callable[..., Any], starts: Array) -> Minimum:
 
 
 class _LinearProblem(eqx.Module):
-    """The linear least-squares problem at theta, from the singular values of its Jacobian in scaled columns."""
+    """Linearised least-squares problem at theta: singular values of the Jacobian with scaled columns."""
 
     theta: Float[Array, " parameters"]
     residuals: Float[Array, " rows"]
     jacobian: Float[Array, "rows parameters"]
-    scale: Float[Array, " parameters"]  # largest column norms of late
+    scale: Float[Array, " parameters"]  # recent maximum of the column norms
     values: Float[Array, " parameters"]
     directions: Float[Array, "parameters parameters"]
-    projections: Float[Array, " parameters"]  # the residuals, along the left singular vectors
+    projections: Float[Array, " parameters"]  # residuals projected on the left singular vectors
     offset: Float[Array, ""]  # standard errors to the optimum; Bates and Watts, Technometrics 23 (1981) 179
     rank: Array
 
@@ -164,12 +164,14 @@ class _LinearProblem(eqx.Module):
 class _Descent(optx.AbstractDescent):
     """Damped Gauss-Newton steps."""
 
-    rows: int = eqx.field(static=True)  # how many residuals there are
-    damping: float = 1e-2  # at the first step, of the largest curvature
-    # of the scale, from step to step: long enough to cross a plateau, short enough for a valley
+    rows: int = eqx.field(static=True)  # number of residuals
+    damping: float = 1e-2  # first step, relative to the largest curvature
+    # decay of the scale per step: slow enough to cross a plateau, fast enough for a valley
     scale_decay: float = 0.9
-    rank_tolerance: float = 1e-13  # of the largest singular value of the scaled Jacobian: what is smaller is rounding
-    rounding: float = 8.0  # units in the last place by which a parameter's rounding may move the residuals
+    rank_tolerance: float = (
+        1e-13  # relative to the largest singular value of the scaled Jacobian; smaller ones are rounding
+    )
+    rounding: float = 8.0  # rounding error of a parameter, in units of the last place
 
     def init(self, y: Array, f_info_struct: Any) -> _LinearProblem:
         residuals, jacobian, zero = jnp.zeros(self.rows), jnp.zeros((self.rows, y.size)), jnp.zeros_like(y)
@@ -182,45 +184,45 @@ class _Descent(optx.AbstractDescent):
         scale = jnp.maximum(self.scale_decay * state.scale, norms)
         q, r = jnp.linalg.qr(jacobian / jnp.where(scale > 0.0, scale, 1.0))
         u, values, directions = jnp.linalg.svd(r)
-        along = u.T @ (q.T @ residuals)
-        # the test must not depend on the history of the scale
+        projections = u.T @ (q.T @ residuals)
+        # unlike the step, the rank test must not depend on the history of the scale
         u, sizes, _ = jnp.linalg.svd(r * scale / jnp.where(norms > 0.0, norms, 1.0))
         kept = sizes > self.rank_tolerance * sizes[0]
         short = jnp.linalg.norm(jnp.where(kept, u.T @ (q.T @ residuals), 0.0))
         rounding = self.rounding * jnp.finfo(y.dtype).eps * jnp.sum(norms * jnp.abs(y))
         spread = jnp.linalg.norm(residuals) / jnp.sqrt(max(residuals.size - y.size, 1))
         offset = jnp.where(short <= rounding, 0.0, short / spread)
-        return _LinearProblem(y, residuals, jacobian, scale, values, directions, along, offset, jnp.sum(kept))
+        return _LinearProblem(y, residuals, jacobian, scale, values, directions, projections, offset, jnp.sum(kept))
 
     def step(self, step_size: Array, state: _LinearProblem) -> tuple[Array, Any]:
-        along = state.values * state.projections / (jnp.square(state.values) + self.damping / step_size)
-        step = -(along @ state.directions) / jnp.where(state.scale > 0.0, state.scale, 1.0)
+        damped = state.values * state.projections / (jnp.square(state.values) + self.damping / step_size)
+        step = -(damped @ state.directions) / jnp.where(state.scale > 0.0, state.scale, 1.0)
         finite = jnp.all(jnp.isfinite(step))
         return step, optx.RESULTS.where(finite, optx.RESULTS.successful, optx.RESULTS.nonfinite)
 
 
 class LevenbergMarquardt(optx.AbstractGaussNewton):
-    """Ends where the offset is small enough, or where steps change nothing any more."""
+    """Levenberg-Marquardt that stops if the offset is small enough, or if steps no longer change the parameters."""
 
     descent: _Descent
     search: optx.ClassicalTrustRegion
     norm: Callable[..., Array]
     verbose: Callable[..., None]
-    rtol: float = 0.0  # a step that changes nothing is the last
+    rtol: float = 0.0  # only a step without any change meets the Cauchy criterion
     atol: float = 1e-300
-    offset_tolerance: float = 1e-4  # standard errors from the optimum: what passes for it
-    max_rejections: int = 4  # times in a row, near the optimum: the sum of squares changes by its rounding only
-    min_step: float = 1e-10  # of the first step's size: nothing moves any more
+    offset_tolerance: float = 1e-4  # accepted distance from the optimum, in standard errors
+    max_rejections: int = 4  # rejected steps in a row near the optimum, where rounding dominates the sum of squares
+    min_step: float = 1e-10  # relative to the size of the first step
 
     def terminate(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> tuple[Array, Any]:
         local: _LinearProblem = state.descent_state
-        # nearer to the optimum, too, the sum of squares changes by its rounding only
+        # so near to the optimum, rounding dominates the sum of squares
         there = jnp.square(local.offset) <= jnp.finfo(local.theta.dtype).eps * local.residuals.size
         there |= (local.offset < self.offset_tolerance) & (state.num_steps_since_acceptance > self.max_rejections)
         return there | state.terminate | (state.search_state.step_size < self.min_step), state.result
 
     def final_result(self, end: _LinearProblem, start: Array, result: Any) -> Any:
-        """The first of the things that stand against the answer."""
+        """Return the first reason why the result is unreliable, or success."""
         failed = RESULTS.where(result == RESULTS.successful, RESULTS.not_at_optimum, result)
         failed = RESULTS.where(jnp.all(end.theta == start), RESULTS.did_not_move, failed)
         name = RESULTS.where(end.rank < end.theta.size, RESULTS.rank_deficient, RESULTS.successful)

@@ -1,4 +1,4 @@
-"""A folder of one result: its JSON, its figure and its page."""
+"""Folder of one result: JSON, figure and page."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -21,7 +21,7 @@ from fitact.report.tradeoff import draw_tradeoff, write_tradeoff_page
 from fitact.scene.scene import Scene
 from fitact.tradeoff.tradeoff import Tradeoff
 
-# by class: the files' name, what draws the figure, and what writes the page
+# by class: file name, function that draws the figure, function that writes the page
 _WRITERS: dict[type, tuple[str, Callable[..., Figure], Callable[..., None]]] = {
     DriveDesign: ("drive", draw_drive_design, write_drive_design_page),
     MeasurementDesign: ("design", draw_design, write_design_page),
@@ -33,10 +33,10 @@ _WRITERS: dict[type, tuple[str, Callable[..., Figure], Callable[..., None]]] = {
 def write_folder(
     folder: Path, result: Any, command: str, scene: Scene | None, records: Sequence[Record | Finger] = ()
 ) -> None:
-    """Write a design, a plan or a trade-off into a folder, with the command, scene and records that it came from.
+    """Write a design, a plan or a trade-off into a folder, with its command, scene and records.
 
     Raises:
-        InputError: the place cannot be written.
+        InputError: the folder cannot be written.
     """
     name, draw, write_page = _WRITERS[type(result)]
     write_json(folder / f"{name}.json", result.to_dict())

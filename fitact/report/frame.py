@@ -1,4 +1,4 @@
-"""The frame that pages of results share: what it is about, the verdict, the answers, and how to repeat it."""
+"""Frame of all result pages: subject, verdict, answers, and how to repeat the result."""
 
 import base64
 import dataclasses
@@ -24,12 +24,12 @@ from fitact.units import format_engineering
 
 @dataclasses.dataclass(frozen=True)
 class Provenance:
-    """How a result came about.
+    """Origin of a result.
 
     Attributes:
-        command: that gives it.
-        scene: what the scene states, SI; {}: nothing.
-        records: SHA-256 of the numbers of each, by name.
+        command: command line that repeats it.
+        scene: stated keys of the scene, SI; {} if none.
+        records: SHA-256 of the data of each record, by name.
     """
 
     command: str
@@ -38,18 +38,18 @@ class Provenance:
 
     @classmethod
     def from_inputs(cls, command: str, scene: Scene | None, records: Sequence[Record | Finger] = ()) -> Self:
-        """From what the command was given."""
+        """Make the provenance from the inputs of a command."""
         stated = {} if scene is None else scene.model_dump(mode="json", exclude_unset=True)
         return cls(command, stated, {os.path.basename(each.source): each.fingerprint for each in records})
 
     @property
     def scene_text(self) -> str:
-        """The scene for people; "": it states nothing."""
+        """Scene as text; "" if it states nothing."""
         return json.dumps(self.scene, indent=2, ensure_ascii=False) if self.scene else ""
 
 
 class Answer(NamedTuple):
-    """A tile: a number that people came for, what it is, and how sure it is."""
+    """Tile with a title, a value and a note on its uncertainty."""
 
     title: str
     value: str
@@ -58,15 +58,17 @@ class Answer(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class PageSummary:
-    """The top of every page.
+    """Top of every page.
 
     Attributes:
-        subject: what the page is about.
-        trusted: whether nothing stands against the answer.
-        verdict: one sentence; of an untrusted answer, what stands against it.
-        findings: sentences, by what they answer.
-        answers: the few numbers.
-        has_reservation: whether a trusted answer is not the one that was hoped for, as the verdict says.
+        subject: subject of the page.
+        trusted: whether the result is reliable.
+        verdict: one sentence; for an unreliable result, the reason.
+        findings: sentences, by the question that they answer.
+        answers: the main numbers.
+        warnings: sentences on what may change the result.
+        has_reservation: whether a reliable result is limited, as the verdict states.
+        notes: sentences for information.
     """
 
     title: str
@@ -77,26 +79,29 @@ class PageSummary:
     answers: Sequence[Answer]
     warnings: Sequence[str]
     has_reservation: bool = False
+    notes: Sequence[str] = ()
 
 
 def write_page(path: str | os.PathLike[str], template: str, **content: Any) -> None:
-    """Write what a template makes of `content`: mostly `frame` (a `PageSummary`), `origin` (a `Provenance`) and more.
+    """Render a template with `content`: mostly `frame` (a `PageSummary`), `origin` (a `Provenance`) and more.
 
     Raises:
         InputError: the place cannot be written.
-        jinja2.UndefinedError: the template wants more than there is.
+        jinja2.UndefinedError: the template needs a value that is missing.
     """
     loader = jinja2.PackageLoader("fitact.report")
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     environment.globals["engineering"] = format_engineering
     environment.filters["picture"] = lambda chart: image(lambda: draw_chart(chart))
-    environment.globals["verbatim"] = lambda name: Markup(loader.get_source(environment, name)[0])  # scripts of ours
+    environment.globals["verbatim"] = lambda name: Markup(
+        loader.get_source(environment, name)[0]
+    )  # trusted scripts of this package
     page = environment.get_template(template).render(content, versions=versions())
     with atomic_write(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
 
 def image(draw: Callable[[], Figure]) -> str:
-    """Draw a figure in the shared style, as the source of an image: it cannot clash with another's ids."""
+    """Draw a figure in the shared style, as the source of an image, so that its ids cannot clash with others."""
     with mpl.rc_context(STYLE):
         return "data:image/svg+xml;base64," + base64.b64encode(svg(draw()).encode()).decode()

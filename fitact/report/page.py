@@ -29,7 +29,7 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
     """Write the page from a posterior's DataTree and the content of summary.json.
 
     Raises:
-        InputError: the place cannot be written, or the results are of another version.
+        InputError: the file cannot be written, or another version wrote the results.
     """
     try:
         scene = Scene.from_dict(summary["scene"])

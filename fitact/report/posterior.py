@@ -1,4 +1,4 @@
-"""The charts of a posterior: each record with its fit, the parameters, and the force."""
+"""Charts of a posterior: each record with its fit, the parameters, and the force."""
 
 import itertools
 from typing import Any
@@ -11,13 +11,13 @@ from fitact.charts.interactive import Axis, Chart, Plot, PlotlyTrace
 
 CHANNELS = {"Vsc": "skin voltage Vsc", "I": "loop current I"}
 _FORCES = {"force_mean": "mean force", "force_rms": "rms force", "force_peak": "peak force"}
-_DENSITY = Axis("density", hides_numbers=True)  # each is scaled to its own peak
+_DENSITY = Axis("density", hides_numbers=True)  # each density is scaled to its own maximum
 
 
 def make_charts(tree: Any, page_columns: int = 10_000) -> dict[str, Chart]:
     """Make the charts of the DataTree of a posterior, by name; `page_columns`: columns for all records of a page."""
     records = [str(name) for name in tree["observed_data"].data_vars]
-    columns = min(2000, page_columns // len(records))  # no screen shows more
+    columns = min(2000, page_columns // len(records))  # screens have no more columns
     charts = {f"trace_{i}": _channel_chart(tree, name, columns) for i, name in enumerate(records)}
     return charts | {"corner": _corner_chart(tree), "force": _force_chart(tree)}
 

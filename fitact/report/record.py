@@ -1,4 +1,4 @@
-"""A record as a picture: its channels over time."""
+"""Picture of a record: its channels over time."""
 
 import os
 from pathlib import Path
@@ -16,10 +16,10 @@ from fitact.errors import InputError
 
 
 def write_record(path: str | os.PathLike[str], inspection: Inspection) -> None:
-    """Draw a record's channels at `path`: SVG or PNG by its ending.
+    """Draw the channels of a record and write SVG or PNG, by the ending of `path`.
 
     Raises:
-        InputError: another ending, or a place that cannot be written.
+        InputError: the ending is another one, or the file cannot be written.
     """
     path = Path(path)
     if path.suffix not in (".svg", ".png"):
@@ -42,7 +42,7 @@ def _figure(inspection: Inspection) -> Figure:
 
 
 def _draw(axes: Axes, time: np.ndarray, channel: Channel, columns: int = 2000) -> None:
-    """Draw each sample, or the extremes of `columns` stretches where there are more than twice as many samples."""
+    """Draw each sample, or the extremes in `columns` intervals if there are more than twice as many samples."""
     values = channel.values
     at = extremes(values, columns)
     axes.plot(time[at], values[at], ".-" if at.size == values.size else "-", color=DATA, ms=2.0, lw=0.6)

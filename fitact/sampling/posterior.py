@@ -204,7 +204,7 @@ class Posterior:
 
     @functools.cached_property
     def _posterior_predictive(self) -> Any:
-        """Records as the posterior predicts them, noise included: 50 of each ensemble, of some 4000 samples at most."""
+        """Posterior predictive records with noise: 50 of each ensemble, each of about 4000 samples at most."""
         import xarray as xr
 
         ensembles, count = self.points.shape[:2]
@@ -234,7 +234,7 @@ class Posterior:
             tree.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
 
     def report(self, path: str | os.PathLike[str], plan: Plan | None = None) -> None:
-        """Write the report, one self-contained HTML page; with `plan`, whose scene was fitted, what that left out."""
+        """Write the report as one self-contained HTML page; `plan` adds the simplifications of the fitted scene."""
         from fitact.report import write_report
 
         stated = {} if plan is None else {"plan": {"used": "planned", "sentence": plan.sentence} | plan.to_dict()}
@@ -242,7 +242,7 @@ class Posterior:
 
 
 def _relative_noise_sd(channel: ChannelFit) -> Float[np.ndarray, " samples"]:
-    """Standard deviation of each sample's noise over the channel's; NaN where one was left out."""
+    """Standard deviation of each sample's noise over the channel's; NaN where a sample was excluded."""
     if channel.weight is None:
         return np.ones(len(channel.record))
     counts = channel.weight > 0.0
@@ -255,7 +255,7 @@ def _time_axis_name(channel: ChannelFit) -> str:
 
 
 def _variable_name(trace: ChannelFit, channel: str = "") -> str:
-    """Name a fitted channel, or another channel of its record."""
+    """Return the variable name of a fitted channel, or of another channel of its record."""
     return (channel or trace.channel) + _time_axis_name(trace).removeprefix("time")
 
 

@@ -1,7 +1,7 @@
-"""Scene: the device, the skin, how it is grounded and driven, what is measured and what is believed.
+"""Scene: device, skin, grounding, drive, measurement and prior.
 
-Read from TOML, where quantities carry units ("160 kohm"); inside, every number is SI. An empty scene
-is the paper's nominal device.
+Scenes are read from TOML, where quantities have units ("160 kohm"); inside, every number is in SI units. An empty
+scene is the nominal device of the reference paper.
 """
 
 import difflib
@@ -27,7 +27,7 @@ from fitact.prior.published import Layer
 from fitact.scene import sections, toml
 from fitact.scene.prior_section import PriorSection
 
-_DIRECT_GROUND_KEYS = ("R_H", "grounding_Rsc", "grounding_Csc")  # what only one way of grounding has
+_DIRECT_GROUND_KEYS = ("R_H", "grounding_Rsc", "grounding_Csc")  # keys of only one kind of grounding
 _NATURAL_GROUND_KEYS = ("Z", "Z_capacitance")
 
 
@@ -74,37 +74,37 @@ class Scene(sections.Section):
 
     @classmethod
     def from_dict(cls, content: dict[str, Any], source: str = "scene") -> Self:
-        """From the tables of a scene file; `source` names it in errors."""
+        """Make a scene from the tables of a scene file; `source` names the file in errors."""
         try:
             return cls.model_validate(content)
         except pydantic.ValidationError as error:
             raise InputError(f"{source}: {_sentence(error.errors()[0])}") from None
 
     def __str__(self) -> str:
-        """The scene as a file: every key, with its unit; what was not given, as a comment. Loads to an equal scene."""
+        """Return the scene as TOML: every key with its unit, defaults as comments. It loads to an equal scene."""
         return toml.to_toml(self)
 
     def to_json(self) -> str:
-        """The keys that were given, in SI units; `from_json` reads it back."""
+        """Return the stated keys as JSON, in SI units; `from_json` reads it."""
         stated = self.model_dump(mode="json", exclude_unset=True)
         return json.dumps({name: section for name, section in stated.items() if section}, sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """The scene that `to_json` wrote."""
+        """Make a scene from the output of `to_json`."""
         return cls.from_dict(json.loads(text))
 
     def states_waveform(self) -> bool:
-        """Whether the file names the waveform, rather than leaving the default."""
+        """Return whether the file states the waveform."""
         return "waveform" in self.drive.model_fields_set
 
     def steady_state(self) -> bool | None:
-        """The steady state as the file has it; None where it is silent."""
+        """Return `steady_state` as stated in the file; None if it is not stated."""
         return self.drive.steady_state if "steady_state" in self.drive.model_fields_set else None
 
     def require_available(self, *, fit: bool = False) -> None:
-        """Refuse what this version cannot model (or, with `fit`, cannot fit), rather than leave it out in silence."""
-        follows = ("constant", "fractional") if fit else ("constant",)  # the skins whose transients are computed
+        """Raise InputError if this version cannot model (or, with `fit`, cannot fit) the scene."""
+        follows = ("constant", "fractional") if fit else ("constant",)  # skins with computable transients
         if self.skin.level not in follows and not self.drive.steady_state:
             raise InputError(
                 f"scene: [skin] level = '{self.skin.level}' with [drive] steady_state = false is not available in this"
@@ -112,14 +112,14 @@ class Scene(sections.Section):
             )
 
     def nominal_values(self) -> dict[str, float | None]:
-        """The scene's own values of all that can have a prior, SI; None: it has none."""
+        """Return nominal values of all parameters that can have a prior, SI; None if there is no such element."""
         ground, measured = self.grounding, self.measurement
         return {
             "Rsc": self.skin.Rsc,
             "Csc": self.skin.Csc,
             "Ci": self.device.Ci,
             **{name: getattr(ground, name) for name in (*_DIRECT_GROUND_KEYS, *_NATURAL_GROUND_KEYS)},
-            "Z": ground.Z or None,  # 0: the body is at earth
+            "Z": ground.Z or None,  # 0 means that the body is at earth
             "series_resistor": measured.series_resistor or None,
             "alpha": self.skin.alpha if self.skin.level == "fractional" else None,
             "Rgap": self.gap.resistance,
@@ -129,22 +129,22 @@ class Scene(sections.Section):
         }
 
     def _gap_capacitance(self) -> float | None:
-        """The stated one, or that of air of the stated thickness, eq. (3)."""
+        """Return the stated capacitance, or that of air with the stated thickness, eq. (3)."""
         thickness = self.gap.thickness
         if self.gap.capacitance is not None or thickness is None:
             return self.gap.capacitance
         return float(plate_capacitance(1.0, self.device.contact_area, thickness))
 
     def geometry(self) -> Geometry:
-        """Sizes that the force needs beside the circuit; a gap's thickness follows Cgap unless both are stated."""
+        """Return the sizes for the force; the thickness of a gap follows from Cgap unless both are stated."""
         both = self.gap.capacitance is not None and self.gap.thickness is not None
         panel, gap = self.device, self.gap.thickness if both else None
         return Geometry(panel.contact_area, panel.insulator_thickness, self.skin.thickness, gap, self.force.model)
 
     def make_circuit(self, values: Mapping[str, ArrayLike] | None = None) -> Circuit:
-        """The circuit at the scene's nominal values, or at others by name (ohm, F).
+        """Make the circuit at the nominal values, or at `values` by name (ohm, F).
 
-        It is the paper's final one unless the scene, or `values`, asks for more.
+        It is `FinalCircuit` unless the scene, or `values`, has further elements.
         """
         self.require_available()
         circuit = self.make_rc_circuit(values)
@@ -154,7 +154,7 @@ class Scene(sections.Section):
         return WithSkin(circuit, Dispersive() if self.skin.level == "dispersive" else Fractional(alpha))
 
     def make_rc_circuit(self, values: Mapping[str, ArrayLike] | None = None) -> RC:
-        """The circuit with the skins constant."""
+        """Make the circuit with constant skins."""
         self.require_available(fit=True)
         at: dict[str, Any] = self.nominal_values() | dict(values or {})
         skin, names = (at["Rsc"], at["Csc"], at["Ci"]), ("series_resistor", "Rgap", "Cgap")
@@ -173,21 +173,21 @@ class Scene(sections.Section):
         return Probe(math.inf if resistance is None else resistance, capacitance or 0.0)
 
     def make_drive(self) -> Drive:
-        """The scene's drive; refused where the waveform is 'measured', so only a record has it."""
+        """Make the drive; refused if the waveform is 'measured', which only a record has."""
         return self.drive.make()
 
     def make_prior(self) -> Prior:
-        """The prior of the parameters that the scene frees, but for gains."""
+        """Make the prior of the free parameters, without gains."""
         layer = Layer(self.device.contact_area, self.skin.thickness, self.drive.lowest_frequency)
         nominal, beliefs = self.nominal_values(), self.prior.specs().items()
         marginals = {name: b.distribution(name, nominal[name], layer) for name, b in beliefs if b.is_free}
         return Prior.of(self.prior.correlations(), self.prior.order_constraints(), **marginals)
 
     def fixed_values(self) -> dict[str, float]:
-        """Parameters that the scene holds, and their values, SI.
+        """Return the fixed parameters and their values, SI.
 
         Raises:
-            InputError: one is held at a value that the scene does not have.
+            InputError: a parameter is fixed at a value that the scene does not have.
         """
         nominal, fixed = self.nominal_values(), {}
         for name, belief in self.prior.specs().items():
@@ -226,7 +226,7 @@ class Scene(sections.Section):
 
 
 def _sentence(error: Any) -> str:
-    """A pydantic error as one sentence with the place and the remedy."""
+    """Return a pydantic error as one sentence with place and remedy."""
     where = [str(part) for part in error["loc"] if part not in ("function-before", "constrained-float")]
     place = f"[{where[0]}] {'.'.join(where[1:])}".strip() if where else "the scene"
     if error["type"] == "extra_forbidden":
@@ -240,7 +240,7 @@ def _sentence(error: Any) -> str:
     if error["type"] == "literal_error":
         known = re.findall("'([^']+)'", error["ctx"]["expected"])
         message = f"not a choice; {_suggest_key(str(error['input']), known)}"
-    if message.startswith("["):  # it names its place itself
+    if message.startswith("["):  # the message already names the place
         return message
     value = error["input"]
     shown = f" = {value!r}" if isinstance(value, str | int | float | bool) else ""

@@ -1,4 +1,4 @@
-"""The sections of a scene file: keys, units, defaults and what they refuse. Inside, every number is SI."""
+"""Sections of a scene file: keys, units, defaults and checks. Inside, every number is in SI units."""
 
 import dataclasses
 import math
@@ -20,12 +20,12 @@ from fitact.model.force import plate_capacitance
 
 @dataclasses.dataclass(frozen=True)
 class Unit:
-    """The SI unit of a field, among its annotations; "" for a ratio. Text with units is accepted; inside, it is SI."""
+    """SI unit of a field, as an annotation; "" for a ratio. Text with units is converted."""
 
     name: str
 
     def parse(self, value: Any) -> Any:
-        """The value in the unit."""
+        """Return the value in the unit."""
         return units.parse_quantity(value, self.name)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -55,13 +55,13 @@ RelativeSD = Annotated[float, Field(ge=0, lt=1)]
 
 
 def field_unit(field: FieldInfo) -> str | None:
-    """The SI unit of a section's field; None: it is no quantity."""
+    """Return the SI unit of a field; None if it is not a quantity."""
     parts = _walk_annotations(*field.metadata, field.annotation)
     return next((part.name for part in parts if isinstance(part, Unit)), None)
 
 
 def field_section(field: FieldInfo) -> type["Section"]:
-    """The section that a field holds."""
+    """Return the section class of a field."""
     parts = _walk_annotations(*field.metadata, field.annotation)
     return next(part for part in parts if isinstance(part, type) and issubclass(part, Section))
 
@@ -73,13 +73,13 @@ def _walk_annotations(*annotations: Any) -> Iterator[Any]:
 
 
 class Section(pydantic.BaseModel):
-    """A section of a scene: frozen, and without keys they do not know."""
+    """Section of a scene: frozen, without unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Device(Section):
-    """The panel."""
+    """Panel: insulator and contact area, and limits of field and current."""
 
     Ci: Farad = 1.35e-9
     insulator_thickness: Meter = 1e-6
@@ -99,7 +99,7 @@ class Device(Section):
 
 
 class SkinSection(Section):
-    """One skin layer; `alpha` is the exponent of a fractional one (see `fitact.Fractional`)."""
+    """Skin layer; `alpha` is the exponent of a fractional skin (see `fitact.Fractional`)."""
 
     Rsc: Ohm = 160e3
     Csc: Farad = 22e-9
@@ -115,7 +115,7 @@ class SkinSection(Section):
 
 
 class Grounding(Section):
-    """How the body is connected to the device's ground."""
+    """Connection of the body to the ground of the device."""
 
     connection: Literal["direct", "natural"] = "direct"
     R_H: Ohm | None = None
@@ -134,7 +134,7 @@ class Grounding(Section):
 
 
 class Gap(Section):
-    """Between the finger and the panel, which sliding opens; without any key there is none."""
+    """Gap between finger and panel; without any key there is none."""
 
     resistance: Ohm | None = None
     capacitance: Farad | None = None
@@ -142,7 +142,7 @@ class Gap(Section):
 
 
 _PERIODIC_WAVEFORMS = ("sine", "triangle", "square", "trapezoid")
-_KEY_WAVEFORMS = {  # the keys of [drive] that only some waveforms have
+_KEY_WAVEFORMS = {  # keys of [drive] that belong to some waveforms only
     "peak_to_peak": (*_PERIODIC_WAVEFORMS, "burst", "chirp", "measured"),
     "frequency": (*_PERIODIC_WAVEFORMS, "burst", "measured"),
     "duty": ("square", "trapezoid", "burst"),
@@ -154,7 +154,7 @@ _KEY_WAVEFORMS = {  # the keys of [drive] that only some waveforms have
 
 
 class DriveSection(Section):
-    """The voltage on the electrode."""
+    """Voltage on the electrode."""
 
     waveform: Literal["sine", "triangle", "square", "trapezoid", "burst", "chirp", "multitone", "measured"] = "square"
     peak_to_peak: Volt = 360.0
@@ -197,7 +197,7 @@ class DriveSection(Section):
         if self.waveform in ("burst", "chirp"):
             if "steady_state" in self.model_fields_set and self.steady_state:
                 raise ValueError(f"a {self.waveform} has no steady state; leave steady_state out, or make it false")
-            object.__setattr__(self, "steady_state", False)  # the model is frozen from here on
+            object.__setattr__(self, "steady_state", False)  # bypasses the frozen model
         return self
 
     @model_validator(mode="after")
@@ -221,7 +221,7 @@ class DriveSection(Section):
 
     @property
     def lowest_frequency(self) -> float:
-        """The lowest frequency in it, Hz; of several tones that at which they repeat."""
+        """Lowest frequency, Hz; for several tones, the frequency at which they repeat together."""
         if self.frequencies is not None:
             tones = [Fraction(repr(tone)) for tone in self.frequencies]
             whole = math.lcm(*(tone.denominator for tone in tones))
@@ -229,7 +229,7 @@ class DriveSection(Section):
         return min(self.start_frequency or self.frequency, self.end_frequency or self.frequency)
 
     def make(self) -> Drive:
-        """The drive; refused where the waveform is 'measured', so only a record has it."""
+        """Make the drive; refused if the waveform is 'measured', which only a record has."""
         if self.waveform == "chirp":
             sweep = self.start_frequency, self.end_frequency, self.sweep_time
             return Chirp(self.peak_to_peak, *sweep, self.spacing, self.offset, self.phase)
@@ -255,7 +255,7 @@ class DriveSection(Section):
 
 
 class Measurement(Section):
-    """The channels that are recorded, and the means."""
+    """Recorded channels, their noise and gain errors, series resistor and probe."""
 
     channels: tuple[Literal["Vsc", "I"], ...] = Field(default=("Vsc",), min_length=1)
     series_resistor: AnyOhm = 0.0
@@ -283,27 +283,27 @@ class Measurement(Section):
 
 
 class Friction(Section):
-    """Eq. (2)."""
+    """Friction coefficient and normal force of eq. (2)."""
 
     coefficient: Annotated[float, Field(gt=0)] = 0.5
     normal_force: Newton = 0.5
 
 
 class ForceSection(Section):
-    """Which voltage makes the force."""
+    """Force law: eq. (22) of the reference paper from Vsc, or an interface gap."""
 
     model: Literal["paper", "gap"] = "paper"
 
 
 class Perception(Section):
-    """The least force that counts as felt."""
+    """Perception threshold."""
 
     threshold_force: Threshold | None = None
     friction_change: Annotated[float, Field(gt=0)] | None = None
 
 
 class PopulationSection(Section):
-    """Traits that fingers on one panel share, and how the next one's layers differ from the stated ones."""
+    """Contact area of the fingers, common or varying, and the variability of thicknesses."""
 
     contact_area: Literal["common", "varies"] = "common"
     skin_thickness_relative_sd: RelativeSD = 0.0
@@ -311,12 +311,12 @@ class PopulationSection(Section):
 
     @property
     def thickness_sd(self) -> dict[str, float]:
-        """Log-standard deviations of the thicknesses that vary."""
+        """Standard deviations of the logarithms of varying thicknesses."""
         stated = {name: getattr(self, f"{name}_relative_sd") for name in ("skin_thickness", "insulator_thickness")}
         return {name: math.sqrt(math.log1p(sd**2)) for name, sd in stated.items() if sd > 0.0}
 
 
 class Tolerance(Section):
-    """The relative error the user accepts."""
+    """Accepted relative error of the force."""
 
     force: Share = 0.01

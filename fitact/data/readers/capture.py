@@ -1,4 +1,4 @@
-"""The contents of a file before anything is said about it: time and channels under their maker's names."""
+"""Contents of a file before channels are assigned: time, and channels with the names in the file."""
 
 import dataclasses
 import math
@@ -18,9 +18,9 @@ Pick = Callable[[list[str], str], Iterable[str]]  # of the names found, and thei
 
 @dataclasses.dataclass(frozen=True)
 class FileChannel:
-    """One channel as the file has it, in the SI unit `unit` (V, A; "" where the file states none).
+    """One channel of a file, in the SI unit `unit` (V, A; "" if the file states none).
 
-    `unit_text` is the unit in the file's words, `attenuation` the probe's as the file states it, already applied.
+    `unit_text`: unit as written in the file. `attenuation`: probe attenuation that the file states, already applied.
     """
 
     name: str
@@ -28,7 +28,7 @@ class FileChannel:
     unit: str = ""
     unit_text: str = ""
     attenuation: float | None = None
-    location: str = ""  # of its name, for messages
+    location: str = ""  # location of the name, for messages
 
     @classmethod
     def from_file(
@@ -46,11 +46,11 @@ class FileChannel:
 
 @dataclasses.dataclass(frozen=True)
 class Capture:
-    """Time (s) and traces of one file.
+    """Time (s) and channels of one file.
 
     Attributes:
-        format: who wrote it, as "Keysight CSV".
-        row_label: what a sample's number is called in messages, as "line 12".
+        format: name of the file format, e.g. "Keysight CSV".
+        row_label: function from a sample index to its name in messages, e.g. "line 12".
         notes: sentences for information.
         warnings: sentences on what was assumed and may change the result.
         unread_columns: columns that were not requested, or without numbers.
@@ -67,7 +67,7 @@ class Capture:
 
 
 def resolve_channels(names: list[str], channels: Mapping[str, str], source: str, location: str = "") -> dict[str, str]:
-    """For each of V, Vsc and I that is known, the name it has in the file: stated, or by the name itself."""
+    """Return the column name of each of V, Vsc and I that the user assigned or that has its standard name."""
     known: dict[str, str] = {}
     for channel in CHANNEL_UNITS:
         own = [name for name in names if name.lower() == channel.lower()]
@@ -93,7 +93,7 @@ def resolve_channels(names: list[str], channels: Mapping[str, str], source: str,
 
 
 def find_channel(requested: str, names: list[str], source: str) -> str:
-    """The name in the file of the channel that is asked for, as "CH2" for "Channel 2"."""
+    """Return the name in the file of a requested channel, e.g. "CH2" for "Channel 2"."""
     exact = [name for name in names if name.strip().lower() == requested.strip().lower()]
     alike = exact or [name for name in names if normalize_channel(name) == normalize_channel(requested)]
     if len(alike) != 1:
@@ -108,7 +108,7 @@ def has_standard_names(capture: Capture) -> bool:
 
 
 def to_record(capture: Capture, channels: Mapping[str, str], scale: Mapping[str, float]) -> Record:
-    """The record that the stated channels and factors make of a capture."""
+    """Convert the contents of a file to a record, with the assigned channels and scale factors."""
     for channel, factor in scale.items():
         if channel not in CHANNEL_UNITS:
             raise InputError(f"{capture.source}: '{channel}' is no channel of fitact; scale {', '.join(CHANNEL_UNITS)}")
