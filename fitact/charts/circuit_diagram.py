@@ -179,15 +179,15 @@ def _add_touching_skin(diagram: Diagram, values: Mapping[str, str], y: float) ->
     if "alpha" in values:
         shown["Csc"] += f"\nalpha {values['alpha']}"
     below = _add_layer(diagram, ("Rsc", "Csc"), shown, y, "touching\nfinger", height=2.4)
-    end, x = y - 2.4, 7.2
     probe = [name for name in ("probe_resistance", "probe_capacitance") if name in values]
+    end, x = y - 2.4, 7.75 if probe else 7.2
     for name in probe:
         kind = schemdraw.elements.ResistorIEC() if name == "probe_resistance" else schemdraw.elements.Capacitor()
         diagram.part(name, kind, (x, y), (x, end))
         x += 0.75
     if probe:
         diagram.text("\n".join(["probe", *(values[name] for name in probe)]), (x - 0.4, (y + end) / 2))
-        x += 1.0
+        x += 1.1
     for name, at, place, side in (("Vsc+", y, "skin's surface", "top"), ("Vsc-", end, "inside the finger", "bottom")):
         diagram.wire((_RIGHT, at), (x, at))
         diagram.add(schemdraw.elements.Dot(open=True, radius=0.09).at((x, at)))
