@@ -226,7 +226,7 @@ def lay_out_wiring(
     diagram, elements, direct = Diagram(), schemdraw.elements, grounding == "direct"
     current = "I" in channels
     for (x, y), (width, height), text in (
-        ((0.0, -2.4), (2.1, 2.6), "amplifier"),
+        ((0.0, -2.4), (2.0, 2.6), "amplifier"),
         ((5.6, -0.8), (3.8, 0.55), "electrode"),
         ((5.6, -0.25), (3.8, 0.5), "insulator"),
         ((6.4, 0.25), (2.4, 1.25), "finger"),
@@ -239,7 +239,7 @@ def lay_out_wiring(
     diagram.text("body", (10.0, -0.8))
     in_lead = "series\nresistor" if series_resistor else "" if direct or not current else "shunt"
     start, end = (2.9, -0.5), (4.9, -0.5)
-    diagram.wire((2.1, -0.5), start)
+    diagram.wire((2.0, -0.5), start)
     if in_lead:
         diagram.part(in_lead, elements.ResistorIEC(), start, end, in_lead, "top")
     else:
@@ -250,14 +250,14 @@ def lay_out_wiring(
         diagram.part("shunt", elements.ResistorIEC(), start, end, "shunt", "top")
     else:
         diagram.wire(start, end)
-    diagram.wire(end, (2.9, -3.15), (2.9, -1.9), (2.1, -1.9))
+    diagram.wire(end, (2.9, -3.15), (2.9, -1.9), (2.0, -1.9))
     diagram.add(elements.Ground().at((2.9, -3.15)))
     diagram.text("common\nground", (2.55, -3.6), "left")
-    taps = [((2.5, -0.5), 1.2, "1: V")]
+    taps = [((2.55, -0.5), 1.2, "1: V")]
     if current and direct:
         taps += [((5.45, -3.15), -0.8, "3: I × shunt")]
     elif current:
-        taps += [((2.5, -0.5), -0.7, "3 +"), ((5.2, -0.5), -0.7, "3 −: I × resistance")]
+        taps += [((2.55, -0.5), -0.7, "3 +"), ((5.2, -0.5), -0.7, "3 −: I × resistance")]
     for (x, y), length, text in taps:
         _add_tap(diagram, (x, y), (x, y + length), text, "top" if length > 0.0 else "bottom")
     if "Vsc" in channels:

@@ -155,6 +155,7 @@ def test_a_chart_that_fails_leaves_its_picture(browser: Browser, page: Path, tmp
     broken.write_text(page.read_text().replace("window.Plotly = Plotly", "window.Plotly = null"))
     browser.open(broken)
     image = browser.all("figure.chart img")[0]
+    browser.ask("arguments[0].closest('figure').scrollIntoView()", image)  # a chart is drawn once it is near
     WebDriverWait(browser.driver, 10).until(lambda _: image.is_displayed())
 
 
