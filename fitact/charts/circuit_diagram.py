@@ -49,10 +49,8 @@ class Diagram:
         """Add a part between two points, its label right or left of it, or above ("top") or below ("bottom")."""
         self.add(kind.endpoints(start, end))
         self.parts[name] = start, end
-        (x, y), (dx, dy) = ((a + b) / 2 for a, b in zip(start, end, strict=True)), {
-            "right": (0.36, 0.0), "left": (-0.36, 0.0), "top": (0.0, 0.34), "bottom": (0.0, -0.34)
-        }[side]  # fmt: skip
-        self.text(label, (x + dx, y + dy), side)
+        dx, dy = {"right": (0.36, 0.0), "left": (-0.36, 0.0), "top": (0.0, 0.34), "bottom": (0.0, -0.34)}[side]
+        self.text(label, ((start[0] + end[0]) / 2 + dx, (start[1] + end[1]) / 2 + dy), side)
 
     def wire(self, *points: Point) -> None:
         """Connect points by straight wires."""
@@ -78,7 +76,7 @@ class Diagram:
             content = figure.getimage().decode()
         finally:
             schemdraw.svgconfig.text = mode
-        body = content[content.index(">", content.index("<svg")) + 1 :]
+        body = content[content.index(">", content.index("<svg")) + 1 :].replace("stroke-dasharray:-;", "")
         left, top = figure.bbox.xmin * _PIXELS, -figure.bbox.ymax * _PIXELS
         width, height = figure.pxwidth, figure.pxheight
         if is_file:
@@ -109,7 +107,7 @@ def lay_out_circuit(values: Mapping[str, str], grounding: Grounding = "direct", 
     diagram.part("source", schemdraw.elements.SourceV(), *source)
     diagram.text("V", (_SOURCE - 0.6, bottom / 2), "left")
     diagram.wire(source[1], (_SOURCE, 0.0), (1.1, 0.0))
-    in_lead = current and grounding == "natural"  # a shunt to earth would be bypassed by the mains earth
+    in_lead = current and grounding == "natural"  # the mains earth would bypass a shunt in the way back
     measured = "\nI = its voltage / R" if in_lead else ""
     if "series_resistor" in values:
         label = f"series resistor\n{values['series_resistor']}{measured}"
