@@ -1,7 +1,7 @@
-"""Many records on many machines: a journal that loses nothing, batches that come back, poisoned records set aside.
+"""Fits of many records on many machines, with a journal, repeated batches, and isolation of records that crash workers.
 
-The work is done by Dask's workers, in batches; what they give back is written by this process alone, a line for each
-batch, so that a record is done once however often a worker, the scheduler or this process is killed.
+Dask workers compute batches of records, and this process alone writes the results to the journal. A record is
+therefore computed once, no matter how often a worker, the scheduler or this process is killed.
 """
 
 import contextlib
@@ -33,31 +33,31 @@ from fitact.scene.scene import Scene
 if TYPE_CHECKING:
     from distributed import Client
 
-BATCH = 32  # records in a task, which take seconds; a batch is the least that is done again
+BATCH = 32  # records in a task, which takes seconds; a lost batch is computed again as a whole
 _ONE_THREAD = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
-    "MALLOC_TRIM_THRESHOLD_": "65536",  # bytes: what is freed goes back to the machine
+    "MALLOC_TRIM_THRESHOLD_": "65536",  # bytes; freed memory returns to the system
 }
 JOURNAL = "journal.jsonl"
 
-Batch = tuple[tuple[str, str], ...]  # keys of the journal and paths
+Batch = tuple[tuple[str, str], ...]  # (key of the journal, path) of each record
 
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """All that a worker needs beside the records.
+    """Input of a worker in addition to the records.
 
     Attributes:
-        scene: as JSON; None: the paper's device.
+        scene: scene as JSON; None means the device of the reference paper.
         columns: `channels` and `scale` of files, as in `fitact.read`.
-        reports: folder for a sampled posterior and a report of each record; None: none.
-        seed: of the sampling.
-        posteriors: whether rows are those of `sample_many`, or of `fit_many`.
-        max_maps: areas of memory, above which what JAX compiled is dropped; Linux grants a process 65,530 by default,
-            a new length of records takes some 600, and a batch has 32.
+        reports: folder for a posterior and a report of each record, or None.
+        seed: seed of the sampling.
+        posteriors: whether rows are made by `sample_many` instead of `fit_many`.
+        max_maps: number of memory maps above which compiled code is dropped; Linux allows a process 65,530 by default,
+            a new length of records needs some 600, and a batch has 32.
     """
 
     scene: str | None
@@ -69,7 +69,7 @@ class Task:
 
     @property
     def fingerprint(self) -> str:
-        """Return a hash of all that an answer depends on beside the record."""
+        """Hash of everything that determines a result, except the record."""
         sampled = [bool(self.reports), self.posteriors, self.seed]
         settings = [importlib.metadata.version("fitact"), self.scene, self.columns, *sampled]
         return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
@@ -80,7 +80,7 @@ class Task:
         self._clear_large_caches()
         rows = [dict(row) for row in self._fit_or_sample(paths, scene)]
         for path, row in zip(paths, rows, strict=True):
-            if row["result"] == "crashed":  # it may have been the machine
+            if row["result"] == "crashed":  # the machine may be the cause
                 row |= self._fit_or_sample([path], scene)[0]
             if self.reports is not None and "samples" in row:
                 self._clear_large_caches()
@@ -88,7 +88,7 @@ class Task:
         return rows
 
     def _fit_or_sample(self, paths: Sequence[str], scene: Scene | None) -> Fits:
-        if self.posteriors and self.reports is None:  # reports sample each by itself
+        if self.posteriors and self.reports is None:  # reports sample each record separately
             return sample_many(paths, scene, **self.columns, seed=self.seed, progress=False)
         return fit_many(paths, scene, **self.columns, progress=False)
 
@@ -101,19 +101,19 @@ class Task:
         return row | {"report": f"{reports.name}/{place.name}/report.html", "trusted": posterior.trusted}
 
     def _clear_large_caches(self) -> None:
-        """Drop what JAX compiled once it is much: it compiles anew for every kind of record, and keeps it all."""
+        """Drop code compiled by JAX if there is much of it, since JAX keeps the code for every kind of record."""
         maps = Path("/proc/self/maps")
         if maps.exists() and maps.read_bytes().count(b"\n") > self.max_maps:
             jax.clear_caches()
 
 
 class Journal:
-    """Rows by their key, in a file to which lines are only added."""
+    """Rows by key, in an append-only file."""
 
     def __init__(self, path: Path) -> None:
         self.rows: dict[str, Row] = {}
         path.parent.mkdir(parents=True, exist_ok=True)
-        size = 0  # bytes of whole lines: a kill may have left part of one
+        size = 0  # bytes of complete lines; a killed run may leave an incomplete one
         if path.exists():
             with path.open("rb") as file:
                 for line in file:
@@ -125,7 +125,7 @@ class Journal:
         self._file.truncate(size)
 
     def add(self, rows: Mapping[str, Row]) -> None:
-        """Add the rows of a batch, which are on disk when this returns."""
+        """Add the rows of a batch and flush them to disk."""
         self.rows |= rows
         self._file.write(to_json(rows, indent=None).encode())
         self._file.flush()
@@ -150,34 +150,34 @@ def run_campaign(
     seed: int = 0,
     progress: bool = True,
 ) -> Fits:
-    """Fit many files on Dask's workers, each once; the same call goes on where an interrupted one stopped.
+    """Fit many files on Dask workers, each once; the same call resumes an interrupted one.
 
-    Into `folder` go journal.jsonl and the reports as the work proceeds; the tables are what comes back. A record counts
-    as done when its content, the settings and fitact's version are those of the journal. A batch whose workers die is
-    taken apart until the record that kills them is known, which is then set aside.
+    The journal (journal.jsonl) and the reports are written to `folder` during the work, and the table is returned. A
+    record is done if its content, the settings and fitact's version agree with the journal. If a batch has killed four
+    workers, it is split until the offending record is isolated; this record is reported as failed.
 
     Args:
-        records: paths, which workers on other machines must see, too.
-        folder: for the results.
-        scene: of all of them.
-        channels, scale: of files, as in `fitact.read`.
-        scheduler: address of a Dask scheduler; absent: workers of this machine.
-        workers: how many of these, of one thread each; absent: one for each core.
-        memory: what each of these may take before it is started anew.
-        posteriors: sample the posterior of each, as `fitact.sample_many` does.
-        reports: sample the posterior of each by itself, and write its report.
-        seed: of the sampling.
-        progress: report on standard error.
+        records: paths, which must be accessible to workers on other machines.
+        folder: folder for the results.
+        scene: scene of all records.
+        channels, scale: channels of the files, as in `fitact.read`.
+        scheduler: address of a Dask scheduler; None starts workers on this machine.
+        workers: number of these workers, with one thread each; None means one for each core.
+        memory: memory limit of each of these workers, above which it is restarted.
+        posteriors: whether to sample the posterior of each record, like `fitact.sample_many`.
+        reports: whether to sample the posterior of each record separately and write its report.
+        seed: seed of the sampling.
+        progress: whether to report the progress on standard error.
 
     Raises:
-        InputError: a file is named twice, Dask is not installed, the folder cannot be written, or the scheduler is
-            not there.
+        InputError: a file is named twice, Dask is not installed, the folder cannot be written, or the scheduler
+            cannot be reached.
     """
     (scene or Scene()).require_available(fit=True)
     paths = [os.path.abspath(path) for path in records]
     for path, count in Counter(paths).most_common(1):
         if count > 1:
-            raise InputError(f"{path}: is named twice; name each record once")
+            raise InputError(f"{path}: is given twice; give each record once")
     place = Path(folder)
     columns = {"channels": dict(channels or {}), "scale": dict(scale or {})}
     stated = None if scene is None else scene.to_json()
@@ -197,7 +197,7 @@ def run_campaign(
 
 
 def _journal_keys(paths: Sequence[str], task: Task) -> list[str]:
-    """Hash what a row is kept under: settings, name and content."""
+    """Return the key of each row in the journal, a hash of settings, name and content."""
     settings = task.fingerprint
 
     def key(path: str) -> str:
@@ -213,7 +213,7 @@ def _journal_keys(paths: Sequence[str], task: Task) -> list[str]:
 
 
 def _pending_batches(keys: Sequence[str], paths: Sequence[str], journal: Journal) -> deque[Batch]:
-    """Return batches of what is not done: always the same ones, whatever was interrupted."""
+    """Return the batches of pending records, identical after any interruption."""
     pairs = list(zip(keys, paths, strict=True))
     parts = (pairs[first : first + BATCH] for first in range(0, len(pairs), BATCH))
     batches = (tuple(pair for pair in part if pair[0] not in journal.rows) for part in parts)
@@ -230,9 +230,9 @@ def _run_batches(
     progress: "_Progress",
     patience: float = 60.0,
 ) -> None:
-    """Run all batches; a scheduler that is gone is waited for, `patience` seconds."""
+    """Run all batches; wait up to `patience` seconds for a lost scheduler."""
     progress.done = progress.total - sum(map(len, batches))
-    deadline = time.monotonic()  # until which a scheduler is waited for: one that was there may come back
+    deadline = time.monotonic()  # how long to wait for a scheduler, which may return once it was reached
     while batches:
         with _open_client(scheduler, workers, memory, progress, deadline) as client:
             futures: dict[Any, Batch] = {}
@@ -241,22 +241,22 @@ def _run_batches(
                     journal.add({key: row for (key, _), row in zip(batch, rows, strict=True)})
                     progress.add(rows)
                 return
-            except (CancelledError, OSError) as error:  # the scheduler is gone, and with it what it knew
+            except (CancelledError, OSError) as error:  # the scheduler and its state are lost
                 if scheduler is None:
                     raise
                 batches.extendleft(futures.values())
                 deadline = time.monotonic() + patience
-                progress.print_status(f"the scheduler at {scheduler} is gone ({type(error).__name__}); waiting for it")
+                progress.print_status(f"lost the scheduler at {scheduler} ({type(error).__name__}); waiting for it")
 
 
 def _completed_batches(
     client: "Client", task: Task, batches: deque[Batch], futures: dict[Any, Batch], per_worker: int = 3
 ) -> Iterator[tuple[Batch, list[Row]]]:
-    """Yield batches as they are done, `per_worker` being sent ahead; those that kill their workers are taken apart."""
+    """Yield finished batches, with `per_worker` batches in flight; split batches that kill their workers."""
     completed = _import_distributed().as_completed()
 
     def submit() -> None:
-        workers = client.scheduler_info(n_workers=-1)["workers"]  # all that the scheduler knows of
+        workers = client.scheduler_info(n_workers=-1)["workers"]  # all workers of the scheduler
         for _ in range(min(per_worker * max(1, len(workers)) - len(futures), len(batches))):
             batch = batches.popleft()
             future = client.submit(task.rows, [path for _, path in batch], pure=False)
@@ -283,7 +283,7 @@ def _completed_batches(
 def _crash_row(path: str, error: BaseException) -> Row:
     reason = f"{type(error).__name__}: {error}"
     if isinstance(error, _import_distributed().scheduler.KilledWorker):
-        reason = f"killed the {error.allowed_failures + 1} workers that tried it"
+        reason = f"killed {error.allowed_failures + 1} workers"
     return {"record": os.path.basename(path), "result": "crashed", "trusted": False, "message": f"{path}: {reason}"}
 
 
@@ -299,7 +299,7 @@ def _import_distributed() -> Any:
 def _open_client(
     scheduler: str | None, workers: int | None, memory: str, progress: "_Progress", deadline: float
 ) -> Iterator["Client"]:
-    """Connect to the scheduler at that address, or to one with workers of its own."""
+    """Connect to the scheduler at this address, or start one with workers on this machine."""
     distributed = _import_distributed()
     if scheduler is not None:
         with _connect_scheduler(scheduler, deadline) as client:
@@ -308,8 +308,8 @@ def _open_client(
     settings = {
         "distributed.nanny.pre-spawn-environ": _ONE_THREAD,
         "distributed.worker.multiprocessing-method": "spawn",
-        "distributed.scheduler.allowed-failures": 3,  # workers that a batch may lose before it is taken apart
-        # compiled code cannot be spilled: a worker that paused for it would wait for ever
+        "distributed.scheduler.allowed-failures": 3,  # workers that a batch may kill before it is split
+        # compiled code cannot be spilled, so a worker that paused because of it would never resume
         **{f"distributed.worker.memory.{name}": False for name in ("target", "spill", "pause")},
         "distributed.admin.log-format": "",
     }
@@ -332,17 +332,17 @@ def _connect_scheduler(scheduler: str, deadline: float) -> "Client":
         except (OSError, TimeoutError, ValueError) as error:
             if time.monotonic() >= deadline:
                 raise InputError(
-                    f"--scheduler {scheduler}: is not to be reached ({error}); what is done is kept, and the same"
-                    " command goes on"
+                    f"--scheduler {scheduler}: cannot connect ({error}). Finished records are saved; run the same"
+                    " command again to resume."
                 ) from error
             time.sleep(1.0)
 
 
 class _Progress:
-    """How many records are done and failed, how fast, and for how long still; on standard error."""
+    """Number of finished and failed records, rate and remaining time, on standard error."""
 
     def __init__(self, total: int, show: bool, interval: float = 5.0) -> None:
-        """`interval`: s between lines."""
+        """Start with `total` records; `interval` is the time between lines, s."""
         self.total, self.done, self.failed, self._interval = total, 0, 0, interval
         self._show, self._timed_records, self._start_time, self._next_report = show, 0, 0.0, 0.0
 
@@ -354,7 +354,7 @@ class _Progress:
         self.done += len(rows)
         self.failed += sum("samples" not in row for row in rows)
         now = time.monotonic()
-        if not self._start_time:  # before the first, workers start and compile
+        if not self._start_time:  # workers start and compile before the first batch
             self._start_time = now
         else:
             self._timed_records += len(rows)

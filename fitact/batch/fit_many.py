@@ -1,4 +1,4 @@
-"""Fits of many records, each by itself: alike ones together, a failure kept apart from the others."""
+"""Separate fits of many records, in batches of similar records; a failure does not affect other records."""
 
 import collections
 import contextlib
@@ -29,9 +29,9 @@ from fitact.fitting.problem import build_problem
 from fitact.progress import track_progress
 from fitact.scene.scene import Scene
 
-_BATCH_RECORDS = 256  # records; so many are stacked, whatever their number, and compiled for once
+_BATCH_RECORDS = 256  # records in a batch, padded so that it is compiled once
 _UNTESTED_MESSAGE = (
-    "The fit is at its optimum and leaves no more than noise; what it leaves was not tested for structure."
+    "The fit converged, and the residuals are no larger than the noise; they were not tested for structure."
 )
 _FIT_COLUMNS = (
     *("result", "trusted", "message", "samples", "noise", "chi2_reduced", "rms_residual", "verdict"),
@@ -48,13 +48,13 @@ _Done = TypeVar("_Done")
 
 @dataclasses.dataclass(frozen=True)
 class Fits(Sequence[Row]):
-    """Fits of many records as a table: a row for each, in the order in which they were given.
+    """Table of the fits of many records, with one row for each record in the given order.
 
     Attributes:
-        rows: of each record: `record` (its name), `result` (a member of `RESULTS`, "refused" or "crashed"), `trusted`,
-            `message`, and where there is an answer `samples`, `noise` (V or A), `chi2_reduced`, `rms_residual`,
-            `verdict`, `force_from_prior`, `freed`, and of each parameter and derived quantity the median, by its name
-            (SI), and the standard deviation of its logarithm, by name_log_sd.
+        rows: one dictionary for each record: `record` (its name), `result` (a member of `RESULTS`, "refused" or
+            "crashed"), `trusted` and `message`. Successful fits add `samples`, `noise` (V or A), `chi2_reduced`,
+            `rms_residual`, `verdict`, `force_from_prior`, `freed`, and the median (SI) of each parameter and derived
+            quantity by its name, with the standard deviation of its logarithm by name_log_sd.
     """
 
     rows: tuple[Row, ...]
@@ -67,31 +67,31 @@ class Fits(Sequence[Row]):
 
     @property
     def failures(self) -> tuple[Row, ...]:
-        """The rows without an answer."""
+        """Rows of records without a result."""
         return tuple(row for row in self.rows if "samples" not in row)
 
     @property
     def answered(self) -> "Fits":
-        """The rows with an answer."""
+        """Rows of records with a result."""
         return Fits(tuple(row for row in self.rows if "samples" in row))
 
     @property
     def columns(self) -> dict[str, np.ndarray]:
-        """The table by columns; NaN, or "", where a row has no answer."""
+        """Columns of the table; NaN, or "", for rows without a result."""
         samples = {name: next(row[name] for row in self.rows if name in row) for name in self._column_names}
         blank = {name: "" if isinstance(sample, str) else np.nan for name, sample in samples.items()}
         return {name: np.array([row.get(name, blank[name]) for row in self.rows]) for name in samples}
 
     @property
     def _column_names(self) -> list[str]:
-        """Names of the columns: those of the fullest row, then what others have beside."""
+        """Names of the columns: the keys of the longest row, then additional keys of other rows."""
         return list(dict.fromkeys(name for row in sorted(self.rows, key=len, reverse=True) for name in row))
 
     def to_csv(self, path: str | os.PathLike[str], columns: Sequence[str] | None = None) -> None:
-        """Write the table, or some of its columns, as CSV; empty where there is no answer.
+        """Write the table, or some of its columns, as CSV; cells without a result are empty.
 
         Raises:
-            InputError: the place cannot be written.
+            InputError: the path cannot be written.
         """
         with atomic_write(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(columns or self._column_names), extrasaction="ignore")
@@ -102,7 +102,7 @@ class Fits(Sequence[Row]):
         """Write the table as Parquet; needs `pip install 'fitact[campaign]'`.
 
         Raises:
-            InputError: the place cannot be written, or pyarrow is not installed.
+            InputError: the path cannot be written, or pyarrow is not installed.
         """
         try:
             import pyarrow as pa
@@ -116,8 +116,8 @@ class Fits(Sequence[Row]):
 
     def __str__(self) -> str:
         trusted = sum(bool(row["trusted"]) for row in self.rows)
-        text = f"{len(self)} records: {trusted} answers to be trusted, {len(self) - len(self.failures) - trusted} not"
-        return "\n".join([f"{text}, {len(self.failures)} without", *(row["message"] for row in self.failures)])
+        text = f"{len(self)} records: {trusted} reliable fits, {len(self) - len(self.failures) - trusted} unreliable"
+        return "\n".join([f"{text}, {len(self.failures)} failed", *(row["message"] for row in self.failures)])
 
 
 def fit_many(
@@ -129,22 +129,22 @@ def fit_many(
     whiteness: bool = True,
     progress: bool = True,
 ) -> Fits:
-    """Fit each of many records by itself, as `fitact.fit` does, in one go.
+    """Fit each of many records separately, like `fitact.fit`.
 
-    Records of Vsc on one time grid, under a drive that the scene names, are fitted together, which takes a hundredth
-    of the time; those of them that are in any way doubtful, and all others, one after the other. A record that is
-    refused or fails leaves the others alone; its row says why.
+    Records of Vsc on a common time grid, with the drive of the scene, are fitted in batches, which takes a hundredth
+    of the time. Doubtful ones among them, and all other records, are fitted one by one. A record that is refused or
+    fails does not affect the others, and its row states the reason.
 
     Args:
-        records: records, or the paths of files; taken one after the other.
-        scene: of all of them.
-        channels, scale: of files, as in `fitact.read`.
-        whiteness: test the residuals of records that are fitted together for structure. Otherwise such a record is
-            trusted where they are no larger than its noise, and its `message` says that no more was tested.
-        progress: report on standard error.
+        records: records, or paths of files; consumed one by one.
+        scene: scene of all records.
+        channels, scale: channels of the files, as in `fitact.read`.
+        whiteness: whether to test the residuals of batches for structure. Without this test, a record is trusted if
+            its residuals are no larger than its noise, and its `message` mentions the missing test.
+        progress: whether to report the progress on standard error.
 
     Raises:
-        InputError: the scene asks for what is not available.
+        InputError: the scene requests an unsupported option.
     """
     make_rows = functools.partial(_fit_rows, scene=scene, whiteness=whiteness)
     title = "fitting the records" if progress else ""
@@ -158,7 +158,7 @@ def tabulate_records(
     make_rows: Callable[[Iterable[Batch]], Iterator[tuple[int, Row]]],
     progress_title: str,
 ) -> Fits:
-    """Tabulate the rows that batches of records give, and those of what cannot be read; `columns` as in `read`."""
+    """Collect the rows of batches and of files that cannot be read; `columns` as in `read`."""
     (scene or Scene()).require_available(fit=True)
     rows: dict[int, Row] = {}
     total = len(records) if isinstance(records, Sequence) else 0
@@ -177,14 +177,14 @@ def _fit_rows(batches: Iterable[Batch], scene: Scene | None, whiteness: bool) ->
 
 
 class _BlasThreadLimit:
-    """One thread for linear algebra, whose threads would fight with those of `run_in_threads` for the cores."""
+    """Limit of one thread for BLAS, which would otherwise compete with `run_in_threads` for the cores."""
 
     def __init__(self) -> None:
         self._lock, self._users = threading.Lock(), 0
 
     @contextlib.contextmanager
     def limit_to_one(self) -> Iterator[None]:
-        """Hold the limit, which is of the whole process, until the last of several calls at once has ended."""
+        """Limit the whole process until the last of several simultaneous calls has ended."""
         with self._lock:
             self._users += 1
             if self._users == 1:
@@ -204,7 +204,7 @@ _BLAS_THREADS = _BlasThreadLimit()
 def _read_records(
     records: Iterable[Input], scene: Scene | None, columns: Mapping[str, Any], rows: dict[int, Row]
 ) -> Iterator[Member]:
-    """Yield records by their number; those that cannot be read become rows."""
+    """Yield numbered records; add failure rows for files that cannot be read."""
     for number, record in enumerate(records):
         try:
             yield number, record if isinstance(record, Record) else read(record, scene, **columns)
@@ -215,16 +215,16 @@ def _read_records(
 def run_in_threads(
     jobs: Iterable[_Job], work: Callable[[_Job], _Done], jobs_per_core: int = 4
 ) -> Iterator[tuple[_Job, _Done]]:
-    """Yield jobs and what `work` makes of them, in double precision.
+    """Yield each job with the result of `work`, computed in double precision.
 
-    `jobs_per_core` are ahead for each core, so that a record that is fitted by itself keeps none waiting.
+    `jobs_per_core` jobs are in flight for each core, so that a record that is fitted separately delays no others.
     """
     asked = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
     cores = int(asked) if asked.isdigit() else len(os.sched_getaffinity(0))
     under_way: collections.deque[tuple[_Job, Future[_Done]]] = collections.deque()
 
     def run_job(job: _Job) -> _Done:
-        with jax.enable_x64(True):  # of each thread
+        with jax.enable_x64(True):  # x64 is a setting of each thread
             return work(job)
 
     with ThreadPoolExecutor(cores) as pool:
@@ -238,11 +238,11 @@ def run_in_threads(
 
 @dataclasses.dataclass
 class RecordGroup:
-    """Records of one time grid that wait for each other.
+    """Records on one time grid that are collected for a batch.
 
     Attributes:
-        min_records: alike ones, below which fits by themselves take less than compiling.
-        tries: records from which to learn what the group shares, since the first may be an odd one.
+        min_records: minimum size of a batch; separate fits of fewer records take less time than compilation.
+        tries: number of records that may serve as the template of the batch, since the first may be unusual.
     """
 
     time: np.ndarray
@@ -253,7 +253,7 @@ class RecordGroup:
     voltage: np.ndarray | None = None
 
     def is_batchable(self, scene: Scene | None) -> bool:
-        """Return whether they can be fitted together; learnt from some of them."""
+        """Return whether the records can be fitted in batches, as determined from some of them."""
         if len(self.members) < self.min_records:
             return False
         for _, record in self.members[: self.tries]:
@@ -269,7 +269,7 @@ class RecordGroup:
 
 
 def _group_records(records: Iterable[Member], scene: Scene | None) -> Iterator[Batch]:
-    """Records to be fitted together, or each by itself."""
+    """Yield batches of records to fit together, or single records."""
     groups: dict[tuple[float, ...], RecordGroup] = {}
     for number, record in records:
         time = record.time
@@ -296,7 +296,7 @@ def _split_group(group: RecordGroup, scene: Scene | None) -> Iterator[Batch]:
 
 
 def _has_same_drive(record: Record, voltage: np.ndarray, tolerance: float = 0.01) -> bool:
-    """Return whether the record has no V, or the scene's but for a relative rms difference of `tolerance`."""
+    """Return whether the record has no V, or a V equal to the scene's within a relative rms of `tolerance`."""
     if "Vsc" not in record:
         return False
     if "V" not in record:
@@ -306,7 +306,7 @@ def _has_same_drive(record: Record, voltage: np.ndarray, tolerance: float = 0.01
 
 
 def fit_batch(batch: Batch, whiteness: bool = True) -> tuple[dict[int, Row], BatchFit | None]:
-    """Fit a batch: rows of those that are beyond doubt, and the optima of all; `whiteness` as of `fit_many`."""
+    """Fit a batch; return rows of the accepted records, and the optima of all; `whiteness` as in `fit_many`."""
     problem, members = batch
     if problem is None or not members:
         return {}, None
@@ -315,11 +315,13 @@ def fit_batch(batch: Batch, whiteness: bool = True) -> tuple[dict[int, Row], Bat
         optima = problem.fit([record["Vsc"] for record in padded], whiteness)
         columns = {"record": [os.path.basename(record.source) for record in padded]}
         columns |= _fit_columns(problem, optima, SUCCESS_MESSAGE if whiteness else _UNTESTED_MESSAGE)
-    except np.linalg.LinAlgError:  # one of them spoils what is computed for all
+    except np.linalg.LinAlgError:  # one record may make the joint computation fail
         return {}, None
     rows = {
         member[0]: dict(zip(columns, values, strict=True))
-        for member, accepted, *values in zip(members, optima.accepted, *columns.values(), strict=False)  # less padding
+        for member, accepted, *values in zip(
+            members, optima.accepted, *columns.values(), strict=False
+        )  # without padding
         if accepted
     }
     return rows, optima

@@ -1,7 +1,7 @@
-"""Records of one scene, drive and time grid, fitted together: each step of least squares is taken for all of them.
+"""Least-squares fits of records with a common scene, drive and time grid, in batches.
 
-Only what is beyond doubt is settled here: a record that asks for a nuisance, was clipped, is not described, or does
-not converge within a few steps is left for a fit of its own.
+Only clear cases are accepted here. A record that needs a nuisance parameter, is clipped, is not described by the model
+or does not converge within a few steps is fitted separately.
 """
 
 import dataclasses
@@ -31,23 +31,23 @@ from fitact.likelihood.likelihood import Likelihood
 from fitact.model.chirp import Chirp
 from fitact.model.skin import WithSkin
 
-_CANDIDATES = (*NUISANCES, "delay", "clock")  # nuisances that a record may ask for
+_CANDIDATES = (*NUISANCES, "delay", "clock")  # nuisances that a record may need
 
 
 @dataclasses.dataclass(frozen=True)
 class GaussNewton:
-    """Settings of the least squares, and of what is left for a fit by itself.
+    """Settings of the least squares, and conditions for separate fits.
 
     Attributes:
-        max_samples: above which a fit by itself costs no more.
-        max_steps: of each record.
-        max_log_change: longest step in a logarithm.
-        loop_tolerance: standard errors from the optimum before the last step, which squares what is left,
-        tolerance: and at the end.
-        max_rounding_loss: of the residuals' sum of squares: what coordinates may lose of it where noise is very low.
-        clock_bic_error: of the Bayesian information criterion: a clock's evidence, whose shape is not exact here.
-        adc_samples: that tell whether noise hides the converter's steps.
-        max_rail_samples: at an extreme, from which it may be a rail.
+        max_samples: record length above which a separate fit costs no more.
+        max_steps: maximum number of steps of each record.
+        max_log_change: maximum step in a log-parameter.
+        loop_tolerance: distance to the optimum before the last step, in standard errors; this step squares it.
+        tolerance: distance to the optimum after the last step, in standard errors.
+        max_rounding_loss: maximum relative error of the residual sum of squares in the coordinates (very low noise).
+        clock_bic_error: error of the BIC difference for a clock error, whose regressor is only approximate here.
+        adc_samples: number of samples used to decide whether noise exceeds the LSB of the ADC.
+        max_rail_samples: number of samples at an extreme from which saturation is suspected.
     """
 
     max_samples: int = 65_536
@@ -62,14 +62,14 @@ class GaussNewton:
 
 
 class BatchFit(NamedTuple):
-    """Optima of records fitted together, one a row.
+    """Optima of the records of a batch, one in each row.
 
     Attributes:
-        accepted: where nothing is in doubt; elsewhere the other fields mean nothing.
-        coordinates: of the records, as by `SharedBasis.project`.
-        theta, sigma, covariance_factor: as `Fit.theta`, `Fit.sigma` and `Fit.covariance_root`.
-        logs, gradients: as of `DerivedQuantities.log_value_and_grad`.
-        figures: as `Fit.figures`.
+        accepted: whether the fit is reliable; otherwise the other fields are invalid.
+        coordinates: coordinates of the records from `SharedBasis.project`.
+        theta, sigma, covariance_factor: see `Fit.theta`, `Fit.sigma` and `Fit.covariance_root`.
+        logs, gradients: see `DerivedQuantities.log_value_and_grad`.
+        figures: see `Fit.figures`.
     """
 
     accepted: Bool[np.ndarray, " records"]
@@ -83,15 +83,15 @@ class BatchFit(NamedTuple):
 
 
 class GaussNewtonResult(NamedTuple):
-    """Where least squares end, of a record or of many.
+    """Result of the least squares, for one record or many.
 
     Attributes:
-        theta, sigma: as `Fit.theta`, `Fit.sigma`.
-        sum_of_squares: of the residuals by the coordinates, V^2.
-        r_factor: of the whitened Jacobian's QR decomposition.
-        r_squared: shares of `_CANDIDATES` in the residuals' sum of squares.
-        signal: the response, in the first coordinates of the basis.
-        converged: whether at the optimum.
+        theta, sigma: see `Fit.theta`, `Fit.sigma`.
+        sum_of_squares: residual sum of squares from the coordinates, V^2.
+        r_factor: factor R of the whitened Jacobian (QR decomposition).
+        r_squared: fraction of the residual sum of squares that each of `_CANDIDATES` explains.
+        signal: response in the first coordinates of the basis.
+        converged: whether the optimum was reached.
     """
 
     theta: Float[Array, "*records parameters"]
@@ -105,13 +105,13 @@ class GaussNewtonResult(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class BatchProblem:
-    """All that records of one scene, drive and time grid share.
+    """Common data of records with the same scene, drive and time grid.
 
     Attributes:
-        likelihood: in the coordinates of `basis`.
-        phases: of the samples in the drive's period; None: too little repeats.
-        samples: of each.
-        optional_nuisances: that a record may ask for.
+        likelihood: likelihood in the coordinates of `basis`.
+        phases: phase bins of the samples in the drive's period, or None if there are too few periods.
+        samples: number of samples of each record.
+        optional_nuisances: nuisances that a record may need.
     """
 
     likelihood: Likelihood
@@ -124,9 +124,9 @@ class BatchProblem:
 
     @classmethod
     def from_problem(cls, problem: Problem) -> "BatchProblem | None":
-        """Pose the problem of records like that of `problem`; None where such cannot be fitted together.
+        """Make the problem for records like the one of `problem`, or None if they cannot be fitted in batches.
 
-        In double precision.
+        Double precision is required.
         """
         likelihood, (source, *others) = problem.likelihood, problem.sources
         (trace, *_), choice, start = likelihood.channels, source.choice, source.start
@@ -147,7 +147,7 @@ class BatchProblem:
         return cls(likelihood.replace_channel(0, shared), derive, basis, phases, time.size, source.optional_nuisances)
 
     def fit(self, observed: Sequence[Float[np.ndarray, " samples"]], whiteness: bool = True) -> BatchFit:
-        """Fit records, and test their residuals for structure (`whiteness`). In double precision."""
+        """Fit records, and optionally test the residuals for structure (`whiteness`), in double precision."""
         parts = list(_chunk_records(observed))
         screened = [(*self._screen_records(part), self.basis.project(part)) for part in parts]
         noise, height, plain, coordinates = map(np.concatenate, zip(*screened, strict=True))
@@ -159,7 +159,7 @@ class BatchProblem:
             loss = np.abs(square_in_basis - square)
         else:
             square, tests = square_in_basis, None
-            # of the record's own square; 12 eps was seen
+            # relative to the square of the record; 12 eps was observed
             loss = 32.0 * np.finfo(float).eps * np.vecdot(coordinates, coordinates)
         accepted &= loss <= self.settings.max_rounding_loss * square
         figures = residual_statistics(square, self.samples, tests, noise, self.samples - theta.shape[1], self.phases)
@@ -170,7 +170,7 @@ class BatchProblem:
     def _residual_statistics(
         self, parts: Sequence[np.ndarray], signal: Float[np.ndarray, "records rank"]
     ) -> tuple[Float[np.ndarray, " records"], ResidualTestStatistics]:
-        """Take the responses off the samples: the sums of squares, and what structure is left."""
+        """Return the residual sums of squares over the samples, and statistics of the residual tests."""
         responses = map(self.basis.response, _chunk_records(list(signal)))
         residuals = (np.subtract(part, u, out=u) for part, u in zip(parts, responses, strict=True))
         statistics = [
@@ -186,9 +186,9 @@ class BatchProblem:
         noise: Float[np.ndarray, " records"],
         noise_floor: Float[np.ndarray, " records"],
     ) -> tuple[GaussNewtonResult, Bool[np.ndarray, " records"]]:
-        """Solve the least squares alone, and say which records the table holds, by their `coordinates` in `basis`.
+        """Solve the least squares for `coordinates` in `basis`, and return which records the table covers.
 
-        Sigma begins at `noise` and ends above `noise_floor`, V.
+        Sigma starts at `noise` and has the lower bound `noise_floor`, V.
         """
         theta, in_table = self._initial_estimates(coordinates)
         per_record = map(jnp.asarray, (coordinates, theta, np.maximum(noise, noise_floor), noise_floor))
@@ -198,7 +198,7 @@ class BatchProblem:
     def _initial_estimates(
         self, coordinates: Float[np.ndarray, "records coordinates+1"]
     ) -> tuple[Float[np.ndarray, "records parameters"], Bool[np.ndarray, " records"]]:
-        """Take the best response of the table's nodes to each, on the ridge, and say whether the table holds it."""
+        """Return the best node of the table for each record, on the ridge, and whether the table covers it."""
         tau, signal, size = self._table_responses
         products = coordinates[:, : len(signal)] @ signal
         best = np.argmax(np.where(products > 0.0, products**2 / size, -1.0), axis=1)
@@ -213,7 +213,7 @@ class BatchProblem:
 
     @functools.cached_property
     def _table_responses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Time constants of the table's nodes (s), their responses to the drive (one a column), and those squared."""
+        """Time constants of the nodes (s), their responses to the drive (in columns), and the squared responses."""
         x, _ = chebyshev(NODES)
         signal = self.basis.signal @ np.polynomial.chebyshev.chebvander(x, NODES - 1).T
         return np.exp(self.basis.center + TABLE_HALF_WIDTH * x), signal, np.einsum("ij,ij->j", signal, signal)
@@ -224,7 +224,7 @@ class BatchProblem:
 
     @functools.cached_property
     def prior_factor(self) -> Float[np.ndarray, "parameters parameters"]:
-        """The likelihood's `prior_factor`, worked out once for all records."""
+        """Cached `prior_factor` of the likelihood."""
         return self.likelihood.prior_factor
 
     def _needs_nuisance(self, r_squared: Float[np.ndarray, "records nuisances"]) -> Bool[np.ndarray, " records"]:
@@ -237,7 +237,7 @@ class BatchProblem:
         return np.max(gains, axis=0, initial=-math.inf) > MIN_BIC_DECREASE
 
     def _screen_records(self, observed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return noise and height of records, and whether they show neither a rail nor the steps of a converter."""
+        """Return noise and height of records, and whether they show neither saturation nor ADC steps."""
         noise, low, high = white_noise_sds(observed), observed.min(axis=1), observed.max(axis=1)
         steps = np.abs(np.diff(observed[:, : self.settings.adc_samples], axis=1))
         is_fine = np.any((steps > 0.0) & (steps <= noise[:, None]), axis=1)
@@ -247,10 +247,10 @@ class BatchProblem:
 
 
 def _chunk_records(rows: Sequence[np.ndarray], size: int = 64) -> Iterator[np.ndarray]:
-    """Stack `size` records at a time, whose samples stay in the processor's cache."""
+    """Yield stacks of `size` records, whose samples fit into the processor cache."""
     for first in range(0, len(rows), size):
         part = rows[first : first + size]
-        yield np.concatenate(part).reshape(len(part), -1)  # which takes less than `np.stack`
+        yield np.concatenate(part).reshape(len(part), -1)  # faster than `np.stack`
 
 
 @eqx.filter_jit
@@ -267,7 +267,7 @@ def _find_optimum(
     noise: Array,
     noise_floor: Array,
 ) -> GaussNewtonResult:
-    """Iterate by Gauss and Newton from a start near the optimum, the noise being that of the residuals."""
+    """Find the optimum by Gauss-Newton steps from a nearby start, with sigma estimated from the residuals."""
     trace = likelihood.channels[0]
     assert trace.compression is not None
     table = dataclasses.replace(trace.compression, observed=observed)
@@ -309,9 +309,9 @@ def _find_optimum(
 
 
 def _orthonormalise(columns: list[Array], others: list[Array], tolerance: float = 1e-9) -> list[Array]:
-    """Make columns orthonormal against `others` and each other, by Gram and Schmidt, twice.
+    """Make columns orthonormal to `others` and to each other, by Gram-Schmidt, applied twice.
 
-    0 for one of which no more than `tolerance` of its length is left, as rounding leaves of one that depends on others.
+    A column becomes 0 if at most `tolerance` of its length remains, i.e. if it is linearly dependent within rounding.
     """
     basis: list[Array] = []
     for column in columns:
@@ -325,7 +325,7 @@ def _orthonormalise(columns: list[Array], others: list[Array], tolerance: float 
 
 
 def _qr_decompose(jacobian: Float[Array, "rows n"], residuals: Array) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
-    """Compute R and Q' residuals of the QR decomposition: vectorised over many small ones, unlike LAPACK's."""
+    """Return R and Q^T residuals of a QR decomposition; it vectorises over many small matrices, unlike LAPACK."""
     q = jnp.stack(_orthonormalise(list(jacobian.T), [], tolerance=0.0))
     return jnp.triu(q @ jacobian), q @ residuals
 

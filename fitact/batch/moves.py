@@ -1,8 +1,8 @@
-"""Ensembles of many posteriors side by side in one run of emcee; moves and random numbers never mix them.
+"""Ensembles of many posteriors in one run of emcee, with independent moves and random numbers.
 
-All posteriors have the same number of coordinates and are near normal. emcee knows their walkers flattened, in the
-order (posteriors, ensembles, walkers). Each posterior's random numbers come from a seed of its own, so that its draws
-do not depend on what stands beside it.
+All posteriors have the same number of coordinates and are nearly normal. emcee holds all walkers in one array, in the
+order (posteriors, ensembles, walkers). Each posterior has its own seed, so that its draws do not depend on the other
+posteriors.
 """
 
 import dataclasses
@@ -16,29 +16,29 @@ from jaxtyping import Bool, Float
 from fitact.sampling.proposal import OVERDISPERSION, SHARES, draw_student_t, principal_axes, student_log_density
 
 ENSEMBLES = 4
-WALKERS = 16  # of each ensemble: posteriors side by side keep emcee busy, few walkers make steps cheap
+WALKERS = 16  # per ensemble; few suffice, since many posteriors are evaluated together
 
-# of points (posteriors, any, n), not NaN
+# log-densities of points (posteriors, any, n), never NaN
 LogProbs = Callable[[Float[np.ndarray, "posteriors any n"]], Float[np.ndarray, "posteriors any"]]
 Generators = Sequence[np.random.Generator]
 
 
 class EnsembleDraws(NamedTuple):
-    """Points that were drawn, and which moves were accepted."""
+    """Points drawn, and whether each move was accepted."""
 
     points: Float[np.ndarray, "posteriors ensembles steps walkers n"]
     accepted: Float[np.ndarray, "posteriors ensembles walkers"]
 
 
 class GaussianApproximations(NamedTuple):
-    """Normal approximations: centers, and roots of their covariances."""
+    """Gaussian approximations: centers, and factors of the covariances."""
 
     centers: Float[np.ndarray, "posteriors n"]
     covariance_factors: Float[np.ndarray, "posteriors n n"]
 
     @classmethod
     def from_covariance_factors(cls, centers: np.ndarray, covariance_factors: np.ndarray) -> Self:
-        """Take roots whose columns are principal axes, a standard deviation long."""
+        """Return approximations whose covariance factors have the principal axes as columns, one sd long."""
         return cls(centers, principal_axes(covariance_factors))
 
     def from_standard_normal(self, z: Float[np.ndarray, "posteriors any n"]) -> Float[np.ndarray, "posteriors any n"]:
@@ -50,9 +50,9 @@ class GaussianApproximations(NamedTuple):
         return (points - self.centers[:, None]) @ np.swapaxes(np.linalg.inv(self.covariance_factors), 1, 2)
 
     def refine(self, values: Float[np.ndarray, "posteriors n probes"]) -> Self:
-        """Correct centers and lengths by parabolas through log-densities at `PROBES` of each axis, if there are any."""
+        """Correct centers and lengths by parabolas through the log-densities at `PROBES` on each axis, if any."""
         below, middle, above = np.moveaxis(values[..., 1:4], -1, 0)
-        with np.errstate(invalid="ignore"):  # an impossible place
+        with np.errstate(invalid="ignore"):  # a point outside the support
             curvature = 2.0 * middle - below - above
             step = 0.5 * (above - below) / curvature
             is_peak = (curvature > 0.25) & (curvature < 4.0) & (np.abs(step) < 1.0)
@@ -65,7 +65,7 @@ def sample_posteriors(
 ) -> EnsembleDraws:
     """Sample posteriors that are close to `approximations`.
 
-    `seeds`: of each posterior's random numbers; `seed`: of the order of the moves, which they share.
+    `seeds` are the seeds of the posteriors; `seed` determines their common order of moves.
     """
     count, size = approximations.centers.shape
     shape = (count, ENSEMBLES, WALKERS)
@@ -80,7 +80,7 @@ def sample_posteriors(
     )
     white = np.stack([draw_student_t(generator, ENSEMBLES * WALKERS, size) for generator in generators])
     start = approximations.from_standard_normal(OVERDISPERSION * white).reshape(-1, size)
-    random = np.random.RandomState(np.random.SeedSequence(seed).generate_state(8))  # of the moves' order
+    random = np.random.RandomState(np.random.SeedSequence(seed).generate_state(8))  # for the order of the moves
     state = emcee.State(start, random_state=random.get_state())
     sampler.run_mcmc(state, steps, skip_initial_state_check=True)
     points = sampler.get_chain().reshape(steps, *shape, size)
@@ -89,7 +89,7 @@ def sample_posteriors(
 
 @dataclasses.dataclass(eq=False)
 class _MultiPosteriorMove(emcee.moves.Move):
-    """A move of the walkers of many posteriors, each with random numbers of its own."""
+    """A move of the walkers of many posteriors, each with its own random numbers."""
 
     shape: tuple[int, int, int]
     generators: Generators
@@ -102,18 +102,18 @@ class _MultiPosteriorMove(emcee.moves.Move):
         proposed: Float[np.ndarray, "some n"],
         factors: Float[np.ndarray, " some"],
     ) -> tuple[emcee.State, np.ndarray]:
-        """Accept by Metropolis and Hastings; `proposed` are for the walkers of the mask, as many of each posterior."""
+        """Apply the Metropolis-Hastings rule to `proposed` points of the masked walkers, equally many per posterior."""
         subset, accepted = walker_mask.ravel(), np.zeros(walker_mask.size, dtype=bool)
-        values = model.log_prob_fn(proposed)  # emcee's own `compute_log_prob_fn` loops over walkers
+        values = model.log_prob_fn(proposed)  # emcee's `compute_log_prob_fn` loops over walkers
         uniform = np.concatenate([g.random(len(proposed) // len(self.generators)) for g in self.generators])
-        with np.errstate(invalid="ignore"):  # from one impossible place to another
+        with np.errstate(invalid="ignore"):  # both points are outside the support
             accepted[subset] = np.log(uniform) < factors + values - state.log_prob[subset]
         return self.update(state, emcee.State(proposed, log_prob=values), accepted, subset), accepted
 
 
 @dataclasses.dataclass(eq=False)
 class Independence(_MultiPosteriorMove):
-    """Proposals from each posterior's own Student-t, wherever the walker is."""
+    """Independence proposals from a Student-t approximation of each posterior."""
 
     approximations: GaussianApproximations
 
@@ -127,9 +127,9 @@ class Independence(_MultiPosteriorMove):
 
 
 class Stretch(_MultiPosteriorMove):
-    """Goodman and Weare's stretch move within each ensemble, every other walker in turn.
+    """Stretch move of Goodman and Weare within each ensemble, for alternate halves of the walkers.
 
-    emcee's own would pair walkers of different posteriors, and accepts in a loop over walkers.
+    emcee's own move would pair walkers of different posteriors, and accepts in a loop over walkers.
     """
 
     def propose(self, model: emcee.model.Model, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
@@ -140,7 +140,7 @@ class Stretch(_MultiPosteriorMove):
             here, others = points[:, :, half::2], points[:, :, 1 - half :: 2]
             partners = np.stack([g.integers(others.shape[2], size=here.shape[1:3]) for g in self.generators])
             uniform = np.stack([g.random(here.shape[1:3]) for g in self.generators])
-            z = (uniform + 1.0) ** 2 / 2.0  # with Goodman and Weare's a = 2
+            z = (uniform + 1.0) ** 2 / 2.0  # a = 2, as in Goodman and Weare
             anchors = np.take_along_axis(others, partners[..., None], axis=2)
             proposed = (anchors + (here - anchors) * z[..., None]).reshape(-1, points.shape[-1])
             factors = (points.shape[-1] - 1.0) * np.log(z).ravel()

@@ -1,4 +1,4 @@
-"""Posteriors of many records, each by itself: alike ones sampled side by side in one run of emcee."""
+"""Separate posteriors of many records; similar ones are sampled in one run of emcee."""
 
 import dataclasses
 import functools
@@ -40,7 +40,7 @@ from fitact.sampling.proposal import PROBES, is_normal
 from fitact.scene.scene import Scene
 from fitact.summary import PROBABILITIES
 
-_BLOCK = 32  # records sampled side by side, always so many; 16 MB of draws
+_BLOCK = 32  # records sampled together, padded to this number; 16 MB of draws
 _TRACKED = derived.DERIVED_NAMES[:3]  # g, b, force_mean
 _CONVERGENCE_COLUMNS = ("converged", "rhat_max", "ess_min", "tau_max", "acceptance", "steps", "walkers", "ensembles")
 
@@ -54,26 +54,26 @@ def sample_many(
     seed: int = 0,
     progress: bool = True,
 ) -> Fits:
-    """Fit each of many records by itself and sample its posterior by emcee, as `fitact.sample` does, in one go.
+    """Fit each of many records separately and sample its posterior by emcee, like `fitact.sample`.
 
-    Rows are those of `fit_many`, and have beside, of every parameter, derived quantity and the noise, the posterior's
-    quantiles (`Rsc_q05`, `force_mean_q975`; those of a summary), and `converged`, `rhat_max`, `ess_min`, `tau_max`,
-    `acceptance`, `steps` and `walkers` of each ensemble. What has not converged is not `trusted`.
+    Rows of `fit_many` are extended by the posterior quantiles of each parameter, each derived quantity and the noise
+    (e.g. `Rsc_q05`, `force_mean_q975`), and by `converged`, `rhat_max`, `ess_min`, `tau_max`, `acceptance`, `steps`
+    and `walkers` of each ensemble. Rows that have not converged are not `trusted`.
 
-    Records that are fitted together and whose posterior is near its Laplace approximation are sampled together, 32 in
-    a run of emcee, and each draws its random numbers from `seed` and its own content, so that it hardly matters for a
-    record what else is in the list. What has not converged then, and all others, are sampled by themselves, as
-    `fitact.sample` does with that seed.
+    Records that are fitted in a batch and have a posterior near its Laplace approximation are sampled together, 32 in
+    one run of emcee. The random numbers of each record depend on `seed` and its content only, so that other records
+    hardly affect it. Records that have not converged, and all others, are sampled separately, like `fitact.sample`
+    with this seed.
 
     Args:
-        records: records, or the paths of files; taken one after the other.
-        scene: of all of them.
-        channels, scale: of files, as in `fitact.read`.
-        seed: the same seed gives the same rows.
-        progress: report on standard error.
+        records: records, or paths of files; consumed one by one.
+        scene: scene of all records.
+        channels, scale: channels of the files, as in `fitact.read`.
+        seed: seed of the random numbers; the same seed gives the same rows.
+        progress: whether to report the progress on standard error.
 
     Raises:
-        InputError: the scene asks for what is not available.
+        InputError: the scene requests an unsupported option.
     """
     make_rows = functools.partial(_sample_rows, scene=scene, seed=seed)
     title = "sampling the posteriors" if progress else ""
@@ -81,11 +81,11 @@ def sample_many(
 
 
 class _Targets(NamedTuple):
-    """Posteriors near their Laplace approximations, of records that share a likelihood but for their own table.
+    """Posteriors near their Laplace approximations, of records that share a likelihood except for the tables.
 
     Attributes:
-        members, rows: the records, and the rows of their fits.
-        likelihood: whose compression is to be replaced by one of `tables`.
+        members, rows: records, and rows of their fits.
+        likelihood: common likelihood; its compression is replaced by one of `tables`.
     """
 
     members: list[Member]
@@ -106,7 +106,7 @@ class _Targets(NamedTuple):
 
 
 def _sample_rows(batches: Iterable[Batch], scene: Scene | None, seed: int) -> Iterator[tuple[int, Row]]:
-    """Yield numbers of records and their rows, as they are done."""
+    """Yield the number and the row of each record when it is finished."""
     jobs = (
         job
         for (_, members), targets in run_in_threads(batches, _make_targets)
@@ -118,7 +118,7 @@ def _sample_rows(batches: Iterable[Batch], scene: Scene | None, seed: int) -> It
 
 
 def _split_blocks(members: list[Member], targets: _Targets | None) -> Iterator[tuple[list[Member], _Targets | None]]:
-    """Yield records that are sampled side by side, and those that cannot be."""
+    """Yield blocks of records to sample together, and records to sample separately."""
     numbers: set[int] = set()
     if targets is not None:
         for first in range(0, len(targets.members), _BLOCK):
@@ -129,7 +129,7 @@ def _split_blocks(members: list[Member], targets: _Targets | None) -> Iterator[t
 
 
 def _make_targets(batch: Batch) -> _Targets | None:
-    """Set up those records of a batch whose fits are beyond doubt and near normal; None where there are none."""
+    """Return the accepted records of a batch whose posteriors are nearly normal, or None."""
     (problem, members), (rows, optima) = batch, fit_batch(batch)
     places = [place for place, (number, _) in enumerate(members) if number in rows]
     if problem is None or optima is None or not places or not _has_tables(problem.likelihood, optima.theta[0]):
@@ -156,7 +156,7 @@ def _make_targets(batch: Batch) -> _Targets | None:
 
 
 def _has_tables(likelihood: Likelihood, theta: Float[np.ndarray, " parameters"]) -> bool:
-    """Return whether one time constant makes the record, so that a table around it suffices, and walkers are enough."""
+    """Return whether the record has one time constant, so that a table suffices, and there are enough walkers."""
     taus = likelihood.circuit(jnp.asarray(theta)).channel_terms(likelihood.channels[0].channel).tau
     return len(taus) == 1 and 2 * (len(theta) + 1) <= WALKERS
 
@@ -164,7 +164,7 @@ def _has_tables(likelihood: Likelihood, theta: Float[np.ndarray, " parameters"])
 def _laplace_approximations(
     theta: np.ndarray, sigma: np.ndarray, covariance_factor: np.ndarray, samples: int
 ) -> GaussianApproximations:
-    """Compute `Fit.point` and `Fit.point_root` of each."""
+    """Compute `Fit.point` and `Fit.point_root` of each record."""
     size = theta.shape[1]
     roots = np.pad(covariance_factor, ((0, 0), (0, 1), (0, 1)))
     roots[:, size, size] = (scale_information("white") * (samples - size)) ** -0.5
@@ -172,7 +172,7 @@ def _laplace_approximations(
 
 
 def _probe_axes(targets: _Targets) -> Float[np.ndarray, "records n probes"]:
-    """Evaluate log-posteriors along the axes of their approximations."""
+    """Evaluate the log-posteriors along the principal axes of their approximations."""
     size = targets.approximations.centers.shape[1]
     white = (np.eye(size)[:, None] * PROBES[:, None]).reshape(-1, size)
     points = targets.approximations.from_standard_normal(np.tile(white, (len(targets.members), 1, 1)))
@@ -180,9 +180,9 @@ def _probe_axes(targets: _Targets) -> Float[np.ndarray, "records n probes"]:
 
 
 class _LogProbs:
-    """Log-posteriors of points of each record; impossible where its table does not reach, which is noted.
+    """Log-posteriors of points of each record; -inf outside its table, which is recorded.
 
-    `chunk_points` of each record are evaluated at once: half of its walkers, so that one size is compiled.
+    `chunk_points` of each record are evaluated at once, i.e. half of its walkers, so that one size is compiled.
     """
 
     def __init__(self, targets: _Targets, chunk_points: int = ENSEMBLES * WALKERS // 2) -> None:
@@ -205,7 +205,7 @@ def _log_probs(
 ) -> Float[Array, " points"]:
     channel, rows = likelihood.channels[0], observed.size
     assert channel.compression is not None
-    zeros = jnp.zeros(rows)  # no nuisance is free
+    zeros = jnp.zeros(rows)  # no linear nuisance is in use
     table = Compression(
         center=center,
         half_width=half_width,
@@ -223,9 +223,10 @@ def _log_probs(
 def _sample_block(
     job: tuple[list[Member], _Targets | None], seed: int, steps: int = 200, rhat_draws: int = 1000
 ) -> dict[int, Row]:
-    """Sample a block: rows of those that have converged.
+    """Sample a block, and return the rows of converged records.
 
-    `steps`: of each ensemble; those near to normal need some 120. `rhat_draws`: as in `diagnose_chain`.
+    `steps` is the length of each ensemble (nearly normal posteriors need some 120); `rhat_draws` as in
+    `diagnose_chain`.
     """
     members, targets = job
     if targets is None:
@@ -252,7 +253,7 @@ def _draws_by_name(
     points: Float[np.ndarray, "ensembles steps walkers n"],
     thin: int = 4,
 ) -> dict[str, np.ndarray]:
-    """Name draws, in SI units; of derived quantities, which cost more, those of every `thin`th step."""
+    """Return draws by name in SI units; derived quantities, which cost more, from every `thin`-th step only."""
     derived_draws = _evaluate_draws(_derive_quantities, derive, points[:, ::thin])
     draws = dict(zip(names, np.moveaxis(np.exp(points), -1, 0), strict=True))
     return draws | dict(zip(derived.DERIVED_NAMES, np.moveaxis(derived_draws, -1, 0), strict=True))
@@ -274,7 +275,7 @@ def _derive_tracked(derive: DerivedQuantities, point: Array) -> Float[Array, " j
 
 
 def _posterior_columns(row: Row, draws: Mapping[str, np.ndarray], convergence: Convergence) -> Row:
-    """Tabulate the quantiles of what the row has a value of, and how far to trust them."""
+    """Return the posterior quantiles of the quantities in a row, and convergence diagnostics."""
     columns: Row = {}
     for key in row:
         name = "sigma" if key == "noise" else key
@@ -285,7 +286,7 @@ def _posterior_columns(row: Row, draws: Mapping[str, np.ndarray], convergence: C
 
 
 def _alone(record: Record, scene: Scene | None, seed: int) -> Row:
-    """Sample a record by itself; the row of its fit alone where the sampler fails."""
+    """Sample a record separately; return the row of its fit if the sampler fails."""
     try:
         fitted = fit(record, scene)
         row = row_from_fit(fitted)
@@ -302,7 +303,7 @@ def _alone(record: Record, scene: Scene | None, seed: int) -> Row:
 
 
 def add_posterior(row: Row, posterior: Posterior) -> Row:
-    """Add what a posterior says to the row of its fit."""
+    """Return the row of a fit extended by its posterior."""
     sigma, *_ = posterior.fit.likelihood.sigma_names
     parameters = posterior.parameters()
     draws = parameters | {"sigma": parameters[sigma]} | posterior.derived()

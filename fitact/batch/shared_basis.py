@@ -1,7 +1,7 @@
-"""Records of one drive on one time grid, in coordinates that they share.
+"""Records with one drive and one time grid, in common coordinates.
 
-As a `fitact.likelihood.compression.Compression` of each, but the basis is worked out once, so that a record costs
-one product with a matrix of some twenty columns.
+The coordinates serve like those of a `fitact.likelihood.compression.Compression` of each record. The basis is computed
+only once, so that a record costs one product with a matrix of some twenty columns.
 """
 
 from typing import NamedTuple
@@ -27,10 +27,10 @@ from fitact.model.response import highpass
 
 
 class RestrictedTables(NamedTuple):
-    """Records on tables of their own, of few coordinates: signal and record of a `Compression` around each center.
+    """Restricted tables of records: signal and record of a `Compression` around the center of each record.
 
     Attributes:
-        center, half_width: of each, in log s.
+        center, half_width: range of each table, in log tau (tau in s).
     """
 
     center: Float[np.ndarray, " records"]
@@ -40,13 +40,13 @@ class RestrictedTables(NamedTuple):
 
 
 class SharedBasis(NamedTuple):
-    """Orthonormal functions over the samples, whose first span the responses of time constants around a middle one.
+    """Orthonormal functions over the samples, the first of which span the responses around a central time constant.
 
     Attributes:
-        center: of the table, log s.
-        functions: over the samples; the last is how a faster clock changes the record, to first order.
+        center: center of the table, in log tau (tau in s).
+        functions: values at the samples; the last is the first-order effect of a clock error on the record.
         signal: Chebyshev coefficients in log tau of the response to the drive (V), in the first coordinates.
-        baseline, slope, clock: the shapes of a `Compression` in these coordinates, and that of the clock.
+        baseline, slope, clock: shapes of a `Compression`, and of a clock error, in these coordinates.
     """
 
     center: float
@@ -60,7 +60,7 @@ class SharedBasis(NamedTuple):
     def from_drive(
         cls, drive: Drive, time: Float[np.ndarray, " samples"], steady_state: bool, tau: float
     ) -> "SharedBasis":
-        """Span responses of time constants within a factor 9 of `tau` (s). Call it in double precision."""
+        """Return a basis for time constants within a factor 9 of `tau` (s). Double precision is required."""
         x, to_series = chebyshev(NODES)
         nodes = jnp.asarray(tau * np.exp(TABLE_HALF_WIDTH * x))
         u, baseline, slope = _basis_functions(drive, time, nodes, steady_state)
@@ -73,7 +73,7 @@ class SharedBasis(NamedTuple):
         return cls(float(np.log(tau)), functions, series, baseline, slope, clock)
 
     def compression(self, samples: int) -> Compression:
-        """Make what all records have in common; `observed` is to be replaced by a row of `project`."""
+        """Return the compression common to all records; `observed` must be replaced by a row of `project`."""
         size = self.functions.shape[1] + 1
 
         def append_zero(rows: np.ndarray) -> Array:
@@ -92,7 +92,7 @@ class SharedBasis(NamedTuple):
         )
 
     def project(self, observed: Float[np.ndarray, "records samples"]) -> Float[np.ndarray, "records coordinates+1"]:
-        """Compute coordinates of records; the last is the length of what lies outside of the basis."""
+        """Return coordinates of records; the last is the length of the component outside the basis."""
         inside = observed @ self.functions
         square = np.vecdot(observed, observed) - np.vecdot(inside, inside)
         return np.column_stack([inside, np.sqrt(np.maximum(square, 0.0))])
@@ -107,9 +107,9 @@ class SharedBasis(NamedTuple):
         half_width: Float[np.ndarray, " records"],
         precision: Float[np.ndarray, " records"],
     ) -> RestrictedTables:
-        """Return tables for log tau within `half_width` of each record's `center`, which cost less to evaluate.
+        """Return tables for log tau in `center` ± `half_width` of each record, which cost less to evaluate.
 
-        What is left out changes the response to the drive by no more than `precision` (V, root of the sum of squares).
+        Omitted terms change the response to the drive by at most `precision` (V, root of the sum of squares).
         """
         x, to_series = chebyshev(NODES)
         inside = (center[:, None] + half_width[:, None] * x - self.center) / TABLE_HALF_WIDTH
@@ -124,7 +124,7 @@ class SharedBasis(NamedTuple):
 
 
 def _basis_functions(drive: Drive, time: np.ndarray, nodes: Array, steady_state: bool) -> list[np.ndarray]:
-    """Evaluate the responses of the nodes, the baseline's shapes, and dV/dt over two samples."""
+    """Evaluate the responses of the nodes, the baseline functions, and dV/dt over two samples."""
     step = jnp.asarray((time[-1] - time[0]) / (time.size - 1))
     functions = _evaluate_basis_functions(drive, pad_samples(time), step, nodes, steady_state)
     return [np.asarray(values)[..., : time.size] for values in functions]
