@@ -1,4 +1,4 @@
-"""Which of several models of the same samples the data prefer: prediction of what was left out, and criteria."""
+"""Comparison of several models of the same samples by cross-validation and information criteria."""
 
 import dataclasses
 import math
@@ -20,36 +20,36 @@ _CRITERIA = ("log_likelihood", "parameters_counted", "aic", "aicc", "bic")
 
 @dataclasses.dataclass(frozen=True)
 class ModelScore:
-    """One model."""
+    """Fit and cross-validation of one model."""
 
-    name: str  # of its scene
-    fit: Fit  # to all samples
-    cross_validation: CrossValidation  # log densities of blocks left out
+    name: str  # name of its scene
+    fit: Fit  # fit to all samples
+    cross_validation: CrossValidation  # log predictive densities of held-out blocks
 
     @property
     def elpd(self) -> float:
-        """Log predictive density of all blocks, each left out."""
+        """Expected log predictive density, summed over the held-out blocks."""
         return float(self.cross_validation.log_density.sum())
 
     @property
     def elpd_se(self) -> float:
-        """Its standard error."""
+        """Standard error of `elpd`."""
         return _standard_error(self.cross_validation.log_density)
 
     def elpd_difference(self, other: "ModelScore") -> tuple[float, float]:
-        """Return by how much its elpd falls short of another's, and the standard error of that."""
+        """Return the elpd of another model minus the elpd of this one, and the standard error of the difference."""
         difference = other.cross_validation.log_density - self.cross_validation.log_density
         return float(difference.sum()), _standard_error(difference)
 
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """Models of the same samples.
+    """Comparison of models of the same samples.
 
     Attributes:
-        models: that which predicts best first.
-        elpd_threshold: standard errors of a difference, from which predictions differ.
-        bic_threshold: a difference of the Bayesian criterion below which it tells nothing for sure.
+        models: models in the order of decreasing elpd.
+        elpd_threshold: minimum significant difference of the elpd, in standard errors.
+        bic_threshold: minimum significant difference of the BIC.
     """
 
     models: tuple[ModelScore, ...]
@@ -58,20 +58,20 @@ class Comparison:
 
     @property
     def _candidates(self) -> list[ModelScore]:
-        """Models that prediction cannot tell from the best, the lowest Bayesian criterion first."""
+        """Models whose elpd does not differ significantly from the best, in the order of increasing BIC."""
         best, *others = self.models
         rows = [(model, *model.elpd_difference(best)) for model in others]
         return sorted([best, *(model for model, short, se in rows if short < self.elpd_threshold * se)], key=_bic)
 
     @property
     def preferred(self) -> str | None:
-        """The model that the data prefer; None where several cannot be told apart."""
+        """Preferred model, or None if several cannot be distinguished."""
         first, *others = self._candidates
         return None if others and _bic(others[0]) - _bic(first) < self.bic_threshold else first.name
 
     @property
     def trusted(self) -> bool:
-        """Whether nothing stands against the preferred model's fit, or the best one's where none is preferred."""
+        """Whether the fit of the preferred model (or of the best, if none is preferred) is reliable."""
         return self._leading_model.fit.trusted
 
     @property
@@ -80,35 +80,39 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """Which model is preferred, by how much, or that none is, in a sentence."""
+        """Preferred model and the difference to the next, or that none is preferred, in a sentence."""
         leading, preference = self._leading_model, self._describe_preference()
-        return preference if self.trusted else f"{preference} Do not trust it: of {leading.name}, {leading.fit.message}"
+        return (
+            preference
+            if self.trusted
+            else f"{preference} The fit of {leading.name} is unreliable: {leading.fit.message}"
+        )
 
     def _describe_preference(self) -> str:
         first, *others = self._candidates
         if not others:
             second = min(self.models[1:], key=lambda model: model.elpd_difference(first)[0])
             return (
-                f"{first.name} is preferred: it predicts what was left out better than {second.name}, by an elpd of"
+                f"{first.name} is preferred: it predicts the held-out blocks better than {second.name}, by an elpd of"
                 f" {_format_elpd_difference(second, first)}."
             )
         rival = others[0]
         worse, better = (rival, first) if rival.elpd_difference(first)[0] >= 0.0 else (first, rival)
         why = (
-            f"{better.name} predicts what was left out better by an elpd of only"
+            f"{better.name} predicts the held-out blocks better by an elpd of only"
             f" {_format_elpd_difference(worse, better)}, and {first.name}"
-            f" has the lower BIC, by {_bic(rival) - _bic(first):.3g}."
+            f" has a BIC that is lower by {_bic(rival) - _bic(first):.3g}."
         )
         if self.preferred is None:
-            return f"{first.name} and {rival.name} cannot be told apart: {why}"
-        return f"{first.name} is preferred, for its BIC: {why}"
+            return f"{first.name} and {rival.name} cannot be distinguished: {why}"
+        return f"{first.name} is preferred because of its BIC: {why}"
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences."""
+        """Warnings as sentences."""
         failed = [
-            f"{m.name}: {m.cross_validation.folds_failed} of {m.cross_validation.folds} fits without a fold did not"
-            " reach an optimum, so its elpd may be too low; free less, or state narrower priors"
+            f"{m.name}: {m.cross_validation.folds_failed} of {m.cross_validation.folds} fits without one fold did not"
+            " converge, so its elpd may be too low; fix parameters or state narrower priors"
             for m in self.models
             if m.cross_validation.folds_failed
         ]
@@ -116,7 +120,7 @@ class Comparison:
         return (*doubtful, *failed)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what `fitact compare --json` prints."""
+        """Return the JSON output of `fitact compare`."""
         best = self.models[0]
         rows = []
         for model in self.models:
@@ -138,7 +142,7 @@ class Comparison:
         }
 
     def summary(self) -> str:
-        """Return a table for people."""
+        """Return a text table and the verdict."""
         best = self.models[0]
         titles = ("model", "log-lik.", "parameters", "AIC", "AICc", "BIC", "elpd", " below the best")
         rows = []
@@ -149,7 +153,7 @@ class Comparison:
         widths = (max(12, *(len(model.name) for model in self.models)), *[14] * 7)
         legend = (
             f"elpd: log predictive density of {best.cross_validation.log_density.size} blocks, in"
-            f" {best.cross_validation.folds} folds left out; below the best: by how much, ± its standard error."
+            f" {best.cross_validation.folds} held-out folds; below the best: difference ± its standard error."
         )
         return join_lines([*align_rows([titles, *rows], widths), legend, self.verdict], self.warnings)
 
@@ -157,29 +161,29 @@ class Comparison:
 
 
 def compare(records: Record | Sequence[Record], scenes: Mapping[str, Scene] | Sequence[Scene]) -> Comparison:
-    """Fit each scene's model to the same records, and say which the data prefer.
+    """Fit the model of each scene to the same records, and determine which the data prefer.
 
-    The score is the elpd: the log predictive density of blocks of samples (whole periods where a record has twenty,
-    else contiguous stretches), each given all that is outside its fold. Where it cannot tell models apart (2 standard
-    errors of the difference), a Bayesian information criterion lower by 10 decides. Each scene stands for all records.
+    The score is the elpd, i.e. the log predictive density of blocks of samples given all samples outside their fold.
+    Blocks are whole periods if a record has twenty, else contiguous intervals. If elpds differ by less than 2 standard
+    errors, a BIC that is lower by 10 decides. Each scene applies to all records.
 
     Args:
-        records: one, or several of one finger.
-        scenes: two or more, by name; without names they are "scene 1", "scene 2", ...
+        records: one record, or several of one finger.
+        scenes: two or more scenes, by name; without names they are "scene 1", "scene 2", ...
 
     Raises:
-        InputError: as `fitact.fit`; or fewer than two scenes, or they do not account for the same samples.
+        InputError: see `fitact.fit`; also for fewer than two scenes, or scenes that do not model the same samples.
     """
     if not isinstance(scenes, Mapping):
         scenes = {f"scene {i}": scene for i, scene in enumerate(scenes, 1)}
     if len(scenes) < 2:
-        raise InputError(f"{len(scenes)} scene to compare: give two or more, each a model of the same samples")
+        raise InputError(f"{len(scenes)} scene to compare: give two or more models of the same samples")
     (first, reference), *others = ((name, sorted(set(s.measurement.channels))) for name, s in scenes.items())
     for name, channels in others:
         if channels != reference:
             raise InputError(
-                f"{first} accounts for {' and '.join(reference)}, {name} for {' and '.join(channels)}: only"
-                " models of the same samples compare; give both the same [measurement] channels"
+                f"{first} models {' and '.join(reference)}, {name} models {' and '.join(channels)}: only"
+                " models of the same samples can be compared; give both the same [measurement] channels"
             )
     fits = {name: fit(records, scene) for name, scene in scenes.items()}
     _require_same_samples(fits)
@@ -195,9 +199,9 @@ def _require_same_samples(fits: Mapping[str, Fit]) -> None:
             differ = np.count_nonzero(np.not_equal(*map(likelihood_mask, pair)))
             if differ:
                 raise InputError(
-                    f"{first} and {name} do not account for the same samples of {trace.channel}: {differ} count in one"
-                    " only (beside edges where no resistance limits the current; the first of AR(1) noise; those"
-                    " between which a clock lies); give both the same series resistor or R_H, and noise_model"
+                    f"{first} and {name} do not use the same samples of {trace.channel}: {differ} samples enter only"
+                    " one of them (near edges if no resistance limits the current; the first of AR(1) noise; samples"
+                    " that bound a clock error); give both the same series resistor or R_H, and noise_model"
                 )
 
 

@@ -1,9 +1,9 @@
-"""How well a fit predicts samples that it was not given: blocks of a record, left out in turn.
+"""Cross-validation of a fit by held-out blocks of a record.
 
-Samples near each other share what a model gets wrong and, where noise is coloured, the noise; so blocks are left out,
-not samples. Of each fold the least squares are repeated without it, from the samples themselves. What they leave open
-of parameters and linear nuisances together is normal, to Laplace's approximation; over that a block's density is
-integrated, exactly where the noise is Gaussian. The noise's standard deviation is the refit's.
+Neighbouring samples share the errors of a model and, for coloured noise, the noise; therefore blocks are held out, not
+samples. For each fold, the model is refitted to the samples outside the fold. The posterior of the parameters and
+linear nuisances is approximated as Gaussian (Laplace). The predictive density of each held-out block is integrated
+over it, exactly for Gaussian noise. The noise standard deviation is taken from the refit.
 """
 
 import dataclasses
@@ -29,17 +29,17 @@ from fitact.likelihood.noise import STUDENT_DOF, student_curvature, student_weig
 
 
 class CrossValidation(NamedTuple):
-    """Prediction of the blocks left out."""
+    """Predictive densities of the held-out blocks."""
 
-    log_density: Float[np.ndarray, " blocks"]  # of each, given all samples outside its fold
-    folds: int  # how many refits there were
-    folds_failed: int  # and how many of them did not reach an optimum
+    log_density: Float[np.ndarray, " blocks"]  # log density of each block, given all samples outside its fold
+    folds: int  # number of refits
+    folds_failed: int  # number of refits that did not converge
 
 
 def block_indices(record: Record, blocks: int = 40, min_periods: int = 20) -> Int[np.ndarray, " samples"]:
-    """Return the block of each sample: whole periods from `min_periods` on, else stretches of as many samples.
+    """Return the block of each sample: whole periods if there are `min_periods`, else intervals of equal length.
 
-    At most 40 `blocks`, which are enough for a standard error of their sum.
+    There are at most 40 `blocks`, which suffice for the standard error of their sum.
     """
     frequency, since = record.frequency(), record.time - record.time[0]
     periods = 0 if frequency is None else math.floor((since[-1] + record.time_step) * frequency + 1e-6)
@@ -50,18 +50,18 @@ def block_indices(record: Record, blocks: int = 40, min_periods: int = 20) -> In
 
 
 def likelihood_mask(trace: ChannelLikelihood) -> Bool[np.ndarray, " samples"]:
-    """Mark the samples whose density is a part of the likelihood."""
+    """Return a mask of the samples that enter the likelihood."""
     return trace.weights > 0.0 if trace.whitening is None else np.asarray(trace.whitening.mask) > 0.0
 
 
 def cross_validate(fit: Fit, folds: int = 10) -> CrossValidation:
-    """Return log densities of the blocks of a fit's records, each predicted without the fold that it belongs to."""
+    """Return log densities of the blocks of a fit's records, each predicted from the samples outside its fold."""
     starts, total = {}, 0
     for record in fit.records:
         starts[id(record)] = total
         total += int(block_indices(record)[-1]) + 1
     blocks = [pad_samples(starts[id(trace.record)] + block_indices(trace.record)) for trace in fit.traces]
-    # dealt out at random, so that no fold holds the same part of every period; any dealing does
+    # random folds, so that no fold holds the same part of every period; any seed serves
     folds = min(folds, total)
     fold = np.random.default_rng(0).permutation(total) % folds
     log_density, failed = np.zeros(total), 0
@@ -80,11 +80,11 @@ def cross_validate(fit: Fit, folds: int = 10) -> CrossValidation:
 
 
 def _mask_samples(likelihood: Likelihood, masks: list[np.ndarray]) -> Likelihood:
-    """Let only some of each channel's samples count."""
+    """Return the likelihood of the masked samples of each channel only."""
     for i, (trace, mask) in enumerate(zip(likelihood.channels, masks, strict=True)):
         if trace.whitening is None:
             trace = dataclasses.replace(trace, weight=jnp.asarray(trace.weights * mask))
-        else:  # the filter goes on seeing all of them
+        else:  # the whitening filter still runs over all samples
             whitening = dataclasses.replace(trace.whitening, mask=trace.whitening.mask * mask)
             trace = dataclasses.replace(trace, whitening=whitening)
         likelihood = likelihood.replace_channel(i, trace)
@@ -92,16 +92,16 @@ def _mask_samples(likelihood: Likelihood, masks: list[np.ndarray]) -> Likelihood
 
 
 class _LinearisedChannel(NamedTuple):
-    """A channel's samples about a refit, to first order, in coordinates that are standard normal by the prior."""
+    """Samples of a channel, linearised about a refit, in coordinates that are standard normal under the prior."""
 
-    z: np.ndarray  # residuals in standard deviations of the noise
-    slope: np.ndarray  # their derivatives by the parameters and all channels' linear nuisances
-    log_scale: np.ndarray  # of each sample, what the logarithm of its density has beside that of z
-    is_student: bool  # whether z has Student's distribution
+    z: np.ndarray  # residuals in noise standard deviations
+    slope: np.ndarray  # derivatives with respect to the parameters and the linear nuisances of all channels
+    log_scale: np.ndarray  # log density of each sample minus log density of z
+    is_student: bool  # whether z has a Student-t distribution
 
 
 class _LinearisedModel(NamedTuple):
-    """All channels, and the precision of the coordinates by the samples of the refit and the prior."""
+    """Linearised channels, and the precision of the coordinates given the samples of the refit and the prior."""
 
     channels: list[_LinearisedChannel]
     precision: np.ndarray
@@ -123,13 +123,13 @@ class _LinearisedModel(NamedTuple):
                 log_scale = np.where(counts, np.log(trace.weights * first / sigma[i]), -np.inf)
             channels.append(_LinearisedChannel(np.asarray(residuals[i]) / sigma[i], slope, log_scale, is_student))
             rows = slope[mask & counts]
-            # a sample's Fisher information on its location, in scales
+            # Fisher information of a sample on its location, in units of the scale
             information = (STUDENT_DOF + 1.0) / (STUDENT_DOF + 3.0) if is_student else 1.0
             precision += information * rows.T @ rows
         return cls(channels, precision)
 
     def log_density(self, masks: Sequence[np.ndarray]) -> float:
-        """Integrate the density of the chosen samples together over the coordinates."""
+        """Return the log density of the masked samples jointly, integrated over the coordinates."""
         total, score, added = 0.0, np.zeros(len(self.precision)), np.zeros_like(self.precision)
         for (z, slope, log_scale, is_student), mask in zip(self.channels, masks, strict=True):
             chosen = mask & np.isfinite(log_scale)
@@ -137,7 +137,7 @@ class _LinearisedModel(NamedTuple):
             density = scipy.stats.t.logpdf(z, STUDENT_DOF) if is_student else scipy.stats.norm.logpdf(z)
             total += float(np.sum(density + log_scale[chosen]))
             score -= slope.T @ (np.asarray(student_weight(z)) * z if is_student else z)
-            # an outlier's negative curvature would not leave a maximum for sure
+            # the negative curvature at an outlier could remove the maximum
             curvature = np.maximum(np.asarray(student_curvature(z)), 0.0) if is_student else np.ones(len(z))
             added += (curvature[:, None] * slope).T @ slope
         wider = self.precision + added
@@ -149,7 +149,7 @@ class _LinearisedModel(NamedTuple):
 def _linearise(
     full: Likelihood, training: Likelihood, theta: Array, sigma: Array
 ) -> tuple[tuple[Array, ...], tuple[Array, ...], tuple[Array, ...]]:
-    """Return the refit's residuals of all samples, weighted; their derivatives; and the linear nuisances' shapes."""
+    """Return whitened residuals of all samples at the refit, their derivatives, and the shapes of linear nuisances."""
 
     def residuals(theta: Array) -> tuple[Array, ...]:
         return tuple(trace.residuals_and_shapes(inputs)[0] for trace, inputs in full.channels_and_inputs(theta))

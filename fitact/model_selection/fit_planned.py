@@ -1,4 +1,4 @@
-"""Fits with the model that a scene requires, and with the full one where the records contradict it."""
+"""Fits with the planned model of a scene, or with the full model if the records contradict it."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,17 +15,17 @@ from fitact.scene.scene import Scene
 
 Model: TypeAlias = Literal["planned", "full"]
 
-_FAILED_RESULTS = ("misfit", "not_at_optimum")  # how a fit ends whose model is too simple
+_FAILED_RESULTS = ("misfit", "not_at_optimum")  # results of a fit whose model is too simple
 
 
 @dataclasses.dataclass(frozen=True)
 class PlannedFit:
-    """A fit, and how its model came about."""
+    """A fit, and the choice of its model."""
 
     fit: Fit
-    model: Model  # which one is used
-    sentence: str  # why, and what that costs
-    plan: Plan | None = None  # None where there was nothing to plan
+    model: Model  # model in use
+    sentence: str  # reason for the choice, and the error that it causes
+    plan: Plan | None = None  # None if nothing was planned
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry `plan` of fit.json and summary.json."""
@@ -34,21 +34,22 @@ class PlannedFit:
 
 
 def fit_planned(records: Sequence[Record], scenes: Sequence[Scene], model: Model, **options: Any) -> PlannedFit:
-    """Fit with the planned model of a scene; where that does not describe the records and the full one does, with it.
+    """Fit with the planned model of a scene, or with the full model if only that describes the records.
 
-    Where the recorded V drives the fit, that is planned for, as it was recorded. `scenes`: none, one for all, or one
-    for each; several would each have their own plan, and get the full model. `options` are those of `fitact.fit`.
+    If the recorded V drives the fit, the plan is made for the recorded V. `scenes` holds no scene, one for all records,
+    or one for each record. Several scenes would have different plans, so they get the full model. `options` as in
+    `fitact.fit`.
     """
     records = tuple(records)
     full: tuple[Scene | None, ...] = tuple(scenes) if len(scenes) > 1 else (*scenes, None)[:1] * len(records)
     why = _reason_for_full_model(scenes, model)
     drives: tuple[DriveModel, ...] = ()
-    if not why:  # only now is the record worth a look
+    if not why:  # the drive is needed only for a plan
         drives = (choose_drive(records[0], scenes[0]),)
         if drives[0].name == "measured" and scenes[0].skin.level != "constant":
-            why = "a skin that depends on the frequency has no plan with a measured drive"
+            why = "a frequency-dependent skin cannot be planned with a measured drive"
     if why:
-        return PlannedFit(fit_records(records, full, drives, **options), "full", f"The full model is fitted: {why}.")
+        return PlannedFit(fit_records(records, full, drives, **options), "full", f"Fitted the full model: {why}.")
     planned = plan(scenes[0], _measured_part(records[0], drives[0]))
     reduced = reduce_scene(scenes[0], planned.left_out)
     same = reduced.drive == scenes[0].drive and reduced.drive.model_fields_set == scenes[0].drive.model_fields_set
@@ -57,8 +58,8 @@ def fit_planned(records: Sequence[Record], scenes: Sequence[Scene], model: Model
         whole = _fit_full_model(records, scenes[0], drives, options)
         if whole is not None and whole.result not in _FAILED_RESULTS:
             warning = (
-                f"the record contradicts the planned model, which leaves out {', '.join(planned.left_out)}: its fit"
-                " does not describe it and that of the full model does, so the full model is fitted"
+                f"the record contradicts the planned model, which neglects {', '.join(planned.left_out)}: only the"
+                " full model describes the record, so the full model was fitted"
             )
             whole = dataclasses.replace(whole, warnings=(*whole.warnings, warning))
             return PlannedFit(whole, "full", f"{warning[0].upper()}{warning[1:]}.", planned)
@@ -66,23 +67,23 @@ def fit_planned(records: Sequence[Record], scenes: Sequence[Scene], model: Model
 
 
 def plan_for_record(record: Record, scene: Scene) -> Plan:
-    """Plan for a record: for its V, where that is what drives the fit, else for the scene's drive."""
+    """Make a plan for a record: for its V if this drives the fit, else for the scene's drive."""
     return plan(scene, _measured_part(record, choose_drive(record, scene)))
 
 
 def _reason_for_full_model(scenes: Sequence[Scene], model: Model) -> str:
-    """Say why the full model is fitted from the first, as a clause; "" where there is a plan."""
+    """Return why the full model is fitted without a plan, as a clause; "" if a plan is made."""
     if model == "full":
         return "it was requested"
     if not scenes:
-        return "without a scene it is the paper's final circuit, which has nothing to leave out"
+        return "without a scene it is the final circuit of the reference paper, which has no element to neglect"
     if len(scenes) > 1:
         return "several scenes have no common plan"
-    return "" if applicable_omissions(scenes[0]) else "the scene names nothing that it could do without"
+    return "" if applicable_omissions(scenes[0]) else "the scene has no circuit element that could be neglected"
 
 
 def _measured_part(record: Record, choice: DriveModel, max_samples: int = 20_000) -> Sampled | None:
-    """Take the beginning of the recorded V, where that drives the fit: whole periods of it where it holds some."""
+    """Return the beginning of the recorded V if it drives the fit, in whole periods if possible."""
     if choice.name != "measured":
         return None
     begin = Record(record.time[:max_samples], {"V": choice.voltage[:max_samples]}, record.source)
@@ -93,7 +94,7 @@ def _measured_part(record: Record, choice: DriveModel, max_samples: int = 20_000
 def _fit_full_model(
     records: tuple[Record, ...], scene: Scene, drives: tuple[DriveModel, ...], options: dict[str, Any]
 ) -> Fit | None:
-    """Fit the full model; None where this version cannot fit it."""
+    """Fit the full model, or return None if this version cannot fit it."""
     try:
         scene.require_available(fit=True)
     except InputError:

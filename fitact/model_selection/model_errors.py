@@ -1,9 +1,9 @@
-"""Errors of Vsc and force that a changed model makes, of many circuits under one drive.
+"""Errors of Vsc and force in a simplified model, for many circuits under one drive.
 
-The time constants come from `fitact.model_selection.partial_fractions`. The rest is NumPy, where nothing is compiled
-(a vmapped `fitact.response` evaluates 5 times faster, but compiling it for a new drive, regime or length takes 7 times
-as long as a whole plan): every response is a sum of exponentials along the straight pieces of its drive, on nodes that
-are graded towards the corners, where a small resistance makes its difference.
+The time constants come from `fitact.model_selection.partial_fractions`. The rest is NumPy, which needs no compilation:
+a vmapped `fitact.response` evaluates 5 times faster, but its compilation for a new drive, regime or length takes 7
+times as long as a whole plan. Every response is a sum of exponentials on the linear pieces of its drive. The nodes are
+graded towards the corners, where a small resistance has its effect.
 """
 
 import dataclasses
@@ -32,23 +32,23 @@ Rows: TypeAlias = Float[np.ndarray, "circuits times"]
 
 
 class ComparisonGrid(NamedTuple):
-    """Nodes over the time in which models are compared."""
+    """Time nodes at which models are compared."""
 
-    cycle: Float[np.ndarray, " times"]  # s since the drive's last start of a period
+    cycle: Float[np.ndarray, " times"]  # s since the last start of a period
     elapsed: Float[np.ndarray, " times"]  # s since t = 0
-    weight: Float[np.ndarray, " times"]  # the share of the window that each stands for
-    n_intervals: int = 1  # without a corner, each of as many times as another
+    weight: Float[np.ndarray, " times"]  # fraction of the window that each node represents
+    n_intervals: int = 1  # intervals without a corner, each with the same number of nodes
 
     @classmethod
     def from_scene(cls, scene: Scene, measured: Sampled | None = None) -> "ComparisonGrid":
-        """Take one period of the steady state, or the scene's duration from rest; of a measured drive, its samples."""
+        """Return nodes over a steady-state period, over the duration from rest, or at the samples of a measured drive."""
         if measured is not None:
             time, last = (np.asarray(x) for x in (measured.time, measured.time[-1]))
             step = np.diff(time, append=last if measured.period is None else time[0] + measured.period)
             return cls(time, time, step / step.sum())
         drive, duration = scene.make_drive(), scene.measurement.duration
         if isinstance(drive, Chirp):
-            # some 16 a cycle of the highest frequency; a power of 2, so that few programs are compiled
+            # about 16 per cycle of the highest frequency; a power of 2, so that few programs are compiled
             count = int(np.clip(2 ** math.ceil(math.log2(2 * drive.pieces)), 2048, 32768))
             times = duration * (np.arange(count) + 0.5) / count
             return cls(times, times, np.full(times.size, 1.0 / times.size))
@@ -59,7 +59,7 @@ class ComparisonGrid(NamedTuple):
         else:
             end = lead + duration
             cuts = np.union1d(cuts, [lead, end % period])
-            cuts = np.append(cuts[:-1][np.diff(cuts) > 1e-9 * period], cuts[-1])  # corners so close are one
+            cuts = np.append(cuts[:-1][np.diff(cuts) > 1e-9 * period], cuts[-1])  # such close corners are merged
             stretches = [
                 (number, low, high, stands)
                 for number, stands in _representative_periods(math.ceil(end / period), getattr(drive, "cycles", 0))
@@ -78,21 +78,21 @@ class ComparisonGrid(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class CircuitResponses:
-    """A channel of circuits under one drive: weighted responses of time constants, and a skin's harmonics besides."""
+    """Responses of one channel of many circuits to one drive: time constants, and harmonics of a skin."""
 
     drive: Drive
     steady_state: bool  # or from rest
-    segments: LinearPieces | None  # one period of the drive, where it is straight
-    weight: Float[np.ndarray, "circuits terms"]  # of the high-pass terms
+    segments: LinearPieces | None  # one period of a piecewise linear drive
+    weight: Float[np.ndarray, "circuits terms"]  # weights of the high-pass terms
     tau: Float[np.ndarray, "circuits terms"]  # s
-    knots: Float[np.ndarray, "circuits terms pieces"]  # each term's steady state at the starts of the drive's pieces, V
-    harmonics: Complex[np.ndarray, "circuits harmonics"]  # amplitude that the terms miss, V
+    knots: Float[np.ndarray, "circuits terms pieces"]  # steady state of each term at the starts of the pieces, V
+    harmonics: Complex[np.ndarray, "circuits harmonics"]  # amplitudes not covered by the terms, V
 
     @classmethod
     def from_scene(
         cls, scene: Scene, drive: Drive, values: Mapping[str, Any], precision: type[np.floating[Any]], channel: Channel
     ) -> "CircuitResponses":
-        """Drive the scene's circuit at `values` (SI, by name; arrays of at most `ROWS`), in that precision."""
+        """Return responses of the scene's circuit at `values` (SI, by name; at most `ROWS`) in this precision."""
         count = max(np.size(value) for value in values.values())
 
         def pad(values: Any) -> np.ndarray:
@@ -100,11 +100,13 @@ class CircuitResponses:
 
         with jax.enable_x64(precision is np.float64):
             circuit = scene.make_circuit(dict(values))
-            # the skin's exponent may differ from circuit to circuit
+            # the exponent of the skin may differ between circuits
             skin = jax.tree.map(pad, circuit.skin) if isinstance(circuit, WithSkin) else None
             complete = jax.tree.map(pad, complete_circuit(scene.make_rc_circuit(dict(values))))
             weight, tau, harmonics = partial_fractions(complete, skin, drive, precision, channel)
-            tau = np.maximum(tau, np.finfo(np.float32).tiny)  # single precision may lose that of an absent part
+            tau = np.maximum(
+                tau, np.finfo(np.float32).tiny
+            )  # in single precision, that of an absent element may vanish
             wave = drive.wave if isinstance(drive, Burst) else drive
             segments, knots = None, np.zeros((*tau.shape, 0), dtype=precision)
             if isinstance(wave, PiecewiseLinear | Sampled):
@@ -123,9 +125,9 @@ class CircuitResponses:
         return self.drive.wave if isinstance(self.drive, Burst) else self.drive
 
     def evaluate(self, cycle: np.ndarray, elapsed: np.ndarray) -> Rows:
-        """Evaluate at nodes common to all circuits, or at each circuit's own."""
+        """Return the response at nodes common to all circuits, or at separate nodes of each circuit."""
         cycle, elapsed = (np.atleast_2d(x).astype(self.tau.dtype) for x in (cycle, elapsed))
-        if isinstance(self.drive, Sampled):  # whose samples are the nodes
+        if isinstance(self.drive, Sampled):  # the samples are the nodes
             u = self.knots
         elif isinstance(self.drive, Chirp):
             with jax.enable_x64(self.tau.dtype == np.float64):
@@ -161,7 +163,7 @@ class CircuitResponses:
         return float(self.segments.start[piece] + slope * since)
 
     def _steady_state_response(self, cycle: np.ndarray) -> np.ndarray:
-        """Each term's response in the steady state."""
+        """Return the steady-state response of each term."""
         tau, cycle = self.tau[..., None], cycle[:, None, :]
         if self.segments is None:
             omega, u = 2.0 * np.pi * self.wave.frequency, np.zeros((1, 1, 1), dtype=tau.dtype)
@@ -175,10 +177,9 @@ class CircuitResponses:
 
 
 class ReferenceModel:
-    """The full model's Vsc and force over a window, to compare others with.
+    """Vsc and force of the full model over a window, as the reference for other models.
 
-    `values` of its circuits as in `CircuitResponses.from_scene`; `measured`: what drives all of them in place of the
-    scene's drive.
+    `values` of the circuits as in `CircuitResponses.from_scene`; a `measured` drive replaces the scene's drive.
     """
 
     def __init__(self, scene: Scene, values: Mapping[str, Any], measured: Sampled | None = None) -> None:
@@ -188,9 +189,9 @@ class ReferenceModel:
     def compare(
         self, scene: Scene, values: Mapping[str, Any], precision: type[np.floating[Any]] = np.float64
     ) -> Float[np.ndarray, "4 circuits"]:
-        """Return how far another scene's model lies from the full one, of as many circuits from the first on.
+        """Return relative errors of another scene's model against the full one, for the first circuits.
 
-        Relative errors: of Vsc the root mean square's and the peak's, of the force the mean's and the peak's.
+        The four errors are those in rms and peak of Vsc, and in mean and peak of the force.
         """
         weight, changed = self.grid.weight, self._evaluate(scene, values, precision)
         (vsc, peak), (acting, acting_peak), factor = changed
@@ -207,12 +208,12 @@ class ReferenceModel:
     def _evaluate(
         self, scene: Scene, values: Mapping[str, Any], precision: type[np.floating[Any]]
     ) -> tuple[tuple[Rows, np.ndarray], tuple[Rows, np.ndarray], Float[np.ndarray, " circuits"]]:
-        """Return Vsc and its peak; those of the voltage that makes the force; the force over its square, N/V^2."""
+        """Return Vsc and its peak, the voltage that causes the force and its peak, and force / voltage^2 (N/V^2)."""
         drive = self.measured or scene.make_drive()
         vsc = acting = _voltages(self.grid, CircuitResponses.from_scene(scene, drive, values, precision, "Vsc"))
         if scene.force.model != "paper":
             acting = _voltages(self.grid, CircuitResponses.from_scene(scene, drive, values, precision, "Vgap"))
-        with jax.enable_x64(True):  # whatever the voltages' precision
+        with jax.enable_x64(True):  # for any precision of the voltages
             contact = scene.geometry().contact(scene.make_rc_circuit(dict(values)))
             return vsc, acting, np.broadcast_to(np.asarray(force_constant(contact)), len(vsc[0]))
 
@@ -220,14 +221,14 @@ class ReferenceModel:
 def _voltages(
     grid: ComparisonGrid, responses: CircuitResponses, candidates: int = 4, points: int = 17, refinements: int = 3
 ) -> tuple[Rows, Float[np.ndarray, " circuits"]]:
-    """Return voltages at the nodes, and the largest, between the nodes too.
+    """Return voltages at the nodes, and the maximum, which may lie between nodes.
 
-    The `candidates` highest stretches are looked at more closely: `refinements` times at so many `points`.
+    The `candidates` intervals with the highest values are refined `refinements` times with `points` nodes.
     """
     voltage = responses.evaluate(grid.cycle, grid.elapsed)
-    if isinstance(responses.drive, Chirp):  # compiled for its nodes
+    if isinstance(responses.drive, Chirp):  # its code is compiled for these nodes
         return voltage, _parabola_vertex(np.abs(voltage))
-    if isinstance(responses.drive, Sampled):  # not known between them
+    if isinstance(responses.drive, Sampled):  # unknown between the samples
         return voltage, np.abs(voltage).max(axis=1)
     height = np.abs(voltage).reshape(len(voltage), grid.n_intervals, -1)
     highest = np.argsort(-height.max(axis=2), axis=1)[:, :candidates]
@@ -245,7 +246,7 @@ def _voltages(
 
 
 def _parabola_vertex(height: Rows) -> Float[np.ndarray, " circuits"]:
-    """Return the top of the parabola through the highest node of each row and its neighbours."""
+    """Return the maximum of the parabola through the highest node of each row and its neighbours."""
     at = np.clip(height.argmax(axis=1), 1, height.shape[1] - 2)
     before, top, after = (height[np.arange(len(height)), at + i] for i in (-1, 0, 1))
     bend = before - 2.0 * top + after
@@ -255,7 +256,7 @@ def _parabola_vertex(height: Rows) -> Float[np.ndarray, " circuits"]:
 
 @functools.cache
 def _quadrature_nodes(decades: int = 8, order: int = 8) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and weights on (0, 1), graded towards 0, `order` in each decade; both ends have no weight."""
+    """Return nodes and weights on (0, 1), graded towards 0, with `order` nodes per decade; the ends have weight 0."""
     x, w = np.polynomial.legendre.leggauss(order)
     ends = np.concatenate([[0.0], np.logspace(-decades, -1.0, decades), [0.25, 0.5, 0.75, 1.0]])
     low, length = ends[:-1, None], np.diff(ends)[:, None]
@@ -265,9 +266,10 @@ def _quadrature_nodes(decades: int = 8, order: int = 8) -> tuple[np.ndarray, np.
 
 
 def _representative_periods(periods: int, cycles: int, groups: int = 12) -> list[tuple[int, int]]:
-    """Return periods from rest, and how many each stands for: the first, the last and a burst's end stand alone.
+    """Return periods from rest, and the number of periods that each represents.
 
-    The others form some `groups` in geometric progression, so that every early one counts.
+    The first, the last and the end of a burst represent themselves. The others form `groups` in geometric progression,
+    so that early periods are resolved.
     """
     edges = np.unique(np.rint(np.geomspace(1, periods + 1, groups + 1)).astype(int) - 1)
     alone = np.array([1, periods - 1, cycles, cycles + 1])
@@ -276,7 +278,7 @@ def _representative_periods(periods: int, cycles: int, groups: int = 12) -> list
 
 
 def _phase_offset(wave: Any) -> float:
-    """Return how far into a period t = 0 lies, s."""
+    """Return the position of t = 0 within a period, s."""
     return float(wave.phase / (2.0 * np.pi) % 1.0 / wave.frequency)
 
 
@@ -288,7 +290,7 @@ def _corner_times(wave: Periodic) -> np.ndarray:
 
 
 def _period_segments(wave: PiecewiseLinear | Sampled) -> LinearPieces:
-    """Return one period, filled up to a trapezoid's 4 pieces with ones of no length, so that one program serves."""
+    """Return one period, padded to 4 pieces with pieces of zero length, so that one compiled program serves."""
     with jax.enable_x64(True):
         knots, start, end = (np.asarray(x) for x in wave.pieces())
     missing = np.zeros(max(4 - start.size, 0))
@@ -296,7 +298,7 @@ def _period_segments(wave: PiecewiseLinear | Sampled) -> LinearPieces:
 
 
 def _locate_segment(segments: LinearPieces, cycle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the piece that each time lies in, the time since it began, and its slope."""
+    """Return the piece of each time, the time since its start, and its slope."""
     knots, length = segments.knots.astype(cycle.dtype), np.diff(segments.knots)
     last = int(np.flatnonzero(length)[-1])
     piece = np.clip(np.searchsorted(knots, cycle, side="right") - 1, 0, last)
@@ -305,7 +307,7 @@ def _locate_segment(segments: LinearPieces, cycle: np.ndarray) -> tuple[np.ndarr
 
 
 def _tones(wave: Any) -> list[tuple[int, float, float]]:
-    """List a smooth drive's orders, amplitudes (V), and phases beside the whole's (rad)."""
+    """Return orders, amplitudes (V) and phases (rad, relative to the drive's phase) of the sines in a smooth drive."""
     if isinstance(wave, Sine):
         return [(1, 0.5 * float(wave.peak_to_peak), 0.0)]
     phases = wave.phases or (0.0,) * len(wave.orders)
@@ -317,7 +319,7 @@ def _tones(wave: Any) -> list[tuple[int, float, float]]:
 def _column_knots(
     segments: LinearPieces, tau: Float[Array, " circuits"], steady_state: bool
 ) -> Float[Array, "circuits pieces"]:
-    """Return u just after the start of each piece, in the steady state or without charge before the first."""
+    """Return u just after the start of each piece, in the steady state or from rest."""
     begin = functools.partial(knot_values, segments, first=segments.start[0])
     return jax.vmap(functools.partial(steady_knot_values, segments) if steady_state else begin)(tau)
 

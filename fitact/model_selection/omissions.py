@@ -1,4 +1,4 @@
-"""Parts of a scene that may be left out of its model, the scene without them, and the cost of its model."""
+"""Simplifications of a scene: elements that may be neglected, the reduced scene, and the cost of a model."""
 
 import dataclasses
 import json
@@ -12,7 +12,7 @@ from fitact.model.circuit import RC, FinalCircuit
 from fitact.model.skin import Fractional, WithSkin
 from fitact.scene.scene import Scene
 
-# for each omission, the keys of a scene that change, and to what (None: they go)
+# keys of a scene that each omission changes, and their new values (None removes a key)
 _KEYS: dict[str, dict[tuple[str, str], Any]] = {
     "R_H": {("grounding", "R_H"): None},
     "grounding skin": {("grounding", "grounding_Rsc"): None, ("grounding", "grounding_Csc"): None},
@@ -25,37 +25,37 @@ _KEYS: dict[str, dict[tuple[str, str], Any]] = {
     "dispersion": {("skin", "level"): None, ("skin", "alpha"): None},
     "transient": {("drive", "steady_state"): True},
 }
-_PARAMETERS = {"resistance": "Rgap", "capacitance": "Cgap"}  # those that are not named as their key
-_RESISTANCES = ("R_H", "series resistor")  # what limits the current at an edge
-FLOAT32_SPEEDUP = 1.6  # by benchmarks/plan.py, where many circuits are computed side by side
+_PARAMETERS = {"resistance": "Rgap", "capacitance": "Cgap"}  # parameters whose name differs from their key
+_RESISTANCES = ("R_H", "series resistor")  # resistances that limit the current at an edge
+FLOAT32_SPEEDUP = 1.6  # measured by benchmarks/plan.py for many circuits in one program
 
 
 @dataclasses.dataclass(frozen=True)
 class Costs:
-    """Nanoseconds a sample, of many circuits side by side in one compiled program: one exponential takes about one.
+    """Cost in nanoseconds per sample for many circuits in one compiled program; one exponential takes about 1 ns.
 
-    Measured by benchmarks/plan.py, once, so that a plan does not depend on what else a machine does; docs/plan.md has
-    the table.
+    The values were measured once by benchmarks/plan.py, so that a plan does not depend on the load of a machine;
+    docs/plan.md has the table.
     """
 
-    lookup: float = 1.0  # to find a time in the drive
-    square: float = 1.0  # from here on of each time constant, by the drive
+    lookup: float = 1.0  # locating a time in the drive
+    square: float = 1.0  # this and the following per time constant, by drive
     trapezoid: float = 2.0
     triangle: float = 2.0
-    sine: float = 4.0  # of each tone
+    sine: float = 4.0  # per tone
     measured: float = 25.0
     chirp: float = 15.0
-    transient: float = 0.5  # more for each time constant, from rest
-    burst: float = 1.0  # likewise
+    transient: float = 0.5  # additional cost per time constant, from rest
+    burst: float = 1.0  # additional cost per time constant, for a burst
     harmonic: float = 10.0
-    fractional_terms: int = 81  # time constants that a fractional skin counts as
+    fractional_terms: int = 81  # number of time constants of a fractional skin
 
 
 _COSTS = Costs()
 
 
 def applicable_omissions(scene: Scene) -> tuple[str, ...]:
-    """Name what the scene's model has and might do without."""
+    """Return the names of elements in the scene's model that might be neglected."""
     ground, drive = scene.grounding, scene.drive
     has = dict.fromkeys(scene.prior.specs(), 1.0) | {k: v for k, v in scene.nominal_values().items() if v is not None}
     present = {
@@ -74,7 +74,7 @@ def applicable_omissions(scene: Scene) -> tuple[str, ...]:
 
 
 def omitted_parameters(name: str) -> set[str]:
-    """Name the circuit's parameters that go with an omission."""
+    """Return the circuit parameters that an omission removes."""
     keys = {
         key for section, key in _KEYS[name] if section in ("grounding", "gap") or key in ("series_resistor", "alpha")
     }
@@ -82,14 +82,14 @@ def omitted_parameters(name: str) -> set[str]:
 
 
 def reason_to_keep(scene: Scene, name: str) -> str:
-    """Say why it may not be left out whatever that changes, as a clause; "" if it may."""
+    """Return why an element must be kept regardless of its effect, as a clause; "" if it may be neglected."""
     gone, beliefs = omitted_parameters(name), scene.prior.specs()
     if any(key in gone and belief.is_free for key, belief in beliefs.items()):
-        return "the prior frees it"
+        return "it is a free parameter of [prior]"
     if any(belief.tied in gone and key not in gone for key, belief in beliefs.items()):
         return "another parameter is tied to it"
     if name in _RESISTANCES and "I" in scene.measurement.channels:
-        return "the current that is recorded has no value at an edge without it"
+        return "without it, the recorded current is undefined at an edge"
     if name == "gap" and scene.force.model == "gap":
         return "the force acts across it"
     if name == "transient" and scene.drive.waveform == "burst":
@@ -98,7 +98,7 @@ def reason_to_keep(scene: Scene, name: str) -> str:
 
 
 def with_measured_drive(scene: Scene) -> Scene:
-    """Let the scene be driven by what was recorded."""
+    """Return the scene with the measured drive."""
     if scene.skin.level != "constant":
         raise InputError(
             f"scene: [skin] level = '{scene.skin.level}' has no plan with a measured drive;"
@@ -110,7 +110,7 @@ def with_measured_drive(scene: Scene) -> Scene:
 
 
 def reduce_scene(scene: Scene, names: tuple[str, ...], *, prior: bool = True) -> Scene:
-    """Leave these out of the scene; with ``prior=False`` its beliefs, too."""
+    """Return the scene without these elements and, with ``prior=False``, without its prior."""
     content = json.loads(scene.to_json())
     for name in names:
         changes = _KEYS[name]
@@ -126,15 +126,15 @@ def reduce_scene(scene: Scene, names: tuple[str, ...], *, prior: bool = True) ->
 
 
 def drop_parameters(values: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
-    """Leave out the parameters that go with these omissions."""
+    """Return the values without the parameters that these omissions remove."""
     omitted = set().union(*(omitted_parameters(name) for name in names))
     return {name: value for name, value in values.items() if name not in omitted}
 
 
 def evaluation_cost(scene: Scene, values: Mapping[str, ArrayLike] | None = None, costs: Costs = _COSTS) -> float:
-    """Return what a sample of Vsc costs, in exponentials, where many circuits are computed side by side.
+    """Return the cost of a sample of Vsc, in exponentials, for many circuits in one program.
 
-    `values` are of parameters that the scene has by its prior alone.
+    `values` holds the parameters that only the scene's prior states.
     """
     circuit, drive = scene.make_circuit(values), scene.drive
     terms, harmonics, tones = count_time_constants(scene.make_rc_circuit(values)), 0, len(drive.frequencies or (1,))
@@ -155,7 +155,7 @@ def evaluation_cost(scene: Scene, values: Mapping[str, ArrayLike] | None = None,
 
 
 def count_time_constants(circuit: RC) -> int:
-    """Count one for each capacitor, but for Ci where nothing resistive is in series with it."""
+    """Return the number of capacitors, without Ci if no resistance is in series with it."""
     if isinstance(circuit, FinalCircuit):
         return 1
     return len(circuit.elements()) + (circuit.resistance() is not None)

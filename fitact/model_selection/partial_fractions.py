@@ -1,6 +1,6 @@
-"""Gains of many circuits side by side, as time constants with weights and the harmonics that those miss.
+"""Gains of many circuits as weighted time constants, plus harmonics that these do not cover.
 
-All circuits share one compiled program: what a circuit lacks is filled in with a value too small to matter.
+All circuits share one compiled program: elements that a circuit lacks get a negligible value.
 """
 
 import functools
@@ -18,7 +18,7 @@ from fitact.model.drive import Drive, Multitone, Periodic, Sine
 from fitact.model.harmonic import fourier_coefficients
 from fitact.model.skin import Fractional, SkinModel, WithSkin, high_frequency_basis
 
-ROWS = 128  # circuits side by side; fewer are filled up, so that each program is compiled once
+ROWS = 128  # circuits in one evaluation; fewer are padded, so that each program is compiled once
 _BLOCK = 64  # frequencies in one program
 
 _fourier_coefficients = eqx.filter_jit(fourier_coefficients)
@@ -26,8 +26,8 @@ _circuit_at_frequency = eqx.filter_jit(WithSkin.circuit_at_frequency)
 
 
 def complete_circuit(circuit: RC) -> DirectGround | NaturalGround:
-    """Return the circuit with every part that its kind may have but a gap, an absent one too small to matter."""
-    absent = 1e-6  # ohm: with any capacitance here over long before the first node
+    """Return the circuit with all optional elements except a gap; absent elements get a negligible value."""
+    absent = 1e-6  # ohm; its transient with any capacitance ends long before the first node
 
     def resistance(*parts: Any) -> Any:
         return sum((part for part in parts if part is not None), start=absent)
@@ -50,9 +50,9 @@ def partial_fractions(
     precision: type[np.floating[Any]],
     channel: Channel,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return weights, time constants, and amplitudes of the harmonics that they miss, each of `ROWS` circuits.
+    """Return weights, time constants, and amplitudes of the harmonics that these do not cover, for `ROWS` circuits.
 
-    Gains are computed in blocks: a vmapped `harmonic_decomposition` takes 3 to 12 times as long to compile.
+    Gains are computed in blocks, since a vmapped `harmonic_decomposition` takes 3 to 12 times as long to compile.
     """
     if skin is None:
         weight, tau = _constant_skin_terms(circuit, channel)
@@ -65,7 +65,7 @@ def partial_fractions(
     else:
         count = max(1, skin.harmonic_count(frequency))
     omega = 2.0 * np.pi * frequency * np.arange(1, count + 1)
-    with jax.enable_x64(True):  # the drive's, whatever the precision of what follows
+    with jax.enable_x64(True):  # the drive needs double precision in any case
         amplitude = np.asarray(_fourier_coefficients(jax.tree.map(np.asarray, drive), count + -count % _BLOCK))[:count]
     gain = _transfer_function(circuit, skin, omega, channel)
     if smooth:
@@ -75,7 +75,7 @@ def partial_fractions(
         above = _transfer_function(circuit, skin, omega[-1] * x, channel)
         weight = np.concatenate([above.real, above.imag], axis=1) @ fitted.T
         tau = np.broadcast_to(tau / omega[-1], weight.shape)
-    else:  # above 1000 Hz it is constant
+    else:  # the skin is constant above 1000 Hz
         weight, tau = _constant_skin_terms(_circuit_at_frequency(WithSkin(circuit, skin), 1000.0), channel)
     x = 1j * omega * tau[..., None]
     return weight, tau, amplitude * (gain - np.einsum("rk,rkh->rh", weight, x / (1.0 + x)))
@@ -84,9 +84,9 @@ def partial_fractions(
 def _transfer_function(
     circuit: DirectGround | NaturalGround, skin: SkinModel, omega: np.ndarray, channel: Channel
 ) -> np.ndarray:
-    """Return Vsc / V, or Vgap / V, of circuits whose skins follow a level."""
+    """Return Vsc / V, or Vgap / V, of circuits with a skin model."""
     blocks = np.pad(omega, (0, -omega.size % _BLOCK), mode="edge").reshape(-1, _BLOCK)
-    with jax.enable_x64(True):  # for any precision, so that one program serves
+    with jax.enable_x64(True):  # in double precision for any result, so that one program serves
         circuits = jax.tree.map(np.float64, WithSkin(circuit, skin))
         parts = [np.asarray(_channel_gain(circuits, block, channel)) for block in blocks]
     return np.concatenate(parts, axis=1)[:, : omega.size]
@@ -98,7 +98,7 @@ def _channel_gain(circuits: WithSkin, omega: Array, channel: Channel) -> Complex
 
 
 def _constant_skin_terms(circuit: Any, channel: Channel) -> tuple[np.ndarray, np.ndarray]:
-    """Return terms of constant skins. Z stands in the loop where a grounding skin does, so one program serves both."""
+    """Return the terms for constant skins; Z takes the place of a grounding skin, so that one program serves both."""
     if isinstance(circuit, NaturalGround):
         loop = circuit.series_resistor, circuit.Z, circuit.Z_capacitance
         gap = {"Rgap": circuit.Rgap, "Cgap": circuit.Cgap}

@@ -1,7 +1,7 @@
-"""The plan: the cheapest model of a scene that keeps its tolerance, and what everything left out of it costs.
+"""Plans: the fastest model of a scene within its tolerance, and the error and speed-up of each omission.
 
-The full model has everything that the scene names. Each omission is compared with it at the scene's nominal values
-and over its prior; then all combinations of omissions, jointly, since errors may add up or cancel.
+The full model has every element of the scene. Each omission is compared with it at the scene's nominal values and over
+the prior. Then all combinations of omissions are tried, because errors may add up or cancel.
 """
 
 import dataclasses
@@ -23,13 +23,13 @@ from fitact.tables import align_row, join_lines
 from fitact.units import format_engineering, format_percent
 
 _TITLES = ("Vsc rms", "Vsc peak", "mean force", "peak force")
-LEGEND = "Relative errors at the nominal values; in brackets, what 95 % of the prior stay below."
+LEGEND = "Relative errors at the nominal values; in brackets, the 95 % quantile over the prior."
 
 Values = Mapping[str, Float[np.ndarray, " draws"]]
 
 
 class RelativeErrors(NamedTuple):
-    """Relative errors, against the full model."""
+    """Relative errors with respect to the full model."""
 
     Vsc_rms: float
     Vsc_peak: float
@@ -38,38 +38,38 @@ class RelativeErrors(NamedTuple):
 
     @property
     def force(self) -> float:
-        """The larger of the mean and the peak force's."""
+        """Larger of the errors in mean force and peak force."""
         return max(self.force_mean, self.force_peak)
 
 
 @dataclasses.dataclass(frozen=True)
 class Omission:
-    """Something that the model might do without."""
+    """An element that the model might neglect."""
 
     name: str
-    nominal: RelativeErrors  # at the scene's nominal values
-    q95: RelativeErrors  # their 95 % quantiles over the scene's prior
-    speedup: float  # how many times faster the full model is without it
+    nominal: RelativeErrors  # errors at the scene's nominal values
+    q95: RelativeErrors  # 95 % quantiles of the errors over the scene's prior
+    speedup: float  # speed-up factor of the full model without this element
     kept: bool  # whether the planned model has it
-    because: str  # a clause
+    because: str  # reason for the decision, as a clause
 
     def to_dict(self) -> dict[str, Any]:
-        """Return an entry of `omissions` in `fitact plan --json`."""
+        """Return an entry of `omissions` in the JSON output of `fitact plan`."""
         errors = _errors_by_name(self.nominal, self.q95)
         return {"name": self.name} | errors | {"speedup": self.speedup, "kept": self.kept, "because": self.because}
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """The model that a scene requires.
+    """Planned model of a scene.
 
     Attributes:
-        full: the scene as it was given.
-        scene: the scene without what is left out; its circuit and drive are the planned model's.
-        omissions: what might be left out, one by one.
+        full: scene as given.
+        scene: scene without the neglected elements, with circuit and drive of the planned model.
+        omissions: possible omissions, evaluated one by one.
         nominal: errors of the planned model at the scene's nominal values.
-        q95: their 95 % quantiles over the prior.
-        speedup: how many times faster the planned model is than the full one.
+        q95: 95 % quantiles of the errors of the planned model over the prior.
+        speedup: speed-up factor of the planned model relative to the full one.
     """
 
     full: Scene
@@ -81,23 +81,23 @@ class Plan:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Names of the omissions that are made."""
+        """Names of the neglected elements."""
         return tuple(omission.name for omission in self.omissions if not omission.kept)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences."""
+        """Warnings as sentences."""
         tolerance = self.full.tolerance.force
         if self.q95.force <= tolerance:
             return ()
         return (
-            f"over the prior the planned model errs by up to {format_percent(self.q95.force)} of the force (95 %),"
+            f"over the prior the planned model has a force error of up to {format_percent(self.q95.force)} (95 %),"
             f" more than the tolerance of {format_percent(tolerance)}, which it keeps at the nominal values; narrow"
             " [prior], or lower [tolerance] force",
         )
 
     def model(self) -> dict[str, Any]:
-        """Describe the planned model, by name."""
+        """Return the properties of the planned model by name."""
         drive, circuit = self.scene.drive, self.scene.make_rc_circuit()
         natural = "natural" if isinstance(circuit, NaturalGround) else "direct"
         edges = {"square": "ideal", "trapezoid": format_engineering(drive.rise_time or 0.0, "s")}
@@ -116,55 +116,55 @@ class Plan:
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what `fitact plan --json` prints."""
+        """Return the JSON output of `fitact plan`."""
         rows = [omission.to_dict() for omission in self.omissions]
         return {"omissions": rows, "model": self.model(), "warnings": list(self.warnings)}
 
     def summary(self) -> str:
-        """Return the table for people, what is left out, and warnings."""
+        """Return the text table, the neglected elements, and warnings."""
         widths = (17, 22, 22, 22, 22, 9)
         rows = [f"{align_row(cells, widths)}  {decision}".rstrip() for *cells, decision in self.table]
         return join_lines([*rows, LEGEND, self.sentence], self.warnings)
 
     @property
     def table(self) -> tuple[tuple[str, ...], ...]:
-        """Titles; then errors and speed of every omission and of the planned model, and why, for people."""
+        """Titles, then errors, speed-up and decision of each omission and of the planned model, as text."""
 
         def cells(name: str, row: Omission | Plan, decision: str) -> tuple[str, ...]:
             errors = zip(row.nominal, row.q95, strict=True)
             shown = (f"{format_percent(nominal)} ({format_percent(q95)})" for nominal, q95 in errors)
             return name, *shown, f"{row.speedup:.2f}x", decision
 
-        rows = [cells(o.name, o, f"{'kept' if o.kept else 'left out'}: {o.because}") for o in self.omissions]
+        rows = [cells(o.name, o, f"{'kept' if o.kept else 'neglected'}: {o.because}") for o in self.omissions]
         return ("omission", *_TITLES, "speedup", "decision"), *rows, cells("planned model", self, "")
 
     @property
     def sentence(self) -> str:
-        """Name the parts left out, and what that costs."""
+        """Neglected elements and the resulting errors, in a sentence."""
         if not self.left_out:
-            return "Nothing is left out."
+            return "No element is neglected."
         return (
-            f"Left out: {', '.join(self.left_out)}; that changes the peak of Vsc by"
+            f"Neglected: {', '.join(self.left_out)}. This changes the peak of Vsc by"
             f" {format_percent(self.nominal.Vsc_peak)}, the mean force by {format_percent(self.nominal.force_mean)} and"
             f" the peak force by {format_percent(self.nominal.force_peak)} (tolerance"
-            f" {format_percent(self.full.tolerance.force)}), and is {self.speedup:.2g} times faster. This is judged"
-            " by the force; parameters are those of the smaller circuit."
+            f" {format_percent(self.full.tolerance.force)}); the model is {self.speedup:.2g} times faster. The decision"
+            " depends on the force only; fitted parameters are those of the reduced circuit."
         )
 
     __str__ = summary
 
 
 def plan(scene: Scene, measured: Sampled | None = None) -> Plan:
-    """Find the cheapest model of a scene that keeps `[tolerance] force`, among all combinations of omissions.
+    """Find the fastest model of a scene within `[tolerance] force`, among all combinations of omissions.
 
-    The tolerance bounds the larger of mean and peak force's error at the scene's nominal values; where 95 % of the
-    prior do not keep it, the plan warns. Errors are those over one period of the steady state, or over the scene's
-    duration from rest, or over the samples of `measured`, a drive that takes the place of the scene's. Costs are those
-    of `fitact.model_selection.omissions.evaluation_cost`. What saves nothing is kept.
+    The tolerance applies to the larger of the errors in mean and peak force at the scene's nominal values. A warning is
+    issued if the 95 % quantile over the prior exceeds it. Errors refer to one steady-state period, to the scene's
+    duration from rest, or to the samples of `measured`, a drive that replaces the scene's. Costs come from
+    `fitact.model_selection.omissions.evaluation_cost`. An element whose omission saves no time is kept.
 
     Raises:
-        InputError: the scene has no drive of its own (waveform = 'measured') and `measured` is not given, or asks for
-            what is not available.
+        InputError: the scene has a measured drive and `measured` is not given, or the scene requests an unsupported
+            option.
     """
     scene.require_available()
     if measured is not None:
@@ -195,7 +195,7 @@ def plan(scene: Scene, measured: Sampled | None = None) -> Plan:
 def _cheapest_omissions(
     scene: Scene, nominal: Values, reference: ReferenceModel, names: tuple[str, ...], tolerance: float
 ) -> tuple[str, ...]:
-    """Find the cheapest combination that keeps the tolerance; of several that which leaves out, then errs, least."""
+    """Return the fastest combination within the tolerance; ties go to fewer omissions, then to smaller errors."""
     combinations = [c for size in range(len(names) + 1) for c in itertools.combinations(names, size)]
     scenes = {c: omissions.reduce_scene(scene, c, prior=False) for c in combinations}
     rank = {c: (omissions.evaluation_cost(scenes[c], drop_parameters(nominal, c)), len(c)) for c in combinations}
@@ -212,7 +212,7 @@ def _cheapest_omissions(
 
 
 def _circuit_values(scene: Scene) -> dict[str, Float[np.ndarray, " draws"]]:
-    """Return the circuit's parameters: the scene's nominal ones, then draws spread evenly over its prior."""
+    """Return circuit parameters: the scene's nominal values, followed by quasi-random draws from its prior."""
     prior = scene.make_prior()
     stated = {name: value for name, value in scene.nominal_values().items() if value is not None}
     values = {
@@ -227,17 +227,17 @@ def _circuit_values(scene: Scene) -> dict[str, Float[np.ndarray, " draws"]]:
 
 
 def _summarize_errors(errors: Float[np.ndarray, "4 circuits"]) -> tuple[RelativeErrors, RelativeErrors]:
-    """Return those at the nominal values, which come first, and the 95 % quantiles of the others."""
+    """Return the errors at the nominal values (first column), and the 95 % quantiles of the others."""
     q95 = np.quantile(errors[:, 1:], 0.95, axis=1) if errors.shape[1] > 1 else np.zeros(4)
     return RelativeErrors(*errors[:, 0].tolist()), RelativeErrors(*q95.tolist())
 
 
 def _decision_reason(left_out: bool, error: float, tolerance: float, speedup: float) -> str:
     if left_out:
-        return "keeps the tolerance"
+        return "error within the tolerance"
     if error > tolerance:
-        return f"{format_percent(error)} of the force, more than {format_percent(tolerance)}"
-    return "saves nothing" if speedup == 1.0 else "too much together with the others, or saves nothing then"
+        return f"error of the force {format_percent(error)}, more than {format_percent(tolerance)}"
+    return "saves no time" if speedup == 1.0 else "exceeds the tolerance together with the others, or saves no time"
 
 
 def _errors_by_name(nominal: RelativeErrors, q95: RelativeErrors) -> dict[str, float]:

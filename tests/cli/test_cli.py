@@ -254,7 +254,7 @@ def test_plan_is_a_table_json_and_a_picture(fitact_command, tmp_path):
     assert content["model"]["circuit"] == "final"
     assert json.loads((tmp_path / "plan" / "plan.json").read_text()) == content
     assert "<svg" in (tmp_path / "plan" / "plan.svg").read_text()
-    assert "Left out: R_H; that changes the peak of Vsc by 0.14 %" in fitact_command("plan", "scene.toml").stdout
+    assert "Neglected: R_H. This changes the peak of Vsc by 0.14 %" in fitact_command("plan", "scene.toml").stdout
     (tmp_path / "measured.toml").write_text('[drive]\nwaveform = "measured"\n')
     assert fitact_command("plan", "measured.toml").returncode == 2
 

@@ -131,16 +131,20 @@ NOISY = [1.0 + (-1.0) ** i for i in range(16)]  # the same sum, 4.13 as standard
 def test_verdicts():
     better = ranked(scored("a", FLAT, 0.0), scored("b", [x - 1.0 for x in NOISY], -50.0))
     assert better.preferred == "a"  # by 16 ± 4.1, whatever the criterion says
-    assert better.verdict == "a is preferred: it predicts what was left out better than b, by an elpd of 16.00 ± 4.13."
+    assert (
+        better.verdict == "a is preferred: it predicts the held-out blocks better than b, by an elpd of 16.00 ± 4.13."
+    )
     simpler = ranked(scored("a", FLAT, 15.0), scored("b", [x - 0.1 for x in NOISY], 0.0))
     assert simpler.preferred == "b"
     assert simpler.verdict == (
-        "b is preferred, for its BIC: a predicts what was left out better by an elpd of only 1.60 ± 4.13, and b has the"
+        "b is preferred because of its BIC: a predicts the held-out blocks better by an elpd of only 1.60 ± 4.13, and b has the"
         " lower BIC, by 15."
     )
     tied = ranked(scored("a", FLAT, 5.0), scored("b", [x - 0.1 for x in NOISY], 0.0))
     assert tied.preferred is None
-    assert tied.verdict.startswith("b and a cannot be told apart: a predicts what was left out better by an elpd of")
+    assert tied.verdict.startswith(
+        "b and a cannot be distinguished: a predicts the held-out blocks better by an elpd of"
+    )
     assert all(found.trusted for found in (better, simpler, tied))
 
 
@@ -148,7 +152,7 @@ def test_a_preferred_model_that_is_a_misfit_is_not_trusted():
     found = ranked(scored("a", FLAT, 0.0, "misfit"), scored("b", [x - 1.0 for x in NOISY], 0.0))
     assert found.preferred == "a"
     assert not found.trusted
-    assert "Do not trust it: of a, The model does not describe the record." in found.verdict
+    assert "The fit of a is unreliable: The model does not describe the record." in found.verdict
     other = ranked(scored("a", FLAT, 0.0), scored("b", [x - 1.0 for x in NOISY], 0.0, "misfit"))
     assert other.trusted
     assert other.warnings == ("b: The model does not describe the record.",)
@@ -158,13 +162,13 @@ def test_refused():
     made = sine_record(0)
     with pytest.raises(fitact.InputError, match="1 scene to compare: give two or more"):
         fitact.compare(made, [sine_scene()])
-    with pytest.raises(fitact.InputError, match="scene 1 accounts for Vsc, scene 2 for I and Vsc: only models of the"):
+    with pytest.raises(fitact.InputError, match="scene 1 models Vsc, scene 2 models I and Vsc: only models of the"):
         fitact.compare(made, [sine_scene(), sine_scene(channels=["Vsc", "I"])])
 
 
 @pytest.mark.slow
 def test_models_that_leave_out_different_samples_are_refused():
-    with pytest.raises(fitact.InputError, match="do not account for the same samples of Vsc: 1 count in one only"):
+    with pytest.raises(fitact.InputError, match="do not use the same samples of Vsc: 1 samples enter only one of them"):
         fitact.compare(sine_record(0), {"white": sine_scene(), "coloured": sine_scene(noise_model="ar1")})
 
 

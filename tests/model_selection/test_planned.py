@@ -28,7 +28,7 @@ def test_the_planned_model_is_fitted_and_that_is_said():
     assert found.model == "planned"
     assert found.fit.trusted
     assert found.fit.model()["circuit"] == "final"
-    assert found.sentence.startswith("Left out: R_H; that changes the peak of Vsc by 0.14 %")
+    assert found.sentence.startswith("Neglected: R_H. This changes the peak of Vsc by 0.14 %")
     assert json.loads(json.dumps(found.to_dict()))["model"]["left_out"] == "R_H"
     divider = found.fit.derived()["g"]
     assert abs(divider["q50"] - 1.35 / 24.7) < 4.0 * divider["sd"]
@@ -44,7 +44,7 @@ def test_a_record_that_contradicts_the_plan_gets_the_full_model():
     assert found.model == "full"
     assert found.fit.result == "successful"
     assert found.fit.model()["circuit"] == "direct"
-    assert "contradicts the planned model, which leaves out grounding skin" in found.sentence
+    assert "contradicts the planned model, which neglects grounding skin" in found.sentence
     assert any("contradicts" in warning for warning in found.fit.warnings)
     assert found.to_dict()["omissions"][0]["name"] == "grounding skin"
 
@@ -133,8 +133,8 @@ def test_where_nothing_is_planned_the_full_model_is_fitted(monkeypatch):
         ([scene], "full", "requested"),
         ([], "planned", "without a scene"),
         ([scene, scene], "planned", "several scenes"),
-        ([measured], "planned", "no plan with a measured drive"),
-        ([fitact.Scene()], "planned", "names nothing"),
+        ([measured], "planned", "cannot be planned with a measured drive"),
+        ([fitact.Scene()], "planned", "has no circuit element"),
     ]:
         found = fit_planned([simulate(fitact.Scene())], scenes, model)
         assert found.model == "full"

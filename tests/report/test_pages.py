@@ -43,7 +43,7 @@ def plan() -> Plan:
         return RelativeErrors(1.1 * size, 1.3 * size, 1.7 * size, 1.9 * size)
 
     scene = fitact.Scene.from_dict({"grounding": {"R_H": "500 ohm"}})
-    R_H = Omission("R_H", errors(1e-3), errors(1e-2), 2.0, False, "keeps the tolerance")
+    R_H = Omission("R_H", errors(1e-3), errors(1e-2), 2.0, False, "error within the tolerance")
     single = Omission("float64", errors(1e-7), errors(1e-6), 1.6, True, "fits and sampling need its derivatives")
     return Plan(scene, fitact.Scene(), (R_H, single), errors(1e-3), errors(1e-2), 2.0)
 
@@ -256,7 +256,7 @@ def test_an_untrusted_answer_says_so_at_the_top(name: str, tmp_path: Path):
 SHOWN = {
     "plan": [
         *("R_H", "0.11 % (1.1 %)", "0.13 % (1.3 %)", "0.17 % (1.7 %)", "0.19 % (1.9 %)", "2.00x"),
-        *("kept: fits and sampling need its derivatives", "Left out: R_H;", "Read this first", "steady state"),
+        *("kept: fits and sampling need its derivatives", "Neglected: R_H.", "Read this first", "steady state"),
     ],
     "tradeoff": [
         *("best response", "2 µs", "3 µs", "0.70 s", "8 kB", "worse uncertainty", "0.12", "4 µs", "0.512"),
