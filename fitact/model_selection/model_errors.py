@@ -41,7 +41,7 @@ class ComparisonGrid(NamedTuple):
 
     @classmethod
     def from_scene(cls, scene: Scene, measured: Sampled | None = None) -> "ComparisonGrid":
-        """Return nodes over a steady-state period, over the duration from rest, or at the samples of a measured drive."""
+        """Return nodes over a steady-state period, over the duration from rest, or at samples of a measured drive."""
         if measured is not None:
             time, last = (np.asarray(x) for x in (measured.time, measured.time[-1]))
             step = np.diff(time, append=last if measured.period is None else time[0] + measured.period)

@@ -1,4 +1,4 @@
-"""What a campaign leaves: tables of its answers and failures, and a page that links its reports."""
+"""Output of a campaign: tables of results and failures, and a page with links to the reports."""
 
 import os
 from pathlib import Path
@@ -8,10 +8,10 @@ from fitact.report.frame import Answer, PageSummary, Provenance, write_page
 
 
 def write_campaign(folder: str | os.PathLike[str], fits: Fits, origin: Provenance, max_rows: int = 2000) -> Path:
-    """Write results.parquet, failures.csv and index.html, with no more than `max_rows` of each; gives the page.
+    """Write results.parquet, failures.csv and index.html (at most `max_rows` of each), and return the page.
 
     Raises:
-        InputError: the place cannot be written.
+        InputError: the folder cannot be written.
     """
     place, answered, failures = Path(folder), fits.answered, Fits(fits.failures)
     answered.to_parquet(place / "results.parquet")
@@ -19,14 +19,14 @@ def write_campaign(folder: str | os.PathLike[str], fits: Fits, origin: Provenanc
     trusted = sum(bool(row["trusted"]) for row in fits)
     frame = PageSummary(
         title="Campaign",
-        subject=f"{len(fits):,} records, each fitted by itself.",
+        subject=f"{len(fits):,} records, fitted separately.",
         trusted=True,
-        verdict=f"{trusted:,} of {len(fits):,} records have an answer to be trusted",
+        verdict=f"{trusted:,} of {len(fits):,} records have a reliable fit",
         findings={},
         answers=(
-            Answer("trusted", f"{trusted:,}", "answers"),
-            Answer("not to be trusted", f"{len(answered) - trusted:,}", "answers; their result says why"),
-            Answer("without an answer", f"{len(failures):,}", "records; failures.csv has the reasons"),
+            Answer("reliable", f"{trusted:,}", "fits"),
+            Answer("unreliable", f"{len(answered) - trusted:,}", "fits; see the column result"),
+            Answer("failed", f"{len(failures):,}", "records; failures.csv states the reasons"),
         ),
         warnings=(),
         has_reservation=trusted < len(fits),

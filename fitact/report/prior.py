@@ -1,4 +1,4 @@
-"""The prior as a picture: what it means for the skin voltage and the force."""
+"""Picture of the prior predictive distribution of skin voltage and force."""
 
 import html
 from pathlib import Path
@@ -17,13 +17,13 @@ _FORMATS = (".html", ".svg", ".png")
 
 
 def write_prior(path: Path, predicted: PriorPredictive) -> None:
-    """Draw a prior's voltage and force at `path`: SVG or PNG by its ending, or HTML with the table.
+    """Write voltage and force of a prior to `path`: SVG or PNG by its suffix, or HTML with the table.
 
     Raises:
-        InputError: another ending, or a place that cannot be written.
+        InputError: the suffix is another one, or the path cannot be written.
     """
     if path.suffix not in _FORMATS:
-        raise InputError(f"{path}: the figure is written as {', '.join(_FORMATS)}; choose one of these endings")
+        raise InputError(f"{path}: the figure can be written as {', '.join(_FORMATS)}; choose one of these suffixes")
     if path.suffix != ".html":
         write_figure(path, lambda: _figure(predicted), dpi=150)
     else:
@@ -60,6 +60,6 @@ def _figure(predicted: PriorPredictive) -> Figure:
 def _page(figure: Figure, predicted: PriorPredictive) -> str:
     return (
         '<!doctype html><html lang="en"><meta charset="utf-8"><title>fitact: the prior</title>'
-        f"<h1>What the prior means, before any data</h1>{svg(figure)}"
+        f"<h1>Predictions of the prior, before any data</h1>{svg(figure)}"
         f"<pre>{html.escape(str(predicted))}</pre></html>\n"
     )

@@ -1,4 +1,4 @@
-"""The paper's figures in its own form, and its claims beside what they come to."""
+"""Figures of the reference paper, recomputed, and its claims compared with the computed values."""
 
 import dataclasses
 import functools
@@ -21,7 +21,7 @@ from fitact.model.response import response
 from fitact.report.frame import write_page
 from fitact.units import format_engineering
 
-_COLORS = ("#D55E00", "#009E73", "#CC79A7", "#8C564B", "#222222")  # in the order of the paper's figures
+_COLORS = ("#D55E00", "#009E73", "#CC79A7", "#8C564B", "#222222")  # in the order of the figures in the reference paper
 _CI_COLORS = (MODEL, PRIOR, "#555555")
 _TIME = Axis.from_values("time", "s", 2.0 / paper.FREQUENCY)
 _FINAL = FinalCircuit(paper.RSC, paper.CSC, paper.CI)
@@ -29,10 +29,10 @@ _DIRECT = DirectGround(paper.RSC, paper.CSC, paper.CI, R_H=paper.R_H)
 
 
 def write_reproduction(directory: str | os.PathLike[str], claims: tuple[paper.Claim, ...]) -> Path:
-    """Write reproduction.json and reproduction.html, with the figures, into `directory`; gives the page.
+    """Write reproduction.json and reproduction.html, with the figures, into `directory`, and return the page.
 
     Raises:
-        InputError: the place cannot be written.
+        InputError: the folder cannot be written.
     """
     directory = Path(directory)
     page = directory / "reproduction.html"
@@ -51,7 +51,7 @@ def _format_value(value: float | None, unit: str) -> str:
 
 
 def _two_periods() -> np.ndarray:
-    """Return times (s), both sides of each jump of a square among them."""
+    """Return times (s) over two periods, including both sides of each jump of a square."""
     period = 1.0 / paper.FREQUENCY
     edges = np.arange(4) * 0.5 * period
     inside = np.linspace(0.0, 2.0 * period, 2001)[:-1]
@@ -88,7 +88,7 @@ def _grounding_chart(name: str, values: Sequence[float], unit: str) -> Chart:
 
 
 def _insulator_chart() -> Chart:
-    """Return mean force over each property of the insulator, its greatest at 1."""
+    """Return a chart of the mean force, scaled to a maximum of 1, over each property of the insulator."""
     permittivities, thicknesses = np.linspace(1.0, 10.0, 37), 1e-6 * np.geomspace(0.01, 10.0, 46)
     own, y, plots = paper.force_over(paper.PERMITTIVITY, paper.INSULATOR), Axis("mean force, normalised"), []
     for title, unit, here, values, forces in (
@@ -105,7 +105,7 @@ def _insulator_chart() -> Chart:
 
 
 def _frequencies_chart(low: float, high: float, marks_corners: bool) -> Chart:
-    """Return amplitude and phase between two frequencies (Hz), by Ci."""
+    """Return a chart of amplitude and phase between two frequencies (Hz) for each Ci."""
     frequency = np.geomspace(low, high, 400)
     omega, x = jnp.asarray(2.0 * np.pi * frequency), Axis("frequency", "Hz", log=True, has_tick_prefixes=True)
     circuits = {f"Ci = {name}": FinalCircuit(paper.RSC, paper.CSC, Ci) for name, Ci in paper.INSULATORS.items()}
@@ -113,7 +113,7 @@ def _frequencies_chart(low: float, high: float, marks_corners: bool) -> Chart:
     for y, corners, evaluate in (
         (Axis("|H|"), (40.0, 300.0), lambda circuit: circuit.amplitude(omega)),
         (Axis("phase", "degrees"), (90.0, 270.0), lambda circuit: np.degrees(circuit.phase(omega))),
-    ):  # Hz: the paper's knee, and where it calls the curve steady
+    ):  # Hz; corner and steady frequencies stated in the paper
         traces = [
             line(x, y, frequency, evaluate(circuit), name, color)
             for (name, circuit), color in zip(circuits.items(), _CI_COLORS, strict=True)
@@ -140,18 +140,18 @@ def _waveforms_chart() -> Chart:
 _NATURAL = NaturalGround(paper.RSC, paper.CSC, paper.CI, paper.Z)
 _FIGURES = (
     ("Fig. 4: direct and natural ground", lambda: _vsc_chart({"direct": _DIRECT, "natural": _NATURAL}),
-     "Vsc over two periods: large under direct ground, a tenth of it under natural ground."),
+     "Vsc over two periods: large for direct ground, a tenth as large for natural ground."),
     ("Fig. 5: the grounding finger's Rsc", lambda: _grounding_chart("grounding_Rsc", paper.GROUNDING_RSC, "ohm"),
-     "Five curves that differ in how they decay and hardly at the peak."),
+     "Five curves with different decays and almost equal peaks."),
     ("Fig. 6: the grounding finger's Csc", lambda: _grounding_chart("grounding_Csc", paper.GROUNDING_CSC, "F"),
      "Five curves whose peaks rise from 13.7 V to 15.9 V with the capacitance."),
     ("Fig. 10: with and without R_H", lambda: _vsc_chart({"without R_H": _FINAL, "with R_H": _DIRECT}),
-     "Two curves on top of each other."),
+     "Two curves that coincide."),
     ("Fig. 12: the insulator", _insulator_chart,
      "Mean force against permittivity, bending upwards, and against thickness, falling."),
     ("Fig. 13: frequency characteristics", functools.partial(_frequencies_chart, 0.1, 1e5, False),
      "A first-order high-pass."),
-    ("Fig. 14: 10 to 1000 Hz, the paper's knees and steady frequencies dashed",
+    ("Fig. 14: 10 to 1000 Hz, with the paper's corner and steady frequencies dashed",
      functools.partial(_frequencies_chart, 10.0, 1e3, True),
      "Amplitude and phase of the high-pass for three values of Ci."),
     ("Fig. 15: waveforms of 30 Vpp", _waveforms_chart,

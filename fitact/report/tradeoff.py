@@ -1,4 +1,4 @@
-"""Speed against accuracy as a picture and as a page: error over cost, the Pareto front joined."""
+"""Picture and page of accuracy against run time, with the Pareto front."""
 
 import functools
 import itertools
@@ -22,35 +22,35 @@ from fitact.units import format_engineering
 
 _TITLES: dict[Kind, tuple[str, str, str]] = {
     "response": ("response", "one evaluation", "error of Vsc, relative rms"),
-    "likelihood": ("likelihood", "one evaluation, of many at once", "error of the log-likelihood"),
-    "uncertainty": ("uncertainty", "one effective draw", "error, posterior standard deviations"),
+    "likelihood": ("likelihood", "one evaluation in a batch", "error of the log-likelihood"),
+    "uncertainty": ("uncertainty", "one effective draw", "error in posterior standard deviations"),
 }
-_ZERO_RATIO = 30.0  # times below the least error is where an error of 0 is drawn
+_ZERO_RATIO = 30.0  # an error of 0 is drawn at the smallest error over this ratio
 
 
 def draw_tradeoff(tradeoff: Tradeoff, kinds: Sequence[Kind] = tuple(_TITLES)) -> Figure:
-    """Draw some kinds of level."""
+    """Draw the methods of some kinds."""
     figure = Figure(figsize=(13.0 if len(kinds) > 1 else 9.0, 4.8), layout="constrained")
     canvas = FigureCanvasAgg(figure)
     panels = dict(zip(kinds, figure.subplots(1, len(kinds), squeeze=False)[0], strict=True))
     for kind, axes in panels.items():
         _draw_panel(axes, kind, tradeoff)
-    canvas.draw()  # so that it is known where everything is
-    figure.set_layout_engine("none")  # and stays there
+    canvas.draw()  # fixes the positions of everything
+    figure.set_layout_engine("none")  # keeps these positions
     for kind, axes in panels.items():
         _annotate_names(axes, tradeoff.of(kind), _plot(tradeoff, kind)[1], canvas)
     return figure
 
 
 def _heights(levels: Sequence[BenchmarkedMethod]) -> dict[str, float]:
-    """Where errors are drawn: as they are, and 0 below the least of the others."""
+    """Return the positions of errors on the logarithmic axis; an error of 0 is drawn below all others."""
     zero = min((level.error for level in levels if level.error > 0.0), default=1.0) / _ZERO_RATIO
     return {level.name: level.error or zero for level in levels}
 
 
 def _draw_panel(axes: Axes, kind: Kind, tradeoff: Tradeoff) -> None:
     plot, size = _plot(tradeoff, kind)
-    bare = plot["layout"] | {"showlegend": False}  # the names say it
+    bare = plot["layout"] | {"showlegend": False}  # the names of the methods replace a legend
     draw_plot(plot | {"layout": bare, "title": _TITLES[kind][0]}, axes)
     axes.grid(visible=False)
     heights, seconds = _heights(tradeoff.of(kind)).values(), [level.seconds / size for level in tradeoff.of(kind)]
@@ -69,14 +69,14 @@ def _front_points(places: dict[str, np.ndarray], levels: tuple[BenchmarkedMethod
 
 
 def _annotate_names(axes: Axes, levels: tuple[BenchmarkedMethod, ...], size: float, canvas: FigureCanvasAgg) -> None:
-    """Write the levels' names, each on the nearest side of its point where it hides nothing; `size`: of a unit of x."""
+    """Write the name of each method next to its point without overlaps; `size` is the unit of x."""
     points = {x.name: (x.seconds / size, y) for x, y in zip(levels, _heights(levels).values(), strict=True)}
     places = {name: axes.transData.transform(point) for name, point in points.items()}
     taken = [
         Bbox.from_extents(x - 8, y - 8, x + 8, y + 8) for x, y in [*places.values(), *_front_points(places, levels)]
     ]
     inside = axes.get_window_extent()
-    sides = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1)]  # the nearest to read first
+    sides = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1)]  # the preferred side first
     for level in levels:
         color = ALERT if level.dominated_by else MODEL
         for distance, (right, up) in itertools.product((9, 18, 30, 44), sides):
@@ -105,18 +105,20 @@ def write_tradeoff_page(path: str | os.PathLike[str], tradeoff: Tradeoff, origin
     names = ", ".join(f"{level.name} ({kind})" for kind, level in cheapest.items())
     front = {kind: "; ".join(map(_describe_level, tradeoff.front(kind))) for kind in KINDS}
     frame = PageSummary(
-        title="Speed against accuracy",
+        title="Accuracy and run time",
         subject=f"Measured on {tradeoff.record}; {tradeoff.machine['cpu']}, {tradeoff.machine['cores']} cores.",
         trusted=tradeoff.trusted,
-        verdict=f"The cheapest of each front: {names}" if tradeoff.trusted else f"{'; '.join(tradeoff.notes)}.",
+        verdict=f"Fastest methods on the Pareto fronts: {names}"
+        if tradeoff.trusted
+        else f"{'; '.join(tradeoff.notes)}.",
         findings={
-            "How to choose": "Of a front take the cheapest level whose error you accept; every other level costs more"
-            " and is off by no less than one on the front.",
+            "How to choose": "Choose the fastest method on the front whose error is acceptable. Every method off the"
+            " front is dominated: another method is no less accurate and no slower.",
         }
-        | {f"Front of {kind}, cheapest first": f"{levels}." for kind, levels in front.items()},
+        | {f"Pareto front of {kind}, fastest first": f"{levels}." for kind, levels in front.items()},
         answers=[
             Answer(
-                f"{kind}, cheapest", format_engineering(level.seconds, "s", 3), f"{level.name}, error {level.error:.2g}"
+                f"{kind}, fastest", format_engineering(level.seconds, "s", 3), f"{level.name}, error {level.error:.2g}"
             )
             for kind, level in cheapest.items()
         ],
@@ -144,7 +146,7 @@ def _describe_level(level: BenchmarkedMethod) -> str:
 
 
 def _plot(tradeoff: Tradeoff, kind: Kind) -> tuple[interactive.Plot, float]:
-    """Return levels by name, and the unit of the seconds."""
+    """Return the plot of one kind, and the unit of its time axis (s)."""
     levels, height = tradeoff.of(kind), _heights(tradeoff.of(kind))
     _, cost, error = _TITLES[kind]
     seconds = [level.seconds for level in levels]
@@ -166,10 +168,10 @@ def _plot(tradeoff: Tradeoff, kind: Kind) -> tuple[interactive.Plot, float]:
                 "text": [level.name for level in some],
                 "textposition": ["top right" if each < middle else "top left" for each in at],
                 "customdata": [_describe_level(level) for level in some],
-                "hovertemplate": "%{customdata}<extra></extra>",  # a height is not always the error
+                "hovertemplate": "%{customdata}<extra></extra>",  # an error of 0 is drawn at another height
             }
         )
     if kind == "uncertainty":
         ends, least = (min(seconds), max(seconds)), (tradeoff.resolution, tradeoff.resolution)
-        traces.append(interactive.line(x, y, ends, least, "cannot be told from 0 below", PRIOR, dash="dash"))
+        traces.append(interactive.line(x, y, ends, least, "smallest significant error", PRIOR, dash="dash"))
     return interactive.plot(x, (y, traces), size=400), x.size

@@ -1,4 +1,4 @@
-"""The levels themselves, timed: responses, likelihoods and uncertainties of one fit."""
+"""Benchmarks of the response, likelihood and posterior methods for one fit."""
 
 import dataclasses
 import functools
@@ -30,7 +30,7 @@ from fitact.sampling.posterior import Posterior
 
 @dataclasses.dataclass(frozen=True)
 class BenchmarkResult:
-    """Figures of one level; see `fitact.tradeoff.tradeoff.BenchmarkedMethod`."""
+    """Error and cost of one method; see `fitact.tradeoff.tradeoff.BenchmarkedMethod`."""
 
     name: str
     error: float
@@ -43,7 +43,7 @@ class BenchmarkResult:
 
 @dataclasses.dataclass(frozen=True)
 class _Job:
-    """Calls to time, of a value and its gradient: how many evaluations one is, what compiling and memory took."""
+    """Functions to time (value and gradient), evaluations per call, compilation time (s) and memory (bytes)."""
 
     call: Callable[[], Any]
     gradient: Callable[[], Any] | None = None
@@ -55,8 +55,8 @@ class _Job:
 def _compile_job(
     value: Callable[..., Array], gradient: Callable[..., Array], arguments: tuple[Any, ...], evaluations: int = 1
 ) -> _Job:
-    """Compile a function and its gradient ahead, so that what that takes is known."""
-    arguments = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), arguments)  # in the precision that is set
+    """Compile a function and its gradient in advance, and measure the compilation time."""
+    arguments = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), arguments)  # in the current precision of JAX
     start = time.perf_counter()
     value_program = jax.jit(value).lower(*arguments).compile()
     seconds = time.perf_counter() - start
@@ -74,7 +74,7 @@ def _compile_job(
 def _time_jobs(
     jobs: dict[str, _Job], errors: dict[str, float], details: dict[str, dict[str, Any]] | None = None
 ) -> list[BenchmarkResult]:
-    """Measure the median seconds of an evaluation and of a gradient, all in turn."""
+    """Measure the median time of an evaluation and of a gradient for each job, in interleaved rounds."""
     values = median_seconds({name: job.call for name, job in jobs.items()})
     gradients = median_seconds({name: job.gradient for name, job in jobs.items() if job.gradient is not None})
     return [
@@ -92,7 +92,7 @@ def _time_jobs(
 
 
 def median_seconds(jobs: dict[str, Callable[[], Any]], rounds: int = 9) -> dict[str, float]:
-    """Measure the median seconds of a call of each job, run in turn, for 5 ms a round at least."""
+    """Measure the median time (s) of a call of each job, in interleaved rounds of at least 5 ms."""
     counts: dict[str, int] = {}
     seconds: dict[str, list[float]] = {name: [] for name in jobs}
     for name, job in jobs.items():
@@ -100,24 +100,24 @@ def median_seconds(jobs: dict[str, Callable[[], Any]], rounds: int = 9) -> dict[
         counts[name] = max(1, math.ceil(5e-3 / timeit.timeit(job, number=1)))
     for number in range(rounds):
         for name, job in jobs.items():
-            if number < 3 or seconds[name][0] < 0.05:  # three rounds are enough for calls that take long
+            if number < 3 or seconds[name][0] < 0.05:  # three rounds suffice for long calls
                 seconds[name].append(timeit.timeit(job, number=counts[name]) / counts[name])
     return {name: statistics.median(measured) for name, measured in seconds.items()}
 
 
 class _Case(NamedTuple):
-    """A circuit and its drive: that of a fit, or the whole periods that a measured one shows."""
+    """Circuit and drive of a fit; a measured drive is cut to whole periods."""
 
     circuit: RC
     drive: Drive
     time: Float[np.ndarray, " times"]
     steady_state: bool
-    charges: Float[np.ndarray, " terms"]  # what the high-pass response at the first time is beyond the drive, V
+    charges: Float[np.ndarray, " terms"]  # high-pass response at the first time minus the drive, V
 
     @classmethod
     def from_fit(cls, fit: Fit) -> "_Case":
         record, choice = fit.record, fit.choice
-        circuit: Any = fit.likelihood.circuit(jnp.asarray(fit.theta))  # of constant skins
+        circuit: Any = fit.likelihood.circuit(jnp.asarray(fit.theta))  # constant skins only
         drive, time, steady_state = choice.drive, record.time - choice.shift, choice.steady_state
         if isinstance(drive, Sampled):
             samples, period = whole_periods(record)
@@ -127,12 +127,12 @@ class _Case(NamedTuple):
         return cls(circuit, drive, time, steady_state, np.array(first)[:, 0] - np.asarray(drive.value(time[0])))
 
     def with_sampled_drive(self) -> "_Case":
-        """Draw straight lines between the drive's values, from the charge that there is at the first time."""
+        """Return the case with a drive interpolated between the samples, starting from the initial charge."""
         return self._replace(drive=Sampled(self.time, self.drive.value(self.time)), steady_state=False)
 
 
 def benchmark_responses(fit: Fit, harmonics: Sequence[int] = (10, 100, 1000)) -> list[BenchmarkResult]:
-    """Measure levels of the response Vsc(t) at the fit's optimum; exact first. Call it in double precision."""
+    """Benchmark methods for the response Vsc(t) at the optimum, the exact one first, in double precision."""
     case = _Case.from_fit(fit)
 
     def exact(circuit: RC, drive: Drive, time: Array) -> Array:
@@ -155,7 +155,7 @@ def benchmark_responses(fit: Fit, harmonics: Sequence[int] = (10, 100, 1000)) ->
 
 
 def _response_job(level: Callable[[RC, Drive, Array], Array], case: _Case) -> _Job:
-    """Compile a level, and the gradient of the sum of its squares in the circuit's elements."""
+    """Compile a method, and the gradient of its sum of squares with respect to the circuit elements."""
 
     def squares(circuit: RC, drive: Drive, time: Array) -> Array:
         return jnp.sum(jnp.square(level(circuit, drive, time)))
@@ -164,7 +164,7 @@ def _response_job(level: Callable[[RC, Drive, Array], Array], case: _Case) -> _J
 
 
 def _make_ode_solver(case: _Case, rtol: float = 1e-6) -> Callable[[], np.ndarray]:
-    """Solve x' = (V - x) / tau for each time constant's low-pass state by scipy's LSODA; Vsc = sum weight (V - x)."""
+    """Return a solver (LSODA of SciPy) of x' = (V - x) / tau for each time constant, with Vsc = sum weight (V - x)."""
     weight, tau = (np.array(x, dtype=float) for x in case.circuit.terms()[:2])
     voltage, step = np.asarray(case.drive.value(case.time)), float(np.median(np.diff(case.time)))
 
@@ -181,9 +181,9 @@ def _make_ode_solver(case: _Case, rtol: float = 1e-6) -> Callable[[], np.ndarray
 def benchmark_likelihoods(
     full: Fit, compressed: dict[float, Fit], walkers: int = 128, batch_rows: int = 1_000_000
 ) -> list[BenchmarkResult]:
-    """Measure levels of the log-posterior at `walkers` points around the optimum; the full sum first.
+    """Benchmark methods for the log-posterior at `walkers` points around the optimum, the full sum first.
 
-    Only as many at a time as have `batch_rows` samples together, which bounds memory. Call it in double precision.
+    A batch holds at most `batch_rows` samples, which bounds the memory. Double precision is required.
     """
     models, details = {"full": full.likelihood.without_compression()}, {}
     for name, fit in _distinct_compressions(compressed).items():
@@ -202,7 +202,7 @@ def benchmark_likelihoods(
 
 
 def _distinct_compressions(fits: dict[float, Fit]) -> dict[str, Fit]:
-    """Return the compressed ones by name; tolerances that came to one and the same compression share a name."""
+    """Return the compressed fits by name; tolerances with the same compression share one name."""
     groups: dict[tuple[Any, ...], list[float]] = {}
     for tolerance, fit in fits.items():
         if fit.compression_error is not None:
@@ -211,7 +211,7 @@ def _distinct_compressions(fits: dict[float, Fit]) -> dict[str, Fit]:
 
 
 def format_tolerance(value: float) -> str:
-    """Write 1e-3, not 1e-03."""
+    """Return the tolerance as text such as 1e-3 (not 1e-03)."""
     return f"{value:.0e}".replace("e-0", "e-")
 
 
@@ -228,7 +228,7 @@ def _likelihood_job(model: Likelihood, points: Float[np.ndarray, "batch coordina
 
 
 class UncertaintyBenchmark(NamedTuple):
-    """Levels of uncertainty, emcee on the full sum first; what its draws can tell; whether they converged."""
+    """Benchmarks of the posterior methods, resolution of their errors, and convergence of the reference."""
 
     levels: list[BenchmarkResult]
     resolution: float
@@ -238,15 +238,15 @@ class UncertaintyBenchmark(NamedTuple):
 def benchmark_uncertainties(
     full: Fit, compressed: Fit, report: Callable[[str], None], runs: int = 3
 ) -> UncertaintyBenchmark:
-    """Draw by every level, in turn, and measure what is off from the draws of emcee on the full sum.
+    """Sample by each method in interleaved rounds, and compare the draws with emcee on the full sum.
 
-    There are so many `runs` of each level, after one that compiles. An interrupt while sampling is raised again.
+    Each method has `runs` runs, after one that compiles. An interrupt during sampling is raised again.
     """
     jobs: dict[str, tuple[Fit, Level]] = {"emcee, full": (full, "emcee")}
     jobs |= {level: (compressed, level) for level in ("laplace", "psis", "emcee")}
     posteriors: dict[str, list[Posterior]] = {name: [] for name in jobs}
     for seed in range(runs + 1):
-        report(f"uncertainties, round {seed + 1} of {runs + 1}")
+        report(f"posterior methods, round {seed + 1} of {runs + 1}")
         for name, (fit, level) in jobs.items():
             posterior = sample(fit, level=level, seed=seed, progress=False)
             if posterior.convergence.interrupted:
@@ -256,15 +256,15 @@ def benchmark_uncertainties(
     reference = draws["emcee, full"]
     levels = [_summarize_runs(name, posteriors[name], posterior_discrepancies(draws[name], reference)) for name in jobs]
     fewest = min(sum(min(p.convergence.ess_min, p.log_prob.size) for p in ps) for ps in posteriors.values())
-    # 2.11 = sqrt(0.05 0.95) over the normal density there: the sd of a 5 % quantile, times sqrt(draws); 2.5 of them are
-    # what the largest of ten differences is hardly ever above
+    # 2.11 = sqrt(0.05 0.95) over the normal density there, i.e. the sd of a 5 % quantile times sqrt(draws); the largest
+    # of ten differences hardly ever exceeds 2.5 sd
     resolution = 2.5 * 2.11 * math.sqrt(2.0 / fewest)
     converged = all(posterior.convergence.converged for posterior in posteriors["emcee, full"])
     return UncertaintyBenchmark(levels, resolution, converged)
 
 
 def _pool_draws(posteriors: Sequence[Posterior]) -> dict[str, Float[np.ndarray, " draws"]]:
-    """Return logarithms of Rsc, where it is free, and of the mean force."""
+    """Return the logarithms of Rsc (if it is free) and of the mean force, pooled over all runs."""
     names, pooled = posteriors[0].fit.point_names, {}
     if "Rsc" in names:
         pooled["Rsc"] = np.concatenate([p.points[..., names.index("Rsc")].ravel() for p in posteriors])
@@ -272,7 +272,7 @@ def _pool_draws(posteriors: Sequence[Posterior]) -> dict[str, Float[np.ndarray, 
 
 
 def posterior_discrepancies(draws: dict[str, np.ndarray], reference: dict[str, np.ndarray]) -> dict[str, float]:
-    """Return differences of mean, sd and quantiles, in standard deviations of the reference, by name."""
+    """Return the differences of mean, sd and quantiles by name, in standard deviations of the reference."""
     statistic: dict[str, Callable[[np.ndarray], Any]] = {"mean": np.mean, "sd": np.std}
     statistic |= {f"q{round(100 * q):02}": functools.partial(np.quantile, q=q) for q in (0.05, 0.5, 0.95)}
     return {

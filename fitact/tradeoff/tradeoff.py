@@ -1,4 +1,4 @@
-"""Cost and error of each level of the model, measured on one record, in one run, on this machine."""
+"""Error and cost of each response, likelihood and posterior method, measured on one record and this machine."""
 
 import dataclasses
 import os
@@ -23,34 +23,34 @@ from fitact.units import format_engineering
 
 Kind: TypeAlias = Literal["response", "likelihood", "uncertainty"]
 
-_DEFAULT_TOLERANCE = 1e-3  # of `fitact.fit`, on which the levels of uncertainty stand
+_DEFAULT_TOLERANCE = 1e-3  # default of `fitact.fit`; the posterior methods use this fit
 _WIDTHS = [24, 10, 11, 9, 11, 10, 11]
-COLUMNS = ("level", "error", "time", "ratio", "gradient", "compile", "memory")
+COLUMNS = ("method", "error", "time", "ratio", "gradient", "compile", "memory")
 KINDS: dict[Kind, str] = {
     "response": "error of Vsc, relative rms; time of one evaluation",
-    "likelihood": "error of its logarithm; time of one evaluation, of many at once",
+    "likelihood": "error of the log-likelihood; time of one evaluation in a batch",
     "uncertainty": "error in posterior standard deviations; time of one effective draw",
 }
 
 
 @dataclasses.dataclass(frozen=True)
 class BenchmarkedMethod:
-    """One level as measured."""
+    """Error and cost of one method."""
 
     kind: Kind
     name: str  # "exact", "harmonic(100)", "compressed(1e-3)", "psis", ...
-    error: float  # against the kind's reference; see `Tradeoff`
-    seconds: float  # of one evaluation (of one walker in a batch), or of one effective draw of the mean force
-    ratio: float  # `seconds` over those of the exact level
-    gradient_seconds: float | None  # of one gradient; None: it has none
-    compile_seconds: float  # before the first evaluation, beyond its time
-    memory: int | None  # bytes that an evaluation takes, or that the draws do; None: not known
-    dominated_by: str  # a level that is off by no more and costs no more, one of both less; "": it is on the front
-    details: dict[str, Any]  # figures of its own
+    error: float  # relative to the reference method; see `Tradeoff`
+    seconds: float  # time of one evaluation (of one walker in a batch), or of one effective draw of the mean force
+    ratio: float  # `seconds` over the time of the exact method
+    gradient_seconds: float | None  # time of one gradient, or None
+    compile_seconds: float  # compilation time
+    memory: int | None  # bytes for an evaluation, or for the draws; None if unknown
+    dominated_by: str  # a method that is no less accurate and no slower, and better in one; "" on the Pareto front
+    details: dict[str, Any]  # additional figures of this method
 
     @property
     def cells(self) -> tuple[str, ...]:
-        """A row of a table of `COLUMNS`, for people."""
+        """Row of a table with `COLUMNS`, as text."""
         return (
             self.name,
             f"{self.error:.2g}",
@@ -68,20 +68,20 @@ class BenchmarkedMethod:
 
 @dataclasses.dataclass(frozen=True)
 class Tradeoff:
-    """Levels of response, likelihood and uncertainty: error against the best reference, and cost.
+    """Error and cost of the methods for response, likelihood and uncertainty (posterior).
 
-    A response's error is the rms difference of Vsc from the exact one over that one's rms; a likelihood's the
-    largest difference of the log-posterior from the full sum, over draws around the optimum and up to a constant;
-    an uncertainty's the largest difference, in posterior standard deviations, of mean, sd and 5, 50 and 95 %
-    quantiles of log Rsc and log force from those of emcee on the full sum.
+    The error of a response is the rms difference to the exact Vsc over the rms of the exact Vsc. The error of a
+    likelihood is the largest difference of the log-posterior to the full sum, up to a constant, over draws around the
+    optimum. The error of an uncertainty is the largest difference to emcee on the full sum, in posterior standard
+    deviations, of mean, sd and 5, 50 and 95 % quantiles of log Rsc and log force.
 
     Attributes:
-        levels: all that were measured.
-        record: what they were measured on, in words.
-        resolution: errors of an uncertainty below it cannot be told from 0 by so many draws, and count as alike.
-        trusted: whether the record's fit and the reference's draws are.
-        machine: what ran it.
-        notes: sentences.
+        levels: results of all methods.
+        record: description of the record.
+        resolution: smallest significant error of an uncertainty, by the number of draws; smaller ones count as equal.
+        trusted: whether the fit of the record is reliable and the reference chain has converged.
+        machine: description of the machine.
+        notes: notes as sentences.
     """
 
     levels: tuple[BenchmarkedMethod, ...]
@@ -92,15 +92,15 @@ class Tradeoff:
     notes: tuple[str, ...]
 
     def of(self, kind: Kind) -> tuple[BenchmarkedMethod, ...]:
-        """Return the levels of one kind."""
+        """Return the methods of one kind."""
         return tuple(level for level in self.levels if level.kind == kind)
 
     def front(self, kind: Kind) -> tuple[BenchmarkedMethod, ...]:
-        """Return the Pareto front of one kind, cheapest first."""
+        """Return the Pareto front of one kind, fastest first."""
         return tuple(sorted((level for level in self.of(kind) if not level.dominated_by), key=lambda x: x.seconds))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what `fitact tradeoff --json` prints and tradeoff.json holds."""
+        """Return the JSON output of `fitact tradeoff`, also written to tradeoff.json."""
         return dataclasses.asdict(self)
 
     def __str__(self) -> str:
@@ -111,8 +111,8 @@ class Tradeoff:
 
     @property
     def resolved(self) -> str:
-        """From where on errors of an uncertainty mean something."""
-        return f"errors of uncertainty below {self.resolution:.2g} cannot be told from 0"
+        """Smallest significant error of an uncertainty, as text."""
+        return f"errors of uncertainty below {self.resolution:.2g} are not significant"
 
 
 def measure_tradeoff(
@@ -123,26 +123,26 @@ def measure_tradeoff(
     tolerances: Sequence[float] = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6),
     runs: int = 3,
 ) -> Tradeoff:
-    """Measure every level's error and cost on a record (V and Vsc), or on one simulated from the scene.
+    """Measure the error and the cost of each method on a record (V and Vsc), or on one simulated from the scene.
 
-    Times are medians of interleaved rounds. Takes a minute or two.
+    Times are medians of interleaved rounds. The measurement takes one or two minutes.
 
     Args:
-        record: None: simulated.
-        scene: None: the paper's.
-        progress: tell it on standard error.
-        tolerances: of the compressed log-likelihood; 1e-3 must be among them.
-        runs: of each level of uncertainty, after one that compiles.
+        record: record, or None to simulate one.
+        scene: scene, or None for the scene of the reference paper.
+        progress: whether to report the progress on standard error.
+        tolerances: errors allowed for the compressed log-likelihood; they must include 1e-3.
+        runs: number of runs of each posterior method, after one that compiles.
 
     Raises:
         InputError: the record or the scene cannot be fitted, or the scene does not measure Vsc.
     """
     stated = scene or Scene()
     if "Vsc" not in stated.measurement.channels:
-        raise InputError("scene: [measurement] channels has no Vsc, which the levels are compared on; add it")
+        raise InputError("scene: [measurement] channels has no Vsc, on which the methods are compared; add it")
     if stated.skin.level != "constant":
         raise InputError(
-            f"scene: [skin] level = '{stated.skin.level}': the levels are those of a constant skin; leave it out"
+            f"scene: [skin] level = '{stated.skin.level}': the methods are compared for a constant skin only; remove it"
         )
     stated.require_available(fit=True)
 
@@ -163,7 +163,7 @@ def measure_tradeoff(
     draws, resolution, converged = timings.benchmark_uncertainties(full, fits[_DEFAULT_TOLERANCE], say, runs)
     return Tradeoff(
         levels=(
-            *_rank_results("response", responses, 1e-12),  # what docs/numerics.md guarantees of Vsc
+            *_rank_results("response", responses, 1e-12),  # accuracy of Vsc by docs/numerics.md
             *_rank_results("likelihood", likelihoods, 0.0),
             *_rank_results("uncertainty", draws, resolution),
         ),
@@ -176,7 +176,7 @@ def measure_tradeoff(
 
 
 def _rank_results(kind: Kind, rows: Sequence[BenchmarkResult], resolution: float) -> list[BenchmarkedMethod]:
-    """Add ratios to the reference, which comes first, and who dominates whom; errors below `resolution` are alike."""
+    """Add time ratios to the first row (the reference), and dominance; errors below `resolution` count as equal."""
     better = dominators([row.seconds for row in rows], [max(row.error, resolution) for row in rows])
     names = ["" if j is None else rows[j].name for j in better]
     return [
@@ -186,10 +186,10 @@ def _rank_results(kind: Kind, rows: Sequence[BenchmarkResult], resolution: float
 
 
 def dominators(costs: Sequence[float], errors: Sequence[float]) -> list[int | None]:
-    """Return for each level the one on the Pareto front that dominates it, the cheapest of several; None: it is on it.
+    """Return for each method the fastest one on the Pareto front that dominates it; None on the front itself.
 
-    One dominates another when neither its cost nor its error is larger, and one of both is smaller. Of equal
-    levels none dominates the other.
+    A method dominates another if neither its cost nor its error is larger, and at least one is smaller. Equal methods
+    do not dominate each other.
     """
     order = sorted(range(len(costs)), key=lambda i: (costs[i], errors[i]))
     dominator: list[int | None] = [None] * len(costs)
@@ -207,17 +207,19 @@ def dominators(costs: Sequence[float], errors: Sequence[float]) -> list[int | No
 def _notes(full: Fit, fits: dict[float, Fit], converged: bool) -> tuple[str, ...]:
     notes = []
     if not full.trusted:
-        notes.append(f"the fit that the levels stand on must not be trusted: {full.message}")
+        notes.append(f"the fit used for the comparison is unreliable: {full.message}")
     if not converged:
-        notes.append("emcee on the full sum, the reference of the uncertainties, has not converged")
+        notes.append("emcee on the full sum, the reference for the uncertainties, has not converged")
     for tolerance, fitted in fits.items():
         if fitted.compression_error is None:
-            notes.append(f"not compressed at {timings.format_tolerance(tolerance)}, since {fitted.full_because}")
+            notes.append(
+                f"not compressed at tolerance {timings.format_tolerance(tolerance)}, because {fitted.full_because}"
+            )
     return tuple(notes)
 
 
 def describe_machine() -> dict[str, Any]:
-    """Describe what a result was measured on, so that runs can be compared."""
+    """Return a description of the machine, so that runs can be compared."""
     return {
         "cpu": _cpu(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),

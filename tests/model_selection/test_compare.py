@@ -137,8 +137,8 @@ def test_verdicts():
     simpler = ranked(scored("a", FLAT, 15.0), scored("b", [x - 0.1 for x in NOISY], 0.0))
     assert simpler.preferred == "b"
     assert simpler.verdict == (
-        "b is preferred because of its BIC: a predicts the held-out blocks better by an elpd of only 1.60 ± 4.13, and b has the"
-        " lower BIC, by 15."
+        "b is preferred because of its BIC: a predicts the held-out blocks better by an elpd of only"
+        " 1.60 ± 4.13, and b has a BIC that is lower by 15."
     )
     tied = ranked(scored("a", FLAT, 5.0), scored("b", [x - 0.1 for x in NOISY], 0.0))
     assert tied.preferred is None

@@ -220,8 +220,8 @@ def test_no_name_of_a_record_becomes_markup(pages, name: str):
 
 
 VERDICTS = {
-    "plan": "The planned model keeps the tolerance of 1 % of the force at the nominal values, but not over the prior",
-    "tradeoff": "The cheapest of each front: best response (response), best likelihood (likelihood)",
+    "plan": "The planned model is within the force tolerance of 1 % at the nominal values, but not over the prior",
+    "tradeoff": "Fastest methods on the Pareto fronts: best response (response), best likelihood (likelihood)",
     "measurement": "Most for its effort: series resistor, done well, from ± 5 % to ± 0.13 %",
     "drive": "The smallest peak to peak within the limits: sine, 500 V",
     "population": "Trusted: the chain has converged",
@@ -260,7 +260,7 @@ SHOWN = {
     ],
     "tradeoff": [
         *("best response", "2 µs", "3 µs", "0.70 s", "8 kB", "worse uncertainty", "0.12", "4 µs", "0.512"),
-        *("errors of uncertainty below 0.046 cannot be told from 0", "a processor"),
+        *("errors of uncertainty below 0.046 are not significant", "a processor"),
     ],
     "measurement": [
         *(
@@ -351,7 +351,7 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize(
     ("arguments", "title"),
     [
-        (("plan", "scene.toml"), "Which model the scene requires"),
+        (("plan", "scene.toml"), "Simplest model of the scene"),
         pytest.param(("design", "measurement", "scene.toml"), "What to measure next", marks=pytest.mark.thorough),
         pytest.param(
             ("design", "drive", "scene.toml"),

@@ -174,4 +174,4 @@ def test_whole(record: fitact.Record, capsys: pytest.CaptureFixture[str]):
     assert all(level.error < 0.1 for level in found.of("uncertainty"))  # the posterior is nearly normal
     out = capsys.readouterr()
     assert out.out == ""
-    assert "tradeoff: uncertainties, round 2 of 2" in out.err
+    assert "tradeoff: posterior methods, round 2 of 2" in out.err
