@@ -44,8 +44,7 @@ def stated(command: str) -> list[Stated]:
     page = (ROOT / "docs" / "contracts.md").read_text(encoding="utf-8")
     section = next(part for part in page.split("\n## ") if part.startswith(f"`fitact {command} --json`"))
     found = []
-    for row in re.findall(r"^\| (`.*)\|$", section, re.MULTILINE):
-        keys, types, meaning = (cell.strip() for cell in row.split("|"))
+    for keys, types, meaning in re.findall(r"^- (`.*?`): ([^;\n]+)(?:; (.*))?$", section, re.MULTILINE):
         for key in re.findall(r"`(.+?)`", keys):
             always = not meaning.startswith("where ")
             if types == "summary":
