@@ -1,1 +1,1 @@
-"""Synthetic records by routes of their own, scipy and ngspice: nothing here imports fitact, whose tests they serve."""
+"""Synthetic records by scipy and ngspice for the tests of fitact, independent of it: nothing here imports fitact."""

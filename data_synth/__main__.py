@@ -1,4 +1,4 @@
-"""python -m data_synth: records from scenes and recipes."""
+"""Command line: `python -m data_synth` makes records from scenes and recipes."""
 
 import argparse
 import os
@@ -10,21 +10,21 @@ RECORDS = Path(__file__).parent / "records"
 
 
 def main() -> int:
-    """Exit code 0; 2 with one line on standard error for what is refused."""
+    """Run the command; return 0, or 2 after one line on standard error for invalid input."""
     parser = argparse.ArgumentParser(prog="python -m data_synth", description="Synthetic records, by scipy or ngspice.")
     commands = parser.add_subparsers(dest="command", required=True)
-    one = commands.add_parser("make", help="the records of recipes, or of scenes as they are")
+    one = commands.add_parser("make", help="make the records of recipes, or of plain scenes")
     one.add_argument("recipe", nargs="+", type=Path, help="TOML; data_synth/README.md lists the keys of recipes")
-    one.add_argument("--seed", type=int, help="in place of the recipe's")
-    one.add_argument("--route", choices=["scipy", "ngspice"], help="in place of the recipe's")
+    one.add_argument("--seed", type=int, help="replaces the recipe's")
+    one.add_argument("--route", choices=["scipy", "ngspice"], help="replaces the recipe's")
     one.add_argument("--format", default="csv.gz", choices=["csv.gz", "csv", "npz", "mat", "h5"])
-    committed = commands.add_parser("committed", help="the records in data_synth/records that have a recipe, again")
+    committed = commands.add_parser("committed", help="make the records in data_synth/records that have a recipe again")
     for command in (one, committed):
         command.add_argument("--out", type=Path, required=True, help="folder for NAME.csv.gz and NAME.json")
     chosen = parser.parse_args()
 
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads would wait for each other
-    from data_synth.errors import RecipeError  # what follows takes a second to import
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads would only wait
+    from data_synth.errors import RecipeError  # imported late, because what follows takes a second
 
     try:
         if chosen.command == "committed":
@@ -41,12 +41,12 @@ def main() -> int:
 
 
 def _is_route_available(path: Path) -> bool:
-    """Whether its route is there; says so where it is not."""
+    """Return whether the recipe's route is installed; print a line if it is not."""
     from data_synth import recipe, spice
 
     there = recipe.load(path).route != "ngspice" or spice.is_installed()
     if not there:
-        print(f"{path.name}: left out, since ngspice is not installed", file=sys.stderr)
+        print(f"{path.name}: skipped, because ngspice is not installed", file=sys.stderr)
     return there
 
 

@@ -1,4 +1,4 @@
-"""Drives: the voltage as a function of time that is smooth between corners."""
+"""Drives: the voltage as a function of time, smooth between corners."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -9,9 +9,9 @@ import numpy as np
 
 from data_synth.errors import RecipeError
 
-_STRAIGHT, _SMOOTH = 1, 8  # degree of the polynomial that a drive is within a step
-_BESIDE = 1e-7  # of a stretch: what is there is not beyond its end
-_STEPS = 16  # of a cycle at least, for that degree to leave 1e-14 of a sine
+_STRAIGHT, _SMOOTH = 1, 8  # degree of the polynomial that represents a drive within a step
+_BESIDE = 1e-7  # fraction of a stretch: distance from its ends at which the drive is evaluated
+_STEPS = 16  # steps per cycle, so that this degree represents a sine to 1e-14
 
 Values = Callable[[np.ndarray], np.ndarray]
 
@@ -19,10 +19,10 @@ Values = Callable[[np.ndarray], np.ndarray]
 class Drive(NamedTuple):
     """V(t) between corners.
 
-    value: V at times (s); which side a corner takes is not said.
-    corners: times (s) in an interval at which the drive jumps or bends.
-    degree: of the polynomial that it is, to rounding, over `longest` (s).
-    period: s; None: it does not repeat.
+    value: V at times (s); the side taken at a corner is unspecified.
+    corners: times (s) of jumps and bends in an interval.
+    degree: degree of the polynomial that equals the drive, to rounding, over `longest` (s).
+    period: s; None if the drive does not repeat.
     jumps: whether a corner is a jump.
     """
 
@@ -35,14 +35,14 @@ class Drive(NamedTuple):
 
 
 def make_drive(section: Mapping[str, Any]) -> Drive:
-    """The drive of a scene's section [drive], from rest where that says so.
+    """Return the drive of a scene's section [drive], from rest if `steady_state` is false.
 
     Raises:
-        RecipeError: the waveform is measured, so that only a record has it.
+        RecipeError: the waveform is measured, so only a record has it.
     """
     waveform = section["waveform"]
     if waveform == "measured":
-        raise RecipeError("[drive] waveform = 'measured' gives no drive to compute; state one under [truth.drive]")
+        raise RecipeError("[drive] waveform = 'measured' cannot be computed; state a waveform under [truth.drive]")
     if waveform == "chirp":
         return _chirp(section)
     if waveform == "burst":
@@ -115,7 +115,7 @@ def _no_corners(start: float, end: float) -> np.ndarray:
 
 
 def _gate_drive(wave: Drive, begin: float, end: float) -> Drive:
-    """The wave from `begin` to `end` (s), and zero before and after."""
+    """Return the wave from `begin` to `end` (s), and zero before and after."""
 
     def value(time: np.ndarray) -> np.ndarray:
         inside = (time >= begin) & (time < end)
@@ -133,12 +133,12 @@ def _gate_drive(wave: Drive, begin: float, end: float) -> Drive:
 
 
 def _sample_times(wave: Drive) -> np.ndarray:
-    """Times (s) over which the wave shows its height."""
+    """Return times (s) that cover the wave's range."""
     return np.linspace(0.0, wave.period or 64.0 * wave.longest, 64)
 
 
 def end_values(drive: Drive, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """V at the start and at the end of each stretch between neighbouring times, of which none holds a corner inside."""
+    """Return V at the start and end of each stretch between neighbouring times; no stretch has a corner inside."""
     length = np.diff(corners)
     if drive.degree > _STRAIGHT:
         return drive.value(corners[:-1] + _BESIDE * length), drive.value(corners[1:] - _BESIDE * length)

@@ -1,5 +1,5 @@
-"""What is refused, in one sentence."""
+"""Error for invalid input."""
 
 
 class RecipeError(ValueError):
-    """A scene, a recipe or a file that cannot be used; the sentence names place and remedy."""
+    """Scene, recipe or file that cannot be used; the message names the place and the remedy."""

@@ -1,4 +1,4 @@
-"""Records and their truth as files, written under another name first."""
+"""Files of records and their true values, written under a temporary name first."""
 
 import gzip
 import json
@@ -17,30 +17,30 @@ _UNITS = {"time": "s", **UNITS}
 
 
 def write_record(path: Path, time: np.ndarray, channels: Columns) -> None:
-    """Time (s) and channels (V, V, A), in the format of the name's end: .csv, .csv.gz, .npz, .mat or .h5.
+    """Write time (s) and channels (V, V, A); the suffix selects .csv, .csv.gz, .npz, .mat or .h5.
 
     Raises:
-        RecipeError: the name ends otherwise.
+        RecipeError: another suffix.
     """
     write = _FORMATS.get(file_format(path))
     if write is None:
-        raise RecipeError(f"{path}: no format of that name; end it in {', '.join(_FORMATS)}")
+        raise RecipeError(f"{path}: no format has this suffix; use one of {', '.join(_FORMATS)}")
     _write_atomically(path, lambda file: write(file, {"time": time, **channels}))
 
 
 def file_format(path: Path) -> str:
-    """The end of the name: csv.gz, csv, npz, mat, h5, or something else."""
+    """Return the suffix csv.gz, csv, npz, mat or h5, or \"\" for another one."""
     return next((end for end in _FORMATS if path.name.endswith(f".{end}")), "")
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Indented."""
+    """Write indented JSON."""
     text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
     _write_atomically(path, lambda file: file.write(text.encode()))
 
 
 def _csv(columns: Columns) -> bytes:
-    """Times to their last digit, values to nine."""
+    """Return CSV with all digits of the times and nine digits of the values."""
     rows = [",".join(f"{name}_{_UNITS[name]}" for name in columns)]
     for time, *values in zip(*(each.tolist() for each in columns.values()), strict=True):
         rows.append(",".join([repr(time), *(f"{value:.9g}" for value in values)]))
@@ -78,7 +78,7 @@ FORMATS = tuple(_FORMATS)
 
 
 def _write_atomically(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
-    """A file that is there whole or not at all."""
+    """Write a file completely or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:

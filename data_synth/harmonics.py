@@ -1,4 +1,4 @@
-"""Skins whose R and C follow the frequency, in the steady state: sums of harmonics."""
+"""Responses of skins whose R and C depend on the frequency, in the steady state, by sums of harmonics."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,9 +11,9 @@ from data_synth.network import Branch, Network, gains, plain_admittance, state_s
 from data_synth.response import response
 
 HARMONICS = 20_000
-_BLOCK = 250  # harmonics at a time
-_NOTHING = 1e-15  # of the largest
-# the paper, section 3.1
+_BLOCK = 250  # harmonics summed at a time, which bounds memory
+_NOTHING = 1e-15  # fraction of the largest harmonic below which one is neglected
+# the reference paper, section 3.1
 _FREQUENCY = np.array([10.0, 100.0, 1000.0])  # Hz
 _RESISTANCE = np.array([200.0, 160.0, 80.0]) / 160.0
 _CAPACITANCE = np.array([44.25, 22.0, 8.85]) / 22.0
@@ -22,18 +22,18 @@ _CAPACITANCE = np.array([44.25, 22.0, 8.85]) / 22.0
 def harmonic_response(
     circuit: Network, skin: Mapping[str, Any], drive: Drive, time: np.ndarray, count: int = HARMONICS
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """V, Vsc and I at `time` in the steady state, with the outer layers of skin dispersive or fractional.
+    """Return V, Vsc and I at `time` in the steady state, with dispersive or fractional outer skin layers.
 
-    A network whose skin is that of the highest of `count` harmonics is computed in time, the rest as a sum.
+    The response of the skin at the highest of `count` harmonics is computed in time, the difference as a sum.
 
     Raises:
-        RecipeError: the drive does not repeat, or jumps, for which a fractional skin would need far more harmonics.
+        RecipeError: the drive does not repeat, or jumps (a fractional skin would then need far more harmonics).
     """
     if skin["level"] == "fractional" and drive.jumps:
-        raise RecipeError("[skin] level = 'fractional' takes no drive that jumps here; give it a rise time (trapezoid)")
+        raise RecipeError("[skin] level = 'fractional' excludes drives that jump; state a trapezoid with a rise time")
     if drive.period is None:
         raise RecipeError(
-            f"[skin] level = '{skin['level']}' has a steady state only; give it a drive that repeats, not from rest"
+            f"[skin] level = '{skin['level']}' needs the steady state; state a periodic drive, not from rest"
         )
     omega = 2.0 * np.pi / drive.period * np.arange(1, count + 1)
     values = {(start, end): (R, C) for start, end, R, C in circuit.layers}
@@ -62,7 +62,7 @@ def harmonic_response(
 
 
 def _layer_admittance(R: float, C: float, skin: Mapping[str, Any], omega: np.ndarray) -> np.ndarray:
-    """Admittance (S) of an outer layer of `R` ohm and `C` F."""
+    """Return the admittance (S) of an outer layer of `R` ohm and `C` F."""
     if skin["level"] == "fractional":
         return (1.0 + (1j * omega * R * C) ** skin["alpha"]) / R
     where, knots = np.log(np.clip(omega / (2.0 * np.pi), _FREQUENCY[0], _FREQUENCY[-1])), np.log(_FREQUENCY)
@@ -71,7 +71,7 @@ def _layer_admittance(R: float, C: float, skin: Mapping[str, Any], omega: np.nda
 
 
 def fourier_coefficients(drive: Drive, count: int) -> np.ndarray:
-    """Fourier's c_1 to c_count (V) of a drive that repeats: v = sum of c_n exp(2 pi i n t / period) over all n."""
+    """Return the Fourier coefficients c_1 to c_count (V) of a periodic drive, v = sum c_n exp(2 pi i n t / period)."""
     assert drive.period is not None
     if drive.degree > 1:
         points = 1 << int(np.ceil(np.log2(4.0 * drive.period / drive.longest)))

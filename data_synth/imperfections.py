@@ -1,6 +1,6 @@
-"""What instruments and surroundings add to a channel, in the order in which they act.
+"""Imperfections of a channel due to instruments and surroundings, in the order in which they act.
 
-Each kind has random numbers of its own for each channel and finger, so that adding one changes no other.
+Each kind, channel and finger has its own random numbers, so adding one imperfection does not change the others.
 """
 
 import math
@@ -11,17 +11,17 @@ import numpy as np
 
 from data_synth.recipe import UNITS
 
-_STREAMS = ("population", "clock", "hum", "pink", "white", "missing")  # add at the end only
+_STREAMS = ("population", "clock", "hum", "pink", "white", "missing")  # append only: the index seeds the random numbers
 _CHANNELS = tuple(UNITS)
 
 
 def generator(seed: int, finger: int, kind: str, channel: str = "V") -> np.random.Generator:
-    """The random numbers of one kind of imperfection."""
+    """Return the random generator of one kind of imperfection."""
     return np.random.default_rng([seed, finger, _STREAMS.index(kind), _CHANNELS.index(channel)])
 
 
 def sampling_times(time: np.ndarray, clock: Mapping[str, Any], seed: int, finger: int) -> np.ndarray:
-    """When samples are taken (s) that the record says were taken at `time`: jitter, normal, and a late trigger."""
+    """Return the true times (s) of samples recorded as taken at `time`, with normal jitter and a late trigger."""
     jitter = clock["jitter"] * generator(seed, finger, "clock").standard_normal(time.size) if clock["jitter"] else 0.0
     return time + clock["trigger_error"] + jitter
 
@@ -29,7 +29,7 @@ def sampling_times(time: np.ndarray, clock: Mapping[str, Any], seed: int, finger
 def add_imperfections(
     values: np.ndarray, channel: str, time: np.ndarray, parts: Mapping[str, Mapping[str, Any]], seed: int, finger: int
 ) -> np.ndarray:
-    """A channel as it is recorded."""
+    """Return a channel as it is recorded."""
     share = (time - time[0]) / (time[-1] - time[0])
     values = values * parts["gain"][channel] + (parts["offset"][channel] or 0.0)
     values = values + (parts["drift"][channel] or 0.0) * share
@@ -50,7 +50,7 @@ def add_imperfections(
 
 
 def hum(time: np.ndarray, section: Mapping[str, Any], phases: np.ndarray) -> np.ndarray:
-    """Mains and its harmonics, of amplitudes relative to the whole's; all channels of a record have one phase."""
+    """Return mains hum with harmonics of the stated relative amplitudes; all channels of a record share the phases."""
     orders = np.arange(1, len(phases) + 1)
     angle = 2.0 * np.pi * section["frequency"] * np.outer(time, orders) + phases
     return np.sin(angle) @ np.array(section["harmonics"])
@@ -59,14 +59,14 @@ def hum(time: np.ndarray, section: Mapping[str, Any], phases: np.ndarray) -> np.
 def power_law_noise(
     size: int, step: float, exponent: float, corner: float | None, rng: np.random.Generator
 ) -> np.ndarray:
-    """Normal noise of expected variance 1 whose power falls as frequency^-exponent above `corner` (Hz), flat below.
+    """Return normal noise of expected variance 1 with power ~ frequency^-exponent above `corner` (Hz), flat below.
 
-    Without a corner it is the lowest frequency that a record of `size` samples of `step` s shows. Made on a circle
-    of twice the record, so that its end knows nothing of its beginning, without a mean over the circle.
+    The default corner is the lowest frequency in a record of `size` samples of `step` s. The noise is made on a circle
+    of twice the record, so that its end does not depend on its start; its mean over the circle is zero.
     """
     frequency = np.fft.rfftfreq(2 * size, step)[1:]
     power = np.maximum(frequency, corner or 1.0 / (size * step)) ** -exponent
-    twice = np.append(np.full(frequency.size - 1, 2.0), 1.0)  # a spectrum's two sides; the highest frequency has one
+    twice = np.append(np.full(frequency.size - 1, 2.0), 1.0)  # a spectrum has two sides, its highest frequency one
     waves = rng.standard_normal(frequency.size) + 1j * rng.standard_normal(frequency.size)
     waves[-1] = math.sqrt(2.0) * waves[-1].real
     heights = np.sqrt(0.5 * power / np.sum(twice * power)) * waves
@@ -74,11 +74,11 @@ def power_law_noise(
 
 
 def quantize(values: np.ndarray, span: float, bits: int) -> np.ndarray:
-    """To the nearest of 2^bits levels over `span` around 0, the lowest at -span / 2; values beyond get the last one."""
+    """Round to the nearest of 2^bits levels over `span` around 0, the lowest at -span / 2, and saturate beyond."""
     step, half = span / 2**bits, 2 ** (bits - 1)
     return np.clip(np.round(values / step), -half, half - 1) * step
 
 
 def sample_mask(size: int, share: float, seed: int, finger: int) -> np.ndarray:
-    """Which samples are there: each is lost, with its time, with probability `share`."""
+    """Return a mask of the samples kept; each is lost, with its time, with probability `share`."""
     return generator(seed, finger, "missing").uniform(size=size) >= share

@@ -1,4 +1,4 @@
-"""Tables of keys: what a file may say, in which unit, and what stands where it is silent."""
+"""Tables of the keys in a file, with units and defaults, and their validation."""
 
 import difflib
 import functools
@@ -12,7 +12,7 @@ from data_synth.errors import RecipeError
 
 
 class Quantity(NamedTuple):
-    """A number in an SI unit, "" for a plain one; above `low`, or from it on with `least`."""
+    """Number in an SI unit ("" for a ratio), above `low`, or at least `low` with `least`."""
 
     unit: str
     default: float | None = None
@@ -21,27 +21,27 @@ class Quantity(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """One of some words, numbers or truths; the first is the default."""
+    """One of several values; the first is the default."""
 
     options: tuple[Any, ...]
 
 
 class ListKey(NamedTuple):
-    """A list, of quantities or of words."""
+    """List of quantities or choices."""
 
     of: Quantity | Choice
     default: tuple[Any, ...] | None = None
 
 
 class WholeNumber(NamedTuple):
-    """A whole number."""
+    """Whole number."""
 
     default: int | None
     least: int = 0
 
 
 class IgnoredKey(NamedTuple):
-    """What says nothing about a record: known, and passed over."""
+    """Known key without effect on a record."""
 
 
 Key = Quantity | Choice | ListKey | WholeNumber | IgnoredKey
@@ -49,10 +49,10 @@ Table = Mapping[str, Mapping[str, Key]]
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The content of a TOML file.
+    """Read a TOML file.
 
     Raises:
-        RecipeError: it cannot be read.
+        RecipeError: the file cannot be read.
     """
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
@@ -62,10 +62,10 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def validate_sections(content: Mapping[str, Any], table: Table, place: str) -> dict[str, dict[str, Any]]:
-    """Sections with every key of `table`, in SI units; `place` names the file.
+    """Return sections with every key of `table`, in SI units; `place` names the file.
 
     Raises:
-        RecipeError: an unknown section or key, or a value that it cannot have.
+        RecipeError: an unknown section or key, or an invalid value.
     """
     for section, given in content.items():
         if section not in table:
@@ -89,14 +89,14 @@ def validate_sections(content: Mapping[str, Any], table: Table, place: str) -> d
 
 
 def default_value(key: Key) -> Any:
-    """What stands where a file is silent."""
+    """Return the default of a key."""
     if isinstance(key, Choice):
         return key.options[0]
     return None if isinstance(key, IgnoredKey) else key.default
 
 
 def validate_value(given: Any, key: Key, place: str) -> Any:
-    """One value, checked."""
+    """Return one value in SI units after checking it."""
     if isinstance(key, IgnoredKey):
         return given
     if isinstance(key, ListKey):
@@ -119,7 +119,7 @@ def validate_value(given: Any, key: Key, place: str) -> Any:
 
 @functools.cache
 def _registry() -> Any:
-    import pint  # only where text is read
+    import pint  # imported only if there is text to parse, because it is slow
 
     registry = pint.UnitRegistry()
     registry.define("@alias ohm = Ohm = OHM = ohms")
@@ -127,17 +127,17 @@ def _registry() -> Any:
 
 
 def parse_quantity(given: Any, unit: str, place: str) -> float:
-    """Text such as "160 kohm", or a bare number in SI, as a float in the SI unit `unit`.
+    """Convert text such as "160 kohm", or a bare number in SI, to a float in the SI unit `unit`.
 
     Raises:
-        RecipeError: it is none, of another dimension, or not finite.
+        RecipeError: no number, another dimension, or not finite.
     """
     try:
         if isinstance(given, bool):
             raise ValueError
         found = float(_registry().Quantity(given).to(unit).magnitude) if isinstance(given, str) else float(given)
-    except Exception as error:  # pint raises a dozen kinds, tokenize errors among them
-        raise RecipeError(f"{place} = {given!r} is no number with a unit of {unit or '1'}; write one") from error
+    except Exception as error:  # pint raises a dozen kinds of errors, including tokenize errors
+        raise RecipeError(f"{place} = {given!r} is not a number with the unit {unit or '1'}; write one") from error
     if not math.isfinite(found):
         raise RecipeError(f"{place} = {given!r} is not finite; write a number")
     return float(f"{found:.15g}")

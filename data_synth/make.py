@@ -1,4 +1,4 @@
-"""Records from recipes, by scipy's route or ngspice's, with the truth about them."""
+"""Records from recipes, by scipy or ngspice, with their true values."""
 
 import math
 import platform
@@ -36,7 +36,7 @@ _VALUES = {  # name -> section of the scene, key, unit
 
 
 class Synthetic(NamedTuple):
-    """A record (s, V, V, A) and what is true of it."""
+    """Record (s, V, V, A) with its true values."""
 
     time: np.ndarray
     channels: dict[str, np.ndarray]
@@ -44,10 +44,10 @@ class Synthetic(NamedTuple):
 
 
 def make(recipe: Recipe) -> dict[str, Synthetic]:
-    """The recipe's records by name: one, or one of each finger of its population.
+    """Return the recipe's records by name: one, or one for each finger of its population.
 
     Raises:
-        RecipeError: the scene or the route cannot give what is asked for.
+        RecipeError: the route does not support the scene.
     """
     fingers = recipe.parts["population"]["fingers"]
     if fingers is None:
@@ -57,7 +57,7 @@ def make(recipe: Recipe) -> dict[str, Synthetic]:
 
 
 def _population(recipe: Recipe) -> list[Scene]:
-    """The scene of each finger: log-normal Rsc and Csc, and an area that scales Ci, Csc and 1 / Rsc."""
+    """Return the scene of each finger: log-normal Rsc and Csc, and an area that scales Ci, Csc and 1 / Rsc."""
     law, scene = recipe.parts["population"], recipe.scene
     found = []
     for finger in range(law["fingers"]):
@@ -97,12 +97,12 @@ def _record(recipe: Recipe, scene: Scene, finger: int) -> Synthetic:
 
 
 def _scale_second_layer(skin: Mapping[str, Any], area: float) -> Mapping[str, Any]:
-    """A second layer, where there is one, of `area` times the median's."""
+    """Scale the second layer, if there is one, to `area` times the median area."""
     return {**skin, "Rsc_2": skin["Rsc_2"] / area, "Csc_2": skin["Csc_2"] * area} if skin["Rsc_2"] else skin
 
 
 def _resolve_noise(recipe: Recipe) -> dict[str, dict[str, Any]]:
-    """The recipe's sections; where it is silent on white noise, the scene's counts."""
+    """Return the recipe's sections, with the scene's white noise if the recipe states none."""
     measured, white = recipe.scene["measurement"], recipe.parts["white"]
     stated = {"V": 0.0, "Vsc": measured["noise_Vsc"], "I": measured["noise_I"]}
     return {**recipe.parts, "white": {n: stated[n] if white[n] is None else white[n] for n in UNITS}}
@@ -111,10 +111,10 @@ def _resolve_noise(recipe: Recipe) -> dict[str, dict[str, Any]]:
 def simulate_response(
     scene: Scene, time: np.ndarray, skin: Mapping[str, Any] | None = None, route: str = "scipy"
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """V, Vsc (V) and I (A) at `time` (s), without imperfections; `skin` is a recipe's section of that name.
+    """Return V, Vsc (V) and I (A) at `time` (s) without imperfections; `skin` is the recipe's section [skin].
 
     Raises:
-        RecipeError: the route has no such skin, or ngspice is absent.
+        RecipeError: the route does not support this skin, or ngspice is not installed.
     """
     skin = skin or {"model": AS_IT_IS}
     second = (skin["Rsc_2"], skin["Csc_2"]) if skin["model"] == "two layers" else None
@@ -125,7 +125,7 @@ def simulate_response(
         from data_synth.spice import spice_response
 
         if level != "constant":
-            raise RecipeError(f"[skin] level = '{level}' is not among ngspice's circuits; take route = 'scipy'")
+            raise RecipeError(f"[skin] level = '{level}' is not available with ngspice; use route = 'scipy'")
         return spice_response(circuit, law, drive, time)
     return _scipy_response(circuit, law, scene["skin"], drive, time)
 
@@ -133,7 +133,7 @@ def simulate_response(
 def _scipy_response(
     circuit: Network, law: Mapping[str, Any] | None, skin: Mapping[str, Any], drive: Drive, time: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    # each brings a part of scipy along
+    # imported here, because each loads another part of scipy
     if law is not None:
         from data_synth.nonlinear import nonlinear_response
 

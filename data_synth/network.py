@@ -6,22 +6,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-EPS0 = 8.85e-12  # F/m, as the paper takes it
-_EMPTY = 1e-10  # of the largest capacitance: a node with less has none
+EPS0 = 8.85e-12  # F/m, the reference paper's value
+_EMPTY = 1e-10  # fraction of the largest capacitance below which a node counts as having none
 
 
 class Branch(NamedTuple):
-    """A resistor (ohm) or capacitor (F) between two nodes; node 0 is ground, node 1 the drive."""
+    """Resistor (ohm) or capacitor (F) between two nodes; node 0 is ground, node 1 the drive."""
 
     kind: str  # R or C
     start: int
     end: int
     value: float
-    layer: str = ""  # outer: of the skin that a level, or a voltage, changes
+    layer: str = ""  # "outer" for the skin layer that depends on frequency or voltage
 
 
 class Network(NamedTuple):
-    """Branches, the nodes that Vsc lies between, and of each outer layer of skin the ends, R (ohm) and C (F)."""
+    """Branches, the two nodes of Vsc, and for each outer skin layer its nodes, R (ohm) and C (F)."""
 
     branches: tuple[Branch, ...]
     skin: tuple[int, int]
@@ -29,9 +29,9 @@ class Network(NamedTuple):
 
 
 class StateSpace(NamedTuple):
-    """x' = A x + B u and y = C x + D u, + E dV/dt; u: V (V), what each outer layer conducts besides (A).
+    """State space x' = A x + B u, y = C x + D u + E dV/dt.
 
-    y: Vsc (V), I (A), the voltage of each outer layer (V).
+    u: V (V), and the nonlinear current of each outer layer (A). y: Vsc (V), I (A), the voltage of each outer layer (V).
     """
 
     A: np.ndarray
@@ -42,7 +42,7 @@ class StateSpace(NamedTuple):
 
 
 def network(scene: Mapping[str, Mapping[str, Any]], second: tuple[float, float] | None = None) -> Network:
-    """The scene's circuit, from the drive to ground; `second`: R (ohm) and C (F) of a deeper layer in each skin."""
+    """Return the scene's circuit from drive to ground; `second` is R (ohm) and C (F) of a deeper layer in each skin."""
     skin, measured = scene["skin"], scene["measurement"]
     touching = [(skin["Rsc"], skin["Csc"], "outer"), *([(*second, "")] if second else [])]
     before = [(measured["series_resistor"], None, ""), (None, scene["device"]["Ci"], ""), (*_gap(scene), "")]
@@ -74,7 +74,7 @@ def _gap(scene: Mapping[str, Mapping[str, Any]]) -> tuple[float | None, float | 
 
 
 def _ground_elements(scene: Mapping[str, Mapping[str, Any]], second: tuple[float, float] | None) -> Iterator[tuple]:
-    """What lies between the touching skin and ground, in series."""
+    """Yield the elements between the touching skin and ground, in series."""
     ground, skin = scene["grounding"], scene["skin"]
     if ground["connection"] == "natural":
         yield ground["Z"], ground["Z_capacitance"], ""
@@ -86,7 +86,7 @@ def _ground_elements(scene: Mapping[str, Mapping[str, Any]], second: tuple[float
 
 
 def _incidence(pairs: list[tuple[int, int]], size: int) -> np.ndarray:
-    """A column for each pair: 1 where it starts, -1 where it ends, without the row of ground."""
+    """Return the incidence matrix: per pair a column with 1 at its start and -1 at its end, without the ground row."""
     found = np.zeros((size + 1, len(pairs)))
     for column, (start, end) in enumerate(pairs):
         found[start, column] += 1.0
@@ -99,10 +99,10 @@ def _size(circuit: Network) -> int:
 
 
 def state_space(circuit: Network) -> StateSpace:
-    """By nodal analysis: capacitances c x' + conductances g x = 0 at every node but the drive's, row and column 0.
+    """Return the state space by nodal analysis: c x' + g x = 0 at every node except the drive (row and column 0).
 
-    The states are those combinations of the free nodes, plus what the drive puts on them at once, that
-    capacitances hold; nodes without any follow from Kirchhoff's current law.
+    The states are the combinations of free nodes that capacitances hold, relative to the drive's instantaneous
+    contribution; nodes without capacitance follow from Kirchhoff's current law.
     """
     size = _size(circuit)
     g, c = np.zeros((size, size)), np.zeros((size, size))
@@ -112,7 +112,7 @@ def state_space(circuit: Network) -> StateSpace:
             g += ends @ ends.T / each.value
         else:
             c += ends @ ends.T * each.value
-    # what the outer layers conduct besides leaves their start for their end
+    # the nonlinear current of an outer layer flows from its start to its end
     extra = _incidence([(start, end) for start, end, *_ in circuit.layers], size)
     values, vectors = np.linalg.eigh(c[1:, 1:])
     held = values > _EMPTY * values[-1]
@@ -140,7 +140,7 @@ def state_space(circuit: Network) -> StateSpace:
 def gains(
     circuit: Network, omega: np.ndarray, admittance: Callable[[Branch, np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Vsc / V and I / V (S) at angular frequencies `omega` (rad/s), with the admittance (S) of each branch."""
+    """Return Vsc / V and I / V (S) at angular frequencies `omega` (rad/s), with the admittance (S) of each branch."""
     size = _size(circuit)
     Y = np.zeros((omega.size, size, size), dtype=complex)
     for each in circuit.branches:
@@ -152,5 +152,5 @@ def gains(
 
 
 def plain_admittance(branch: Branch, omega: np.ndarray) -> np.ndarray:
-    """S, of a resistor or capacitor."""
+    """Return the admittance (S) of a resistor or capacitor."""
     return 1j * omega * branch.value if branch.kind == "C" else np.full(omega.shape, 1.0 / branch.value, dtype=complex)

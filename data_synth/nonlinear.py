@@ -1,4 +1,4 @@
-"""Skins that conduct more as their voltage rises, by scipy's solve_ivp at tight tolerances."""
+"""Responses of skins whose conductance rises with voltage, by scipy's solve_ivp at tight tolerances."""
 
 import itertools
 from collections.abc import Mapping
@@ -13,18 +13,18 @@ from data_synth.errors import RecipeError
 from data_synth.network import Network, StateSpace, state_space
 from data_synth.response import polynomials, steps
 
-_FLOOR = 1e-13  # of states that are some 1e-2 at their height
+_FLOOR = 1e-13  # absolute tolerance of states, whose peak is some 1e-2
 _SOLVER: dict[str, Any] = {"method": "LSODA", "rtol": 1e-10, "atol": _FLOOR}
-_SETTLED = 1e-8  # of each state, that a period may still change it by
+_SETTLED = 1e-8  # relative change per period of a state that counts as settled
 _MOST_PERIODS = 400
-_BESIDE = 1e-9  # of a stretch between corners: so near to one the drive is taken from inside
+_BESIDE = 1e-9  # fraction of a stretch between corners by which the drive is evaluated inside it
 
 
 class NonlinearSkin(NamedTuple):
-    """The circuit, its outer layers' resistance (ohm) at no voltage, and the law by which they conduct more.
+    """Circuit, resistance (ohm) of its outer layers at zero voltage, and the law of their conductance.
 
-    nonlinear: 1 + (v / half_voltage)^2 times as much, at once. electroporated: up to `factor` times, as a share of
-    pores opens and closes within `time_constant` towards 1 / (1 + exp((threshold - |v|) / width)).
+    nonlinear: the conductance is multiplied by 1 + (v / half_voltage)^2. electroporated: by up to `factor`, with a
+    fraction of open pores that relaxes within `time_constant` to 1 / (1 + exp((threshold - |v|) / width)).
     """
 
     system: StateSpace
@@ -33,18 +33,18 @@ class NonlinearSkin(NamedTuple):
 
     @property
     def remembers(self) -> bool:
-        """Whether shares of open pores follow the circuit's charges among the states."""
+        """Whether fractions of open pores are among the states, after the circuit's charges."""
         return self.law["model"] == "electroporated"
 
     def extra(self, states: np.ndarray, voltage: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What each layer conducts besides V / R (A), and its voltage (V)."""
+        """Return the current of each layer beyond v / R (A), and its voltage (V)."""
         size = len(self.system.A)
         v = self.system.C[2:] @ states[:size] + np.multiply.outer(self.system.D[2:, 0], voltage)
         more = (self.law["factor"] - 1.0) * states[size:] if self.remembers else (v / self.law["half_voltage"]) ** 2
         return more * (v.T / self.R).T, v
 
     def change(self, states: np.ndarray, voltage: np.ndarray) -> np.ndarray:
-        """d states / dt."""
+        """Return the time derivative of the states."""
         size = len(self.system.A)
         current, v = self.extra(states, voltage)
         change = self.system.A @ states[:size] + self.system.B @ np.append(voltage, current)
@@ -57,10 +57,10 @@ class NonlinearSkin(NamedTuple):
 def nonlinear_response(
     circuit: Network, law: Mapping[str, Any], drive: Drive, time: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """V, Vsc (V) and I (A) at `time` (s): periodic drives in the steady state, others from rest.
+    """Return V, Vsc (V) and I (A) at `time` (s): periodic drives in the steady state, others from rest.
 
     Raises:
-        RecipeError: it has not settled after many periods.
+        RecipeError: no steady state after many periods.
     """
     system = state_space(circuit)
     skin = NonlinearSkin(system, np.array([layer[2] for layer in circuit.layers]), law)
@@ -80,7 +80,7 @@ def nonlinear_response(
 
 
 def _states(skin: NonlinearSkin, drive: Drive, state: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """The states at `wanted` (s, increasing), from that at the first."""
+    """Return the states at `wanted` (s, increasing), from the state at the first."""
 
     def change(at: float, state: np.ndarray, start: float, end: float) -> np.ndarray:
         beside = _BESIDE * (end - start)
@@ -99,11 +99,11 @@ def _states(skin: NonlinearSkin, drive: Drive, state: np.ndarray, wanted: np.nda
 
 
 def _steady_state(skin: NonlinearSkin, drive: Drive, state: np.ndarray, start: float) -> np.ndarray:
-    """The states at `start` (s), after as many periods as leave them alone."""
+    """Return the states at `start` (s) after enough periods to settle."""
     assert drive.period is not None
     for _ in range(_MOST_PERIODS):
         before = state
         state = _states(skin, drive, state, np.array([start, start + drive.period]))[-1]
         if np.allclose(state, before, rtol=_SETTLED, atol=10.0 * _FLOOR):
             return state
-    raise RecipeError(f"the skin has not settled after {_MOST_PERIODS} periods; let it start from rest")
+    raise RecipeError(f"the skin has not settled after {_MOST_PERIODS} periods; start from rest")

@@ -1,4 +1,4 @@
-"""Recipes: which scene is recorded, what is true of it that the scene does not say, and what the instruments add."""
+"""Recipes: the scene to record, true values that differ from it, and imperfections of the instruments."""
 
 import itertools
 import math
@@ -11,17 +11,17 @@ from data_synth.scene import KEYS as SCENE
 from data_synth.scene import Scene, make_scene
 
 UNITS = {"V": "V", "Vsc": "V", "I": "A"}
-AS_IT_IS = "as the scene says"  # what skin a recipe has that names no other
+AS_IT_IS = "as the scene says"  # skin model of a recipe that states none
 _SUFFIX = ".recipe"
 
 
 def _channel_quantities(low: float = 0.0, default: float | None = None) -> dict[str, Key]:
-    """A quantity of each channel, `low` or more."""
+    """Return a quantity per channel, at least `low`."""
     return {name: Quantity(unit, default, low, least=True) for name, unit in UNITS.items()}
 
 
 KEYS: Table = {
-    # what the scene's skin is not
+    # skins that a scene cannot state
     "skin": {
         "model": Choice((AS_IT_IS, "two layers", "nonlinear", "electroporated")),
         "Rsc_2": Quantity("ohm"),
@@ -65,10 +65,10 @@ _RECIPE: Table = {"recipe": {"seed": WholeNumber(0), "route": Choice(("scipy", "
 
 
 class Recipe(NamedTuple):
-    """What a record is made from; all numbers SI.
+    """Specification of a record; all numbers SI.
 
-    scene: with what is true in place of what the file says.
-    parts: every section of `KEYS`; given: those that the file has.
+    scene: the scene with the true values inserted.
+    parts: every section of `KEYS`; given: the sections in the file.
     """
 
     name: str
@@ -81,10 +81,10 @@ class Recipe(NamedTuple):
 
 
 def load(path: Path) -> Recipe:
-    """A recipe, or a scene to be recorded as it is.
+    """Load a recipe, or a plain scene.
 
     Raises:
-        RecipeError: naming file, section, key and remedy.
+        RecipeError: invalid input; the message names file, section, key and remedy.
     """
     content, scene_path = read_toml(path), path
     if "scene" in content:
@@ -94,7 +94,7 @@ def load(path: Path) -> Recipe:
         tables, content = content, {}
     truth = content.get("truth", {})
     if not isinstance(truth, dict):
-        raise RecipeError(f"{path}: truth is not a table; write [truth.skin] and the like")
+        raise RecipeError(f"{path}: truth is not a table; write [truth.skin] or another section")
     validate_sections(truth, SCENE, f"{path}, truth")
     scene = make_scene(tables, truth, str(scene_path))
     rest = {name: part for name, part in content.items() if name not in _TOP}
@@ -113,10 +113,10 @@ def _check(parts: dict[str, dict[str, Any]], scene: Scene, place: str) -> None:
     for key in itertools.chain(*_MODELS.values()):
         if (key in needed) != (skin[key] is not None):
             what = "needs" if key in needed else "does not have"
-            raise RecipeError(f"{place}: [skin] model = '{skin['model']}' {what} {key}; mend one of them")
+            raise RecipeError(f"{place}: [skin] model = '{skin['model']}' {what} {key}; correct one of them")
     if needed and scene["skin"]["level"] != "constant":
-        raise RecipeError(f"{place}: [skin] model = '{skin['model']}' needs a scene whose skin has level = 'constant'")
+        raise RecipeError(f"{place}: [skin] model = '{skin['model']}' needs a scene with [skin] level = 'constant'")
     if not -1.0 < parts["population"]["correlation"] < 1.0:
         raise RecipeError(f"{place}: [population] correlation must lie between -1 and 1")
     if parts["missing"]["share"] > 0.9:
-        raise RecipeError(f"{place}: [missing] share = {parts['missing']['share']} leaves too little; give 0.9 or less")
+        raise RecipeError(f"{place}: [missing] share = {parts['missing']['share']} loses too much; state 0.9 or less")

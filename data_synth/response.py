@@ -1,7 +1,7 @@
-"""Vsc and I in time: matrix exponentials of the state space, with the drive a polynomial over each step.
+"""Vsc and I in time, by matrix exponentials of the state space, with a polynomial drive in each step.
 
-For straight lines that is a first-order hold, exact; for sines a polynomial of degree 8 through Chebyshev's points
-of a step of at most a 16th of a cycle.
+This is exact for straight lines (first-order hold). Sines are polynomials of degree 8 through Chebyshev points of
+steps of at most a 16th of a cycle.
 """
 
 import math
@@ -13,14 +13,14 @@ from numpy.polynomial import chebyshev
 from data_synth.drive import Drive
 from data_synth.network import StateSpace
 
-_SAME = 1e-9  # of a record's step: times nearer than that are one
-_STILL = 1e-12  # singular values below are those of charges that nothing moves
+_SAME = 1e-9  # fraction of a record's step below which two times are equal
+_STILL = 1e-12  # smaller singular values belong to charges that no resistance moves
 
 
 def response(system: StateSpace, drive: Drive, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """V, Vsc (V) and I (A) at `time` (s, any order): periodic drives in the steady state, others from rest.
+    """Return V, Vsc (V) and I (A) at `time` (s, any order): periodic drives in the steady state, others from rest.
 
-    At a jump, values are right limits; I is NaN there where nothing limits it.
+    At a jump, values are right limits, and I is NaN if no resistance limits it.
     """
     grid, place = steps(drive, time)
     taylor = polynomials(drive, grid)
@@ -37,14 +37,14 @@ def response(system: StateSpace, drive: Drive, time: np.ndarray) -> tuple[np.nda
 
 
 def frequency_response(system: StateSpace, omega: float) -> tuple[complex, complex]:
-    """Vsc / V and I / V (S) at the angular frequency `omega` (rad/s)."""
+    """Return Vsc / V and I / V (S) at the angular frequency `omega` (rad/s)."""
     x = np.linalg.solve(1j * omega * np.eye(len(system.A)) - system.A, system.B[:, 0])
     Vsc, current = system.C[:2] @ x + system.D[:2, 0] + 1j * omega * system.E[:2]
     return complex(Vsc), complex(current)
 
 
 def steps(drive: Drive, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Times (s) that part the record into steps without a corner inside, and where among them `time` is."""
+    """Return times (s) of steps without a corner inside, and the indices of `time` among them."""
     start, end = float(time.min()), float(time.max())
     if drive.period is None:
         start = min(start, 0.0)
@@ -72,7 +72,7 @@ def _factorials(degree: int) -> np.ndarray:
 
 
 def polynomials(drive: Drive, grid: np.ndarray) -> np.ndarray:
-    """Derivatives of V at the start of each step, in steps: through points inside it, which are on no corner."""
+    """Return derivatives of V at the start of each step, in units of the step, from points inside it."""
     count = drive.degree + 1
     angle = np.pi * (np.arange(count) + 0.5) / count
     values = drive.value(grid[:-1, None] + 0.5 * (1.0 - np.cos(angle)) * np.diff(grid)[:, None])
@@ -83,12 +83,12 @@ def polynomials(drive: Drive, grid: np.ndarray) -> np.ndarray:
 
 
 def _chebyshev_derivative(m: int, order: int) -> float:
-    """d^order/ds^order of T_m(2 s - 1) at s = 0."""
+    """Return d^order/ds^order of T_m(2 s - 1) at s = 0."""
     return 2.0**order * float(chebyshev.chebval(-1.0, chebyshev.chebder(np.eye(m + 1)[m], order)))
 
 
 def _states(system: StateSpace, grid: np.ndarray, taylor: np.ndarray, charge: np.ndarray) -> np.ndarray:
-    """The states at the grid's times, `charge` at the first."""
+    """Return the states at the grid's times, starting from `charge`."""
     lengths, which = np.unique(np.diff(grid), return_inverse=True)
     size, count = len(system.A), taylor.shape[1]
     whole = np.zeros((lengths.size, size + count, size + count))
@@ -105,7 +105,7 @@ def _states(system: StateSpace, grid: np.ndarray, taylor: np.ndarray, charge: np
 
 
 def _steady_state(system: StateSpace, drive: Drive, start: float) -> np.ndarray:
-    """The states at `start` (s) that a period leaves as they were: the fixed point of its map."""
+    """Return the states at `start` (s) of the steady state, the fixed point of the period's map."""
     assert drive.period is not None
     grid, _ = steps(drive, np.array([start, start + drive.period]))
     end = int(np.argmin(np.abs(grid - (start + drive.period))))

@@ -1,4 +1,4 @@
-"""Scene files, as docs/scene.md lists them: the keys that say what a record holds, and the defaults."""
+"""Scene files as in docs/scene.md: the keys that determine a record, with their defaults."""
 
 import math
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from data_synth.network import EPS0
 Scene = dict[str, dict[str, Any]]
 
 _ANY = -math.inf
-_BELIEFS = """Rsc Csc Ci R_H grounding_Rsc grounding_Csc Z Z_capacitance series_resistor Rgap Cgap alpha sigma sigma_I
+_PRIORS = """Rsc Csc Ci R_H grounding_Rsc grounding_Csc Z Z_capacitance series_resistor Rgap Cgap alpha sigma sigma_I
 correlation"""
 KEYS: Table = {
     "device": {
@@ -68,7 +68,7 @@ KEYS: Table = {
         **dict.fromkeys(("gain_relative_sd", "gain_I_relative_sd", "noise_model", "quiet"), IgnoredKey()),
     },
     "friction": dict.fromkeys(("coefficient", "normal_force"), IgnoredKey()),
-    "prior": dict.fromkeys(_BELIEFS.split(), IgnoredKey()),
+    "prior": dict.fromkeys(_PRIORS.split(), IgnoredKey()),
     "force": {"model": IgnoredKey()},
     "perception": dict.fromkeys(("threshold_force", "friction_change"), IgnoredKey()),
     "population": dict.fromkeys(
@@ -84,10 +84,10 @@ _NEEDED = {
 
 
 def make_scene(content: Mapping[str, Any], truth: Mapping[str, Any], place: str) -> Scene:
-    """The scene of a file's tables, with what is true in place of what it says; `place` names the file.
+    """Return the scene of a file's tables, with the values of `truth` inserted; `place` names the file.
 
     Raises:
-        RecipeError: an unknown key, a value that is not possible, or keys that need others.
+        RecipeError: an unknown key, an impossible value, or a missing key.
     """
     merged = {name: {**content.get(name, {}), **truth.get(name, {})} for name in {**content, **truth}}
     scene = validate_sections(merged, KEYS, place)
@@ -98,15 +98,15 @@ def make_scene(content: Mapping[str, Any], truth: Mapping[str, Any], place: str)
         device["Ci"] = EPS0 * permittivity * device["contact_area"] / thickness
     for key in _NEEDED.get(drive["waveform"], ()):
         if drive[key] is None:
-            raise RecipeError(f"{place}: [drive] waveform = '{drive['waveform']}' needs {key}; give it")
+            raise RecipeError(f"{place}: [drive] waveform = '{drive['waveform']}' needs {key}; state it")
     if drive["frequencies"] and any(len(drive[k] or drive["frequencies"]) != len(drive["frequencies"]) for k in _LISTS):
-        raise RecipeError(f"{place}: [drive] frequencies, amplitudes and phases differ in length; give one of each")
+        raise RecipeError(f"{place}: [drive] frequencies, amplitudes and phases differ in length; correct one")
     if not drive["duty"] < 1.0 or not skin["alpha"] <= 1.0:
         raise RecipeError(f"{place}: [drive] duty must be below 1, and [skin] alpha at most 1")
     if scene["grounding"]["connection"] == "natural" and scene["grounding"]["Z"] is None:
         raise RecipeError(f"{place}: [grounding] connection = 'natural' needs Z, such as '14.5 Mohm'")
     if scene["gap"]["resistance"] and not (scene["gap"]["capacitance"] or scene["gap"]["thickness"]):
-        raise RecipeError(f"{place}: [gap] resistance needs capacitance, or thickness; give one of them")
+        raise RecipeError(f"{place}: [gap] resistance needs capacitance or thickness; state one of them")
     return scene
 
 

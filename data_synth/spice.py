@@ -1,4 +1,4 @@
-"""The same circuits by ngspice, which steps through time: a netlist, a source through points, a transient run."""
+"""Responses of the same circuits by a transient run of ngspice, with a piecewise linear source."""
 
 import shutil
 import subprocess
@@ -13,21 +13,21 @@ from data_synth.drive import Drive, end_values
 from data_synth.errors import RecipeError
 from data_synth.network import Network, state_space
 
-_JUMP = 1e-9  # s, that an ideal jump takes here
-_POINTS = 32  # of the source in a step of a drive that is not straight: 512 in a cycle
-_SETTLED = 16.0  # slowest time constants before a steady state: 1e-7 is left
-_STILL = 1e-9  # of the fastest rate: that of a charge which nothing moves
-_STEPS = 4  # of time in one of the record's
-_LONG = 600  # s
+_JUMP = 1e-9  # s, duration of an ideal jump in ngspice
+_POINTS = 32  # source points per step of a curved drive, 512 per cycle
+_SETTLED = 16.0  # slowest time constants simulated before the steady state, which leaves 1e-7
+_STILL = 1e-9  # fraction of the fastest rate below which a charge does not move
+_STEPS = 4  # time steps per sample of the record
+_LONG = 600  # s, limit of a run
 
 
 def is_installed() -> bool:
-    """Whether ngspice is installed."""
+    """Return whether ngspice is installed."""
     return shutil.which("ngspice") is not None
 
 
 def ngspice_version() -> str:
-    """Of ngspice, as it says it."""
+    """Return the version that ngspice prints."""
     said = subprocess.run(["ngspice", "--version"], capture_output=True, text=True, timeout=60).stdout
     return next((word for word in said.split() if word.startswith("ngspice-")), "ngspice")
 
@@ -35,13 +35,13 @@ def ngspice_version() -> str:
 def spice_response(
     circuit: Network, law: Mapping[str, Any] | None, drive: Drive, time: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """V, Vsc (V) and I (A) at `time` (s): periodic drives after many periods, others from rest.
+    """Return V, Vsc (V) and I (A) at `time` (s): periodic drives after many periods, others from rest.
 
     Raises:
-        RecipeError: ngspice is not installed, failed, or the skin is one that only scipy's route has.
+        RecipeError: ngspice is not installed, failed, or does not support the skin.
     """
     if not is_installed():
-        raise RecipeError("ngspice is not installed; install it (apt-get install ngspice), or take route = 'scipy'")
+        raise RecipeError("ngspice is not installed; install it (apt-get install ngspice), or use route = 'scipy'")
     begin = min(float(time.min()), 0.0)
     if drive.period:
         rates = -np.linalg.eigvalsh(state_space(circuit).A)
@@ -59,14 +59,14 @@ def spice_response(
     deck += [f"tran {step:.12g} {end - begin:.15g} {kept:.15g} {step:.12g} uic"]
     deck += [f"wrdata out.txt v(1) v({skin}) i(Vmeter)"]
     table = _run_ngspice([*deck, "quit", ".endc", ".end"], end - begin)
-    # at a jump the value after it is wanted
+    # at a jump the record holds the value after it
     wanted = time - begin + (2.0 * _JUMP if drive.jumps else 0.0)
     voltage, Vsc, current = (np.interp(wanted, table[:, 0], table[:, column]) for column in (1, 2, 3))
     return voltage, Vsc, current
 
 
 def _source_points(drive: Drive, begin: float, end: float) -> str:
-    """Times from `begin` on, and voltages, through which the source goes in straight lines."""
+    """Return times from `begin` on, and voltages, of the piecewise linear source."""
     corners = drive.corners(begin, end)
     corners = np.unique([begin, *corners[(corners > begin) & (corners < end)], end + _JUMP])
     if drive.degree > 1:
@@ -83,11 +83,11 @@ def _source_points(drive: Drive, begin: float, end: float) -> str:
 
 
 def _nonlinear_sources(circuit: Network, law: Mapping[str, Any] | None) -> list[str]:
-    """Sources of what a nonlinear skin conducts besides."""
+    """Return current sources for the nonlinear current of a skin."""
     if law is None:
         return []
     if law["model"] != "nonlinear":
-        raise RecipeError(f"[skin] model = '{law['model']}' is not among ngspice's circuits; take route = 'scipy'")
+        raise RecipeError(f"[skin] model = '{law['model']}' is not available with ngspice; use route = 'scipy'")
     found = []
     for n, (start, end, R, _) in enumerate(circuit.layers):
         v = f"v({start},{end})" if end else f"v({start})"
@@ -96,7 +96,7 @@ def _nonlinear_sources(circuit: Network, law: Mapping[str, Any] | None) -> list[
 
 
 def _run_ngspice(deck: list[str], end: float) -> np.ndarray:
-    """What the deck writes, which must reach `end` (s)."""
+    """Run the deck and return its output table, which must reach `end` (s)."""
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "deck.cir").write_text("\n".join(deck) + "\n")
         try:
@@ -104,10 +104,10 @@ def _run_ngspice(deck: list[str], end: float) -> np.ndarray:
                 ["ngspice", "-b", "deck.cir"], cwd=folder, capture_output=True, text=True, timeout=_LONG
             )
         except subprocess.TimeoutExpired:
-            raise RecipeError(f"ngspice took longer than {_LONG} s; record less, or take route = 'scipy'") from None
+            raise RecipeError(f"ngspice took longer than {_LONG} s; record less, or use route = 'scipy'") from None
         out = Path(folder, "out.txt")
         table = np.loadtxt(out, skiprows=1) if out.exists() else np.empty((0, 4))
         if not table.size or table[-1, 0] < end * (1.0 - 1e-9):
             said = (ran.stderr.strip() or ran.stdout.strip() or "no reason given").splitlines()[-1]
-            raise RecipeError(f"ngspice did not finish ({said}); take route = 'scipy'")
+            raise RecipeError(f"ngspice did not finish ({said}); use route = 'scipy'")
         return table
