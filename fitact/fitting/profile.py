@@ -124,16 +124,8 @@ def interval_bounds(
     """Return the bounds of the intervals of the quantities `indices`; an open bound is not finite.
 
     All bounds are searched in parallel, each between the last value that was too near and the last that was too far.
-
-    Args:
-        model: constrained fit.
-        theta: optimum.
-        sd: expected standard errors of the quantities.
-        indices: indices of the quantities in the model.
-        level: confidence level.
-        pseudo_datum_sd: sd of the pseudo-datum, relative to `sd`.
-        root_tolerance: relative tolerance of the square root of the deviance.
-        max_rounds: maximum number of search steps.
+    `sd` holds the expected standard errors, and `pseudo_datum_sd` is relative to these. `root_tolerance` is the relative
+    tolerance of the square root of the deviance.
     """
     z = NormalDist().inv_cdf(0.5 * (1.0 + level))
     rows, side = np.repeat(np.asarray(indices), 2), np.tile([-1.0, 1.0], len(indices))

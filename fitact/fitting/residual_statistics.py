@@ -56,13 +56,8 @@ def residual_statistics(
 ) -> dict[str, Float[np.ndarray, "*records"]]:
     """Return the figures of merit of each record that follow from sums over its residuals.
 
-    Args:
-        square: sum of the squared residuals.
-        samples: number of residuals.
-        test_statistics: statistics of the residual tests, or None if they are not tested.
-        expected: expected standard deviation of the residuals.
-        freedom: degrees of freedom.
-        phase_bins: samples by phase of the drive.
+    `square` is the sum of the squared residuals, `expected` their expected standard deviation and `freedom` the degrees
+    of freedom. `test_statistics` is None if the residuals are not tested.
     """
     tests = {}
     if test_statistics is not None:

@@ -108,13 +108,8 @@ def diagnose_chain(
 ) -> Convergence:
     """Return autocorrelation times, effective sizes and split-R-hat of all coordinates and `derived` quantities.
 
-    Args:
-        names: names of the coordinates.
-        points: coordinates of every walker at every step.
-        accepted: number of accepted moves of each walker.
-        derived: other quantities, for some of the walkers.
-        rhat_draws: draws of each ensemble that R-hat uses.
-        criteria: criteria of convergence.
+    `names` are those of the coordinates, `accepted` counts accepted moves, and `derived` holds other quantities for some
+    walkers. R-hat uses `rhat_draws` draws of each ensemble.
     """
     ensembles, steps, walkers, _ = points.shape
     if steps < 100:  # too few for any diagnostic

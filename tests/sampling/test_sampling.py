@@ -136,17 +136,17 @@ def test_interrupted_sampling_keeps_what_there_is(finger_fit: fitact.Fit, tmp_pa
 
 def test_an_interrupt_between_rounds_is_not_lost(finger_fit: fitact.Fit, monkeypatch):
     """Also within a weak reference's callback, where Python drops what is raised; JAX has many."""
-    judge = ensemble._Run.judge
+    diagnose = ensemble._Run.diagnose
 
-    def judged(self):
+    def interrupted(self):
         if not self.derived:
             thing = np.zeros(1)
             reference = weakref.ref(thing, lambda _: signal.raise_signal(signal.SIGINT))
             del thing
             assert reference() is None
-        return judge(self)
+        return diagnose(self)
 
-    monkeypatch.setattr(ensemble._Run, "judge", judged)
+    monkeypatch.setattr(ensemble._Run, "diagnose", interrupted)
     posterior = short(finger_fit, 3, max_steps=300)
     assert posterior.convergence.interrupted
     assert posterior.convergence.steps == 100
