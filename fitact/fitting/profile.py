@@ -124,7 +124,7 @@ def interval_bounds(
     """Return the bounds of the intervals of the quantities `indices`; an open bound is not finite.
 
     All bounds are searched in parallel, each between the last value that was too near and the last that was too far.
-    `sd` holds the expected standard errors, and `pseudo_datum_sd` is relative to these. `root_tolerance` is the relative
+    `sd` holds the expected standard errors, and `pseudo_datum_sd` is relative to these. `root_tolerance` is a relative
     tolerance of the square root of the deviance.
     """
     z = NormalDist().inv_cdf(0.5 * (1.0 + level))

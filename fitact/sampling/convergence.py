@@ -108,8 +108,8 @@ def diagnose_chain(
 ) -> Convergence:
     """Return autocorrelation times, effective sizes and split-R-hat of all coordinates and `derived` quantities.
 
-    `names` are those of the coordinates, `accepted` counts accepted moves, and `derived` holds other quantities for some
-    walkers. R-hat uses `rhat_draws` draws of each ensemble.
+    `names` are those of the coordinates, `accepted` counts accepted moves, and `derived` holds other quantities, of some
+    walkers only. R-hat uses `rhat_draws` draws of each ensemble.
     """
     ensembles, steps, walkers, _ = points.shape
     if steps < 100:  # too few for any diagnostic
