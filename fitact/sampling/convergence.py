@@ -108,7 +108,7 @@ def diagnose_chain(
 ) -> Convergence:
     """Return autocorrelation times, effective sizes and split-R-hat of all coordinates and `derived` quantities.
 
-    `names` are those of the coordinates, `accepted` counts accepted moves, and `derived` holds other quantities, of some
+    `names` are those of the coordinates, `accepted` counts accepted moves, and `derived` holds other quantities of some
     walkers only. R-hat uses `rhat_draws` draws of each ensemble.
     """
     ensembles, steps, walkers, _ = points.shape
