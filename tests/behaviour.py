@@ -1,13 +1,13 @@
-"""What users get from every command: a recording of it, and a comparison of two.
+"""Record the results that users get from every command, and compare two such recordings.
 
     python -m tests.behaviour record OUT.json [--only PART] [--quick]
     python -m tests.behaviour compare BEFORE.json AFTER.json [--estimates]
     python -m tests.behaviour store
 
 `record` runs the commands on the shipped records, scenes and spectra, and on files that are refused. `compare` lists
-what differs: numbers by more than 1e-9 of themselves or, with --estimates, estimates by more than 1e-4 of their
-standard error (the solver stops there), the solver's steps by more than a factor of 2. `store` renews the quick part
-that the tests compare with.
+the differences: numbers that differ by more than 1e-9 relative. With --estimates, the limits are 1e-4 standard errors
+for estimates (the tolerance of the solver) and a factor of 2 for the solver's steps. `store` records the quick part
+again, with which the tests compare.
 """
 
 import argparse
@@ -35,14 +35,16 @@ PLAIN = ("clean", "clipped", "eight_bit", "hum", "late_trigger", "low_snr", "non
 OWN_SCENE = ("burst", "chirp", "fractional", "natural_ground")
 FINGERS = [f"records/fingers/finger0{i}.csv.gz" for i in range(8)]
 FINGER = ["records/finger_direct.csv", "--scene", "records/finger_direct.toml"]
-# of one machine, one moment or one version
+# values that depend on the machine, the time or the version
 PASSING = re.compile(r"version|seconds|speedup|(^|[._])time(_s)?$|host|date|created|rate_per|per_second|cost", re.I)
-ROUNDING = re.compile(r"compression_error|eigenvalues|rms_compression")  # figures of rounding: their order of magnitude
-SINGLE = float(np.finfo(np.float32).eps)  # what a model's error is known to: part of it is computed in single precision
+ROUNDING = re.compile(
+    r"compression_error|eigenvalues|rms_compression"
+)  # rounding errors, compared by order of magnitude
+SINGLE = float(np.finfo(np.float32).eps)  # precision of a model error, which is partly computed in single precision
 
 
 def cases() -> Iterator[tuple[str, list[str]]]:
-    """Name and arguments of every command; the first word of the name is its part."""
+    """Return the name and arguments of every command; the first word of the name is its part."""
     for name in PLAIN:
         record = f"records/{name}.csv.gz"
         yield f"inspect {name}", ["inspect", record]
@@ -105,12 +107,12 @@ def _options(kind: str) -> list[str]:
 
 
 def stored_names() -> set[str]:
-    """Return the commands that `make test` has time for: one fit, and what is refused before any fit."""
+    """Return the commands that are quick enough for `make test`: one fit, and input that is refused before any fit."""
     return set(json.loads(STORED.read_text(encoding="utf-8")))
 
 
 def prepare(folder: Path) -> None:
-    """Lay out what the commands read, under names that are the same everywhere."""
+    """Write the input files of the commands, with the same names everywhere."""
     from tests.data.test_bad_input import text_of
 
     os.chdir(folder)
@@ -148,7 +150,7 @@ def prepare(folder: Path) -> None:
 
 
 def _table() -> dict[str, np.ndarray]:
-    """The good record that test_bad_input spoils, from the closed form of a settled square's response."""
+    """Return the valid record that test_bad_input damages, from the closed-form steady response to a square."""
     periods, per_period = 20, 200
     time = np.arange(periods * per_period) * (0.01 / per_period)
     a, b = 130e3 * 1.35e-9, 130e3 * (2.0 * 1.35e-9 + 18e-9)
@@ -166,7 +168,7 @@ def _table() -> dict[str, np.ndarray]:
 
 
 def run(arguments: list[str]) -> dict[str, Any]:
-    """Run one command in this process: its exit code, its JSON, its sentences and the numbers of its files."""
+    """Run one command in this process; return its exit status, its JSON, its sentences and the numbers in its files."""
     import fitact.cli
 
     shutil.rmtree("out", ignore_errors=True)
@@ -193,12 +195,12 @@ def run(arguments: list[str]) -> dict[str, Any]:
 
 
 def _columns(table: np.ndarray) -> dict[str, list[float]]:
-    """First and last value, mean and standard deviation of every column."""
+    """Return the first and last value, mean and standard deviation of every column."""
     return {n: [*table[n][[0, -1]].tolist(), float(table[n].mean()), float(table[n].std())] for n in table.dtype.names}
 
 
 def flatten(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Every leaf of nested objects and lists with its path."""
+    """Yield every leaf of nested objects and lists with its path."""
     if isinstance(value, dict):
         for key, inner in value.items():
             yield from flatten(inner, f"{path}.{key}" if path else str(key))
@@ -210,7 +212,7 @@ def flatten(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def differences(before: Any, after: Any, estimates: bool = False) -> list[str]:
-    """What differs between two recordings of one command, a line each."""
+    """List the differences between two recordings of one command, one per line."""
     old, new = (dict(flatten(x)) for x in (before, after))
     out = [f"{path}: gone" for path in old.keys() - new.keys()] + [f"{path}: new" for path in new.keys() - old.keys()]
     for path in sorted(old.keys() & new.keys()):
@@ -244,7 +246,7 @@ def _is_close(path: str, a: Any, b: Any, old: dict[str, Any], estimates: bool) -
 
 
 def record(only: str = "", quick: bool = False) -> dict[str, Any]:
-    """Run the commands in a folder of their own."""
+    """Run the commands in a separate folder."""
     here = Path.cwd()
     with tempfile.TemporaryDirectory() as folder:
         try:
@@ -260,7 +262,7 @@ def record(only: str = "", quick: bool = False) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Record or compare; the number of commands that differ, 1 at most, is the exit code."""
+    """Record or compare; the exit status is 1 if commands differ."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=("record", "compare", "store"))
     parser.add_argument("files", nargs="*")

@@ -1,18 +1,18 @@
-"""Simulation-based calibration: records of known truth through fit and sampler, and the ranks of the truths.
+"""Simulation-based calibration: records of known truth are fitted and sampled, and the truths are ranked.
 
-Fixed before anything was run: the truths come from `PRIOR`, the drives and lengths from `DRIVES` and `LENGTHS`, Vsc
-from scipy's state space. A rank is that of the truth among 99 draws. Under a right posterior the ranks of each quantity
-are uniform over 0 to 99 (Talts et al. 2018). The statistic is the largest departure of their empirical distribution in
-either tail (Säilynoja, Bürkner, Vehtari 2022), its p-value exact, Holm's correction over the seven quantities at 1 %.
-Central intervals of 50 % and 90 % must cover within three binomial standard deviations. emcee and psis must pass both;
-Laplace is shown for the same records, so that luck of the data, which all levels share, can be told from the sampler.
-Every record counts, also one whose fit is not trusted or whose level is refused: to leave out by what the data look
-like would bend the ranks. A record that `fitact.fit` refuses has no ranks, and fails the run.
+The design was fixed before the first run. Truths come from `PRIOR`, drives and lengths from `DRIVES` and `LENGTHS`, and
+Vsc from scipy's state space. A rank is that of the truth among 99 draws. For a correct posterior, the ranks of each
+quantity are uniform over 0 to 99 (Talts et al. 2018). The statistic is the largest deviation of their empirical
+distribution in either tail (Säilynoja, Bürkner, Vehtari 2022). Its p-value is exact, with Holm's correction for seven
+quantities at 1 %. Central intervals of 50 % and 90 % must cover the truth within three binomial standard deviations.
+emcee and psis must pass both tests. Laplace is shown for the same records: deviations common to all methods are
+sampling noise of the data. Every record counts, also one whose fit is unreliable or whose posterior is refused, because
+a selection by the data would bias the ranks. A record that `fitact.fit` refuses has no ranks, and fails the run.
 
     python -m tests.calibration [--records 1000] [--seed 1] [--workers 2] [--out out/calibration]
 
-Ranks are kept in DIR/ranks.jsonl, and the next run of the same code goes on from there. Each record has a seed of its
-own, so that the first 100 are the same in every run.
+Ranks are saved in DIR/ranks.jsonl, from which the next run of the same code resumes. Each record has its own seed, so
+the first 100 are the same in every run.
 """
 
 import argparse
@@ -43,23 +43,23 @@ QUANTITIES = ("Rsc", "Csc", "Ci", "a", "b", "sigma", "force_mean")
 LEVELS = ("emcee", "psis", "laplace")
 BINDING = ("emcee", "psis")
 DRAWS = 99
-VALUES = DRAWS + 1  # of a rank
+VALUES = DRAWS + 1  # number of possible ranks
 INTERVALS = (0.5, 0.9)
-ERROR = 0.01  # of all quantities of a level together
-SIGMAS = 3.0  # of a coverage
-RECYCLED = 150  # records a process: JAX keeps all that it compiled, 10 MB a record, until the memory maps run out
+ERROR = 0.01  # false-alarm probability of all quantities of a method together
+SIGMAS = 3.0  # allowed deviation of a coverage, in binomial standard deviations
+RECYCLED = 150  # records per process: JAX keeps all compiled code, 10 MB a record, until the memory maps run out
 
 MEDIANS = {"Rsc": 130e3, "Csc": 20e-9, "Ci": 1.35e-9}  # ohm, F, F
-FACTORS = {"Rsc": 3.0, "Csc": 3.0, "Ci": 1.5}  # that hold 95 %
-NOISE = (0.05, 2.0)  # V
+FACTORS = {"Rsc": 3.0, "Csc": 3.0, "Ci": 1.5}  # factors that contain 95 %
+NOISE = (0.05, 2.0)  # bounds on the noise sd, V
 PRIOR: dict[str, Any] = {name: {"median": MEDIANS[name], "factor": FACTORS[name]} for name in MEDIANS}
 PRIOR["sigma"] = {"low": NOISE[0], "high": NOISE[1], "scale": "log"}
-AMPLITUDE = 180.0  # V
-PER_PERIOD = 400  # samples
-RISE = 0.05  # of the trapezoid's period
-THICKNESS = 201e-6  # m, of insulator and skin together: the default scene's
-LENGTHS = (700, 1000, 1500, 2200, 3000)  # samples
-# few enough that most records find their functions compiled
+AMPLITUDE = 180.0  # half the peak-to-peak voltage, V
+PER_PERIOD = 400  # samples per period
+RISE = 0.05  # rise time of the trapezoid in periods
+THICKNESS = 201e-6  # thickness of insulator and skin together in the default scene, m
+LENGTHS = (700, 1000, 1500, 2200, 3000)  # numbers of samples
+# so few that most records find their functions compiled
 DRIVES = (
     ("square", 100.0),
     ("square", 250.0),
@@ -76,7 +76,7 @@ DRIVES = (
 
 
 class Simulated(NamedTuple):
-    """A record, its scene, what it was made with, SI units."""
+    """Simulated record with its scene and its true values in SI units."""
 
     record: fitact.Record
     scene: fitact.Scene
@@ -84,7 +84,7 @@ class Simulated(NamedTuple):
 
 
 def simulate(seed: int, number: int) -> Simulated:
-    """Record `number`: truth, drive and length drawn anew."""
+    """Simulate record `number` with random true values, drive and length."""
     rng = np.random.default_rng([seed, number])
     spread = scipy.stats.norm.ppf(0.975)
     Rsc, Csc, Ci = (MEDIANS[name] * FACTORS[name] ** (rng.standard_normal() / spread) for name in MEDIANS)
@@ -103,7 +103,7 @@ def simulate(seed: int, number: int) -> Simulated:
         vsc, mean_square = np.resize(settled, count), steady_mean_square(waveform, frequency, settled, g, b)
     drive = {"waveform": waveform, "frequency": frequency, "peak_to_peak": 2.0 * AMPLITUDE}
     drive |= {"rise_time": RISE / frequency} if waveform == "trapezoid" else {}
-    drive |= {"steady_state": False} if waveform == "measured" else {}  # from rest
+    drive |= {"steady_state": False} if waveform == "measured" else {}  # the record begins at rest
     record = fitact.Record.from_arrays(
         time, V=voltage, Vsc=vsc + sigma * rng.standard_normal(count), source=f"record {number}"
     )
@@ -113,7 +113,7 @@ def simulate(seed: int, number: int) -> Simulated:
 
 
 def wave(waveform: str, rng: np.random.Generator) -> np.ndarray:
-    """One period, V; a measured one has random harmonics and a random height."""
+    """Return one period of the drive, V; a measured drive has random harmonics and a random amplitude."""
     phase = np.arange(PER_PERIOD) / PER_PERIOD
     if waveform == "measured":
         shares, phases = np.array([1.0, *rng.uniform(0.0, 0.3, 3)]), rng.uniform(0.0, 1.0, 4)
@@ -133,26 +133,26 @@ def wave(waveform: str, rng: np.random.Generator) -> np.ndarray:
 def skin_voltage(
     time: np.ndarray, voltage: np.ndarray, g: float, b: float, charge: float, hold: bool = False
 ) -> np.ndarray:
-    """Vsc, exact for straight lines (or, with hold, steps) between samples; `charge`: of the low-pass at first, V."""
+    """Return Vsc for a drive that is linear (with hold, constant) between samples; `charge` is the initial state, V."""
     return scipy.signal.lsim((-1.0 / b, 1.0 / b, -g, g), voltage, time, charge, interp=not hold)[1]
 
 
 def steady(waveform: str, frequency: float, period: np.ndarray, g: float, b: float) -> np.ndarray:
-    """One settled period of Vsc, V."""
+    """Return one period of Vsc in the steady state, V."""
     phase = np.arange(PER_PERIOD + 1) / PER_PERIOD
     if waveform == "sine":
         omega = 2.0 * np.pi * frequency
         gain = AMPLITUDE * g * 1j * omega * b / (1.0 + 1j * omega * b)
         return np.imag(gain * np.exp(2j * np.pi * phase[:-1]))
     time, hold, closed = phase / frequency, waveform == "square", np.append(period, period[0])
-    # after a period the charge is what it was: charge = reached from none + charge e^{-T/b}
+    # the charge after a period equals that before it: charge = reached from zero + charge e^{-T/b}
     reached = closed[-1] - skin_voltage(time, closed, g, b, 0.0, hold)[-1] / g
     charge = reached / -np.expm1(-time[-1] / b)
     return skin_voltage(time, closed, g, b, charge, hold)[:-1]
 
 
 def steady_mean_square(waveform: str, frequency: float, settled: np.ndarray, g: float, b: float) -> float:
-    """Of Vsc over a period, V^2: closed for a square, whose jumps samples do not show."""
+    """Return the mean square of Vsc over a period, V^2; closed form for a square, whose jumps samples do not show."""
     if waveform == "square":
         x = 1.0 / (frequency * b)
         return float(4.0 * (AMPLITUDE * g) ** 2 * np.tanh(x / 4.0) / x)
@@ -163,7 +163,7 @@ def steady_mean_square(waveform: str, frequency: float, settled: np.ndarray, g: 
 
 
 def ranks(number: int, seed: int) -> dict[str, Any]:
-    """Ranks of one record's truths at every level, and what was said against the answers."""
+    """Rank the true values of one record with every method; also return the warnings."""
     began = time.perf_counter()
     simulated = simulate(seed, number)
     row: dict[str, Any] = {"record": number, "drive": simulated.scene.drive.waveform, "samples": len(simulated.record)}
@@ -182,7 +182,7 @@ def ranks(number: int, seed: int) -> dict[str, Any]:
 
 
 def drawn(posterior: fitact.Posterior, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """So few of the draws that they are independent."""
+    """Return so few of the draws that they are independent."""
     count = posterior.log_prob.size
     chosen = rng.choice(count, DRAWS, replace=False)
     few = dataclasses.replace(
@@ -198,10 +198,10 @@ def drawn(posterior: fitact.Posterior, rng: np.random.Generator) -> dict[str, np
 def collect(
     path: Path, records: int, seed: int, workers: int, task: Callable[[int, int], dict[str, Any]] = ranks
 ) -> list[dict[str, Any]]:
-    """`task`'s rows of records 0 to `records`, those that the file lacks computed and added to it."""
+    """Return the rows of `task` for records 0 to `records`; rows missing in the file are computed and appended."""
     header = {"seed": seed, "sources": sources(inspect.getfile(task))}
     lines = path.read_text().splitlines(keepends=True) if path.exists() else []
-    whole = [json.loads(line) for line in lines if line.endswith("\n")]  # a killed run may leave a part of a line
+    whole = [json.loads(line) for line in lines if line.endswith("\n")]  # a killed run may leave an incomplete line
     if whole and whole[0] != header:
         print(f"{path} is of another seed or other code: begun anew", file=sys.stderr)
         whole = []
@@ -224,26 +224,26 @@ def collect(
 def computed(
     numbers: list[int], seed: int, workers: int, compiled: Path, task: Callable[[int, int], dict[str, Any]]
 ) -> Iterator[dict[str, Any]]:
-    """Rows of the records, as they come."""
+    """Yield the rows of the records in the order of completion."""
     each = RECYCLED * workers
     for first in range(0, len(numbers), each):
         with pool(workers, compiled) as executor:
             futures = [executor.submit(task, number, seed) for number in numbers[first : first + each]]
             try:
                 yield from (future.result() for future in concurrent.futures.as_completed(futures))
-            except BaseException:  # Ctrl-C too
+            except BaseException:  # also Ctrl-C
                 executor.shutdown(cancel_futures=True)
                 raise
 
 
 def sources(script: str) -> str:
-    """SHA-256 of all code that the rows come from."""
+    """Return the SHA-256 of all code on which the rows depend."""
     files = sorted(Path(fitact.__file__).parent.rglob("*.py"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in [*files, Path(script)])).hexdigest()
 
 
 def pool(workers: int, compiled: Path) -> concurrent.futures.ProcessPoolExecutor:
-    """Spawned processes of one thread each, which share what they compile: in `compiled`, unless a place is set."""
+    """Return a pool of spawned single-threaded processes with a common compilation cache (`compiled` by default)."""
     threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     threads["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
     cache = {"JAX_COMPILATION_CACHE_DIR": str(compiled), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1"}
@@ -257,13 +257,13 @@ def pool(workers: int, compiled: Path) -> concurrent.futures.ProcessPoolExecutor
 
 
 def band(records: int, gamma: float) -> tuple[np.ndarray, np.ndarray]:
-    """Least and largest count of ranks below 1, 2, ... whose two-sided binomial tail exceeds gamma."""
-    z, tail = np.arange(1, VALUES) / VALUES, 0.5 * gamma * (1.0 + 1e-9)  # an equal tail is outside
+    """Return the bounds on the counts of ranks below 1, 2, ... whose two-sided binomial tail exceeds gamma."""
+    z, tail = np.arange(1, VALUES) / VALUES, 0.5 * gamma * (1.0 + 1e-9)  # an equal tail counts as outside
     return scipy.stats.binom.ppf(tail, records, z).astype(int), scipy.stats.binom.isf(tail, records, z).astype(int)
 
 
 def leaving(records: int, gamma: float) -> float:
-    """Probability that uniform ranks leave the band somewhere: exact, along the Markov chain of the counts."""
+    """Return the exact probability that uniform ranks leave the band, from the Markov chain of the counts."""
     at, inside = np.zeros(1, dtype=int), np.ones(1)
     for i, (low, high) in enumerate(zip(*band(records, gamma), strict=True)):
         onto = np.arange(low, high + 1)
@@ -273,18 +273,18 @@ def leaving(records: int, gamma: float) -> float:
 
 
 def p_value(found: np.ndarray) -> float:
-    """Of ranks, if they are uniform over 0 to `DRAWS`."""
+    """Return the p-value of ranks under uniformity over 0 to `DRAWS`."""
     z = np.arange(1, VALUES) / VALUES
     below = np.sum(found[:, None] < np.arange(1, VALUES), axis=0)
     law = scipy.stats.binom(found.size, z)
     gamma = 2.0 * min(np.min(law.cdf(below)), np.min(law.sf(below - 1)))
     if gamma < 1e-8:
-        return DRAWS * gamma  # a bound, where the band is so wide that to go through it takes long
+        return DRAWS * gamma  # an upper bound, since the exact value takes long for a wide band
     return leaving(found.size, gamma) if gamma < 1.0 else 1.0
 
 
 def holm(p: np.ndarray) -> np.ndarray:
-    """P-values adjusted for their number (Holm 1979)."""
+    """Return p-values adjusted for their number (Holm 1979)."""
     order = np.argsort(p)
     adjusted = np.maximum.accumulate(p[order] * np.arange(p.size, 0, -1))
     out = np.empty_like(p)
@@ -293,14 +293,14 @@ def holm(p: np.ndarray) -> np.ndarray:
 
 
 def off(found: np.ndarray, share: float) -> float:
-    """By how many binomial standard deviations the central interval covers too often."""
+    """Return the excess coverage of the central interval, in binomial standard deviations."""
     outside = 0.5 * (1.0 - share) * VALUES
     covered = np.mean((found >= outside) & (found < VALUES - outside))
     return float((covered - share) / np.sqrt(share * (1.0 - share) / found.size))
 
 
 class Judged(NamedTuple):
-    """Of one level, by quantity: adjusted p-values, and for each of `INTERVALS` how far its coverage is off."""
+    """Test results of one method by quantity: adjusted p-values, and the excess coverage of each of `INTERVALS`."""
 
     p: np.ndarray
     off: np.ndarray
@@ -311,7 +311,7 @@ class Judged(NamedTuple):
 
 
 def judge(found: np.ndarray) -> Judged:
-    """Of ranks (records, quantities)."""
+    """Test the ranks (records, quantities) of one method."""
     columns = found.T
     return Judged(
         holm(np.array([p_value(column) for column in columns])),
@@ -323,7 +323,7 @@ def judge(found: np.ndarray) -> Judged:
 
 
 def table(found: dict[str, np.ndarray], judged: dict[str, Judged]) -> str:
-    """A row for every quantity and level; the last column: mean rank less Laplace's, in standard errors."""
+    """Format a row per quantity and method; the last column is the mean rank less Laplace's, in standard errors."""
     heads = "".join(f"{f'{100 * share:.0f} %':>8}{'off by':>8}" for share in INTERVALS)
     rows = [f"{'':12}{'level':9}{'p (Holm)':>9}{heads}{'mean rank':>11}{'less Laplace':>14}"]
     for i, name in enumerate(QUANTITIES):
@@ -341,7 +341,7 @@ def table(found: dict[str, np.ndarray], judged: dict[str, Judged]) -> str:
 
 
 def counts(rows: list[dict[str, Any]]) -> str:
-    """What was said against answers, none of which was left out."""
+    """Format the numbers of warnings; no result was excluded."""
     kept = [row for row in rows if "refused" not in row]
     bad = Counter(level for row in kept for level in row["bad"])
     lines = [
@@ -356,11 +356,11 @@ def counts(rows: list[dict[str, Any]]) -> str:
 
 
 def draw(found: dict[str, np.ndarray], path: Path) -> None:
-    """The empirical distribution of the ranks less the uniform one, and the band that it leaves once in 700 runs."""
+    """Plot the empirical distribution of the ranks less the uniform one, with a band that 1 of 700 runs leaves."""
     import matplotlib
 
     matplotlib.use("svg")
-    matplotlib.rcParams |= {"svg.fonttype": "none", "svg.hashsalt": "fitact"}  # small, and the same every time
+    matplotlib.rcParams |= {"svg.fonttype": "none", "svg.hashsalt": "fitact"}  # small, reproducible files
     from matplotlib import pyplot as plt
 
     records = len(found["emcee"])
@@ -383,14 +383,14 @@ def draw(found: dict[str, np.ndarray], path: Path) -> None:
 
 
 def main() -> None:
-    """Print the table, write the picture; exit code 1 where emcee or psis fails, or a record was refused."""
+    """Print the table and write the plot; exit status 1 if emcee or psis fails, or a record was refused."""
     parser = argparse.ArgumentParser(description="simulation-based calibration of fit and sampler")
     parser.add_argument("--records", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--out", type=Path, default=Path("out/calibration"))
     options = parser.parse_args()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, or the workers would outlive this
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as for Ctrl-C, so that the workers end too
     try:
         rows = collect(options.out / "ranks.jsonl", options.records, options.seed, options.workers)
     except KeyboardInterrupt:

@@ -1,8 +1,9 @@
-"""Break oscilloscope files at random: each must end in a record or in one sentence, soon, in little memory.
+"""Damage oscilloscope files at random: each must give a record or a one-line error, quickly and in little memory.
 
     python -m tests.fuzz --count 20000 --seed 0
 
-A finding is printed with its number, which alone makes the file again: --first NUMBER --count 1 --keep broken.csv
+A finding is printed with its number, which suffices to create the file again:
+--first NUMBER --count 1 --keep broken.csv
 """
 
 import argparse
@@ -23,8 +24,8 @@ from fitact.data.readers.capture import resolve_channels
 from fitact.data.readers.read import read_capture
 
 SCOPE = Path(__file__).parent / "data" / "scope"
-SECONDS = 10.0  # for one file
-MEGABYTES = 1000.0  # by which one may raise the peak of memory; HDF5 takes 800 at a string of broken length
+SECONDS = 10.0  # time limit for one file, s
+MEGABYTES = 1000.0  # limit on the rise of peak memory by one file, MB; a string of damaged length in HDF5 takes 800
 TOKENS = (
     b"nan", b"inf", b"-inf", b"1e999", b"-1e-999", b"9.9E+37", b"", b"-", b".", b"e", b"1,5", b"0x1F", b"1_000", b'"',
     b";", b"\t", b"#", b",,,,", b"9" * 400, b"\xe2\x88\x9e", b"\xb5s", b"\xff\xfe", b"\0", b"\r", b"\n\n", b"Start",
@@ -33,7 +34,7 @@ TOKENS = (
 
 
 def samples() -> dict[str, bytes]:
-    """The files to break: the shipped ones, and one of named arrays for each of their kinds."""
+    """Return the files to damage: the shipped ones, and one of each kind with named arrays."""
     from tests.data.test_scope_files import NAMED
 
     found = {path.name: path.read_bytes() for path in sorted(SCOPE.iterdir()) if path.suffix != ".md"}
@@ -45,7 +46,7 @@ def samples() -> dict[str, bytes]:
 
 
 def broken(files: dict[str, bytes], seed: int, number: int) -> tuple[str, bytes]:
-    """The number-th broken file: its name and content."""
+    """Return the name and content of damaged file `number`."""
     rng = random.Random(f"{seed} {number}")
     name = rng.choice(sorted(files))
     content = bytearray(files[name])
@@ -93,7 +94,7 @@ def _splice(rng: random.Random, content: bytearray, other: bytes) -> None:
 
 
 def _token(rng: random.Random, content: bytearray, other: bytes) -> None:
-    """In place of a cell, in the header as often as not."""
+    """Return a replacement for a cell, which is in the header half of the time."""
     start = rng.randrange(min(len(content), rng.choice((300, len(content)))) + 1) if content else 0
     stop = start
     while stop < len(content) and content[stop] not in b",;\t\n ":
@@ -109,7 +110,7 @@ def _swap_lines(rng: random.Random, content: bytearray, other: bytes) -> None:
 
 
 def outcome(path: Path) -> str:
-    """What comes of a file: "record", "capture" or "refused"; anything else is raised."""
+    """Return "record", "capture" or "refused" for a file; any other exception is raised."""
     try:
         capture = read_capture(path)
         assert len({trace.values.size for trace in capture.channels} | {capture.time.size}) == 1
@@ -138,7 +139,7 @@ def _one_sentence(error: fitact.InputError, path: Path) -> None:
 
 
 def findings(count: int, seed: int, first: int = 0, keep: Path | None = None) -> Iterator[tuple[int, str, str]]:
-    """Break and read: number, name and outcome of each file; the outcome of a finding begins with "FOUND"."""
+    """Yield number, name and outcome of each damaged file; the outcome of a finding begins with "FOUND"."""
 
     def late(*_: object) -> None:
         raise TimeoutError(f"longer than {SECONDS:g} s")
@@ -157,7 +158,7 @@ def findings(count: int, seed: int, first: int = 0, keep: Path | None = None) ->
                     result = outcome(path)
                     if _peak() - peak > MEGABYTES:
                         result = f"FOUND memory: {_peak() - peak:.0f} MB more"
-                except BaseException as error:  # whatever a parser lets through
+                except BaseException as error:  # any exception that a parser does not handle
                     if isinstance(error, KeyboardInterrupt):
                         raise
                     result = f"FOUND {type(error).__name__}: {error}"
@@ -184,7 +185,7 @@ def main() -> int:
     base = _peak()
     for number, name, result in findings(given.count, given.seed, given.first, given.keep):
         now = time.perf_counter()
-        if number > given.first:  # which imported the parsers
+        if number > given.first:  # the first file includes the import of the parsers
             slowest = max(slowest, now - before)
         before = now
         outcomes[result.split()[0]] += 1

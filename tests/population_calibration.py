@@ -1,15 +1,15 @@
-"""Coverage of populations: laws drawn from the hyperprior, fingers from each law, records of the fingers through all.
+"""Coverage of populations: parameters drawn from the hyperprior, fingers from each population, records of the fingers.
 
-Fixed before anything was run: the truths come from `PRIOR` and the hyperprior that docs/population.md states, a record
-is two settled periods of a triangle from scipy's state space, with `NOISE`. A truth's place is the share of the
-posterior below it. Central intervals of 50 % and 90 % must cover within three binomial standard deviations: of the
-law's parameters, and of the mean force of one more finger. Every population counts; one that is refused has no places,
-and fails the run.
+The design was fixed before the first run. Truths come from `PRIOR` and the hyperprior of docs/population.md. A record
+is two steady-state periods of a triangle from scipy's state space, with `NOISE`. The place of a truth is the posterior
+probability below it. Central intervals of 50 % and 90 % must cover within three binomial standard deviations, for the
+population parameters and for the mean force of a new finger. Every population counts; a population that is refused has
+no places, and fails the run.
 
     python -m tests.population_calibration [--populations 100] [--seed 1] [--workers 2] [--out out/population]
 
-Places are kept in DIR/places.jsonl, and the next run of the same code goes on from there. Each population has a seed of
-its own, so that the first 20 are the same in every run.
+Places are saved in DIR/places.jsonl, from which the next run of the same code resumes. Each population has its own
+seed, so the first 20 are the same in every run.
 """
 
 import argparse
@@ -27,10 +27,10 @@ from tests.calibration import THICKNESS, collect, steady, wave
 
 FINGERS = 20
 MEDIANS = {"Rsc": 130e3, "Csc": 20e-9, "Ci": 1.35e-9}  # ohm, F, F
-FACTORS = {"Rsc": 2.0, "Csc": 2.0, "Ci": 1.2}  # that hold 95 %
+FACTORS = {"Rsc": 2.0, "Csc": 2.0, "Ci": 1.2}  # factors that contain 95 %
 PRIOR = {name: {"median": MEDIANS[name], "factor": FACTORS[name]} for name in MEDIANS}
 SPREAD = 0.5  # half-normal scale of the log-standard deviations
-NOISE = 0.3  # V
+NOISE = 0.3  # noise sd, V
 FREQUENCY = 100.0  # Hz
 QUANTITIES = ("Rsc", "Csc", "Ci", "log_sd_Rsc", "log_sd_Csc", "correlation", "force_mean")
 INTERVALS = (0.5, 0.9)
@@ -38,7 +38,7 @@ SIGMAS = 3.0
 
 
 class Simulated(NamedTuple):
-    """Records of fingers, their scene, and the truths, SI units."""
+    """Simulated records of several fingers with their scene and true values in SI units."""
 
     records: list[fitact.Record]
     scene: fitact.Scene
@@ -46,7 +46,7 @@ class Simulated(NamedTuple):
 
 
 def simulate(seed: int, number: int, fingers: int = FINGERS, noise: float = NOISE) -> Simulated:
-    """Population `number`."""
+    """Simulate population `number`."""
     rng = np.random.default_rng([seed, number])
     score = scipy.stats.norm.ppf(0.975)
     Rsc, Csc, Ci = (MEDIANS[name] * FACTORS[name] ** (rng.standard_normal() / score) for name in MEDIANS)
@@ -71,13 +71,13 @@ def simulate(seed: int, number: int, fingers: int = FINGERS, noise: float = NOIS
 
 
 def vsc(Rsc: float, Csc: float, Ci: float, rng: np.random.Generator) -> np.ndarray:
-    """One settled period of a finger's Vsc, V."""
+    """Return one steady-state period of Vsc of a finger, V."""
     total = 2.0 * Ci + Csc
     return steady("triangle", FREQUENCY, wave("triangle", rng), Ci / total, Rsc * total)
 
 
 def places(number: int, seed: int) -> dict[str, Any]:
-    """Places of one population's truths, and what was said against the answer."""
+    """Return the places of the true values of one population, and the warnings."""
     began = time.perf_counter()
     simulated = simulate(seed, number)
     row: dict[str, Any] = {"record": number}
@@ -92,7 +92,7 @@ def places(number: int, seed: int) -> dict[str, Any]:
 
 
 def coverage(found: np.ndarray, share: float) -> tuple[float, float]:
-    """Of the central interval: how often it covers, and by how many binomial standard deviations too often."""
+    """Return the coverage of the central interval, and its excess in binomial standard deviations."""
     covered = float(np.mean(np.abs(found - 0.5) < 0.5 * share))
     return covered, float((covered - share) / np.sqrt(share * (1.0 - share) / found.size))
 

@@ -1,7 +1,7 @@
-"""What users get from the commands is what it was: exit codes, numbers, keys of the JSON and sentences.
+"""Results of the commands against recorded ones: exit statuses, numbers, keys of the JSON and sentences.
 
-`tests/data/behaviour.json` was recorded by `tests/behaviour.py` before the packages were rearranged; a change that is
-meant is recorded anew by `python -m tests.behaviour store`.
+`tests/data/behaviour.json` holds the recorded results. After an intended change, record them again with
+`python -m tests.behaviour store`.
 """
 
 import json

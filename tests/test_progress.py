@@ -1,4 +1,4 @@
-"""Progress of long work: told on standard error once it takes a while, and nothing else changes."""
+"""Progress of long work: reported on standard error after a while, without any effect on the result."""
 
 import sys
 

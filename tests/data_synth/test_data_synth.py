@@ -1,4 +1,4 @@
-"""data_synth's routes against closed forms, scipy's own integrators, ngspice, and fitact."""
+"""The routes of data_synth against closed forms, scipy's integrators, ngspice and fitact."""
 
 import shutil
 import tomllib
@@ -42,7 +42,7 @@ def even(count: int = 2000, step: float = 1e-5) -> np.ndarray:
 
 
 def skin_gain(omega: np.ndarray | float, Z: Callable[..., Any]) -> Any:
-    """Vsc / V of two skins Z in series with Ci."""
+    """Return Vsc / V of two skins Z in series with Ci."""
     return Z(omega) / (2.0 * Z(omega) + 1.0 / (1j * omega * CI))
 
 
@@ -59,19 +59,19 @@ def test_a_sine_in_the_steady_state():
 
 
 def test_a_square_in_the_steady_state():
-    """Vsc decays from 360 g / (1 + e^{-T/2b}) after each edge, of which a sample shows the right limit."""
+    """Vsc decays from 360 g / (1 + e^{-T/2b}) after each edge; a sample at an edge holds the right limit."""
     time = even(3000)
     voltage, vsc, current = respond(time)
     since, sign = time % 5e-3, np.where(np.arange(3000) % 1000 < 500, 1.0, -1.0)
     since[np.isclose(since, 5e-3, atol=1e-12) | (since < 1e-12)] = 0.0
     np.testing.assert_array_equal(voltage, 180.0 * sign)
     np.testing.assert_allclose(vsc, sign * 360.0 * G / (1.0 + np.exp(-5e-3 / B)) * np.exp(-since / B), atol=1e-10)
-    assert np.all(np.isnan(current) == (since == 0.0))  # an impulse, where nothing limits it
+    assert np.all(np.isnan(current) == (since == 0.0))  # an impulse, if nothing limits the current
 
 
 @pytest.mark.parametrize("shape", ["square", "triangle"])
 def test_a_burst_from_rest(shape: str):
-    """scipy.signal.lsim of the transfer function, with the corners among its samples."""
+    """scipy.signal.lsim of the transfer function, with the corners on the sampling grid."""
     time = even(4000)
     drive = {"waveform": "burst", "shape": shape, "frequency": 200.0, "cycles": 3}
     voltage, vsc, _ = respond(time, drive=drive)
@@ -83,7 +83,7 @@ def test_a_burst_from_rest(shape: str):
 
 @pytest.mark.parametrize("spacing", ["linear", "logarithmic"])
 def test_a_chirp_from_rest(spacing: str):
-    """The convolution with the circuit's exponential, by scipy's quadrature."""
+    """Convolution with the exponential of the circuit by scipy's quadrature."""
     drive = {"waveform": "chirp", "start_frequency": 50.0, "end_frequency": 400.0, "sweep_time": 0.02}
     frequency = {
         "linear": lambda t: 50.0 + 350.0 * t / 0.02,
@@ -105,7 +105,7 @@ def test_a_chirp_from_rest(spacing: str):
 
 
 def test_several_tones():
-    """The sum of what scipy.signal.freqs makes of each; it repeats after a period that no tone has."""
+    """Sum of the tones' responses from scipy.signal.freqs; its period is longer than that of any tone."""
     time, tones = even(), np.array([80.0, 120.0, 300.0])
     drive = {"waveform": "multitone", "frequencies": tones.tolist(), "amplitudes": [9.0, 5.0, 2.0], "phases": [0, 1, 2]}
     _, vsc, _ = respond(time, drive=drive)
@@ -116,7 +116,7 @@ def test_several_tones():
 
 def test_the_order_of_samples_and_their_steps_do_not_matter():
     time = even()
-    drawn = np.random.default_rng(0).permutation(2000)[:500]  # any
+    drawn = np.random.default_rng(0).permutation(2000)[:500]  # any subset
     drive = {"waveform": "trapezoid", "rise_time": "30 us", "duty": 0.3, "phase": 1.0}
     for all_of_it, some in zip(respond(time, drive=drive), respond(time[drawn], drive=drive), strict=True):
         np.testing.assert_allclose(some, all_of_it[drawn], rtol=1e-8, atol=1e-9)
@@ -175,7 +175,7 @@ def test_two_layers_of_skin():
 
 @pytest.mark.parametrize("alpha", [0.6, 1.0])
 def test_a_fractional_skin(alpha: float):
-    """Vsc and I of a triangle against the triangle's Fourier series, summed far beyond where data_synth stops."""
+    """Vsc and I of a triangle against its Fourier series, summed far beyond the harmonics that data_synth uses."""
     time = np.array([0.3e-3, 2.4e-3, 4.4e-3, 9.9e-3])
     drive, skin = {"waveform": "triangle"}, {"level": "fractional", "alpha": alpha}
     _, vsc, current = respond(time, drive=drive, skin=skin)
@@ -192,7 +192,7 @@ def test_a_fractional_skin(alpha: float):
 
 @pytest.mark.parametrize(("frequency", "values"), [(10.0, (200e3, 44.25e-9)), (1e3, (80e3, 8.85e-9))])
 def test_a_dispersive_skin(frequency: float, values: tuple[float, float]):
-    """The paper's values at its frequencies."""
+    """Values of the paper at its frequencies."""
     time, omega = even(), 2.0 * np.pi * frequency
     _, vsc, _ = respond(time, drive={"waveform": "sine", "frequency": frequency}, skin={"level": "dispersive"})
     gain = skin_gain(omega, lambda w: values[0] / (1.0 + 1j * w * values[0] * values[1]))
@@ -221,7 +221,7 @@ def test_a_nonlinear_skin_becomes_linear_at_small_voltages():
 
 
 def test_half_open_pores_are_a_smaller_resistance():
-    """Where the width is far above all voltages, half of the pores are open, always."""
+    """If the width of the transition is far above all voltages, half of the pores are always open."""
     skin = {"model": "electroporated", "threshold": 1e-3, "width": 1e9, "time_constant": 1e-3, "factor": 4.0}
     time = even(1500)
     found, wanted = respond(time, skin, drive=TRAPEZOID), respond(time, drive=TRAPEZOID, skin={"Rsc": R / 2.5})
@@ -231,7 +231,7 @@ def test_half_open_pores_are_a_smaller_resistance():
 
 
 def test_pores_open_only_where_the_voltage_is_high():
-    """Skin whose pores open above 10 V discharges sooner, and as before where the voltage stays below."""
+    """A skin whose pores open above 10 V discharges faster; at lower voltages it does not change."""
     skin = {"model": "electroporated", "threshold": 10.0, "width": 0.1, "time_constant": 1e-4, "factor": 5.0}
     time = even(1500)
     low, high = {**TRAPEZOID, "peak_to_peak": 36.0}, TRAPEZOID
@@ -270,10 +270,10 @@ SPICE: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 @pytest.mark.parametrize("name", SPICE)
 def test_against_ngspice(name: str):
     model, tables = SPICE[name]
-    time = even() + 3.1e-6  # beside the jumps, for which ngspice takes 1 ns
+    time = even() + 3.1e-6  # next to the jumps, which take 1 ns in ngspice
     ours, theirs = (respond(time, model, route, **tables) for route in ("scipy", "ngspice"))
     for channel, (found, expected) in enumerate(zip(ours, theirs, strict=True)):
-        smooth = channel == 2 and "sines" in name  # of a polygon ngspice's current follows the steps of dV/dt
+        smooth = channel == 2 and "sines" in name  # for a polygon, ngspice's current follows the steps of dV/dt
         np.testing.assert_allclose(found, expected, atol=(1e-2 if smooth else 1e-4) * np.ptp(expected))
 
 
@@ -305,7 +305,7 @@ SHIPPED = sorted(path.stem for path in (Path(fitact.__file__).parent / "scenes")
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_scenes_give_what_fitact_simulates(name: str):
-    """Without noise, by two models that share no code."""
+    """Records without noise from two models that share no code."""
     quiet = {"noise_Vsc": 0.0, "noise_I": 0.0}
     tables = tomllib.loads((Path(fitact.__file__).parent / "scenes" / f"{name}.toml").read_text())
     tables["measurement"] = tables.get("measurement", {}) | quiet

@@ -1,4 +1,4 @@
-"""data_synth's records: imperfections against their laws, recipes, files, the command line, fits of what is shipped."""
+"""Records of data_synth: imperfections and their statistics, recipes, files, command line, fits of shipped records."""
 
 import json
 import shutil
@@ -37,7 +37,7 @@ def spoilt(
 
 
 def test_white_noise():
-    """Its sd to four standard errors, and no correlation from sample to sample."""
+    """The sd agrees to four standard errors, and samples are uncorrelated."""
     noise = spoilt(white={"Vsc": "50 mV"})
     assert np.std(noise) == pytest.approx(0.05, rel=4.0 / np.sqrt(2.0 * LONG.size))
     assert abs(np.corrcoef(noise[1:], noise[:-1])[0, 1]) < 4.0 / np.sqrt(LONG.size)
@@ -46,7 +46,7 @@ def test_white_noise():
 
 @pytest.mark.parametrize("exponent", [0.5, 1.0, 2.0])
 def test_pink_noise(exponent: float):
-    """Slope of Welch's periodogram between the corner and the highest frequencies, and the variance's mean."""
+    """Slope of Welch's periodogram between the corner and the highest frequencies, and the mean of the variance."""
     law = {"Vsc": 0.2, "exponent": exponent, "corner": 200.0}
     drawn = np.array([spoilt(seed=seed, pink=law) for seed in range(8)])
     frequency, power = scipy.signal.welch(drawn, 1e5, nperseg=4000)
@@ -55,12 +55,12 @@ def test_pink_noise(exponent: float):
     slope = np.polyfit(np.log(frequency[above]), np.log(power[above]), 1)[0]
     assert slope == pytest.approx(-exponent, abs=0.05)
     flat = (frequency > 30.0) & (frequency < 150.0)
-    assert np.ptp(np.log(power[flat])) < 0.7  # five points of 8 x 19 windows: sd 0.1 each
+    assert np.ptp(np.log(power[flat])) < 0.7  # five points of 8 x 19 windows, with an sd of 0.1 each
     assert np.mean(np.square(drawn)) == pytest.approx(0.04, rel=0.1)
 
 
 def test_hum_has_the_amplitudes_that_are_asked_for():
-    """50 Hz and its third harmonic, over whole periods of both."""
+    """50 Hz and its third harmonic over whole periods of both."""
     values = spoilt(hum={"Vsc": 2.0, "harmonics": [1.0, 0.0, 0.25]})
     lines = 2.0 * np.abs(np.fft.rfft(values)) / LONG.size
     np.testing.assert_allclose(lines[[20, 40, 60]], [2.0, 0.0, 0.5], atol=1e-9)
@@ -76,7 +76,7 @@ def test_gain_offset_drift_and_clipping():
 
 
 def test_a_converter():
-    """Levels a step apart, errors uniform over a step, and a rail at each end, the lower one a step further out."""
+    """Levels one step apart, errors uniform over a step, and saturation at both ends, the lower one a step further."""
     wave, step = np.linspace(-25.0, 25.0, LONG.size), 40.0 / 2**8
     read = spoilt(values=wave, converter={"bits": 8, "Vsc": "40 V"})
     np.testing.assert_array_equal(read / step, np.round(read / step))
@@ -120,7 +120,7 @@ def only(made: dict[str, make.Synthetic]) -> make.Synthetic:
 
 
 def test_noise_depends_on_the_seed_and_on_no_other_noise(tmp_path: Path):
-    """Of two records that differ by hum alone, the difference is the hum, whatever else is random."""
+    """The difference between two records that differ only in hum is the hum, whatever the other random parts are."""
     noise = '[white]\nVsc = "1 V"\n[pink]\nVsc = "1 V"\n[clock]\njitter = "1 us"\n'
     plain, again, humming, other = (
         only(make.make(written(tmp_path, text))).channels["Vsc"]
@@ -134,7 +134,7 @@ def test_noise_depends_on_the_seed_and_on_no_other_noise(tmp_path: Path):
 
 
 def test_kinds_channels_and_fingers_have_random_numbers_of_their_own():
-    """No two streams go together by five standard errors, which one pair in a million would by chance."""
+    """The correlation of any two streams is below five standard errors; chance exceeds it once in a million pairs."""
     streams = [
         imperfections.generator(1, finger, kind, channel).standard_normal(2000)
         for kind in ("population", "clock", "hum", "pink", "white", "missing")
@@ -154,7 +154,7 @@ def test_what_is_true_goes_before_what_the_scene_says(tmp_path: Path):
 
 
 def test_people_follow_their_law(tmp_path: Path):
-    """Logs normal with the stated spreads and correlation; an area leaves R C and the divider alone."""
+    """Logarithms are normal with the stated sds and correlation; the contact area leaves R C and the divider alone."""
     law = "[population]\nfingers = 4000\nlog_sd_Rsc = 0.3\nlog_sd_Csc = 0.5\ncorrelation = -0.6\n"
     found = {}
     for area in (0.0, 0.2):
@@ -213,7 +213,7 @@ def test_what_is_refused(name: str, tmp_path: Path):
 
 @pytest.mark.parametrize("end", files.FORMATS)
 def test_every_format_is_read_again(end: str, tmp_path: Path):
-    """Times and, but for the nine digits of a CSV, values bit for bit."""
+    """Times and values agree bit for bit, except for the nine digits of a CSV."""
     made = only(make.make(written(tmp_path, "", '[measurement]\nchannels = ["Vsc", "I"]\n[drive]\nwaveform = "sine"')))
     path = tmp_path / f"record.{end}"
     files.write_record(path, made.time, made.channels)
@@ -253,7 +253,7 @@ def test_help_loads_no_library():
 
 @pytest.mark.slow
 def test_the_committed_records_can_be_made_again_without_fitact(tmp_path: Path):
-    """In a process where fitact cannot be imported; ngspice's times and the last digits are the machine's."""
+    """The process cannot import fitact; ngspice's times and the last digits depend on the machine."""
     done = run("committed", "--out", str(tmp_path))
     assert done.returncode == 0, done.stderr
     committed = sorted(path.relative_to(RECORDS) for path in RECORDS.rglob("*.json") if has_recipe(path))
@@ -296,7 +296,7 @@ def test_what_is_refused_ends_in_one_line(tmp_path: Path):
 
 
 def test_a_scene_is_recorded_as_it_is_with_the_seed_and_format_asked_for(tmp_path: Path):
-    """And by ngspice, where that is asked for and there."""
+    """Also by ngspice, if it is requested and installed."""
     path = tmp_path / "plain.toml"
     path.write_text('[drive]\nwaveform = "triangle"\n[measurement]\nduration = "10 ms"\n')
     routes = ["scipy", "ngspice"] if shutil.which("ngspice") else ["scipy"]

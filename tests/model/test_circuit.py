@@ -8,7 +8,7 @@ import fitact
 
 
 def divided(omega: np.ndarray, Rsc: float, Csc: float, Ci: float) -> np.ndarray:
-    """Eqs. (18)-(19) as impedances."""
+    """Eqs. (18) and (19) as impedances."""
     skin = Rsc / (1.0 + 1j * omega * Rsc * Csc)
     return skin / (2.0 * skin + 1.0 / (1j * omega * Ci))
 
@@ -58,7 +58,7 @@ def loaded(omega: np.ndarray) -> np.ndarray:
     return skin * probe / (skin + probe)
 
 
-# circuit, impedance of the touching skin, of what else is in the loop beside Ci
+# circuit, impedance of the sliding finger's skin, impedance of the rest of the loop without Ci
 LOOPS = {
     "final": (fitact.FinalCircuit(R, C, CI), lambda w: element(w, R, C), lambda w: element(w, R, C)),
     "equal skins": (fitact.DirectGround(R, C, CI), lambda w: element(w, R, C), lambda w: element(w, R, C)),
@@ -96,14 +96,14 @@ def test_loops_are_their_impedances(name: str):
         ours, admittance = np.asarray(circuit.transfer_function(omega)), np.asarray(circuit.admittance(omega))
         amplitude, phase = np.asarray(circuit.amplitude(omega)), np.asarray(circuit.phase(omega))
     expected = touching(omega) * current
-    # with a resistance in the loop Vsc falls off at high frequency, where terms cancel down to rounding
+    # with a resistance in the loop, Vsc decreases at high frequency, where terms cancel down to rounding errors
     np.testing.assert_allclose(ours, expected, rtol=1e-12, atol=1e-14 * np.abs(expected).max())
     np.testing.assert_allclose(admittance, current, rtol=1e-11)
     np.testing.assert_allclose(amplitude * np.exp(1j * phase), ours, rtol=1e-12, atol=1e-14 * amplitude.max())
 
 
 def test_equal_skins_are_the_limit_of_unequal_ones_and_differentiable():
-    """The paper's own case: two time constants of the elements coincide."""
+    """The case of the paper, in which two time constants of the elements coincide."""
 
     @jax.jit
     def gain(logs: jax.Array) -> jax.Array:
@@ -122,7 +122,7 @@ def test_equal_skins_are_the_limit_of_unequal_ones_and_differentiable():
 
 @pytest.mark.parametrize(("Ci", "ratio"), [(0.692e-9, 6.08), (1.35e-9, 11.2)])
 def test_direct_against_natural_ground_of_the_paper(Ci: float, ratio: float):
-    """For a sine at 100 Hz 'six times' comes out with 0.692 nF only; the paper's 1.35 nF gives 11.2."""
+    """For a sine at 100 Hz the paper's factor of six requires 0.692 nF; its 1.35 nF gives 11.2."""
     omega = 2.0 * np.pi * 100.0
     with jax.enable_x64(True):
         direct = abs(fitact.FinalCircuit(R, C, Ci).transfer_function(omega))
@@ -131,7 +131,7 @@ def test_direct_against_natural_ground_of_the_paper(Ci: float, ratio: float):
 
 
 def test_knee_of_the_paper():
-    """40.3 Hz with the paper's 1.35 nF (it states 40 Hz)."""
+    """40.3 Hz for the paper's 1.35 nF (it states 40 Hz)."""
     with jax.enable_x64(True):
         knee = 1.0 / (2.0 * np.pi * fitact.FinalCircuit(160e3, 22e-9, 1.35e-9).b)
     assert knee == pytest.approx(40.27, abs=0.01)
@@ -139,7 +139,7 @@ def test_knee_of_the_paper():
 
 @pytest.mark.parametrize("logs", [(-421.5, 599.1, -1070.7), (12.0, -1000.0, -20.0), (12.0, -20.0, 700.0)])
 def test_divider_is_differentiable_where_a_fit_may_stray(logs: tuple[float, float, float]):
-    """One capacitance under- or overflows, and their quotient with it; the divider itself is 0 or 1/2."""
+    """One capacitance underflows or overflows, and with it their quotient; the divider tends to 0 or 1/2."""
     with jax.enable_x64(True):
         value, slope = jax.value_and_grad(lambda x: fitact.FinalCircuit(*jnp.exp(x)).g)(jnp.array(logs))
     assert float(value) == pytest.approx(0.0 if logs[1] > logs[2] else 0.5)
@@ -147,7 +147,7 @@ def test_divider_is_differentiable_where_a_fit_may_stray(logs: tuple[float, floa
 
 
 def test_derivatives_are_finite_where_two_skins_share_a_time_constant():
-    """A resistor far larger than two equal skins leaves their time constants apart by less than rounding."""
+    """With a resistor far larger than two equal skins, their time constants differ by less than rounding errors."""
 
     def square_of_vsc(values: jax.Array) -> jax.Array:
         circuit = fitact.DirectGround(*values, series_resistor=100e3)

@@ -26,7 +26,7 @@ def _double_precision():
 
 
 def test_figures_of_the_paper():
-    """Rx, Cx, Cx' to its digits; Q only from its rounded Rx' and Cx': 2.2112 and 2.1911 are 2.2117 and 2.1915."""
+    """Rx, Cx and Cx' agree to the printed digits; Q = 2.2112, 2.1911 (from rounded Rx', Cx') for 2.2117, 2.1915."""
     Rx, Cx = fitact.series_equivalent(R, C, F)
     assert float(Rx) == pytest.approx(27.16e3, abs=5.0)
     assert float(Cx) == pytest.approx(26.5e-9, abs=0.05e-9)
@@ -36,10 +36,10 @@ def test_figures_of_the_paper():
     assert (float(with_R_H), float(without)) == pytest.approx((2.19151, 2.21168), abs=5e-6)
     rounded = [1.0 / (2.0 * np.pi * F * 13.25e-9 * (54320.0 + R_H)) for R_H in (500.0, 0.0)]
     assert rounded == pytest.approx([2.1911, 2.2112], abs=1e-4)
-    assert float(1.0 - with_R_H / without) == pytest.approx(0.00912, abs=5e-6)  # the paper: 0.909 %
+    assert float(1.0 - with_R_H / without) == pytest.approx(0.00912, abs=5e-6)  # the paper states 0.909 %
 
 
-# each compiled once, not anew for every operation of every point
+# each function is compiled once, not once for every operation at every point
 EQUIVALENT = jax.jit(fitact.series_equivalent)
 QUALITY = jax.jit(functools.partial(fitact.quality_factor, R_H=500.0))
 SLOPES = [

@@ -1,4 +1,4 @@
-"""The whole box of parameters: accuracy against mpmath, and nothing that is not finite."""
+"""Accuracy against mpmath over the whole range of parameters, with finite results everywhere."""
 
 import jax
 import jax.numpy as jnp
@@ -12,14 +12,14 @@ from tests import extremes
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
 @pytest.mark.parametrize(
     "name",
-    # `make extremes` takes all over the whole range
+    # `make extremes` tests all points over the whole range
     [
         "transfer",
         *(pytest.param(n, marks=[] if n == "sine" else pytest.mark.thorough) for n in extremes.DRIVES),
     ],
 )
 def test_accuracy(name: str, kind: type):
-    """On every fourth point; `make extremes`, which CI runs, takes them all."""
+    """Test every fourth point; `make extremes`, which CI runs, tests all."""
     for _, quantity, what, worst in extremes.sweep(kind, (name,), every=4):
         assert worst.error <= extremes.allowed(kind, what), (quantity, what, worst)
         assert worst.compared >= extremes.ENOUGH // 4, (quantity, what, worst)
@@ -46,7 +46,7 @@ def loops(point: jax.Array) -> dict[str, fitact.DirectGround | fitact.NaturalGro
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", ["unequal skins", "R_H", "natural"])
 def test_other_circuits(name: str):
-    """All finite, although time constants may lie 24 decades apart; |H| against numpy's complex impedances."""
+    """Results are finite although time constants may differ by 24 decades; |H| against NumPy's complex impedances."""
     rows = extremes.points()[::3]
     others = 10.0 ** np.random.default_rng(5).uniform([0.0, -18.0, 0.0], [12.0, -3.0, 12.0], (len(rows), 3))
     rows = np.column_stack([rows, others])

@@ -27,7 +27,7 @@ def test_permittivities_follow_the_capacitances():
         contact = fitact.Contact.from_capacitances(Ci, Csc, 1e-4, 1e-6, 200e-6)
         assert float(contact.insulator_permittivity) == pytest.approx(3.9, rel=1e-12)
         assert float(contact.skin_permittivity) == pytest.approx(5e3, rel=1e-12)
-    assert pytest.approx(3.4515e-9) == Ci  # the paper's text says 1.35 nF; its eq. (3) gives this
+    assert pytest.approx(3.4515e-9) == Ci  # the text of the paper says 1.35 nF; its eq. (3) gives this
 
 
 def test_friction():

@@ -1,4 +1,4 @@
-"""An interface gap between finger and panel, and the force across it, against impedances by hand, scipy and ngspice."""
+"""Interface gap between finger and panel, and the force across it, against impedances, scipy and ngspice."""
 
 import shutil
 from pathlib import Path
@@ -66,7 +66,7 @@ def test_a_gap_that_conducts_well_or_has_no_thickness_is_none(gap: dict[str, flo
         np.testing.assert_allclose(ours, without, atol=rtol * np.ptp(without))
 
 
-NETLISTS = {  # the gap lies between the nodes whose voltage the harness writes down
+NETLISTS = {  # the gap lies between the nodes whose voltage the harness records
     "conducting": ["Ci in skin 1.35n", f"Rg skin below {RGAP}", f"Cg skin below {CGAP}"],
     "open": ["Ci in skin 1.35n", f"Cg skin below {CGAP}"],
 }
@@ -78,7 +78,7 @@ BODY = ["R1 below mid 160k", "C1 below mid 22n", "RH mid b 500", "R2 b 0 160k", 
 @pytest.mark.parametrize("gap", GAPS)
 def test_the_voltage_across_it_against_ngspice(gap: str, drive: str, tmp_path: Path):
     wave, source, edges = DRIVES[drive]
-    # ngspice's nodes need a path to ground; this one carries a billionth of the gap's current
+    # ngspice requires a path to ground for every node; this one carries 1e-9 of the current in the gap
     time, vgap, _ = simulate([*NETLISTS[gap], *BODY, "Rleak skin 0 1e15"], source, tmp_path)
     away = away_from(edges, time)
     expected = computed(with_gap("direct, R_H", gap), wave, time, steady_state=False, channel="Vgap")
@@ -157,17 +157,17 @@ def test_plan_keeps_the_gap_that_the_force_acts_across_and_says_what_eq_22_would
     [("conducting", ("Vsc",), 1), ("conducting", ("Vsc", "I"), 0), ("open", ("Vsc",), 2), ("open", ("Vsc", "I"), 1)],
 )
 def test_what_no_record_can_tell(gap: str, measured: tuple[str, ...], blind: int):
-    """Vsc is blind to the area; an open gap is a capacitor in series with Ci, of which only the sum is seen."""
+    """Vsc does not depend on the area. An open gap is in series with Ci, and only their series capacitance shows."""
     found = blind_directions(with_gap("direct", gap), ("Rsc", "Csc", "Ci", *GAPS[gap]), measured)
     assert found.dimension == blind
     if blind == 1 and gap == "open":
         along = dict(zip(found.names, found.directions[0], strict=True))
         assert along["Rsc"] == pytest.approx(0.0, abs=1e-9)
-        assert along["Ci"] / along["Cgap"] == pytest.approx(-CI / CGAP)  # 1/Ci + 1/Cgap stays
+        assert along["Ci"] / along["Cgap"] == pytest.approx(-CI / CGAP)  # 1/Ci + 1/Cgap is constant
 
 
 def test_every_unknown_charge_has_a_unit_in_every_channel():
-    """One for each time constant: two skins, the gap, and the resistor's."""
+    """There is one unknown charge for each time constant: two skins, the gap and the resistor."""
     circuit = fitact.DirectGround(R, C, CI, series_resistor=100e3, Rgap=RGAP, Cgap=CGAP)
     assert len(circuit.terms().tau) == len(CHARGES) == 4
     assert {quantity_unit(name) for name in CHARGES} == {"V"}
@@ -194,7 +194,7 @@ def test_fit_of_vsc_and_current_tells_the_gap_and_its_force():
     vgap, _ = channels(wave("trapezoid", 180.0, 1000, 14), TRUTH["Ci"], elements[::-1], R0)
     force = 8.85e-12 * AREA * np.mean(vgap[-1000:] ** 2) / (2.0 * THICKNESS**2)
     found = fit.derived()["force_mean"]
-    assert abs(found["mean"] - force) < 4.0 * found["sd"] + 1e-4 * force  # the sum over samples is off by that
+    assert abs(found["mean"] - force) < 4.0 * found["sd"] + 1e-4 * force  # the sum over samples has this error
     assert "by the voltage across the gap" in str(fit)
 
 

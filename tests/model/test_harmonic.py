@@ -51,7 +51,7 @@ def test_coefficients_against_quadrature(name: str):
 
 
 def test_high_coefficients_keep_their_digits():
-    """Against the textbook's sums, to 1e-11 of each (square) and 1e-14 of the largest (triangle)."""
+    """Coefficients against the textbook's sums, to 1e-11 of each (square) and 1e-14 of the largest (triangle)."""
     k = np.arange(1, 20002, 2)
     square, triangle = (np.asarray(fourier_coefficients(DRIVES[name], 20001))[::2] for name in ("square", "triangle"))
     np.testing.assert_allclose(square, -1j * 360.0 / (np.pi * k), rtol=1e-11)
@@ -64,12 +64,12 @@ def test_high_coefficients_keep_their_digits():
     ("name", "ground"),
     [
         *((name, "direct") for name in DRIVES),
-        # the drive and the circuit enter as factors: every pair of them is more than it takes
+        # the drive and the circuit enter as factors, so not every pair must be tested
         *(pytest.param(n, "natural", marks=[] if n == "trapezoid" else pytest.mark.thorough) for n in DRIVES),
     ],
 )
 def test_stated_error_is_the_error(name: str, ground: str):
-    """Against the exact response, root mean square over a fine grid."""
+    """The stated error equals the rms error against the exact response on a fine grid."""
     circuit = CIRCUIT if ground == "direct" else fitact.NaturalGround(160e3, 22e-9, 1.35e-9, Z=14.5e6)
     time = (np.arange(20000) + 0.5) * (PERIOD / 20000)
     exact = np.asarray(fitact.response(circuit, DRIVES[name], time))
@@ -77,12 +77,12 @@ def test_stated_error_is_the_error(name: str, ground: str):
         sum_ = np.asarray(fitact.harmonic_response(circuit, DRIVES[name], time, harmonics))
         found = np.sqrt(np.mean((sum_ - exact) ** 2) / np.mean(exact**2))
         stated = float(fitact.harmonic_error(circuit, DRIVES[name], harmonics))
-        # the grid's mean is good to a few 1e-4 where the response jumps
+        # the mean over the grid is accurate to a few 1e-4 if the response jumps
         assert found == pytest.approx(stated, rel=2e-3, abs=1e-8)
 
 
 def test_error_of_a_square_against_closed_form():
-    """Mean square 4 V0^2 g^2 tanh(x/4) / x with x = T/b; the harmonics kept by hand."""
+    """Mean square 4 V0^2 g^2 tanh(x/4) / x with x = T/b; the retained harmonics are summed separately."""
     g, b = CIRCUIT.g, CIRCUIT.b
     x, k = PERIOD / b, np.arange(1, 41, 2)
     total = 4.0 * 180.0**2 * g**2 * np.tanh(0.25 * x) / x

@@ -1,4 +1,4 @@
-"""Sums of sines against scipy: frequency response, straight-line simulation, brute-force extremes."""
+"""Sums of sines against scipy (frequency response, piecewise-linear simulation) and brute-force extremes."""
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ def multitone(phase: float = 0.0) -> fitact.Multitone:
 
 
 def tones(time: np.ndarray, gain: np.ndarray | None = None, phase: float = 0.0) -> np.ndarray:
-    """The sum in NumPy, each tone times its complex gain."""
+    """Return the sum of the tones in NumPy, each multiplied by its complex gain."""
     gain = np.ones(len(ORDERS)) if gain is None else gain
     return sum(
         np.imag(g * height * np.exp(1j * (2.0 * np.pi * n * F0 * time + n * phase + p)))
@@ -50,7 +50,7 @@ def test_value_and_slope(phase: float):
     np.testing.assert_allclose(drive.value(TIME), OFFSET + tones(TIME, phase=phase), atol=1e-10)
     rate = 2j * np.pi * F0 * np.array(ORDERS)
     np.testing.assert_allclose(drive.slope(TIME), tones(TIME, rate, phase), atol=1e-7)
-    assert np.isnan(drive.slope(0.0, steady_state=False))  # it does not start from 0
+    assert np.isnan(drive.slope(0.0, steady_state=False))  # the drive does not start from 0
 
 
 @pytest.mark.parametrize("phase", [0.0, 1.3])
@@ -62,15 +62,15 @@ def test_steady_state_against_scipys_frequency_response(phase: float):
 def test_from_rest_against_scipy():
     fine = np.arange(30001) * 1e-6
     ours = fitact.response(fitact.FinalCircuit(R, C, CI), multitone(), fine, steady_state=False)
-    # straight lines err by step^2 / 8 times V'' = 30 V (2 pi 1 kHz)^2 + ..., and by the divider 0.055 of that
+    # piecewise-linear interpolation errs by step^2 / 8 times V'' = 30 V (2 pi 1 kHz)^2 + ..., times the divider 0.055
     np.testing.assert_allclose(ours, skin_voltage(fine, OFFSET + tones(fine), R, C, CI), atol=1e-5)
 
 
 def test_fourier_coefficients_against_a_fast_transform():
     samples = OFFSET + tones(np.arange(64) * (PERIOD / 64))
     np.testing.assert_allclose(fourier_coefficients(multitone(), 20), np.fft.rfft(samples)[1:21] / 64, atol=1e-12)
-    assert np.asarray(fourier_coefficients(multitone(), 2)).shape == (2,)  # tones above are left out
-    skin = fitact.WithSkin(fitact.FinalCircuit(R, C, CI), fitact.Fractional(1.0))  # an exponent of 1 is R and C
+    assert np.asarray(fourier_coefficients(multitone(), 2)).shape == (2,)  # tones above the second harmonic are ignored
+    skin = fitact.WithSkin(fitact.FinalCircuit(R, C, CI), fitact.Fractional(1.0))  # exponent 1: constant R and C
     np.testing.assert_allclose(fitact.response(skin, multitone(), TIME), tones(TIME, scipy_gain()), atol=1e-9)
 
 
@@ -102,7 +102,7 @@ def test_peaks_are_the_largest_whatever_the_tones():
         brute = np.max(np.abs(np.asarray(fitact.response(fitact.FinalCircuit(R, C, CI), drive, time))))
         peak = float(fitact.peak(fitact.FinalCircuit(R, C, CI), drive))
         assert brute <= peak * (1.0 + 1e-12)
-        assert peak <= brute * (1.0 + 2e-5)  # (pi 39 / 20000)^2 / 2: what a crest falls by between two points
+        assert peak <= brute * (1.0 + 2e-5)  # (pi 39 / 20000)^2 / 2 is the decrease of a peak between two grid points
 
 
 @pytest.mark.thorough
@@ -132,7 +132,7 @@ def test_one_amplitude_and_phase_for_each_tone():
 
 @pytest.mark.slow
 def test_a_record_of_tones_is_fitted():
-    """Data by scipy's frequency response; the shipped scene has the drive, off by a clock of 2e-4."""
+    """Fit data from scipy's frequency response; the shipped scene holds the drive, with a clock error of 2e-4."""
     scene = fitact.Scene.load("multitone")
     time, noise = np.arange(8000) * 5e-6, 0.02
     omega = 2.0 * np.pi * 100.02 * np.array([1, 3, 5, 7, 10])

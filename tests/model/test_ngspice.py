@@ -1,4 +1,4 @@
-"""Vsc and I of every circuit and drive against ngspice, which steps through time and knows no formula of ours."""
+"""Vsc and I of every circuit and drive against ngspice, which integrates in time and uses no formula of ours."""
 
 import shutil
 import subprocess
@@ -19,7 +19,7 @@ PROBE = fitact.Probe(10e6, 10e-12)
 PERIOD = 0.01
 
 TOUCHING = ["Ci in skin 1.35n", "R1 skin below 160k", "C1 skin below 22n"]
-# our circuit, and the netlist from the node of the drive ("in") to ground; Vsc is between "skin" and "below"
+# our circuit, and the netlist from the drive node ("in") to ground; Vsc is between "skin" and "below"
 CIRCUITS = {
     "final": (fitact.FinalCircuit(R, C, CI), [*TOUCHING, "R2 below 0 160k", "C2 below 0 22n"]),
     "simplified with R_H": (
@@ -51,7 +51,7 @@ CIRCUITS = {
     ),
 }
 EDGE = 20e-6
-JUMP = 1e-9  # how long ngspice takes for an ideal one
+JUMP = 1e-9  # duration of an ideal jump in ngspice, s
 
 
 def polyline(corners: list[tuple[float, float]]) -> str:
@@ -59,7 +59,7 @@ def polyline(corners: list[tuple[float, float]]) -> str:
 
 
 def square_burst() -> str:
-    """Three cycles at 200 Hz, from 0 to ±180 V and back to 0, every jump within `JUMP`."""
+    """Three cycles at 200 Hz from 0 to ±180 V and back to 0; every jump takes `JUMP`."""
     levels = [0.0, *[180.0, -180.0] * 3, 0.0]
     corners = [(0.0, 0.0)]
     for time, before, after in zip(BURST_EDGES, levels[:-1], levels[1:], strict=True):
@@ -68,9 +68,9 @@ def square_burst() -> str:
 
 
 BURST_EDGES = [2.5e-3 * i for i in range(7)]
-CORNERS = [0.0, 2.5e-3, 7.5e-3, 12.5e-3, 17.5e-3]  # of a triangle, where the current jumps
+CORNERS = [0.0, 2.5e-3, 7.5e-3, 12.5e-3, 17.5e-3]  # corners of a triangle, where the current jumps, s
 SWEEP = 15e-3
-# our drive, ngspice's, and the times of edges
+# our drive, ngspice's source, and the times of edges
 DRIVES = {
     "sine": (fitact.Sine(360.0, 100.0), "SIN(0 180 100)", [0.0]),
     "sine, phase and offset": (
@@ -112,9 +112,9 @@ IMPULSES = ("sine, phase and offset", "square", "square burst", "linear chirp", 
 
 
 def simulate(netlist: list[str], source: str, folder: Path, start: float = 0.0) -> tuple[np.ndarray, ...]:
-    """Time, Vsc and I over two periods from `start` (s); at rest at 0."""
+    """Return time, Vsc and I over two periods from `start` (s); the circuit is at rest at time 0."""
     drive = f"Bin in 0 V = {source[2:]}" if source.startswith("B:") else f"Vin in 0 {source}"
-    # the source meter in the loop keeps one name for the current, whatever the source
+    # the ammeter in the loop gives the current the same name for every source
     deck = ["* fitact", drive.replace(" in 0 ", " top 0 "), "Vmeter top in 0", *netlist]
     deck += [".options reltol=1e-6 method=gear", ".control", "set wr_vecnames", "set wr_singlescale"]
     deck += [f"tran 4u {start + 2.0 * PERIOD} {start} {2e-6 if start == 0.0 else 5e-6} uic"]
@@ -126,7 +126,7 @@ def simulate(netlist: list[str], source: str, folder: Path, start: float = 0.0) 
 
 
 def computed(circuit: fitact.FinalCircuit, wave: fitact.Sine, time: np.ndarray, **options: object) -> np.ndarray:
-    """Our response; times come in one number, for which JAX has compiled every operation before."""
+    """Return our response; a padded time array avoids new compilations."""
     padded = np.pad(time, (0, 16_000 - time.size), mode="edge")
     with jax.enable_x64(True):
         return np.asarray(fitact.response(circuit, wave, padded, **options))[: time.size]
@@ -148,7 +148,7 @@ def test_from_rest(circuit: str, drive: str, tmp_path: Path):
     away = away_from(edges, time)
     expected = computed(ours, wave, time, steady_state=False)
     np.testing.assert_allclose(vsc[away], expected[away], atol=2e-4 * np.ptp(expected))
-    if drive not in IMPULSES:  # after those, ngspice's current rings
+    if drive not in IMPULSES:  # after impulses, ngspice's current rings
         expected_current = computed(ours, wave, time, steady_state=False, channel="I")[away]
         np.testing.assert_allclose(current[away], expected_current, atol=2e-4 * np.ptp(expected_current))
 
@@ -157,7 +157,7 @@ def test_from_rest(circuit: str, drive: str, tmp_path: Path):
 def test_steady_state_after_many_periods(circuit: str, tmp_path: Path):
     ours, netlist = CIRCUITS[circuit]
     wave, source, edges = DRIVES["trapezoid, duty 0.3"]
-    periods = 60 if "natural" in circuit else 14  # Z and Ci take 20 ms, the skins 4
+    periods = 60 if "natural" in circuit else 14  # Z and Ci have a time constant of 20 ms, the skins of 4 ms
     time, vsc, _ = simulate(netlist, source, tmp_path, start=periods * PERIOD)
     away = away_from(edges, time - periods * PERIOD)
     expected = computed(ours, wave, time)

@@ -1,7 +1,7 @@
-"""Laws that hold for all values.
+"""Properties that hold for all values.
 
-The examples are drawn from a fixed seed, so a run in CI can be repeated: what is sought are errors that a
-whole region of values shares, and a law that fails on a fluke is found by raising `max_examples` by hand.
+The examples are drawn from a fixed seed, so a run in CI can be repeated. The tests look for errors that affect a whole
+region of values; to look for rare failures, increase `max_examples`.
 """
 
 import itertools
@@ -68,12 +68,12 @@ def test_response_is_linear_in_the_drive(
 
 @given(SKINS)
 def test_steady_state_has_no_mean(values: tuple[float, float, float]):
-    """No charge passes the insulator for good. Gauss points on each straight piece, denser at its start."""
+    """No net charge passes the insulator. The integral uses Gauss points on each linear piece, denser at its start."""
     knots = np.array([0.0, 0.1, 0.3, 0.4, 1.0]) * PERIOD
     nodes, weights = np.polynomial.legendre.leggauss(12)
     mean, size = 0.0, 0.0
     for low, high in itertools.pairwise(knots):
-        # cells that double in width from the start, where the response decays with b
+        # cells that double in width from the start, where the response decays with time constant b
         edges = low + (high - low) * np.append(0.0, np.logspace(-30.0, 0.0, 31, base=2.0))
         half = 0.5 * np.diff(edges)[:, None]
         vsc = np.asarray(trapezoid_response(jnp.array(values), edges[:-1, None] + half * (1.0 + nodes)))

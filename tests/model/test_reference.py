@@ -1,4 +1,4 @@
-"""Vsc against an ODE solver that steps the node voltages of each circuit, written down from Kirchhoff's laws."""
+"""Vsc against an ODE solver for the node voltages of each circuit, with equations from Kirchhoff's laws."""
 
 from collections.abc import Callable
 
@@ -15,7 +15,7 @@ R2, C2, R_H, Z, CZ = 80e3, 44.25e-9, 500.0, 14.5e6, 100e-12
 PERIOD, RISE = 0.01, 1e-3
 TIME = np.linspace(0.0, 2.0 * PERIOD, 41)
 
-# a trapezoid from 0 V, and a sine; the corners are where the solver must start a step
+# a trapezoid from 0 V, and a sine; the solver must start a new step at the corners
 CORNERS = np.array([n * PERIOD + t for n in range(2) for t in (0.0, RISE, 0.5 * PERIOD, 0.5 * PERIOD + RISE)])
 LEVELS = np.array([0.0, 360.0, 360.0, 0.0] * 2 + [0.0])
 
@@ -45,13 +45,13 @@ Voltage = Callable[[jax.Array], jax.Array]
 
 
 def final(V: Voltage, slope: Voltage) -> Callable:
-    """y: the upper and the lower skin. The current Ci (V - y1 - y2)' flows through both."""
+    """y holds the upper and the lower skin, which both carry the current Ci (V - y1 - y2)'."""
     nodes = jnp.array([[C + CI, CI], [CI, C + CI]])
     return lambda t, y, _: jnp.linalg.solve(nodes, CI * slope(t) - y / R)
 
 
 def direct(V: Voltage, slope: Voltage) -> Callable:
-    """y: Ci and the two skins. The current is what R_H leaves of V."""
+    """y holds Ci and the two skins; the voltage across R_H gives the current."""
 
     def rate(t: jax.Array, y: jax.Array, _: None) -> jax.Array:
         current = (V(t) - jnp.sum(y)) / R_H
@@ -61,12 +61,12 @@ def direct(V: Voltage, slope: Voltage) -> Callable:
 
 
 def natural(V: Voltage, slope: Voltage) -> Callable:
-    """y: the skin and the environment, both with a capacitance."""
+    """y holds the skin and the environment, both with a capacitance."""
     nodes = jnp.array([[C + CI, CI], [CI, CZ + CI]])
     return lambda t, y, _: jnp.linalg.solve(nodes, CI * slope(t) - y / jnp.array([R, Z]))
 
 
-# our circuit, its equations, which unknown is Vsc, and a solver that suits their stiffness
+# our circuit, its equations, the index of Vsc, and a solver suited to the stiffness
 CIRCUITS = {
     "final": (fitact.FinalCircuit(R, C, CI), final, 0, 2, diffrax.Tsit5()),
     "direct ground, unequal skins, R_H": (

@@ -79,7 +79,7 @@ def test_sine_is_the_transfer_function(phase: float):
 @pytest.mark.parametrize("phase", [0.0, 1.0])
 def test_sine_from_rest_against_scipy(phase: float):
     drive = fitact.Sine(peak_to_peak=360.0, frequency=100.0, phase=phase)
-    fine = np.arange(20001) * 1e-6  # scipy's straight lines err by (step)^2
+    fine = np.arange(20001) * 1e-6  # scipy's linear interpolation errs by (step)^2
     expected = skin_voltage(fine, np.asarray(drive.value(fine)), **VALUES)
     ours = fitact.response(CIRCUIT, drive, fine, steady_state=False)
     np.testing.assert_allclose(ours, expected, atol=1e-6)
@@ -114,7 +114,7 @@ def test_burst_against_scipy(name: str):
     held = name in SQUARES
     expected = skin_voltage(time, voltage, **VALUES, hold=held)
     ours = np.asarray(fitact.response(CIRCUIT, burst, time, steady_state=False))
-    if not held:  # scipy ramps the jump at the end over the step before it
+    if not held:  # scipy turns the jump at the end into a ramp over the step before it
         last = 3 * TIME.size
         g, step = CIRCUIT.g * float(wave.value(0.0)), STEP / CIRCUIT.b
         expected[last:] -= g * (-np.expm1(-step) / step - 1.0) * -np.exp(-(time[last:] - time[last]) / CIRCUIT.b)
@@ -144,7 +144,7 @@ SWEEPS = {
 
 
 def swept(chirp: fitact.Chirp, time: np.ndarray) -> np.ndarray:
-    """The textbook's formulas."""
+    """Textbook formulas of the chirp."""
     f0, f1, T = chirp.start_frequency, chirp.end_frequency, chirp.duration
     if chirp.spacing == "linear":
         cycles = f0 * time + (f1 - f0) * time**2 / (2.0 * T)
@@ -157,7 +157,7 @@ def swept(chirp: fitact.Chirp, time: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_chirp_against_gauss_legendre(name: str):
-    """u(t) = V(t) - integral of V(s) e^{-(t - s) / tau} / tau, by 40 nodes on each eighth of a cycle."""
+    """u(t) = V(t) - integral of V(s) e^{-(t - s) / tau} / tau, from 40 nodes on each eighth of a cycle."""
     chirp = SWEEPS[name]
     f_max, T = max(chirp.start_frequency, chirp.end_frequency), chirp.duration
     times = np.append(T * np.array([0.0, 0.013, 0.31, 0.77, 0.99]), [1.0001 * T, 1.2 * T])
@@ -185,7 +185,7 @@ def test_chirp_in_single_precision():
     with jax.enable_x64(False):
         single = np.asarray(fitact.response(circuit, SWEEPS["up"], time, steady_state=False))
     assert single.dtype == np.float32
-    np.testing.assert_allclose(single, exact, atol=5e-5 * np.abs(exact).max())  # 26 cycles round the phase
+    np.testing.assert_allclose(single, exact, atol=5e-5 * np.abs(exact).max())  # phase over 26 cycles
 
 
 @pytest.mark.slow
@@ -193,7 +193,7 @@ def test_chirp_differentiates_in_circuit_amplitude_and_frequencies():
     time = np.array([1.3e-3, 41e-3, 77e-3, 113e-3])
 
     def vsc(logs: jax.Array, peak_to_peak: jax.Array, x: jax.Array) -> jax.Array:
-        # small relative changes: 26 cycles make large ones of the phase
+        # only small relative changes, because 26 cycles multiply the change of the phase
         changed = peak_to_peak, 20.0 * jnp.exp(0.01 * x[0]), 0.1 * jnp.exp(0.01 * x[1])
         chirp = eqx.tree_at(lambda c: (c.peak_to_peak, c.start_frequency, c.duration), SWEEPS["up"], changed)
         return fitact.response(fitact.FinalCircuit(*jnp.exp(logs)), chirp, time, steady_state=False)
@@ -204,7 +204,7 @@ def test_chirp_differentiates_in_circuit_amplitude_and_frequencies():
 
 @pytest.mark.parametrize("make", ["sine", "square", "triangle", "trapezoid", "burst", "chirp"])
 def test_jit_and_vmap_over_amplitude_and_frequency(make: str):
-    """The whole drive is mapped over, as a tree of numbers."""
+    """The drive is vmapped as a pytree of numbers."""
     drives = [
         {
             "sine": lambda V, f: fitact.Sine(V, f, phase=1.0),
@@ -244,7 +244,7 @@ CORNERS = np.array([0.0, 1e-3, 1e-3, 4e-3, 4e-3, 7e-3]), np.array([0.0, 100.0, -
 
 
 def test_polyline_against_scipy():
-    """A jump is a corner's difference between two lines, each of which scipy computes."""
+    """A jump is the difference between two polylines with a corner, each of which scipy computes."""
     times, voltages = CORNERS
     line = fitact.Polyline(times, voltages)
     time = np.arange(3001) * STEP
@@ -285,7 +285,7 @@ def test_impossible_polyline_is_refused(time, voltage, period, words: str):
 
 
 def test_initial_charge_against_scipy():
-    """scipy's state is Vsc less what jumps with V; any of them is a charge that decays."""
+    """scipy's state is Vsc without the part that jumps with V; any initial state is a charge that decays."""
     drive = fitact.Sampled(TIME, np.asarray(LINEAR_DRIVES["triangle"].value(TIME)))
     a, b = 160e3 * 1.35e-9, 160e3 * 24.7e-9
     system = scipy.signal.StateSpace([[-1.0 / b]], [[-a / b**2]], [[1.0]], [[a / b]])
@@ -296,7 +296,7 @@ def test_initial_charge_against_scipy():
 
 def test_initial_charges_of_two_time_constants_against_scipy():
     circuit, drive = fitact.NaturalGround(**VALUES, Z=14.5e6), LINEAR_DRIVES["triangle"]
-    # the states are Vsc and the voltage over Ci
+    # the states are Vsc and the voltage across Ci
     R, C, Ci, Z = 160e3, 22e-9, 1.35e-9, 14.5e6
     A = np.array([[-1.0 / (R * C) - 1.0 / (Z * C), -1.0 / (Z * C)], [-1.0 / (Z * Ci), -1.0 / (Z * Ci)]])
     system = scipy.signal.StateSpace(A, [[1.0 / (Z * C)], [1.0 / (Z * Ci)]], [[1.0, 0.0]], [[0.0]])
@@ -338,7 +338,7 @@ def test_long_sampled_drive_is_followed_in_parts(part: int, monkeypatch):
 
 
 def test_sampled_drive_on_uneven_times_is_the_same_line():
-    """A broken line is the same drive however it is sampled; scipy computes it on an even grid."""
+    """A polyline is the same drive for any sampling; scipy computes it on an even grid."""
     rng = np.random.default_rng(2)
     kept = np.unique(np.concatenate([[0, 2000], rng.integers(0, 2001, 60)]))
     grid = np.arange(2001) * STEP
@@ -383,7 +383,7 @@ def test_sampled_without_period_has_no_steady_state():
 
 
 def test_every_sample_lies_on_its_side_of_the_edge():
-    """t f is rounded; of 1e6 samples a naive t mod T puts 1,250 on the wrong half-period."""
+    """t f is rounded; of 1e6 samples, a naive t mod T assigns 1,250 to the wrong half-period."""
     index = np.arange(1_000_000)
     voltage = np.asarray(fitact.Square(peak_to_peak=2.0, frequency=100.0).value(index / 100e3))
     np.testing.assert_array_equal(voltage, np.where(index % 1000 < 500, 1.0, -1.0))
@@ -399,7 +399,7 @@ def test_steady_square_far_from_the_period(x: float):
 
 
 DIFFERENTIABLE = ["sine", "square", "trapezoid", "triangle", "sampled", "polyline", "burst"]
-# the others go the same ways
+# the other cases use the same code
 QUICK = [("sine", False), ("square", True), ("sampled", False)]
 
 

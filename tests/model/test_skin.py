@@ -1,4 +1,4 @@
-"""Skins that depend on the frequency, against the impedances of the paper summed over a million harmonics."""
+"""Frequency-dependent skins against sums of a million harmonics with the impedances of the paper."""
 
 import itertools
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from tests.conftest import skin_voltage
 
 R, C, CI = 160e3, 22e-9, 1.35e-9
 RISE, PERIOD = 20e-6, 0.01
-EPS = 1e-3  # of finite differences: a fractional skin's weights magnify rounding to 1e-10, which they divide by it
+EPS = 1e-3  # step of finite differences: the weights of a fractional skin magnify rounding to 1e-10
 TIME = np.array([1e-4, 0.3e-3, 1.1e-3, 4.9e-3, 5.01e-3, 8e-3])
 OTHER = {"grounding_Rsc": 80e3, "grounding_Csc": 44.25e-9}
 Impedance = Callable[[np.ndarray], np.ndarray]
@@ -27,7 +27,7 @@ def _double_precision():
 
 
 def dispersive(omega: np.ndarray, scale_R: float = 1.0, scale_C: float = 1.0) -> np.ndarray:
-    """The paper's values at 10, 100 and 1000 Hz, powers of the frequency between, held outside."""
+    """Return the paper's values at 10, 100 and 1000 Hz, with power laws between them and constants outside."""
     log = np.log10(np.clip(omega / (2.0 * np.pi), 10.0, 1000.0))
     resistance = 10.0 ** np.interp(log, [1, 2, 3], np.log10([200e3, 160e3, 80e3]))
     capacitance = 10.0 ** np.interp(log, [1, 2, 3], np.log10([44.25e-9, 22e-9, 8.85e-9]))
@@ -39,9 +39,9 @@ def fractional(alpha: float) -> Impedance:
 
 
 def trapezoid_response(touching: Impedance, rest: Impedance, channel: str, time: np.ndarray) -> np.ndarray:
-    """The harmonics of a 360 Vpp trapezoid one by one; its Fourier coefficients are a textbook's.
+    """Sum the harmonics of a 360 Vpp trapezoid from textbook Fourier coefficients.
 
-    The last half of them fades out, so that the sum does not ring where the response is smooth.
+    The last half of the harmonics is tapered, so that the sum does not ring where the response is smooth.
     """
     k = np.arange(1, 2**19, 2)
     omega = 2.0 * np.pi * k / PERIOD
@@ -127,7 +127,7 @@ def test_zero_frequency_is_the_limit(level: str):
     assert np.all(np.isfinite(jax.grad(size)(jnp.array([R, C, CI]))))
 
 
-# every ground and channel with one skin, and every skin with one of each; the other pairs are thorough
+# every circuit and channel with one skin, and every skin with one circuit and channel; other pairs are thorough
 GROUNDS = ["final", "direct, R_H", "natural"]
 QUICK = {("fractional 0.8", ground, channel) for ground in GROUNDS for channel in ("Vsc", "I")}
 QUICK |= {("dispersive", "direct, R_H", "I"), ("fractional 0.5", "final", "Vsc")}
@@ -155,14 +155,14 @@ def test_steady_state_is_the_sum_of_its_harmonics(level: str, ground: str, chann
 
 
 def test_constant_phase_of_one_against_scipy():
-    """alpha = 1 is the constant skin: what is left is the error of the fit at high frequency."""
+    """alpha = 1 is the constant skin; the difference is the error of the rational fit at high frequency."""
     time = np.arange(2000) * 5e-6
     voltage = np.where(np.arange(12 * 2000) % 2000 < 1000, 180.0, -180.0)
     settled = skin_voltage(np.arange(voltage.size) * 5e-6, voltage, R, C, CI, hold=True)[-2000:]
     circuit = fitact.WithSkin(fitact.FinalCircuit(R, C, CI), fitact.Fractional(1.0))
     ours = np.asarray(fitact.response(circuit, fitact.Square(360.0, 100.0), time))
     error = np.abs(ours - settled) / np.abs(settled).max()
-    assert error[[0, 1000]].max() < 5e-7  # at the jumps the highest frequencies tell
+    assert error[[0, 1000]].max() < 5e-7  # at the jumps, the highest frequencies dominate
     assert np.delete(error, [0, 1000]).max() < 1e-7
 
 
@@ -212,7 +212,7 @@ def test_differentiable_under_jit_and_vmap(skin: fitact.Dispersive | fitact.Frac
     check_grads(vsc, (logs, jnp.array(360.0)), order=1, modes=("rev",), rtol=1e-5, eps=EPS)
     rows = jnp.stack([logs, logs + 0.3])
     both = jax.jit(jax.vmap(lambda row: vsc(row, 360.0)))(rows)
-    # the fitted weights of a fractional skin alternate in sign, which magnifies rounding to some 1e-10
+    # the fitted weights of a fractional skin alternate in sign, which magnifies rounding to about 1e-10
     np.testing.assert_allclose(both, np.stack([vsc(row, 360.0) for row in rows]), rtol=1e-9)
 
 

@@ -1,4 +1,4 @@
-"""Means and peaks over a period, against harmonic sums of impedances (NumPy), which know no time constants."""
+"""Means and peaks over a period against harmonic sums of impedances (NumPy), which do not use time constants."""
 
 from collections.abc import Callable
 
@@ -33,7 +33,7 @@ def element(resistance: float, capacitance: float) -> Impedance:
     return lambda w: resistance / (1.0 + 1j * w * resistance * capacitance)
 
 
-# circuit, impedance of the touching skin, of the rest beside Ci
+# circuit, impedance of the sliding finger's skin, impedance of the rest in series with Ci
 CIRCUITS = {
     "final": (fitact.FinalCircuit(R, C, CI), element(R, C), element(R, C)),
     "unequal skins": (
@@ -66,7 +66,7 @@ OMEGA = 2.0 * np.pi * F * np.arange(1, COUNT)
 
 
 def coefficients(drive: Drive, omega: np.ndarray) -> np.ndarray:
-    """c_n of V = sum c_n e^{j n w t} over all n, for n = 1, ...: from the kinks and jumps of the straight pieces."""
+    """Return c_n of V = sum c_n e^{j n w t}, n = 1, 2, ..., from the kinks and jumps of the linear pieces."""
     if isinstance(drive, fitact.Sine):
         return np.where(omega < 1.5 * omega[0], 0.25 * V / 1j, 0.0)
     knots, start, end = (np.asarray(x) for x in drive.pieces())
@@ -78,7 +78,7 @@ def coefficients(drive: Drive, omega: np.ndarray) -> np.ndarray:
 
 
 def limits(drive: Drive) -> tuple[float, float]:
-    """Variance of V and mean square of dV/dt, closed form."""
+    """Return the variance of V and the mean square of dV/dt in closed form."""
     if isinstance(drive, fitact.Sine):
         return V**2 / 8.0, 0.5 * (np.pi * F * V) ** 2
     knots, start, end = (np.asarray(x) for x in drive.pieces())
@@ -95,7 +95,7 @@ def test_mean_squares_are_harmonic_sums(circuit: str, drive: str):
     power = 2.0 * np.abs(coefficients(DRIVES[drive], OMEGA)) ** 2
     current = 1.0 / (1.0 / (1j * OMEGA * CI) + touching(OMEGA) + rest(OMEGA))
     variance, slope = limits(DRIVES[drive])
-    # what the gain tends to is summed in closed form; the rest then falls off as n^-4
+    # the limit of the gain is summed in closed form; the remaining terms decrease as n^-4
     last = 1e3 * OMEGA[-1]
     last_current = 1.0 / (1.0 / (1j * last * CI) + touching(last) + rest(last))
     gain, capacitance = abs(touching(last) * last_current), last_current.imag / last
@@ -116,9 +116,9 @@ def test_mean_squares_are_harmonic_sums(circuit: str, drive: str):
 @pytest.mark.parametrize("drive", ["sine", "triangle", "trapezoid", "sampled"])
 @pytest.mark.parametrize("circuit", CIRCUITS)
 def test_peaks_are_those_of_the_harmonic_sum(circuit: str, drive: str):
-    """Knots lie on the grid; between its points a smooth extreme is missed by (step)^2.
+    """Knots lie on the grid; an extreme between grid points is missed by (step)^2.
 
-    What the gain tends to multiplies the drive itself, so that the harmonics left fall off as n^-3.
+    The limit of the gain multiplies the drive itself, so the remaining harmonics decrease as n^-3.
     """
     model, touching, rest = CIRCUITS[circuit]
     omega = np.append(OMEGA, 1e3 * OMEGA[-1])
@@ -143,7 +143,7 @@ def test_peak_of_a_square_is_just_after_its_edge():
 
 
 def test_peak_between_the_knots_far_closer_to_one_than_to_the_other():
-    """Time constants from 1 ns to 1 s after a jump: the extreme is the zero of a sum of exponentials, by Newton."""
+    """Time constants from 1 ns to 1 s after a jump; the extreme is a zero of a sum of exponentials (Newton)."""
     circuit = fitact.DirectGround(1e3, 1e-12, 1e-9, R_H=10.0, grounding_Rsc=1e9, grounding_Csc=1e-9)
     drive = fitact.Square(2.0, 1.0)
     ours = float(fitact.peak(circuit, drive))
@@ -154,11 +154,11 @@ def test_peak_between_the_knots_far_closer_to_one_than_to_the_other():
 
 
 def test_current_peak_of_the_final_circuit_includes_the_edge():
-    """I = Vsc / Rsc + Csc dVsc/dt, at the end of the rise, where Vsc is highest."""
+    """I = Vsc / Rsc + Csc dVsc/dt at the end of the rise, where Vsc is largest."""
     drive = DRIVES["steep trapezoid"]
     b, g = R * (2.0 * CI + C), CI / (2.0 * CI + C)
     rise, half = 1e-5, 0.5 / F
-    # antisymmetric: u at the start of a rise is minus that at the start of the fall
+    # the waveform is antisymmetric: u at the start of a rise is minus u at the start of the fall
     ramp = V * b / rise * -np.expm1(-rise / b)
     u0 = -ramp * np.exp(-(half - rise) / b) / (1.0 + np.exp(-half / b))
     before, after = u0, u0 * np.exp(-rise / b) + ramp
@@ -223,7 +223,7 @@ def test_differentiable_with_several_time_constants():
 
 @pytest.mark.parametrize("x", [0.0, 1e-300, 1e-12, 1e-3, 0.5, 1.99, 2.0, 2.01, 30.0, 1e3, 1e12, 1e300])
 def test_relaxation_functions_against_mpmath(x: float):
-    """Values and derivatives; mpmath with digits to spare for 1 - 1 + x - x^2 ..."""
+    """Values and derivatives against mpmath with additional digits for 1 - 1 + x - x^2 ..."""
     import mpmath
 
     with mpmath.workdps(1300 if 0.0 < x < 1e-100 else 80):

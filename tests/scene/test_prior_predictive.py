@@ -30,7 +30,7 @@ def predicted():
 
 
 def test_each_draw_is_the_circuit_at_its_parameters(predicted):
-    """Settled by scipy's state space (data_synth); force by eqs. (3) and (22)."""
+    """The steady state is computed with scipy's state space (data_synth), the force with eqs. (3) and (22)."""
     Rsc, Csc, Ci = (predicted.parameters[name] for name in ("Rsc", "Csc", "Ci"))
     time = np.arange(800) * 2.5e-5
     there = np.abs(predicted.time[:, None] - time).argmin(axis=0)
@@ -44,7 +44,7 @@ def test_each_draw_is_the_circuit_at_its_parameters(predicted):
         per_square = 8.85e-12 * 1e-4 / (2.0 * gap * (1e-6 + 200e-6))
         assert derived["force_peak"] == pytest.approx(per_square * np.max(settled**2), rel=1e-6)
         g, x = Ci[i] / (Csc[i] + 2.0 * Ci[i]), 0.01 / (Rsc[i] * (Csc[i] + 2.0 * Ci[i]))
-        mean_square = 4.0 * (180.0 * g) ** 2 * math.tanh(0.25 * x) / x  # of a settled square wave
+        mean_square = 4.0 * (180.0 * g) ** 2 * math.tanh(0.25 * x) / x  # square wave, steady state
         assert derived["force_mean"] == pytest.approx(per_square * mean_square, rel=1e-9)
         assert derived["b"] == pytest.approx(Rsc[i] * (Csc[i] + 2.0 * Ci[i]))
         assert derived["g"] == pytest.approx(Ci[i] / (Csc[i] + 2.0 * Ci[i]))
@@ -87,7 +87,7 @@ def test_other_circuits_and_drives(drive: dict):
     peak = predicted.derived["force_peak"]
     assert np.all((predicted.derived["force_mean"] > 0.0) & (predicted.derived["force_mean"] < peak))
     Ci, Csc = predicted.parameters["Ci"], predicted.parameters["Csc"]
-    ratio = peak / np.max(predicted.Vsc**2, axis=1) * (1.0 / Ci + 1.0 / Csc)  # the same for all, by eq. (22)
+    ratio = peak / np.max(predicted.Vsc**2, axis=1) * (1.0 / Ci + 1.0 / Csc)  # constant for all draws, by eq. (22)
     np.testing.assert_allclose(ratio, 0.5 / 201e-6, rtol=0.01)
 
 

@@ -163,7 +163,7 @@ def test_order_alone_keeps_the_default_density(tmp_path: Path):
 @pytest.mark.parametrize(
     ("table", "frequency", "Rsc", "Csc"),
     [
-        # whole-skin values for 1 cm^2 and 200 um that the default prior was chosen to reach
+        # whole-skin values for 1 cm^2 and 200 um that the default prior must cover
         ("gabriel-dry", 100.0, 10e3, 5e-9),
         ("gabriel-wet", 100.0, 4.3e3, 200e-9),
         # conductivity (S/m) and permittivity in table 3 of doi:10.1186/s12938-018-0473-9, which quotes Gabriel
@@ -218,7 +218,7 @@ def test_round_trip(tmp_path: Path):
         printed = load(tmp_path, str(scene))
         assert printed == scene
         assert str(printed) == str(scene)
-        assert printed.to_json() == scene.to_json()  # what was not given is not given there
+        assert printed.to_json() == scene.to_json()  # keys that were not given are still not given
         again = fitact.Scene.from_json(scene.to_json())
         assert again == scene
         assert again.to_json() == scene.to_json()
@@ -248,7 +248,7 @@ def test_errors_name_the_line(tmp_path: Path, text: str):
 @pytest.mark.parametrize(
     ("text", "line"),
     [
-        ('[drive]\nwaveform = "sine"\nfrequency = 5\nduty = 0.3', 4),  # what is wrong with the section as a whole
+        ('[drive]\nwaveform = "sine"\nfrequency = 5\nduty = 0.3', 4),  # the error concerns the section as a whole
         ('[skin]\nlevel = "constant"\n[device]\nlevel = 1', 4),  # the same key in another section
         ('[prior]\nCi = {fixed = true}\nRsc = {factor = 3, hihg = "1 Mohm"}', 3),
         ("drive.frequency = 1\ndrive.duty = 3", 2),
@@ -446,7 +446,7 @@ def test_shipped_scenes_are_simulated_and_respond(name: str):
 
 
 def test_phone_is_a_capacitive_divider():
-    """Far above 1/b of the skin, all of the loop is capacitance: stray, panel, finger in series."""
+    """Far above 1/b of the skin, the whole loop is capacitive: stray capacitance, panel and finger in series."""
     phone = fitact.Scene.load("phone")
     whole = 1.0 / (1.0 / 1.35e-9 + 1.0 / 22e-9 + 1.0 / 9.4e-12)
     with jax.enable_x64(True):
@@ -464,7 +464,7 @@ def test_a_file_goes_before_a_shipped_scene(tmp_path: Path, monkeypatch: pytest.
 
 @functools.cache
 def documented() -> dict[tuple[str, str], list[str]]:
-    """The rows of docs/scene.md: (section, key) -> default, unit, meaning, source."""
+    """Return the rows of docs/scene.md: (section, key) -> default, unit, meaning, source."""
     rows, section = {}, ""
     for line in (Path(__file__).parents[2] / "docs" / "scene.md").read_text().splitlines():
         if header := re.fullmatch(r"## \[(\w+)\]", line):
