@@ -1,7 +1,7 @@
-"""Records from routes outside fitact: the shipped one (ngspice), and scipy's state space; fits that many tests ask.
+"""Records from routes outside fitact (ngspice, scipy's state space), and fits that many tests use.
 
-A fit of another structure (circuit, channels, kind of drive, what is free, length) compiles for some 10 s, so a test
-takes one of these, or of their structures, unless the structure is what it tests.
+A fit of a new structure (circuit, channels, kind of drive, free parameters, length) compiles for about 10 s. A test
+therefore uses one of these fits, or their structures, unless it tests the structure.
 """
 
 import itertools
@@ -16,7 +16,7 @@ import scipy.signal
 
 import fitact
 
-_MOST_MAPS = 35_000  # of the 65,530 areas of memory that Linux grants a process by default
+_MOST_MAPS = 35_000  # of the 65,530 memory maps that Linux grants a process by default
 _TESTS = itertools.count()
 
 
@@ -39,9 +39,9 @@ def pytest_report_header(config: pytest.Config) -> str | None:
     return f"thorough tests: part {rotate[0]} of 0 to {rotate[1] - 1}" if rotate else None
 
 
-@pytest.hookimpl(tryfirst=True)  # before those that the command line names are chosen
+@pytest.hookimpl(tryfirst=True)  # runs before the selection by the command line
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """What is thorough is slow; of that only the part whose turn it is, by a hash of the test's name."""
+    """Mark thorough tests as slow, except for the part that a hash of the name selects for this run."""
     rotate, waiting = config.getoption("rotate"), []
     for item in items:
         if item.get_closest_marker("thorough"):
@@ -56,10 +56,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(autouse=True)
 def _room_for_programs():
-    """Drop what JAX compiled before there are more programs than a process can hold: beyond, it crashes."""
+    """Clear JAX's caches before a process has too many memory maps, at which it would crash."""
     yield
     maps = Path("/proc/self/maps")
-    if next(_TESTS) % 20 == 0 and maps.exists() and maps.read_bytes().count(b"\n") > _MOST_MAPS:  # a look takes 10 ms
+    if next(_TESTS) % 20 == 0 and maps.exists() and maps.read_bytes().count(b"\n") > _MOST_MAPS:  # reading takes 10 ms
         jax.clear_caches()
 
 
@@ -102,13 +102,13 @@ SQUARE = fitact.Scene.from_dict({"drive": {"waveform": "square"}})
 
 @pytest.fixture(scope="session")
 def square_fit() -> fitact.Fit:
-    """Of `square_record()`, compressed."""
+    """Return the fit of `square_record()`, which is compressed."""
     return fitact.fit(square_record(), SQUARE)
 
 
 @pytest.fixture(scope="session")
 def summed_fit() -> fitact.Fit:
-    """Of so few samples that they are summed."""
+    """Return a fit of so few samples that they are summed."""
     fit = fitact.fit(square_record(per_period=200), SQUARE)
     assert fit.compression_error is None
     return fit
@@ -117,7 +117,7 @@ def summed_fit() -> fitact.Fit:
 def skin_voltage(
     time: np.ndarray, voltage: np.ndarray, Rsc: float, Csc: float, Ci: float, hold: bool = False
 ) -> np.ndarray:
-    """Vsc from rest by scipy.signal.lsim, exact for straight lines (or, with hold, steps) between samples."""
+    """Return Vsc from rest by scipy.signal.lsim, for a drive that is linear (with hold, constant) between samples."""
     system = ([Rsc * Ci, 0.0], [Rsc * (2.0 * Ci + Csc), 1.0])
     return scipy.signal.lsim(system, voltage, time, interp=not hold)[1]
 
@@ -134,7 +134,7 @@ def square_record(
     per_period: int = 2000,
     periods: int = 2,
 ) -> fitact.Record:
-    """Settled periods of a 360 Vpp square at 100 Hz, with V sampled exactly at the edges."""
+    """Return steady-state periods of a 360 Vpp square at 100 Hz, with V sampled exactly at the edges."""
     settle, kept = 12, periods
     time = np.arange((settle + kept) * per_period) * (0.01 / per_period)
     voltage = np.where(np.arange(time.size) % per_period < per_period // 2, 180.0, -180.0)

@@ -1,9 +1,9 @@
-"""The numbers at the ends of the range, against mpmath: the sweep, its oracle, and a table of the worst points.
+"""Accuracy at the ends of the parameter range against mpmath: the sweep, the reference, a table of the worst points.
 
-The points are part of the test's definition: 2,100 from seed 20180 and the corners of the box, log-uniform in
-Rsc 1 ohm to 1 Tohm, Csc 1 aF to 1 mF (every tenth: 0), Ci 1 aF to 1 uF, f 1 uHz to 1 GHz. The oracle gets exactly
-the binary numbers that fitact gets. It solves one period with plain formulas and 220 digits, so that nothing
-clever is needed (differences cancel up to 100 of them), and takes derivatives as central differences.
+The points are part of the definition of the test: 2,100 from seed 20180 and the corners of the box, log-uniform in
+Rsc 1 ohm to 1 Tohm, Csc 1 aF to 1 mF (every tenth: 0), Ci 1 aF to 1 uF, f 1 uHz to 1 GHz. The reference uses exactly
+the same binary numbers as fitact. It solves one period with plain formulas and 220 digits, because differences cancel
+up to 100 of them, and computes derivatives as central differences.
 
     python -m tests.extremes
 """
@@ -31,15 +31,15 @@ DRIVES = ("sine", "square", "square, duty 0.2", "triangle", "trapezoid")
 DIGITS = 220
 TOLERANCE = {np.float64: 1e-12, np.float32: 1e-5}
 GRADIENT_TOLERANCE = 1e-9
-ENOUGH = 1200  # points compared
-# a crest reached at t = (3/4) / f, when T / tau exceeds tolerance / eps: rounding of t decides how far behind it
+ENOUGH = 1200  # number of points compared
+# a peak at t = (3/4) / f, if T / tau exceeds tolerance / eps: rounding of t decides how far behind it a sample lies
 EDGES = {"triangle": (12,)}
-NOISE = mpf(10) ** -150  # what a difference quotient can tell from 0, relative to the peak
+NOISE = mpf(10) ** -150  # resolution of a difference quotient, relative to the peak
 nan = mpf("nan")
 
 
 def points(count: int = 2100) -> np.ndarray:
-    """(points, 4): Rsc, Csc, Ci, f."""
+    """Return Rsc, Csc, Ci, f of each point, shape (points, 4)."""
     low, high = np.array([0.0, -18.0, -18.0, -6.0]), np.array([12.0, -3.0, -6.0, 9.0])
     box = 10.0 ** np.random.default_rng(20180).uniform(low, high, size=(count, 4))
     corners = 10.0 ** np.array(list(itertools.product(*zip(low, high, strict=True))))
@@ -62,7 +62,7 @@ def drive_of(name: str, f: jax.Array, rise_time: jax.Array) -> fitact.Sine:
 
 
 def quantities(name: str) -> Callable[[jax.Array, jax.Array], dict[str, jax.Array]]:
-    """Of `logs`, added to the logarithms of Rsc, Csc, Ci, and of a point."""
+    """Return the quantities at a point, with `logs` added to the logarithms of Rsc, Csc and Ci."""
 
     def evaluate(logs: jax.Array, point: jax.Array) -> dict[str, jax.Array]:
         R, C, Ci = (point[i] * jnp.exp(logs[i]) for i in range(3))
@@ -97,7 +97,7 @@ def ours(name: str, rows: np.ndarray, gradients: bool) -> tuple[dict[str, np.nda
 
 
 def straight(name: str, rise: mpf) -> list[tuple[mpf, mpf, mpf]]:
-    """(fraction of the period, start, end) of each piece of amplitude 1."""
+    """Return (fraction of the period, start, end) of each linear piece of a waveform of amplitude 1."""
     one = mpf(1)
     if name == "triangle":
         return [(one / 4, mpf(0), one), (one / 2, one, -one), (one / 4, -one, mpf(0))]
@@ -108,9 +108,9 @@ def straight(name: str, rise: mpf) -> list[tuple[mpf, mpf, mpf]]:
 
 
 def periodic(pieces: list[tuple[mpf, mpf, mpf]], x: mpf) -> tuple[mpf, mpf, list[mpf]]:
-    """Mean square, peak and waveform of the high-pass response to straight pieces; x = T / tau."""
+    """Return mean square, peak and waveform of the high-pass response to linear pieces; x = T / tau."""
     decays = [mp.exp(-share * x) for share, _, _ in pieces]
-    slopes = [(end - start) / (share * x) for share, start, end in pieces]  # what u tends to
+    slopes = [(end - start) / (share * x) for share, start, end in pieces]  # limit that u approaches
     jumps = [start - before[2] for (_, start, _), before in zip(pieces, [pieces[-1], *pieces[:-1]], strict=True)]
 
     def around(u: mpf) -> mpf:
@@ -139,7 +139,7 @@ def periodic(pieces: list[tuple[mpf, mpf, mpf]], x: mpf) -> tuple[mpf, mpf, list
 
 
 def highpass(name: str, point: tuple[mpf, ...], duty: mpf, x: mpf) -> tuple[mpf, mpf, list[mpf]]:
-    """Mean square, peak, waveform of the response of s tau / (1 + s tau) at x = T / tau, drive of amplitude 1."""
+    """Return mean square, peak and waveform of s tau / (1 + s tau) for a drive of amplitude 1; x = T / tau."""
     if name == "sine":
         w = 2 * mp.pi / x
         squared = w**2 / (1 + w**2)
@@ -157,20 +157,20 @@ with mp.workdps(DIGITS):
 
 
 class Truth(NamedTuple):
-    """A quantity and its derivatives by log Rsc, log Csc, log Ci; of a waveform as many as phases."""
+    """Quantity with its derivatives by log Rsc, log Csc and log Ci; a waveform has one set per phase."""
 
     value: list[mpf]
     slope: list[list[mpf]]
-    scale: mpf  # what errors of the value are relative to
+    scale: mpf  # scale of the errors of the value
 
 
 def chain(value: mpf, by_g: mpf, by_b: mpf, r: mpf) -> list[mpf]:
-    """d/dlog(Rsc, Csc, Ci) from d/dlog g and d/dlog b; r = Csc / (2 Ci + Csc)."""
+    """Return d/dlog(Rsc, Csc, Ci) from d/dlog g and d/dlog b; r = Csc / (2 Ci + Csc)."""
     return [by_b, r * (by_b - by_g), r * by_g + (1 - r) * by_b]
 
 
 def truth(name: str, row: np.ndarray, gradients: bool) -> dict[str, Truth]:
-    """All quantities at one point, from the binary numbers in `row`."""
+    """Return all quantities at one point, from the binary numbers in `row`."""
     kind = row.dtype.type
     point = tuple(mpf(float(v)) for v in row)
     R, C, Ci, f = point[:4]
@@ -212,7 +212,7 @@ def truth(name: str, row: np.ndarray, gradients: bool) -> dict[str, Truth]:
 def forces(
     point: tuple[mpf, ...], kind: type, g: mpf, r: mpf, mean: tuple[mpf, mpf], peak: tuple[mpf, mpf]
 ) -> dict[str, Truth]:
-    """Mean and peak force with both contacts, from mean square and peak of u with their d/dlog b."""
+    """Return the mean and peak force of both contacts, from the mean square and peak of u with their d/dlog b."""
     area, t_i, t_sc, eps_i, eps_sc, eps0 = (mpf(float(kind(v))) for v in (AREA, T_I, T_SC, EPS_I, EPS_SC, EPSILON_0))
     _, C, Ci, *_ = point
     fixed = eps0 * area / (2 * (t_i / eps_i + t_sc / eps_sc) * (t_i + t_sc))
@@ -236,7 +236,7 @@ def forces(
 
 
 class Worst(NamedTuple):
-    """The largest error of a quantity, and where."""
+    """Largest error of a quantity, and its point."""
 
     error: float
     point: np.ndarray
@@ -244,10 +244,10 @@ class Worst(NamedTuple):
 
 
 def errors(name: str, rows: np.ndarray, gradients: bool) -> Iterator[tuple[str, str, Worst]]:
-    """Worst error of every value and gradient of one drive; infinite where something is not finite.
+    """Return the worst error of every value and gradient of one drive; infinite if a result is not finite.
 
-    A waveform's values are relative to the period's peak, its gradients to the largest component over the
-    period. What is outside the normal range does not count, nor a gradient within 1e10 of its end.
+    Values of a waveform are relative to the peak of the period, its gradients to the largest component over the
+    period. Numbers outside the normal range do not count, nor does a gradient within 1e10 of its ends.
     """
     values, slopes = ours(name, rows, gradients)
     smallest = mpf(float(np.finfo(rows.dtype).tiny))
@@ -274,7 +274,7 @@ def errors(name: str, rows: np.ndarray, gradients: bool) -> Iterator[tuple[str, 
 
 
 def rows_for(kind: type) -> np.ndarray:
-    """The points and the trapezoid's rise time, in the precision asked for."""
+    """Return the points and the rise time of the trapezoid, in the requested precision."""
     rows = points().astype(kind)
     return np.column_stack([rows, (RISE / rows[:, 3]).astype(kind)])
 
@@ -282,7 +282,7 @@ def rows_for(kind: type) -> np.ndarray:
 def sweep(
     kind: type, names: tuple[str, ...] = ("transfer", *DRIVES), every: int = 1
 ) -> Iterator[tuple[str, str, str, Worst]]:
-    """(drive, quantity, value or gradient, worst) over the whole box; gradients in double precision only."""
+    """Yield (drive, quantity, value or gradient, worst) over the whole box; gradients only in double precision."""
     with jax.enable_x64(kind is np.float64), mpmath.workdps(DIGITS):
         for name in names:
             for quantity, what, worst in errors(name, rows_for(kind)[::every], kind is np.float64):
@@ -290,12 +290,12 @@ def sweep(
 
 
 def allowed(kind: type, what: str) -> float:
-    """The largest error that the documentation promises."""
+    """Return the largest error that the documentation promises."""
     return TOLERANCE[kind] if what == "value" else GRADIENT_TOLERANCE
 
 
 def main() -> None:
-    """Print the table; exit code 1 where it does not hold what is promised."""
+    """Print the table; the exit status is 1 if an error is larger than promised."""
     bad = False
     print(f"{'drive':18}{'quantity':24}{'':10}{'dtype':9}{'worst':>9}{'points':>8}   Rsc ohm, Csc F, Ci F, f Hz")
     kinds, names = (np.float64, np.float32), ("transfer", *DRIVES)

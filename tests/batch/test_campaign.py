@@ -1,4 +1,4 @@
-"""Many records on Dask's workers: every one done once, whatever is killed, and the poisoned ones set aside."""
+"""Many records on Dask workers: each is processed once, whatever is killed, and invalid files are reported."""
 
 import contextlib
 import csv
@@ -31,7 +31,7 @@ POISONED = 20
 
 @dataclasses.dataclass(frozen=True)
 class Study:
-    """Records in a folder, twenty of which no one can fit, and what a campaign that nothing disturbs makes of them."""
+    """Records in a folder, twenty of which cannot be fitted, with the results of an uninterrupted campaign."""
 
     folder: Path
     count: int
@@ -49,14 +49,14 @@ class Study:
         return self.count / module.BATCH
 
     def started(self, out: Path, *more: str) -> subprocess.Popen[str]:
-        """A campaign on its way, in a process group of its own."""
+        """Start a campaign in a separate process group."""
         command = [sys.executable, "-c", "from fitact.cli import main; main()", "campaign", *self.paths]
         command += ["--scene", str(self.folder / "scene.toml"), "--out", str(out), *more]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
         return subprocess.Popen(command, text=True, start_new_session=True, **pipes)
 
     def assert_done_once(self, out: Path) -> None:
-        """Each record in one line of the journal, the tables the same to the last bit, the poisoned set aside."""
+        """Assert that each record is in one line of the journal, tables agree bit for bit, and failures are listed."""
         keys = [key for line in (out / JOURNAL).read_text().splitlines() for key in json.loads(line)]
         assert len(keys) == len(set(keys)) == self.count
         assert table(out) == table(self.undisturbed)
@@ -67,13 +67,13 @@ class Study:
 
 
 def skin_of(number: int) -> dict[str, float]:
-    """A person's."""
+    """Return the skin of a finger."""
     scale = np.exp(0.3 * np.sin(np.arange(2) + number))
     return {"Rsc": 130e3 * scale[0], "Csc": 18e-9 * scale[1]}
 
 
 def study(folder: Path, count: int) -> Study:
-    """So many records, fitted."""
+    """Write the records, and run an uninterrupted campaign on them."""
     (folder / "scene.toml").write_text(SCENE)
     (folder / "records").mkdir()
     for number in range(count - POISONED):
@@ -87,7 +87,7 @@ def study(folder: Path, count: int) -> Study:
 
 
 def poison(place: Path) -> None:
-    """Twenty files that no one can fit, of nine kinds."""
+    """Write twenty files that cannot be fitted, of nine kinds."""
     header, rows = "time_s,Vsc_V", [f"{1e-5 * i},{i % 7}" for i in range(100)]
     contents = {
         "nan": "\n".join([header, *rows[:50], "5e-4,nan", *rows[51:]]),
@@ -127,7 +127,7 @@ def lines(out: Path) -> int:
 
 
 def until(condition: Callable[[], Any], process: subprocess.Popen[str]) -> Any:
-    """What the condition found, once it is true."""
+    """Wait until the condition returns a true value, and return it."""
     deadline = time.monotonic() + 300.0
     while not (found := condition()):
         assert process.poll() is None, process.communicate()
@@ -137,7 +137,7 @@ def until(condition: Callable[[], Any], process: subprocess.Popen[str]) -> Any:
 
 
 def workers(*parents: int) -> list["psutil.Process"]:
-    """The processes spawned by these that hold JAX."""
+    """Return the spawned processes below these that have imported JAX."""
     found = []
     for child in (child for parent in parents for child in psutil.Process(parent).children(recursive=True)):
         try:
@@ -176,7 +176,7 @@ def assert_reasons(out: Path, names: list[str]) -> None:
 
 
 def assert_truths(out: Path, names: list[str]) -> None:
-    """An answer for each, whose time constant and divider are the person's within five standard errors."""
+    """Assert that each record has a result whose b and g agree with the truth within five standard errors."""
     answers = table(out)
     assert answers["record"] == names
     Rsc, Csc = np.transpose([list(skin_of(number).values()) for number in range(len(names))])
@@ -200,7 +200,7 @@ def test_everything_is_killed_and_goes_on(many: Study, tmp_path: Path):
     until(lambda: lines(tmp_path) >= 1, process)
     kill_tree(process.pid)
     process.wait()
-    assert lines(tmp_path) < many.batches  # else nothing was left to do
+    assert lines(tmp_path) < many.batches  # otherwise there would be nothing left to do
     ended(many.started(tmp_path, "--workers", "2"))
     many.assert_done_once(tmp_path)
 
@@ -213,7 +213,7 @@ def port() -> int:
 
 
 def cluster(port: int) -> Iterator[subprocess.Popen[bytes]]:
-    """A scheduler at that port, then two workers of it."""
+    """Start a scheduler at that port, then two workers."""
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
     dask = [sys.executable, "-m", "dask"]
     address = f"tcp://127.0.0.1:{port}"
@@ -243,17 +243,17 @@ def test_three_workers_and_the_scheduler_are_killed(many: Study, tmp_path: Path,
 
 
 def fill(size: float) -> None:
-    """Make a worker hold so many bytes in all, and keep them."""
+    """Make a worker allocate memory up to a total of `size` bytes, and keep it."""
     missing = int(size) - psutil.Process().memory_info().rss
     assert missing > 0
     sys.held = b"\1" * missing
-    time.sleep(1.0)  # Dask looks ten times a second
+    time.sleep(1.0)  # Dask checks ten times a second
 
 
 @pytest.mark.slow
 def test_a_worker_that_is_nearly_full_goes_on():
     with module._open_client(None, 1, "1 GiB", module._Progress(0, False), 0.0) as client:
-        client.submit(fill, 0.88 * 2**30).result(timeout=60)  # Dask would have it pause from 0.8 on
+        client.submit(fill, 0.88 * 2**30).result(timeout=60)  # Dask would pause the worker above 0.8
         assert client.submit(os.getpid).result(timeout=60) != os.getpid()
 
 
@@ -270,7 +270,7 @@ def test_compiled_code_is_dropped_once_it_is_much(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.slow
 @pytest.mark.parametrize("reports", [False, pytest.param(True, marks=pytest.mark.thorough)], ids=["rows", "reports"])
 def test_rows_of_posteriors_are_those_of_sample_many(reports: bool, tmp_path: Path):
-    """A report's own draws are those of a record by itself, as here."""
+    """The draws of a report are those of a record sampled alone, as they are here."""
     made = square_record(noise=0.1, per_period=500)
     path = tmp_path / "finger.csv"
     write_csv(path, fitact.Record.from_arrays(made.time, Vsc=made["Vsc"]))
@@ -289,7 +289,7 @@ def test_a_torn_line_is_dropped(tmp_path: Path):
     journal.add({"a": {"record": "a"}})
     journal.close()
     with (tmp_path / JOURNAL).open("a") as file:
-        file.write('{"b": {"rec')  # as a kill leaves it
+        file.write('{"b": {"rec')  # an incomplete line, as after a kill
     again = Journal(tmp_path / JOURNAL)
     assert set(again.rows) == {"a"}
     again.add({"c": {"record": "c"}})

@@ -1,4 +1,4 @@
-"""Ensembles side by side on normals that are known, neighbours of other widths and places: to 1 %, and apart."""
+"""Ensembles sampled together on known normals of different widths and centers: accurate to 1 %, and independent."""
 
 import emcee
 import numpy as np
@@ -8,11 +8,11 @@ from fitact.batch import moves
 from fitact.batch.moves import GaussianApproximations, sample_posteriors
 
 COUNT, SIZE, STEPS, BURN = 48, 3, 800, 200
-SCALES = 10.0 ** np.resize([0.0, 2.0, -1.0], COUNT)  # of neighbours
+SCALES = 10.0 ** np.resize([0.0, 2.0, -1.0], COUNT)  # scales of neighbouring targets
 
 
 def targets() -> tuple[np.ndarray, np.ndarray]:
-    """Centers and covariances."""
+    """Return centers and covariances."""
     rng = np.random.default_rng(5)
     centers = 30.0 * SCALES[:, None] * rng.standard_normal((COUNT, SIZE))
     mixed = np.eye(SIZE) + 0.5 * rng.standard_normal((COUNT, SIZE, SIZE))
@@ -20,9 +20,9 @@ def targets() -> tuple[np.ndarray, np.ndarray]:
 
 
 def whitened(seeds: range) -> np.ndarray:
-    """What was drawn, in each normal's own standard deviations: (posteriors, ensembles, steps, walkers, n).
+    """Return draws in standard deviations of each normal, shape (posteriors, ensembles, steps, walkers, n).
 
-    The approximations that it starts from are off by half a standard deviation, in width by a fifth.
+    The initial approximations are wrong by half a standard deviation in the center and by a fifth in width.
     """
     centers, covariances = (each[seeds] for each in targets())
     precisions, roots = np.linalg.inv(covariances), np.linalg.cholesky(covariances)
@@ -37,7 +37,7 @@ def whitened(seeds: range) -> np.ndarray:
 
 
 def off_by(white: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What means and second moments of standard normals are off by, and its standard error by the ensembles' own."""
+    """Return errors of means and second moments of standard normals, and their standard errors over the ensembles."""
     kept = white[:, :, BURN:].reshape(white.shape[0] * white.shape[1], -1, SIZE)
     second = np.einsum("eni,enj->eij", kept, kept) / kept.shape[1] - np.eye(SIZE)
     each = np.concatenate([kept.mean(axis=1), second.reshape(len(kept), -1)], axis=1)
@@ -46,9 +46,9 @@ def off_by(white: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("shares", [(0.7, 0.3), (0.0, 1.0)], ids=["mixture", "stretch"])
 def test_moves_give_known_normals(shares, monkeypatch):
-    """To 1 % in the mixture; the stretch move alone, whose draws are fewer by their autocorrelation, to 4.5 errors.
+    """Accurate to 1 % with all moves, and to 4.5 standard errors with stretch moves, which give fewer effective draws.
 
-    The 192 ensembles are independent, so that their own scatter gives the standard error.
+    The 192 ensembles are independent, so their scatter gives the standard error.
     """
     monkeypatch.setattr(moves, "SHARES", shares)
     off, error = off_by(whitened(range(COUNT)))
@@ -57,11 +57,11 @@ def test_moves_give_known_normals(shares, monkeypatch):
 
 
 def test_walkers_of_neighbours_would_be_seen(monkeypatch):
-    """emcee's own stretch move over the same walkers: any anchor leaves a normal alone, but few moves are accepted."""
+    """Stretch moves with walkers of other targets still sample each normal, but few moves are accepted."""
     monkeypatch.setattr(moves, "SHARES", (0.0, 1.0))
     monkeypatch.setattr(moves, "Stretch", lambda shape, generators: emcee.moves.StretchMove())
     _, error = off_by(whitened(range(8)))
-    assert np.all(error > 0.012)  # of 32 ensembles; 0.0075 of 192 would be 0.018
+    assert np.all(error > 0.012)  # 0.0075 for 192 ensembles would be 0.018 for 32
 
 
 def test_draws_do_not_depend_on_neighbours():

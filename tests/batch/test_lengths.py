@@ -1,4 +1,4 @@
-"""Records of any length share what JAX compiled, and filling them up changes no answer."""
+"""Records of any length use the same compiled functions, and padding does not change a result."""
 
 import functools
 
@@ -23,7 +23,7 @@ STUDENT = {"measurement": {"noise_model": "student"}}
 COLOURED = {"measurement": {"noise_model": "ar1"}}
 FRACTIONAL = {"skin": {"level": "fractional"}}
 
-# what was recorded, by which scene it is fitted, at how many samples a second, and of what length
+# record, scene of the fit, sampling rate and length
 KINDS = {
     "named": (SQUARE, SQUARE, 1e5, 4000),
     "with V": (SQUARE, SQUARE, 1e5, 4000),
@@ -52,7 +52,7 @@ def whole(kind: str) -> fitact.Record:
 
 
 def record(kind: str, missing: int = 0) -> fitact.Record:
-    """One of a kind, less so many samples at its end."""
+    """Return a record of one kind, shortened by some samples at its end."""
     given, kept = whole(kind), slice(len(whole(kind)) - missing)
     channels = {name: np.array(given[name][kept]) for name in given.channels if name != "V" or _keeps_drive(kind)}
     if kind == "clipped":
@@ -90,7 +90,7 @@ def test_the_last_sample_is_repeated_without_weight():
 
 
 def compiled_for(kind: str, caplog: pytest.LogCaptureFixture) -> list[str]:
-    """What is compiled for fits of other lengths after a first."""
+    """Return what is compiled for fits of other lengths after the first."""
     given = scene(kind)
     fitact.fit(record(kind), given)
     caplog.clear()
@@ -127,7 +127,7 @@ def test_other_lengths_fitted_together_compile_nothing_anew(caplog: pytest.LogCa
 
 
 def optimum(made: fitact.Record, fit: fitact.Fit) -> np.ndarray:
-    """By MINPACK, from the closed form of a settled square."""
+    """Return the optimum by MINPACK, from the closed form of a steady-state square."""
     half = np.floor(made.time * 200.0 + 1e-9)
     sign, since = np.where(half % 2 == 0.0, 1.0, -1.0), made.time - half / 200.0
     mean, sd = fit.likelihood.prior.log_mean, fit.likelihood.prior.log_sd
@@ -160,7 +160,7 @@ def test_filling_up_changes_no_answer(kind: str, monkeypatch: pytest.MonkeyPatch
     filled = fitact.fit(made, given)
     monkeypatch.setattr(compiled, "padded_length", lambda samples: samples)
     plain = fitact.fit(made, given)
-    # where rounding lets least squares stop a step sooner, as far as they end from the optimum
+    # rounding may end least squares one step earlier; then the results differ by the distance to the optimum
     same = 1e-9 if filled.figures["steps"] == plain.figures["steps"] else 1e-5
     assert np.abs(filled.theta - plain.theta).max() < same * plain.sd.min()
     assert np.allclose(filled.residuals, plain.residuals, rtol=0.0, atol=same * plain.sigma)

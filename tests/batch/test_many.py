@@ -1,4 +1,4 @@
-"""Many records at once: the same answers as one by one, and a failure that stays where it is."""
+"""Fits of many records at once: the same results as one by one, and failures that do not affect other records."""
 
 import csv
 from pathlib import Path
@@ -34,7 +34,7 @@ def record(number: int, **how) -> fitact.Record:
 
 
 def settled(time: np.ndarray, theta: np.ndarray) -> np.ndarray:
-    """Under the square of `SCENE`, of logarithms."""
+    """Return the steady state for the square of `SCENE`, from logarithms."""
     half = np.floor(time * 200.0 + 1e-9)
     sign, since = np.where(half % 2 == 0.0, 1.0, -1.0), time - half / 200.0
     R, C, Ci = np.exp(theta)
@@ -43,7 +43,7 @@ def settled(time: np.ndarray, theta: np.ndarray) -> np.ndarray:
 
 
 def optimum(record: fitact.Record, sigma: float, start: np.ndarray = MEDIANS) -> np.ndarray:
-    """By MINPACK, from the closed form of a settled square."""
+    """Return the optimum by MINPACK, from the closed form of a steady-state square."""
 
     def residuals(theta):
         return np.append((record["Vsc"] - settled(record.time, theta)) / sigma, (theta - MEDIANS) / LOG_SDS)
@@ -54,7 +54,7 @@ def optimum(record: fitact.Record, sigma: float, start: np.ndarray = MEDIANS) ->
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory) -> list:
-    """Clean records, and among them odd ones of each kind."""
+    """Return clean records with unusual ones of each kind among them."""
     folder = tmp_path_factory.mktemp("records")
     (folder / "broken.csv").write_text("time_s,Vsc_V\n0,1\n1,nan\n")
     given: list = [record(number) for number in range(COUNT)]
@@ -96,13 +96,13 @@ def test_each_row_is_the_fit_of_its_record(fits, given, number):
 
 
 def with_line(clean: fitact.Record, amplitude: float) -> fitact.Record:
-    """The record with a sine beside its noise, whose standard deviation is the unit of `amplitude`."""
+    """Return the record with an added sine; `amplitude` is in units of the noise sd."""
     line = 0.1 * amplitude * np.sin(2.0 * np.pi * 730.0 * clean.time)
     return fitact.Record.from_arrays(clean.time, Vsc=clean["Vsc"] + line, source=clean.source)
 
 
 def test_without_tests_of_whiteness_only_size_is_judged():
-    """A sine of 0.35 standard deviations adds 6 % to the variance, which its noise may be off by; of 1.5, 110 %."""
+    """A sine of 0.35 sd adds 6 % to the variance, within the error of the noise estimate; one of 1.5 sd adds 110 %."""
     given = [record(number) for number in range(COUNT)]
     given[2], given[3] = with_line(given[2], 0.35), with_line(given[3], 1.5)
     tested = fitact.fit_many(given, SCENE, progress=False)
@@ -128,7 +128,7 @@ def test_optimum_against_scipy(fits, given, number):
 
 @pytest.mark.slow
 def test_noise_so_low_that_coordinates_lose_it():
-    """Some billionths of the height: what is left of a record must be told from its samples."""
+    """Noise of some billionths of the height: the residuals must be computed from the samples."""
     quiet = [record(number, noise=1e-7) for number in range(16)]
     error = 5.0 / np.sqrt(2.0 * len(quiet[0]))
     for row in fitact.fit_many(quiet, SCENE, progress=False):
@@ -137,10 +137,10 @@ def test_noise_so_low_that_coordinates_lose_it():
 
 @pytest.mark.slow
 def test_without_tests_of_whiteness_low_noise_is_told_from_samples():
-    """Coordinates would be off by some per cent."""
+    """Residuals from coordinates would have errors of several per cent."""
     quiet = [record(number, noise=6e-7, Rsc=20e3) for number in range(16)]
     for each, row in zip(quiet, fitact.fit_many(quiet, SCENE, whiteness=False, progress=False), strict=True):
-        near = np.log([row[name] for name in NAMES])  # from the medians it ends elsewhere
+        near = np.log([row[name] for name in NAMES])  # the fit starts here, because it ends elsewhere from the medians
         left = each["Vsc"] - settled(each.time, optimum(each, row["noise"], near))
         assert row["rms_residual"] == pytest.approx(np.sqrt(np.mean(left**2)), rel=1e-3)
 

@@ -1,4 +1,4 @@
-"""Posteriors of many records: the same as one by one and as an integral, each by itself whatever is beside it."""
+"""Posteriors of many records: the same as one by one and as an integral, independent of the other records."""
 
 import dataclasses
 import functools
@@ -40,7 +40,7 @@ def record(number: int) -> fitact.Record:
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory) -> list:
-    """Alike records, one of which asks for an offset, and a file that is refused."""
+    """Return similar records, one of which requires an offset, and a file that is refused."""
     found: list = [record(number) for number in range(COUNT)]
     found[OFFSET] = fitact.Record.from_arrays(found[OFFSET].time, Vsc=found[OFFSET]["Vsc"] + 2.0, source="offset")
     found[BROKEN] = tmp_path_factory.mktemp("records") / "broken.csv"
@@ -58,19 +58,19 @@ def quantiles(row: dict, name: str) -> np.ndarray:
 
 
 def assert_alike(row: dict, other: dict, error: float) -> None:
-    """All that the first has, numbers to a relative error; not R-hat, which ranks what rounding tells apart."""
+    """Compare all entries of the first, numbers to a relative error; not R-hat, whose ranks depend on rounding."""
     for name in row.keys() - {"rhat_max"}:
         value = row[name]
         assert other[name] == (value if isinstance(value, str) else pytest.approx(value, rel=error)), name
 
 
 def effective(row: dict, name: str) -> float:
-    """Draws at least; of every fourth step at least a quarter, as a mean of four such means errs no more than each."""
+    """Return a lower bound on the effective number of draws; quantities of every fourth step have a quarter of them."""
     return row["ess_min"] / (1.0 if name in (*MEDIANS, "noise") else 4.0)
 
 
 def assert_shares(shares: np.ndarray, draws: float) -> None:
-    """Of a distribution below quantiles of so many draws from it: binomial, to 4.5 standard deviations."""
+    """Assert that the fractions below quantiles are binomial within 4.5 standard deviations."""
     error = np.sqrt(PROBABILITY * (1.0 - PROBABILITY) / draws)
     np.testing.assert_array_less(np.abs(shares - PROBABILITY) / error, 4.5)
 
@@ -99,7 +99,7 @@ def test_alike_records_are_sampled_together_and_others_alone(found):
 
 @pytest.mark.parametrize("number", [0, OFFSET])
 def test_quantiles_are_those_of_each_by_itself(found, given, number):
-    """Both are draws of one posterior: each share's error is that of both."""
+    """Both are draws of the same posterior, so the error of each fraction is that of both."""
     posterior = fitact.sample(fitact.fit(given[number], SCENE), seed=5, progress=False)
     parameters, convergence = posterior.parameters(), posterior.convergence
     drawn = parameters | posterior.derived() | {"noise": parameters["sigma"]}
@@ -111,10 +111,10 @@ def test_quantiles_are_those_of_each_by_itself(found, given, number):
 
 
 def marginals(record: fitact.Record) -> dict:
-    """Cumulative distributions of a record's posterior, by sums on a grid of (log g, log b), without fitact.
+    """Return cumulative distributions of a record's posterior by sums on a grid of (log g, log b), without fitact.
 
-    The noise, flat in its logarithm, integrates out: (squares)^(-n/2). So does the blind direction: given g and b, log
-    Rsc and log Csc are log Ci and a constant, and three normals of log Ci make one.
+    The noise, flat in its logarithm, integrates out as (sum of squares)^(-n/2). So does the unidentified direction:
+    given g and b, log Rsc and log Csc are log Ci plus constants, and three normals of log Ci multiply to one.
     """
     half = np.floor(record.time * 2.0 * FREQUENCY + 1e-9)
     sign, since = np.where(half % 2 == 0.0, 1.0, -1.0), record.time - half / (2.0 * FREQUENCY)
@@ -132,8 +132,8 @@ def marginals(record: fitact.Record) -> dict:
     z = np.linspace(-7.0, 7.0, 71)
     log_g, log_b = best.x[:, None] + root @ np.stack(np.meshgrid(z, z, indexing="ij")).reshape(2, -1)
     squares = np.sum((record["Vsc"] - signal(log_g, log_b)) ** 2, axis=-1)
-    log_ratio = np.log(np.exp(-log_g) - 2.0)  # of Csc to Ci
-    # each prior as a normal of log Ci
+    log_ratio = np.log(np.exp(-log_g) - 2.0)  # log(Csc / Ci)
+    # each prior as a normal distribution of log Ci
     means = np.stack(
         [
             log_b + log_g - np.log(MEDIANS["Rsc"]),
@@ -202,7 +202,7 @@ def test_what_has_not_converged_is_not_trusted(monkeypatch):
 
 @pytest.mark.slow
 def test_what_is_not_near_laplace_is_sampled_alone():
-    """A prior of Csc that ends at the truth of one record, and far from the others'."""
+    """The prior of Csc ends at the truth of one record, far from those of the others."""
     heights = np.sin(np.arange(100) + 1.0)
     numbers = [int(np.argmin(heights)), *np.flatnonzero(heights > -0.2)[:16].tolist()]
     settings = SCENE.model_dump(mode="json", exclude_unset=True)
@@ -238,7 +238,7 @@ def test_an_interrupted_chain_ends_the_call(given, monkeypatch):
 
 
 def drawn_from_the_prior(number: int, time: np.ndarray) -> tuple[fitact.Record, dict[str, float]]:
-    """Under `calibration.PRIOR`, a settled square by scipy's state space, and its truths."""
+    """Return a steady-state square by scipy's state space, its parameters drawn from `calibration.PRIOR`, and these."""
     rng = np.random.default_rng([8, number])
     spread = scipy.stats.norm.ppf(0.975)
     truth = {
@@ -259,7 +259,7 @@ def drawn_from_the_prior(number: int, time: np.ndarray) -> tuple[fitact.Record, 
 
 @pytest.mark.thorough
 def test_calibration(monkeypatch):
-    """Ranks of 300 truths from the prior among 99 independent draws of each posterior, as `calibration` judges them."""
+    """Rank 300 truths from the prior among 99 independent draws of each posterior, as `calibration` does."""
     time = np.arange(1000) / (calibration.PER_PERIOD * FREQUENCY)
     made = [drawn_from_the_prior(number, time) for number in range(300)]
     scene = fitact.Scene.from_dict(

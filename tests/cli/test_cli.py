@@ -1,4 +1,4 @@
-"""The command line as a user meets it: its output, its files, its exit code; in another process where that shows."""
+"""The command line from the user's side: output, files and exit status; in a separate process where that matters."""
 
 import json
 import math
@@ -16,7 +16,7 @@ from fitact.cli import main
 FILES = {"fit.json", "summary.json", "posterior.nc", "chain.h5", "report.html"}
 
 
-# a program that can be interrupted although test runners may pass on an ignored SIGINT
+# a program that can be interrupted even if the test runner passes on an ignored SIGINT
 INTERRUPTIBLE = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from fitact.cli import main; main()"
 )
@@ -29,7 +29,7 @@ def environment(tmp_path_factory) -> dict[str, str]:
 
 @pytest.fixture
 def fitact_process(environment, tmp_path):
-    """The command in another process."""
+    """Return a function that runs the command in a separate process."""
 
     def call(*arguments: object) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-c", "from fitact.cli import main; main()", *map(str, arguments)]
@@ -42,11 +42,11 @@ def fitact_process(environment, tmp_path):
 
 @pytest.fixture
 def fitact_command(tmp_path, monkeypatch, capsys):
-    """The command in this process, which has imported and compiled most of what it takes: a tenth of the time."""
+    """Return a function that runs the command in this process, where most is already compiled: ten times as fast."""
     monkeypatch.chdir(tmp_path)
-    # else the command would move this process's compilation cache to the user's
+    # otherwise the command would move the compilation cache of this process to the user's
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", os.environ.get("JAX_COMPILATION_CACHE_DIR", str(tmp_path)))
-    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)  # main() sets its own
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)  # main() sets its own hook
 
     def call(*arguments: object) -> subprocess.CompletedProcess[str]:
         monkeypatch.setattr(sys, "argv", ["fitact", *map(str, arguments)])
@@ -103,7 +103,7 @@ def test_run_again_goes_on_from_the_chain_and_json_stands_alone(
     done = fitact_process("run", finger_path, "--scene", finger_scene_path, "--out", folder, "--seed", 1, "--json")
     assert done.returncode == 0
     assert json.loads(done.stdout) == json.loads((folder / "summary.json").read_text())
-    assert "sampling:" not in done.stderr  # it had converged
+    assert "sampling:" not in done.stderr  # the chain had already converged
     assert (folder / "posterior.nc").read_bytes() == before
     other = fitact_process("run", finger_path, "--scene", finger_scene_path, "--out", folder, "--seed", 2)
     assert other.returncode == 2
@@ -284,7 +284,7 @@ def test_simulated_current_needs_a_finite_one(fitact_command, tmp_path):
     assert fitact_command("simulate", "real.toml", "--out", "real.csv").returncode == 0
     header, first, *_ = (tmp_path / "real.csv").read_text().splitlines()
     assert header == "time_s,V_V,Vsc_V,I_A"
-    # just after the edge R_H alone, with what Ci and the skins hold, limits the current: below 360 V / 500 ohm
+    # just after the edge only R_H limits the current, with the charge on Ci and the skins: below 360 V / 500 ohm
     assert 0.7 < float(first.split(",")[3]) < 0.72
 
 
@@ -359,7 +359,7 @@ def test_help_is_a_page_to_start_from(fitact_process):
 
 
 def test_an_interrupt_that_python_drops_comes_again(environment):
-    """SIGINT within a weak reference's callback, where Python prints what is raised and goes on."""
+    """SIGINT within the callback of a weak reference, where Python prints the exception and continues."""
     script = """
 import signal, time, weakref
 import fitact.cli
@@ -383,7 +383,7 @@ fitact.cli.main()
 
 @pytest.mark.slow
 def test_an_interrupted_run_goes_on(environment, finger_path, finger_scene_path, results, tmp_path):
-    """SIGINT while it samples: no traceback, exit code not 0, and the same command finishes with the same draws."""
+    """After SIGINT while sampling there is no traceback, and the same command finishes with the same draws."""
     folder = tmp_path / "out"
     command = [
         sys.executable,

@@ -1,4 +1,4 @@
-"""docs/contracts.md against what the commands print: every key that is stated is there, and no other."""
+"""The keys in docs/contracts.md against those that the commands print: all of them, and no others."""
 
 import contextlib
 import io
@@ -28,7 +28,7 @@ SUMMARY = ("unit", "mean", "sd", "q025", "q05", "q25", "q50", "q75", "q95", "q97
 
 
 class Stated(NamedTuple):
-    """One key as the page has it; `always`: it is there whatever was asked for."""
+    """Key as stated on the page; `always` means that it is always present."""
 
     pattern: str
     types: str
@@ -40,7 +40,7 @@ class Stated(NamedTuple):
 
 
 def stated(command: str) -> list[Stated]:
-    """The rows of the section whose heading begins with the command."""
+    """Return the rows of the section whose heading begins with the command."""
     page = (ROOT / "docs" / "contracts.md").read_text(encoding="utf-8")
     section = next(part for part in page.split("\n## ") if part.startswith(f"`fitact {command} --json`"))
     found = []
@@ -62,7 +62,7 @@ def _part(name: str) -> str:
 
 
 def leaves(path: str, value: Any, known: list[Stated]):
-    """The paths of what no key states as a whole, and of what one does."""
+    """Yield the paths and values of all leaves, where a value that a stated key covers as a whole is one leaf."""
     if isinstance(value, dict) and value and not any(key.covers(path, value) for key in known):
         for name, inner in value.items():
             yield from leaves(f"{path}.{name}" if path else name, inner, known)
@@ -78,7 +78,7 @@ def leaves(path: str, value: Any, known: list[Stated]):
         yield path, value
 
 
-OWN = pytest.mark.thorough  # commands that other tests run, too
+OWN = pytest.mark.thorough  # commands that other tests also run
 CASES = [
     pytest.param("fit", [*FINGER], id="fit"),
     pytest.param("fit", [*FINGER, "--intervals"], id="fit --intervals", marks=OWN),
@@ -107,7 +107,7 @@ CASES = [
 ]
 
 
-@pytest.mark.filterwarnings("error::UserWarning")  # which people would see
+@pytest.mark.filterwarnings("error::UserWarning")  # warnings that users would see
 @pytest.mark.parametrize(("command", "arguments"), CASES)
 def test_keys_are_those_of_the_page(command, arguments, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -131,7 +131,7 @@ def test_every_command_has_its_place():
 
 
 def names(command: Any) -> list[str]:
-    """Of all commands, with those of a group behind its own."""
+    """Yield the names of all commands, including those of groups."""
     found = []
     for name, inner in command.commands.items():
         found += [f"{name} {last}" for last in names(inner)] if hasattr(inner, "commands") else [name]

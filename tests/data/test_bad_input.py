@@ -1,4 +1,4 @@
-"""What each kind of bad input gets; docs/input.md lists the same, and a test holds the two together."""
+"""Handling of each kind of bad input; docs/input.md lists the same kinds, and a test compares the two."""
 
 import gzip
 import io
@@ -14,12 +14,12 @@ from tests.conftest import square_record
 
 PAGE = Path(__file__).parents[2] / "docs" / "input.md"
 PERIODS, PER_PERIOD = 20, 200
-Table = dict[str, np.ndarray]  # by the header's names
+Table = dict[str, np.ndarray]  # columns by name in the header
 
 
 @pytest.fixture(scope="module")
 def table() -> Table:
-    """0.2 s of a 360 Vpp square at 100 Hz and the skin voltage it makes, with edges and noise of their own."""
+    """Return 0.2 s of a 360 Vpp square at 100 Hz and its skin voltage, with finite edges and noise."""
     record = square_record(periods=PERIODS, per_period=PER_PERIOD)
     rng = np.random.default_rng(5)
     return {
@@ -36,7 +36,7 @@ def text_of(table: Table, digits: str = "%.9g", delimiter: str = ",") -> str:
     return "\n".join([delimiter.join(table), *rows]) + "\n"
 
 
-# ---- how a file is spoilt: a text, or bytes, from the good table
+# ---- functions that damage a file: a text, or bytes, from the valid table
 
 
 def rename(**names: str) -> Callable[[Table], str]:
@@ -80,7 +80,7 @@ def adding(column: str, wave: Callable[[np.ndarray], np.ndarray]) -> Callable[[T
 
 
 def headed(header: str, scale: float = 1.0) -> Callable[[Table], str]:
-    """The table under another header, its values scaled."""
+    """Return the table with another header and scaled values."""
     return lambda table: "\n".join([header, *text_of({n: scale * v for n, v in table.items()}).splitlines()[1:]])
 
 
@@ -102,7 +102,7 @@ def as_npz(table: Table) -> bytes:
 ALL = {"channels": {"V": "CH1", "Vsc": "CH2"}}
 SCENE = {"drive": {"waveform": "square", "peak_to_peak": "360 V", "frequency": "100 Hz"}}
 
-# kind: verdict, how it is made, words of the sentence, and what is asked for
+# kind: verdict, function that makes the file, words of the sentence, and options
 KINDS: dict[str, tuple] = {
     # the file
     "missing file": ("refused", None, "no such file"),

@@ -114,7 +114,7 @@ def test_bad_files_are_refused_with_the_place(write, rows: Rows, name: str):
 
 def test_pure_noise_is_refused_and_a_single_edge_is_not():
     time, rng = np.arange(400) * 5e-6, np.random.default_rng(3)
-    noise = rng.normal(size=400)  # any seed: the test's level is 1e-4
+    noise = rng.normal(size=400)  # any seed; the significance level of the test is 1e-4
     with pytest.raises(fitact.InputError, match="nothing but noise"):
         fitact.Record.from_arrays(time, V=np.sin(time * 1e3), Vsc=noise)
     edge = np.where(np.arange(400) < 3, -180.0, 180.0) + 0.4 * noise
@@ -137,8 +137,8 @@ def test_directory_and_missing_file(tmp_path: Path):
 
 
 def test_what_is_written_is_read_again(tmp_path: Path):
-    """Times to the last bit, values to the 12 digits that are written."""
-    rng = np.random.default_rng(0)  # any
+    """Times agree to the last bit, values to the 12 digits that are written."""
+    rng = np.random.default_rng(0)  # any seed
     time = np.cumsum(rng.uniform(0.9e-5, 1.1e-5, 500)) - 1e-3
     waves = {"V": 360.0 * np.sin(2e3 * time), "Vsc": 15.0 * np.cos(2e3 * time), "I": 1e-6 * np.cos(2e3 * time)}
     write_csv(tmp_path / "record.csv", fitact.Record.from_arrays(time, **waves))
@@ -181,7 +181,7 @@ def test_the_callers_arrays_are_left_alone():
 
 @pytest.mark.parametrize("spacing", ["linear", "logarithmic"])
 def test_a_sweep_is_no_noise(spacing: str):
-    """Its spectrum has no line, but it is smooth."""
+    """A sweep has no spectral line, but it is smooth."""
     time = np.arange(20_000) / 20e3
     phase = {
         "linear": 100.0 * time + 0.5 * 900.0 * time**2,
@@ -192,11 +192,11 @@ def test_a_sweep_is_no_noise(spacing: str):
 
 
 def test_what_shows_only_further_down_is_read(tmp_path: Path):
-    """A channel that begins late, and a decimal comma that comes late."""
+    """A channel that begins late, and a decimal comma that appears late."""
     values = np.sin(0.01 * np.arange(1000)) + (np.arange(1000) > 700)
     late = ["time_s,V_V,Vsc_V", *(f"{1e-5 * i:.6f},{v:.4f}," + f"{v:.3f}" * (i >= 500) for i, v in enumerate(values))]
     (tmp_path / "late.csv").write_text("\n".join(late))
-    with pytest.raises(fitact.InputError, match="line 2, column 3: the cell is empty"):  # not: there is no Vsc
+    with pytest.raises(fitact.InputError, match="line 2, column 3: the cell is empty"):  # not that Vsc is missing
         fitact.read(tmp_path / "late.csv")
     shown = ["0" if i < 700 else f"{v:.4f}".replace(".", ",") for i, v in enumerate(values)]
     comma = ["time_us;V_V;Vsc_V", *(f"{10 * i};{v};{v}" for i, v in enumerate(shown))]

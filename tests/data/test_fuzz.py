@@ -1,4 +1,4 @@
-"""A part of `make fuzz`, which breaks 20,000 files."""
+"""Part of `make fuzz`, which damages 20,000 files."""
 
 from tests import fuzz
 

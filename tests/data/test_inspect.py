@@ -1,4 +1,4 @@
-"""What `inspect` says of a record, and that files from outside reach a fit only when it was said which is which."""
+"""Results of `inspect`, and the refusal to fit a foreign file before its columns are assigned."""
 
 import json
 import os
@@ -40,10 +40,10 @@ def test_the_shipped_record(finger_path: Path, finger_truth: dict[str, float]):
 
 
 def test_drift_and_hum_are_measured(tmp_path: Path):
-    """2 V of 50 Hz and 4 V of drift beside 18 V of 130 Hz, found to the digits shown; and neither without them."""
+    """2 V of 50 Hz and 4 V of drift on 18 V of 130 Hz are measured to the digits shown; otherwise nothing is shown."""
     time = np.arange(20_000) * 2e-5
     drive = 180.0 * np.sin(2.0 * np.pi * 130.0 * time)
-    clean = 0.1 * drive + 0.02 * np.random.default_rng(2).normal(size=time.size)  # any seed: a hundredth of the hum
+    clean = 0.1 * drive + 0.02 * np.random.default_rng(2).normal(size=time.size)  # any seed; 1 % of the hum
     spoilt = clean + 2.0 * np.sin(2.0 * np.pi * 50.0 * time + 1.0) + 10.0 * time
     for values, expected in (
         (clean, []),
@@ -102,7 +102,7 @@ def test_it_must_be_said_which_is_which(command, options: tuple[str, ...], words
 
 @pytest.mark.slow
 def test_a_fit_of_an_oscilloscopes_file(command):
-    """A settled square of period T: Vsc jumps to 360 V g / (1 + exp(-T / 2b)) and falls as exp(-t / b)."""
+    """Steady-state square of period T: Vsc jumps to 360 V g / (1 + exp(-T / 2b)) and decays as exp(-t / b)."""
     path = SCOPE / "keysight_scope_0.csv"
     done = command("fit", path, "--channel", "V=1", "--channel", "Vsc=2", "--json")
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""Files of oscilloscopes: real captures, and small ones in the layouts that makers document."""
+"""Oscilloscope files: real captures, and small files in the layouts that manufacturers document."""
 
 import gzip
 import struct
@@ -14,7 +14,7 @@ from fitact.data.readers.read import read_capture
 SCOPE = Path(__file__).parents[1] / "data" / "scope"
 SKIN = {"V": "CH1", "Vsc": "CH2"}
 
-# file: maker, names, samples, first time, step, first and last value of the last channel, as a text editor shows them
+# file: manufacturer, names, samples, first time, step, first and last value of the last channel (from a text editor)
 SHOWN = {
     "tek_TDS2000_F0000CH1.CSV": ("Tektronix TDS", ["CH1"], 400, -0.01, 5e-5, 15.345, -4.3853),
     "keysight_scope_0.csv": ("Keysight", ["1", "2"], 400, -0.01, 5e-5, 15.345, -4.385),
@@ -80,7 +80,7 @@ LAYOUTS = {
     "text": (
         '"Time / us","drive (kV)",note,"Vsc / mV"\n', "{us},{a},ok,{b}", [("drive", "V", 1e3), ("Vsc", "V", 1e-3)],
     ),
-    "fitact": ("# time_s V_V Vsc_V\n", "{t} {a} {b}", [("V", "V", 1.0), ("Vsc", "V", 1.0)]),  # as numpy.savetxt writes
+    "fitact": ("# time_s V_V Vsc_V\n", "{t} {a} {b}", [("V", "V", 1.0), ("Vsc", "V", 1.0)]),  # layout of numpy.savetxt
 }  # fmt: skip
 
 
@@ -111,7 +111,7 @@ def test_documented_layouts(tmp_path: Path, maker: str):
     ],
 )
 def test_time_from_start_and_increment(tmp_path: Path, header: str, row: str, start: float, step: float):
-    """Rows of the first count from 22, as Rigol's may."""
+    """Row numbers of the first file start at 22, as in files of Rigol."""
     path = tmp_path / "record.csv"
     path.write_text(header + "\n".join(row.format(i=i, a=i % 7) for i in range(22, 62)))
     capture = read_capture(path)
@@ -143,7 +143,7 @@ def test_utf_16_and_other_line_ends(tmp_path: Path, end: str):
 
 
 def test_many_blocks_and_gzip(tmp_path: Path, monkeypatch, finger_path: Path):
-    """Parts that end in the middle of a line change nothing."""
+    """Chunks that end in the middle of a line do not change the result."""
     plain = fitact.read(finger_path)
     path = tmp_path / "record.csv.gz"
     path.write_bytes(gzip.compress(finger_path.read_bytes()))
@@ -170,7 +170,7 @@ def floats(path: Path, start: int, count: int) -> np.ndarray:
 
 @pytest.mark.usefixtures("rigolwfm")
 def test_keysight_and_rigol_binary_against_their_floats():
-    """The makers' manuals: 12 bytes of file header; then, a channel, 140 + 12 bytes of headers and float32 samples."""
+    """Manuals: a file header of 12 bytes; then, for each channel, headers of 140 + 12 bytes and float32 samples."""
     capture = read_capture(SCOPE / "agilent_1.bin")
     np.testing.assert_array_equal(capture.channels[0].values, floats(SCOPE / "agilent_1.bin", 164, 2000))
     assert capture.time[1] - capture.time[0] == pytest.approx(5e-7)
@@ -195,7 +195,7 @@ def test_lecroy_binary_against_its_descriptor():
 
 @pytest.mark.usefixtures("rigolwfm")
 def test_rigol_binary_against_the_csv_of_the_same_capture():
-    """The DS1052E's CSV begins at 0 and four samples later; the DS2072A's has a tenth of the times, 25 ns late."""
+    """The DS1052E's CSV begins at 0, four samples later; the DS2072A's has a tenth of the times, 25 ns later."""
     text, binary = (read_capture(SCOPE / f"rigol_DS1052E.{end}") for end in ("csv.gz", "wfm"))
     for shown, kept in zip(text.channels, binary.channels, strict=True):
         np.testing.assert_allclose(shown.values[4:], kept.values[:-4], atol=1e-12)
@@ -243,7 +243,7 @@ WAVES = {"drive": np.sin(2e3 * np.pi * TIME), "skin": 0.1 * np.cos(2e3 * np.pi *
 def write_mat(path: Path) -> None:
     import scipy.io
 
-    scipy.io.savemat(path, {"Tstart": TIME[0], "Tinterval": 1e-5, **WAVES})  # as PicoScope does
+    scipy.io.savemat(path, {"Tstart": TIME[0], "Tinterval": 1e-5, **WAVES})  # layout of PicoScope
 
 
 def write_mat_73(path: Path) -> None:
@@ -309,7 +309,7 @@ def test_files_of_named_arrays(tmp_path: Path, name: str):
 def test_matlab_against_what_scipy_wrote(tmp_path: Path, compressed: bool):
     import scipy.io
 
-    rng = np.random.default_rng(0)  # any
+    rng = np.random.default_rng(0)  # any seed
     written = {
         "a": rng.normal(size=(5, 3)), "b": rng.integers(-9, 9, (1, 40)).astype("i2"),
         "c": np.float32(rng.normal(size=(7, 1))), "d": np.array([[1 + 2j, 3.0]]), "a_long_name": np.ones((1, 1)),
@@ -355,7 +355,7 @@ def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch):
         read_capture(SCOPE / "agilent_1.bin")
 
 
-# ---- which is which
+# ---- assignment of the columns
 
 
 def test_the_mapping_is_asked_for_and_noted():
@@ -389,7 +389,7 @@ def test_a_wrong_mapping_is_refused(asked: dict, words: str):
 
 
 def test_channels_from_files_of_their_own(tmp_path: Path):
-    """As LeCroy and Tektronix TDS write them; a file of another capture is refused."""
+    """One file per channel, as LeCroy and Tektronix TDS write them; a file of another capture is refused."""
     table = np.loadtxt(SCOPE / "keysight_scope_0.csv", delimiter=",", skiprows=2)
     for name, column in (("C1.csv", 1), ("C2.csv", 2)):
         np.savetxt(tmp_path / name, table[:, [0, column]], "%.9g", ",", header="Time,Ampl", comments="")

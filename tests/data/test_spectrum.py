@@ -1,4 +1,4 @@
-"""Impedance spectra: files as analysers write them, and fits of spectra computed from complex arithmetic alone."""
+"""Impedance spectra: files in the formats of analysers, and fits of spectra computed from complex arithmetic alone."""
 
 import json
 import math
@@ -15,7 +15,7 @@ TRUTH = {"Rsc": 130e3, "Csc": 18e-9, "Ci": 1.4e-9}
 
 
 def impedance(frequency: np.ndarray, Rsc: float, Csc: float, Ci: float, alpha: float = 1.0) -> np.ndarray:
-    """Two layers and the insulator in series; alpha < 1: the layers are Cole's."""
+    """Return the impedance of two layers in series with the insulator; for alpha < 1 the layers are Cole elements."""
     s = 2j * np.pi * frequency
     return 2.0 * Rsc / (1.0 + (s * Rsc * Csc) ** alpha) + 1.0 / (s * Ci)
 
@@ -130,7 +130,7 @@ def test_a_record_is_no_spectrum_and_a_spectrum_no_record(tmp_path: Path, finger
 
 
 def test_parameters_within_their_errors():
-    """Pulls of 20 spectra of fingers apart by a factor of 9; the seed is any: 60 pulls beyond 4 have p = 0.004."""
+    """Errors of 20 spectra of fingers within a factor of 9. For any seed, one of 60 deviates by 4 sd with p = 0.004."""
     rng = np.random.default_rng(3)
     pulls = []
     for seed in range(20):
@@ -145,7 +145,7 @@ def test_parameters_within_their_errors():
 
 def test_what_is_left_is_the_noise():
     found = [fitact.fit_spectrum(spectrum(noise=1e-2, seed=seed)).noise for seed in range(10)]
-    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(1e-2, rel=0.13)  # 5 sds of 790 degrees of freedom
+    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(1e-2, rel=0.13)  # 5 sd for 790 degrees of freedom
 
 
 def test_force_is_that_of_the_circuit_under_the_scenes_drive():

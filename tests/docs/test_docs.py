@@ -1,4 +1,4 @@
-"""The documentation holds: its code and commands run, its scenes load, and it leaves no public name out."""
+"""The documentation: its code and commands run, its scenes load, and it covers all public names."""
 
 import glob
 import gzip
@@ -22,19 +22,19 @@ import fitact.cli
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PROGRAMS = ("fitact", "make", "python", "pytest")
-# pages whose Python samples a posterior, fits many times or compiles much; the rest is quick
-OWN = pytest.mark.thorough  # what they show has tests of its own
+# marks for pages whose Python samples a posterior, fits often or compiles much; the other pages are quick
+OWN = pytest.mark.thorough  # pages with separate tests of the same functions
 SLOW = {
     "README.md": pytest.mark.slow,
     "theory.md": pytest.mark.slow,
     **dict.fromkeys(("plan.md", "compare.md", "many.md"), OWN),
 }
-# commands that take minutes; their own tests run them with fewer records
+# commands that take minutes; separate tests run them with fewer records
 MINUTES = {"population", "design", "tradeoff", "compare", "reproduce"}
 
 
 class Block(NamedTuple):
-    """A fenced block: its language, the file it is (`title="scene.toml"`), its text, and its lines of the page."""
+    """Fenced block: its language, its file (`title="scene.toml"`), its text, and its lines in the page."""
 
     language: str
     title: str | None
@@ -54,13 +54,13 @@ def blocks(page: Path, *languages: str) -> list[Block]:
 
 
 def commands(text: str) -> list[list[str]]:
-    """The words of each command, without comments."""
+    """Return the words of each command, without comments."""
     lines = (shlex.split(line, comments=True) for line in text.splitlines())
     return [[Path(words[0]).name, *words[1:]] for words in lines if words]
 
 
 def mentioned(page: Path) -> list[list[str]]:
-    """Commands of the page's shell blocks and of its running text."""
+    """Return the commands of the page's shell blocks and of its text."""
     spans = [
         child.content
         for token in MarkdownIt().enable("table").parse(page.read_text(encoding="utf-8"))
@@ -93,7 +93,7 @@ def test_commands_exist_with_their_options(page):
 
 
 def has_options(arguments: list[str]) -> None:
-    """The command of `fitact` is there, and has the options given; what is left out does no harm in a text."""
+    """Return whether the command of `fitact` exists and has the options; elided arguments are ignored."""
     command, given = typer.main.get_command(fitact.cli.app), [word.strip("[]") for word in arguments]
     while commands_of := getattr(command, "commands", None):
         if not given or given[0].startswith("--"):
@@ -109,7 +109,7 @@ def has_target(arguments: list[str]) -> None:
 
 
 def names_files(arguments: list[str]) -> None:
-    """The files of tests and benchmarks are there, and know the options given."""
+    """Return whether the files of tests and benchmarks exist and have the options."""
     files = [ROOT / word for word in arguments if word.endswith(".py")]
     for file in files:
         own = [word for word in arguments if word.startswith("--")]
@@ -118,7 +118,7 @@ def names_files(arguments: list[str]) -> None:
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """Where a reader of the page stands: the project's data, and the files that pages call by these names."""
+    """Return a folder with the project's data and with the files that pages name."""
     records = ROOT / "data_synth" / "records"
     (tmp_path / "data_synth").symlink_to(ROOT / "data_synth")
     shutil.copy(records / "finger_direct.csv", tmp_path / "finger.csv")
@@ -134,7 +134,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     precision = jax.config.jax_enable_x64
     yield
-    jax.config.update("jax_enable_x64", precision)  # which a page may change
+    jax.config.update("jax_enable_x64", precision)  # a page may change this setting
 
 
 @pytest.mark.parametrize(
@@ -142,23 +142,23 @@ def folder(tmp_path, monkeypatch):
     [pytest.param(page, id=by_name(page), marks=SLOW.get(page.name, ())) for page in PAGES if blocks(page, "python")],
 )
 def test_python_runs(page, folder):
-    """The blocks of a page one after the other, as a reader would paste them."""
+    """Run the blocks of a page in order, as a reader would paste them."""
     names: dict[str, object] = {}
     for block in blocks(page, "python", "toml"):
         if block.title:
             Path(block.title).write_text(block.text)
         elif block.language == "python":
-            above = "\n" * (block.begin + 1)  # so that a traceback names the page's line
+            above = "\n" * (block.begin + 1)  # the traceback then shows the line of the page
             exec(compile(above + block.text, page, "exec"), names)
 
 
 def shell_blocks():
-    """Each block with a command of `fitact` on files, and the block that follows at once, what it prints."""
+    """Return each block with a command of `fitact` on files, and the output in the block that follows directly."""
     for page in PAGES:
         found = blocks(page)
         for block in found:
             own = [words for words in commands(block.text) if words[0] == "fitact"] if block.language == "sh" else []
-            if own and "[" not in block.text and "FILE" not in block.text:  # those state what can be given
+            if own and "[" not in block.text and "FILE" not in block.text:  # other blocks list possible arguments
                 short = page.name == "README.md" and own[0][1] not in MINUTES
                 marks = pytest.mark.slow if short else pytest.mark.thorough
                 printed = next((after.text for after in found if after.begin == block.end + 1), None)
@@ -181,7 +181,7 @@ def test_commands_run(page, lines, printed, folder, monkeypatch, capsys):
 
 
 def figures(text: str) -> list[str]:
-    """Line by line, without the row of float64: what single precision rounds to is the machine's."""
+    """Return the figures of each line, except for the row of float64, whose rounding depends on the machine."""
     return [line for line in text.rstrip().splitlines() if not line.startswith("float64 ")]
 
 

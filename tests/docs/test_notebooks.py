@@ -1,4 +1,4 @@
-"""Notebooks: what all have in common, and that a failing cell is named."""
+"""Notebooks: their common form, and the error message for a failing cell."""
 
 import ast
 import subprocess

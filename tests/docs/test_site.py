@@ -1,4 +1,4 @@
-"""The documentation's site, as `make docs` builds it: complete by itself, its equations set."""
+"""The documentation site of `make docs`: it needs no other host, and its equations are typeset."""
 
 import re
 import runpy

@@ -1,4 +1,4 @@
-"""Fits of the trunk current, alone and with Vsc, on records that ngspice made, against their truth."""
+"""Fits of the loop current, alone and with Vsc, on records of ngspice with known truth."""
 
 import dataclasses
 import json
@@ -68,7 +68,7 @@ def test_current_is_taken_where_there_is_no_skin_voltage():
 
 @pytest.mark.parametrize(("noise", "trusted"), [(0.05, True), pytest.param(0.4, False, marks=pytest.mark.thorough)])
 def test_noise_of_the_drive_is_not_taken_for_that_of_the_current(noise: float, trusted: bool):
-    """It reaches the current through its derivative; where that drowns the current's own, the answer is not trusted."""
+    """Noise of V enters the current through dV/dt; if it dominates the noise of the current, the fit is unreliable."""
     record, truth = fitact.read(FINGERS / "finger00.csv.gz"), TRUTH[0]
     noisy = record["V"] + noise * np.random.default_rng(1).standard_normal(len(record))
     found = fitact.fit(dataclasses.replace(record, channels={**record.channels, "V": noisy}), scene(["Vsc", "I"]))

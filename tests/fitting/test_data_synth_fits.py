@@ -1,4 +1,4 @@
-"""What fits say of the records that data_synth ships: the truth within the errors, or that it cannot be had."""
+"""Fits of the records that data_synth ships: the truth lies within the errors, or the fit reports why not."""
 
 import functools
 import json
@@ -29,7 +29,7 @@ def fitted(name: str) -> fitact.Fit:
 
 
 def truths(path: Path) -> dict[str, float]:
-    """Of the parameters and, where both skins alone are in series with Ci, of g and b."""
+    """Return the true parameters and, if only the two skins are in series with Ci, g and b."""
     content = shipped(path)
     found = {name: entry["value"] for name, entry in content["truth"].items() if not name.startswith("noise")}
     gain = content["recipe"].get("gain", {}).get("Vsc", 1.0)
@@ -40,7 +40,7 @@ def truths(path: Path) -> dict[str, float]:
 
 
 def deviation(summary: dict[str, Any], truth: float) -> float:
-    """In standard deviations of the posterior."""
+    """Return the error in posterior standard deviations."""
     return (float(summary["q50"]) - truth) / float(summary["sd"])
 
 
@@ -52,7 +52,7 @@ def deviation(summary: dict[str, Any], truth: float) -> float:
     ],
 )
 def test_vsc_alone_gives_g_and_b(name: str):
-    """A gain of the probe counts to g, which no record of Vsc alone could tell apart."""
+    """The gain of the probe is included in g, from which a record of Vsc cannot separate it."""
     fit, truth = fitted(name), truths(RECORDS / f"{name}.json")
     assert fit.trusted
     assert fit.identifiability.verdict == "prior-limited"
@@ -63,7 +63,7 @@ def test_vsc_alone_gives_g_and_b(name: str):
 
 
 def test_little_signal_is_told_as_such():
-    """Noise of 8 V against 1 mV, all else alike: 8000 times the width, as for a linear fit."""
+    """Noise of 8 V instead of 1 mV, with all else equal: 8000 times the width, as for a linear fit."""
     loud, quiet = (fitted(name).derived() for name in ("low_snr", "clean"))
     for quantity in ("g", "b"):
         widths = [float(each[quantity]["sd"]) / float(each[quantity]["q50"]) for each in (loud, quiet)]
@@ -94,7 +94,7 @@ def test_another_skin_than_the_scene_says_is_noticed(name: str):
 
 @pytest.mark.thorough
 def test_people_with_areas():
-    """Each finger's own values, and medians and spreads of the law that they follow."""
+    """True values of each finger, and medians and log-sds of their population."""
     paths = sorted((RECORDS / "areas").glob("*.json"))
     scene = fitact.Scene.load(RECORDS / "areas.toml")
     records = [fitact.read(path.with_suffix(".csv.gz"), scene) for path in paths]

@@ -1,4 +1,4 @@
-"""What residuals tell: nothing of good records, a second skin layer of bad ones. Oracles: scipy."""
+"""Residual tests: no alarms for correct models, alarms for a second skin layer. The references are from scipy."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ NOISE, PERIOD = 0.05, 2000
 
 
 def two_layers(R2: float, C2: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time, V and Vsc of settled periods over two layers in series, by scipy's state space; s, V, V."""
+    """Return time, V and Vsc (s, V, V) of steady-state periods over two layers in series, by scipy's state space."""
     R, C, Ci = 160e3, 22e-9, 1.35e-9
     time = np.arange(14 * PERIOD) * (0.01 / PERIOD)
     voltage = np.where(np.arange(time.size) % PERIOD < PERIOD // 2, 180.0, -180.0)
@@ -30,7 +30,7 @@ def two_layers(R2: float, C2: float) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def significance(vsc: np.ndarray) -> float:
-    """Sum of squares, in units of the noise, that the best single layer leaves of it, by scipy."""
+    """Return the sum of squares, in units of the noise variance, that the best single layer leaves, by scipy."""
     since = (np.arange(vsc.size) % (PERIOD // 2)) * (0.01 / PERIOD)
     sign = np.where(np.arange(vsc.size) % PERIOD < PERIOD // 2, 1.0, -1.0)
 
@@ -51,7 +51,7 @@ def significance(vsc: np.ndarray) -> float:
 )
 def test_a_second_skin_layer_is_misfit_wherever_it_shows(R2: float, C2: float):
     time, voltage, vsc = two_layers(R2, C2)
-    assert significance(vsc) > 75.0  # what an F test of 32 phases finds at 1e-7 nearly always
+    assert significance(vsc) > 75.0  # the value that an F test of 32 phases detects at 1e-7 nearly always
     noise = NOISE * np.random.default_rng(0).standard_normal(vsc.size)
     fit = fitact.fit(fitact.Record.from_arrays(time, V=voltage, Vsc=vsc + noise), SQUARE)
     assert fit.result == "misfit"
@@ -72,13 +72,13 @@ def test_the_shipped_record_is_no_misfit_and_shows_no_structure(finger_fit: fita
 def residual_p_values(
     residuals: np.ndarray, time: np.ndarray, frequency: float, precision=np.float32
 ) -> dict[str, np.ndarray]:
-    """In the precision in which fits are tested, unless another is given."""
+    """Return the p-values of residuals, by default in the precision that fits use."""
     of_time = PhaseBins.from_times(time, frequency)
     return p_values(ResidualTestStatistics.from_residuals(residuals.astype(precision), of_time), time.size, of_time)
 
 
 def test_false_alarms_of_white_noise_are_as_many_as_stated():
-    """Of 2,000 records, each test calls 1 % (folded: up to 4 tests) at a level of 1 %."""
+    """Each test at 1 % rejects about 1 % of 2,000 records (up to 4 times as many for the folded tests)."""
     time, rng = np.arange(1000) * 1e-4, np.random.default_rng(0)
     of_time = PhaseBins.from_times(time, 37.3)
     found = p_values(
@@ -86,12 +86,12 @@ def test_false_alarms_of_white_noise_are_as_many_as_stated():
     )
     alarms = {name: np.count_nonzero(p < 0.01) for name, p in found.items()}
     assert 20 - 15 <= alarms["folded_p"] <= 80 + 15
-    assert alarms["spectrum_p"] <= 20 + 15  # the law of large samples is a little strict
+    assert alarms["spectrum_p"] <= 20 + 15  # the asymptotic distribution is slightly conservative
     assert 20 - 15 <= alarms["line_p"] <= 20 + 15
 
 
 def test_noise_alone_is_never_larger_than_expected():
-    """The expectation is uncertain as well: of 20,000 records, none may be called a misfit at one in a million each."""
+    """The noise estimate is uncertain, too: of 20,000 records, none may be a misfit at one in a million each."""
     rng, samples = np.random.default_rng(4), 500
     noise = rng.standard_normal((20_000, samples))
     of_residuals = {"rounding_noise": 0.0, "interpolation_error": 0.0, "runs_z": 0.0, "rms_residual": 1.0}
@@ -106,7 +106,7 @@ def test_noise_alone_is_never_larger_than_expected():
 
 
 def test_folding_is_the_F_test_of_the_phase_means():
-    """scipy's F distribution, where one number of phases is left by the record's length."""
+    """scipy's F distribution, for a record so short that only one number of phases is tested."""
     time, rng = np.arange(64) * 1e-3, np.random.default_rng(1)
     residuals = rng.standard_normal(64) + 0.5 * np.sin(2.0 * np.pi * time / 8e-3)
     means = residuals.reshape(8, 8).mean(axis=0)

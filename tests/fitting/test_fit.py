@@ -8,7 +8,7 @@ from tests.conftest import SQUARE, skin_voltage, square_record
 
 
 def deviation(fit: fitact.Fit, name: str, truth: float) -> float:
-    """In posterior standard deviations."""
+    """Return the error in posterior standard deviations."""
     s = fit.derived()[name]
     return (s["q50"] - truth) / s["sd"]
 
@@ -45,7 +45,7 @@ def test_shipped_record_with_a_trapezoid_that_lacks_the_overshoot(finger_path, f
 
 
 def test_errors_are_those_of_the_linear_theory(finger_fit: fitact.Fit):
-    """scipy's least squares on the same record: a and b, offset, charge free, no prior."""
+    """scipy's least squares on the same record: a and b, with free offset and charge, without a prior."""
     scipy_optimize = pytest.importorskip("scipy.optimize")
     record = finger_fit.record
     time, step = record.time - record.time[0], record.time_step
@@ -97,7 +97,7 @@ def test_nuisances_are_freed_by_evidence_and_leave_g_and_b_unbiased(
 @pytest.mark.slow
 @pytest.mark.parametrize("frequency", [50.0, pytest.param(60.0, marks=pytest.mark.thorough)])
 def test_hum_of_the_mains_is_modelled(frequency: float):
-    """Left out, 1 V of it on this record would shift g and b by many of their errors."""
+    """Ignoring 1 V of hum in this record would bias g and b by many standard errors."""
     made = square_record(periods=5)
     hum = 1.0 * np.sin(2.0 * np.pi * frequency * made.time + 0.7)
     fit = fitact.fit(fitact.Record.from_arrays(made.time, V=made["V"], Vsc=made["Vsc"] + hum), SQUARE)
@@ -117,13 +117,13 @@ def test_gain_is_freed_only_with_its_prior():
     fit = fitact.fit(record, scene)
     assert "gain" in fit.names
     s = fit.parameters()["gain"]
-    assert s["sd"] == pytest.approx(0.02, rel=0.1)  # confounded with a: the record says nothing
+    assert s["sd"] == pytest.approx(0.02, rel=0.1)  # the gain is confounded with a, so the posterior is the prior
     assert "gain" in fit.identifiability.remedy
 
 
 @pytest.mark.slow
 def test_ideal_square_in_the_file_is_not_read_as_ramps():
-    """The scene's square is used, V is checked against it; without a scene, the edges are warned of."""
+    """The scene's square is used and V is checked against it; without a scene, there is a warning about the edges."""
     record = square_record()
     assert fitact.fit(record, fitact.Scene()).choice.name == "square"
     assert any("sampling interval" in warning for warning in fitact.fit(record).warnings)
@@ -189,7 +189,7 @@ def test_implausible_values_are_remarked_upon(finger_path):
 
 def misfits(record: fitact.Record) -> dict[str, fitact.Record]:
     time, V, Vsc = record.time, record["V"], record["Vsc"]
-    lost = np.r_[0:1500, 1700:4000]  # samples lost without their times
+    lost = np.r_[0:1500, 1700:4000]  # samples that were lost together with their times
     return {
         "lost": fitact.Record.from_arrays(time[: lost.size], V=V[lost], Vsc=Vsc[lost]),
         "saturating": fitact.Record.from_arrays(time, V=V, Vsc=20.0 * np.tanh(Vsc / 20.0)),
@@ -212,7 +212,7 @@ def test_short_record_is_answered_with_its_width_and_a_warning(finger_path, fing
     short = slice(0, 400)  # a fifth of a period, with one edge
     fit = fitact.fit(fitact.Record.from_arrays(record.time[short], V=record["V"][short], Vsc=record["Vsc"][short]))
     assert any("1.5 periods" in warning for warning in fit.warnings)
-    assert fit.derived()["b"]["sd"] > 3.0 * 1.4e-6  # that of the whole record
+    assert fit.derived()["b"]["sd"] > 3.0 * 1.4e-6  # the sd from the whole record
     assert abs(deviation(fit, "b", finger_truth["b"])) < 3.0
 
 
@@ -241,7 +241,7 @@ def test_it_prints_errors_correlations_and_the_verdict(finger_fit: fitact.Fit):
 
 
 def trapezoid_record(step: float, edge: float = 20e-6, noise: float = 0.05) -> fitact.Record:
-    """A 100 Hz trapezoid, computed by scipy on a fine grid and sampled every `step`."""
+    """Return a 100 Hz trapezoid, computed by scipy on a fine grid and sampled every `step`."""
     fine = np.arange(140_001) * 1e-6
     phase = (fine + 3.3e-6) % 0.01
     voltage = np.interp(phase, [0.0, edge, 5e-3, 5e-3 + edge, 0.01], [-180.0, 180.0, 180.0, -180.0, -180.0])
@@ -260,7 +260,7 @@ def trapezoid_record(step: float, edge: float = 20e-6, noise: float = 0.05) -> f
     ],
 )
 def test_edges_faster_than_the_samples_widen_g(step: float):
-    """Straight lines through a jump put its edge in the middle of a step, wherever it was."""
+    """Linear interpolation of a jump puts its edge in the middle of a step, wherever it was."""
     fit = fitact.fit(trapezoid_record(step))
     assert abs(deviation(fit, "g", 1.35 / 20.7)) < 4.0
     assert abs(deviation(fit, "b", 130e3 * 20.7e-9)) < 4.0
@@ -292,7 +292,7 @@ def test_a_record_without_noise_is_not_called_identified(noise: float):
 
 
 def test_coarse_converter(finger_path):
-    """8 bits over 40 V: the noise is smaller than a step."""
+    """8 bits over 40 V: the noise is smaller than an ADC step."""
     record, step = square_record(noise=0.01), 40.0 / 256.0
     rounded = np.round(record["Vsc"] / step) * step
     fit = fitact.fit(fitact.Record.from_arrays(record.time, V=record["V"], Vsc=rounded), SQUARE)
@@ -328,7 +328,7 @@ def test_any_shift_is_found(shift: float):
 
 @pytest.mark.slow
 def test_from_rest_with_what_was_recorded_before_the_trigger():
-    """scipy starts at rest; the record begins half a period before the drive does."""
+    """scipy starts from rest; the record begins half a period before the drive."""
     time = np.arange(-1000, 4000) * 5e-6
     voltage = np.where(time < 0.0, 0.0, np.where((time % 0.01) < 5e-3 - 1e-9, 180.0, -180.0))
     vsc = skin_voltage(time - time[0], voltage, 130e3, 18e-9, 1.35e-9, hold=True)
@@ -355,7 +355,7 @@ SWEEP = {"waveform": "chirp", "start_frequency": 20.0, "end_frequency": 500.0, "
     ("drive", "shift"), [({"waveform": "burst"}, 0.0), (SWEEP, 1.37e-3)], ids=["burst", "shifted chirp"]
 )
 def test_burst_and_chirp_against_scipy(drive: dict[str, object], shift: float):
-    """scipy on a fine grid of steps (burst) or straight lines (chirp), sampled; perhaps the trigger came earlier."""
+    """scipy on a fine grid with constant (burst) or linear (chirp) interpolation, also with an earlier trigger."""
     fine = np.arange(70_000) * 1e-6
     cycles = 20.0 * fine + 480.0 / (2.0 * 0.05) * fine**2
     if drive is SWEEP:
@@ -381,7 +381,7 @@ def test_burst_and_chirp_against_scipy(drive: dict[str, object], shift: float):
     ],
 )
 def test_a_recorder_whose_clock_is_not_the_generators(off: float, with_V: bool):
-    """A named sine at another frequency; a thousandth, unnoticed, biases b by 3 standard errors."""
+    """A named sine at another frequency; an unnoticed difference of 0.1 % biases b by 3 standard errors."""
     time = np.arange(10_000) * 5e-6
     omega = 2.0 * np.pi * 100.0 * (1.0 + off)
     gain = 1j * omega * 130e3 * 1.35e-9 / (1.0 + 1j * omega * 130e3 * 20.7e-9)
@@ -398,17 +398,17 @@ def test_a_recorder_whose_clock_is_not_the_generators(off: float, with_V: bool):
 
 @pytest.mark.slow
 def test_another_drive_and_prior_compile_nothing_anew(caplog: pytest.LogCaptureFixture):
-    """What is compiled takes most of a first fit's time, so numbers must not be constants of it."""
+    """Most of the time of a first fit is compilation, so numbers must not be constants of the compiled code."""
 
     def fitted(frequency: float, rise_time: float, Ci: float) -> fitact.Fit:
         drive = {"waveform": "trapezoid", "rise_time": rise_time, "frequency": frequency}
         scene = fitact.Scene.from_dict({"device": {"Ci": Ci}, "drive": drive})
         return fitact.fit(simulate(scene, seed=1), scene)
 
-    fitted(97.0, 2e-4, 1.35e-9)  # neither frequency meets the sampling grid, on which periods would be folded
+    fitted(97.0, 2e-4, 1.35e-9)  # neither frequency fits the sampling grid, to which periods would be folded
     caplog.clear()
     with jax.log_compiles():
         assert fitted(91.0, 3e-4, 2e-9).result == "successful"
     compiled = [record.getMessage() for record in caplog.records if record.getMessage().startswith("Compiling")]
-    # the drive's value is asked for once in numbers, before there is a fit
+    # the drive is evaluated once with numbers, before the fit
     assert [message.split()[1] for message in compiled if "_value" not in message] == []

@@ -1,4 +1,4 @@
-"""The verdict against the Fisher information written out."""
+"""The verdict against the Fisher information, written out."""
 
 import dataclasses
 
@@ -29,7 +29,7 @@ def judged(experiment: Experiment, jacobian: np.ndarray) -> Identifiability:
 
 
 def test_any_order_of_coordinates_correlated_priors_and_nuisances():
-    """Eigenvalues, and the force's share, by the Schur complement of the information."""
+    """Eigenvalues and the prior's fraction of the force variance, by the Schur complement of the information."""
     rng = np.random.default_rng(0)  # any numbers would do
     names = ("delay", "Ci", "gain", "Rsc", "Csc")
     jacobian, mixing = rng.standard_normal((40, 5)) * [3.0, 0.3, 2.0, 1.0, 5.0], rng.standard_normal((3, 3))
@@ -70,7 +70,7 @@ def test_no_record_of_vsc_alone():
 
 
 def test_a_record_that_only_is_too_noisy():
-    """With a known resistor a record can tell the contact area; one with 1 kV of noise cannot."""
+    """A record with a known resistor determines the contact area; a record with 1 kV of noise does not."""
     noisy = dataclasses.replace(NOMINAL, circuit=RESISTOR, noise={"Vsc": 1e3, "I": 20e-9})
     found = judged(noisy, derivative(scipy_vsc, 100e3) / 1e3)
     assert found.verdict == "prior-limited"

@@ -1,4 +1,4 @@
-"""Fits of other circuits, of several records, and of parameters held or believed together; scipy made the records."""
+"""Fits of other circuits, of several records, and of fixed or correlated parameters; the records come from scipy."""
 
 import functools
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ NOISE_V, NOISE_I = 0.05, 20e-9
 
 
 def wave(kind: str, amplitude: float, per_period: int, periods: int) -> np.ndarray:
-    """A trapezoid with edges of four steps, or a sine or triangle."""
+    """Return a trapezoid with edges of four steps, or a sine or triangle."""
     phase = np.arange(periods * per_period) % per_period / per_period
     if kind == "sine":
         return amplitude * np.sin(2.0 * np.pi * phase)
@@ -28,11 +28,11 @@ def wave(kind: str, amplitude: float, per_period: int, periods: int) -> np.ndarr
 def channels(
     voltage: np.ndarray, Ci: float, elements: Sequence[tuple[float, float]], R0: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Vsc and I of a loop of Ci, R0 and elements R‖C, the touching skin first, by scipy.signal.lsim from rest.
+    """Return Vsc and I of a loop of Ci, R0 and RC elements, the sliding skin first, by scipy.signal.lsim from rest.
 
-    Between samples V is a line, so V' (which I is computed from) is held.
+    V is linear between samples, so V' (from which I is computed) is constant there.
     """
-    unit = 1e-3  # s, so that the polynomials' coefficients are near 1
+    unit = 1e-3  # s, so that the coefficients of the polynomials are of order 1
     below = [np.poly1d([R * C / unit, 1.0]) for R, C in elements]
     s, one = np.poly1d([1.0, 0.0]), np.poly1d([1.0])
 
@@ -62,7 +62,7 @@ def record(
     offset: float = 0.0,
     noise: float = NOISE_V,
 ) -> fitact.Record:
-    """Two settled periods of V, Vsc and I."""
+    """Return two steady-state periods of V, Vsc and I."""
     voltage = wave(kind, amplitude, per_period, 14)
     vsc, current = channels(voltage, TRUTH["Ci"], elements, R0)
     last, rng = slice(12 * per_period, None), np.random.default_rng(seed)
@@ -80,12 +80,12 @@ def scene(**sections: dict[str, object]) -> fitact.Scene:
 
 
 def free(**factors: float) -> dict[str, object]:
-    """Priors around the scene's own values, 95 % within these factors."""
+    """Return priors around the values of the scene; 95 % lie within these factors."""
     return {name: {"factor": factor} for name, factor in factors.items()}
 
 
 def assert_true(fit: fitact.Fit, **truth: float) -> None:
-    """Within four standard deviations, in the logarithm."""
+    """Assert agreement within four standard deviations, in logarithms."""
     for name, value in truth.items():
         i = fit.names.index(name)
         assert abs(fit.theta[i] - np.log(value)) < 4.0 * fit.sd[i], name
@@ -176,7 +176,7 @@ def test_a_held_insulator_leaves_nothing_to_the_prior(first: fitact.Record):
 
 @pytest.mark.slow
 def test_correlated_beliefs_show_along_the_blind_direction(first: fitact.Record):
-    """With g and b known, t along (-1, 1, 1) is normal with the precision d' S^-1 d, S the prior's covariance."""
+    """For given g and b, t along (-1, 1, 1) is normal with precision d' S^-1 d, where S is the prior covariance."""
     sd, r = np.log([3.0, 3.0, 1.5]) / 1.959963984540054, 0.8
     beliefs = free(Rsc=3.0, Csc=3.0, Ci=1.5) | {"correlation": {"Csc-Ci": r}}
     fit = fitact.fit(first, scene(prior=beliefs))

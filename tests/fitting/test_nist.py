@@ -1,4 +1,4 @@
-"""The engine on NIST's certified problems of nonlinear regression (Statistical Reference Datasets)."""
+"""The least-squares engine on NIST's certified nonlinear regression problems (Statistical Reference Datasets)."""
 
 import functools
 import re
@@ -82,7 +82,7 @@ MODELS: dict[str, Callable[[Array, Array], Array]] = {
 
 
 class Problem(NamedTuple):
-    """What a file certifies: two starts, values, standard deviations and the sum of squares."""
+    """Certified content of a file: two starts, values, standard deviations and the sum of squares."""
 
     y: np.ndarray
     x: np.ndarray
@@ -106,14 +106,14 @@ def read(name: str) -> Problem:
 
 
 def digits(found: np.ndarray, certified: np.ndarray) -> float:
-    """Of the worst parameter, at most 11, which is what NIST gives."""
+    """Return the correct digits of the worst parameter, at most the 11 that NIST gives."""
     error = np.max(np.abs(found - certified) / np.abs(certified))
     return float(-np.log10(max(error, 1e-11)))
 
 
 @functools.cache
 def solved(name: str) -> tuple[Problem, levenberg_marquardt.Minimum]:
-    """Both starts at once."""
+    """Return the solutions from both starts."""
     problem, model = read(name), MODELS[name]
 
     @eqx.filter_jit
@@ -138,14 +138,14 @@ def test_certified_values(name: str, start: int):
     problem, ends = solved(name)
     assert levenberg_marquardt.result_name(jax.tree.map(lambda leaf: leaf[start], ends.result)) == "successful"
     assert digits(np.asarray(ends.theta)[start], problem.values) >= 6.0
-    # Lanczos1's residuals are the rounding of its data, and of double precision
+    # the residuals of Lanczos1 are rounding errors of its data and of double precision
     if name != "Lanczos1":
         assert 2.0 * np.asarray(ends.cost)[start] == pytest.approx(problem.sum_of_squares, rel=1e-8)
         assert digits(standard_deviations(problem, ends, start), problem.sd) >= 6.0
 
 
 def standard_deviations(problem: Problem, ends: levenberg_marquardt.Minimum, start: int) -> np.ndarray:
-    """Of the parameters, by linear theory from the engine's Jacobian."""
+    """Return standard deviations of the parameters by linear theory, from the engine's Jacobian."""
     freedom = problem.y.size - problem.values.size
     _, triangle = np.linalg.qr(np.asarray(ends.jacobian)[start])
     return np.linalg.norm(np.linalg.inv(triangle), axis=1) * np.sqrt(2.0 * np.asarray(ends.cost)[start] / freedom)

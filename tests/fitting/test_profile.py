@@ -21,12 +21,12 @@ def fit(summed_fit: fitact.Fit) -> fitact.Fit:
 
 @pytest.fixture(scope="module")
 def noisy() -> fitact.Fit:
-    """So noisy that g and b are known to several per cent, and b's interval is lopsided."""
+    """Return a fit so noisy that g and b are known to several per cent, and the interval of b is asymmetric."""
     return fitact.fit(square_record(per_period=200, noise=13.0), SQUARE)
 
 
 def brute_force(fit: fitact.Fit, level: float) -> tuple[float, float]:
-    """The interval of b of the records alone, by scipy: for each b the best g is linear."""
+    """Return the interval of b from the data alone, by scipy; for each b the best g is linear."""
     record, sigma = fit.record, fit.sigma
     V, phase = record["V"], (record.time + 1e-9) % 5e-3
 
@@ -50,7 +50,7 @@ def test_interval_of_b_against_a_brute_force_profile(noisy: fitact.Fit, level: f
 
 @pytest.mark.slow
 def test_along_the_blind_direction_the_profile_is_the_priors_normal(fit: fitact.Fit):
-    """Linear and Gaussian there: ± z standard deviations, by scipy's quantile of chi-square."""
+    """The problem is linear and Gaussian in this direction: ± z standard deviations, z from scipy's chi-square."""
     z = np.sqrt(scipy.stats.chi2.ppf(0.9, 1))
     for name, found in fit.intervals(0.9).items():
         if name in fit.names:
@@ -86,7 +86,7 @@ def test_without_the_prior_vsc_alone_is_rank_deficient(fit: fitact.Fit):
     assert alone.result == "rank_deficient"
     assert alone.identifiability.verdict == "unidentified"
     assert np.all(np.isfinite(alone.sd))
-    assert np.all(alone.sd > 5.0)  # logs
+    assert np.all(alone.sd > 5.0)  # in logarithms
     assert alone.derived()["b"]["q50"] == pytest.approx(fit.derived()["b"]["q50"], rel=1e-6)
     assert alone.derived()["b"]["sd"] == pytest.approx(fit.derived()["b"]["sd"], rel=1e-3)
     assert "contraction" not in alone.parameters()["Rsc"]
@@ -109,7 +109,7 @@ def test_the_command_line_adds_them(finger_path, tmp_path):
 
 
 def test_criteria_of_a_regression_in_closed_form():
-    """Against the sum of scipy's normal log-densities at the largest likelihood's noise."""
+    """Sum of scipy's normal log-densities at the maximum-likelihood noise."""
     rng = np.random.default_rng(5)
     x = rng.standard_normal(40)
     y = 2.0 * x + 0.3 * rng.standard_normal(40)
@@ -133,7 +133,7 @@ def test_log_likelihood_of_unequal_noise():
 
 
 def test_a_fits_criteria_count_what_was_freed(fit: fitact.Fit):
-    """Three parameters and a noise."""
+    """The count includes three parameters and a noise sd."""
     residuals = fit.residuals
     likelihood = scipy.stats.norm.logpdf(residuals, scale=np.sqrt(np.mean(residuals**2))).sum()
     assert fit.figures["aic"] == pytest.approx(2.0 * 4 - 2.0 * likelihood, rel=1e-12)

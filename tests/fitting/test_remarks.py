@@ -1,4 +1,4 @@
-"""Remarks on a channel, from its figures alone: each where it belongs and nowhere else."""
+"""Warnings of a channel from its figures of merit: each if it applies, and only then."""
 
 import pytest
 
@@ -26,7 +26,7 @@ def test_a_part_of_a_wave():
     (found,) = remarks(part)
     assert "does not repeat within the record (6.995 ms)" in found
     assert "1.5 periods" in found
-    assert remarks(part, fitact.Burst(SQUARE, 2)) == []  # which repeats nothing
+    assert remarks(part, fitact.Burst(SQUARE, 2)) == []  # a burst does not repeat
 
 
 @pytest.mark.parametrize(

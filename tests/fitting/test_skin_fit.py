@@ -1,4 +1,4 @@
-"""Fits of skins that depend on the frequency, on records that are sums of harmonics with the impedances written out."""
+"""Fits of frequency-dependent skins on records that are sums of harmonics with explicit impedances."""
 
 from collections.abc import Callable
 
@@ -19,7 +19,7 @@ TRUTH = {"Rsc": R, "Csc": C, "Ci": CI, "alpha": ALPHA}
 STEP, PERIOD, SAMPLES = 5e-6, 0.01, 4000
 RISE, NOISE_V, NOISE_I = 20e-6, 0.05, 20e-9
 TONES, HEIGHTS = (1, 3, 7, 20), (60.0, 50.0, 40.0, 30.0)
-HIGHEST = 2**22  # of the harmonics: fewer miss I beside an ideal jump
+HIGHEST = 2**22  # number of harmonics: fewer are inaccurate for I next to an ideal jump
 Impedance = Callable[[np.ndarray], np.ndarray]
 
 
@@ -28,7 +28,7 @@ def cole(alpha: float = ALPHA, R: float = R, C: float = C) -> Impedance:
 
 
 def paper(omega: np.ndarray) -> np.ndarray:
-    """Section 3.1's factors on R and C, powers of the frequency between 10, 100 and 1000 Hz."""
+    """Return the factors of section 3.1 on R and C, with power laws between 10, 100 and 1000 Hz."""
     log = np.log10(np.clip(omega / (2.0 * np.pi), 10.0, 1000.0))
     resistance = R * 10.0 ** np.interp(log, [1, 2, 3], np.log10([200 / 160, 1.0, 80 / 160]))
     capacitance = C * 10.0 ** np.interp(log, [1, 2, 3], np.log10([44.25 / 22, 1.0, 8.85 / 22]))
@@ -36,7 +36,7 @@ def paper(omega: np.ndarray) -> np.ndarray:
 
 
 def amplitudes(waveform: str, highest: int = HIGHEST) -> tuple[np.ndarray, np.ndarray]:
-    """Orders and Fourier coefficients of the drive."""
+    """Return the orders and Fourier coefficients of the drive."""
     if waveform == "multitone":
         return np.array(TONES), -0.5j * np.array(HEIGHTS)
     k = np.arange(1, highest, 2)
@@ -45,14 +45,14 @@ def amplitudes(waveform: str, highest: int = HIGHEST) -> tuple[np.ndarray, np.nd
 
 
 def channels(waveform: str, impedance: Impedance, time: np.ndarray) -> tuple[np.ndarray, ...]:
-    """V, Vsc and I, over samples that lie on the same places of each period; the highest harmonics fade out."""
+    """Return V, Vsc and I at the same phases in each period; the highest harmonics are tapered."""
     k, drive = amplitudes(waveform)
     omega, fade = 2.0 * np.pi * k / PERIOD, np.cos(0.5 * np.pi * np.clip(2.0 * k / HIGHEST - 1.0, 0.0, 1.0)) ** 2
     current = drive * fade / (1.0 / (1j * omega * CI) + 2.0 * impedance(omega))
     per_period = round(PERIOD / STEP)
 
     def summed(amplitude: np.ndarray) -> np.ndarray:
-        folded = np.zeros(per_period, complex)  # harmonics that the samples do not tell apart
+        folded = np.zeros(per_period, complex)  # harmonics that the samples alias
         np.add.at(folded, k % per_period, amplitude * np.exp(1j * omega * time[0]))
         return np.resize(2.0 * np.fft.ifft(folded).real * per_period, time.size)
 
@@ -60,7 +60,7 @@ def channels(waveform: str, impedance: Impedance, time: np.ndarray) -> tuple[np.
 
 
 def record(waveform: str, impedance: Impedance, seed: int = 0, noise: float = 1.0) -> fitact.Record:
-    """Two periods, sampled in the middle of steps: no sample lies at a corner."""
+    """Return two periods, sampled in the middle of steps, so that no sample lies at a corner."""
     time, rng = (np.arange(SAMPLES) + 0.5) * STEP, np.random.default_rng(seed)
     V, vsc, current = channels(waveform, impedance, time)
     return fitact.Record.from_arrays(
@@ -83,7 +83,7 @@ def scene(waveform: str, level: str = "fractional", *, seen: tuple[str, ...] = (
 
 
 def assert_recovers(fit: fitact.Fit, **truth: float) -> None:
-    """Within four standard deviations in every direction."""
+    """Assert agreement within four standard deviations in every direction."""
     assert fit.result == "successful"
     error = fit.theta - np.log([truth[name] for name in fit.names])
     assert np.linalg.norm(np.linalg.solve(fit.covariance_root, error)) < 4.0 * np.sqrt(error.size)
@@ -134,7 +134,7 @@ def test_a_fractional_skin_is_found_with_its_exponent(trapezoid: fitact.Fit):
     assert found["unit"] == "1"
     assert found["contraction"] > 0.99
     assert trapezoid.model()["skin"] == "fractional"
-    # Vsc is blind to the area, which the exponent does not follow
+    # Vsc does not depend on the area, nor does the exponent
     direction = trapezoid.identifiability.blind_direction
     assert trapezoid.identifiability.structural
     np.testing.assert_allclose(list(direction.values()), np.array([-1.0, 1.0, 1.0, 0.0]) / np.sqrt(3.0), atol=1e-3)
@@ -148,8 +148,8 @@ def test_its_compressed_likelihood_is_the_sum_over_the_samples(trapezoid: fitact
 
 
 def force_of(impedance: Impedance, values: dict[str, float]) -> tuple[float, float]:
-    """Mean and peak by eq. (22), with eq. (3)'s permittivities of the default 1 cm^2, 1 um and 200 um."""
-    k, drive = amplitudes("trapezoid", 2**22)  # at a corner the sum converges as the inverse of their number
+    """Return the mean and peak force by eq. (22), with permittivities from eq. (3) for 1 cm^2, 1 um and 200 um."""
+    k, drive = amplitudes("trapezoid", 2**22)  # at a corner, the error is inversely proportional to their number
     omega, eps0, area, Ti, Tsc = 2.0 * np.pi * k / PERIOD, 8.85e-12, 1e-4, 1e-6, 200e-6
     vsc = drive * impedance(omega) / (1.0 / (1j * omega * values["Ci"]) + 2.0 * impedance(omega))
     layers = eps0 * area * (1.0 / values["Ci"] + 1.0 / values["Csc"])  # Ti / eps_i + Tsc / eps_sc
@@ -270,14 +270,14 @@ def test_a_constant_skin_does_not_describe_a_fractional_one(trapezoid: fitact.Fi
 @pytest.mark.thorough
 @pytest.mark.parametrize("steady", [True, False], ids=["steady", "from rest"])
 def test_a_measured_drive(steady: bool):
-    """From rest: the wave begins after so long a pause that next to nothing is left of what was before."""
+    """The waveform begins after so long a pause that the earlier charge has decayed."""
     time = (np.arange(SAMPLES) + 0.5) * STEP
     rng = np.random.default_rng(0)
     on, whole = time.size, time.size * (1 if steady else 256)
-    phase = np.mod(time - time[0], PERIOD)  # from rest V begins at 0
+    phase = np.mod(time - time[0], PERIOD)  # V begins at 0 from rest
     wave = np.interp(phase, [0.0, 4 * STEP, PERIOD / 2, PERIOD / 2 + 4 * STEP, PERIOD], [-180, 180, 180, -180, -180])
     voltage = np.concatenate([wave if steady else wave + 180.0, np.zeros(whole - on)])
-    # straight lines between samples: the samples' spectrum times that of a triangle, over all its aliases
+    # linear between samples: the spectrum of the samples times that of a triangle, over all its aliases
     k = np.fft.fftfreq(whole, 1.0 / whole)
     aliases = k[:, None] + whole * np.arange(-64, 65)
     omega = 2.0 * np.pi * aliases / (whole * STEP)

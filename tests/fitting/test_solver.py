@@ -1,4 +1,4 @@
-"""What the least-squares engine says of problems whose answers are known in closed form, and of the finger."""
+"""The least-squares engine on problems with closed-form solutions, and on the record of a finger."""
 
 import functools
 import operator
@@ -26,7 +26,7 @@ def double_precision():
 
 
 def decay(theta: Array) -> Array:
-    """Noise-free: 2 exp(-1.5 t)."""
+    """Noise-free data of 2 exp(-1.5 t)."""
     return theta[0] * jnp.exp(-theta[1] * TIME) - 2.0 * np.exp(-1.5 * TIME)
 
 
@@ -49,7 +49,7 @@ def test_a_start_at_the_optimum_is_successful():
 
 
 def test_linear_problem_against_normal_equations():
-    """Residuals in two leaves; the second is a prior."""
+    """The residuals have two leaves, the second of which is a prior."""
     design = np.random.default_rng(0).standard_normal((30, 3)) * [1.0, 1e6, 1e-9]
     y, mean, sd = np.arange(30.0), np.array([1.0, 1e-6, 1e9]), np.array([0.1, 1e-7, 1e8])
     end = levenberg_marquardt.minimise(lambda theta: (design @ theta - y, {"prior": (theta - mean) / sd}), jnp.zeros(3))
@@ -69,7 +69,7 @@ def test_a_datum_that_is_not_finite(bad: float):
 
 
 def test_a_trial_that_is_not_finite_is_stepped_back_from():
-    """The undamped first step from 0.05 leads to a negative x."""
+    """The undamped first step from 0.05 leads to negative x."""
     end = levenberg_marquardt.minimise(
         lambda x: jnp.log(x) - jnp.log(5.0) + 0.0 * jnp.sqrt(x - 0.04), jnp.array([0.05])
     )
@@ -86,7 +86,7 @@ def test_redundant_parameters_are_rank_deficient():
 
 
 def test_a_parameter_without_effect_is_rank_deficient():
-    """From far away exp(-theta t) underflows, and the sum of squares is flat."""
+    """For a distant start exp(-theta t) underflows, and the sum of squares is flat."""
     end = levenberg_marquardt.minimise(
         lambda theta: jnp.exp(-theta * TIME[1:]) - np.exp(-1.5 * TIME[1:]), jnp.array([1e5])
     )
@@ -94,7 +94,7 @@ def test_a_parameter_without_effect_is_rank_deficient():
 
 
 def test_no_step_helps():
-    """A wrong derivative, which points uphill: no trial is accepted."""
+    """A derivative of the wrong sign: no trial step is accepted."""
 
     @jax.custom_jvp
     def wrong(x: Array) -> Array:
@@ -110,7 +110,7 @@ def test_out_of_steps():
 
 
 def two_wells(x: Array, tilt: float) -> Array:
-    """Optima near -3 and +3, whose costs differ by about 3 tilt."""
+    """Cost with minima near -3 and +3, whose values differ by about 3 tilt."""
     return jnp.array([x[0] ** 2 - 9.0, jnp.sqrt(2.0 * (10.0 + 0.5 * tilt * x[0]))])
 
 
@@ -118,7 +118,7 @@ def two_wells(x: Array, tilt: float) -> Array:
 def test_several_optima_only_where_they_are_of_like_height(tilt: float, result: str):
     starts = np.linspace(-8.0, 8.0, 16)[:, None]
     optima = levenberg_marquardt.minimise_many(functools.partial(two_wells, tilt=tilt), starts)
-    cubic = np.polynomial.Polynomial([0.5 * tilt, -18.0, 0.0, 2.0]).roots()  # of the cost's derivative
+    cubic = np.polynomial.Polynomial([0.5 * tilt, -18.0, 0.0, 2.0]).roots()  # derivative of the cost
     np.testing.assert_allclose(optima.minima.theta[:, 0], cubic[[0, 2]], rtol=1e-6)
     assert result_name(optima.result) == result
     assert sum(optima.start_counts) + optima.n_failed == 16
@@ -142,7 +142,7 @@ def test_no_start_leads_to_an_optimum():
 
 @pytest.fixture
 def finger(summed_fit: fitact.Fit) -> fitact.Fit:
-    """Whose samples are summed, so that no table ends within the range of the starts."""
+    """Return a likelihood summed over samples, so that no table ends within the range of the starts."""
     return summed_fit
 
 
@@ -150,7 +150,7 @@ TRUTH = np.log([130e3, 18e-9, 1.35e-9])
 
 
 def finger_ends(fit: fitact.Fit, with_prior: bool) -> levenberg_marquardt.Minimum:
-    """From a hundred starts within a factor of 1,000 of the truth."""
+    """Return the end points from a hundred starts within a factor of 1,000 of the truth."""
     starts = np.tile(np.append(TRUTH, fit.theta[3:]), (100, 1))
     starts[:, :3] += np.random.default_rng(3).uniform(-np.log(1e3), np.log(1e3), (100, 3))
 
@@ -167,7 +167,7 @@ def finger_ends(fit: fitact.Fit, with_prior: bool) -> levenberg_marquardt.Minimu
 
 @pytest.mark.slow
 def test_hundred_far_starts_with_the_prior(finger: fitact.Fit):
-    """Against scipy from the truth."""
+    """The reference is scipy's optimum from the truth."""
     ends = finger_ends(finger, with_prior=True)
     model = jax.jit(
         lambda theta: jnp.concatenate(
@@ -189,7 +189,7 @@ def test_hundred_far_starts_with_the_prior(finger: fitact.Fit):
 
 @pytest.mark.thorough
 def test_hundred_far_starts_without_a_prior(finger: fitact.Fit):
-    """Vsc alone sees two of three parameters, so no end is the answer."""
+    """Vsc alone determines two of three parameters, so no end point is unique."""
     results = names(finger_ends(finger, with_prior=False))
     assert "successful" not in results
     assert results.count("rank_deficient") > 80  # the others ended on a plateau

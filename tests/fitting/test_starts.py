@@ -1,4 +1,4 @@
-"""Starts: given ones, and many; optima that exchange two skins are two."""
+"""Given starts and multiple starts; optima that differ by an exchange of two skins count as two."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ FAR = [[1e3, 1e-3, 1e-3], [1e-3, 1e3, 1e3], [1e3, 1e3, 1e-3], [38.0, 1.5e-3, 21.
 
 @pytest.mark.parametrize("factors", [pytest.param(f, id=" ".join(f"{x:g}" for x in f)) for f in FAR])
 def test_from_far_starts_beyond_the_table(fit: fitact.Fit, factors: list[float]):
-    """Each parameter far off, so that b is, too; the last once led to a circuit that no double holds."""
+    """Each parameter, and thus b, is far from the truth; the last start once led to a circuit beyond double range."""
     start = dict(zip(fit.names, np.exp(fit.theta) * factors, strict=True))
     found = fitact.fit(fit.record, SQUARE, start=start)
     assert found.trusted
@@ -27,7 +27,7 @@ def test_from_far_starts_beyond_the_table(fit: fitact.Fit, factors: list[float])
 
 @pytest.mark.thorough
 def test_a_start_where_the_circuit_gives_no_signal(fit: fitact.Fit):
-    """A time constant far below a sample: without the prior no step leads out."""
+    """The time constant is far below a sample step, so without the prior no step leads away."""
     start = {"Rsc": 1e-6 * np.exp(fit.theta[0])}
     found = fitact.fit(fit.record, SQUARE, start=start, prior=False)
     assert found.result == "rank_deficient"
@@ -37,7 +37,7 @@ def test_a_start_where_the_circuit_gives_no_signal(fit: fitact.Fit):
 @pytest.mark.thorough
 @pytest.mark.parametrize("prior", [True, False])
 def test_a_hundred_starts_reach_the_optimum(fit: fitact.Fit, prior: bool):
-    """Without the prior, the optimum is the ridge: g and b are what there is to reach."""
+    """Without the prior, the optimum is a line on which g and b are constant."""
     rng = np.random.default_rng(3)
     for _ in range(100):
         theta = fit.theta + rng.uniform(-1.0, 1.0, 3) * np.log(1000.0)
@@ -59,7 +59,7 @@ def test_one_optimum_from_many_starts(fit: fitact.Fit):
 
 @pytest.mark.thorough
 def test_the_current_alone_cannot_tell_which_skin_is_which():
-    """The admittance is the same with the two skins exchanged; beliefs in both are alike."""
+    """The admittance does not change if the two skins are exchanged, and their priors are equal."""
     made = record([SKIN, (80e3, 44e-9)], per_period=250)
     skins = {"grounding": {"grounding_Rsc": 160e3, "grounding_Csc": 22e-9}}
     beliefs = free(Rsc=10.0, Csc=10.0, grounding_Rsc=10.0, grounding_Csc=10.0)

@@ -1,4 +1,4 @@
-"""Recorders whose clock is not the generator's, against closed forms."""
+"""Clock errors between recorder and generator, against closed forms."""
 
 import jax
 import numpy as np
@@ -12,7 +12,7 @@ G, B = CI / (2.0 * CI + CSC), RSC * (2.0 * CI + CSC)
 
 
 def record(waveform: str, frequency: float, periods: int, per_period: int) -> fitact.Record:
-    """Vsc alone, steady, at 360 Vpp; the trigger comes 0.37 steps before the first sample."""
+    """Return Vsc in the steady state at 360 Vpp; the trigger comes 0.37 steps before the first sample."""
     time = (np.arange(periods * per_period) + 0.37) * 0.01 / per_period
     if waveform == "sine":
         s = 2j * np.pi * frequency
@@ -34,12 +34,12 @@ def fitted(waveform: str, off: float, periods: int, per_period: int) -> fitact.F
     [
         pytest.param("sine", 1e-5, 50, 400, marks=pytest.mark.slow),
         pytest.param("square", 3e-5, 50, 400, marks=pytest.mark.thorough),  # no edge has passed a sample
-        pytest.param("square", 3e-4, 5, 2000, marks=pytest.mark.thorough),  # edges have
-        pytest.param("square", 5e-4, 2, 25_000, marks=pytest.mark.thorough),  # by many
+        pytest.param("square", 3e-4, 5, 2000, marks=pytest.mark.thorough),  # edges have passed samples
+        pytest.param("square", 5e-4, 2, 25_000, marks=pytest.mark.thorough),  # edges have passed many samples
     ],
 )
 def test_a_clock_is_found(waveform: str, off: float, periods: int, per_period: int):
-    """A hundred-thousandth, unnoticed over 50 periods, biases b (sine) or g (square) by 13 standard errors or more."""
+    """An unnoticed 1e-5 over 50 periods biases b (sine) or g (square) by 13 standard errors or more."""
     fit = fitted(waveform, off, periods, per_period)
     assert fit.result == "successful"
     clock = fit.parameters()["clock"]
@@ -59,7 +59,7 @@ def test_no_clock_where_there_is_none():
 @pytest.mark.parametrize("periods", [2, 5])
 @pytest.mark.parametrize("samples", [10_000, 50_000, pytest.param(400_000, marks=pytest.mark.slow)])
 def test_a_fine_record_is_not_of_another_frequency(samples: int, periods: int):
-    """The correlation that shows the frequency peaks beside the period, by many of its small steps."""
+    """The correlation that determines the frequency has its peak many small steps away from the period."""
     found = record("square", 100.0, periods, samples // periods)
     with jax.enable_x64(True):
         choice = choose_drive(found, fitact.Scene.from_dict({"drive": {"waveform": "square"}}))

@@ -1,4 +1,4 @@
-"""What stands against a fit: bounds and orders that the records contradict, records that do not belong together."""
+"""Reasons against a fit: bounds and orders that the records contradict, records that do not belong together."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ NOMINAL = {"drive": {"waveform": "square"}}
 @pytest.mark.parametrize(
     ("prior", "result"),
     [
-        ({"Ci": {"low": "1 nF", "high": "1.2 nF"}}, "successful"),  # an edge along the blind direction
+        ({"Ci": {"low": "1 nF", "high": "1.2 nF"}}, "successful"),  # the bound limits only the unidentified direction
         ({"Rsc": {"low": "1 kohm", "high": "2 kohm"}, "Csc": {"low": "1 nF", "high": "2 nF"}}, "on_bound"),
         ({"Csc": {"above": "Ci"}}, "successful"),
         ({"Csc": {"below": "Ci"}}, "on_bound"),

@@ -1,4 +1,4 @@
-"""The compressed likelihood against sums over the samples that are computed without it."""
+"""The compressed likelihood against sums over the samples that are computed independently."""
 
 import math
 import re
@@ -26,7 +26,7 @@ def _double_precision():
 
 
 def unit_response(time: np.ndarray, voltage: np.ndarray, tau: float, hold: bool = False) -> np.ndarray:
-    """scipy's response of s tau / (1 + s tau), from rest: a finger of tiny Ci."""
+    """Return scipy's response of s tau / (1 + s tau) from rest, which is a finger with tiny Ci."""
     return skin_voltage(time, voltage, Rsc=tau / (2e-15 + 1e-9), Csc=1e-9, Ci=1e-15, hold=hold) * (1e-9 + 2e-15) / 1e-15
 
 
@@ -35,7 +35,7 @@ def products(columns: np.ndarray) -> np.ndarray:
 
 
 def check(compression, u: np.ndarray, decay: np.ndarray | None, slow: np.ndarray, y: np.ndarray, tau: float) -> None:
-    """Every inner product of the model's functions and the record, against the sums over samples."""
+    """Compare every inner product of the model functions and the record with its sum over the samples."""
     theirs = [u, *slow, y] if decay is None else [u, *slow, y, decay]
     ours = [compression.response(HighpassTerms((1.0,), (tau,))), *compression.baseline, compression.observed]
     if decay is not None:
@@ -65,7 +65,7 @@ def test_measured_drive(kind: str, factor: float):
     time, voltage = grid[kept], np.cumsum(rng.standard_normal(kept.size))
     y = rng.standard_normal(kept.size)
     tau = factor * TAU
-    # the same broken line on the even grid that scipy needs
+    # the same polyline on the even grid that scipy requires
     u = unit_response(grid, np.interp(grid, time, voltage), tau)[kept]
     compression = compress(
         fitact.Sampled(time, voltage), time, y, steady_state=False, expected_terms=HighpassTerms((0.05,), (TAU,))
@@ -75,7 +75,7 @@ def test_measured_drive(kind: str, factor: float):
 
 @pytest.mark.parametrize("frequency", [100.0, 300.0, 101.37])
 def test_settled_square(frequency: float):
-    """Periods of 2000 samples, three of them in 2000, and none that fits the sampling grid."""
+    """Periods of 2000 samples, of 2000/3 samples, and one that does not fit the sampling grid."""
     time = np.arange(30000) * 5e-6
     drive = fitact.Square(360.0, frequency)
     half = 0.5 / frequency
@@ -111,7 +111,7 @@ def test_fit_and_log_probabilities_are_those_of_the_samples(scene):
     np.testing.assert_allclose(ours.theta, full.theta, atol=1e-4 * full.sd.min())
     np.testing.assert_allclose(ours.sd, full.sd, rtol=1e-6)
     assert ours.linear.keys() == full.linear.keys()
-    # points further out than those of the certificate
+    # points further away than those of the diagnostic
     deviates = np.random.default_rng(6).standard_normal((20, full.theta.size))
     points = np.column_stack([full.theta + 3.0 * deviates @ full.covariance_root.T, np.full(20, np.log(full.sigma))])
     a, b = (certificate.batched_log_prob(fit.likelihood, 32)(points) for fit in (ours, full))
@@ -122,7 +122,7 @@ def test_fit_and_log_probabilities_are_those_of_the_samples(scene):
 @pytest.mark.thorough
 def test_cost_does_not_grow_with_the_record():
     rows = [fitact.fit(square_record(periods=n), SQUARE).likelihood.rows for n in (1, 40)]
-    assert rows[1] <= rows[0] + 2  # a longer record is known better, and asks for a term or two more
+    assert rows[1] <= rows[0] + 2  # a longer record is more accurate and needs one or two more terms
     assert rows[1] < 40
 
 
@@ -169,7 +169,7 @@ def test_what_speaks_against_a_compression(error: float, excess: float, reason: 
 
 
 class OnDisk:
-    """An array of which no more than a chunk is ever asked for."""
+    """Array that must not be read in more than one chunk at a time."""
 
     def __init__(self, values: np.ndarray) -> None:
         self.values, self.size = values, values.size
@@ -182,7 +182,7 @@ class OnDisk:
 
 @pytest.mark.parametrize("kind", ["measured", "folded", "not folded", "chirp"])
 def test_no_more_than_a_chunk_is_read_at_a_time(kind: str):
-    """Records larger than memory: the arrays may be memory maps."""
+    """Records may be larger than memory: the arrays may be memory maps."""
     count = 150_000
     time, y = np.arange(count) * 5e-6, np.random.default_rng(8).standard_normal(count)
     drive = {
@@ -206,7 +206,7 @@ def test_a_tolerance_that_is_none_is_refused(tolerance: float):
 
 @pytest.mark.thorough
 def test_force_of_a_long_record_is_that_of_a_short_one():
-    """Above 20,000 samples only its last periods are computed, after the charge has decayed."""
+    """Above 20,000 samples only the last periods are computed, after the charge has decayed."""
     short, long = (fitact.fit(square_record(periods=n, noise=1e-3)).derived() for n in (9, 30))
     for name in ("force_mean", "force_peak", "force_rms"):
         assert long[name]["q50"] == pytest.approx(short[name]["q50"], rel=2e-4)

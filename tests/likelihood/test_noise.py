@@ -1,4 +1,4 @@
-"""Noise that is not white, clipped and rounded samples. Truths known; oracles: scipy."""
+"""Coloured noise, outliers, clipped and rounded samples: known truths, and scipy as the reference."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def with_vsc(record: fitact.Record, vsc: np.ndarray) -> fitact.Record:
 
 
 def deviations(fits: list[fitact.Fit]) -> np.ndarray:
-    """Errors of g and b over their stated standard deviations."""
+    """Return the errors of g and b in units of their stated standard deviations."""
     found = [fit.derived() for fit in fits]
     return np.array([[(d[n]["q50"] - truth) / d[n]["sd"] for n, truth in (("g", G), ("b", B))] for d in found])
 
@@ -49,7 +49,7 @@ def test_student_residuals_are_the_t_density():
     np.testing.assert_allclose(-0.5 * np.asarray(student_residual(z)) ** 2, log, rtol=1e-5, atol=1e-12)
     mean_curvature, _ = scipy.integrate.quad(lambda x: scipy.stats.t.pdf(x, 4) * student_curvature(x), -np.inf, np.inf)
     mean_weight, _ = scipy.integrate.quad(lambda x: scipy.stats.t.pdf(x, 4) * student_weight(x), -np.inf, np.inf)
-    assert mean_curvature == pytest.approx(5.0 / 7.0, rel=1e-5)  # (nu + 1) / (nu + 3), the information of a location
+    assert mean_curvature == pytest.approx(5.0 / 7.0, rel=1e-5)  # (nu + 1) / (nu + 3), Fisher information of a location
     assert mean_weight == pytest.approx(1.0, rel=1e-5)
 
 
@@ -77,7 +77,7 @@ def test_coloured_noise_is_drawn_with_its_correlations(coefficients: list[float]
     whitening = process.whitening(np.ones(50 * stride, bool))
     drawn = draw_noise(np.random.default_rng(0), "spectrum", whitening, (20_000, 50), stride)
     found = drawn.T @ drawn / len(drawn)
-    # by their place in the record too; standard errors are 0.01 at most
+    # also by position in the record; standard errors are at most 0.01
     expected = scipy.linalg.toeplitz(law[: 50 * stride : stride] / law[0])
     np.testing.assert_allclose(found, expected, atol=0.05)
 
@@ -87,7 +87,7 @@ def test_burg_finds_a_known_process():
     values = scipy.signal.lfilter([1.0], [1.0, -1.2, 0.5], rng.standard_normal(21_000))[1000:]
     found = fit_ar_burg(values)
     assert found.coefficients[:2] == pytest.approx([1.2, -0.5], abs=0.03)  # four standard errors
-    # a closed form: the process's variance is (1 - a2) / (1 + a2) / ((1 - a2)^2 - a1^2) times the innovation's
+    # closed form: the variance of the process is (1 - a2) / (1 + a2) / ((1 - a2)^2 - a1^2) times the innovation's
     variance = 1.5 / 0.5 / (1.5**2 - 1.2**2)
     assert found.innovation_ratio**-2.0 == pytest.approx(variance, rel=0.05)
 
@@ -110,7 +110,7 @@ def test_outliers_cost_student_little_and_white_much():
         assert abs(robust["q50"] - good["q50"]) < 0.7 * good["sd"]
         assert robust["sd"] < 1.25 * good["sd"]
         assert plain["sd"] > 1.7 * good["sd"]
-    # the noise's core, by scipy's own fit of the density
+    # scale of the noise from scipy's fit of the density
     scale = scipy.stats.t.fit(student.residuals, fdf=4, floc=0.0)[2]
     assert student.sigma == pytest.approx(scale, rel=0.02)
 
@@ -118,7 +118,7 @@ def test_outliers_cost_student_little_and_white_much():
 @pytest.mark.thorough
 @pytest.mark.parametrize(("model", "covers"), [("ar1", True), ("white", False)])
 def test_intervals_cover_under_autoregressive_noise(model: str, covers: bool):
-    """Errors over their standard deviations have a root mean square of 1 ± 0.13 for 30 records."""
+    """Errors in units of their standard deviations have an rms of 1 ± 0.13 for 30 records."""
     record = square_record(per_period=200, noise=0.0)
     fits = []
     for seed in range(30):
@@ -130,14 +130,14 @@ def test_intervals_cover_under_autoregressive_noise(model: str, covers: bool):
 
 
 def burst_record() -> fitact.Record:
-    """40 ms of rest, three periods of a triangle, rest again, at 20 kHz; by scipy, without noise, Vsc and I."""
+    """Return 40 ms of rest, three periods of a triangle and rest, at 20 kHz, by scipy, without noise: Vsc and I."""
     time = np.arange(-800, 1000) * 50e-6
     voltage = np.where(
         (time > 0.0) & (time < 0.03), 180.0 * np.interp(time % 0.01, [0.0, 2.5e-3, 7.5e-3, 0.01], [0, 1, -1, 0]), 0.0
     )
     slope = np.diff(voltage) / 50e-6
     rate = 0.5 * (np.append(slope, 0.0) + np.append(0.0, slope))
-    # I = V s Ci (1 + s Rsc Csc) / (1 + s b): dV/dt through all three capacitances, and what decays with b
+    # I = V s Ci (1 + s Rsc Csc) / (1 + s b): dV/dt through the three capacitances, and a part that decays with b
     at_once = 1.35e-9 * 18e-9 / 20.7e-9
     decaying = scipy.signal.lsim(([1.35e-9 - at_once, 0.0], [B, 1.0]), voltage, time - time[0])[1]
     vsc = skin_voltage(time - time[0], voltage, 130e3, 18e-9, 1.35e-9)
@@ -145,7 +145,7 @@ def burst_record() -> fitact.Record:
 
 
 def pink(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Noise of a spectrum that falls as 1/f but for its lowest frequencies, of standard deviation 1."""
+    """Return noise of standard deviation 1 whose spectrum falls as 1/f above the lowest frequencies."""
     lines = np.fft.rfft(rng.standard_normal(4096))
     values = np.fft.irfft(lines / np.sqrt(np.arange(lines.size) + 3.0))
     return values[:size] / values.std()
@@ -154,7 +154,7 @@ def pink(rng: np.random.Generator, size: int) -> np.ndarray:
 @pytest.mark.thorough
 @pytest.mark.parametrize("channel", ["Vsc", "I"])
 def test_a_measured_spectrum_widens_what_white_noise_would_make_too_narrow(channel: str):
-    """The root mean square of 12 errors is 1 ± 0.2."""
+    """The rms of 12 normalised errors is 1 ± 0.2."""
     record = burst_record()
     stated = {"waveform": "measured"}, {"channels": [channel]}
     plain, quiet = (
@@ -194,7 +194,7 @@ def test_student_noise_is_as_wide_as_sampled_and_predicted_with_its_tails():
     fit = fitact.fit(with_vsc(record, noisy), scene(noise_model="student"))
     posterior = fitact.sample(fit, seed=1, progress=False)
     assert posterior.trusted
-    # 400 samples show a scale's information to 4 %; that of normal noise would give 0.76
+    # 400 samples determine the information of a scale to 4 %; normal noise would give 0.76
     assert fit.point_root[-1, -1] == pytest.approx(np.log(posterior.parameters()["sigma"]).std(), rel=0.1)
     far = np.abs(scattered(posterior, "Vsc"))
     ratio = np.quantile(far, 0.99) / np.median(far)
@@ -208,13 +208,13 @@ def test_autoregressive_noise_is_predicted_with_its_correlation():
     fit = fitact.fit(with_vsc(record, noisy), scene(noise_model="ar1"))
     noise = scattered(fitact.sample(fit, level="laplace", seed=1), "Vsc")
     before, after = noise[:, :-1].ravel(), noise[:, 1:].ravel()
-    assert np.corrcoef(before, after)[0, 1] == pytest.approx(0.9, abs=0.07)  # three standard errors of one record's
+    assert np.corrcoef(before, after)[0, 1] == pytest.approx(0.9, abs=0.07)  # three standard errors of one record
     assert noise.std() == pytest.approx(fit.sigma, rel=0.1)
 
 
 @pytest.mark.thorough
 def test_current_is_predicted_as_noisy_as_its_drive_makes_it():
-    """Where V is noisy, its slope over two steps, of noise sd / (sqrt(2) step), reaches I through Ci Csc / b Rsc."""
+    """The slope of V over two steps has noise of sd / (sqrt(2) step), which reaches I through Ci Csc / b Rsc."""
     record, rng = burst_record(), np.random.default_rng(3)
     noisy = record["V"] + 0.02 * rng.standard_normal(len(record)) * (record.time > -0.035)
     current = record["I"] + 5e-7 * rng.standard_normal(len(record))
@@ -227,7 +227,7 @@ def test_current_is_predicted_as_noisy_as_its_drive_makes_it():
 
 
 def scattered(posterior: fitact.Posterior, channel: str) -> np.ndarray:
-    """Predicted records, less their mean."""
+    """Return predicted records less their mean."""
     predicted = posterior.to_datatree()["posterior_predictive"][channel].values.astype(float)
     predicted = predicted.reshape(-1, predicted.shape[-1])
     return predicted - predicted.mean(axis=0)
@@ -241,7 +241,7 @@ def test_clipped_samples_are_left_out():
     fit = fitact.fit(railed, scene())
     assert fit.trusted
     assert np.all(np.abs(deviations([fit])) < 4.0)
-    assert fit.derived()["b"]["q50"] == pytest.approx(B, rel=1.5e-3)  # ignored, it biases b by 10.5 %, by scipy
+    assert fit.derived()["b"]["q50"] == pytest.approx(B, rel=1.5e-3)  # if ignored, b is biased by 10.5 % (scipy)
     assert any("clipped" in warning and "wider range" in warning for warning in fit.warnings)
     assert fit.traces[0].weight is not None
     assert not np.any(fit.traces[0].weight[np.abs(railed["Vsc"]) == rail])
@@ -267,7 +267,7 @@ def test_a_clipped_drive_is_refused():
 @pytest.mark.slow
 @pytest.mark.parametrize("steps", [0.5, 2.0, 10.0])
 def test_intervals_cover_rounded_samples(steps: float):
-    """Converter steps of so many noises, at any offset."""
+    """ADC steps of several noise sds, at any offset."""
     record, step = square_record(per_period=200, noise=0.0), 0.05 * steps
     fits = []
     for seed in range(20):
@@ -276,7 +276,7 @@ def test_intervals_cover_rounded_samples(steps: float):
         fits.append(fitact.fit(with_vsc(record, np.round(shifted / step) * step + start), scene()))
     assert all(fit.trusted for fit in fits)
     spread = np.sqrt(np.mean(deviations(fits) ** 2, axis=0))
-    assert np.all((spread > 0.4) & (spread < 1.5))  # where rounding is coarse its errors average out better
+    assert np.all((spread > 0.4) & (spread < 1.5))  # with coarse rounding, its errors average out better
 
 
 @pytest.mark.parametrize(
@@ -308,7 +308,7 @@ def test_records_that_do_not_show_their_noise_are_refused():
 
 @pytest.mark.parametrize(("gain", "order"), [(1.5, 0), (3.0, 1)])
 def test_an_order_is_taken_where_akaike_gains_more_than_its_price(gain: float, order: int):
-    """Of n samples with a reflection r the criterion gains n r^2, and a coefficient costs 2."""
+    """For n samples with reflection coefficient r the AIC decreases by n r^2, and a coefficient costs 2."""
     z = np.random.default_rng(0).standard_normal(1001)
 
     def reflection(a: float) -> float:

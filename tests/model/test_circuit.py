@@ -147,7 +147,7 @@ def test_divider_is_differentiable_where_a_fit_may_stray(logs: tuple[float, floa
 
 
 def test_derivatives_are_finite_where_two_skins_share_a_time_constant():
-    """With a resistor far larger than two equal skins, their time constants differ by less than rounding errors."""
+    """The time constants of two equal skins with a far larger resistor differ by less than rounding errors."""
 
     def square_of_vsc(values: jax.Array) -> jax.Array:
         circuit = fitact.DirectGround(*values, series_resistor=100e3)

@@ -1,4 +1,4 @@
-"""Which of several models the data prefer. Records and refits by scipy; laws: chi-square, normal, Student's t."""
+"""Comparison of models by their data. References: records and refits by scipy; chi-square, normal and Student's t."""
 
 import json
 import math
@@ -24,7 +24,7 @@ from fitact.model_selection.cross_validation import (
 )
 from tests.fitting.test_joint import SKIN, free, record, scene
 
-PRIOR = {"Rsc": (160e3, 3.0), "Csc": (22e-9, 3.0), "Ci": (1.35e-9, 1.5)}  # median, and a factor that holds 95 %
+PRIOR = {"Rsc": (160e3, 3.0), "Csc": (22e-9, 3.0), "Ci": (1.35e-9, 1.5)}  # median, and a factor that contains 95 %
 AMPLITUDE, OMEGA, SAMPLES = 180.0, 2.0 * np.pi * 100.0, 400
 
 
@@ -48,7 +48,7 @@ def sine_scene(**measurement: object) -> fitact.Scene:
 
 
 def predicted_by_scipy(made: fitact.Record) -> np.ndarray:
-    """Log densities of 40 stretches, each by a refit without its fold, whose normal posterior is integrated over."""
+    """Return log-densities of 40 blocks, each from a refit without its fold, integrated over its normal posterior."""
     mean = np.log([median for median, _ in PRIOR.values()])
     sd = np.log([factor for _, factor in PRIOR.values()]) / 1.959963984540054
     block = np.arange(SAMPLES) // 10
@@ -56,7 +56,7 @@ def predicted_by_scipy(made: fitact.Record) -> np.ndarray:
     found = np.zeros(40)
     for number in range(10):
         kept, sigma, theta = fold[block] != number, 2.0, mean
-        for _ in range(4):  # the noise is that of the residuals
+        for _ in range(4):  # the noise is estimated from the residuals
 
             def residuals(theta: np.ndarray, kept: np.ndarray = kept, sigma: float = sigma) -> np.ndarray:
                 left = (made["Vsc"] - sine(theta, made.time))[kept] / sigma
@@ -80,13 +80,13 @@ def test_blocks_left_out_are_predicted_as_by_scipys_refits():
     made = sine_record(0)
     ours = cross_validate(fitact.fit(made, sine_scene()))
     assert (ours.folds, ours.folds_failed) == (10, 0)
-    # the noise is settled to 1 %, which changes a block of ten samples by 1e-3
+    # the noise converges to 1 %, which changes a block of ten samples by 1e-3
     np.testing.assert_allclose(ours.log_density, predicted_by_scipy(made), atol=5e-3)
 
 
 @pytest.mark.parametrize("student", [False, True])
 def test_a_block_is_integrated_over_what_the_rest_leaves_open(student: bool):
-    """One parameter, against quadrature; Student's to the error of Laplace's approximation."""
+    """One parameter, against quadrature; under Student's t to the error of the Laplace approximation."""
     z, slope, precision = np.array([0.3, -1.2, 2.0, 0.1]), np.array([1.5, -0.9, 0.6, 1.2]), 300.0
     channel = _LinearisedChannel(z, slope[:, None], np.zeros(4), student)
     near = _LinearisedModel([channel], np.array([[precision]]))
@@ -96,7 +96,7 @@ def test_a_block_is_integrated_over_what_the_rest_leaves_open(student: bool):
         return math.exp(law.logpdf(z + slope * x).sum()) * scipy.stats.norm.pdf(x, scale=precision**-0.5)
 
     expected = math.log(scipy.integrate.quad(density, -0.6, 0.6, epsabs=0.0, epsrel=1e-10)[0])
-    # without the integral it is off by 2e-3
+    # without the integral the error is 2e-3
     assert near.log_density([np.ones(4, bool)]) == pytest.approx(expected, abs=1e-4 if student else 1e-9)
 
 
@@ -125,7 +125,7 @@ def ranked(*models: ModelScore) -> Comparison:
 
 
 FLAT = [1.0] * 16
-NOISY = [1.0 + (-1.0) ** i for i in range(16)]  # the same sum, 4.13 as standard error of the difference
+NOISY = [1.0 + (-1.0) ** i for i in range(16)]  # the same sum; the standard error of the difference is 4.13
 
 
 def test_verdicts():
@@ -192,7 +192,7 @@ def test_a_gap_is_preferred_where_there_is_one_and_only_there(gap: bool):
 
 @pytest.mark.thorough
 def test_nested_models_differ_by_the_chi_square_law():
-    """Twice the log-likelihood that one true parameter more gains: chi-square of 1, so AIC by that less 2."""
+    """Twice the gain in log-likelihood by one more parameter is chi-square (1 dof); the AIC changes by 2 less that."""
     measured = {"channels": ["Vsc", "I"]}
     fixed, freed = (
         scene(measurement=measured, prior={"Ci": belief}) for belief in ({"fixed": "1.35 nF"}, {"factor": 100.0})
@@ -203,7 +203,7 @@ def test_nested_models_differ_by_the_chi_square_law():
         small, large = (fitact.fit(made, each).figures for each in (fixed, freed))
         gains.append(small["aic"] - large["aic"] + 2.0)
         assert large["parameters_counted"] == small["parameters_counted"] + 1
-    # false alarm of a right program: 1e-4
+    # false-alarm probability 1e-4
     assert scipy.stats.kstest(gains, scipy.stats.chi2(1).cdf).pvalue > 1e-4
 
 

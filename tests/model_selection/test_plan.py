@@ -1,4 +1,4 @@
-"""The plan against models that know no formula of ours: Kirchhoff's laws and their eigenvectors, and ngspice."""
+"""The plan against independent models: Kirchhoff's laws with their eigenvectors, and ngspice."""
 
 import itertools
 import json
@@ -23,7 +23,7 @@ from tests.model.test_ngspice import JUMP, simulate
 PAPER = {"grounding": {"R_H": "500 ohm"}}
 NATURAL = {"grounding": {"connection": "natural", "Z": "14.5 Mohm"}}
 BURST = {"drive": {"waveform": "burst", "cycles": 2}}
-_GRID = 1e-5  # what the times below miss of a peak
+_GRID = 1e-5  # relative error of a peak on the time grid below
 ERRORS = ("Vsc_rms", "Vsc_peak", "force_mean", "force_peak")
 
 
@@ -31,11 +31,11 @@ def planned(**scene: dict) -> fitact.Plan:
     return fitact.plan(fitact.Scene.from_dict(scene))
 
 
-# --- the independent route ----------------------------------------------------------------------------------------
+# --- independent route ------------------------------------------------------------------------------------------------
 
 
 def state_space(scene: fitact.Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A, B, E of x' = A x + B V + E V'; x holds the voltages over the touching skin, what else is there, and Ci."""
+    """Return A, B, E of x' = A x + B V + E V'; x holds the voltages across the sliding skin, other elements, and Ci."""
     ground, measured, Ci = scene.grounding, scene.measurement, scene.device.Ci
     probe = 1.0 / (measured.probe_resistance or math.inf), measured.probe_capacitance or 0.0
     conductances, capacitances = [1.0 / scene.skin.Rsc + probe[0]], [scene.skin.Csc + probe[1]]
@@ -62,7 +62,7 @@ def state_space(scene: fitact.Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def lines(scene: fitact.Scene) -> list[tuple[float, float, float]]:
-    """(length, V at its start, V at its end) of each line of one period."""
+    """Return (length, V at the start, V at the end) of each linear piece of a period."""
     d = scene.drive
     T, high = 1.0 / d.frequency, 0.5 * d.peak_to_peak
     wave = d.shape if d.waveform == "burst" else d.waveform
@@ -80,7 +80,7 @@ def lines(scene: fitact.Scene) -> list[tuple[float, float, float]]:
 
 
 def window(scene: fitact.Scene) -> list[tuple[float, float, float]]:
-    """The lines over one period, or over the duration from rest."""
+    """Return the linear pieces over one period, or over the duration from rest."""
     if scene.drive.steady_state:
         return lines(scene)
     left, found = scene.measurement.duration, []
@@ -99,7 +99,7 @@ def grid(length: float) -> np.ndarray:
 
 
 def skin_voltage(scene: fitact.Scene, lengths: list[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Times and Vsc over stretches that hold no corner; the stretches follow each other."""
+    """Return times and Vsc over consecutive intervals without corners."""
     A, B, E = state_space(scene)
     n, inverse = len(A), np.linalg.inv(A)
     rates, modes = np.linalg.eig(A)
@@ -109,7 +109,7 @@ def skin_voltage(scene: fitact.Scene, lengths: list[float]) -> tuple[np.ndarray,
     ) -> tuple[list[np.ndarray], np.ndarray]:
         found = []
         for length, start, end in drive:
-            # along a line: a line of its own, and what decays towards it
+            # on a linear piece: a linear solution, and a decaying difference from it
             slope = (end - start) / length
             line = -inverse @ B * slope
             level = inverse @ (line - B * start - E * slope)
@@ -132,7 +132,7 @@ def skin_voltage(scene: fitact.Scene, lengths: list[float]) -> tuple[np.ndarray,
 
 
 def cut(drive: list[tuple[float, float, float]], lengths: list[float]) -> list[tuple[float, float, float]]:
-    """Lines cut into shorter ones, of `lengths` (with a cut wherever the lines have one), repeated to fill them."""
+    """Return the linear pieces cut at `lengths` and at their corners, repeated to fill these."""
     found, source = [], itertools.cycle(drive)
     left, start, end = next(source)
     for length in lengths:
@@ -188,7 +188,7 @@ def random_scene(rng: np.random.Generator) -> fitact.Scene:
 
 
 def check_random_scenes(count: int, seed: int) -> int:
-    """How many plans have a cheaper model that would have kept the tolerance; asserts that each keeps it itself."""
+    """Return how many plans have a cheaper model within the tolerance; assert that each plan is within it."""
     rng, dearer = np.random.default_rng(seed), 0
     for _ in range(count):
         scene = random_scene(rng)
@@ -265,7 +265,7 @@ def test_a_burst_never_gets_the_steady_state():
     assert [o.name for o in plan.omissions] == ["transient", "float64"]
     assert plan.omissions[0].kept
     assert plan.scene.drive.waveform == "burst"
-    # at the second edge 360 V meet what the first one left: g (360 - 180 e^{-x}) against 360 g / (1 + e^{-x})
+    # at the second edge, 360 V add to the rest of the first response: g (360 - 180 e^{-x}) and 360 g / (1 + e^{-x})
     left = math.exp(-5e-3 / (160e3 * 24.7e-9))
     assert plan.omissions[0].nominal.Vsc_peak == pytest.approx(
         1.0 - 1.0 / ((1.0 + left) * (1.0 - 0.5 * left)), rel=1e-6
@@ -282,7 +282,7 @@ def test_two_hundred_random_scenes():
 
 
 def test_errors_are_judged_together():
-    """Of two resistors each keeps the tolerance alone, both together do not: only the one that saves time goes."""
+    """Each of two resistors could be dropped, but not both; only the one that saves time is dropped."""
     scene = {"grounding": {"R_H": 300.0, "grounding_Rsc": 160e3}, "measurement": {"series_resistor": 300.0}}
     alone = [o.nominal.force for o in planned(**scene).omissions if o.name in ("R_H", "series resistor")]
     plan = planned(**scene, tolerance={"force": 1.5 * alone[0]})
@@ -292,7 +292,7 @@ def test_errors_are_judged_together():
 
 
 def dispersive_skin(f: np.ndarray) -> np.ndarray:
-    """Impedance of the paper's skin: its three frequencies, log-log between them."""
+    """Return the impedance of the paper's skin, interpolated log-log between its three frequencies."""
     knots = np.log([10.0, 100.0, 1000.0])
     where = np.log(np.minimum(f, 1000.0))
     R = np.exp(np.interp(where, knots, np.log([200e3, 160e3, 80e3])))
@@ -301,7 +301,7 @@ def dispersive_skin(f: np.ndarray) -> np.ndarray:
 
 
 def fractional_skin(f: np.ndarray) -> np.ndarray:
-    """Impedance by Cole's formula."""
+    """Return the impedance of a Cole element."""
     return 160e3 / (1.0 + (2j * np.pi * f * 160e3 * 22e-9) ** 0.7)
 
 
@@ -310,12 +310,12 @@ def fractional_skin(f: np.ndarray) -> np.ndarray:
     [({"level": "dispersive"}, dispersive_skin), ({"level": "fractional", "alpha": 0.7}, fractional_skin)],
 )
 def test_dispersion_against_a_sum_of_harmonics(skin: dict, impedance: Callable[[np.ndarray], np.ndarray]):
-    """The rms of the difference and of Vsc by Parseval."""
+    """The rms values of the difference and of Vsc by Parseval."""
     plan = planned(skin=skin, drive={"waveform": "trapezoid", "rise_time": "50 us"})
     k = np.arange(1, 20_001)
     f = 100.0 * k
     s = 2j * np.pi * f
-    drive = np.sin(0.5 * np.pi * k) * np.sinc(k * 0.005) / k  # to a factor
+    drive = np.sin(0.5 * np.pi * k) * np.sinc(k * 0.005) / k  # up to a factor
     full, constant = (
         drive * skin / (2.0 * skin + 1.0 / (s * 1.35e-9)) for skin in (impedance(f), 160e3 / (1.0 + s * 160e3 * 22e-9))
     )
@@ -327,7 +327,7 @@ def test_dispersion_against_a_sum_of_harmonics(skin: dict, impedance: Callable[[
 
 
 def test_quantiles_are_those_of_the_prior():
-    """A finger of the prior at a time, planned by itself: as many have a larger error as the quantile says."""
+    """Fingers drawn from the prior are planned one by one; the fraction with larger errors agrees with the quantile."""
     prior = {"Rsc": {"fixed": True}, "Ci": {"fixed": True}, "Csc": {"low": "5 nF", "high": "50 nF"}}
     stated = planned(**PAPER, prior=prior).omissions[0].q95.force_peak
     shares = np.linspace(0.005, 0.995, 12)
@@ -335,7 +335,7 @@ def test_quantiles_are_those_of_the_prior():
     alone = [
         planned(**PAPER, prior=held, skin={"Csc": 5e-9 + 45e-9 * p}).omissions[0].nominal.force_peak for p in shares
     ]
-    assert stated == pytest.approx(np.interp(0.05, shares, alone), rel=0.03)  # the error falls with Csc
+    assert stated == pytest.approx(np.interp(0.05, shares, alone), rel=0.03)  # the error decreases with Csc
 
 
 def test_what_is_known_to_matter_is_kept():
@@ -393,7 +393,7 @@ def test_contract_and_picture(tmp_path: Path):
     assert content["model"]["circuit"] == "final"
     assert not any(isinstance(value, dict | list) for value in content["model"].values())
     assert json.loads(json.dumps(content)) == content
-    assert len(content["warnings"]) == 1  # the default prior is wide
+    assert len(content["warnings"]) == 1  # one warning, because the default prior is wide
     assert "0.14 %" in str(plan)
     write_figure(tmp_path / "plan.svg", lambda: draw_plan(plan))
     assert "<svg" in (tmp_path / "plan.svg").read_text()
@@ -407,7 +407,7 @@ def test_a_second_plan_takes_no_time():
 
 
 def test_a_body_at_earth():
-    """Z = 0: one skin in series with Ci."""
+    """Z = 0 leaves one skin in series with Ci."""
     at_earth = fitact.Scene.from_dict({"grounding": {"connection": "natural", "Z": 0}}).make_circuit()
     s = 2j * np.pi * 100.0
     skin = 160e3 / (1.0 + s * 160e3 * 22e-9)
@@ -421,13 +421,13 @@ def test_draws_are_spread_evenly_over_the_prior():
     prior = fitact.Prior.of(Rsc=fitact.LogNormal(1e5, 0.5), Csc=fitact.Uniform(1e-9, 3e-9))
     drawn = prior.sample_qmc(500)
     shares = scipy.stats.norm.cdf(np.log(drawn["Rsc"] / 1e5) / 0.5), (drawn["Csc"] - 1e-9) / 2e-9
-    # independent draws leave 0.03, a lattice 0.02 in two dimensions
+    # independent draws give 0.03, a lattice in two dimensions 0.02
     assert scipy.stats.qmc.discrepancy(np.column_stack(shares), method="L2-star") < 0.01
     np.testing.assert_array_equal(prior.sample_qmc(500)["Csc"], drawn["Csc"])
 
 
 def test_a_multitone_by_phasors():
-    """R_H left out, tone by tone; peaks on a fine grid."""
+    """Without R_H, tone by tone; peaks on a fine grid."""
     tones, amplitudes, phases = (
         np.array([100.0, 300.0, 700.0]),
         np.array([100.0, 60.0, 40.0]),

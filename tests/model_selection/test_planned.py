@@ -1,4 +1,4 @@
-"""Fits with planned models: what is left out is said, and a record that contradicts it is heard."""
+"""Fits with planned models: dropped elements are reported, and a record that contradicts the plan is refitted."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ from fitact.model_selection import fit_planned as module
 from fitact.model_selection.fit_planned import fit_planned
 
 SCENE = {"grounding": {"R_H": "500 ohm"}}
-# a skin at the ground that is thinner, and a tolerance that lets it go
+# a thinner skin at the ground, and a tolerance that allows dropping it
 UNEQUAL = {
     "grounding": {"grounding_Rsc": "100 kohm", "grounding_Csc": "30 nF"},
     "tolerance": {"force": 0.9},
@@ -51,7 +51,7 @@ def test_a_record_that_contradicts_the_plan_gets_the_full_model():
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """Of a fit that was not made."""
+    """Result of a fit, without the fit."""
 
     scene: fitact.Scene
     result: str
@@ -88,7 +88,7 @@ def test_which_model_is_used(monkeypatch, of_planned: str, of_full: str, used: s
 @pytest.mark.thorough
 def test_a_recorded_drive_is_planned_for_as_it_was_recorded():
     drive = {"waveform": "trapezoid", "rise_time": "0.5 ms", "peak_to_peak": "200 V", "frequency": "250 Hz"}
-    body = {"grounding": {"R_H": "20 kohm"}}  # acts over 27 us, which samples each microsecond resolve
+    body = {"grounding": {"R_H": "20 kohm"}}  # acts over 27 us, which samples at 1 us resolve
     named = fitact.Scene.from_dict(body | {"drive": drive, "measurement": {"sampling_rate": "1 MHz"}})
     record = simulate(named)
     stated = fitact.plan(named)
@@ -98,14 +98,14 @@ def test_a_recorded_drive_is_planned_for_as_it_was_recorded():
         scene = fitact.Scene.from_dict(body | drive)
         found = module.plan_for_record(record, scene).omissions[0]
         assert found.name == "R_H"
-        # a sum over the samples, which the peak lies beside
+        # a sum over samples, which do not include the peak
         assert tuple(found.nominal) == pytest.approx(tuple(r_h.nominal), rel=1e-3)
         assert tuple(found.q95) == pytest.approx(tuple(r_h.q95), rel=1e-3)
     assert module.plan_for_record(record, named).omissions == stated.omissions
 
 
 def test_a_part_of_a_period_is_planned_for_from_its_first_sample():
-    """Against scipy, from no charge: one time constant, and R_H = 0.5 Mohm as a second."""
+    """Against scipy from zero charge, with one time constant, and with R_H = 0.5 Mohm as a second."""
     scene = fitact.Scene.from_dict({"grounding": {"R_H": "0.5 Mohm"}})
     time = np.linspace(0.0, 3e-3, 3001)
     voltage = 100.0 * np.sin(2.0 * np.pi * 60.0 * time**1.1)

@@ -1,4 +1,4 @@
-"""The paper's claims: numbers that were found in closed form and with ngspice before this package was."""
+"""Claims of the paper against numbers computed in closed form and with ngspice before this package existed."""
 
 import json
 import re
@@ -63,7 +63,7 @@ def test_every_claim_is_there_and_judged(claims: dict[str, dict]):
         assert claim["reason"]
 
 
-# half a unit of the last digit that was written down
+# half a unit of the last printed digit
 @pytest.mark.parametrize(
     ("id", "Ci", "value", "half"),
     [

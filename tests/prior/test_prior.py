@@ -9,7 +9,7 @@ import fitact
 
 SPREAD = math.log(3.0) / scipy.stats.norm.ppf(0.975)
 
-# each beside what scipy calls it: a law of x, or of log x
+# each prior with its scipy equivalent, a distribution of x or of log x
 LAWS_OF_X = {
     "factor": (fitact.LogNormal.within_factor(130e3, 3.0), scipy.stats.lognorm(SPREAD, scale=130e3)),
     "relative sd": (
@@ -40,7 +40,7 @@ LAWS = LAWS_OF_X | LAWS_OF_LOG
 
 
 def of_logs(name: str, function: str, u: np.ndarray) -> np.ndarray:
-    """scipy's log-density or distribution function of u = log x."""
+    """Return scipy's log-density or distribution function of u = log x."""
     law = LAWS[name][1]
     if name in LAWS_OF_LOG:
         return getattr(law, function)(u)
@@ -81,7 +81,7 @@ def test_density_of_the_logarithm_has_its_integral_and_moments(name: str):
 
 @pytest.mark.parametrize("name", LAWS)
 def test_draws_follow_it(name: str):
-    """Kolmogorov-Smirnov at 1e-4: the fixed seed keeps one run in a thousand of the eleven from failing."""
+    """Kolmogorov-Smirnov test at 1e-4; with a random seed, one run in a thousand would fail."""
     draws = np.log(LAWS[name][0].sample(np.random.default_rng(0), 20_000))
     assert scipy.stats.kstest(draws, lambda u: of_logs(name, "cdf", u)).pvalue > 1e-4
 
@@ -143,19 +143,19 @@ def test_log_normals_are_multivariate_normal_in_the_logs():
     u = law.rvs(20, random_state=1)
     np.testing.assert_allclose(prior.covariance, covariance, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(jax.vmap(prior.log_density)(u), law.logpdf(u), rtol=1e-10)
-    squares = jax.vmap(lambda v: (prior.residuals(v) ** 2).sum())(u)  # half of them, negated: the log-density
+    squares = jax.vmap(lambda v: (prior.residuals(v) ** 2).sum())(u)  # minus half of these is the log-density
     np.testing.assert_allclose(-0.5 * squares, law.logpdf(u) - law.logpdf(law.mean), rtol=1e-8, atol=1e-10)
 
 
 def test_copula_keeps_the_marginals_and_has_the_covariance_it_states():
     prior = three(CORRELATION, uniform=True)
     count = 400_000
-    logs = np.log(list(prior.sample(np.random.default_rng(3), count).values()))  # 5 sigma: nearly any seed passes
+    logs = np.log(list(prior.sample(np.random.default_rng(3), count).values()))  # 5 sd: nearly any seed passes
     assert scipy.stats.kstest(np.exp(logs[1]), scipy.stats.uniform(8.85e-9, 35.4e-9).cdf).pvalue > 1e-4
     np.testing.assert_allclose(logs.mean(axis=1), prior.log_mean, atol=5.0 * prior.log_sd.max() / math.sqrt(count))
     scale = np.outer(prior.log_sd, prior.log_sd)
     np.testing.assert_allclose(np.cov(logs) / scale, prior.covariance / scale, atol=5.0 * math.sqrt(2.0 / count))
-    # Pearson's result for the rank correlation under a normal copula: the correlation here is not that of the logs
+    # Pearson's rank correlation of a normal copula, because the correlation here is not that of the logarithms
     rank = scipy.stats.spearmanr(logs[0], logs[1]).statistic
     assert rank == pytest.approx(6.0 / math.pi * math.asin(-0.3), abs=0.008)
 
@@ -181,7 +181,7 @@ def test_replacing_a_marginal_keeps_the_correlations():
 
 
 def test_order_is_a_factor_of_0_or_1():
-    """Of two equal marginals either is the lower with probability 1/2: the kept draws are order statistics."""
+    """Either of two equal marginals is the lower with probability 1/2, so the accepted draws are order statistics."""
     alone = fitact.Prior.of(low=fitact.Uniform(1.0, 2.0), high=fitact.Uniform(1.0, 2.0))
     prior = fitact.Prior.of(None, (("low", "high"),), low=fitact.Uniform(1.0, 2.0), high=fitact.Uniform(1.0, 2.0))
     u = np.log([1.2, 1.3])

@@ -1,7 +1,7 @@
-"""The report in a real Chromium: what it loads, what its buttons do, how it looks, prints and reads aloud.
+"""The report in Chromium: what it loads, what its buttons do, its appearance, its print-out and its accessibility.
 
-How it should look is kept in tests/data/screens, in one font wherever it runs (matplotlib brings it). To renew:
-`RENEW_SCREENS=1 pytest tests/test_browser.py -k looks`, then look at what changed.
+Reference pictures are in tests/data/screens, in one font on every machine (matplotlib ships it). To renew them, run
+`RENEW_SCREENS=1 pytest tests/report/test_browser.py -k looks` and look at the changes.
 """
 
 import base64
@@ -31,15 +31,15 @@ pytestmark = pytest.mark.skipif(
 )
 SCREENS = Path(__file__).parents[1] / "data" / "screens"
 OPTIONS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--hide-scrollbars")
-SAME_TEXT = ("--font-render-hinting=none", "--disable-lcd-text")  # whatever the machine's settings of fonts are
-SHRUNK = 8  # pixels of the page to one of a kept picture
-BLOCK = 8  # of those, across what is compared
-ALIKE = 6.0  # grey levels
+SAME_TEXT = ("--font-render-hinting=none", "--disable-lcd-text")  # independent of the machine's font settings
+SHRUNK = 8  # pixels of the page per pixel of a reference picture
+BLOCK = 8  # size of a compared block in pixels of the reference picture
+ALIKE = 6.0  # allowed difference in grey levels
 PLOTS = 1 + 6 + 3  # record; three parameters and their pairs; forces
 
 
 class Browser:
-    """A page in Chromium."""
+    """Page in Chromium."""
 
     def __init__(self, driver: Any):
         self.driver = driver
@@ -73,7 +73,7 @@ class Browser:
         self.size(self.ask("innerWidth"), self.ask("document.documentElement.scrollHeight"))
 
     def figure(self, number: int) -> tuple[Any, dict[str, Any]]:
-        """A drawn chart, and its buttons by name."""
+        """Return a drawn chart and its buttons by name."""
         figure = self.all("figure.chart")[number]
         self.ask("arguments[0].scrollIntoView({block: 'center'})", figure)
         self.wait("arguments[0].querySelector('.plot .main-svg') !== null", figure)
@@ -83,7 +83,7 @@ class Browser:
         return self.ask(f"arguments[0].querySelector('.plot').layout.{axis}.range", figure)
 
     def check_alone(self, path: Path) -> None:
-        """The page at `path` asked for nothing from outside, and complained of nothing."""
+        """Assert that the page at `path` made no external request and logged no error."""
         assert self.driver.get_log("browser") == []
         events = [json.loads(entry["message"])["message"] for entry in self.driver.get_log("performance")]
         asked = [e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"]
@@ -110,7 +110,7 @@ def browser():
 
 @pytest.fixture(scope="module")
 def page(finger_fit: fitact.Fit, tmp_path_factory) -> Path:
-    """The demo's report of independent draws, which are the same everywhere, in a font that is the same everywhere."""
+    """Return the report of the demo with independent draws and a font that are the same on every machine."""
     path = tmp_path_factory.mktemp("report") / "report.html"
     fitact.sample(finger_fit, level="laplace", seed=1, progress=False).report(path)
     path.write_text(path.read_text().replace("</head>", f"<style>{_font()}</style></head>"))
@@ -300,7 +300,7 @@ CONTRASTS = """(() => {
 
 
 def test_it_reads_aloud_and_is_legible(browser: Browser, page: Path):
-    """WCAG 2.2: names, headings in order, language, and a contrast of text of 4.5 at least."""
+    """WCAG 2.2: accessible names, headings in order, language, and a text contrast of at least 4.5."""
     browser.open(page)
     browser.whole()
     assert browser.ask("document.documentElement.lang") == "en"
@@ -317,7 +317,7 @@ def test_it_reads_aloud_and_is_legible(browser: Browser, page: Path):
 
 
 def differences(seen: np.ndarray, kept: np.ndarray) -> float:
-    """The largest over blocks of the mean absolute difference, in grey levels; infinite for another shape."""
+    """Return the largest block mean of the absolute difference, in grey levels; infinite if the shapes differ."""
     if seen.shape != kept.shape:
         return np.inf
     gap = np.abs(seen.astype(float) - kept)

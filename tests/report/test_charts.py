@@ -1,4 +1,4 @@
-"""What is drawn for readers who zoom and ask: numbers as plotly.js is to read them, and nothing as markup."""
+"""Data of charts that readers can zoom and inspect: numbers as plotly.js reads them, and no markup."""
 
 import base64
 import json
@@ -50,7 +50,7 @@ def test_a_long_series_keeps_its_extremes_and_is_bounded():
 
 
 def test_a_density_is_that_of_the_axis_it_is_drawn_on():
-    """Of log-normal draws: over the logarithm the peak is at the median, over the value at exp(-s^2) of it."""
+    """For log-normal draws, the density of the logarithm peaks at the median, that of the value at exp(-s^2) of it."""
     draws = scipy.stats.lognorm(s=0.5, scale=160e3).rvs(200_000, random_state=3)
     axis = Axis.from_values("Rsc", "ohm", draws, log=True)
     trace = interactive.density(axis, draws, "posterior")

@@ -1,4 +1,4 @@
-"""Pages of a population, a plan, a trade-off and the two designs: what they show, of results made by hand."""
+"""Pages of a population, a plan, a trade-off and the two designs: their content for results made by hand."""
 
 import dataclasses
 import json
@@ -106,7 +106,7 @@ def summary(median: float, unit: str) -> dict[str, Any]:
 
 
 def population(trusted: bool = True) -> tuple[xr.DataTree, dict[str, Any]]:
-    """Tree and content as `fitact population` leaves them, of two fingers."""
+    """Return tree and content in the form that `fitact population` writes, for two fingers."""
     new = {name: summary(x, "ohm" if name == "Rsc" else "F") for name, x in (("Rsc", 124e3), ("Csc", 25e-9))}
     new |= {"g": summary(0.051, "1"), "b": summary(3.5e-3, "s")}
     new |= {name: summary(x, "N") for name, x in (("force_mean", 231e-6), ("force_peak", 709e-6))}
@@ -188,7 +188,7 @@ WRITE: dict[str, Callable[[Path, bool], None]] = {
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory) -> dict[str, tuple[Page, str]]:
-    """Each page, and its words."""
+    """Return each page and its words."""
     folder = tmp_path_factory.mktemp("pages")
     for name, write in WRITE.items():
         write(folder / f"{name}.html", True)
@@ -213,7 +213,7 @@ def test_a_page_stands_alone_and_closes_its_tags(pages, name: str):
 
 @pytest.mark.parametrize("name", WRITE)
 def test_no_name_of_a_record_becomes_markup(pages, name: str):
-    """It is shown as it is; a tag of it would have left the page's tags open, too."""
+    """The name is displayed unchanged; a tag in it would leave tags of the page open."""
     page, text = pages[name]
     assert HOSTILE in text
     assert not any("alert(1)" in script and "\\u003cscript\\u003ealert(1)" not in script for script in page.scripts)
@@ -289,13 +289,13 @@ SHOWN = {
 
 @pytest.mark.parametrize("name", WRITE)
 def test_the_numbers_are_on_the_page(pages, name: str):
-    """As they follow by hand from those that the results above were made with."""
+    """The numbers follow by hand from those of the results above."""
     _, text = pages[name]
     assert [part for part in SHOWN[name] if part not in text] == []
 
 
 def test_what_is_drawn_is_what_the_page_says(pages):
-    """Charts name every finger and every level; an error of 0 is called that, wherever it is drawn."""
+    """Charts name every finger and every method; an error of 0 is labelled as such."""
     charts = {name: "".join(page.scripts) for name, (page, _) in pages.items()}
     assert '"second.csv"' in charts["population"]
     assert "best response, 2 \\u00b5s, error 0" in charts["tradeoff"]
@@ -312,7 +312,7 @@ def test_a_drive_that_no_limit_allows(tmp_path: Path):
 
 
 def test_a_population_is_read_again(tmp_path: Path):
-    """To the same page; what is no population is refused."""
+    """A saved population gives the same page; other files are refused."""
     tree, content = population()
     with pytest.raises(fitact.InputError, match=r"holds no complete population .*; make it with: fitact population"):
         read_population(tmp_path)
@@ -327,7 +327,7 @@ def test_a_population_is_read_again(tmp_path: Path):
 
 
 def test_a_chain_cut_short_is_told_without_figures(tmp_path: Path):
-    """Its draws may overflow; JSON has null for what is not finite."""
+    """Its draws may overflow; JSON has null for non-finite values."""
     tree, content = population(trusted=False)
     tree["new_fingers"]["force_mean"].values[3] = math.inf
     content["new_finger"]["force_mean"] |= {"q975": math.inf, "sd": math.nan}

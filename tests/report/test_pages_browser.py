@@ -1,4 +1,4 @@
-"""The pages of test_pages.py in a real Chromium, as test_browser.py has the report."""
+"""The pages of test_pages.py in Chromium, tested like the report in test_browser.py."""
 
 import itertools
 from pathlib import Path

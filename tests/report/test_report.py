@@ -10,7 +10,7 @@ from fitact.summary import describe_quantity
 
 
 class Page(HTMLParser):
-    """Collects what a test asks for, and checks that tags close."""
+    """Parser that collects what a test needs, and checks that tags are closed."""
 
     def __init__(self, text: str):
         super().__init__()

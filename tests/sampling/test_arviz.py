@@ -1,4 +1,4 @@
-"""posterior.nc in whichever ArviZ is installed: 0.23 (InferenceData, Python 3.11) or 1.x (DataTree, 3.12 and later)."""
+"""posterior.nc in the installed ArviZ: 0.23 (InferenceData, Python 3.11) or 1.x (DataTree, 3.12 and later)."""
 
 import warnings
 from collections.abc import Callable
@@ -18,7 +18,7 @@ NAMES = ["Rsc", "Csc", "Ci", "g", "b", "force_mean"]
 def arviz() -> Any:
     mpl.use("Agg")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # 0.23 announces its successor at import
+        warnings.simplefilter("ignore")  # 0.23 announces its successor on import
         return pytest.importorskip("arviz")
 
 
@@ -33,7 +33,7 @@ def test_summary_is_that_of_the_draws(arviz: Any, data: Any):
     table = arviz.summary(data, var_names=NAMES)
     assert list(table.index) == NAMES
     draws = data["posterior"]["Rsc"].values
-    # 1.x rounds to the digits that the Monte-Carlo error leaves
+    # 1.x rounds to the digits that the Monte Carlo error supports
     assert float(table["mean"].astype(float)["Rsc"]) == pytest.approx(np.mean(draws), rel=1e-2)
     assert float(table["sd"].astype(float)["Rsc"]) == pytest.approx(np.std(draws, ddof=1), rel=1e-2)
     assert np.all(table["r_hat"].astype(float) < 1.01)
@@ -49,7 +49,7 @@ def test_summary_is_that_of_the_draws(arviz: Any, data: Any):
     ],
 )
 def test_main_plots(arviz: Any, data: Any, plots: tuple[str, ...], names: list[str] | None):
-    """The first is 1.x's name, the last 0.23's, which may mean another plot in the other."""
+    """The first name is that of 1.x, the last that of 0.23, where it may be another plot in the other version."""
     plot: Callable[..., Any] = getattr(arviz, plots[0] if hasattr(arviz, "plot_trace_dist") else plots[-1])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

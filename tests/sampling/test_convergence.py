@@ -1,4 +1,4 @@
-"""What is said of draws, against laws in closed form."""
+"""Convergence diagnostics against closed forms."""
 
 import emcee
 import numpy as np
@@ -27,7 +27,7 @@ def log_normal_density(points: np.ndarray) -> np.ndarray:
 
 
 def log_box_density(points: np.ndarray) -> np.ndarray:
-    """Uniform between -1 and 2 in the first coordinate, standard normal in the others."""
+    """Log-density that is uniform between -1 and 2 in the first coordinate, standard normal in the others."""
     inside = (points[:, 0] > -1.0) & (points[:, 0] < 2.0)
     return np.where(inside, -0.5 * np.sum(points[:, 1:] ** 2, axis=1), -np.inf)
 
@@ -41,7 +41,7 @@ PROPOSALS = {
 @pytest.mark.parametrize("move", range(2))
 @pytest.mark.slow
 def test_every_move_reproduces_a_normals_variance(move: int):
-    """To 1 %: the effective draws put 3.5 standard errors there, sqrt(2 / (3 n)) each."""
+    """Accurate to 1 %, which is 3.5 standard errors for the effective number of draws, sqrt(2 / (3 n)) each."""
     offered = make_moves(PROPOSALS["student"][0])[move][0]
     independent = isinstance(offered, emcee.moves.MHMove)
     walkers, steps = (256, 1500) if independent else (512, 6000)
@@ -51,13 +51,13 @@ def test_every_move_reproduces_a_normals_variance(move: int):
     chain = sampler.get_chain(flat=True)
     effective = chain.shape[0] / np.max(emcee.autocorr.integrated_time(sampler.get_chain(), tol=0))
     assert 3.5 * np.sqrt(2.0 / (3.0 * effective)) < 0.01
-    # the normal's three variances in its own axes, pooled
+    # variances along the three axes of the normal, pooled
     assert np.mean(np.linalg.solve(ROOT, chain.T) ** 2) == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.parametrize("name", PROPOSALS)
 def test_proposal_draws_what_its_density_says(name: str):
-    """Importance weights have the target's normalising constant as their mean, and its moments."""
+    """Importance weights have the target's normalising constant as their mean, and give the target's moments."""
     proposal, target = PROPOSALS[name]
     points = proposal.draw(np.random.default_rng(2), 200_000)
     weights = np.exp(target(points) - proposal.log_density(points))
@@ -81,7 +81,7 @@ def test_table_is_the_density_and_ends_where_it_does():
 
 
 def autoregressive(rho: float, shape: tuple[int, int, int], rng: np.random.Generator) -> np.ndarray:
-    """Standard normal series with autocorrelation time (1 + rho) / (1 - rho): (ensembles, steps, walkers)."""
+    """Return normal series with autocorrelation time (1 + rho) / (1 - rho), shape (ensembles, steps, walkers)."""
     noise = np.sqrt(1.0 - rho**2) * rng.standard_normal(shape)
     values = np.empty(shape)
     values[:, 0] = rng.standard_normal((shape[0], shape[2]))
@@ -110,7 +110,7 @@ def test_autocorrelation_time_and_effective_size(chain: np.ndarray):
 
 @pytest.mark.parametrize("apart", [0.0, 0.3], ids=["agreeing", "apart"])
 def test_split_rhat_is_that_of_arviz(chain: np.ndarray, apart: float):
-    """Of all draws after the burn-in; rejected moves repeat each value."""
+    """R-hat of all draws after the burn-in; rejected moves repeat values."""
     walked = np.repeat(chain[:, ::2], 2, axis=1) + apart * np.arange(4)[:, None, None, None]
     c = diagnose_chain(("x",), walked, ACCEPTED, {}, rhat_draws=10**9)
     kept = walked[:, c.burn :].reshape(4, -1)
@@ -124,12 +124,12 @@ def test_autocorrelation_time_is_that_of_emcee(chain: np.ndarray):
 
 
 def test_chain_that_is_short_or_parted_is_not_converged(chain: np.ndarray):
-    assert not diagnose_chain(("x",), chain[:, :300], ACCEPTED, {}).converged  # under 50 autocorrelation times
+    assert not diagnose_chain(("x",), chain[:, :300], ACCEPTED, {}).converged  # shorter than 50 autocorrelation times
     parted = chain.copy()
     parted[0] += 0.5
     assert diagnose_chain(("x",), parted, ACCEPTED, {}).rhat_max > 1.01
     assert not diagnose_chain(("x",), parted, ACCEPTED, {}).converged
-    # a derived quantity counts like a coordinate
+    # derived quantities count like coordinates
     assert not diagnose_chain(("x",), chain, ACCEPTED, {"force_mean": parted[..., :4, 0]}).converged
 
 
@@ -146,7 +146,7 @@ def test_stuck_walker_is_named(chain: np.ndarray):
 
 @pytest.mark.parametrize(("rate", "accepted"), [(2.0, True), (5.0, False)])
 def test_pareto_shape_of_exponential_weights(rate: float, accepted: bool):
-    """Exp(1) by importance from Exp(rate): P(w > t) ~ t^(-rate / (rate - 1)), whose shape is 1 - 1 / rate."""
+    """Exp(1) by importance sampling from Exp(rate): P(w > t) ~ t^(-rate / (rate - 1)), so the shape is 1 - 1 / rate."""
     x = np.random.default_rng(3).exponential(1.0 / rate, 40_000)
     weighted = pareto_smooth((rate - 1.0) * x)
     assert weighted.k_hat == pytest.approx(1.0 - 1.0 / rate, abs=0.08)
@@ -169,7 +169,7 @@ def test_weights_without_a_tail_are_refused():
 
 
 def test_laplace_says_what_it_is_off_by():
-    """Draws of N(0, 1) for N(m, s^2): off by -m / s in the mean, and 1 / s - 1 in the sd."""
+    """Draws of N(0, 1) for N(m, s^2): the error is -m / s in the mean, and 1 / s - 1 in the sd."""
     x, m, s = np.random.default_rng(4).standard_normal(40_000), 0.3, 0.9
     weighted = pareto_smooth(-0.5 * ((x - m) / s) ** 2 + 0.5 * x**2)
     c = diagnose_weights("laplace", weighted, {"x": x}, x.size)
@@ -177,7 +177,7 @@ def test_laplace_says_what_it_is_off_by():
     assert c.widening["x"] == pytest.approx(1.0 / s - 1.0, abs=0.02)
     assert not c.converged
     assert "largest error of a mean 0.33 sd" in str(c)
-    # a half of the draws impossible: refused although what is left has its moments
+    # half of the draws are outside the prior, so the method is refused although the moments of the others agree
     forbidden = np.where(np.arange(x.size) % 2, 0.0, -np.inf) + 1e-9 * x
     assert not diagnose_weights("laplace", pareto_smooth(forbidden), {"x": x}, x.size).converged
 

@@ -1,4 +1,4 @@
-"""A run that is killed, again and again, ends with the draws of an undisturbed one."""
+"""A run that is killed repeatedly gives the same draws as an uninterrupted one."""
 
 import os
 import random
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 STEPS = 4000
-# a chain that never counts as converged, so that there is time to kill it
+# a chain that never converges, so that there is time to kill it
 SAMPLE = """
 import functools
 import sys
@@ -30,7 +30,7 @@ posterior.to_netcdf(out)
 
 
 def kept(path: Path) -> tuple[int, np.ndarray]:
-    """Steps in a chain file, which must be whole, and the first ensemble's points."""
+    """Return the number of steps in a chain file, which must be intact, and the points of the first ensemble."""
     with h5py.File(path, "r") as file:
         steps = {file[f"ensemble_{i}"].attrs["iteration"] for i in range(4)}
         shapes = {file[f"ensemble_{i}"]["chain"].shape[0] for i in range(4)}

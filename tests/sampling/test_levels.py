@@ -1,4 +1,4 @@
-"""Levels of uncertainty against closed-form laws: along the blind direction, and of importance weights."""
+"""Posterior methods against closed forms, for a prior with bounds along the unidentified direction."""
 
 import functools
 import itertools
@@ -33,12 +33,12 @@ def box_fit(box: str, likelihood: str) -> fitact.Fit:
     scene = fitact.Scene.from_dict({"drive": {"waveform": "square"}, "prior": prior})
     fit = fitact.fit(square_record(per_period=400), scene, tolerance=TOLERANCES[likelihood])
     assert fit.model()["likelihood"] == likelihood
-    assert fit.result == "successful"  # an optimum on the edge of the box is no failure
+    assert fit.result == "successful"  # an optimum at the edge of the box is not a failure
     return fit
 
 
 def limits_along_the_ridge(fit: fitact.Fit) -> tuple[float, float]:
-    """Of Rsc, ohm: the line (Rsc/k, k Csc, k Ci) leaves the box where the first of the three does."""
+    """Return the bounds of Rsc, ohm, where the line (Rsc/k, k Csc, k Ci) leaves the box of the prior."""
     Rsc, Csc, Ci = np.exp(fit.point[:3])
     prior = fit.scene.prior
     low = max(prior.Rsc.low, Rsc * Csc / prior.Csc.high, Rsc * Ci / prior.Ci.high)
@@ -46,9 +46,9 @@ def limits_along_the_ridge(fit: fitact.Fit) -> tuple[float, float]:
 
 
 def deviations(posterior: fitact.Posterior) -> np.ndarray:
-    """Of the quantiles of Rsc from those of p(Rsc) ~ 1/Rsc^2 between its limits, in standard errors.
+    """Return deviations of quantiles of Rsc from those of p(Rsc) ~ 1/Rsc^2 between its bounds, in standard errors.
 
-    1/Rsc is uniform there: with q the share passed, Rsc = 1 / (1/low - q (1/low - 1/high)).
+    1/Rsc is uniform, so the quantile of probability q is Rsc = 1 / (1/low - q (1/low - 1/high)).
     """
     low, high = limits_along_the_ridge(posterior.fit)
     expected = 1.0 / (1.0 / low - SHARES * (1.0 / low - 1.0 / high))
@@ -63,10 +63,10 @@ def test_uniform_priors_give_the_inverse_square_law_along_the_blind_direction(bo
     for level in ("emcee", "psis"):
         posterior = fitact.sample(fit, level=level, seed=5, progress=False)
         assert posterior.convergence.converged
-        # four standard errors: one seed in a thousand fails, whatever it is
+        # four standard errors: one seed in a thousand fails
         assert np.max(np.abs(deviations(posterior))) < 4.0, level
     laplace = fitact.sample(fit, level="laplace", seed=5, progress=False).convergence
-    assert not laplace.converged  # the normal does not know the limits, and says so
+    assert not laplace.converged  # the Gaussian approximation ignores the bounds, which its diagnostic detects
     assert "REFUSED" in str(laplace)
 
 

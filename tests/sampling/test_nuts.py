@@ -1,4 +1,4 @@
-"""The levels against a long run of another sampler: blackjax's NUTS."""
+"""The posterior methods against a long run of another sampler, NUTS of blackjax."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ CHAINS, STEPS = 4, 10_000
 
 @pytest.fixture(scope="module")
 def reference(finger_fit: fitact.Fit) -> fitact.Posterior:
-    """NUTS in coordinates that the fit makes round, so that neither mass nor step size need adapting."""
+    """Run NUTS in coordinates that the fit standardises, so that mass matrix and step size need no adaptation."""
     import blackjax
 
     with jax.enable_x64(True):
@@ -42,7 +42,7 @@ def reference(finger_fit: fitact.Fit) -> fitact.Posterior:
 @pytest.mark.thorough
 @pytest.mark.parametrize(("level", "runs"), [("emcee", 4), ("psis", 6)])
 def test_widths_are_those_of_nuts(level: str, runs: int, finger_fit: fitact.Fit, reference: fitact.Posterior):
-    """To 2 %: some 40,000 effective draws on either side put four standard errors there, 1 / sqrt(2 n) each."""
+    """Accurate to 2 %: for 40,000 effective draws on both sides these are four standard errors, 1 / sqrt(2 n) each."""
     posteriors = [fitact.sample(finger_fit, level=level, seed=seed, progress=False) for seed in range(runs)]
     assert sum(min(p.convergence.ess_min, p.points[..., 0].size) for p in posteriors) > 35_000
     for quantity in ("Rsc", "force_mean"):

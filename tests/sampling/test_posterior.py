@@ -20,7 +20,7 @@ def netcdf(finger_posterior: fitact.Posterior, tmp_path_factory) -> Path:
 
 
 def test_force_of_a_draw_by_hand(finger_posterior: fitact.Posterior):
-    """Eq. (22) with eps_i = Ci Ti / (eps0 A), eps_sc = Csc Tsc / (eps0 A), on Vsc that scipy would give."""
+    """Eq. (22) with eps_i = Ci Ti / (eps0 A), eps_sc = Csc Tsc / (eps0 A), with Vsc from scipy."""
     fit = finger_posterior.fit
     draws, force = finger_posterior.parameters(), finger_posterior.force()
     record = fit.record
@@ -101,7 +101,7 @@ def test_predicted_records_cover_the_record(netcdf: Path):
     with xr.open_datatree(netcdf, engine="h5netcdf") as tree:
         predicted, observed = tree["posterior_predictive"]["Vsc"].values, tree["observed_data"]["Vsc"].values
     low, high = np.quantile(predicted.reshape(-1, observed.size), [0.05, 0.95], axis=0)
-    # 90 % but for the finite number of predictions; binomial sd of the share is 0.5 %
+    # 90 % up to the finite number of predictions; the binomial sd of the fraction is 0.5 %
     assert np.mean((low < observed) & (observed < high)) == pytest.approx(0.9, abs=0.025)
 
 

@@ -17,7 +17,7 @@ from tests.conftest import square_record
 
 
 def test_log_normal_prior_along_the_blind_direction(finger_posterior: fitact.Posterior, finger_fit: fitact.Fit):
-    """The ridge is a line in the logs, the priors normal along it: precision and mean add up."""
+    """Points with equal g and b form a line in logarithms, on which the precisions and means of the priors add up."""
     prior, along = finger_fit.likelihood.prior, np.array([-1.0, 1.0, 1.0])
     precision = np.sum((along / prior.log_sd) ** 2)
     logs = {
@@ -49,7 +49,7 @@ def test_convergence_is_what_it_says(finger_posterior: fitact.Posterior):
     assert set(c.tau) == set(c.ess) == {*finger_posterior.fit.point_names, "g", "b", "force_mean"}
     assert c.ess_min == min(c.ess.values())
     assert c.seconds > 0.0
-    assert c.tau_max < 5.0  # the moves that know the fit
+    assert c.tau_max < 5.0  # the moves that draw from the fit
     assert c.acceptance > 0.6
 
 
@@ -61,7 +61,7 @@ def short(fit: fitact.Fit, seed: int, **settings) -> fitact.Posterior:
 
 @pytest.fixture
 def endless(monkeypatch):
-    """No chain counts as converged."""
+    """Replace the diagnosis, so that no chain converges."""
     never = functools.partial(ensemble.diagnose_chain, criteria=Criteria(rhat=0.0))
     monkeypatch.setattr(ensemble, "diagnose_chain", never)
 
@@ -118,7 +118,7 @@ def test_interrupted_sampling_keeps_what_there_is(finger_fit: fitact.Fit, tmp_pa
 
     def interrupted(self, *args, **kwargs):
         calls.append(1)
-        if len(calls) == 120:  # of some 240: three in ten of 200 steps of 4 ensembles
+        if len(calls) == 120:  # of about 240 calls: 3 in 10 of 200 steps of 4 ensembles
             signal.raise_signal(signal.SIGINT)
         return step(self, *args, **kwargs)
 
@@ -135,7 +135,7 @@ def test_interrupted_sampling_keeps_what_there_is(finger_fit: fitact.Fit, tmp_pa
 
 
 def test_an_interrupt_between_rounds_is_not_lost(finger_fit: fitact.Fit, monkeypatch):
-    """Also within a weak reference's callback, where Python drops what is raised; JAX has many."""
+    """Also within the callback of a weak reference, where Python drops exceptions; JAX has many."""
     diagnose = ensemble._Run.diagnose
 
     def interrupted(self):
@@ -172,7 +172,7 @@ def test_log_probability_is_minus_infinity_for_nonsense(finger_fit: fitact.Fit):
 
 
 def test_sampling_passes_over_nonsense(finger_fit: fitact.Fit, monkeypatch):
-    """A log-probability that is NaN or +inf in places: emcee would end, or its walkers stick there."""
+    """A log-probability with NaN or +inf: emcee would stop, or walkers would be stuck there."""
     log_prob = certificate.batched_log_prob
 
     def broken(likelihood, walkers):

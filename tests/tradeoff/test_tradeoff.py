@@ -1,4 +1,4 @@
-"""The trade-off: Pareto's definition by brute force, errors against scipy and normal laws, the picture's labels."""
+"""The trade-off: the Pareto front by brute force, errors against scipy and normal distributions, labels of the plot."""
 
 import itertools
 import json
@@ -33,7 +33,7 @@ def test_front_is_that_of_the_definition(pairs: list[tuple[int, int]]):
         assert (by is None) == (not any(dominates(other, pair) for other in pairs))
         if by is not None:
             assert dominates(pairs[by], pair)
-            assert found[by] is None  # itself on the front
+            assert found[by] is None  # the dominating method is itself on the front
             rivals = [other for other in pairs if dominates(other, pair)]
             assert pairs[by][0] == min(cost for cost, _ in rivals)
 
@@ -43,7 +43,7 @@ def test_an_error_that_is_no_number_is_on_no_front():
 
 
 def test_differences_are_in_standard_deviations_of_the_reference():
-    """Of normal samples moved by 0.5 sd and widened by 1.2: quantiles move by 0.5 + 0.2 z."""
+    """Normal samples shifted by 0.5 sd and widened by 1.2: quantiles move by 0.5 + 0.2 z."""
     z = np.random.default_rng(0).standard_normal(200_001)
     off = timings.posterior_discrepancies({"Rsc": 3.0 + 2.0 * (0.5 + 1.2 * z)}, {"Rsc": 3.0 + 2.0 * z})
     expected = {"mean": 0.5, "sd": 0.2, "q05": 0.5 - 0.2 * 1.644854, "q50": 0.5, "q95": 0.5 + 0.2 * 1.644854}
@@ -78,12 +78,12 @@ def test_errors_of_responses_against_scipy(fit: fitact.Fit, responses: dict[str,
     voltage = np.where(np.arange(time.size) % per_period < per_period // 2, 180.0, -180.0)
     last = slice(12 * per_period, None)
     exact, ramps = (skin_voltage(time, voltage, *circuit, hold=hold)[last] for hold in (True, False))
-    # straight lines between samples, but for the first, which has the ideal edge behind it
+    # linear between samples, except before the first, which follows an ideal edge
     error = np.sqrt(np.mean((ramps - exact)[per_period // 2 :] ** 2)) / np.sqrt(np.mean(exact**2))
     assert responses["recurrence"].error == pytest.approx(error, rel=0.2)
     assert responses["ODE (scipy)"].error == pytest.approx(responses["recurrence"].error, rel=0.05)
 
-    order = np.arange(1, 200_001, 2)  # of a square, by Parseval
+    order = np.arange(1, 200_001, 2)  # odd harmonics of a square, by Parseval
     R, C, Ci = circuit
     gain = scipy.signal.freqs([R * Ci, 0.0], [R * (2.0 * Ci + C), 1.0], 200.0 * np.pi * order)[1]
     power = np.abs(gain / order) ** 2
@@ -99,7 +99,7 @@ def test_costs_of_responses_are_told(responses: dict[str, timings.BenchmarkResul
     for name in ("exact", "float32", "recurrence", "harmonic(10)"):
         assert responses[name].gradient_seconds > 0.0
         assert responses[name].compile_seconds > 0.0
-        assert responses[name].memory >= 4000 * (4 if name == "float32" else 8)  # the answer alone
+        assert responses[name].memory >= 4000 * (4 if name == "float32" else 8)  # memory of the result alone
     assert responses["harmonic(1000)"].seconds > 5.0 * responses["harmonic(10)"].seconds
 
 
