@@ -70,7 +70,7 @@ KEYS: Table = {
     "friction": dict.fromkeys(("coefficient", "normal_force"), IgnoredKey()),
     "prior": dict.fromkeys(_PRIORS.split(), IgnoredKey()),
     "force": {"model": IgnoredKey()},
-    "perception": dict.fromkeys(("threshold_force", "friction_change"), IgnoredKey()),
+    "perception": dict.fromkeys(("threshold_force", "friction_change", "source"), IgnoredKey()),
     "population": dict.fromkeys(
         ("contact_area", "skin_thickness_relative_sd", "insulator_thickness_relative_sd"), IgnoredKey()
     ),

@@ -1,4 +1,4 @@
-"""Who a panel is designed for: fingers of a population's laws, or of a scene's prior."""
+"""The fingers that a drive is designed for: drawn from a fitted population, or from the scene's prior."""
 
 import dataclasses
 from typing import Any, Self
@@ -17,33 +17,37 @@ from fitact.scene.scene import Scene
 
 @dataclasses.dataclass(frozen=True)
 class FingerSample:
-    """Fingers under each of some laws that people may follow."""
+    """Fingers of each of some samples of the population parameters.
 
-    values: dict[
-        str, Float[np.ndarray, "laws fingers"]
-    ]  # SI: Rsc, Csc, Ci and whatever else is believed of the circuit
-    source: str  # for people to read
-    trusted: bool = True  # whether nothing stands against them
+    Attributes:
+        values: Rsc, Csc, Ci and other free parameters of the circuit, SI.
+        source: description of the fingers for people.
+        trusted: whether the population fit is reliable.
+    """
+
+    values: dict[str, Float[np.ndarray, "laws fingers"]]
+    source: str
+    trusted: bool = True
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Laws, fingers of each."""
+        """Number of population samples, and of fingers in each."""
         laws, fingers = self.values[SHARED_PARAMETER].shape
         return laws, fingers
 
     @property
     def has_separate_uncertainty(self) -> bool:
-        """Whether how people differ is told apart from what is not known of them."""
+        """Whether variability between fingers is separated from uncertainty of the population parameters."""
         return self.shape[0] > 1
 
     @classmethod
     def from_population(
         cls, population: Population, scene: Scene, seed: int = 0, laws: int = 512, fingers: int = 128
     ) -> Self:
-        """Draw fingers to come; an area that varies scales both capacitances up and the resistance down.
+        """Draw new fingers from a population; a larger contact area raises both capacitances and lowers Rsc.
 
-        What the scene holds or ties to these follows; all else is the scene's. Sobol's sequence, which spreads the
-        `fingers` evenly within each of `laws` and over all, wants powers of 2 of both.
+        Parameters that the scene fixes or ties follow; all others are the scene's. One Sobol sequence covers all
+        fingers, and each population sample evenly if `laws` and `fingers` are powers of 2.
         """
         uniform = scipy.stats.qmc.Sobol(3, rng=np.random.default_rng([seed, 2])).random(laws * fingers)
         z = scipy.special.ndtri(uniform).reshape(laws, fingers, 3)
@@ -58,7 +62,7 @@ class FingerSample:
 
     @classmethod
     def from_prior(cls, scene: Scene, seed: int = 0, fingers: int = 4096) -> Self:
-        """Draw fingers that the scene believes possible, which stand for people and for ignorance alike."""
+        """Draw fingers from the scene's prior, which mixes variability between fingers with lack of knowledge."""
         values = {name: x[None] for name, x in sample_prior(scene, np.random.default_rng(seed), fingers).items()}
         nominal = {name: np.full((1, fingers), scene.nominal_values()[name]) for name in (*SKIN, SHARED_PARAMETER)}
         return cls(_circuit_values(nominal | values), "the scene's prior")

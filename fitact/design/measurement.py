@@ -1,4 +1,4 @@
-"""Which measurement would tell most of the mean force: what a user may change, the errors to expect, in order."""
+"""Changes of a measurement, ranked by the expected uncertainty of the mean force."""
 
 import contextlib
 import dataclasses
@@ -25,30 +25,30 @@ from fitact.scene.scene import Scene
 from fitact.tables import align_row, join_lines
 from fitact.units import format_percent
 
-_MIN_GAIN = math.log(1.01)  # from which an option counts as telling more
+_MIN_GAIN = math.log(1.01)  # smallest gain that counts as an improvement
 
 
 @dataclasses.dataclass(frozen=True)
 class SettingCurve:
-    """How well the mean force is known along one setting, samples and edges keeping their place in the period."""
+    """Expected uncertainty of the mean force along one setting; samples and edges keep their phase in the period."""
 
     setting: str
-    unit: str  # of its values
+    unit: str
     values: tuple[float, ...]  # SI
     force_sd: tuple[float, ...]  # as in `DesignOption`
 
 
 @dataclasses.dataclass(frozen=True)
 class MeasurementDesign:
-    """Measurements that might be made, and how well the mean force would then be known.
+    """Possible changes of a measurement, and the expected uncertainty of the mean force.
 
     Attributes:
-        now: the measurement as it stands.
-        options: what might be changed, the smallest error of the force first.
-        curves: along the settings that can have any value.
+        now: measurement as it stands.
+        options: changed measurements, the smallest uncertainty of the force first.
+        curves: uncertainty along the continuous settings.
         prior_force_sd: standard deviation of the log mean force before any measurement.
-        trusted: whether nothing stands against the fit of the records; true without records.
-        warnings: sentences.
+        trusted: whether the fit of the records is reliable; true without records.
+        warnings: sentences on conditions that may change the result.
     """
 
     now: DesignOption
@@ -60,7 +60,7 @@ class MeasurementDesign:
 
     @property
     def best_for_effort(self) -> DesignOption | None:
-        """The option that gives most for its effort; None where nothing gains one part in a hundred."""
+        """Option with the largest gain per effort; None if no option gains 1 %."""
         return max(self._informative_options, key=lambda option: option.gain_per_effort, default=None)
 
     @property
@@ -68,7 +68,7 @@ class MeasurementDesign:
         return tuple(option for option in self.options if option.gain > _MIN_GAIN)
 
     def to_dict(self) -> dict[str, Any]:
-        """The content of design.json."""
+        """Return the content of design.json."""
         best = self.best_for_effort
         return {
             "now": self.now.to_dict(),
@@ -81,13 +81,13 @@ class MeasurementDesign:
         }
 
     def __str__(self) -> str:
-        """The table for people, what gives most for its effort, and what gives nothing."""
+        """Return the table for people, the option with the largest gain per effort, and the options without gain."""
         rows = [align_row(("", *cells, f"  {text}"), (0, 10, 13, 8, 13, 0)) for text, *cells in self.table]
         return join_lines([*rows, *self.sentences], self.warnings)
 
     @property
     def table(self) -> tuple[tuple[str, ...], ...]:
-        """Titles; then what each option that tells more, and the measurement as it stands, tell of the force."""
+        """Titles, then rows of the options that gain and of the measurement as it stands."""
         rows = [("", "mean force", "contraction", "effort", "gain/effort")]
         for option in (*self._informative_options, self.now):
             cost = (f"{option.effort:.3g}", f"{option.gain_per_effort:.2f}") if option.effort else ("", "")
@@ -96,52 +96,52 @@ class MeasurementDesign:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """The option that gives most for its effort, and those that give nothing."""
+        """The option with the largest gain per effort, and the options without gain."""
         best, others = self.best_for_effort, [o.name for o in self.options if o not in self._informative_options]
         sentences = []
         if best is not None:
             errors = f"from ± {format_percent(self.now.force_sd)} to ± {format_percent(best.force_sd)}"
-            sentences.append(f"Most for its effort: {best.text}, {errors}.")
+            sentences.append(f"Largest gain per effort: {best.text}; uncertainty of the mean force {errors}.")
         if others:
-            sentences.append(f"Nothing is gained by: {', '.join(others)}.")
+            sentences.append(f"No gain from: {', '.join(others)}.")
         return tuple(sentences)
 
 
 def design_measurement(scene: Scene, records: Record | Sequence[Record] = ()) -> MeasurementDesign:
-    """Find what might be measured in place of a scene's measurement, and how well its mean force would be known.
+    """Rank changes of a scene's measurement by the expected uncertainty of the mean force.
 
-    The force is that of the scene's circuit and drive, whatever they are changed to for the measurement. Settings
-    that can have any value are optimised. Errors are those of the Laplace approximation, with neither offset,
-    drift, delay nor charge unknown.
+    The force is always the one of the scene's circuit and drive; the changes apply to the measurement only. Continuous
+    settings are optimized. Uncertainties come from the Laplace approximation, with no unknown offset, drift, delay or
+    initial charge.
 
     Args:
-        scene: the measurement as it stands.
-        records: made in it; the values and noises of their joint fit stand for the scene's. Of several, the first
-            is taken to be repeated.
+        scene: measurement as it stands.
+        records: records of it; their joint fit replaces the scene's values and noise. Of several records, the first is
+            the one that is changed.
 
     Raises:
-        InputError: the scene frees no parameter, or gives no noise, or no drive and there is no record; as
-            `fitact.fit`; or the fit ended where nothing can be computed.
+        InputError: the scene frees no parameter, states no noise, or states no drive and there is no record; as
+            `fitact.fit`; or the fit ended at values that cannot be computed with.
     """
     records = (records,) if isinstance(records, Record) else tuple(records)
     if records:
         fitted = fit(records, scene)
         experiment, gradient = fitted.experiment, _force_gradient(fitted)
-        # the least difference between a record's values: the step of its converter, or less
+        # the smallest difference between a record's values is the LSB of its ADC, or less
         steps = {name: float(np.diff(np.unique(records[0][name])).min()) for name in experiment.channels}
         judgement = fitted.trusted, (*([] if fitted.trusted else [fitted.message]), *fitted.warnings)
     else:
         experiment, judgement = experiment_from_scene(scene), (True, ())
         gradient = force_gradient(experiment)
-        # of an ordinary oscilloscope's converter of 8 bit
+        # an ordinary oscilloscope has an ADC of 8 bits
         steps = {channel: span / 256 for channel, span in signal_spans(experiment).items()}
     trial = CandidateDesign((experiment,))
     try:
         now = dataclasses.replace(evaluate_design(trial, (), gradient), name="now", text="as it stands")
     except np.linalg.LinAlgError as error:
         raise InputError(
-            f"what is recorded cannot be computed with at these values ({error}); check the scene's, or first get a"
-            " fit of the record that is trusted"
+            f"the information of the records cannot be computed at these values ({error}); check the scene's values,"
+            " or first get a reliable fit of the record"
         ) from error
     options, curves = _rank_options(trial, gradient, now, changes(steps))
     prior_sd = float(np.linalg.norm(gradient @ experiment.prior_factor))
@@ -149,7 +149,7 @@ def design_measurement(scene: Scene, records: Record | Sequence[Record] = ()) ->
 
 
 def experiment_from_scene(scene: Scene) -> Experiment:
-    """Make the measurement that a scene states, at its own values."""
+    """Make the experiment that a scene states, at its own values."""
     scene.require_available()
     measured, prior, nominal = scene.measurement, scene.make_prior(), scene.nominal_values()
     values = {name: math.exp(prior[name].log_mean) for name in prior.names if nominal[name] is None}
@@ -159,14 +159,12 @@ def experiment_from_scene(scene: Scene) -> Experiment:
     noise = {"Vsc": measured.noise_Vsc, "I": measured.noise_I}
     silent = [channel for channel in measured.channels if noise[channel] == 0.0]
     if silent:
-        raise InputError(
-            f"scene: [measurement] noise_{silent[0]} is 0, and without noise every sample tells all; give the noise"
-        )
+        raise InputError(f"scene: [measurement] noise_{silent[0]} is 0, so the data would be exact; state the noise")
     if not prior.names:
-        raise InputError("scene: [prior] frees no parameter, so there is nothing to learn; give one a prior")
+        raise InputError("scene: [prior] frees no parameter, so there is nothing to estimate; give a parameter a prior")
     circuit = scene.make_circuit(values)
     if isinstance(circuit, WithSkin) and isinstance(circuit.skin, Dispersive):
-        # counted now, since what is compiled has its frequency traced
+        # the number of harmonics must be known before compilation
         skin = Dispersive(circuit.skin.harmonic_count(scene.drive.lowest_frequency))
         circuit = dataclasses.replace(circuit, skin=skin)
     prior = prior.drop_marginals(*(name for name in prior.names if name not in circuit_parameters(circuit)))
@@ -188,7 +186,7 @@ def experiment_from_scene(scene: Scene) -> Experiment:
 
 
 def _force_gradient(fit_result: Fit) -> Float[np.ndarray, " circuit_parameters"]:
-    """Differentiate the logarithm of a fit's mean force by the free parameters of its experiment."""
+    """Return the gradient of a fit's log mean force in the free parameters of its experiment."""
     columns = [fit_result.names.index(name) for name in fit_result.experiment.free]
     return fit_result.laplace.log_gradient("force_mean")[columns]
 
@@ -199,7 +197,7 @@ def _rank_options(
     baseline: DesignOption,
     candidates: Sequence[Change],
 ) -> tuple[tuple[DesignOption, ...], tuple[SettingCurve, ...]]:
-    """Evaluate each change's option, and that of the best two together, best first; and curves along one setting."""
+    """Evaluate each change, and the best two together, best first; also return curves along one setting."""
     evaluated = {
         change.name: result
         for change in candidates
@@ -217,7 +215,7 @@ def _rank_options(
 
 
 def _combine_changes(trial: CandidateDesign, first: Change, second: Change) -> CandidateDesign | None:
-    """Make both changes; None where neither can be made after the other."""
+    """Make both changes, or return None if neither can follow the other."""
     for one, other in ((first, second), (second, first)):
         changed = one(trial)
         changed = None if changed is None else other(changed)
@@ -229,7 +227,7 @@ def _combine_changes(trial: CandidateDesign, first: Change, second: Change) -> C
 def _evaluate_best_settings(
     trial: CandidateDesign | None, gradient: Float[np.ndarray, " circuit_parameters"], baseline: DesignOption
 ) -> tuple[DesignOption, SettingCurve | None] | None:
-    """Evaluate a trial at its best settings; None where it cannot be made, or computed."""
+    """Evaluate a design at its best settings, or return None if it cannot be made or computed."""
     if trial is None:
         return None
     with contextlib.suppress(np.linalg.LinAlgError):

@@ -1,8 +1,8 @@
-"""Blind directions, which no record can tell: combinations of parameters that leave what the channels show as it is.
+"""Unidentified directions: combinations of parameters that no record of the channels determines.
 
-Found from the model. A record without noise, of every frequency, shows each channel's gain over V as a function
-of frequency, and no more; a direction in the log-parameters along which none of these gains changes is seen by
-no record. The first derivatives of the gains' logarithms know it: it is their null space.
+They follow from the model. A noise-free record of all frequencies determines the gain of each channel over V as a
+function of frequency, and nothing else. A direction in the log-parameters that changes none of these gains is not
+identified. Such directions are the null space of the first derivatives of the gains' logarithms.
 """
 
 import dataclasses
@@ -20,25 +20,32 @@ from fitact.errors import InputError
 from fitact.model.circuit import Channel, Circuit
 from fitact.model.skin import circuit_parameters, constant_skin_circuit, with_values
 
-_MIN_SINE = 1e-6  # of the angle between directions, below which they count as one
+_MIN_SINE = 1e-6  # sine of the angle between directions below which they count as equal
 
 
 @dataclasses.dataclass(frozen=True)
 class StructuralIdentifiability:
-    """The directions that no record of these channels can see."""
+    """Directions that no record of these channels determines.
 
-    names: tuple[str, ...]  # the free parameters
-    channels: tuple[Channel, ...]  # recorded beside V
-    directions: Float[np.ndarray, "dimension parameters"]  # unit vectors in the log-parameters, at the circuit's values
-    is_constant: bool  # whether they are the same for all values; if not, the ridges of equal answers curve
+    Attributes:
+        names: free parameters.
+        channels: channels recorded in addition to V.
+        directions: unit vectors in the log-parameters, at the circuit's values.
+        is_constant: whether the directions are the same for all values.
+    """
+
+    names: tuple[str, ...]
+    channels: tuple[Channel, ...]
+    directions: Float[np.ndarray, "dimension parameters"]
+    is_constant: bool
 
     @property
     def dimension(self) -> int:
-        """How many independent combinations cannot be told."""
+        """Number of independent combinations that are not identified."""
         return len(self.directions)
 
     def contains(self, direction: dict[str, float], *, max_sine: float = 0.1) -> bool:
-        """Whether a direction in some of the log-parameters is one of those, whatever the others do along it."""
+        """Return whether a direction in some of the log-parameters is unidentified, for any change of the others."""
         if self.dimension == 0:
             return False
         part = self.directions[:, [self.names.index(name) for name in direction]]
@@ -47,24 +54,24 @@ class StructuralIdentifiability:
     def __str__(self) -> str:
         channels = " and ".join(self.channels)
         if self.dimension == 0:
-            return f"A record of {channels} can tell {', '.join(self.names)}."
+            return f"A record of {channels} can determine {', '.join(self.names)}."
         what = "; ".join(name_direction(dict(zip(self.names, row, strict=True))) for row in self.directions)
-        here = "" if self.is_constant else " (the direction at these values; elsewhere it differs)"
-        return f"No record of {channels}{' alone' * (len(self.channels) == 1)} can tell {what}{here}."
+        here = "" if self.is_constant else " (direction at these values; elsewhere it differs)"
+        return f"No record of {channels}{' alone' * (len(self.channels) == 1)} can determine {what}{here}."
 
 
 def blind_directions(
     circuit: Circuit, free: Sequence[str], channels: Sequence[Channel], points: int = 8
 ) -> StructuralIdentifiability:
-    """The directions in the logarithms of `free` that no record of `channels` can see.
+    """Find the directions in the logarithms of `free` that no record of `channels` determines.
 
-    `free` names fields of the circuit, "gain" (of the channel Vsc) and "gain_I"; all else is known. A direction
-    counts if it is blind at the circuit's values, which may be special (two equal skins), and at `points` at random
-    around it, each up to a factor of 10 away.
+    `free` names fields of the circuit, "gain" (of the channel Vsc) and "gain_I"; all else is known. The circuit's
+    values may be special (two equal skins). A direction therefore counts only if it is unidentified there and at
+    `points` random values around them, each up to a factor of 10 away.
     """
     free, channels = tuple(free), tuple(channels)
-    spread = np.array([0.1 if name == "alpha" else math.log(10.0) for name in free])  # 1 bounds alpha
-    offsets = spread * np.random.default_rng(0).uniform(-1.0, 1.0, (points, len(free)))  # any points would do
+    spread = np.array([0.1 if name == "alpha" else math.log(10.0) for name in free])  # alpha is at most 1
+    offsets = spread * np.random.default_rng(0).uniform(-1.0, 1.0, (points, len(free)))  # any other points would serve
     thetas = log_values(circuit, free, channels) + np.vstack([np.zeros(len(free)), offsets])
     with jax.enable_x64(True):
         circuit = jax.tree.map(jnp.asarray, circuit)
@@ -80,7 +87,7 @@ def blind_directions(
 
 
 def gain_names(channels: Sequence[Channel]) -> dict[str, Channel]:
-    """The channels by the names that their gains have where they are free."""
+    """Return the channels by the parameter names of their gains."""
     names: dict[str, Channel] = {"gain": "Vsc", "gain_I": "I"}
     return {name: channel for name, channel in names.items() if channel in channels}
 
@@ -88,7 +95,7 @@ def gain_names(channels: Sequence[Channel]) -> dict[str, Channel]:
 def log_values(
     circuit: Circuit, free: Sequence[str], channels: Sequence[Channel]
 ) -> Float[np.ndarray, " circuit_parameters"]:
-    """Logarithms of the parameters `free`, those of the circuit and gains of these channels; a gain is 1."""
+    """Return the logarithms of the parameters `free`: of the circuit, and of the channels' gains, which are 1."""
     gains = dict.fromkeys(gain_names(channels), 1.0)
     known = gains | {name: float(value) for name, value in circuit_parameters(circuit).items() if value is not None}
     for name in free:
@@ -103,7 +110,7 @@ def log_values(
 def with_parameters(
     circuit: Circuit, free: Sequence[str], channels: Sequence[Channel], theta: Float[Array, " circuit_parameters"]
 ) -> tuple[Circuit, list[ArrayLike]]:
-    """The circuit and the gain of each channel where the parameters `free` have the logarithms `theta`."""
+    """Return the circuit and the gain of each channel for logarithms `theta` of the parameters `free`."""
     values = dict(zip(free, jnp.exp(theta), strict=True))
     named = gain_names(channels)
     gains = {named[name]: values.pop(name) for name in free if name in named}
@@ -116,13 +123,13 @@ def name_direction(direction: dict[str, float]) -> str:
     along = sum(power * direction[name] for name, power in area.items())
     if abs(along) > 0.99 * np.sqrt(len(area)) * np.linalg.norm(list(direction.values())):
         scaled = [name if power > 0.0 else f"1/{name}" for name, power in area.items()]
-        return f"the contact area, which scales {', '.join(scaled[:-1])} and {scaled[-1]} alike"
+        return f"the contact area, which multiplies {', '.join(scaled[:-1])} and {scaled[-1]} by a common factor"
     moves = ", ".join(f"{name} {value:+.2g}" for name, value in direction.items() if abs(value) > 1e-3)
     return f"the combination ({moves})"
 
 
 def _area_power(name: str) -> float:
-    """Return the power of the contact area that a circuit's parameter goes with: R ~ 1/A, C ~ A."""
+    """Return the exponent of the contact area in a circuit's parameter: -1 for R, 1 for C."""
     return 1.0 if name == "Ci" or name.endswith(("Csc", "capacitance", "Cgap")) else -1.0
 
 
@@ -135,7 +142,7 @@ def _log_gain_slopes(
     frequencies: int = 128,
     margin: float = 100.0,
 ) -> Complex[Array, "n rows parameters"]:
-    """Derivatives of the channels' log gains, at frequencies `margin` times beyond the circuit's own at both ends."""
+    """Return derivatives of the log gains, at frequencies up to `margin` times beyond the circuit's at both ends."""
 
     def slopes(theta: Array) -> Array:
         tau = jnp.stack(constant_skin_circuit(with_parameters(circuit, free, channels, theta)[0]).terms().tau)
@@ -155,12 +162,12 @@ def _log_gain_slopes(
 def _null_space(
     sensitivity: Float[np.ndarray, "rows parameters"], rounding: float = 1e-11, gap: float = 1e-3
 ) -> Float[np.ndarray, "dimension parameters"]:
-    """An orthonormal basis of the directions without effect.
+    """Return an orthonormal basis of the directions without effect.
 
-    Of the largest singular value rounding leaves 1e-15, and what is real lies above 1e-5: those below `rounding` count
-    as 0 if they lie below `gap` times the others; without that gap nothing is called structural. The frequencies reach
-    all corners of the circuit, so that even the smallest resistance has its effect at some; what is left of the
-    parameters' different sizes, the scaling to columns of one length takes out.
+    Relative to the largest singular value, rounding leaves 1e-15, and real effects lie above 1e-5. Values below
+    `rounding` count as 0 if they lie below `gap` times the others; without that gap no direction is structural. The
+    frequencies cover all corner frequencies of the circuit, so even the smallest resistance has an effect at some.
+    Columns are scaled to one length, which removes the parameters' different sizes.
     """
     scale = np.linalg.norm(sensitivity, axis=0)
     scale = np.where(scale > 0.0, scale, 1.0)
@@ -174,17 +181,17 @@ def _null_space(
 def _subspace_distance(
     directions: Float[np.ndarray, "n parameters"], others: Float[np.ndarray, "m parameters"]
 ) -> float:
-    """Sine of the largest angle by which `others` stand out of the space of `directions`."""
-    inside = others @ np.linalg.pinv(directions, rcond=1e-6) @ directions  # parts of directions may be parallel
+    """Return the sine of the largest angle between `others` and the space of `directions`."""
+    inside = others @ np.linalg.pinv(directions, rcond=1e-6) @ directions  # projected directions may be parallel
     return float(np.linalg.norm((others - inside) / np.linalg.norm(others, axis=1, keepdims=True), 2))
 
 
 def _sparse_basis(basis: Float[np.ndarray, "dimension parameters"]) -> Float[np.ndarray, "dimension parameters"]:
-    """Unit vectors of the same space that move few parameters each, the circuit's own first: a reduced echelon form."""
+    """Return unit vectors of the same space that change few parameters each: a reduced echelon form."""
     rows = basis.copy()
     for i in range(len(rows)):
         largest = np.max(np.abs(rows[i:]), axis=0)
-        pivot = np.flatnonzero(largest > 0.5 * largest.max())[-1]  # of those that move much, the last
+        pivot = np.flatnonzero(largest > 0.5 * largest.max())[-1]  # the last parameter with a large component
         best = i + int(np.argmax(np.abs(rows[i:, pivot])))
         rows[[i, best]] = rows[[best, i]]
         rows[i] /= rows[i, pivot]

@@ -1,4 +1,4 @@
-"""A measurement that might be made: its records, and what it would tell."""
+"""A candidate measurement: its records and its expected uncertainties."""
 
 import dataclasses
 import math
@@ -19,29 +19,29 @@ from fitact.units import format_engineering
 class Setting:
     """A quantity that can be set to any value within bounds."""
 
-    name: str  # its own in the candidate
-    field: str  # of the circuit, or `FREQUENCY`
+    name: str  # unique in the candidate
+    field: str  # field of the circuit, or `FREQUENCY`
     unit: str
-    start: float  # where it stands
+    start: float  # present value
     low: float
     high: float
-    experiment_indices: tuple[int, ...] = (0,)  # which of the candidate's experiments have it
+    experiment_indices: tuple[int, ...] = (0,)  # experiments of the candidate with this setting
 
 
 @dataclasses.dataclass(frozen=True)
 class CandidateDesign:
-    """A measurement that might be made of one finger."""
+    """A candidate measurement of one finger."""
 
-    experiments: tuple[Experiment, ...]  # its records; they share the free parameters, but for those of their own
+    experiments: tuple[Experiment, ...]  # records; they share the free parameters, except each one's own
     settings: tuple[Setting, ...] = ()  # still to be chosen
-    names: tuple[str, ...] = ()  # of the changes that lead to it
-    texts: tuple[str, ...] = ()  # the same in words, with a place for each setting
-    effort: float = 0.0  # what they cost together (docs/design_measurement.md)
+    names: tuple[str, ...] = ()  # names of the changes
+    texts: tuple[str, ...] = ()  # changes in words, with a placeholder for each setting
+    effort: float = 0.0  # total effort of the changes (docs/design_measurement.md)
 
     def make_experiments(self, values: Sequence[float], *, keep_phase: bool = False) -> tuple[Experiment, ...]:
-        """The experiments with their settings at `values`.
+        """Return the experiments with their settings at `values`.
 
-        `keep_phase`: samples and edges stay where they are in the period, so that no frequency makes them jump.
+        With `keep_phase`, samples and edges keep their phase in the period, so the result is smooth in the frequency.
         """
         experiments = list(self.experiments)
         for setting, value in zip(self.settings, values, strict=True):
@@ -51,36 +51,36 @@ class CandidateDesign:
 
     @property
     def start_values(self) -> tuple[float, ...]:
-        """Where the settings stand."""
+        """Present values of the settings."""
         return tuple(setting.start for setting in self.settings)
 
     def describe(self, values: Sequence[float]) -> str:
-        """The changes in words."""
+        """Return the changes in words."""
         shown = [format_engineering(v, setting.unit) for v, setting in zip(values, self.settings, strict=True)]
         return " and ".join(self.texts).format(*shown)
 
 
 @dataclasses.dataclass(frozen=True)
 class DesignOption:
-    """A candidate at its best settings, and the errors to expect of it."""
+    """A candidate at its best settings, with its expected uncertainties."""
 
-    name: str  # of what is done
-    text: str  # that in words
-    settings: dict[str, float]  # the values chosen, SI
-    effort: float  # of it, where turning a knob of an instrument that is there is 1
-    force_sd: float  # standard deviation of the mean force, in its logarithm; small, it is the relative one
-    contraction: float  # 1 - that over the prior's
-    sd: dict[str, float]  # of the parameters, in their logarithms
-    contractions: dict[str, float]  # of those
-    gain: float  # logarithm of the force_sd now over this one
+    name: str
+    text: str  # description in words
+    settings: dict[str, float]  # chosen values, SI
+    effort: float  # 1 means changing a setting of an existing instrument
+    force_sd: float  # standard deviation of the log mean force; relative uncertainty where it is small
+    contraction: float  # 1 - force_sd / its value before any measurement
+    sd: dict[str, float]  # standard deviations of the log-parameters
+    contractions: dict[str, float]  # 1 - sd / prior sd of the log-parameters
+    gain: float  # ln(present force_sd / this force_sd)
 
     @property
     def gain_per_effort(self) -> float:
-        """The gain over the effort; 0 of none."""
+        """Gain per effort; 0 without effort."""
         return self.gain / self.effort if self.effort else 0.0
 
     def to_dict(self) -> dict[str, Any]:
-        """An entry of design.json."""
+        """Return an entry of design.json."""
         return dataclasses.asdict(self) | {"gain_per_effort": self.gain_per_effort}
 
 
@@ -90,10 +90,13 @@ def evaluate_design(
     gradient: Float[np.ndarray, " parameters"],
     baseline_sd: float | None = None,
 ) -> DesignOption:
-    """A candidate with its settings at `values`, rounded; numpy.linalg.LinAlgError where no double holds its records.
+    """Evaluate a candidate with its settings at `values`, rounded to three digits.
 
-    `gradient` is that of the logarithm of the force asked for, in the logarithms of the first experiment's free
-    parameters; `baseline_sd` its standard deviation without any change.
+    `gradient` is the gradient of the log force in the first experiment's free log-parameters; `baseline_sd` is the
+    standard deviation of the log force without any change.
+
+    Raises:
+        numpy.linalg.LinAlgError: the records have values beyond double precision.
     """
     values = [float(f"{value:.3g}") for value in values]
     experiments = design.make_experiments(values)
@@ -117,7 +120,7 @@ def evaluate_design(
 def joint_jacobian(
     experiments: Sequence[Experiment], settings: Sequence[Setting] = ()
 ) -> Float[np.ndarray, "1+settings rows parameters"]:
-    """The `jacobian` of experiments on one finger: the parameters of their own come after the shared ones."""
+    """Return the `jacobian` of experiments on one finger; each one's own parameters follow the shared ones."""
     free, blocks = experiments[0].free, []
     next_own = len(free)
     total = next_own + sum(len(e.own_parameters) for e in experiments)
@@ -136,7 +139,7 @@ def joint_jacobian(
 
 
 def joint_prior_factor(experiments: Sequence[Experiment]) -> Float[np.ndarray, "parameters parameters"]:
-    """A root of the prior's covariance; parameters of an experiment's own are independent of the others."""
+    """Return a root of the prior's covariance; an experiment's own parameters are independent of the others."""
     own = [np.linalg.norm(e.prior_factor[e.free.index(name)]) for e in experiments for name in e.own_parameters]
     return scipy.linalg.block_diag(experiments[0].prior_factor, np.diag(own))
 
@@ -147,7 +150,7 @@ def _apply_setting(e: Experiment, field: str, value: float, keep_phase: bool) ->
     drive: Any = e.drive
     slower = float(drive.frequency) / value
     changed = dataclasses.replace(drive, frequency=value)
-    if not keep_phase:  # a slower drive needs a longer record for its periods, a faster one no shorter
+    if not keep_phase:  # a slower drive needs a longer record; a faster one keeps its length
         return dataclasses.replace(e, drive=changed, time=max(slower, 1.0) * e.time)
     if isinstance(drive, Trapezoid):
         changed = dataclasses.replace(changed, rise_time=slower * drive.rise_time)

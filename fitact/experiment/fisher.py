@@ -1,7 +1,7 @@
-"""The errors to expect of parameters and force from an experiment, before or after it is done.
+"""Expected uncertainties of parameters and force from an experiment, before or after it is done.
 
-From the Fisher information of the channels' noise and the prior, in the Laplace approximation, as a fit's own.
-Nothing else is taken to be unknown: no offset, drift, delay or charge at the start.
+They come from the Fisher information of the channels and the prior, in the same Laplace approximation as a fit. No
+offset, drift, delay or initial charge is taken to be unknown.
 """
 
 import dataclasses
@@ -24,30 +24,30 @@ from fitact.model.force import Geometry, force_constant
 from fitact.model.response import highpass, response_and_rate
 from fitact.model.skin import circuit_parameters, has_time_constants, limits_current, with_values
 
-FREQUENCY = "frequency"  # the drive's, as the name of a setting
-Ties: TypeAlias = tuple[tuple[str, str, float], ...]  # (name, other, ratio) of fields that follow another one
+FREQUENCY = "frequency"  # name of the setting for the drive's frequency
+Ties: TypeAlias = tuple[tuple[str, str, float], ...]  # (name, other, ratio): name = ratio * other
 
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """A measurement, as it was done or might be."""
+    """A measurement, made or planned."""
 
-    circuit: Circuit  # at the values to expect
-    free: tuple[str, ...]  # the unknown parameters: fields of the circuit, "gain" (of Vsc) and "gain_I"
-    prior_factor: Float[np.ndarray, "parameters parameters"]  # a root of the prior's covariance of their logarithms
+    circuit: Circuit  # at the expected values
+    free: tuple[str, ...]  # unknown parameters: fields of the circuit, "gain" (of Vsc) and "gain_I"
+    prior_factor: Float[np.ndarray, "parameters parameters"]  # root of the prior covariance of the log-parameters
     drive: Drive
-    time: Float[np.ndarray, " samples"]  # s, in the drive's time
-    channels: tuple[Channel, ...]  # recorded beside V
-    noise: Mapping[str, float]  # standard deviation of each channel's, V and A
-    steady_state: bool = True  # or from rest
-    records: float = 1.0  # how many such records there are
-    geometry: Geometry = Geometry()  # noqa: RUF009  (a frozen Module; of its areas nothing but factors depends)
-    own_parameters: tuple[str, ...] = ()  # of `free`, shared with no other experiment on the same finger
-    ties: Ties = ()  # of the circuit's fields
+    time: Float[np.ndarray, " samples"]  # s, on the drive's time axis
+    channels: tuple[Channel, ...]  # recorded in addition to V
+    noise: Mapping[str, float]  # standard deviation of each channel, V and A
+    steady_state: bool = True  # False means from rest
+    records: float = 1.0  # number of such records
+    geometry: Geometry = Geometry()  # noqa: RUF009  (a frozen Module; areas are factors only)
+    own_parameters: tuple[str, ...] = ()  # parameters in `free` that no other experiment shares
+    ties: Ties = ()  # between fields of the circuit
 
 
 def force_gradient(experiment: Experiment) -> Float[np.ndarray, " circuit_parameters"]:
-    """The derivative of the logarithm of the mean force that an experiment makes, in its log-parameters."""
+    """Return the gradient of the log mean force of an experiment in its log-parameters."""
     with jax.enable_x64(True):
         sampling, model = _sampling(experiment), _Model.from_experiment(experiment, experiment.free)
         ((voltage, slope),) = _derivatives(model, sampling, slice(-1, None))
@@ -57,10 +57,10 @@ def force_gradient(experiment: Experiment) -> Float[np.ndarray, " circuit_parame
 
 
 def jacobian(experiment: Experiment, settings: Sequence[str] = ()) -> Float[np.ndarray, "1+settings rows parameters"]:
-    """Differentiate what is recorded, over its noise; then the result by the logarithms of `settings`.
+    """Return the Jacobian of the signals in units of their noise, and its derivatives in the log of `settings`.
 
-    A setting is a field of the circuit, or `FREQUENCY`, in which each sample, and each edge, stays where it is in
-    the period. Settings need a circuit with time constants.
+    A setting is a field of the circuit or `FREQUENCY`, along which samples and edges keep their phase in the period.
+    Settings need a circuit with time constants.
     """
     e, names = experiment, tuple(dict.fromkeys([*experiment.free, *sorted(settings, key=FREQUENCY.__eq__)]))
     with jax.enable_x64(True):
@@ -76,7 +76,7 @@ def jacobian(experiment: Experiment, settings: Sequence[str] = ()) -> Float[np.n
 
 
 def signal_spans(experiment: Experiment) -> dict[Channel, float]:
-    """The range of each channel's samples, V and A, but for a current within edges."""
+    """Return the range of each channel's samples, V and A, without a current's samples at edges."""
     with jax.enable_x64(True):
         sampling, model = _sampling(experiment), _Model.from_experiment(experiment, experiment.free)
         signals = _derivatives(model, sampling, slice(-1))
@@ -87,11 +87,11 @@ def signal_spans(experiment: Experiment) -> dict[Channel, float]:
 def covariance_factor(
     jacobian: Float[np.ndarray, "samples parameters"], prior_factor: Float[np.ndarray, "parameters parameters"]
 ) -> Float[np.ndarray, "parameters parameters"]:
-    """A matrix whose product with its transpose is the Laplace approximation's covariance.
+    """Return the Cholesky factor of the covariance in the Laplace approximation.
 
-    `jacobian` is that of the whitened residuals, `prior_factor` a root of the prior's covariance. From singular
-    values: their squares span more digits than a number has. Of all such matrices it is the lower triangular one with a
-    positive diagonal, since rounding decides which way singular vectors point, and seeded draws would follow it.
+    `jacobian` is the Jacobian of the whitened residuals, `prior_factor` a root of the prior's covariance. Singular
+    values are used because their squares span more digits than a double has. The factor is lower triangular with a
+    positive diagonal, because rounding decides the sign of singular vectors, and seeded draws would depend on it.
     """
     _, sizes, directions = np.linalg.svd(jacobian @ prior_factor, full_matrices=False)
     _, triangle = np.linalg.qr((prior_factor @ directions.T / np.hypot(1.0, sizes)).T)
@@ -99,24 +99,24 @@ def covariance_factor(
 
 
 class _Model(eqx.Module):
-    """An experiment's circuit by the logarithms of parameters; what is tied follows."""
+    """An experiment's circuit as a function of log-parameters, with ties."""
 
     circuit: Circuit
-    theta: Float[Array, " parameters"]  # at which it stands
-    names: tuple[str, ...] = eqx.field(static=True)  # of the parameters; if `FREQUENCY` is one, it comes last
-    channels: tuple[Channel, ...] = eqx.field(static=True)  # recorded, and last that which makes the force
+    theta: Float[Array, " parameters"]  # present values
+    names: tuple[str, ...] = eqx.field(static=True)  # parameters; `FREQUENCY` comes last
+    channels: tuple[Channel, ...] = eqx.field(static=True)  # recorded channels, then the voltage that causes the force
     ties: Ties = eqx.field(static=True)
 
     @classmethod
     def from_experiment(cls, e: Experiment, names: tuple[str, ...]) -> "_Model":
         fields = [name for name in names if name != FREQUENCY]
         theta = np.append(log_values(e.circuit, fields, e.channels), np.zeros(len(names) - len(fields)))
-        circuit = jax.tree.map(jnp.asarray, e.circuit)  # plain numbers would be compiled in
+        circuit = jax.tree.map(jnp.asarray, e.circuit)  # plain numbers would become constants of the compiled program
         channels: tuple[Channel, ...] = (*e.channels, "Vsc" if e.geometry.model == "paper" else "Vgap")
         return cls(circuit, jnp.asarray(theta), names, channels, e.ties)
 
     def circuit_and_gains(self, theta: Array) -> tuple[Circuit, list[ArrayLike]]:
-        """The circuit, and the gain of each channel, at other values."""
+        """Return the circuit and the gain of each channel at `theta`."""
         fields = [name for name in self.names if name != FREQUENCY]
         circuit, gains = with_parameters(self.circuit, fields, self.channels[:-1], theta[: len(fields)])
         known = circuit_parameters(circuit)
@@ -124,7 +124,7 @@ class _Model(eqx.Module):
 
 
 def _derivatives(model: _Model, sampling: "_Sampling", selection: slice, order: int = 1) -> list[list[np.ndarray]]:
-    """The signal, and its derivatives in the parameters up to `order`, of each channel in `selection`."""
+    """Return the signal of each channel in `selection`, and its derivatives in the parameters up to `order`."""
     if has_time_constants(model.circuit):
         terms = jax.tree.map(np.asarray, _term_derivatives(model, order))
         return [_signal_derivatives(orders, sampling) for orders in terms[selection]]
@@ -134,7 +134,7 @@ def _derivatives(model: _Model, sampling: "_Sampling", selection: slice, order: 
 
 
 class _LogTauTerms(NamedTuple):
-    """A channel's high-pass terms, or their derivatives in the parameters."""
+    """High-pass terms of a channel, or their derivatives in the parameters."""
 
     weight: Array
     log_tau: Array
@@ -143,11 +143,11 @@ class _LogTauTerms(NamedTuple):
 
 @eqx.filter_jit
 def _term_derivatives(model: _Model, order: int) -> tuple[tuple[_LogTauTerms, ...], ...]:
-    """For each channel its terms and their derivatives."""
+    """Return each channel's terms and their derivatives."""
 
     def terms(theta: Array) -> list[_LogTauTerms]:
         circuit, gains = model.circuit_and_gains(theta)
-        # at another frequency the same happens in the period as with all time constants so many times longer
+        # a change of the frequency has the same effect in the period as a change of all time constants
         faster = theta[-1] if FREQUENCY in model.names else jnp.zeros(())
         of_channels = []
         for gain, channel in zip(gains, model.channels, strict=True):
@@ -165,7 +165,7 @@ def _term_derivatives(model: _Model, order: int) -> tuple[tuple[_LogTauTerms, ..
 
 @eqx.filter_jit
 def _force_constant_slope(model: _Model, geometry: Geometry) -> Float[Array, " parameters"]:
-    """The derivative of the logarithm of force over the square of the voltage that makes it."""
+    """Return the gradient of log(force / voltage^2) in the parameters."""
 
     def log_force(theta: Array) -> Array:
         return jnp.log(force_constant(geometry.contact(model.circuit_and_gains(theta)[0])))
@@ -174,26 +174,26 @@ def _force_constant_slope(model: _Model, geometry: Geometry) -> Float[Array, " p
 
 
 class _Sampling(NamedTuple):
-    """Where the drive's responses are computed, always as many times, so that it compiles once."""
+    """Times at which the responses are computed; their number is fixed, so that the function compiles once."""
 
     drive: Drive
     steady_state: bool
     time: Float[np.ndarray, " times"]  # s
     slope: Float[np.ndarray, " times"]  # dV/dt there, V/s
-    sample_weight: Float[np.ndarray, " times"]  # the root of the number of samples that each time stands for
-    off_edge_weight: Float[np.ndarray, " times"]  # likewise, and 0 near the drive's edges
-    force_weight: Float[np.ndarray, " times"]  # which times the force is averaged over
+    sample_weight: Float[np.ndarray, " times"]  # square root of the number of samples that each time represents
+    off_edge_weight: Float[np.ndarray, " times"]  # same, but 0 near the drive's edges
+    force_weight: Float[np.ndarray, " times"]  # weights of the times in the mean force
 
 
 def _sampling(e: Experiment, max_samples: int = 4096, period_times: int = 1024, edge_ratio: float = 10.0) -> _Sampling:
-    """So many samples of a long record stand for all, and over so many times in a period the force is averaged.
+    """Choose at most `max_samples` samples that represent a record, and `period_times` times for the mean force.
 
-    A step of V `edge_ratio` times the mean one is an edge: a sine's largest is 1.6 times, a triangle's 1.
+    A step of V above `edge_ratio` times the mean step is an edge; the largest step of a sine is 1.6 times the mean.
     """
     drive, time = _pad_drive(e.drive, np.asarray(e.time, dtype=float))
     drive = jax.tree.map(jnp.asarray, drive)
     k, used = np.arange(max_samples), min(time.size, max_samples)
-    # of many samples some, spread evenly and in step with no period
+    # the golden ratio spreads the chosen samples evenly and out of step with any period
     spread = (time.size * ((scipy.constants.golden - 1.0) * k % 1.0)).astype(int)
     chosen = np.minimum(k, used - 1) if used < max_samples else spread
     represented = np.where(k < used, math.sqrt(e.records * np.size(e.time) / used), 0.0)
@@ -201,8 +201,8 @@ def _sampling(e: Experiment, max_samples: int = 4096, period_times: int = 1024, 
     phases = (np.arange(period_times) + 0.5) / period_times
     period = float(drive.period) * phases if periodic else np.full(period_times, time[0])
     times = np.append(time[chosen], period)
-    # two samples to either side of an edge say nothing of a current that follows dV/dt; a quarter of a step further,
-    # lest rounding decide where edges coincide with samples
+    # two samples on either side of an edge carry no information on a current that follows dV/dt; the quarter step keeps
+    # rounding from deciding where edges coincide with samples
     around = time[chosen][:, None] + (np.arange(-2, 3) + 0.25) * float(np.median(np.diff(time)))
     voltage, slope = map(np.asarray, _evaluate_drive(drive, jnp.asarray(around), jnp.asarray(times), e.steady_state))
     step = np.abs(np.diff(voltage, axis=1))
@@ -212,7 +212,7 @@ def _sampling(e: Experiment, max_samples: int = 4096, period_times: int = 1024, 
         drive,
         e.steady_state,
         times,
-        # that of a measured drive is mostly noise: what follows it is not counted as told
+        # the slope of a measured drive is mostly noise, so a signal that follows it counts as uninformative
         np.zeros(times.size) if isinstance(drive, Sampled) else np.nan_to_num(slope),
         sample_weight=np.append(represented, outside),
         off_edge_weight=np.append(off_edge * represented, outside),
@@ -221,8 +221,8 @@ def _sampling(e: Experiment, max_samples: int = 4096, period_times: int = 1024, 
 
 
 def _pad_drive(drive: Drive, time: np.ndarray, samples: int = 8192) -> tuple[Drive, np.ndarray]:
-    """A measured drive with always as many samples, held after its end, and the times within them."""
-    # of a long one the beginning stands for all, since its every sample costs
+    """Pad a measured drive to a fixed number of samples; return it with the times within its record."""
+    # the beginning represents a long record, because each sample costs time
     if not isinstance(drive, Sampled) or drive.period is not None:
         return drive, time
     knots, voltage = np.asarray(drive.time)[:samples], np.asarray(drive.samples)[:samples]
@@ -240,7 +240,7 @@ def _evaluate_drive(drive: Drive, around: Array, time: Array, steady_state: bool
 def _highpass_derivatives(
     drive: Drive, time: Array, log_tau: Array, steady_state: bool, order: int
 ) -> tuple[Array, ...]:
-    """The response of one term, and its derivatives in log tau up to `order`, 1 or 2."""
+    """Return the response of one term, and its derivatives in log tau up to `order`, 1 or 2."""
     one = jnp.ones_like(log_tau)
 
     def response(log_tau: Array) -> Array:
@@ -272,9 +272,9 @@ def _predicted_signals(
 
 
 def _signal_derivatives(terms: Sequence[_LogTauTerms], sampling: _Sampling) -> list[np.ndarray]:
-    """A channel's signal, by its terms and their derivatives, and its derivatives in the log-parameters.
+    """Return a channel's signal and its derivatives in the log-parameters, from the terms and their derivatives.
 
-    Term by term, and the terms' derivatives apart: at once it takes ten times as long to compile.
+    The sum runs term by term, because one compiled function for all takes ten times as long to compile.
     """
     time, signals = jnp.asarray(sampling.time), [np.multiply.outer(sampling.slope, order.rate) for order in terms]
     for k, (weight, log_tau) in enumerate(zip(terms[0].weight, terms[0].log_tau, strict=True)):

@@ -1,4 +1,4 @@
-"""The best values of the settings of a measurement: of a coarse grid, or downhill from there by exact gradients."""
+"""Optimization of a measurement's settings: a coarse grid, then descent with exact gradients."""
 
 import itertools
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from fitact.model.skin import has_time_constants
 
 
 class Optimum(NamedTuple):
-    """The best settings found, and the standard deviation of the log mean force on the way."""
+    """Best settings, and the standard deviation of the log mean force on the grid."""
 
     values: tuple[float, ...]  # of the settings, SI
     grid: tuple[Float[np.ndarray, " points"], ...]  # along each setting
@@ -25,13 +25,14 @@ class Optimum(NamedTuple):
 def optimise(
     design: CandidateDesign, gradient: Float[np.ndarray, " parameters"], starts: int = 3, min_improvement: float = 1e-3
 ) -> Optimum:
-    """The settings that tell most of a force, by its `gradient` in the logarithms of the free parameters.
+    """Find the settings with the smallest uncertainty of a force with this `gradient` in the free log-parameters.
 
-    So many `starts`, the grid's lowest points, are followed downhill; a skin without time constants has no derivatives
-    in the settings here. A setting is moved only if the error falls by `min_improvement` of it, at least.
+    The descent starts from the `starts` lowest points of the grid. It is skipped for a skin without time constants,
+    which has no derivatives in the settings. A setting moves only if the uncertainty falls by the
+    fraction `min_improvement`.
     """
     bounds = [(setting.low, setting.high) for setting in design.settings]
-    count = {1: 33, 2: 6}.get(len(bounds), 4)  # points of the grid along each of so many settings
+    count = {1: 33, 2: 6}.get(len(bounds), 4)  # grid points along each setting, by the number of settings
     grid = tuple(np.geomspace(*pair, count) for pair in bounds)
     points = list(itertools.product(*grid))
     coarse = np.array([force_sd(design, point, gradient) for point in points])
@@ -44,13 +45,13 @@ def optimise(
     best, values = min(optima)
     if force_sd(design, design.start_values, gradient) < (1.0 + min_improvement) * best:
         values = design.start_values
-    if len({setting.field for setting in design.settings}) == 1:  # of records alike but for it
+    if len({setting.field for setting in design.settings}) == 1:  # the records are interchangeable
         values = sorted(values)
     return Optimum(tuple(map(float, values)), grid, coarse.reshape(shape))
 
 
 def force_sd(design: CandidateDesign, values: Sequence[float], gradient: Float[np.ndarray, " parameters"]) -> float:
-    """The standard deviation of the log mean force with the settings at `values`."""
+    """Return the standard deviation of the log mean force with the settings at `values`."""
     experiments = design.make_experiments(values, keep_phase=True)
     root = covariance_factor(joint_jacobian(experiments)[0], joint_prior_factor(experiments))
     return float(np.linalg.norm(gradient @ root[: gradient.size]))
@@ -59,9 +60,9 @@ def force_sd(design: CandidateDesign, values: Sequence[float], gradient: Float[n
 def log_force_sd_slope(
     design: CandidateDesign, values: Sequence[float], gradient: Float[np.ndarray, " parameters"]
 ) -> tuple[float, Float[np.ndarray, " settings"]]:
-    """The logarithm of `force_sd`, and its derivatives in the logarithms of the settings.
+    """Return the logarithm of `force_sd`, and its derivatives in the logarithms of the settings.
 
-    The variance is g C g with 1 / C = J J + 1 / prior: its derivative is -2 (J v) (J' v) with v = C g.
+    The variance is g C g with 1 / C = J J + 1 / prior; its derivative is -2 (J v) (J' v) with v = C g.
     """
     experiments = design.make_experiments(values, keep_phase=True)
     jacobian, *slopes = joint_jacobian(experiments, design.settings)

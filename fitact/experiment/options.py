@@ -1,4 +1,4 @@
-"""Changes that a user may make to a measurement, each with its effort; and those that a fit's verdict names."""
+"""Possible changes of a measurement, each with its effort, and the changes that a fit suggests."""
 
 import contextlib
 import dataclasses
@@ -23,12 +23,12 @@ class Change(NamedTuple):
     """A change of a measurement."""
 
     name: str
-    group: str  # of changes of one thing, of which only one can be made
-    effort: float  # turning a knob of an instrument that is there is 1
-    apply: Callable[[CandidateDesign], CandidateDesign | None]  # the candidate with it; None: it cannot be made there
+    group: str  # only one change of a group can be made
+    effort: float  # 1 means changing a setting of an existing instrument
+    apply: Callable[[CandidateDesign], CandidateDesign | None]  # returns None if the change cannot be made
 
     def __call__(self, design: CandidateDesign) -> CandidateDesign | None:
-        """The candidate with the change, and its effort; None: it cannot be made there."""
+        """Return the candidate with the change and its effort, or None if it cannot be made."""
         changed = self.apply(design)
         if changed is None:
             return None
@@ -36,7 +36,7 @@ class Change(NamedTuple):
 
 
 def changes(adc_steps: Mapping[Channel, float] | None = None) -> tuple[Change, ...]:
-    """All changes; `adc_steps` are those of the converter in each channel, V and A, where they are known."""
+    """Return all changes; `adc_steps` has the LSB of each channel's ADC (V, A) where it is known."""
     lighter = "a probe of 10 times the impedance", lambda probe: Probe(10.0 * probe.R, probe.C / 10.0)
     no_load = "a probe that does not load the skin", lambda probe: None
     return (
@@ -49,7 +49,7 @@ def changes(adc_steps: Mapping[Channel, float] | None = None) -> tuple[Change, .
         Change("lighter probe", "probe", 3.0, lambda d: _other_probe(d, *lighter)),
         Change("no probe load", "probe", 4.0, lambda d: _other_probe(d, *no_load)),
         Change("better Ci", "Ci", 3.0, _better_Ci),
-        Change("current", "current", 3.0, lambda d: _add_channel(d, "I", "the trunk current I", 20e-9)),
+        Change("current", "current", 3.0, lambda d: _add_channel(d, "I", "the loop current I", 20e-9)),
         Change("skin voltage", "skin voltage", 3.0, lambda d: _add_channel(d, "Vsc", "the skin voltage Vsc", 0.1)),
         Change("finer converter", "converter", 4.0, lambda d: _higher_adc_resolution(d, adc_steps or {})),
         Change("second panel", "panel", 5.0, _second_panel),
@@ -61,10 +61,9 @@ def suggest_measurements(
     gradient: Float[np.ndarray, " circuit_parameters"],
     names: Sequence[str] = ("current", "series resistor", "better Ci", "longer record"),
 ) -> tuple[DesignOption, ...]:
-    """The changes of these `names` as options, best first, where they can be made and computed.
+    """Evaluate the changes of these `names`, best first, if they can be made and computed.
 
-    `gradient` is that of the force's logarithm. A fit that failed may have ended at a circuit whose current no
-    double holds.
+    `gradient` is the gradient of the log force. A failed fit may end at a circuit whose current overflows.
     """
     as_it_is, options = CandidateDesign((experiment,)), []
     for change in changes():
@@ -87,7 +86,7 @@ def _apply_to_all(
 
 
 def _longer_record(design: CandidateDesign) -> CandidateDesign:
-    return _apply_to_all(design, "four times the record", lambda e: dataclasses.replace(e, records=4 * e.records))
+    return _apply_to_all(design, "four times as much data", lambda e: dataclasses.replace(e, records=4 * e.records))
 
 
 def _higher_sampling_rate(design: CandidateDesign) -> CandidateDesign:
@@ -99,9 +98,9 @@ def _higher_sampling_rate(design: CandidateDesign) -> CandidateDesign:
 
 
 def _frequencies(design: CandidateDesign, count: int) -> CandidateDesign | None:
-    """So many records in place of one, each with a frequency of its own, and as many samples as that one.
+    """Replace one record by `count` records, each with its own frequency and the same number of samples.
 
-    They lie between 1 Hz and where a period has fewer than 100 samples, or the shorter half of one than 4 rises.
+    Frequencies lie between 1 Hz and the frequency with 100 samples per period, or with 4 rise times per shorter half.
     """
     first, *others = design.experiments
     drive = first.drive
@@ -124,14 +123,14 @@ def _frequencies(design: CandidateDesign, count: int) -> CandidateDesign | None:
 
 
 def _replicate_experiment(design: CandidateDesign, experiments: tuple[Experiment, ...]) -> CandidateDesign:
-    """The candidate of one experiment with several in its place, which share its settings."""
+    """Replace a candidate's single experiment by several that share its settings."""
     indices = tuple(range(len(experiments)))
     shared = tuple(dataclasses.replace(setting, experiment_indices=indices) for setting in design.settings)
     return dataclasses.replace(design, experiments=experiments, settings=shared)
 
 
 def _series_resistor(design: CandidateDesign, default: float = 100e3) -> CandidateDesign | None:
-    """A known resistor in series, or another one in place of a known one; it stands where it is, or at `default`."""
+    """Insert a known series resistor, or change a known one; it starts at its present value or at `default`."""
     first = design.experiments[0]
     if "series_resistor" in first.free or not isinstance(constant_skin_circuit(first.circuit), RC):
         return None
@@ -147,18 +146,18 @@ def _series_resistor(design: CandidateDesign, default: float = 100e3) -> Candida
 
     stated = circuit_parameters(first.circuit).get("series_resistor")
     start, indices = default if stated is None else float(stated), tuple(range(len(design.experiments)))
-    # one can buy those from 1 kohm to 100 Mohm, and the cable's capacitance does not short them
+    # resistors from 1 kohm to 100 Mohm can be bought, and the cable's capacitance does not short them
     where = Setting("series_resistor", "series_resistor", "ohm", start, 1e3, 1e8, indices)
     return _apply_to_all(design, "a known resistor of {} in series", insert_resistor, where)
 
 
 def _with_fields(e: Experiment, **fields: Any) -> Experiment:
-    """The experiment with other fields of its circuit, within a skin level if it has one."""
+    """Return the experiment with other fields of its circuit."""
     return dataclasses.replace(e, circuit=with_values(e.circuit, fields))
 
 
 def _other_probe(design: CandidateDesign, text: str, change: Callable[[Probe], Probe | None]) -> CandidateDesign | None:
-    """The candidate with other probes, where its experiments have one."""
+    """Change the probe, or return None if there is none."""
     probe = getattr(constant_skin_circuit(design.experiments[0].circuit), "probe", None)
     return None if probe is None else _apply_to_all(design, text, lambda e: _with_fields(e, probe=change(probe)))
 
@@ -168,11 +167,13 @@ def _better_Ci(design: CandidateDesign) -> CandidateDesign | None:
         halves = np.where([name == "Ci" for name in e.free], 0.5, 1.0)
         return dataclasses.replace(e, prior_factor=halves[:, None] * e.prior_factor)
 
-    return _apply_to_all(design, "Ci known twice as well", halve_Ci_sd) if "Ci" in design.experiments[0].free else None
+    return (
+        _apply_to_all(design, "half the uncertainty of Ci", halve_Ci_sd) if "Ci" in design.experiments[0].free else None
+    )
 
 
 def _add_channel(design: CandidateDesign, channel: Channel, what: str, default_noise: float) -> CandidateDesign | None:
-    """The candidate with a channel that is not recorded yet; its noise is the default where none is stated."""
+    """Add a channel that is not recorded yet, with the stated noise or the default."""
     if channel in design.experiments[0].channels:
         return None
     noise = design.experiments[0].noise.get(channel) or default_noise
@@ -181,11 +182,11 @@ def _add_channel(design: CandidateDesign, channel: Channel, what: str, default_n
         return dataclasses.replace(e, channels=(*e.channels, channel), noise={**e.noise, channel: noise})
 
     shown = format_engineering(noise, _UNITS[channel])
-    return _apply_to_all(design, f"{what} recorded to ± {shown}", record_channel)
+    return _apply_to_all(design, f"{what} also recorded ({shown} rms noise)", record_channel)
 
 
 def _higher_adc_resolution(design: CandidateDesign, adc_steps: Mapping[Channel, float]) -> CandidateDesign | None:
-    """The noise without that of the converters, where it is more than 1 % of a channel's."""
+    """Remove the ADC's quantization noise, if it contributes more than 1 % of a channel's noise."""
     e = design.experiments[0]
     quieter: dict[str, float] = {}
     for channel in e.channels:
@@ -194,20 +195,20 @@ def _higher_adc_resolution(design: CandidateDesign, adc_steps: Mapping[Channel, 
             quieter[channel] = noise
     if not quieter:
         return None
-    shown = ", ".join(f"± {format_engineering(noise, _UNITS[name])} on {name}" for name, noise in quieter.items())
+    shown = ", ".join(f"{format_engineering(noise, _UNITS[name])} rms on {name}" for name, noise in quieter.items())
 
     def lower_noise(e: Experiment) -> Experiment:
         return dataclasses.replace(e, noise={**e.noise, **quieter})
 
-    return _apply_to_all(design, f"converters of finer steps, which leave {shown}", lower_noise)
+    return _apply_to_all(design, f"an ADC with finer steps, which leaves noise of {shown}", lower_noise)
 
 
 def _second_panel(design: CandidateDesign, max_ratio: float = 10.0) -> CandidateDesign | None:
-    """The same finger on another insulator, whose capacitance is known as well as the first's, and on its own."""
+    """Measure the same finger also on another insulator, with an equally accurate and independent value of Ci."""
     first, *others = design.experiments
     if others or "Ci" not in first.free:
         return None
     Ci = float(circuit_parameters(first.circuit)["Ci"])
     where = Setting("second_Ci", "Ci", "F", Ci, Ci / max_ratio, Ci * max_ratio, (1,))
     both = _replicate_experiment(design, (first, dataclasses.replace(first, own_parameters=("Ci",))))
-    return _apply_to_all(both, "a second panel, of {} known on its own as well as Ci", lambda e: e, where)
+    return _apply_to_all(both, "a second panel of {}, known independently and as well as Ci", lambda e: e, where)

@@ -1,4 +1,4 @@
-"""All else that is known of the people behind records, such as how moist their skin is."""
+"""Covariates: further numbers about the fingers of the records, such as skin moisture."""
 
 import csv
 import dataclasses
@@ -11,17 +11,17 @@ from jaxtyping import Float
 
 from fitact.errors import InputError
 
-_KEY = "record"  # the column that names the record's file
+_KEY = "record"  # column with the file names of the records
 
 
 @dataclasses.dataclass(frozen=True)
 class Covariates:
-    """A number or several of each finger.
+    """Covariates of the fingers.
 
     Attributes:
-        names: of the covariates.
-        mean, sd: over the fingers.
-        z_scores: less their mean, over their standard deviation.
+        names: names of the covariates.
+        mean, sd: mean and standard deviation over the fingers.
+        z_scores: covariates minus their mean, over their standard deviation.
     """
 
     names: tuple[str, ...]
@@ -31,10 +31,10 @@ class Covariates:
 
     @classmethod
     def from_values(cls, values: Mapping[str, Sequence[float]], fingers: int) -> Self:
-        """Standardise a number of each finger by every name.
+        """Standardize covariates, with one number per finger under each name.
 
         Raises:
-            InputError: they are not as many, not finite, all the same, or follow from each other.
+            InputError: the number of values is wrong, or they are not finite, all equal, or linearly dependent.
         """
         for name, column in values.items():
             if len(column) != fingers:
@@ -42,22 +42,24 @@ class Covariates:
             if not np.all(np.isfinite(column)):
                 raise InputError(f"covariate {name}: a value is not finite; measure it, or leave that finger out")
             if np.ptp(column) == 0.0:
-                raise InputError(f"covariate {name}: all fingers have the same value, which tells nothing; drop it")
+                raise InputError(
+                    f"covariate {name}: all fingers have the same value, so its effect cannot be estimated; drop it"
+                )
         table = np.array([values[name] for name in values], dtype=float).reshape(len(values), fingers).T
         mean, sd = table.mean(axis=0), table.std(axis=0)
         z_scores = (table - mean) / sd
         if np.linalg.matrix_rank(np.column_stack([np.ones(fingers), z_scores])) <= len(values):
             raise InputError(
-                f"covariates {', '.join(values)}: one follows from the others over these {fingers} fingers; drop one,"
+                f"covariates {', '.join(values)}: they are linearly dependent over these {fingers} fingers; drop one,"
                 " or measure more fingers"
             )
         return cls(tuple(values), mean, sd, z_scores)
 
     def standardize(self, raw_values: Mapping[str, float]) -> Float[np.ndarray, " covariates"]:
-        """Express values in standard deviations from the mean; 0 where none is given.
+        """Express values in standard deviations from the mean; a missing one is 0.
 
         Raises:
-            InputError: a name is none of the covariates.
+            InputError: a name is not a covariate of the records.
         """
         unknown = [name for name in raw_values if name not in self.names]
         if unknown:
@@ -68,10 +70,10 @@ class Covariates:
 
 
 def read_covariates(path: Path, records: Sequence[Path]) -> dict[str, list[float]]:
-    """Read a CSV with a column `record` (file names) and a numeric column a covariate, in the order of `records`.
+    """Read covariates from a CSV with a column `record` (file names), in the order of `records`.
 
     Raises:
-        InputError: it cannot be read, or lacks a record or a number.
+        InputError: the file cannot be read, or a record or a number is missing.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:

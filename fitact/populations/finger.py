@@ -1,4 +1,4 @@
-"""One finger of a population: what is kept of its record once it is fitted."""
+"""One finger of a population: the likelihood that is kept of its record after the fit."""
 
 import dataclasses
 import math
@@ -24,18 +24,18 @@ SHARED_PARAMETER = "Ci"
 
 @dataclasses.dataclass(frozen=True)
 class Finger:
-    """A fitted record, and its likelihood around the optimum: normal in the finger's own coordinates given log Ci.
+    """Fitted record with its likelihood around the optimum, normal in the finger's own coordinates given log Ci.
 
     Attributes:
-        source, fingerprint: of the record.
-        result, message, parameters: of the fit by itself, as in `Fit`.
-        likelihood: with priors of the nuisances alone; without samples where a compression stands for them.
-        names: the coordinates of a point; its own are all but Ci.
+        source, fingerprint: name of the record, and hash of its numbers.
+        result, message, parameters: result of the separate fit, as in `Fit`.
+        likelihood: likelihood with priors of the nuisances only; without samples if it is compressed.
+        names: coordinates of a point; all but Ci are the finger's own.
         center: log Ci of the optimum.
-        conditional_mean, covariance_factor: of its own coordinates there, given log Ci.
-        slope: how the mean moves with log Ci.
-        precision: of log Ci, from the record alone.
-        weighted_offset: precision times how far the record wants log Ci from `center`.
+        conditional_mean, covariance_factor: mean and root of the covariance of its own coordinates there, given log Ci.
+        slope: derivative of the mean with respect to log Ci.
+        precision: inverse variance of log Ci from the record alone.
+        weighted_offset: `precision` times (log Ci that the record alone gives, minus `center`).
     """
 
     source: str
@@ -54,7 +54,7 @@ class Finger:
 
     @classmethod
     def from_fit(cls, fit: Fit) -> Self:
-        """Reduce a fit by its whitened residuals and their Jacobian; a noise by its Fisher information."""
+        """Reduce a fit to its whitened residuals and their Jacobian, and the noise to its Fisher information."""
         likelihood = _flatten_skin_prior(fit.likelihood).without_samples()
         size, shared = fit.theta.size, fit.names.index(SHARED_PARAMETER)
         theta, log_sigma = np.split(fit.point, [size])
@@ -62,7 +62,7 @@ class Finger:
             np.asarray, _linearize(likelihood, jnp.asarray(theta), jnp.asarray(np.exp(log_sigma)))
         )
         own = [i for i in range(size) if i != shared]
-        # R of (own, Ci, residuals): what Ci's column holds below the own ones' is what the record alone says of it
+        # in R of (own, Ci, residuals), the column of Ci below the own columns holds the record's information on Ci
         R = np.asarray(np.linalg.qr(np.column_stack([jacobian[:, [*own, shared]], residuals]), mode="r"))
         n, noise = len(own), np.diag(fit.point_root)[size:]
         root = np.linalg.inv(R[:n, :n])
@@ -90,7 +90,7 @@ class Finger:
 
 
 def _flatten_skin_prior(likelihood: Likelihood, log_sd: float = 1e3) -> Likelihood:
-    """Replace the priors of Rsc, Csc and Ci by such that say nothing."""
+    """Replace the priors of Rsc, Csc and Ci by uninformative ones."""
     prior = likelihood.prior
     flat = {name: LogNormal(math.exp(prior[name].log_mean), log_sd) for name in (*SKIN, SHARED_PARAMETER)}
     marginals = dict(zip(prior.names, prior.marginals, strict=True)) | flat

@@ -1,10 +1,10 @@
-"""The likelihood of each of several fingers as a function of what they share, all that is its own integrated out.
+"""Likelihoods of several fingers under population parameters, with each finger's own parameters integrated out.
 
-Given log Ci, a finger's likelihood is nearly normal in log Rsc, log Csc and its nuisances, also where Vsc alone
-leaves the three together open: its mean then slides along that line with log Ci. Draws of a Student-t over that
-normal slide with it, so the weight of each draw is a smooth function of log Ci alone, tabulated once. Under any law
-the likelihood is that of the normal, in closed form, times what averages of the law's density over the draws, with
-their exact weights and with the normal's, say that it is off by.
+Given log Ci, the likelihood of a finger is nearly normal in log Rsc, log Csc and its nuisances. The mean moves with
+log Ci along a line, also where Vsc alone does not determine the three. Draws of a Student-t distribution over that
+normal move with it, so the weight of each draw is a smooth function of log Ci, tabulated once. The likelihood is the
+normal's, in closed form, times a correction: the ratio of two averages of the population density over the draws, with
+their exact weights and with the normal's weights.
 """
 
 import math
@@ -26,19 +26,19 @@ from fitact.populations.finger import SHARED_PARAMETER, SKIN, Finger
 from fitact.prior.distributions import Distribution
 from fitact.sampling.proposal import DEGREES_OF_FREEDOM, student_log_density
 
-TABLE_HALF_WIDTH = 8.0  # standard deviations of log Ci that the tables hold
+TABLE_HALF_WIDTH = 8.0  # half-width of the tables, in standard deviations of log Ci
 
 
 class PopulationParameters(NamedTuple):
-    """How fingers of a population are distributed.
+    """Parameters of the distribution of fingers.
 
     Attributes:
-        median: of log Rsc and log Csc, at the panel's Ci: their means.
-        log_sd: of Rsc and Csc.
-        correlation: of their logarithms.
-        log_Ci: of the panel, for the median finger's area.
-        area: standard deviation of the logarithm of a finger's area; None: they are the same.
-        slopes: by how much a standard deviation of each covariate shifts `median`, which is at their mean.
+        median: means of log Rsc and log Csc, at the panel's Ci.
+        log_sd: standard deviations of log Rsc and log Csc.
+        correlation: correlation of log Rsc and log Csc.
+        log_Ci: log Ci of the panel, for the median contact area.
+        area: standard deviation of the logarithm of the contact area; None means that all areas are equal.
+        slopes: shift of `median` per standard deviation of each covariate; `median` is at their mean.
     """
 
     median: Float[Array, "2"]
@@ -49,7 +49,7 @@ class PopulationParameters(NamedTuple):
     slopes: Float[Array, "covariates 2"] | None = None
 
     def shift_medians(self, covariates: Float[Array, "*shape covariates"]) -> Self:
-        """Give the law of fingers with those (standardised) covariates, its median of shape (*shape, 2)."""
+        """Return the parameters for fingers with these (standardized) covariates, with medians of shape (*shape, 2)."""
         return self if self.slopes is None else self._replace(median=self.median + covariates @ self.slopes)
 
     def log_density(self, skin: Float[Array, "*shape 2"]) -> Float[Array, "*shape"]:
@@ -65,13 +65,13 @@ class FingerLikelihoods(eqx.Module):
 
     Attributes:
         skin: log Rsc and log Csc of each draw at `center`.
-        slope: how they move with log Ci.
-        center, half_width: of the tables in log Ci.
+        slope: their derivatives with respect to log Ci.
+        center, half_width: center and half-width of the tables in log Ci.
         weight: Chebyshev coefficients of the log-weights.
-        precision, weighted_offset: of log Ci, by each record alone, as of `Finger`.
-        area_deviates: standard normal numbers that draw the fingers' areas.
+        precision, weighted_offset: information of each record alone on log Ci, as in `Finger`.
+        area_deviates: standard normal numbers for the fingers' areas.
         normal_log_weight: log-weights of the draws under the normal likelihood, at `center`.
-        mean, covariance: of log Rsc and log Csc by that.
+        mean, covariance: moments of log Rsc and log Csc under the normal likelihood.
     """
 
     skin: Float[Array, "fingers draws 2"]
@@ -98,9 +98,9 @@ class FingerLikelihoods(eqx.Module):
         seed: Sequence[int],
         max_log_sd_area: float = 1.0,
     ) -> Self:
-        """Tabulate `terms`, wherever the records and the panel's `prior` allow log Ci to be.
+        """Tabulate `terms` Chebyshev terms over the log Ci that the records and the panel's `prior` allow.
 
-        `max_log_sd_area`: of an area's logarithm, the widest that the tables allow for.
+        `max_log_sd_area` is the largest standard deviation of an area's logarithm that the tables cover.
         """
         tables = []
         center, half_width = _log_Ci_interval(fingers, prior.log_mean, prior.log_sd)
@@ -114,14 +114,14 @@ class FingerLikelihoods(eqx.Module):
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *tables)
 
     def log_likelihood(self, parameters: PopulationParameters) -> Float[Array, " fingers"]:
-        """Evaluate the log-likelihood of each finger under a law, up to a constant; -inf beyond the tables.
+        """Evaluate the log-likelihood of each finger, up to a constant; -inf beyond the tables.
 
-        That of the normal likelihood is known in closed form; the draws say by what factor the exact one differs, which
-        takes most of their noise away where a law is narrower than they are apart.
+        The normal likelihood is known in closed form, and the draws give the factor to the exact one. This removes most
+        of their noise where the population is narrower than the distance between draws.
         """
         log_Ci, value = jnp.broadcast_to(parameters.log_Ci, self.area_deviates.shape), jnp.zeros(())
         if parameters.area is not None:
-            # given the law, log Ci of a finger is normal, but for what the tables correct
+            # a finger's log Ci is normal given the population parameters; the tables correct the difference
             precision, middle = self._log_Ci_moments(parameters.log_Ci, parameters.area)
             log_Ci = self.center + middle + self.area_deviates / jnp.sqrt(precision)
             value = (
@@ -141,7 +141,7 @@ class FingerLikelihoods(eqx.Module):
     def _log_Ci_moments(
         self, log_Ci: Array, area: Array
     ) -> tuple[Float[Array, "fingers 1"], Float[Array, "fingers 1"]]:
-        """Compute each finger's precision of log Ci, and its mean from `center`, where areas differ by `area`."""
+        """Compute each finger's precision of log Ci, and its mean relative to `center`, if areas differ by `area`."""
         precision = self.precision + area**-2
         return precision, (self.weighted_offset + (log_Ci - self.center) * area**-2) / precision
 
@@ -167,14 +167,14 @@ class FingerLikelihoods(eqx.Module):
 
 
 def _sobol_student_t(size: int, draws: int, random: np.random.Generator) -> Float[np.ndarray, "draws size"]:
-    """Draw a standard Student-t by Sobol's scrambled sequence: fewer draws hold an integral as well."""
+    """Draw standard Student-t numbers by a scrambled Sobol sequence, which needs fewer draws for an integral."""
     uniform = scipy.stats.qmc.Sobol(size + 1, rng=random).random(draws)
     chi_square = scipy.stats.chi2.ppf(uniform[:, -1:], DEGREES_OF_FREEDOM)
     return scipy.special.ndtri(uniform[:, :-1]) * np.sqrt(DEGREES_OF_FREEDOM / chi_square)
 
 
 def _chebyshev_series(weight: Float[Array, "fingers draws terms"], x: Float[Array, "fingers draws"]) -> Array:
-    """Sum Chebyshev series, by Clenshaw's recurrence."""
+    """Sum Chebyshev series by Clenshaw's recurrence."""
     later, latest = jnp.zeros_like(x), jnp.zeros_like(x)
     for k in range(weight.shape[-1] - 1, 0, -1):
         latest, later = 2.0 * x * latest - later + weight[..., k], latest
@@ -182,7 +182,7 @@ def _chebyshev_series(weight: Float[Array, "fingers draws terms"], x: Float[Arra
 
 
 def _log_Ci_interval(fingers: Sequence[Finger], mean: float, sd: float) -> tuple[float, float]:
-    """Find the middle and half of the width of where log Ci may lie by records and a normal prior."""
+    """Find the center and half-width of the interval of log Ci that records and a normal prior allow."""
     precision = sd**-2 + sum(finger.precision for finger in fingers)
     offset = sum(finger.weighted_offset + finger.precision * (finger.center - mean) for finger in fingers)
     return mean + offset / precision, TABLE_HALF_WIDTH / math.sqrt(precision)
@@ -191,7 +191,7 @@ def _log_Ci_interval(fingers: Sequence[Finger], mean: float, sd: float) -> tuple
 def _tabulate_finger(
     finger: Finger, center: float, half_width: float, deviates: Float[np.ndarray, "draws size"], terms: int
 ) -> FingerLikelihoods:
-    """Tabulate a finger for log Ci within `half_width` of `center`; a deviate beyond its own draws its area."""
+    """Tabulate a finger for log Ci within `half_width` of `center`; an additional deviate draws its area."""
     own, draws = finger.conditional_mean.size, len(deviates)
     z, shared = deviates[:, :own], finger.names.index(SHARED_PARAMETER)
     nodes = np.cos(np.pi * (np.arange(terms) + 0.5) / terms)
@@ -201,8 +201,10 @@ def _tabulate_finger(
     values = log_prob(points.reshape(-1, points.shape[-1])).reshape(terms, draws) - log_density
     possible = np.isfinite(values).all(axis=0)
     if not possible.any():
-        raise InputError(f"{finger.source}: the record leaves Rsc and Csc too open for a population; leave it out")
-    # some nuisance's prior forbids the others, or a compression does not reach them
+        raise InputError(
+            f"{finger.source}: the record does not constrain Rsc and Csc enough for a population; leave it out"
+        )
+    # a nuisance's prior excludes the other draws, or the compression does not cover them
     values = np.where(possible, values - np.max(values[:, possible]), -1e6)
     skin = [finger.names.index(name) for name in SKIN]
     at_center = finger.from_standard_normal(center, np.vstack([np.zeros(own), z]))[:, skin]

@@ -1,4 +1,4 @@
-"""From one finger to people: the law that fingers follow, sampled."""
+"""Fit of a population: its parameters are sampled from records of several fingers."""
 
 import functools
 import hashlib
@@ -30,7 +30,7 @@ from fitact.sampling.ensemble import Target, reject_nonfinite, run_ensembles
 from fitact.sampling.proposal import Proposal
 from fitact.scene.scene import Scene
 
-# in the fingers' tables, and where so few turn out to be too few
+# by the number of draws in the fingers' tables; the second is used where the first is too coarse
 _CHAIN_FILES = {64: "chain.h5", 1024: "chain_1024.h5"}
 
 
@@ -45,29 +45,29 @@ def population(
     max_steps: int = 20_000,
     progress: bool = True,
 ) -> Population:
-    """The law that fingers on one panel follow, from a record of each, sampled until converged.
+    """Sample the distribution of fingers on one panel, from one record of each finger, until converged.
 
-    Rsc and Csc are log-normal over fingers, with a correlation; the panel's Ci is common, or, with the scene's
-    `[population] contact_area = "varies"`, scales with each finger's own log-normal area, as Rsc and Csc do. Medians
-    and Ci have the scene's prior, log-standard deviations a half-normal one of scale 0.5, the correlation r the
-    density 3/4 (1 - r^2). All that is a finger's own is integrated out.
+    Rsc and Csc are log-normal over fingers, with a correlation. All fingers share the panel's Ci. With the scene's
+    `[population] contact_area = "varies"`, Ci, Csc and 1/Rsc scale with each finger's own log-normal contact area.
+    Medians and Ci have the scene's prior, log-standard deviations a half-normal prior of scale 0.5, and the correlation
+    r has the density 3/4 (1 - r^2). Each finger's own parameters are integrated out.
 
     Args:
-        records: one of each finger, on one panel; taken one after the other, none is kept.
-        scene: of all; its prior of Rsc and Csc is that of their medians.
-        covariates: by name, a number of each finger, such as how moist its skin is; the medians of log Rsc and
-            log Csc change linearly with each, by a normal prior of scale 0.5 per standard deviation of it.
-        at: covariates of the next finger, where they are not the mean of these.
-        folder: where to keep the chain; if it holds one of these records, sampling goes on from there.
+        records: one record of each finger, on one panel; they are read one after the other and not kept.
+        scene: scene of all records; its prior of Rsc and Csc is the prior of their medians.
+        covariates: one number per finger under each name, such as skin moisture; the medians of log Rsc and log Csc
+            change linearly with each, with a normal prior of scale 0.5 per standard deviation of the covariate.
+        at: covariates of the next finger; default: their mean.
+        folder: folder for the chain; a chain of the same records there is resumed.
         seed: the same seed gives the same draws, whether or not sampling was interrupted.
-        max_steps: per ensemble, after which the answer is marked as not converged.
-        progress: report on standard error.
+        max_steps: largest number of steps per ensemble, after which the result is marked as not converged.
+        progress: whether to report on standard error.
 
-    Ctrl-C while sampling ends it with what there is, marked as not converged.
+    Ctrl-C ends the sampling; the result is then marked as not converged.
 
     Raises:
-        InputError: there are fewer than two, one is given twice or is refused, the scene's prior does not leave
-            Rsc, Csc and Ci free, a covariate tells nothing, or the folder's chain belongs to others.
+        InputError: there are fewer than two records, one is given twice or refused, the scene's prior does not leave
+            Rsc, Csc and Ci free, a covariate has no effect to estimate, or the folder's chain has other inputs.
     """
     scene = scene or Scene()
     medians = _prior(scene)
@@ -97,7 +97,7 @@ def population(
 
 
 def delete_chains(folder: str | os.PathLike[str]) -> None:
-    """Remove the chains that `population` left in a folder."""
+    """Remove the chains of `population` from a folder."""
     for name in _CHAIN_FILES.values():
         (Path(folder) / name).unlink(missing_ok=True)
 
@@ -113,7 +113,7 @@ def _sample_hierarchy(
     ensembles: int = 4,
     draws: int = 2500,
 ) -> tuple[np.ndarray, Convergence]:
-    """Sample points (ensembles, some `draws`, coordinates), and say how far they can be trusted."""
+    """Sample points (ensembles, about `draws`, coordinates), with their diagnostics."""
     rows = hierarchy.fingers.weight.size
     log_prob = reject_nonfinite(BatchEvaluator(Hierarchy.log_prob, hierarchy, rows, walkers // 2))
     target = Target(
@@ -129,21 +129,24 @@ def _sample_hierarchy(
 
 
 def _prior(scene: Scene) -> Prior:
-    """Make the prior of the medians and Ci."""
+    """Return the prior of the medians and Ci."""
     prior, names = scene.make_prior(), (*SKIN, SHARED_PARAMETER)
     if not set(names) <= set(prior.names):
-        raise InputError("scene: [prior] holds or ties Rsc, Csc or Ci; a population needs a density of each")
+        raise InputError("scene: [prior] fixes or ties Rsc, Csc or Ci; a population needs a prior density of each")
     if not {name for pair in (*prior.pairs, *prior.order_constraints) for name in pair[:2]} <= set(names):
-        raise InputError("scene: [prior] correlates or orders Rsc, Csc or Ci with others; a population takes that not")
+        raise InputError(
+            "scene: [prior] correlates or orders Rsc, Csc or Ci with other parameters, which fitact population does not"
+            " support; remove that"
+        )
     return Prior(names, tuple(prior[name] for name in names), prior.pairs, prior.order_constraints)
 
 
 def _fit_fingers(
     records: Sequence[Record], scene: Scene, factors: tuple[str, ...], progress: bool
 ) -> tuple[tuple[Finger, ...], NewFingerModel]:
-    """Fit each by itself; the next finger is under the first one's drive."""
+    """Fit each record by itself, and model the next finger under the first record's drive."""
     if len(records) < 2:
-        raise InputError(f"{len(records)} records: a population needs one of each of two or more fingers")
+        raise InputError(f"{len(records)} records: a population needs one record of each of two or more fingers")
     fingers: dict[str, Finger] = {}
     refusals: list[InputError] = []
     new_finger = None
@@ -170,8 +173,8 @@ def _fit_fingers(
 
 
 def _refusal(errors: Sequence[InputError], max_named: int = 5) -> InputError:
-    """Make one error of several: the first, and the names of `max_named` other records."""
-    # an error begins with the record that it is about
+    """Combine errors: the first in full, and the names of at most `max_named` other records."""
+    # an error message begins with the name of its record
     names = [os.path.basename(str(error).partition(":")[0]) for error in errors[1:]]
     if len(names) > max_named:
         names[max_named:] = [f"{len(names) - max_named} more"]
@@ -181,9 +184,9 @@ def _refusal(errors: Sequence[InputError], max_named: int = 5) -> InputError:
 def _integration_error(
     hierarchy: Hierarchy, finer: Hierarchy, points: Float[np.ndarray, "ensembles draws n"], count: int = 500
 ) -> float:
-    """Estimate by how many of its standard deviations any mean shifts at most with finer tables, by `count` points.
+    """Estimate the largest shift of any mean with finer tables, in standard deviations, from `count` points.
 
-    To first order a mean shifts by its covariance with the change of the log-posterior.
+    To first order, a mean shifts by its covariance with the change of the log-posterior.
     """
     flat = points.reshape(-1, points.shape[-1])
     flat = flat[np.linspace(0, len(flat) - 1, count).astype(int)]
@@ -194,7 +197,7 @@ def _integration_error(
 
 
 def _fingerprint(fingers: Sequence[Finger], covariates: Covariates, scene: Scene, seed: int, draws: int) -> str:
-    """Hash what a chain belongs to; any change of it makes another chain."""
+    """Return a hash of all inputs of a chain."""
     data = [[finger.fingerprint, finger.center, finger.conditional_mean.tolist()] for finger in fingers]
     settings = [importlib.metadata.version("fitact"), data, covariates.z_scores.tolist(), scene.to_json(), seed, draws]
     return hashlib.sha256(json.dumps(settings).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""The posterior of a population's law, given its fingers."""
+"""Posterior of the population parameters, given the fingers."""
 
 import equinox as eqx
 import jax
@@ -15,20 +15,19 @@ NAMES = ("shift_Rsc", "shift_Csc", "log_Ci", "log_sd_Rsc", "log_sd_Csc", "atanh_
 
 
 class Hierarchy(eqx.Module):
-    """The log-posterior of a law, in coordinates `names` that are nearly independent.
+    """Log-posterior of the population parameters, in coordinates `names` that are nearly independent.
 
-    The medians, and what covariates change them by, are in standard errors from the fingers' regression, which takes
-    away that they spread with the fingers and follow Ci; standard deviations are logarithms, the correlation an
-    inverse hyperbolic tangent.
+    Medians and slopes are in standard errors from the fingers' regression, which removes their dependence on the
+    spread of the fingers and on Ci. Standard deviations are logarithms, the correlation an inverse hyperbolic tangent.
 
     Attributes:
-        fingers: what the records say.
-        prior: of the medians of Rsc and Csc, and of Ci.
-        area_varies: whether each finger has an area of its own.
-        covariates: of the fingers, standardised.
-        log_sd_scale: of the half-normal prior of log-standard deviations: 95 % of it lies below 0.98.
-        slope_sd: prior standard deviation of what a covariate's own one changes log Rsc and log Csc by.
-        lkj: the correlation's density is (1 - r^2)^(lkj - 1): Lewandowski, Kurowicka, Joe 2009.
+        fingers: likelihoods of the records.
+        prior: prior of the medians of Rsc and Csc, and of Ci.
+        area_varies: whether each finger has its own contact area.
+        covariates: covariates of the fingers, standardized.
+        log_sd_scale: scale of the half-normal prior of log-standard deviations; 95 % of it lie below 0.98.
+        slope_sd: prior standard deviation of the change of log Rsc and log Csc per standard deviation of a covariate.
+        lkj: shape of the correlation's density (1 - r^2)^(lkj - 1) (Lewandowski, Kurowicka, Joe 2009).
     """
 
     fingers: FingerLikelihoods
@@ -65,47 +64,47 @@ class Hierarchy(eqx.Module):
         return PopulationParameters(coefficients[0], log_sd, correlation, point[2], area, slopes)
 
     def _regress_skin(self, log_Ci: Array) -> Float[Array, "regressors 2"]:
-        """Compute the fingers' mean log Rsc and log Csc, and their least-squares slopes."""
+        """Compute the fingers' mean log Rsc and log Csc, and the least-squares slopes."""
         design = self._design
         return jnp.linalg.solve(design.T @ design, design.T @ self._skin(log_Ci))
 
     def _skin(self, log_Ci: Array) -> Float[Array, "fingers 2"]:
-        """Estimate the fingers' log Rsc and log Csc, roughly, at the panel's Ci."""
+        """Estimate the fingers' log Rsc and log Csc at the panel's Ci."""
         skin, off = jnp.mean(self.fingers.skin, axis=1), log_Ci - self.fingers.center
         return skin + off * (jnp.array([-1.0, 1.0]) if self.area_varies else self.fingers.slope[:, 0])
 
     def log_prior(self, point: Float[Array, " coordinates"]) -> Float[Array, ""]:
-        """Sum the log-priors of a law, up to a constant: of the medians, half-normal spreads, LKJ's correlation."""
+        """Return the log-prior of the population parameters, up to a constant."""
         law = self.population_parameters(point)
         spreads = jnp.concatenate([point[3:5], point[6 : self._first_slope_index]])
         half_normal = jnp.sum(spreads - 0.5 * jnp.square(jnp.exp(spreads) / self.log_sd_scale))
         rest = jnp.log1p(-jnp.square(law.correlation))
         regressors = 1 + self.covariates.shape[1]
-        to_medians = regressors * (jnp.sum(point[3:5]) + 0.5 * rest)  # the coordinates' determinants
+        to_medians = regressors * (jnp.sum(point[3:5]) + 0.5 * rest)  # log-determinant of the change of coordinates
         log_prior = self.prior.log_density(jnp.append(law.median, law.log_Ci))
         if law.slopes is not None:
             log_prior = log_prior - 0.5 * jnp.sum(jnp.square(law.slopes / self.slope_sd))
         return log_prior + half_normal + to_medians + self.lkj * rest
 
     def sample_prior(self, random: np.random.Generator, count: int) -> PopulationParameters:
-        """Draw laws before any record is seen, leaves (count, 1)."""
+        """Draw population parameters from the prior; leaves (count, 1)."""
         draws, size = self.prior.sample(random, count), self.covariates.shape[1]
         spreads = self.log_sd_scale * np.abs(random.standard_normal((count, 1, 3)))
         return PopulationParameters(
             np.log(np.stack([draws[name] for name in SKIN], axis=-1))[:, None],
             spreads[..., :2],
-            2.0 * random.beta(self.lkj, self.lkj, (count, 1)) - 1.0,  # what makes (1 - r^2)^(lkj - 1)
+            2.0 * random.beta(self.lkj, self.lkj, (count, 1)) - 1.0,  # has the density (1 - r^2)^(lkj - 1)
             np.log(draws[SHARED_PARAMETER])[:, None],
             spreads[..., 2] if self.area_varies else None,
             self.slope_sd * random.standard_normal((count, 1, size, 2)) if size else None,
         )
 
     def start(self) -> Float[np.ndarray, " coordinates"]:
-        """Take the moments of the fingers, as if each were known."""
+        """Return the moments of the fingers, as if each were known exactly."""
         log_Ci = jnp.mean(self.fingers.center)
         residuals = self._skin(log_Ci) - self._design @ self._regress_skin(log_Ci)
         sds = jnp.append(jnp.std(residuals, axis=0), jnp.std(self.fingers.center))
-        spreads = jnp.log(0.05 + sds)  # so that none begins at 0
+        spreads = jnp.log(0.05 + sds)  # the offset keeps each away from 0
         of_law = np.array([0.0, 0.0, log_Ci, *spreads[:2], 0.0, spreads[2]])[: self._first_slope_index]
         return np.append(of_law, np.zeros(2 * self.covariates.shape[1]))
 
@@ -116,11 +115,11 @@ class Hierarchy(eqx.Module):
 
 
 def laplace(hierarchy: Hierarchy) -> tuple[Float[np.ndarray, " coordinates"], Float[np.ndarray, "n n"]]:
-    """Find the most probable law, and a root of the covariance there; call it in double precision."""
+    """Find the posterior mode, and a root of the covariance there; call it in double precision."""
     start = hierarchy.start()
     scale = np.full(start.size, 1.0 / np.sqrt(len(hierarchy.fingers.center)))
     scale[[name.startswith("shift") for name in hierarchy.names]] = 1.0
-    # the records and the prior together leave log Ci a known width; the tables' reach is a multiple of it
+    # the tables' half-width is a known multiple of the standard deviation of log Ci
     scale[2] = float(jnp.min(hierarchy.fingers.half_width)) / TABLE_HALF_WIDTH
     objective = eqx.Partial(_objective, hierarchy, jnp.asarray(start), jnp.asarray(scale))
     optimum = scipy.optimize.minimize(
@@ -130,7 +129,7 @@ def laplace(hierarchy: Hierarchy) -> tuple[Float[np.ndarray, " coordinates"], Fl
         method="BFGS",
     ).x
     curvature, axes = np.linalg.eigh(np.asarray(_hessian(objective, jnp.asarray(optimum))))
-    # less than a tenth of the start's curvature is not believed
+    # a curvature below a tenth of the start's is taken as a tenth
     return start + scale * optimum, scale[:, None] * axes / np.sqrt(np.maximum(curvature, 0.1))
 
 

@@ -1,4 +1,4 @@
-"""The next finger of a population: its force, and what of the spread is people and what is ignorance."""
+"""The next finger of a population: its force, and the variance between fingers and from the population parameters."""
 
 import dataclasses
 import math
@@ -20,19 +20,19 @@ from fitact.populations.finger_likelihoods import PopulationParameters
 
 AREA = "contact_area"
 THICKNESSES = ("skin_thickness", "insulator_thickness")
-FACTORS = (*SKIN, SHARED_PARAMETER, AREA, *THICKNESSES)  # the first three at the median area and thickness
+FACTORS = (*SKIN, SHARED_PARAMETER, AREA, *THICKNESSES)  # the first three are at the median area and thickness
 NAMES = (*SKIN, *derived.DERIVED_NAMES)
 HARMONICS = ("force_at_f", "force_at_2f", "friction_at_f", "friction_at_2f")
 
 
 class NewFingerModel(eqx.Module):
-    """A model of what follows from the logarithms of a finger's `factors`: all of `names`, SI units.
+    """Model of the quantities `names` (SI units) as functions of the logarithms of a finger's `factors`.
 
     Attributes:
-        derive: of a fit, without its record's charge.
-        theta, sigma: of the fit; what is not the finger's stays as it is.
-        factors: which of `FACTORS`, in that order.
-        frequency: of the drive, Hz; None: it does not repeat.
+        derive: derived quantities of a fit, without the record's initial charge.
+        theta, sigma: parameters and noise of the fit; those that are not the finger's stay fixed.
+        factors: subset of `FACTORS`, in that order.
+        frequency: frequency of the drive, Hz; None means that it does not repeat.
     """
 
     derive: derived.DerivedQuantities
@@ -43,7 +43,7 @@ class NewFingerModel(eqx.Module):
 
     @classmethod
     def from_fit(cls, fit: Fit, factors: tuple[str, ...]) -> Self:
-        """Take a fit's; a measured drive that repeats is taken to go on doing so."""
+        """Make the model from a fit; a measured drive that repeats is continued periodically."""
         derive = fit.derive
         if derive.charge:
             samples, period = whole_periods(fit.record)
@@ -62,13 +62,13 @@ class NewFingerModel(eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """`NAMES`, and where the drive repeats the amplitudes at its frequency and twice that."""
+        """Names of the quantities; with a periodic drive also the amplitudes at its frequency and twice that."""
         return NAMES if self.frequency is None else (*NAMES, *HARMONICS)
 
     def apply_factors(
         self, factors: Float[Array, " factors"]
     ) -> tuple[derived.DerivedQuantities, Float[Array, " parameters"]]:
-        """Make a finger's geometry and circuit; area and thickness scale the latter by eqs. (3) and (4)."""
+        """Return a finger's derived quantities and parameters; area and thickness scale these by eqs. (3) and (4)."""
         by_name = dict(zip(self.factors, factors, strict=True))
         area, skin, insulator = (by_name.get(name, 0.0) for name in FACTORS[3:])
         logs = jnp.stack([by_name["Rsc"] - area, by_name["Csc"] + area, by_name["Ci"] + area - insulator])
@@ -82,7 +82,7 @@ class NewFingerModel(eqx.Module):
         return dataclasses.replace(self.derive, geometry=thicker), self.theta.at[places].set(logs)
 
     def __call__(self, factors: Float[Array, " factors"]) -> Float[Array, " names"]:
-        """Compute all of `names`."""
+        """Compute the quantities `names`."""
         derive, theta = self.apply_factors(factors)
         skin = jnp.exp(theta[np.array([derive.likelihood.names.index(name) for name in SKIN])])
         parts = [skin, derive(theta, self.sigma)]
@@ -93,7 +93,7 @@ class NewFingerModel(eqx.Module):
         return jnp.concatenate(parts)
 
     def evaluate(self, factors: Float[np.ndarray, "*shape factors"]) -> Float[np.ndarray, "*shape names"]:
-        """Compute all of `names` of many fingers."""
+        """Compute the quantities `names` of many fingers."""
         with jax.enable_x64(True):
             evaluator = BatchEvaluator(NewFingerModel.__call__, self, self.derive.time.size, batch=512)
             return evaluator.map_over(factors.shape[:-1], factors)
@@ -101,7 +101,7 @@ class NewFingerModel(eqx.Module):
     def force_in_time(
         self, factors: Float[np.ndarray, "fingers factors"], count: int
     ) -> tuple[Float[np.ndarray, " count"], Float[np.ndarray, "fingers count"]]:
-        """Compute times (s) and force (N) of many fingers over the last period (all of a drive that has none)."""
+        """Compute times (s) and force (N) of many fingers over the last period, or over a whole aperiodic drive."""
         with jax.enable_x64(True):
             first, last = float(jnp.min(self.derive.time)), float(jnp.max(self.derive.time))
             span = last - first if self.frequency is None else 1.0 / self.frequency
@@ -118,11 +118,11 @@ def _force(finger: NewFingerModel, factors: Float[Array, " factors"]) -> Float[A
 
 
 class VarianceDecomposition(NamedTuple):
-    """The variance of a quantity of the next finger, by the law of total variance.
+    """Variance of a quantity of the next finger, by the law of total variance.
 
     Attributes:
-        between_finger: E[Var[x | law]], of fingers about their population's mean.
-        parameter_uncertainty: Var[E[x | law]], of that mean, since the law is not known.
+        between_finger: E[Var(x | parameters)], the variance between fingers.
+        parameter_uncertainty: Var(E[x | parameters]), from the uncertainty of the population parameters.
     """
 
     between_finger: float
@@ -130,23 +130,23 @@ class VarianceDecomposition(NamedTuple):
 
     @classmethod
     def from_draws(cls, values: Float[np.ndarray, "laws fingers"]) -> Self:
-        """Decompose fingers drawn from each law; what the few of each leave in their mean is taken off."""
+        """Decompose draws of fingers from each population sample, corrected for the finite number of fingers."""
         between_finger = float(np.mean(np.var(values, axis=1, ddof=1)))
         of_means = float(np.var(np.mean(values, axis=1), ddof=1))
         return cls(between_finger, max(of_means - between_finger / values.shape[1], 0.0))
 
     @property
     def between_finger_fraction(self) -> float:
-        """The fingers' share of the variance."""
+        """Fraction of the variance that comes from differences between fingers."""
         return self.between_finger / (self.between_finger + self.parameter_uncertainty)
 
 
 def draw_factors(
     parameters: PopulationParameters, thickness_sd: dict[str, float], fingers: int, random: np.random.Generator
 ) -> Float[np.ndarray, "laws fingers factors"]:
-    """Draw logarithms of the factors of some fingers of each law (whose leaves are (laws, 1)).
+    """Draw logarithms of the factors of `fingers` fingers for each population sample; leaves of these are (laws, 1).
 
-    `thickness_sd`: log-standard deviation of each of `THICKNESSES` that is a factor.
+    `thickness_sd` has the log-standard deviation of each of `THICKNESSES` that is a factor.
     """
     z = random.standard_normal((len(parameters.median), fingers, 3))
     thicknesses = [sd * random.standard_normal((*z.shape[:2], 1)) for sd in thickness_sd.values()]
@@ -156,7 +156,7 @@ def draw_factors(
 def factors_from_normal(
     parameters: PopulationParameters, z: Float[np.ndarray, "laws fingers 3"]
 ) -> Float[np.ndarray, "laws fingers factors"]:
-    """Turn standard normal numbers into logarithms of Rsc, Csc, Ci and, where it varies, area of fingers."""
+    """Turn standard normal numbers into logarithms of Rsc, Csc, Ci and, if it varies, contact area."""
     r = parameters.correlation
     second = r * z[..., 0] + np.sqrt(1.0 - r**2) * z[..., 1]
     skin = parameters.median + parameters.log_sd * np.stack([z[..., 0], second], axis=-1)

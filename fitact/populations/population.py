@@ -1,9 +1,11 @@
-"""The answer for a population: draws of the law that fingers follow, the next finger, what its force depends on."""
+"""Result of a population fit: draws of the population parameters, the next finger, and its variance by source."""
 
 import dataclasses
 import functools
 import importlib.metadata
+import math
 import os
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -12,6 +14,7 @@ from jaxtyping import Float
 
 from fitact import summary
 from fitact.files import atomic_write
+from fitact.populations.contact_area import ContactAreaTest
 from fitact.populations.covariates import Covariates
 from fitact.populations.finger import SHARED_PARAMETER, SKIN, Finger
 from fitact.populations.finger_likelihoods import PopulationParameters
@@ -20,31 +23,31 @@ from fitact.populations.next_finger import AREA, NAMES, NewFingerModel, Variance
 from fitact.populations.sobol import SobolIndices, variance_shares
 from fitact.sampling.convergence import Convergence
 from fitact.scene.scene import Scene
-from fitact.tables import align_rows, join_lines
-from fitact.units import format_engineering, quantity_unit
+from fitact.tables import align_table, join_lines
+from fitact.units import choose_prefixed_unit, format_engineering, quantity_unit
 
 QUANTILES = tuple(summary.PROBABILITIES.values())  # of the force in time
-MAX_INTEGRATION_ERROR = 0.1  # standard deviations of a mean that the fingers' tables may shift it by
-VARIANCE_QUANTITIES = ("force_mean", "force_peak")  # whose variance is shared out
-SHARES_LEGEND = "factors: the share of the variance that goes once each is known (that stays if only it is not)"
+MAX_INTEGRATION_ERROR = 0.1  # largest shift of a mean by the fingers' tables, in posterior standard deviations
+VARIANCE_QUANTITIES = ("force_mean", "force_peak")  # quantities with Sobol indices
+SHARES_LEGEND = "Parameters: Sobol indices, first-order (total)."
 
 
 @dataclasses.dataclass(frozen=True)
 class Population:
-    """Draws of the law that fingers follow, and of fingers to come.
+    """Draws of the population parameters, and of new fingers.
 
     Attributes:
-        fingers: each record's fit by itself.
-        hierarchy: the law's posterior.
+        fingers: fit of each record by itself.
+        hierarchy: posterior of the population parameters.
         points: draws in the coordinates of `hierarchy`.
-        convergence: how far they can be trusted.
-        off: by how much, at most, the integrals over the fingers shift any mean, in standard deviations.
-        finger: the next one, under the first record's drive.
-        covariates: of the fingers; may be none.
-        at: those of the next finger, in standard deviations from the mean.
-        scene: of all records.
-        seed: of every random number here.
-        laws, fingers_per_law: that new fingers are drawn of.
+        convergence: diagnostics of these draws.
+        off: largest shift of a mean by the integrals over the fingers, in posterior standard deviations.
+        finger: model of the next finger, under the first record's drive.
+        covariates: covariates of the fingers; may be empty.
+        at: covariates of the next finger, in standard deviations from the mean.
+        scene: scene of all records.
+        seed: seed of all random numbers.
+        laws, fingers_per_law: number of population samples for new fingers, and of new fingers for each.
     """
 
     fingers: tuple[Finger, ...]
@@ -62,28 +65,60 @@ class Population:
 
     @property
     def trusted(self) -> bool:
-        """Whether nothing stands against the answer; one finger's misfit is named among the warnings."""
+        """Whether the result is reliable; a misfit of one finger is a warning only."""
         return self.convergence.converged and self.off <= MAX_INTEGRATION_ERROR
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences."""
+        """Sentences on conditions that may change the result."""
         sentences = [f"{finger.source}: {finger.message}" for finger in self.fingers if finger.result != "successful"]
         if self.convergence.warning:
             sentences.append(self.convergence.warning)
         if not self.off <= MAX_INTEGRATION_ERROR:
             sentences.append(
                 f"the integrals over the fingers may shift means by {self.off:.2g} standard deviations; leave out the"
-                " records that leave Rsc and Csc most open"
+                " records that constrain Rsc and Csc least"
             )
         if self.hierarchy.area_varies and "I" not in self.scene.measurement.channels:
-            sentences.append("Vsc alone does not show the contact area, so its spread is the prior's; record I, too")
+            sentences.append(
+                "Vsc alone does not determine the contact area, so its standard deviation is the prior's; record I, too"
+            )
+        if self.contact_area.disagrees:
+            sentences.append(self.contact_area.sentence)
         return tuple(sentences)
 
-    def parameters(self) -> dict[str, Float[np.ndarray, "ensembles draws"]]:
-        """Draws of the law: medians of Rsc (ohm) and Csc (F), Ci (F), log-standard deviations, correlation.
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences that inform."""
+        skin = self.scene.skin
+        origin = "stated" if "thickness" in skin.model_fields_set else "the default"
+        sentences = [
+            f"the force is computed with [force] model = '{self.scene.force.model}', not measured; its intervals"
+            " include neither the uncertainty of that law nor of the skin thickness"
+            f" {format_engineering(skin.thickness, 'm')} ({origin})"
+        ]
+        if "friction" not in self.scene.model_fields_set:
+            friction = self.scene.friction
+            sentences.append(
+                f"friction uses the default coefficient {friction.coefficient:g} and normal force"
+                f" {format_engineering(friction.normal_force, 'N')}, which the scene does not state"
+            )
+        area = self.contact_area
+        return tuple(sentences) if area.disagrees else (*sentences, area.sentence)
 
-        Where there are covariates, also slopes: by how much log Rsc and log Csc change per unit of each.
+    @functools.cached_property
+    def contact_area(self) -> ContactAreaTest:
+        """Test of the assumption that all fingers have the same contact area."""
+        prior, scene = self.hierarchy.prior[SHARED_PARAMETER], self.scene
+        return ContactAreaTest.from_fingers(
+            self.fingers, prior, scene.population.contact_area, math.log1p(scene.tolerance.force)
+        )
+
+    def parameters(self) -> dict[str, Float[np.ndarray, "ensembles draws"]]:
+        """Return draws of the population parameters.
+
+        These are the medians of Rsc (ohm) and Csc (F), Ci (F), log-standard deviations and correlation. With covariates
+        also slopes: change of log Rsc and log Csc per unit of each covariate.
         """
         law = self._parameter_draws
         draws = {f"log_sd_{name}": law.log_sd[..., i] for i, name in enumerate(SKIN)}
@@ -99,17 +134,17 @@ class Population:
         return evaluate_parameters(self.hierarchy, self.points)
 
     def new_fingers(self) -> dict[str, Float[np.ndarray, "laws fingers"]]:
-        """Draws of fingers to come, some of each of many laws: Rsc, Csc, g, b, force and friction, SI units."""
+        """Return draws of new fingers from each population sample: Rsc, Csc, g, b, force and friction, SI units."""
         return {name: self._new_predictions[..., i] for i, name in enumerate(self.finger.names)}
 
     @functools.cached_property
     def factors(self) -> Float[np.ndarray, "laws fingers factors"]:
-        """Logarithms of what makes the new fingers, in the order of `finger.factors`."""
+        """Logarithms of the factors of new fingers, in the order of `finger.factors`."""
         return self._draw_factors(np.random.default_rng([self.seed, 1]), draw_parameters(self, self.laws))
 
     @property
     def prior_factors(self) -> Float[np.ndarray, "laws fingers factors"]:
-        """Logarithms as in `factors`, of fingers of laws that are believed before any record is seen."""
+        """Logarithms of the factors of fingers from the prior of the population parameters."""
         random = np.random.default_rng([self.seed, 4])
         laws = self.hierarchy.sample_prior(random, self.laws).shift_medians(self.at)
         return self._draw_factors(random, laws)
@@ -129,19 +164,19 @@ class Population:
 
     @functools.cached_property
     def shares(self) -> SobolIndices:
-        """Shares of each factor in the variance of the next finger's force; see `variance_shares`."""
+        """Sobol indices of the next finger's force; see `variance_shares`."""
         return self._sobol_indices(self.factors)
 
     @functools.cached_property
     def prior_shares(self) -> SobolIndices:
-        """Shares as `shares` has them, before any record is seen."""
+        """Sobol indices before any record, from the prior."""
         return self._sobol_indices(self.prior_factors)
 
     def _sobol_indices(self, factors: Float[np.ndarray, "laws fingers factors"]) -> SobolIndices:
         return variance_shares(self.finger, factors.reshape(-1, factors.shape[-1]), VARIANCE_QUANTITIES, self.seed)
 
     def to_dict(self) -> dict[str, Any]:
-        """Make the content of population.json, which `fitact population --json` prints."""
+        """Return the content of population.json, which `fitact population --json` prints."""
         new: dict[str, dict[str, Any]] = {}
         for name, values in self.new_fingers().items():
             people = VarianceDecomposition.from_draws(values).between_finger_fraction
@@ -164,7 +199,9 @@ class Population:
             ],
             "convergence": dataclasses.asdict(self.convergence) | {"sentence": str(self.convergence)},
             "integrals_off": self.off,
+            "contact_area": self.contact_area.to_dict(),
             "warnings": list(self.warnings),
+            "notes": list(self.notes),
             "trusted": self.trusted,
             "seed": self.seed,
             "scene": self.scene.model_dump(mode="json", exclude_unset=True),
@@ -193,26 +230,26 @@ class Population:
         return law
 
     def summary(self) -> str:
-        """A table for people, what the force's variance depends on, and warnings."""
+        """Return the table for people, the variance of the force by source, notes and warnings."""
         content = self.to_dict()
-        rows = align_rows(population_table(content), (26, 12, 14, 12))
+        rows = align_table(population_table(content))
         rows += [*variance_sentences(content), SHARES_LEGEND, str(self.convergence)]
-        return join_lines(rows, self.warnings)
+        return join_lines(rows, self.warnings, self.notes)
 
     __str__ = summary
 
     @functools.cached_property
     def force_in_time(self) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "quantiles times"]]:
-        """Times (s) of a period (all of a drive without one), and `QUANTILES` of the next finger's force (N)."""
+        """Times (s) of one period, or of a whole aperiodic drive, and `QUANTILES` of the next finger's force (N)."""
         factors = self.factors.reshape(-1, len(self.finger.factors))
-        some = factors[:: max(1, len(factors) // 4000)]  # enough for the outermost quantiles
+        some = factors[:: max(1, len(factors) // 4000)]  # enough draws for the outermost quantiles
         time, force = self.finger.force_in_time(some, count=256)
         return time, np.quantile(force, QUANTILES, axis=0)
 
     def to_datatree(self) -> Any:
-        """An `xarray.DataTree`: the law's draws in ArviZ's `posterior`, and `new_fingers` with their `factors`.
+        """Return an `xarray.DataTree` with ArviZ's `posterior`, and `new_fingers` with their `factors`.
 
-        Beside them the force of fingers before any record, `prior_new_fingers`, and of those to come, `force_in_time`.
+        It also holds the force of fingers from the prior, `prior_new_fingers`, and of new fingers, `force_in_time`.
         """
         import xarray as xr
 
@@ -256,7 +293,7 @@ class Population:
 
 
 def population_table(content: dict[str, Any]) -> tuple[tuple[str, ...], ...]:
-    """Lay out titles, then the law and the next finger of what population.json holds, for people."""
+    """Return titles, then rows of the population and the next finger from population.json, for people."""
     law, new = content["population"], content["new_finger"]
     shown = {f"{name}, {key}": s for name in SKIN for key, s in law[name].items()}
     shown |= {name: law[name] for name in (SHARED_PARAMETER, "correlation")}
@@ -264,22 +301,40 @@ def population_table(content: dict[str, Any]) -> tuple[tuple[str, ...], ...]:
         shown["contact area, log_sd"] = law[AREA]["log_sd"]
     shown |= {f"{skin}, slope in {name}": x[skin]["slope"] for name, x in law["covariates"].items() for skin in SKIN}
     shown |= {f"next finger, {name}": new[name] for name in NAMES}
-    rows = (
-        (name, *(format_engineering(s[q], s["unit"]) for q in ("q50", "q025", "q975"))) for name, s in shown.items()
-    )
-    return (f"{len(content['fingers'])} fingers", "median", "2.5 %", "97.5 %"), *rows
+    rows = [(name, *format_quantiles(s)) for name, s in shown.items()]
+    if "friction" not in content["scene"]:  # two defaults give it, so more digits would mislead
+        name, s = "next finger, friction_mean", new["friction_mean"]
+        cells = (format_engineering(float(f"{s[key]:.2g}"), s["unit"], 3) for key in ("q50", "q025", "q975"))
+        rows = [(name, *cells) if row[0] == name else row for row in rows]
+    if AREA not in law:
+        rows.insert(len(rows) - len(NAMES), ("contact area", "common", "(assumed)", ""))
+    return (f"{len(content['fingers'])} fingers", "median", "2.5 % quantile", "97.5 % quantile"), *rows
+
+
+def format_quantiles(s: dict[str, Any], keys: Sequence[str] = ("q50", "q025", "q975")) -> list[str]:
+    """Format quantiles of a summary to the place of the second digit of its standard deviation, at most 4 digits."""
+    median, sd, unit = float(s["q50"]), float(s["sd"]), s["unit"]
+    if not 0.0 < sd <= 0.5 * abs(median):
+        return [format_engineering(float(f"{s[key]:.2g}"), unit, 3) for key in keys]
+    digits = min(4, math.floor(math.log10(abs(median))) - math.floor(math.log10(float(f"{sd:.1e}"))) + 2)
+    size, symbol = choose_prefixed_unit(median, unit)
+    places = max(0, digits - 1 - math.floor(math.log10(abs(median) / size)))
+    return [f"{float(s[key]) / size:.{places}f} {symbol}".rstrip() for key in keys]
 
 
 def variance_sentences(content: dict[str, Any]) -> tuple[str, ...]:
-    """Say what the variance of the next finger's force comes from, by what population.json holds."""
+    """Return sentences on the sources of variance of the next finger's force, from population.json."""
     sentences = []
     for name in VARIANCE_QUANTITIES:
         people = 100.0 * content["new_finger"][name]["variance"]["people"]
         parts = (
-            f"{factor} {100.0 * share['first']:.0f} % ({100.0 * share['total']:.0f} %)"
+            f"{factor} {round(100.0 * share['first'])} % ({round(100.0 * share['total'])} %)"
             for factor, share in content["variance_shares"][name].items()
         )
-        sentences.append(f"variance of {name}: {people:.0f} % people, the rest ignorance; {', '.join(parts)}")
+        sentences.append(
+            f"Variance of {name}: {people:.0f} % from differences between fingers, {100.0 - people:.0f} % from"
+            f" uncertainty of the population parameters; Sobol indices {', '.join(parts)}"
+        )
     return tuple(sentences)
 
 
@@ -289,7 +344,7 @@ def evaluate_parameters(hierarchy: Hierarchy, points: Float[np.ndarray, "chains 
 
 
 def draw_parameters(population: Population, count: int) -> PopulationParameters:
-    """Take `count` draws of the law that the next finger follows, spread over the chain; leaves (count, 1)."""
+    """Take `count` draws of the next finger's population parameters, spread over the chain; leaves (count, 1)."""
     flat = population.points.reshape(-1, population.points.shape[-1])
     points = flat[np.linspace(0, len(flat) - 1, count).astype(int), None]
     return evaluate_parameters(population.hierarchy, points).shift_medians(population.at)

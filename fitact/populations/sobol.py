@@ -1,4 +1,4 @@
-"""Which factor makes the spread of a quantity of the next finger: shares of its variance, on a certified polynomial."""
+"""Sobol indices of a quantity of the next finger, from a polynomial surrogate with a cross-validated error."""
 
 import functools
 import itertools
@@ -17,16 +17,16 @@ SobolIndices = dict[str, dict[str, dict[str, float]]]
 
 
 class Surrogate(NamedTuple):
-    """Logarithms of quantities as polynomials of normal factors, by least squares; Hermite's, in whitened factors.
+    """Logarithms of quantities as Hermite polynomials of the whitened factors, by least squares.
 
     Attributes:
-        mean, covariance_factor: of the factors.
-        tail_scale: how much wider than the factors the points evaluated are, for the tails, where the largest of y lie.
-        powers, coefficients: of the terms.
-        log_range: least and largest logarithm that the model gave.
-        cross_validation_error: of each quantity, sqrt(1 - r^2), where r is its correlation with the model's at points
-            held out.
-        evaluations: of the model that this took.
+        mean, covariance_factor: mean and root of the covariance of the factors.
+        tail_scale: width of the evaluated points over the width of the factors; the largest values lie in the tails.
+        powers, coefficients: powers and coefficients of the terms.
+        log_range: smallest and largest logarithm of the evaluated model.
+        cross_validation_error: sqrt(1 - r^2) of each quantity, where r is its correlation with the model at held-out
+            points.
+        evaluations: number of evaluations of the model.
     """
 
     mean: Float[np.ndarray, " factors"]
@@ -49,20 +49,22 @@ class Surrogate(NamedTuple):
         tolerance: float = 5e-3,
         evaluations_per_term: int = 4,
     ) -> Self:
-        """Fit the lowest degree that is close at points held out, or the one that is closest there.
+        """Fit the lowest degree within the tolerance at held-out points, or else the best one.
 
         Args:
-            tolerance: of the error, far below what Sobol's sequence leaves open.
-            evaluations_per_term: at least; with fewer, what lies in the tails runs away.
+            tolerance: largest cross-validation error, far below the error of the Sobol sequence.
+            evaluations_per_term: smallest ratio of evaluations to terms; with fewer, the tails diverge.
         """
         size = factors.shape[1]
         mean, covariance_factor = factors.mean(axis=0), np.linalg.cholesky(np.cov(factors.T))
-        count = 4096 * (size + 2) * size // 100  # a hundredth of what `sobol_indices` asks for
+        count = 4096 * (size + 2) * size // 100  # a hundredth of the evaluations in `sobol_indices`
         z = _to_normal(scipy.stats.qmc.Halton(size, rng=np.random.default_rng(0)).random(count))
         points = mean + tail_scale * z @ covariance_factor.T
         logs = np.log(finger.evaluate(points)[:, [finger.names.index(name) for name in names]])
         log_range = np.stack([logs.min(axis=0), logs.max(axis=0)])
-        weight = np.exp(-0.5 * (tail_scale**2 - 1.0) * np.sum(z**2, axis=1))  # the factors' density over the points'
+        weight = np.exp(
+            -0.5 * (tail_scale**2 - 1.0) * np.sum(z**2, axis=1)
+        )  # density of the factors over the density of the points
         surrogates: list[Self] = []
         for degree in itertools.count(1):
             powers = _powers(size, degree)
@@ -77,7 +79,7 @@ class Surrogate(NamedTuple):
     def predict(
         self, factors: Float[np.ndarray, "points factors"], chunk: int = 1024
     ) -> Float[np.ndarray, "points quantities"]:
-        """Evaluate the quantities themselves, `chunk` points at a time, which stay in the processor's cache."""
+        """Evaluate the quantities, `chunk` points at a time so that they fit the processor's cache."""
         z = np.linalg.solve(self.tail_scale * self.covariance_factor, (factors - self.mean).T).T
         parts = (z[i : i + chunk] for i in range(0, len(z), chunk))
         logs = np.concatenate([_hermite(part, self.powers) @ self.coefficients for part in parts])
@@ -85,20 +87,20 @@ class Surrogate(NamedTuple):
 
 
 def _to_normal(uniform: np.ndarray) -> np.ndarray:
-    return ndtri(np.clip(uniform, 1e-12, 1.0 - 1e-12))  # no nearer to 0 and 1, where it is infinite
+    return ndtri(np.clip(uniform, 1e-12, 1.0 - 1e-12))  # it is infinite at 0 and 1
 
 
 def _least_squares(
     terms: Float[np.ndarray, "points terms"], logs: Float[np.ndarray, "points quantities"]
 ) -> np.ndarray:
-    """Solve the normal equations, which Hermite's polynomials leave well-conditioned."""
+    """Solve the normal equations, which are well-conditioned for Hermite polynomials."""
     return np.linalg.solve(terms.T @ terms, terms.T @ logs)
 
 
 def _clip_to_range(
     reference: Float[np.ndarray, "n quantities"], logs: Float[np.ndarray, "points quantities"]
 ) -> np.ndarray:
-    """Clip logarithms to those of the reference: beyond, a polynomial soon runs away."""
+    """Clip logarithms to the range of the reference, because a polynomial diverges beyond."""
     return np.clip(logs, reference.min(axis=0), reference.max(axis=0))
 
 
@@ -108,10 +110,10 @@ def _cross_validation_error(
     weight: Float[np.ndarray, " points"],
     folds: int = 4,
 ) -> Float[np.ndarray, " quantities"]:
-    """How far each quantity is from a polynomial that has not seen it: sqrt(1 - r^2), over the factors' density."""
+    """Return sqrt(1 - r^2) between each quantity and its prediction at held-out points, weighted to the factors."""
     predictions = np.empty_like(logs)
     for fold in range(folds):
-        is_out = np.arange(len(logs)) * folds // len(logs) == fold  # a stretch of Halton's sequence is spread evenly
+        is_out = np.arange(len(logs)) * folds // len(logs) == fold  # each section of a Halton sequence is spread evenly
         coefficients = _least_squares(terms[~is_out], logs[~is_out])
         predictions[is_out] = _clip_to_range(logs, terms[is_out] @ coefficients)
     squares = []
@@ -127,7 +129,7 @@ def _powers(size: int, degree: int) -> Int[np.ndarray, "terms factors"]:
 
 
 def _hermite(z: Float[np.ndarray, "points factors"], powers: Int[np.ndarray, "terms factors"]) -> np.ndarray:
-    """Products of Hermite polynomials, of unit variance over normal factors."""
+    """Return products of Hermite polynomials, which have unit variance over normal factors."""
     degree = int(powers.max())
     norm = np.sqrt([float(math.factorial(n)) for n in range(degree + 1)])
     single = np.polynomial.hermite_e.hermevander(z, degree) / norm
@@ -137,10 +139,10 @@ def _hermite(z: Float[np.ndarray, "points factors"], powers: Int[np.ndarray, "te
 def variance_shares(
     finger: NewFingerModel, factors: Float[np.ndarray, "fingers factors"], names: tuple[str, ...], seed: int
 ) -> SobolIndices:
-    """Compute `sobol_indices` of quantities `names`, from a `Surrogate`.
+    """Compute `sobol_indices` of quantities `names` from a `Surrogate`.
 
-    Each share is the mean square of a projection of y over that of y, so a surrogate whose correlation with y is r
-    shifts none by more than sqrt(1 - r^2); the errors include that.
+    Each index is the mean square of a projection of y over the mean square of y. A surrogate whose correlation with y
+    is r thus shifts no index by more than sqrt(1 - r^2), which the errors include.
     """
     surrogate = Surrogate.from_model(finger, factors, names)
     indices = sobol_indices(surrogate.predict, finger.factors, factors, names, seed)
@@ -159,17 +161,17 @@ def sobol_indices(
     seed: int,
     count: int = 4096,
 ) -> SobolIndices:
-    """Compute first-order, total and interaction shares of each factor in the variance of quantities, with 95 % errors.
+    """Compute first-order, total and interaction Sobol indices of each factor, with 95 % errors.
 
-    The factors are taken as normal with the mean and covariance of `factors`. Where they depend on each other, first
-    is Var(E[y | x]) and total E[Var(y | others)] over the variance of y (Kucherenko, Tarantola, Annoni 2012): Sobol's
-    indices, by SALib, of independent normal numbers that build the factors one after the other. That of the first
-    holds what x shares with the others, that of the last what is x's alone (Mara, Tarantola 2012); of this, interaction
-    is what x does together with others only.
+    The factors are taken as normal with the mean and covariance of `factors`. For dependent factors, the first-order
+    index is Var(E[y | x]) and the total index E[Var(y | others)], over the variance of y (Kucherenko, Tarantola, Annoni
+    2012). SALib computes both from independent normal numbers that build the factors one after the other: the
+    first-order index with x as the first factor, the total index with x as the last (Mara, Tarantola 2012). The
+    interaction is the part of the total index that x contributes only together with others.
 
     Args:
-        model: the quantities (points, quantities) of points (points, factors).
-        count: of points of Sobol's sequence.
+        model: function from points (points, factors) to quantities (points, quantities).
+        count: number of points of the Sobol sequence.
     """
     import SALib.analyze.sobol
     import SALib.sample.sobol

@@ -1,4 +1,4 @@
-"""A drive's design as a picture and as a page: who feels it, at which frequency, on which insulator."""
+"""The design of a drive as a picture and as a page: who feels it, at which frequency, on which insulator."""
 
 import os
 from collections.abc import Sequence
@@ -12,16 +12,27 @@ from fitact.charts import interactive
 from fitact.charts.figure import ALERT, DATA, GREEN, MODEL, ORANGE, PINK, PRIOR, SKY, log_ticks
 from fitact.charts.interactive import Axis
 from fitact.charts.picture import draw_plot
-from fitact.design.drive import LEGEND, DriveDesign
+from fitact.design.drive import DriveDesign
 from fitact.design.drive_option import FINGER_QUANTILES, DriveOption, format_quantity, quantile
+from fitact.design.limits import NO_SAFETY_ASSESSMENT
 from fitact.report.frame import Answer, PageSummary, Provenance, image, write_page
 from fitact.units import format_engineering
 
 _COLORS = {"sine": MODEL, "triangle": GREEN, "square": PINK, "trapezoid": DATA, "multitone": SKY}
 
 
+_VOLTAGES = (
+    "Set the amplitude in the first sentence. The table also gives its Monte Carlo error, which says how far another"
+    " seed changes it, and the median and 90 % interval, which say what is known of the amplitude that just suffices."
+)
+_PRIOR_VOLTAGES = (
+    "Set the amplitude in the first sentence. The table also gives its Monte Carlo error, which says how far another"
+    " seed changes it."
+)
+
+
 def draw_drive_design(design: DriveDesign) -> Figure:
-    """Draw the drive curves and the amplitude that is needed."""
+    """Draw the drive curves and the required amplitudes."""
     figure = Figure(figsize=(11.0, 8.0), layout="constrained")
     (curves, frequencies), (thicknesses, permittivities) = figure.subplots(2, 2)
     draw_plot(_curve_plot(design), curves)
@@ -54,7 +65,7 @@ def _order_waveforms(design: DriveDesign) -> list[str]:
 
 
 def _line_width(design: DriveDesign, name: str) -> float:
-    """So that another wave on top of the scene's own hides it not."""
+    """Return the line width; the scene's waveform is wider, so that it stays visible under other curves."""
     return 3.0 if name == design.own else 1.3
 
 
@@ -62,11 +73,11 @@ def _draw_insulators(axes: Axes, design: DriveDesign, options: Sequence[DriveOpt
     color = _COLORS[design.own]
     low, median, high = (_mask_infinite([float(quantile(o.amplitude, q)) for o in options]) for q in (0.05, 0.5, 0.95))
     axes.fill_between(at, low, high, color=color, alpha=0.25, lw=0)
-    axes.plot(at, median, ".-", color=color, label=f"{100.0 * design.share:g} % need")
+    axes.plot(at, median, ".-", color=color, label=f"suffices for {100.0 * design.share:g} %")
     for what, quantity, limit, shade in (
-        ("the insulator breaks down", "insulator_peak", lambda o: o.breakdown_voltage, ALERT),
-        ("rms current's limit", "current_rms", lambda o: o.device.current_limit_rms, ORANGE),
-        ("peak current's limit", "current_peak", lambda o: o.device.current_limit_peak, PRIOR),
+        ("breakdown of the insulator", "insulator_peak", lambda o: o.breakdown_voltage, ALERT),
+        ("your limit of the rms current", "current_rms", lambda o: o.device.current_limit_rms, ORANGE),
+        ("your limit of the peak current", "current_peak", lambda o: o.device.current_limit_peak, PRIOR),
     ):
         amplitude = [_limit_amplitude(option, quantity, limit(option)) for option in options]
         if np.any(np.isfinite(amplitude)):
@@ -78,13 +89,13 @@ def _draw_insulators(axes: Axes, design: DriveDesign, options: Sequence[DriveOpt
 
 
 def _limit_amplitude(option: DriveOption, quantity: str, limit: float | None) -> float:
-    """The amplitude at which a limit is met, V: all are linear in it."""
+    """Return the amplitude (V) at which a limit is reached; currents and voltages are proportional to it."""
     reached = float(getattr(option.at_assured, quantity))
     return np.nan if limit is None or not np.isfinite(reached) else option.assured * limit / reached
 
 
 def _mask_infinite(amplitude: Sequence[float] | Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """With a gap where it is infinite."""
+    """Replace infinite amplitudes by NaN, which leaves a gap in the curve."""
     values = np.asarray(amplitude, dtype=float)
     return np.where(np.isfinite(values), values, np.nan)
 
@@ -92,7 +103,7 @@ def _mask_infinite(amplitude: Sequence[float] | Float[np.ndarray, " n"]) -> Floa
 def _note_if_empty(axes: Axes) -> None:
     if not any(np.isfinite(np.asarray(line.get_ydata(), dtype=float)).any() for line in axes.lines):
         axes.set(yscale="linear", yticks=[])
-        axes.text(0.5, 0.5, "too few feel it at any amplitude", transform=axes.transAxes, ha="center")
+        axes.text(0.5, 0.5, "too few fingers feel it at any amplitude", transform=axes.transAxes, ha="center")
 
 
 def write_drive_design_page(path: str | os.PathLike[str], design: DriveDesign, origin: Provenance) -> None:
@@ -100,11 +111,6 @@ def write_drive_design_page(path: str | os.PathLike[str], design: DriveDesign, o
     people += [
         (name, *(format_quantity(each, "V") for each in option.people)) for name, option in design.options.items()
     ]
-    limits = (
-        ("the insulator breaks down", design.options[design.own].breakdown_voltage, "V"),
-        ("rms current", design.scene.device.current_limit_rms, "A"),
-        ("peak current", design.scene.device.current_limit_peak, "A"),
-    )
     curves, frequencies = _curve_plot(design), _frequency_plot(design)
     switch = interactive.log_axis_button([frequencies], "xy", "logarithmic axes")
     write_page(
@@ -113,11 +119,13 @@ def write_drive_design_page(path: str | os.PathLike[str], design: DriveDesign, o
         frame=_frame(design),
         origin=origin,
         table=design.table,
-        legend=LEGEND,
+        legend=design.legend,
         excluded=design.excluded,
         separated=design.people.has_separate_uncertainty,
         people=people,
-        limits=[(name, "not stated" if x is None else format_engineering(x, unit)) for name, x, unit in limits],
+        limits=design.limits_table,
+        no_safety_assessment=NO_SAFETY_ASSESSMENT,
+        notes=[note for note in design.notes if not note.startswith(NO_SAFETY_ASSESSMENT)],
         curves=interactive.chart(curves, controls=[interactive.log_axis_button([curves])]),
         frequencies=interactive.chart(frequencies, controls=[switch]),
         insulators=image(lambda: _insulator_figure(design)),
@@ -125,35 +133,38 @@ def write_drive_design_page(path: str | os.PathLike[str], design: DriveDesign, o
 
 
 def _frame(design: DriveDesign) -> PageSummary:
-    least, *others = (sentence.split(": ", 1) for sentence in design.sentences)
-    kept = design.smallest()["peak_to_peak"] is not None
-    verdict = f"The {least[0]} within the limits: {least[1]}" if kept else "No waveform keeps the limits"
-    findings = {"Who is to feel what": f"{design.question}."}
-    findings |= {f"{what[0].upper()}{what[1:]}": f"{answer}." for what, answer in (others if kept else others[2:])}
+    smallest, findings = [sentence.split(": ", 1) for sentence in design.sentences], {}
+    findings["What counts as felt"] = design.question
+    findings["Body current and insulator"] = design.exposure
+    recommended = design.recommended
+    if recommended is not None:
+        findings["Which voltage to set"] = _VOLTAGES if design.people.has_separate_uncertainty else _PRIOR_VOLTAGES
+        findings |= {f"{name[0].upper()}{name[1:]}": f"{answer}." for name, answer in smallest}
     return PageSummary(
-        title=f"The smallest drive that {100.0 * design.share:g} % of people feel",
-        subject=f"Peak-to-peak amplitude, power, current and the insulator's voltage by waveform at"
-        f" {format_engineering(design.options[design.own].frequency, 'Hz', 3)}, by frequency and by insulator.",
+        title=f"The smallest drive that {100.0 * design.share:g} % of fingers feel",
+        subject=f"Peak-to-peak amplitude, power, current and insulator voltage of each waveform at"
+        f" {format_engineering(design.options[design.own].frequency, 'Hz', 3)}, at other frequencies and on other"
+        " insulators.",
         trusted=design.trusted,
-        verdict=verdict if design.trusted else f"{'; '.join(design.warnings)}.",
+        verdict=design.recommendation.rstrip(".") if design.trusted else f"{'; '.join(design.warnings)}.",
         findings=findings,
         answers=[
             Answer(
-                name,
-                format_quantity(option.assured, "V", option.assured_error),
-                "excluded" if option.violations else "keeps the limits stated",
+                f"{name}, peak to peak",
+                format_quantity(option.assured, "V"),
+                "recommended" if option is recommended else "excluded" if option.violations else "not recommended",
             )
             for name, option in design.options.items()
         ],
         warnings=design.warnings,
-        has_reservation=not kept,
+        has_reservation=recommended is None or any(each.exceeds_published for each in design.limits),
     )
 
 
 def _curve_plot(design: DriveDesign) -> interactive.Plot:
     curves = {name: design.curve(name) for name in _order_waveforms(design)}
     x = Axis.from_values("peak-to-peak amplitude", "V", curves[design.own]["peak_to_peak"], log=True)
-    y = Axis("people who feel it", "%", 0.01)
+    y = Axis("fingers that feel it", "%", 0.01)
     traces = []
     for name, curve in curves.items():
         at, color = curve["peak_to_peak"], _COLORS[name]
@@ -163,9 +174,9 @@ def _curve_plot(design: DriveDesign) -> interactive.Plot:
             traces += [each | {"showlegend": False} for each in band]
         traces.append(interactive.line(x, y, at, curve["q50"], name, color, width=_line_width(design, name)))
     at = curves[design.own]["peak_to_peak"][[0, -1]]
-    traces.append(interactive.line(x, y, at, [design.share] * 2, "asked for", ALERT, dash="dash"))
+    traces.append(interactive.line(x, y, at, [design.share] * 2, "required", ALERT, dash="dash"))
     plot = interactive.plot(x, (y, traces), size=420)
-    plot["layout"]["legend"]["traceorder"] = "normal"  # bands would turn it over
+    plot["layout"]["legend"]["traceorder"] = "normal"  # plotly reverses the order where areas are filled
     return plot
 
 
@@ -177,11 +188,11 @@ def _frequency_plot(design: DriveDesign) -> interactive.Plot:
     own = design.by_frequency[design.own]
     frequency, people = np.array([option.frequency for option in own]), np.stack([option.people for option in own])
     x = Axis.from_values("frequency of the drive", "Hz", frequency, log=True)
-    y = Axis.from_values("peak-to-peak amplitude needed", "V", medians[design.own], log=True)
+    y = Axis.from_values("peak-to-peak amplitude required", "V", medians[design.own], log=True)
     traces = []
     for low, high, share in ((0, 4, 90), (1, 3, 50)):
         kept = np.isfinite(people[:, high])
-        edges = (f"{50 - share // 2} % of people", f"{50 + share // 2} %", f"{share} % of people, {design.own}")
+        edges = (f"{50 - share // 2} % of fingers", f"{50 + share // 2} %", f"{share} % of fingers, {design.own}")
         traces += interactive.band(
             x, y, frequency[kept], people[kept, low], people[kept, high], edges, _COLORS[design.own]
         )

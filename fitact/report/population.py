@@ -1,4 +1,4 @@
-"""A population as a picture and as a page: how people differ, what the next finger feels, and what that depends on."""
+"""A population as a picture and as a page: differences between fingers, force on the next one, sources of variance."""
 
 import functools
 import json
@@ -22,6 +22,7 @@ from fitact.populations.population import (
     MAX_INTEGRATION_ERROR,
     SHARES_LEGEND,
     VARIANCE_QUANTITIES,
+    format_quantiles,
     population_table,
     variance_sentences,
 )
@@ -45,7 +46,7 @@ _NAMES = {
     "friction_at_2f": "friction at 2 f",
 }
 _NUMERIC = ("population", "new_finger", "variance_shares", "variance_shares_prior", "fingers", "convergence")
-_NEW_LABEL, _PRIOR_LABEL = "fingers to come", "before the records"
+_NEW_LABEL, _PRIOR_LABEL = "new fingers", "prior"
 _NOT_DRAWN_MESSAGE = "Not drawn: some draws are not finite."
 
 
@@ -69,15 +70,15 @@ def _figure(tree: Any, content: dict[str, Any]) -> Figure:
 
 
 def _is_drawable(tree: Any) -> bool:
-    """Whether every draw has a place on a logarithmic axis; a chain that was cut short may hold others."""
+    """Return whether all draws are finite; an interrupted chain may hold others."""
     drawn = (values.values for name in ("new_fingers", "prior_new_fingers") for values in tree[name].data_vars.values())
     return all(bool(np.all(np.isfinite(values))) for values in drawn)
 
 
 def _draw_skin(axes: Axes, tree: Any, content: dict[str, Any], max_fingers: int = 4000) -> None:
-    """Rsc and Csc of the fingers, with 95 % intervals, and of fingers to come."""
+    """Draw Rsc and Csc of the fingers, with 95 % intervals, and of new fingers."""
     Rsc, Csc = (tree["new_fingers"][name].values.ravel()[:max_fingers] for name in ("Rsc", "Csc"))
-    axes.plot(Rsc, Csc, ".", ms=2, color=MODEL, alpha=0.25, rasterized=True, label="fingers to come")
+    axes.plot(Rsc, Csc, ".", ms=2, color=MODEL, alpha=0.25, rasterized=True, label=_NEW_LABEL)
     low_Rsc, Rsc, high_Rsc, low_Csc, Csc, high_Csc = (
         np.array([finger["parameters"][name][key] for finger in content["fingers"]], dtype=float)
         for name in ("Rsc", "Csc")
@@ -92,7 +93,7 @@ def _draw_skin(axes: Axes, tree: Any, content: dict[str, Any], max_fingers: int 
 
 
 def _draw_force(axes: Axes, tree: Any, content: dict[str, Any], bins: int = 50) -> None:
-    """The force that the next finger may feel; and by each law that may be the true one, that of its fingers."""
+    """Draw the predictive distribution of the force, and the credible band of its distribution over fingers."""
     logs = np.log(tree["new_fingers"]["force_mean"].values)
     least, largest = np.quantile(logs, [0.002, 0.998]).tolist()
     edges = np.linspace(least, largest, bins + 1)
@@ -101,22 +102,22 @@ def _draw_force(axes: Axes, tree: Any, content: dict[str, Any], bins: int = 50) 
     mean, sd = logs.mean(axis=1)[:, None], logs.std(axis=1, ddof=1)[:, None]
     of_laws = np.exp(-0.5 * np.square((np.log(middle) - mean) / sd)) / (sd * np.sqrt(2.0 * np.pi))
     low, high = np.quantile(of_laws, [0.025, 0.975], axis=0)
-    of_people = "people, by 95 % of the laws that may be true"
+    of_people = "between fingers (95 % credible band)"
     axes.fill_between(middle, low, high, color=ALERT, alpha=0.3, lw=0, label=of_people)
-    axes.plot(middle, next_one, color=MODEL, drawstyle="steps-mid", label="next finger: people and ignorance")
+    axes.plot(middle, next_one, color=MODEL, drawstyle="steps-mid", label="next finger (predictive)")
     axes.set_xscale("log")
     log_ticks(axes.xaxis, "N", (1.0, 3.0))
-    axes.set_ylim(0.0, 1.3 * float(np.max(high)))  # room for the legend
+    axes.set_ylim(0.0, 1.3 * float(np.max(high)))  # leaves room for the legend
     axes.set_yticks([])
-    axes.set(xlabel="mean electrostatic force", title="Force across people")
+    axes.set(xlabel="mean electrostatic force", title="Force on different fingers")
     axes.legend(fontsize=9)
 
 
 def _draw_time(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
-    """Bands of force in time over fingers to come; friction, by eq. (2), on the other side."""
+    """Draw bands of the force in time over new fingers; the right axis is friction, by eq. (2)."""
     drawn = tree["force_in_time"]
     time, force = drawn["time"].values, dict(zip(drawn["quantile"].values.tolist(), drawn["force"].values, strict=True))
-    bands = {(0.025, 0.975): 0.15, (0.05, 0.95): 0.3, (0.25, 0.75): 0.55}  # quantiles: how opaque between
+    bands = {(0.025, 0.975): 0.15, (0.05, 0.95): 0.3, (0.25, 0.75): 0.55}  # quantiles: opacity of the area between them
     for (low, high), opaque in bands.items():
         label = f"{100.0 * (high - low):g} % of fingers"
         axes.fill_between(time, force[low], force[high], color=MODEL, alpha=opaque, lw=0, label=label)
@@ -127,7 +128,7 @@ def _draw_time(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
     axes.xaxis.set_major_formatter(EngFormatter("s"))
     axes.yaxis.set_major_formatter(EngFormatter("N"))
     right.yaxis.set_major_formatter(EngFormatter("N"))
-    top = 1.3 * float(max(force[high].max() for _, high in bands))  # room for the legend
+    top = 1.3 * float(max(force[high].max() for _, high in bands))  # leaves room for the legend
     axes.set(xlim=(time[0], time[-1]), ylim=(0.0, top), ylabel="electrostatic force", title="The next finger in time")
     axes.set_xlabel("time in the period" if drawn.attrs["periodic"] else "time")
     right.set_ylabel("friction")
@@ -135,14 +136,14 @@ def _draw_time(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
 
 
 def _draw_shares(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
-    """Each factor's share of the variance of the mean force, the largest on top; before the records, too."""
+    """Draw the Sobol indices of the mean force, the largest on top, from the posterior and the prior."""
     after, before = (content[key]["force_mean"] for key in ("variance_shares", "variance_shares_prior"))
     order = sorted(after, key=lambda factor: after[factor]["total"])
     height = 0.2
     rows = (
-        (after, "first", MODEL, 1.0, "goes once it is known"),
-        (after, "total", ALERT, 1.0, "stays if only it is not"),
-        (before, "first", MODEL, 0.35, "before the records"),
+        (after, "first", MODEL, 1.0, "first-order"),
+        (after, "total", ALERT, 1.0, "total"),
+        (before, "first", MODEL, 0.35, "prior"),
         (before, "total", ALERT, 0.35, None),
     )
     for row, (shares, key, color, opaque, label) in enumerate(rows):
@@ -159,7 +160,7 @@ def _draw_shares(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
     axes.set_yticks(np.arange(len(order)), [factor.replace("_", " ") for factor in order])
     axes.set_xlim(left=0.0)
     axes.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
-    axes.set(xlabel="share of the variance of the mean force", title="What makes it differ")
+    axes.set(xlabel="Sobol index of the mean force", title="Sources of variance")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=len(rows) - 1, handlelength=1.2, fontsize=9)
 
 
@@ -210,7 +211,7 @@ def read_population(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, A
 
 
 def _null_to_nan(content: Any) -> Any:
-    """With NaN for whatever is not finite, which JSON has as null."""
+    """Replace null, which JSON has for non-finite numbers, by NaN."""
     if isinstance(content, dict):
         return {name: _null_to_nan(value) for name, value in content.items()}
     if isinstance(content, list | tuple):
@@ -231,37 +232,42 @@ def _frame(content: dict[str, Any]) -> PageSummary:
     law, new, count = content["population"], content["new_finger"], len(content["fingers"])
     force, friction = new["force_mean"], new["friction_mean"]
     off = f"{content['integrals_off']:.2g} standard deviations"
-    certificate = f"integrals over the fingers shift no mean by more than {off}"
+    certificate = f"the integrals over the fingers shift no mean by more than {off}"
     return PageSummary(
-        title=f"How people differ: {count} fingers",
-        subject=f"What {count} fingers on one panel, a record of each, tell of people: how skins differ, what force the"
-        " next finger feels, and what that depends on.",
+        title=f"Population of {count} fingers",
+        subject=f"Differences between fingers, estimated from one record of each of {count} fingers on one panel, and"
+        " the force on the next finger.",
         trusted=content["trusted"],
-        verdict=f"Trusted: the chain has converged, and {certificate}"
+        verdict=f"Reliable: the chain has converged, and {certificate}"
         if content["trusted"]
-        else f"{content['convergence']['sentence']}; {certificate} ({MAX_INTEGRATION_ERROR:g} are trusted).",
+        else f"{content['convergence']['sentence']}; {certificate} (at most {MAX_INTEGRATION_ERROR:g} are accepted).",
         findings={
-            "What the next finger feels": f"A mean electrostatic force of {_format_range(force)}, and a mean friction"
-            f" of {_format_range(friction)}; 95 % lie between.",
-            "What makes it differ": "; ".join(variance_sentences(content)) + f" ({SHARES_LEGEND}).",
-        },
+            "Force on the next finger": f"Mean electrostatic force {_format_range(force)}, with 95 % prediction"
+            f" interval. Mean friction {_format_range(friction)}.",
+            "Sources of variance": "; ".join(variance_sentences(content)) + f". {SHARES_LEGEND}",
+        }
+        | ({"Contact area": _sentence(content["contact_area"]["sentence"])} if "contact_area" in content else {}),
         answers=[
-            _answer("Rsc, median of people", law["Rsc"]["median"]),
-            _answer("Csc, median of people", law["Csc"]["median"]),
+            _answer("Rsc, median of fingers", law["Rsc"]["median"]),
+            _answer("Csc, median of fingers", law["Csc"]["median"]),
             _answer("Ci of the panel", law["Ci"]),
-            _answer("next finger's mean force", force),
+            _answer("mean force on the next finger", force),
         ],
         warnings=content["warnings"],
     )
 
 
+def _sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}"
+
+
 def _format_range(s: dict[str, Any]) -> str:
-    median, low, high = (format_engineering(s[key], s["unit"]) for key in ("q50", "q025", "q975"))
+    median, low, high = format_quantiles(s)
     return f"{median} ({low} to {high})"
 
 
 def _answer(title: str, s: dict[str, Any]) -> Answer:
-    median, low, high = (format_engineering(s[key], s["unit"], 3) for key in ("q50", "q025", "q975"))
+    median, low, high = format_quantiles(s)
     return Answer(title, median, f"95 %: {low} to {high}")
 
 
@@ -282,8 +288,8 @@ def _finger_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
 
 
 def _new_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
-    yield ("next finger", *_QUANTILES.values(), "people", "ignorance")
-    none = 1e-12 * content["new_finger"]["force_mean"]["q50"]  # rounding
+    yield ("next finger", *_QUANTILES.values(), "between fingers", "parameter uncertainty")
+    none = 1e-12 * content["new_finger"]["force_mean"]["q50"]  # smaller forces are rounding errors
     for name, s in content["new_finger"].items():
         values = (
             format_engineering(s[key] if s["unit"] != "N" or s["q975"] > none else 0.0, s["unit"], 3)
@@ -293,7 +299,7 @@ def _new_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
 
 
 def _share_rows(content: dict[str, Any], name: str) -> Iterator[tuple[str, ...]]:
-    yield ("factor", "goes once it is known", "stays if only it is not", "before: goes", "before: stays")
+    yield ("parameter", "first-order", "total", "first-order (prior)", "total (prior)")
     before = content["variance_shares_prior"][name]
     for factor, share in content["variance_shares"][name].items():
         cells = (

@@ -300,6 +300,7 @@ class Perception(Section):
 
     threshold_force: Threshold | None = None
     friction_change: Annotated[float, Field(gt=0)] | None = None
+    source: str | None = None
 
 
 class PopulationSection(Section):

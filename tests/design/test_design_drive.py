@@ -1,5 +1,6 @@
 """The design of a drive: against scipy's state space, closed forms, and random fingers drawn by scipy."""
 
+import dataclasses
 import itertools
 import json
 import math
@@ -254,10 +255,11 @@ def test_the_share_is_that_of_fingers_drawn_by_scipy(believed):
 
 def test_a_prior_does_not_tell_people_from_ignorance(believed):
     assert not believed.people.has_separate_uncertainty
-    assert any("people and for ignorance" in warning for warning in believed.warnings)
+    assert any("cannot be separated" in warning for warning in believed.warnings)
     option = believed.to_dict()["options"][0]
     assert (option["peak_to_peak"]["q05"], option["peak_to_peak"]["q95"]) == (None, None)
-    assert "%  " not in str(believed).splitlines()[2]
+    assert " to " not in str(believed).splitlines()[5]
+    assert "no record supports this" in believed.recommendation
 
 
 LAWS = FingerSample(
@@ -326,7 +328,7 @@ def test_friction_changes_by_a_share_of_itself(tmp_path: Path):
     fe = 2e-4 * 0.5 / (1.0 - 2e-4)
     assert few.assured == pytest.approx(sine_amplitude(F) * math.sqrt(fe / THRESHOLD), rel=1e-9)
     never = fitact.design_drive(scene(perception={"friction_change": 1.01}), one_finger())
-    assert never.options["sine"].violations == ("too few feel it at any amplitude",)
+    assert never.options["sine"].violations == ("too few fingers feel it at any amplitude",)
     assert never.options["sine"].to_dict()["peak_to_peak"]["assured"] == math.inf
     assert "unbounded" in str(never)
     assert never.smallest()["peak_to_peak"] == "triangle"  # whose force is more pointed
@@ -345,6 +347,94 @@ def test_what_breaks_a_limit_is_named_and_not_the_smallest(one):
     assert "the peak current is unbounded, above" in str(limited)
     assert "trapezoid: excluded, the peak current is" in str(limited)
     assert [name for name, option in limited.options.items() if not option.violations] == ["triangle"]
+
+
+def test_one_sentence_says_what_to_set(laws):
+    """The smallest amplitude at a finite current, for the same fingers as in the table; in text and JSON alike."""
+    settable = {name: option for name, option in laws.options.items() if name != "square"}
+    name, option = min(settable.items(), key=lambda pair: pair[1].assured)
+    assert laws.options["square"].assured < option.assured  # but its current is unbounded
+    said = laws.to_dict()["recommendation"]
+    assert said["waveform"] == name
+    assert said["peak_to_peak"] == 2.0 * said["amplitude"] == option.assured
+    met = np.mean(laws.needed[name] <= said["peak_to_peak"], axis=1) >= 0.8 - 0.5 / 32
+    assert 15 <= np.sum(met) <= 16
+    volts = [f"{x:.3g} V" for x in (said["amplitude"], said["peak_to_peak"])]
+    sentence = (
+        f"Set a {name} of {volts[0]} amplitude ({volts[1]} peak to peak) at 100 Hz: with 95 % probability, at least"
+        " 80 % of fingers then feel it."
+    )
+    assert said["sentence"] == sentence == str(laws).splitlines()[0]
+
+
+def test_no_amplitude_is_recommended_that_cannot_be_met_or_trusted():
+    nobody = fitact.design_drive(scene(perception={"friction_change": 5.0}), one_finger())
+    assert nobody.recommendation.startswith(
+        "No amplitude is recommended, because no waveform meets all conditions (sine"
+    )
+    assert nobody.to_dict()["recommendation"]["peak_to_peak"] is None
+    assert not any("times the limit" in warning for warning in nobody.warnings)
+    unreliable = fitact.design_drive(scene(), dataclasses.replace(one_finger(), trusted=False))
+    assert "population is not reliable" in unreliable.recommendation
+    assert unreliable.to_dict()["recommendation"]["amplitude"] is None
+
+
+def test_a_threshold_without_a_source_is_an_example(one):
+    assert "the same at all frequencies (example: [perception] states no source)" in one.question
+    assert any("100 µN" in warning and "is an example" in warning for warning in one.warnings)
+    assert one.to_dict()["threshold"] | {"sentence": ""} == {
+        "threshold_force": THRESHOLD, "source": None, "frequency": "all", "sentence": "",
+    }  # fmt: skip
+    stated = scene(drive=TRAPEZOID, perception={"threshold_force": THRESHOLD, "source": "our own staircase, 12 people"})
+    sourced = dataclasses.replace(one, scene=stated)
+    assert "(source: our own staircase, 12 people)" in sourced.question
+    assert not any("example" in warning for warning in sourced.warnings)
+
+
+@pytest.mark.parametrize("frequency", [50.0, 400.0, 4000.0])
+def test_current_and_field_stand_beside_published_limits_though_none_was_stated(frequency: float):
+    """Of a sine through two skins and Ci, by its impedance."""
+    thickness = 2e-6
+    stated = scene(
+        drive={"waveform": "sine", "frequency": frequency}, device={"insulator_thickness": thickness, "Ci": CI}
+    )
+    design = fitact.design_drive(stated, one_finger())
+    assert design.recommended is design.options["sine"]
+    s = 2j * np.pi * frequency
+    peak = 0.5 * design.options["sine"].assured / abs(2.0 * R / (1.0 + s * R * C) + 1.0 / (s * CI))
+    found = {(each["source"], each["quantity"]): each for each in design.to_dict()["limits"]}
+    ES1 = found["IEC 62368-1, class ES1", "rms current"]
+    assert (ES1["value"], ES1["limit"], ES1["unit"]) == (pytest.approx(peak / math.sqrt(2.0)), 0.5e-3, "A")
+    assert ES1["ratio"] == pytest.approx(ES1["value"] / 0.5e-3)
+    assert found["IEC 62368-1, class ES1", "peak current"]["value"] == pytest.approx(peak)
+    field = found["data sheet of the insulator", "insulator field"]
+    assert field["value"] == pytest.approx(peak / abs(s * CI) / thickness)
+    assert (field["limit"], field["ratio"]) == (None, None)
+    inside = {source for (source, _), each in found.items() if each["in_range"] and each["frequency_range"]}
+    assert inside == {source for source, highest in HIGHEST.items() if frequency <= highest}
+    exceeded = {source for source in inside if found[source, "rms current"]["ratio"] > 1.0}
+    warned = {source for source in HIGHEST if any(f"the limit of {source}" in warning for warning in design.warnings)}
+    assert warned == exceeded
+    assert "no safety assessment" in str(design)
+    assert "safe " not in str(design).replace("safety", "")
+
+
+# the highest frequency that each standard's limit is stated for, Hz
+HIGHEST = {
+    "IEC 60479-1, zone AC-1": 100.0,
+    "IEC 60479-1, zone AC-3": 100.0,
+    "IEC 62368-1, class ES1": 1e3,
+    "IEC 60601-1, patient leakage current": 1e3,
+}
+
+
+def test_an_ideal_edge_s_current_is_unbounded_and_said_to_be():
+    square = fitact.design_drive(scene(), one_finger())
+    limits = square.options["square"].limits
+    assert all(math.isinf(each.value) for each in limits if each.unit == "A")
+    assert all(each.row[3] == "unbounded" for each in limits if each.unit == "A")
+    assert square.recommended is not square.options["square"]
+    assert "square: not recommended, the current is unbounded at ideal edges; state [drive] rise_time." in square.notes
 
 
 def test_an_offset_scales_with_the_drive_and_lies_over_the_insulator(one):
@@ -371,14 +461,18 @@ def test_no_probe_is_connected_to_what_is_designed(one):
 @pytest.mark.parametrize(
     ("sections", "share", "sentence"),
     [
-        ({"perception": {}}, 0.95, r"\[perception\] must state what is felt, once; write threshold_force = '1 mN'"),
-        ({"perception": {"threshold_force": 1.0, "friction_change": 0.1}}, 0.95, "once"),
+        ({"perception": {}}, 0.95, r"\[perception\] must state one threshold, .*; write threshold_force = "),
+        ({"perception": {"threshold_force": 1.0, "friction_change": 0.1}}, 0.95, "one threshold"),
         ({"perception": {"friction_change": 0.1}, "friction": {"normal_force": 0.0}}, 0.95, "normal_force"),
-        ({"drive": {"waveform": "measured"}}, 0.95, "'measured': a drive is designed in the steady state; name a sine"),
+        (
+            {"drive": {"waveform": "measured"}},
+            0.95,
+            "'measured': a drive is designed in the steady state; state a sine",
+        ),
         ({"drive": {"waveform": "burst"}}, 0.95, "'burst'"),
         ({"drive": {"steady_state": False}}, 0.95, "steady_state"),
         ({"skin": {"level": "fractional"}}, 0.95, r"\[skin\] level = 'fractional'.*; write level = 'constant'"),
-        ({}, 0.0, "share = 0: give a share of people from 0.01 to 0.99"),
+        ({}, 0.0, "share = 0: give a fraction of fingers from 0.01 to 0.99"),
         ({}, math.nan, "share = nan"),
     ],
 )

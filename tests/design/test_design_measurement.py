@@ -246,11 +246,11 @@ def test_no_random_setting_is_better(names: tuple[str, ...]):
 def test_remedies_are_the_quick_changes_best_first():
     found = {option.name: option for option in suggest_measurements(NOMINAL, force_gradient(NOMINAL))}
     assert list(found) == ["current", "series resistor", "better Ci", "longer record"]
-    assert found["current"].text == "the trunk current I recorded to ± 20 nA"
+    assert found["current"].text == "the loop current I also recorded (20 nA rms noise)"
     assert found["series resistor"].text == "a known resistor of 100 kΩ in series"
     assert found["better Ci"].force_sd == pytest.approx((2.0 / 0.09 + 4.0 / 0.0025) ** -0.5, rel=1e-4)
     noisier = dataclasses.replace(NOMINAL, noise={"Vsc": 0.1, "I": 40e-9})
-    assert "the trunk current I recorded to ± 40 nA" in {
+    assert "the loop current I also recorded (40 nA rms noise)" in {
         o.text for o in suggest_measurements(noisier, force_gradient(NOMINAL))
     }
 

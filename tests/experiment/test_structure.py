@@ -95,10 +95,11 @@ def test_constant_directions_leave_the_channels_as_they_are_far_along(case: str)
 def test_contact_area_is_named():
     found = blind_directions(FINAL, SKIN, ("Vsc",))
     np.testing.assert_allclose(found.directions[0], np.array([-1.0, 1.0, 1.0]) / np.sqrt(3.0), atol=1e-12)
-    assert str(found) == "No record of Vsc alone can tell the contact area, which scales 1/Rsc, Csc and Ci alike."
+    area = "the contact area, which multiplies 1/Rsc, Csc and Ci by a common factor"
+    assert str(found) == f"No record of Vsc alone can determine {area}."
     assert found.contains({"Rsc": -0.58, "Csc": 0.58, "Ci": 0.57})
     assert not found.contains({"Rsc": 0.58, "Csc": 0.58, "Ci": 0.57})
-    assert "can tell Rsc, Csc, Ci" in str(blind_directions(FINAL, SKIN, ("Vsc", "I")))
+    assert "can determine Rsc, Csc, Ci" in str(blind_directions(FINAL, SKIN, ("Vsc", "I")))
     assert blind_directions(FINAL, ("Rsc", "Ci", "gain"), ("Vsc",)).directions[0, 1] > 0.0  # that of a larger Ci
 
 

@@ -1,0 +1,131 @@
+"""Published limits of the current through the body, and how a drive compares with them.
+
+The comparison is no safety assessment: the model has no fault, no stored energy and no current limit of an amplifier.
+"""
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+from fitact.model.steady_cycle import PeriodQuantities
+from fitact.scene.sections import Device
+from fitact.units import format_engineering
+
+NO_SAFETY_ASSESSMENT = (
+    "The comparison with limits is no safety assessment: the model has no fault (a pierced insulator), no energy stored"
+    " in the amplifier and no current limit"
+)
+
+
+class PublishedLimit(NamedTuple):
+    """A limit of a quantity of `PeriodQuantities`, from a standard."""
+
+    source: str
+    name: str  # its meaning there
+    quantity: str
+    limit: float  # A
+    lowest: float  # Hz; the standard gives the limit from here
+    highest: float  # to here
+
+
+AC_1, AC_3 = "IEC 60479-1, zone AC-1", "IEC 60479-1, zone AC-3"
+ES1 = "IEC 62368-1, class ES1"
+PATIENT_LEAKAGE = "IEC 60601-1, patient leakage current"
+PUBLISHED_LIMITS = (
+    PublishedLimit(AC_1, "upper end: perception possible, usually no startle", "current_rms", 0.5e-3, 15.0, 100.0),
+    PublishedLimit(AC_3, "lower end, long contact: muscles contract involuntarily", "current_rms", 5e-3, 15.0, 100.0),
+    PublishedLimit(ES1, "touchable by ordinary persons", "current_rms", 0.5e-3, 0.0, 1e3),
+    PublishedLimit(ES1, "touchable by ordinary persons", "current_peak", 0.707e-3, 0.0, 1e3),
+    PublishedLimit(PATIENT_LEAKAGE, "medical equipment, type BF, normal condition", "current_rms", 0.1e-3, 0.0, 1e3),
+)
+_NAMES = {"current_rms": "rms current", "current_peak": "peak current"}
+
+
+@dataclasses.dataclass(frozen=True)
+class LimitComparison:
+    """A quantity at the amplitude of a `DriveOption` beside a limit.
+
+    Attributes:
+        source: standard or scene key that states the limit.
+        name: meaning of the limit.
+        quantity: rms current, peak current, or field in the insulator.
+        value: largest one of the fingers drawn, A or V/m; infinite at ideal edges.
+        limit: in the same unit, or None if the scene states none.
+        unit: of both.
+        frequency_range: frequencies (Hz) for which the limit is published; None for a limit of the scene.
+        in_range: whether the drive's frequency lies there.
+    """
+
+    source: str
+    name: str
+    quantity: str
+    value: float
+    limit: float | None
+    unit: str
+    frequency_range: tuple[float, float] | None = None
+    in_range: bool = True
+
+    @property
+    def ratio(self) -> float | None:
+        """The value over the limit, or None without a limit."""
+        return None if self.limit is None else self.value / self.limit
+
+    @property
+    def exceeds_published(self) -> bool:
+        """Whether the value exceeds a published limit at a frequency for which it is published."""
+        published = self.ratio is not None and self.frequency_range is not None and self.in_range
+        return published and self.value > (self.limit or 0.0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return an entry of `limits` in drive.json; null stands for what is unbounded or not stated."""
+        between = None if self.frequency_range is None else list(self.frequency_range)
+        return dataclasses.asdict(self) | {"ratio": self.ratio, "frequency_range": between}
+
+    @property
+    def row(self) -> tuple[str, ...]:
+        """Cells for people: source, meaning, quantity, value, limit, ratio, frequencies."""
+        ratio = "" if self.ratio is None else f"{self.ratio:.2g}" if math.isfinite(self.ratio) else "unbounded"
+        limit = "not stated" if self.limit is None else format_value(self.limit, self.unit)
+        return self.source, self.name, self.quantity, format_value(self.value, self.unit), limit, ratio, self._range
+
+    @property
+    def _range(self) -> str:
+        if self.frequency_range is None:
+            return ""
+        low, high = (format_engineering(frequency, "Hz", 3) for frequency in self.frequency_range)
+        given = f"{low} to {high}" if self.frequency_range[0] else f"up to {high}"
+        return given if self.in_range else f"{given}, not here"
+
+
+def compare_with_limits(frequency: float, at_amplitude: PeriodQuantities, device: Device) -> list[LimitComparison]:
+    """Compare the body current and the insulator's field at an amplitude with published limits and the scene's."""
+    rows = [
+        LimitComparison(
+            each.source,
+            each.name,
+            _NAMES[each.quantity],
+            float(getattr(at_amplitude, each.quantity)),
+            each.limit,
+            "A",
+            (each.lowest, each.highest),
+            each.lowest <= frequency <= each.highest,
+        )
+        for each in PUBLISHED_LIMITS
+    ]
+    stated = {"current_rms": device.current_limit_rms, "current_peak": device.current_limit_peak}
+    for name, limit in stated.items():
+        if limit is not None:
+            key = f"[device] {name.replace('_', '_limit_')}"
+            value = float(getattr(at_amplitude, name))
+            rows.append(LimitComparison(key, "your limit", _NAMES[name], value, limit, "A"))
+    field = float(at_amplitude.insulator_peak) / device.insulator_thickness
+    source = "data sheet of the insulator" if device.breakdown_field is None else "[device] breakdown_field"
+    name = "breakdown field of the material at this thickness"
+    return [*rows, LimitComparison(source, name, "insulator field", field, device.breakdown_field, "V/m")]
+
+
+def format_value(value: float, unit: str) -> str:
+    """Format a current or a field for people; a field is in V/µm, as data sheets have it."""
+    if not math.isfinite(value):
+        return "unbounded"
+    return f"{1e-6 * value:.3g} V/µm" if unit == "V/m" else format_engineering(value, unit, 3)

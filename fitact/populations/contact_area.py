@@ -1,0 +1,98 @@
+"""Test of the assumption that all fingers have the same contact area, by each finger's own estimate of Ci.
+
+The contact area multiplies Ci, Csc and 1/Rsc by a common factor. A record of the current determines a
+finger's own Ci; a record of Vsc alone does not.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.stats
+
+from fitact.populations.finger import Finger
+from fitact.prior.distributions import Distribution
+from fitact.units import format_percent
+
+MAX_P_VALUE = 0.01  # below which the fingers' own estimates disagree
+
+
+class ContactAreaTest(NamedTuple):
+    """Result of a chi-square test that all fingers have the same Ci, and so the same contact area.
+
+    Attributes:
+        assumption: `[population] contact_area`, "common" or "varies".
+        fingers: number of fingers whose record determines log Ci better than the prior does.
+        chi_square: of their own log Ci about the weighted mean, with `fingers` - 1 degrees of freedom.
+        p_value: probability of a larger one if all have the same Ci; NaN if fewer than two fingers tell.
+        log_sd: standard deviation of log Ci between fingers beyond the standard errors (DerSimonian & Laird 1986).
+        tolerance: log_sd that changes the force by no more than `[tolerance] force`.
+    """
+
+    assumption: str
+    fingers: int
+    chi_square: float
+    p_value: float
+    log_sd: float
+    tolerance: float
+
+    @classmethod
+    def from_fingers(
+        cls, fingers: Sequence[Finger], prior: Distribution, assumption: str, tolerance: float
+    ) -> "ContactAreaTest":
+        """Test the fingers whose record determines log Ci better than its `prior`."""
+        informative = [finger for finger in fingers if finger.precision > prior.log_sd**-2]
+        count, nan = len(informative), math.nan
+        if count < 2:
+            return cls(assumption, count, nan, nan, nan, tolerance)
+        weight = np.array([finger.precision for finger in informative])
+        log_Ci = np.array([finger.center for finger in informative])
+        log_Ci += np.array([finger.weighted_offset for finger in informative]) / weight
+        mean = np.average(log_Ci, weights=weight)
+        chi_square = float(weight @ np.square(log_Ci - mean))
+        excess = (chi_square - (count - 1)) / float(weight.sum() - np.sum(weight**2) / weight.sum())
+        p_value = float(scipy.stats.chi2.sf(chi_square, count - 1))
+        return cls(assumption, count, chi_square, p_value, math.sqrt(max(excess, 0.0)), tolerance)
+
+    @property
+    def is_tested(self) -> bool:
+        """Whether at least two records determine their finger's own Ci."""
+        return math.isfinite(self.p_value)
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether the fingers' own Ci differ significantly and relevantly, although one area is assumed."""
+        return (
+            self.assumption == "common"
+            and self.is_tested
+            and self.p_value < MAX_P_VALUE
+            and self.log_sd > self.tolerance
+        )
+
+    @property
+    def sentence(self) -> str:
+        """Sentence on the assumption and on the records' evidence about it."""
+        if self.assumption == "varies":
+            return '[population] contact_area = "varies": each finger has its own contact area.'
+        assumed = 'assumed: all fingers have the same contact area ([population] contact_area = "common")'
+        if not self.is_tested:
+            return f"{assumed}; these records cannot test this, because Vsc alone does not determine a finger's own Ci."
+        scatter = f"the fingers' own Ci differ by {format_percent(self.log_sd)} (1 sd) beyond their standard errors"
+        if self.disagrees:
+            return f'{assumed}; the records disagree: {scatter}; set contact_area = "varies".'
+        return f"{assumed}; the records agree with it: {scatter}."
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entry `contact_area` of population.json."""
+        tested = self.is_tested
+        return {
+            "assumption": self.assumption,
+            "tested": tested,
+            "disagrees": self.disagrees if tested else None,
+            "fingers": self.fingers,
+            "chi_square": self.chi_square if tested else None,
+            "p_value": self.p_value if tested else None,
+            "log_sd": self.log_sd if tested else None,
+            "sentence": self.sentence,
+        }
