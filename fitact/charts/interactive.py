@@ -22,8 +22,10 @@ Chart = dict[str, Any]
 _FONT = {"family": "system-ui, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif", "size": 13, "color": "#1c2733"}
 _AXIS = {
     "showline": True, "linecolor": "#51606f", "ticks": "outside", "tickcolor": "#51606f", "gridcolor": "#e3e7eb",
-    "zeroline": False, "automargin": True, "exponentformat": "SI", "nticks": 6,
+    "zeroline": False, "automargin": True, "exponentformat": "SI",
 }  # fmt: skip
+# with 3, plotly.js labels powers of ten above two decades, and 1, 2, 5 below: labels that do not overlap
+_TICKS = {"linear": 6, "log": 3}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +59,8 @@ class Axis:
         sizes = sizes[np.isfinite(sizes) & (sizes > 0.0)]
         # beyond four decades no single prefix is readable
         wide = log and sizes.size > 0 and bool(np.log10(sizes.max() / sizes.min()) > 4.0)
-        size, symbol = choose_prefixed_unit(float(sizes.max()) if sizes.size and not wide else 0.0, unit)
+        middle = float(np.sqrt(sizes.min() * sizes.max()) if log else sizes.max()) if sizes.size and not wide else 0.0
+        size, symbol = choose_prefixed_unit(middle, unit)
         return cls(title, symbol, size, log, limits, has_tick_prefixes=wide)
 
     def encode(self, values: ArrayLike, dtype: str = "f4") -> dict[str, str]:
@@ -69,6 +72,9 @@ class Axis:
         """Return the axis layout for plotly.js."""
         title = f"{self.title} / {self.symbol}" if self.symbol else self.title
         layout = _AXIS | {"title": {"text": title, "standoff": 6}, "type": "log" if self.log else "linear"}
+        layout["nticks"] = _TICKS[layout["type"]]
+        if self.has_tick_prefixes:
+            layout["tickformat"] = "~s"
         if self.hides_numbers:
             layout |= {"showticklabels": False, "ticks": "", "showgrid": False, "rangemode": "tozero"}
         if self.limits is not None:
@@ -228,7 +234,7 @@ def _axis_type_update(plot: Plot, axes: str, kind: str) -> dict[str, Any]:
     return {
         "traces": traces,
         "restyle": {"y": [plot["data"][i]["meta"][kind] for i in traces]} if traces else {},
-        "relayout": {f"{name}.type": kind for name in names},
+        "relayout": {key: x for name in names for key, x in ((f"{name}.type", kind), (f"{name}.nticks", _TICKS[kind]))},
     }
 
 

@@ -1,4 +1,4 @@
-"""Commands on what to do next: which measurement would tell most, which drive is felt."""
+"""Commands that design the next measurement, and the drive that is felt."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,31 +15,29 @@ from fitact.cli.terminal import command_line, show
 design = typer.Typer(
     name="design",
     no_args_is_help=True,
-    help="What to do next: which measurement would tell most, which drive enough people feel.",
+    help="Find the next measurement, or the drive that a given fraction of fingers feel.",
 )
 app.add_typer(design)
 
 
 @design.command()
 def measurement(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene (TOML): the measurement as it stands.")],
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene (TOML) of the present measurement.")],
     record: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--record", metavar="RECORD", help="A record of it, whose fit gives values and noise; may be repeated."
-        ),
+        typer.Option("--record", metavar="RECORD", help="Record whose fit gives values and noise; may be repeated."),
     ] = None,
     channel: Channels = None,
     scale: Scales = None,
     out: Out = None,
     json: Json = False,
 ) -> None:
-    """Which measurement would tell most of the mean force: the error to expect of each option, best first.
+    """Rank changes to the measurement by the expected uncertainty of the mean force.
 
-    Into DIR it writes report.html, design.json and design.svg.
+    Writes report.html, design.json and design.svg into DIR.
     """
     stated = fitact.Scene.load(scene)
-    measured = list(LazyRecords(record, stated, (channel, scale)))  # refused before the slow imports
+    measured = list(LazyRecords(record, stated, (channel, scale)))  # refuses bad records before the slow imports
     internal.use_compilation_cache()
     options = fitact.design_measurement(stated, measured)
     if out is not None:
@@ -49,26 +47,29 @@ def measurement(
 
 @design.command()
 def drive(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Scene (TOML): panel, drive, threshold and limits.")],
+    scene: Annotated[
+        str, typer.Argument(metavar="SCENE", help="Scene (TOML) with panel, drive, threshold and limits.")
+    ],
     records: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="[RECORD]...", help="One of each finger; absent: the scene's prior stands for people."),
+        typer.Argument(metavar="[RECORD]...", help="One record of each finger; default: the scene's prior is used."),
     ] = None,
-    share: Annotated[float, typer.Option("--share", help="Of people, who are to feel it.")] = 0.95,
+    share: Annotated[float, typer.Option("--share", help="Fraction of fingers that should feel the drive.")] = 0.95,
     channel: Channels = None,
     scale: Scales = None,
     out: Out = None,
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
-    """The smallest drive that enough people feel: by waveform, frequency and insulator, within stated limits.
+    """Find the smallest drive that a given fraction of fingers feel, by waveform, frequency and insulator.
 
-    Into DIR it writes report.html, drive.json and drive.svg, and of records chain.h5 (for going on).
+    The threshold and your limits are stated in the scene. Writes report.html, drive.json and drive.svg into DIR; with
+    records also chain.h5, from which an interrupted run resumes.
     """
     stated = fitact.Scene.load(scene)
     measured = LazyRecords(records, stated, (channel, scale))
     internal.use_compilation_cache()
-    internal.require_designable(stated, share)  # before the people are sampled
+    internal.require_designable(stated, share)  # refuses before the population is sampled
     people = fitact.population(measured, stated, folder=out, seed=seed) if measured else None
     options = fitact.design_drive(stated, people, share, seed=seed)
     if out is not None:

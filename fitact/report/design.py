@@ -1,4 +1,4 @@
-"""What to measure next as a picture and as a page: the error to expect of the force by each option and setting."""
+"""The next measurement as a picture and as a page: expected uncertainty of the force by option and setting."""
 
 import os
 
@@ -21,7 +21,7 @@ _SETTINGS = {
 
 
 def draw_design(design: MeasurementDesign, has_curves: bool = True) -> Figure:
-    """Draw the bars of all options' expected errors, above the curves along what can be set."""
+    """Draw bars of the expected uncertainties, above the curves along the continuous settings."""
     chart = _chart(design) if has_curves else None
     heights = [0.6 + 0.34 * (2 + len(design.options)), *([3.2] if chart else [])]
     figure = Figure(figsize=(9.0, sum(heights)), layout="constrained")
@@ -44,7 +44,9 @@ def _draw_bars(axes: Axes, design: MeasurementDesign) -> None:
     axes.set_yticks(range(len(shown)), [option.name for option in shown])
     axes.get_yticklabels()[-1].set_fontweight("bold")
     axes.grid(axis="y", visible=False)
-    axes.set_xlabel("expected error of the mean force, %" + ("" if best is None else " (green: most for its effort)"))
+    axes.set_xlabel(
+        "expected uncertainty of the mean force, %" + ("" if best is None else " (green: largest gain per effort)")
+    )
 
 
 def write_design_page(path: str | os.PathLike[str], design: MeasurementDesign, origin: Provenance) -> None:
@@ -72,21 +74,21 @@ def write_design_page(path: str | os.PathLike[str], design: MeasurementDesign, o
 def _frame(design: MeasurementDesign) -> PageSummary:
     best, now, prior = design.best_for_effort, design.now, format_percent(design.prior_force_sd)
     most, *others = (
-        design.sentences if best else ("Nothing that can be changed tells more of the force.", *design.sentences)
+        design.sentences if best else ("No change reduces the uncertainty of the mean force.", *design.sentences)
     )
     answers = [Answer("as it stands", f"± {format_percent(now.force_sd)}", f"before any measurement: ± {prior}")]
     if best is not None:
-        answers.append(Answer("most for its effort", f"± {format_percent(best.force_sd)}", best.text))
+        answers.append(Answer("largest gain per effort", f"± {format_percent(best.force_sd)}", best.text))
     least = design.options[0] if design.options else now
     if least not in (best, now):
-        answers.append(Answer("least error", f"± {format_percent(least.force_sd)}", least.text))
+        answers.append(Answer("smallest uncertainty", f"± {format_percent(least.force_sd)}", least.text))
     return PageSummary(
         title="What to measure next",
-        subject="How well the mean force would be known by what might be measured in place of the scene's measurement:"
-        " standard deviations to expect.",
+        subject="Expected uncertainty (1 sd) of the mean force after a change of the scene's measurement."
+        " Calibration errors are not included.",
         trusted=design.trusted,
         verdict=most.rstrip(".") if design.trusted else f"{'; '.join(design.warnings)}.",
-        findings={"What else": " ".join(others)} if others else {},
+        findings={"Other changes": " ".join(others)} if others else {},
         answers=answers,
         warnings=design.warnings,
         has_reservation=best is None,
@@ -94,7 +96,7 @@ def _frame(design: MeasurementDesign) -> PageSummary:
 
 
 def _chart(design: MeasurementDesign) -> interactive.Chart | None:
-    """The error along each setting, and the settings chosen; None: nothing can be set."""
+    """Make the chart of the uncertainty along each setting; None without continuous settings."""
     if not design.curves:
         return None
     plots: list[interactive.Plot] = []
@@ -102,7 +104,7 @@ def _chart(design: MeasurementDesign) -> interactive.Chart | None:
     limits = (0.7 * min(reached), 1.4 * max(*reached, design.now.force_sd))
     for curve in design.curves:
         x = Axis.from_values(_SETTINGS[curve.setting], curve.unit, curve.values, log=True)
-        y = Axis("error of the mean force", "%", 0.01, log=True, limits=limits)
+        y = Axis("uncertainty of the mean force", "%", 0.01, log=True, limits=limits)
         ends = (curve.values[0], curve.values[-1])
         now = (design.now.force_sd, design.now.force_sd)
         alone = [option for option in design.options if list(option.settings) == [curve.setting]]

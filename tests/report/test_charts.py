@@ -74,7 +74,7 @@ def test_buttons_switch_what_they_say():
     assert hide["off"] == {"traces": [0], "restyle": {"visible": False}, "relayout": {}}
     log = interactive.log_axis_button(plots)
     assert log["pressed"]
-    assert log["updates"][0]["off"]["relayout"] == {"xaxis.type": "linear"}
+    assert log["updates"][0]["off"]["relayout"] == {"xaxis.type": "linear", "xaxis.nticks": 6}
     assert log["updates"][0]["off"]["restyle"]["y"] == [trace["meta"]["linear"] for trace in traces]
 
 

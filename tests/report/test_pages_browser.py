@@ -44,3 +44,23 @@ def test_it_reads_aloud_and_is_legible(browser: Browser, page: Path):
     contrasts = browser.ask(CONTRASTS)
     assert len(contrasts) > 30
     assert [each for each in contrasts if each[1] < 4.5] == []
+
+
+# pairs of labels of one axis that overlap, by a pixel or more each way
+OVERLAPPING = """[...document.querySelectorAll('.plot .xaxislayer-above, .plot .yaxislayer-above')].flatMap((axis) => {
+  const labels = [...axis.querySelectorAll('.xtick text, .ytick text')].filter((text) => text.textContent.trim());
+  const boxes = labels.map((text) => text.getBoundingClientRect());
+  return labels.flatMap((text, i) => labels.slice(i + 1).filter((_, k) => {
+    const [a, b] = [boxes[i], boxes[i + 1 + k]];
+    return a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1;
+  }).map((other) => `${text.textContent} and ${other.textContent}`));
+})"""
+
+
+@pytest.mark.parametrize("width", [1280, 420])
+def test_no_tick_labels_overlap(browser: Browser, page: Path, width: int):
+    browser.open(page, width)
+    browser.whole()
+    labels = browser.ask("document.querySelectorAll('.plot .xtick text, .plot .ytick text').length")
+    assert (labels > 0) == (CHARTS[page.stem] > 0)
+    assert browser.ask(OVERLAPPING) == []
