@@ -71,8 +71,8 @@ class Axis:
     def layout(self) -> dict[str, Any]:
         """Return the axis layout for plotly.js."""
         title = f"{self.title} / {self.symbol}" if self.symbol else self.title
-        layout = _AXIS | {"title": {"text": title, "standoff": 6}, "type": "log" if self.log else "linear"}
-        layout["nticks"] = _TICKS[layout["type"]]
+        layout = _AXIS | {"title": {"text": title, "standoff": 6}, "type": (kind := "log" if self.log else "linear")}
+        layout["nticks"] = _TICKS[kind]
         if self.has_tick_prefixes:
             layout["tickformat"] = "~s"
         if self.hides_numbers:

@@ -1,4 +1,4 @@
-"""What a force rests on: law, defaults, the other law, the fraction of the prior, and the assumed Ci."""
+"""Basis of a computed force: law, defaults, the other law, the fraction of the prior, and the assumed Ci."""
 
 import json
 
@@ -81,7 +81,7 @@ def test_a_scene_without_Ci_is_warned(text: str, warned: bool, tmp_path):
 
 
 def test_a_Ci_that_the_data_determine_is_only_noted():
-    """With the current Ci comes from the data, so that an assumed one cannot change the result."""
+    """The current determines Ci, so that an assumed one cannot change the result."""
     scene = fitact.Scene(drive={"waveform": "measured"}, measurement={"channels": ["Vsc", "I"]})
     path = sorted((RECORDS / "fingers").glob("*.csv.gz"))[0]
     fit = fitact.fit(fitact.read(path, scene), scene)
@@ -91,7 +91,7 @@ def test_a_Ci_that_the_data_determine_is_only_noted():
 
 
 def test_the_fraction_from_the_prior_is_that_of_the_information(finger_fit: fitact.Fit):
-    """Of the variance C, the part C P^-1 C comes from the prior; the rest from the data."""
+    """The prior contributes C P^-1 C to the variance C, the data contribute the rest."""
     covariance, prior = finger_fit.covariance, finger_fit.likelihood.prior_factor
     share = np.diag(covariance @ np.linalg.inv(prior @ prior.T) @ covariance) / np.diag(covariance)
     stated = [finger_fit.parameters()[name]["from_prior"] for name in finger_fit.names]
