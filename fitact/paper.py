@@ -166,7 +166,7 @@ def _grounding_finger_claims() -> Iterator[Claim]:
         yield _make_claim(
             id, f"the peak of Vsc with a grounding Csc of {C * 1e9:g} nF", printed, peaks, "V",
             "in the circuit as drawn a larger grounding capacitance takes less of the drive, so Vsc rises with it, from"
-            " 13.7 to 15.9 V; the paper's falls",
+            " 13.7 to 15.9 V; in the paper it falls",
         )  # fmt: skip
 
 

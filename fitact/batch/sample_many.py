@@ -150,7 +150,7 @@ def _make_targets(batch: Batch) -> _Targets | None:
         targets = _Targets(members, fit_rows, problem.likelihood, problem.derive, tables, approximations)
         targets = targets._replace(approximations=approximations.refine(_probe_axes(targets)))
         is_near = np.all(is_normal(_probe_axes(targets)), axis=1)
-    except np.linalg.LinAlgError:  # one of them spoils what is computed for all
+    except np.linalg.LinAlgError:  # one record may make the joint computation fail
         return None
     return targets.subset(np.flatnonzero(is_near).tolist()) if is_near.any() else None
 

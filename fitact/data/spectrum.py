@@ -76,8 +76,8 @@ class Spectrum:
             raise InputError(f"{source}: the impedance is 0 at {f[np.abs(z) == 0.0][0]:g} Hz; remove that point")
         if np.mean(z.imag > 0.0) > 0.5:
             raise InputError(
-                f"{source}: the imaginary part is positive, as of a coil; a finger's is negative: name a column that"
-                " holds -Im Z with a leading minus, as -Z_imag_ohm"
+                f"{source}: the imaginary part is positive (inductive), but a finger's is negative; begin the name of a"
+                " column of -Im Z with a minus, e.g. -Z_imag_ohm"
             )
         for array in (f, z):
             array.flags.writeable = False

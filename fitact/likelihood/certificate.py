@@ -147,8 +147,8 @@ def _compression_failure(error: float, excess: float, tolerance: float) -> str:
     if np.isnan(error):
         return "the uncertainty of its time constant exceeds the range of the table"
     if not error <= tolerance:
-        return f"the compressed log-likelihood was off by {error:.2g} near the optimum"
-    return f"the compressed log-likelihood was off by {excess:.2g} within the prior" if excess > tolerance else ""
+        return f"the error of the compressed log-likelihood is {error:.2g} near the optimum"
+    return f"the error of the compressed log-likelihood is {excess:.2g} within the prior" if excess > tolerance else ""
 
 
 def _prior_points(likelihood: Likelihood, theta: np.ndarray, count: int) -> Float[np.ndarray, "n parameters"]:

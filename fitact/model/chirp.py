@@ -68,7 +68,7 @@ class Chirp(Drive):
         if self.pieces > most:
             raise InputError(
                 f"Chirp: {self.pieces // per_cycle:,} cycles of its highest frequency are more than"
-                f" {most // per_cycle:,}; make it shorter, or its frequencies lower"
+                f" {most // per_cycle:,}; reduce its duration or frequencies"
             )
 
     def is_over(self, time: ArrayLike) -> Array:

@@ -103,7 +103,7 @@ def drive_frequency(drive: Drive) -> ArrayLike:
     if isinstance(drive, InterpolatedDrive) and drive.period is not None:
         return 1.0 / drive.period
     raise InputError(
-        f"a {type(drive).__name__} drive does not repeat, so it has no harmonics; give one of points its period"
+        f"a {type(drive).__name__} drive is not periodic, so it has no harmonics; give a drive of points a period"
     )
 
 

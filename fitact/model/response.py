@@ -62,8 +62,8 @@ def response(
 
     Raises:
         InputError: the drive has no steady state; `initial` is given for the steady state, or has a wrong number of
-            values; the skin depends on the frequency and the steady state of a periodic drive is not what is
-            requested; or Vgap is requested without a gap.
+            values; a frequency-dependent skin is combined with anything but the steady state of a periodic drive; or
+            the circuit has no gap for Vgap.
     """
     total, rate = response_and_rate(circuit, drive, time, steady_state=steady_state, channel=channel)
     if rate is not None:
@@ -86,7 +86,7 @@ def response_and_rate(
     if not steady_state:
         raise InputError(
             f"a {type(circuit.skin).__name__.lower()} skin has a response in the steady state only;"
-            " ask for steady_state=True, or take the constant skin level"
+            " use steady_state=True, or a constant skin"
         )
     harmonics = harmonic_decomposition(circuit, drive, channel)
     missing = harmonic_sum(harmonics.drive * harmonics.missing_gain, drive, time)

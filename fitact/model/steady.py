@@ -164,7 +164,7 @@ def _period_pieces(drive: Drive) -> LinearPieces:
         raise TypeError(f"no exact response to a {type(drive).__name__}")
     raise InputError(
         f"a {type(drive).__name__} drive without a period has no steady state to average over;"
-        " take a periodic drive, or Sampled(..., period=T)"
+        " use a periodic drive, or Sampled(..., period=T)"
     )
 
 

@@ -106,7 +106,7 @@ class CircuitResponses:
             weight, tau, harmonics = partial_fractions(complete, skin, drive, precision, channel)
             tau = np.maximum(
                 tau, np.finfo(np.float32).tiny
-            )  # in single precision, that of an absent element may vanish
+            )  # in single precision, the tau of an absent element may be 0
             wave = drive.wave if isinstance(drive, Burst) else drive
             segments, knots = None, np.zeros((*tau.shape, 0), dtype=precision)
             if isinstance(wave, PiecewiseLinear | Sampled):

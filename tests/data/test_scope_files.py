@@ -339,7 +339,7 @@ def test_named_arrays_that_are_refused(tmp_path: Path):
     with pytest.raises(fitact.InputError, match="complex"):
         read_capture(tmp_path / "iq.mat")
     np.savez(tmp_path / "counts.npz", XInc=1e-6, YInc=0.01, Vsc=np.arange(50))
-    with pytest.raises(fitact.InputError, match="a converter's counts"):
+    with pytest.raises(fitact.InputError, match="ADC counts"):
         read_capture(tmp_path / "counts.npz")
     np.savez(tmp_path / "no_time.npz", Vsc=TIME)
     with pytest.raises(fitact.InputError, match="has no time; store an array 'time'"):
@@ -397,7 +397,10 @@ def test_channels_from_files_of_their_own(tmp_path: Path):
     record = fitact.read(tmp_path / "C2.csv", channels={"Vsc": "Ampl", "V": "C1.csv:Ampl"})
     np.testing.assert_array_equal(record["V"], table[:, 1])
     np.testing.assert_array_equal(record["Vsc"], table[:, 2])
-    for asked, words in (("C3.csv:Ampl", "not of one capture"), ("C1.csv:B", "C1.csv: there is no column 'B'")):
+    for asked, words in (
+        ("C3.csv:Ampl", "does not belong to the same acquisition"),
+        ("C1.csv:B", "C1.csv: there is no column 'B'"),
+    ):
         with pytest.raises(fitact.InputError, match=words):
             fitact.read(tmp_path / "C2.csv", channels={"Vsc": "Ampl", "V": asked})
 

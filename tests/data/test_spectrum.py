@@ -109,7 +109,7 @@ BROKEN = {
     "not finite": ([NAMES, *GOOD, "7,nan,-1"], "not finite"),
     "twice": ([NAMES, *GOOD, "10,1e5,-1e5"], "10 Hz occurs twice"),
     "at 0 Hz": ([NAMES, *GOOD, "0,1e5,-1e5"], "the frequency 0 Hz"),
-    "a coil": ([NAMES, *(row.replace("-", "") for row in GOOD)], "leading minus"),
+    "inductive": ([NAMES, *(row.replace("-", "") for row in GOOD)], "with a minus"),
     "zero": ([NAMES, *GOOD, "7,0,0"], "the impedance is 0 at 7 Hz"),
     "no header": (["a,b,c,d", "1,2,3,4"], "no line names a frequency"),
 }

@@ -159,8 +159,8 @@ def test_samples_are_summed_where_compression_does_not_hold(made: dict[str, int]
     ("error", "excess", "reason"),
     [
         (0.9e-3, 0.9e-3, "^$"),
-        (1.1e-3, 0.0, "off by 0.0011 near the optimum"),
-        (0.0, 0.01, "off by 0.01 within the prior"),
+        (1.1e-3, 0.0, "is 0.0011 near the optimum"),
+        (0.0, 0.01, "is 0.01 within the prior"),
         (math.nan, 0.0, "time constant exceeds the range of the table"),
     ],
 )

@@ -174,7 +174,7 @@ def _make_capture(contents: _Contents, source: str, pick: Pick) -> Capture:
     """Make a capture: find the time, or start and step of the time, among the named arrays, and the channels."""
     arrays = contents.arrays
     if any(array.dtype.kind == "c" for array in arrays.values()):
-        raise InputError(f"{source}: holds complex numbers (IQ data), not voltages in time; export those")
+        raise InputError(f"{source}: holds complex numbers (IQ data); export voltages against time")
     last = {name: layouts.split_name_and_unit(name.rpartition("/")[2]) for name in arrays}
     times = ("time", *sorted(layouts.TIME_NAMES))
     timed = [name for wanted in times for name in arrays if last[name][0].lower() == wanted]
@@ -184,9 +184,9 @@ def _make_capture(contents: _Contents, source: str, pick: Pick) -> Capture:
     wanted = set(pick(names, ""))
     chosen = [(name, other) for name, other in zip(names, others, strict=True) if name in wanted]
     if "yinc" in contents.metadata and any(arrays[other].dtype.kind in "iu" for _, other in chosen):
-        raise InputError(f"{source}: holds a converter's counts under its maker's scale (YInc); export volts, or CSV")
+        raise InputError(f"{source}: holds ADC counts with a manufacturer's scale (YInc); export volts, or CSV")
     if not chosen:
-        raise InputError(f"{source}: holds no array of one axis besides the time; store V, Vsc or I in it")
+        raise InputError(f"{source}: has no one-dimensional array except the time; store V, Vsc or I in it")
     if timed:
         unit = last[timed[0]][1] or contents.units[timed[0]]
         time = layouts.convert_time(arrays[timed[0]].astype(float), unit, source, "store seconds")
@@ -199,7 +199,7 @@ def _make_capture(contents: _Contents, source: str, pick: Pick) -> Capture:
         if arrays[other].size != time.size:
             raise InputError(
                 f"{source}: '{name}' has {arrays[other].size:,} samples and the time {time.size:,}; store channels of"
-                " one length, or name those wanted with --channel"
+                " equal length, or select channels with --channel"
             )
     stated = next((_to_text(contents.metadata[key]) for key in layouts.UNIT_KEYS if key in contents.metadata), "")
     channels = tuple(
@@ -220,8 +220,10 @@ def _time_grid(contents: _Contents, count: int, source: str) -> tuple[np.ndarray
     zero = find(("zeroindex",))  # Tektronix
     step = 1.0 / rate if step is None and rate else step
     if step is None or not 0.0 < step < float("inf"):
-        raise InputError(f"{source}: has no time; store an array 'time' (s) beside the channels, or the step as 'dt'")
-    notes = [] if start is not None or zero is not None else [f"{source}: the time was taken to start at 0"]
+        raise InputError(
+            f"{source}: has no time; store an array 'time' (s) with the channels, or the time step as 'dt'"
+        )
+    notes = [] if start is not None or zero is not None else [f"{source}: the time was assumed to start at 0"]
     return step * (np.arange(count) - (zero or 0.0)) + (start or 0.0), notes
 
 
@@ -245,8 +247,8 @@ def _check_one_grid(times: Sequence[np.ndarray], names: Sequence[str], source: s
     for time, name in zip(times, names, strict=True):
         if not layouts.is_same_grid(time, times[0]):
             raise InputError(
-                f"{source}: '{name}' has another length or other times than '{names[0]}'; export channels of one"
-                " time base"
+                f"{source}: '{name}' has a different length or different times than '{names[0]}'; export channels of"
+                " one time base"
             )
 
 
@@ -257,7 +259,9 @@ def _size_limit(path: Path) -> int:
 
 def _check_size(size: int, path: Path, source: str) -> None:
     if size > _size_limit(path):
-        raise InputError(f"{source}: announces {size:,} bytes of numbers, more than it can hold; export it again")
+        raise InputError(
+            f"{source}: the header states {size:,} bytes of numbers, more than the file can hold; export it again"
+        )
 
 
 def _to_text(value: Any) -> str:

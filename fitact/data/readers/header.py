@@ -50,11 +50,11 @@ def read_header(text: str, source: str, sidecar_text: str = "") -> "Header":
         found = ", ".join(header.names.cells) if header.names else "no header"
         raise InputError(
             f"{source}{header.location}: no column time_s, and no other time column (found: {found[:200]}); name the"
-            f" columns as in {_EXAMPLE}, or export the time as well (Rohde & Schwarz keep that of NAME.Wfm.csv in"
-            " NAME.csv beside it)"
+            f" columns as in {_EXAMPLE}, or export the time as well (Rohde & Schwarz store the time of NAME.Wfm.csv in"
+            " NAME.csv)"
         )
     if not header.channels:
-        raise InputError(f"{source}{header.location}: there is no column of numbers besides the time; export channels")
+        raise InputError(f"{source}{header.location}: there is no column of numbers except the time; export channels")
     return header
 
 

@@ -49,7 +49,7 @@ def read(
     if "V" not in record and (scene is None or scene.drive.waveform == "measured"):
         place = capture.channels[0].location
         raise InputError(
-            f"{source}{place}: the column V_V is missing and no scene gives the drive;"
+            f"{source}{place}: the column V_V is missing and no scene states the drive;"
             " record the drive, or name its waveform under [drive] in a scene file"
         )
     return record
@@ -72,7 +72,7 @@ def read_capture(path: str | os.PathLike[str], pick: Pick = lambda names, place:
     if is_binary(head) or is_known_binary(head, path.suffix):
         return read_binary(path, source, head, pick)
     if is_spectrum(path):
-        raise InputError(f"{source}: is an impedance spectrum, without time; give it to: fitact fit (fit_spectrum)")
+        raise InputError(f"{source}: is an impedance spectrum without time; use fitact fit (fit_spectrum)")
     return read_text(path, source, pick)
 
 
@@ -84,8 +84,8 @@ def merge_other_files(capture: Capture, path: str | os.PathLike[str], channels: 
             other = _read_column(*found)
             if not is_same_grid(capture.time, other.time):
                 raise InputError(
-                    f"{capture.source}: {found[0]} has another length or other times, so it is not of one capture with"
-                    " this file; export both anew"
+                    f"{capture.source}: {found[0]} has a different length or different times, so it does not belong to"
+                    " the same acquisition; export both files again"
                 )
             traces.append(dataclasses.replace(other.channels[0], name=asked))
     return dataclasses.replace(capture, channels=tuple(traces))
