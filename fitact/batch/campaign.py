@@ -178,14 +178,14 @@ def run_campaign(
     for path, count in Counter(paths).most_common(1):
         if count > 1:
             raise InputError(f"{path}: is given twice; give each record once")
-    place = Path(folder)
+    out = Path(folder)
     columns = {"channels": dict(channels or {}), "scale": dict(scale or {})}
     stated = None if scene is None else scene.to_json()
-    task = Task(stated, columns, str(place / "reports") if reports else None, seed, posteriors)
+    task = Task(stated, columns, str(out / "reports") if reports else None, seed, posteriors)
     try:
-        journal = Journal(place / JOURNAL)
+        journal = Journal(out / JOURNAL)
     except (OSError, ValueError) as error:
-        raise InputError(f"{place / JOURNAL}: cannot be used ({error}); choose another folder") from error
+        raise InputError(f"{out / JOURNAL}: cannot be used ({error}); choose another folder") from error
     try:
         keys = _journal_keys(paths, task)
         batches = _pending_batches(keys, paths, journal)

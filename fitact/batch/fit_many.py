@@ -219,8 +219,8 @@ def run_in_threads(
 
     `jobs_per_core` jobs are in flight for each core, so that a record that is fitted separately delays no others.
     """
-    asked = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
-    cores = int(asked) if asked.isdigit() else len(os.sched_getaffinity(0))
+    requested = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
+    cores = int(requested) if requested.isdigit() else len(os.sched_getaffinity(0))
     under_way: collections.deque[tuple[_Job, Future[_Done]]] = collections.deque()
 
     def run_job(job: _Job) -> _Done:

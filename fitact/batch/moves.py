@@ -78,8 +78,8 @@ def sample_posteriors(
     sampler = emcee.EnsembleSampler(
         count * ENSEMBLES * WALKERS, size, flat_log_probs, moves=list(zip(moves, SHARES, strict=True)), vectorize=True
     )
-    white = np.stack([draw_student_t(generator, ENSEMBLES * WALKERS, size) for generator in generators])
-    start = approximations.from_standard_normal(OVERDISPERSION * white).reshape(-1, size)
+    z = np.stack([draw_student_t(generator, ENSEMBLES * WALKERS, size) for generator in generators])
+    start = approximations.from_standard_normal(OVERDISPERSION * z).reshape(-1, size)
     random = np.random.RandomState(np.random.SeedSequence(seed).generate_state(8))  # for the order of the moves
     state = emcee.State(start, random_state=random.get_state())
     sampler.run_mcmc(state, steps, skip_initial_state_check=True)

@@ -174,8 +174,8 @@ def _laplace_approximations(
 def _probe_axes(targets: _Targets) -> Float[np.ndarray, "records n probes"]:
     """Evaluate the log-posteriors along the principal axes of their approximations."""
     size = targets.approximations.centers.shape[1]
-    white = (np.eye(size)[:, None] * PROBES[:, None]).reshape(-1, size)
-    points = targets.approximations.from_standard_normal(np.tile(white, (len(targets.members), 1, 1)))
+    z = (np.eye(size)[:, None] * PROBES[:, None]).reshape(-1, size)
+    points = targets.approximations.from_standard_normal(np.tile(z, (len(targets.members), 1, 1)))
     return _LogProbs(targets)(points).reshape(-1, size, PROBES.size)
 
 

@@ -289,9 +289,7 @@ def _check_shapes(time: np.ndarray, channels: Mapping[str, np.ndarray], source: 
         raise InputError(f"{source}: no channel was given; give at least Vsc")
     for name, values in {"time": time, **channels}.items():
         if values.ndim != 1 or values.size != time.size:
-            raise InputError(
-                f"{source}: {name} has shape {values.shape}, time {time.shape}; give arrays of equal length"
-            )
+            raise InputError(f"{source}: {name} has shape {values.shape}, time {time.shape}; give equal lengths")
     if time.size < MINIMUM_SAMPLES:
         raise InputError(
             f"{source}: {time.size} samples are too few to fit; record at least {MINIMUM_SAMPLES},"

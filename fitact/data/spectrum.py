@@ -57,9 +57,7 @@ class Spectrum:
         """
         f, z = np.array(frequency, dtype=float), np.array(impedance, dtype=complex)
         if f.ndim != 1 or f.shape != z.shape:
-            raise InputError(
-                f"{source}: frequency has shape {f.shape}, impedance {z.shape}; give one of each for every point"
-            )
+            raise InputError(f"{source}: frequency has shape {f.shape}, impedance {z.shape}; give equal shapes")
         if f.size < MINIMUM_POINTS:
             raise InputError(f"{source}: {f.size} points are too few to fit; measure {MINIMUM_POINTS} or more")
         if not (np.isfinite(f).all() and np.isfinite(z).all()):
@@ -220,6 +218,4 @@ def _parse_rows(
         elif begun and (not text.strip() or text.lstrip()[0] not in "0123456789+-."):
             return  # the table has ended
         elif begun or line - place > max_unit_lines + 1:
-            raise InputError(
-                f"{source}, line {line}: '{text.strip()[:40]}' is not a row of numbers; correct or remove it"
-            )
+            raise InputError(f"{source}, line {line}: '{text.strip()[:40]}' is not a row of numbers; remove it")

@@ -111,23 +111,23 @@ def certify(
     reach = float(table_half_width(np.linalg.norm(np.asarray(slope) @ covariance_factor)))
     precisions = table_precision(sigma, tolerance).tolist()
     optimal = zip(likelihood.channels_and_inputs(optimum), precisions, strict=True)
-    near = tuple(_restrict_table(*pair, float(log_b), reach, precision) for pair, precision in optimal)
+    restricted = tuple(_restrict_table(*pair, float(log_b), reach, precision) for pair, precision in optimal)
     deviates = np.random.default_rng(0).standard_normal((check_points, theta.size))  # any reproducible points serve
     around = np.vstack([theta, theta + 1.5 * deviates @ covariance_factor.T])
     points = np.vstack([around, _prior_points(light, theta, check_points)])
-    narrow = dataclasses.replace(likelihood, channels=near).without_samples()
+    narrow = dataclasses.replace(likelihood, channels=restricted).without_samples()
     exact, compressed, tabulated = (
         _evaluate_log_likelihoods(model, points, sigma) for model in (likelihood.without_compression(), narrow, light)
     )
     errors = np.max(np.abs(compressed - exact)[: len(around)], axis=0)
     # far from the optimum, the error may grow with the difference in log-likelihood to the optimum
     excesses = np.nanmax(np.abs(tabulated - exact) - 1e-6 * np.abs(exact[0] - exact), axis=0, initial=-np.inf)
-    found = []
-    for i, channel in enumerate(near):
-        failure = _compression_failure(errors[i], excesses[i], tolerance / len(near))
-        found.append(reasons[i] or (_TIMING_REASON if channel.compression is None else failure))
-        likelihood = likelihood.replace_channel(i, channel.without_compression() if found[i] else channel)
-    return CertifiedLikelihood(likelihood, None if any(found) else float(np.sum(errors)), tuple(found))
+    failures = []
+    for i, channel in enumerate(restricted):
+        failure = _compression_failure(errors[i], excesses[i], tolerance / len(restricted))
+        failures.append(reasons[i] or (_TIMING_REASON if channel.compression is None else failure))
+        likelihood = likelihood.replace_channel(i, channel.without_compression() if failures[i] else channel)
+    return CertifiedLikelihood(likelihood, None if any(failures) else float(np.sum(errors)), tuple(failures))
 
 
 def table_half_width(

@@ -138,9 +138,9 @@ class Chirp(Drive):
 
     def locate(self, time: ArrayLike) -> tuple[Array, Array]:
         """Return the piece that contains `time`, and the position within it, from 0 to 1."""
-        place = jnp.clip(jnp.asarray(time, dtype=float) / self.duration, 0.0, 1.0) * self.pieces
-        piece = jnp.clip(lax.stop_gradient(jnp.floor(place)), 0, self.pieces - 1)
-        return piece.astype(int), place - piece
+        position = jnp.clip(jnp.asarray(time, dtype=float) / self.duration, 0.0, 1.0) * self.pieces
+        piece = jnp.clip(lax.stop_gradient(jnp.floor(position)), 0, self.pieces - 1)
+        return piece.astype(int), position - piece
 
     def _log_ratio(self) -> Array:
         return jnp.log(self.end_frequency / jnp.asarray(self.start_frequency, dtype=float))

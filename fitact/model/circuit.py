@@ -138,10 +138,10 @@ class FinalCircuit(Circuit):
         """High-frequency gain a / b = Ci / (2 Ci + Csc), at most 1/2."""
         Csc, Ci = jnp.asarray(self.Csc, dtype=float), jnp.asarray(self.Ci, dtype=float)
         # dividing the smaller by the larger avoids cancellation in log-derivatives, and NaN from overflow
-        below = Csc <= Ci
-        skin = jnp.where(below, Csc, 0.0) / jnp.where(below, Ci, 1.0)
-        insulator = jnp.where(below, 0.0, Ci) / jnp.where(below, 1.0, Csc)
-        return jnp.where(below, 1.0 / (2.0 + skin), insulator / (1.0 + 2.0 * insulator))
+        is_smaller = Csc <= Ci
+        skin = jnp.where(is_smaller, Csc, 0.0) / jnp.where(is_smaller, Ci, 1.0)
+        insulator = jnp.where(is_smaller, 0.0, Ci) / jnp.where(is_smaller, 1.0, Csc)
+        return jnp.where(is_smaller, 1.0 / (2.0 + skin), insulator / (1.0 + 2.0 * insulator))
 
     @property
     def b(self) -> ArrayLike:
@@ -409,20 +409,20 @@ def gain_at(terms: HighpassTerms, omega: ArrayLike) -> Complex[Array, "*shape"]:
 
 def highpass_gain(x: ArrayLike) -> Complex[Array, "*shape"]:
     """Return j x / (1 + j x) for x >= 0, without overflow at either end."""
-    below, small, inverse = _split_range(x)
+    is_small, small, inverse = _split_range(x)
     low = small / (1.0 + small**2)  # (x^2 + j x) / (1 + x^2)
     high = 1.0 / (1.0 + inverse**2)
-    return jnp.where(below, low * small + 1j * low, high + 1j * high * inverse)
+    return jnp.where(is_small, low * small + 1j * low, high + 1j * high * inverse)
 
 
 def highpass_amplitude(x: ArrayLike) -> Float[Array, "*shape"]:
     """Return |j x / (1 + j x)| for x >= 0, in forms whose derivatives do not cancel."""
-    below, small, inverse = _split_range(x)
-    return jnp.where(below, small / jnp.sqrt(1.0 + small**2), 1.0 / jnp.sqrt(1.0 + inverse**2))
+    is_small, small, inverse = _split_range(x)
+    return jnp.where(is_small, small / jnp.sqrt(1.0 + small**2), 1.0 / jnp.sqrt(1.0 + inverse**2))
 
 
 def _split_range(x: ArrayLike) -> tuple[Array, Array, Array]:
     """Return whether x <= 1, x where it is (else 1), and 1/x where it is not (else 1); the 1s keep gradients finite."""
     x = jnp.asarray(x)
-    below = x <= 1.0
-    return below, jnp.where(below, x, 1.0), 1.0 / jnp.where(below, 1.0, x)
+    is_small = x <= 1.0
+    return is_small, jnp.where(is_small, x, 1.0), 1.0 / jnp.where(is_small, 1.0, x)

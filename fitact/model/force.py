@@ -75,9 +75,7 @@ class Geometry(eqx.Module):
             return Contact.from_capacitances(inner.Ci, inner.Csc, self.area, *layers)
         Cgap = getattr(inner, "Cgap", None)
         if Cgap is None:
-            raise InputError(
-                "the force across a gap needs a circuit with a gap; give Cgap, or use the reference paper's force"
-            )
+            raise InputError("the force across a gap needs a circuit with a gap; give Cgap, or use the force from Vsc")
         return AirGap(self.area, EPSILON_0 * self.area / Cgap if self.gap_thickness is None else self.gap_thickness)
 
 

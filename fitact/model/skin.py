@@ -298,13 +298,13 @@ def series_equivalent(Rsc: ArrayLike, Csc: ArrayLike, frequency: ArrayLike) -> S
     Two equal skins in series have Rx' = 2 Rx, eq. (14), and Cx' = Cx / 2.
     """
     q = quality_factor(Rsc, Csc, frequency)
-    below = q <= 1.0
-    small, inverse = jnp.where(below, q, 1.0), 1.0 / jnp.where(below, 1.0, q)
+    is_small = q <= 1.0
+    small, inverse = jnp.where(is_small, q, 1.0), 1.0 / jnp.where(is_small, 1.0, q)
     # 1 / (1 + q^2) and 1 + q^-2, without squaring a large number
-    Rx = Rsc * jnp.where(below, 1.0 / (1.0 + small**2), inverse**2 / (1.0 + inverse**2))
+    Rx = Rsc * jnp.where(is_small, 1.0 / (1.0 + small**2), inverse**2 / (1.0 + inverse**2))
     # C (1 + q^-2), computed for small q as 1 / (w^2 R^2 C) + C
     wR = 2.0 * np.pi * jnp.asarray(frequency, dtype=float) * Rsc
-    Cx = Csc + jnp.where(below, 1.0 / (jnp.where(below, wR, 1.0) * small), Csc * inverse**2)
+    Cx = Csc + jnp.where(is_small, 1.0 / (jnp.where(is_small, wR, 1.0) * small), Csc * inverse**2)
     return SeriesElement(Rx, Cx)
 
 

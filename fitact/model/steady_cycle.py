@@ -95,12 +95,12 @@ class PeriodGrid(eqx.Module):
             weight = jnp.full(count, 1.0 / count)
             return cls(drive, time[None], cycles, weight, drive.value(time), drive.slope(time))
         pieces = drive.pieces()
-        place, weight = _quadrature_rule()
+        nodes, weight = _quadrature_rule()
         length = jnp.diff(pieces.knots)[:, None]
-        slope = jnp.broadcast_to(pieces.slopes()[:, None], (length.size, place.size))
-        local_time, period = length * place, pieces.knots[-1]
+        slope = jnp.broadcast_to(pieces.slopes()[:, None], (length.size, nodes.size))
+        local_time, period = length * nodes, pieces.knots[-1]
         cycles, weights = (pieces.knots[:-1, None] + local_time) / period, length * weight / period
-        voltage = pieces.start[:, None] + (pieces.end - pieces.start)[:, None] * place
+        voltage = pieces.start[:, None] + (pieces.end - pieces.start)[:, None] * nodes
         return cls(drive, local_time, *(x.reshape(-1) for x in (cycles, weights, voltage, slope)))
 
     def highpass(self, tau: ArrayLike) -> Float[Array, " points"]:

@@ -82,11 +82,8 @@ class Comparison:
     def verdict(self) -> str:
         """Preferred model and the difference to the next, or that none is preferred, in a sentence."""
         leading, preference = self._leading_model, self._describe_preference()
-        return (
-            preference
-            if self.trusted
-            else f"{preference} The fit of {leading.name} is unreliable: {leading.fit.message}"
-        )
+        doubt = "" if self.trusted else f" The fit of {leading.name} is unreliable: {leading.fit.message}"
+        return preference + doubt
 
     def _describe_preference(self) -> str:
         first, *others = self._candidates
@@ -148,8 +145,8 @@ class Comparison:
         rows = []
         for model in self.models:
             criteria = [f"{model.fit.figures[name]:.{0 if name == 'parameters_counted' else 2}f}" for name in _CRITERIA]
-            below = "" if model is best else _format_elpd_difference(model, best)
-            rows.append((model.name, *criteria, f"{model.elpd:.2f}", below))
+            difference = "" if model is best else _format_elpd_difference(model, best)
+            rows.append((model.name, *criteria, f"{model.elpd:.2f}", difference))
         widths = (max(12, *(len(model.name) for model in self.models)), *[14] * 7)
         legend = (
             f"elpd: log predictive density of {best.cross_validation.log_density.size} blocks, in"

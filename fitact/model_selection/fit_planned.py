@@ -29,8 +29,8 @@ class PlannedFit:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry `plan` of fit.json and summary.json."""
-        stated = {"used": self.model, "sentence": self.sentence}
-        return stated if self.plan is None else stated | self.plan.to_dict()
+        entry = {"used": self.model, "sentence": self.sentence}
+        return entry if self.plan is None else entry | self.plan.to_dict()
 
 
 def fit_planned(records: Sequence[Record], scenes: Sequence[Scene], model: Model, **options: Any) -> PlannedFit:

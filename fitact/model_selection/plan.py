@@ -214,7 +214,7 @@ def _cheapest_omissions(
 def _circuit_values(scene: Scene) -> dict[str, Float[np.ndarray, " draws"]]:
     """Return circuit parameters: the scene's nominal values, followed by quasi-random draws from its prior."""
     prior = scene.make_prior()
-    stated = {name: value for name, value in scene.nominal_values().items() if value is not None}
+    nominal = {name: value for name, value in scene.nominal_values().items() if value is not None}
     values = {
         name: np.append(np.exp(marginal.log_mean), draws)
         for (name, draws), marginal in zip(prior.sample_qmc(ROWS - 1).items(), prior.marginals, strict=True)
@@ -223,7 +223,7 @@ def _circuit_values(scene: Scene) -> dict[str, Float[np.ndarray, " draws"]]:
     values |= {name: ratio * values[other] for name, (other, ratio) in scene.prior.ties().items()}
     for name in ("sigma", "sigma_I"):
         values.pop(name, None)
-    return {name: np.append(stated.get(name, draws[0]), draws[1:]) for name, draws in values.items()}
+    return {name: np.append(nominal.get(name, draws[0]), draws[1:]) for name, draws in values.items()}
 
 
 def _summarize_errors(errors: Float[np.ndarray, "4 circuits"]) -> tuple[RelativeErrors, RelativeErrors]:

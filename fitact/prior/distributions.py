@@ -75,9 +75,7 @@ class LogNormal(Distribution):
     def within_factor(cls, median: float, factor: float) -> "LogNormal":
         """Return the log-normal with 95 % probability between median / `factor` and median * `factor` (> 1)."""
         if not factor > 1.0:
-            raise InputError(
-                f"factor = {factor:g} must be above 1: 95 % of the prior lies within this factor of the median"
-            )
+            raise InputError(f"factor = {factor:g} must be above 1: 95 % of the prior lies within this factor")
         return cls(median, math.log(factor) / _Z95)
 
     @classmethod

@@ -136,8 +136,8 @@ class Prior(eqx.Module):
             return value
         z = jnp.stack([marginal.to_standard_normal(u[i]) for i, marginal in enumerate(self.marginals)])
         root = np.linalg.cholesky(self.correlation)
-        white = solve_triangular(root, z, lower=True)
-        return value - 0.5 * (white @ white - z @ z) - np.log(np.diag(root)).sum()
+        whitened = solve_triangular(root, z, lower=True)
+        return value - 0.5 * (whitened @ whitened - z @ z) - np.log(np.diag(root)).sum()
 
     def residuals(self, u: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         """Return the log-parameters whitened by mean and covariance (residuals of the normal prior)."""

@@ -35,14 +35,14 @@ def published_prior(table: PublishedTable, name: str, layer: Layer, factor: floa
     The state of a finger is less certain than the tables. Dry and wet skin each differ by a factor sqrt(40) in
     permittivity from their geometric mean; with this `factor`, each prior extends half-way to the other table.
     """
-    of_resistance = name.endswith("Rsc")
-    plate = plate_resistance if of_resistance else plate_capacitance
+    is_resistance = name.endswith("Rsc")
+    plate = plate_resistance if is_resistance else plate_capacitance
     if table == "paper":
-        ends = _PAPER_RESISTIVITY if of_resistance else _PAPER_PERMITTIVITY
+        ends = _PAPER_RESISTIVITY if is_resistance else _PAPER_PERMITTIVITY
         return Uniform(*(plate(end, layer.area, layer.thickness) for end in ends))
     permittivity = skin_permittivity(table, layer.frequency)
     resistivity = -1.0 / (permittivity.imag * EPSILON_0 * 2.0 * math.pi * layer.frequency)
-    middle = resistivity if of_resistance else permittivity.real
+    middle = resistivity if is_resistance else permittivity.real
     return LogNormal.within_factor(plate(middle, layer.area, layer.thickness), factor)
 
 

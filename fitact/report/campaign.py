@@ -13,9 +13,9 @@ def write_campaign(folder: str | os.PathLike[str], fits: Fits, origin: Provenanc
     Raises:
         InputError: the folder cannot be written.
     """
-    place, answered, failures = Path(folder), fits.answered, Fits(fits.failures)
-    answered.to_parquet(place / "results.parquet")
-    failures.to_csv(place / "failures.csv", ("record", "result", "message"))
+    out, answered, failures = Path(folder), fits.answered, Fits(fits.failures)
+    answered.to_parquet(out / "results.parquet")
+    failures.to_csv(out / "failures.csv", ("record", "result", "message"))
     trusted = sum(bool(row["trusted"]) for row in fits)
     frame = PageSummary(
         title="Campaign",
@@ -32,7 +32,7 @@ def write_campaign(folder: str | os.PathLike[str], fits: Fits, origin: Provenanc
         has_reservation=trusted < len(fits),
     )
     write_page(
-        place / "index.html",
+        out / "index.html",
         "campaign.html",
         frame=frame,
         origin=origin,
@@ -40,4 +40,4 @@ def write_campaign(folder: str | os.PathLike[str], fits: Fits, origin: Provenanc
         failures=[(row["record"], row["result"], row["message"]) for row in failures[:max_rows]],
         count=len(answered),
     )
-    return place / "index.html"
+    return out / "index.html"

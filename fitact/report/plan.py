@@ -19,16 +19,16 @@ def draw_plan(plan: Plan) -> Figure:
         bars.append(("planned model", plan.nominal.force, plan.q95.force, False, plan.speedup))
     names, nominal, q95, kept, speedup = zip(*reversed(bars), strict=True)
     least = 1e-8  # lower end of the logarithmic axis; smaller errors are negligible
-    place, shown = np.arange(len(bars)), np.maximum(nominal, least)
+    positions, shown = np.arange(len(bars)), np.maximum(nominal, least)
     figure = Figure(figsize=(9.0, 1.6 + 0.45 * len(bars)), layout="constrained")
     axes = figure.add_subplot()
-    axes.barh(place, shown, left=0.0, color=[PRIOR if each else MODEL for each in kept], height=0.6)
-    axes.plot(np.maximum(q95, least), place, "|", color=DATA, ms=14, mew=2, label="95 % quantile over the prior")
+    axes.barh(positions, shown, left=0.0, color=[PRIOR if each else MODEL for each in kept], height=0.6)
+    axes.plot(np.maximum(q95, least), positions, "|", color=DATA, ms=14, mew=2, label="95 % quantile over the prior")
     axes.axvline(plan.full.tolerance.force, color=ALERT, label="tolerance")
-    for at, error, faster in zip(place, np.maximum(nominal, q95), speedup, strict=True):
+    for at, error, faster in zip(positions, np.maximum(nominal, q95), speedup, strict=True):
         axes.annotate(f"{faster:.3g}×", (max(error, least), at), (8, 0), textcoords="offset points", va="center")
     axes.set(xscale="log", xlim=(0.3 * min(shown), 5.0 * max(*nominal, *q95, plan.full.tolerance.force)))
-    axes.set_yticks(place, names)
+    axes.set_yticks(positions, names)
     axes.grid(axis="y", visible=False)
     axes.set_xlabel("relative error of the force (larger of mean and peak), and speed-up factor of the model")
     handles = [mpl.patches.Patch(color=MODEL, label="neglected"), mpl.patches.Patch(color=PRIOR, label="kept")]

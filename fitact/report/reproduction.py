@@ -90,7 +90,7 @@ def _grounding_chart(name: str, values: Sequence[float], unit: str) -> Chart:
 def _insulator_chart() -> Chart:
     """Return a chart of the mean force, scaled to a maximum of 1, over each property of the insulator."""
     permittivities, thicknesses = np.linspace(1.0, 10.0, 37), 1e-6 * np.geomspace(0.01, 10.0, 46)
-    own, y, plots = paper.force_over(paper.PERMITTIVITY, paper.INSULATOR), Axis("mean force, normalised"), []
+    nominal, y, plots = paper.force_over(paper.PERMITTIVITY, paper.INSULATOR), Axis("mean force, normalised"), []
     for title, unit, here, values, forces in (
         ("relative permittivity", "1", paper.PERMITTIVITY, permittivities,
          [paper.force_over(e, paper.INSULATOR) for e in permittivities]),
@@ -99,7 +99,7 @@ def _insulator_chart() -> Chart:
     ):  # fmt: skip
         x = Axis.from_values(title, unit, here)
         curve = line(x, y, values, np.array(forces) / max(forces), "mean force", MODEL)
-        panel = points(x, y, [here], [own / max(forces)], "the paper's panel", _COLORS[0], size=9.0)
+        panel = points(x, y, [here], [nominal / max(forces)], "the paper's panel", _COLORS[0], size=9.0)
         plots.append(plot(x, (y, [curve, panel]), unified_hover=True))
     return chart(*plots, controls=[log_axis_button(plots), log_axis_button(plots, "y", "logarithmic force")])
 

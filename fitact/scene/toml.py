@@ -42,8 +42,8 @@ def read_scene_text(path: str | Path) -> str:
 def _suggest_shipped(name: str) -> str:
     if "." in name or "/" in name:
         return ""
-    if near := difflib.get_close_matches(name, shipped_scenes(), n=1):
-        return f", or the shipped scene '{near[0]}'"
+    if matches := difflib.get_close_matches(name, shipped_scenes(), n=1):
+        return f", or the shipped scene '{matches[0]}'"
     return f", or a shipped scene: {', '.join(sorted(shipped_scenes()))}"
 
 
@@ -84,11 +84,11 @@ def _inline_table(items: dict[str, str]) -> str:
 
 def find_line(text: str, sentence: str) -> int | None:
     """Return the line of a scene file for a message such as "[drive] duty = 2: ...", or None."""
-    place = re.match(r"\[(\w+)\](.*)", sentence)
-    if place is None:
+    match = re.match(r"\[(\w+)\](.*)", sentence)
+    if match is None:
         return None
-    section, lines = place[1], _key_lines(text)
-    words = re.findall(r"[\w-]+", place[2])
+    section, lines = match[1], _key_lines(text)
+    words = re.findall(r"[\w-]+", match[2])
     for index, word in enumerate(words):
         for path in lines:
             if path[0] == section and path[-1] == word and len(path) > 1:

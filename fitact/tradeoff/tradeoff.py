@@ -137,23 +137,23 @@ def measure_tradeoff(
     Raises:
         InputError: the record or the scene cannot be fitted, or the scene does not measure Vsc.
     """
-    stated = scene or Scene()
-    if "Vsc" not in stated.measurement.channels:
+    used_scene = scene or Scene()
+    if "Vsc" not in used_scene.measurement.channels:
         raise InputError("scene: [measurement] channels has no Vsc, on which the methods are compared; add it")
-    if stated.skin.level != "constant":
+    if used_scene.skin.level != "constant":
         raise InputError(
-            f"scene: [skin] level = '{stated.skin.level}': the methods are compared for a constant skin only; remove it"
+            f"scene: [skin] level = '{used_scene.skin.level}': methods are compared for a constant skin only; remove it"
         )
-    stated.require_available(fit=True)
+    used_scene.require_available(fit=True)
 
     def say(text: str) -> None:
         if progress:
             print(f"tradeoff: {text}", file=sys.stderr)
 
-    measured = record or simulate(stated)
+    measured = record or simulate(used_scene)
     say(f"fitting {measured.source} at {len(tolerances)} tolerances and without compression")
-    fits = {tolerance: fit(measured, scene if record else stated, tolerance=tolerance) for tolerance in tolerances}
-    full = fit(measured, scene if record else stated, tolerance=0.0)
+    fits = {tolerance: fit(measured, scene if record else used_scene, tolerance=tolerance) for tolerance in tolerances}
+    full = fit(measured, scene if record else used_scene, tolerance=0.0)
     with jax.enable_x64(True):
         say("responses")
         responses = timings.benchmark_responses(full)
@@ -212,9 +212,7 @@ def _notes(full: Fit, fits: dict[float, Fit], converged: bool) -> tuple[str, ...
         notes.append("emcee on the full sum, the reference for the uncertainties, has not converged")
     for tolerance, fitted in fits.items():
         if fitted.compression_error is None:
-            notes.append(
-                f"not compressed at tolerance {timings.format_tolerance(tolerance)}, because {fitted.full_because}"
-            )
+            notes.append(f"not compressed at {timings.format_tolerance(tolerance)}, because {fitted.full_because}")
     return tuple(notes)
 
 

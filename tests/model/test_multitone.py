@@ -126,7 +126,7 @@ def test_impossible_orders_are_refused(orders: tuple):
 
 def test_one_amplitude_and_phase_for_each_tone():
     for amplitudes, phases in [((1.0,), ()), ((1.0, 2.0), (0.1,))]:
-        with pytest.raises(fitact.InputError, match="one of each"):
+        with pytest.raises(fitact.InputError, match="one amplitude"):
             fitact.Multitone(F0, (1, 2), amplitudes, phases)
 
 

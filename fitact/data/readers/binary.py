@@ -220,9 +220,7 @@ def _time_grid(contents: _Contents, count: int, source: str) -> tuple[np.ndarray
     zero = find(("zeroindex",))  # Tektronix
     step = 1.0 / rate if step is None and rate else step
     if step is None or not 0.0 < step < float("inf"):
-        raise InputError(
-            f"{source}: has no time; store an array 'time' (s) with the channels, or the time step as 'dt'"
-        )
+        raise InputError(f"{source}: has no time; store an array 'time' (s) with the channels, or the step as 'dt'")
     notes = [] if start is not None or zero is not None else [f"{source}: the time was assumed to start at 0"]
     return step * (np.arange(count) - (zero or 0.0)) + (start or 0.0), notes
 
@@ -259,9 +257,7 @@ def _size_limit(path: Path) -> int:
 
 def _check_size(size: int, path: Path, source: str) -> None:
     if size > _size_limit(path):
-        raise InputError(
-            f"{source}: the header states {size:,} bytes of numbers, more than the file can hold; export it again"
-        )
+        raise InputError(f"{source}: the header states {size:,} bytes, more than the file can hold; export it again")
 
 
 def _to_text(value: Any) -> str:

@@ -47,9 +47,9 @@ def read_header(text: str, source: str, sidecar_text: str = "") -> "Header":
     if segments and (parse_number(segments[0], header.decimal_comma) or 1.0) > 1.0:
         raise InputError(f"{source}: holds {segments[0]} segments; export one of them")
     if header.time is None and header.time_grid[1] is None:
-        found = ", ".join(header.names.cells) if header.names else "no header"
+        names = ", ".join(header.names.cells) if header.names else "no header"
         raise InputError(
-            f"{source}{header.location}: no column time_s, and no other time column (found: {found[:200]}); name the"
+            f"{source}{header.location}: no column time_s, and no other time column (found: {names[:200]}); name the"
             f" columns as in {_EXAMPLE}, or export the time as well (Rohde & Schwarz store the time of NAME.Wfm.csv in"
             " NAME.csv)"
         )
@@ -151,8 +151,8 @@ class Header:
 
     def find_quantity(self, keys: Sequence[str]) -> float | None:
         """Return the largest of these values in SI units, since values may differ between channels."""
-        found = (self._parse_quantity(text) for text in self.find_values(keys))
-        return max((value for value in found if value is not None), default=None)
+        quantities = (self._parse_quantity(text) for text in self.find_values(keys))
+        return max((value for value in quantities if value is not None), default=None)
 
     def _parse_quantity(self, text: str) -> float | None:
         match = _QUANTITY.fullmatch(text.strip())

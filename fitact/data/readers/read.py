@@ -40,8 +40,8 @@ def read(
         InputError: the file cannot be read, or its data are invalid; the message names the line and a remedy.
     """
     source, channels = os.fspath(path), channels or {}
-    own = {channel: asked for channel, asked in channels.items() if _locate_file_column(path, asked) is None}
-    capture = read_capture(path, lambda names, place: resolve_channels(names, own, source, place).values())
+    local_columns = {channel: asked for channel, asked in channels.items() if _locate_file_column(path, asked) is None}
+    capture = read_capture(path, lambda names, place: resolve_channels(names, local_columns, source, place).values())
     capture = merge_other_files(capture, path, channels)
     record = to_record(capture, channels, scale or {})
     for channel in scene.measurement.channels if scene else ("Vsc",):
@@ -79,15 +79,15 @@ def read_capture(path: str | os.PathLike[str], pick: Pick = lambda names, place:
 def merge_other_files(capture: Capture, path: str | os.PathLike[str], channels: Mapping[str, str]) -> Capture:
     """Return the capture with the columns of other files that `channels` names as FILE:COLUMN added."""
     traces = list(capture.channels)
-    for asked in channels.values():
-        if found := _locate_file_column(path, asked):
+    for requested in channels.values():
+        if found := _locate_file_column(path, requested):
             other = _read_column(*found)
             if not is_same_grid(capture.time, other.time):
                 raise InputError(
                     f"{capture.source}: {found[0]} has a different length or different times, so it does not belong to"
                     " the same acquisition; export both files again"
                 )
-            traces.append(dataclasses.replace(other.channels[0], name=asked))
+            traces.append(dataclasses.replace(other.channels[0], name=requested))
     return dataclasses.replace(capture, channels=tuple(traces))
 
 
@@ -98,8 +98,8 @@ def _read_column(file: Path, column: str) -> Capture:
 def _locate_file_column(path: str | os.PathLike[str], requested: str) -> tuple[Path, str] | None:
     """Return file and column of a channel given as FILE:COLUMN, relative to the current folder or to `path`."""
     file, colon, column = requested.rpartition(":")
-    found = [place for place in (Path(path).parent / file, Path(file)) if colon and column and place.is_file()]
-    return (found[0], column) if found else None
+    candidates = [place for place in (Path(path).parent / file, Path(file)) if colon and column and place.is_file()]
+    return (candidates[0], column) if candidates else None
 
 
 def write_csv(path: str | os.PathLike[str], record: Record) -> None:

@@ -93,9 +93,7 @@ def _blocks(stream: IO[bytes], source: str) -> Iterator[bytes]:
     while part := stream.read(_BLOCK):
         size += len(part)
         if size > _MAX_BYTES:
-            raise InputError(
-                f"{source}: contains more than {_MAX_BYTES // 2**30} GB of uncompressed text; shorten the record"
-            )
+            raise InputError(f"{source}: has more than {_MAX_BYTES // 2**30} GB of uncompressed text; shorten it")
         whole, newline, rest = (rest + part).rpartition(b"\n")
         if newline:
             yield whole
@@ -232,8 +230,8 @@ class _TableParser:
         if inside or first == rows:
             place = self._line_label(inside[0]) if inside else "all rows"
             raise InputError(f"{self._source}, {place}: the cells of the channels are empty; correct or remove the row")
-        left = rows - (last + 1 - first)
-        notes = [f"{self._source}: rows without values at the ends were ignored ({left:,})"] if left else []
+        ignored = rows - (last + 1 - first)
+        notes = [f"{self._source}: rows without values at the ends were ignored ({ignored:,})"] if ignored else []
         return slice(first, last + 1), notes
 
     def _time_in_seconds(self, time: np.ndarray) -> tuple[np.ndarray, list[str], list[str]]:
