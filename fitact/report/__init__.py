@@ -1,6 +1,6 @@
-"""Reports of results.
+"""HTML reports and figures of results.
 
-Makes self-contained HTML pages and figures from results; each is imported at its first use.
+Makes self-contained pages; each function is imported at its first use.
 """
 
 import lazy_loader
