@@ -92,8 +92,8 @@ class Plan:
             return ()
         return (
             f"over the prior the planned model has a force error of up to {format_percent(self.q95.force)} (95 %),"
-            f" more than the tolerance of {format_percent(tolerance)}, which holds at the nominal values only; narrow"
-            " [prior], or lower [tolerance] force",
+            f" more than the tolerance of {format_percent(tolerance)}, which holds at the nominal values only;"
+            " lower [tolerance] force, or state a narrower [prior] if you know one",
         )
 
     def model(self) -> dict[str, Any]:

@@ -168,7 +168,7 @@ def test_refused():
 
 @pytest.mark.slow
 def test_models_that_leave_out_different_samples_are_refused():
-    with pytest.raises(fitact.InputError, match="do not use the same samples of Vsc: 1 samples enter only one of them"):
+    with pytest.raises(fitact.InputError, match="do not use the same samples of Vsc: 1 enter only one of them"):
         fitact.compare(sine_record(0), {"white": sine_scene(), "coloured": sine_scene(noise_model="ar1")})
 
 
