@@ -9,9 +9,10 @@
 # %% [markdown]
 # # Do the paper's circuit and its figures hold?
 #
-# *Electrostatic Tactile System Analyzing and Modelling* (2018) reduces a finger on an electrovibration display to one
-# circuit (its Fig. 11). The drive V passes the panel's insulator and two equal layers of outer skin, one of the
-# sliding finger and one of the finger at ground. Vsc, over one of them, makes the force.
+# The reference paper, *Electrostatic Tactile System Analyzing and Modelling* (2018), models a finger on an
+# electrovibration display by one circuit (its Fig. 11). The drive V is in series with the panel's insulator and two
+# equal layers of outer skin, one of the sliding finger and one of the grounded finger. The force is computed from Vsc,
+# the voltage across the sliding finger's layer.
 #
 #                          Rsc            Rsc
 #                        ┌─────┐        ┌─────┐
@@ -42,41 +43,43 @@ circuit = fitact.FinalCircuit(Rsc=Rsc, Csc=Csc, Ci=1.35e-9)
 # $$H(s) = \frac{V_{sc}}{V} = \frac{g\, b s}{1 + b s},\qquad g = \frac{C_i}{2 C_i + C_{sc}},\qquad
 # b = R_{sc}\,(2 C_i + C_{sc})$$
 #
-# A jump of the drive appears divided by 1/g and decays with the time constant b. That is all that Vsc can show.
+# A jump of the drive appears in Vsc multiplied by g and decays with the time constant b. Vsc depends on nothing else.
 
 # %%
 g, b = float(circuit.g), float(circuit.b)
-print(f"g = {g:.4f}: 360 V make a jump of {360 * g:.1f} V;  b = {1e3 * b:.2f} ms: knee at {1 / (2 * np.pi * b):.1f} Hz")
+print(
+    f"g = {g:.4f}: 360 V give a jump of {360 * g:.1f} V;  b = {1e3 * b:.2f} ms: corner at {1 / (2 * np.pi * b):.1f} Hz"
+)
 omega = 2 * np.pi * np.geomspace(1, 1e4, 41)
 H = 1j * omega * g * b / (1 + 1j * omega * b)
 assert np.allclose(circuit.transfer_function(omega), H, rtol=1e-12)
 
 # %% [markdown]
-# The paper's numbers imply three values of Ci, and they disagree: its text says 1.35 nF; its eq. (3), with the
-# thickness and permittivity that it states, gives 3.45 nF; and its |Z_Ci| = 2.3 MΩ at 100 Hz is that of 0.69 nF. Fig.
-# 14 cannot tell them apart by its knee ("about 40 Hz"), but the size of Vsc differs fivefold.
+# The paper implies three different values of Ci. Its text states 1.35 nF. Its eq. (3) gives 3.45 nF for the stated
+# thickness and permittivity. Its |Z_Ci| = 2.3 MΩ at 100 Hz belongs to 0.69 nF. The corner frequency of Fig. 14 ("about
+# 40 Hz") is nearly the same for all three, but the amplitude of Vsc differs fivefold.
 
 # %%
 frequency = np.geomspace(1, 1e4, 200)
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6))
 for name, Ci in paper.INSULATORS.items():
     of = fitact.FinalCircuit(Rsc=Rsc, Csc=Csc, Ci=Ci)
-    knee = 1 / (2 * np.pi * float(of.b))
-    (line,) = left.loglog(frequency, of.amplitude(2 * np.pi * frequency), label=f"{name}, knee at {knee:.1f} Hz")
-    left.plot(knee, float(of.g) / np.sqrt(2), "o", color=line.get_color())
+    corner = 1 / (2 * np.pi * float(of.b))
+    (line,) = left.loglog(frequency, of.amplitude(2 * np.pi * frequency), label=f"{name}, corner at {corner:.1f} Hz")
+    left.plot(corner, float(of.g) / np.sqrt(2), "o", color=line.get_color())
     right.semilogx(frequency, np.degrees(of.phase(2 * np.pi * frequency)), color=line.get_color())
-    right.plot(knee, 45, "o", color=line.get_color())
+    right.plot(corner, 45, "o", color=line.get_color())
 left.set(xlabel="frequency (Hz)", ylabel="|Vsc / V|", title="Fig. 14: amplitude")
-right.set(xlabel="frequency (Hz)", ylabel="lead of Vsc over V (degrees)", title="Fig. 14: phase, 45° at the same knee")
+right.set(xlabel="frequency (Hz)", ylabel="lead of Vsc over V (degrees)", title="Fig. 14: phase, 45° at the corner")
 left.legend(title="Ci")
 plt.show()
 
 # %% [markdown]
 # ## The same drive in three shapes
 #
-# A first-order circuit in the steady state has closed forms for each. The square makes the highest peak, since all of
-# its 360 V jump at once. Fig. 15 shows about 30, 15 and 15 Vpp, yet states a drive of 30 Vpp, a twelfth of this one:
-# that would leave a twelfth of what is seen here.
+# Each has a closed form in the steady state. The square gives the highest peak, because its 360 V jump at once. Fig. 15
+# shows about 30, 15 and 15 Vpp for a stated drive of 30 Vpp. That drive is a twelfth of this one, so it would give a
+# twelfth of the values below.
 
 # %%
 drives = {
@@ -103,8 +106,8 @@ assert np.isclose(fitact.peak(circuit, drives["square"]), decayed, rtol=1e-9)
 # %% [markdown]
 # ## Grounding: Figs. 4 to 6
 #
-# Touching ground directly puts the second finger's skin and the body's resistance R_H in the path; without that, the
-# body's impedance Z of 14.5 MΩ is in series and takes most of the drive.
+# With direct ground, the second finger's skin and the body's resistance R_H are in the loop. Without it, the impedance
+# Z = 14.5 MΩ to earth is in series and drops most of the drive voltage.
 
 # %%
 square = drives["square"]
@@ -140,8 +143,8 @@ print(f"Fig. 6: {of_C[0]:.2f} V rising to {of_C[-1]:.2f} V")
 # %% [markdown]
 # ## Force: Fig. 12
 #
-# The force by eq. (22) falls with the insulator's thickness and rises with its permittivity, more steeply than the
-# paper says: a thinner or denser insulator is also a larger Ci, so Vsc grows as well.
+# The force computed with eq. (22) falls with the insulator's thickness and rises with its permittivity. Both changes
+# are steeper than the paper states, because they also change Ci and hence Vsc.
 
 # %%
 permittivity, thickness = np.linspace(1, 10, 19), np.geomspace(0.01e-6, 10e-6, 31)
@@ -151,7 +154,7 @@ exponent = np.polyfit(np.log(permittivity), np.log(over_permittivity), 1)[0]
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.4))
 left.loglog(permittivity, 1e3 * over_permittivity, "o-", ms=3, label=f"force ~ permittivity^{exponent:.1f}")
 left.loglog(
-    permittivity, 1e3 * over_permittivity[0] * permittivity, "--", color="0.5", label="linear, as the paper says"
+    permittivity, 1e3 * over_permittivity[0] * permittivity, "--", color="0.5", label="linear, as the paper states"
 )
 right.loglog(1e6 * thickness, 1e3 * over_thickness, "o-", ms=3)
 right.axvline(0.2, color="0.5", ls="--")
@@ -163,9 +166,9 @@ plt.show()
 assert 2.2 < exponent < 2.6
 
 # %% [markdown]
-# ## Every claim, judged
+# ## Every claim
 #
-# `fitact reproduce --out DIR` computes all the paper's numbers and equations and says which agree. Those that do not:
+# `fitact reproduce --out DIR` recomputes the paper's numbers and equations. These do not agree:
 
 # %%
 claims = paper.reproduce()
@@ -184,8 +187,8 @@ assert ratio["1.35 nF"] > 11
 # %% [markdown]
 # ## What to take away
 #
-# - The circuit and its transfer function hold, to rounding; so do most of the numbers.
-# - Its Ci is one of 0.69, 1.35 and 3.45 nF, depending on which sentence one believes: "six times" for direct ground
-#   holds with the first only. Where a device's data sheet says as little, Ci is the number to be careful with.
-# - Fig. 15's ordinate belongs to a drive twelve times the one it states, and Fig. 6 falls where the circuit as drawn
-#   rises. No constant was adjusted to make anything agree.
+# - The circuit, its transfer function and most of the numbers hold.
+# - Its Ci is 0.69, 1.35 or 3.45 nF, depending on the sentence; "six times" for direct ground holds only with the first.
+#   Ci contains the contact area, so none of them is the value for your finger.
+# - Fig. 15 belongs to a drive twelve times the stated one, and Fig. 6 falls where the circuit as drawn rises. No
+#   constant was adjusted to make anything agree.

@@ -9,9 +9,9 @@
 # %% [markdown]
 # # What are this finger's Rsc and Csc, how strong is the force, and how sure am I?
 #
-# From an oscilloscope's file to a report. The file here is written in the layout of a Tektronix MSO from a record
-# that ships with the project, as a lab would have got it: V on CH1, and on CH2 the skin voltage behind a 10x probe
-# that the oscilloscope took for 1x. Put the path of your own in its place.
+# From an oscilloscope's file to a report. The record ships with the project and was simulated by ngspice; here it is
+# written in the layout of a Tektronix MSO. V is on CH1. Vsc is on CH2, behind a 10x probe that the oscilloscope took
+# for a 1x probe. Replace the path with your own.
 
 # %%
 import json
@@ -42,8 +42,8 @@ np.savetxt(captured, table * [1.0, 1.0, 0.1], fmt="%.7g", delimiter=",", header=
 # %% [markdown]
 # ## Look before you fit
 #
-# `fitact inspect FILE`, or `fitact.inspect`, shows what a file holds. Which channel is which is never guessed. Once
-# it is told, it finds the probe's factor missing; with `scale` it has nothing left to say.
+# `fitact inspect FILE`, or `fitact.inspect`, lists the channels of a file. You assign them; fitact does not guess. It
+# then finds that the probe's factor is missing, and with `scale` the warning is gone.
 
 # %%
 channels = {"V": "CH1", "Vsc": "CH2"}
@@ -54,18 +54,20 @@ assert any("10x probe" in warning for warning in seen.warnings)
 assert not fitact.inspect(captured, channels=channels, scale={"Vsc": 10}).warnings
 
 # %% [markdown]
-# ## What is known beforehand
+# ## Prior knowledge
 #
-# A scene says what you know of the device; what is absent is the paper's nominal one. Ci from the panel's data sheet,
-# to 5 %, is the one thing stated here; the skin's priors are wide. The drive is taken as recorded, since its edges
-# are not ideal.
+# A scene states what you know of the device; absent keys have the values of the reference paper's nominal device. Here
+# it states Ci with 5 % uncertainty. Ci = eps A / Ti contains the contact area A of this finger under this load, so no
+# data sheet states it. Take eps and Ti from the data sheet and A from a picture of the footprint; or record the loop
+# current I, or add a known resistor in series, which determine Ci. The priors on the skin are wide. The fit uses the
+# recorded drive, because its edges are not ideal.
 
 # %%
 scene = fitact.Scene.from_dict(
     {
-        "device": {"Ci": "1.35 nF"},
+        "device": {"contact_area": "1 cm^2", "insulator_thickness": "1 um", "insulator_permittivity": 1.525},
         "drive": {"waveform": "measured"},
-        "prior": {"Ci": {"median": "1.35 nF", "relative_sd": 0.05}},
+        "prior": {"Ci": {"relative_sd": 0.05}},  # around eps A / Ti; mostly the uncertainty of the area
     }
 )
 record = fitact.read(captured, scene, channels=channels, scale={"Vsc": 10})
@@ -81,9 +83,10 @@ assert fit.trusted
 assert fit.identifiability.verdict == "prior-limited"
 
 # %% [markdown]
-# The verdict matters more than the numbers: "prior-limited". The record fixes the divider g and the time constant b
-# to a few parts in ten thousand and says nothing of the contact area, so Rsc, Csc and the force are as uncertain as
-# Ci was before. The residuals below are noise, with no structure left at the edges: the circuit holds.
+# The verdict matters more than the numbers: "prior-limited". The data determine the divider g and the time constant b
+# to a few parts in ten thousand, but not the contact area. So Rsc, Csc and the force are as uncertain as the prior on
+# Ci. The force is computed with eq. (22) of the reference paper; these data do not test that law. The residuals below
+# are consistent with noise, also at the edges, so the circuit describes the record.
 
 # %%
 figure, (above, below) = plt.subplots(2, 1, figsize=(9, 4.6), sharex=True, height_ratios=[2, 1])
@@ -99,8 +102,7 @@ plt.show()
 # %% [markdown]
 # ## Sample
 #
-# emcee, until it has converged, which is judged by its autocorrelation time and by split-R-hat over independent
-# ensembles.
+# emcee runs until it has converged, by its autocorrelation time and by split-R-hat over independent ensembles.
 
 # %%
 posterior = fitact.sample(fit, seed=1, progress=False)
@@ -113,7 +115,7 @@ figure, axes = plt.subplots(1, 3, figsize=(12, 3.6))
 every = slice(None, None, 5)
 for here, name, scale, unit in ((axes[0], "Rsc", 1e-3, "kΩ"), (axes[1], "Csc", 1e9, "nF")):
     here.plot(1e9 * draws["Ci"].ravel()[every], scale * draws[name].ravel()[every], ".", ms=1)
-    here.set(xlabel="Ci (nF)", ylabel=f"{name} ({unit})", title=f"{name} and Ci: one line is left open")
+    here.set(xlabel="Ci (nF)", ylabel=f"{name} ({unit})", title=f"{name} and Ci: not separated by Vsc")
 axes[2].hist(1e6 * force["force_mean"].ravel(), bins=40, color="C2")
 axes[2].set(xlabel="mean force (µN)", ylabel="draws", title="Mean force")
 plt.show()
@@ -127,7 +129,7 @@ assert max(spread["g"], spread["b"]) < 1e-3
 assert all(0.03 < spread[name] < 0.07 for name in ("Rsc", "Csc", "Ci", "force_mean"))
 
 # %% [markdown]
-# The record is synthetic, so the truth is known. All of it lies within two posterior standard deviations:
+# The record is simulated, so the true values are known. They lie within two posterior standard deviations:
 
 # %%
 truth = json.loads((RECORDS / "finger_direct.json").read_text())["truth"]
@@ -139,9 +141,8 @@ for name in ("Rsc", "Csc", "Ci"):
 # %% [markdown]
 # ## Report
 #
-# One file with everything: verdict, numbers, pictures, how it was computed. It opens offline. `fitact run FILE
-# --channel V=CH1 --channel Vsc=CH2 --scale Vsc=10 --scene scene.toml --out results` does all of this page in one
-# command.
+# One file holds verdict, numbers, pictures and the command, and opens offline. `fitact run FILE --channel V=CH1
+# --channel Vsc=CH2 --scale Vsc=10 --scene scene.toml --out results` does all of this in one command.
 
 # %%
 page = folder / "report.html"
@@ -154,7 +155,8 @@ assert page.stat().st_size < 5e6
 # %% [markdown]
 # ## What to take away
 #
-# - Inspect first: a probe's factor, swapped channels or clipping are seen there, and no fit can repair them.
-# - g and b are the record's; Rsc, Csc, Ci and the force inherit the width of the prior on Ci.
-# - More of the same data will not help. The current, a known series resistor or a better Ci will: [the next
+# - Inspect first: it shows a missing probe factor, swapped channels or clipping, which no fit can repair.
+# - The data determine g and b; Rsc, Csc, Ci and the force inherit the uncertainty of the prior on Ci.
+# - More data of the same kind do not help. The current, a known series resistor or a better Ci do: [the next
 #   notebook](3_what_vsc_cannot_see.ipynb) shows why.
+# - The stated error of the force covers the circuit only, not the force law, the skin thickness or the calibration.

@@ -9,12 +9,10 @@
 # %% [markdown]
 # # Can other circuit fitters do this?
 #
-# SciPy and lmfit fit curves; impedance.py, pyimpspec, ImpedanceFitter and AutoEIS fit circuits to impedance spectra,
-# and do so for many laboratories. They read no drive, and know neither force nor skin; but the circuit's impedance is
-# something that all of them can be asked for. Here each gets the same spectra and the same starts, first in the way
-# that its documentation begins with, then with the help that it offers, and in units that make all numbers near 1.
-#
-# `make peers` builds the environment that they run in.
+# SciPy and lmfit fit curves; impedance.py, pyimpspec, ImpedanceFitter and AutoEIS fit circuits to impedance spectra.
+# None of them handles drives, skin or force, but all can fit the impedance of the circuit. Here each gets the same
+# spectra and the same starting points: first as in the first example of its documentation, then with its options, and
+# with units that make all numbers close to 1. `make peers` builds their environment.
 
 # %%
 import json
@@ -28,15 +26,14 @@ import fitact
 
 plt.style.use("style.mplstyle")
 PYTHON = Path("../out/peers/bin/python")
-assert PYTHON.exists(), "the other fitters are not there; run: make peers"
+assert PYTHON.exists(), "the other fitters are not installed; run: make peers"
 
 # %% [markdown]
 # ## The task
 #
 # Two equal layers of skin and the insulator: 2 Rsc ‖ Csc / 2 in series with Ci, from 1 Hz to 100 kHz, with 0.3 % of
-# noise on size and phase. The starts are within a factor of five of the truth in each parameter. The best that an
-# unbiased fit can do follows from the Jacobian (Cramér and Rao); right is here what lies within four of those
-# standard deviations in all three parameters.
+# noise on magnitude and phase. The starting points are within a factor of five of the truth in each parameter. "Right"
+# means that all three parameters lie within four Cramér-Rao standard deviations of the truth.
 
 # %%
 TRUTH = np.array([2 * 130e3, 18e-9 / 2, 1.4e-9])  # ohm, F, F
@@ -61,15 +58,14 @@ columns = [np.log(impedance(TRUTH * np.exp(step * e)) / impedance(TRUTH * np.exp
 jacobian = np.stack([np.concatenate([c.real, c.imag]) for c in columns], axis=1) / (2 * step)
 best = NOISE * TRUTH * np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
 print(
-    "best possible:",
+    "Cramér-Rao bound:",
     ", ".join(f"{name} ± {100 * x:.2g} %" for name, x in zip(("R", "C", "Ci"), best / TRUTH, strict=True)),
 )
 
 # %% [markdown]
-# ## Their answers
+# ## Their results
 #
-# AutoEIS compiles anew for each spectrum and gets the first five; what it is known for, the search for a circuit, is
-# not asked of it.
+# AutoEIS compiles for each spectrum and gets the first five; its search for a circuit is not used.
 
 # %%
 done = subprocess.run(
@@ -84,7 +80,7 @@ answer = json.loads(done.stdout)
 print(", ".join(f"{name} {version}" for name, version in answer["versions"].items()))
 
 # %% [markdown]
-# And fitact, which takes no start: it finds its own from the spectrum. Its prior is wide and off the truth.
+# fitact needs no starting point: it finds one from the spectrum. Its prior is wide and not centred on the truth.
 
 # %%
 prior = {name: {"median": m, "factor": 30} for name, m in (("Rsc", "80 kohm"), ("Csc", "40 nF"), ("Ci", "1 nF"))}
@@ -99,17 +95,17 @@ for case in cases:
 attempts = [*answer["found"], {"peer": "fitact", "how": "no start needed", "rows": rows}]
 
 # %% [markdown]
-# ## Right, and wrong in which way
+# ## Right and wrong results
 #
-# A wrong answer does little harm where its own errors admit it. It does where they exclude the truth, by four of its
+# A wrong result is harmless if its stated errors are as large. It is harmful if they exclude the truth, by four of its
 # own standard deviations or more.
 
 # %%
 VERDICTS = {
     "right": "C2",
-    "wrong, and its errors are as wide": "C4",
+    "wrong, with errors as wide": "C4",
     "wrong, without errors, or an exception": "0.6",
-    "wrong, and its errors exclude the truth": "C1",
+    "wrong, with errors that exclude the truth": "C1",
 }
 
 
@@ -137,12 +133,12 @@ for y, verdicts in enumerate(table.values()):
 here.set_yticks(range(len(table)), [f"{peer}: {how}" for peer, how in table])
 here.invert_yaxis()
 here.grid(False)
-here.set(xlabel="share of the spectra", xlim=(0, 1.1), title="The same spectra, the same starts")
+here.set(xlabel="fraction of the spectra", xlim=(0, 1.1), title="The same spectra and starting points")
 here.legend(loc="upper center", bbox_to_anchor=(0.3, -0.08), ncols=2)
 plt.show()
 
 # %% [markdown]
-# What the most confident of the wrong ones claimed:
+# The smallest stated errors among the wrong results:
 
 # %%
 for a in attempts:
@@ -153,13 +149,13 @@ for a in attempts:
         print(f"{a['peer'] + ': ' + a['how']:50} {claim}  {row['said']}")
 least = min(row["errors"][0] for a in attempts if a["peer"] == "impedance.py" for row in a["rows"])
 assert least < 1e-20
-print(f"{'the truth':50} R = {TRUTH[0]:.4g} ohm, to be known to ± {best[0]:.1g} ohm")
+print(f"{'the truth':50} R = {TRUTH[0]:.4g} ohm, Cramér-Rao bound ± {best[0]:.1g} ohm")
 
 # %% [markdown]
-# The cause is one: resistances of 1e5 and capacitances of 1e-9 in one vector. A step that is small for the one is
-# nothing or everything for the other, so SciPy's `least_squares`, which most of these call, ends beside its start and
-# reports that a tolerance is met. Logarithms, units that make all numbers near 1, or MINPACK's `leastsq`, which
-# scales by itself, cure it. (Not in pyimpspec, whose residuals are squares already: there it takes the units.)
+# There is one cause: resistances of 1e5 and capacitances of 1e-9 in one vector. A step that suits one is far too small
+# or too large for the other. So SciPy's `least_squares`, which most of these call, ends near its starting point and
+# reports that a tolerance is met. Logarithms, units that make all numbers close to 1, or MINPACK's `leastsq`, which
+# scales automatically, solve this. (pyimpspec needs the units, because its residuals are squares already.)
 
 # %%
 right = {key: verdicts.count("right") / len(verdicts) for key, verdicts in table.items()}
@@ -185,9 +181,9 @@ for key in (
 # %% [markdown]
 # ## What to take away
 #
-# - In ohm and farad, as their first examples are written, most of the fitters do not leave their starts on this
-#   circuit; impedance.py then claims to know R to 3e-22 ohm.
-# - None of them is unfit for it: with scaled units or logarithms, and weights, each is right, or nearly always.
-#   lmfit's default and AutoEIS's Bayesian inference are right as they come.
-# - So the difference is not in the optimiser. fitact fits in logarithms, starts from the data, and says where an
-#   answer must not be trusted. What the others do not do at all is records in time, drives, and force.
+# - In ohm and farad, as in their first examples, most of the fitters do not leave their starting points on this
+#   circuit; impedance.py then states an error of R of 3e-22 ohm.
+# - All of them can fit it: with scaled units or logarithms, and weights, each is right always or nearly always. lmfit's
+#   default and AutoEIS's Bayesian inference are right without changes.
+# - So the optimiser is not the difference. fitact fits in logarithms, starts from the data, and reports unreliable
+#   results. The others do not handle records in time, drives or force.

@@ -1,6 +1,6 @@
-"""Other fitters on the spectra of `6_other_fitters.py`: JSON on standard input, JSON on standard output.
+"""Other fitters on the spectra of `6_other_fitters.py`, with JSON on standard input and output.
 
-The circuit is theirs to read: R parallel to C1, in series with C2. A case is a spectrum and a start (ohm, F, F).
+The circuit is R parallel to C1, in series with C2. A case is a spectrum and a starting point (ohm, F, F).
 """
 
 import contextlib
@@ -23,23 +23,23 @@ import pyimpspec
 import scipy.optimize
 from impedance.models.circuits import CustomCircuit
 
-UNITS = np.array([1e6, 1e-9, 1e-9])  # Mohm and nF, so that with kHz all numbers are near 1
+UNITS = np.array([1e6, 1e-9, 1e-9])  # Mohm and nF: with kHz all numbers are close to 1
 KILO = 1e3
 
 
 class Found(NamedTuple):
-    """Values, the errors claimed for them, and what the fitter said."""
+    """Values, their stated errors, and the fitter's message."""
 
     values: Any
     errors: Any
     said: str
 
 
-Fitter = Callable[[np.ndarray, np.ndarray, np.ndarray], Found]  # of frequency, impedance and start
+Fitter = Callable[[np.ndarray, np.ndarray, np.ndarray], Found]  # arguments: frequency, impedance and start
 
 
 def scaled(fitter: Fitter) -> Fitter:
-    """The same in Mohm, nF and kHz."""
+    """Return the same fitter in Mohm, nF and kHz."""
 
     def fit(f: np.ndarray, z: np.ndarray, start: np.ndarray) -> Found:
         values, errors, said = fitter(f / KILO, z / UNITS[0], start / UNITS)
@@ -49,7 +49,7 @@ def scaled(fitter: Fitter) -> Fitter:
 
 
 def residuals(p: Any, f: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Of the whole impedance, relative to its size."""
+    """Return residuals relative to the magnitude of the impedance."""
     s = 2j * np.pi * f
     off = (p[0] / (1.0 + s * p[0] * p[1]) + 1.0 / (s * p[2]) - z) / np.abs(z)
     return np.concatenate([off.real, off.imag])
@@ -80,13 +80,13 @@ def of_lmfit(method: str, log: bool = False) -> Fitter:
             else:
                 params.add(name, value=value, min=value / 100.0, max=value * 100.0)
         found = lmfit.minimize(lambda p: residuals([p[k].value for k in ("R", "C1", "C2")], f, z), params, method)
-        return of_params([found.params[name] for name in ("R", "C1", "C2")], found.message)
+        return from_params([found.params[name] for name in ("R", "C1", "C2")], found.message)
 
     return fit
 
 
-def of_params(params: list[Any], said: str) -> Found:
-    """lmfit's own."""
+def from_params(params: list[Any], said: str) -> Found:
+    """Return the result of lmfit's parameters."""
     errors = [p.stderr for p in params]
     return Found(np.array([p.value for p in params]), None if None in errors else np.array(errors), said)
 
@@ -123,7 +123,7 @@ def of_impedancefitter(**settings: Any) -> Fitter:
         fitter = impedancefitter.Fitter("DF", df=table, LogLevel="WARNING", **columns)
         fitter.run("parallel(R_s, C_s) + C_i", parameters=bounded, **settings)
         found = fitter.fittedValues
-        return of_params([found.params[name] for name in names], found.message)
+        return from_params([found.params[name] for name in names], found.message)
 
     return fit
 
@@ -166,11 +166,11 @@ FITTERS: dict[tuple[str, str], Fitter] = {
     ("AutoEIS", "the same, scaled units"): scaled(of_autoeis(False)),
     ("AutoEIS", "Bayesian inference"): of_autoeis(True),
 }
-FEWER = {key: 5 for key in FITTERS if key[0] == "AutoEIS"}  # it compiles anew for each
+FEWER = {key: 5 for key in FITTERS if key[0] == "AutoEIS"}  # compiles for each case
 
 
 def attempts(fitter: Fitter, f: np.ndarray, cases: list[dict[str, Any]]) -> dict[str, Any]:
-    """Each case's values, claimed errors and words; where it raised, the error's last line."""
+    """Return values, stated errors and message of each case, or the last line of its exception."""
     rows, began = [], time.perf_counter()
     for case in cases:
         try:
@@ -179,7 +179,7 @@ def attempts(fitter: Fitter, f: np.ndarray, cases: list[dict[str, Any]]) -> dict
             rows.append(
                 {"values": np.asarray(found.values, dtype=float).tolist(), "errors": errors, "said": found.said}
             )
-        except Exception as error:  # whatever a fitter raises is its answer
+        except Exception as error:  # an exception is recorded as the fitter's result
             rows.append({"values": None, "errors": None, "said": str(error).strip().splitlines()[-1]})
     return {"rows": rows, "seconds": time.perf_counter() - began}
 
