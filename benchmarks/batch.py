@@ -1,10 +1,9 @@
-"""Many records fitted by `fit_many`, against a Python loop of lmfit and of scipy on the same ones.
+"""Speed of `fit_many` against Python loops of lmfit and of scipy on the same records.
 
-The peers minimise the same sum of squares, prior included, in log-parameters from the prior's medians, with the noise
-that fitact found; beside an optimum, fitact also judges each fit, and the peers do not. lmfit is run with the model as
-one writes it (`vs_lmfit`) and with all that does not change from step to step worked out before (`vs_lmfit_good`, as
-for scipy). `untested_vs` are the same ratios where residuals are not tested for structure (`whiteness=False`);
-`optimum_vs` those of the time for the optimum alone, one batch after the other.
+The other packages minimise the same sum of squares, prior included, in log-parameters from the prior's medians, with
+the noise that fitact estimated; only fitact also computes diagnostics. lmfit runs with a direct model (`vs_lmfit`) and
+with all constants precomputed (`vs_lmfit_good`, as for scipy). `untested_vs` are the same ratios without residual tests
+(`whiteness=False`), and `optimum_vs` the ratios for the optimum alone, one batch after the other.
 
     python benchmarks/batch.py [--json] [--records 10000] [--samples 5000]
 """
@@ -39,15 +38,15 @@ SCENE = fitact.Scene.from_dict(
     }
 )
 MEANS, SDS = np.log([160e3, 22e-9, 1.35e-9]), np.sqrt(np.log1p(np.square([0.3, 0.3, 0.05])))
-PEERS = 60  # records of each round that the peers fit
+PEERS = 60  # records per round that the other packages fit
 ROUNDS = 5
 
 
-Model = Callable[[np.ndarray], np.ndarray]  # of the logarithms
+Model = Callable[[np.ndarray], np.ndarray]  # function of the log-parameters
 
 
 class Square:
-    """The paper's final circuit under a settled square, in closed form, on samples that meet the period."""
+    """Final circuit under a settled square, in closed form, for an integer number of samples per period."""
 
     def __init__(self, time: np.ndarray) -> None:
         self.time = time
@@ -61,7 +60,7 @@ class Square:
 
 
 def plain_model(time: np.ndarray, theta: np.ndarray) -> np.ndarray:
-    """The same as one writes it."""
+    """Return the same model without precomputed constants."""
     R, C, Ci = np.exp(theta)
     g, b = Ci / (2.0 * Ci + C), R * (2.0 * Ci + C)
     phase = np.mod(time + 1e-12, 1.0 / FREQUENCY)
@@ -71,7 +70,7 @@ def plain_model(time: np.ndarray, theta: np.ndarray) -> np.ndarray:
 
 
 def simulate_records(count: int, samples: int) -> list[fitact.Record]:
-    """People, whose panel is the same; two periods of each."""
+    """Simulate fingers on one panel, two periods each."""
     time = np.arange(samples) * (2.0 / FREQUENCY / samples)
     model, random = Square(time), np.random.default_rng(1)
     truths = MEANS + random.standard_normal((count, 3)) * [0.3, 0.3, 0.0]
@@ -82,7 +81,7 @@ def simulate_records(count: int, samples: int) -> list[fitact.Record]:
 
 
 def fit_lmfit(model: Model, observed: np.ndarray, sigma: float) -> np.ndarray:
-    """With lmfit's own settings."""
+    """Fit with lmfit's default settings."""
     parameters = lmfit.Parameters()
     for name, mean in zip(NAMES, MEANS, strict=True):
         parameters.add(name, value=mean)
@@ -96,7 +95,7 @@ def fit_lmfit(model: Model, observed: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def fit_scipy(model: Model, observed: np.ndarray, sigma: float) -> np.ndarray:
-    """MINPACK's Levenberg-Marquardt, as tight as it goes."""
+    """Fit with MINPACK's Levenberg-Marquardt at its tightest tolerances."""
 
     def residuals(theta: np.ndarray) -> np.ndarray:
         return np.append((observed - model(theta)) / sigma, (theta - MEANS) / SDS)
@@ -106,7 +105,7 @@ def fit_scipy(model: Model, observed: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def optimum_seconds(records: list[fitact.Record]) -> float:
-    """Seconds a record for what the peers give: the optimum, with the noise known."""
+    """Return the seconds per record for the optimum alone, with known noise."""
     batches = [np.stack([record["Vsc"] for record in records[i : i + 256]]) for i in range(0, len(records) - 255, 256)]
     with jax.enable_x64(True), threadpool_limits(1):
         together = BatchProblem.from_problem(build_problem([records[0]], [SCENE]))
@@ -119,7 +118,7 @@ def optimum_seconds(records: list[fitact.Record]) -> float:
 
 
 def measure(count: int, samples: int) -> dict[str, float]:
-    """Ratios of fits per second, and how far optima are apart in the logarithms."""
+    """Return ratios of fits per second, and the distance of the optima in the logarithms."""
     records = simulate_records(count, samples)
     good = Square(records[0].time)
     peers = {

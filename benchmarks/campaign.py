@@ -1,8 +1,8 @@
-"""What a campaign costs: two workers against one, overhead, a model of its time, and what a million records need.
+"""Cost of a campaign: two workers against one, overhead, a model of its time, and an estimate for a million records.
 
-Campaigns run on workers that are up and have compiled; what that takes is stated apart. Records are of two kinds: alike
-ones, of Vsc under a drive that the scene names, which a worker fits 32 at a time, and others, whose drive was recorded,
-each of which needs a fit of its own. Names are hard links to 250 files.
+Workers are running and have compiled; that time is stated separately. There are two kinds of records: alike ones, of
+Vsc under a named drive, which a worker fits 32 at a time, and records with a measured drive, each fitted separately.
+Names are hard links to 250 files.
 
     python benchmarks/campaign.py [--json] [--quick]
 """
@@ -39,23 +39,23 @@ FILES, SAMPLES = 250, 1_000
 LEAST_ALIKE, LONGEST_ALIKE = (
     fit_many.RecordGroup.min_records,
     gauss_newton.GaussNewton.max_samples,
-)  # records, samples: what fit_many fits together
+)  # records, samples: a batch that fit_many fits together
 ROUNDS, REPEATS = 5, 3
 NEW_LENGTHS = 5
-PADDED = (1_100, 1_250, 1_400)  # samples: lengths that records are filled up to, beside that of `SAMPLES`
+PADDED = (1_100, 1_250, 1_400)  # samples: padded lengths besides that of `SAMPLES`
 MILLION = 1e6
 
 
 class Extent(NamedTuple):
-    """How much is measured.
+    """Extent of the measurement.
 
     Attributes:
-        counts: records of campaigns, by kind.
-        longer: records and samples of those with more samples.
-        pair: records of the comparison of 2 workers with 1.
+        counts: records per campaign, by kind.
+        longer: records and samples of campaigns with more samples.
+        pair: records for the comparison of two workers with one.
         reported: records with reports.
-        walkers: of the sampler.
-        stubbed: records whose fits are left out.
+        walkers: numbers of walkers of the sampler.
+        stubbed: records without fits.
     """
 
     counts: dict[str, tuple[int, ...]]
@@ -85,7 +85,7 @@ QUICK = Extent(
 
 
 def write_records(folder: Path, kind: str, count: int, samples: int = SAMPLES) -> list[str]:
-    """Names of so many records: two settled periods of people under a square, in closed form."""
+    """Write records, two settled periods of fingers under a square in closed form, and return their names."""
     place = folder / f"{kind}-{samples}"
     place.mkdir(exist_ok=True)
     names = [place / f"finger{i:06d}.csv" for i in range(count)]
@@ -115,12 +115,12 @@ def campaign_scene(kind: str) -> fitact.Scene | None:
 
 
 def workers(count: int) -> contextlib.AbstractContextManager[Any]:
-    """A client of workers as the command starts them."""
+    """Yield a client of workers started as by the command."""
     return campaign._open_client(None, count, "2 GiB", campaign._Progress(0, False), 0.0)
 
 
 class Cost(NamedTuple):
-    """Seconds of a campaign, on the wall and of the processors, here and in the workers; bytes of what it left."""
+    """Wall and processor seconds of a campaign, in the command and in the workers, and bytes that it wrote."""
 
     wall: float
     here: float
@@ -151,21 +151,21 @@ def _size(path: Path) -> int:
 
 
 def fit_seconds(paths: list[str], kind: str) -> float:
-    """Seconds of the same fits without a campaign."""
+    """Return the seconds of the same fits without a campaign."""
     start = time.perf_counter()
     fitact.fit_many(paths, campaign_scene(kind), progress=False)
     return time.perf_counter() - start
 
 
 def compile_on_workers(paths: list[str], kind: str, *clients: Any) -> None:
-    """See to it that every worker has compiled what such records need."""
+    """Compile on every worker what such records need."""
     for client in clients:
         client.run(fit_seconds, paths[: campaign.BATCH], kind)
         client.run(fit_seconds, paths[:1], kind)
 
 
 def compare_workers(folder: Path, one: Any, two: Any, pair: dict[str, int]) -> dict[str, float]:
-    """Throughput, and what a campaign of one worker takes beyond the same fits in that worker's process, in turn."""
+    """Return the throughput, and the overhead of a one-worker campaign over the same fits in that worker, in turn."""
     found: dict[str, float] = {}
     for kind, count in pair.items():
         paths = write_records(folder, kind, count)
@@ -182,12 +182,12 @@ def compare_workers(folder: Path, one: Any, two: Any, pair: dict[str, int]) -> d
 
 
 def busiest_worker_records(count: int, workers: int) -> int:
-    """Records of the worker that has most."""
+    """Return the number of records of the busiest worker."""
     return min(count, campaign.BATCH * math.ceil(math.ceil(count / campaign.BATCH) / workers))
 
 
 def terms(kind: str, count: int, samples: int, workers: int) -> list[float]:
-    """What the seconds of a campaign are linear in, with coefficients that are not negative."""
+    """Return the terms of the linear model of a campaign's time, with non-negative coefficients."""
     together = kind == "alike" and count >= LEAST_ALIKE and samples <= LONGEST_ALIKE
     most = busiest_worker_records(count, workers)
     of_kind = [most * together, most * samples * together, most * (not together), most * samples * (not together)]
@@ -195,7 +195,7 @@ def terms(kind: str, count: int, samples: int, workers: int) -> list[float]:
 
 
 def scale(folder: Path, one: Any, two: Any, extent: Extent) -> dict[str, float]:
-    """The model of a campaign's time, fitted to campaigns of all sizes by least relative squares, and its errors."""
+    """Fit the model of a campaign's time by relative least squares to all campaigns; return it and its errors."""
     points = [(kind, count, SAMPLES) for kind, counts in extent.counts.items() for count in counts]
     points += [(kind, *length) for kind, lengths in extent.longer.items() for length in lengths]
     rows, walls, found = [], [], {}
@@ -208,7 +208,7 @@ def scale(folder: Path, one: Any, two: Any, extent: Extent) -> dict[str, float]:
             rows.append(terms(kind, count, samples, number))
             found[f"seconds_{kind}_{count}_records_{samples}_samples_{number}_workers"] = walls[-1]
             cores = statistics.median(each.here + each.there for each in taken)
-            found[f"core_ms_{kind}_{samples}_samples"] = 1e3 * cores / count  # of most records
+            found[f"core_ms_{kind}_{samples}_samples"] = 1e3 * cores / count  # core time of the bulk of the records
     relative = np.array(rows) / np.array(walls)[:, None]
     model, _ = scipy.optimize.nnls(relative, np.ones(len(walls)))
     off = relative @ model - 1.0
@@ -219,7 +219,7 @@ def scale(folder: Path, one: Any, two: Any, extent: Extent) -> dict[str, float]:
 
 
 def sampling_seconds(path: str, walkers: int) -> tuple[float, int]:
-    """Seconds of the sampling of a record's posterior, and the draws kept."""
+    """Return the seconds to sample a record's posterior, and the draws kept."""
     found = fitact.fit(fitact.read(path))
     fitact.sample(found, walkers=walkers, seed=1, progress=False)  # compiles
     start = time.perf_counter()
@@ -228,7 +228,7 @@ def sampling_seconds(path: str, walkers: int) -> tuple[float, int]:
 
 
 def reports(folder: Path, two: Any, extent: Extent) -> dict[str, float]:
-    """What posteriors and reports cost, and sampling with more walkers."""
+    """Return the cost of posteriors and reports, and of sampling with more walkers."""
     paths = write_records(folder, "own", extent.reported + 2)
     cost(two, paths[:2], "own", reports=True)  # compiles
     taken = cost(two, paths[2:], "own", reports=True)
@@ -243,7 +243,7 @@ def reports(folder: Path, two: Any, extent: Extent) -> dict[str, float]:
 
 
 def fit_cost(paths: list[str]) -> tuple[float, float]:
-    """Processor seconds and MB of a fit."""
+    """Return processor seconds and MB of a fit."""
     before, start = psutil.Process().memory_info().rss, time.process_time()
     fitact.fit_many(paths, progress=False)
     seconds, more = time.process_time() - start, psutil.Process().memory_info().rss - before
@@ -251,9 +251,9 @@ def fit_cost(paths: list[str]) -> tuple[float, float]:
 
 
 def length_costs(known: list[str], new: list[str], padded: list[str]) -> dict[str, float]:
-    """What fits cost of new lengths that are filled up to a known one, and to others; JAX's cache is left alone."""
+    """Return the cost of fits of new lengths padded to a known length and to new ones, without clearing JAX's cache."""
     jax.config.update("jax_enable_compilation_cache", False)
-    fitact.fit_many(known, progress=False)  # some ask for an offset, some not
+    fitact.fit_many(known, progress=False)  # some need an offset, some do not
     found = {"known_length_core_s": fit_cost(known)[0]}
     for name, paths in (("new_length", new), ("padded_length", padded)):
         found[f"{name}_core_s"], found[f"{name}_mb"] = fit_cost(paths)
@@ -261,8 +261,8 @@ def length_costs(known: list[str], new: list[str], padded: list[str]) -> dict[st
 
 
 def lengths(folder: Path) -> dict[str, float]:
-    """What it costs when records differ in length."""
-    # time steps that files round: uneven ones are a kind of their own
+    """Return the cost of records of different lengths."""
+    # rounded time steps, because uneven steps compile separately
     first, *new = (SAMPLES + 2 * i for i in range(1, NEW_LENGTHS + 2))
     others = [write_records(folder, "own", 1, samples)[0] for samples in (*new, *PADDED)]
     with workers(1) as client:
@@ -271,12 +271,12 @@ def lengths(folder: Path) -> dict[str, float]:
 
 
 def peak() -> float:
-    """Most memory that this process had, MB."""
+    """Return the peak memory of this process, MB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0 / 1e6
 
 
 def stub_fits(path: str) -> None:
-    """Make a worker give back rows at once, whose numbers differ."""
+    """Make a worker return distinct rows without fitting."""
     (row,) = fitact.fit_many([path], SCENE, progress=False)
     numbers = [name for name, value in row.items() if isinstance(value, float)]
 
@@ -295,7 +295,7 @@ def record_time(found: dict[str, float], name: str, count: int) -> Iterator[None
 
 
 def measure_parent(folder: Path, count: int) -> dict[str, float]:
-    """What the command itself does for each record, with Dask's scheduler; fits are left out."""
+    """Return the cost of the command per record, with Dask's scheduler and without fits."""
     found: dict[str, float] = {}
     paths, out = write_records(folder, "alike", count), folder / f"parent-{count}"
     with workers(2) as client:
@@ -319,7 +319,7 @@ def run_in_process(folder: Path, count: int) -> dict[str, float]:
 
 
 def million(found: dict[str, float]) -> dict[str, float]:
-    """What a million records of 1,000 samples need."""
+    """Return the extrapolation to a million records of 1,000 samples."""
     needs = {
         f"million_core_hours_{kind}": MILLION * found[f"core_ms_{kind}_{SAMPLES}_samples"] / 3.6e6
         for kind in ("alike", "own")

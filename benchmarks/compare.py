@@ -1,11 +1,10 @@
-"""How often `fitact.compare` prefers the wrong model: records simulated with and without a gap, fitted with both.
+"""Error rate of `fitact.compare`: records simulated with and without a gap, fitted with both models.
 
     python benchmarks/compare.py [--records N] [--json]
 
-Vsc and I of a 360 Vpp square at 100 Hz through 100 kohm, two periods of 1,000 samples; noise 0.1 V and 20 nA. The
-nominal finger, fixed true values, another seed for each record. The gap of the fits has wide priors (95 % within a
-factor of 100), about 2 Mohm beside 2 um of air, which is also the largest one simulated; smaller ones have the same
-time constant.
+Vsc and I of a 360 Vpp square at 100 Hz through 100 kohm, two periods of 1,000 samples; noise 0.1 V and 20 nA; the
+nominal finger, with another seed for each record. The fitted gap has wide priors (95 % within a factor of 100) around
+2 Mohm parallel to 2 um of air, the largest simulated gap; smaller ones have the same time constant.
 """
 
 import argparse
@@ -29,13 +28,13 @@ SIZES = {"no gap": 0.0, "gap of 10 %": 1e-1, "whole gap": 1.0}
 
 
 def scene(size: float, **more: dict) -> fitact.Scene:
-    """With a gap of that share of the largest one's impedance."""
+    """Return a scene whose gap has this fraction of the largest gap's impedance."""
     gap = {"gap": {"resistance": RGAP * size, "capacitance": CGAP / size}} if size else {}
     return fitact.Scene.from_dict({"measurement": MEASURED} | gap | more)
 
 
 def verdicts(size: float, records: int) -> Counter:
-    """How often which model is preferred."""
+    """Count how often each model is preferred."""
     models = {"plain": scene(0.0), "gap": scene(1.0, **WIDE)}
     found: Counter = Counter()
     for seed in range(records):
@@ -47,7 +46,7 @@ def verdicts(size: float, records: int) -> Counter:
 
 
 def main() -> None:
-    """Count, for each size of the gap."""
+    """Run the comparison for each size of the gap."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--records", type=int, default=30, help="without a gap; with one, a quarter as many")
     parser.add_argument("--json", action="store_true")

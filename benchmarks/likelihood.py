@@ -1,12 +1,11 @@
-"""The compressed log-likelihood against NumPy over the samples, side by side in one run.
+"""Speed of the compressed log-likelihood against NumPy over the samples, side by side in one run.
 
     python benchmarks/likelihood.py [--json]
 
-Prints ratios: how many times faster a log-probability of 1,000 walkers is, each, than one evaluation over
-the samples in plain NumPy (and in NumPy that keeps what does not change); what an evaluation costs at 1e7
-samples against 1e4; and what building the compression costs against one `np.dot` for each column of its
-basis, for a settled square (whose periods are folded) and for a measured drive. Medians of interleaved
-repeats.
+Prints ratios: the speed per walker of a log-probability of 1,000 walkers against one evaluation over the samples in
+plain NumPy (and in NumPy with precomputed constants); the cost at 1e7 samples against 1e4; and the cost of building the
+compression against one `np.dot` per column of its basis, for a settled square (whose periods are averaged) and a
+measured drive. Medians of interleaved repeats.
 """
 
 import argparse
@@ -23,13 +22,13 @@ from fitact.likelihood import compression
 from fitact.likelihood.certificate import batched_log_prob
 from fitact.model.circuit import HighpassTerms
 
-TRUTH = np.log([160e3, 22e-9, 1.35e-9, 0.1])  # and sigma, V
+TRUTH = np.log([160e3, 22e-9, 1.35e-9, 0.1])  # Rsc, Csc, Ci and sigma (V)
 SQUARE = fitact.Scene.from_dict({"drive": {"waveform": "square"}})
 RATE, FREQUENCY, WALKERS = 250e3, 100.0, 1000
 
 
 def record(samples: int) -> fitact.Record:
-    """A settled square wave in white noise."""
+    """Return a settled square wave in white noise."""
     t = np.arange(samples) / RATE
     sign, since = square_phase(t)
     noise = math.exp(TRUTH[3]) * np.random.default_rng(1).standard_normal(samples)
@@ -37,21 +36,21 @@ def record(samples: int) -> fitact.Record:
 
 
 def square_phase(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The sign of the square, and the time since its last edge."""
+    """Return the sign of the square, and the time since its last edge."""
     index = np.arange(t.size) % int(RATE / FREQUENCY)
     half = int(RATE / FREQUENCY) // 2
     return np.where(index < half, 1.0, -1.0), (index % half) / RATE
 
 
 def skin_voltage(point: np.ndarray, sign: np.ndarray, since: np.ndarray) -> np.ndarray:
-    """The closed form of eq. (20) for a settled square."""
+    """Return the closed form of eq. (20) for a settled square."""
     R, C, Ci = np.exp(point[:3])
     g, b = Ci / (2.0 * Ci + C), R * (2.0 * Ci + C)
     return sign * 360.0 * g / (1.0 + math.exp(-0.5 / FREQUENCY / b)) * np.exp(-since / b)
 
 
 def plain_log_likelihood(point: np.ndarray, t: np.ndarray, y: np.ndarray) -> float:
-    """A log-likelihood as one would write it first (`mod` puts a few samples on the wrong side of an edge)."""
+    """Return the directly coded log-likelihood (`mod` puts a few samples on the wrong side of an edge)."""
     period = 1.0 / FREQUENCY
     phase = np.mod(t, period)
     sign = np.where(phase < 0.5 * period, 1.0, -1.0)
@@ -61,20 +60,20 @@ def plain_log_likelihood(point: np.ndarray, t: np.ndarray, y: np.ndarray) -> flo
 
 
 def good_log_likelihood(point: np.ndarray, sign: np.ndarray, since: np.ndarray, y: np.ndarray) -> float:
-    """The same, with what does not change computed beforehand."""
+    """Return the same with constants precomputed."""
     residual = y - skin_voltage(point, sign, since)
     return -0.5 * float(residual @ residual) * math.exp(-2.0 * point[3]) - y.size * point[3]
 
 
 def compressed_log_prob(fit: fitact.Fit, points: np.ndarray) -> Callable[[], np.ndarray]:
-    """Log-probabilities of all points, NumPy in and out."""
+    """Return log-probabilities of all points as NumPy arrays."""
     assert fit.model()["likelihood"] == "compressed", fit.full_because
     function = batched_log_prob(fit.likelihood, len(points))
     return lambda: function(points)
 
 
 def evaluation(samples: int, points: np.ndarray) -> dict[str, float]:
-    """Ratios of one evaluation over the samples to one of many compressed ones; and whether they agree."""
+    """Return ratios of one evaluation over the samples to one of many compressed ones; check that they agree."""
     data = record(samples)
     t, y = data.time, data["Vsc"]
     sign, since = square_phase(t)
@@ -98,7 +97,7 @@ def evaluation(samples: int, points: np.ndarray) -> dict[str, float]:
 
 
 def growth(points: np.ndarray) -> float:
-    """Cost of an evaluation at 1e7 samples over that at 1e4."""
+    """Return the cost of an evaluation at 1e7 samples relative to 1e4."""
     jobs = {
         str(samples): compressed_log_prob(fitact.fit(record(samples), SQUARE), points)
         for samples in (10_000, 10_000_000)
@@ -108,7 +107,7 @@ def growth(points: np.ndarray) -> float:
 
 
 def build_cost(samples: int) -> dict[str, float]:
-    """Cost of a compression over that of one `np.dot` for each basis column, read from memory."""
+    """Return the cost of a compression relative to one `np.dot` per basis column, read from memory."""
     data = record(samples)
     t, y = data.time, data["Vsc"]
     drives = {
@@ -116,7 +115,7 @@ def build_cost(samples: int) -> dict[str, float]:
         "unfolded_square": (fitact.Square(360.0, 101.37), True),
         "measured": (fitact.Sampled(t, data["V"]), False),
     }
-    columns = np.random.default_rng(2).standard_normal((4, samples))  # as many as memory holds with ease
+    columns = np.random.default_rng(2).standard_normal((4, samples))  # as many columns as fit in memory
     jobs: dict[str, Callable[[], object]] = {
         name: lambda drive=drive, steady=steady: compression.compress(
             drive, t, y, steady_state=steady, expected_terms=HighpassTerms((0.05,), (4e-3,))
@@ -126,7 +125,7 @@ def build_cost(samples: int) -> dict[str, float]:
     jobs["dot"] = lambda: [np.dot(column, y) for column in columns]
     seconds = medians(jobs, 5)
     dot = seconds["dot"] / len(columns)
-    kinds = {"square": 1, "unfolded_square": 1, "measured": 2}  # responses; and the decays of an unknown charge
+    kinds = {"square": 1, "unfolded_square": 1, "measured": 2}  # responses, and decays of an unknown charge
     return {f"build_{name}_vs_dots": seconds[name] / (dot * kind * compression.NODES) for name, kind in kinds.items()}
 
 

@@ -1,4 +1,4 @@
-"""What one writes to fit and sample a record with lmfit; `posterior.py` times it against `fitact run`.
+"""Typical script to fit and sample a record with lmfit; `posterior.py` times it against `fitact run`.
 
 python benchmarks/lmfit_script.py RECORD.csv STEPS FIGURE.png
 """

@@ -1,8 +1,8 @@
-"""Posteriors of many records by `sample_many`, against `fit` and `sample` record by record, in turn, once compiled.
+"""Speed of `sample_many` against `fit` and `sample` record by record, in turn, once compiled.
 
-`vs_alone` is the ratio of posteriors a second, `ess_vs_alone` that of effective draws a second (of each record's worst
-quantity), `vs_sampling_alone` and `ess_vs_sampling_alone` the same against `sample` without the fit. `together`: share
-of the records that were sampled side by side.
+`vs_alone` is the ratio of posteriors per second, and `ess_vs_alone` the ratio of effective draws per second (of each
+record's worst quantity). `vs_sampling_alone` and `ess_vs_sampling_alone` are the same against `sample` without the fit.
+`together` is the fraction of the records sampled together.
 
     python benchmarks/many_posteriors.py [--json] [--records 128] [--samples 2000]
 """
@@ -17,12 +17,12 @@ from timing import show
 import fitact
 from fitact.batch.moves import WALKERS
 
-ALONE = 4  # records of each round that are sampled one by one
+ALONE = 4  # records per round sampled one by one
 ROUNDS = 5
 
 
 def measure(count: int, samples: int) -> dict[str, float]:
-    """Medians of the rounds."""
+    """Return the medians of the rounds."""
     records = simulate_records(count, samples)
     fitact.sample_many(records[:300], SCENE, progress=False)  # compiles
     fitact.sample(fitact.fit(records[0], SCENE), progress=False)

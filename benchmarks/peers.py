@@ -1,6 +1,6 @@
-"""The posterior of `posterior.py` as one writes it without fitact, and the samplers that fitact is compared with.
+"""The posterior of `posterior.py` coded without fitact, and the samplers that fitact is compared with.
 
-All draw (log Rsc, log Csc, log Ci, log sigma), with normal priors on the first three and a flat one on the last.
+All draw (log Rsc, log Csc, log Ci, log sigma), with normal priors on the first three and a flat prior on the last.
 """
 
 import contextlib
@@ -30,13 +30,14 @@ LogProb = Callable[[np.ndarray], float]
 
 
 def plain_log_prob(record: fitact.Record) -> LogProb:
-    """Over all samples, each time from their times."""
-    t, y = record.time + 1e-9, record["Vsc"]  # later by less than matters, so that rounding moves none over an edge
+    """Return the log-probability over all samples, computed from their times."""
+    # shifted by a negligible time, so that rounding moves no sample over an edge
+    t, y = record.time + 1e-9, record["Vsc"]
     return lambda point: plain_log_likelihood(point, t, y) + _log_prior(point)
 
 
 def good_log_prob(record: fitact.Record) -> LogProb:
-    """The closed form for one period, against every period of the record."""
+    """Return the log-probability from the closed form of one period for every period of the record."""
     period = round(RATE / FREQUENCY)
     sign, since = square_phase(record.time[:period])
     y = record["Vsc"].reshape(-1, period)
@@ -49,7 +50,7 @@ def good_log_prob(record: fitact.Record) -> LogProb:
 
 
 def raw_log_density(record: fitact.Record) -> Callable[[Array], Array]:
-    """Over all samples in JAX."""
+    """Return the log-density over all samples in JAX."""
     sign, since = (jnp.asarray(x) for x in square_phase(record.time))
     y = jnp.asarray(record["Vsc"])
 
@@ -68,7 +69,7 @@ def _log_prior(point: np.ndarray) -> float:
 
 
 def mean_force(points: np.ndarray) -> np.ndarray:
-    """Of eq. (22) for the settled square, N, with the permittivities that follow from Ci and Csc."""
+    """Return the mean force (N) of eq. (22) for the settled square, with permittivities from Ci and Csc."""
     R, C, Ci = np.exp(np.moveaxis(points[..., :3], -1, 0))
     g, b = Ci / (2.0 * Ci + C), R * (2.0 * Ci + C)
     x = 1.0 / FREQUENCY / b
@@ -76,7 +77,7 @@ def mean_force(points: np.ndarray) -> np.ndarray:
 
 
 def importance_sds(log_prob: LogProb, point: np.ndarray, root: np.ndarray, draws: int = 40_000) -> np.ndarray:
-    """Standard deviations of log Rsc and the mean force, by importance sampling from a Student-t: to 0.4 %."""
+    """Return the sd of log Rsc and the mean force by importance sampling from a Student-t, to 0.4 %."""
     rng, degrees = np.random.default_rng(5), 8.0
     tail = rng.chisquare(degrees, draws) / degrees
     white = rng.standard_normal((draws, 4)) / np.sqrt(tail)[:, None]
@@ -89,7 +90,7 @@ def importance_sds(log_prob: LogProb, point: np.ndarray, root: np.ndarray, draws
 
 
 class Peer:
-    """A sampler that goes on by `steps` at a time; the first time it compiles and burns in."""
+    """Sampler that advances by `steps`; the first call compiles and burns in."""
 
     def __init__(self, steps: int) -> None:
         self.steps = steps
@@ -100,7 +101,7 @@ class Peer:
         raise NotImplementedError
 
     def draw(self) -> float:
-        """Go on; gives the seconds that a step took."""
+        """Advance; return the seconds per step."""
         began = time.perf_counter()
         self._chains.append(self._advance())
         return (time.perf_counter() - began) / self.steps
@@ -110,12 +111,12 @@ class Peer:
         return np.concatenate(self._chains)
 
     def effective(self) -> float:
-        """Effective draws of mean force a step."""
+        """Return the effective draws of the mean force per step."""
         return WALKERS / float(emcee.autocorr.integrated_time(mean_force(self.draws), tol=0)[0])
 
 
 class Ensemble(Peer):
-    """emcee as its manual begins: stretch moves, one log-probability at a time."""
+    """Default emcee: stretch moves, one log-probability at a time."""
 
     def __init__(self, log_prob: LogProb, starts: np.ndarray, steps: int) -> None:
         self._sampler = emcee.EnsembleSampler(WALKERS, 4, log_prob)
@@ -130,7 +131,7 @@ class Ensemble(Peer):
 
 
 class Lmfit(Peer):
-    """`lmfit.emcee`."""
+    """Sampler of `lmfit.emcee`."""
 
     def __init__(self, log_prob: LogProb, starts: np.ndarray, steps: int) -> None:
         params = lmfit.Parameters()
@@ -143,23 +144,23 @@ class Lmfit(Peer):
 
     def _advance(self) -> np.ndarray:
         settings = {"nwalkers": WALKERS, "float_behavior": "posterior", "progress": False}
-        with contextlib.redirect_stdout(sys.stderr):  # it prints where it finds the chain short
+        with contextlib.redirect_stdout(sys.stderr):  # it prints a warning if the chain is short
             chain = self._minimizer.emcee(steps=self.steps, pos=self._last, **settings).chain
         self._last = chain[-1]
         return chain
 
 
 class Nuts(Peer):
-    """One chain."""
+    """NUTS with one chain."""
 
     def effective(self) -> float:
-        """Effective draws of mean force a step, by ArviZ."""
+        """Return the effective draws of the mean force per step, by ArviZ."""
         force = mean_force(self.draws)
         return float(array_stats.ess(force[None], chain_axis=0, draw_axis=1)) / force.size
 
 
 class Numpyro(Nuts):
-    """numpyro's NUTS with its default adaptation."""
+    """NUTS of numpyro with its default adaptation."""
 
     def __init__(self, log_density: Callable[[Array], Array], start: np.ndarray, steps: int) -> None:
         kernel = NUTS(potential_fn=lambda point: -log_density(point))
@@ -174,7 +175,7 @@ class Numpyro(Nuts):
 
 
 class Blackjax(Nuts):
-    """blackjax's NUTS in the coordinates that a Laplace approximation whitens."""
+    """NUTS of blackjax in coordinates whitened by a Laplace approximation."""
 
     def __init__(self, log_density: Callable[[Array], Array], start: np.ndarray, root: np.ndarray, steps: int) -> None:
         self._start, self._root, self._key = start, root, jax.random.PRNGKey(0)

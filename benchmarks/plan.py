@@ -1,10 +1,10 @@
-"""Whether the plan's costs are those of this machine, and its models the cheapest in hindsight.
+"""Check of the plan's counted costs against measured times, and of its choice of models in hindsight.
 
     python benchmarks/plan.py [--scenes N] [--json]
 
-Every kind of circuit, drive and regime is timed as `fitact.response` of 64 circuits side by side, 4,000 samples each,
-double precision, and compared with the plan's cost. Then random scenes are planned, and the time of each plan's model
-is compared with the shortest among all combinations of omissions that keep the tolerance. Rounds are interleaved.
+Every kind of circuit, drive and regime is timed as `fitact.response` of 64 circuits, 4,000 samples each, in double
+precision, and compared with the plan's cost. Then random scenes are planned, and the time of each plan's model is
+compared with the shortest of all combinations of omissions within the tolerance. Rounds are interleaved.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from fitact.model_selection import omissions
 from fitact.model_selection.model_errors import ReferenceModel
 
 CIRCUITS, SAMPLES, ROUNDS = 64, 4000, 200
-SAME = 1.1  # times closer than this count as equal
+SAME = 1.1  # ratio of times below which they count as equal
 
 GROUNDINGS = {
     "final": {},
@@ -52,13 +52,13 @@ Scene = fitact.Scene
 
 
 def kind(scene: Scene) -> tuple:
-    """What the time depends on: circuits with as many time constants run the same loop."""
+    """Return the key that determines the time: circuits with equally many time constants run the same loop."""
     drive = scene.drive
     return omissions.count_time_constants(scene.make_rc_circuit()), drive.waveform, drive.shape, drive.steady_state
 
 
 def job(scene: Scene, dtype: type = np.float64) -> Callable[[], object]:
-    """One call of the response of many circuits."""
+    """Return a call that computes the response of many circuits."""
     steady, duration = scene.drive.steady_state, scene.measurement.duration
     time = duration * np.arange(SAMPLES) / SAMPLES
     with jax.enable_x64(dtype is np.float64):
@@ -80,7 +80,7 @@ def job(scene: Scene, dtype: type = np.float64) -> Callable[[], object]:
 
 
 def table() -> dict[str, tuple[float, float]]:
-    """Cost, and nanoseconds a sample, of each kind of model."""
+    """Return counted cost and measured nanoseconds per sample of each kind of model."""
     scenes = {
         f"{ground}, {drive}": Scene.from_dict(of | {"drive": DRIVES[drive]})
         for (ground, of), drive in itertools.product(GROUNDINGS.items(), DRIVES)
@@ -97,7 +97,7 @@ def table() -> dict[str, tuple[float, float]]:
 
 
 def random_scene(rng: np.random.Generator) -> Scene:
-    """A scene with some of everything."""
+    """Return a random scene."""
 
     def log_uniform(low: float, high: float) -> float:
         return math.exp(rng.uniform(math.log(low), math.log(high)))
@@ -121,7 +121,7 @@ def random_scene(rng: np.random.Generator) -> Scene:
 
 
 def admissible_scenes(scene: Scene) -> list[Scene]:
-    """All reduced scenes that keep the tolerance."""
+    """Return all reduced scenes within the tolerance."""
     values = {"Rsc": scene.skin.Rsc, "Csc": scene.skin.Csc, "Ci": scene.device.Ci}
     reference = ReferenceModel(scene, values)
     free = [name for name in omissions.applicable_omissions(scene) if not omissions.reason_to_keep(scene, name)]
@@ -134,7 +134,7 @@ def admissible_scenes(scene: Scene) -> list[Scene]:
 
 
 def hindsight(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Time of each plan's model over the shortest admissible one's, and seconds that planning took."""
+    """Return the time of each plan's model relative to the fastest admissible one, and the planning time (s)."""
     rng = np.random.default_rng(0)
     scenes = [random_scene(rng) for _ in range(count)]
     plans, seconds = [], []

@@ -1,6 +1,6 @@
-"""What a population of 1,000 fingers costs, how memory follows the records' length, and what shares of variance cost.
+"""Cost of a population of 1,000 fingers, memory against record length, and cost of Sobol indices.
 
-Every run is a process of its own, so that its peak memory is its own; records are made when they are asked for.
+Each run is a separate process, to measure its peak memory; records are made on demand.
 
     python benchmarks/population.py [--json] [--fingers 1000]
 """
@@ -23,7 +23,7 @@ import fitact
 from fitact.populations.sobol import Surrogate, sobol_indices
 
 SAMPLES = 500
-LONGER = 10  # times
+LONGER = 10  # factor in record length
 FREQUENCY, AMPLITUDE, NOISE = 100.0, 180.0, 0.3  # Hz, V, V
 SCENE: dict[str, Any] = {
     "drive": {"waveform": "triangle", "frequency": FREQUENCY},
@@ -37,7 +37,7 @@ NAMES = ("force_mean", "force_peak")
 
 
 class SimulatedRecords(Sequence[fitact.Record]):
-    """Two settled periods of fingers, log-normal in Rsc and Csc, by 200 harmonics of the triangle."""
+    """Two settled periods of fingers with log-normal Rsc and Csc, by 200 harmonics of the triangle."""
 
     def __init__(self, fingers: int, samples: int) -> None:
         self._skins = np.log([130e3, 20e-9]) + np.random.default_rng(0).standard_normal((fingers, 2)) * [0.25, 0.35]
@@ -67,7 +67,7 @@ def fit_simulated(fingers: int, samples: int) -> fitact.Population:
 
 
 def measure_run(fingers: int, samples: int) -> dict[str, float]:
-    """Seconds with all that is printed, and peak memory, MB, of this process."""
+    """Return the seconds, including all output, and the peak memory (MB) of this process."""
     began = time.perf_counter()
     with contextlib.redirect_stdout(io.StringIO()):
         print(fit_simulated(fingers, samples))
@@ -81,7 +81,7 @@ def run_in_process(fingers: int, samples: int) -> dict[str, float]:
 
 
 def shares() -> dict[str, float]:
-    """Saltelli's design on the model itself over the same on the surrogate, the posterior's factors."""
+    """Return the time of Saltelli's design on the model relative to the surrogate, for the posterior's factors."""
     population = fit_simulated(12, SAMPLES)
     factors = population.factors.reshape(-1, len(population.finger.factors))
     columns = [population.finger.names.index(name) for name in NAMES]

@@ -1,24 +1,24 @@
-"""Effective draws of mean force per second: `fitact.sample` against the samplers one would otherwise write.
+"""Effective draws of the mean force per second: `fitact.sample` against other samplers.
 
     pip install "fitact[bench]"; python benchmarks/posterior.py [--quick] [--json]
 
-One posterior for all: a settled 100 Hz square, 0.1 V of noise that is sampled too, normal priors of 0.29, 0.29 and
-0.05 on log Rsc, Csc and Ci. fitact's figure is that of the call a user makes, `fitact.sample(fit)`, its judging of
-convergence included, once compiled. Its peers are timed in turn with it, a median of rounds, after burn-in or
-adaptation and compilation; what each draws must have the standard deviations of log Rsc and force that importance
-sampling finds, to 2 %, or to three standard errors where so few draws tell no more (`--quick`: a tenth of the steps).
+All sample one posterior: a settled 100 Hz square, 0.1 V of noise (also sampled), normal priors of 0.29, 0.29 and 0.05
+on log Rsc, Csc and Ci. fitact is timed by the user's call `fitact.sample(fit)`, diagnostics included, once compiled.
+The others are timed in turn with it (median of rounds), after burn-in or adaptation and compilation. All draws must
+have the standard deviations of log Rsc and force from importance sampling, to 2 % or three standard errors (`--quick`:
+a tenth of the steps).
 
-- `ess_vs_plain_N`: times emcee on a plain NumPy time-domain log-probability, 32 walkers;
-- `ess_vs_good_N`: on a well-written one (closed form of one period against all). At 1,000,000 samples the time of
-  its steps is measured, and its autocorrelation time is that at 5,000: stretch moves are affine-invariant, and both
-  posteriors are close to normal;
-- `ess_vs_lmfit_N`: times lmfit.emcee on the well-written one;
-- `ess_vs_numpyro_N`: times numpyro's NUTS on the samples, default adaptation;
-- `ess_vs_blackjax_N`: times blackjax's NUTS on the samples, whitened by the Laplace approximation;
-- `run_vs_lmfit_script`: time of a whole `fitact run` over that of lmfit_script.py (fit, lmfit.emcee to the same
-  effective size of the force, corner plot), both as processes; `cold_run_vs_lmfit_script`: of a user's first run,
-  which compiles. `whole_vs_good_5000`: effective draws of the warm process per second, from its start to its end, over
-  those of the well-written emcee, which has nothing to read, to burn in or to report.
+- `ess_vs_plain_N`: against emcee on a plain NumPy time-domain log-probability, 32 walkers;
+- `ess_vs_good_N`: against emcee on an optimised one (closed form of one period). At 1,000,000 samples the time of its
+  steps is measured and its autocorrelation time taken from 5,000 samples, because stretch moves are affine-invariant
+  and both posteriors are close to normal;
+- `ess_vs_lmfit_N`: against lmfit.emcee on the optimised one;
+- `ess_vs_numpyro_N`: against numpyro's NUTS on the samples, default adaptation;
+- `ess_vs_blackjax_N`: against blackjax's NUTS on the samples, whitened by the Laplace approximation;
+- `run_vs_lmfit_script`: time of `fitact run` relative to lmfit_script.py (fit, lmfit.emcee to the same effective size
+  of the force, corner plot), both as processes; `cold_run_vs_lmfit_script`: the same for a first run, which
+  compiles. `whole_vs_good_5000`: effective draws per second of the warm process, from start to end, relative to the
+  optimised emcee, which neither reads, burns in nor reports.
 """
 
 import argparse
@@ -61,17 +61,17 @@ Csc = {median = "22 nF", relative_sd = 0.3}
 Ci = {median = "1.35 nF", relative_sd = 0.05}
 """
 ROUNDS = 5
-STEPS = 5000  # a round
+STEPS = 5000  # per round
 
 
 class FitactSampler:
-    """`fitact.sample`, with another seed each time."""
+    """Sampler that calls `fitact.sample` with another seed each time."""
 
     def __init__(self, fit: fitact.Fit) -> None:
         self._fit, self._posteriors = fit, [fitact.sample(fit, progress=False)]
 
     def draw(self) -> float:
-        """Effective draws of the force per second."""
+        """Return effective draws of the force per second."""
         began = time.perf_counter()
         posterior = fitact.sample(self._fit, seed=len(self._posteriors), progress=False)
         took = time.perf_counter() - began
@@ -85,7 +85,7 @@ class FitactSampler:
 
 
 def check(name: str, draws: np.ndarray, effective: float, expected: np.ndarray) -> None:
-    """That what was drawn is the posterior."""
+    """Check that the draws have the posterior's standard deviations."""
     found = np.array([draws[..., 0].std(), mean_force(draws).std()])
     error = float(np.max(np.abs(found / expected - 1.0)))
     allowed = max(0.02, 3.0 / np.sqrt(2.0 * effective))
@@ -94,7 +94,7 @@ def check(name: str, draws: np.ndarray, effective: float, expected: np.ndarray) 
 
 
 def rates(data: fitact.Record, quick: bool) -> tuple[dict[str, float], dict[str, float]]:
-    """Effective draws of everyone per second; and of the peers, a step."""
+    """Return effective draws per second of all samplers, and per step of the others."""
     fit = fitact.fit(data, fitact.Scene.from_dict(tomllib.loads(SCENE)))
     steps = STEPS // 10 if quick else STEPS
     starts = fit.point + np.random.default_rng(4).standard_normal((WALKERS, 4)) @ fit.point_root.T
@@ -125,7 +125,7 @@ def rates(data: fitact.Record, quick: bool) -> tuple[dict[str, float], dict[str,
 
 
 def long_record(effective: float) -> float:
-    """The ratio to the well-written emcee, `effective` draws a step, at 1,000,000 samples."""
+    """Return the ratio to the optimised emcee, `effective` draws per step, at 1,000,000 samples."""
     data = record(1_000_000)
     fit = fitact.fit(data, fitact.Scene.from_dict(tomllib.loads(SCENE)))
     starts = fit.point + np.random.default_rng(4).standard_normal((WALKERS, 4)) @ fit.point_root.T
@@ -136,9 +136,9 @@ def long_record(effective: float) -> float:
 
 
 def processes(data: fitact.Record, each: float, quick: bool) -> tuple[dict[str, float], float]:
-    """Times of `fitact run` over that of lmfit's script; and its effective draws per second.
+    """Return times of `fitact run` relative to lmfit's script, and its effective draws per second.
 
-    `each`: effective draws of a step of lmfit's. With `quick`, a tenth of its steps are run, and the others counted.
+    `each` is the effective draws per step of lmfit. With `quick`, a tenth of its steps are run and the rest counted.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -160,7 +160,7 @@ def processes(data: fitact.Record, each: float, quick: bool) -> tuple[dict[str, 
 
 
 def _time_command(folder: Path, *command: str) -> float:
-    """Seconds of a process, with caches of its own."""
+    """Return the seconds of a process with its own caches."""
     kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     kept["XDG_CACHE_HOME"] = str(folder / "cache")
     began = time.perf_counter()

@@ -1,9 +1,9 @@
-"""How long a report takes to open in Chromium, and to answer a button: the demo's, and that of 1,000,000 samples.
+"""Time to open a report in Chromium, and to respond to a button, for the demo and for 1,000,000 samples.
 
     python benchmarks/report.py [--json]
 
-Opened: until what is on the first screen is drawn, its chart included. Answered: from a press of the button that makes
-axes linear, the slowest one, until the next picture is on the screen. Needs Chromium with its driver, and selenium.
+Opening ends when the first screen with its chart is drawn. The response is timed from a press of the slowest button
+(linear axes) to the next picture on the screen. Needs Chromium with its driver, and selenium.
 """
 
 import argparse
@@ -24,7 +24,7 @@ ROUNDS, SAMPLES, RATE = 7, 1_000_000, 200e3
 
 
 def write_pages(folder: Path) -> dict[str, Path]:
-    """The pages, from independent draws: they differ from the demo's in numbers alone."""
+    """Write the pages from independent draws, which differ from the demo's in numbers only."""
     scene = fitact.Scene.load(RECORDS / "finger_direct.toml")
     demo = fitact.fit(fitact.read(RECORDS / "finger_direct.csv", scene), scene)
     known = fitact.Scene.from_dict({"drive": {"waveform": "trapezoid", "rise_time": "50 us"}})
@@ -41,7 +41,7 @@ def write_pages(folder: Path) -> dict[str, Path]:
 
 
 def browser() -> Any:
-    """Chromium, as a reader has it but for its window."""
+    """Yield a headless Chromium."""
     options = webdriver.ChromeOptions()
     options.binary_location = shutil.which("chromium")
     for each in (
@@ -69,7 +69,7 @@ look();"""
 
 
 def measure_pages() -> tuple[dict[str, float], dict[str, int]]:
-    """Median seconds of each, and bytes of each page."""
+    """Return median seconds, and bytes of each page."""
     driver = browser()
     try:
         with tempfile.TemporaryDirectory() as folder:

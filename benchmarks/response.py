@@ -1,8 +1,8 @@
-"""What the exact response costs, side by side with scipy.signal.lsim and with one bare NumPy exp per sample.
+"""Cost of the exact response, side by side with scipy.signal.lsim and with one NumPy exp per sample.
 
     python benchmarks/response.py [--json]
 
-One from-rest period of a triangle, 5,000 samples; lsim's first-order hold is exact for it. Rounds are interleaved.
+One period of a triangle from rest, 5,000 samples, for which lsim's first-order hold is exact. Rounds are interleaved.
 """
 
 import argparse
@@ -21,7 +21,7 @@ B = R * (2.0 * CI + C)
 
 
 def contenders() -> dict[str, Callable[[], object]]:
-    """What is timed, by name. Accuracy is checked first."""
+    """Return the timed functions by name, after checking their accuracy."""
     circuit, drive = fitact.FinalCircuit(R, C, CI), fitact.Triangle(360.0, 100.0)
     t = np.arange(SAMPLES) * (0.01 / SAMPLES)
     voltage = np.asarray(drive.value(t))
@@ -46,7 +46,7 @@ def contenders() -> dict[str, Callable[[], object]]:
 
 
 def measure_seconds() -> dict[str, float]:
-    """Median seconds of each."""
+    """Return the median seconds of each."""
     with jax.enable_x64(True):
         jobs = contenders()
         return medians(jobs, ROUNDS, {name: 50 for name in jobs if name != "lsim"})

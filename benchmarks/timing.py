@@ -1,4 +1,4 @@
-"""The stopwatch of the benchmarks, and how they tell what they found."""
+"""Timing and output of the benchmarks."""
 
 import json
 import statistics
@@ -9,12 +9,12 @@ from collections.abc import Callable
 def medians(
     jobs: dict[str, Callable[[], object]], rounds: int, calls: dict[str, int] | None = None
 ) -> dict[str, float]:
-    """Median seconds of a call of each job, run in turn; `calls`: how many a round, 1 where it is silent."""
+    """Return the median seconds per call of jobs run in turn; `calls` is the number per round, default 1."""
     return {name: statistics.median(times) for name, times in _call_seconds(jobs, rounds, calls).items()}
 
 
 def minima(jobs: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """The least seconds of a call of each job, run in turn: what else the machine does only adds to it."""
+    """Return the minimum seconds per call of jobs run in turn, which other load can only increase."""
     return {name: min(times) for name, times in _call_seconds(jobs, rounds, None).items()}
 
 
@@ -35,7 +35,7 @@ def _call_seconds(
 
 
 def show(ratios: dict[str, float], as_json: bool) -> None:
-    """Print named ratios, a line each or as one JSON object."""
+    """Print named ratios, one per line or as one JSON object."""
     if as_json:
         print(json.dumps(ratios))
         return

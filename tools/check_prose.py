@@ -1,4 +1,4 @@
-"""Refuse docstrings that begin with a preposition or a pronoun in place of a verb or a noun (see CONTRIBUTING.md)."""
+"""Report docstrings that begin with a preposition or a pronoun instead of a verb or a noun (see CONTRIBUTING.md)."""
 
 import ast
 import sys
@@ -9,7 +9,7 @@ DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def main(folders: list[str]) -> int:
-    """Print each docstring that begins so, and return how many do."""
+    """Print each such docstring, and return their number."""
     found = 0
     for path in (path for folder in folders for path in sorted(Path(folder).rglob("*.py"))):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -1,4 +1,4 @@
-"""Constructors of equinox modules, which mkdocstrings does not know for the dataclasses that they are."""
+"""Constructor signatures of equinox modules, which mkdocstrings does not recognise as dataclasses."""
 
 import inspect
 from typing import Any
@@ -10,7 +10,7 @@ import fitact
 
 
 class Constructors(griffe.Extension):
-    """Gives each public module the signature that Python sees, with the annotations of its source."""
+    """Extension that gives each public module its Python signature, with the annotations of its source."""
 
     def on_package(self, *, pkg: griffe.Module, **_: Any) -> None:
         for name in fitact.__all__ if pkg.name == "fitact" else ():

@@ -1,4 +1,4 @@
-"""What mkdocs does beside its configuration: notebooks become pages, and equations MathML."""
+"""Hooks of mkdocs: pages from notebooks, and equations as MathML."""
 
 import base64
 import html
@@ -21,14 +21,14 @@ _EQUATION = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """The navigation lists every notebook there is."""
+    """Add every notebook to the navigation."""
     pages = [f"notebooks/{path.stem}.md" for path in _sources()]
     config.nav = [{"Notebooks": pages} if "Notebooks" in entry else entry for entry in config.nav or []]
     return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """A page for each notebook, with the pictures that running it made."""
+    """Add a page for each notebook, with the pictures of its executed copy if there is one."""
     for source in _sources():
         executed = EXECUTED / f"{source.stem}.ipynb"
         notebook = nbformat.read(executed, as_version=4) if executed.exists() else jupytext.read(source)
@@ -41,7 +41,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    """TeX as MathML, which browsers set without a script."""
+    """Convert TeX to MathML, which browsers render without a script."""
     return _EQUATION.sub(_mathml, content)
 
 
@@ -49,7 +49,7 @@ def _mathml(found: re.Match[str]) -> str:
     tex = html.unescape(found[3])
     if found[2] == "(":
         return convert(tex)
-    # a wide one is scrolled, also by keyboard
+    # wide equations scroll, also by keyboard
     return f'<div class="equation" tabindex="0">{convert(tex, display="block")}</div>'
 
 
@@ -58,7 +58,7 @@ def _sources() -> list[Path]:
 
 
 def _blocks(notebook: Any, stem: str, pictures: dict[str, bytes]) -> Iterator[str]:
-    """The notebook as Markdown; a picture is described by the notebook's title and the heading above it."""
+    """Yield the notebook as Markdown; the title and the heading above a picture describe it."""
     title = heading = ""
     for cell in notebook.cells:
         if cell.cell_type == "markdown":

@@ -1,6 +1,6 @@
-"""Draw the packages of fitact as rooms, one storey a layer of the import contract: `python tools/draw_rooms.py`.
+"""Draw the packages of fitact as rooms, one storey per layer of the import contract: `python tools/draw_rooms.py`.
 
-Names and order come from pyproject.toml, each room's question from its docstring. Writes docs/rooms.svg.
+Names and order come from pyproject.toml, and each room's question from its docstring. Writes docs/rooms.svg.
 """
 
 import ast
@@ -13,11 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
 ROOT = Path(__file__).parents[1]
-STREET = ("scene", "prior", "model", "data", "likelihood", "fitting", "sampling")  # entered on the way to the force
+# packages on the path of a parameter to the force
+STREET = ("scene", "prior", "model", "data", "likelihood", "fitting", "sampling")
 
 
 def read_layers() -> list[list[str]]:
-    """Return the layers from top to bottom, each a list of names without the package's."""
+    """Return the layers from top to bottom, each a list of names without the package prefix."""
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
     layers = next(contract for contract in contracts if contract["type"] == "layers")["layers"]
     return [[name.strip().removeprefix("fitact.") for name in layer.split("|")] for layer in layers]
@@ -32,7 +33,7 @@ def read_question(name: str) -> str:
 
 
 def draw(layers: list[list[str]]) -> Figure:
-    """Return the picture: a storey for each layer, the rooms of the street in colour."""
+    """Return the figure, with a storey per layer and the rooms of `STREET` in colour."""
     height, width = 0.5, 8.0
     figure = Figure(figsize=(width, height * len(layers)), layout="constrained")
     axes = figure.add_subplot(xlim=(0.0, width), ylim=(-len(layers), 0.0))

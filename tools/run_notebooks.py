@@ -1,4 +1,4 @@
-"""Run notebooks given as text, two at a time, each in its own folder; leave the executed copies in out/notebooks."""
+"""Run notebooks in text form, two at a time, each in its own folder, and write executed copies to out/notebooks."""
 
 import sys
 import time
@@ -11,12 +11,12 @@ from nbclient import NotebookClient
 from nbclient.exceptions import CellControlSignal, DeadKernelError
 
 TARGET = Path("out/notebooks")
-SECONDS = 600  # that a cell may take; a tenth is what it takes on a quiet machine
+SECONDS = 600  # limit per cell, ten times what the slowest takes on a quiet machine
 QUIET = ["--IPKernelApp.log_level=ERROR"]
 
 
 def run(path: Path) -> tuple[str, float]:
-    """Where and why it failed ("" where it did not), and the seconds that it took."""
+    """Run one notebook; return where and why it failed ("" if it did not), and its time in seconds."""
     notebook, began = jupytext.read(path), time.perf_counter()
     place = {"metadata": {"path": str(path.parent)}}
     client = NotebookClient(notebook, timeout=SECONDS, resources=place, extra_arguments=QUIET)
@@ -29,13 +29,13 @@ def run(path: Path) -> tuple[str, float]:
         number = max(len(begun), 1)
         why = f"{error.ename}: {error.evalue}" if hasattr(error, "ename") else str(error).strip()
         failure = f"{path}, code cell {number} of {len(code)}:\n\n{code[number - 1].source}\n\n{why}"
-    # under another name where it failed, lest make take it for done
+    # a failed one gets another name, so that make does not take it as done
     nbformat.write(notebook, TARGET / f"{path.stem}{'.failed' if failure else ''}.ipynb")
     return failure, time.perf_counter() - began
 
 
 def main() -> None:
-    """Run all, then tell of those that failed."""
+    """Run all notebooks, then report failures."""
     TARGET.mkdir(parents=True, exist_ok=True)
     paths, failures = [Path(argument) for argument in sys.argv[1:]], []
     with ThreadPoolExecutor(2) as pool:
