@@ -37,8 +37,8 @@ def prior(params):
 
 
 def log_posterior(params):
-    left, believed = residual(params), prior(params)
-    return -0.5 * (left @ left + believed @ believed) - left.size * params["log_sigma"].value
+    left, prior_residual = residual(params), prior(params)
+    return -0.5 * (left @ left + prior_residual @ prior_residual) - left.size * params["log_sigma"].value
 
 
 params = lmfit.Parameters()

@@ -58,8 +58,8 @@ def raw_log_density(record: fitact.Record) -> Callable[[Array], Array]:
         R, C, Ci = jnp.exp(point[:3])
         g, b = Ci / (2.0 * Ci + C), R * (2.0 * Ci + C)
         residual = y - sign * 360.0 * g / (1.0 + jnp.exp(-0.5 / FREQUENCY / b)) * jnp.exp(-since / b)
-        believed = -0.5 * jnp.sum(jnp.square((point[:3] - TRUTH[:3]) / LOG_SD))
-        return believed - 0.5 * residual @ residual * jnp.exp(-2.0 * point[3]) - y.size * point[3]
+        log_prior = -0.5 * jnp.sum(jnp.square((point[:3] - TRUTH[:3]) / LOG_SD))
+        return log_prior - 0.5 * residual @ residual * jnp.exp(-2.0 * point[3]) - y.size * point[3]
 
     return value
 
