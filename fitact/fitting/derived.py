@@ -81,9 +81,7 @@ class DerivedQuantities(eqx.Module):
         """Return the quantities of `DERIVED_NAMES`, in SI units."""
         circuit = self.likelihood.circuit(theta)
         force = summarize(self.force(theta, sigma, deviate), self.weight)
-        if self.steady_state and isinstance(
-            self.drive, Periodic
-        ):  # mean and peak are exact; only the rms needs quadrature
+        if self.steady_state and isinstance(self.drive, Periodic):  # only the rms needs quadrature
             exact = circuit, self.drive, self.geometry.contact(circuit)
             force = force._replace(mean=mean_force(*exact))
             if not isinstance(circuit, WithSkin) or isinstance(self.drive, Sine | Multitone):
@@ -169,8 +167,8 @@ def _last_periods(
 ) -> tuple[Drive, tuple[np.ndarray, np.ndarray]] | None:
     """Return the end of a long measured drive with times and weights of its last whole periods, or None.
 
-    A record is long above `max_samples`. The force is evaluated over the last periods in `window` samples, at least
-    one, which the drive precedes by `lead_taus` time constants.
+    A record is long above `max_samples`. The force is evaluated over the last whole periods in `window` samples, but at
+    least one. The drive begins `lead_taus` time constants earlier.
     """
     frequency, time = record.frequency(), record.time
     if not isinstance(choice.drive, Sampled) or frequency is None or time.size <= max_samples:
