@@ -26,7 +26,7 @@ class ContactAreaTest(NamedTuple):
         fingers: number of fingers whose record determines log Ci better than the prior does.
         chi_square: of their own log Ci about the weighted mean, with `fingers` - 1 degrees of freedom.
         p_value: probability of a larger one if all have the same Ci; NaN if fewer than two fingers tell.
-        log_sd: standard deviation of log Ci between fingers beyond the standard errors (DerSimonian & Laird 1986).
+        log_sd: standard deviation of log Ci between fingers beyond the standard errors (Hedges & Olkin 1985).
         tolerance: log_sd that changes the force by no more than `[tolerance] force`.
     """
 
@@ -51,7 +51,7 @@ class ContactAreaTest(NamedTuple):
         log_Ci += np.array([finger.weighted_offset for finger in informative]) / weight
         mean = np.average(log_Ci, weights=weight)
         chi_square = float(weight @ np.square(log_Ci - mean))
-        excess = (chi_square - (count - 1)) / float(weight.sum() - np.sum(weight**2) / weight.sum())
+        excess = float(np.var(log_Ci, ddof=1) - np.mean(1.0 / weight))
         p_value = float(scipy.stats.chi2.sf(chi_square, count - 1))
         return cls(assumption, count, chi_square, p_value, math.sqrt(max(excess, 0.0)), tolerance)
 

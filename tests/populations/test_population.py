@@ -17,6 +17,7 @@ import scipy.stats
 from arviz_stats.base import array_stats
 
 import fitact
+from fitact.populations.contact_area import ContactAreaTest
 from fitact.populations.covariates import Covariates, read_covariates
 from fitact.populations.finger import Finger
 from fitact.populations.finger_likelihoods import FingerLikelihoods, PopulationParameters
@@ -232,11 +233,61 @@ def test_what_makes_no_population_is_refused():
     with pytest.raises(fitact.InputError, match=r"finger 0 .* same record as finger 0"):
         fitact.population([first, first])
     held = fitact.Scene.from_dict({"prior": {"Ci": {"fixed": True}}})
-    with pytest.raises(fitact.InputError, match="holds or ties"):
+    with pytest.raises(fitact.InputError, match="fixes or ties"):
         fitact.population([first, *others], held)
     correlated = {"R_H": {"median": "500 ohm", "factor": 2}, "correlation": {"R_H-Csc": 0.5}}
-    with pytest.raises(fitact.InputError, match="with others"):
+    with pytest.raises(fitact.InputError, match="with other parameters"):
         fitact.population([first, *others], fitact.Scene.from_dict({"prior": correlated, "grounding": {"R_H": 500.0}}))
+
+
+def fingers_that_say(log_Ci: np.ndarray, standard_error: float) -> list[Finger]:
+    """Fingers of which nothing is known but their own log Ci, from centers that differ from it."""
+    nothing = np.zeros(0)
+    centers = log_Ci + 0.3 * np.random.default_rng(1).standard_normal(log_Ci.size)
+    weights = standard_error**-2 * (log_Ci - centers)
+    return [
+        Finger("", "", "successful", "", {}, None, (), center, nothing, nothing, nothing, standard_error**-2, weight)
+        for center, weight in zip(centers.tolist(), weights.tolist(), strict=True)
+    ]
+
+
+PANEL = fitact.LogNormal.with_relative_sd(1.35e-9, 0.1)
+
+
+def test_fingers_of_one_area_agree_with_the_assumption():
+    """Over 2,000 populations of six fingers the test rejects one in a hundred, as its p-value says."""
+    rng, rejected = np.random.default_rng(7), 0
+    for _ in range(2000):
+        fingers = fingers_that_say(-20.4 + 0.05 * rng.standard_normal(6), 0.05)
+        found = ContactAreaTest.from_fingers(fingers, PANEL, "common", 0.0)
+        rejected += found.disagrees
+    assert rejected == pytest.approx(20, abs=5 * np.sqrt(20))
+    assert found.is_tested
+
+
+def test_fingers_of_different_areas_disagree_and_varies_is_offered():
+    """Areas that differ by 30 %: chi-square and the excess by hand."""
+    log_Ci = -20.4 + 0.3 * np.random.default_rng(8).standard_normal(40)
+    found = ContactAreaTest.from_fingers(fingers_that_say(log_Ci, 0.02), PANEL, "common", 0.01)
+    assert found.chi_square == pytest.approx(np.var(log_Ci) * 40 / 0.02**2)
+    assert found.log_sd == pytest.approx(np.sqrt(np.var(log_Ci, ddof=1) - 0.02**2))
+    assert found.disagrees
+    assert 'set contact_area = "varies"' in found.sentence
+    told = found._replace(assumption="varies")
+    assert not told.disagrees
+    assert "assumed" not in told.sentence
+    small = ContactAreaTest.from_fingers(fingers_that_say(-20.4 + 1e-3 * (log_Ci + 20.4), 1e-5), PANEL, "common", 0.01)
+    assert small.p_value < 1e-6
+    assert not small.disagrees  # a thousandth changes no force by as much as the tolerance
+
+
+def test_records_of_vsc_alone_cannot_test_the_area():
+    found = ContactAreaTest.from_fingers(fingers_that_say(np.full(5, -20.4), 50.0), PANEL, "common", 0.01)
+    assert found.to_dict() | {"sentence": ""} == {
+        "assumption": "common", "tested": False, "disagrees": None, "fingers": 0, "chi_square": None, "p_value": None,
+        "log_sd": None, "sentence": "",
+    }  # fmt: skip
+    assert "cannot test this" in found.sentence
 
 
 @pytest.mark.parametrize(
@@ -263,7 +314,7 @@ def test_covariates_are_those_of_the_records_in_their_order(tmp_path):
     for values, said in (
         ({"moisture": [1.0, 2.0]}, "2 values for 3 records"),
         ({"moisture": [2.0, 2.0, 2.0]}, "same value"),
-        ({"a": [1.0, 2.0, 4.0], "b": [2.0, 4.0, 8.0]}, "one follows from the others"),
+        ({"a": [1.0, 2.0, 4.0], "b": [2.0, 4.0, 8.0]}, "linearly dependent"),
     ):
         with pytest.raises(fitact.InputError, match=said):
             Covariates.from_values(values, 3)

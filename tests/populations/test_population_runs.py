@@ -4,10 +4,13 @@ import weakref
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
 import fitact
+from fitact.populations.contact_area import ContactAreaTest
+from fitact.populations.finger import Finger
 from tests.calibration import AMPLITUDE, PER_PERIOD, wave
 from tests.population_calibration import FREQUENCY, NOISE, simulate, vsc
 
@@ -121,6 +124,30 @@ def test_areas_are_seen_by_the_current(channels: tuple[str, ...]):
         assert low < value < high, name
     low, high = np.quantile(draws["log_sd_area"], [0.025, 0.975])
     assert high / low < 3.5  # ten fingers of known area: chi-square's 95 % are a factor of 2.7 apart
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("area_sd", [0.0, 0.3])
+@pytest.mark.parametrize("channels", [("Vsc",), ("Vsc", "I")])
+def test_records_disagree_with_one_area_where_areas_differ(channels: tuple[str, ...], area_sd: float):
+    """Five simulated fingers fitted with `contact_area = "common"`: the current shows it, and Vsc alone cannot."""
+    rng = np.random.default_rng(13)
+    areas = np.exp(area_sd * rng.standard_normal(5))
+    records = [
+        record(np.array([130e3 / area, 20e-9 * area]), 1.35e-9 * area, i, rng, current=True)
+        for i, area in enumerate(areas)
+    ]
+    sections = simulate(SEED, 0, fingers=2).scene.model_dump(exclude_unset=True) | {
+        "measurement": {"channels": channels}
+    }
+    scene = fitact.Scene.from_dict(sections)
+    with jax.enable_x64(True):
+        fingers = [Finger.from_fit(fitact.fit(each, scene)) for each in records]
+    found = ContactAreaTest.from_fingers(fingers, scene.make_prior()["Ci"], "common", 0.01)
+    assert found.is_tested == ("I" in channels)
+    assert found.disagrees == ("I" in channels and area_sd > 0.0)
+    if found.disagrees:
+        assert found.log_sd == pytest.approx(np.std(np.log(areas), ddof=1), rel=0.05)
 
 
 def record(skin: np.ndarray, Ci: float, number: int, rng: np.random.Generator, current: bool = False) -> fitact.Record:
