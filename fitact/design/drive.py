@@ -276,7 +276,7 @@ class DriveDesign:
     @property
     def limits_table(self) -> tuple[tuple[str, ...], ...]:
         """Titles, then a row for each limit, for people."""
-        titles = "limit", "meaning", "quantity", "here", "limit", "ratio", "published for"
+        titles = "source", "meaning", "quantity", "here", "limit", "ratio", "published for"
         return titles, *(each.row for each in self.limits)
 
     @property

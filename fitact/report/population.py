@@ -231,6 +231,8 @@ def _figures(tree: Any, content: dict[str, Any]) -> dict[str, Any]:
 def _frame(content: dict[str, Any]) -> PageSummary:
     law, new, count = content["population"], content["new_finger"], len(content["fingers"])
     force, friction = new["force_mean"], new["friction_mean"]
+    # two defaults give the friction of a scene that states none
+    stated_friction = f" Mean friction {_format_range(friction)}." if "friction" in content["scene"] else ""
     off = f"{content['integrals_off']:.2g} standard deviations"
     certificate = f"the integrals over the fingers shift no mean by more than {off}"
     return PageSummary(
@@ -243,7 +245,7 @@ def _frame(content: dict[str, Any]) -> PageSummary:
         else f"{content['convergence']['sentence']}; {certificate} (at most {MAX_INTEGRATION_ERROR:g} are accepted).",
         findings={
             "Force on the next finger": f"Mean electrostatic force {_format_range(force)}, with 95 % prediction"
-            f" interval. Mean friction {_format_range(friction)}.",
+            f" interval.{stated_friction}",
             "Sources of variance": "; ".join(variance_sentences(content)) + f". {SHARES_LEGEND}",
         }
         | ({"Contact area": _sentence(content["contact_area"]["sentence"])} if "contact_area" in content else {}),
@@ -288,7 +290,7 @@ def _finger_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
 
 
 def _new_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
-    yield ("next finger", *_QUANTILES.values(), "between fingers", "parameter uncertainty")
+    yield ("next finger", *_QUANTILES.values(), "between fingers", "parameters")
     none = 1e-12 * content["new_finger"]["force_mean"]["q50"]  # smaller forces are rounding errors
     for name, s in content["new_finger"].items():
         values = (
@@ -303,11 +305,17 @@ def _share_rows(content: dict[str, Any], name: str) -> Iterator[tuple[str, ...]]
     before = content["variance_shares_prior"][name]
     for factor, share in content["variance_shares"][name].items():
         cells = (
-            f"{format_percent(of[key])} ± {format_percent(of[f'{key}_error'])}"
-            for of in (share, before[factor])
-            for key in ("first", "total")
+            _format_index(of[key], of[f"{key}_error"]) for of in (share, before[factor]) for key in ("first", "total")
         )
         yield (factor.replace("_", " "), *cells)
+
+
+def _format_index(value: float, error: float) -> str:
+    """Format a Sobol index with its error to two digits, both to the same place, in per cent."""
+    if not 0.0 < error < math.inf:
+        return format_percent(value)
+    places = max(0, 1 - math.floor(math.log10(float(f"{100.0 * error:.1e}"))))
+    return f"{round(100.0 * value, places) + 0.0:.{places}f} % ± {100.0 * error:.{places}f} %"
 
 
 def _draw_panel(draw: Callable[[Axes, Any, dict[str, Any]], None], tree: Any, content: dict[str, Any]) -> Figure:
