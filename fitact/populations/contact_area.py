@@ -25,7 +25,7 @@ class ContactAreaTest(NamedTuple):
         assumption: `[population] contact_area`, "common" or "varies".
         fingers: number of fingers whose record determines log Ci better than the prior does.
         chi_square: of their own log Ci about the weighted mean, with `fingers` - 1 degrees of freedom.
-        p_value: probability of a larger one if all have the same Ci; NaN if fewer than two fingers tell.
+        p_value: probability of a larger one if all have the same Ci; NaN for fewer than two such fingers.
         log_sd: standard deviation of log Ci between fingers beyond the standard errors (Hedges & Olkin 1985).
         tolerance: log_sd that changes the force by no more than `[tolerance] force`.
     """

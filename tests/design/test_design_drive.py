@@ -165,7 +165,7 @@ def one_finger(**values: float) -> FingerSample:
 
 @pytest.fixture(scope="module")
 def one() -> fitact.DriveDesign:
-    """Of one finger, a trapezoid."""
+    """The design for one finger, with a trapezoid."""
     return fitact.design_drive(scene(drive=TRAPEZOID), one_finger())
 
 
@@ -308,7 +308,7 @@ def test_quantiles_hold_where_some_never_feel_it():
 
 @pytest.mark.parametrize("share", [0.05, 0.5, 0.95])
 def test_the_error_of_a_quantile_is_that_of_an_order_statistic(share: float):
-    """Of exponential draws (Renyi): the k-th of n has the variance of 1/n to 1/(n - k + 1), each squared, in all."""
+    """The k-th of n exponential draws has the variance 1/n^2 + ... + 1/(n - k + 1)^2 (Renyi)."""
     count = 2000
     at = scipy.stats.expon.ppf((np.arange(count) + 0.5) / count)
     expected = math.sqrt(np.sum(np.arange(count, count * (1.0 - share), -1.0) ** -2.0))
@@ -323,7 +323,7 @@ def test_the_error_of_a_quantile_where_some_never_feel_it():
 
 
 def test_friction_changes_by_a_share_of_itself(tmp_path: Path):
-    """Of a sine mean and amplitude of fe are one: c (fe + fN) = fe; none reaches the mean itself."""
+    """Mean and amplitude of a sine's fe are equal: c (fe + fN) = fe; no amplitude changes friction by its mean."""
     few = fitact.design_drive(scene(perception={"friction_change": 2e-4}), one_finger()).options["sine"]
     fe = 2e-4 * 0.5 / (1.0 - 2e-4)
     assert few.assured == pytest.approx(sine_amplitude(F) * math.sqrt(fe / THRESHOLD), rel=1e-9)
@@ -393,7 +393,7 @@ def test_a_threshold_without_a_source_is_an_example(one):
 
 @pytest.mark.parametrize("frequency", [50.0, 400.0, 4000.0])
 def test_current_and_field_stand_beside_published_limits_though_none_was_stated(frequency: float):
-    """Of a sine through two skins and Ci, by its impedance."""
+    """The current of a sine through two skins and Ci follows from the impedance."""
     thickness = 2e-6
     stated = scene(
         drive={"waveform": "sine", "frequency": frequency}, device={"insulator_thickness": thickness, "Ci": CI}
@@ -502,7 +502,7 @@ def test_the_command_writes_what_it_prints(tmp_path: Path, capsys: pytest.Captur
 
 @pytest.fixture(scope="module")
 def eight() -> tuple[fitact.Population, fitact.DriveDesign]:
-    """Of ngspice's fingers."""
+    """The population of ngspice's fingers, and a design for it."""
     stated = scene(
         drive=TRAPEZOID,
         measurement={"channels": ["Vsc", "I"]},
@@ -517,7 +517,7 @@ def eight() -> tuple[fitact.Population, fitact.DriveDesign]:
 
 @pytest.mark.thorough
 def test_people_are_those_of_the_population(eight):
-    """What share of other fingers of the same laws feel a sine, by its closed form."""
+    """Other fingers of the same population samples feel a sine as often, by its closed form."""
     people, design = eight
     assert design.people.has_separate_uncertainty
     assert design.trusted
@@ -541,7 +541,7 @@ def test_people_are_those_of_the_population(eight):
 
 
 def test_an_area_scales_capacitances_up_and_the_resistance_down():
-    """Of one law, whose fingers differ in nothing else; what is tied follows."""
+    """Fingers of one population sample differ in their area only; tied parameters follow."""
 
     def law(_: np.ndarray) -> PopulationParameters:
         return PopulationParameters(np.log([R, C]), np.zeros(2), 0.0, math.log(CI), 0.3)

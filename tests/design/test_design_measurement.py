@@ -1,4 +1,4 @@
-"""What to measure next, against Fisher information from scipy's transfer functions and against posteriors."""
+"""The next measurement, against Fisher information from scipy's transfer functions and against posteriors."""
 
 import dataclasses
 import functools
@@ -77,7 +77,7 @@ def log_force(Rsc: float, Csc: float, Ci: float) -> float:
 
 
 def derivative(function, h: float = 1e-4) -> np.ndarray:
-    """In the logarithms of Rsc, Csc, Ci, one row for each."""
+    """Return derivatives in the logarithms of Rsc, Csc and Ci, one row for each."""
     return np.array([
         (np.asarray(function(*np.exp(LOGS + h * e))) - np.asarray(function(*np.exp(LOGS - h * e)))) / (2.0 * h)
         for e in np.eye(3)
@@ -103,7 +103,7 @@ def information(channels: str = "Vsc", count: float = COUNT, noise: float = NOIS
 
 
 def standard_deviations(total: np.ndarray, prior_sd: np.ndarray = PRIOR_SD) -> np.ndarray:
-    """Of the logarithms of Rsc, Csc, Ci and of the mean force."""
+    """Return those of the logarithms of Rsc, Csc, Ci and the mean force."""
     covariance = np.linalg.inv(total + np.diag(prior_sd**-2.0))
     return np.sqrt([*np.diag(covariance)[:3], GRADIENT @ covariance[:3, :3] @ GRADIENT])
 
@@ -137,7 +137,7 @@ def test_the_paper_s_measurement(design: fitact.MeasurementDesign, options: dict
 
 
 def second_panel(Ci: float) -> np.ndarray:
-    """Of Rsc, Csc, Ci and the second panel's, whose samples see its own."""
+    """Return the information on Rsc, Csc, Ci and the second panel's Ci, which its own samples determine."""
     scale = Ci / VALUES["Ci"]
     total = np.zeros((4, 4))
     total[:3, :3] += information()
@@ -179,7 +179,7 @@ def trial_of(experiment: Experiment, *names: str, steps: dict | None = None) -> 
 
 @pytest.mark.parametrize("names", [("series resistor", "current"), ("two frequencies", "current"), ("second panel",)])
 def test_slopes_of_what_is_to_be_expected(names: tuple[str, ...]):
-    """By central differences, away from the best settings."""
+    """Central differences away from the best settings."""
     trial, gradient = trial_of(NOMINAL, *names), force_gradient(NOMINAL)
     at = np.array(trial.start_values) * [1.7, 0.6][: len(trial.settings)]
     value, slope = log_force_sd_slope(trial, at, gradient)
@@ -318,7 +318,7 @@ NATURAL = {"grounding": {"connection": "natural", "Z": 14.5e6}}
 def record(
     vsc: np.ndarray, step: float = 1.0 / RATE, current: np.ndarray | None = None, seed: int = 0
 ) -> fitact.Record:
-    """As many samples as the scene's, with noise, from one half period of each channel."""
+    """Make as many samples as the scene has, with noise, from one half period of each channel."""
     rng, half = np.random.default_rng(seed), len(vsc)
 
     def whole(values: np.ndarray) -> np.ndarray:

@@ -44,7 +44,7 @@ def scipy_vsc(Rsc: float, Csc: float, Ci: float, series: float) -> np.ndarray:
 
 
 def scipy_current(Rsc: float, Csc: float, Ci: float, series: float) -> np.ndarray:
-    """What flows through the skin between the edges: Vsc / Rsc + Csc dVsc/dt, with Vsc falling at its time constant."""
+    """Return the current between the edges: Vsc / Rsc + Csc dVsc/dt, with Vsc falling at its time constant."""
     return scipy_vsc(Rsc, Csc, Ci, series) * (1.0 / Rsc - Csc / (Rsc * (2.0 * Ci + Csc)))
 
 
@@ -101,7 +101,7 @@ def test_vsc_alone_leaves_the_prior_along_the_contact_area(nominal: DesignOption
     ids=["current", "resistor"],
 )
 def test_remedies_that_see_the_contact_area(experiment: Experiment, series: float, percent: float):
-    """As scipy has it; for 4,000 samples in two periods, 0.1 V and 20 nA."""
+    """The expectation is scipy's, for 4,000 samples in two periods, 0.1 V and 20 nA."""
     sd, force_sd = scipy_expected(experiment.channels, series)
     found = expected_sd(experiment)
     np.testing.assert_allclose(list(found.sd.values()), sd, rtol=1e-4)
@@ -164,7 +164,7 @@ def test_the_beginning_of_a_long_measured_drive_stands_for_all():
 
 
 def test_a_root_of_the_covariance_is_the_same_however_rounding_turns_the_singular_vectors():
-    """As it would be on another machine: residuals in another order, two directions that nothing is known of."""
+    """Another machine's rounding: residuals in another order, and two directions without information."""
     random = np.random.default_rng(1)
     jacobian = random.standard_normal((50, 2)) @ random.standard_normal((2, 4)) * 1e4
     prior_factor = np.linalg.cholesky(np.cov(random.standard_normal((4, 40))))

@@ -48,7 +48,7 @@ def known(skins: np.ndarray, log_Ci: np.ndarray, precision: float) -> FingerLike
 
 @pytest.mark.parametrize(("varies", "known_of_each"), [(False, 0), (True, 0), (False, 2)])
 def test_log_posterior_of_known_fingers_is_scipys(varies: bool, known_of_each: int):
-    """Of Rsc and Csc; of Ci too where each finger's area scales all three; and with covariates."""
+    """The densities of Rsc and Csc, of Ci too if each finger's area scales all three, and with covariates."""
     rng = np.random.default_rng(1)
     with jax.enable_x64(True):
         skins = rng.normal([11.8, -17.7], 0.3, (5, 2))
@@ -156,7 +156,7 @@ def test_force_of_a_new_finger_is_that_of_scipys_response():
 
 
 def test_spread_of_the_next_finger_is_people_and_ignorance():
-    """Of means with a variance of 4, and fingers with one of 9 about them."""
+    """Means have a variance of 4, and fingers a variance of 9 about them."""
     rng = np.random.default_rng(2)
     spread = VarianceDecomposition.from_draws(
         2.0 * rng.standard_normal((20_000, 1)) + 3.0 * rng.standard_normal((20_000, 8))
@@ -216,7 +216,7 @@ def test_variance_shares_of_a_product_are_those_of_the_closed_form():
 
 
 def test_a_surrogate_that_is_off_says_by_how_much():
-    """Of a quantity with a kink, which no polynomial has: the correlation at 100,000 other points."""
+    """A quantity with a kink, which no polynomial has: the error is the correlation at 100,000 other points."""
     finger = Known(lambda x: np.exp(np.abs(x[:, 0] - 0.5) + 0.3 * x[:, 1]), FACTORS[:2])
     surrogate = Surrogate.from_model(finger, np.random.default_rng(5).standard_normal((4000, 2)), finger.names)
     points = surrogate.mean + np.random.default_rng(6).standard_normal((100_000, 2)) @ surrogate.covariance_factor.T
@@ -379,7 +379,7 @@ def nuts(fits: list[fitact.Fit], prior: Prior) -> dict[str, np.ndarray]:
 @pytest.mark.thorough
 @pytest.mark.parametrize("count", [3, 6])
 def test_law_is_that_of_nuts_over_all_parameters(count: int):
-    """Of fingers known no better than they differ; within four standard errors of means, and 5 % in width."""
+    """Fingers are known no better than they differ; means agree within four standard errors, widths within 5 %."""
     simulated = simulate(5, 1, fingers=count, noise=4.0)
     found = fitact.population(simulated.records, simulated.scene, seed=1, progress=False)
     assert found.trusted
@@ -413,7 +413,7 @@ def test_a_misfit_is_named_and_the_population_stays_trusted():
 
 @pytest.fixture(scope="module")
 def eight(tmp_path_factory) -> dict:
-    """What the command prints for ngspice's eight fingers, with V, Vsc and I."""
+    """The output of the command for ngspice's eight fingers, with V, Vsc and I."""
     folder = tmp_path_factory.mktemp("population")
     scene = folder / "scene.toml"
     scene.write_text(
