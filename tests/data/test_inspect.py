@@ -113,4 +113,4 @@ def test_a_fit_of_an_oscilloscopes_file(command):
     assert content["derived"]["g"]["mean"] == pytest.approx(
         np.exp(level) * (1.0 + np.exp(slope * 5e-3)) / 360.0, rel=0.01
     )
-    assert any("Vsc is '2' (in Volt; no attenuation stated) times 1" in warning for warning in content["warnings"])
+    assert any("Vsc read from column '2' (unit Volt); the file" in note for note in content["notes"])

@@ -115,7 +115,7 @@ def test_blocks_are_whole_periods_where_there_are_many(periods: int, count: int)
 def scored(name: str, log_density: list[float], bic: float, result: str = "successful") -> ModelScore:
     fit = SimpleNamespace(
         figures={"bic": bic, "aic": bic, "aicc": bic, "log_likelihood": 0.0, "parameters_counted": 5, "samples": 100},
-        trusted=result == "successful", result=result, message="The model does not describe the record.",
+        trusted=result == "successful", result=result, message="Poor fit.",
     )  # fmt: skip
     return ModelScore(name, fit, CrossValidation(np.array(log_density), 10, 0))
 
@@ -152,10 +152,10 @@ def test_a_preferred_model_that_is_a_misfit_is_not_trusted():
     found = ranked(scored("a", FLAT, 0.0, "misfit"), scored("b", [x - 1.0 for x in NOISY], 0.0))
     assert found.preferred == "a"
     assert not found.trusted
-    assert "The fit of a is unreliable: The model does not describe the record." in found.verdict
+    assert "The fit of a is unreliable: Poor fit." in found.verdict
     other = ranked(scored("a", FLAT, 0.0), scored("b", [x - 1.0 for x in NOISY], 0.0, "misfit"))
     assert other.trusted
-    assert other.warnings == ("b: The model does not describe the record.",)
+    assert other.warnings == ("b: Poor fit.",)
 
 
 def test_refused():
