@@ -1,6 +1,6 @@
 """Draw the packages of fitact as rooms, one storey per layer of the import contract: `python tools/draw_rooms.py`.
 
-Names and order come from pyproject.toml, and each room's question from its docstring. Writes docs/rooms.svg.
+Names and order come from pyproject.toml, and each package's task from its docstring. Writes docs/rooms.svg.
 """
 
 import ast
@@ -24,7 +24,7 @@ def read_layers() -> list[list[str]]:
     return [[name.strip().removeprefix("fitact.") for name in layer.split("|")] for layer in layers]
 
 
-def read_question(name: str) -> str:
+def read_task(name: str) -> str:
     """Return the first line of a package's or module's docstring."""
     path = ROOT / "fitact" / name
     source = (path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text(encoding="utf-8")
@@ -46,7 +46,7 @@ def draw(layers: list[list[str]]) -> Figure:
             box = FancyBboxPatch((x, y), room - 0.1, 0.84, "round,pad=0,rounding_size=0.08", fc=colour, ec="#777777")
             axes.add_patch(box)
             axes.text(x + 0.12, y + 0.6, name, va="center", weight="bold", size=10)
-            axes.text(x + 0.12, y + 0.24, read_question(name), va="center", size=7.5)
+            axes.text(x + 0.12, y + 0.24, read_task(name), va="center", size=7.5)
     return figure
 
 
