@@ -65,7 +65,7 @@ assert not fitact.inspect(captured, channels=channels, scale={"Vsc": 10}).warnin
 # %%
 scene = fitact.Scene.from_dict(
     {
-        "device": {"contact_area": "1 cm^2", "insulator_thickness": "1 um", "insulator_permittivity": 1.525},
+        "device": {"contact_area": "39.1 mm^2", "insulator_thickness": "1 um", "insulator_permittivity": 3.9},
         "drive": {"waveform": "measured"},
         "prior": {"Ci": {"relative_sd": 0.05}},  # around eps A / Ti; mostly the uncertainty of the area
     }
