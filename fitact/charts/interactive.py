@@ -6,6 +6,7 @@ units of the axes; x has 64 bits, so that late samples of a record remain distin
 
 import base64
 import dataclasses
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any, Self
 
@@ -24,8 +25,10 @@ _AXIS = {
     "showline": True, "linecolor": "#51606f", "ticks": "outside", "tickcolor": "#51606f", "gridcolor": "#e3e7eb",
     "zeroline": False, "automargin": True, "exponentformat": "SI",
 }  # fmt: skip
-# with 3, plotly.js labels powers of ten above two decades, and 1, 2, 5 below: labels that do not overlap
-_TICKS = {"linear": 6, "log": 3}
+_LINEAR_TICKS = 6
+# plotly.js labels powers of ten if there are fewer ticks than 1.4 for each decade, and otherwise 1, 2, 5 or all digits,
+# which overlap
+_LOG_TICKS = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +52,7 @@ class Axis:
     limits: tuple[float, float] | None = None
     hides_numbers: bool = False
     has_tick_prefixes: bool = False
+    log_ticks: int = _LOG_TICKS
 
     @classmethod
     def from_values(
@@ -61,7 +65,8 @@ class Axis:
         wide = log and sizes.size > 0 and bool(np.log10(sizes.max() / sizes.min()) > 4.0)
         middle = float(np.sqrt(sizes.min() * sizes.max()) if log else sizes.max()) if sizes.size and not wide else 0.0
         size, symbol = choose_prefixed_unit(middle, unit)
-        return cls(title, symbol, size, log, limits, has_tick_prefixes=wide)
+        ticks = min(max(_LOG_TICKS, math.ceil(decades)), _LINEAR_TICKS)
+        return cls(title, symbol, size, log, limits, has_tick_prefixes=wide, log_ticks=ticks)
 
     def encode(self, values: ArrayLike, dtype: str = "f4") -> dict[str, str]:
         """Return `values` (SI) in the displayed unit, encoded for plotly.js."""
@@ -229,12 +234,15 @@ def _visibility_update(plot: Plot, name: str) -> dict[str, Any]:
 
 
 def _axis_type_update(plot: Plot, axes: str, kind: str) -> dict[str, Any]:
-    names = [name for name in plot["layout"] if name[:5] in [f"{letter}axis" for letter in axes]]
+    layout = plot["layout"]
+    names = [name for name in layout if name[:5] in [f"{letter}axis" for letter in axes]]
     traces = [i for i, trace in enumerate(plot["data"]) if "x" in axes and "meta" in trace]
+    ticks = {name: layout[name]["nticks"] if layout[name]["type"] == "log" else _LOG_TICKS for name in names}
     return {
         "traces": traces,
         "restyle": {"y": [plot["data"][i]["meta"][kind] for i in traces]} if traces else {},
-        "relayout": {key: x for name in names for key, x in ((f"{name}.type", kind), (f"{name}.nticks", _TICKS[kind]))},
+        "relayout": {f"{name}.type": kind for name in names}
+        | {f"{name}.nticks": ticks[name] if kind == "log" else _LINEAR_TICKS for name in names},
     }
 
 

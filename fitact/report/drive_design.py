@@ -152,13 +152,20 @@ def _frame(design: DriveDesign) -> PageSummary:
             Answer(
                 f"{name}, peak to peak",
                 format_quantity(option.assured, "V"),
-                "recommended" if option is recommended else "excluded" if option.violations else "not recommended",
+                _note(option, recommended),
             )
             for name, option in design.options.items()
         ],
         warnings=design.warnings,
         has_reservation=recommended is None or any(each.exceeds_published for each in design.limits),
     )
+
+
+def _note(option: DriveOption, recommended: DriveOption | None) -> str:
+    if option is recommended:
+        return "recommended"
+    unbounded = not np.isfinite(option.at_assured.current_rms)
+    return "excluded" if option.violations else "current unbounded" if unbounded else "alternative"
 
 
 def _curve_plot(design: DriveDesign) -> interactive.Plot:

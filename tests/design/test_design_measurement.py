@@ -103,7 +103,7 @@ def information(channels: str = "Vsc", count: float = COUNT, noise: float = NOIS
 
 
 def standard_deviations(total: np.ndarray, prior_sd: np.ndarray = PRIOR_SD) -> np.ndarray:
-    """Return those of the logarithms of Rsc, Csc, Ci and the mean force."""
+    """Return the standard deviations of the logarithms of Rsc, Csc, Ci and the mean force."""
     covariance = np.linalg.inv(total + np.diag(prior_sd**-2.0))
     return np.sqrt([*np.diag(covariance)[:3], GRADIENT @ covariance[:3, :3] @ GRADIENT])
 
