@@ -124,21 +124,25 @@ def format_estimate(summary: Summary) -> str:
     if not 0.0 < sd <= abs(median):
         spread = "" if sd == 0.0 else f" (sd {format_sd(summary)})"
         return f"{median / size:.{2 if spread else 4}g} {symbol}".rstrip() + spread
-    value, spread = _round_to_sd((median / size, sd / size), sd / size)
+    value, spread = round_to_sd((median / size, sd / size), sd / size)
     return f"{value} ± {spread} {symbol}".rstrip()
 
 
 def format_interval(summary: Summary, low: str = "q05", high: str = "q95") -> str:
     """Return two quantiles, to the place of the standard deviation's second digit: "147.3 to 173.4 kΩ"."""
-    ends, sd = (float(summary[low]), float(summary[high])), float(summary["sd"])
-    unit = str(summary["unit"])
+    ends, unit, sd = (float(summary[low]), float(summary[high])), str(summary["unit"]), float(summary["sd"])
     if not 0.0 < sd <= abs(float(summary["q50"])):
         return " to ".join(format_engineering(end, unit, 2) for end in ends)
-    size, symbol = choose_prefixed_unit(float(summary["q50"]), unit)
-    return f"{' to '.join(_round_to_sd((ends[0] / size, ends[1] / size), sd / size))} {symbol}".rstrip()
+    return format_range(*ends, sd, unit)
 
 
-def _round_to_sd(values: Iterable[float], sd: float) -> list[str]:
+def format_range(low: float, high: float, sd: float, unit: str) -> str:
+    """Return two values of a quantity to the place of the second digit of its standard deviation `sd`."""
+    size, symbol = choose_prefixed_unit(0.5 * (low + high), unit)
+    return f"{' to '.join(round_to_sd((low / size, high / size), sd / size))} {symbol}".rstrip()
+
+
+def round_to_sd(values: Iterable[float], sd: float) -> list[str]:
     """Return numbers rounded to the place of the second significant digit of `sd`."""
     places = 1 - int(f"{sd:.1e}".partition("e")[2])
     return [f"{round(value, places):.{max(places, 0)}f}" for value in values]

@@ -62,7 +62,8 @@ class Axis:
         sizes = np.abs(np.asarray(values, dtype=float))
         sizes = sizes[np.isfinite(sizes) & (sizes > 0.0)]
         # beyond four decades no single prefix is readable
-        wide = log and sizes.size > 0 and bool(np.log10(sizes.max() / sizes.min()) > 4.0)
+        decades = float(np.log10(sizes.max() / sizes.min())) if log and sizes.size else 0.0
+        wide = decades > 4.0
         middle = float(np.sqrt(sizes.min() * sizes.max()) if log else sizes.max()) if sizes.size and not wide else 0.0
         size, symbol = choose_prefixed_unit(middle, unit)
         ticks = min(max(_LOG_TICKS, math.ceil(decades)), _LINEAR_TICKS)
@@ -76,8 +77,8 @@ class Axis:
     def layout(self) -> dict[str, Any]:
         """Return the axis layout for plotly.js."""
         title = f"{self.title} / {self.symbol}" if self.symbol else self.title
-        layout = _AXIS | {"title": {"text": title, "standoff": 6}, "type": (kind := "log" if self.log else "linear")}
-        layout["nticks"] = _TICKS[kind]
+        layout = _AXIS | {"title": {"text": title, "standoff": 6}, "type": "log" if self.log else "linear"}
+        layout["nticks"] = self.log_ticks if self.log else _LINEAR_TICKS
         if self.has_tick_prefixes:
             layout["tickformat"] = "~s"
         if self.hides_numbers:

@@ -22,7 +22,8 @@ from fitact.fitting.derived import DERIVED_NAMES, DerivedQuantities
 from fitact.fitting.laplace import FitResult
 from fitact.fitting.levenberg_marquardt import minimise
 from fitact.likelihood.likelihood import UNCONSTRAINED_SD, Likelihood
-from fitact.tables import align_rows, join_lines
+from fitact.summary import format_range
+from fitact.tables import align_table, join_lines
 from fitact.units import format_engineering, quantity_unit
 
 PROFILE_QUANTITIES = ("g", "b", "force_mean")
@@ -166,14 +167,16 @@ def table(with_prior: Mapping[str, Interval], without_prior: Mapping[str, Interv
     """Return a text table of the intervals with and without the prior."""
 
     def format_interval(name: str, interval: Interval) -> str:
+        if not interval.open:
+            return format_range(interval.low, interval.high, 0.25 * (interval.high - interval.low), quantity_unit(name))
         ends = [
-            "open" if interval.open in (side, "both") else format_engineering(end, quantity_unit(name))
+            "unbounded" if interval.open in (side, "both") else format_engineering(end, quantity_unit(name), 2)
             for side, end in (("low", interval.low), ("high", interval.high))
         ]
-        return f"{ends[0]} to {ends[1]}"
+        return " to ".join(ends)
 
     level = next(iter(with_prior.values())).level
     cells = [(f"{100.0 * level:g} % interval", "with prior", "data only")]
     for name, interval in with_prior.items():
         cells.append((name, format_interval(name, interval), format_interval(name, without_prior[name])))
-    return join_lines(align_rows(cells, (14, 28, 28)))
+    return join_lines(align_table(cells))

@@ -13,7 +13,8 @@ from fitact.errors import InputError
 from fitact.fitting.fit import Fit, fit
 from fitact.model_selection.cross_validation import CrossValidation, cross_validate, likelihood_mask
 from fitact.scene.scene import Scene
-from fitact.tables import align_rows, join_lines
+from fitact.summary import round_to_sd
+from fitact.tables import align_table, join_lines
 
 _CRITERIA = ("log_likelihood", "parameters_counted", "aic", "aicc", "bic")
 
@@ -141,18 +142,17 @@ class Comparison:
     def summary(self) -> str:
         """Return a text table and the verdict."""
         best = self.models[0]
-        titles = ("model", "log-lik.", "parameters", "AIC", "AICc", "BIC", "elpd", " below the best")
+        titles = ("model", "log-lik.", "parameters", "AIC", "AICc", "BIC", "elpd", "below the best")
         rows = []
         for model in self.models:
             criteria = [f"{model.fit.figures[name]:.{0 if name == 'parameters_counted' else 2}f}" for name in _CRITERIA]
             difference = "" if model is best else _format_elpd_difference(model, best)
             rows.append((model.name, *criteria, f"{model.elpd:.2f}", difference))
-        widths = (max(12, *(len(model.name) for model in self.models)), *[14] * 7)
         legend = (
             f"elpd: log predictive density of {best.cross_validation.log_density.size} blocks, in"
             f" {best.cross_validation.folds} held-out folds; below the best: difference ± its standard error."
         )
-        return join_lines([*align_rows([titles, *rows], widths), legend, self.verdict], self.warnings)
+        return join_lines([*align_table([titles, *rows]), legend, self.verdict], self.warnings)
 
     __str__ = summary
 
@@ -208,7 +208,7 @@ def _bic(model: ModelScore) -> float:
 
 def _format_elpd_difference(worse: ModelScore, better: ModelScore) -> str:
     short, error = worse.elpd_difference(better)
-    return f"{short:.2f} ± {error:.2f}"
+    return " ± ".join(round_to_sd((short, error), error))
 
 
 def _standard_error(values: Float[np.ndarray, " blocks"]) -> float:

@@ -131,14 +131,12 @@ NOISY = [1.0 + (-1.0) ** i for i in range(16)]  # the same sum; the standard err
 def test_verdicts():
     better = ranked(scored("a", FLAT, 0.0), scored("b", [x - 1.0 for x in NOISY], -50.0))
     assert better.preferred == "a"  # by 16 ± 4.1, whatever the criterion says
-    assert (
-        better.verdict == "a is preferred: it predicts the held-out blocks better than b, by an elpd of 16.00 ± 4.13."
-    )
+    assert better.verdict == "a is preferred: it predicts the held-out blocks better than b, by an elpd of 16.0 ± 4.1."
     simpler = ranked(scored("a", FLAT, 15.0), scored("b", [x - 0.1 for x in NOISY], 0.0))
     assert simpler.preferred == "b"
     assert simpler.verdict == (
         "b is preferred because of its BIC: a predicts the held-out blocks better by an elpd of only"
-        " 1.60 ± 4.13, and b has a BIC that is lower by 15."
+        " 1.6 ± 4.1, and b has a BIC that is lower by 15."
     )
     tied = ranked(scored("a", FLAT, 5.0), scored("b", [x - 0.1 for x in NOISY], 0.0))
     assert tied.preferred is None
