@@ -119,20 +119,20 @@ class DriveDesign:
     def exposure(self) -> str:
         """Sentences on the body current and the insulator's field at the recommended amplitude."""
         option = self.recommended or self.options[self.own]
+        if not math.isfinite(option.assured):
+            return "No amplitude suffices, so there are no body current and insulator field to compare."
         at, where = option.at_assured, "this amplitude" if self.recommended else f"the {option.waveform}'s amplitude"
-        rms, peak = (format_value(float(x), "A") for x in (at.current_rms, at.current_peak))
-        edges = "" if math.isfinite(at.current_rms) else ": the edges are ideal, so state [drive] rise_time to bound it"
+        current = "the body current is unbounded, because the edges are ideal; state [drive] rise_time"
+        if math.isfinite(at.current_rms):
+            rms, peak = (format_value(float(x), "A") for x in (at.current_rms, at.current_peak))
+            current = f"the largest body current of the fingers drawn is {rms} rms, {peak} peak"
+            compared = next((x for x in self.limits if x.source == ES1 and x.in_range), None)
+            if compared is not None:
+                limit = format_value(compared.limit or math.nan, "A")
+                current += f"; its rms value is {compared.ratio:.2g} times the {ES1} limit of {limit}"
         field = format_value(float(at.insulator_peak) / option.device.insulator_thickness, "V/m")
         thickness = format_engineering(option.device.insulator_thickness, "m", 3)
-        compared = next((x for x in self.limits if x.source == ES1 and x.in_range), None)
-        share = ""
-        if compared is not None and math.isfinite(compared.value):
-            limit = format_value(compared.limit or math.nan, "A")
-            share = f"; its rms value is {compared.ratio:.2g} times the {ES1} limit of {limit}"
-        return (
-            f"At {where} the largest body current of the fingers drawn is {rms} rms, {peak} peak{edges}{share}."
-            f" The field in the insulator is at most {field}, for a thickness of {thickness}."
-        )
+        return f"At {where} {current}. The field in the insulator is at most {field}, for a thickness of {thickness}."
 
     @property
     def legend(self) -> str:
@@ -251,7 +251,7 @@ class DriveDesign:
         force, change = self.scene.perception.threshold_force, self.scene.perception.friction_change
         if force is not None:
             return f"{format_engineering(force, 'N')} amplitude of the alternating electrostatic force"
-        return f"friction that alternates by {change:.3g} of its mean"
+        return f"friction that alternates by {100.0 * (change or 0.0):.3g} % of its mean"
 
     @property
     def threshold(self) -> str:

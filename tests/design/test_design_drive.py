@@ -374,6 +374,12 @@ def test_no_amplitude_is_recommended_that_cannot_be_met_or_trusted():
     )
     assert nobody.to_dict()["recommendation"]["peak_to_peak"] is None
     assert not any("times the limit" in warning for warning in nobody.warnings)
+    assert nobody.exposure.startswith("No amplitude suffices")
+    assert "friction that alternates by 500 % of its mean" in nobody.question
+    tight = scene(device={"current_limit_rms": 1e-9})
+    limited = fitact.design_drive(tight, one_finger())
+    assert "sine: the rms current is" in limited.recommendation
+    assert limited.exposure.startswith("At the square's amplitude the body current is unbounded, because the edges are")
     unreliable = fitact.design_drive(scene(), dataclasses.replace(one_finger(), trusted=False))
     assert "population is not reliable" in unreliable.recommendation
     assert unreliable.to_dict()["recommendation"]["amplitude"] is None
