@@ -291,9 +291,9 @@ def test_what_ngspice_has_not():
 
 
 def test_scenes_have_the_keys_and_defaults_that_fitact_reads():
-    theirs = fitact.Scene.model_fields
-    assert set(theirs) == set(scene.KEYS)
-    for name, section in fitact.Scene():
+    sections = {name: section for name, section in fitact.Scene() if name != "description"}
+    assert set(sections) == set(scene.KEYS)
+    for name, section in sections.items():
         assert set(type(section).model_fields) <= set(scene.KEYS[name])
         for key, kind in scene.KEYS[name].items():
             if not isinstance(kind, keys.IgnoredKey):

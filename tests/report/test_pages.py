@@ -224,9 +224,9 @@ def test_no_name_of_a_record_becomes_markup(pages, name: str):
 VERDICTS = {
     "plan": "The planned model is within the force tolerance of 1 % at the nominal values, but not over the prior",
     "tradeoff": "Fastest methods on the Pareto fronts: best response (response), best likelihood (likelihood)",
-    "measurement": "Most for its effort: series resistor, done well, from ± 5 % to ± 0.13 %",
-    "drive": "The smallest peak to peak within the limits: sine, 500 V",
-    "population": "Trusted: the chain has converged",
+    "measurement": "Largest gain per effort: series resistor, done well; uncertainty of the mean force from ± 5 %",
+    "drive": "Set a sine of 250 V amplitude (500 V peak to peak) at 100 Hz: with 95 % probability, at least 95 %",
+    "population": "Reliable: the chain has converged",
 }
 
 
@@ -236,7 +236,7 @@ def test_the_verdict_comes_first_and_how_to_repeat_it_last(pages, name: str):
     command = "fitact population" if name == "population" else ORIGIN.command
     places = [text.index(part) for part in (VERDICTS[name], "How to repeat it", command, DIGEST[:16], '"Ci": 1.35e-09')]
     assert places == sorted(places)
-    assert "Do not trust" not in text
+    assert "Unreliable:" not in text
 
 
 AGAINST = {
@@ -252,13 +252,13 @@ def test_an_untrusted_answer_says_so_at_the_top(name: str, tmp_path: Path):
     WRITE[name](tmp_path / "report.html", False)
     text = words(Page((tmp_path / "report.html").read_text()))
     assert VERDICTS[name] not in text
-    assert text.index("Do not trust these numbers") < text.index(AGAINST[name]) < text.index("Read this first")
+    assert text.index("Unreliable: do not use these numbers") < text.index(AGAINST[name]) < text.index("Warnings")
 
 
 SHOWN = {
     "plan": [
         *("R_H", "0.11 % (1.1 %)", "0.13 % (1.3 %)", "0.17 % (1.7 %)", "0.19 % (1.9 %)", "2.00x"),
-        *("kept: fits and sampling need its derivatives", "Neglected: R_H.", "Read this first", "steady state"),
+        *("kept: fits and sampling need its derivatives", "Neglected: R_H.", "Warnings", "steady state"),
     ],
     "tradeoff": [
         *("best response", "2 µs", "3 µs", "0.70 s", "8 kB", "worse uncertainty", "0.12", "4 µs", "0.512"),
@@ -352,7 +352,9 @@ def test_a_chain_cut_short_is_told_without_figures(tmp_path: Path):
     content["convergence"]["rhat_max"] = math.nan
     write_population_page(tmp_path / "first.html", tree, content)
     page = Page((tmp_path / "first.html").read_text())
-    assert words(page).index("Do not trust these numbers") < words(page).index("Not drawn: some draws are not finite.")
+    assert words(page).index("Unreliable: do not use these numbers") < words(page).index(
+        "Not drawn: some draws are not finite."
+    )
     assert not page.images
     write_json(tmp_path / "population.json", content)
     tree.to_netcdf(tmp_path / "population.nc", engine="h5netcdf")

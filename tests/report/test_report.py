@@ -53,7 +53,7 @@ def test_page_is_one_self_contained_file(path: Path):
     text = path.read_text()
     page = Page(text)
     assert page.open == []
-    assert all(address.startswith("data:") for address in page.addresses)
+    assert all(address.startswith(("data:", "#")) for address in page.addresses)
     assert page.styles
     assert not re.search(r"@import|url\(", page.styles)
     assert len(page.images) == 3
@@ -68,27 +68,27 @@ def test_page_says_the_verdict_first_and_how_to_repeat_it(path: Path):
         for part in (
             "Prior-limited",
             "contact area",
-            "trunk current",
+            "loop current",
             "Diagnostics",
             "--seed 1",
         )
     ]
     assert places == sorted(places)
-    assert "Do not trust" not in words
+    assert "Unreliable" not in words
 
 
 def test_untrusted_answers_say_so_at_the_top(finger_fit: fitact.Fit, tmp_path):
     posterior = fitact.sample(finger_fit, walkers=16, max_steps=100, progress=False)
     posterior.report(tmp_path / "report.html")
     words = " ".join(Page((tmp_path / "report.html").read_text()).words)
-    assert words.index("Do not trust these numbers") < words.index("What is known")
+    assert words.index("Unreliable: do not use these numbers") < words.index("Determined by the data")
 
 
 def test_a_plan_is_stated(finger_posterior: fitact.Posterior, tmp_path):
     plan = fitact.plan(fitact.Scene.from_dict({"grounding": {"R_H": "500 ohm"}}))
     finger_posterior.report(tmp_path / "report.html", plan)
     words = " ".join(Page((tmp_path / "report.html").read_text()).words)
-    assert "What the model leaves out" in words
+    assert "Simplifications of the model" in words
     assert plan.sentence in words
 
 
