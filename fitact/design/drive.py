@@ -198,6 +198,7 @@ class DriveDesign:
         sentences = []
         if not self.people.trusted:
             sentences.append("the population fit is not reliable; see fitact population")
+        sentences += self.people.warnings
         if self.scene.perception.source is None:
             sentences.append(
                 f"the threshold ({self._threshold_value}, the same at all frequencies) is an example, because"
@@ -357,7 +358,7 @@ def design_drive(
     if people is None:
         people = FingerSample.from_prior(scene, seed)
     elif isinstance(people, Population):
-        people = FingerSample.from_population(people, scene, seed)
+        people = dataclasses.replace(FingerSample.from_population(people, scene, seed), warnings=people.warnings)
     bench, device = _DriveEvaluator(scene, people, share), scene.device
     own, here = scene.drive.waveform, scene.drive.lowest_frequency
     names = [name for name in WAVEFORMS if name != "trapezoid" or scene.drive.rise_time is not None]

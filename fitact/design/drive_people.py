@@ -23,11 +23,13 @@ class FingerSample:
         values: Rsc, Csc, Ci and other free parameters of the circuit, SI.
         source: description of the fingers for people.
         trusted: whether the population fit is reliable.
+        warnings: warnings of the population fit.
     """
 
     values: dict[str, Float[np.ndarray, "laws fingers"]]
     source: str
     trusted: bool = True
+    warnings: tuple[str, ...] = ()
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -57,7 +59,8 @@ class FingerSample:
         fixed = {name: np.full((laws, fingers), value) for name, value in scene.fixed_values().items()}
         known: dict[str, Any] = {**scene.nominal_values(), **fixed, **values}
         tied = {name: ratio * known[other] for name, (other, ratio) in scene.prior.ties().items()}
-        source = f"the population of {len(population.fingers)} fingers"
+        contact = "each with its own contact area" if areas else "assumed to have the same contact area"
+        source = f"the population of {len(population.fingers)} fingers, {contact}"
         return cls(_circuit_values(fixed | tied | values), source, population.trusted)
 
     @classmethod

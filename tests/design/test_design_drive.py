@@ -527,6 +527,7 @@ def test_people_are_those_of_the_population(eight):
     people, design = eight
     assert design.people.has_separate_uncertainty
     assert design.trusted
+    assert "assumed to have the same contact area" in design.question
     laws = {name: x.reshape(-1) for name, x in people.parameters().items()}
     chosen = np.linspace(0, laws["Ci"].size - 1, 512).astype(int)
     of = {name: x[chosen, None] for name, x in laws.items()}
@@ -560,7 +561,9 @@ def test_an_area_scales_capacitances_up_and_the_resistance_down():
         trusted=True,
     )
     tied = scene(prior={"grounding_Rsc": {"tied": "Rsc", "ratio": 3}, "R_H": {"fixed": "500 ohm"}})
-    values = FingerSample.from_population(population, tied).values
+    sample = FingerSample.from_population(population, tied)
+    assert "each with its own contact area" in sample.source
+    values = sample.values
     area = values["Ci"] / CI
     np.testing.assert_allclose(values["Csc"], C * area)
     np.testing.assert_allclose(values["Rsc"], R / area)
