@@ -5,7 +5,8 @@ from .data.inspection import Inspection, inspect
 from .data.readers.read import read
 from .data.record import Record
 from .data.spectrum import Spectrum, read_spectrum
-from .design.drive import DriveDesign, design_drive
+from .design.drive import design_drive
+from .design.drive_design import DriveDesign
 from .design.measurement import MeasurementDesign, design_measurement
 from .errors import InputError
 from .fitting.fit import Fit, fit

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from typing import Any, ClassVar, Self
 
+import jax
 import numpy as np
 import scipy.stats
 from jax.typing import ArrayLike
@@ -11,7 +12,7 @@ from jaxtyping import Float
 
 from fitact.design.limits import LimitComparison, compare_with_limits
 from fitact.model.steady_cycle import PeriodQuantities
-from fitact.scene.sections import Device
+from fitact.scene.sections import Device, DriveSection
 from fitact.units import choose_prefixed_unit, format_engineering
 
 ASSURANCE = 0.95  # probability that the fraction of fingers is reached at the assured amplitude
@@ -154,3 +155,15 @@ def _scale_to_amplitude(unit_quantities: PeriodQuantities, amplitude: float) -> 
             for name, values in unit_quantities._asdict().items()
         }
     return PeriodQuantities(**scaled)
+
+
+def normalize_drive(drive: DriveSection) -> DriveSection:
+    """Scale a drive to 1 V peak to peak, its offset in proportion."""
+    height = drive.peak_to_peak
+    if drive.amplitudes is not None:  # at least 65 points of the fastest cycle
+        time = np.linspace(0.0, 1.0 / drive.lowest_frequency, 16_384, endpoint=False)
+        with jax.enable_x64(True):
+            height = float(np.ptp(drive.make().value(time)))
+    amplitudes = drive.amplitudes and tuple(amplitude / height for amplitude in drive.amplitudes)
+    scaled = {"peak_to_peak": 1.0, "offset": drive.offset / height, "amplitudes": amplitudes}
+    return drive.model_copy(update=scaled)

@@ -12,7 +12,7 @@ from fitact.charts import interactive
 from fitact.charts.figure import ALERT, DATA, GREEN, MODEL, ORANGE, PINK, PRIOR, SKY, log_ticks
 from fitact.charts.interactive import Axis
 from fitact.charts.picture import draw_plot
-from fitact.design.drive import DriveDesign
+from fitact.design.drive_design import DriveDesign
 from fitact.design.drive_option import FINGER_QUANTILES, DriveOption, format_quantity, quantile
 from fitact.design.limits import NO_SAFETY_ASSESSMENT
 from fitact.report.frame import Answer, PageSummary, Provenance, image, write_page

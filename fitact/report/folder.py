@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from fitact.charts.figure import write_figure
 from fitact.data.record import Record
-from fitact.design.drive import DriveDesign
+from fitact.design.drive_design import DriveDesign
 from fitact.design.measurement import MeasurementDesign
 from fitact.files import write_json
 from fitact.model_selection.plan import Plan

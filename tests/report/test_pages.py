@@ -15,7 +15,7 @@ import pytest
 import xarray as xr
 
 import fitact
-from fitact.design.drive import DriveDesign
+from fitact.design.drive_design import DriveDesign
 from fitact.design.drive_option import DriveOption
 from fitact.design.drive_people import FingerSample
 from fitact.design.measurement import MeasurementDesign, SettingCurve

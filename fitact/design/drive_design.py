@@ -1,0 +1,316 @@
+"""Result of a drive design: the recommended amplitude, the options beside it, limits, and the text for people."""
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from fitact.design.drive_option import ASSURANCE, DriveOption, format_quantity, normalize_drive, quantile
+from fitact.design.drive_people import FingerSample
+from fitact.design.limits import ES1, NO_SAFETY_ASSESSMENT, LimitComparison, format_value
+from fitact.scene.scene import Scene
+from fitact.tables import align_table, join_lines
+from fitact.units import format_engineering
+
+_UNBOUNDED = "the current is unbounded at ideal edges"
+_LEGEND = (
+    "* waveform of the scene. Set: the peak-to-peak amplitude to set, {set}; ±: Monte Carlo error of this number only."
+    " {others} Other columns, at the amplitude to set: power for the median finger; largest body current and insulator"
+    " voltage of all fingers drawn."
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class DriveDesign:
+    """Drives that a given fraction of fingers feel on a panel.
+
+    Attributes:
+        scene: panel, drive and threshold.
+        people: fingers that are to feel it.
+        share: fraction of them.
+        options: waveforms at the scene's frequency.
+        needed: peak-to-peak amplitude (V) at which each finger feels that waveform; infinite if it never does.
+        by_frequency: the same waveforms from 10 Hz to 1 kHz.
+        by_thickness, by_permittivity: the scene's own drive on other insulators, with Ci by eq. (3).
+        seed: seed of the fingers drawn.
+    """
+
+    scene: Scene
+    people: FingerSample
+    share: float
+    options: dict[str, DriveOption]
+    needed: dict[str, Float[np.ndarray, "laws fingers"]]
+    by_frequency: dict[str, tuple[DriveOption, ...]]
+    by_thickness: tuple[DriveOption, ...]
+    by_permittivity: tuple[DriveOption, ...]
+    seed: int
+
+    @property
+    def own(self) -> str:
+        """Waveform of the scene."""
+        return self.scene.drive.waveform
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the population fit is reliable; true without a population."""
+        return self.people.trusted
+
+    def smallest(self) -> dict[str, str | None]:
+        """Return the waveform within the limits that needs the least amplitude or power; None if all exceed a limit."""
+        kept = {name: option for name, option in self.options.items() if not option.violations}
+        return {
+            what: min(kept, key=lambda name: kept[name].criterion_value(what)) if kept else None
+            for what in DriveOption.CRITERIA
+        }
+
+    @property
+    def recommended(self) -> DriveOption | None:
+        """Option to set: the smallest amplitude within the stated limits at a finite current; None if there is none."""
+        settable = [o for o in self.options.values() if not o.violations and math.isfinite(o.at_assured.current_rms)]
+        return min(settable, key=lambda option: option.assured, default=None) if self.trusted else None
+
+    @property
+    def recommendation(self) -> str:
+        """Sentence that says which amplitude to set, for whom and with which assurance."""
+        option, fraction = self.recommended, f"{100.0 * self.share:g} %"
+        if not self.trusted:
+            return "No amplitude is recommended, because the fit of the population is not reliable."
+        if option is None:
+            broken = "; ".join(f"{name}: {' and '.join(_obstacles(o))}" for name, o in self.options.items())
+            return f"No amplitude is recommended, because no waveform meets all conditions ({broken})."
+        drive, volts = normalize_drive(self.scene.drive), option.assured
+        assurance = (
+            f"with {100.0 * ASSURANCE:g} % probability, at least {fraction} of fingers then feel it"
+            if self.people.has_separate_uncertainty
+            else f"{fraction} of the fingers drawn from the scene's prior then feel it; no record supports this"
+        )
+        offset = f" around an offset of {format_quantity(drive.offset * volts, 'V')}" if drive.offset else ""
+        article = "an" if option.waveform[0] in "aeiou" else "a"
+        return (
+            f"Set {article} {option.waveform} of {format_quantity(0.5 * volts, 'V')} amplitude"
+            f" ({format_quantity(volts, 'V')} peak to peak){offset} at {format_engineering(option.frequency, 'Hz', 3)}:"
+            f" {assurance}."
+        )
+
+    @property
+    def limits(self) -> list[LimitComparison]:
+        """Limits beside the values at the recommended amplitude, or else at the amplitude of the scene's waveform."""
+        return (self.recommended or self.options[self.own]).limits
+
+    @property
+    def exposure(self) -> str:
+        """Sentences on the body current and the insulator's field at the recommended amplitude."""
+        option = self.recommended or self.options[self.own]
+        if not math.isfinite(option.assured):
+            return "No amplitude suffices, so there are no body current and insulator field to compare."
+        at, where = option.at_assured, "this amplitude" if self.recommended else f"the {option.waveform}'s amplitude"
+        current = "the body current is unbounded, because the edges are ideal; state [drive] rise_time"
+        if math.isfinite(at.current_rms):
+            rms, peak = (format_value(float(x), "A") for x in (at.current_rms, at.current_peak))
+            current = f"the largest body current of the fingers drawn is {rms} rms, {peak} peak"
+            compared = next((x for x in self.limits if x.source == ES1 and x.in_range), None)
+            if compared is not None:
+                limit = format_value(compared.limit or math.nan, "A")
+                current += f"; its rms value is {compared.ratio:.2g} times the {ES1} limit of {limit}"
+        field = format_value(float(at.insulator_peak) / option.device.insulator_thickness, "V/m")
+        thickness = format_engineering(option.device.insulator_thickness, "m", 3)
+        return f"At {where} {current}. The field in the insulator is at most {field}, for a thickness of {thickness}."
+
+    @property
+    def legend(self) -> str:
+        """Meaning of the table's columns."""
+        if not self.people.has_separate_uncertainty:
+            return _LEGEND.format(set="the upper quantile of the prior's fingers", others="Median: the same quantile.")
+        level = f"sufficient with {100.0 * ASSURANCE:g} % probability (one-sided tolerance limit)"
+        others = "Median and 90 % interval: what is known of the amplitude that just suffices; do not set these."
+        return _LEGEND.format(set=level, others=others)
+
+    def curve(self, waveform: str) -> dict[str, Float[np.ndarray, " amplitudes"]]:
+        """Return peak-to-peak amplitudes (V), and quantiles of the fraction of fingers who feel them."""
+        finite = np.concatenate([needed[np.isfinite(needed)] for needed in self.needed.values()])
+        ends = np.quantile(finite, [0.001, 0.999]) if finite.size else np.ones(2)
+        amplitude = np.geomspace(ends[0], ends[1], 41)
+        felt = np.sort(self.needed[waveform], axis=1)
+        shares = np.stack([np.searchsorted(law, amplitude, side="right") for law in felt]) / felt.shape[1]
+        low, median, high = np.quantile(shares, [0.05, 0.5, 0.95], axis=0)
+        return {"peak_to_peak": amplitude, "q05": low, "q50": median, "q95": high}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of drive.json, which `fitact design drive --json` prints, in SI units."""
+        laws, fingers = self.people.shape
+        return {
+            "recommendation": self._recommendation_content(),
+            "share": self.share,
+            "threshold": self.scene.perception.model_dump(exclude_none=True, exclude={"source"})
+            | {"source": self.scene.perception.source, "frequency": "all", "sentence": self.threshold},
+            "people": {"source": self.people.source, "laws": laws, "fingers": fingers},
+            "options": [option.to_dict() for option in self.options.values()],
+            "limits": [each.to_dict() for each in self.limits],
+            "smallest": self.smallest(),
+            "curves": {name: {k: x.tolist() for k, x in self.curve(name).items()} for name in self.options},
+            "frequencies": [option.to_dict() for options in self.by_frequency.values() for option in options],
+            "thicknesses": [option.to_dict() for option in self.by_thickness],
+            "permittivities": [option.to_dict() for option in self.by_permittivity],
+            "warnings": list(self.warnings),
+            "notes": list(self.notes),
+            "seed": self.seed,
+            "scene": self.scene.model_dump(mode="json", exclude_unset=True),
+        }
+
+    def _recommendation_content(self) -> dict[str, Any]:
+        option = self.recommended
+        volts = None if option is None else option.assured
+        offset = normalize_drive(self.scene.drive).offset
+        return {
+            "sentence": self.recommendation,
+            "waveform": None if option is None else option.waveform,
+            "frequency": None if option is None else option.frequency,
+            "unit": "V",
+            "amplitude": None if volts is None else 0.5 * volts,
+            "peak_to_peak": volts,
+            "offset": None if volts is None else offset * volts,
+            "monte_carlo_error": None if option is None else option.assured_error,
+            "fraction": self.share,
+            "probability": ASSURANCE if self.people.has_separate_uncertainty else None,
+        }
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences on conditions that may change the answer."""
+        sentences = []
+        if not self.people.trusted:
+            sentences.append("the population fit is not reliable; see fitact population")
+        sentences += self.people.warnings
+        if self.scene.perception.source is None:
+            sentences.append(
+                f"the threshold ({self._threshold_value}, the same at all frequencies) is an example, because"
+                " [perception] states no source; state your own threshold, and where it comes from as source = '...'"
+            )
+        if not self.people.has_separate_uncertainty:
+            sentences.append(
+                "no records were given, so the scene's prior is used as the population; variability between fingers and"
+                " lack of knowledge cannot be separated"
+            )
+        sentences += [
+            f"at the recommended amplitude the {each.quantity} is {each.ratio:.2g} times the limit of {each.source}"
+            f" ({each.name})"
+            for each in (self.limits if self.recommended else ())
+            if each.exceeds_published
+        ]
+        thickness = self.scene.population.thickness_sd
+        if thickness:
+            sentences.append(
+                f"all fingers and panels have the same thicknesses here, although [population] varies"
+                f" {' and '.join(thickness)}"
+            )
+        return tuple(sentences)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences that inform."""
+        limits = ("breakdown_field", "current_limit_rms", "current_limit_peak")
+        absent = [name for name in limits if getattr(self.scene.device, name) is None]
+        unstated = f"[device] does not state {', '.join(absent)}, so no waveform was excluded for exceeding"
+        unbounded = [name for name, o in self.options.items() if math.isinf(o.at_assured.current_rms)]
+        return (
+            f"the force is computed with [force] model = '{self.scene.force.model}', not measured; the amplitude to"
+            " set is proportional to 1 / sqrt(force).",
+            f"{NO_SAFETY_ASSESSMENT}.",
+            *([f"{unstated} {'it' if len(absent) == 1 else 'them'}."] if absent else []),
+            *(f"{name}: not recommended, {_UNBOUNDED}; state [drive] rise_time." for name in unbounded),
+        )
+
+    def summary(self) -> str:
+        """Return the recommendation, the tables for people, and notes and warnings."""
+        lines = [self.recommendation, self.question, self.exposure, "", *align_table(self.table), self.legend]
+        limits = align_table([(source, *cells) for source, _, *cells in self.limits_table])
+        lines += ["", *limits, "", *self.excluded, *self.sentences]
+        return join_lines(lines, self.warnings, self.notes)
+
+    __str__ = summary
+
+    @property
+    def _threshold_value(self) -> str:
+        force, change = self.scene.perception.threshold_force, self.scene.perception.friction_change
+        if force is not None:
+            return f"{format_engineering(force, 'N')} amplitude of the alternating electrostatic force"
+        return f"friction that alternates by {100.0 * (change or 0.0):.3g} % of its mean"
+
+    @property
+    def threshold(self) -> str:
+        """Threshold with its source and frequency, for people."""
+        source = self.scene.perception.source
+        origin = "example: [perception] states no source" if source is None else f"source: {source}"
+        return f"{self._threshold_value}, the same at all frequencies ({origin})"
+
+    @property
+    def question(self) -> str:
+        """Sentence on who is to feel what."""
+        fingers = f"{100.0 * self.share:g} % of fingers"
+        return f"To be felt by {fingers}: {self.threshold}. Fingers: {self.people.source}."
+
+    @property
+    def table(self) -> tuple[tuple[str, ...], ...]:
+        """Titles, then a row for each waveform, for people."""
+        here = format_engineering(self.options[self.own].frequency, "Hz", 3)
+        titles = here, "set", "median", "90 % interval", "real", "apparent", "I rms", "I peak", "insulator"
+        return titles, *(_cells(name, option, name == self.own) for name, option in self.options.items())
+
+    @property
+    def limits_table(self) -> tuple[tuple[str, ...], ...]:
+        """Titles, then a row for each limit, for people."""
+        titles = "source", "meaning", "quantity", "here", "limit", "ratio", "published for"
+        return titles, *(each.row for each in self.limits)
+
+    @property
+    def excluded(self) -> tuple[str, ...]:
+        """Waveforms that exceed a limit of the scene, with that limit."""
+        return tuple(f"{name}: excluded, {phrase}" for name, o in self.options.items() for phrase in o.violations)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The smallest drives, the frequency with the lowest amplitude, and the thinnest insulator."""
+        smallest, sentences = self.smallest(), []
+        for criterion, unit in DriveOption.CRITERIA.items():
+            name = smallest[criterion]
+            least = name and f"{name}, {format_quantity(self.options[name].criterion_value(criterion), unit)}"
+            sentences.append(f"smallest {criterion.replace('_', ' ')}: {least or 'no waveform keeps the limits'}")
+        best = {name: min(options, key=lambda option: option.assured) for name, options in self.by_frequency.items()}
+        easiest = ", ".join(
+            f"{name} {format_engineering(o.frequency, 'Hz', 3)} ({format_quantity(o.assured, 'V')})"
+            for name, o in best.items()
+        )
+        sentences.append(
+            "frequency with the lowest amplitude to set, 10 Hz to 1 kHz, for a frequency-independent threshold:"
+            f" {easiest}"
+        )
+        return *sentences, f"{self.own}, {_thinnest_insulator(self.by_thickness)}"
+
+
+def _cells(name: str, option: DriveOption, is_scene_waveform: bool) -> tuple[str, ...]:
+    low, median, high = (format_quantity(quantile(option.amplitude, q), "V") for q in (0.05, 0.5, 0.95))
+    between = f"{low} to {high}" if option.amplitude.size > 1 else ""
+    shown = {"real_power": "W", "apparent_power": "VA", "current_rms": "A", "current_peak": "A", "insulator_peak": "V"}
+    return (
+        name + (" *" if is_scene_waveform else ""),
+        format_quantity(option.assured, "V", option.assured_error),
+        median,
+        between,
+        *(format_quantity(getattr(option.at_assured, quantity), unit) for quantity, unit in shown.items()),
+    )
+
+
+def _obstacles(option: DriveOption) -> tuple[str, ...]:
+    """Return the reasons not to recommend an option, as phrases."""
+    return option.violations or (_UNBOUNDED,)
+
+
+def _thinnest_insulator(options: tuple[DriveOption, ...]) -> str:
+    allowed = [option for option in options if not option.violations]
+    if not allowed:
+        return "insulator: no thickness from a hundredth to ten times the scene's keeps the limits"
+    thin = min(allowed, key=lambda option: option.device.insulator_thickness)
+    thickness = format_engineering(thin.device.insulator_thickness, "m", 3)
+    return f"thinnest insulator tried that keeps the limits: {thickness}, at {format_quantity(thin.assured, 'V')}"
