@@ -13,6 +13,7 @@ from jaxtyping import Float
 from fitact.design.limits import LimitComparison, compare_with_limits
 from fitact.model.steady_cycle import PeriodQuantities
 from fitact.scene.sections import Device, DriveSection
+from fitact.summary import round_to_sd
 from fitact.units import choose_prefixed_unit, format_engineering
 
 ASSURANCE = 0.95  # probability that the fraction of fingers is reached at the assured amplitude
@@ -43,8 +44,7 @@ def format_quantity(value: ArrayLike, unit: str, error: float | None = None) -> 
     if error is None or not 0.0 < error < math.inf:
         return format_engineering(float(value), unit, 3)
     size, symbol = choose_prefixed_unit(float(value), unit)
-    places = max(0, 1 - math.floor(math.log10(float(f"{error / size:.1e}"))))
-    return f"{value / size:.{places}f} {symbol} ± {float(f'{error / size:.1e}'):.{places}f} {symbol}"
+    return " ± ".join(f"{x} {symbol}" for x in round_to_sd((float(value) / size, error / size), error / size))
 
 
 @dataclasses.dataclass(frozen=True)
