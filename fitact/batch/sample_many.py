@@ -270,7 +270,7 @@ def _derive_quantities(derive: DerivedQuantities, point: Array) -> Float[Array, 
     return derive(theta, jnp.exp(log_sigma))
 
 
-def _derive_tracked(derive: DerivedQuantities, point: Array) -> Float[Array, " judged"]:
+def _derive_tracked(derive: DerivedQuantities, point: Array) -> Float[Array, " tracked"]:
     return _derive_quantities(derive, point)[: len(_TRACKED)]
 
 

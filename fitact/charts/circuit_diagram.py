@@ -1,7 +1,7 @@
-"""Draw the circuit, and the wiring on the bench, as SVG that takes the page's colour and font.
+"""Circuit and wiring diagrams as SVG in the colour and font of the page.
 
-The current runs down one column: insulator, gap, touching finger, body, and the way back to the source. What is drawn
-follows from which values there are, so a part that a scene lacks is not in the picture.
+The elements stand in one column: insulator, gap, touching finger, body, and the return to the source. Only elements
+with a value are drawn.
 """
 
 import dataclasses
@@ -24,12 +24,12 @@ _SOURCE, _CAPTION, _COLUMN, _LEFT, _RIGHT = 0.0, 0.75, 4.75, 4.1, 5.4  # x of wh
 
 @dataclasses.dataclass
 class Diagram:
-    """A drawing, and what is connected to what in it.
+    """Diagram and its connections.
 
     Attributes:
-        parts: the two ends of each part by its name in a scene; `source` is V, its second end the positive one.
-        wires: the two ends of each straight wire.
-        terminals: the points that Vsc is measured between, "Vsc+" and "Vsc-".
+        parts: both ends of each element, by its name in a scene; the second end of `source` is positive.
+        wires: both ends of each straight wire.
+        terminals: points between which Vsc is measured, "Vsc+" and "Vsc-".
     """
 
     parts: dict[str, tuple[Point, Point]] = dataclasses.field(default_factory=dict)
@@ -46,7 +46,7 @@ class Diagram:
         return self._drawing.add(element)
 
     def part(self, name: str, kind: Any, start: Point, end: Point, label: str = "", side: str = "right") -> None:
-        """Add a part between two points, its label right or left of it, or above ("top") or below ("bottom")."""
+        """Add an element between two points; `side` of its label: right, left, top or bottom."""
         self.add(kind.endpoints(start, end))
         self.parts[name] = start, end
         dx, dy = {"right": (0.36, 0.0), "left": (-0.36, 0.0), "top": (0.0, 0.34), "bottom": (0.0, -0.34)}[side]
@@ -68,7 +68,7 @@ class Diagram:
             self.add(element)
 
     def svg(self, title: str, *, is_file: bool = False) -> str:
-        """Return an `svg` element with a title: as wide as its place in a page, or a file of dark lines on white."""
+        """Return an SVG element with a title, as wide as its container; `is_file`: dark lines on white for a file."""
         mode = schemdraw.svgconfig.text
         schemdraw.svgconfig.text = "text"  # so that the page's font applies
         try:
@@ -91,7 +91,7 @@ class Diagram:
 
 
 def lay_out_circuit(values: Mapping[str, str], grounding: Grounding = "direct", current: bool = False) -> Diagram:
-    """Place the parts of the circuit that a scene describes.
+    """Lay out the elements of a circuit.
 
     Args:
         values: text for each part by its name in a scene ("Rsc", "Csc", "Ci", "R_H", "grounding_Rsc", "grounding_Csc",
@@ -214,11 +214,11 @@ def _add_return(diagram: Diagram, bottom: float, grounding: Grounding, current: 
 def lay_out_wiring(
     grounding: Grounding, channels: Collection[str] = ("Vsc", "I"), series_resistor: bool = False
 ) -> Diagram:
-    """Place what is connected on the bench, V on the oscilloscope's channel 1, Vsc on 2, and the current on 3.
+    """Lay out the wiring of a bench: oscilloscope channel 1 on V, 2 on Vsc, and 3 on the current.
 
     Args:
-        grounding: how the body returns the current.
-        channels: what is recorded beside V: "Vsc", "I" or both.
+        grounding: connection of the body to ground.
+        channels: channels recorded besides V: "Vsc", "I" or both.
         series_resistor: whether a known resistor is in the lead to the electrode.
     """
     diagram, elements, direct = Diagram(), schemdraw.elements, grounding == "direct"

@@ -30,7 +30,7 @@ class Record:
 
     Attributes:
         time: strictly increasing, s.
-        channels: by name: V (drive), Vsc (over the skin), I (trunk current).
+        channels: by name: V (drive), Vsc (over the skin), I (loop current).
         source: where it came from, for messages.
         notes: sentences for information.
         warnings: sentences on what may change the result.

@@ -38,12 +38,12 @@ class Source(NamedTuple):
     record: Record
     scene: Scene
     choice: DriveModel
-    noise: float  # of the channel, judged without a model
-    optional_nuisances: tuple[str, ...]  # nuisances that the channel can ask for
-    start: Estimate | None  # what a linear fit says of it; None: nothing
+    noise: float  # model-free standard deviation of the channel
+    optional_nuisances: tuple[str, ...]  # nuisances that the BIC may select
+    start: Estimate | None  # estimate from a linear fit, or None
     notes: tuple[str, ...]  # sentences for information
     warnings: tuple[str, ...]  # sentences on what may change the result
-    drive_noise_dominates: bool  # whether the drive's noise drowns the channel, which then biases the answer
+    drive_noise_dominates: bool  # whether noise of the drive dominates the channel and biases the fit
 
 
 class Problem(NamedTuple):

@@ -1,4 +1,4 @@
-"""The circuit of a scene as a drawing, each part with its value."""
+"""Circuit and wiring diagrams of a scene, with the values of its elements."""
 
 from collections.abc import Mapping
 
@@ -15,7 +15,7 @@ def scene_circuit(scene: Scene, values: Mapping[str, float] | None = None, *, is
     """Draw a scene's circuit as an SVG element, or as a file.
 
     Args:
-        values: by name, SI, such as a posterior's medians; what is absent has the scene's value.
+        values: values by name, SI, e.g. posterior medians; others are taken from the scene.
     """
     grounding, current = scene.grounding.connection, "I" in scene.measurement.channels
     diagram = lay_out_circuit(describe_parts(scene, values or {}), grounding, current)

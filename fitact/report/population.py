@@ -234,15 +234,15 @@ def _frame(content: dict[str, Any]) -> PageSummary:
     # two defaults give the friction of a scene that states none
     stated_friction = f" Mean friction {_format_range(friction)}." if "friction" in content["scene"] else ""
     off = f"{content['integrals_off']:.2g} standard deviations"
-    certificate = f"the integrals over the fingers shift no mean by more than {off}"
+    accuracy = f"the integrals over the fingers shift no mean by more than {off}"
     return PageSummary(
         title=f"Population of {count} fingers",
         subject=f"Differences between fingers, estimated from one record of each of {count} fingers on one panel, and"
         " the force on the next finger.",
         trusted=content["trusted"],
-        verdict=f"Reliable: the chain has converged, and {certificate}"
+        verdict=f"Reliable: the chain has converged, and {accuracy}"
         if content["trusted"]
-        else f"{content['convergence']['sentence']}; {certificate} (at most {MAX_INTEGRATION_ERROR:g} are accepted).",
+        else f"{content['convergence']['sentence']}; {accuracy} (at most {MAX_INTEGRATION_ERROR:g} are accepted).",
         findings={
             "Force on the next finger": f"Mean electrostatic force {_format_range(force)}, with 95 % prediction"
             f" interval.{stated_friction}",
