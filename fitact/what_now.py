@@ -8,9 +8,10 @@ from fitact.errors import InputError
 
 
 def advice_sections() -> dict[str, str]:
-    """Return the sections of the page in Markdown, without links, by result name."""
+    """Return the sections of the page in Markdown, with links as text, by result name."""
     page = (importlib.resources.files("fitact") / "what_now.md").read_text(encoding="utf-8")
-    text = re.sub(r"\[([^\]]+)\]\([^)]*\)", r"\1", page)
+    text = re.sub(r"\[([^\]]+)\]\(#[^)]*\)", r"\1", page)
+    text = re.sub(r"\[([^\]]+)\]\(([^)]*)\)", r"\1: docs/\2", text)
     parts = text.split("\n## ")[1:]
     return {title.strip(): body.strip() for title, _, body in (part.partition("\n") for part in parts)}
 

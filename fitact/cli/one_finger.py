@@ -134,10 +134,13 @@ def report(directory: options.Results, json: options.Json = False) -> None:
 
 @app.command()
 def explain(
-    name: Annotated[str, typer.Argument(help="Result name, e.g. misfit or prior-limited.", show_default=False)] = "",
+    words: Annotated[
+        list[str] | None, typer.Argument(metavar="NAME", help="Result name, e.g. misfit or prior-limited.")
+    ] = None,
     json: options.Json = False,
 ) -> None:
     """Explain a result name and what to try first; without a name, list all."""
+    name = " ".join(words or [])
     content = {name: what_now.explain(name)} if name else what_now.advice_sections()
     show(content[name] if name else "\n".join(content), content, json)
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from fitact.design.drive_option import ASSURANCE, DriveOption, format_quantity, normalize_drive, quantile
 from fitact.design.drive_people import FingerSample
-from fitact.design.limits import ES1, NO_SAFETY_ASSESSMENT, LimitComparison, format_value
+from fitact.design.limits import AC_3, ES1, NO_SAFETY_ASSESSMENT, LimitComparison, format_value
 from fitact.scene.scene import Scene
 from fitact.tables import align_table, join_lines
 from fitact.units import format_engineering
@@ -68,7 +68,7 @@ class DriveDesign:
     @property
     def recommended(self) -> DriveOption | None:
         """Option to set: the smallest amplitude within the stated limits at a finite current; None if there is none."""
-        settable = [o for o in self.options.values() if not o.violations and math.isfinite(o.at_assured.current_rms)]
+        settable = [option for option in self.options.values() if not _obstacles(option)]
         return min(settable, key=lambda option: option.assured, default=None) if self.trusted else None
 
     @property
@@ -76,7 +76,7 @@ class DriveDesign:
         """Sentence that says which amplitude to set, for whom and with which assurance."""
         option, fraction = self.recommended, f"{100.0 * self.share:g} %"
         if not self.trusted:
-            return "No amplitude is recommended, because the fit of the population is not reliable."
+            return "No amplitude is recommended, because the population is not reliable (its warnings say why)."
         if option is None:
             broken = "; ".join(f"{name}: {' and '.join(_obstacles(o))}" for name, o in self.options.items())
             return f"No amplitude is recommended, because no waveform meets all conditions ({broken})."
@@ -181,7 +181,9 @@ class DriveDesign:
         """Sentences on conditions that may change the answer."""
         sentences = []
         if not self.people.trusted:
-            sentences.append("the population fit is not reliable; see fitact population")
+            sentences.append(
+                "the population fit is not reliable, or most fingers are fitted poorly; see fitact population"
+            )
         sentences += self.people.warnings
         if self.scene.perception.source is None:
             sentences.append(
@@ -286,6 +288,11 @@ class DriveDesign:
             "frequency with the lowest amplitude to set, 10 Hz to 1 kHz, for a frequency-independent threshold:"
             f" {easiest}"
         )
+        device = self.scene.device
+        if all(
+            limit is None for limit in (device.breakdown_field, device.current_limit_rms, device.current_limit_peak)
+        ):
+            return tuple(sentences)
         return *sentences, f"{self.own}, {_thinnest_insulator(self.by_thickness)}"
 
 
@@ -304,7 +311,14 @@ def _cells(name: str, option: DriveOption, is_scene_waveform: bool) -> tuple[str
 
 def _obstacles(option: DriveOption) -> tuple[str, ...]:
     """Return the reasons not to recommend an option, as phrases."""
-    return option.violations or (_UNBOUNDED,)
+    if option.violations or not math.isfinite(option.at_assured.current_rms):
+        return option.violations or (_UNBOUNDED,)
+    return tuple(
+        f"at {format_quantity(option.assured, 'V')}, the amplitude that it needs, the {each.quantity} is"
+        f" {each.ratio:.2g} times the limit of {each.source}"
+        for each in option.limits
+        if each.exceeds_published and each.source in (ES1, AC_3)
+    )
 
 
 def _thinnest_insulator(options: tuple[DriveOption, ...]) -> str:

@@ -22,7 +22,7 @@ class FingerSample:
     Attributes:
         values: Rsc, Csc, Ci and other free parameters of the circuit, SI.
         source: description of the fingers for people.
-        trusted: whether the population fit is reliable.
+        trusted: whether the population fit is reliable, and most of its fingers are fitted well.
         warnings: warnings of the population fit.
     """
 
@@ -61,7 +61,9 @@ class FingerSample:
         tied = {name: ratio * known[other] for name, (other, ratio) in scene.prior.ties().items()}
         contact = "each with its own contact area" if areas else "assumed to have the same contact area"
         source = f"the population of {len(population.fingers)} fingers, {contact}"
-        return cls(_circuit_values(fixed | tied | values), source, population.trusted)
+        poor = sum(finger.result != "successful" for finger in population.fingers)
+        trusted = population.trusted and 2 * poor <= len(population.fingers)
+        return cls(_circuit_values(fixed | tied | values), source, trusted)
 
     @classmethod
     def from_prior(cls, scene: Scene, seed: int = 0, fingers: int = 4096) -> Self:

@@ -310,6 +310,13 @@ def _assemble_fit(
     notes = [
         scene.description for scene in {id(s.scene): s.scene for s in problem.sources}.values() if scene.description
     ]
+    for record in {id(source.record): source.record for source in problem.sources}.values():
+        fitted = {channel.channel for channel in traces if channel.record is record}
+        notes += [
+            f"{record.source}: {name} is recorded but not fitted; to use it, add it to [measurement] channels"
+            for name in record.channels
+            if name not in ("V", *fitted)
+        ]
     for source, channel in zip(problem.sources, traces, strict=True):
         warnings += source.warnings
         notes += source.notes

@@ -17,6 +17,9 @@ from fitact.experiment.fisher import Experiment
 from fitact.experiment.options import suggest_measurements
 from fitact.units import format_percent
 
+# smallest fraction of the variance of a parameter from the prior at which the prior counts as an assumption
+MIN_PRIOR_FRACTION = 0.1
+
 
 class NextMeasurement(NamedTuple):
     """Suggested next measurement if not all parameters are identified."""
@@ -57,15 +60,22 @@ class Identifiability:
         with jax.enable_x64(True):
             structure = blind_directions(experiment.circuit, experiment.free, experiment.channels)
             options = suggest_measurements(experiment, self.force_gradient)
+        calibration = "Only the gain errors that the scene states are included."
+        if not set(experiment.free) & set(gain_names(experiment.channels)):
+            calibration = (
+                "Calibration errors are not included: a gain that is wrong by 2 % changes the force by 2 to 4 %."
+            )
         figures = [f"± {format_percent(option.force_sd)} with {option.text}" for option in options]
-        remedy = f"{force}. Expected after one change: {', '.join(figures)}. Calibration errors are not included."
+        remedy = f"{force}. Expected after one change: {', '.join(figures)}. {calibration}"
         if self.verdict == "unidentified":
             remedy = (
                 f"No prior constrains that direction; state one for Ci and this contact area under [prior]. {remedy}"
             )
         gains = structure.directions[:, [name in gain_names(structure.channels) for name in structure.names]]
         if np.any(np.abs(gains) > 0.1):  # components of a unit vector above this belong to a direction
-            remedy += " The free gain is confounded with the circuit; calibrate the probe and resolve the drive edges."
+            remedy += (
+                " The free gain is confounded with the circuit; calibrate the probe and sample each edge several times."
+            )
         return NextMeasurement(structure.contains(self.blind_direction), remedy, options)
 
     @property

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from fitact import summary
 from fitact.fitting import derived
-from fitact.fitting.identifiability import Identifiability, prior_variance_fraction
+from fitact.fitting.identifiability import MIN_PRIOR_FRACTION, Identifiability, prior_variance_fraction
 from fitact.fitting.levenberg_marquardt import result_message
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.force import ForceModel
@@ -177,9 +177,9 @@ class FitResult(abc.ABC):
         """Force law, values that the force rests on, and the mean force by the other law if a gap is stated."""
         law = self.derive.geometry.model
         other_law: ForceModel = "gap" if law == "paper" else "paper"
-        assumptions = list_assumptions(
-            self.scene, law, prior=self.likelihood.use_prior, stated_drive=self.uses_stated_drive
-        )
+        from_prior = self.parameters().get("Ci", {"from_prior": 0.0})["from_prior"]
+        prior = self.likelihood.use_prior and float(from_prior) > MIN_PRIOR_FRACTION
+        assumptions = list_assumptions(self.scene, law, prior=prior, stated_drive=self.uses_stated_drive)
         other: dict[str, Any] | None = None
         if getattr(constant_skin_circuit(self.likelihood.template), "Cgap", None) is not None:
             geometry = dataclasses.replace(self.derive.geometry, model=other_law)

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from fitact.data.inspection import check_divider
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.fitting.drive_choice import DriveModel
+from fitact.fitting.identifiability import MIN_PRIOR_FRACTION
 from fitact.fitting.residual_statistics import is_undersampled
 from fitact.likelihood.likelihood import Likelihood
 from fitact.scene.assumptions import states_Ci
@@ -84,7 +85,7 @@ def describe_assumed_Ci(
     scene: Scene | None,
     likelihood: Likelihood,
     from_prior: Float[np.ndarray, " parameters"],
-    min_fraction: float = 0.1,
+    min_fraction: float = MIN_PRIOR_FRACTION,
 ) -> Remarks:
     """Describe a Ci that nobody stated: in a warning if its prior sets results, otherwise in a note.
 

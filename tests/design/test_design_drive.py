@@ -349,8 +349,17 @@ def test_what_breaks_a_limit_is_named_and_not_the_smallest(one):
     assert [name for name, option in limited.options.items() if not option.violations] == ["triangle"]
 
 
-def test_one_sentence_says_what_to_set(laws):
+def test_no_amplitude_above_a_published_limit_is_recommended(laws):
+    """The sine needs a current above class ES1, which no scene has to state."""
+    assert laws.options["sine"].at_assured.current_rms > 0.5e-3
+    assert laws.recommended is None
+    assert "times the limit of IEC 62368-1, class ES1" in laws.recommendation
+    assert laws.to_dict()["recommendation"]["peak_to_peak"] is None
+
+
+def test_one_sentence_says_what_to_set():
     """The smallest amplitude at a finite current, for the same fingers as in the table; in text and JSON alike."""
+    laws = fitact.design_drive(scene(perception={"threshold_force": 0.1 * THRESHOLD}), LAWS, 0.8)
     settable = {name: option for name, option in laws.options.items() if name != "square"}
     name, option = min(settable.items(), key=lambda pair: pair[1].assured)
     assert laws.options["square"].assured < option.assured  # but its current is unbounded
@@ -547,19 +556,31 @@ def test_people_are_those_of_the_population(eight):
     assert np.std(off) < 0.2 * np.std(np.log(option.amplitude))
 
 
-def test_an_area_scales_capacitances_up_and_the_resistance_down():
-    """Fingers of one population sample differ in their area only; tied parameters follow."""
+def population_of(results: list[str]) -> types.SimpleNamespace:
+    """A population that differs in its contact area only, with fits of these results."""
 
-    def law(_: np.ndarray) -> PopulationParameters:
+    def parameters(_: np.ndarray) -> PopulationParameters:
         return PopulationParameters(np.log([R, C]), np.zeros(2), 0.0, math.log(CI), 0.3)
 
-    population = types.SimpleNamespace(
-        hierarchy=types.SimpleNamespace(population_parameters=law),
+    return types.SimpleNamespace(
+        hierarchy=types.SimpleNamespace(population_parameters=parameters),
         points=np.zeros((1, 1000, 1)),
         at=np.zeros(0),
-        fingers=(),
+        fingers=tuple(types.SimpleNamespace(result=result) for result in results),
         trusted=True,
     )
+
+
+@pytest.mark.parametrize(("poor", "trusted"), [(2, True), (3, False)])
+def test_a_population_of_mostly_poor_fits_is_not_designed_for(poor: int, trusted: bool):
+    """Two of five fingers may be poor, three may not."""
+    sample = FingerSample.from_population(population_of(["misfit"] * poor + ["successful"] * (5 - poor)), scene())
+    assert sample.trusted == trusted
+
+
+def test_an_area_scales_capacitances_up_and_the_resistance_down():
+    """Fingers of one population sample differ in their area only; tied parameters follow."""
+    population = population_of([])
     tied = scene(prior={"grounding_Rsc": {"tied": "Rsc", "ratio": 3}, "R_H": {"fixed": "500 ohm"}})
     sample = FingerSample.from_population(population, tied)
     assert "each with its own contact area" in sample.source

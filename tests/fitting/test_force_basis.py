@@ -88,6 +88,15 @@ def test_a_Ci_that_the_data_determine_is_only_noted():
     assert fit.parameters()["Ci"]["from_prior"] < 0.01
     assert not any("Ci" in warning for warning in fit.warnings)
     assert any("the data determine Ci" in note for note in fit.notes)
+    assert "Ci" not in origins(fit.force_basis)  # the force no longer rests on the prior
+
+
+def test_a_recorded_channel_that_is_not_fitted_is_named():
+    path = sorted((RECORDS / "fingers").glob("*.csv.gz"))[0]
+    for channels, named in ((["Vsc"], True), (["Vsc", "I"], False)):
+        scene = fitact.Scene(drive={"waveform": "measured"}, measurement={"channels": channels})
+        fit = fitact.fit(fitact.read(path, scene), scene)
+        assert any("I is recorded but not fitted" in note for note in fit.notes) == named
 
 
 def test_the_fraction_from_the_prior_is_that_of_the_information(finger_fit: fitact.Fit):

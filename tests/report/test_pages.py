@@ -80,7 +80,7 @@ def measurement(trusted: bool = True) -> MeasurementDesign:
 def drive(trusted: bool = True) -> DriveDesign:
     scene = fitact.Scene.from_dict({"perception": {"threshold_force": "1 mN"}, "device": {"current_limit_rms": "2 mA"}})
 
-    def made(waveform: str, amplitude: float, frequency: float = 100.0, current: float = 1e-3) -> DriveOption:
+    def made(waveform: str, amplitude: float, frequency: float = 100.0, current: float = 2e-4) -> DriveOption:
         at = PeriodQuantities(1e-3, 1e-3, np.full(4, 1e-3), 0.5 * amplitude, 3e-3, 0.1, current, 2.0 * current)
         people = amplitude * np.array([0.3, 0.5, 0.6, 0.7, 0.9])
         return DriveOption(waveform, frequency, scene.device, np.full(3, amplitude), 12.0, people, at)
@@ -275,10 +275,10 @@ SHOWN = {
     ],
     "drive": [
         "To be felt by 95 % of fingers: 1 mN amplitude of the alternating electrostatic force, the same at all",
-        "sine 500 V ± 12 V 500 V 500 V to 500 V 3 mW 100 mVA 1 mA 2 mA",
+        "sine 500 V ± 12 V 500 V 500 V to 500 V 3 mW 100 mVA 200 µA 400 µA",
         *(
             "square: excluded, the rms current is unbounded, above 2 mA",
-            "IEC 62368-1, class ES1 touchable by ordinary persons rms current 1 mA 500 µA 2 up to 1 kHz",
+            "IEC 62368-1, class ES1 touchable by ordinary persons rms current 200 µA 500 µA 0.4 up to 1 kHz",
         ),
         *(
             "sine 150 V 250 V 300 V 350 V 450 V",
