@@ -30,7 +30,7 @@ def test_records_of_two_fingers_are_not_one():
     other = dataclasses.replace(square_record(Rsc=80e3, seed=8), source="other.csv")
     found = fitact.fit([one, other], fitact.Scene.from_dict(NOMINAL))
     assert not found.trusted
-    assert any("other.csv" in warning and "is not described" in warning for warning in found.warnings)
+    assert any("other.csv" in warning and "common model fits" in warning for warning in found.warnings)
 
 
 def test_one_record_twice_is_refused():

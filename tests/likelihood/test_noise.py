@@ -183,7 +183,7 @@ def test_a_decay_in_the_quiet_stretch_is_noticed():
         with_vsc(record, record["Vsc"] + noise),
         scene("measured", noise_model="spectrum", quiet=["30.5 ms", "50 ms"]),
     )
-    assert any("quiet holds more than noise" in warning for warning in fit.warnings)
+    assert any("quiet contains more than noise" in warning for warning in fit.warnings)
     assert fit.figures["rms_residual"] < 0.1 < fit.sigma
 
 

@@ -195,7 +195,7 @@ def test_fit_of_vsc_and_current_tells_the_gap_and_its_force():
     force = 8.85e-12 * AREA * np.mean(vgap[-1000:] ** 2) / (2.0 * THICKNESS**2)
     found = fit.derived()["force_mean"]
     assert abs(found["mean"] - force) < 4.0 * found["sd"] + 1e-4 * force  # the sum over samples has this error
-    assert "by the voltage across the gap" in str(fit)
+    assert "from the voltage across the interface gap" in str(fit)
 
 
 @pytest.mark.thorough
@@ -204,4 +204,4 @@ def test_fit_of_vsc_alone_says_that_the_prior_speaks():
     assert fit.identifiability.verdict == "prior-limited"
     assert fit.identifiability.structural
     assert fit.identifiability.force_from_prior > 0.5
-    assert "the trunk current" in fit.identifiability.remedy
+    assert "the loop current" in fit.identifiability.remedy
