@@ -27,7 +27,7 @@ from fitact.populations.population import (
     variance_sentences,
 )
 from fitact.report.frame import Answer, PageSummary, Provenance, image, write_page
-from fitact.summary import PROBABILITIES, format_sd
+from fitact.summary import PROBABILITIES, format_estimate
 from fitact.units import format_engineering, format_percent
 
 _QUANTILES = {key: f"{100.0 * probability:g} %" for key, probability in PROBABILITIES.items()}
@@ -282,10 +282,9 @@ def _origin(content: dict[str, Any]) -> Provenance:
 
 
 def _finger_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
-    yield ("finger", "Rsc", "± 1 sd", "Csc", "± 1 sd", "Ci", "± 1 sd", "fit")
+    yield ("finger", "Rsc ± 1 sd", "Csc ± 1 sd", "Ci ± 1 sd", "fit")
     for each in content["fingers"]:
-        own = [each["parameters"][name] for name in ("Rsc", "Csc", "Ci")]
-        cells = (cell for s in own for cell in (format_engineering(s["q50"], s["unit"]), format_sd(s)))
+        cells = (format_estimate(each["parameters"][name]) for name in ("Rsc", "Csc", "Ci"))
         yield (each["record"], *cells, each["result"])
 
 

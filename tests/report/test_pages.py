@@ -288,7 +288,7 @@ SHOWN = {
         ),
     ],
     "population": [
-        *(f"{HOSTILE} 146.4 kΩ 10 % 33 nF 10 % 1.43 nF 10 % successful", "second.csv 119.5 kΩ", "misfit"),
+        *(f"{HOSTILE} 146 ± 15 kΩ 33.0 ± 3.3 nF 1.43 ± 0.14 nF successful", "second.csv 120 ± 12 kΩ", "misfit"),
         *("Rsc, median 126 kΩ 63 kΩ 252 kΩ", "Csc, log_sd 0.410 0.205 0.820", "correlation 0.370", "Ci 1.42 nF"),
         *("force, mean 116 µN 139 µN 185 µN 231 µN 289 µN 370 µN 462 µN 88 % 12 %", "18.0 % ± 2.0 % 4.0 % ± 1.0 %"),
         *("moisture 0.45 0.22 0.61", "Rsc, slope in moisture 0.0640", "4 × 128 × 300 (22 burn-in)", "4.21 steps"),
