@@ -157,8 +157,11 @@ def quantity_table(content: dict[str, Any]) -> list[tuple[str, ...]]:
     summaries = content["parameters"] | content["derived"]
     groups: dict[str, list[tuple[str, ...]]] = {"circuit": [], "computed, not measured": [], "measurement": []}
     for name, s in summaries.items():
-        group = "measurement" if is_nuisance(name) else "circuit" if name not in _DERIVED or name in ("g", "b") else ""
-        groups[group or "computed, not measured"].append(_quantity_row(name, s, content["force_basis"]))
+        if is_nuisance(name):
+            group = "measurement"
+        else:
+            group = "circuit" if name in _PARAMETERS or name in ("g", "b") else "computed, not measured"
+        groups[group].append(_quantity_row(name, s, content["force_basis"]))
     for name, s in content.get("nuisances", {}).items():
         value = format_engineering(s["value"], s["unit"], 3)
         groups["measurement"].append((name, value, "", "", describe_quantity(name)))
@@ -170,18 +173,13 @@ def quantity_table(content: dict[str, Any]) -> list[tuple[str, ...]]:
 
 def _quantity_row(name: str, summary: Summary, basis: dict[str, Any]) -> tuple[str, ...]:
     remark = "" if name in _PARAMETERS else describe_quantity(name)
-    if name == "friction_mean" and (assumed := _list_assumptions(basis, ("friction",), "default")):
+    defaults = [a for a in basis["assumptions"] if a["affects"] == "friction" and a["origin"] == "default"]
+    if name == "friction_mean" and defaults:
         value = format_engineering(float(f"{summary['q50']:.2g}"), str(summary["unit"]))
+        assumed = ", ".join(f"{a['symbol']} = {a['text']}" for a in defaults)
         return name, f"about {value}", "", "", f"{remark}; default {assumed}"
     fraction = format_percent(round(float(summary["from_prior"]), 3)) if "from_prior" in summary else ""
     return name, format_estimate(summary), format_interval(summary), fraction, remark
-
-
-def _list_assumptions(basis: dict[str, Any], affects: tuple[str, ...], origin: str = "") -> str:
-    """Return the assumed values of a kind as text, each with its origin unless one is asked for."""
-    items = [each for each in basis["assumptions"] if each["affects"] in affects and origin in ("", each["origin"])]
-    texts = [f"{each['symbol']} = {each['text']}" + ("" if origin else f" ({each['origin']})") for each in items]
-    return ", ".join(texts)
 
 
 def force_sentences(basis: dict[str, Any]) -> list[str]:
@@ -189,7 +187,8 @@ def force_sentences(basis: dict[str, Any]) -> list[str]:
     sentences = [
         f"Force: computed {FORCE_LAWS[basis['law']]}; it was not measured, and these data do not test that law."
     ]
-    if values := _list_assumptions(basis, ("prior", "drive", "force", "friction")):
+    if basis["assumptions"]:
+        values = ", ".join(f"{a['symbol']} = {a['text']} ({a['origin']})" for a in basis["assumptions"])
         sentences.append(
             f"Force and friction rest on {values}; default means that nobody stated it. The errors above do not include"
             " an uncertainty of these values, except that of the prior."

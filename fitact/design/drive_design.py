@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from fitact.design.drive_option import ASSURANCE, DriveOption, format_quantity, normalize_drive, quantile
+from fitact.design.drive_option import ASSURANCE, DriveOption, normalize_drive, quantile
 from fitact.design.drive_people import FingerSample
-from fitact.design.limits import AC_3, ES1, NO_SAFETY_ASSESSMENT, LimitComparison, format_value
+from fitact.design.limits import AC_3, ES1, NO_SAFETY_ASSESSMENT, LimitComparison, format_quantity
 from fitact.scene.scene import Scene
 from fitact.tables import align_table, join_lines
 from fitact.units import format_engineering
 
+_STATED_LIMITS = ("breakdown_field", "current_limit_rms", "current_limit_peak")  # keys of [device]
 _UNBOUNDED = "the current is unbounded at ideal edges"
 _LEGEND = (
     "* waveform of the scene. Set: the peak-to-peak amplitude to set, {set}; ±: Monte Carlo error of this number only."
@@ -48,7 +49,7 @@ class DriveDesign:
     seed: int
 
     @property
-    def own(self) -> str:
+    def scene_waveform(self) -> str:
         """Waveform of the scene."""
         return self.scene.drive.waveform
 
@@ -97,24 +98,28 @@ class DriveDesign:
     @property
     def limits(self) -> list[LimitComparison]:
         """Limits beside the values at the recommended amplitude, or else at the amplitude of the scene's waveform."""
-        return (self.recommended or self.options[self.own]).limits
+        return self._shown.limits
+
+    @property
+    def _shown(self) -> DriveOption:
+        return self.recommended or self.options[self.scene_waveform]
 
     @property
     def exposure(self) -> str:
         """Sentences on the body current and the insulator's field at the recommended amplitude."""
-        option = self.recommended or self.options[self.own]
+        option = self._shown
         if not math.isfinite(option.assured):
             return "No amplitude suffices, so there are no body current and insulator field to compare."
         at, where = option.at_assured, "this amplitude" if self.recommended else f"the {option.waveform}'s amplitude"
         current = "the body current is unbounded, because the edges are ideal; state [drive] rise_time"
         if math.isfinite(at.current_rms):
-            rms, peak = (format_value(float(x), "A") for x in (at.current_rms, at.current_peak))
+            rms, peak = (format_quantity(float(x), "A") for x in (at.current_rms, at.current_peak))
             current = f"the largest body current of the fingers drawn is {rms} rms, {peak} peak"
             compared = next((x for x in self.limits if x.source == ES1 and x.in_range), None)
             if compared is not None:
-                limit = format_value(compared.limit or math.nan, "A")
+                limit = format_quantity(compared.limit or math.nan, "A")
                 current += f"; its rms value is {compared.ratio:.2g} times the {ES1} limit of {limit}"
-        field = format_value(float(at.insulator_peak) / option.device.insulator_thickness, "V/m")
+        field = format_quantity(float(at.insulator_peak) / option.device.insulator_thickness, "V/m")
         thickness = format_engineering(option.device.insulator_thickness, "m", 3)
         return f"At {where} {current}. The field in the insulator is at most {field}, for a thickness of {thickness}."
 
@@ -212,8 +217,7 @@ class DriveDesign:
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences that inform."""
-        limits = ("breakdown_field", "current_limit_rms", "current_limit_peak")
-        absent = [name for name in limits if getattr(self.scene.device, name) is None]
+        absent = [name for name in _STATED_LIMITS if getattr(self.scene.device, name) is None]
         unstated = f"[device] does not state {', '.join(absent)}, so no waveform was excluded for exceeding"
         unbounded = [name for name, o in self.options.items() if math.isinf(o.at_assured.current_rms)]
         return (
@@ -256,9 +260,9 @@ class DriveDesign:
     @property
     def table(self) -> tuple[tuple[str, ...], ...]:
         """Titles, then a row for each waveform, for people."""
-        here = format_engineering(self.options[self.own].frequency, "Hz", 3)
+        here = format_engineering(self.options[self.scene_waveform].frequency, "Hz", 3)
         titles = here, "set", "median", "90 % interval", "real", "apparent", "I rms", "I peak", "insulator"
-        return titles, *(_cells(name, option, name == self.own) for name, option in self.options.items())
+        return titles, *(_cells(name, option, name == self.scene_waveform) for name, option in self.options.items())
 
     @property
     def limits_table(self) -> tuple[tuple[str, ...], ...]:
@@ -288,12 +292,9 @@ class DriveDesign:
             "frequency with the lowest amplitude to set, 10 Hz to 1 kHz, for a frequency-independent threshold:"
             f" {easiest}"
         )
-        device = self.scene.device
-        if all(
-            limit is None for limit in (device.breakdown_field, device.current_limit_rms, device.current_limit_peak)
-        ):
+        if all(getattr(self.scene.device, name) is None for name in _STATED_LIMITS):
             return tuple(sentences)
-        return *sentences, f"{self.own}, {_thinnest_insulator(self.by_thickness)}"
+        return *sentences, f"{self.scene_waveform}, {_thinnest_insulator(self.by_thickness)}"
 
 
 def _cells(name: str, option: DriveOption, is_scene_waveform: bool) -> tuple[str, ...]:
@@ -311,8 +312,10 @@ def _cells(name: str, option: DriveOption, is_scene_waveform: bool) -> tuple[str
 
 def _obstacles(option: DriveOption) -> tuple[str, ...]:
     """Return the reasons not to recommend an option, as phrases."""
-    if option.violations or not math.isfinite(option.at_assured.current_rms):
-        return option.violations or (_UNBOUNDED,)
+    if option.violations:
+        return option.violations
+    if not math.isfinite(option.at_assured.current_rms):
+        return (_UNBOUNDED,)
     return tuple(
         f"at {format_quantity(option.assured, 'V')}, the amplitude that it needs, the {each.quantity} is"
         f" {each.ratio:.2g} times the limit of {each.source}"

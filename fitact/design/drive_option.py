@@ -7,14 +7,12 @@ from typing import Any, ClassVar, Self
 import jax
 import numpy as np
 import scipy.stats
-from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from fitact.design.limits import LimitComparison, compare_with_limits
+from fitact.design.limits import LimitComparison, compare_with_limits, format_quantity
 from fitact.model.steady_cycle import PeriodQuantities
 from fitact.scene.sections import Device, DriveSection
-from fitact.summary import round_to_sd
-from fitact.units import choose_prefixed_unit, format_engineering
+from fitact.units import format_engineering
 
 ASSURANCE = 0.95  # probability that the fraction of fingers is reached at the assured amplitude
 FINGER_QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
@@ -35,16 +33,6 @@ def quantile_error(amplitude: Float[np.ndarray, " n"], share: float) -> float:
     rank = scipy.stats.beta(0.5 + count * (1.0 - share), 0.5 + count * share)  # of reciprocals, as in `quantile`
     weight, inverse = np.diff(rank.cdf(np.arange(count + 1) / count)), np.sort(1.0 / amplitude)
     return place**2 * math.sqrt(weight @ (inverse - weight @ inverse) ** 2)
-
-
-def format_quantity(value: ArrayLike, unit: str, error: float | None = None) -> str:
-    """Format a value for people; with an `error`, to the place of the error's second significant digit."""
-    if not math.isfinite(value):
-        return "unbounded"
-    if error is None or not 0.0 < error < math.inf:
-        return format_engineering(float(value), unit, 3)
-    size, symbol = choose_prefixed_unit(float(value), unit)
-    return " ± ".join(f"{x} {symbol}" for x in round_to_sd((float(value) / size, error / size), error / size))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,9 +7,12 @@ import dataclasses
 import math
 from typing import Any, NamedTuple
 
+from jax.typing import ArrayLike
+
 from fitact.model.steady_cycle import PeriodQuantities
 from fitact.scene.sections import Device
-from fitact.units import format_engineering
+from fitact.summary import round_to_sd
+from fitact.units import choose_prefixed_unit, format_engineering
 
 NO_SAFETY_ASSESSMENT = (
     "The comparison with limits is no safety assessment: the model has no fault (a pierced insulator), no energy stored"
@@ -85,8 +88,8 @@ class LimitComparison:
     def row(self) -> tuple[str, ...]:
         """Cells for people: source, meaning, quantity, value, limit, ratio, frequencies."""
         ratio = "" if self.ratio is None else f"{self.ratio:.2g}" if math.isfinite(self.ratio) else "unbounded"
-        limit = "not stated" if self.limit is None else format_value(self.limit, self.unit)
-        return self.source, self.name, self.quantity, format_value(self.value, self.unit), limit, ratio, self._range
+        limit = "not stated" if self.limit is None else format_quantity(self.limit, self.unit)
+        return self.source, self.name, self.quantity, format_quantity(self.value, self.unit), limit, ratio, self._range
 
     @property
     def _range(self) -> str:
@@ -124,8 +127,16 @@ def compare_with_limits(frequency: float, at_amplitude: PeriodQuantities, device
     return [*rows, LimitComparison(source, name, "insulator field", field, device.breakdown_field, "V/m")]
 
 
-def format_value(value: float, unit: str) -> str:
-    """Format a current or a field for people; a field is in V/µm, as data sheets have it."""
+def format_quantity(value: ArrayLike, unit: str, error: float | None = None) -> str:
+    """Format a value for people; with an `error`, to the place of the error's second significant digit.
+
+    A field (V/m) is in V/µm, as in data sheets.
+    """
     if not math.isfinite(value):
         return "unbounded"
-    return f"{1e-6 * value:.3g} V/µm" if unit == "V/m" else format_engineering(value, unit, 3)
+    if unit == "V/m":
+        return f"{1e-6 * float(value):.3g} V/µm"
+    if error is None or not 0.0 < error < math.inf:
+        return format_engineering(float(value), unit, 3)
+    size, symbol = choose_prefixed_unit(float(value), unit)
+    return " ± ".join(f"{x} {symbol}" for x in round_to_sd((float(value) / size, error / size), error / size))

@@ -18,7 +18,7 @@ from fitact.experiment.fisher import Experiment, covariance_factor
 from fitact.fitting import derived, remarks
 from fitact.fitting.channel_fit import ChannelFit, information_criteria
 from fitact.fitting.drive_choice import DriveModel
-from fitact.fitting.identifiability import assess_identifiability, prior_variance_fraction
+from fitact.fitting.identifiability import assess_identifiability
 from fitact.fitting.laplace import FitResult, Laplace
 from fitact.fitting.least_squares import LeastSquaresResult, solve
 from fitact.fitting.levenberg_marquardt import Optima
@@ -307,24 +307,17 @@ def _assemble_fit(
     if optima is not None:
         figures |= {"optima": len(optima.start_counts), "starts_failed": optima.n_failed}
     warnings: list[str] = []
-    notes = [
-        scene.description for scene in {id(s.scene): s.scene for s in problem.sources}.values() if scene.description
-    ]
-    for record in {id(source.record): source.record for source in problem.sources}.values():
-        fitted = {channel.channel for channel in traces if channel.record is record}
-        notes += [
-            f"{record.source}: {name} is recorded but not fitted; to use it, add it to [measurement] channels"
-            for name in record.channels
-            if name not in ("V", *fitted)
-        ]
+    notes = [source.scene.description for source in problem.sources if source.scene.description]
+    for source in problem.sources:
+        fitted = {channel.channel for channel in traces if channel.record is source.record}
+        notes += remarks.unfitted_channel_notes(source.record, fitted)
     for source, channel in zip(problem.sources, traces, strict=True):
         warnings += source.warnings
         notes += source.notes
         warnings += remarks.channel_warnings(source.record, source.choice, channel.channel, channel.figures)
     warnings += misfit_warnings(traces)
     warnings += remarks.parameter_warnings(likelihood, theta)
-    from_prior = prior_variance_fraction(root, likelihood.prior_factor, np.eye(theta.size))
-    assumed = remarks.describe_assumed_Ci(None if without_scene else first.scene, likelihood, from_prior)
+    assumed = remarks.describe_assumed_Ci(None if without_scene else first.scene, likelihood, laplace.prior_sets_Ci)
     warnings += assumed.warnings
     notes += assumed.notes
     experiment = problem.experiment(likelihood, theta, sigma)

@@ -15,7 +15,7 @@ from fitact import summary
 from fitact.data.spectrum import Spectrum
 from fitact.experiment.fisher import covariance_factor
 from fitact.fitting import derived
-from fitact.fitting.identifiability import assess_parameters, prior_variance_fraction
+from fitact.fitting.identifiability import assess_parameters
 from fitact.fitting.laplace import FitResult, Laplace
 from fitact.fitting.levenberg_marquardt import Minimum, minimise, result_name
 from fitact.fitting.problem import likelihood_without_channels
@@ -112,8 +112,7 @@ def fit_spectrum(spectrum: Spectrum, scene: Scene | None = None) -> SpectrumFit:
     result = result_name(end.result)
     if result == "successful" and figures["structure_z"] > 4.0:  # neighbouring residuals are correlated
         result = "misfit"
-    from_prior = prior_variance_fraction(root, likelihood.prior_factor, np.eye(theta.size))
-    assumed = describe_assumed_Ci(scene, likelihood, from_prior)
+    assumed = describe_assumed_Ci(scene, likelihood, laplace.prior_sets_Ci)
     return SpectrumFit(
         laplace,
         result=result,

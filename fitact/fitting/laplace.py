@@ -63,6 +63,18 @@ class Laplace:
         """Standard deviations of the logarithms of the derived quantities."""
         return np.linalg.norm(self.log_derived[1] @ self.covariance_root, axis=1)
 
+    def variance_from_prior(self, gradients: Float[np.ndarray, "quantities parameters"]) -> np.ndarray:
+        """Return the fraction of each quantity's variance that comes from the prior, by its gradient in theta."""
+        return prior_variance_fraction(self.covariance_root, self.likelihood.prior_factor, gradients)
+
+    @property
+    def prior_sets_Ci(self) -> bool:
+        """Whether the prior of Ci was used, and contributes at least `MIN_PRIOR_FRACTION` of its variance."""
+        if not self.likelihood.use_prior or "Ci" not in self.likelihood.names:
+            return False
+        gradient = np.eye(self.theta.size)[[self.likelihood.names.index("Ci")]]
+        return bool(self.variance_from_prior(gradient)[0] >= MIN_PRIOR_FRACTION)
+
     def log_gradient(self, name: str) -> Float[np.ndarray, " parameters"]:
         """Gradient of the logarithm of a derived quantity in theta."""
         return self.log_derived[1][derived.DERIVED_NAMES.index(name)]
@@ -142,7 +154,7 @@ class FitResult(abc.ABC):
         the logarithm that comes from the prior.
         """
         values, timing = self.likelihood.to_physical(self.theta), self.likelihood.timing
-        summaries, from_prior = {}, self.variance_from_prior(np.eye(self.theta.size))
+        summaries, from_prior = {}, self.laplace.variance_from_prior(np.eye(self.theta.size))
         for i, name in enumerate(self.names):
             value, sd = float(values[name]), float(self.sd[i])
             if name in timing:
@@ -157,15 +169,11 @@ class FitResult(abc.ABC):
     def derived(self) -> dict[str, summary.Summary]:
         """Summarize divider, time constant, force and friction in the Laplace approximation."""
         logs, gradients = self.laplace.log_derived
-        columns = logs, self.laplace.derived_log_sd, self.variance_from_prior(gradients)
+        columns = logs, self.laplace.derived_log_sd, self.laplace.variance_from_prior(gradients)
         return {
             name: summary.summarize_log_normal(name, math.exp(log), float(sd)) | {"from_prior": float(fraction)}
             for name, log, sd, fraction in zip(derived.DERIVED_NAMES, *columns, strict=True)
         }
-
-    def variance_from_prior(self, gradients: Float[np.ndarray, "quantities parameters"]) -> np.ndarray:
-        """Return the fraction of each quantity's variance that comes from the prior, by its gradient in theta."""
-        return prior_variance_fraction(self.covariance_root, self.likelihood.prior_factor, gradients)
 
     @property
     @abc.abstractmethod
@@ -177,9 +185,9 @@ class FitResult(abc.ABC):
         """Force law, values that the force rests on, and the mean force by the other law if a gap is stated."""
         law = self.derive.geometry.model
         other_law: ForceModel = "gap" if law == "paper" else "paper"
-        from_prior = self.parameters().get("Ci", {"from_prior": 0.0})["from_prior"]
-        prior = self.likelihood.use_prior and float(from_prior) > MIN_PRIOR_FRACTION
-        assumptions = list_assumptions(self.scene, law, prior=prior, stated_drive=self.uses_stated_drive)
+        assumptions = list_assumptions(
+            self.scene, law, prior=self.laplace.prior_sets_Ci, stated_drive=self.uses_stated_drive
+        )
         other: dict[str, Any] | None = None
         if getattr(constant_skin_circuit(self.likelihood.template), "Cgap", None) is not None:
             geometry = dataclasses.replace(self.derive.geometry, model=other_law)

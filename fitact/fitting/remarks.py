@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Collection
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,7 +14,6 @@ from jaxtyping import Array, Float
 from fitact.data.inspection import check_divider
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.fitting.drive_choice import DriveModel
-from fitact.fitting.identifiability import MIN_PRIOR_FRACTION
 from fitact.fitting.residual_statistics import is_undersampled
 from fitact.likelihood.likelihood import Likelihood
 from fitact.scene.assumptions import states_Ci
@@ -81,23 +81,24 @@ class Remarks(NamedTuple):
     warnings: tuple[str, ...] = ()
 
 
-def describe_assumed_Ci(
-    scene: Scene | None,
-    likelihood: Likelihood,
-    from_prior: Float[np.ndarray, " parameters"],
-    min_fraction: float = MIN_PRIOR_FRACTION,
-) -> Remarks:
-    """Describe a Ci that nobody stated: in a warning if its prior sets results, otherwise in a note.
+def unfitted_channel_notes(record: Record, fitted: Collection[str]) -> list[str]:
+    """Return notes about the recorded channels, other than V, that are not among the `fitted` ones."""
+    return [
+        f"{record.source}: {name} is recorded but not fitted; to use it, add it to [measurement] channels"
+        for name in record.channels
+        if name not in ("V", *fitted)
+    ]
 
-    `from_prior`: fraction of each parameter's variance that comes from the prior; it sets results above `min_fraction`.
-    """
+
+def describe_assumed_Ci(scene: Scene | None, likelihood: Likelihood, prior_sets_Ci: bool) -> Remarks:
+    """Describe a Ci that nobody stated: in a warning if its prior sets results, otherwise in a note."""
     if (scene is not None and states_Ci(scene)) or not likelihood.use_prior or "Ci" not in likelihood.names:
         return Remarks()
-    prior, place = likelihood.prior["Ci"], likelihood.names.index("Ci")
+    prior = likelihood.prior["Ci"]
     value = f"{format_engineering(math.exp(prior.log_mean), 'F')} ± {format_percent(float(prior.log_sd))}"
     subject = "no scene was given" if scene is None else "the scene does not state Ci"
     assumed = f"{subject}, so the insulator of the reference paper is assumed (Ci = {value})"
-    if from_prior[place] < min_fraction:
+    if not prior_sets_Ci:
         return Remarks(notes=(f"{assumed}; the data determine Ci, so this assumption hardly matters",))
     return Remarks(
         warnings=(

@@ -13,8 +13,8 @@ from fitact.charts.figure import ALERT, DATA, GREEN, MODEL, ORANGE, PINK, PRIOR,
 from fitact.charts.interactive import Axis
 from fitact.charts.picture import draw_plot
 from fitact.design.drive_design import DriveDesign
-from fitact.design.drive_option import FINGER_QUANTILES, DriveOption, format_quantity, quantile
-from fitact.design.limits import NO_SAFETY_ASSESSMENT
+from fitact.design.drive_option import FINGER_QUANTILES, DriveOption, quantile
+from fitact.design.limits import NO_SAFETY_ASSESSMENT, format_quantity
 from fitact.report.frame import Answer, PageSummary, Provenance, image, write_page
 from fitact.units import format_engineering
 
@@ -61,16 +61,16 @@ def _draw_both_insulators(thicknesses: Axes, permittivities: Axes, design: Drive
 
 
 def _order_waveforms(design: DriveDesign) -> list[str]:
-    return sorted(design.options, key=lambda name: name != design.own)
+    return sorted(design.options, key=lambda name: name != design.scene_waveform)
 
 
 def _line_width(design: DriveDesign, name: str) -> float:
     """Return the line width; the scene's waveform is wider, so that it stays visible under other curves."""
-    return 3.0 if name == design.own else 1.3
+    return 3.0 if name == design.scene_waveform else 1.3
 
 
 def _draw_insulators(axes: Axes, design: DriveDesign, options: Sequence[DriveOption], at: Sequence[float]) -> None:
-    color = _COLORS[design.own]
+    color = _COLORS[design.scene_waveform]
     low, median, high = (_mask_infinite([float(quantile(o.amplitude, q)) for o in options]) for q in (0.05, 0.5, 0.95))
     axes.fill_between(at, low, high, color=color, alpha=0.25, lw=0)
     axes.plot(at, median, ".-", color=color, label=f"suffices for {100.0 * design.share:g} %")
@@ -85,7 +85,7 @@ def _draw_insulators(axes: Axes, design: DriveDesign, options: Sequence[DriveOpt
     axes.set_yscale("log")
     log_ticks(axes.yaxis, "V")
     _note_if_empty(axes)
-    axes.set_ylabel(f"peak-to-peak amplitude, {design.own}")
+    axes.set_ylabel(f"peak-to-peak amplitude, {design.scene_waveform}")
 
 
 def _limit_amplitude(option: DriveOption, quantity: str, limit: float | None) -> float:
@@ -143,8 +143,8 @@ def _frame(design: DriveDesign) -> PageSummary:
     return PageSummary(
         title=f"The smallest drive that {100.0 * design.share:g} % of fingers feel",
         subject=f"Peak-to-peak amplitude, power, current and insulator voltage of each waveform at"
-        f" {format_engineering(design.options[design.own].frequency, 'Hz', 3)}, at other frequencies and on other"
-        " insulators.",
+        f" {format_engineering(design.options[design.scene_waveform].frequency, 'Hz', 3)}, at other frequencies and on"
+        " other insulators.",
         trusted=design.trusted,
         verdict=design.recommendation.rstrip(".") if design.trusted else f"{'; '.join(design.warnings)}.",
         findings=findings,
@@ -170,7 +170,7 @@ def _note(option: DriveOption, recommended: DriveOption | None) -> str:
 
 def _curve_plot(design: DriveDesign) -> interactive.Plot:
     curves = {name: design.curve(name) for name in _order_waveforms(design)}
-    x = Axis.from_values("peak-to-peak amplitude", "V", curves[design.own]["peak_to_peak"], log=True)
+    x = Axis.from_values("peak-to-peak amplitude", "V", curves[design.scene_waveform]["peak_to_peak"], log=True)
     y = Axis("fingers that feel it", "%", 0.01)
     traces = []
     for name, curve in curves.items():
@@ -180,7 +180,7 @@ def _curve_plot(design: DriveDesign) -> interactive.Plot:
             band = interactive.band(x, y, at, curve["q05"], curve["q95"], edges, color)
             traces += [each | {"showlegend": False} for each in band]
         traces.append(interactive.line(x, y, at, curve["q50"], name, color, width=_line_width(design, name)))
-    at = curves[design.own]["peak_to_peak"][[0, -1]]
+    at = curves[design.scene_waveform]["peak_to_peak"][[0, -1]]
     traces.append(interactive.line(x, y, at, [design.share] * 2, "required", ALERT, dash="dash"))
     plot = interactive.plot(x, (y, traces), size=420)
     plot["layout"]["legend"]["traceorder"] = "normal"  # plotly reverses the order where areas are filled
@@ -192,16 +192,20 @@ def _frequency_plot(design: DriveDesign) -> interactive.Plot:
         name: _mask_infinite([float(quantile(option.amplitude, 0.5)) for option in options])
         for name, options in design.by_frequency.items()
     }
-    own = design.by_frequency[design.own]
+    own = design.by_frequency[design.scene_waveform]
     frequency, people = np.array([option.frequency for option in own]), np.stack([option.people for option in own])
     x = Axis.from_values("frequency of the drive", "Hz", frequency, log=True)
-    y = Axis.from_values("peak-to-peak amplitude required", "V", medians[design.own], log=True)
+    y = Axis.from_values("peak-to-peak amplitude required", "V", medians[design.scene_waveform], log=True)
     traces = []
     for low, high, share in ((0, 4, 90), (1, 3, 50)):
         kept = np.isfinite(people[:, high])
-        edges = (f"{50 - share // 2} % of fingers", f"{50 + share // 2} %", f"{share} % of fingers, {design.own}")
+        edges = (
+            f"{50 - share // 2} % of fingers",
+            f"{50 + share // 2} %",
+            f"{share} % of fingers, {design.scene_waveform}",
+        )
         traces += interactive.band(
-            x, y, frequency[kept], people[kept, low], people[kept, high], edges, _COLORS[design.own]
+            x, y, frequency[kept], people[kept, low], people[kept, high], edges, _COLORS[design.scene_waveform]
         )
     for name in _order_waveforms(design):
         at = [option.frequency for option in design.by_frequency[name]]

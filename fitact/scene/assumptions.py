@@ -14,16 +14,14 @@ class Assumption(NamedTuple):
     key: str  # where the scene file states it
     value: float | str
     unit: str
+    text: str  # the value with its unit, for people
     stated: bool
     affects: str  # "prior", "drive", "force" or "friction"
 
     def to_dict(self) -> dict[str, Any]:
         """Return an entry of `force_basis.assumptions` in fit.json and summary.json."""
-        text = self.value if isinstance(self.value, str) else format_engineering(self.value, self.unit)
-        if self.symbol.startswith("relative"):
-            text = format_percent(float(self.value))
         return {
-            "symbol": self.symbol, "key": self.key, "value": self.value, "unit": self.unit, "text": text,
+            "symbol": self.symbol, "key": self.key, "value": self.value, "unit": self.unit, "text": self.text,
             "origin": "scene" if self.stated else "default", "affects": self.affects,
         }  # fmt: skip
 
@@ -43,7 +41,15 @@ def list_assumptions(scene: Scene, law: str, *, prior: bool, stated_drive: bool)
     friction = ("mu", "friction", "coefficient", ""), ("fN", "friction", "normal_force", "N")
     groups = {"drive": wave if stated_drive else (), "force": gap if law == "gap" else layers, "friction": friction}
     assumptions = [
-        Assumption(symbol, f"[{section}] {key}", value, unit, key in getattr(scene, section).model_fields_set, affects)
+        Assumption(
+            symbol,
+            f"[{section}] {key}",
+            value,
+            unit,
+            value if isinstance(value, str) else format_engineering(value, unit),
+            key in getattr(scene, section).model_fields_set,
+            affects,
+        )
         for affects, entries in groups.items()
         for symbol, section, key, unit in entries
         if (value := getattr(getattr(scene, section), key)) is not None
@@ -56,11 +62,14 @@ def _prior_assumptions(scene: Scene) -> tuple[Assumption, ...]:
     if not spec.is_free:
         return ()
     marginal, key = scene.make_prior()["Ci"], "[prior] Ci"
-    median = Assumption("Ci", key, math.exp(marginal.log_mean), "F", states_Ci(scene), "prior")
+    median, log_sd = math.exp(marginal.log_mean), float(marginal.log_sd)
     own_spread = "Ci" in scene.prior.model_fields_set and bool(
         {"factor", "relative_sd", "low", "tolerance"} & scene.prior.Ci.model_fields_set
     )
-    return median, Assumption("relative sd of Ci", key, float(marginal.log_sd), "", own_spread, "prior")
+    return (
+        Assumption("Ci", key, median, "F", format_engineering(median, "F"), states_Ci(scene), "prior"),
+        Assumption("relative sd of Ci", key, log_sd, "", format_percent(log_sd), own_spread, "prior"),
+    )
 
 
 def states_Ci(scene: Scene) -> bool:

@@ -463,7 +463,7 @@ def test_an_offset_scales_with_the_drive_and_lies_over_the_insulator(one):
 def test_a_multitone_of_one_tone_is_a_sine(one):
     tones = {"waveform": "multitone", "frequencies": [50.0, 100.0], "amplitudes": [1e-9, 7.0]}
     found = fitact.design_drive(scene(drive=tones), one_finger())
-    assert found.own == "multitone"
+    assert found.scene_waveform == "multitone"
     assert found.options["multitone"].assured == pytest.approx(one.options["sine"].assured, rel=1e-6)
 
 
