@@ -1,7 +1,7 @@
 # make demo   set up, fit the shipped record, sample its posterior, write the report
 # make test   set up, run the tests
 PY = .venv/bin/python
-# what one process compiles serves the others, and the next run
+# what the tests compile by themselves serves the next run; fitact keeps its own programs in the user's cache folder
 export JAX_COMPILATION_CACHE_DIR = $(CURDIR)/out/jax
 export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS = 0
 # a test runs what it compiles once or twice: XLA compiles in a third of the time where it optimises less; all else that

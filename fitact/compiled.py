@@ -1,26 +1,39 @@
-"""Compilation by JAX: few shapes for all records and batches, numbers as arrays, and a persistent cache.
+"""Compilation by JAX: programs for many records, kept on disk; few shapes, numbers as arguments.
+
+A function that `jit` decorates takes and returns NumPy arrays. It is compiled once for each structure of its arguments:
+classes, shapes of arrays, and values of all else. Programs are stored with `fitact.program_cache`, so that another
+process neither traces nor compiles them.
 
 JAX compiles code for each array length. Records are therefore padded to one of a few lengths by repeating the last
 sample with weight 0. Times then never decrease, a drive keeps its last value, and the ends, the minimum and the
 maximum of a record do not change. Batches are padded to one size.
 """
 
+import contextlib
 import functools
+import hashlib
+import importlib.metadata
 import os
+import pickle
 import platform
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.experimental import serialize_executable
+from jax.experimental.compilation_cache import compilation_cache
+from jaxtyping import Array
 
+from fitact import program_cache
 from fitact.progress import track_progress
 
 _Module = TypeVar("_Module", bound=eqx.Module)
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
 
 MAX_PADDED_LENGTH = 1_048_576  # samples; a fit of more takes longer than the compilation
 
@@ -59,23 +72,250 @@ def pad_rows(values: np.ndarray, size: int, axis: int = 0) -> np.ndarray:
 
 
 def as_arrays(module: _Module) -> _Module:
-    """Return the module with its numbers as arrays, so that all modules of its type share compiled code."""
-    with jax.enable_x64(True):
-        return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, module)
+    """Return the module with its numbers as arrays in double precision, with which NumPy computes outside `jit`."""
+    return jax.tree.map(lambda x: np.asarray(x, dtype=float) if isinstance(x, float | jax.Array) else x, module)
 
 
-def to_device(values: Float[np.ndarray, " samples"]) -> Float[Array, " samples"]:
-    """Return the samples of a record as a JAX array, without a copy if possible."""
-    with jax.enable_x64(True):
-        return jax.device_put(values, may_alias=True)
+def jit(
+    function: Callable[_Arguments, _Result], *, fast: bool = False, double: bool = True
+) -> Callable[_Arguments, _Result]:
+    """Return a function that runs `function` as a compiled program, on NumPy arrays.
+
+    Without `fast`, the program compiles faster and runs up to twice as long: for what runs a few times for each record.
+    It computes in double precision or, without `double`, in the current precision of JAX. Arrays are arguments of the
+    program; all else in the arguments, Python's floats included, is static. Within another traced function, `function`
+    itself is traced.
+    """
+
+    @functools.wraps(function)
+    def run(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> Any:
+        leaves, structure = jax.tree.flatten((args, kwargs))
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+            return function(*args, **kwargs)
+        x64 = double or bool(jax.config.jax_enable_x64)
+        with jax.enable_x64(x64):
+            program = _find_program(function, fast, x64, structure, _signature(leaves))
+            return program(*map(_as_argument, filter(_is_dynamic, leaves)))
+
+    return run
+
+
+class _Program(NamedTuple):
+    """An executable on flat lists of arrays."""
+
+    execute: Callable[..., list[Array]]
+    result: Any  # structure of the result
+
+    def __call__(self, *arrays: np.ndarray | Array) -> Any:
+        return jax.tree.unflatten(self.result, [np.asarray(x) for x in self.execute(*arrays)])
+
+
+class _Shape(NamedTuple):
+    """Shape and type of an array among the arguments."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+
+class _Static(NamedTuple):
+    """A value among the arguments for which a program is compiled; the class keeps True and 1 apart."""
+
+    kind: type
+    value: Any
+
+
+def _is_dynamic(leaf: Any) -> bool:
+    return isinstance(leaf, np.ndarray | jax.Array | np.generic)
+
+
+def _as_argument(leaf: Any) -> np.ndarray | Array:
+    return leaf if isinstance(leaf, np.ndarray | jax.Array) else np.asarray(leaf)
+
+
+def _signature(leaves: Sequence[Any]) -> tuple[_Shape | _Static, ...]:
+    return tuple(
+        _Shape(leaf.shape, leaf.dtype)
+        if _is_dynamic(leaf)
+        else _Static(type(leaf), _Partial.from_partial(leaf) if isinstance(leaf, functools.partial) else leaf)
+        for leaf in leaves
+    )
+
+
+class _Partial(NamedTuple):
+    """A `functools.partial` that equals others of the same function and arguments."""
+
+    function: Callable[..., Any]
+    args: tuple[Any, ...]
+    kwargs: tuple[tuple[str, Any], ...]
+
+    @classmethod
+    def from_partial(cls, partial: "functools.partial[Any]") -> "_Partial":
+        return cls(partial.func, partial.args, tuple(sorted(partial.keywords.items())))
+
+    def __call__(self, *args: Any) -> Any:
+        return self.function(*self.args, *args, **dict(self.kwargs))
+
+
+@functools.lru_cache(maxsize=2048)
+def _find_program(
+    function: Callable[..., Any], fast: bool, x64: bool, structure: Any, signature: tuple[_Shape | _Static, ...]
+) -> _Program:
+    """Load the program from the disk, or compile it and store it there; `x64` is the current setting of JAX."""
+    if jax.default_backend() != "cpu" or jax.config.jax_default_device is not None:
+        return _compile(function, fast, structure, signature)[0]
+    try:
+        described = _describe(function), _describe(jax.tree.unflatten(structure, signature))
+    except _NotStorableError:
+        return _compile(function, fast, structure, signature)[0]
+    parts = _environment(), os.environ.get("XLA_FLAGS", ""), str(fast), str(x64), *described
+    key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
+    content = program_cache.load(key)
+    if content is not None:
+        try:
+            return _load_program(content)
+        except Exception:  # of another version of a library, or whatever: it is compiled again
+            program_cache.remove(key)
+    program, compiled = _compile(function, fast, structure, signature)
+    if program_cache.cache_folder() is not None:
+        try:
+            executable, *_ = serialize_executable.serialize(compiled)
+            skeleton = jax.tree.unflatten(program.result, range(program.result.num_leaves))
+            program_cache.store(key, pickle.dumps((executable, compiled.in_tree.num_leaves, skeleton)))
+        except (NotImplementedError, ValueError, pickle.PicklingError):  # it cannot be serialised
+            pass
+    return program
+
+
+def _load_program(content: bytes) -> _Program:
+    executable, n_arguments, skeleton = pickle.loads(content)
+    _initialize_lapack()
+    result = jax.tree.structure(skeleton)
+    trees = jax.tree.structure(((0,) * n_arguments, {})), jax.tree.structure([0] * result.num_leaves)
+    device = jax.devices()[0]
+    loaded = serialize_executable.deserialize_and_load(executable, *trees, device.client, [device])
+    return _Program(loaded, result)
+
+
+@functools.cache
+def _initialize_lapack() -> None:
+    """Load LAPACK, without which a deserialised program that calls it crashes."""
+    import jaxlib.lapack
+
+    jaxlib.lapack.prepare_lapack_call("potrf", np.dtype(float))
+
+
+def _compile(
+    function: Callable[..., Any], fast: bool, structure: Any, signature: tuple[_Shape | _Static, ...]
+) -> tuple[_Program, Any]:
+    result = None
+
+    def run_flat(*arrays: Array) -> list[Any]:
+        nonlocal result
+        given = iter(arrays)
+        leaves = [next(given) if isinstance(each, _Shape) else each.value for each in signature]
+        args, kwargs = jax.tree.unflatten(structure, leaves)
+        outputs, result = jax.tree.flatten(function(*args, **kwargs))
+        return outputs
+
+    run_flat.__name__ = run_flat.__qualname__ = function.__name__
+    shapes = [jax.ShapeDtypeStruct(*each) for each in signature if isinstance(each, _Shape)]
+    options = _XLA_OPTIONS | ({} if fast else _FAST_COMPILATION) if jax.default_backend() == "cpu" else None
+    with _outside_users_cache():
+        compiled = jax.jit(run_flat).lower(*shapes).compile(compiler_options=options)
+    return _Program(compiled, result), compiled
+
+
+# Options of XLA for the CPU. Without its newer way to compile loops, programs compile in half the time and run as fast.
+_XLA_OPTIONS = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
+_FAST_COMPILATION = {"xla_backend_optimization_level": 0}
+
+
+@contextlib.contextmanager
+def _outside_users_cache() -> Iterator[None]:
+    """Keep JAX's own persistent cache, which belongs to the user, from what is compiled in this context.
+
+    JAX decides only once whether its cache is used, so it must decide anew before, and after for the user's programs.
+    """
+    compilation_cache.reset_cache()
+    try:
+        with jax._src.config.enable_compilation_cache(False):
+            yield
+    finally:
+        compilation_cache.reset_cache()
+
+
+_LIBRARIES = ("jax", "jaxlib", "numpy", "equinox", "optimistix", "lineax")  # on whose versions a program depends
+
+
+class _NotStorableError(Exception):
+    """An argument or function cannot be described for another process."""
+
+
+def _describe(value: Any) -> str:
+    """Return a text that is equal in two processes only if programs for these arguments are."""
+    if isinstance(value, _Shape):
+        return f"{value.dtype}{value.shape}"
+    if isinstance(value, _Static):
+        return _describe(value.value)
+    if value is None or isinstance(value, bool | int | float | str):
+        return repr(value)
+    if hasattr(value, "__qualname__"):  # a class or a function
+        return _describe_name(value)
+    name = _describe_name(type(value))
+    if isinstance(value, dict):
+        parts = [f"{key!r}:{_describe(item)}" for key, item in value.items()]
+    elif isinstance(value, tuple | list):
+        parts = list(map(_describe, value))
+    elif isinstance(value, functools.partial):
+        parts = [_describe(value.func), _describe(value.args), _describe(value.keywords)]
+    elif isinstance(value, eqx.Module):
+        parts = [_describe(getattr(value, name)) for name in value.__dataclass_fields__]
+    else:
+        raise _NotStorableError
+    return f"{name}({','.join(parts)})"
+
+
+def _describe_name(named: Any) -> str:
+    """Return the full name of a class or function whose source is part of `_environment`."""
+    module, name = named.__module__, named.__qualname__
+    if module.partition(".")[0] not in ("fitact", "builtins", "functools", *_LIBRARIES):
+        raise _NotStorableError
+    found: Any = sys.modules[module]
+    for part in name.split("."):
+        found = getattr(found, part, None)
+    if named not in (found, getattr(found, "__wrapped__", None)):  # a closure, or another function with this name
+        raise _NotStorableError
+    return f"{module}.{name}"
+
+
+@functools.cache
+def _environment() -> str:
+    """Return what programs depend on besides their arguments: sources, versions, platform and processor."""
+    sources = hashlib.sha256()
+    root = Path(__file__).parent
+    for path in sorted(root.rglob("*.py")):
+        sources.update(str(path.relative_to(root)).encode() + path.read_bytes())
+    versions = [sys.version, *map(importlib.metadata.version, _LIBRARIES)]
+    matmul = str(jax.config.jax_default_matmul_precision)
+    return "\0".join([sources.hexdigest(), *versions, platform.platform(), matmul, _processor()])
+
+
+def _processor() -> str:
+    """Return the processor with its features, since a program may use instructions that another lacks."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
+            lines = file.read(16384).partition("\n\n")[0].splitlines()
+    except OSError:
+        return platform.processor() + platform.machine()
+    kept = ("vendor", "cpu family", "model", "stepping", "flags", "features", "cpu part", "cpu variant", "isa")
+    return "\n".join(line for line in lines if line.lower().startswith(kept))
 
 
 class BatchEvaluator:
     """Evaluation of `function(model, *rows)` over the rows of arrays of equal length, in batches.
 
     Batches are padded to one size, so that they compile once. The size is limited such that size x `rows` (numbers per
-    evaluation) does not exceed `max_numbers`, which bounds the memory. The model is partitioned for jit only once,
-    since a call may take less time than that. Double precision is required.
+    evaluation) does not exceed `max_numbers`, which bounds the memory. The model is copied to the device only once.
     """
 
     def __init__(
@@ -85,10 +325,12 @@ class BatchEvaluator:
         rows: int,
         batch: int = 32,
         max_numbers: int = 4_000_000,
+        fast: bool = True,
     ) -> None:
-        dynamic, static = eqx.partition(model, eqx.is_array)
-        self._dynamic, treedef = jax.tree.flatten(dynamic)
-        self._static = _StaticModel(function, static, treedef)
+        self._arguments, self._fast = (function, model), fast
+        with jax.enable_x64(True):
+            self._arrays = jax.device_put(list(filter(_is_dynamic, jax.tree.leaves(self._arguments))))
+        self._programs: dict[tuple[_Shape | _Static, ...], _Program] = {}
         self._batch = max(1, min(batch, max_numbers // rows))
 
     def __call__(self, *arrays: np.ndarray, description: str = "") -> np.ndarray:
@@ -96,11 +338,20 @@ class BatchEvaluator:
         count, batch = len(arrays[0]), self._batch
         arrays = tuple(pad_rows(a, batch) for a in arrays)
         starts = range(0, count, batch)
-        parts = [
-            np.asarray(_evaluate(self._static, self._dynamic, tuple(a[i : i + batch] for a in arrays)))
-            for i in (track_progress(starts, description, len(starts)) if description else starts)
-        ]
+        with jax.enable_x64(True):
+            program = self._find_program(*(a[:batch] for a in arrays))
+            parts = [
+                program(*self._arrays, *(a[i : i + batch] for a in arrays))
+                for i in (track_progress(starts, description, len(starts)) if description else starts)
+            ]
         return (parts[0] if len(parts) == 1 else np.concatenate(parts))[:count]
+
+    def _find_program(self, *rows: np.ndarray) -> _Program:
+        signature = _signature(rows)
+        if signature not in self._programs:
+            leaves, structure = jax.tree.flatten(((*self._arguments, *rows), {}))
+            self._programs[signature] = _find_program(_map_rows, self._fast, True, structure, _signature(leaves))
+        return self._programs[signature]
 
     def map_over(self, shape: tuple[int, ...], *arrays: np.ndarray) -> np.ndarray:
         """Return the values of rows that are arranged in `shape`, in this shape."""
@@ -108,42 +359,5 @@ class BatchEvaluator:
         return values.reshape(*shape, *values.shape[1:])
 
 
-class _StaticModel:
-    """A function and a model without its arrays; equal if their compiled code is the same."""
-
-    def __init__(self, function: Callable[..., Array], model: eqx.Module, arrays: Any) -> None:
-        self.function, self.model, self.arrays = function, model, arrays
-        leaves, treedef = jax.tree.flatten(model)
-        self._key = (function, arrays, tuple(leaves), treedef)
-        self._hash = hash(self._key)
-
-    def __hash__(self) -> int:
-        return self._hash
-
-    def __eq__(self, other: object) -> bool:
-        return self is other or (isinstance(other, _StaticModel) and self._key == other._key)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _evaluate(static: _StaticModel, dynamic: list[Array], rows: tuple[Array, ...]) -> Array:
-    model = eqx.combine(jax.tree.unflatten(static.arrays, dynamic), static.model)
-    return jax.vmap(lambda *row: static.function(model, *row))(*rows)
-
-
-def use_compilation_cache() -> None:
-    """Store code compiled by JAX, in this process and its children, in a cache folder of the user.
-
-    Nothing happens if the folder is not writable, or if an environment variable already names a cache.
-    """
-    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
-        return
-    try:
-        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        folder = root / "fitact" / f"jax-{jax.__version__}-{platform.node()}"
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError):  # no home folder, or not writable
-        return
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # many small functions add up to a second
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
-    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+def _map_rows(function: Callable[..., Array], model: eqx.Module, *rows: Array) -> Array:
+    return jax.vmap(lambda *row: function(model, *row))(*rows)

@@ -38,6 +38,8 @@ def _registry() -> Any:
 def parse_quantity(value: object, unit: str) -> float:
     """Return a quantity such as ``"160 kohm"`` as a float in the SI unit `unit`; a bare number is in `unit`."""
     remedy = f"write a number with a unit, such as '1 {unit}'"
+    if isinstance(value, str) and (plain := _parse_plain_quantity(value, unit)) is not None:
+        value = plain
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise InputError(f"{value!r} is not a quantity; {remedy}")
     if isinstance(value, str):
@@ -52,6 +54,18 @@ def parse_quantity(value: object, unit: str) -> float:
     if not math.isfinite(value):
         raise InputError(f"{value} is not finite; {remedy}")
     return float(f"{value:.15g}")  # 200 um is 2e-4 m, not 1.9999999999999998e-4
+
+
+def _parse_plain_quantity(text: str, unit: str) -> float | None:
+    """Return a number with a prefix and exactly this `unit`, as most scenes have, without pint; else None."""
+    base, _, power = unit.partition("^")
+    match = (
+        re.fullmatch(r"([+-]?\d+(?:\.\d*)?(?:e[+-]?\d+)?) ?(\w?)" + re.escape(unit), text) if base.isalpha() else None
+    )
+    factors = PREFIX_FACTORS | {"c": 1e-2}
+    if match is None or match[2] not in factors:
+        return None
+    return float(match[1]) * factors[match[2]] ** int(power or 1)
 
 
 def format_exact(value: float, unit: str) -> str:

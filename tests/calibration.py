@@ -211,7 +211,7 @@ def collect(
         temporary.write_text("".join(json.dumps(row) + "\n" for row in [header, *rows.values()]))
     began = time.monotonic()
     with path.open("a") as file:
-        for done, row in enumerate(computed(missing, seed, workers, path.parent / "compiled", task), 1):
+        for done, row in enumerate(computed(missing, seed, workers, task), 1):
             rows[row["record"]] = row
             file.write(json.dumps(row) + "\n")
             file.flush()
@@ -222,12 +222,12 @@ def collect(
 
 
 def computed(
-    numbers: list[int], seed: int, workers: int, compiled: Path, task: Callable[[int, int], dict[str, Any]]
+    numbers: list[int], seed: int, workers: int, task: Callable[[int, int], dict[str, Any]]
 ) -> Iterator[dict[str, Any]]:
     """Yield the rows of the records in the order of completion."""
     each = RECYCLED * workers
     for first in range(0, len(numbers), each):
-        with pool(workers, compiled) as executor:
+        with pool(workers) as executor:
             futures = [executor.submit(task, number, seed) for number in numbers[first : first + each]]
             try:
                 yield from (future.result() for future in concurrent.futures.as_completed(futures))
@@ -242,12 +242,11 @@ def sources(script: str) -> str:
     return hashlib.sha256(b"".join(file.read_bytes() for file in [*files, Path(script)])).hexdigest()
 
 
-def pool(workers: int, compiled: Path) -> concurrent.futures.ProcessPoolExecutor:
-    """Return a pool of spawned single-threaded processes with a common compilation cache (`compiled` by default)."""
+def pool(workers: int) -> concurrent.futures.ProcessPoolExecutor:
+    """Return a pool of spawned single-threaded processes."""
     threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     threads["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-    cache = {"JAX_COMPILATION_CACHE_DIR": str(compiled), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1"}
-    os.environ.update(threads | {name: os.environ.get(name, value) for name, value in cache.items()})
+    os.environ.update(threads)
     return concurrent.futures.ProcessPoolExecutor(
         workers, multiprocessing.get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)
     )

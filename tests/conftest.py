@@ -15,6 +15,7 @@ import pytest
 import scipy.signal
 
 import fitact
+from fitact import compiled
 
 _MOST_MAPS = 35_000  # of the 65,530 memory maps that Linux grants a process by default
 _TESTS = itertools.count()
@@ -61,6 +62,7 @@ def _room_for_programs():
     maps = Path("/proc/self/maps")
     if next(_TESTS) % 20 == 0 and maps.exists() and maps.read_bytes().count(b"\n") > _MOST_MAPS:  # reading takes 10 ms
         jax.clear_caches()
+        compiled._find_program.cache_clear()
 
 
 RECORDS = Path(__file__).parents[1] / "data_synth" / "records"

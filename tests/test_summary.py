@@ -5,7 +5,7 @@ import scipy.stats
 
 import fitact
 from fitact import summary
-from fitact.fitting.levenberg_marquardt import RESULT_NAMES
+from fitact.fitting.minimum import RESULT_NAMES
 from fitact.summary import format_estimate, format_interval, quantity_table, summarize_normal
 from fitact.what_now import advice_sections, explain
 

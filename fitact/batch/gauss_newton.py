@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from fitact.batch.shared_basis import SharedBasis
+from fitact.compiled import jit
 from fitact.data.record import white_noise_sds
 from fitact.fitting import derived
 from fitact.fitting.derived import DerivedQuantities, log_derivatives
@@ -253,7 +253,7 @@ def _chunk_records(rows: Sequence[np.ndarray], size: int = 64) -> Iterator[np.nd
         yield np.concatenate(part).reshape(len(part), -1)  # faster than `np.stack`
 
 
-@eqx.filter_jit
+@jit
 def _find_optima(likelihood: Likelihood, settings: GaussNewton, clock: Array, *per_record: Array) -> GaussNewtonResult:
     return jax.vmap(functools.partial(_find_optimum, likelihood, settings, clock))(*per_record)
 
@@ -337,6 +337,6 @@ def _back_substitute(r_factor: Float[Array, "n n"], rhs: Float[Array, " n"]) -> 
     return solution
 
 
-@eqx.filter_jit
+@jit
 def _log_derived(derive: DerivedQuantities, theta: Array, sigma: Array) -> tuple[Array, Array]:
     return jax.vmap(lambda theta, sigma: log_derivatives(derive, theta, sigma[None]))(theta, sigma)

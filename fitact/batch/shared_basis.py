@@ -6,13 +6,12 @@ only once, so that a record costs one product with a matrix of some twenty colum
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitact.compiled import pad_samples
+from fitact.compiled import jit, pad_samples
 from fitact.likelihood.compression import (
     NODES,
     RANK_TOLERANCE,
@@ -130,7 +129,7 @@ def _basis_functions(drive: Drive, time: np.ndarray, nodes: Array, steady_state:
     return [np.asarray(values)[..., : time.size] for values in functions]
 
 
-@eqx.filter_jit
+@jit
 def _evaluate_basis_functions(
     drive: Drive, time: Array, step: Array, nodes: Array, steady_state: bool
 ) -> tuple[Array, Array, Array]:

@@ -7,10 +7,9 @@ import typer
 
 import fitact
 from fitact import report
-from fitact.cli import internal
 from fitact.cli.app import app
 from fitact.cli.options import Channels, CommonScene, Json, Scales, Seed, column_options, load_scene
-from fitact.cli.terminal import command_line, show
+from fitact.cli.terminal import announce, command_line, show
 
 
 @app.command()
@@ -43,8 +42,8 @@ def campaign(
     Writes results.parquet, failures.csv and index.html into DIR. After an interruption, run the same command again:
     finished records are kept. Exit status 0 means that every record has a result or a reason for its failure.
     """
+    announce("fitting", records)
     loaded = load_scene(scene)
-    internal.use_compilation_cache()
     fits = fitact.run_campaign(
         records, out, loaded, **column_options((channel, scale)),
         scheduler=scheduler, workers=workers, memory=memory, posteriors=posteriors,

@@ -10,7 +10,7 @@ from fitact import report
 from fitact.cli import internal
 from fitact.cli.app import app
 from fitact.cli.options import Channels, Json, LazyRecords, Out, Scales, Seed
-from fitact.cli.terminal import command_line, show
+from fitact.cli.terminal import announce, command_line, show
 
 design = typer.Typer(
     name="design",
@@ -36,9 +36,9 @@ def measurement(
 
     Writes report.html, design.json and design.svg into DIR.
     """
+    announce("ranking measurements for", [scene])
     stated = fitact.Scene.load(scene)
     measured = list(LazyRecords(record, stated, (channel, scale)))  # refuses bad records before the slow imports
-    internal.use_compilation_cache()
     options = fitact.design_measurement(stated, measured)
     if out is not None:
         report.write_folder(out, options, command_line(), stated, measured)
@@ -66,9 +66,9 @@ def drive(
     The threshold and your limits are stated in the scene. Writes report.html, drive.json and drive.svg into DIR; with
     records also chain.h5, from which an interrupted run resumes.
     """
+    announce("designing a drive for", [scene])
     stated = fitact.Scene.load(scene)
     measured = LazyRecords(records, stated, (channel, scale))
-    internal.use_compilation_cache()
     internal.require_designable(stated, share)  # refuses before the population is sampled
     people = fitact.population(measured, stated, folder=out, seed=seed) if measured else None
     options = fitact.design_drive(stated, people, share, seed=seed)

@@ -6,7 +6,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     "fitact",
     submodules={"summary"},
     submod_attrs={
-        "compiled": ["use_compilation_cache"],
         "data.readers.read": ["write_csv"],
         "data.simulate": ["simulate"],
         "data.spectrum": ["is_spectrum"],

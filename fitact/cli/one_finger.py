@@ -10,7 +10,7 @@ from fitact import report as reporting
 from fitact import what_now
 from fitact.cli import internal, options
 from fitact.cli.app import app
-from fitact.cli.terminal import command_line, print_stderr, show
+from fitact.cli.terminal import announce, command_line, print_stderr, show
 from fitact.files import write_json
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ def run(
     Writes fit.json, summary.json, posterior.nc (for ArviZ), chain.h5 (to resume sampling) and report.html into DIR.
     Several records are fitted jointly.
     """
+    announce("reading", records)
     folder = out or Path(f"{records[0].name.removesuffix('.gz').removesuffix('.csv')}-fitact")
     planned = _fit_records(records, scene, (channel, scale), model, tolerance)
     print_stderr(planned.sentence)
@@ -86,9 +87,9 @@ def fit(
     With --out, writes fit.json into DIR. Several records are fitted jointly.
     """
     fitted: fitact.SpectrumFit | fitact.Fit
+    announce("reading", records)
     if len(records) == 1 and internal.is_spectrum(records[0]):
         loaded, spectrum = options.load_scene(scene[0] if scene else None), fitact.read_spectrum(records[0])
-        internal.use_compilation_cache()
         fitted = fitact.fit_spectrum(spectrum, loaded)
         text, content = str(fitted), fitted.to_dict()
     else:
@@ -160,7 +161,6 @@ def _fit_records(
     column_kwargs = options.column_options(columns)
     # invalid files are refused before the slow imports
     measured = [fitact.read(path, scene, **column_kwargs) for path, scene in zip(records, paired, strict=True)]
-    internal.use_compilation_cache()
     for path, record in zip(records, measured, strict=True):
         print_stderr(f"fitting {path} ({len(record):,} samples)")
     return internal.fit_planned(measured, loaded, model, starts=starts, tolerance=tolerance)

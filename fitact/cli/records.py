@@ -9,7 +9,7 @@ import fitact
 from fitact import report
 from fitact.cli import internal, options
 from fitact.cli.app import app
-from fitact.cli.terminal import command_line, print_stderr, show
+from fitact.cli.terminal import announce, command_line, print_stderr, show
 from fitact.files import write_json
 
 
@@ -44,12 +44,12 @@ def compare(
     json: options.Json = False,
 ) -> None:
     """Fit the full model of each scene to the same records, and report which model predicts the data best."""
+    announce("fitting", records)
     same_stems = len({path.stem for path in scenes}) < len(scenes)
     models = {str(path) if same_stems else path.stem: fitact.Scene.load(path) for path in scenes}
     for model in models.values():
         model.require_available(fit=True)
     measured = list(options.LazyRecords(records, next(iter(models.values())), (channel, scale)))
-    internal.use_compilation_cache()
     comparison = fitact.compare(measured, models)
     show(str(comparison), comparison.to_dict(), json, comparison.trusted)
 
@@ -80,9 +80,9 @@ def population(
     With --out, writes report.html, population.json, population.nc (the draws), population.svg and chain.h5 (to resume
     sampling) into DIR.
     """
+    announce("fitting", records)
     loaded = options.load_scene(scene)
     covariate_values = {} if covariates is None else internal.read_covariates(covariates, records)
-    internal.use_compilation_cache()
     if fresh and out is not None:
         internal.delete_chains(out)
     fitted = fitact.population(
@@ -115,6 +115,7 @@ def tradeoff(
 
     Takes one or two minutes. With --out, writes report.html, tradeoff.json and tradeoff.svg into DIR.
     """
+    announce("measuring", [record or scene or "the nominal scene"])
     loaded = options.load_scene(scene)
     measured = None if record is None else fitact.read(record, loaded, **options.column_options((channel, scale)))
     try:

@@ -10,7 +10,7 @@ from fitact import report
 from fitact.cli import internal
 from fitact.cli.app import app
 from fitact.cli.options import Channels, Json, Out, Scales, SceneFile, Seed, column_options
-from fitact.cli.terminal import command_line, show
+from fitact.cli.terminal import announce, command_line, show
 
 
 @app.command()
@@ -40,7 +40,7 @@ def prior(
 ) -> None:
     """Predict Vsc and the force from the prior of a scene alone, before any data."""
     loaded = fitact.Scene.load(scene)
-    internal.use_compilation_cache()
+    announce("drawing from the prior of", [scene])
     predicted = internal.prior_predictive(loaded, draws, seed)
     if out is not None:
         report.write_prior(out, predicted)
@@ -64,9 +64,9 @@ def plan(
     Lists the error and the speed-up of each simplification. With --out, writes report.html, plan.json and plan.svg into
     DIR.
     """
+    announce("planning for", [scene])
     loaded = fitact.Scene.load(scene)
     measured = None if record is None else fitact.read(record, loaded, **column_options((channel, scale)))
-    internal.use_compilation_cache()
     planned = fitact.plan(loaded) if measured is None else internal.plan_for_record(measured, loaded)
     if out is not None:
         report.write_folder(out, planned, command_line(), loaded, [measured] if measured else [])
@@ -98,7 +98,7 @@ def reproduce(
 
     Writes reproduction.json and reproduction.html into DIR.
     """
-    internal.use_compilation_cache()
+    announce("computing the claims of", ["the reference paper"])
     claims = internal.reproduce()
     page = report.write_reproduction(out, claims)
     lines = [f"{claim.verdict:8} {claim.id:24} {claim.claim}" for claim in claims]

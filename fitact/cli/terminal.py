@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import typer
@@ -24,4 +25,13 @@ def show(text: str, content: dict[str, Any], as_json: bool, trusted: bool = True
 
 
 def print_stderr(text: str) -> None:
-    print(text, file=sys.stderr)
+    print(text, file=sys.stderr, flush=True)
+
+
+def announce(action: str, paths: Sequence[object]) -> None:
+    """Tell a person at a terminal at once what a command does; the imports that follow take a second.
+
+    Elsewhere nothing is printed, because programs read a refusal as the only line.
+    """
+    if sys.stderr.isatty():
+        print_stderr(f"{action} {paths[0]}" + f" and {len(paths) - 1} more" * (len(paths) > 1))

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitact.compiled import jit
 from fitact.design.drive_design import DriveDesign
 from fitact.design.drive_option import DriveOption, normalize_drive
 from fitact.design.drive_people import FingerSample
@@ -121,7 +122,7 @@ class _DriveEvaluator:
             return PeriodQuantities(*(np.asarray(x).reshape(*self.people.shape, *x.shape[1:]) for x in quantities))
 
 
-@eqx.filter_jit
+@jit
 def _map_fingers(
     template: RC, geometry: Geometry, drive: Periodic, values: dict[str, Float[Array, " fingers"]]
 ) -> PeriodQuantities:

@@ -9,13 +9,13 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
+from fitact.compiled import as_arrays, jit
 from fitact.errors import InputError
 from fitact.model.circuit import Channel, Circuit
 from fitact.model.skin import circuit_parameters, constant_skin_circuit, with_values
@@ -74,8 +74,7 @@ def blind_directions(
     offsets = spread * np.random.default_rng(0).uniform(-1.0, 1.0, (points, len(free)))  # any other points would serve
     thetas = log_values(circuit, free, channels) + np.vstack([np.zeros(len(free)), offsets])
     with jax.enable_x64(True):
-        circuit = jax.tree.map(jnp.asarray, circuit)
-        slopes = np.asarray(_log_gain_slopes(circuit, jnp.asarray(thetas), free, channels))
+        slopes = _log_gain_slopes(as_arrays(circuit), thetas, free, channels)
     null_spaces = [_null_space(np.concatenate([slope.real, slope.imag])) for slope in slopes]
     dimension = min(len(directions) for directions in null_spaces)
     generic = [directions for directions in null_spaces if len(directions) == dimension]
@@ -133,7 +132,7 @@ def _area_power(name: str) -> float:
     return 1.0 if name == "Ci" or name.endswith(("Csc", "capacitance", "Cgap")) else -1.0
 
 
-@eqx.filter_jit
+@jit
 def _log_gain_slopes(
     circuit: Circuit,
     thetas: Float[Array, "n parameters"],

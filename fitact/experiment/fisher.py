@@ -7,16 +7,16 @@ offset, drift, delay or initial charge is taken to be unknown.
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.constants
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from fitact.compiled import as_arrays, jit
 from fitact.experiment.blind_directions import log_values, with_parameters
 from fitact.model.circuit import Channel, Circuit
 from fitact.model.drive import Drive, Periodic, Sampled
@@ -51,9 +51,9 @@ def force_gradient(experiment: Experiment) -> Float[np.ndarray, " circuit_parame
     with jax.enable_x64(True):
         sampling, model = _sampling(experiment), _Model.from_experiment(experiment, experiment.free)
         ((voltage, slope),) = _derivatives(model, sampling, slice(-1, None))
-        constant = _force_constant_slope(model, jax.tree.map(jnp.asarray, experiment.geometry))
+        constant = _force_constant_slope(model, as_arrays(experiment.geometry))
     weight = sampling.force_weight * voltage
-    return np.asarray(constant) + 2.0 * (weight @ slope) / (weight @ voltage)
+    return constant + 2.0 * (weight @ slope) / (weight @ voltage)
 
 
 def jacobian(experiment: Experiment, settings: Sequence[str] = ()) -> Float[np.ndarray, "1+settings rows parameters"]:
@@ -111,9 +111,9 @@ class _Model(eqx.Module):
     def from_experiment(cls, e: Experiment, names: tuple[str, ...]) -> "_Model":
         fields = [name for name in names if name != FREQUENCY]
         theta = np.append(log_values(e.circuit, fields, e.channels), np.zeros(len(names) - len(fields)))
-        circuit = jax.tree.map(jnp.asarray, e.circuit)  # plain numbers would become constants of the compiled program
+        circuit = as_arrays(e.circuit)  # plain numbers would become constants of the compiled program
         channels: tuple[Channel, ...] = (*e.channels, "Vsc" if e.geometry.model == "paper" else "Vgap")
-        return cls(circuit, jnp.asarray(theta), names, channels, e.ties)
+        return cls(circuit, theta, names, channels, e.ties)
 
     def circuit_and_gains(self, theta: Array) -> tuple[Circuit, list[ArrayLike]]:
         """Return the circuit and the gain of each channel at `theta`."""
@@ -126,11 +126,11 @@ class _Model(eqx.Module):
 def _derivatives(model: _Model, sampling: "_Sampling", selection: slice, order: int = 1) -> list[list[np.ndarray]]:
     """Return the signal of each channel in `selection`, and its derivatives in the parameters up to `order`."""
     if has_time_constants(model.circuit):
-        terms = jax.tree.map(np.asarray, _term_derivatives(model, order))
+        terms = _term_derivatives(model, order)
         return [_signal_derivatives(orders, sampling) for orders in terms[selection]]
-    times = jnp.asarray(sampling.time), jnp.asarray(sampling.slope)
+    times = sampling.time, sampling.slope
     values, slopes = _predicted_signals(model, sampling.drive, *times, sampling.steady_state)
-    return [[np.asarray(value), np.asarray(slope)] for value, slope in zip(values, slopes, strict=True)][selection]
+    return [list(pair) for pair in zip(values, slopes, strict=True)][selection]
 
 
 class _LogTauTerms(NamedTuple):
@@ -141,7 +141,7 @@ class _LogTauTerms(NamedTuple):
     rate: Array
 
 
-@eqx.filter_jit
+@jit
 def _term_derivatives(model: _Model, order: int) -> tuple[tuple[_LogTauTerms, ...], ...]:
     """Return each channel's terms and their derivatives."""
 
@@ -163,7 +163,7 @@ def _term_derivatives(model: _Model, order: int) -> tuple[tuple[_LogTauTerms, ..
     return tuple(zip(*orders, strict=True))
 
 
-@eqx.filter_jit
+@jit
 def _force_constant_slope(model: _Model, geometry: Geometry) -> Float[Array, " parameters"]:
     """Return the gradient of log(force / voltage^2) in the parameters."""
 
@@ -190,11 +190,11 @@ def _sampling(e: Experiment, max_samples: int = 4096, period_times: int = 1024, 
 
     A step of V above `edge_ratio` times the mean step is an edge; the largest step of a sine is 1.6 times the mean.
     """
-    drive, time = _pad_drive(e.drive, np.asarray(e.time, dtype=float))
-    drive = jax.tree.map(jnp.asarray, drive)
+    padded, time = _pad_drive(e.drive, np.asarray(e.time, dtype=float))
+    drive: Any = as_arrays(padded)
     k, used = np.arange(max_samples), min(time.size, max_samples)
     # the golden ratio spreads the chosen samples evenly and out of step with any period
-    spread = (time.size * ((scipy.constants.golden - 1.0) * k % 1.0)).astype(int)
+    spread = (time.size * (0.5 * (math.sqrt(5.0) - 1.0) * k % 1.0)).astype(int)
     chosen = np.minimum(k, used - 1) if used < max_samples else spread
     represented = np.where(k < used, math.sqrt(e.records * np.size(e.time) / used), 0.0)
     periodic = e.steady_state and isinstance(drive, Periodic)
@@ -204,7 +204,7 @@ def _sampling(e: Experiment, max_samples: int = 4096, period_times: int = 1024, 
     # two samples on either side of an edge carry no information on a current that follows dV/dt; the quarter step keeps
     # rounding from deciding where edges coincide with samples
     around = time[chosen][:, None] + (np.arange(-2, 3) + 0.25) * float(np.median(np.diff(time)))
-    voltage, slope = map(np.asarray, _evaluate_drive(drive, jnp.asarray(around), jnp.asarray(times), e.steady_state))
+    voltage, slope = _evaluate_drive(drive, around, times, e.steady_state)
     step = np.abs(np.diff(voltage, axis=1))
     off_edge = step.max(axis=1) <= edge_ratio * step[:used].mean()
     outside = np.zeros(period_times)
@@ -212,8 +212,7 @@ def _sampling(e: Experiment, max_samples: int = 4096, period_times: int = 1024, 
         drive,
         e.steady_state,
         times,
-        # the slope of a measured drive is mostly noise, so a signal that follows it counts as uninformative
-        np.zeros(times.size) if isinstance(drive, Sampled) else np.nan_to_num(slope),
+        slope,
         sample_weight=np.append(represented, outside),
         off_edge_weight=np.append(off_edge * represented, outside),
         force_weight=np.append(np.zeros(max_samples), 1.0 + outside) if periodic else np.append(k < used, outside),
@@ -231,12 +230,15 @@ def _pad_drive(drive: Drive, time: np.ndarray, samples: int = 8192) -> tuple[Dri
     return Sampled(np.append(knots, after), np.pad(voltage, (0, missing), mode="edge")), time[time <= knots[-1]]
 
 
-@eqx.filter_jit
+@jit
 def _evaluate_drive(drive: Drive, around: Array, time: Array, steady_state: bool) -> tuple[Array, Array]:
-    return drive.value(around), drive.slope(time, steady_state=steady_state)
+    """Return the drive at the times `around`, and its slope at `time`, 0 at jumps."""
+    if isinstance(drive, Sampled):  # its slope is mostly noise, so a signal that follows it counts as uninformative
+        return drive.value(around), jnp.zeros_like(time)
+    return drive.value(around), jnp.nan_to_num(drive.slope(time, steady_state=steady_state))
 
 
-@eqx.filter_jit
+@jit
 def _highpass_derivatives(
     drive: Drive, time: Array, log_tau: Array, steady_state: bool, order: int
 ) -> tuple[Array, ...]:
@@ -255,7 +257,7 @@ def _highpass_derivatives(
     return (*values, slopes[1])
 
 
-@eqx.filter_jit
+@jit
 def _predicted_signals(
     model: _Model, drive: Drive, time: Array, drive_slope: Array, steady_state: bool
 ) -> tuple[list[Array], list[Array]]:
@@ -276,12 +278,12 @@ def _signal_derivatives(terms: Sequence[_LogTauTerms], sampling: _Sampling) -> l
 
     The sum runs term by term, because one compiled function for all takes ten times as long to compile.
     """
-    time, signals = jnp.asarray(sampling.time), [np.multiply.outer(sampling.slope, order.rate) for order in terms]
+    signals = [np.multiply.outer(sampling.slope, order.rate) for order in terms]
     for k, (weight, log_tau) in enumerate(zip(terms[0].weight, terms[0].log_tau, strict=True)):
         derivatives = _highpass_derivatives(
-            sampling.drive, time, jnp.asarray(log_tau), sampling.steady_state, len(terms) - 1
+            sampling.drive, sampling.time, log_tau, sampling.steady_state, len(terms) - 1
         )
-        u, du, *ddu = map(np.asarray, derivatives)
+        u, du, *ddu = derivatives
         w, tau = terms[1].weight[k], terms[1].log_tau[k]
         signals[0] += weight * u
         signals[1] += np.outer(u, w) + np.outer(weight * du, tau)

@@ -3,21 +3,20 @@
 import dataclasses
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitact.compiled import jit
 from fitact.data.record import Record
 from fitact.fitting.criteria import criteria, gaussian_log_likelihood, student_log_likelihood
 from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.problem import Source
 from fitact.fitting.residual_statistics import channel_statistics, outliers
 from fitact.likelihood.channel import LINEAR_NUISANCES, ChannelInputs, ChannelLikelihood
-from fitact.likelihood.likelihood import Likelihood
+from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import student_weight
 from fitact.model.circuit import Circuit
-from fitact.model.skin import WithSkin
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,13 +37,20 @@ class ChannelFit:
 
     @classmethod
     def from_optimum(
-        cls, likelihood: Likelihood, index: int, theta: np.ndarray, sigma: float, source: Source, reason: str
+        cls,
+        likelihood: Likelihood,
+        index: int,
+        theta: np.ndarray,
+        sigma: float,
+        optimum: CircuitValues,
+        source: Source,
+        reason: str,
     ) -> "ChannelFit":
-        """Return the result for channel `index` at the optimum `theta` with noise `sigma`."""
+        """Return the result for channel `index` at theta, where the circuit is `optimum`, with noise `sigma`."""
         channel = likelihood.channels[index].without_compression()
-        inputs = likelihood.channel_inputs(jnp.asarray(theta), index)
+        inputs = likelihood.make_inputs(optimum.circuit, theta, channel)
         # the noise is passed as an array, because jit would compile again for every new number
-        residuals, white, beta = (np.asarray(x) for x in _sample_residuals(channel, inputs, jnp.asarray(sigma)))
+        residuals, white, beta = _sample_residuals(channel, inputs, np.asarray(sigma))
         unpadded = slice(channel.n_samples)
         residuals, weight = residuals[unpadded], None if channel.equally_weighted else channel.weights[unpadded]
         names = [channel.qualified_name(LINEAR_NUISANCES[column]) for column in channel.columns]
@@ -52,7 +58,7 @@ class ChannelFit:
         counted = (channel.weights if channel.whitening is None else np.asarray(channel.whitening.mask))[unpadded] > 0.0
         white = white[unpadded][counted]
         n_fitted = theta.size * white.size / float(likelihood.count) + len(linear)
-        gain = _gain(inputs.circuit, channel)
+        gain = _gain(optimum, channel)
         noise = sigma if channel.noise == "ar1" else source.noise  # AR(1) noise is estimated only from the residuals
         time = source.record.time[counted]
         figures = channel_statistics(white, time, noise, n_fitted, gain, source.record, channel.channel, source.choice)
@@ -80,11 +86,14 @@ class ChannelFit:
         )
 
 
-def _gain(circuit: Circuit, channel: ChannelLikelihood) -> float:
+def _gain(optimum: CircuitValues, channel: ChannelLikelihood) -> float:
     """Return the factor by which noise of a measured drive enters the channel."""
-    if isinstance(circuit, WithSkin):  # the gain falls with frequency, and most of the noise is fast
-        return float(jnp.abs(circuit.channel_gain(channel.channel, 1.0 / channel.time_step)))
-    return abs(sum(float(w) for w in circuit.channel_terms(channel.channel).weight))
+    if not optimum.terms:  # the gain falls with frequency, and most of the noise is fast
+        return float(np.abs(_channel_gain(optimum.circuit, channel.channel, 1.0 / channel.time_step)))
+    return abs(float(np.sum(optimum.terms[channel.channel].weight)))
+
+
+_channel_gain = jit(Circuit.channel_gain)
 
 
 def _log_likelihood(
@@ -101,7 +110,7 @@ def _log_likelihood(
     return gaussian_log_likelihood(innovations, None) + float(np.sum(np.log(channel.weights[used])))
 
 
-@eqx.filter_jit
+@jit
 def _sample_residuals(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: Array) -> tuple[Array, Array, Array]:
     """Return the residuals, the whitened residuals, and the linear nuisances in units of their prior sd."""
     _, beta, _ = channel.fit_nuisances(inputs, sigma)

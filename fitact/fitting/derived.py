@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,7 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from fitact.compiled import BatchEvaluator, as_arrays, pad_samples, pad_weight
+from fitact.compiled import BatchEvaluator, as_arrays, jit, pad_samples, pad_weight
 from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.fitting.drive_choice import DriveModel, has_ideal_edges, whole_periods
@@ -93,17 +94,17 @@ class DerivedQuantities(eqx.Module):
         self, theta: Float[np.ndarray, " parameters"], sigma: Float[np.ndarray, " channels"]
     ) -> tuple[Float[np.ndarray, " derived"], Float[np.ndarray, "derived parameters"]]:
         """Return the logarithms of the quantities of `DERIVED_NAMES`, and their gradients in theta."""
-        with jax.enable_x64(True):
-            values, gradient = log_derivatives(self, jnp.asarray(theta), jnp.asarray(sigma))
-            return np.asarray(values), np.asarray(gradient)
+        return log_derivatives(self, theta, sigma)
 
 
-@eqx.filter_jit
+@jit
 def log_derivatives(derive: DerivedQuantities, theta: Array, sigma: Array) -> tuple[Array, Array]:
-    def logs(theta: Array) -> Array:
-        return jnp.log(derive(theta, sigma))
+    def logs(theta: Array) -> tuple[Array, Array]:
+        logs = jnp.log(derive(theta, sigma))
+        return logs, logs
 
-    return logs(theta), jax.jacfwd(logs)(theta)
+    gradient, values = jax.jacfwd(logs, has_aux=True)(theta)
+    return values, gradient
 
 
 def draw_derived(
@@ -151,10 +152,17 @@ def derived_from_fit(
     return DerivedQuantities(likelihood.without_samples(), drive, *_settings(scene, grid), steady_state, charge)
 
 
-def _settings(scene: Scene, grid: tuple[np.ndarray, np.ndarray]) -> tuple[Array, Array, Geometry, float, float]:
+def _settings(scene: Scene, grid: tuple[np.ndarray, np.ndarray]) -> tuple[Any, Any, Geometry, Any, Any]:
     """Return the times of the force with their weights, and the geometry and friction of the scene."""
-    time, weight = jnp.asarray(grid[0]), jnp.asarray(grid[1] / grid[1].sum())
-    return time, weight, scene.geometry(), scene.friction.coefficient, scene.friction.normal_force
+    time, weight = grid[0], grid[1] / grid[1].sum()
+    friction = scene.friction
+    return (
+        time,
+        weight,
+        as_arrays(scene.geometry()),
+        np.asarray(friction.coefficient),
+        np.asarray(friction.normal_force),
+    )
 
 
 def _last_periods(

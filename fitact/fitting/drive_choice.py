@@ -1,16 +1,16 @@
 """Choice of the drive of a fit (recorded V or the scene's waveform), its frequency and its time shift."""
 
 import dataclasses
+import functools
 import math
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from fitact.compiled import as_arrays, pad_samples, to_device
+from fitact.compiled import as_arrays, jit, pad_samples
 from fitact.data.record import Record, resample_uniform
 from fitact.errors import InputError
 from fitact.model.chirp import Chirp
@@ -105,7 +105,7 @@ def _measured_drive(record: Record, steady_state: bool | None, notes: tuple[str,
             " one interval (a free gain accounts for it); record faster, or state the waveform in a scene",
         )
     if not steady_state:
-        drive = Sampled(to_device(pad_samples(record.time)), to_device(pad_samples(voltage)))
+        drive = Sampled(pad_samples(record.time), pad_samples(voltage))
         return DriveModel(drive, voltage, False, steady_state is None, 0.0, "measured", notes, warnings)
     n_samples, period = whole_periods(record)
     if period is None:
@@ -235,13 +235,13 @@ def _voltage(drive: Drive, time: np.ndarray, steady_state: bool) -> np.ndarray:
     return np.asarray(_value(drive, pad_samples(time), steady_state))[: time.size]
 
 
-@eqx.filter_jit
+@jit
 def _value(drive: Drive, time: ArrayLike, steady_state: bool) -> Array:
     voltage = drive.value(time)
     return voltage if steady_state else jnp.where(time < 0.0, 0.0, voltage)
 
 
-@eqx.filter_jit
+@functools.partial(jit, fast=True)
 def _shifted_voltages(drive: Drive, time: Array, shifts: Array, steady_state: bool) -> Float[Array, "shifts times"]:
     return jax.vmap(lambda shift: _value(drive, time - shift, steady_state))(shifts)
 
@@ -255,17 +255,17 @@ def unit_response(choice: DriveModel, time: np.ndarray, tau: float) -> Float[np.
     """Return the drive filtered by a high-pass of time constant `tau` (s), at the times of the record, V."""
     # tau is passed as an array, because jit would compile again for every new number
     voltage = _highpass(
-        choice.drive, pad_samples(time - choice.shift), jnp.asarray(tau), steady_state=choice.steady_state
+        choice.drive, pad_samples(time - choice.shift), np.asarray(tau), steady_state=choice.steady_state
     )
-    return np.asarray(voltage)[: time.size]
+    return voltage[: time.size]
 
 
-@eqx.filter_jit
+@jit
 def _slope(drive: Drive, time: ArrayLike, steady_state: bool) -> Array:
     return drive.slope(time, steady_state=steady_state)
 
 
-_highpass = eqx.filter_jit(highpass)
+_highpass = jit(highpass)
 
 
 def _align(

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -21,7 +20,7 @@ from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.identifiability import assess_identifiability
 from fitact.fitting.laplace import FitResult, Laplace
 from fitact.fitting.least_squares import LeastSquaresResult, solve
-from fitact.fitting.levenberg_marquardt import Optima
+from fitact.fitting.minimum import Optima
 from fitact.fitting.multistart import choose_start, find_optima, lower_optimum
 from fitact.fitting.problem import Problem, build_problem
 from fitact.fitting.profile import PROFILE_QUANTITIES, Interval, profile_intervals
@@ -274,8 +273,7 @@ def _solve_problem(
     while True:
         solved = solve(likelihood, theta_0, noise, freeable)
         root = covariance_factor(np.concatenate(solved.jacobian), solved.likelihood.prior_factor)
-        theta, sigma = np.asarray(solved.theta), np.asarray(solved.sigma)
-        certified = certificate.certify(solved.likelihood, reasons, theta, root, sigma, tolerance)
+        certified = certificate.certify(solved.likelihood, reasons, solved.theta, root, solved.sigma, tolerance)
         pairs = zip(solved.likelihood.channels, certified.reasons, strict=True)
         failed = [bool(reason) and channel.compression is not None for channel, reason in pairs]
         if not any(failed):
@@ -293,16 +291,16 @@ def _assemble_fit(
     optima: Optima | None,
     without_scene: bool,
 ) -> Fit:
-    likelihood, theta, sigma = certified.likelihood, np.asarray(solution.theta), np.asarray(solution.sigma)
+    likelihood, theta, sigma = certified.likelihood, solution.theta, solution.sigma
     first = problem.sources[0]
-    b = float(likelihood.circuit(jnp.asarray(theta)).b)
-    derive = derived.derived_from_fit(likelihood, first.record, first.choice, first.scene, b)
+    optimum = likelihood.evaluate_circuits(theta[None]).row(0)
+    derive = derived.derived_from_fit(likelihood, first.record, first.choice, first.scene, float(optimum.b))
     laplace = Laplace(theta, root, sigma, likelihood, derive, derive.log_value_and_grad(theta, sigma))
     traces = tuple(
-        ChannelFit.from_optimum(likelihood, i, theta, float(sigma[i]), source, certified.reasons[i])
+        ChannelFit.from_optimum(likelihood, i, theta, float(sigma[i]), optimum, source, certified.reasons[i])
         for i, source in enumerate(problem.sources)
     )
-    figures = pooled_statistics([channel.figures for channel in traces]) | {"steps": int(solution.steps)}
+    figures = pooled_statistics([channel.figures for channel in traces]) | {"steps": solution.steps}
     figures |= information_criteria(theta.size, traces)
     if optima is not None:
         figures |= {"optima": len(optima.start_counts), "starts_failed": optima.n_failed}
@@ -320,11 +318,11 @@ def _assemble_fit(
     assumed = remarks.describe_assumed_Ci(None if without_scene else first.scene, likelihood, laplace.prior_sets_Ci)
     warnings += assumed.warnings
     notes += assumed.notes
-    experiment = problem.experiment(likelihood, theta, sigma)
+    experiment = problem.experiment(likelihood, optimum.circuit, sigma)
     gradient = laplace.log_gradient("force_mean")
     return Fit(
         laplace,
-        result=diagnose_fit(solution, root, traces, problem.sources, optima),
+        result=diagnose_fit(solution, likelihood, root, traces, problem.sources, optima),
         figures=figures,
         identifiability=assess_identifiability(likelihood.names, root, likelihood.prior_factor, gradient, experiment),
         scene=first.scene,

@@ -4,7 +4,6 @@ import dataclasses
 import math
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,12 +11,13 @@ import scipy.optimize
 from jaxtyping import Array, Complex, Float
 
 from fitact import summary
+from fitact.compiled import jit
 from fitact.data.spectrum import Spectrum
 from fitact.experiment.fisher import covariance_factor
 from fitact.fitting import derived
 from fitact.fitting.identifiability import assess_parameters
 from fitact.fitting.laplace import FitResult, Laplace
-from fitact.fitting.levenberg_marquardt import Minimum, minimise, result_name
+from fitact.fitting.minimum import Minimum, minimise, result_name
 from fitact.fitting.problem import likelihood_without_channels
 from fitact.fitting.remarks import describe_assumed_Ci
 from fitact.likelihood.likelihood import Likelihood
@@ -169,7 +169,7 @@ def _start(
     return theta
 
 
-@eqx.filter_jit
+@jit
 def _solve_round(
     likelihood: Likelihood, omega: Array, log_z: Array, noise: Array, start: Array
 ) -> tuple[Minimum, Complex[Array, " points"], Array]:

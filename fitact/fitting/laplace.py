@@ -12,7 +12,7 @@ from jaxtyping import Float
 from fitact import summary
 from fitact.fitting import derived
 from fitact.fitting.identifiability import MIN_PRIOR_FRACTION, Identifiability, prior_variance_fraction
-from fitact.fitting.levenberg_marquardt import result_message
+from fitact.fitting.minimum import result_message
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.force import ForceModel
 from fitact.model.skin import constant_skin_circuit

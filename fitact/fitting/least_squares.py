@@ -2,9 +2,8 @@
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +11,8 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from fitact.fitting.levenberg_marquardt import minimise
+from fitact.compiled import jit
+from fitact.fitting.minimum import minimise, result_name
 from fitact.fitting.timing import clock_r_squared, free_timing, orthonormal_basis
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
@@ -23,41 +23,56 @@ NUISANCES = {"offset": (0,), "drift": (1,), "hum_50Hz": (2, 3), "hum_60Hz": (4, 
 MIN_BIC_DECREASE = 10.0  # least decrease of the BIC for which a nuisance is added as a free parameter
 
 
-class LeastSquaresResult(eqx.Module):
+@dataclasses.dataclass(frozen=True)
+class LeastSquaresResult:
     """End point of a fit. The rows of a channel are its samples, or their coordinates if it is compressed."""
 
     likelihood: Likelihood  # likelihood with the selected nuisances
-    theta: Float[Array, " parameters"]  # the optimum
-    sigma: Float[Array, " channels"]  # noise sd of each channel, from its residuals
-    result: Any  # member of `RESULTS`
-    steps: Array  # total number of trial steps
-    jacobian: tuple[Float[Array, "rows parameters"], ...]  # Jacobian of the whitened residuals
+    theta: Float[np.ndarray, " parameters"]  # the optimum
+    sigma: Float[np.ndarray, " channels"]  # noise sd of each channel, from its residuals
+    result: str  # name of a member of `RESULTS`
+    steps: int  # total number of trial steps
+    jacobian: tuple[Float[np.ndarray, "rows parameters"], ...]  # Jacobian of the whitened residuals
     # under Student's t, the residuals, the shapes, the slopes and the Jacobian are reweighted
-    residuals: tuple[Float[Array, " rows"], ...]
-    shapes: tuple[Float[Array, "columns rows"], ...]  # regressors of the linear nuisances
-    slope: tuple[Float[Array, " rows"], ...]  # derivative of the signal with respect to the delay
+    residuals: tuple[Float[np.ndarray, " rows"], ...]
+    shapes: tuple[Float[np.ndarray, "columns rows"], ...]  # regressors of the linear nuisances
+    slope: tuple[Float[np.ndarray, " rows"], ...]  # derivative of the signal with respect to the delay
+
+
+class _Round(NamedTuple):
+    """End of a round; the fields are those of `LeastSquaresResult`."""
+
+    theta: Array
+    sigma: Array
+    result: Array  # index in `RESULT_NAMES`
+    steps: Array
+    jacobian: tuple[Array, ...]
+    residuals: tuple[Array, ...]
+    shapes: tuple[Array, ...]
+    slope: tuple[Array, ...]
 
 
 def least_squares(
-    likelihood: Likelihood, start: Array, noise: Array, noise_tolerance: float = 0.01, max_rounds: int = 6
+    likelihood: Likelihood, start: np.ndarray, noise: np.ndarray, noise_tolerance: float = 0.01, max_rounds: int = 6
 ) -> LeastSquaresResult:
     """Fit in rounds, first with the given noise, then with that of the residuals, until the noise has converged.
 
     It has converged when its relative change is below `noise_tolerance`; further rounds do not change the result.
     """
-    reduced, steps = likelihood.without_samples(), jnp.zeros((), dtype=int)
+    reduced, steps = likelihood.without_samples(), 0
     theta, sigma = start, noise
     for _ in range(max_rounds):
         solved = _solve_round(reduced, theta, sigma)
-        change = float(jnp.max(jnp.abs(solved.sigma / sigma - 1.0)))
-        theta, sigma, steps = solved.theta, solved.sigma, steps + solved.steps
+        change = np.max(np.abs(solved.sigma / sigma - 1.0))
+        theta, sigma, steps = solved.theta, solved.sigma, steps + int(solved.steps)
         if not change > noise_tolerance:
             break
-    return dataclasses.replace(solved, likelihood=likelihood, steps=steps)
+    end = solved._asdict() | {"steps": steps, "result": result_name(solved.result)}
+    return LeastSquaresResult(likelihood, **end)
 
 
-@eqx.filter_jit
-def _solve_round(likelihood: Likelihood, start: Array, sigma: Array) -> LeastSquaresResult:
+@jit
+def _solve_round(likelihood: Likelihood, start: Array, sigma: Array) -> _Round:
     minimum = minimise(lambda theta: (likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)), start)
     theta, fraction = minimum.theta, minimum.theta.size / likelihood.count  # parameters per sample
     parts = []
@@ -73,7 +88,7 @@ def _solve_round(likelihood: Likelihood, start: Array, sigma: Array) -> LeastSqu
     else:
         sizes = [channel.rows + len(channel.columns) for channel in likelihood.channels]
         jacobians = tuple(jnp.split(minimum.jacobian, np.cumsum(sizes))[:-1])
-    return LeastSquaresResult(likelihood, theta, jnp.stack(noise), minimum.result, minimum.steps, jacobians, *weighted)
+    return _Round(theta, jnp.stack(noise), minimum.result, minimum.steps, jacobians, *weighted)
 
 
 def _information_jacobian(
@@ -119,7 +134,7 @@ def solve(
     optional_nuisances: tuple[tuple[str, ...], ...],
 ) -> LeastSquaresResult:
     """Fit, then add nuisances (`NUISANCES`, `TIMING_NUISANCES`) one by one while the BIC favours one."""
-    solved = _solve_coloured_noise(likelihood, jnp.asarray(start), jnp.asarray(noise, dtype=float))
+    solved = _solve_coloured_noise(likelihood, start, noise)
     for _ in range(sum(map(len, optional_nuisances))):
         gains = _bic_decreases(solved, optional_nuisances)
         which, name = max(gains, key=gains.__getitem__, default=(0, ""))
@@ -130,7 +145,7 @@ def solve(
     return solved
 
 
-def _solve_coloured_noise(likelihood: Likelihood, start: Array, noise: Array) -> LeastSquaresResult:
+def _solve_coloured_noise(likelihood: Likelihood, start: np.ndarray, noise: np.ndarray) -> LeastSquaresResult:
     """Fit; if the noise of a channel is AR(1), fit again with the coefficient estimated from the residuals.
 
     The coefficient is then fixed. For many samples its error is uncorrelated with those of the parameters (the
@@ -142,26 +157,27 @@ def _solve_coloured_noise(likelihood: Likelihood, start: Array, noise: Array) ->
             white = dataclasses.replace(channel, whitening=None)
             residuals, *_ = _fit_nuisances(white, likelihood.channel_inputs(solved.theta, i), solved.sigma[i])
             counted = channel.weights > 0.0
-            whitening = fit_ar1(np.asarray(residuals), counted).whitening(counted)
+            whitening = fit_ar1(residuals, counted).whitening(counted)
             likelihood = likelihood.replace_channel(i, dataclasses.replace(channel, whitening=whitening))
     if likelihood is solved.likelihood:
         return solved
     return least_squares(likelihood, solved.theta, solved.sigma)
 
 
-_fit_nuisances = eqx.filter_jit(ChannelLikelihood.fit_nuisances)
+_fit_nuisances = jit(ChannelLikelihood.fit_nuisances)
 
 
-def _add_nuisance(solution: LeastSquaresResult, index: int, name: str) -> tuple[Likelihood, Array]:
+def _add_nuisance(solution: LeastSquaresResult, index: int, name: str) -> tuple[Likelihood, np.ndarray]:
     """Return the likelihood with an added nuisance of channel `index`, and the theta from which to continue."""
     likelihood, theta = solution.likelihood, solution.theta
     channel = likelihood.channels[index]
     if name in TIMING_NUISANCES:
         channel = free_timing(channel, likelihood.channel_inputs(theta, index), name)
         new, before = likelihood.replace_channel(index, channel).names, likelihood.names
-        theta = jnp.array([theta[before.index(n)] if n in before else 0.0 for n in new])
+        theta = np.array([theta[before.index(n)] if n in before else 0.0 for n in new])
     else:
-        sd = channel.linear_sd.at[np.array(NUISANCES[name])].set(10.0 * jnp.ptp(channel.observed))
+        sd = channel.linear_sd.copy()
+        sd[list(NUISANCES[name])] = 10.0 * np.ptp(channel.observed)
         channel = dataclasses.replace(channel, linear_sd=sd)
     return likelihood.replace_channel(index, channel), theta
 
@@ -170,10 +186,10 @@ def _bic_decreases(
     solution: LeastSquaresResult, optional_nuisances: tuple[tuple[str, ...], ...]
 ) -> dict[tuple[int, str], float]:
     """Return the decrease of the BIC that adding each nuisance would cause, to first order."""
-    likelihood, sigma = solution.likelihood, np.asarray(solution.sigma)
-    residuals = [np.asarray(x) / s for x, s in zip(solution.residuals, sigma, strict=True)]
+    likelihood, sigma = solution.likelihood, solution.sigma
+    residuals = [x / s for x, s in zip(solution.residuals, sigma, strict=True)]
     starts = np.cumsum([0, *(x.size for x in residuals)])
-    columns = [np.concatenate([np.asarray(j)[: x.size] for j, x in zip(solution.jacobian, residuals, strict=True)])]
+    columns = [np.concatenate([j[: x.size] for j, x in zip(solution.jacobian, residuals, strict=True)])]
 
     def pad_columns(index: int, shapes: np.ndarray) -> np.ndarray:
         """Return the columns of one channel, padded with zeros for the others."""
@@ -182,14 +198,14 @@ def _bic_decreases(
 
     candidates, gains = {}, {}
     for i, channel in enumerate(likelihood.channels):
-        shapes, free = np.asarray(solution.shapes[i]), np.asarray(channel.linear_sd) > 0.0
+        shapes, free = solution.shapes[i], channel.linear_sd > 0.0
         columns.append(pad_columns(i, shapes[free[list(channel.columns)]]))
         if "clock" in optional_nuisances[i] and "clock" not in channel.timing:
             fraction = clock_r_squared(channel, likelihood.channel_inputs(solution.theta, i), sigma[i])
             gains[i, "clock"] = bic_decrease(fraction, float(channel.count), 1)
         for name in optional_nuisances[i]:
             if name == "delay" and name not in channel.timing:
-                candidates[i, name] = pad_columns(i, np.asarray(solution.slope[i]))
+                candidates[i, name] = pad_columns(i, solution.slope[i])
             elif name in NUISANCES and not free[NUISANCES[name][0]]:
                 candidates[i, name] = pad_columns(i, shapes[list(NUISANCES[name])])
     basis = orthonormal_basis(np.concatenate(columns, axis=1))

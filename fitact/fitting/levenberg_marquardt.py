@@ -1,6 +1,5 @@
 """Levenberg-Marquardt by optimistix, with checks that a successful result is a minimum."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +10,8 @@ import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
+
+from fitact.fitting.minimum import RESULT_NAMES, Minimum
 
 
 class RESULTS(optx.RESULTS):
@@ -38,41 +39,20 @@ class RESULTS(optx.RESULTS):
     )
 
 
-RESULT_NAMES = (
-    "successful", "did_not_move", "not_at_optimum", "rank_deficient", "on_bound", "several_optima", "misfit",
-    "nonfinite", "nonlinear_max_steps_reached", "nonlinear_divergence",
-)  # fmt: skip
+def _result_index(result: Any) -> Int[Array, ""]:
+    """Return the index of a member of `RESULTS` in `RESULT_NAMES`; a failure of the linear solver is "nonfinite"."""
+    index: Any = RESULT_NAMES.index("nonfinite")
+    for i, name in enumerate(RESULT_NAMES):
+        index = jnp.where(result == getattr(RESULTS, name), i, index)
+    return index
 
 
-def result_name(result: Any) -> str:
-    """Return the name of a member of `RESULTS`; a failure of the linear solver counts as "nonfinite"."""
-    return next((name for name in RESULT_NAMES if bool(result == getattr(RESULTS, name))), "nonfinite")
-
-
-def result_message(name: str) -> str:
-    """Return the sentence of a member of `RESULTS`."""
-    return str(RESULTS[getattr(RESULTS, name)])  # type: ignore[misc]  # equinox's enumerations look up by item
-
-
-class Minimum(eqx.Module):
-    """Point at which Levenberg-Marquardt ended."""
-
-    theta: Float[Array, " parameters"]
-    cost: Float[Array, ""]  # half of the sum of squared residuals
-    jacobian: Float[Array, "rows parameters"]  # Jacobian of the residuals, in the order of their pytree
-    steps: Array  # trial steps taken
-    result: Any  # a member of `RESULTS`
-
-
-def minimise(
+def find_minimum(
     residuals: Callable[[Float[Array, " parameters"]], PyTree[Float[Array, "..."]]],
     start: Float[Array, " parameters"],
-    max_steps: int = 1000,
+    max_steps: int,
 ) -> Minimum:
-    """Find the least-squares optimum nearest to `start`; pure, for use within jit and vmap, in double precision.
-
-    Steps are damped in units of the Jacobian's columns (Marquardt 1963).
-    """
+    """Find a minimum as `fitact.fitting.minimum.minimise` does."""
     start = jnp.asarray(start)
 
     def flat_residuals(theta: Array, _: None) -> Array:
@@ -91,60 +71,8 @@ def minimise(
         cost=0.5 * jnp.sum(jnp.square(end.residuals)),
         jacobian=end.jacobian,
         steps=solution.stats["num_steps"],
-        result=solver.final_result(end, start, RESULTS.promote(solution.result)),
+        result=_result_index(solver.final_result(end, start, RESULTS.promote(solution.result))),
     )
-
-
-@dataclasses.dataclass(frozen=True)
-class Optima:
-    """Distinct optima from many starting points."""
-
-    minima: Minimum  # stacked, lowest cost first; if no start converged, the lowest end point
-    start_counts: Int[np.ndarray, " optima"]  # number of starts that ended in each
-    n_failed: int  # number of starts that did not converge
-    result: Any  # result of the lowest
-
-
-def minimise_many(
-    residuals: Callable[[Float[Array, " parameters"]], PyTree[Float[Array, "..."]]],
-    starts: Float[Array, "starts parameters"],
-    same_optimum: float = 0.1,
-    log_density_margin: float = 3.0,
-) -> Optima:
-    """Minimise from all starts at once; with residuals in units of their sd, the cost is -log(probability).
-
-    End points less than `same_optimum` standard errors apart count as one optimum. An optimum whose log-probability
-    is lower by less than `log_density_margin` (a twentieth of the density) counts as competing.
-    """
-    ends = _minimise_each(residuals, jnp.asarray(starts))
-    theta, jacobian = np.asarray(ends.theta), np.asarray(ends.jacobian)
-    cost = np.where(np.isfinite(ends.cost), ends.cost, np.inf)
-    order = np.argsort(cost)
-    settled = np.asarray(ends.result == RESULTS.successful) | np.asarray(ends.result == RESULTS.rank_deficient)
-    firsts: list[int] = []
-    counts: list[int] = []
-    for i in order[settled[order]]:
-        apart = [np.linalg.norm(jacobian[first] @ (theta[i] - theta[first])) for first in firsts]
-        if apart and min(apart) < same_optimum:
-            counts[int(np.argmin(apart))] += 1
-        else:
-            firsts.append(i)
-            counts.append(1)
-    lowest = order[0]
-    # an end point below all optima has not converged, so a better optimum exists
-    if not firsts or cost[lowest] < cost[firsts[0]] - 0.5 * same_optimum**2:
-        firsts, counts = [lowest, *firsts], [0, *counts]
-    minima = jax.tree.map(lambda leaf: leaf[np.array(firsts)], ends)
-    result = jax.tree.map(lambda leaf: leaf[firsts[0]], ends.result)
-    several = len(firsts) > 1 and cost[firsts[1]] < cost[firsts[0]] + log_density_margin
-    if several and bool(result == RESULTS.successful):
-        result = RESULTS.several_optima
-    return Optima(minima, np.array(counts), int(np.sum(~settled)), result)
-
-
-@eqx.filter_jit
-def _minimise_each(residuals: Callable[..., Any], starts: Array) -> Minimum:
-    return jax.vmap(lambda start: minimise(residuals, start))(starts)
 
 
 class _LinearProblem(eqx.Module):
@@ -175,7 +103,7 @@ class _Descent(optx.AbstractDescent):
 
     def init(self, y: Array, f_info_struct: Any) -> _LinearProblem:
         residuals, jacobian, zero = jnp.zeros(self.rows), jnp.zeros((self.rows, y.size)), jnp.zeros_like(y)
-        nowhere = jnp.array(jnp.inf), jnp.array(0)
+        nowhere = np.asarray(np.inf), np.asarray(0)
         return _LinearProblem(y, residuals, jacobian, zero, zero, jnp.eye(y.size), zero, *nowhere)
 
     def query(self, y: Array, f_info: Any, state: _LinearProblem) -> _LinearProblem:

@@ -4,13 +4,12 @@ import math
 from collections.abc import Mapping
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from fitact.errors import InputError
 from fitact.fitting.least_squares import LeastSquaresResult, solve
-from fitact.fitting.levenberg_marquardt import Optima, minimise_many
+from fitact.fitting.minimum import Optima, minimise_many
 from fitact.fitting.problem import Problem
 from fitact.fitting.starting_point import residual_objective
 from fitact.likelihood.likelihood import Likelihood
@@ -34,7 +33,7 @@ def choose_start(problem: Problem, start: Mapping[str, float] | None) -> Float[n
             raise InputError(f"start {name} = {value}: give positive values in SI units for any of {', '.join(names)}")
         theta[names.index(name)] = math.log(value)
     noise = np.array([source.noise for source in problem.sources])
-    end = np.asarray(solve(problem.likelihood, theta, noise, ((),) * noise.size).theta)
+    end = solve(problem.likelihood, theta, noise, ((),) * noise.size).theta
     objective_end, objective_start = residual_objective(problem.likelihood, np.stack([end, problem.start]))
     return end if objective_end < objective_start else problem.start
 
@@ -46,12 +45,12 @@ def find_optima(solution: LeastSquaresResult, count: int, draws_per_start: int =
     `draws_per_start` draws are made for each start.
     """
     likelihood = solution.likelihood.without_samples()
-    draws = likelihood.sample_prior(np.asarray(solution.theta), draws_per_start * count)
-    slowest = jax.vmap(lambda theta: likelihood.circuit(theta).b)(jnp.asarray(draws))
+    draws = likelihood.sample_prior(solution.theta, draws_per_start * count)
+    slowest = likelihood.evaluate_circuits(draws).b
     tables = [channel.compression for channel in likelihood.channels if channel.compression is not None]
     within_tables = np.all([np.ones(len(draws), bool), *(table.covers(slowest) for table in tables)], axis=0)
     starts = np.vstack([solution.theta, draws[within_tables][: count - 1]])
-    return minimise_many(jax.tree_util.Partial(_residuals, likelihood, solution.sigma), jnp.asarray(starts))
+    return minimise_many(jax.tree_util.Partial(_residuals, likelihood, solution.sigma), starts)
 
 
 def _residuals(
@@ -62,8 +61,8 @@ def _residuals(
 
 def lower_optimum(optima: Optima, solution: LeastSquaresResult, min_separation: float = 0.5) -> dict[str, float] | None:
     """Return the parameters (SI) of a lower optimum at least `min_separation` standard errors away, or None."""
-    lowest = np.asarray(optima.minima.theta[0])
-    separation = np.linalg.norm(np.asarray(optima.minima.jacobian[0]) @ (np.asarray(solution.theta) - lowest))
+    lowest = optima.minima.theta[0]
+    separation = np.linalg.norm(optima.minima.jacobian[0] @ (solution.theta - lowest))
     if not separation > min_separation:
         return None
     return {name: math.exp(lowest[i]) for i, name in enumerate(solution.likelihood.prior.names)}

@@ -6,11 +6,10 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from fitact.compiled import MAX_PADDED_LENGTH, as_arrays, pad_samples, pad_weight, to_device
+from fitact.compiled import MAX_PADDED_LENGTH, as_arrays, pad_samples, pad_weight
 from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
 from fitact.errors import InputError
@@ -23,7 +22,7 @@ from fitact.likelihood import certificate
 from fitact.likelihood.channel import CHARGES, LINEAR_NUISANCES, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import Autoregression, estimate_quiet_noise, require_uniform
-from fitact.model.circuit import RC, Channel, FinalCircuit
+from fitact.model.circuit import RC, Channel, Circuit, FinalCircuit
 from fitact.model.skin import WithSkin, circuit_parameters, constant_skin_circuit, limits_current
 from fitact.prior.distributions import LogNormal
 from fitact.prior.prior import Prior
@@ -55,16 +54,16 @@ class Problem(NamedTuple):
 
     def compress_likelihood(self, tolerance: float) -> tuple[Likelihood, tuple[str, ...]]:
         """Return the likelihood with compressed channels, and for each channel the reason if it is not compressed."""
-        circuit = self.likelihood.circuit(jnp.asarray(self.start))
+        at_start = self.likelihood.evaluate_circuits(self.start[None]).row(0)
         pairs = []
         for channel, source in zip(self.likelihood.channels, self.sources, strict=True):
             shows_tau = source.start is not None and math.isfinite(source.start.b)
-            pairs.append(certificate.compress_channel(channel, circuit, shows_tau, tolerance))
+            pairs.append(certificate.compress_channel(channel, at_start, shows_tau, tolerance))
         channels, reasons = zip(*pairs, strict=True)
         return dataclasses.replace(self.likelihood, channels=channels), reasons
 
-    def experiment(self, likelihood: Likelihood, theta: np.ndarray, sigma: np.ndarray) -> Experiment:
-        """Return the measurement as an experiment; several records count as repetitions of the first."""
+    def experiment(self, likelihood: Likelihood, circuit: Circuit, sigma: np.ndarray) -> Experiment:
+        """Return the measurement at `circuit` as an experiment; several records are repetitions of the first."""
         source, records = self.sources[0], len({id(source.record) for source in self.sources})
         pairs = zip(likelihood.channels, self.sources, strict=True)
         channels = tuple(channel.channel for channel, other in pairs if other.record is source.record)
@@ -75,7 +74,7 @@ class Problem(NamedTuple):
         factor, measurement = likelihood.prior_factor, source.scene.measurement
         noise = {"Vsc": measurement.noise_Vsc, "I": measurement.noise_I}
         return Experiment(
-            circuit=likelihood.circuit(jnp.asarray(theta)),
+            circuit=circuit,
             free=free,
             prior_factor=np.linalg.cholesky((factor @ factor.T)[np.ix_(rows, rows)]),
             drive=source.choice.drive,
@@ -105,11 +104,12 @@ def build_problem(
     likelihood = likelihood_without_channels(
         first, prior, lambda values: apply_skin_model(first.make_rc_circuit(values), records, scenes)
     )
+    taus = likelihood.evaluate_circuits(likelihood.prior.log_mean[None]).row(0).tau
     parts = []
     for number, (record, scene, drive) in enumerate(itertools.zip_longest(records, scenes, drives), 1):
         choice, suffix = drive or choose_drive(record, scene), str(number) * (len(records) > 1)
         for name in _channels(record, scene):
-            parts.append(_build_channel(record, scene or Scene(), choice, name, suffix, likelihood.template))
+            parts.append(_build_channel(record, scene or Scene(), choice, name, suffix, likelihood.template, taus))
     channels, sources, gains = zip(*parts, strict=True)
     pairs = zip(channels, gains, strict=True)
     free_gains = {channel.qualified_name("gain"): LogNormal(1.0, sd) for channel, sd in pairs if sd > 0.0}
@@ -152,9 +152,18 @@ def _channels(record: Record, scene: Scene | None) -> tuple[Channel, ...]:
 
 
 def _build_channel(
-    record: Record, scene: Scene, choice: DriveModel, channel: Channel, number: str, template: RC | WithSkin
+    record: Record,
+    scene: Scene,
+    choice: DriveModel,
+    channel: Channel,
+    number: str,
+    template: RC | WithSkin,
+    taus: Float[np.ndarray, " time_constants"],
 ) -> tuple[ChannelLikelihood, Source, float]:
-    """Return the likelihood of a channel over its samples, its source, and the sd of log(gain)."""
+    """Return the likelihood of a channel over its samples, its source, and the sd of log(gain).
+
+    `taus` are the time constants (s) of the `template`.
+    """
     _require_whole_drive(record, choice)
     require_skin_response(template, record, choice)
     label = "_".join(filter(None, ("" if channel == "Vsc" else channel, number)))
@@ -167,7 +176,7 @@ def _build_channel(
         if choice.periodic and choice.steady_state and choice.name != "measured":
             optional = (*optional, "clock")
         plain = constant_skin_circuit(template)
-        if not limits_current(template) or float(plain.terms().tau[-1]) < record.time_step:  # Vsc jumps with V
+        if not limits_current(template) or taus[-1] < record.time_step:  # Vsc jumps with V
             max_divider = 0.5 if isinstance(plain, FinalCircuit) else 1.0
             start = estimate_from_vsc(record, choice, max_divider * math.exp(3.0 * gain))
             gain = math.hypot(gain, _edge_gain_sd(record, choice, start))
@@ -184,16 +193,16 @@ def _build_channel(
     weight = None if weight is None else pad_weight(weight)
     colour, noise = _noise(record, channel, scene)
     likelihood = ChannelLikelihood(
-        **_prior_of_nuisances(record, choice, channel, template),
-        time=to_device(pad_samples(record.time)),
-        observed=to_device(pad_samples(record[channel])),
-        weight=None if weight is None else jnp.asarray(weight),
+        **_prior_of_nuisances(record, choice, channel, len(taus) if choice.unknown_charge else 0),
+        time=pad_samples(record.time),
+        observed=pad_samples(record[channel]),
+        weight=weight,
         whitening=colour and colour.whitening(np.ones(len(record), bool) if weight is None else weight > 0.0),
-        rate=None if samples is None else to_device(pad_samples(samples.rate)),
+        rate=None if samples is None else pad_samples(samples.rate),
         drive=choice.drive,
-        shift=jnp.asarray(choice.shift, dtype=float),
-        clock=jnp.zeros(()),
-        time_step=jnp.asarray(record.time_step, dtype=float),
+        shift=np.asarray(choice.shift, dtype=float),
+        clock=np.zeros(()),
+        time_step=np.asarray(record.time_step, dtype=float),
         compression=None,
         label=label,
         channel=channel,
@@ -248,14 +257,15 @@ def _log_sd(relative_sd: float) -> float:
 
 
 def _prior_of_nuisances(
-    record: Record, choice: DriveModel, channel: str, template: RC | WithSkin
-) -> dict[str, Float[Array, "..."]]:
+    record: Record, choice: DriveModel, channel: str, n_charges: int
+) -> dict[str, Float[np.ndarray, "..."]]:
     """Return the noise floor and the prior sds of linear nuisances, delay and clock, by their field in a channel."""
     peak_to_peak = float(np.ptp(record[channel]))
-    n_charges = len(template.terms().tau) if choice.unknown_charge else 0
-    charges = len(LINEAR_NUISANCES) - len(CHARGES) + np.arange(n_charges)
+    linear_sd = np.zeros(len(LINEAR_NUISANCES))
+    first_charge = len(LINEAR_NUISANCES) - len(CHARGES)
+    linear_sd[first_charge : first_charge + n_charges] = 10.0 * peak_to_peak  # wide
     # a fraction of a period cannot determine an offset, so its prior is the accuracy of an oscilloscope (2 %)
-    offset = 0.02 * peak_to_peak if record.frequency() is None and choice.periodic else 0.0
+    linear_sd[0] = 0.02 * peak_to_peak if record.frequency() is None and choice.periodic else 0.0
     # in time steps at the ends of the record; the frequency of the drive is known to one or two steps
     clock_sd = 5.0
     if channel == "Vsc" and choice.name != "measured":
@@ -263,9 +273,9 @@ def _prior_of_nuisances(
     # samples near an ideal edge determine the delay only to within one step, in the middle of which it starts
     delay_sd = math.sqrt(1.0 / 12.0) if has_ideal_edges(choice.drive) else 5.0
     return {
-        "noise_floor": jnp.asarray(max(MIN_RELATIVE_NOISE * peak_to_peak, rounding_noise_sd(record[channel]))),
-        "linear_sd": jnp.zeros(len(LINEAR_NUISANCES)).at[0].set(offset).at[charges].set(10.0 * peak_to_peak),  # wide
-        "timing_sd": jnp.array([delay_sd, clock_sd]),
+        "noise_floor": np.asarray(max(MIN_RELATIVE_NOISE * peak_to_peak, rounding_noise_sd(record[channel]))),
+        "linear_sd": linear_sd,
+        "timing_sd": np.array([delay_sd, clock_sd]),
     }
 
 

@@ -17,10 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitact.compiled import jit
 from fitact.errors import InputError
 from fitact.fitting.derived import DERIVED_NAMES, DerivedQuantities
 from fitact.fitting.laplace import FitResult
-from fitact.fitting.levenberg_marquardt import minimise
+from fitact.fitting.minimum import minimise
 from fitact.likelihood.likelihood import UNCONSTRAINED_SD, Likelihood
 from fitact.summary import format_range
 from fitact.tables import align_table, join_lines
@@ -65,7 +66,7 @@ class ConstrainedFit(eqx.Module):
         return jnp.log(jnp.stack([values[DERIVED_NAMES.index(name)] for name in PROFILE_QUANTITIES]))
 
 
-@eqx.filter_jit
+@jit
 def _fit_constrained(
     model: ConstrainedFit, indices: Array, goal: Array, weight: Array, start: Array
 ) -> tuple[Array, Array, Array]:

@@ -1,15 +1,11 @@
 """Warnings and notes about a fit that is otherwise reliable, in sentences."""
 
-import dataclasses
 import math
 from collections.abc import Collection
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from fitact.data.inspection import check_divider
 from fitact.data.record import CHANNEL_UNITS, Record
@@ -111,15 +107,9 @@ def describe_assumed_Ci(scene: Scene | None, likelihood: Likelihood, prior_sets_
 def _plausibility(likelihood: Likelihood, theta: np.ndarray) -> list[tuple[str, float, float]]:
     """Return for g and b the name, the ratio to the prior median, and the prior probability further out."""
     points = np.vstack([theta, likelihood.sample_prior(theta, 10_000)])
-    g, b = (np.asarray(x) for x in _divider(dataclasses.replace(likelihood, channels=()), jnp.asarray(points)))
+    circuits = likelihood.evaluate_circuits(points)
     return [
         (name, float(x[0] / np.median(x[1:])), float(min(np.mean(x[1:] < x[0]), np.mean(x[1:] > x[0]))))
-        for name, x in (("the divider g", g), ("the time constant b", b))
+        for name, x in (("the divider g", circuits.g), ("the time constant b", circuits.b))
         if np.ptp(x) > 0.0
     ]
-
-
-@eqx.filter_jit
-def _divider(likelihood: Likelihood, theta: Float[Array, "n parameters"]) -> tuple[Array, Array]:
-    circuits = jax.vmap(likelihood.circuit)(theta)
-    return jax.vmap(lambda circuit: circuit.g)(circuits), jax.vmap(lambda circuit: circuit.b)(circuits)

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -27,7 +26,7 @@ def apply_skin_model(circuit: RC, records: Sequence[Record], scenes: Sequence[Sc
         return WithSkin(circuit, Dispersive(math.ceil(2.0 * math.pi * MAX_DISPERSION_FREQUENCY / (0.9 * slowest))))
     # the grid extends from below the lowest angular frequency to far above those that a time step resolves
     fastest = 100.0 / min(record.time_step for record in records)
-    alpha = jnp.asarray(scene.fixed_values().get("alpha", scene.skin.alpha))
+    alpha = np.asarray(scene.fixed_values().get("alpha", scene.skin.alpha))
     return WithSkin(circuit, Fractional(alpha), TimeConstantGrid.from_frequency_range(0.3 * slowest, fastest))
 
 

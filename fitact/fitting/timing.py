@@ -1,14 +1,14 @@
 """Delay and clock error of a channel: their best value on a grid, and the gain from fitting a clock error."""
 
 import dataclasses
+import functools
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitact.compiled import pad_rows, pad_samples, pad_weight
+from fitact.compiled import jit, pad_rows, pad_samples, pad_weight
 from fitact.fitting.drive_choice import has_ideal_edges, ideal_edge_mask
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
 from fitact.likelihood.noise import student_weight
@@ -50,8 +50,7 @@ def free_timing(
     if not edges.any():
         return channel
     timing_sd = np.hypot(good.std(axis=0), step / np.sqrt(12.0))
-    weight = jnp.asarray(np.where(edges, 0.0, channel.weights))
-    return dataclasses.replace(channel, weight=weight, timing_sd=jnp.asarray(timing_sd))
+    return dataclasses.replace(channel, weight=np.where(edges, 0.0, channel.weights), timing_sd=timing_sd)
 
 
 def _edge_mask(channel: ChannelLikelihood, margin: float = 3.0) -> np.ndarray:
@@ -65,8 +64,8 @@ def _edge_mask(channel: ChannelLikelihood, margin: float = 3.0) -> np.ndarray:
 def _select_samples(channel: ChannelLikelihood, mask: np.ndarray) -> ChannelLikelihood:
     """Return the channel with only the samples of the mask."""
     indices, arrays = np.flatnonzero(mask), (channel.time, channel.observed)
-    time, observed = (jnp.asarray(pad_samples(np.asarray(x)[indices])) for x in arrays)
-    weight = jnp.asarray(pad_weight(channel.weights[indices]))
+    time, observed = (pad_samples(np.asarray(x)[indices]) for x in arrays)
+    weight = pad_weight(channel.weights[indices])
     return dataclasses.replace(channel, time=time, observed=observed, weight=weight)
 
 
@@ -101,10 +100,10 @@ def _residual_sums_of_squares(
     return np.concatenate(sums)
 
 
-_shapes = eqx.filter_jit(ChannelLikelihood.shapes)
+_shapes = jit(ChannelLikelihood.shapes)
 
 
-@eqx.filter_jit
+@jit
 def _signals(
     channel: ChannelLikelihood, inputs: ChannelInputs, offsets: dict[str, Float[Array, " candidates"]]
 ) -> Float[Array, "candidates samples"]:
@@ -127,7 +126,7 @@ def clock_r_squared(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: fl
 
     It is computed from the samples, because the response table cannot represent the effect of a clock error.
     """
-    rows = np.asarray(_clock_regressors(channel.without_compression(), inputs, jnp.asarray(sigma)))
+    rows = _clock_regressors(channel.without_compression(), inputs, np.asarray(sigma))
     used, edges = channel.weights > 0.0, _edge_mask(channel)
     r_squared = _r_squared(rows[:, used])
     # a clock error shows at an ideal edge only if the edge has passed a sample; otherwise samples there hide it
@@ -140,7 +139,7 @@ def _r_squared(rows: np.ndarray) -> float:
     return float((clock @ residuals) ** 2 / max((clock @ clock) * (residuals @ residuals), 1e-300))
 
 
-@eqx.filter_jit
+@functools.partial(jit, fast=True)
 def _clock_regressors(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: Array) -> Float[Array, "n samples"]:
     """Return the effect of a clock error, the residuals, and the effects of all circuit and linear parameters."""
     time = channel.time - (channel.shift + inputs.delay)

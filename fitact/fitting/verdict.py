@@ -3,22 +3,21 @@
 import math
 from collections.abc import Sequence
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from fitact.fitting.channel_fit import ChannelFit
 from fitact.fitting.least_squares import LeastSquaresResult
-from fitact.fitting.levenberg_marquardt import Optima, result_name
+from fitact.fitting.minimum import Optima
 from fitact.fitting.problem import Source
 from fitact.fitting.residual_statistics import is_misfit
+from fitact.likelihood.certificate import batch_log_prob_parts
 from fitact.likelihood.likelihood import Likelihood
 
 
 def diagnose_fit(
     solution: LeastSquaresResult,
+    likelihood: Likelihood,
     covariance_factor: Float[np.ndarray, "parameters parameters"],
     traces: Sequence[ChannelFit],
     sources: Sequence[Source],
@@ -26,14 +25,13 @@ def diagnose_fit(
 ) -> str:
     """Return the name of the first of the `RESULTS` that makes the fit unreliable; "successful" if none does.
 
-    `covariance_factor`: factor of the covariance of theta.
+    `likelihood` is the one for sampling; `covariance_factor`: factor of the covariance of theta.
     """
-    name = result_name(solution.result)
-    if name != "successful":
-        return name
-    if is_out_of_bounds(solution.likelihood, np.asarray(solution.theta), np.asarray(solution.sigma), covariance_factor):
+    if solution.result != "successful":
+        return solution.result
+    if is_out_of_bounds(likelihood, solution.theta, solution.sigma, covariance_factor):
         return "on_bound"
-    if optima is not None and result_name(optima.result) == "several_optima":
+    if optima is not None and optima.result == "several_optima":
         return "several_optima"
     noisy = any(source.drive_noise_dominates for source in sources)
     return "misfit" if noisy or any(is_misfit(channel.figures) for channel in traces) else "successful"
@@ -56,12 +54,8 @@ def is_out_of_bounds(
     axes, sizes, _ = np.linalg.svd(covariance_factor)
     along = np.linspace(-half_width, half_width, 241)[:, None] * (axes[:, 0] * sizes[0])
     points = np.hstack([_clip_exponent(likelihood, theta, covariance_factor) + along, np.tile(np.log(sigma), (241, 1))])
-    return not bool(_has_possible_point(likelihood.without_samples(), jnp.asarray(points)))
-
-
-@eqx.filter_jit
-def _has_possible_point(likelihood: Likelihood, points: Float[Array, "n coordinates"]) -> Array:
-    return jnp.any(jnp.isfinite(jax.vmap(likelihood.log_prior)(points)))
+    log_prior = batch_log_prob_parts(likelihood.without_samples())(points)[:, -1]
+    return not np.any(np.isfinite(log_prior))
 
 
 def _clip_exponent(likelihood: Likelihood, theta: np.ndarray, covariance_factor: np.ndarray) -> np.ndarray:

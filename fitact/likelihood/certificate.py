@@ -4,24 +4,22 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from fitact.compiled import BatchEvaluator
-from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
+from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.compression import BASELINE_NAMES, Compression, compress
 from fitact.likelihood.compression_on_grid import GridCompression, compress_on_grid
-from fitact.likelihood.likelihood import Likelihood
-from fitact.model.circuit import Circuit
+from fitact.likelihood.likelihood import CircuitValues, Likelihood
+from fitact.model.circuit import Circuit, HighpassTerms
 from fitact.model.drive import Sampled
 from fitact.model.skin import WithSkin
 
 TOLERANCE = 1e-3  # error of the log-likelihood
 _TIMING_REASON = "a delay or a clock error is a free parameter"
+_MANY_ROWS = 65_536  # samples, above which a faster program saves more than its compilation takes
 FEW_ROWS = 200  # numbers per evaluation, below which the overhead of the call dominates
 
 
@@ -35,13 +33,14 @@ class CertifiedLikelihood(NamedTuple):
 
 
 def compress_channel(
-    channel: ChannelLikelihood, circuit: Circuit, tau_identified: bool, tolerance: float
+    channel: ChannelLikelihood, start: CircuitValues, tau_identified: bool, tolerance: float
 ) -> tuple[ChannelLikelihood, str]:
     """Return the channel with a compression and "", or the unchanged channel and the reason.
 
-    `circuit` is close to the optimum; `tau_identified` states whether the record determines its time constant.
+    `start` is close to the optimum; `tau_identified` states whether the record determines its time constant.
     """
-    reason = _uncompressed_reason(channel, circuit, tau_identified, tolerance)
+    circuit, terms = start.circuit, start.terms.get(channel.channel)
+    reason = _uncompressed_reason(channel, circuit, terms, tau_identified, tolerance)
     if reason:
         return channel, reason
     samples = slice(channel.n_samples)
@@ -52,16 +51,22 @@ def compress_channel(
         "rate": None if channel.rate is None else np.asarray(channel.rate)[samples],
     }
     compression: Compression | GridCompression
-    if isinstance(circuit, WithSkin):
+    if terms is None:
+        assert isinstance(circuit, WithSkin)
         assert circuit.grid is not None  # otherwise there is a reason against compression
         compression = compress_on_grid(*arrays, grid=circuit.grid, **how)
     else:
-        compression = compress(*arrays, expected_terms=circuit.channel_terms(channel.channel), **how)
+        compression = compress(*arrays, expected_terms=terms, **how)
     return dataclasses.replace(channel, compression=compression), ""
 
 
 def _uncompressed_reason(
-    channel: ChannelLikelihood, circuit: Circuit, tau_identified: bool, tolerance: float, min_samples: int = 512
+    channel: ChannelLikelihood,
+    circuit: Circuit,
+    terms: HighpassTerms | None,
+    tau_identified: bool,
+    tolerance: float,
+    min_samples: int = 512,
 ) -> str:
     if tolerance == 0.0:
         return "the full sum was requested"
@@ -79,7 +84,7 @@ def _uncompressed_reason(
         return "the steady state of a measured drive is not tabulated"
     if not tau_identified:
         return "the record does not determine its time constant"
-    if len(circuit.channel_terms(channel.channel).tau) > 1:
+    if terms is not None and len(terms.tau) > 1:
         return "the circuit has several time constants"
     return ""
 
@@ -106,12 +111,15 @@ def certify(
     )
     if all(channel.compression is None for channel in likelihood.channels):
         return CertifiedLikelihood(likelihood, None, tuple(r or _TIMING_REASON for r in reasons))
-    light, optimum = likelihood.without_samples(), jnp.asarray(theta)
-    log_b, slope = _log_b_and_slope(light, optimum)
-    reach = float(table_half_width(np.linalg.norm(np.asarray(slope) @ covariance_factor)))
+    light, optimum = likelihood.without_samples(), likelihood.evaluate_circuits(theta[None]).row(0)
+    log_b = float(np.log(optimum.b))
+    reach = float(table_half_width(np.linalg.norm(_log_b_slope(light, theta) @ covariance_factor)))
     precisions = table_precision(sigma, tolerance).tolist()
-    optimal = zip(likelihood.channels_and_inputs(optimum), precisions, strict=True)
-    restricted = tuple(_restrict_table(*pair, float(log_b), reach, precision) for pair, precision in optimal)
+    inputs = [likelihood.make_inputs(optimum.circuit, theta, channel) for channel in likelihood.channels]
+    restricted = tuple(
+        _restrict_table(channel, optimum.terms.get(channel.channel), each.gain, log_b, reach, precision)
+        for channel, each, precision in zip(likelihood.channels, inputs, precisions, strict=True)
+    )
     deviates = np.random.default_rng(0).standard_normal((check_points, theta.size))  # any reproducible points serve
     around = np.vstack([theta, theta + 1.5 * deviates @ covariance_factor.T])
     points = np.vstack([around, _prior_points(light, theta, check_points)])
@@ -154,7 +162,7 @@ def _compression_failure(error: float, excess: float, tolerance: float) -> str:
 def _prior_points(likelihood: Likelihood, theta: np.ndarray, count: int) -> Float[np.ndarray, "n parameters"]:
     """Return draws from the prior that the tables cover, filled up with the optimum if there are too few."""
     draws = likelihood.sample_prior(theta, 1000)
-    tau = jnp.exp(_log_b_at_points(likelihood, jnp.asarray(draws)))
+    tau = likelihood.evaluate_circuits(draws).b
     covered = [channel.compression.covers(tau) for channel in likelihood.channels if channel.compression is not None]
     return np.vstack([draws[np.all(covered, axis=0)], np.tile(theta, (count, 1))])[:count]
 
@@ -164,8 +172,14 @@ def _evaluate_log_likelihoods(
 ) -> np.ndarray:
     """Return the log-likelihood of each channel at points with common sigma, (n, channels)."""
     points = np.column_stack([theta, np.tile(np.log(sigma), (len(theta), 1))])
-    evaluate = BatchEvaluator(Likelihood.log_likelihoods, likelihood, likelihood.rows)
-    return evaluate(points, description="checking the compression")
+    few, many = likelihood.rows <= FEW_ROWS, likelihood.rows > _MANY_ROWS
+    evaluate = batch_log_prob_parts(likelihood, 128 if few else 1, fast=many)
+    return evaluate(points, description="checking the compression")[:, :-1]
+
+
+def batch_log_prob_parts(likelihood: Likelihood, batch: int = 128, *, fast: bool = False) -> BatchEvaluator:
+    """Return the evaluation of `Likelihood.log_prob_parts` at many points; `fast` as in `compiled.jit`."""
+    return BatchEvaluator(Likelihood.log_prob_parts, likelihood, likelihood.rows, batch, fast=fast)
 
 
 def batched_log_prob(likelihood: Likelihood, walkers: int) -> Callable[[np.ndarray], np.ndarray]:
@@ -175,31 +189,38 @@ def batched_log_prob(likelihood: Likelihood, walkers: int) -> Callable[[np.ndarr
     """
     # pad halves where this costs nothing, so that only one size is compiled
     batch = walkers if likelihood.rows <= FEW_ROWS else walkers // 2
-    tabulated = BatchEvaluator(Likelihood.log_prob, likelihood.without_samples(), likelihood.rows, batch)
-    full = likelihood.without_compression()
-    summed = BatchEvaluator(Likelihood.log_prob, full, full.rows, batch=1)
+    light, full = likelihood.without_samples(), likelihood.without_compression()
+    tabulated, summed = batch_log_prob_parts(light, batch, fast=True), batch_log_prob_parts(full, 1, fast=True)
+    # bound once, because Equinox takes longer to bind a method than the evaluation takes
+    combine_tabulated, combine_summed = light.combine_log_prob, full.combine_log_prob
 
     def values(points: Float[np.ndarray, "n coordinates"]) -> np.ndarray:
-        log_prob = np.array(tabulated(points))
+        log_prob = combine_tabulated(points, tabulated(points))
         beyond = np.isnan(log_prob)
         if beyond.any():
-            log_prob[beyond] = summed(points[beyond])
+            log_prob[beyond] = combine_summed(points[beyond], summed(points[beyond]))
         return log_prob
 
     return values
 
 
 def _restrict_table(
-    channel: ChannelLikelihood, inputs: ChannelInputs, center: float, half_width: float, error: float
+    channel: ChannelLikelihood,
+    terms: HighpassTerms | None,
+    gain: ArrayLike,
+    center: float,
+    half_width: float,
+    error: float,
 ) -> ChannelLikelihood:
     """Return the channel with its table restricted to the posterior, if the table covers the optimum.
 
-    The restricted table covers `center` ± `half_width` in log b, with an `error` of the signal (V or A).
+    `terms` and `gain` are those at the optimum. The restricted table covers `center` ± `half_width` in log b, with an
+    `error` of the signal (V or A).
     """
     table = channel.compression
-    if not isinstance(table, Compression) or not table.covers(np.exp(center)):
+    if terms is None or not isinstance(table, Compression) or not table.covers(np.exp(center)):
         return channel
-    largest = float(jnp.sum(jnp.abs(jnp.stack(inputs.circuit.channel_terms(channel.channel).weight))) * inputs.gain)
+    largest = float(np.sum(np.abs(terms.weight)) * gain)
     has_charge = max(channel.columns, default=0) >= len(BASELINE_NAMES)
     charge = float(np.ptp(channel.observed)) / largest if has_charge else 0.0
     low, high = (float(table.center + side * table.half_width) for side in (-1.0, 1.0))
@@ -208,10 +229,8 @@ def _restrict_table(
     return dataclasses.replace(channel, compression=narrow)
 
 
-def _log_b(likelihood: Likelihood, theta: Array) -> Array:
-    """Return the logarithm of the slowest time constant (s)."""
-    return jnp.log(likelihood.circuit(theta).b)
-
-
-_log_b_and_slope = eqx.filter_jit(jax.value_and_grad(_log_b, argnums=1))
-_log_b_at_points = eqx.filter_jit(jax.vmap(_log_b, in_axes=(None, 0)))
+def _log_b_slope(likelihood: Likelihood, theta: np.ndarray, step: float = 1e-4) -> Float[np.ndarray, " parameters"]:
+    """Return the gradient of the logarithm of the slowest time constant, from differences over two steps."""
+    steps = step * np.eye(theta.size)
+    later, earlier = np.split(likelihood.evaluate_circuits(np.vstack([theta + steps, theta - steps])).b, 2)
+    return np.log(later / earlier) / (2.0 * step)

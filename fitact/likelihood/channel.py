@@ -32,6 +32,11 @@ LINEAR_NUISANCES = (*BASELINE_NAMES, *CHARGES)
 TIMING_NUISANCES = ("delay", "clock")
 
 
+def count_nonzero(values: Array | np.ndarray) -> ArrayLike:
+    """Return the number of nonzero values, by NumPy outside compiled functions."""
+    return np.count_nonzero(values) if isinstance(values, np.ndarray) else jnp.count_nonzero(values)
+
+
 class ChannelInputs(eqx.Module):
     """Quantities of a channel that depend on the parameters."""
 
@@ -88,8 +93,8 @@ class ChannelLikelihood(eqx.Module):
         if self.compression is not None:
             return self.compression.samples
         if self.whitening is not None:
-            return jnp.count_nonzero(self.whitening.mask)
-        return self.time.size if self.weight is None else jnp.count_nonzero(self.weight)
+            return count_nonzero(self.whitening.mask)
+        return self.time.size if self.weight is None else count_nonzero(self.weight)
 
     @property
     def rows(self) -> int:
@@ -122,7 +127,7 @@ class ChannelLikelihood(eqx.Module):
         time, observed, drive = np.asarray(self.time), np.asarray(self.observed), self.drive
         if isinstance(drive, Sampled):
             drive = Sampled(np.asarray(drive.time)[:2], np.asarray(drive.samples)[:2], drive.period)
-        ends, extremes = jnp.asarray(time[:2]), jnp.array([observed.min(), observed.max()])
+        ends, extremes = time[:2], np.array([observed.min(), observed.max()])
         return dataclasses.replace(self, time=ends, observed=extremes, drive=drive, weight=None, rate=None)
 
     def signal(self, inputs: ChannelInputs, extra_delay: ArrayLike = 0.0) -> Float[Array, " samples"]:

@@ -22,7 +22,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from fitact.compiled import pad_samples, pad_weight
+from fitact.compiled import jit, pad_samples, pad_weight
 from fitact.data.record import is_uniform
 from fitact.model.chirp import Chirp
 from fitact.model.circuit import HighpassTerms
@@ -60,7 +60,8 @@ class Compression(eqx.Module):
 
     def covers(self, tau: Array) -> Array:
         """Return whether the table covers the time constant (s)."""
-        return jnp.abs(jnp.log(tau) - self.center) <= self.half_width
+        log = np.log if isinstance(tau, np.ndarray | float) else jnp.log
+        return abs(log(tau) - self.center) <= self.half_width
 
     def response(self, terms: HighpassTerms) -> Float[Array, " rows"]:
         """Return the response of a circuit; compare `fitact.response`."""
@@ -110,7 +111,7 @@ class Compression(eqx.Module):
         _, rows = np.linalg.qr(np.hstack(columns))
         decay = rows[:, terms : 2 * terms] if charge > 0.0 else np.zeros((len(rows), terms))
         table = center, half_width, rows[:terms, :terms], decay
-        return Compression(*map(jnp.asarray, (*table, *_baseline_and_record(rows), self.samples)))
+        return Compression(*map(np.asarray, (*table, *_baseline_and_record(rows), self.samples)))
 
 
 def _baseline_and_record(rows: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -170,14 +171,14 @@ class _ResponseTable(eqx.Module):
         (tau,) = map(float, expected_terms.tau)
         relative, mix, series = _exponentials()
         return cls(
-            center=jnp.asarray(math.log(tau)),
-            nodes=jnp.asarray(tau * relative),
-            combinations=jnp.asarray(mix),
+            center=np.asarray(math.log(tau)),
+            nodes=tau * relative,
+            combinations=mix,
             series=series,
-            expected_terms=jax.tree.map(jnp.asarray, expected_terms),
-            middle=jnp.asarray(0.5 * (time[0] + time[-1])),
-            half=jnp.asarray(0.5 * (time[-1] - time[0])),
-            step=jnp.asarray((time[-1] - time[0]) / (time.size - 1)),
+            expected_terms=jax.tree.map(np.asarray, expected_terms),
+            middle=np.asarray(0.5 * (time[0] + time[-1])),
+            half=np.asarray(0.5 * (time[-1] - time[0])),
+            step=np.asarray((time[-1] - time[0]) / (time.size - 1)),
         )
 
 
@@ -202,10 +203,10 @@ def baseline_functions(time: Float[Array, " n"], middle: Array, half: Array) -> 
 
 def evaluate_baseline(time: np.ndarray, middle: ArrayLike, half: ArrayLike) -> Float[np.ndarray, "6 n"]:
     """Return `baseline_functions` at any number of times without compilation."""
-    return np.asarray(_baseline_functions(pad_samples(time), middle, half))[:, : time.size]
+    return _baseline_functions(pad_samples(time), np.asarray(middle), np.asarray(half))[:, : time.size]
 
 
-_baseline_functions = jax.jit(baseline_functions)
+_baseline_functions = jit(baseline_functions)
 
 
 class _Samples(NamedTuple):
@@ -236,10 +237,10 @@ def _accumulate_directly(
     size = samples.time.size
     length = _chunk_length(size, 65_536) if isinstance(drive, Chirp) else _chunk_length(size)  # of few chirps
     for chunk in _chunks(samples, length):
-        yield np.asarray(_chunk_products(table, drive, chunk, None, steady_state))
+        yield _chunk_products(table, drive, chunk, None, steady_state)
 
 
-@eqx.filter_jit
+@jit
 def _chunk_products(
     table: _ResponseTable, drive: Drive, chunk: _Samples, baseline: Array | None, steady_state: bool
 ) -> Array:
@@ -321,17 +322,17 @@ def _accumulate_measured(table: _ResponseTable, drive: Sampled, samples: _Sample
     """Yield the inner products of each chunk for a measured drive."""
     time = samples.time
     length, step, first = _chunk_length(time.size), float(table.step), float(drive.samples[0])
-    x = step / table.nodes if _is_exactly_uniform(time) and step < float(jnp.min(table.nodes)) else None
-    last = jnp.zeros(NODES), jnp.asarray(time[0]), jnp.zeros(())  # the first sample is a jump from 0
+    x = step / table.nodes if _is_exactly_uniform(time) and step < np.min(table.nodes) else None
+    last = np.zeros(NODES), np.asarray(time[0]), np.zeros(())  # the first sample is a jump from 0
     if x is not None:
-        last = first * jnp.exp(x), jnp.asarray(time[0] - step), jnp.asarray(first)
+        last = first * np.exp(x), np.asarray(time[0] - step), np.asarray(first)
     voltages = _chunks(samples._replace(observed=np.asarray(drive.samples)[: time.size]), length)
     for chunk, driven in zip(_chunks(samples, length), voltages, strict=True):
         total, last = _advance_chunk(table, chunk, driven.observed, last, time[0], x)
-        yield np.asarray(total)
+        yield total
 
 
-@eqx.filter_jit
+@jit
 def _advance_chunk(
     table: _ResponseTable,
     chunk: _Samples,
@@ -391,7 +392,7 @@ def _assemble(table: _ResponseTable, total: np.ndarray, decays: bool, samples: i
     following = 0.0 if table.expected_terms.rate is None else float(table.expected_terms.rate) * rate
     observed = remainder + float(table.expected_terms.weight[0]) * middle + following
     arrays = table.center, TABLE_HALF_WIDTH, signal[:rank], decay, baseline, rate, slope, observed, float(samples)
-    return Compression(*map(jnp.asarray, arrays))
+    return Compression(*map(np.asarray, arrays))
 
 
 def round_up_column_count(count: SupportsFloat, maximum: int) -> int:

@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from fitact.compiled import pad_samples
+from fitact.compiled import jit, pad_samples
 from fitact.likelihood.compression import BASELINE_NAMES, evaluate_baseline
 from fitact.model.circuit import HighpassTerms
 from fitact.model.drive import Drive, Sampled
@@ -34,7 +34,7 @@ class GridCompression(eqx.Module):
 
     def covers(self, tau: Array) -> Bool[Array, "*shape"]:
         """Return True, since the grid belongs to the circuit."""
-        return jnp.ones_like(tau, dtype=bool)
+        return np.ones(np.shape(tau), dtype=bool)
 
     def response(self, terms: HighpassTerms) -> Float[Array, " rows"]:
         """Return the response of a circuit; compare `fitact.response`."""
@@ -80,14 +80,14 @@ def compress_on_grid(
         rows = [u[0], baseline, rate[part][None], observed[part][None] / scale, (u[1] - u[2]) / (2.0 * step)]
         columns = (np.concatenate(rows) * weight[part]).T
         triangle = np.linalg.qr(np.vstack([triangle, columns]), mode="r")
-    parts = [jnp.asarray(x.T) for x in np.split(triangle, np.cumsum([size, len(BASELINE_NAMES), 1, 1]), axis=1)]
+    parts = [x.T for x in np.split(triangle, np.cumsum([size, len(BASELINE_NAMES), 1, 1]), axis=1)]
     return GridCompression(
         signal=parts[0],
         delay_slopes=parts[4],
         baseline=parts[1],
         rate=parts[2][0],
         observed=parts[3][0] * scale,
-        samples=jnp.asarray(float(np.count_nonzero(weight))),
+        samples=np.asarray(float(np.count_nonzero(weight))),
     )
 
 
@@ -99,11 +99,11 @@ def _responses(
     for first in range(0, time.size, length):
         part = slice(first, first + length)
         times = pad_samples(time[part], min(length, time.size))
-        u = np.stack([np.asarray(_compute_responses(drive, tau, times + x, steady_state)) for x in offsets])
+        u = np.stack([_compute_responses(drive, tau, times + x, steady_state) for x in offsets])
         yield part, u[..., : time[part].size]
 
 
-@eqx.filter_jit
+@jit
 def _compute_responses(drive: Drive, tau: Array, time: Array, steady_state: bool) -> Float[Array, "terms samples"]:
     def highpass_response(tau: Array) -> Array:
         return highpass(drive, time, tau, steady_state=steady_state)

@@ -7,6 +7,7 @@ logarithm of each channel's noise. Linear nuisances are integrated out (`fitact.
 import dataclasses
 import math
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,13 +16,28 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from fitact.compiled import jit, pad_rows
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
-from fitact.model.circuit import RC, Circuit
-from fitact.model.skin import WithSkin, circuit_parameters, with_values
+from fitact.model.circuit import RC, Channel, Circuit, HighpassTerms
+from fitact.model.skin import WithSkin, circuit_parameters, constant_skin_circuit, has_time_constants, with_values
 from fitact.prior.distributions import Distribution
 from fitact.prior.prior import Prior
 
 UNCONSTRAINED_SD = math.log(1e6)  # in a log-parameter; a larger sd counts as no constraint
+
+
+class CircuitValues(NamedTuple):
+    """A circuit at one point theta, or circuits at many, with a row for each."""
+
+    circuit: Circuit
+    g: Array
+    b: Array  # slowest time constant, s
+    tau: Array  # all time constants, s; with a skin model, of the circuit without it
+    terms: dict[Channel, HighpassTerms]  # of Vsc and I; empty for a skin without time constants
+
+    def row(self, index: int) -> "CircuitValues":
+        """Return the circuit at one point."""
+        return jax.tree.map(lambda values: values[index], self)
 
 
 class Likelihood(eqx.Module):
@@ -106,6 +122,8 @@ class Likelihood(eqx.Module):
 
     def circuit(self, theta: Float[Array, " circuit_parameters"]) -> Circuit:
         """Return the circuit at theta, with NaN for extreme values, so that no optimiser step leads there."""
+        if isinstance(theta, np.ndarray):  # outside compiled functions
+            return self.evaluate_circuits(theta[None]).row(0).circuit
         # no finger exceeds 1e30 or falls below 1e-30 SI units, where products overflow
         theta = jnp.where(jnp.abs(theta) < 70.0, theta, jnp.nan)
         known = circuit_parameters(self.template)
@@ -114,22 +132,36 @@ class Likelihood(eqx.Module):
             values[name] = ratio * values.get(other, known[other])
         return with_values(self.template, values)
 
+    def evaluate_circuits(self, points: Float[np.ndarray, "n parameters"]) -> CircuitValues:
+        """Return the circuits at many points theta, as NumPy arrays with a row for each point."""
+        known = circuit_parameters(self.template)
+        kept = [i for i, name in enumerate(self.prior.names) if name in known]
+        names = tuple(self.prior.names[i] for i in kept)
+        # without all that the circuit does not depend on, so that one program serves all likelihoods
+        bare = Likelihood((), self.template, Prior(names, ()), (), self.tied)
+        batch = 64 if len(points) <= 64 else 2048
+        rows = pad_rows(points[:, kept], batch)
+        parts = [_evaluate_circuits(bare, rows[i : i + batch]) for i in range(0, len(rows), batch)]
+        return jax.tree.map(lambda *values: np.concatenate(values)[: len(points)], *parts)
+
     def channel_inputs(self, theta: Float[Array, " circuit_parameters"], index: int = 0) -> ChannelInputs:
         """Return the inputs of the channel with this index at theta."""
-        return self._make_inputs(self.circuit(theta), theta, self.channels[index])
+        return self.make_inputs(self.circuit(theta), theta, self.channels[index])
 
-    def _make_inputs(self, circuit: Circuit, theta: Array, channel: ChannelLikelihood) -> ChannelInputs:
+    def make_inputs(self, circuit: Circuit, theta: Array, channel: ChannelLikelihood) -> ChannelInputs:
+        """Return the inputs of a channel at theta, where the circuit is `circuit`."""
         places = {name: i for i, name in enumerate(self.names)}
         timing = {n: theta[places[channel.qualified_name(n)]] * channel.timing_unit(n) for n in channel.timing}
         gain = places.get(channel.qualified_name("gain"))
-        return ChannelInputs(circuit, 1.0 if gain is None else jnp.exp(theta[gain]), **timing)
+        exp = np.exp if isinstance(theta, np.ndarray) else jnp.exp
+        return ChannelInputs(circuit, 1.0 if gain is None else exp(theta[gain]), **timing)
 
     def channels_and_inputs(
         self, theta: Float[Array, " circuit_parameters"]
     ) -> Iterator[tuple[ChannelLikelihood, ChannelInputs]]:
         """Yield each channel and its inputs at theta."""
         circuit = self.circuit(theta)
-        return ((channel, self._make_inputs(circuit, theta, channel)) for channel in self.channels)
+        return ((channel, self.make_inputs(circuit, theta, channel)) for channel in self.channels)
 
     def residuals(
         self, theta: Float[Array, " circuit_parameters"], sigma: Float[Array, " channels"]
@@ -172,16 +204,27 @@ class Likelihood(eqx.Module):
             value = value if prior is None else value + prior.log_density(log)
         return value
 
-    def log_prob(self, point: Float[Array, " coordinates"]) -> Float[Array, ""]:
-        """Return the log-posterior of (theta, log sigma), up to a constant.
+    def log_prob_parts(self, point: Float[Array, " coordinates"]) -> Float[Array, "channels+1"]:
+        """Return the log-likelihood of each channel and the log-prior; see `combine_log_prob`."""
+        return jnp.append(self.log_likelihoods(point), self.log_prior(point))
+
+    def combine_log_prob(
+        self, point: Float[Array, "*n coordinates"], parts: Float[Array, "*n channels+1"]
+    ) -> Float[Array, "*n"]:
+        """Return the log-posterior of points (theta, log sigma), up to a constant, from their `log_prob_parts`.
 
         A value that is not finite becomes -inf, but it is NaN outside a compression.
         """
-        log_prior, value = self.log_prior(point), self.log_likelihood(point)
+        xp = np if isinstance(parts, np.ndarray) else jnp
+        value, log_prior = xp.sum(parts[..., :-1], axis=-1), parts[..., -1]
         compressed = any(channel.compression is not None for channel in self.channels)
-        beyond = jnp.isnan(value) & jnp.all(jnp.isfinite(point)) & jnp.isfinite(log_prior) & compressed
+        beyond = xp.isnan(value) & xp.all(xp.isfinite(point), axis=-1) & xp.isfinite(log_prior) & compressed
         value = value + log_prior
-        return jnp.where(jnp.isfinite(value) | beyond, value, -jnp.inf)
+        return xp.where(xp.isfinite(value) | beyond, value, -xp.inf)
+
+    def log_prob(self, point: Float[Array, " coordinates"]) -> Float[Array, ""]:
+        """Return the log-posterior of (theta, log sigma), up to a constant; see `combine_log_prob`."""
+        return self.combine_log_prob(point, self.log_prob_parts(point))
 
     def sample_prior(
         self, theta: Float[np.ndarray, " circuit_parameters"], count: int
@@ -198,3 +241,15 @@ class Likelihood(eqx.Module):
         for i, (name, (base, unit)) in enumerate(self.timing.items(), len(values)):
             values[name] = base + theta[..., i] * unit
         return values
+
+
+@jit
+def _evaluate_circuits(likelihood: Likelihood, points: Float[Array, "n parameters"]) -> CircuitValues:
+    def evaluate(theta: Array) -> CircuitValues:
+        circuit = likelihood.circuit(theta)
+        channels: tuple[Channel, ...] = ("Vsc", "I") if has_time_constants(circuit) else ()
+        terms = {channel: circuit.channel_terms(channel) for channel in channels}
+        tau = jnp.stack(constant_skin_circuit(circuit).terms().tau)
+        return jax.tree.map(jnp.asarray, CircuitValues(circuit, circuit.g, circuit.b, tau, terms))
+
+    return jax.vmap(evaluate)(points)

@@ -84,7 +84,7 @@ class Autoregression(NamedTuple):
         # padded with zeros, so that most orders share compiled code
         fill = 2 ** math.ceil(math.log2(max(self.coefficients.size, 1))) - self.coefficients.size
         taps = np.concatenate([[1.0], -self.coefficients, np.zeros(fill)]) / self.innovation_ratio
-        return Whitening(jnp.asarray(taps), jnp.asarray(kept, dtype=float))
+        return Whitening(taps, np.asarray(kept, dtype=float))
 
 
 def fit_ar_burg(values: Float[np.ndarray, " n"], max_order: int = 40) -> Autoregression:

@@ -6,7 +6,7 @@ value is the limit from the right. From rest, a drive is zero before t = 0 (or b
 there.
 """
 
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,6 +21,11 @@ from fitact.errors import InputError
 
 def _as_float(values: ArrayLike) -> Array:
     return jnp.asarray(values, dtype=float)
+
+
+def _as_array(values: ArrayLike) -> Any:
+    """Return an array as it is, so that a record stays in NumPy outside compiled functions, and else a JAX array."""
+    return values if isinstance(values, np.ndarray | Array) else jnp.asarray(values)
 
 
 def _rounding_error(size: Array, ulps: float = 8.0) -> Array:
@@ -327,8 +332,8 @@ class Sampled(InterpolatedDrive):
             next period, and a steady state exists.
     """
 
-    time: Float[Array, " samples"] = eqx.field(converter=jnp.asarray)
-    samples: Float[Array, " samples"] = eqx.field(converter=jnp.asarray)
+    time: Float[Array, " samples"] = eqx.field(converter=_as_array)
+    samples: Float[Array, " samples"] = eqx.field(converter=_as_array)
     period: ArrayLike | None = None
 
     def points(self) -> tuple[Float[Array, " samples"], Float[Array, " samples"]]:

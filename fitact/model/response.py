@@ -134,8 +134,9 @@ def harmonic_decomposition(circuit: WithSkin, drive: Drive, channel: Channel) ->
 
 def highpass(drive: Drive, time: ArrayLike, tau: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
     """Return the response of s tau / (1 + s tau) to `drive` at `time`; arguments as in `response`."""
-    time = jnp.asarray(time, dtype=float)
     wave = drive.wave if isinstance(drive, Burst) else drive
+    at_samples = isinstance(wave, Sampled) and time is wave.time
+    time = jnp.asarray(time, dtype=float)
     if not isinstance(wave, Sine | Multitone | PiecewiseLinear | InterpolatedDrive | Chirp):
         raise TypeError(f"no exact response to a {type(wave).__name__}")
     if steady_state:
@@ -145,7 +146,7 @@ def highpass(drive: Drive, time: ArrayLike, tau: ArrayLike, *, steady_state: boo
     if isinstance(wave, InterpolatedDrive) and wave.period is None:
         pieces = wave.pieces()
         at_knots = knot_values(pieces, tau, pieces.start[0])
-        if isinstance(wave, Sampled) and time is wave.time:  # the samples of the drive itself need no search
+        if at_samples:  # they need no search
             return at_knots
         u = _propagate(wave, time, tau, at_knots)
         return u if isinstance(wave, Sampled) else jnp.where(time >= wave.start_time, u, 0.0)

@@ -11,18 +11,15 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 from jaxtyping import Array, Bool, Float, Int
 
-from fitact.compiled import pad_samples
+from fitact.compiled import jit, pad_samples
 from fitact.data.record import Record
 from fitact.fitting.fit import Fit
 from fitact.fitting.least_squares import least_squares
-from fitact.fitting.levenberg_marquardt import result_name
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import STUDENT_DOF, student_curvature, student_weight
@@ -67,13 +64,13 @@ def cross_validate(fit: Fit, folds: int = 10) -> CrossValidation:
     log_density, failed = np.zeros(total), 0
     with jax.enable_x64(True):
         likelihood = fit.likelihood.without_compression()
-        sigma = jnp.asarray([trace.sigma for trace in fit.traces])
+        sigma = np.array([trace.sigma for trace in fit.traces])
         for number in range(folds):
             training = [fold[block] != number for block in blocks]
             without = _mask_samples(likelihood, training)
-            refit = least_squares(without, jnp.asarray(fit.theta), sigma)
-            failed += result_name(refit.result) != "successful"
-            model = _LinearisedModel.from_refit(likelihood, without, refit.theta, np.asarray(refit.sigma), training)
+            refit = least_squares(without, fit.theta, sigma)
+            failed += refit.result != "successful"
+            model = _LinearisedModel.from_refit(likelihood, without, refit.theta, refit.sigma, training)
             for held_out in np.flatnonzero(fold == number):
                 log_density[held_out] = model.log_density([block == held_out for block in blocks])
     return CrossValidation(log_density, folds, failed)
@@ -83,7 +80,7 @@ def _mask_samples(likelihood: Likelihood, masks: list[np.ndarray]) -> Likelihood
     """Return the likelihood of the masked samples of each channel only."""
     for i, (trace, mask) in enumerate(zip(likelihood.channels, masks, strict=True)):
         if trace.whitening is None:
-            trace = dataclasses.replace(trace, weight=jnp.asarray(trace.weights * mask))
+            trace = dataclasses.replace(trace, weight=trace.weights * mask)
         else:  # the whitening filter still runs over all samples
             whitening = dataclasses.replace(trace.whitening, mask=trace.whitening.mask * mask)
             trace = dataclasses.replace(trace, whitening=whitening)
@@ -110,7 +107,7 @@ class _LinearisedModel(NamedTuple):
     def from_refit(
         cls, full: Likelihood, training: Likelihood, theta: Array, sigma: np.ndarray, masks: list[np.ndarray]
     ) -> "_LinearisedModel":
-        residuals, slopes, shapes = _linearise(full, training, theta, jnp.asarray(sigma))
+        residuals, slopes, shapes = _linearise(full, training, theta, sigma)
         ends = np.cumsum([0, *map(len, shapes)])
         channels, precision = [], np.eye(theta.size + ends[-1])
         for i, (trace, mask) in enumerate(zip(full.channels, masks, strict=True)):
@@ -145,7 +142,7 @@ class _LinearisedModel(NamedTuple):
         return total + 0.5 * float(score @ np.linalg.solve(wider, score)) - 0.5 * float(log_ratio)
 
 
-@eqx.filter_jit
+@jit
 def _linearise(
     full: Likelihood, training: Likelihood, theta: Array, sigma: Array
 ) -> tuple[tuple[Array, ...], tuple[Array, ...], tuple[Array, ...]]:

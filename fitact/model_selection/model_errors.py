@@ -13,12 +13,11 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple, TypeAlias
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from fitact.compiled import pad_rows
+from fitact.compiled import jit, pad_rows
 from fitact.model.chirp import Chirp
 from fitact.model.circuit import Channel
 from fitact.model.drive import Burst, Drive, LinearPieces, Multitone, Periodic, PiecewiseLinear, Sampled, Sine
@@ -315,7 +314,7 @@ def _tones(wave: Any) -> list[tuple[int, float, float]]:
     return [(order, float(height), float(phase)) for order, height, phase in tones]
 
 
-@functools.partial(jax.jit, static_argnums=2)
+@functools.partial(jit, double=False)
 def _column_knots(
     segments: LinearPieces, tau: Float[Array, " circuits"], steady_state: bool
 ) -> Float[Array, "circuits pieces"]:
@@ -324,7 +323,7 @@ def _column_knots(
     return jax.vmap(functools.partial(steady_knot_values, segments) if steady_state else begin)(tau)
 
 
-@eqx.filter_jit
+@functools.partial(jit, double=False)
 def _chirp_response(
     drive: Drive, time: Array, tau: Float[Array, "circuits terms"]
 ) -> Float[Array, "circuits terms times"]:

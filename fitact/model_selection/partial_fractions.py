@@ -3,16 +3,15 @@
 All circuits share one compiled program: elements that a circuit lacks get a negligible value.
 """
 
-import functools
 import math
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex
 
+from fitact.compiled import jit
 from fitact.model.circuit import RC, Channel, DirectGround, FinalCircuit, NaturalGround, Probe
 from fitact.model.drive import Drive, Multitone, Periodic, Sine
 from fitact.model.harmonic import fourier_coefficients
@@ -21,8 +20,8 @@ from fitact.model.skin import Fractional, SkinModel, WithSkin, high_frequency_ba
 ROWS = 128  # circuits in one evaluation; fewer are padded, so that each program is compiled once
 _BLOCK = 64  # frequencies in one program
 
-_fourier_coefficients = eqx.filter_jit(fourier_coefficients)
-_circuit_at_frequency = eqx.filter_jit(WithSkin.circuit_at_frequency)
+_fourier_coefficients = jit(fourier_coefficients)
+_circuit_at_frequency = jit(WithSkin.circuit_at_frequency)
 
 
 def complete_circuit(circuit: RC) -> DirectGround | NaturalGround:
@@ -92,7 +91,7 @@ def _transfer_function(
     return np.concatenate(parts, axis=1)[:, : omega.size]
 
 
-@functools.partial(jax.jit, static_argnums=2)
+@jit
 def _channel_gain(circuits: WithSkin, omega: Array, channel: Channel) -> Complex[Array, "circuits frequencies"]:
     return jax.vmap(lambda circuit: circuit.channel_gain(channel, omega))(circuits)
 
@@ -107,7 +106,7 @@ def _constant_skin_terms(circuit: Any, channel: Channel) -> tuple[np.ndarray, np
     return np.asarray(weight), np.asarray(tau)
 
 
-@functools.partial(jax.jit, static_argnums=1)
+@jit
 def _batch_terms(circuit: DirectGround, channel: Channel) -> tuple[Array, Array]:
     terms = jax.vmap(lambda one: one.channel_terms(channel))(circuit)
     return jnp.stack(terms.weight, axis=1), jnp.stack(terms.tau, axis=1)

@@ -5,7 +5,6 @@ import math
 import os
 from typing import Self
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +12,7 @@ import scipy.linalg
 from jaxtyping import Array, Float
 
 from fitact import summary
+from fitact.compiled import jit
 from fitact.fitting.fit import Fit
 from fitact.likelihood.likelihood import Likelihood
 from fitact.prior.distributions import LogNormal
@@ -97,7 +97,7 @@ def _flatten_skin_prior(likelihood: Likelihood, log_sd: float = 1e3) -> Likeliho
     return dataclasses.replace(likelihood, prior=Prior.of(**marginals))
 
 
-@eqx.filter_jit
+@jit
 def _linearize(likelihood: Likelihood, theta: Array, sigma: Array) -> tuple[Array, Array]:
     def residuals(theta: Array) -> Array:
         return jnp.concatenate([*likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)])

@@ -7,6 +7,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Array, Float
 
+from fitact.compiled import jit
 from fitact.populations.finger import SHARED_PARAMETER, SKIN
 from fitact.populations.finger_likelihoods import TABLE_HALF_WIDTH, FingerLikelihoods, PopulationParameters
 from fitact.prior.prior import Prior
@@ -121,14 +122,13 @@ def laplace(hierarchy: Hierarchy) -> tuple[Float[np.ndarray, " coordinates"], Fl
     scale[[name.startswith("shift") for name in hierarchy.names]] = 1.0
     # the tables' half-width is a known multiple of the standard deviation of log Ci
     scale[2] = float(jnp.min(hierarchy.fingers.half_width)) / TABLE_HALF_WIDTH
-    objective = eqx.Partial(_objective, hierarchy, jnp.asarray(start), jnp.asarray(scale))
     optimum = scipy.optimize.minimize(
-        lambda z: tuple(map(np.asarray, _value_and_gradient(objective, jnp.asarray(z)))),
+        lambda z: _value_and_gradient(hierarchy, start, scale, z),
         np.zeros(start.size),
         jac=True,
         method="BFGS",
     ).x
-    curvature, axes = np.linalg.eigh(np.asarray(_hessian(objective, jnp.asarray(optimum))))
+    curvature, axes = np.linalg.eigh(_hessian(hierarchy, start, scale, optimum))
     # a curvature below a tenth of the start's is taken as a tenth
     return start + scale * optimum, scale[:, None] * axes / np.sqrt(np.maximum(curvature, 0.1))
 
@@ -137,5 +137,11 @@ def _objective(hierarchy: Hierarchy, start: Array, scale: Array, z: Array) -> Ar
     return -hierarchy.log_prob(start + scale * z)
 
 
-_value_and_gradient = eqx.filter_jit(lambda objective, z: jax.value_and_grad(objective)(z))
-_hessian = eqx.filter_jit(lambda objective, z: jax.hessian(objective)(z))
+@jit
+def _value_and_gradient(hierarchy: Hierarchy, start: Array, scale: Array, z: Array) -> tuple[Array, Array]:
+    return jax.value_and_grad(_objective, argnums=3)(hierarchy, start, scale, z)
+
+
+@jit
+def _hessian(hierarchy: Hierarchy, start: Array, scale: Array, z: Array) -> Array:
+    return jax.hessian(_objective, argnums=3)(hierarchy, start, scale, z)

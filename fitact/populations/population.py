@@ -10,9 +10,10 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from fitact import summary
+from fitact.compiled import jit
 from fitact.files import atomic_write
 from fitact.populations.contact_area import ContactAreaTest
 from fitact.populations.covariates import Covariates
@@ -339,8 +340,12 @@ def variance_sentences(content: dict[str, Any]) -> tuple[str, ...]:
 
 
 def evaluate_parameters(hierarchy: Hierarchy, points: Float[np.ndarray, "chains draws n"]) -> PopulationParameters:
-    with jax.enable_x64(True):
-        return jax.tree.map(np.asarray, jax.jit(jax.vmap(jax.vmap(hierarchy.population_parameters)))(points))
+    return _evaluate_parameters(hierarchy, points)
+
+
+@jit
+def _evaluate_parameters(hierarchy: Hierarchy, points: Float[Array, "chains draws n"]) -> PopulationParameters:
+    return jax.vmap(jax.vmap(hierarchy.population_parameters))(points)
 
 
 def draw_parameters(population: Population, count: int) -> PopulationParameters:

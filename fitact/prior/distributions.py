@@ -102,7 +102,7 @@ class LogNormal(Distribution):
 
     def from_standard_normal(self, z: ArrayLike) -> Float[Array, "*shape"]:
         """Return u = log x, the inverse of `to_standard_normal`."""
-        return _log(self.median) + self.spread * jnp.asarray(z)
+        return _log(self.median) + self.spread * z
 
 
 class Bounded(Distribution):
@@ -267,8 +267,8 @@ class TruncatedLogNormal(Bounded):
 
 
 def _log(x: Any) -> Any:
-    """Return the logarithm of an array, or of a number in double precision."""
-    return jnp.log(x) if isinstance(x, jax.Array) else math.log(x)
+    """Return the logarithm, by NumPy outside compiled functions."""
+    return jnp.log(x) if isinstance(x, jax.Array) else np.log(x)
 
 
 def _check_limits(kind: str, low: float, high: float) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitact import summary
+from fitact.compiled import jit
 from fitact.model.circuit import FinalCircuit
 from fitact.model.drive import Drive, Periodic, PiecewiseLinear
 from fitact.model.force import electrostatic_force, mean_force, peak_force
@@ -56,9 +57,7 @@ def prior_predictive(scene: Scene, draws: int = 2000, seed: int = 0) -> PriorPre
     with jax.enable_x64(True):
         time = jnp.asarray(_times(drive, scene.measurement.duration, repeats))
         circuits = {name: jnp.asarray(x) for name, x in parameters.items() if name not in ("sigma", "sigma_I")}
-        predict = functools.partial(_predict_draw, scene, drive, repeats, time)
-        # this batch size bounds the memory for draws with many harmonics
-        vsc, derived = jax.jit(lambda rows: jax.lax.map(predict, rows, batch_size=100))(circuits)
+        vsc, derived = _predict_draws(scene.to_json(), drive, repeats, time, circuits)
     order = ("g", "b", "Vsc_peak_to_peak", "force_mean", "force_peak")
     derived = {name: np.asarray(derived[name]) for name in order if name in derived}
     return PriorPredictive(parameters, derived, np.asarray(time), np.asarray(vsc), seed)
@@ -81,6 +80,15 @@ def sample_prior(scene: Scene, rng: np.random.Generator, size: int) -> dict[str,
     drawn = scene.make_prior().sample(rng, size)
     drawn |= {name: np.full(size, value) for name, value in scene.fixed_values().items()}
     return drawn | {name: ratio * drawn[other] for name, (other, ratio) in scene.prior.ties().items()}
+
+
+@jit
+def _predict_draws(
+    scene: str, drive: Drive, repeats: bool, time: Float[Array, " times"], values: dict[str, Float[Array, " draws"]]
+) -> tuple[Float[Array, "draws times"], dict[str, Float[Array, " draws"]]]:
+    predict = functools.partial(_predict_draw, Scene.from_json(scene), drive, repeats, time)
+    # this batch size bounds the memory for draws with many harmonics
+    return jax.lax.map(predict, values, batch_size=100)
 
 
 def _predict_draw(

@@ -44,8 +44,6 @@ def fitact_process(environment, tmp_path):
 def fitact_command(tmp_path, monkeypatch, capsys):
     """Return a function that runs the command in this process, where most is already compiled: ten times as fast."""
     monkeypatch.chdir(tmp_path)
-    # otherwise the command would move the compilation cache of this process to the user's
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", os.environ.get("JAX_COMPILATION_CACHE_DIR", str(tmp_path)))
     monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)  # main() sets its own hook
 
     def call(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -228,9 +226,40 @@ def test_tradeoff_is_written_or_ends_without_a_trace(fitact_process, environment
     assert done.returncode == 0
     content = json.loads(done.stdout)
     assert json.loads((tmp_path / "whole" / "tradeoff.json").read_text()) == content
-    assert {level["kind"] for level in content["levels"]} == {"response", "likelihood", "uncertainty"}
+    assert {level["kind"] for level in content["levels"]} == {"answer", "response", "likelihood", "uncertainty"}
     assert (tmp_path / "whole" / "tradeoff.svg").read_text().startswith("<?xml")
     assert f"tradeoff {finger_path} --out whole" in (tmp_path / "whole" / "report.html").read_text()
+
+
+def test_a_fit_imports_only_what_it_uses(finger_path: Path, finger_scene_path: Path):
+    """Submodules are looked for, since a lazily imported package is in sys.modules before it is loaded."""
+    code = """
+import sys
+from fitact.cli import main
+try:
+    main()
+except SystemExit as end:
+    assert not end.code, end.code
+loaded = ["matplotlib.figure", "pandas", "arviz_stats", "dask", "h5py._hl", "plotly", "pint.registry", "emcee"]
+print([name for name in loaded if name in sys.modules], file=sys.stderr)
+"""
+    command = [sys.executable, "-c", code, "fit", str(finger_path), "--scene", str(finger_scene_path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.stderr.splitlines()[-1] == "[]"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
+def test_a_terminal_shows_at_once_what_is_read(finger_path: Path):
+    """Before the record is read and anything heavy is imported: of a missing scene, the record's name comes first."""
+    ours, theirs = os.openpty()
+    command = [sys.executable, "-c", "from fitact.cli import main; main()", "fit", str(finger_path), "--scene", "none"]
+    done = subprocess.run(command, stderr=theirs, stdout=subprocess.PIPE)
+    os.close(theirs)
+    shown = os.read(ours, 4096).decode().splitlines()
+    os.close(ours)
+    assert done.returncode == 2
+    assert shown[0] == f"reading {finger_path}"
+    assert "none" in shown[1]
 
 
 def test_prior_is_shown_before_any_data(fitact_command, tmp_path):

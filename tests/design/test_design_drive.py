@@ -556,14 +556,15 @@ def test_people_are_those_of_the_population(eight):
     assert np.std(off) < 0.2 * np.std(np.log(option.amplitude))
 
 
-def population_of(results: list[str]) -> types.SimpleNamespace:
-    """A population that differs in its contact area only, with fits of these results."""
-
-    def parameters(_: np.ndarray) -> PopulationParameters:
+class _FixedHierarchy:
+    def population_parameters(self, _: np.ndarray) -> PopulationParameters:
         return PopulationParameters(np.log([R, C]), np.zeros(2), 0.0, math.log(CI), 0.3)
 
+
+def population_of(results: list[str]) -> types.SimpleNamespace:
+    """A population that differs in its contact area only, with fits of these results."""
     return types.SimpleNamespace(
-        hierarchy=types.SimpleNamespace(population_parameters=parameters),
+        hierarchy=_FixedHierarchy(),
         points=np.zeros((1, 1000, 1)),
         at=np.zeros(0),
         fingers=tuple(types.SimpleNamespace(result=result) for result in results),

@@ -292,7 +292,6 @@ def test_what_cannot_be_asked():
 
 def test_command_line(design: fitact.MeasurementDesign, tmp_path: Path, monkeypatch, capsys):
     (tmp_path / "scene.toml").write_text(str(SCENE))
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))  # so that this process keeps its own
     monkeypatch.setattr("fitact.design.measurement.design_measurement", lambda scene, records: design)
     monkeypatch.setattr(
         sys,

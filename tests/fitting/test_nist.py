@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from jax import Array
 
-from fitact.fitting import levenberg_marquardt
+from fitact.fitting import minimum
 
 DATA = Path(__file__).parents[1] / "nist_strd"
 
@@ -112,15 +112,13 @@ def digits(found: np.ndarray, certified: np.ndarray) -> float:
 
 
 @functools.cache
-def solved(name: str) -> tuple[Problem, levenberg_marquardt.Minimum]:
+def solved(name: str) -> tuple[Problem, minimum.Minimum]:
     """Return the solutions from both starts."""
     problem, model = read(name), MODELS[name]
 
     @eqx.filter_jit
-    def both(starts: Array, x: Array, y: Array) -> levenberg_marquardt.Minimum:
-        return jax.vmap(lambda start: levenberg_marquardt.minimise(lambda b: model(b, x) - y, start, max_steps=10_000))(
-            starts
-        )
+    def both(starts: Array, x: Array, y: Array) -> minimum.Minimum:
+        return jax.vmap(lambda start: minimum.minimise(lambda b: model(b, x) - y, start, max_steps=10_000))(starts)
 
     with jax.enable_x64(True):
         return problem, both(jnp.asarray(problem.starts), jnp.asarray(problem.x), jnp.asarray(problem.y))
@@ -136,7 +134,7 @@ QUICK = {"Misra1a", "Chwirut2", "Lanczos3", "Gauss1", "MGH09", "Thurber", "BoxBO
 )
 def test_certified_values(name: str, start: int):
     problem, ends = solved(name)
-    assert levenberg_marquardt.result_name(jax.tree.map(lambda leaf: leaf[start], ends.result)) == "successful"
+    assert minimum.result_name(jax.tree.map(lambda leaf: leaf[start], ends.result)) == "successful"
     assert digits(np.asarray(ends.theta)[start], problem.values) >= 6.0
     # the residuals of Lanczos1 are rounding errors of its data and of double precision
     if name != "Lanczos1":
@@ -144,7 +142,7 @@ def test_certified_values(name: str, start: int):
         assert digits(standard_deviations(problem, ends, start), problem.sd) >= 6.0
 
 
-def standard_deviations(problem: Problem, ends: levenberg_marquardt.Minimum, start: int) -> np.ndarray:
+def standard_deviations(problem: Problem, ends: minimum.Minimum, start: int) -> np.ndarray:
     """Return standard deviations of the parameters by linear theory, from the engine's Jacobian."""
     freedom = problem.y.size - problem.values.size
     _, triangle = np.linalg.qr(np.asarray(ends.jacobian)[start])

@@ -338,7 +338,11 @@ def nuts(fits: list[fitact.Fit], prior: Prior) -> dict[str, np.ndarray]:
 
     count = len(fits)
     arrays, (static, *_) = zip(
-        *(eqx.partition(fit.likelihood.without_compression(), eqx.is_array) for fit in fits), strict=True
+        *(
+            eqx.partition(fit.likelihood.without_compression(), lambda leaf: isinstance(leaf, np.ndarray | jax.Array))
+            for fit in fits
+        ),
+        strict=True,
     )
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *arrays)
 

@@ -1,0 +1,110 @@
+"""Minima of sums of squares, from one start or many, and the names of the reasons why a search ended.
+
+The solver itself is in `fitact.fitting.levenberg_marquardt`. It is imported only where a program is traced, because a
+program from the disk does without optimistix.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int, PyTree
+
+from fitact.compiled import jit
+
+RESULT_NAMES = (
+    "successful", "did_not_move", "not_at_optimum", "rank_deficient", "on_bound", "several_optima", "misfit",
+    "nonfinite", "nonlinear_max_steps_reached", "nonlinear_divergence",
+)  # fmt: skip
+
+
+def result_name(index: Int[ArrayLike, ""]) -> str:
+    """Return the name of a result in `RESULT_NAMES`."""
+    return RESULT_NAMES[int(index)]
+
+
+def result_message(name: str) -> str:
+    """Return the sentence of a member of `RESULTS`."""
+    from fitact.fitting.levenberg_marquardt import RESULTS
+
+    return str(RESULTS[getattr(RESULTS, name)])  # type: ignore[misc]  # equinox's enumerations look up by item
+
+
+class Minimum(eqx.Module):
+    """Point at which Levenberg-Marquardt ended."""
+
+    theta: Float[Array, " parameters"]
+    cost: Float[Array, ""]  # half of the sum of squared residuals
+    jacobian: Float[Array, "rows parameters"]  # Jacobian of the residuals, in the order of their pytree
+    steps: Array  # trial steps taken
+    result: Int[Array, ""]  # index in `RESULT_NAMES`
+
+
+def minimise(
+    residuals: Callable[[Float[Array, " parameters"]], PyTree[Float[Array, "..."]]],
+    start: Float[Array, " parameters"],
+    max_steps: int = 1000,
+) -> Minimum:
+    """Find the least-squares optimum nearest to `start`; pure, for use within jit and vmap, in double precision.
+
+    Steps are damped in units of the Jacobian's columns (Marquardt 1963).
+    """
+    from fitact.fitting.levenberg_marquardt import find_minimum
+
+    return find_minimum(residuals, start, max_steps)
+
+
+@dataclasses.dataclass(frozen=True)
+class Optima:
+    """Distinct optima from many starting points."""
+
+    minima: Minimum  # stacked, lowest cost first; if no start converged, the lowest end point
+    start_counts: Int[np.ndarray, " optima"]  # number of starts that ended in each
+    n_failed: int  # number of starts that did not converge
+    result: str  # result of the lowest
+
+
+def minimise_many(
+    residuals: Callable[[Float[Array, " parameters"]], PyTree[Float[Array, "..."]]],
+    starts: Float[np.ndarray, "starts parameters"],
+    same_optimum: float = 0.1,
+    log_density_margin: float = 3.0,
+) -> Optima:
+    """Minimise from all starts at once; with residuals in units of their sd, the cost is -log(probability).
+
+    End points less than `same_optimum` standard errors apart count as one optimum. An optimum whose log-probability
+    is lower by less than `log_density_margin` (a twentieth of the density) counts as competing.
+    """
+    ends = _minimise_each(residuals, starts)
+    theta, jacobian = ends.theta, ends.jacobian
+    cost = np.where(np.isfinite(ends.cost), ends.cost, np.inf)
+    order = np.argsort(cost)
+    settled = np.isin(ends.result, [RESULT_NAMES.index(name) for name in ("successful", "rank_deficient")])
+    firsts: list[int] = []
+    counts: list[int] = []
+    for i in order[settled[order]]:
+        apart = [np.linalg.norm(jacobian[first] @ (theta[i] - theta[first])) for first in firsts]
+        if apart and min(apart) < same_optimum:
+            counts[int(np.argmin(apart))] += 1
+        else:
+            firsts.append(i)
+            counts.append(1)
+    lowest = order[0]
+    # an end point below all optima has not converged, so a better optimum exists
+    if not firsts or cost[lowest] < cost[firsts[0]] - 0.5 * same_optimum**2:
+        firsts, counts = [lowest, *firsts], [0, *counts]
+    minima = jax.tree.map(lambda leaf: leaf[np.array(firsts)], ends)
+    result = result_name(minima.result[0])
+    several = len(firsts) > 1 and cost[firsts[1]] < cost[firsts[0]] + log_density_margin
+    if several and result == "successful":
+        result = "several_optima"
+    return Optima(minima, np.array(counts), int(np.sum(~settled)), result)
+
+
+@jit
+def _minimise_each(residuals: Callable[..., Any], starts: Array) -> Minimum:
+    return jax.vmap(lambda start: minimise(residuals, start))(starts)
