@@ -21,6 +21,7 @@ from fitact.tradeoff.tradeoff import COLUMNS, KINDS, BenchmarkedMethod, Kind, Tr
 from fitact.units import format_engineering
 
 _TITLES: dict[Kind, tuple[str, str, str]] = {
+    "answer": ("answer", "the answer", "error of the stated force, relative"),
     "response": ("response", "one evaluation", "error of Vsc, relative rms"),
     "likelihood": ("likelihood", "one evaluation in a batch", "error of the log-likelihood"),
     "uncertainty": ("uncertainty", "one effective draw", "error in posterior standard deviations"),
@@ -30,7 +31,7 @@ _ZERO_RATIO = 30.0  # an error of 0 is drawn at the smallest error over this rat
 
 def draw_tradeoff(tradeoff: Tradeoff, kinds: Sequence[Kind] = tuple(_TITLES)) -> Figure:
     """Draw the methods of some kinds."""
-    figure = Figure(figsize=(13.0 if len(kinds) > 1 else 9.0, 4.8), layout="constrained")
+    figure = Figure(figsize=(max(9.0, 4.4 * len(kinds)), 4.8), layout="constrained")
     canvas = FigureCanvasAgg(figure)
     panels = dict(zip(kinds, figure.subplots(1, len(kinds), squeeze=False)[0], strict=True))
     for kind, axes in panels.items():
@@ -48,12 +49,17 @@ def _heights(levels: Sequence[BenchmarkedMethod]) -> dict[str, float]:
     return {level.name: level.error or zero for level in levels}
 
 
+def _all_seconds(levels: Sequence[BenchmarkedMethod]) -> list[float]:
+    """Return all times on the axis: those of the methods, and of answers in a first process."""
+    return [level.seconds for level in levels] + [x.details["cold_seconds"] for x in levels if x.kind == "answer"]
+
+
 def _draw_panel(axes: Axes, kind: Kind, tradeoff: Tradeoff) -> None:
     plot, size = _plot(tradeoff, kind)
     bare = plot["layout"] | {"showlegend": False}  # the names of the methods replace a legend
     draw_plot(plot | {"layout": bare, "title": _TITLES[kind][0]}, axes)
     axes.grid(visible=False)
-    heights, seconds = _heights(tradeoff.of(kind)).values(), [level.seconds / size for level in tradeoff.of(kind)]
+    heights, seconds = _heights(tradeoff.of(kind)).values(), [x / size for x in _all_seconds(tradeoff.of(kind))]
     zero, margin = min(heights), 1.5 * (max(seconds) / min(seconds)) ** 0.25
     axes.axhline(zero, color=DATA, lw=0.8, ls=":")
     axes.set(xlim=(min(seconds) / margin, max(seconds) * margin), ylim=(zero / 6.0, 10.0 * max(heights)))
@@ -150,7 +156,7 @@ def _plot(tradeoff: Tradeoff, kind: Kind) -> tuple[interactive.Plot, float]:
     levels, height = tradeoff.of(kind), _heights(tradeoff.of(kind))
     _, cost, error = _TITLES[kind]
     seconds = [level.seconds for level in levels]
-    x, y = Axis.from_values(f"time of {cost}", "s", seconds, log=True), Axis(error, log=True)
+    x, y = Axis.from_values(f"time of {cost}", "s", _all_seconds(levels), log=True), Axis(error, log=True)
     middle = (min(seconds) * max(seconds)) ** 0.5
     traces = []
     for name, some, color in (
@@ -171,6 +177,13 @@ def _plot(tradeoff: Tradeoff, kind: Kind) -> tuple[interactive.Plot, float]:
                 "hovertemplate": "%{customdata}<extra></extra>",  # an error of 0 is drawn at another height
             }
         )
+    if kind == "answer":
+        cold = [level.details["cold_seconds"] for level in levels]
+        trace = interactive.points(x, y, cold, list(height.values()), "first time", PRIOR, size=9.0, hollow=True)
+        text = [
+            f"{each.name}, first time, {format_engineering(each.details['cold_seconds'], 's', 3)}" for each in levels
+        ]
+        traces.append(trace | {"customdata": text, "hovertemplate": "%{customdata}<extra></extra>"})
     if kind == "uncertainty":
         ends, least = (min(seconds), max(seconds)), (tradeoff.resolution, tradeoff.resolution)
         traces.append(interactive.line(x, y, ends, least, "smallest significant error", PRIOR, dash="dash"))

@@ -3,7 +3,11 @@
 import dataclasses
 import functools
 import math
+import os
+import pickle
 import statistics
+import subprocess
+import sys
 import time
 import timeit
 from collections.abc import Callable, Sequence
@@ -17,8 +21,10 @@ import scipy.integrate
 from jaxtyping import Array, Float
 
 from fitact.compiled import BatchEvaluator
+from fitact.data.record import Record
 from fitact.fitting.drive_choice import whole_periods
 from fitact.fitting.fit import Fit
+from fitact.fitting.fit import fit as fit_record
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.circuit import RC
 from fitact.model.drive import Drive, Sampled
@@ -26,6 +32,7 @@ from fitact.model.harmonic import harmonic_response
 from fitact.model.response import highpass, response
 from fitact.sampling.ensemble import Level, sample
 from fitact.sampling.posterior import Posterior
+from fitact.scene.scene import Scene
 
 
 @dataclasses.dataclass(frozen=True)
@@ -216,7 +223,7 @@ def format_tolerance(value: float) -> str:
 
 
 def _likelihood_job(model: Likelihood, points: Float[np.ndarray, "batch coordinates"]) -> _Job:
-    dynamic, static = eqx.partition(model, eqx.is_array)
+    dynamic, static = eqx.partition(model, lambda leaf: isinstance(leaf, np.ndarray | jax.Array))
 
     def log_probs(dynamic: Any, points: Array) -> Array:
         return jax.vmap(eqx.combine(dynamic, static).log_prob)(points)
@@ -227,12 +234,22 @@ def _likelihood_job(model: Likelihood, points: Float[np.ndarray, "batch coordina
     return _compile_job(log_probs, gradients, (dynamic, points), len(points))
 
 
+_FORCE_QUANTILES = (0.5, 0.05, 0.95)
+
+
 class UncertaintyBenchmark(NamedTuple):
     """Benchmarks of the posterior methods, resolution of their errors, and convergence of the reference."""
 
     levels: list[BenchmarkResult]
     resolution: float
     converged: bool
+    force: dict[str, list[Float[np.ndarray, " draws"]]]  # draws of the mean force (N), by method and run
+    sampling_seconds: dict[str, float]  # median time of a run by method, compiled, s
+
+    @property
+    def force_log_sd(self) -> float:
+        """Posterior standard deviation of the logarithm of the mean force, by the reference."""
+        return float(np.std(np.log(np.concatenate(self.force["emcee, full"]))))
 
 
 def benchmark_uncertainties(
@@ -260,7 +277,10 @@ def benchmark_uncertainties(
     # of ten differences hardly ever exceeds 2.5 sd
     resolution = 2.5 * 2.11 * math.sqrt(2.0 / fewest)
     converged = all(posterior.convergence.converged for posterior in posteriors["emcee, full"])
-    return UncertaintyBenchmark(levels, resolution, converged)
+    force = {name: [p.force()["force_mean"].ravel() for p in repeated] for name, repeated in posteriors.items()}
+    return UncertaintyBenchmark(
+        levels, resolution, converged, force, {level.name: level.details["seconds"] for level in levels}
+    )
 
 
 def _pool_draws(posteriors: Sequence[Posterior]) -> dict[str, Float[np.ndarray, " draws"]]:
@@ -295,3 +315,62 @@ def _summarize_runs(name: str, posteriors: Sequence[Posterior], discrepancies: d
         8 * points * (posteriors[0].points.shape[-1] + 1),
         discrepancies | {"seconds": seconds, "certified": all(c.converged for c in warm)},
     )
+
+
+# the work of a first answer, as a user's script does it
+_FIRST_ANSWER = """
+import pickle, sys, fitact
+record, scene, level = pickle.load(sys.stdin.buffer)
+fit = fitact.fit(record, scene)
+result = fitact.sample(fit, level=level, progress=False).summary() if level else fit.derived()
+"""
+
+
+def benchmark_answers(
+    record: Record,
+    scene: Scene | None,
+    draws: UncertaintyBenchmark,
+    report: Callable[[str], None],
+    rounds: int = 3,
+) -> list[BenchmarkResult]:
+    """Measure the wall time from a record to the force, by least squares and by each posterior method.
+
+    `seconds` is for a process that has answered before; `cold_seconds` of the details is for a new process without any
+    stored program. The error is the largest difference of median, 5 and 95 % quantile of the mean force, relative to
+    the median by emcee on the full sum; of several runs, the root mean square.
+    """
+    fit_seconds = statistics.median(timeit.timeit(lambda: fit_record(record, scene), number=1) for _ in range(rounds))
+    fitted = fit_record(record, scene).derived()["force_mean"]
+    reference = np.quantile(np.concatenate(draws.force["emcee, full"]), _FORCE_QUANTILES)
+    stated = [np.array([fitted["q50"], fitted["q05"], fitted["q95"]], dtype=float)]
+    results = []
+    for level in (None, "laplace", "psis", "emcee"):
+        report(f"first answer by {level or 'least squares'} in a new process")
+        quantiles = [np.quantile(force, _FORCE_QUANTILES) for force in draws.force[level]] if level else stated
+        errors = [np.max(np.abs(each - reference)) / reference[0] for each in quantiles]
+        sampling = 0.0 if level is None else draws.sampling_seconds[level]
+        cold = _time_first_answer(record, scene, level)
+        results.append(
+            BenchmarkResult(
+                level or "least squares",
+                float(np.sqrt(np.mean(np.square(errors)))),
+                fit_seconds + sampling,
+                compile_seconds=max(0.0, cold - fit_seconds - sampling),
+                details={"cold_seconds": cold},
+            )
+        )
+    return results
+
+
+def _time_first_answer(record: Record, scene: Scene | None, level: str | None) -> float:
+    """Return the time (s) of a new process, imports included, that finds no stored program."""
+    start = time.perf_counter()
+    subprocess.run(
+        [sys.executable, "-c", _FIRST_ANSWER],
+        input=pickle.dumps((record, scene, level)),
+        env=os.environ | {"FITACT_CACHE": "off"},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        check=True,
+    )
+    return time.perf_counter() - start

@@ -21,12 +21,13 @@ from fitact.tradeoff import timings
 from fitact.tradeoff.timings import BenchmarkResult
 from fitact.units import format_engineering
 
-Kind: TypeAlias = Literal["response", "likelihood", "uncertainty"]
+Kind: TypeAlias = Literal["answer", "response", "likelihood", "uncertainty"]
 
 _DEFAULT_TOLERANCE = 1e-3  # default of `fitact.fit`; the posterior methods use this fit
 _WIDTHS = [24, 10, 11, 9, 11, 10, 11]
 COLUMNS = ("method", "error", "time", "ratio", "gradient", "compile", "memory")
 KINDS: dict[Kind, str] = {
+    "answer": "error of the force and its 90 % interval, relative; wall time from the record to the force, compiled",
     "response": "error of Vsc, relative rms; time of one evaluation",
     "likelihood": "error of the log-likelihood; time of one evaluation in a batch",
     "uncertainty": "error in posterior standard deviations; time of one effective draw",
@@ -38,12 +39,13 @@ class BenchmarkedMethod:
     """Error and cost of one method."""
 
     kind: Kind
-    name: str  # "exact", "harmonic(100)", "compressed(1e-3)", "psis", ...
+    name: str  # "least squares", "exact", "harmonic(100)", "compressed(1e-3)", "psis", ...
     error: float  # relative to the reference method; see `Tradeoff`
-    seconds: float  # time of one evaluation (of one walker in a batch), or of one effective draw of the mean force
+    # time of an answer, of one evaluation (of one walker in a batch), or of one effective draw of the mean force
+    seconds: float
     ratio: float  # `seconds` over the time of the exact method
     gradient_seconds: float | None  # time of one gradient, or None
-    compile_seconds: float  # compilation time
+    compile_seconds: float  # compilation time; of an answer, what a first process without stored programs adds
     memory: int | None  # bytes for an evaluation, or for the draws; None if unknown
     dominated_by: str  # a method that is no less accurate and no slower, and better in one; "" on the Pareto front
     details: dict[str, Any]  # additional figures of this method
@@ -68,8 +70,10 @@ class BenchmarkedMethod:
 
 @dataclasses.dataclass(frozen=True)
 class Tradeoff:
-    """Error and cost of the methods for response, likelihood and uncertainty (posterior).
+    """Error and cost of the methods for the answer, response, likelihood and uncertainty (posterior).
 
+    The error of an answer is the largest difference of median, 5 and 95 % quantile of the mean force to emcee on the
+    full sum, over the median; a single run's, so that it includes the error of few draws.
     The error of a response is the rms difference to the exact Vsc over the rms of the exact Vsc. The error of a
     likelihood is the largest difference of the log-posterior to the full sum, up to a constant, over draws around the
     optimum. The error of an uncertainty is the largest difference to emcee on the full sum, in posterior standard
@@ -160,12 +164,15 @@ def measure_tradeoff(
         say("likelihoods")
         likelihoods = timings.benchmark_likelihoods(full, fits)
     say("uncertainties")
-    draws, resolution, converged = timings.benchmark_uncertainties(full, fits[_DEFAULT_TOLERANCE], say, runs)
+    uncertainties = timings.benchmark_uncertainties(full, fits[_DEFAULT_TOLERANCE], say, runs)
+    answers = timings.benchmark_answers(measured, scene if record else used_scene, uncertainties, say)
+    resolution, converged = uncertainties.resolution, uncertainties.converged
     return Tradeoff(
         levels=(
+            *_rank_results("answer", answers, resolution * uncertainties.force_log_sd),
             *_rank_results("response", responses, 1e-12),  # accuracy of Vsc by docs/numerics.md
             *_rank_results("likelihood", likelihoods, 0.0),
-            *_rank_results("uncertainty", draws, resolution),
+            *_rank_results("uncertainty", uncertainties.levels, resolution),
         ),
         record=f"{os.path.basename(measured.source)}: {len(measured):,} samples, drive {full.choice.name}",
         resolution=resolution,

@@ -11,7 +11,7 @@ from tests.report.test_pages import WRITE
 
 __all__ = ["browser"]  # a fixture
 pytestmark = [pytestmark, pytest.mark.slow]
-CHARTS = {"plan": 0, "tradeoff": 3, "measurement": 1, "drive": 2, "population": 2}
+CHARTS = {"plan": 0, "tradeoff": 4, "measurement": 1, "drive": 2, "population": 2}
 
 
 @pytest.fixture(params=WRITE)

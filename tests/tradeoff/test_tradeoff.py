@@ -108,7 +108,16 @@ def some(kind: str, points: list[tuple[float, float]]) -> list[BenchmarkedMethod
     names = [f"a level of {kind} {i}" for i in range(len(points))]
     return [
         BenchmarkedMethod(
-            kind, name, error, cost, cost / points[0][0], None, 0.0, None, "" if j is None else names[j], {}
+            kind,
+            name,
+            error,
+            cost,
+            cost / points[0][0],
+            None,
+            0.0,
+            None,
+            "" if j is None else names[j],
+            {"cold_seconds": 5.0 + cost} if kind == "answer" else {},
         )
         for name, (cost, error), j in zip(names, points, by, strict=True)
     ]
@@ -119,6 +128,7 @@ def made_up() -> Tradeoff:
     rng = np.random.default_rng(1)
     close = [(float(c), float(e)) for c, e in np.exp(rng.normal(size=(7, 2)))]
     found = [
+        *some("answer", [(0.1, 1e-4), (0.5, 1e-3), (1.0, 3e-4)]),
         *some("response", [(1.0, 0.0), *close]),
         *some("likelihood", [(1e-3, 0.0), (1e-6, 1e-9), (1.1e-6, 1.1e-9), (1e-6, 1e-3)]),
         *some("uncertainty", [(1.0, 0.01)]),
@@ -144,7 +154,7 @@ def test_it_is_written_and_says_who_dominates(made_up: Tradeoff, tmp_path):
     for level in made_up.levels:
         row = next(line for line in text.splitlines() if line.startswith(level.name + " "))
         assert row.endswith(f"dominated by {level.dominated_by}") == bool(level.dominated_by)
-    for kind in ("response", "likelihood", "uncertainty"):
+    for kind in ("answer", "response", "likelihood", "uncertainty"):
         front = made_up.front(kind)
         assert front
         assert not any(level.dominated_by for level in front)
@@ -171,6 +181,14 @@ def test_whole(record: fitact.Record, capsys: pytest.CaptureFixture[str]):
     for level in found.of("likelihood")[1:]:
         assert level.error < 1e-1
         assert level.seconds < 0.2 * found.of("likelihood")[0].seconds
+    answers = {level.name: level for level in found.of("answer")}
+    assert list(answers) == ["least squares", "laplace", "psis", "emcee"]
+    for level in answers.values():
+        assert level.error < 5e-3  # a tenth of the force's standard deviation of 5 %
+        # a new process imports and compiles
+        assert level.details["cold_seconds"] == pytest.approx(level.seconds + level.compile_seconds)
+        assert level.compile_seconds > 1.0
+    assert all(level.seconds > answers["least squares"].seconds for level in found.of("answer")[1:])
     assert all(level.error < 0.1 for level in found.of("uncertainty"))  # the posterior is nearly normal
     out = capsys.readouterr()
     assert out.out == ""
