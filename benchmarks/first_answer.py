@@ -1,0 +1,80 @@
+"""Time until the first answer, as whole processes: `fitact fit` and `fitact run` against scripts with lmfit.
+
+    pip install "fitact[bench]"; python benchmarks/first_answer.py [--rounds 5] [--before PYTHON] [--json]
+
+The commands run in turn on the shipped record, and medians are compared. Cold means that no compiled program is
+stored, warm that all are.
+
+- `fit_warm`, `fit_cold`: `fitact fit` against lmfit_fit_script.py;
+- `run_warm`, `run_cold`: `fitact run` against lmfit_script.py (fit, lmfit.emcee of `--steps` steps, corner plot);
+- `python_cold`: `import fitact` and the first `fitact.fit` against the same by `--before`, the Python of an environment
+  with another version of fitact; left out without it.
+"""
+
+import argparse
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from timing import show
+
+HERE = Path(__file__).resolve().parent
+RECORD = HERE.parent / "data_synth" / "records" / "finger_direct.csv"
+FIT = "import fitact; s = fitact.Scene.load({!r}); fitact.fit(fitact.read({!r}, s), s)"
+
+
+def seconds(command: list[str], cache: Path, folder: Path) -> float:
+    """Return the time of a process whose caches are in `cache`."""
+    caches = {"FITACT_CACHE": str(cache), "XDG_CACHE_HOME": str(cache)}
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")} | caches
+    began = time.perf_counter()
+    subprocess.run(command, env=environment, cwd=folder, check=True, capture_output=True)
+    return time.perf_counter() - began
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Time until the first answer, against scripts with lmfit.")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--rounds", type=int, default=5, help="rounds, of which the median is taken")
+    parser.add_argument("--steps", type=int, default=5000, help="steps of lmfit.emcee")
+    parser.add_argument("--before", help="Python of an environment with another version of fitact")
+    given = parser.parse_args()
+    scene, fitact = RECORD.with_suffix(".toml"), str(Path(sys.executable).with_name("fitact"))
+    fit = [fitact, "fit", str(RECORD), "--scene", str(scene)]
+    run = [fitact, "run", str(RECORD), "--scene", str(scene), "--fresh", "--out", "results"]
+    python = ["-c", FIT.format(str(scene), str(RECORD))]
+    lmfit_run = [sys.executable, str(HERE / "lmfit_script.py"), str(RECORD), str(given.steps), "corner.png"]
+    commands = {
+        "lmfit fit": [sys.executable, str(HERE / "lmfit_fit_script.py"), str(RECORD)],
+        "fit_warm": fit,
+        "fit_cold": fit,
+        "lmfit run": lmfit_run,
+        "run_warm": run,
+        "run_cold": run,
+        "python": [sys.executable, *python],
+    }
+    if given.before:
+        commands["python before"] = [given.before, *python]
+    taken: dict[str, list[float]] = {name: [] for name in commands}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for command in (fit, run):  # fills the warm cache
+            seconds(command, folder / "warm", folder)
+        for number in range(given.rounds):
+            for key, command in commands.items():
+                cache = folder / ("warm" if key.endswith("warm") else f"cold {number} {key}")
+                taken[key].append(seconds(command, cache, folder))
+    median = {key: statistics.median(each) for key, each in taken.items()}
+    print(", ".join(f"{key} {value:.2f} s" for key, value in median.items()), file=sys.stderr)
+    ratios = {key: median[key] / median[f"lmfit {key[:3]}"] for key in ("fit_warm", "fit_cold", "run_warm", "run_cold")}
+    if given.before:
+        ratios["python_cold"] = median["python"] / median["python before"]
+    show(ratios, given.json)
+
+
+if __name__ == "__main__":
+    main()
