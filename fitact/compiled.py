@@ -181,7 +181,7 @@ def _find_program(
             executable, *_ = serialize_executable.serialize(compiled)
             skeleton = jax.tree.unflatten(program.result, range(program.result.num_leaves))
             program_cache.store(key, pickle.dumps((executable, compiled.in_tree.num_leaves, skeleton)))
-        except (NotImplementedError, ValueError, pickle.PicklingError):  # it cannot be serialised
+        except (NotImplementedError, ValueError, TypeError, AttributeError, pickle.PicklingError):  # not serialisable
             pass
     return program
 
@@ -221,7 +221,11 @@ def _compile(
     shapes = [jax.ShapeDtypeStruct(*each) for each in signature if isinstance(each, _Shape)]
     options = _XLA_OPTIONS | ({} if fast else _FAST_COMPILATION) if jax.default_backend() == "cpu" else None
     with _outside_users_cache():
-        compiled = jax.jit(run_flat).lower(*shapes).compile(compiler_options=options)
+        lowered = jax.jit(run_flat).lower(*shapes)
+        try:
+            compiled = lowered.compile(compiler_options=options)
+        except jax.errors.JaxRuntimeError:  # a version of XLA without these options
+            compiled = lowered.compile()
     return _Program(compiled, result), compiled
 
 
@@ -297,7 +301,7 @@ def _environment() -> str:
         sources.update(str(path.relative_to(root)).encode() + path.read_bytes())
     versions = [sys.version, *map(importlib.metadata.version, _LIBRARIES)]
     matmul = str(jax.config.jax_default_matmul_precision)
-    return "\0".join([sources.hexdigest(), *versions, platform.platform(), matmul, _processor()])
+    return "\0".join([sources.hexdigest(), *versions, platform.system(), platform.machine(), matmul, _processor()])
 
 
 def _processor() -> str:
