@@ -17,6 +17,7 @@ from fitact.likelihood.channel import LINEAR_NUISANCES, ChannelInputs, ChannelLi
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import student_weight
 from fitact.model.circuit import Circuit
+from fitact.model.skin import WithSkin
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +89,7 @@ class ChannelFit:
 
 def _gain(optimum: CircuitValues, channel: ChannelLikelihood) -> float:
     """Return the factor by which noise of a measured drive enters the channel."""
-    if not optimum.terms:  # the gain falls with frequency, and most of the noise is fast
+    if isinstance(optimum.circuit, WithSkin):  # the gain falls with frequency, and most of the noise is fast
         return float(np.abs(_channel_gain(optimum.circuit, channel.channel, 1.0 / channel.time_step)))
     return abs(float(np.sum(optimum.terms[channel.channel].weight)))
 

@@ -51,11 +51,11 @@ def compress_channel(
         "rate": None if channel.rate is None else np.asarray(channel.rate)[samples],
     }
     compression: Compression | GridCompression
-    if terms is None:
-        assert isinstance(circuit, WithSkin)
+    if isinstance(circuit, WithSkin):
         assert circuit.grid is not None  # otherwise there is a reason against compression
         compression = compress_on_grid(*arrays, grid=circuit.grid, **how)
     else:
+        assert terms is not None
         compression = compress(*arrays, expected_terms=terms, **how)
     return dataclasses.replace(channel, compression=compression), ""
 

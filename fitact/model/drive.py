@@ -284,7 +284,7 @@ class InterpolatedDrive(Drive):
 
     def pieces(self) -> LinearPieces:
         """Return the lines between the points, and the line that closes the period or extends the last point."""
-        knots, values = self.points()
+        knots, values = map(jnp.asarray, self.points())  # JAX arrays, which a traced index may select from
         if self.period is None:
             return LinearPieces(jnp.append(knots, jnp.inf), values, jnp.append(values[1:], values[-1]))
         close = jnp.maximum(knots[0] + self.period, knots[-1])
