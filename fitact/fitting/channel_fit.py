@@ -16,7 +16,7 @@ from fitact.fitting.residual_statistics import channel_statistics, outliers
 from fitact.likelihood.channel import LINEAR_NUISANCES, ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import student_weight
-from fitact.model.circuit import Circuit
+from fitact.model.circuit import Channel, Circuit
 from fitact.model.skin import WithSkin
 
 
@@ -94,7 +94,9 @@ def _gain(optimum: CircuitValues, channel: ChannelLikelihood) -> float:
     return abs(float(np.sum(optimum.terms[channel.channel].weight)))
 
 
-_channel_gain = jit(Circuit.channel_gain)
+@jit
+def _channel_gain(circuit: Circuit, channel: Channel, omega: Array) -> Array:
+    return circuit.channel_gain(channel, omega)
 
 
 def _log_likelihood(
