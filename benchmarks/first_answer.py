@@ -12,28 +12,16 @@ stored, warm that all are.
 """
 
 import argparse
-import os
 import statistics
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
-from timing import show
+from timing import process_seconds, show
 
 HERE = Path(__file__).resolve().parent
 RECORD = HERE.parent / "data_synth" / "records" / "finger_direct.csv"
 FIT = "import fitact; s = fitact.Scene.load({!r}); fitact.fit(fitact.read({!r}, s), s)"
-
-
-def seconds(command: list[str], cache: Path, folder: Path) -> float:
-    """Return the time of a process whose caches are in `cache`."""
-    caches = {"FITACT_CACHE": str(cache), "XDG_CACHE_HOME": str(cache)}
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")} | caches
-    began = time.perf_counter()
-    subprocess.run(command, env=environment, cwd=folder, check=True, capture_output=True)
-    return time.perf_counter() - began
 
 
 def main() -> None:
@@ -63,11 +51,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for command in (fit, run):  # fills the warm cache
-            seconds(command, folder / "warm", folder)
+            process_seconds(command, folder, folder / "warm")
         for number in range(given.rounds):
             for key, command in commands.items():
                 cache = folder / ("warm" if key.endswith("warm") else f"cold {number} {key}")
-                taken[key].append(seconds(command, cache, folder))
+                taken[key].append(process_seconds(command, folder, cache))
     median = {key: statistics.median(each) for key, each in taken.items()}
     print(", ".join(f"{key} {value:.2f} s" for key, value in median.items()), file=sys.stderr)
     ratios = {key: median[key] / median[f"lmfit {key[:3]}"] for key in ("fit_warm", "fit_cold", "run_warm", "run_cold")}

@@ -23,9 +23,7 @@ a tenth of the steps).
 
 import argparse
 import json
-import os
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -48,7 +46,7 @@ from peers import (
     plain_log_prob,
     raw_log_density,
 )
-from timing import show
+from timing import process_seconds, show
 
 import fitact
 from fitact.data.readers.read import write_csv
@@ -142,30 +140,24 @@ def processes(data: fitact.Record, each: float, quick: bool) -> tuple[dict[str, 
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
+        cache = folder / "cache"
         (folder / "scene.toml").write_text(SCENE)
         write_csv(folder / "record.csv", data)
         fitact_run = [str(Path(sys.executable).with_name("fitact")), "run", "record.csv", "--scene", "scene.toml"]
-        cold, *warm = (_time_command(folder, *fitact_run, "--out", str(i)) for i in range(4))
+        cold, *warm = (process_seconds([*fitact_run, "--out", str(i)], folder, cache) for i in range(4))
         content = json.loads((folder / "0" / "summary.json").read_text())
         effective, run = content["convergence"]["ess"]["force_mean"], statistics.median(warm)
         steps = round(effective / each)
         script = [sys.executable, str(Path(__file__).with_name("lmfit_script.py")), "record.csv"]
         if quick:
-            start, tenth = (_time_command(folder, *script, str(count), "corner.png") for count in (100, steps // 10))
+            start, tenth = (
+                process_seconds([*script, str(count), "corner.png"], folder, cache) for count in (100, steps // 10)
+            )
             lmfit = start + (tenth - start) * (steps - 100) / (steps // 10 - 100)
         else:
-            lmfit = _time_command(folder, *script, str(steps), "corner.png")
+            lmfit = process_seconds([*script, str(steps), "corner.png"], folder, cache)
         print(f"fitact run: {run:.1f} s, first {cold:.1f} s; lmfit's script: {lmfit:.0f} s", file=sys.stderr)
         return {"run_vs_lmfit_script": run / lmfit, "cold_run_vs_lmfit_script": cold / lmfit}, effective / run
-
-
-def _time_command(folder: Path, *command: str) -> float:
-    """Return the seconds of a process with its own caches."""
-    kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
-    kept["XDG_CACHE_HOME"] = str(folder / "cache")
-    began = time.perf_counter()
-    subprocess.run(command, cwd=folder, env=kept, check=True, capture_output=True)
-    return time.perf_counter() - began
 
 
 def main() -> None:

@@ -1,9 +1,12 @@
 """Timing and output of the benchmarks."""
 
 import json
+import os
 import statistics
+import subprocess
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 
 def medians(
@@ -32,6 +35,16 @@ def _call_seconds(
                 job()
             taken[name].append((time.perf_counter() - start) / count)
     return taken
+
+
+def process_seconds(command: list[str], folder: Path, cache: Path) -> float:
+    """Return the seconds of a process in `folder` whose caches are in `cache`."""
+    left_out = ("JAX_", "PYTHONDONTWRITEBYTECODE")
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(left_out)}
+    caches = {"FITACT_CACHE": str(cache), "XDG_CACHE_HOME": str(cache)}
+    start = time.perf_counter()
+    subprocess.run(command, env=kept | caches, cwd=folder, check=True, capture_output=True)
+    return time.perf_counter() - start
 
 
 def show(ratios: dict[str, float], as_json: bool) -> None:

@@ -23,6 +23,7 @@ from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
@@ -76,6 +77,16 @@ def as_arrays(module: _Module) -> _Module:
     return jax.tree.map(lambda x: np.asarray(x, dtype=float) if isinstance(x, float | jax.Array) else x, module)
 
 
+def array_module(values: Any) -> Any:
+    """Return `jax.numpy` for JAX's arrays, which compiled functions see, and NumPy for all else."""
+    return jnp if isinstance(values, jax.Array) else np
+
+
+def is_array(leaf: Any) -> bool:
+    """Return whether a leaf of the arguments of `jit` is an argument of the program."""
+    return isinstance(leaf, np.ndarray | jax.Array | np.generic)
+
+
 def jit(
     function: Callable[_Arguments, _Result], *, fast: bool = False, double: bool = True
 ) -> Callable[_Arguments, _Result]:
@@ -95,7 +106,7 @@ def jit(
         x64 = double or bool(jax.config.jax_enable_x64)
         with jax.enable_x64(x64):
             program = _find_program(function, fast, x64, structure, _signature(leaves))
-            return program(*map(_as_argument, filter(_is_dynamic, leaves)))
+            return program(*map(_as_argument, filter(is_array, leaves)))
 
     return run
 
@@ -124,10 +135,6 @@ class _Static(NamedTuple):
     value: Any
 
 
-def _is_dynamic(leaf: Any) -> bool:
-    return isinstance(leaf, np.ndarray | jax.Array | np.generic)
-
-
 def _as_argument(leaf: Any) -> np.ndarray | Array:
     return leaf if isinstance(leaf, np.ndarray | jax.Array) else np.asarray(leaf)
 
@@ -135,7 +142,7 @@ def _as_argument(leaf: Any) -> np.ndarray | Array:
 def _signature(leaves: Sequence[Any]) -> tuple[_Shape | _Static, ...]:
     return tuple(
         _Shape(leaf.shape, leaf.dtype)
-        if _is_dynamic(leaf)
+        if is_array(leaf)
         else _Static(type(leaf), _Partial.from_partial(leaf) if isinstance(leaf, functools.partial) else leaf)
         for leaf in leaves
     )
@@ -173,7 +180,7 @@ def _find_program(
     if content is not None:
         try:
             return _load_program(content)
-        except Exception:  # of another version of a library, or whatever: it is compiled again
+        except _LOAD_ERRORS:  # a whole file in which there is no program; it is compiled again
             program_cache.remove(key)
     program, compiled = _compile(function, fast, structure, signature)
     if program_cache.cache_folder() is not None:
@@ -184,6 +191,13 @@ def _find_program(
         except (NotImplementedError, ValueError, TypeError, AttributeError, pickle.PicklingError):  # not serialisable
             pass
     return program
+
+
+# what reading a pickle may raise, by its documentation, and RuntimeError by XLA
+_LOAD_ERRORS = (
+    pickle.UnpicklingError, AttributeError, EOFError, ImportError, IndexError, KeyError, TypeError, ValueError,
+    RuntimeError,
+)  # fmt: skip
 
 
 def _load_program(content: bytes) -> _Program:
@@ -333,7 +347,7 @@ class BatchEvaluator:
     ) -> None:
         self._arguments, self._fast = (function, model), fast
         with jax.enable_x64(True):
-            self._arrays = jax.device_put(list(filter(_is_dynamic, jax.tree.leaves(self._arguments))))
+            self._arrays = jax.device_put(list(filter(is_array, jax.tree.leaves(self._arguments))))
         self._programs: dict[tuple[_Shape | _Static, ...], _Program] = {}
         self._batch = max(1, min(batch, max_numbers // rows))
 

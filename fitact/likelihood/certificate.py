@@ -13,7 +13,7 @@ from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.compression import BASELINE_NAMES, Compression, compress
 from fitact.likelihood.compression_on_grid import GridCompression, compress_on_grid
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
-from fitact.model.circuit import Circuit, HighpassTerms
+from fitact.model.circuit import HighpassTerms
 from fitact.model.drive import Sampled
 from fitact.model.skin import WithSkin
 
@@ -39,8 +39,8 @@ def compress_channel(
 
     `start` is close to the optimum; `tau_identified` states whether the record determines its time constant.
     """
-    circuit, terms = start.circuit, start.terms.get(channel.channel)
-    reason = _uncompressed_reason(channel, circuit, terms, tau_identified, tolerance)
+    circuit = start.circuit
+    reason = _uncompressed_reason(channel, start, tau_identified, tolerance)
     if reason:
         return channel, reason
     samples = slice(channel.n_samples)
@@ -55,18 +55,12 @@ def compress_channel(
         assert circuit.grid is not None  # otherwise there is a reason against compression
         compression = compress_on_grid(*arrays, grid=circuit.grid, **how)
     else:
-        assert terms is not None
-        compression = compress(*arrays, expected_terms=terms, **how)
+        compression = compress(*arrays, expected_terms=start.terms[channel.channel], **how)
     return dataclasses.replace(channel, compression=compression), ""
 
 
 def _uncompressed_reason(
-    channel: ChannelLikelihood,
-    circuit: Circuit,
-    terms: HighpassTerms | None,
-    tau_identified: bool,
-    tolerance: float,
-    min_samples: int = 512,
+    channel: ChannelLikelihood, start: CircuitValues, tau_identified: bool, tolerance: float, min_samples: int = 512
 ) -> str:
     if tolerance == 0.0:
         return "the full sum was requested"
@@ -78,13 +72,13 @@ def _uncompressed_reason(
         return f"the record is shorter than {min_samples} samples"
     if channel.timing:
         return _TIMING_REASON
-    if isinstance(circuit, WithSkin):
-        return "a dispersive skin has no time constants" if circuit.grid is None else ""
+    if isinstance(start.circuit, WithSkin):
+        return "a dispersive skin has no time constants" if start.circuit.grid is None else ""
     if isinstance(channel.drive, Sampled) and channel.steady_state:
         return "the steady state of a measured drive is not tabulated"
     if not tau_identified:
         return "the record does not determine its time constant"
-    if terms is not None and len(terms.tau) > 1:
+    if len(start.terms[channel.channel].tau) > 1:
         return "the circuit has several time constants"
     return ""
 

@@ -19,6 +19,7 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from fitact.compiled import array_module
 from fitact.likelihood.compression import BASELINE_NAMES, Compression, baseline_functions
 from fitact.likelihood.compression_on_grid import GridCompression
 from fitact.likelihood.noise import NoiseModel, Whitening, student_curvature, student_residual, student_weight
@@ -30,11 +31,6 @@ from fitact.model.skin import WithSkin
 CHARGES = ("charge", "charge_2", "charge_3", "charge_4")  # one for each time constant, the slowest first
 LINEAR_NUISANCES = (*BASELINE_NAMES, *CHARGES)
 TIMING_NUISANCES = ("delay", "clock")
-
-
-def count_nonzero(values: Array | np.ndarray) -> ArrayLike:
-    """Return the number of nonzero values, by NumPy outside compiled functions."""
-    return np.count_nonzero(values) if isinstance(values, np.ndarray) else jnp.count_nonzero(values)
 
 
 class ChannelInputs(eqx.Module):
@@ -93,8 +89,8 @@ class ChannelLikelihood(eqx.Module):
         if self.compression is not None:
             return self.compression.samples
         if self.whitening is not None:
-            return count_nonzero(self.whitening.mask)
-        return self.time.size if self.weight is None else count_nonzero(self.weight)
+            return array_module(self.whitening.mask).count_nonzero(self.whitening.mask)
+        return self.time.size if self.weight is None else array_module(self.weight).count_nonzero(self.weight)
 
     @property
     def rows(self) -> int:

@@ -22,7 +22,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from fitact.compiled import jit, pad_samples, pad_weight
+from fitact.compiled import array_module, jit, pad_samples, pad_weight
 from fitact.data.record import is_uniform
 from fitact.model.chirp import Chirp
 from fitact.model.circuit import HighpassTerms
@@ -60,8 +60,7 @@ class Compression(eqx.Module):
 
     def covers(self, tau: Array) -> Array:
         """Return whether the table covers the time constant (s)."""
-        log = np.log if isinstance(tau, np.ndarray | float) else jnp.log
-        return abs(log(tau) - self.center) <= self.half_width
+        return abs(array_module(tau).log(tau) - self.center) <= self.half_width
 
     def response(self, terms: HighpassTerms) -> Float[Array, " rows"]:
         """Return the response of a circuit; compare `fitact.response`."""

@@ -16,7 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from fitact.compiled import jit, pad_rows
+from fitact.compiled import array_module, jit, pad_rows
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
 from fitact.model.circuit import RC, Channel, Circuit, HighpassTerms
 from fitact.model.skin import WithSkin, circuit_parameters, constant_skin_circuit, has_time_constants, with_values
@@ -153,8 +153,7 @@ class Likelihood(eqx.Module):
         places = {name: i for i, name in enumerate(self.names)}
         timing = {n: theta[places[channel.qualified_name(n)]] * channel.timing_unit(n) for n in channel.timing}
         gain = places.get(channel.qualified_name("gain"))
-        exp = np.exp if isinstance(theta, np.ndarray) else jnp.exp
-        return ChannelInputs(circuit, 1.0 if gain is None else exp(theta[gain]), **timing)
+        return ChannelInputs(circuit, 1.0 if gain is None else array_module(theta).exp(theta[gain]), **timing)
 
     def channels_and_inputs(
         self, theta: Float[Array, " circuit_parameters"]
@@ -215,7 +214,7 @@ class Likelihood(eqx.Module):
 
         A value that is not finite becomes -inf, but it is NaN outside a compression.
         """
-        xp = np if isinstance(parts, np.ndarray) else jnp
+        xp = array_module(parts)
         value, log_prior = xp.sum(parts[..., :-1], axis=-1), parts[..., -1]
         compressed = any(channel.compression is not None for channel in self.channels)
         beyond = xp.isnan(value) & xp.all(xp.isfinite(point), axis=-1) & xp.isfinite(log_prior) & compressed

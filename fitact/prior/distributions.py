@@ -16,6 +16,7 @@ from jax.scipy.special import ndtr, ndtri
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from fitact.compiled import array_module
 from fitact.errors import InputError
 
 _Z95 = 1.959963984540054  # half-width, in standard deviations, of a central 95 % interval
@@ -268,7 +269,7 @@ class TruncatedLogNormal(Bounded):
 
 def _log(x: Any) -> Any:
     """Return the logarithm, by NumPy outside compiled functions."""
-    return jnp.log(x) if isinstance(x, jax.Array) else np.log(x)
+    return array_module(x).log(x)
 
 
 def _check_limits(kind: str, low: float, high: float) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 import scipy.integrate
 from jaxtyping import Array, Float
 
-from fitact.compiled import BatchEvaluator
+from fitact.compiled import BatchEvaluator, is_array
 from fitact.data.record import Record
 from fitact.fitting.drive_choice import whole_periods
 from fitact.fitting.fit import Fit
@@ -223,7 +223,7 @@ def format_tolerance(value: float) -> str:
 
 
 def _likelihood_job(model: Likelihood, points: Float[np.ndarray, "batch coordinates"]) -> _Job:
-    dynamic, static = eqx.partition(model, lambda leaf: isinstance(leaf, np.ndarray | jax.Array))
+    dynamic, static = eqx.partition(model, is_array)
 
     def log_probs(dynamic: Any, points: Array) -> Array:
         return jax.vmap(eqx.combine(dynamic, static).log_prob)(points)
