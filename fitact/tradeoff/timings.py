@@ -244,7 +244,6 @@ class UncertaintyBenchmark(NamedTuple):
     resolution: float
     converged: bool
     force: dict[str, list[Float[np.ndarray, " draws"]]]  # draws of the mean force (N), by method and run
-    sampling_seconds: dict[str, float]  # median time of a run by method, compiled, s
 
     @property
     def force_log_sd(self) -> float:
@@ -278,9 +277,7 @@ def benchmark_uncertainties(
     resolution = 2.5 * 2.11 * math.sqrt(2.0 / fewest)
     converged = all(posterior.convergence.converged for posterior in posteriors["emcee, full"])
     force = {name: [p.force()["force_mean"].ravel() for p in repeated] for name, repeated in posteriors.items()}
-    return UncertaintyBenchmark(
-        levels, resolution, converged, force, {level.name: level.details["seconds"] for level in levels}
-    )
+    return UncertaintyBenchmark(levels, resolution, converged, force)
 
 
 def _pool_draws(posteriors: Sequence[Posterior]) -> dict[str, Float[np.ndarray, " draws"]]:
@@ -343,12 +340,13 @@ def benchmark_answers(
     fitted = fit_record(record, scene).derived()["force_mean"]
     reference = np.quantile(np.concatenate(draws.force["emcee, full"]), _FORCE_QUANTILES)
     stated = [np.array([fitted["q50"], fitted["q05"], fitted["q95"]], dtype=float)]
+    sampling_seconds = {level.name: level.details["seconds"] for level in draws.levels}
     results = []
     for level in (None, "laplace", "psis", "emcee"):
         report(f"first answer by {level or 'least squares'} in a new process")
         quantiles = [np.quantile(force, _FORCE_QUANTILES) for force in draws.force[level]] if level else stated
         errors = [np.max(np.abs(each - reference)) / reference[0] for each in quantiles]
-        sampling = 0.0 if level is None else draws.sampling_seconds[level]
+        sampling = 0.0 if level is None else sampling_seconds[level]
         cold = _time_first_answer(record, scene, level)
         results.append(
             BenchmarkResult(
