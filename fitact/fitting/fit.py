@@ -293,7 +293,7 @@ def _assemble_fit(
 ) -> Fit:
     likelihood, theta, sigma = certified.likelihood, solution.theta, solution.sigma
     first = problem.sources[0]
-    optimum = likelihood.evaluate_circuits(theta[None]).row(0)
+    optimum = likelihood.evaluate_circuit(theta)
     derive = derived.derived_from_fit(likelihood, first.record, first.choice, first.scene, float(optimum.b))
     laplace = Laplace(theta, root, sigma, likelihood, derive, derive.log_value_and_grad(theta, sigma))
     traces = tuple(

@@ -46,7 +46,7 @@ def find_optima(solution: LeastSquaresResult, count: int, draws_per_start: int =
     """
     likelihood = solution.likelihood.without_samples()
     draws = likelihood.sample_prior(solution.theta, draws_per_start * count)
-    slowest = likelihood.evaluate_circuits(draws).b
+    _, slowest = likelihood.evaluate_g_and_b(draws)
     tables = [channel.compression for channel in likelihood.channels if channel.compression is not None]
     within_tables = np.all([np.ones(len(draws), bool), *(table.covers(slowest) for table in tables)], axis=0)
     starts = np.vstack([solution.theta, draws[within_tables][: count - 1]])

@@ -54,7 +54,7 @@ class Problem(NamedTuple):
 
     def compress_likelihood(self, tolerance: float) -> tuple[Likelihood, tuple[str, ...]]:
         """Return the likelihood with compressed channels, and for each channel the reason if it is not compressed."""
-        at_start = self.likelihood.evaluate_circuits(self.start[None]).row(0)
+        at_start = self.likelihood.evaluate_circuit(self.start)
         pairs = []
         for channel, source in zip(self.likelihood.channels, self.sources, strict=True):
             shows_tau = source.start is not None and math.isfinite(source.start.b)
@@ -104,7 +104,7 @@ def build_problem(
     likelihood = likelihood_without_channels(
         first, prior, lambda values: apply_skin_model(first.make_rc_circuit(values), records, scenes)
     )
-    taus = likelihood.evaluate_circuits(likelihood.prior.log_mean[None]).row(0).tau
+    taus = likelihood.evaluate_circuit(likelihood.prior.log_mean).tau
     parts = []
     for number, (record, scene, drive) in enumerate(itertools.zip_longest(records, scenes, drives), 1):
         choice, suffix = drive or choose_drive(record, scene), str(number) * (len(records) > 1)

@@ -107,9 +107,9 @@ def describe_assumed_Ci(scene: Scene | None, likelihood: Likelihood, prior_sets_
 def _plausibility(likelihood: Likelihood, theta: np.ndarray) -> list[tuple[str, float, float]]:
     """Return for g and b the name, the ratio to the prior median, and the prior probability further out."""
     points = np.vstack([theta, likelihood.sample_prior(theta, 10_000)])
-    circuits = likelihood.evaluate_circuits(points)
+    g, b = likelihood.evaluate_g_and_b(points)
     return [
         (name, float(x[0] / np.median(x[1:])), float(min(np.mean(x[1:] < x[0]), np.mean(x[1:] > x[0]))))
-        for name, x in (("the divider g", circuits.g), ("the time constant b", circuits.b))
+        for name, x in (("the divider g", g), ("the time constant b", b))
         if np.ptp(x) > 0.0
     ]

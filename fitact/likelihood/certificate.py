@@ -105,7 +105,7 @@ def certify(
     )
     if all(channel.compression is None for channel in likelihood.channels):
         return CertifiedLikelihood(likelihood, None, tuple(r or _TIMING_REASON for r in reasons))
-    light, optimum = likelihood.without_samples(), likelihood.evaluate_circuits(theta[None]).row(0)
+    light, optimum = likelihood.without_samples(), likelihood.evaluate_circuit(theta)
     log_b = float(np.log(optimum.b))
     reach = float(table_half_width(np.linalg.norm(_log_b_slope(light, theta) @ covariance_factor)))
     precisions = table_precision(sigma, tolerance).tolist()
@@ -156,7 +156,7 @@ def _compression_failure(error: float, excess: float, tolerance: float) -> str:
 def _prior_points(likelihood: Likelihood, theta: np.ndarray, count: int) -> Float[np.ndarray, "n parameters"]:
     """Return draws from the prior that the tables cover, filled up with the optimum if there are too few."""
     draws = likelihood.sample_prior(theta, 1000)
-    tau = likelihood.evaluate_circuits(draws).b
+    _, tau = likelihood.evaluate_g_and_b(draws)
     covered = [channel.compression.covers(tau) for channel in likelihood.channels if channel.compression is not None]
     return np.vstack([draws[np.all(covered, axis=0)], np.tile(theta, (count, 1))])[:count]
 
@@ -226,5 +226,6 @@ def _restrict_table(
 def _log_b_slope(likelihood: Likelihood, theta: np.ndarray, step: float = 1e-4) -> Float[np.ndarray, " parameters"]:
     """Return the gradient of the logarithm of the slowest time constant, from differences over two steps."""
     steps = step * np.eye(theta.size)
-    later, earlier = np.split(likelihood.evaluate_circuits(np.vstack([theta + steps, theta - steps])).b, 2)
+    _, b = likelihood.evaluate_g_and_b(np.vstack([theta + steps, theta - steps]))
+    later, earlier = np.split(b, 2)
     return np.log(later / earlier) / (2.0 * step)

@@ -16,7 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from fitact.compiled import array_module, jit, pad_rows
+from fitact.compiled import BatchEvaluator, array_module, jit
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
 from fitact.model.circuit import RC, Channel, Circuit, HighpassTerms
 from fitact.model.skin import WithSkin, circuit_parameters, constant_skin_circuit, has_time_constants, with_values
@@ -27,17 +27,12 @@ UNCONSTRAINED_SD = math.log(1e6)  # in a log-parameter; a larger sd counts as no
 
 
 class CircuitValues(NamedTuple):
-    """A circuit at one point theta, or circuits at many, with a row for each."""
+    """A circuit at a point theta, as NumPy arrays."""
 
     circuit: Circuit
-    g: Array
     b: Array  # slowest time constant, s
     tau: Array  # all time constants, s; with a skin model, of the circuit without it
     terms: dict[Channel, HighpassTerms]  # of Vsc and I; empty for a skin without time constants
-
-    def row(self, index: int) -> "CircuitValues":
-        """Return the circuit at one point."""
-        return jax.tree.map(lambda values: values[index], self)
 
 
 class Likelihood(eqx.Module):
@@ -123,7 +118,7 @@ class Likelihood(eqx.Module):
     def circuit(self, theta: Float[Array, " circuit_parameters"]) -> Circuit:
         """Return the circuit at theta, with NaN for extreme values, so that no optimiser step leads there."""
         if isinstance(theta, np.ndarray):  # outside compiled functions
-            return self.evaluate_circuits(theta[None]).row(0).circuit
+            return self.evaluate_circuit(theta).circuit
         # no finger exceeds 1e30 or falls below 1e-30 SI units, where products overflow
         theta = jnp.where(jnp.abs(theta) < 70.0, theta, jnp.nan)
         known = circuit_parameters(self.template)
@@ -132,17 +127,27 @@ class Likelihood(eqx.Module):
             values[name] = ratio * values.get(other, known[other])
         return with_values(self.template, values)
 
-    def evaluate_circuits(self, points: Float[np.ndarray, "n parameters"]) -> CircuitValues:
-        """Return the circuits at many points theta, as NumPy arrays with a row for each point."""
+    def evaluate_circuit(self, theta: Float[np.ndarray, " circuit_parameters"]) -> CircuitValues:
+        """Return the circuit at theta, outside compiled functions."""
+        bare, kept = self._bare()
+        return _evaluate_circuit(bare, theta[kept])
+
+    def evaluate_g_and_b(
+        self, points: Float[np.ndarray, "n parameters"], batch: int = 256
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Return the divider ratio g and the slowest time constant b (s) at many points theta."""
+        bare, kept = self._bare()
+        return tuple(BatchEvaluator(_g_and_b, bare, len(kept), batch, fast=False)(points[:, kept]).T)
+
+    def _bare(self) -> tuple["Likelihood", list[int]]:
+        """Return the likelihood without all that the circuit does not depend on, and its coordinates.
+
+        One program then serves all likelihoods of a circuit.
+        """
         known = circuit_parameters(self.template)
         kept = [i for i, name in enumerate(self.prior.names) if name in known]
         names = tuple(self.prior.names[i] for i in kept)
-        # without all that the circuit does not depend on, so that one program serves all likelihoods
-        bare = Likelihood((), self.template, Prior(names, ()), (), self.tied)
-        batch = 64 if len(points) <= 64 else 2048
-        rows = pad_rows(points[:, kept], batch)
-        parts = [_evaluate_circuits(bare, rows[i : i + batch]) for i in range(0, len(rows), batch)]
-        return jax.tree.map(lambda *values: np.concatenate(values)[: len(points)], *parts)
+        return Likelihood((), self.template, Prior(names, ()), (), self.tied), kept
 
     def channel_inputs(self, theta: Float[Array, " circuit_parameters"], index: int = 0) -> ChannelInputs:
         """Return the inputs of the channel with this index at theta."""
@@ -243,12 +248,14 @@ class Likelihood(eqx.Module):
 
 
 @jit
-def _evaluate_circuits(likelihood: Likelihood, points: Float[Array, "n parameters"]) -> CircuitValues:
-    def evaluate(theta: Array) -> CircuitValues:
-        circuit = likelihood.circuit(theta)
-        channels: tuple[Channel, ...] = ("Vsc", "I") if has_time_constants(circuit) else ()
-        terms = {channel: circuit.channel_terms(channel) for channel in channels}
-        tau = jnp.stack(constant_skin_circuit(circuit).terms().tau)
-        return jax.tree.map(jnp.asarray, CircuitValues(circuit, circuit.g, circuit.b, tau, terms))
+def _evaluate_circuit(likelihood: Likelihood, theta: Float[Array, " circuit_parameters"]) -> CircuitValues:
+    circuit = likelihood.circuit(theta)
+    channels: tuple[Channel, ...] = ("Vsc", "I") if has_time_constants(circuit) else ()
+    terms = {channel: circuit.channel_terms(channel) for channel in channels}
+    tau = jnp.stack(constant_skin_circuit(circuit).terms().tau)
+    return jax.tree.map(jnp.asarray, CircuitValues(circuit, circuit.b, tau, terms))
 
-    return jax.vmap(evaluate)(points)
+
+def _g_and_b(likelihood: Likelihood, theta: Float[Array, " circuit_parameters"]) -> Float[Array, "2"]:
+    circuit = likelihood.circuit(theta)
+    return jnp.stack([circuit.g, circuit.b])

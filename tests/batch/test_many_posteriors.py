@@ -267,9 +267,9 @@ def test_calibration(monkeypatch):
         | {"prior": calibration.PRIOR}
     )
     ranks: dict[str, list[int]] = {}
-    quantiles_of = module._quantiles
+    columns_of = module._posterior_columns
 
-    def seen(row, draws):
+    def seen(row, draws, convergence):
         number = int(row["record"])
         rng, truth = np.random.default_rng([9, number]), made[number][1]
         found = dict(draws) | {"a": draws["Rsc"] * draws["Ci"]}
@@ -277,9 +277,9 @@ def test_calibration(monkeypatch):
             name: rng.choice(found[name].ravel(), calibration.DRAWS, replace=False) for name in calibration.QUANTITIES
         }
         ranks[row["record"]] = [int(np.sum(few[name] < truth[name])) for name in calibration.QUANTITIES]
-        return quantiles_of(row, draws)
+        return columns_of(row, draws, convergence)
 
-    monkeypatch.setattr(module, "_quantiles", seen)
+    monkeypatch.setattr(module, "_posterior_columns", seen)
     rows = sample_many([record for record, _ in made], scene, seed=1, progress=False)
     assert len(ranks) == len(rows) == 300
     assert sum(row["walkers"] == module.WALKERS for row in rows) > 150
