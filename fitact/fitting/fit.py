@@ -322,7 +322,7 @@ def _assemble_fit(
     gradient = laplace.log_gradient("force_mean")
     return Fit(
         laplace,
-        result=diagnose_fit(solution, likelihood, root, traces, problem.sources, optima),
+        result=diagnose_fit(solution, root, traces, problem.sources, optima),
         figures=figures,
         identifiability=assess_identifiability(likelihood.names, root, likelihood.prior_factor, gradient, experiment),
         scene=first.scene,

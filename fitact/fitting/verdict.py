@@ -6,18 +6,17 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from fitact.compiled import BatchEvaluator
 from fitact.fitting.channel_fit import ChannelFit
 from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.fitting.minimum import Optima
 from fitact.fitting.problem import Source
 from fitact.fitting.residual_statistics import is_misfit
-from fitact.likelihood.certificate import batch_log_prob_parts
 from fitact.likelihood.likelihood import Likelihood
 
 
 def diagnose_fit(
     solution: LeastSquaresResult,
-    likelihood: Likelihood,
     covariance_factor: Float[np.ndarray, "parameters parameters"],
     traces: Sequence[ChannelFit],
     sources: Sequence[Source],
@@ -25,11 +24,11 @@ def diagnose_fit(
 ) -> str:
     """Return the name of the first of the `RESULTS` that makes the fit unreliable; "successful" if none does.
 
-    `likelihood` is the one for sampling; `covariance_factor`: factor of the covariance of theta.
+    `covariance_factor`: factor of the covariance of theta.
     """
     if solution.result != "successful":
         return solution.result
-    if is_out_of_bounds(likelihood, solution.theta, solution.sigma, covariance_factor):
+    if is_out_of_bounds(solution.likelihood, solution.theta, solution.sigma, covariance_factor):
         return "on_bound"
     if optima is not None and optima.result == "several_optima":
         return "several_optima"
@@ -54,8 +53,8 @@ def is_out_of_bounds(
     axes, sizes, _ = np.linalg.svd(covariance_factor)
     along = np.linspace(-half_width, half_width, 241)[:, None] * (axes[:, 0] * sizes[0])
     points = np.hstack([_clip_exponent(likelihood, theta, covariance_factor) + along, np.tile(np.log(sigma), (241, 1))])
-    log_prior = batch_log_prob_parts(likelihood.without_samples())(points)[:, -1]
-    return not np.any(np.isfinite(log_prior))
+    evaluate = BatchEvaluator(Likelihood.log_prior, likelihood.without_samples(), points.shape[1], 256, fast=False)
+    return not np.any(np.isfinite(evaluate(points)))
 
 
 def _clip_exponent(likelihood: Likelihood, theta: np.ndarray, covariance_factor: np.ndarray) -> np.ndarray:
