@@ -8,7 +8,9 @@ stored, warm that all are.
 - `fit_warm`, `fit_cold`: `fitact fit` against lmfit_fit_script.py;
 - `run_warm`, `run_cold`: `fitact run` against lmfit_script.py (fit, lmfit.emcee of `--steps` steps, corner plot);
 - `python_cold`: `import fitact` and the first `fitact.fit` against the same by `--before`, the Python of an environment
-  with another version of fitact; left out without it.
+  with another version of fitact; left out without it;
+- `population_*`, `design_*`: `fitact population` of the eight shipped fingers with V, Vsc and I, and
+  `fitact design measurement`, against the same by `--before`.
 """
 
 import argparse
@@ -21,6 +23,13 @@ from timing import process_seconds, show
 
 HERE = Path(__file__).resolve().parent
 RECORD = HERE.parent / "data_synth" / "records" / "finger_direct.csv"
+FINGERS = sorted(map(str, (RECORD.parent / "fingers").glob("*.csv.gz")))
+FINGER_SCENE = """
+[drive]
+waveform = "measured"
+[measurement]
+channels = ["Vsc", "I"]
+"""
 FIT = "import fitact; s = fitact.Scene.load({!r}); fitact.fit(fitact.read({!r}, s), s)"
 
 
@@ -45,13 +54,23 @@ def main() -> None:
         "run_cold": run,
         "python": [sys.executable, *python],
     }
+    longer = {
+        "population": ["population", *FINGERS, "--scene", "fingers.toml", "--fresh", "--out", "people", "--seed", "1"],
+        "design": ["design", "measurement", str(scene), "--record", str(RECORD), "--out", "next"],
+    }
     if given.before:
+        before = str(Path(given.before).with_name("fitact"))
         commands["python before"] = [given.before, *python]
+        for name, arguments in longer.items():
+            for state in ("warm", "cold"):
+                commands |= {f"{name}_{state}": [fitact, *arguments], f"{name}_before_{state}": [before, *arguments]}
     taken: dict[str, list[float]] = {name: [] for name in commands}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for command in (fit, run):  # fills the warm cache
-            process_seconds(command, folder, folder / "warm")
+        (folder / "fingers.toml").write_text(FINGER_SCENE)
+        for key, command in commands.items():  # fills the warm cache
+            if key.endswith("warm"):
+                process_seconds(command, folder, folder / "warm")
         for number in range(given.rounds):
             for key, command in commands.items():
                 cache = folder / ("warm" if key.endswith("warm") else f"cold {number} {key}")
@@ -61,6 +80,9 @@ def main() -> None:
     ratios = {key: median[key] / median[f"lmfit {key[:3]}"] for key in ("fit_warm", "fit_cold", "run_warm", "run_cold")}
     if given.before:
         ratios["python_cold"] = median["python"] / median["python before"]
+        for name in longer:
+            for state in ("warm", "cold"):
+                ratios[f"{name}_{state}"] = median[f"{name}_{state}"] / median[f"{name}_before_{state}"]
     show(ratios, given.json)
 
 

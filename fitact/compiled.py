@@ -339,7 +339,7 @@ class BatchEvaluator:
     def __init__(
         self,
         function: Callable[..., Array],
-        model: eqx.Module,
+        model: Any,
         rows: int,
         batch: int = 32,
         max_numbers: int = 4_000_000,
@@ -377,5 +377,5 @@ class BatchEvaluator:
         return values.reshape(*shape, *values.shape[1:])
 
 
-def _map_rows(function: Callable[..., Array], model: eqx.Module, *rows: Array) -> Array:
+def _map_rows(function: Callable[..., Array], model: Any, *rows: Array) -> Array:
     return jax.vmap(lambda *row: function(model, *row))(*rows)

@@ -26,9 +26,9 @@ from fitact.fitting.problem import MIN_RELATIVE_NOISE, Problem
 from fitact.fitting.residual_statistics import is_misfit, residual_statistics
 from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics, count_true
 from fitact.fitting.starting_point import most_probable_skin, prior_skin_moments
-from fitact.likelihood.compression import NODES, TABLE_HALF_WIDTH, chebyshev
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.chirp import Chirp
+from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, chebyshev
 from fitact.model.skin import WithSkin
 
 _CANDIDATES = (*NUISANCES, "delay", "clock")  # nuisances that a record may need

@@ -30,9 +30,10 @@ from fitact.fitting import derived
 from fitact.fitting.derived import DerivedQuantities
 from fitact.fitting.fit import fit
 from fitact.likelihood.certificate import table_half_width, table_precision
-from fitact.likelihood.compression import BASELINE_NAMES, TABLE_HALF_WIDTH, Compression
+from fitact.likelihood.compression import BASELINE_NAMES, Compression
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import scale_information
+from fitact.model.response_table import TABLE_HALF_WIDTH
 from fitact.sampling.convergence import Convergence, diagnose_chain
 from fitact.sampling.ensemble import TRACKED_WALKERS, sample
 from fitact.sampling.posterior import Posterior

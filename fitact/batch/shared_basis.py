@@ -12,17 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitact.compiled import jit, pad_samples
-from fitact.likelihood.compression import (
-    NODES,
-    RANK_TOLERANCE,
-    TABLE_HALF_WIDTH,
-    Compression,
-    baseline_functions,
-    chebyshev,
-    round_up_column_count,
-)
+from fitact.likelihood.compression import RANK_TOLERANCE, Compression, baseline_functions
 from fitact.model.drive import Drive
 from fitact.model.response import highpass
+from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, chebyshev, round_up_column_count
 
 
 class RestrictedTables(NamedTuple):

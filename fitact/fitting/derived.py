@@ -1,8 +1,9 @@
 """Quantities derived from the parameters: divider, time constant, force and friction, at any theta."""
 
+import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import jax
@@ -15,11 +16,13 @@ from fitact.compiled import BatchEvaluator, as_arrays, jit, pad_samples, pad_wei
 from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.fitting.drive_choice import DriveModel, has_ideal_edges, whole_periods
-from fitact.likelihood.channel import CHARGES, LINEAR_NUISANCES
+from fitact.likelihood.channel import CHARGES, LINEAR_NUISANCES, ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
+from fitact.model.circuit import Circuit
 from fitact.model.drive import Drive, Multitone, Periodic, PiecewiseLinear, Sampled, Sine
 from fitact.model.force import Geometry, electrostatic_force, friction, mean_force, peak_force, summarize
 from fitact.model.response import response
+from fitact.model.response_table import ResponseTable
 from fitact.model.skin import WithSkin
 from fitact.scene.scene import Scene
 
@@ -37,7 +40,7 @@ class DerivedQuantities(eqx.Module):
     """
 
     likelihood: Likelihood
-    drive: Drive
+    drive: Drive | ResponseTable  # V(t), or its responses at `time`
     time: Float[Array, " times"]  # times at which the force is evaluated, s
     weight: Float[Array, " times"]  # weight of each time in means; times with weight 0 count only for the peak
     geometry: Geometry  # geometry of the contact
@@ -46,42 +49,65 @@ class DerivedQuantities(eqx.Module):
     steady_state: bool = eqx.field(static=True)
     charge: bool = eqx.field(static=True)  # whether the unknown charge at the first sample matters
 
+    def tabulate(self, points: Float[np.ndarray, "n parameters"]) -> Self:
+        """Return the quantities with a table for all circuits at the points theta, where it saves time.
+
+        A response in closed form costs as little.
+        """
+        is_closed = self.steady_state and isinstance(self.drive, Periodic)
+        if is_closed or isinstance(self.drive, ResponseTable) or isinstance(self.likelihood.template, WithSkin):
+            return self
+        begin, tau_range = float(self.likelihood.channels[0].time[0]), self.likelihood.tau_range(points)
+        table = ResponseTable.from_drive(self.drive, self.time, begin, tau_range, self.steady_state)
+        return self if table is None else dataclasses.replace(self, drive=table)
+
     def force(
-        self, theta: Float[Array, " parameters"], sigma: Float[Array, " channels"], deviate: ArrayLike = 0.0
+        self, theta: Float[Array, " parameters"], sigma: Float[Array, " channels"], deviate: Array | None = None
     ) -> Float[Array, " times"]:
         """Return the electrostatic force at `time`, N; see `fitact.model.force.Geometry`.
 
         `deviate` holds standard normal numbers (channels, `LINEAR_NUISANCES`) that draw the charges from their
-        posterior; 0 gives their mean.
+        posterior; None gives their mean.
         """
-        circuit = self.likelihood.circuit(theta)
+        return self._force(self.likelihood.circuit(theta), theta, sigma, deviate)
+
+    def _force(self, circuit: Circuit, theta: Array, sigma: Array, deviate: Array | None) -> Float[Array, " times"]:
         contact = self.geometry.contact(circuit)
-        voltage = response(circuit, self.drive, self.time, steady_state=self.steady_state, channel=contact.channel)
+        if isinstance(self.drive, ResponseTable):
+            voltage = self.drive.response(circuit.channel_terms(contact.channel))
+        else:
+            voltage = response(circuit, self.drive, self.time, steady_state=self.steady_state, channel=contact.channel)
         if self.charge:
-            voltage = voltage + self._charges(theta, sigma, deviate)
+            channel = self.likelihood.channels[0]
+            inputs = self.likelihood.make_inputs(circuit, theta, channel)
+            voltage = voltage + self._charges(channel, inputs, sigma[0], deviate)
         return electrostatic_force(voltage, contact)
 
-    def _charges(self, theta: Array, sigma: Array, deviate: ArrayLike) -> Float[Array, " times"]:
+    def _charges(
+        self, channel: ChannelLikelihood, inputs: ChannelInputs, sigma: Array, deviate: ArrayLike
+    ) -> Float[Array, " times"]:
         """Return the contribution of unknown charges at the first sample to the voltage that generates the force.
 
         A charge that stays on a gap is not included, because no channel shows it.
         """
-        channel, inputs = self.likelihood.channels[0], self.likelihood.channel_inputs(theta)
-        first = jnp.broadcast_to(deviate, (len(self.likelihood.channels), len(LINEAR_NUISANCES)))[0]
-        sizes = (channel.sample_nuisances(inputs, sigma[0], first) * channel.linear_sd)[-len(CHARGES) :]
+        first = None if deviate is None else deviate[0]
+        sizes = (channel.sample_nuisances(inputs, sigma, first) * channel.linear_sd)[-len(CHARGES) :]
         # the effect of a charge scales between channels like the response to a drive
         names = self.geometry.contact(inputs.circuit).channel, channel.channel
         acting, recorded = (inputs.circuit.channel_terms(name).weight for name in names)
         ratios = jnp.stack([v / jnp.where(w == 0.0, 1.0, w) for v, w in zip(acting, recorded, strict=False)])
-        ratios = jnp.pad(ratios, (0, len(CHARGES) - ratios.size))
-        return (sizes * ratios) @ channel.decays(inputs.circuit, self.time) / inputs.gain
+        if isinstance(self.drive, ResponseTable):
+            decays = jnp.stack([self.drive.decays(tau) for tau in inputs.circuit.terms().tau])
+        else:
+            decays = channel.decays(inputs.circuit, self.time)[: ratios.size]
+        return (sizes[: ratios.size] * ratios) @ decays / inputs.gain
 
     def __call__(
-        self, theta: Float[Array, " parameters"], sigma: Float[Array, " channels"], deviate: ArrayLike = 0.0
+        self, theta: Float[Array, " parameters"], sigma: Float[Array, " channels"], deviate: Array | None = None
     ) -> Float[Array, " derived"]:
         """Return the quantities of `DERIVED_NAMES`, in SI units."""
         circuit = self.likelihood.circuit(theta)
-        force = summarize(self.force(theta, sigma, deviate), self.weight)
+        force = summarize(self._force(circuit, theta, sigma, deviate), self.weight)
         if self.steady_state and isinstance(self.drive, Periodic):  # only the rms needs quadrature
             exact = circuit, self.drive, self.geometry.contact(circuit)
             force = force._replace(mean=mean_force(*exact))
@@ -94,7 +120,7 @@ class DerivedQuantities(eqx.Module):
         self, theta: Float[np.ndarray, " parameters"], sigma: Float[np.ndarray, " channels"]
     ) -> tuple[Float[np.ndarray, " derived"], Float[np.ndarray, "derived parameters"]]:
         """Return the logarithms of the quantities of `DERIVED_NAMES`, and their gradients in theta."""
-        return log_derivatives(self, theta, sigma)
+        return log_derivatives(self.tabulate(theta[None]), theta, sigma)
 
 
 @jit
@@ -111,8 +137,9 @@ def draw_derived(
     derive: DerivedQuantities, likelihood: Likelihood, points: Float[np.ndarray, "*draws coordinates"], seed: int
 ) -> Float[np.ndarray, "*draws derived"]:
     """Return the quantities of `DERIVED_NAMES` at points of a posterior; unknown charges are drawn for each point."""
-    deviates = nuisance_deviates(likelihood, points, seed)
-    return evaluate_draws(_derive_draw, derive, likelihood.channels[0].time.size, points, deviates)
+    deviates, size = nuisance_deviates(likelihood, points, seed), points.shape[-1] - len(likelihood.channels)
+    derive = derive.tabulate(points.reshape(-1, points.shape[-1])[:, :size])
+    return evaluate_draws(_derive_draw, derive, derive.time.size, points, deviates)
 
 
 def nuisance_deviates(

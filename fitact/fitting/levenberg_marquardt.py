@@ -55,6 +55,7 @@ def find_minimum(
     """Find a minimum as `fitact.fitting.minimum.minimise` does."""
     start = jnp.asarray(start)
 
+    @jax.jit  # optimistix traces its function six times, and jit only once
     def flat_residuals(theta: Array, _: None) -> Array:
         return ravel_pytree(residuals(theta))[0]
 

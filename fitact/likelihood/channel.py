@@ -200,8 +200,12 @@ class ChannelLikelihood(eqx.Module):
         A = self.linear_sd[self._column_indices, None] * shapes
         # keeps XLA from computing both again at each use
         remainder, A = lax.optimization_barrier((remainder, A))
-        factor = jnp.linalg.cholesky(jnp.eye(len(A)) + A @ A.T / sigma**2)
-        beta = cho_solve((factor, True), A @ remainder / sigma**2)
+        precision = jnp.eye(len(A)) + A @ A.T / sigma**2
+        factor = jnp.linalg.cholesky(precision)
+        fixed = lax.stop_gradient(factor), True  # the derivative of a solution does not need that of the factor
+        beta = lax.custom_linear_solve(
+            lambda x: precision @ x, A @ remainder / sigma**2, lambda _, y: cho_solve(fixed, y), symmetric=True
+        )
         if self.noise != "student":
             return remainder - beta @ A, beta, factor
         return self._fit_nuisances_student(remainder, A, beta, sigma)
@@ -225,15 +229,16 @@ class ChannelLikelihood(eqx.Module):
         return remainder, beta, jnp.linalg.cholesky(one + curvature * A @ A.T / sigma**2)
 
     def sample_nuisances(
-        self, inputs: ChannelInputs, sigma: ArrayLike, deviate: ArrayLike = 0.0
+        self, inputs: ChannelInputs, sigma: ArrayLike, deviate: Float[Array, " 10"] | None = None
     ) -> Float[Array, " 10"]:
         """Return posterior draws of the nuisance coefficients, in prior standard deviations.
 
-        `deviate` holds ten standard normal numbers; 0 gives the posterior mean.
+        `deviate` holds ten standard normal numbers; None gives the posterior mean.
         """
         _, beta, factor = self.fit_nuisances(inputs, sigma)
-        deviate = jnp.broadcast_to(deviate, len(LINEAR_NUISANCES))[self._column_indices]
-        return jnp.zeros(len(LINEAR_NUISANCES)).at[self._column_indices].set(beta + solve_triangular(factor.T, deviate))
+        if deviate is not None:
+            beta = beta + solve_triangular(factor.T, deviate[self._column_indices])
+        return jnp.zeros(len(LINEAR_NUISANCES)).at[self._column_indices].set(beta)
 
     def residuals(self, inputs: ChannelInputs, sigma: ArrayLike) -> Float[Array, " rows+columns"]:
         """Return whitened residuals, priors of nuisances included; half their sum of squares is -log-likelihood."""

@@ -12,7 +12,7 @@ import functools
 import math
 from collections.abc import Iterator
 from fractions import Fraction
-from typing import NamedTuple, SupportsFloat
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -28,6 +28,13 @@ from fitact.model.chirp import Chirp
 from fitact.model.circuit import HighpassTerms
 from fitact.model.drive import Drive, Periodic, Sampled
 from fitact.model.response import highpass, phi, recurrence
+from fitact.model.response_table import (
+    NODES,
+    TABLE_HALF_WIDTH,
+    chebyshev,
+    chebyshev_polynomials,
+    round_up_column_count,
+)
 from fitact.progress import track_progress
 
 BASELINE_NAMES = ("offset", "drift", "hum_50Hz_cos", "hum_50Hz_sin", "hum_60Hz_cos", "hum_60Hz_sin")
@@ -36,8 +43,6 @@ BASELINE_NAMES = ("offset", "drift", "hum_50Hz_cos", "hum_50Hz_sin", "hum_60Hz_c
 _RATE, _SLOPE, _OBSERVED = -3, -2, -1
 _BASELINE = slice(_RATE - len(BASELINE_NAMES), _RATE)
 
-NODES = 41  # odd, so that the middle of the table is a node
-TABLE_HALF_WIDTH = math.log(9.0)  # half-width of the table in log tau
 RANK_TOLERANCE = 1e-13  # relative size of the singular values that are omitted
 
 
@@ -80,14 +85,7 @@ class Compression(eqx.Module):
         return self.decay @ self._series(tau)
 
     def _series(self, tau: Array) -> Float[Array, " terms"]:
-        x = (jnp.log(tau) - self.center) / self.half_width
-        terms = self.signal.shape[1]
-
-        def step(last: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
-            return (last[1], 2.0 * x * last[1] - last[0]), last[0]
-
-        # a loop compiles faster, but runs slower for few terms
-        return lax.scan(step, (jnp.ones_like(x), x), None, length=terms, unroll=terms <= NODES // 2)[1]
+        return chebyshev_polynomials((jnp.log(tau) - self.center) / self.half_width, self.signal.shape[1])
 
     def restrict(self, center: float, half_width: float, precision: float, charge: float) -> "Compression":
         """Return the compression for log tau in `center` ± `half_width` only, with fewer terms and rows.
@@ -392,16 +390,3 @@ def _assemble(table: _ResponseTable, total: np.ndarray, decays: bool, samples: i
     observed = remainder + float(table.expected_terms.weight[0]) * middle + following
     arrays = table.center, TABLE_HALF_WIDTH, signal[:rank], decay, baseline, rate, slope, observed, float(samples)
     return Compression(*map(np.asarray, arrays))
-
-
-def round_up_column_count(count: SupportsFloat, maximum: int) -> int:
-    """Return `count` rounded up to a multiple of 4, at most `maximum`, so that most records share compiled code."""
-    return min(4 * max(1, math.ceil(float(count) / 4)), maximum)
-
-
-def chebyshev(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return Chebyshev nodes in [-1, 1], and the matrix from values there to series coefficients (terms, nodes)."""
-    angle = np.pi * (np.arange(count) + 0.5) / count
-    matrix = 2.0 / count * np.cos(np.arange(count)[:, None] * angle)
-    matrix[0] *= 0.5
-    return np.cos(angle), matrix

@@ -136,8 +136,17 @@ class Likelihood(eqx.Module):
         self, points: Float[np.ndarray, "n parameters"], batch: int = 256
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Return the divider ratio g and the slowest time constant b (s) at many points theta."""
+        g, b, _ = self._evaluate_divider(points, batch)
+        return g, b
+
+    def tau_range(self, points: Float[np.ndarray, "n parameters"]) -> tuple[float, float]:
+        """Return the shortest and the longest time constant (s) of the circuits at the points theta."""
+        _, slowest, fastest = self._evaluate_divider(points)
+        return float(np.min(fastest)), float(np.max(slowest))
+
+    def _evaluate_divider(self, points: np.ndarray, batch: int = 256) -> Float[np.ndarray, "3 n"]:
         bare, kept = self._bare()
-        return tuple(BatchEvaluator(_g_and_b, bare, len(kept), batch, fast=False)(points[:, kept]).T)
+        return BatchEvaluator(_divider, bare, len(kept), batch, fast=False)(points[:, kept]).T
 
     def _bare(self) -> tuple["Likelihood", list[int]]:
         """Return the likelihood without all that the circuit does not depend on, and its coordinates.
@@ -256,6 +265,7 @@ def _evaluate_circuit(likelihood: Likelihood, theta: Float[Array, " circuit_para
     return jax.tree.map(jnp.asarray, CircuitValues(circuit, circuit.b, tau, terms))
 
 
-def _g_and_b(likelihood: Likelihood, theta: Float[Array, " circuit_parameters"]) -> Float[Array, "2"]:
+def _divider(likelihood: Likelihood, theta: Float[Array, " circuit_parameters"]) -> Float[Array, "3"]:
+    """Return g, b, and the fastest time constant (s)."""
     circuit = likelihood.circuit(theta)
-    return jnp.stack([circuit.g, circuit.b])
+    return jnp.stack([circuit.g, circuit.b, constant_skin_circuit(circuit).terms().tau[-1]])

@@ -58,9 +58,7 @@ class Finger:
         likelihood = _flatten_skin_prior(fit.likelihood).without_samples()
         size, shared = fit.theta.size, fit.names.index(SHARED_PARAMETER)
         theta, log_sigma = np.split(fit.point, [size])
-        residuals, jacobian = map(
-            np.asarray, _linearize(likelihood, jnp.asarray(theta), jnp.asarray(np.exp(log_sigma)))
-        )
+        residuals, jacobian = _linearize(likelihood, theta, np.exp(log_sigma))
         own = [i for i in range(size) if i != shared]
         # in R of (own, Ci, residuals), the column of Ci below the own columns holds the record's information on Ci
         R = np.asarray(np.linalg.qr(np.column_stack([jacobian[:, [*own, shared]], residuals]), mode="r"))

@@ -111,7 +111,7 @@ class FingerLikelihoods(eqx.Module):
             size = finger.conditional_mean.size + area_varies
             deviates = _sobol_student_t(size, draws, np.random.default_rng(child))
             tables.append(_tabulate_finger(finger, center, half_width, deviates, terms))
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *tables)
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *tables)
 
     def log_likelihood(self, parameters: PopulationParameters) -> Float[Array, " fingers"]:
         """Evaluate the log-likelihood of each finger, up to a constant; -inf beyond the tables.
@@ -211,15 +211,15 @@ def _tabulate_finger(
     factor = np.insert(finger.covariance_factor, shared, 0.0, axis=0)[skin]
     off = center - finger.center
     return FingerLikelihoods(
-        skin=jnp.asarray(at_center[1:]),
-        slope=jnp.asarray(np.insert(finger.slope, shared, 1.0)[None, skin]),
-        center=jnp.array([center]),
-        half_width=jnp.array([half_width]),
-        weight=jnp.asarray(np.polynomial.chebyshev.chebfit(nodes, values, terms - 1).T),
-        precision=jnp.array([finger.precision]),
-        weighted_offset=jnp.array([finger.weighted_offset - finger.precision * off]),
-        area_deviates=jnp.asarray(deviates[:, -1] if deviates.shape[1] > own else np.zeros(draws)),
-        normal_log_weight=jnp.asarray(-0.5 * np.sum(np.square(z), axis=1) - log_density),
-        mean=jnp.asarray(at_center[0]),
-        covariance=jnp.asarray(factor @ factor.T),
+        skin=at_center[1:],
+        slope=np.insert(finger.slope, shared, 1.0)[None, skin],
+        center=np.array([center]),
+        half_width=np.array([half_width]),
+        weight=np.polynomial.chebyshev.chebfit(nodes, values, terms - 1).T,
+        precision=np.array([finger.precision]),
+        weighted_offset=np.array([finger.weighted_offset - finger.precision * off]),
+        area_deviates=deviates[:, -1] if deviates.shape[1] > own else np.zeros(draws),
+        normal_log_weight=-0.5 * np.sum(np.square(z), axis=1) - log_density,
+        mean=at_center[0],
+        covariance=factor @ factor.T,
     )

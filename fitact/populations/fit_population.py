@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -83,7 +82,7 @@ def population(
 
         def hierarchy(draws: int, terms: int, purpose: int) -> Hierarchy:
             tables = make_tables(draws=draws, terms=terms, seed=[seed, purpose])
-            return Hierarchy(tables, medians, area_varies, jnp.asarray(standardized.z_scores))
+            return Hierarchy(tables, medians, area_varies, standardized.z_scores)
 
         for draws, name in _CHAIN_FILES.items():
             sampled = hierarchy(draws, terms=9, purpose=2)

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Array, Float
 
-from fitact.compiled import jit
+from fitact.compiled import array_module, jit
 from fitact.populations.finger import SHARED_PARAMETER, SKIN
 from fitact.populations.finger_likelihoods import TABLE_HALF_WIDTH, FingerLikelihoods, PopulationParameters
 from fitact.prior.prior import Prior
@@ -51,7 +51,8 @@ class Hierarchy(eqx.Module):
 
     @property
     def _design(self) -> Float[Array, "fingers regressors"]:
-        return jnp.column_stack([jnp.ones(len(self.covariates)), self.covariates])
+        xp = array_module(self.covariates)
+        return xp.column_stack([xp.ones(len(self.covariates)), self.covariates])
 
     def population_parameters(self, point: Float[Array, " coordinates"]) -> PopulationParameters:
         log_sd, correlation = jnp.exp(point[3:5]), jnp.tanh(point[5])
@@ -67,12 +68,12 @@ class Hierarchy(eqx.Module):
     def _regress_skin(self, log_Ci: Array) -> Float[Array, "regressors 2"]:
         """Compute the fingers' mean log Rsc and log Csc, and the least-squares slopes."""
         design = self._design
-        return jnp.linalg.solve(design.T @ design, design.T @ self._skin(log_Ci))
+        return array_module(log_Ci).linalg.solve(design.T @ design, design.T @ self._skin(log_Ci))
 
     def _skin(self, log_Ci: Array) -> Float[Array, "fingers 2"]:
         """Estimate the fingers' log Rsc and log Csc at the panel's Ci."""
-        skin, off = jnp.mean(self.fingers.skin, axis=1), log_Ci - self.fingers.center
-        return skin + off * (jnp.array([-1.0, 1.0]) if self.area_varies else self.fingers.slope[:, 0])
+        skin, off = self.fingers.skin.mean(axis=1), log_Ci - self.fingers.center
+        return skin + off * (np.array([-1.0, 1.0]) if self.area_varies else self.fingers.slope[:, 0])
 
     def log_prior(self, point: Float[Array, " coordinates"]) -> Float[Array, ""]:
         """Return the log-prior of the population parameters, up to a constant."""
@@ -102,10 +103,10 @@ class Hierarchy(eqx.Module):
 
     def start(self) -> Float[np.ndarray, " coordinates"]:
         """Return the moments of the fingers, as if each were known exactly."""
-        log_Ci = jnp.mean(self.fingers.center)
+        log_Ci = np.mean(self.fingers.center)
         residuals = self._skin(log_Ci) - self._design @ self._regress_skin(log_Ci)
-        sds = jnp.append(jnp.std(residuals, axis=0), jnp.std(self.fingers.center))
-        spreads = jnp.log(0.05 + sds)  # the offset keeps each away from 0
+        sds = np.append(np.std(residuals, axis=0), np.std(self.fingers.center))
+        spreads = np.log(0.05 + sds)  # the offset keeps each away from 0
         of_law = np.array([0.0, 0.0, log_Ci, *spreads[:2], 0.0, spreads[2]])[: self._first_slope_index]
         return np.append(of_law, np.zeros(2 * self.covariates.shape[1]))
 
@@ -121,7 +122,7 @@ def laplace(hierarchy: Hierarchy) -> tuple[Float[np.ndarray, " coordinates"], Fl
     scale = np.full(start.size, 1.0 / np.sqrt(len(hierarchy.fingers.center)))
     scale[[name.startswith("shift") for name in hierarchy.names]] = 1.0
     # the tables' half-width is a known multiple of the standard deviation of log Ci
-    scale[2] = float(jnp.min(hierarchy.fingers.half_width)) / TABLE_HALF_WIDTH
+    scale[2] = float(np.min(hierarchy.fingers.half_width)) / TABLE_HALF_WIDTH
     optimum = scipy.optimize.minimize(
         lambda z: _value_and_gradient(hierarchy, start, scale, z),
         np.zeros(start.size),

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitact.compiled import BatchEvaluator
+from fitact.compiled import BatchEvaluator, array_module
 from fitact.fitting import derived
 from fitact.fitting.drive_choice import whole_periods
 from fitact.fitting.fit import Fit
@@ -57,8 +57,8 @@ class NewFingerModel(eqx.Module):
         elif isinstance(derive.drive, Sampled) and whole_periods(fit.record)[1] is not None:
             frequency = float(fit.record.frequency() or math.nan)
         with jax.enable_x64(True):
-            sigma = jnp.asarray([trace.sigma for trace in fit.traces])
-            return cls(derive, jnp.asarray(fit.theta), sigma, factors, frequency)
+            sigma = np.array([trace.sigma for trace in fit.traces])
+            return cls(derive, fit.theta, sigma, factors, frequency)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -69,17 +69,28 @@ class NewFingerModel(eqx.Module):
         self, factors: Float[Array, " factors"]
     ) -> tuple[derived.DerivedQuantities, Float[Array, " parameters"]]:
         """Return a finger's derived quantities and parameters; area and thickness scale these by eqs. (3) and (4)."""
-        by_name = dict(zip(self.factors, factors, strict=True))
-        area, skin, insulator = (by_name.get(name, 0.0) for name in FACTORS[3:])
-        logs = jnp.stack([by_name["Rsc"] - area, by_name["Csc"] + area, by_name["Ci"] + area - insulator])
-        places = np.array([self.derive.likelihood.names.index(name) for name in (*SKIN, SHARED_PARAMETER)])
+        by_name = self._factors_by_name(factors)
+        skin, insulator = (by_name.get(name, 0.0) for name in THICKNESSES)
         geometry = self.derive.geometry
         thicker = dataclasses.replace(
             geometry,
             skin_thickness=geometry.skin_thickness * jnp.exp(skin),
             insulator_thickness=geometry.insulator_thickness * jnp.exp(insulator),
         )
-        return dataclasses.replace(self.derive, geometry=thicker), self.theta.at[places].set(logs)
+        return dataclasses.replace(self.derive, geometry=thicker), self._theta(factors)
+
+    def _theta(self, factors: Float[Array, "*shape factors"]) -> Float[Array, "*shape parameters"]:
+        """Return the parameters of fingers."""
+        by_name, xp = self._factors_by_name(factors), array_module(factors)
+        area, insulator = by_name.get(AREA, 0.0), by_name.get(THICKNESSES[1], 0.0)
+        logs = {"Rsc": by_name["Rsc"] - area, "Csc": by_name["Csc"] + area, "Ci": by_name["Ci"] + area - insulator}
+        others = xp.broadcast_to(self.theta, (*factors.shape[:-1], self.theta.size))
+        return xp.stack(
+            [logs.get(name, others[..., i]) for i, name in enumerate(self.derive.likelihood.names)], axis=-1
+        )
+
+    def _factors_by_name(self, factors: Float[Array, "*shape factors"]) -> dict[str, Array]:
+        return {name: factors[..., i] for i, name in enumerate(self.factors)}
 
     def __call__(self, factors: Float[Array, " factors"]) -> Float[Array, " names"]:
         """Compute the quantities `names`."""
@@ -87,28 +98,34 @@ class NewFingerModel(eqx.Module):
         skin = jnp.exp(theta[np.array([derive.likelihood.names.index(name) for name in SKIN])])
         parts = [skin, derive(theta, self.sigma)]
         if self.frequency is not None:
-            turn = jnp.exp(2j * jnp.pi * self.frequency * jnp.outer(jnp.array([1.0, 2.0]), derive.time))
-            tones = 2.0 * jnp.abs(turn @ (derive.weight * derive.force(theta, self.sigma)))
+            turns = 2.0 * np.pi * self.frequency * jnp.outer(np.array([1.0, 2.0]), derive.time)
+            weighted = derive.weight * derive.force(theta, self.sigma)
+            tones = 2.0 * jnp.hypot(jnp.cos(turns) @ weighted, jnp.sin(turns) @ weighted)
             parts += [tones, derive.coefficient * tones]
         return jnp.concatenate(parts)
 
     def evaluate(self, factors: Float[np.ndarray, "*shape factors"]) -> Float[np.ndarray, "*shape names"]:
         """Compute the quantities `names` of many fingers."""
         with jax.enable_x64(True):
-            evaluator = BatchEvaluator(NewFingerModel.__call__, self, self.derive.time.size, batch=512)
+            model = self._tabulate(factors)
+            evaluator = BatchEvaluator(NewFingerModel.__call__, model, model.derive.time.size, batch=512)
             return evaluator.map_over(factors.shape[:-1], factors)
+
+    def _tabulate(self, factors: Float[np.ndarray, "*shape factors"]) -> Self:
+        points = self._theta(factors).reshape(-1, self.theta.size)
+        return dataclasses.replace(self, derive=self.derive.tabulate(points))
 
     def force_in_time(
         self, factors: Float[np.ndarray, "fingers factors"], count: int
     ) -> tuple[Float[np.ndarray, " count"], Float[np.ndarray, "fingers count"]]:
         """Compute times (s) and force (N) of many fingers over the last period, or over a whole aperiodic drive."""
         with jax.enable_x64(True):
-            first, last = float(jnp.min(self.derive.time)), float(jnp.max(self.derive.time))
+            first, last = float(np.min(self.derive.time)), float(np.max(self.derive.time))
             span = last - first if self.frequency is None else 1.0 / self.frequency
             time = span * np.arange(count) / count
             start = 0.0 if isinstance(self.derive.drive, Periodic) else last - span
-            derive = dataclasses.replace(self.derive, time=jnp.asarray(start + time))
-            force = BatchEvaluator(_force, dataclasses.replace(self, derive=derive), count, batch=512)(factors)
+            model = dataclasses.replace(self, derive=dataclasses.replace(self.derive, time=start + time))
+            force = BatchEvaluator(_force, model._tabulate(factors), count, batch=512)(factors)
         return time, force
 
 

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import emcee
 import numpy as np
-from arviz_stats.base import array_stats
 from jaxtyping import Float, Int
 from scipy.special import ndtri
 
@@ -202,6 +201,8 @@ class ImportanceWeights(NamedTuple):
 
 def pareto_smooth(log_weights: Float[np.ndarray, " draws"]) -> ImportanceWeights:
     """Smooth the largest weights with a generalised Pareto distribution (Vehtari et al. 2024), as ArviZ does."""
+    from arviz_stats.base import array_stats  # slow to import, and MCMC does without it
+
     possible = np.isfinite(log_weights)
     count = np.count_nonzero(possible)
     if count <= 3.0 * np.sqrt(log_weights.size):  # size of the tail that is fitted
