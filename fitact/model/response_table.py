@@ -21,7 +21,7 @@ from fitact.model.response import highpass
 NODES = 41  # odd, so that the middle of the table is a node
 TABLE_HALF_WIDTH = math.log(9.0)  # half-width in log tau that `NODES` cover to rounding
 _MARGIN = 0.05  # least half-width of a `ResponseTable`, in log tau
-_MAX_HALF_WIDTH = 4.0 * TABLE_HALF_WIDTH
+_MAX_HALF_WIDTH = 4.0 * TABLE_HALF_WIDTH  # beyond it, a table costs more than it saves
 _MAX_NUMBERS = 4_000_000  # responses of all nodes at all times, which bounds the memory
 _PRECISION = 1e-13  # of a `ResponseTable`, relative to the largest response
 _OPEN = 1e6  # a time constant longer than the table's slowest by this factor counts as infinite
