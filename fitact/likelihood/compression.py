@@ -136,7 +136,7 @@ def compress(
     multiplies the residuals of the samples (0 excludes a sample, None means 1). `rate` is dV/dt (V/s) for a channel
     that follows it.
     """
-    table = _ResponseTable.from_terms(expected_terms, time)
+    table = _TableNodes.from_terms(expected_terms, time)
     squares = np.broadcast_to(1.0 if weight is None else np.square(weight), time.size)
     samples = _Samples(time, observed, squares, np.broadcast_to(0.0 if rate is None else rate, time.size))
     if isinstance(drive, Sampled):
@@ -151,7 +151,7 @@ def compress(
     return _assemble(table, sum(parts, np.zeros(())), isinstance(drive, Sampled), int(np.count_nonzero(squares)))
 
 
-class _ResponseTable(eqx.Module):
+class _TableNodes(eqx.Module):
     """Response table during the pass: its nodes, and the few significant combinations of their responses."""
 
     center: Array
@@ -164,7 +164,7 @@ class _ResponseTable(eqx.Module):
     step: Array  # mean time step, s
 
     @classmethod
-    def from_terms(cls, expected_terms: HighpassTerms, time: np.ndarray) -> "_ResponseTable":
+    def from_terms(cls, expected_terms: HighpassTerms, time: np.ndarray) -> "_TableNodes":
         (tau,) = map(float, expected_terms.tau)
         relative, mix, series = _exponentials()
         return cls(
@@ -229,7 +229,7 @@ def _chunk_length(samples: int, longest: int = 8_192) -> int:
 
 
 def _accumulate_directly(
-    table: _ResponseTable, drive: Drive, samples: _Samples, steady_state: bool
+    table: _TableNodes, drive: Drive, samples: _Samples, steady_state: bool
 ) -> Iterator[np.ndarray]:
     size = samples.time.size
     length = _chunk_length(size, 65_536) if isinstance(drive, Chirp) else _chunk_length(size)  # of few chirps
@@ -239,7 +239,7 @@ def _accumulate_directly(
 
 @jit
 def _chunk_products(
-    table: _ResponseTable, drive: Drive, chunk: _Samples, baseline: Array | None, steady_state: bool
+    table: _TableNodes, drive: Drive, chunk: _Samples, baseline: Array | None, steady_state: bool
 ) -> Array:
     """Return the inner products of a chunk, for a drive whose response can be computed at any time."""
     time = chunk.time
@@ -259,7 +259,7 @@ def _chunk_products(
 
 
 def _inner_products(
-    table: _ResponseTable, responses: list[Array], baseline: Array, slope: Array, chunk: _Samples
+    table: _TableNodes, responses: list[Array], baseline: Array, slope: Array, chunk: _Samples
 ) -> Array:
     """Return the inner products of the responses (and charge decays) at the nodes, the shapes and the record."""
     rest = chunk.observed - table.expected_terms.weight[0] * responses[0][NODES // 2]
@@ -270,7 +270,7 @@ def _inner_products(
     return (rows * chunk.weight) @ rows.T
 
 
-def _accumulate_folded(table: _ResponseTable, drive: Drive, samples: _Samples, period: int) -> Iterator[np.ndarray]:
+def _accumulate_folded(table: _TableNodes, drive: Drive, samples: _Samples, period: int) -> Iterator[np.ndarray]:
     """Yield the inner products from folded periods; the response is computed for one period only."""
     periods = max(1, _chunk_length(samples.time.size) // period)
     reference = np.asarray(samples.observed[:period])
@@ -315,7 +315,7 @@ def _is_exactly_uniform(time: np.ndarray, tolerance: float = 1e-9) -> bool:
     return is_uniform(time, tolerance + rounding / step)
 
 
-def _accumulate_measured(table: _ResponseTable, drive: Sampled, samples: _Samples) -> Iterator[np.ndarray]:
+def _accumulate_measured(table: _TableNodes, drive: Sampled, samples: _Samples) -> Iterator[np.ndarray]:
     """Yield the inner products of each chunk for a measured drive."""
     time = samples.time
     length, step, first = _chunk_length(time.size), float(table.step), float(drive.samples[0])
@@ -331,7 +331,7 @@ def _accumulate_measured(table: _ResponseTable, drive: Sampled, samples: _Sample
 
 @jit
 def _advance_chunk(
-    table: _ResponseTable,
+    table: _TableNodes,
     chunk: _Samples,
     voltage: Array,
     last: tuple[Array, Array, Array],
@@ -375,7 +375,7 @@ def _uniform_recurrence(
     return gain * (alone.transpose(1, 2, 0) + starts.T[:, :, None] * decays[:, None]).reshape(x.size, -1)
 
 
-def _assemble(table: _ResponseTable, total: np.ndarray, decays: bool, samples: int) -> Compression:
+def _assemble(table: _TableNodes, total: np.ndarray, decays: bool, samples: int) -> Compression:
     """Return coordinates that have the accumulated inner products."""
     size, rank = len(total), table.series.shape[0]
     scale = np.sqrt(np.diagonal(total))
