@@ -21,6 +21,7 @@ from fitact.model.response import highpass
 NODES = 41  # odd, so that the middle of the table is a node
 TABLE_HALF_WIDTH = math.log(9.0)  # half-width in log tau that `NODES` cover to rounding
 _MARGIN = 0.05  # least half-width of a `ResponseTable`, in log tau
+_FEW_NODES, _NARROW = 11, 0.2  # nodes of a narrow table, and its largest half-width
 _MAX_HALF_WIDTH = 4.0 * TABLE_HALF_WIDTH  # beyond it, a table costs more than it saves
 _MAX_NUMBERS = 4_000_000  # responses of all nodes at all times, which bounds the memory
 _PRECISION = 1e-13  # of a `ResponseTable`, relative to the largest response
@@ -56,7 +57,7 @@ class ResponseTable(eqx.Module):
         x, to_series = chebyshev(count)
         nodes = np.append(np.exp(center + half_width * x), 10.0 * _OPEN * math.exp(high))
         respond = functools.partial(_respond, steady_state=steady_state)
-        signal = BatchEvaluator(respond, (drive, time), time.size, batch=NODES + 1, fast=False)(nodes)
+        signal = BatchEvaluator(respond, (drive, time), time.size, batch=min(count, NODES) + 1, fast=False)(nodes)
         signal, settled = signal[:-1].T @ to_series.T, signal[-1:].T
         decay = np.exp(-(time[:, None] - begin) / nodes[:-1]) @ to_series.T
         kept = np.max(np.abs(signal), axis=0) > _PRECISION * np.max(np.abs(signal))
@@ -85,7 +86,8 @@ class ResponseTable(eqx.Module):
 
 
 def _node_count(half_width: float) -> int:
-    return NODES * math.ceil(half_width / TABLE_HALF_WIDTH)
+    """Return how many nodes reach rounding: e^{-t/tau} is analytic in log tau within a strip of half-width pi / 2."""
+    return _FEW_NODES if half_width <= _NARROW else NODES * math.ceil(half_width / TABLE_HALF_WIDTH)
 
 
 def _respond(driven: tuple[Drive, Array], tau: Array, *, steady_state: bool) -> Float[Array, " times"]:
