@@ -48,6 +48,8 @@ class Browser:
         self.driver.get_log("browser"), self.driver.get_log("performance")
         self.size(width, height)
         self.driver.get(path.as_uri())
+        # on a busy machine, Chromium may still show the page before
+        self.wait("document.readyState === 'complete' && location.href === arguments[0]", path.as_uri())
 
     def size(self, width: int, height: int) -> None:
         self.command(
