@@ -15,7 +15,7 @@ from fitact.compiled import jit, pad_samples
 from fitact.likelihood.compression import RANK_TOLERANCE, Compression, baseline_functions
 from fitact.model.drive import Drive
 from fitact.model.response import highpass
-from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, chebyshev, round_up_column_count
+from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, chebyshev, count_terms, round_up_column_count
 
 
 class RestrictedTables(NamedTuple):
@@ -107,8 +107,7 @@ class SharedBasis(NamedTuple):
         inside = (center[:, None] + half_width[:, None] * x - self.center) / TABLE_HALF_WIDTH
         polynomials = np.polynomial.chebyshev.chebvander(inside, NODES - 1)
         series = self.signal @ np.swapaxes(polynomials, 1, 2) @ to_series.T
-        tail = np.cumsum(np.linalg.norm(series, axis=1)[:, ::-1], axis=1)[:, ::-1]
-        terms = round_up_column_count(np.max(np.count_nonzero(tail > precision[:, None], axis=1)), NODES)
+        terms = count_terms(np.linalg.norm(series, axis=1), precision[:, None])
         others = ((0, 0), (0, coordinates.shape[1] - len(self.signal)), (0, 0))
         columns = np.concatenate([np.pad(series[..., :terms], others), coordinates[..., None]], axis=2)
         _, rows = np.linalg.qr(columns)

@@ -84,7 +84,7 @@ class DerivedQuantities(eqx.Module):
         return electrostatic_force(voltage, contact)
 
     def _charges(
-        self, channel: ChannelLikelihood, inputs: ChannelInputs, sigma: Array, deviate: ArrayLike
+        self, channel: ChannelLikelihood, inputs: ChannelInputs, sigma: Array, deviate: Array | None
     ) -> Float[Array, " times"]:
         """Return the contribution of unknown charges at the first sample to the voltage that generates the force.
 
@@ -137,8 +137,8 @@ def draw_derived(
     derive: DerivedQuantities, likelihood: Likelihood, points: Float[np.ndarray, "*draws coordinates"], seed: int
 ) -> Float[np.ndarray, "*draws derived"]:
     """Return the quantities of `DERIVED_NAMES` at points of a posterior; unknown charges are drawn for each point."""
-    deviates, size = nuisance_deviates(likelihood, points, seed), points.shape[-1] - len(likelihood.channels)
-    derive = derive.tabulate(points.reshape(-1, points.shape[-1])[:, :size])
+    deviates, theta = nuisance_deviates(likelihood, points, seed), points[..., : -len(likelihood.channels)]
+    derive = derive.tabulate(theta.reshape(-1, theta.shape[-1]))
     return evaluate_draws(_derive_draw, derive, derive.time.size, points, deviates)
 
 

@@ -33,7 +33,7 @@ from fitact.model.response_table import (
     TABLE_HALF_WIDTH,
     chebyshev,
     chebyshev_polynomials,
-    round_up_column_count,
+    count_terms,
 )
 from fitact.progress import track_progress
 
@@ -99,9 +99,7 @@ class Compression(eqx.Module):
         polynomials = np.polynomial.chebyshev.chebvander(inside, self.signal.shape[1] - 1).T
         signal = np.asarray(self.signal @ polynomials) @ to_series.T
         decay = np.asarray(self.decay @ polynomials) @ to_series.T
-        sizes = np.linalg.norm(signal, axis=0) + charge * np.linalg.norm(decay, axis=0)
-        costs = np.cumsum(sizes[::-1])[::-1]  # error after omitting this and all later terms
-        terms = round_up_column_count(np.count_nonzero(costs > precision), costs.size)
+        terms = count_terms(np.linalg.norm(signal, axis=0) + charge * np.linalg.norm(decay, axis=0), precision)
         signal = np.pad(signal[:, :terms], ((0, self.observed.size - signal.shape[0]), (0, 0)))
         others = [decay[:, :terms]] if charge > 0.0 else []
         columns = [signal, *others, self.baseline.T, *(x[:, None] for x in (self.rate, self.slope, self.observed))]

@@ -11,14 +11,13 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from fitact.compiled import jit, pad_samples
+from fitact.compiled import pad_samples
 from fitact.likelihood.compression import BASELINE_NAMES, evaluate_baseline
 from fitact.model.circuit import HighpassTerms
 from fitact.model.drive import Drive, Sampled
-from fitact.model.response import highpass
+from fitact.model.response_table import highpass_responses
 from fitact.model.skin import TimeConstantGrid
 
 
@@ -75,7 +74,7 @@ def compress_on_grid(
     size = grid.tau.size
     triangle: Any = np.zeros((0, 2 * size + len(BASELINE_NAMES) + 2))
     middle, half = 0.5 * (time[0] + time[-1]), 0.5 * (time[-1] - time[0])
-    for part, u in _responses(drive, grid.tau, time, around, steady_state):
+    for part, u in _responses(drive, np.asarray(grid.tau), time, around, steady_state):
         baseline = evaluate_baseline(time[part], middle, half)
         rows = [u[0], baseline, rate[part][None], observed[part][None] / scale, (u[1] - u[2]) / (2.0 * step)]
         columns = (np.concatenate(rows) * weight[part]).T
@@ -92,20 +91,12 @@ def compress_on_grid(
 
 
 def _responses(
-    drive: Drive, tau: Array, time: np.ndarray, offsets: np.ndarray, steady_state: bool, chunk: int = 8_192
+    drive: Drive, tau: np.ndarray, time: np.ndarray, offsets: np.ndarray, steady_state: bool, chunk: int = 8_192
 ) -> Iterator[tuple[slice, Float[np.ndarray, "around terms samples"]]]:
     """Yield the responses at the sample times and at `offsets` from them, in chunks to bound the memory."""
     length = time.size if isinstance(drive, Sampled) else chunk  # a long drive is traversed only once
     for first in range(0, time.size, length):
         part = slice(first, first + length)
         times = pad_samples(time[part], min(length, time.size))
-        u = np.stack([_compute_responses(drive, tau, times + x, steady_state) for x in offsets])
+        u = np.stack([highpass_responses(drive, times + x, tau, steady_state) for x in offsets])
         yield part, u[..., : time[part].size]
-
-
-@jit
-def _compute_responses(drive: Drive, tau: Array, time: Array, steady_state: bool) -> Float[Array, "terms samples"]:
-    def highpass_response(tau: Array) -> Array:
-        return highpass(drive, time, tau, steady_state=steady_state)
-
-    return lax.map(highpass_response, tau, batch_size=8)

@@ -133,10 +133,10 @@ class Likelihood(eqx.Module):
         return _evaluate_circuit(bare, theta[kept])
 
     def evaluate_g_and_b(
-        self, points: Float[np.ndarray, "n parameters"], batch: int = 256
+        self, points: Float[np.ndarray, "n parameters"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Return the divider ratio g and the slowest time constant b (s) at many points theta."""
-        g, b, _ = self._evaluate_divider(points, batch)
+        g, b, _ = self._evaluate_divider(points)
         return g, b
 
     def tau_range(self, points: Float[np.ndarray, "n parameters"]) -> tuple[float, float]:
@@ -144,9 +144,9 @@ class Likelihood(eqx.Module):
         _, slowest, fastest = self._evaluate_divider(points)
         return float(np.min(fastest)), float(np.max(slowest))
 
-    def _evaluate_divider(self, points: np.ndarray, batch: int = 256) -> Float[np.ndarray, "3 n"]:
+    def _evaluate_divider(self, points: np.ndarray) -> Float[np.ndarray, "3 n"]:
         bare, kept = self._bare()
-        return BatchEvaluator(_divider, bare, len(kept), batch, fast=False)(points[:, kept]).T
+        return BatchEvaluator(_divider, bare, len(kept), batch=256, fast=False)(points[:, kept]).T
 
     def _bare(self) -> tuple["Likelihood", list[int]]:
         """Return the likelihood without all that the circuit does not depend on, and its coordinates.

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.compiled import BatchEvaluator
@@ -56,13 +57,11 @@ class ResponseTable(eqx.Module):
             return None
         x, to_series = chebyshev(count)
         nodes = np.append(np.exp(center + half_width * x), 10.0 * _OPEN * math.exp(high))
-        respond = functools.partial(_respond, steady_state=steady_state)
-        signal = BatchEvaluator(respond, (drive, time), time.size, batch=min(count, NODES) + 1, fast=False)(nodes)
+        signal = highpass_responses(drive, time, nodes, steady_state)
         signal, settled = signal[:-1].T @ to_series.T, signal[-1:].T
         decay = np.exp(-(time[:, None] - begin) / nodes[:-1]) @ to_series.T
-        kept = np.max(np.abs(signal), axis=0) > _PRECISION * np.max(np.abs(signal))
-        kept |= np.max(np.abs(decay), axis=0) > _PRECISION
-        terms = round_up_column_count(np.max(np.flatnonzero(kept), initial=0) + 1, count)
+        largest = max(np.max(np.abs(signal)), np.finfo(float).tiny)
+        terms = count_terms(np.max(np.abs(signal) / largest, axis=0) + np.max(np.abs(decay), axis=0), _PRECISION)
         return cls(
             np.asarray(center), np.asarray(half_width), np.hstack([signal[:, :terms], settled]), decay[:, :terms]
         )
@@ -74,7 +73,7 @@ class ResponseTable(eqx.Module):
             x = self._position(tau)
             is_open = x > 1.0 + math.log(_OPEN) / self.half_width
             series = chebyshev_polynomials(jnp.where(is_open, 0.0, x), self.decay.shape[1])
-            total += weight * jnp.where(is_open, jnp.eye(1, total.size, total.size - 1)[0], jnp.append(series, 0.0))
+            total += weight * jnp.append(jnp.where(is_open, 0.0, series), is_open)
         return self.signal @ total
 
     def decays(self, tau: Array) -> Float[Array, " times"]:
@@ -88,6 +87,15 @@ class ResponseTable(eqx.Module):
 def _node_count(half_width: float) -> int:
     """Return how many nodes reach rounding: e^{-t/tau} is analytic in log tau within a strip of half-width pi / 2."""
     return _FEW_NODES if half_width <= _NARROW else NODES * math.ceil(half_width / TABLE_HALF_WIDTH)
+
+
+def highpass_responses(
+    drive: Drive, time: Float[np.ndarray, " times"], tau: Float[np.ndarray, " n"], steady_state: bool
+) -> Float[np.ndarray, "n times"]:
+    """Return the responses of `highpass` to `drive` at `time` (s) for many time constants (s)."""
+    batch = math.ceil(tau.size / math.ceil(tau.size / (NODES + 1)))  # equal batches, at most a whole table
+    respond = functools.partial(_respond, steady_state=steady_state)
+    return BatchEvaluator(respond, (drive, time), time.size, batch, fast=False)(tau)
 
 
 def _respond(driven: tuple[Drive, Array], tau: Array, *, steady_state: bool) -> Float[Array, " times"]:
@@ -111,6 +119,12 @@ def chebyshev_polynomials(x: Array, terms: int) -> Float[Array, " terms"]:
 
     # a loop compiles faster, but runs slower for few terms
     return lax.scan(step, (jnp.ones_like(x), x), None, length=terms, unroll=terms <= NODES // 2)[1]
+
+
+def count_terms(sizes: Float[np.ndarray, "*tables terms"], precision: ArrayLike) -> int:
+    """Return how many terms keep series of these sizes within `precision`, rounded up as by `round_up_column_count`."""
+    tails = np.cumsum(sizes[..., ::-1], axis=-1)[..., ::-1]  # error after omitting a term and all later ones
+    return round_up_column_count(np.max(np.count_nonzero(tails > precision, axis=-1)), sizes.shape[-1])
 
 
 def round_up_column_count(count: float | np.integer, maximum: int) -> int:
