@@ -26,6 +26,7 @@ from fitact.fitting.problem import MIN_RELATIVE_NOISE, Problem
 from fitact.fitting.residual_statistics import is_misfit, residual_statistics
 from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics, count_true
 from fitact.fitting.starting_point import most_probable_skin, prior_skin_moments
+from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.chirp import Chirp
 from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, chebyshev
@@ -269,7 +270,7 @@ def _find_optimum(
 ) -> GaussNewtonResult:
     """Find the optimum by Gauss-Newton steps from a nearby start, with sigma estimated from the residuals."""
     trace = likelihood.channels[0]
-    assert trace.compression is not None
+    assert isinstance(trace.compression, Compression)
     table = dataclasses.replace(trace.compression, observed=observed)
     model = likelihood.replace_channel(0, dataclasses.replace(trace, compression=table))
     size = start.size

@@ -217,6 +217,9 @@ def _log_probs(
         slope=zeros,
         observed=observed,
         samples=channel.compression.samples,
+        steps=jnp.zeros((0, rows)),
+        origin=jnp.zeros(()),
+        time_step=jnp.zeros(()),
     )
     return jax.vmap(likelihood.replace_channel(0, dataclasses.replace(channel, compression=table)).log_prob)(points)
 

@@ -81,6 +81,9 @@ class SharedBasis(NamedTuple):
             slope=append_zero(self.slope),
             observed=jnp.zeros(size),
             samples=jnp.asarray(float(samples)),
+            steps=jnp.zeros((0, size)),
+            origin=jnp.zeros(()),
+            time_step=jnp.zeros(()),
         )
 
     def project(self, observed: Float[np.ndarray, "records samples"]) -> Float[np.ndarray, "records coordinates+1"]:

@@ -96,11 +96,10 @@ class DerivedQuantities(eqx.Module):
         names = self.geometry.contact(inputs.circuit).channel, channel.channel
         acting, recorded = (inputs.circuit.channel_terms(name).weight for name in names)
         ratios = jnp.stack([v / jnp.where(w == 0.0, 1.0, w) for v, w in zip(acting, recorded, strict=False)])
+        sizes = sizes[: ratios.size] * ratios / inputs.gain
         if isinstance(self.drive, ResponseTable):
-            decays = jnp.stack([self.drive.decays(tau) for tau in inputs.circuit.terms().tau])
-        else:
-            decays = channel.decays(inputs.circuit, self.time)[: ratios.size]
-        return (sizes[: ratios.size] * ratios) @ decays / inputs.gain
+            return self.drive.decays(inputs.circuit.terms().tau, sizes)
+        return sizes @ channel.decays(inputs.circuit, self.time)[: ratios.size]
 
     def __call__(
         self, theta: Float[Array, " parameters"], sigma: Float[Array, " channels"], deviate: Array | None = None

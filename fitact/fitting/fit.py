@@ -270,8 +270,9 @@ def _solve_problem(
     (likelihood, reasons), theta_0 = problem.compress_likelihood(tolerance), choose_start(problem, start)
     noise = np.array([source.noise for source in problem.sources])
     freeable = tuple(source.optional_nuisances for source in problem.sources)
+    interpolated = [not certificate.may_compress(each, tolerance) for each in likelihood.channels]
     while True:
-        solved = solve(likelihood, theta_0, noise, freeable)
+        solved = solve(likelihood, theta_0, noise, freeable, tuple(interpolated))
         root = covariance_factor(np.concatenate(solved.jacobian), solved.likelihood.prior_factor)
         certified = certificate.certify(solved.likelihood, reasons, solved.theta, root, solved.sigma, tolerance)
         pairs = zip(solved.likelihood.channels, certified.reasons, strict=True)
@@ -279,8 +280,9 @@ def _solve_problem(
         if not any(failed):
             return solved, certified, root
         reasons = certified.reasons
-        for i, channel in enumerate(likelihood.channels):
-            likelihood = likelihood.replace_channel(i, channel.without_compression() if failed[i] else channel)
+        for i in (i for i, each in enumerate(failed) if each):
+            interpolated[i] = False
+            likelihood = likelihood.replace_channel(i, likelihood.channels[i].without_compression())
 
 
 def _assemble_fit(

@@ -12,8 +12,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.compiled import jit
+from fitact.experiment.fisher import covariance_factor
 from fitact.fitting.minimum import minimise, result_name
 from fitact.fitting.timing import clock_r_squared, free_timing, orthonormal_basis
+from fitact.likelihood.certificate import interpolate_channel, recompress
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import fit_ar1, student_curvature, student_weight
@@ -132,36 +134,68 @@ def solve(
     start: Float[np.ndarray, " parameters"],
     noise: Float[np.ndarray, " channels"],
     optional_nuisances: tuple[tuple[str, ...], ...],
+    interpolated: tuple[bool, ...],
 ) -> LeastSquaresResult:
-    """Fit, then add nuisances (`NUISANCES`, `TIMING_NUISANCES`) one by one while the BIC favours one."""
-    solved = _solve_coloured_noise(likelihood, start, noise)
+    """Fit, then add nuisances (`NUISANCES`, `TIMING_NUISANCES`) one by one while the BIC favours one.
+
+    `interpolated` states for each channel whether it may be compressed around its optimum if no table serves.
+    """
+    solved = _solve_coloured_noise(likelihood, start, noise, interpolated)
     for _ in range(sum(map(len, optional_nuisances))):
         gains = _bic_decreases(solved, optional_nuisances)
         which, name = max(gains, key=gains.__getitem__, default=(0, ""))
         if not name or not gains[which, name] > MIN_BIC_DECREASE:
             break
         likelihood, theta = _add_nuisance(solved, which, name)
-        solved = _solve_coloured_noise(likelihood, theta, solved.sigma)
+        solved = _solve_coloured_noise(likelihood, theta, solved.sigma, interpolated)
     return solved
 
 
-def _solve_coloured_noise(likelihood: Likelihood, start: np.ndarray, noise: np.ndarray) -> LeastSquaresResult:
+def _solve_coloured_noise(
+    likelihood: Likelihood, start: np.ndarray, noise: np.ndarray, interpolated: tuple[bool, ...]
+) -> LeastSquaresResult:
     """Fit; if the noise of a channel is AR(1), fit again with the coefficient estimated from the residuals.
 
     The coefficient is then fixed. For many samples its error is uncorrelated with those of the parameters (the
     information matrix is block-diagonal), so it does not widen them.
     """
-    solved = least_squares(likelihood, start, noise)
+    solved = least_squares(*_interpolate(likelihood, start, noise, interpolated))
+    likelihood = solved.likelihood
     for i, channel in enumerate(likelihood.channels):
         if channel.noise == "ar1":
-            white = dataclasses.replace(channel, whitening=None)
+            white = dataclasses.replace(channel.without_compression(), whitening=None)
             residuals, *_ = _fit_nuisances(white, likelihood.channel_inputs(solved.theta, i), solved.sigma[i])
             counted = channel.weights > 0.0
-            whitening = fit_ar1(residuals, counted).whitening(counted)
-            likelihood = likelihood.replace_channel(i, dataclasses.replace(channel, whitening=whitening))
+            channel = dataclasses.replace(channel, whitening=fit_ar1(residuals, counted).whitening(counted))
+            channel = recompress(channel, likelihood.evaluate_circuit(solved.theta))
+            likelihood = likelihood.replace_channel(i, channel)
     if likelihood is solved.likelihood:
         return solved
-    return least_squares(likelihood, solved.theta, solved.sigma)
+    return least_squares(*_interpolate(likelihood, solved.theta, solved.sigma, interpolated))
+
+
+def _interpolate(
+    likelihood: Likelihood, start: np.ndarray, noise: np.ndarray, interpolated: tuple[bool, ...], few: int = 4096
+) -> tuple[Likelihood, np.ndarray, np.ndarray]:
+    """Return the likelihood with interpolations for channels without a table, and the optimum and noise near it.
+
+    The optimum is that of `few` samples of these channels, as if their noise were white.
+    """
+    pairs = enumerate(zip(likelihood.channels, interpolated, strict=True))
+    chosen = [i for i, (channel, may) in pairs if may and channel.compression is None]
+    if not chosen:
+        return likelihood, start, noise
+    thin = likelihood
+    for i in chosen:
+        thin = thin.replace_channel(i, likelihood.channels[i].thin(few))
+    solved = least_squares(thin, start, noise, noise_tolerance=0.1)
+    root = covariance_factor(np.concatenate(solved.jacobian), thin.prior_factor)
+    for i in chosen:
+        size = likelihood.channels[i].n_samples
+        reach = 6.0 + 20.0 * math.sqrt(min(few / size, 1.0))
+        channel = interpolate_channel(likelihood, i, solved.theta, root, float(solved.sigma[i]), reach)
+        likelihood = likelihood.replace_channel(i, channel)
+    return likelihood, solved.theta, solved.sigma
 
 
 _fit_nuisances = jit(ChannelLikelihood.fit_nuisances)
@@ -172,7 +206,9 @@ def _add_nuisance(solution: LeastSquaresResult, index: int, name: str) -> tuple[
     likelihood, theta = solution.likelihood, solution.theta
     channel = likelihood.channels[index]
     if name in TIMING_NUISANCES:
-        channel = free_timing(channel, likelihood.channel_inputs(theta, index), name)
+        channel = free_timing(
+            channel, likelihood.channel_inputs(theta, index), likelihood.evaluate_circuit(theta), name
+        )
         new, before = likelihood.replace_channel(index, channel).names, likelihood.names
         theta = np.array([theta[before.index(n)] if n in before else 0.0 for n in new])
     else:

@@ -33,7 +33,7 @@ def choose_start(problem: Problem, start: Mapping[str, float] | None) -> Float[n
             raise InputError(f"start {name} = {value}: give positive values in SI units for any of {', '.join(names)}")
         theta[names.index(name)] = math.log(value)
     noise = np.array([source.noise for source in problem.sources])
-    end = solve(problem.likelihood, theta, noise, ((),) * noise.size).theta
+    end = solve(problem.likelihood, theta, noise, ((),) * noise.size, (False,) * noise.size).theta
     objective_end, objective_start = residual_objective(problem.likelihood, np.stack([end, problem.start]))
     return end if objective_end < objective_start else problem.start
 

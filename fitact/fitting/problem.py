@@ -55,10 +55,7 @@ class Problem(NamedTuple):
     def compress_likelihood(self, tolerance: float) -> tuple[Likelihood, tuple[str, ...]]:
         """Return the likelihood with compressed channels, and for each channel the reason if it is not compressed."""
         at_start = self.likelihood.evaluate_circuit(self.start)
-        pairs = []
-        for channel, source in zip(self.likelihood.channels, self.sources, strict=True):
-            shows_tau = source.start is not None and math.isfinite(source.start.b)
-            pairs.append(certificate.compress_channel(channel, at_start, shows_tau, tolerance))
+        pairs = [certificate.compress_channel(each, at_start, tolerance) for each in self.likelihood.channels]
         channels, reasons = zip(*pairs, strict=True)
         return dataclasses.replace(self.likelihood, channels=channels), reasons
 

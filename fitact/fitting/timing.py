@@ -8,10 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitact.compiled import jit, pad_rows, pad_samples, pad_weight
+from fitact.compiled import jit, pad_rows
 from fitact.fitting.drive_choice import has_ideal_edges, ideal_edge_mask
+from fitact.likelihood.certificate import recompress
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
+from fitact.likelihood.compression import MAX_DELAY
+from fitact.likelihood.likelihood import CircuitValues
 from fitact.likelihood.noise import student_weight
+from fitact.model.drive import Sampled
 from fitact.model.response import highpass
 from fitact.model.skin import constant_skin_circuit
 
@@ -19,38 +23,47 @@ from fitact.model.skin import constant_skin_circuit
 def free_timing(
     channel: ChannelLikelihood,
     inputs: ChannelInputs,
+    circuit: CircuitValues,
     name: str,
     step: float = 1 / 8,
     delay_half_width: float = 5.0,
     clock_half_width: float = 2.0,
+    few: int = 16_384,
 ) -> ChannelLikelihood:
-    """Return the channel with a free delay or clock error (`name`), over its samples; tables cannot represent either.
+    """Return the channel with a free delay or clock error (`name`); `circuit` is that of the `inputs`.
 
-    The start is the center of the best points of a grid, because an ideal edge has no slope to follow. `step` and the
-    half widths of the grid are in units of the coordinates. With ideal edges, only the samples next to them determine a
-    clock error, and a delay with it. These samples bound both by a prior, and are then excluded from the fit.
+    It keeps its compression if a table can represent the delay. The start is the center of the best points of a grid,
+    because an ideal edge has no slope to follow. `step` and the half widths of the grid are in units of the
+    coordinates; at most `few` samples decide. With ideal edges, only the samples next to them determine a clock error,
+    and a delay with it. These samples bound both by a prior, and are then excluded from the fit.
     """
     edges = _edge_mask(channel) if name == "clock" else np.zeros(channel.time.size, bool)
     names = TIMING_NUISANCES if edges.any() else (name,)
     units = np.array([float(channel.timing_unit(n)) for n in names])
     timing = tuple(n for n in TIMING_NUISANCES if n in names or n in channel.timing)
-    channel = dataclasses.replace(channel.without_compression(), timing=timing)
+    channel = dataclasses.replace(channel, timing=timing)
+    if isinstance(channel.drive, Sampled) and not channel.steady_state:  # V is not known beyond the record
+        index = np.arange(channel.time.size)
+        channel = channel.exclude_samples((index < MAX_DELAY) | (index >= channel.n_samples - MAX_DELAY))
+    channel = recompress(channel, circuit)
     half_widths = {"delay": 1.0 if len(names) > 1 else delay_half_width, "clock": clock_half_width}
     axes = [step * np.arange(-int(w / step), int(w / step) + 1) for w in map(half_widths.__getitem__, names)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(names))
-    used = _select_samples(channel, edges) if edges.any() else channel
+    used = channel
+    if edges.any():
+        used = channel.select(np.flatnonzero(edges), channel.weights[edges])
+    elif channel.compression is None:
+        used = channel.thin(few)
     squares = _residual_sums_of_squares(used, inputs, names, grid * units)
     # less than the effect of one sample on the wrong side of an edge, whose error is most of the height
-    margin = (
-        (0.1 * np.ptp(np.asarray(channel.observed))) ** 2 if edges.any() else squares.min() * 25.0 / channel.n_samples
-    )
+    margin = (0.1 * np.ptp(np.asarray(channel.observed))) ** 2 if edges.any() else squares.min() * 25.0 / used.n_samples
     good = grid[squares < squares.min() + margin]
     change = {"delay": 0.0, "clock": 0.0} | dict(zip(names, good.mean(axis=0) * units, strict=True))
     channel = dataclasses.replace(channel, shift=channel.shift + change["delay"], clock=channel.clock + change["clock"])
     if not edges.any():
         return channel
     timing_sd = np.hypot(good.std(axis=0), step / np.sqrt(12.0))
-    return dataclasses.replace(channel, weight=np.where(edges, 0.0, channel.weights), timing_sd=timing_sd)
+    return dataclasses.replace(channel.exclude_samples(edges), timing_sd=timing_sd)
 
 
 def _edge_mask(channel: ChannelLikelihood, margin: float = 3.0) -> np.ndarray:
@@ -59,14 +72,6 @@ def _edge_mask(channel: ChannelLikelihood, margin: float = 3.0) -> np.ndarray:
         return np.zeros(channel.time.size, bool)
     time, step = np.asarray(channel.time) - float(channel.shift), margin * float(channel.time_step)
     return ideal_edge_mask(channel.drive, time, step)
-
-
-def _select_samples(channel: ChannelLikelihood, mask: np.ndarray) -> ChannelLikelihood:
-    """Return the channel with only the samples of the mask."""
-    indices, arrays = np.flatnonzero(mask), (channel.time, channel.observed)
-    time, observed = (pad_samples(np.asarray(x)[indices]) for x in arrays)
-    weight = pad_weight(channel.weights[indices])
-    return dataclasses.replace(channel, time=time, observed=observed, weight=weight)
 
 
 def _residual_sums_of_squares(
@@ -81,35 +86,36 @@ def _residual_sums_of_squares(
 
     The signals of a `batch` are computed in parallel, but not more than `max_numbers` values at once.
     """
-    weights, shapes = channel.weights, np.asarray(_shapes(channel, inputs))[np.asarray(channel.linear_sd) > 0.0]
-    basis = orthonormal_basis((shapes * weights).T)
+    observed, shapes = _observed_and_shapes(channel, inputs)
+    basis = orthonormal_basis(shapes[np.asarray(channel.linear_sd)[list(channel.columns)] > 0.0].T)
 
     def project_out(values: np.ndarray) -> np.ndarray:
-        weighted = values * weights
-        return weighted - (weighted @ basis) @ basis.T
+        return values - (values @ basis) @ basis.T
 
-    observed, sums = project_out(np.asarray(channel.observed)), []
-    size = max(1, min(batch, max_numbers // weights.size))
+    observed, sums = project_out(observed), []
+    size = max(1, min(batch, max_numbers // observed.size))
     for first in range(0, len(candidates), size):
         some = candidates[first : first + size]
         offsets = dict(zip(names, pad_rows(some, size).T, strict=True))
-        signals = project_out(np.asarray(_signals(channel, inputs, offsets))[: len(some)])
+        signals = project_out(np.asarray(_signals(channel.without_samples(), inputs, offsets))[: len(some)])
         gains = signals @ observed / np.maximum(np.vecdot(signals, signals), 1e-300)
         residuals = observed - gains[:, None] * signals
         sums.append(np.vecdot(residuals, residuals))
     return np.concatenate(sums)
 
 
-_shapes = jit(ChannelLikelihood.shapes)
+@jit
+def _observed_and_shapes(channel: ChannelLikelihood, inputs: ChannelInputs) -> tuple[Array, Array]:
+    return channel.whitened_observed(), channel.residuals_and_shapes(inputs)[1]
 
 
 @jit
 def _signals(
     channel: ChannelLikelihood, inputs: ChannelInputs, offsets: dict[str, Float[Array, " candidates"]]
-) -> Float[Array, "candidates samples"]:
+) -> Float[Array, "candidates rows"]:
     def shifted_signal(offset: dict[str, Array]) -> Array:
         shifted = {name: getattr(inputs, name) + offset[name] for name in offset}
-        return channel.signal(dataclasses.replace(inputs, **shifted))
+        return channel.whitened_observed() - channel.residuals_and_shapes(dataclasses.replace(inputs, **shifted))[0]
 
     return jax.vmap(shifted_signal)(offsets)
 
@@ -149,11 +155,13 @@ def _clock_regressors(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: 
         return highpass(channel.drive, time, jnp.exp(log_tau), steady_state=channel.steady_state)
 
     responses, tau_slopes = jax.vmap(lambda x: jax.jvp(response, (x,), (jnp.ones_like(x),)))(jnp.log(taus))
-    slope = channel.delay_derivative(inputs)
+    signal = channel.signal(inputs)
+    rise, span = map(jnp.asarray, (jnp.gradient(signal), jnp.gradient(channel.time)))
+    slope = -rise / jnp.where(span > 0.0, span, 1.0)  # over two samples, so that a jump appears on both sides
     shapes = jnp.where(channel.linear_sd[:, None] > 0.0, channel.shapes(inputs), 0.0)
     # a free delay adds only the slope as a regressor
     delay = slope if "delay" in channel.timing else jnp.zeros_like(slope)
-    rows = jnp.stack([time * slope, channel.observed - channel.signal(inputs), *responses, *tau_slopes, *shapes, delay])
+    rows = jnp.stack([time * slope, channel.observed - signal, *responses, *tau_slopes, *shapes, delay])
     rows = channel.apply_whitening(rows)
     if channel.noise != "student":
         return rows

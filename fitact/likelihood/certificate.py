@@ -1,17 +1,26 @@
 """Compression of channels: built before the fit, and verified against all samples after it."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from fitact.compiled import BatchEvaluator
-from fitact.likelihood.channel import ChannelLikelihood
-from fitact.likelihood.compression import BASELINE_NAMES, Compression, compress
-from fitact.likelihood.compression_on_grid import GridCompression, compress_on_grid
+from fitact.compiled import BatchEvaluator, jit
+from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
+from fitact.likelihood.compression import (
+    BASELINE_NAMES,
+    Compression,
+    compress,
+    is_exactly_uniform,
+    table_multiple,
+)
+from fitact.likelihood.compression_on_grid import GridCompression
+from fitact.likelihood.interpolation import interpolate
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.model.circuit import HighpassTerms
 from fitact.model.drive import Sampled
@@ -20,6 +29,7 @@ from fitact.model.skin import WithSkin
 TOLERANCE = 1e-3  # error of the log-likelihood
 _TIMING_REASON = "a delay or a clock error is a free parameter"
 _MANY_ROWS = 65_536  # samples, above which a faster program saves more than its compilation takes
+_TRAINING = 63  # points around an optimum whose signals an interpolation represents
 FEW_ROWS = 200  # numbers per evaluation, below which the overhead of the call dominates
 
 
@@ -33,14 +43,14 @@ class CertifiedLikelihood(NamedTuple):
 
 
 def compress_channel(
-    channel: ChannelLikelihood, start: CircuitValues, tau_identified: bool, tolerance: float
+    channel: ChannelLikelihood, start: CircuitValues, tolerance: float
 ) -> tuple[ChannelLikelihood, str]:
-    """Return the channel with a compression and "", or the unchanged channel and the reason.
+    """Return the channel with a compression and "", or the uncompressed channel and the reason.
 
-    `start` is close to the optimum; `tau_identified` states whether the record determines its time constant.
+    The compression holds around the circuit `start`, for the channel's present noise and timing.
     """
-    circuit = start.circuit
-    reason = _uncompressed_reason(channel, start, tau_identified, tolerance)
+    circuit, channel = start.circuit, channel.without_compression()
+    reason = _uncompressed_reason(channel, start, tolerance)
     if reason:
         return channel, reason
     samples = slice(channel.n_samples)
@@ -48,39 +58,89 @@ def compress_channel(
     how: dict[str, Any] = {
         "steady_state": channel.steady_state,
         "weight": None if channel.equally_weighted else channel.weights[samples],
+        "whitening": channel.whitening and channel.whitening.restrict(samples),
         "rate": None if channel.rate is None else np.asarray(channel.rate)[samples],
     }
-    compression: Compression | GridCompression
+    terms = start.terms[channel.channel]
     if isinstance(circuit, WithSkin):
-        assert circuit.grid is not None  # otherwise there is a reason against compression
-        compression = compress_on_grid(*arrays, grid=circuit.grid, **how)
+        inputs = ChannelInputs(circuit, *map(np.asarray, (1.0, 0.0, 0.0)))
+        signal = _signal(channel, inputs)[samples]
+        slope = -np.gradient(signal, arrays[1])
+        compression = compress(*arrays, expected_terms=terms, slope=slope, **how)
+        fields = {field.name: getattr(compression, field.name) for field in dataclasses.fields(compression)}
+        compression = GridCompression(**fields)
     else:
-        compression = compress(*arrays, expected_terms=start.terms[channel.channel], **how)
+        compression = compress(*arrays, expected_terms=terms, delayed=bool(channel.timing), **how)
     return dataclasses.replace(channel, compression=compression), ""
 
 
-def _uncompressed_reason(
-    channel: ChannelLikelihood, start: CircuitValues, tau_identified: bool, tolerance: float, min_samples: int = 512
-) -> str:
+_signal = jit(ChannelLikelihood.signal)
+
+
+def recompress(channel: ChannelLikelihood, circuit: CircuitValues) -> ChannelLikelihood:
+    """Return a channel whose noise or timing has changed with a new compression, if it had one and a table serves."""
+    return channel if channel.compression is None else compress_channel(channel, circuit, TOLERANCE)[0]
+
+
+def may_compress(channel: ChannelLikelihood, tolerance: float, min_samples: int = 512) -> str:
+    """Return why a channel may not be compressed at all, or ""."""
     if tolerance == 0.0:
         return "the full sum was requested"
     if channel.noise == "student":
         return "the likelihood of Student-t noise does not follow from inner products"
-    if channel.whitening is not None:
-        return "the noise is coloured"
     if channel.n_samples < min_samples:  # compression would save nothing
         return f"the record is shorter than {min_samples} samples"
-    if channel.timing:
-        return _TIMING_REASON
-    if isinstance(start.circuit, WithSkin):
-        return "a dispersive skin has no time constants" if start.circuit.grid is None else ""
-    if isinstance(channel.drive, Sampled) and channel.steady_state:
-        return "the steady state of a measured drive is not tabulated"
-    if not tau_identified:
-        return "the record does not determine its time constant"
-    if len(start.terms[channel.channel].tau) > 1:
-        return "the circuit has several time constants"
     return ""
+
+
+def _uncompressed_reason(
+    channel: ChannelLikelihood, start: CircuitValues, tolerance: float, max_multiple: int = 4
+) -> str:
+    """Return why there is no table of responses for a channel, or ""."""
+    if reason := may_compress(channel, tolerance):
+        return reason
+    if isinstance(start.circuit, WithSkin):
+        if channel.timing:
+            return _TIMING_REASON
+        return "a dispersive skin has no time constants" if start.circuit.grid is None else ""
+    if channel.timing and not can_delay(channel, start.tau):
+        return _TIMING_REASON
+    if table_multiple(start.tau) > max_multiple:
+        return "the time constants of the circuit are too far apart"
+    return ""
+
+
+def interpolate_channel(
+    likelihood: Likelihood, index: int, theta: np.ndarray, covariance_factor: np.ndarray, sigma: float, reach: float
+) -> ChannelLikelihood:
+    """Return a channel with an interpolation around theta, or without a compression if that is not possible.
+
+    It extends `reach` standard deviations in all directions that the record determines, less in others.
+    """
+    channel = likelihood.channels[index]
+    if isinstance(channel.drive, Sampled) and not channel.steady_state:
+        return channel  # a signal at few samples would cost as much as at all
+    directions, sd, _ = np.linalg.svd(covariance_factor)
+    widths = np.minimum(reach * sd, 6.0 * sd + 1.0)
+    deviates = np.random.default_rng(0).standard_normal((_TRAINING, theta.size))  # any reproducible points serve
+    deviates *= np.random.default_rng(1).uniform(0.2, 1.0, (_TRAINING, 1)) / np.linalg.norm(deviates, axis=1)[:, None]
+    points = theta + np.vstack([np.zeros(theta.size), deviates * widths @ directions.T])
+    light = dataclasses.replace(likelihood, channels=tuple(each.shorten() for each in likelihood.channels))
+    inputs = _inputs(light, points)[index]
+    compression = interpolate(channel, inputs, 0.3 * TOLERANCE * sigma)
+    return dataclasses.replace(channel, compression=compression)
+
+
+@jit
+def _inputs(likelihood: Likelihood, points: Array) -> tuple[ChannelInputs, ...]:
+    return jax.vmap(lambda theta: tuple(inputs for _, inputs in likelihood.channels_and_inputs(theta)))(points)
+
+
+def can_delay(channel: ChannelLikelihood, tau: Float[np.ndarray, " terms"]) -> bool:
+    """Return whether a compression represents a delay: of a measured drive on a uniform grid, if no tau is short."""
+    time, steps = np.asarray(channel.time)[: channel.n_samples], np.min(tau) / float(channel.time_step)
+    measured = isinstance(channel.drive, Sampled) and not channel.steady_state
+    return measured and channel.timing == ("delay",) and steps > 2.0 and is_exactly_uniform(time)
 
 
 def certify(
@@ -106,16 +166,26 @@ def certify(
     if all(channel.compression is None for channel in likelihood.channels):
         return CertifiedLikelihood(likelihood, None, tuple(r or _TIMING_REASON for r in reasons))
     light, optimum = likelihood.without_samples(), likelihood.evaluate_circuit(theta)
-    log_b = float(np.log(optimum.b))
-    reach = float(table_half_width(np.linalg.norm(_log_b_slope(light, theta) @ covariance_factor)))
+    reach = table_half_width(np.linalg.norm(_log_tau_slopes(light, theta) @ covariance_factor, axis=1))
+    tau_range = float(np.min(optimum.tau) * np.exp(-reach[1])), float(np.max(optimum.tau) * np.exp(reach[0]))
     precisions = table_precision(sigma, tolerance).tolist()
     inputs = [likelihood.make_inputs(optimum.circuit, theta, channel) for channel in likelihood.channels]
+    delay_sd = dict(zip(likelihood.names, np.linalg.norm(covariance_factor, axis=1), strict=True))
     restricted = tuple(
-        _restrict_table(channel, optimum.terms.get(channel.channel), each.gain, log_b, reach, precision)
+        _restrict_table(
+            channel,
+            each,
+            optimum.terms.get(channel.channel),
+            tau_range,
+            delay_sd.get(channel.qualified_name("delay"), 0.0),
+            precision,
+        )
         for channel, each, precision in zip(likelihood.channels, inputs, precisions, strict=True)
     )
     deviates = np.random.default_rng(0).standard_normal((check_points, theta.size))  # any reproducible points serve
-    around = np.vstack([theta, theta + 1.5 * deviates @ covariance_factor.T])
+    if likelihood.count > _MANY_ROWS:
+        check_points = math.ceil(check_points / 3)
+    around = np.vstack([theta, theta + 1.5 * deviates[:check_points] @ covariance_factor.T])
     points = np.vstack([around, _prior_points(light, theta, check_points)])
     narrow = dataclasses.replace(likelihood, channels=restricted).without_samples()
     exact, compressed, tabulated = (
@@ -127,7 +197,7 @@ def certify(
     failures = []
     for i, channel in enumerate(restricted):
         failure = _compression_failure(errors[i], excesses[i], tolerance / len(restricted))
-        failures.append(reasons[i] or (_TIMING_REASON if channel.compression is None else failure))
+        failures.append((reasons[i] or _TIMING_REASON) if channel.compression is None else failure)
         likelihood = likelihood.replace_channel(i, channel.without_compression() if failures[i] else channel)
     return CertifiedLikelihood(likelihood, None if any(failures) else float(np.sum(errors)), tuple(failures))
 
@@ -147,18 +217,18 @@ def table_precision(noise: ArrayLike, tolerance: float = TOLERANCE) -> Float[np.
 def _compression_failure(error: float, excess: float, tolerance: float) -> str:
     """Return why a compression fails, from its errors near the optimum and within the prior; "" if it passes."""
     if np.isnan(error):
-        return "the uncertainty of its time constant exceeds the range of the table"
+        return "the uncertainty of its parameters exceeds the range of the compression"
     if not error <= tolerance:
         return f"the error of the compressed log-likelihood is {error:.2g} near the optimum"
     return f"the error of the compressed log-likelihood is {excess:.2g} within the prior" if excess > tolerance else ""
 
 
 def _prior_points(likelihood: Likelihood, theta: np.ndarray, count: int) -> Float[np.ndarray, "n parameters"]:
-    """Return draws from the prior that the tables cover, filled up with the optimum if there are too few."""
+    """Return draws from the prior that the tables cover, `count` if there are so many."""
     draws = likelihood.sample_prior(theta, 1000)
-    _, tau = likelihood.evaluate_g_and_b(draws)
+    tau = likelihood.tau_extremes(draws)
     covered = [channel.compression.covers(tau) for channel in likelihood.channels if channel.compression is not None]
-    return np.vstack([draws[np.all(covered, axis=0)], np.tile(theta, (count, 1))])[:count]
+    return draws[np.all(covered, axis=(0, 1))][:count]
 
 
 def _evaluate_log_likelihoods(
@@ -172,8 +242,11 @@ def _evaluate_log_likelihoods(
 
 
 def batch_log_prob_parts(likelihood: Likelihood, batch: int = 128, *, fast: bool = False) -> BatchEvaluator:
-    """Return the evaluation of `Likelihood.log_prob_parts` at many points; `fast` as in `compiled.jit`."""
-    return BatchEvaluator(Likelihood.log_prob_parts, likelihood, likelihood.rows, batch, fast=fast)
+    """Return the evaluation of `Likelihood.log_prob_parts` at many points; `fast` as in `compiled.jit`.
+
+    Batches of a sum over samples are so small that intermediate arrays stay in the processor's cache.
+    """
+    return BatchEvaluator(Likelihood.log_prob_parts, likelihood, likelihood.rows, batch, max_numbers=65_536, fast=fast)
 
 
 def batched_log_prob(likelihood: Likelihood, walkers: int) -> Callable[[np.ndarray], np.ndarray]:
@@ -200,32 +273,37 @@ def batched_log_prob(likelihood: Likelihood, walkers: int) -> Callable[[np.ndarr
 
 def _restrict_table(
     channel: ChannelLikelihood,
+    inputs: ChannelInputs,
     terms: HighpassTerms | None,
-    gain: ArrayLike,
-    center: float,
-    half_width: float,
+    tau_range: tuple[float, float],
+    delay_sd: float,
     error: float,
 ) -> ChannelLikelihood:
     """Return the channel with its table restricted to the posterior, if the table covers the optimum.
 
-    `terms` and `gain` are those at the optimum. The restricted table covers `center` ± `half_width` in log b, with an
-    `error` of the signal (V or A).
+    `inputs` and `terms` are those at the optimum. The restricted table covers `tau_range` (s) as far as the table does,
+    with an `error` of the signal (V or A). `delay_sd` is in time steps.
     """
     table = channel.compression
-    if terms is None or not isinstance(table, Compression) or not table.covers(np.exp(center)):
+    delay = float(channel.shift) + float(inputs.delay)
+    if terms is None or not isinstance(table, Compression) or isinstance(table, GridCompression):
         return channel
-    largest = float(np.sum(np.abs(terms.weight)) * gain)
+    if not np.all(table.covers(np.asarray(terms.tau, dtype=float), delay)):
+        return channel
+    largest = float(np.sum(np.abs(terms.weight)) * inputs.gain)
     has_charge = max(channel.columns, default=0) >= len(BASELINE_NAMES)
     charge = float(np.ptp(channel.observed)) / largest if has_charge else 0.0
     low, high = (float(table.center + side * table.half_width) for side in (-1.0, 1.0))
-    low, high = max(center - half_width, low), min(center + half_width, high)
-    narrow = table.restrict(0.5 * (low + high), 0.5 * (high - low), error / largest, charge=charge)
+    low, high = max(math.log(tau_range[0]), low), min(math.log(tau_range[1]), high)
+    reach = float(table_half_width(delay_sd)) * float(channel.time_step)
+    narrow = table.restrict(
+        0.5 * (low + high), 0.5 * (high - low), error / largest, charge=charge, delay=(delay - reach, delay + reach)
+    )
     return dataclasses.replace(channel, compression=narrow)
 
 
-def _log_b_slope(likelihood: Likelihood, theta: np.ndarray, step: float = 1e-4) -> Float[np.ndarray, " parameters"]:
-    """Return the gradient of the logarithm of the slowest time constant, from differences over two steps."""
+def _log_tau_slopes(likelihood: Likelihood, theta: np.ndarray, step: float = 1e-4) -> Float[np.ndarray, "2 parameters"]:
+    """Return the gradients of the logarithms of the slowest and the fastest time constant, from differences."""
     steps = step * np.eye(theta.size)
-    _, b = likelihood.evaluate_g_and_b(np.vstack([theta + steps, theta - steps]))
-    later, earlier = np.split(b, 2)
-    return np.log(later / earlier) / (2.0 * step)
+    later, earlier = (np.log(likelihood.tau_extremes(theta + side * steps)) for side in (1.0, -1.0))
+    return (later - earlier) / (2.0 * step)

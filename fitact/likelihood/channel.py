@@ -17,11 +17,12 @@ import numpy as np
 from jax import lax
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from fitact.compiled import array_module
+from fitact.compiled import array_module, pad_samples, pad_weight
 from fitact.likelihood.compression import BASELINE_NAMES, Compression, baseline_functions
 from fitact.likelihood.compression_on_grid import GridCompression
+from fitact.likelihood.interpolation import Interpolation
 from fitact.likelihood.noise import NoiseModel, Whitening, student_curvature, student_residual, student_weight
 from fitact.model.circuit import Channel, Circuit
 from fitact.model.drive import Drive, Sampled
@@ -62,9 +63,7 @@ class ChannelLikelihood(eqx.Module):
     time_step: ArrayLike  # s
     # prior standard deviations of `TIMING_NUISANCES`, in time steps (clock: over half the record)
     timing_sd: Float[Array, "2"]
-    compression: (
-        Compression | GridCompression | None
-    )  # projection of the record; None means that all samples are summed
+    compression: Compression | Interpolation | None  # projection of the record; None means that all samples are summed
     label: str = eqx.field(static=True)  # "", or a name that distinguishes it from other channels, e.g. "I_2"
     channel: Channel = eqx.field(static=True)  # "Vsc" or "I"
     steady_state: bool = eqx.field(static=True)  # or from rest
@@ -112,19 +111,47 @@ class ChannelLikelihood(eqx.Module):
         """Whether all samples of the record have equal, nonzero weight."""
         return self.weight is None or bool(np.all(self.weights[: self.n_samples] == 1.0))
 
+    def exclude_samples(self, excluded: Bool[np.ndarray, " samples"]) -> "ChannelLikelihood":
+        """Return the channel without some of its samples; a compression must be made anew."""
+        weight, whitening = np.where(excluded, 0.0, self.weights), self.whitening
+        return dataclasses.replace(self, weight=weight, whitening=whitening and whitening.exclude(excluded))
+
     def without_samples(self) -> "ChannelLikelihood":
         """Return the channel with only two samples if it has a compression.
 
         Code compiled for it then serves records of any length.
         """
-        if self.compression is None:
-            return self
+        return self if self.compression is None else self.shorten()
+
+    def shorten(self) -> "ChannelLikelihood":
+        """Return the channel with only its first and last sample."""
         # by NumPy, since JAX would compile this for every length
         time, observed, drive = np.asarray(self.time), np.asarray(self.observed), self.drive
         if isinstance(drive, Sampled):
             drive = Sampled(np.asarray(drive.time)[:2], np.asarray(drive.samples)[:2], drive.period)
-        ends, extremes = time[:2], np.array([observed.min(), observed.max()])
-        return dataclasses.replace(self, time=ends, observed=extremes, drive=drive, weight=None, rate=None)
+        ends, extremes = time[[0, -1]], np.array([observed.min(), observed.max()])
+        rate = None if self.rate is None else np.zeros(2)
+        return dataclasses.replace(
+            self, time=ends, observed=extremes, drive=drive, weight=None, whitening=None, rate=rate
+        )
+
+    def thin(self, count: int) -> "ChannelLikelihood":
+        """Return the channel with `count` of its samples, the ends among them, and white noise."""
+        counted = np.flatnonzero(self.weights[: self.n_samples] > 0.0)
+        if counted.size > count:
+            counted = np.random.default_rng(0).permutation(counted)[:count]  # any subset serves
+        weight = np.zeros(self.n_samples)
+        weight[counted] = self.weights[counted]
+        part = np.unique(np.concatenate([[0, self.n_samples - 1], counted]))
+        return self.select(part, weight[part])
+
+    def select(self, part: Int[np.ndarray, " n"], weight: Float[np.ndarray, " n"]) -> "ChannelLikelihood":
+        """Return the channel with only the samples `part`, with new weights and white noise."""
+        time, observed = (pad_samples(np.asarray(x)[part]) for x in (self.time, self.observed))
+        rate = None if self.rate is None else pad_samples(np.asarray(self.rate)[part])
+        return dataclasses.replace(
+            self, time=time, observed=observed, rate=rate, weight=pad_weight(weight), whitening=None, compression=None
+        )
 
     def signal(self, inputs: ChannelInputs, extra_delay: ArrayLike = 0.0) -> Float[Array, " samples"]:
         """Return the modelled signal without linear nuisances and noise; `extra_delay` (s) is added to the delay."""
@@ -132,14 +159,17 @@ class ChannelLikelihood(eqx.Module):
         if undelayed and isinstance(self.drive, Sampled) and self.drive.period is None:
             time = self.drive.time  # identical to the samples of V, so that `highpass` needs no search
         else:
-            time = self.time - (self.shift + inputs.delay + extra_delay)
-        if "clock" in self.timing:
-            time = time * (1.0 + self.clock + inputs.clock)
+            time = self.drive_time(inputs.delay + extra_delay, inputs.clock)
         how: dict[str, Any] = {"steady_state": self.steady_state, "channel": self.channel}
         total, rate = response_and_rate(inputs.circuit, self.drive, time, **how)
         if rate is not None and self.rate is not None:
             total = total + rate * self.rate
         return inputs.gain * total
+
+    def drive_time(self, delay: ArrayLike, clock: ArrayLike) -> Float[Array, " samples"]:
+        """Return the times of the samples on the drive's clock, s."""
+        time = self.time - (self.shift + delay)
+        return time * (1.0 + self.clock + clock) if "clock" in self.timing else time
 
     def shapes(self, inputs: ChannelInputs) -> Float[Array, "10 samples"]:
         """Return the shapes in time of the linear nuisances, each of height 1."""
@@ -163,16 +193,35 @@ class ChannelLikelihood(eqx.Module):
         if self.compression is None:
             remainder, shapes = self.observed - self.signal(inputs), self.shapes(inputs)[self._column_indices]
             return self.apply_whitening(remainder), self.apply_whitening(shapes)
-        terms = inputs.circuit.channel_terms(self.channel)
-        remainder = self.compression.observed - inputs.gain * self.compression.response(terms)
-        decays = self.compression.decays(terms.tau[0])[None]
-        shapes = jnp.concatenate([self.compression.baseline, decays, jnp.zeros((len(CHARGES) - 1, remainder.size))])
-        return remainder, shapes[self._column_indices]
+        remainder = self.compression.observed - self._compressed_signal(inputs)[0]
+        shapes = [self.compression.baseline]
+        if isinstance(self.compression, Compression) and not isinstance(self.compression, GridCompression):
+            taus = inputs.circuit.channel_terms(self.channel).tau
+            shapes += [self.compression.decays(tau)[None] for tau in taus]
+        missing = len(LINEAR_NUISANCES) - sum(map(len, shapes))
+        shapes.append(jnp.zeros((missing, remainder.size)))
+        return remainder, jnp.concatenate(shapes)[self._column_indices]
+
+    def _compressed_signal(self, inputs: ChannelInputs) -> tuple[Float[Array, " rows"], Array]:
+        """Return the signal in the coordinates of the compression, and whether the compression holds there."""
+        compression = self.compression
+        assert compression is not None
+        if isinstance(compression, Interpolation):
+            points = dataclasses.replace(self, time=compression.time, rate=compression.rate)
+            signal, timing = points.signal(inputs), jnp.stack([jnp.asarray(inputs.delay), jnp.asarray(inputs.clock)])
+            return compression.to_rows @ signal, compression.holds(signal, timing)
+        terms, delay = inputs.circuit.channel_terms(self.channel), self.shift + inputs.delay
+        covered = compression.covers(jnp.stack(jnp.broadcast_arrays(*terms.tau)), delay)
+        return inputs.gain * compression.response(terms, delay), jnp.all(covered)
 
     def apply_whitening(self, values: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
         """Return values over the samples in units of independent noise of equal sd; 0 for excluded samples."""
         values = values if self.weight is None else values * self.weight
         return values if self.whitening is None else self.whitening(values)
+
+    def whitened_observed(self) -> Float[Array, " rows"]:
+        """Return the record, over samples or coordinates, in units of independent noise of equal sd."""
+        return self.apply_whitening(self.observed) if self.compression is None else self.compression.observed
 
     def mean(self, values: Float[Array, " samples"]) -> Float[Array, ""]:
         return jnp.mean(values, where=None if self.weight is None else self.weight > 0.0)
@@ -186,6 +235,8 @@ class ChannelLikelihood(eqx.Module):
         """Return the whitened `delay_derivative`, over samples or coordinates."""
         if self.compression is None:
             return self.apply_whitening(self.delay_derivative(inputs))
+        if isinstance(self.compression, Interpolation | GridCompression):
+            return self.compression.slope
         return inputs.gain * self.compression.delay_derivative(inputs.circuit.channel_terms(self.channel))
 
     def fit_nuisances(
@@ -257,4 +308,4 @@ class ChannelLikelihood(eqx.Module):
         value = -0.5 * misfit - self.count * log_sigma - jnp.sum(jnp.log(jnp.diagonal(factor)))
         if self.compression is None:
             return value
-        return jnp.where(self.compression.covers(inputs.circuit.b), value, jnp.nan)
+        return jnp.where(self._compressed_signal(inputs)[1], value, jnp.nan)

@@ -6,9 +6,9 @@ of time constants, all u(.; tau) lie, to rounding, in the span of some twenty fu
 convolutions of dV/dt with e^{-t/tau}, and these exponentials do. One pass accumulates the inner products of these
 functions, the shapes and the record. A factor of this matrix gives coordinates in which the difference between record
 and model has the same length as over all samples. As functions of log tau, the coordinates are Chebyshev series.
+Coloured noise is whitened by a linear filter, which is applied to all functions and the record during the pass.
 """
 
-import functools
 import math
 from collections.abc import Iterator
 from fractions import Fraction
@@ -24,6 +24,7 @@ from jaxtyping import Array, Float
 
 from fitact.compiled import array_module, jit, pad_samples, pad_weight
 from fitact.data.record import is_uniform
+from fitact.likelihood.noise import Whitening
 from fitact.model.chirp import Chirp
 from fitact.model.circuit import HighpassTerms
 from fitact.model.drive import Drive, Periodic, Sampled
@@ -34,6 +35,8 @@ from fitact.model.response_table import (
     chebyshev,
     chebyshev_polynomials,
     count_terms,
+    exponential_basis,
+    significant_combinations,
 )
 from fitact.progress import track_progress
 
@@ -44,6 +47,7 @@ _RATE, _SLOPE, _OBSERVED = -3, -2, -1
 _BASELINE = slice(_RATE - len(BASELINE_NAMES), _RATE)
 
 RANK_TOLERANCE = 1e-13  # relative size of the singular values that are omitted
+MAX_DELAY = 6  # time steps by which the response to a measured drive may be shifted
 
 
 class Compression(eqx.Module):
@@ -62,18 +66,49 @@ class Compression(eqx.Module):
     slope: Float[Array, " rows"]  # dV/dt, V/s, over two samples, so that a jump appears on both sides
     observed: Float[Array, " rows"]  # the record, V or A
     samples: Float[Array, ""]  # number of samples
+    # dV/dt of a measured drive (V/s) between the samples k - i - 1 and k - i, for the ages i from `origin` on; empty
+    # if the response cannot be delayed
+    steps: Float[Array, "ages rows"]
+    origin: Float[Array, ""]  # delay of `signal`, in time steps
+    time_step: Float[Array, ""]  # s
 
-    def covers(self, tau: Array) -> Array:
-        """Return whether the table covers the time constant (s)."""
-        return abs(array_module(tau).log(tau) - self.center) <= self.half_width
+    def covers(self, tau: Array, delay: ArrayLike = 0.0) -> Array:
+        """Return whether the table covers the time constant (s) and the delay (s)."""
+        xp = array_module(tau)
+        covered = abs(xp.log(tau) - self.center) <= self.half_width
+        if not len(self.steps):
+            return covered
+        since = delay / self.time_step - self.origin
+        return covered & (since >= self.first_age) & (since <= self.first_age + len(self.steps))
 
-    def response(self, terms: HighpassTerms) -> Float[Array, " rows"]:
-        """Return the response of a circuit; compare `fitact.response`."""
-        total = sum(
-            weight * (self.signal @ self._series(tau)) for weight, tau in zip(terms.weight, terms.tau, strict=True)
-        )
-        total = jnp.pad(total, (0, self.observed.size - self.signal.shape[0]))
+    @property
+    def first_age(self) -> int:
+        """First of the ages of `steps`, relative to `origin`."""
+        return -(len(self.steps) // 2)
+
+    def response(self, terms: HighpassTerms, delay: ArrayLike = 0.0) -> Float[Array, " rows"]:
+        """Return the response of a circuit (compare `fitact.response`) with a `delay` (s), if it has `steps`."""
+        total = jnp.zeros(self.signal.shape[0])
+        slopes = jnp.zeros(len(self.steps))
+        for weight, tau in zip(terms.weight, terms.tau, strict=True):
+            if len(self.steps):
+                growth, gains = self._shift(delay, tau)
+                weight, slopes = weight * growth, slopes + weight * growth * gains
+            total = total + weight * (self.signal @ self._series(tau))
+        total = jnp.pad(total, (0, self.observed.size - total.size)) + slopes @ self.steps
         return total if terms.rate is None else total + terms.rate * self.rate
+
+    def _shift(self, delay: ArrayLike, tau: ArrayLike) -> tuple[Array, Float[Array, "*nodes ages"]]:
+        """Return factors p, q such that the response delayed by `delay` is p (signal + q @ steps).
+
+        On the way back from a sample to an earlier time, the response u grows by 1 / decay, and each part of a linear
+        step of the drive that has not yet happened is subtracted.
+        """
+        xp, since = array_module(tau), delay - self.origin * self.time_step
+        ages = self.time_step * (self.first_age + np.arange(len(self.steps) + 1))
+        ends = xp.clip(ages, xp.minimum(since, 0.0), xp.maximum(since, 0.0))
+        gained = -tau * xp.exp(-ends[..., :-1] / tau) * xp.expm1(-xp.diff(ends) / tau)
+        return xp.exp(since / tau), xp.where(since > 0.0, -gained, gained)
 
     def delay_derivative(self, terms: HighpassTerms) -> Float[Array, " rows"]:
         """Return the derivative of the response with respect to a delay (per s): u / tau - V' for each term."""
@@ -87,26 +122,58 @@ class Compression(eqx.Module):
     def _series(self, tau: Array) -> Float[Array, " terms"]:
         return chebyshev_polynomials((jnp.log(tau) - self.center) / self.half_width, self.signal.shape[1])
 
-    def restrict(self, center: float, half_width: float, precision: float, charge: float) -> "Compression":
+    def restrict(
+        self, center: float, half_width: float, precision: float, charge: float, delay: tuple[float, float]
+    ) -> "Compression":
         """Return the compression for log tau in `center` ± `half_width` only, with fewer terms and rows.
 
         Omitted terms change no response, and no decay of a `charge` (V), by more than `precision` (V, root of the
-        sum of squares). If `charge` is 0, the decay is omitted.
+        sum of squares). If `charge` is 0, the decay is omitted. `delay` (s) is the range of delays.
         """
-        x, to_series = chebyshev(NODES)
+        x, to_series = chebyshev(self.signal.shape[1])
         # nodes of the narrow table in the wide one, with NumPy because JAX would compile its loop for every record
         inside = (center + half_width * x - float(self.center)) / float(self.half_width)
         polynomials = np.polynomial.chebyshev.chebvander(inside, self.signal.shape[1] - 1).T
-        signal = np.asarray(self.signal @ polynomials) @ to_series.T
+        signal = np.asarray(self.signal @ polynomials)
+        signal, steps, origin = self._move_origin(signal, np.exp(center + half_width * x), delay)
+        signal = signal @ to_series.T
         decay = np.asarray(self.decay @ polynomials) @ to_series.T
         terms = count_terms(np.linalg.norm(signal, axis=0) + charge * np.linalg.norm(decay, axis=0), precision)
-        signal = np.pad(signal[:, :terms], ((0, self.observed.size - signal.shape[0]), (0, 0)))
-        others = [decay[:, :terms]] if charge > 0.0 else []
-        columns = [signal, *others, self.baseline.T, *(x[:, None] for x in (self.rate, self.slope, self.observed))]
-        _, rows = np.linalg.qr(np.hstack(columns))
-        decay = rows[:, terms : 2 * terms] if charge > 0.0 else np.zeros((len(rows), terms))
-        table = center, half_width, rows[:terms, :terms], decay
-        return Compression(*map(np.asarray, (*table, *_baseline_and_record(rows), self.samples)))
+        basis, series = _significant_modes(signal[:, :terms], precision)
+        charges, charge_series = _significant_modes(charge * decay[:, :terms], precision)
+        last = self.baseline.T, *(x[:, None] for x in (self.rate, self.slope, self.observed))
+        _, rows = np.linalg.qr(np.hstack([basis, steps.T, charges, *last]))
+        sizes = len(series), len(steps), len(charge_series)
+        basis, shifted, charges, _ = np.split(rows, np.cumsum(sizes), axis=1)
+        table = center, half_width, basis[: len(series)] @ series, charges @ charge_series / (charge or 1.0)
+        record = *_baseline_and_record(rows), self.samples
+        return Compression(*map(np.asarray, (*table, *record, shifted.T, origin, self.time_step)))
+
+    def _move_origin(
+        self, signal: Float[np.ndarray, "rank nodes"], tau: np.ndarray, delay: tuple[float, float]
+    ) -> tuple[Float[np.ndarray, "rows nodes"], Float[np.ndarray, "ages rows"], float]:
+        """Return the signals at the nodes `tau`, delayed to a new origin in the range `delay`, its steps and itself."""
+        signal = np.pad(np.asarray(signal), ((0, self.observed.size - len(signal)), (0, 0)))
+        if not len(self.steps):
+            return signal, np.asarray(self.steps), 0.0
+        low, high = (edge / float(self.time_step) - float(self.origin) for edge in delay)
+        middle = round(0.5 * (low + high))
+        ages = min(2 ** math.ceil(math.log2(max(high - middle, middle - low, 1.0))), len(self.steps) // 2)
+        middle = min(max(middle, self.first_age + ages), -self.first_age - ages)
+        first = middle - ages - self.first_age
+        origin = float(self.origin) + middle
+        growth, gains = self._shift(origin * float(self.time_step), tau[:, None])
+        signal = growth.T * (signal + np.asarray(self.steps).T @ gains.T)
+        return signal, np.asarray(self.steps)[first : first + 2 * ages], origin
+
+
+def _significant_modes(
+    coefficients: Float[np.ndarray, "rows terms"], precision: float
+) -> tuple[Float[np.ndarray, "rows rank"], Float[np.ndarray, "rank terms"]]:
+    """Return two factors of coefficients; what they omit changes a sum of series by at most `precision`."""
+    modes, sizes, series = np.linalg.svd(coefficients, full_matrices=False)
+    rank = count_terms(sizes, precision) if sizes[0] > 0.0 else 0
+    return modes[:, :rank] * sizes[:rank], series[:rank]
 
 
 def _baseline_and_record(rows: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -122,31 +189,49 @@ def compress(
     steady_state: bool,
     expected_terms: HighpassTerms,
     weight: Float[np.ndarray, " samples"] | None = None,
+    whitening: Whitening | None = None,
     rate: Float[np.ndarray, " samples"] | None = None,
+    delayed: bool = False,
+    slope: Float[np.ndarray, " samples"] | None = None,
 ) -> Compression:
     """Project a record on responses to `drive`, for time constants within a factor 9 of the one in `expected_terms`.
 
     This is one pass over the arrays in chunks, which may be `numpy.memmap`. If a steady drive repeats on the sampling
-    grid of the record, its periods are first folded exactly. Double precision is required.
+    grid of the record and the noise is white, its periods are first folded exactly. Double precision is required.
 
-    A `Sampled` drive has the times of the record, and may be padded. `expected_terms` is one term whose response is
-    close to the record; it is subtracted before and added after, so that the noise keeps its digits. `weight`
-    multiplies the residuals of the samples (0 excludes a sample, None means 1). `rate` is dV/dt (V/s) for a channel
-    that follows it.
+    A `Sampled` drive has the times of the record, and may be padded. The response of `expected_terms` is close to the
+    record; it is subtracted before and added after, so that the noise keeps its digits. The table covers more than a
+    factor 9 if several terms need it (see `table_multiple`). `weight` multiplies the residuals of the samples
+    (0 excludes a sample, None means 1). `rate` is dV/dt (V/s) for a channel that follows it. If `delayed`, the response
+    to a measured drive on a uniform grid can be shifted by up to `MAX_DELAY` steps; V is then taken as constant before
+    the first and after the last sample. `slope` replaces dV/dt in the field of that name.
+
+    Terms of a grid of time constants have arrays of weights and time constants; the table then holds the responses of
+    the grid instead of series.
     """
     table = _TableNodes.from_terms(expected_terms, time)
-    squares = np.broadcast_to(1.0 if weight is None else np.square(weight), time.size)
-    samples = _Samples(time, observed, squares, np.broadcast_to(0.0 if rate is None else rate, time.size))
-    if isinstance(drive, Sampled):
-        parts = _accumulate_measured(table, drive, samples)
+    one = np.ones(time.size) if weight is None else np.asarray(weight)
+    mask = one if whitening is None else np.asarray(whitening.mask)[: time.size]
+    samples = Samples(time, observed, one, np.broadcast_to(0.0 if rate is None else rate, time.size), mask, slope)
+    taps = None if whitening is None else np.asarray(whitening.taps)
+    measured = isinstance(drive, Sampled) and not steady_state
+    if isinstance(drive, Sampled) and measured:
+        parts = _accumulate_measured(table, drive, samples, taps, MAX_DELAY if delayed else 0)
     else:
-        period = _samples_per_period(drive, time) if steady_state else None
+        period = _samples_per_period(drive, time) if steady_state and taps is None else None
         if period is None:
-            parts = _accumulate_directly(table, drive, samples, steady_state)
+            parts = _accumulate_directly(table, drive, samples, steady_state, taps)
         else:
             parts = _accumulate_folded(table, drive, samples, period)
-    parts = track_progress(parts, "compressing the record", math.ceil(time.size / _chunk_length(time.size)))
-    return _assemble(table, sum(parts, np.zeros(())), isinstance(drive, Sampled), int(np.count_nonzero(squares)))
+    parts = track_progress(parts, "compressing the record", math.ceil(time.size / chunk_length(time.size)))
+    ages = 2 * MAX_DELAY if measured and delayed else 0
+    count = int(np.count_nonzero(mask))
+    return _assemble(table, sum(parts, np.zeros(())), measured and not table.is_grid, ages, count)
+
+
+def table_multiple(tau: Float[np.ndarray, " terms"]) -> int:
+    """Return the half-width of a table for these time constants (s), in units of `TABLE_HALF_WIDTH`."""
+    return max(1, math.ceil((0.5 * float(np.ptp(np.log(tau))) + math.log(3.0)) / TABLE_HALF_WIDTH))
 
 
 class _TableNodes(eqx.Module):
@@ -156,36 +241,42 @@ class _TableNodes(eqx.Module):
     nodes: Float[Array, " nodes"]  # s
     combinations: Float[Array, "nodes rank"]
     series: np.ndarray  # coefficients (rank, terms) of any response in these combinations
-    expected_terms: HighpassTerms
+    half_width: Array
+    expected_series: Float[Array, " terms"]  # the expected response is the product of the series with this
+    expected: Float[Array, " nodes"]  # the same for the responses of the nodes
+    expected_rate: ArrayLike | None  # F
     middle: Array  # of the record, s
     half: Array  # half the length of the record, s
     step: Array  # mean time step, s
+    is_grid: bool = eqx.field(static=True)
 
     @classmethod
     def from_terms(cls, expected_terms: HighpassTerms, time: np.ndarray) -> "_TableNodes":
-        (tau,) = map(float, expected_terms.tau)
-        relative, mix, series = _exponentials()
+        tau, weight = (np.asarray(x, dtype=float) for x in (expected_terms.tau, expected_terms.weight))
+        log_tau = np.log(tau)
+        center = 0.5 * (np.min(log_tau) + np.max(log_tau))
+        if isinstance(expected_terms.tau, tuple):
+            half_width, count = table_multiple(tau) * TABLE_HALF_WIDTH, table_multiple(tau) * NODES
+            relative, mix, series = exponential_basis(half_width, count)
+            nodes, (_, to_series) = np.exp(center) * relative, chebyshev(count)
+            expected = weight @ np.polynomial.chebyshev.chebvander((log_tau - center) / half_width, count - 1)
+        else:
+            nodes, half_width, to_series, expected = tau, 0.5 * np.ptp(log_tau), np.eye(tau.size), weight
+            mix, series = significant_combinations(tau, RANK_TOLERANCE)
         return cls(
-            center=np.asarray(math.log(tau)),
-            nodes=tau * relative,
+            center=np.asarray(center),
+            nodes=nodes,
             combinations=mix,
             series=series,
-            expected_terms=jax.tree.map(np.asarray, expected_terms),
+            half_width=np.asarray(half_width),
+            expected_series=expected,
+            expected=expected @ to_series,
+            expected_rate=None if expected_terms.rate is None else np.asarray(expected_terms.rate),
             middle=np.asarray(0.5 * (time[0] + time[-1])),
             half=np.asarray(0.5 * (time[-1] - time[0])),
             step=np.asarray((time[-1] - time[0]) / (time.size - 1)),
+            is_grid=not isinstance(expected_terms.tau, tuple),
         )
-
-
-@functools.cache
-def _exponentials() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the nodes of a table relative to its centre, their significant combinations, and the series in these."""
-    x, to_series = chebyshev(NODES)
-    relative = np.exp(TABLE_HALF_WIDTH * x)
-    ages = np.concatenate([[0.0], np.geomspace(1e-3 * relative.min(), 40.0 * relative.max(), 400)])
-    _, sizes, modes = np.linalg.svd(np.exp(-ages[:, None] / relative), full_matrices=False)
-    rank = int(np.count_nonzero(sizes > RANK_TOLERANCE * sizes[0]))
-    return relative, modes[:rank].T / sizes[:rank], (sizes[:rank, None] * modes[:rank]) @ to_series.T
 
 
 def baseline_functions(time: Float[Array, " n"], middle: Array, half: Array) -> Float[Array, "6 n"]:
@@ -204,41 +295,64 @@ def evaluate_baseline(time: np.ndarray, middle: ArrayLike, half: ArrayLike) -> F
 _baseline_functions = jit(baseline_functions)
 
 
-class _Samples(NamedTuple):
+class Samples(NamedTuple):
     """Arrays over all samples (possibly on disk) or over a chunk of them."""
 
     time: np.ndarray
     observed: np.ndarray
-    weight: np.ndarray  # weight of the squares
+    weight: np.ndarray
     rate: np.ndarray  # dV/dt
+    mask: np.ndarray  # of the whitening filter
+    slope: np.ndarray | None = None  # dV/dt over two samples, or what replaces it; None: computed from the drive
 
 
-def _chunks(samples: _Samples, length: int) -> Iterator[_Samples]:
+def chunks(samples: Samples, length: int) -> Iterator[Samples]:
     """Yield chunks of `length` samples; the last is padded with weight 0."""
     for first in range(0, samples.time.size, length):
-        time, *others = (np.asarray(x[first : first + length]) for x in samples)
+        time, *others, slope = (None if x is None else np.asarray(x[first : first + length]) for x in samples)
+        assert time is not None
         missing = (0, length - time.size)
-        yield _Samples(np.pad(time, missing, mode="edge"), *(np.pad(x, missing) for x in others))
+        observed, weight, rate, mask = (np.pad(x, missing) for x in others if x is not None)
+        slope = None if slope is None else np.pad(slope, missing)
+        yield Samples(np.pad(time, missing, mode="edge"), observed, weight, rate, mask, slope)
 
 
-def _chunk_length(samples: int, longest: int = 8_192) -> int:
+def chunk_length(samples: int, longest: int = 8_192) -> int:
     """Return the number of samples in a chunk, which bounds the memory."""
     return min(longest, 1 << (samples - 1).bit_length())
 
 
 def _accumulate_directly(
-    table: _TableNodes, drive: Drive, samples: _Samples, steady_state: bool
+    table: _TableNodes, drive: Drive, samples: Samples, steady_state: bool, taps: np.ndarray | None
 ) -> Iterator[np.ndarray]:
     size = samples.time.size
-    length = _chunk_length(size, 65_536) if isinstance(drive, Chirp) else _chunk_length(size)  # of few chirps
-    for chunk in _chunks(samples, length):
-        yield _chunk_products(table, drive, chunk, None, steady_state)
+    length = chunk_length(size, 65_536) if isinstance(drive, Chirp) else chunk_length(size)  # of few chirps
+    filtering = WhiteningState.start(taps, table.series.shape[0] + len(BASELINE_NAMES) + 3)
+    for chunk in chunks(samples, length):
+        total, filtering = _chunk_products(table, drive, chunk, None, steady_state, filtering)
+        yield total
+
+
+class WhiteningState(NamedTuple):
+    """Whitening filter during the pass."""
+
+    taps: np.ndarray
+    last: Float[np.ndarray, "functions reach"]  # values before the chunk
+
+    @classmethod
+    def start(cls, taps: np.ndarray | None, functions: int) -> "WhiteningState | None":
+        return None if taps is None else cls(taps, np.zeros((functions, taps.size - 1)))
 
 
 @jit
 def _chunk_products(
-    table: _TableNodes, drive: Drive, chunk: _Samples, baseline: Array | None, steady_state: bool
-) -> Array:
+    table: _TableNodes,
+    drive: Drive,
+    chunk: Samples,
+    baseline: Array | None,
+    steady_state: bool,
+    filtering: WhiteningState | None,
+) -> tuple[Array, WhiteningState | None]:
     """Return the inner products of a chunk, for a drive whose response can be computed at any time."""
     time = chunk.time
 
@@ -253,29 +367,48 @@ def _chunk_products(
 
     slope = (voltage(time + table.step) - voltage(time - table.step)) / (2.0 * table.step)
     baseline = baseline_functions(time, table.middle, table.half) if baseline is None else baseline
-    return _inner_products(table, [u], baseline, slope, chunk)
+    return _inner_products(table, [u], baseline, slope, chunk, filtering)
 
 
 def _inner_products(
-    table: _TableNodes, responses: list[Array], baseline: Array, slope: Array, chunk: _Samples
-) -> Array:
-    """Return the inner products of the responses (and charge decays) at the nodes, the shapes and the record."""
-    rest = chunk.observed - table.expected_terms.weight[0] * responses[0][NODES // 2]
-    if table.expected_terms.rate is not None:
-        rest = rest - table.expected_terms.rate * chunk.rate
+    table: _TableNodes,
+    responses: list[Array],
+    others: Float[Array, "functions n"],
+    slope: Array,
+    chunk: Samples,
+    filtering: WhiteningState | None,
+) -> tuple[Array, WhiteningState | None]:
+    """Return the inner products of the responses (and charge decays) at the nodes, other functions and the record."""
+    rest = chunk.observed - table.expected @ responses[0]
+    if table.expected_rate is not None:
+        rest = rest - table.expected_rate * chunk.rate
     parts = [table.combinations.T @ response for response in responses]
-    rows = jnp.concatenate([*parts, baseline, chunk.rate[None], slope[None], rest[None]])
-    return (rows * chunk.weight) @ rows.T
+    slope = slope if chunk.slope is None else chunk.slope
+    rows = jnp.concatenate([*parts, others, chunk.rate[None], slope[None], rest[None]])
+    return whitened_products(rows, chunk, filtering)
 
 
-def _accumulate_folded(table: _TableNodes, drive: Drive, samples: _Samples, period: int) -> Iterator[np.ndarray]:
+def whitened_products(
+    rows: Float[Array, "functions n"], chunk: Samples, filtering: WhiteningState | None
+) -> tuple[Float[Array, "functions functions"], WhiteningState | None]:
+    """Return the inner products of functions over the samples of a chunk, whitened if there is a filter."""
+    rows = rows * chunk.weight
+    if filtering is not None:
+        around = jnp.concatenate([filtering.last, rows], axis=1)
+        rows = Whitening(filtering.taps, chunk.mask).filter(around)
+        filtering = WhiteningState(filtering.taps, around[:, rows.shape[1] :])
+    return rows @ rows.T, filtering
+
+
+def _accumulate_folded(table: _TableNodes, drive: Drive, samples: Samples, period: int) -> Iterator[np.ndarray]:
     """Yield the inner products from folded periods; the response is computed for one period only."""
-    periods = max(1, _chunk_length(samples.time.size) // period)
+    periods = max(1, chunk_length(samples.time.size) // period)
     reference = np.asarray(samples.observed[:period])
     count = np.zeros(period)
     sums = np.zeros((len(BASELINE_NAMES) + 1, period))
     squares = np.zeros((len(BASELINE_NAMES) + 1, len(BASELINE_NAMES) + 1))
-    for t, y, weight, _ in _chunks(samples, periods * period):
+    for t, y, weight, *_ in chunks(samples, periods * period):
+        weight = np.square(weight)
         difference = (y.reshape(periods, period) - reference).reshape(-1)
         z = np.concatenate([evaluate_baseline(t, table.middle, table.half), difference[None]])
         count += weight.reshape(periods, period).sum(axis=0)
@@ -285,8 +418,9 @@ def _accumulate_folded(table: _TableNodes, drive: Drive, samples: _Samples, peri
     means = sums / np.where(count > 0.0, count, 1.0)
     time, rate = (np.asarray(x[:period]) for x in (samples.time, samples.rate))
     time, mean, rate, baseline = map(pad_samples, (time, means[-1] + reference, rate, means[:-1]))
-    folded = _Samples(time, mean, pad_weight(count), rate)
-    total = np.array(_chunk_products(table, drive, folded, baseline, True))
+    weight, slope = pad_weight(np.sqrt(count)), None if samples.slope is None else pad_samples(samples.slope[:period])
+    folded = Samples(time, mean, weight, rate, weight, slope)
+    total = np.array(_chunk_products(table, drive, folded, baseline, True, None)[0])
     # scatter of the samples of one phase about their mean
     kept = np.r_[_BASELINE, _OBSERVED]
     total[np.ix_(kept, kept)] += squares - means @ sums.T
@@ -297,7 +431,7 @@ def _samples_per_period(
     drive: Drive, time: np.ndarray, max_samples: int = 65_536, tolerance: float = 1e-9
 ) -> int | None:
     """Return after how many samples drive and grid coincide (to `tolerance` steps), or None if folding is useless."""
-    if not isinstance(drive, Periodic) or not _is_exactly_uniform(time):
+    if not isinstance(drive, Periodic) or not is_exactly_uniform(time):
         return None
     advance = (time[-1] - time[0]) / (time.size - 1) * float(drive.frequency)  # cycles per sample
     cycles = Fraction(advance).limit_denominator(max(1, min(time.size // 2, max_samples)))
@@ -306,36 +440,50 @@ def _samples_per_period(
     return cycles.denominator if cycles > 0 and error < tolerance + rounding else None
 
 
-def _is_exactly_uniform(time: np.ndarray, tolerance: float = 1e-9) -> bool:
+def is_exactly_uniform(time: np.ndarray, tolerance: float = 1e-9) -> bool:
     """Return whether the samples lie on a uniform grid, to `tolerance` of a step plus rounding."""
     step = (time[-1] - time[0]) / (time.size - 1)
     rounding = 4.0 * np.finfo(float).eps * max(abs(time[0]), abs(time[-1]))
     return is_uniform(time, tolerance + rounding / step)
 
 
-def _accumulate_measured(table: _TableNodes, drive: Sampled, samples: _Samples) -> Iterator[np.ndarray]:
-    """Yield the inner products of each chunk for a measured drive."""
-    time = samples.time
-    length, step, first = _chunk_length(time.size), float(table.step), float(drive.samples[0])
-    x = step / table.nodes if _is_exactly_uniform(time) and step < np.min(table.nodes) else None
-    last = np.zeros(NODES), np.asarray(time[0]), np.zeros(())  # the first sample is a jump from 0
+def _accumulate_measured(
+    table: _TableNodes, drive: Sampled, samples: Samples, taps: np.ndarray | None, ages: int
+) -> Iterator[np.ndarray]:
+    """Yield the inner products of each chunk for a measured drive; `ages` steps before and after a sample."""
+    time, voltage = samples.time, np.asarray(drive.samples)[: samples.time.size]
+    length, step, first = chunk_length(time.size), float(table.step), float(voltage[0])
+    x = step / table.nodes if is_exactly_uniform(time) and step < 300.0 * np.min(table.nodes) else None  # no overflow
+    last = np.zeros(table.nodes.size), np.asarray(time[0]), np.zeros(())  # the first sample is a jump from 0
     if x is not None:
         last = first * np.exp(x), np.asarray(time[0] - step), np.asarray(first)
-    voltages = _chunks(samples._replace(observed=np.asarray(drive.samples)[: time.size]), length)
-    for chunk, driven in zip(_chunks(samples, length), voltages, strict=True):
-        total, last = _advance_chunk(table, chunk, driven.observed, last, time[0], x)
+    tables = 1 if table.is_grid else 2
+    filtering = WhiteningState.start(taps, tables * table.series.shape[0] + len(BASELINE_NAMES) + 3 + 2 * ages)
+    voltages = chunks(samples._replace(observed=voltage), length)
+    for number, (chunk, driven) in enumerate(zip(chunks(samples, length), voltages, strict=True)):
+        steps = _drive_steps(voltage, number * length, length, ages) / step
+        total, last, filtering = _advance_chunk(table, chunk, driven.observed, steps, last, time[0], x, filtering)
         yield total
+
+
+def _drive_steps(voltage: np.ndarray, first: int, length: int, ages: int) -> Float[np.ndarray, "ages samples"]:
+    """Return the step of V from sample k - i - 1 to k - i, for i from -`ages` to `ages` - 1, at `length` samples k."""
+    indices = np.clip(np.arange(first - ages, first + length + ages + 1), 0, voltage.size - 1)
+    steps = np.diff(voltage[indices])
+    return np.array([steps[i : i + length] for i in range(2 * ages)][::-1]).reshape(2 * ages, length)
 
 
 @jit
 def _advance_chunk(
     table: _TableNodes,
-    chunk: _Samples,
+    chunk: Samples,
     voltage: Array,
+    steps: Float[Array, "ages n"],
     last: tuple[Array, Array, Array],
     first: Array,
     x: Array | None,
-) -> tuple[Array, tuple[Array, Array, Array]]:
+    filtering: WhiteningState | None,
+) -> tuple[Array, tuple[Array, Array, Array], WhiteningState | None]:
     """Return inner products of a chunk, and u, time and drive at its end; `x`: uniform step over the nodes."""
     time, (u, since, before) = chunk.time, last
     step, rise = jnp.diff(time, prepend=since), jnp.diff(voltage, prepend=before)
@@ -344,12 +492,13 @@ def _advance_chunk(
         u = jax.vmap(recurrence)(jnp.exp(-ages), rise * phi(ages), u)
     else:
         u = _uniform_recurrence(rise, u, x)
-    decays = jnp.exp((first - time) / table.nodes[:, None])
+    decays = [] if table.is_grid else [jnp.exp((first - time) / table.nodes[:, None])]
     times, voltages = jnp.append(since, time), jnp.append(before, voltage)
     span = jnp.append(times[2:] - times[:-2], step[-1])
     slope = jnp.append(voltages[2:] - voltages[:-2], 0.0) / jnp.where(span > 0.0, span, 1.0)
-    baseline = baseline_functions(time, table.middle, table.half)
-    return _inner_products(table, [u, decays], baseline, slope, chunk), (u[:, -1], time[-1], voltage[-1])
+    others = jnp.concatenate([steps, baseline_functions(time, table.middle, table.half)])
+    total, filtering = _inner_products(table, [u, *decays], others, slope, chunk, filtering)
+    return total, (u[:, -1], time[-1], voltage[-1]), filtering
 
 
 def _uniform_recurrence(
@@ -373,18 +522,22 @@ def _uniform_recurrence(
     return gain * (alone.transpose(1, 2, 0) + starts.T[:, :, None] * decays[:, None]).reshape(x.size, -1)
 
 
-def _assemble(table: _TableNodes, total: np.ndarray, decays: bool, samples: int) -> Compression:
+def _assemble(table: _TableNodes, total: np.ndarray, decays: bool, ages: int, samples: int) -> Compression:
     """Return coordinates that have the accumulated inner products."""
-    size, rank = len(total), table.series.shape[0]
+    rows, size, (rank, terms) = factor_products(total), len(total), table.series.shape
+    signal = rows[:, :rank] @ table.series
+    decay = rows[:, rank : 2 * rank] @ table.series if decays else np.zeros((size, terms))
+    steps = rows[:, 2 * rank : 2 * rank + ages].T
+    baseline, rate, slope, remainder = _baseline_and_record(rows)
+    following = 0.0 if table.expected_rate is None else table.expected_rate * rate
+    observed = remainder + signal @ table.expected_series + following
+    arrays = table.center, table.half_width, signal[:rank], decay, baseline, rate, slope, observed, float(samples)
+    return Compression(*map(np.asarray, (*arrays, steps, 0.0, table.step)))
+
+
+def factor_products(total: Float[np.ndarray, "functions functions"]) -> Float[np.ndarray, "rows functions"]:
+    """Return coordinates (columns) of functions that have these inner products."""
     scale = np.sqrt(np.diagonal(total))
     scale[scale == 0.0] = 1.0
     values, vectors = np.linalg.eigh(total / np.outer(scale, scale))
-    _, rows = np.linalg.qr(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * scale)
-    signal = rows[:, :rank] @ table.series
-    decay = rows[:, rank : 2 * rank] @ table.series if decays else np.zeros((size, NODES))
-    middle = signal @ np.cos(0.5 * np.pi * np.arange(NODES))  # Chebyshev polynomials at 0
-    baseline, rate, slope, remainder = _baseline_and_record(rows)
-    following = 0.0 if table.expected_terms.rate is None else float(table.expected_terms.rate) * rate
-    observed = remainder + float(table.expected_terms.weight[0]) * middle + following
-    arrays = table.center, TABLE_HALF_WIDTH, signal[:rank], decay, baseline, rate, slope, observed, float(samples)
-    return Compression(*map(np.asarray, arrays))
+    return np.asarray(np.linalg.qr(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * scale).R)

@@ -139,9 +139,13 @@ class Likelihood(eqx.Module):
         g, b, _ = self._evaluate_divider(points)
         return g, b
 
+    def tau_extremes(self, points: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, "2 n"]:
+        """Return the slowest and the fastest time constant (s) of the circuits at the points theta."""
+        return self._evaluate_divider(points)[1:]
+
     def tau_range(self, points: Float[np.ndarray, "n parameters"]) -> tuple[float, float]:
         """Return the shortest and the longest time constant (s) of the circuits at the points theta."""
-        _, slowest, fastest = self._evaluate_divider(points)
+        slowest, fastest = self.tau_extremes(points)
         return float(np.min(fastest)), float(np.max(slowest))
 
     def _evaluate_divider(self, points: np.ndarray) -> Float[np.ndarray, "3 n"]:

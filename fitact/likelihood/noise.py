@@ -48,9 +48,21 @@ class Whitening(eqx.Module):
 
     def __call__(self, values: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
         """Return the filtered values, with 0 where `mask` is 0."""
-        reach, size = self.taps.size - 1, values.shape[-1]
-        padded = jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(reach, 0)])
-        parts = [self.taps[lag] * padded[..., reach - lag : reach - lag + size] for lag in range(reach + 1)]
+        return self.filter(jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(self.taps.size - 1, 0)]))
+
+    def exclude(self, excluded: Bool[np.ndarray, " samples"]) -> "Whitening":
+        """Return the filter without the samples that it computes from an excluded one."""
+        mask, taps = np.asarray(self.mask), np.trim_zeros(np.asarray(self.taps), "b")
+        return Whitening(self.taps, np.where(np.convolve(excluded, np.ones(taps.size))[: mask.size] > 0.5, 0.0, mask))
+
+    def restrict(self, samples: slice) -> "Whitening":
+        """Return the filter for some of the samples."""
+        return Whitening(self.taps, self.mask[samples])
+
+    def filter(self, values: Float[Array, "*shape reach+samples"]) -> Float[Array, "*shape samples"]:
+        """Return the same for values that include those within the filter's reach before the samples."""
+        reach, size = self.taps.size - 1, self.mask.size
+        parts = [self.taps[lag] * values[..., reach - lag : reach - lag + size] for lag in range(reach + 1)]
         return self.mask * sum(parts[1:], parts[0])
 
 

@@ -203,10 +203,10 @@ def _steady_response(
     return lambda time: _propagate(drive, time, tau, u)
 
 
-def knot_values(pieces: LinearPieces, tau: ArrayLike, first: ArrayLike, part: int = 262_144) -> Float[Array, " pieces"]:
+def knot_values(pieces: LinearPieces, tau: ArrayLike, first: ArrayLike, part: int = 32_768) -> Float[Array, " pieces"]:
     """Return u just after the start of each piece, given u just after the first start.
 
-    More pieces than `part` are processed in parts, since intermediate arrays take several times the record's memory.
+    More pieces than `part` are processed in parts, whose intermediate arrays stay in the processor's cache.
     """
 
     def propagate_part(before: Array, begin: ArrayLike, count: int) -> tuple[Array, Array]:

@@ -6,6 +6,7 @@ exponential is smooth, whatever the age t, and so its Chebyshev series converges
 
 import functools
 import math
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -34,9 +35,10 @@ class ResponseTable(eqx.Module):
 
     center: Float[Array, ""]  # the table covers log tau in `center` ± `half_width` (tau in s)
     half_width: Float[Array, ""]
-    # Chebyshev coefficients in log tau of the response (V); the last column is the response for an infinite tau
-    signal: Float[Array, "times terms+1"]
-    decay: Float[Array, "times terms"]  # the same for e^{-(t - t0) / tau}
+    # responses (V) are the product with `series`; the last column is the response for an infinite tau
+    signal: Float[Array, "times rank+1"]
+    decay: Float[Array, "times rank"]  # the same for e^{-(t - t0) / tau}
+    series: Float[Array, "rank terms"]  # Chebyshev coefficients in log tau
 
     @classmethod
     def from_drive(
@@ -55,16 +57,12 @@ class ResponseTable(eqx.Module):
         center, half_width = 0.5 * (low + high), 0.5 * (high - low) + _MARGIN
         if not half_width < _MAX_HALF_WIDTH or (count := _node_count(half_width)) * time.size > _MAX_NUMBERS:
             return None
-        x, to_series = chebyshev(count)
-        nodes = np.append(np.exp(center + half_width * x), 10.0 * _OPEN * math.exp(high))
+        relative, combinations, series = exponential_basis(half_width, count)
+        nodes = np.append(math.exp(center) * relative, 10.0 * _OPEN * math.exp(high))
         signal = highpass_responses(drive, time, nodes, steady_state)
-        signal, settled = signal[:-1].T @ to_series.T, signal[-1:].T
-        decay = np.exp(-(time[:, None] - begin) / nodes[:-1]) @ to_series.T
-        largest = max(np.max(np.abs(signal)), np.finfo(float).tiny)
-        terms = count_terms(np.max(np.abs(signal) / largest, axis=0) + np.max(np.abs(decay), axis=0), _PRECISION)
-        return cls(
-            np.asarray(center), np.asarray(half_width), np.hstack([signal[:, :terms], settled]), decay[:, :terms]
-        )
+        signal, settled = signal[:-1].T @ combinations, signal[-1:].T
+        decay = np.exp(-(time[:, None] - begin) / nodes[:-1]) @ combinations
+        return cls(np.asarray(center), np.asarray(half_width), np.hstack([signal, settled]), decay, series)
 
     def response(self, terms: HighpassTerms) -> Float[Array, " times"]:
         """Return the response of `terms` without the one in dV/dt; compare `superpose_terms`."""
@@ -72,13 +70,16 @@ class ResponseTable(eqx.Module):
         for weight, tau in zip(terms.weight, terms.tau, strict=True):
             x = self._position(tau)
             is_open = x > 1.0 + math.log(_OPEN) / self.half_width
-            series = chebyshev_polynomials(jnp.where(is_open, 0.0, x), self.decay.shape[1])
-            total += weight * jnp.append(jnp.where(is_open, 0.0, series), is_open)
+            combined = self._combine(jnp.where(is_open, 0.0, x))
+            total += weight * jnp.append(jnp.where(is_open, 0.0, combined), is_open)
         return self.signal @ total
 
-    def decays(self, tau: Array) -> Float[Array, " times"]:
-        """Return e^{-(t - t0) / tau}, where t0 is the beginning."""
-        return self.decay @ chebyshev_polynomials(self._position(tau), self.decay.shape[1])
+    def decays(self, tau: Sequence[Array], size: Float[Array, " taus"]) -> Float[Array, " times"]:
+        """Return the sum of size e^{-(t - t0) / tau}, where t0 is the beginning."""
+        return self.decay @ sum(each * self._combine(self._position(t)) for each, t in zip(size, tau, strict=True))
+
+    def _combine(self, position: Array) -> Float[Array, " rank"]:
+        return self.series @ chebyshev_polynomials(position, self.series.shape[1])
 
     def _position(self, tau: Array) -> Array:
         return (jnp.log(tau) - self.center) / self.half_width
@@ -87,6 +88,31 @@ class ResponseTable(eqx.Module):
 def _node_count(half_width: float) -> int:
     """Return how many nodes reach rounding: e^{-t/tau} is analytic in log tau within a strip of half-width pi / 2."""
     return _FEW_NODES if half_width <= _NARROW else NODES * math.ceil(half_width / TABLE_HALF_WIDTH)
+
+
+@functools.lru_cache(maxsize=64)
+def exponential_basis(
+    half_width: float, count: int, tolerance: float = _PRECISION
+) -> tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, "nodes rank"], Float[np.ndarray, "rank terms"]]:
+    """Return nodes over a half-width in log tau, and what represents e^{-t/tau} at any age t by values at the nodes.
+
+    The nodes are relative to the center. Few combinations of these values are significant (relative to `tolerance`),
+    and the product of these with the Chebyshev coefficients is the series in log tau.
+    """
+    x, to_series = chebyshev(count)
+    relative = np.exp(half_width * x)
+    combinations, values = significant_combinations(relative, tolerance)
+    return relative, combinations, values @ to_series.T
+
+
+def significant_combinations(
+    tau: Float[np.ndarray, " nodes"], tolerance: float
+) -> tuple[Float[np.ndarray, "nodes rank"], Float[np.ndarray, "rank nodes"]]:
+    """Return combinations of e^{-t/tau} at any age t that give all of them, to a relative `tolerance`; and how."""
+    ages = np.concatenate([[0.0], np.geomspace(1e-3 * tau.min(), 40.0 * tau.max(), 400)])
+    _, sizes, modes = np.linalg.svd(np.exp(-ages[:, None] / tau), full_matrices=False)
+    rank = round_up_column_count(np.count_nonzero(sizes > tolerance * sizes[0]), tau.size)
+    return modes[:rank].T / sizes[:rank], sizes[:rank, None] * modes[:rank]
 
 
 def highpass_responses(

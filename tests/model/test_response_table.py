@@ -33,7 +33,7 @@ def test_any_time_constant_in_the_range_is_scipys(tau_range: tuple[float, float]
     assert table is not None
     for tau in np.geomspace(*tau_range, 7):
         np.testing.assert_allclose(table.response(HighpassTerms((1.0,), (tau,))), scipy_highpass(tau), atol=3e-9)
-        np.testing.assert_allclose(table.decays(tau), np.exp(-UNIFORM / tau), atol=1e-11)
+        np.testing.assert_allclose(table.decays((tau,), np.ones(1)), np.exp(-UNIFORM / tau), atol=1e-11)
 
 
 @pytest.mark.parametrize("steady_state", [False, True])
