@@ -216,6 +216,7 @@ def _log_probs(
         rate=zeros,
         slope=zeros,
         observed=observed,
+        observed_slope=zeros,
         samples=channel.compression.samples,
         steps=jnp.zeros((0, rows)),
         origin=jnp.zeros(()),

@@ -80,6 +80,7 @@ class SharedBasis(NamedTuple):
             rate=jnp.zeros(size),
             slope=append_zero(self.slope),
             observed=jnp.zeros(size),
+            observed_slope=jnp.zeros(size),
             samples=jnp.asarray(float(samples)),
             steps=jnp.zeros((0, size)),
             origin=jnp.zeros(()),

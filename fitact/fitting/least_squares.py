@@ -15,7 +15,7 @@ from fitact.compiled import jit
 from fitact.experiment.fisher import covariance_factor
 from fitact.fitting.minimum import minimise, result_name
 from fitact.fitting.timing import clock_r_squared, free_timing, orthonormal_basis
-from fitact.likelihood.certificate import interpolate_channel, recompress
+from fitact.likelihood.certificate import expand_student, interpolate_channel, recompress
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import fit_ar1, student_curvature, student_weight
@@ -80,12 +80,12 @@ def _solve_round(likelihood: Likelihood, start: Array, sigma: Array) -> _Round:
     parts = []
     for (channel, inputs), s in zip(likelihood.channels_and_inputs(theta), sigma, strict=True):
         residuals = channel.fit_nuisances(inputs, s)[0]
-        factor = jnp.sqrt(student_weight(residuals / s)) if channel.noise == "student" else 1.0
+        factor = jnp.sqrt(student_weight(residuals / s)) if channel.is_student else 1.0
         shapes, slope = channel.residuals_and_shapes(inputs)[1], channel.whitened_delay_derivative(inputs)
-        sigma_new = _noise(channel, residuals, fraction)
+        sigma_new = _noise(channel, residuals, fraction) if channel.expansion is None else channel.expansion.sigma
         parts.append((residuals, sigma_new, factor * residuals, factor * shapes, factor * slope))
     unweighted, noise, *weighted = zip(*parts, strict=True)
-    if any(channel.noise == "student" for channel in likelihood.channels):
+    if any(channel.is_student for channel in likelihood.channels):
         jacobians = _information_jacobian(likelihood, theta, sigma, unweighted)
     else:
         sizes = [channel.rows + len(channel.columns) for channel in likelihood.channels]
@@ -105,7 +105,7 @@ def _information_jacobian(
 
     scaled, jacobians = [], jax.jacfwd(whitened_residuals)(theta)
     for channel, jacobian, residual, s in zip(likelihood.channels, jacobians, residuals, sigma, strict=True):
-        if channel.noise == "student":
+        if channel.is_student:
             z = residual / s
             weight = student_weight(z)
             weight = weight * channel.mean(student_curvature(z)) / channel.mean(weight)
@@ -159,7 +159,7 @@ def _solve_coloured_noise(
     The coefficient is then fixed. For many samples its error is uncorrelated with those of the parameters (the
     information matrix is block-diagonal), so it does not widen them.
     """
-    solved = least_squares(*_interpolate(likelihood, start, noise, interpolated))
+    solved = _solve_student(*_interpolate(likelihood, start, noise, interpolated))
     likelihood = solved.likelihood
     for i, channel in enumerate(likelihood.channels):
         if channel.noise == "ar1":
@@ -171,7 +171,38 @@ def _solve_coloured_noise(
             likelihood = likelihood.replace_channel(i, channel)
     if likelihood is solved.likelihood:
         return solved
-    return least_squares(*_interpolate(likelihood, solved.theta, solved.sigma, interpolated))
+    return _solve_student(*_interpolate(likelihood, solved.theta, solved.sigma, interpolated))
+
+
+def _solve_student(
+    likelihood: Likelihood, start: np.ndarray, noise: np.ndarray, tolerance: float = 0.03, max_rounds: int = 20
+) -> LeastSquaresResult:
+    """Fit; expand Student-t noise of compressed channels around the optimum until it moves by less than `tolerance`.
+
+    The tolerance is in standard errors. The first fit is that of normal noise.
+    """
+    which = [
+        i for i, each in enumerate(likelihood.channels) if each.noise == "student" and each.compression is not None
+    ]
+    if not which:
+        return least_squares(likelihood, start, noise)
+    normal = likelihood
+    for i in which:
+        normal = normal.replace_channel(i, dataclasses.replace(likelihood.channels[i], noise="white", expansion=None))
+    solved, steps, moved = least_squares(normal, start, noise), 0, math.inf
+    for _ in range(max_rounds):
+        exact = moved < 1.0  # from further away, Newton's step may lead astray
+        theta, sigma, steps = solved.theta, solved.sigma.copy(), steps + solved.steps
+        for i in which:
+            channel = expand_student(solved.likelihood, i, theta, float(sigma[i]), exact=exact)
+            likelihood = likelihood.replace_channel(i, channel)
+            assert channel.expansion is not None
+            sigma[i] = channel.expansion.sigma
+        solved = least_squares(likelihood, theta, sigma, max_rounds=1)
+        moved = float(np.linalg.norm(np.concatenate(solved.jacobian) @ (solved.theta - theta)))
+        if exact and not tolerance < moved < 1.0:  # a larger step shows that the expansion does not hold
+            break
+    return dataclasses.replace(solved, steps=steps + solved.steps)
 
 
 def _interpolate(
@@ -182,7 +213,7 @@ def _interpolate(
     The optimum is that of `few` samples of these channels, as if their noise were white.
     """
     pairs = enumerate(zip(likelihood.channels, interpolated, strict=True))
-    chosen = [i for i, (channel, may) in pairs if may and channel.compression is None]
+    chosen = [i for i, (each, may) in pairs if may and each.compression is None and each.noise != "student"]
     if not chosen:
         return likelihood, start, noise
     thin = likelihood

@@ -201,6 +201,7 @@ def _build_channel(
         clock=np.zeros(()),
         time_step=np.asarray(record.time_step, dtype=float),
         compression=None,
+        expansion=None,
         label=label,
         channel=channel,
         steady_state=choice.steady_state,

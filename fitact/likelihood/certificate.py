@@ -22,6 +22,7 @@ from fitact.likelihood.compression import (
 from fitact.likelihood.compression_on_grid import GridCompression
 from fitact.likelihood.interpolation import interpolate
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
+from fitact.likelihood.noise import StudentExpansion, fit_student_scale, student_curvature, student_weight
 from fitact.model.circuit import HighpassTerms
 from fitact.model.drive import Sampled
 from fitact.model.skin import WithSkin
@@ -43,11 +44,12 @@ class CertifiedLikelihood(NamedTuple):
 
 
 def compress_channel(
-    channel: ChannelLikelihood, start: CircuitValues, tolerance: float
+    channel: ChannelLikelihood, start: CircuitValues, tolerance: float, student: np.ndarray | None = None
 ) -> tuple[ChannelLikelihood, str]:
     """Return the channel with a compression and "", or the uncompressed channel and the reason.
 
-    The compression holds around the circuit `start`, for the channel's present noise and timing.
+    The compression holds around the circuit `start`, for the channel's present noise and timing. For Student-t noise,
+    it needs an expansion (`expand_student`); `student` is as in `compress`.
     """
     circuit, channel = start.circuit, channel.without_compression()
     reason = _uncompressed_reason(channel, start, tolerance)
@@ -56,6 +58,7 @@ def compress_channel(
     samples = slice(channel.n_samples)
     arrays = channel.drive, np.asarray(channel.time)[samples], np.asarray(channel.observed)[samples]
     how: dict[str, Any] = {
+        "student": student,
         "steady_state": channel.steady_state,
         "weight": None if channel.equally_weighted else channel.weights[samples],
         "whitening": channel.whitening and channel.whitening.restrict(samples),
@@ -86,8 +89,6 @@ def may_compress(channel: ChannelLikelihood, tolerance: float, min_samples: int 
     """Return why a channel may not be compressed at all, or ""."""
     if tolerance == 0.0:
         return "the full sum was requested"
-    if channel.noise == "student":
-        return "the likelihood of Student-t noise does not follow from inner products"
     if channel.n_samples < min_samples:  # compression would save nothing
         return f"the record is shorter than {min_samples} samples"
     return ""
@@ -103,15 +104,75 @@ def _uncompressed_reason(
         if channel.timing:
             return _TIMING_REASON
         return "a dispersive skin has no time constants" if start.circuit.grid is None else ""
-    if channel.timing and not can_delay(channel, start.tau):
+    if channel.timing and (channel.noise == "student" or not can_delay(channel, start.tau)):
         return _TIMING_REASON
     if table_multiple(start.tau) > max_multiple:
         return "the time constants of the circuit are too far apart"
     return ""
 
 
+def expand_student(
+    likelihood: Likelihood, index: int, theta: np.ndarray, sigma: float, *, exact: bool
+) -> ChannelLikelihood:
+    """Return a channel of Student-t noise that has a table of responses, expanded around theta.
+
+    Unless `exact`, the weights of the squares are positive, with which each step of the fit is a descent.
+    """
+    channel, inputs, circuit = (
+        likelihood.channels[index],
+        likelihood.channel_inputs(theta, index),
+        likelihood.evaluate_circuit(theta),
+    )
+    _, beta, _ = _fit_nuisances(channel, inputs, np.asarray(sigma))
+    size, full = channel.n_samples, channel.without_compression()
+    residuals = (np.asarray(channel.observed) - _model(full, inputs, beta))[:size]
+    counted = channel.weights[:size] > 0.0
+    free = theta.size / likelihood.count
+    sigma = max(fit_student_scale(residuals[counted], counted.sum() * (1.0 - free)), float(channel.noise_floor))
+    z = residuals / sigma
+    weight, curvature = student_weight(z), student_curvature(z)
+    slopes = sigma * weight * z, -sigma * (weight + curvature) * z
+    student = np.stack([curvature if exact else weight, *slopes])
+    changed, _ = compress_channel(full, circuit, TOLERANCE, student)
+    table = changed.compression
+    assert isinstance(table, Compression)
+    expansion = StudentExpansion.from_residuals(z[counted], sigma)
+    _, derivative = np.polynomial.chebyshev.chebval(
+        0.0,
+        np.stack([expansion.curvature, np.append(np.polynomial.chebyshev.chebder(expansion.curvature), 0.0)], axis=1),
+    )
+    first = np.array(table.observed)
+    # the rest of the record, so that the sum of squares is that of the reweighted residuals
+    first[-1] = math.sqrt(max(sigma**2 * np.sum(weight[counted] * np.square(z[counted])) - first @ first, 0.0))
+    slope = np.asarray(table.observed_slope) - first * derivative / float(expansion.half_width)
+    squares = np.array([first @ first, 2.0 * first @ slope, slope @ slope])
+    expansion = dataclasses.replace(expansion, squares=squares)
+    changed = dataclasses.replace(changed, compression=dataclasses.replace(table, observed=np.zeros_like(first)))
+    observed = first - _model(changed, inputs, beta, coordinates=True)
+    table = dataclasses.replace(table, observed=observed, observed_slope=slope)
+    return dataclasses.replace(changed, compression=table, expansion=expansion, noise="student")
+
+
+_fit_nuisances = jit(ChannelLikelihood.fit_nuisances)
+
+
+@jit
+def _model(channel: ChannelLikelihood, inputs: ChannelInputs, beta: Array, coordinates: bool = False) -> Array:
+    """Return signal and linear nuisances, over samples or (negative) in coordinates of a record that is 0."""
+    sizes = beta * channel.linear_sd[np.array(channel.columns, dtype=int)]
+    if not coordinates:
+        return channel.signal(inputs) + sizes @ channel.shapes(inputs)[np.array(channel.columns, dtype=int)]
+    remainder, shapes = channel.residuals_and_shapes(inputs)
+    return remainder - sizes @ shapes
+
+
 def interpolate_channel(
-    likelihood: Likelihood, index: int, theta: np.ndarray, covariance_factor: np.ndarray, sigma: float, reach: float
+    likelihood: Likelihood,
+    index: int,
+    theta: np.ndarray,
+    covariance_factor: np.ndarray,
+    sigma: float,
+    reach: float,
 ) -> ChannelLikelihood:
     """Return a channel with an interpolation around theta, or without a compression if that is not possible.
 
@@ -186,14 +247,20 @@ def certify(
     if likelihood.count > _MANY_ROWS:
         check_points = math.ceil(check_points / 3)
     around = np.vstack([theta, theta + 1.5 * deviates[:check_points] @ covariance_factor.T])
-    points = np.vstack([around, _prior_points(light, theta, check_points)])
+    is_local = any(channel.expansion is not None for channel in likelihood.channels)
+    points = around if is_local else np.vstack([around, _prior_points(light, theta, check_points)])
     narrow = dataclasses.replace(likelihood, channels=restricted).without_samples()
     exact, compressed, tabulated = (
         _evaluate_log_likelihoods(model, points, sigma) for model in (likelihood.without_compression(), narrow, light)
     )
-    errors = np.max(np.abs(compressed - exact)[: len(around)], axis=0)
+    # a constant error of an expansion, in the integral over nuisances, does not change the posterior
+    is_expanded = np.array([channel.expansion is not None for channel in likelihood.channels])
+    differences = compressed - exact
+    differences -= np.where(is_expanded, differences[0], 0.0)
+    errors = np.max(np.abs(differences)[: len(around)], axis=0)
     # far from the optimum, the error may grow with the difference in log-likelihood to the optimum
     excesses = np.nanmax(np.abs(tabulated - exact) - 1e-6 * np.abs(exact[0] - exact), axis=0, initial=-np.inf)
+    excesses = np.where(is_expanded, errors, excesses)
     failures = []
     for i, channel in enumerate(restricted):
         failure = _compression_failure(errors[i], excesses[i], tolerance / len(restricted))

@@ -23,7 +23,14 @@ from fitact.compiled import array_module, pad_samples, pad_weight
 from fitact.likelihood.compression import BASELINE_NAMES, Compression, baseline_functions
 from fitact.likelihood.compression_on_grid import GridCompression
 from fitact.likelihood.interpolation import Interpolation
-from fitact.likelihood.noise import NoiseModel, Whitening, student_curvature, student_residual, student_weight
+from fitact.likelihood.noise import (
+    NoiseModel,
+    StudentExpansion,
+    Whitening,
+    student_curvature,
+    student_residual,
+    student_weight,
+)
 from fitact.model.circuit import Channel, Circuit
 from fitact.model.drive import Drive, Sampled
 from fitact.model.response import response_and_rate
@@ -64,6 +71,7 @@ class ChannelLikelihood(eqx.Module):
     # prior standard deviations of `TIMING_NUISANCES`, in time steps (clock: over half the record)
     timing_sd: Float[Array, "2"]
     compression: Compression | Interpolation | None  # projection of the record; None means that all samples are summed
+    expansion: StudentExpansion | None  # of Student-t noise around an optimum; the compression has weighted samples
     label: str = eqx.field(static=True)  # "", or a name that distinguishes it from other channels, e.g. "I_2"
     channel: Channel = eqx.field(static=True)  # "Vsc" or "I"
     steady_state: bool = eqx.field(static=True)  # or from rest
@@ -81,7 +89,12 @@ class ChannelLikelihood(eqx.Module):
         return self.time_step if name == "delay" else 2.0 * self.time_step / (self.time[-1] - self.time[0])
 
     def without_compression(self) -> "ChannelLikelihood":
-        return dataclasses.replace(self, compression=None)
+        return dataclasses.replace(self, compression=None, expansion=None)
+
+    @property
+    def is_student(self) -> bool:
+        """Whether residuals have a Student-t distribution, and not its expansion."""
+        return self.noise == "student" and self.expansion is None
 
     @property
     def count(self) -> ArrayLike:
@@ -150,7 +163,14 @@ class ChannelLikelihood(eqx.Module):
         time, observed = (pad_samples(np.asarray(x)[part]) for x in (self.time, self.observed))
         rate = None if self.rate is None else pad_samples(np.asarray(self.rate)[part])
         return dataclasses.replace(
-            self, time=time, observed=observed, rate=rate, weight=pad_weight(weight), whitening=None, compression=None
+            self,
+            time=time,
+            observed=observed,
+            rate=rate,
+            weight=pad_weight(weight),
+            whitening=None,
+            compression=None,
+            expansion=None,
         )
 
     def signal(self, inputs: ChannelInputs, extra_delay: ArrayLike = 0.0) -> Float[Array, " samples"]:
@@ -248,6 +268,9 @@ class ChannelLikelihood(eqx.Module):
         the posterior precision of the coefficients.
         """
         remainder, shapes = self.residuals_and_shapes(inputs)
+        if self.expansion is not None and isinstance(self.compression, Compression):
+            sigma, log_sigma = self.expansion.normal_sigma(sigma)
+            remainder = remainder + log_sigma * self.compression.observed_slope
         A = self.linear_sd[self._column_indices, None] * shapes
         # keeps XLA from computing both again at each use
         remainder, A = lax.optimization_barrier((remainder, A))
@@ -257,7 +280,7 @@ class ChannelLikelihood(eqx.Module):
         beta = lax.custom_linear_solve(
             lambda x: precision @ x, A @ remainder / sigma**2, lambda _, y: cho_solve(fixed, y), symmetric=True
         )
-        if self.noise != "student":
+        if not self.is_student:
             return remainder - beta @ A, beta, factor
         return self._fit_nuisances_student(remainder, A, beta, sigma)
 
@@ -294,14 +317,16 @@ class ChannelLikelihood(eqx.Module):
     def residuals(self, inputs: ChannelInputs, sigma: ArrayLike) -> Float[Array, " rows+columns"]:
         """Return whitened residuals, priors of nuisances included; half their sum of squares is -log-likelihood."""
         remainder, beta, _ = self.fit_nuisances(inputs, sigma)
-        whitened = remainder / sigma
-        return jnp.concatenate([student_residual(whitened) if self.noise == "student" else whitened, beta])
+        whitened = remainder / (sigma if self.expansion is None else self.expansion.normal_sigma(sigma)[0])
+        return jnp.concatenate([student_residual(whitened) if self.is_student else whitened, beta])
 
     def log_likelihood(self, inputs: ChannelInputs, log_sigma: ArrayLike) -> Float[Array, ""]:
         """Return the log-likelihood up to a constant; NaN outside the range of the compression."""
         remainder, beta, factor = self.fit_nuisances(inputs, jnp.exp(log_sigma))
-        if self.noise == "student":
+        if self.is_student:
             misfit = jnp.sum(jnp.square(student_residual(remainder * jnp.exp(-log_sigma))))
+        elif self.expansion is not None:
+            misfit = 2.0 * self.expansion.add_misfit(remainder, jnp.exp(log_sigma))
         else:
             misfit = jnp.sum(jnp.square(remainder)) * jnp.exp(-2.0 * log_sigma)
         misfit = misfit + jnp.sum(jnp.square(beta))

@@ -12,7 +12,7 @@ Coloured noise is whitened by a linear filter, which is applied to all functions
 import math
 from collections.abc import Iterator
 from fractions import Fraction
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -30,12 +30,13 @@ from fitact.model.circuit import HighpassTerms
 from fitact.model.drive import Drive, Periodic, Sampled
 from fitact.model.response import highpass, phi, recurrence
 from fitact.model.response_table import (
-    NODES,
+    NARROW,
     TABLE_HALF_WIDTH,
     chebyshev,
     chebyshev_polynomials,
     count_terms,
     exponential_basis,
+    node_count,
     significant_combinations,
 )
 from fitact.progress import track_progress
@@ -65,6 +66,7 @@ class Compression(eqx.Module):
     rate: Float[Array, " rows"]  # dV/dt, V/s, if the channel follows it, else 0
     slope: Float[Array, " rows"]  # dV/dt, V/s, over two samples, so that a jump appears on both sides
     observed: Float[Array, " rows"]  # the record, V or A
+    observed_slope: Float[Array, " rows"]  # derivative of `observed` in log sigma, 0 but for `StudentExpansion`
     samples: Float[Array, ""]  # number of samples
     # dV/dt of a measured drive (V/s) between the samples k - i - 1 and k - i, for the ages i from `origin` on; empty
     # if the response cannot be delayed
@@ -142,11 +144,12 @@ class Compression(eqx.Module):
         basis, series = _significant_modes(signal[:, :terms], precision)
         charges, charge_series = _significant_modes(charge * decay[:, :terms], precision)
         last = self.baseline.T, *(x[:, None] for x in (self.rate, self.slope, self.observed))
-        _, rows = np.linalg.qr(np.hstack([basis, steps.T, charges, *last]))
-        sizes = len(series), len(steps), len(charge_series)
-        basis, shifted, charges, _ = np.split(rows, np.cumsum(sizes), axis=1)
+        observed_slope = np.asarray(self.observed_slope)[:, None]
+        _, rows = np.linalg.qr(np.hstack([basis, steps.T, charges, observed_slope, *last]))
+        sizes = len(series), len(steps), len(charge_series), 1
+        basis, shifted, charges, observed_slope, _ = np.split(rows, np.cumsum(sizes), axis=1)
         table = center, half_width, basis[: len(series)] @ series, charges @ charge_series / (charge or 1.0)
-        record = *_baseline_and_record(rows), self.samples
+        record = *_baseline_and_record(rows), observed_slope[:, 0], self.samples
         return Compression(*map(np.asarray, (*table, *record, shifted.T, origin, self.time_step)))
 
     def _move_origin(
@@ -193,6 +196,7 @@ def compress(
     rate: Float[np.ndarray, " samples"] | None = None,
     delayed: bool = False,
     slope: Float[np.ndarray, " samples"] | None = None,
+    student: Float[np.ndarray, "3 samples"] | None = None,
 ) -> Compression:
     """Project a record on responses to `drive`, for time constants within a factor 9 of the one in `expected_terms`.
 
@@ -204,21 +208,26 @@ def compress(
     factor 9 if several terms need it (see `table_multiple`). `weight` multiplies the residuals of the samples
     (0 excludes a sample, None means 1). `rate` is dV/dt (V/s) for a channel that follows it. If `delayed`, the response
     to a measured drive on a uniform grid can be shifted by up to `MAX_DELAY` steps; V is then taken as constant before
-    the first and after the last sample. `slope` replaces dV/dt in the field of that name.
+    the first and after the last sample. `slope` replaces dV/dt in the field of that name. `student`
+    holds weights of the squares, and two functions to be projected instead of the record; `observed` and its slope are
+    then without the model at which they were computed.
 
     Terms of a grid of time constants have arrays of weights and time constants; the table then holds the responses of
     the grid instead of series.
     """
-    table = _TableNodes.from_terms(expected_terms, time)
+    table = _TableNodes.from_terms(expected_terms, time, narrow=student is not None)
     one = np.ones(time.size) if weight is None else np.asarray(weight)
     mask = one if whitening is None else np.asarray(whitening.mask)[: time.size]
-    samples = Samples(time, observed, one, np.broadcast_to(0.0 if rate is None else rate, time.size), mask, slope)
+    samples = Samples(
+        time, observed, one, np.broadcast_to(0.0 if rate is None else rate, time.size), mask, slope, student
+    )
     taps = None if whitening is None else np.asarray(whitening.taps)
     measured = isinstance(drive, Sampled) and not steady_state
     if isinstance(drive, Sampled) and measured:
         parts = _accumulate_measured(table, drive, samples, taps, MAX_DELAY if delayed else 0)
     else:
-        period = _samples_per_period(drive, time) if steady_state and taps is None else None
+        is_simple = steady_state and taps is None and student is None
+        period = _samples_per_period(drive, time) if is_simple else None
         if period is None:
             parts = _accumulate_directly(table, drive, samples, steady_state, taps)
         else:
@@ -251,12 +260,14 @@ class _TableNodes(eqx.Module):
     is_grid: bool = eqx.field(static=True)
 
     @classmethod
-    def from_terms(cls, expected_terms: HighpassTerms, time: np.ndarray) -> "_TableNodes":
+    def from_terms(cls, expected_terms: HighpassTerms, time: np.ndarray, *, narrow: bool) -> "_TableNodes":
         tau, weight = (np.asarray(x, dtype=float) for x in (expected_terms.tau, expected_terms.weight))
         log_tau = np.log(tau)
         center = 0.5 * (np.min(log_tau) + np.max(log_tau))
         if isinstance(expected_terms.tau, tuple):
-            half_width, count = table_multiple(tau) * TABLE_HALF_WIDTH, table_multiple(tau) * NODES
+            # a wide table has functions of few samples, which Student's t may weight negatively
+            half_width = 0.5 * np.ptp(log_tau) + NARROW if narrow else table_multiple(tau) * TABLE_HALF_WIDTH
+            count = node_count(half_width)
             relative, mix, series = exponential_basis(half_width, count)
             nodes, (_, to_series) = np.exp(center) * relative, chebyshev(count)
             expected = weight @ np.polynomial.chebyshev.chebvander((log_tau - center) / half_width, count - 1)
@@ -304,17 +315,22 @@ class Samples(NamedTuple):
     rate: np.ndarray  # dV/dt
     mask: np.ndarray  # of the whitening filter
     slope: np.ndarray | None = None  # dV/dt over two samples, or what replaces it; None: computed from the drive
+    student: np.ndarray | None = None  # as in `compress`
 
 
 def chunks(samples: Samples, length: int) -> Iterator[Samples]:
     """Yield chunks of `length` samples; the last is padded with weight 0."""
+
+    def part(values: np.ndarray | None, first: int) -> Any:
+        if values is None:
+            return None
+        inside = np.asarray(values[..., first : first + length])
+        return np.pad(inside, [(0, 0)] * (inside.ndim - 1) + [(0, length - inside.shape[-1])])
+
     for first in range(0, samples.time.size, length):
-        time, *others, slope = (None if x is None else np.asarray(x[first : first + length]) for x in samples)
-        assert time is not None
-        missing = (0, length - time.size)
-        observed, weight, rate, mask = (np.pad(x, missing) for x in others if x is not None)
-        slope = None if slope is None else np.pad(slope, missing)
-        yield Samples(np.pad(time, missing, mode="edge"), observed, weight, rate, mask, slope)
+        time = np.asarray(samples.time[first : first + length])
+        others = (part(values, first) for values in samples[1:])
+        yield Samples(np.pad(time, (0, length - time.size), mode="edge"), *others)
 
 
 def chunk_length(samples: int, longest: int = 8_192) -> int:
@@ -391,8 +407,13 @@ def _inner_products(
 def whitened_products(
     rows: Float[Array, "functions n"], chunk: Samples, filtering: WhiteningState | None
 ) -> tuple[Float[Array, "functions functions"], WhiteningState | None]:
-    """Return the inner products of functions over the samples of a chunk, whitened if there is a filter."""
+    """Return the inner products of functions over the samples of a chunk, whitened if there is a filter.
+
+    For Student-t noise they are weighted, and two columns follow: the products with the functions to be projected.
+    """
     rows = rows * chunk.weight
+    if chunk.student is not None:
+        return jnp.hstack([(rows * chunk.student[0]) @ rows.T, rows @ chunk.student[1:].T]), filtering
     if filtering is not None:
         around = jnp.concatenate([filtering.last, rows], axis=1)
         rows = Whitening(filtering.taps, chunk.mask).filter(around)
@@ -524,20 +545,49 @@ def _uniform_recurrence(
 
 def _assemble(table: _TableNodes, total: np.ndarray, decays: bool, ages: int, samples: int) -> Compression:
     """Return coordinates that have the accumulated inner products."""
-    rows, size, (rank, terms) = factor_products(total), len(total), table.series.shape
+    rows, projected = factor_products(total)
+    size, (rank, terms) = len(rows), table.series.shape
     signal = rows[:, :rank] @ table.series
     decay = rows[:, rank : 2 * rank] @ table.series if decays else np.zeros((size, terms))
-    steps = rows[:, 2 * rank : 2 * rank + ages].T
+    first = (1 + decays) * rank
+    steps = rows[:, first : first + ages].T
     baseline, rate, slope, remainder = _baseline_and_record(rows)
     following = 0.0 if table.expected_rate is None else table.expected_rate * rate
-    observed = remainder + signal @ table.expected_series + following
-    arrays = table.center, table.half_width, signal[:rank], decay, baseline, rate, slope, observed, float(samples)
-    return Compression(*map(np.asarray, (*arrays, steps, 0.0, table.step)))
+    observed, observed_slope = remainder + signal @ table.expected_series + following, np.zeros(size)
+    if projected.size:
+        observed, observed_slope = projected.T
+    arrays = table.center, table.half_width, signal[:rank], decay, baseline, rate, slope, observed, observed_slope
+    return Compression(*map(np.asarray, (*arrays, float(samples), steps, 0.0, table.step)))
 
 
-def factor_products(total: Float[np.ndarray, "functions functions"]) -> Float[np.ndarray, "rows functions"]:
-    """Return coordinates (columns) of functions that have these inner products."""
-    scale = np.sqrt(np.diagonal(total))
+def factor_products(
+    total: Float[np.ndarray, "functions functions+projected"],
+) -> tuple[Float[np.ndarray, "rows functions"], Float[np.ndarray, "rows projected"]]:
+    """Return coordinates (columns) of functions that have these inner products, and of others in their span.
+
+    With others, the last function (the record) is left out. The one before (the slope) comes last, since few samples
+    determine it, whose weights may be negative. A coordinate that is 0 for all is added for the rest of the record.
+    """
+    total, products = np.split(total, [len(total)], axis=1)
+    if not products.size:
+        return _factor(total, products)
+    first = slice(-2)
+    rows, projected = _factor(total[first, first], np.hstack([products[first], total[first, -2:-1]]))
+    projected, slope = projected[:, :-1], projected[:, -1]
+    beyond = math.sqrt(max(total[-2, -2] - slope @ slope, 0.0))
+    last = (products[-2] - slope @ projected) / (beyond or np.inf)
+    columns = np.column_stack([rows, slope, np.zeros(len(rows))])
+    return np.vstack([columns, [*np.zeros(len(rows)), beyond, 0.0], np.zeros(len(total))]), np.vstack(
+        [projected, last, np.zeros(2)]
+    )
+
+
+def _factor(total: np.ndarray, products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    scale = np.sqrt(np.abs(np.diagonal(total)))
     scale[scale == 0.0] = 1.0
     values, vectors = np.linalg.eigh(total / np.outer(scale, scale))
-    return np.asarray(np.linalg.qr(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * scale).R)
+    roots = np.sqrt(np.maximum(values, 0.0))
+    rotation, rows = np.linalg.qr(roots[:, None] * vectors.T * scale)
+    kept = values > 1e-11 * values[-1]  # what the others may not be projected on lies within rounding
+    inverse = np.where(kept, 1.0 / np.where(kept, roots, 1.0), 0.0)
+    return rows, rotation.T @ (inverse[:, None] * (vectors.T @ (products / scale[:, None])))

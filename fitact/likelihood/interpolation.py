@@ -81,7 +81,10 @@ def interpolate(
     and points are chosen among `tried` samples. Returns None if more than `max_functions` are needed, or more than
     `max_kept` samples may pass a corner of the drive. Double precision is required.
     """
-    samples, taps = _samples(channel), None if channel.whitening is None else np.asarray(channel.whitening.taps)
+    samples, taps = (
+        _samples(channel),
+        None if channel.whitening is None else np.asarray(channel.whitening.taps),
+    )
     size, rms = samples.time.size, precision / math.sqrt(samples.time.size)
     timing = np.stack([np.broadcast_to(each, inputs.gain.shape) for each in (inputs.delay, inputs.clock)])
     lowest, highest = timing.min(axis=1), timing.max(axis=1)
@@ -105,7 +108,7 @@ def interpolate(
     training = jax.tree.map(lambda leaf: leaf[np.append(chosen, 0)], inputs)
     parts = _accumulate(channel, training, np.linalg.inv(triangle), samples._replace(**without_kept), taps)
     parts = track_progress(parts, "compressing the record", math.ceil(size / chunk_length(size)))
-    rows = factor_products(sum(parts, np.zeros(())))
+    rows, _ = factor_products(sum(parts, np.zeros(())))
     functions, baseline, last = np.split(rows.T, np.cumsum([len(chosen), len(BASELINE_NAMES)]))
     needed, filtering = _kept_rows(kept, taps, samples)
     middle, half = 0.5 * (samples.time[0] + samples.time[-1]), 0.5 * (samples.time[-1] - samples.time[0])

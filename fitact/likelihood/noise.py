@@ -1,16 +1,19 @@
 """Noise models other than white Gaussian noise: Student-t noise, and coloured noise with a whitening filter."""
 
 import math
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy.optimize
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from fitact.data.clipping import longest_run
 from fitact.data.record import Record, is_uniform
 from fitact.errors import InputError
+from fitact.model.response_table import chebyshev, chebyshev_polynomials
 
 NoiseModel: TypeAlias = Literal["white", "student", "ar1", "spectrum"]
 
@@ -25,19 +28,77 @@ def student_residual(z: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     return z * jnp.sqrt((STUDENT_DOF + 1.0) / STUDENT_DOF * ratio)
 
 
-def student_weight(z: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+def student_weight(z: Any) -> Any:
     """Return the weight of a squared residual in reweighted least squares; its mean is 1."""
-    return (STUDENT_DOF + 1.0) / (STUDENT_DOF + jnp.square(z))
+    return (STUDENT_DOF + 1.0) / (STUDENT_DOF + z * z)
 
 
-def student_curvature(z: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+def student_curvature(z: Any) -> Any:
     """Return the second derivative of the negative log-density."""
-    return (STUDENT_DOF + 1.0) * (STUDENT_DOF - jnp.square(z)) / jnp.square(STUDENT_DOF + jnp.square(z))
+    return (STUDENT_DOF + 1.0) * (STUDENT_DOF - z * z) / (STUDENT_DOF + z * z) ** 2
 
 
 def scale_information(model: NoiseModel) -> float:
     """Return the Fisher information of one sample on log sigma."""
     return 2.0 * STUDENT_DOF / (STUDENT_DOF + 3.0) if model == "student" else 2.0
+
+
+class StudentExpansion(eqx.Module):
+    """Likelihood under Student-t noise near an optimum: that of weighted samples under normal noise, and its scale.
+
+    The log-likelihood is expanded to second order in the signal. How its value and its curvature depend on the scale
+    sigma are series in log sigma.
+    """
+
+    sigma: Float[Array, ""]  # scale at the optimum, V or A
+    half_width: Float[Array, ""]  # range of the series, in log sigma
+    misfit: Float[Array, " terms"]  # sum over the samples of -log(density) - log sigma
+    curvature: Float[Array, " terms"]  # relative to that at the optimum
+    # |o|^2, 2 o.d and |d|^2 of the remainder o at the optimum and its slope d in log sigma, in coordinates
+    squares: Float[Array, "3"]
+
+    @classmethod
+    def from_residuals(cls, z: Float[np.ndarray, " samples"], sigma: float, terms: int = 9) -> "StudentExpansion":
+        """Expand around the residuals over `sigma` of the valid samples; `squares` are 0."""
+        x, to_series = chebyshev(terms)
+        half_width = min(1.0, 12.0 / math.sqrt(scale_information("student") * z.size))
+        scaled = [np.square(z * math.exp(-half_width * each)) for each in x]
+        misfit = [0.5 * (STUDENT_DOF + 1.0) * np.sum(np.log1p(each / STUDENT_DOF)) for each in scaled]
+        factors = np.exp(-2.0 * half_width * x) / np.mean(student_curvature(z))
+        curvature = [np.mean(student_curvature(np.sqrt(each))) for each in scaled] * factors
+        arrays = sigma, half_width, to_series @ misfit, to_series @ curvature, np.zeros(3)
+        return cls(*map(np.asarray, arrays))
+
+    def normal_sigma(self, sigma: ArrayLike) -> tuple[Array, Array]:
+        """Return the sd of normal noise that gives the curvature, and log sigma relative to that at the optimum."""
+        log = jnp.log(sigma / self.sigma)
+        precision = jnp.maximum(self.curvature @ self._polynomials(log), 1e-3)
+        return self.sigma / jnp.sqrt(precision), log
+
+    def add_misfit(self, remainder: Float[Array, " rows"], sigma: ArrayLike, largest: float = 50.0) -> Array:
+        """Return -log-likelihood up to a constant; NaN beyond the series, or if it exceeds the optimum by `largest`."""
+        normal, log = self.normal_sigma(sigma)
+        squares = self.squares @ jnp.stack([jnp.ones_like(log), log, log * log])
+        excess = 0.5 * (remainder @ remainder - squares) / jnp.square(normal)
+        holds = (jnp.abs(log) <= self.half_width) & (excess <= largest)
+        return jnp.where(holds, self.misfit @ self._polynomials(log) + excess, jnp.nan)
+
+    def _polynomials(self, log: Array) -> Float[Array, " terms"]:
+        return chebyshev_polynomials(log / self.half_width, self.misfit.size)
+
+
+def fit_student_scale(residuals: Float[np.ndarray, " samples"], counted: float) -> float:
+    """Return the scale of Student's t with which residuals agree, if they count as `counted` samples."""
+    size = max(math.sqrt(float(np.mean(np.square(residuals)))), 1e-300)
+
+    def excess(log: float) -> float:
+        z = residuals * math.exp(-log) / size
+        return float(np.sum(np.asarray(student_weight(z)) * z * z)) / counted - 1.0
+
+    low = -1.0
+    while excess(low) < 0.0 and low > -60.0:
+        low *= 2.0
+    return size * math.exp(scipy.optimize.brentq(excess, low, 1.0, xtol=1e-6))
 
 
 class Whitening(eqx.Module):

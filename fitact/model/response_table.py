@@ -23,7 +23,8 @@ from fitact.model.response import highpass
 NODES = 41  # odd, so that the middle of the table is a node
 TABLE_HALF_WIDTH = math.log(9.0)  # half-width in log tau that `NODES` cover to rounding
 _MARGIN = 0.05  # least half-width of a `ResponseTable`, in log tau
-_FEW_NODES, _NARROW = 11, 0.2  # nodes of a narrow table, and its largest half-width
+NARROW = 0.2  # half-width in log tau of a narrow table
+_FEW_NODES = 11  # nodes of a narrow table
 _MAX_HALF_WIDTH = 4.0 * TABLE_HALF_WIDTH  # beyond it, a table costs more than it saves
 _MAX_NUMBERS = 4_000_000  # responses of all nodes at all times, which bounds the memory
 _PRECISION = 1e-13  # of a `ResponseTable`, relative to the largest response
@@ -55,7 +56,7 @@ class ResponseTable(eqx.Module):
         """
         low, high = np.log(tau_range)
         center, half_width = 0.5 * (low + high), 0.5 * (high - low) + _MARGIN
-        if not half_width < _MAX_HALF_WIDTH or (count := _node_count(half_width)) * time.size > _MAX_NUMBERS:
+        if not half_width < _MAX_HALF_WIDTH or (count := node_count(half_width)) * time.size > _MAX_NUMBERS:
             return None
         relative, combinations, series = exponential_basis(half_width, count)
         nodes = np.append(math.exp(center) * relative, 10.0 * _OPEN * math.exp(high))
@@ -85,9 +86,9 @@ class ResponseTable(eqx.Module):
         return (jnp.log(tau) - self.center) / self.half_width
 
 
-def _node_count(half_width: float) -> int:
+def node_count(half_width: float) -> int:
     """Return how many nodes reach rounding: e^{-t/tau} is analytic in log tau within a strip of half-width pi / 2."""
-    return _FEW_NODES if half_width <= _NARROW else NODES * math.ceil(half_width / TABLE_HALF_WIDTH)
+    return _FEW_NODES if half_width <= NARROW else NODES * math.ceil(half_width / TABLE_HALF_WIDTH)
 
 
 @functools.lru_cache(maxsize=64)

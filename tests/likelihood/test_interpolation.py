@@ -4,10 +4,12 @@ import jax
 import numpy as np
 import pytest
 import scipy.signal
+import scipy.stats
 
 import fitact
 from fitact.likelihood import certificate
 from fitact.likelihood.interpolation import Interpolation
+from fitact.likelihood.noise import fit_student_scale
 
 STEP, SAMPLES, NOISE = 5e-6, 12_000, 0.06
 RSC, CSC, CI = 160e3, 22e-9, 1.35e-9
@@ -39,11 +41,13 @@ def record(vsc: np.ndarray, measured: bool = True, noise: np.ndarray | None = No
 
 
 def scene(stated: bool, **sections: dict) -> fitact.Scene:
-    drive = DRIVE if stated else {"waveform": "measured", "steady_state": False}
+    drive = DRIVE if stated else {"waveform": "measured"}
     return fitact.Scene.from_dict({"device": {"Ci": "1.35 nF"}, "drive": drive} | sections)
 
 
-def assert_equals_full_sum(given: fitact.Record, stated: fitact.Scene, names: set[str]) -> fitact.Fit:
+def assert_equals_full_sum(
+    given: fitact.Record, stated: fitact.Scene, names: set[str], error: float = 2e-3
+) -> fitact.Fit:
     """Check that the optimum, the errors and the log-probabilities up to 4 standard deviations are the full sum's."""
     ours, full = (fitact.fit(given, stated, tolerance=tolerance) for tolerance in (1e-3, 0.0))
     assert ours.full_because == ""
@@ -60,7 +64,7 @@ def assert_equals_full_sum(given: fitact.Record, stated: fitact.Scene, names: se
             certificate.batched_log_prob(model, 8)(points)
             for model in (ours.likelihood, ours.likelihood.without_compression())
         )
-    np.testing.assert_allclose(a - a[0], b - b[0], atol=2e-3)
+    np.testing.assert_allclose(a - a[0], b - b[0], atol=error)
     assert np.ptp(b) > 10.0
     return ours
 
@@ -114,3 +118,41 @@ def test_an_ideal_edge_between_two_samples():
     assert np.max(delay) < 3.0 + 1e-6
     for name, truth in (("g", CI / (2.0 * CI + CSC)), ("b", RSC * (2.0 * CI + CSC))):
         assert abs(np.mean(posterior.derived()[name]) - truth) < 4.0 * np.std(posterior.derived()[name])
+
+
+@pytest.mark.parametrize(
+    ("stated", "largest"),
+    [
+        (False, 10.0),
+        pytest.param(True, 10.0, marks=pytest.mark.slow),
+        pytest.param(False, 100.0, marks=pytest.mark.slow),
+    ],
+)
+def test_student_noise_with_outliers(stated: bool, largest: float):
+    """Test one sample in twenty with an outlier on one side."""
+    rng = np.random.default_rng(4)
+    outliers = np.where(rng.uniform(size=SAMPLES) < 0.05, rng.uniform(5.0, largest, SAMPLES), 0.0)
+    given = record(late_voltage(0.0, 0.0), noise=rng.standard_normal(SAMPLES) + outliers)
+    fit = assert_equals_full_sum(given, scene(stated, measurement={"noise_model": "student"}), set(), error=0.01)
+    assert fit.likelihood.channels[0].expansion is not None
+    for name, truth in (("g", CI / (2.0 * CI + CSC)), ("b", RSC * (2.0 * CI + CSC))):
+        assert abs(fit.derived()[name]["q50"] - truth) < 5.0 * fit.derived()[name]["sd"]
+
+
+@pytest.mark.slow
+def test_student_noise_with_a_delay_is_summed():
+    """Test a skew so small that edges are not outliers; the fit says that all samples are summed."""
+    rng = np.random.default_rng(4)
+    noise = rng.standard_normal(SAMPLES) * np.where(rng.uniform(size=SAMPLES) < 0.05, 10.0, 1.0)
+    given = record(late_voltage(0.05, 0.0), noise=noise)
+    fit = fitact.fit(given, scene(False, measurement={"noise_model": "student"}))
+    assert "delay" in fit.names
+    assert "a delay or a clock error" in fit.full_because
+    assert fit.trusted
+
+
+def test_student_scale_is_that_of_scipy():
+    values = 0.3 * np.random.default_rng(5).standard_t(4.0, 5000)
+    assert fit_student_scale(values, values.size) == pytest.approx(
+        scipy.stats.t.fit(values, fix_df=4, floc=0.0)[2], rel=1e-3
+    )
