@@ -270,7 +270,7 @@ def _solve_problem(
     (likelihood, reasons), theta_0 = problem.compress_likelihood(tolerance), choose_start(problem, start)
     noise = np.array([source.noise for source in problem.sources])
     freeable = tuple(source.optional_nuisances for source in problem.sources)
-    interpolated = [not certificate.may_compress(each, tolerance) for each in likelihood.channels]
+    interpolated = [not certificate.reason_against_compression(each, tolerance) for each in likelihood.channels]
     while True:
         solved = solve(likelihood, theta_0, noise, freeable, tuple(interpolated))
         root = covariance_factor(np.concatenate(solved.jacobian), solved.likelihood.prior_factor)

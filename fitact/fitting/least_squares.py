@@ -15,7 +15,7 @@ from fitact.compiled import jit
 from fitact.experiment.fisher import covariance_factor
 from fitact.fitting.minimum import minimise, result_name
 from fitact.fitting.timing import clock_r_squared, free_timing, orthonormal_basis
-from fitact.likelihood.certificate import expand_student, interpolate_channel, recompress
+from fitact.likelihood.certificate import can_interpolate, expand_student, interpolate_channel, recompress
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import fit_ar1, student_curvature, student_weight
@@ -213,7 +213,7 @@ def _interpolate(
     The optimum is that of `few` samples of these channels, as if their noise were white.
     """
     pairs = enumerate(zip(likelihood.channels, interpolated, strict=True))
-    chosen = [i for i, (each, may) in pairs if may and each.compression is None and each.noise != "student"]
+    chosen = [i for i, (channel, may) in pairs if may and can_interpolate(channel)]
     if not chosen:
         return likelihood, start, noise
     thin = likelihood

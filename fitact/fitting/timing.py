@@ -15,7 +15,6 @@ from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLi
 from fitact.likelihood.compression import MAX_DELAY
 from fitact.likelihood.likelihood import CircuitValues
 from fitact.likelihood.noise import student_weight
-from fitact.model.drive import Sampled
 from fitact.model.response import highpass
 from fitact.model.skin import constant_skin_circuit
 
@@ -42,7 +41,7 @@ def free_timing(
     units = np.array([float(channel.timing_unit(n)) for n in names])
     timing = tuple(n for n in TIMING_NUISANCES if n in names or n in channel.timing)
     channel = dataclasses.replace(channel, timing=timing)
-    if isinstance(channel.drive, Sampled) and not channel.steady_state:  # V is not known beyond the record
+    if channel.follows_samples:  # V is not known beyond the record
         index = np.arange(channel.time.size)
         channel = channel.exclude_samples((index < MAX_DELAY) | (index >= channel.n_samples - MAX_DELAY))
     channel = recompress(channel, circuit)

@@ -24,7 +24,6 @@ from fitact.likelihood.interpolation import interpolate
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import StudentExpansion, fit_student_scale, student_curvature, student_weight
 from fitact.model.circuit import HighpassTerms
-from fitact.model.drive import Sampled
 from fitact.model.skin import WithSkin
 
 TOLERANCE = 1e-3  # error of the log-likelihood
@@ -52,7 +51,7 @@ def compress_channel(
     it needs an expansion (`expand_student`); `student` is as in `compress`.
     """
     circuit, channel = start.circuit, channel.without_compression()
-    reason = _uncompressed_reason(channel, start, tolerance)
+    reason = _reason_against_table(channel, start, tolerance)
     if reason:
         return channel, reason
     samples = slice(channel.n_samples)
@@ -85,7 +84,7 @@ def recompress(channel: ChannelLikelihood, circuit: CircuitValues) -> ChannelLik
     return channel if channel.compression is None else compress_channel(channel, circuit, TOLERANCE)[0]
 
 
-def may_compress(channel: ChannelLikelihood, tolerance: float, min_samples: int = 512) -> str:
+def reason_against_compression(channel: ChannelLikelihood, tolerance: float, min_samples: int = 512) -> str:
     """Return why a channel may not be compressed at all, or ""."""
     if tolerance == 0.0:
         return "the full sum was requested"
@@ -94,15 +93,17 @@ def may_compress(channel: ChannelLikelihood, tolerance: float, min_samples: int 
     return ""
 
 
-def _uncompressed_reason(
+def _reason_against_table(
     channel: ChannelLikelihood, start: CircuitValues, tolerance: float, max_multiple: int = 4
 ) -> str:
     """Return why there is no table of responses for a channel, or ""."""
-    if reason := may_compress(channel, tolerance):
+    if reason := reason_against_compression(channel, tolerance):
         return reason
     if isinstance(start.circuit, WithSkin):
         if channel.timing:
             return _TIMING_REASON
+        if channel.channel == "I" and not channel.follows_samples:  # inner products would lose digits of large weights
+            return "the current of a fractional skin is not tabulated"
         return "a dispersive skin has no time constants" if start.circuit.grid is None else ""
     if channel.timing and (channel.noise == "student" or not can_delay(channel, start.tau)):
         return _TIMING_REASON
@@ -179,8 +180,6 @@ def interpolate_channel(
     It extends `reach` standard deviations in all directions that the record determines, less in others.
     """
     channel = likelihood.channels[index]
-    if isinstance(channel.drive, Sampled) and not channel.steady_state:
-        return channel  # a signal at few samples would cost as much as at all
     directions, sd, _ = np.linalg.svd(covariance_factor)
     widths = np.minimum(reach * sd, 6.0 * sd + 1.0)
     deviates = np.random.default_rng(0).standard_normal((_TRAINING, theta.size))  # any reproducible points serve
@@ -197,11 +196,15 @@ def _inputs(likelihood: Likelihood, points: Array) -> tuple[ChannelInputs, ...]:
     return jax.vmap(lambda theta: tuple(inputs for _, inputs in likelihood.channels_and_inputs(theta)))(points)
 
 
+def can_interpolate(channel: ChannelLikelihood) -> bool:
+    """Return whether a channel without a table may be interpolated, i.e. few samples of a signal cost less than all."""
+    return channel.compression is None and channel.noise != "student" and not channel.follows_samples
+
+
 def can_delay(channel: ChannelLikelihood, tau: Float[np.ndarray, " terms"]) -> bool:
     """Return whether a compression represents a delay: of a measured drive on a uniform grid, if no tau is short."""
     time, steps = np.asarray(channel.time)[: channel.n_samples], np.min(tau) / float(channel.time_step)
-    measured = isinstance(channel.drive, Sampled) and not channel.steady_state
-    return measured and channel.timing == ("delay",) and steps > 2.0 and is_exactly_uniform(time)
+    return channel.follows_samples and channel.timing == ("delay",) and steps > 2.0 and is_exactly_uniform(time)
 
 
 def certify(

@@ -92,6 +92,11 @@ class ChannelLikelihood(eqx.Module):
         return dataclasses.replace(self, compression=None, expansion=None)
 
     @property
+    def follows_samples(self) -> bool:
+        """Whether the response follows a measured drive from sample to sample."""
+        return isinstance(self.drive, Sampled) and not self.steady_state
+
+    @property
     def is_student(self) -> bool:
         """Whether residuals have a Student-t distribution, and not its expansion."""
         return self.noise == "student" and self.expansion is None

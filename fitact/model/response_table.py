@@ -107,13 +107,17 @@ def exponential_basis(
 
 
 def significant_combinations(
-    tau: Float[np.ndarray, " nodes"], tolerance: float
+    tau: Float[np.ndarray, " nodes"], tolerance: float, scale: ArrayLike = 1.0
 ) -> tuple[Float[np.ndarray, "nodes rank"], Float[np.ndarray, "rank nodes"]]:
-    """Return combinations of e^{-t/tau} at any age t that give all of them, to a relative `tolerance`; and how."""
+    """Return combinations of e^{-t/tau} at any age t that give all of them, to a relative `tolerance`; and how.
+
+    The tolerance is relative to the largest of them times its `scale`.
+    """
     ages = np.concatenate([[0.0], np.geomspace(1e-3 * tau.min(), 40.0 * tau.max(), 400)])
-    _, sizes, modes = np.linalg.svd(np.exp(-ages[:, None] / tau), full_matrices=False)
+    scale = np.broadcast_to(scale, tau.shape)
+    _, sizes, modes = np.linalg.svd(np.exp(-ages[:, None] / tau) * scale, full_matrices=False)
     rank = round_up_column_count(np.count_nonzero(sizes > tolerance * sizes[0]), tau.size)
-    return modes[:rank].T / sizes[:rank], sizes[:rank, None] * modes[:rank]
+    return scale[:, None] * modes[:rank].T / sizes[:rank], sizes[:rank, None] * modes[:rank] / scale
 
 
 def highpass_responses(

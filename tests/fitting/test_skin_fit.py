@@ -143,7 +143,7 @@ def test_a_fractional_skin_is_found_with_its_exponent(trapezoid: fitact.Fit):
 
 @pytest.mark.slow
 def test_its_compressed_likelihood_is_the_sum_over_the_samples(trapezoid: fitact.Fit):
-    assert trapezoid.compression_error < 1e-8
+    assert trapezoid.compression_error < 1e-5  # inner products hold half the digits of a sum
     assert trapezoid.model()["likelihood"] == "compressed"
 
 
@@ -229,7 +229,7 @@ def test_recovery_of_the_papers_dispersion(waveform: str, seen: tuple[str, ...])
     fit = fitact.fit(record(waveform, paper), scene(waveform, "dispersive", seen=seen))
     assert_recovers(fit, **TRUTH)
     assert fit.model()["skin"] == "dispersive"
-    assert "no time constants" in fit.full_because
+    assert fit.full_because == ""
     if waveform == "trapezoid":
         values = dict(zip(fit.names, np.exp(fit.theta), strict=True))
         ratio_R, ratio_C = values["Rsc"] / R, values["Csc"] / C
