@@ -5,6 +5,9 @@ the noise that fitact estimated; only fitact also computes diagnostics. lmfit ru
 with all constants precomputed (`vs_lmfit_good`, as for scipy). `untested_vs` are the same ratios without residual tests
 (`whiteness=False`), and `optimum_vs` the ratios for the optimum alone, one batch after the other.
 
+`recorded_vs_lmfit` is the ratio for records with drives of their own, whose Vsc is 2.3 samples late and has an unknown
+charge and offset. lmfit filters the interpolated drive by `scipy.signal.lfilter`, from the nominal parameters.
+
     python benchmarks/batch.py [--json] [--records 10000] [--samples 5000]
 """
 
@@ -18,25 +21,24 @@ import jax
 import lmfit
 import numpy as np
 import scipy.optimize
+import scipy.signal
 from threadpoolctl import threadpool_limits
 from timing import show
 
 import fitact
-from fitact.batch.gauss_newton import BatchProblem
+from fitact.batch.stated_drive import StatedDriveProblem
 from fitact.fitting.problem import build_problem
 
 V0, FREQUENCY, NOISE = 180.0, 100.0, 0.1  # V, Hz, V
 NAMES = ("Rsc", "Csc", "Ci")
-SCENE = fitact.Scene.from_dict(
-    {
-        "drive": {"waveform": "square", "peak_to_peak": 2.0 * V0, "frequency": FREQUENCY},
-        "prior": {
-            "Rsc": {"median": 160e3, "relative_sd": 0.3},
-            "Csc": {"median": 22e-9, "relative_sd": 0.3},
-            "Ci": {"median": 1.35e-9, "relative_sd": 0.05},
-        },
-    }
-)
+PRIOR = {
+    "Rsc": {"median": 160e3, "relative_sd": 0.3},
+    "Csc": {"median": 22e-9, "relative_sd": 0.3},
+    "Ci": {"median": 1.35e-9, "relative_sd": 0.05},
+}
+DRIVE = {"waveform": "square", "peak_to_peak": 2.0 * V0, "frequency": FREQUENCY}
+SCENE = fitact.Scene.from_dict({"drive": DRIVE, "prior": PRIOR})
+RECORDED_SCENE = fitact.Scene.from_dict({"drive": {"waveform": "measured"}, "prior": PRIOR})
 MEANS, SDS = np.log([160e3, 22e-9, 1.35e-9]), np.sqrt(np.log1p(np.square([0.3, 0.3, 0.05])))
 PEERS = 60  # records per round that the other packages fit
 ROUNDS = 5
@@ -104,11 +106,77 @@ def fit_scipy(model: Model, observed: np.ndarray, sigma: float) -> np.ndarray:
     return scipy.optimize.least_squares(residuals, MEANS, method="lm", jac="3-point", **tight).x
 
 
+def simulate_recorded(count: int, samples: int, delay: float = 2.3, offset: float = 0.2) -> list[fitact.Record]:
+    """Simulate the same fingers with recorded drives; `delay` of Vsc in samples, `offset` (V) and charges differ."""
+    time = np.arange(samples) * (2.0 / FREQUENCY / samples)
+    drive, random = fitact.Trapezoid(2.0 * V0, FREQUENCY, 20e-6), np.random.default_rng(2)
+    voltage = np.asarray(drive.value(time))
+    recorded = fitact.Sampled(time, voltage)
+    respond = jax.jit(lambda circuit, time: fitact.response(circuit, recorded, time, steady_state=False))
+    records = []
+    for number, truth in enumerate(MEANS + random.standard_normal((count, 3)) * [0.3, 0.3, 0.0]):
+        circuit = fitact.FinalCircuit(*np.exp(truth))
+        charge = random.standard_normal() * np.exp(-time / float(circuit.b)) + offset * random.standard_normal()
+        vsc = np.asarray(respond(circuit, time - delay * time[1])) + charge + NOISE * random.standard_normal(samples)
+        v = voltage + NOISE * random.standard_normal(samples)
+        records.append(fitact.Record.from_arrays(time, V=v, Vsc=vsc, source=f"{number}"))
+    return records
+
+
+def fit_recorded_lmfit(record: fitact.Record, sigma: float) -> np.ndarray:
+    """Fit the circuit, the delay, the charge and the offset with lmfit's default settings."""
+    time, voltage, observed = record.time, record["V"], record["Vsc"]
+    parameters = lmfit.Parameters()
+    for name, mean in zip(NAMES, MEANS, strict=True):
+        parameters.add(name, value=mean)
+    for name, value in {"delay": 0.5, "charge": 0.0, "offset": 0.0}.items():
+        parameters.add(name, value=value)
+
+    def residuals(p: lmfit.Parameters) -> np.ndarray:
+        theta = np.array([p[name].value for name in NAMES])
+        R, C, Ci = np.exp(theta)
+        g, b = Ci / (2.0 * Ci + C), R * (2.0 * Ci + C)
+        x = time[1] / b
+        rise = np.diff(np.interp(time - p["delay"].value * time[1], time, voltage), prepend=voltage[0])
+        response = scipy.signal.lfilter([-np.expm1(-x) / x], [1.0, -np.exp(-x)], rise)
+        model = g * response + p["charge"].value * np.exp(-time / b) + p["offset"].value
+        return np.append((observed - model) / sigma, (theta - MEANS) / SDS)
+
+    found = lmfit.minimize(residuals, parameters, scale_covar=False)
+    return np.array([found.params[name].value for name in NAMES])
+
+
+def measure_recorded(count: int, samples: int) -> dict[str, float]:
+    """Return the ratio of fits per second for recorded drives, and the largest difference of g from lmfit's."""
+    records = simulate_recorded(count, samples)
+    fitact.fit_many(records[:300], RECORDED_SCENE, progress=False)  # compiles
+    taken: dict[str, list[float]] = {"fitact": [], "lmfit": []}
+    differences = []
+    for turn in range(ROUNDS):
+        start = time.perf_counter()
+        fits = fitact.fit_many(records, RECORDED_SCENE, progress=False)
+        taken["fitact"].append((time.perf_counter() - start) / count)
+        some = [(turn * PEERS + i) % count for i in range(PEERS)]
+        start = time.perf_counter()
+        found = [fit_recorded_lmfit(records[i], fits[i]["noise"]) for i in some]
+        taken["lmfit"].append((time.perf_counter() - start) / PEERS)
+        for i, theta in zip(some, found, strict=True):
+            _, C, Ci = np.exp(theta)
+            differences.append(abs(np.log(Ci / (2.0 * Ci + C) / fits[i]["g"])) / fits[i]["g_log_sd"])
+    ours, theirs = (statistics.median(values) for values in taken.values())
+    return {
+        "recorded_vs_lmfit": theirs / ours,
+        "recorded_fits_per_second": 1.0 / ours,
+        "recorded_apart_sd": float(np.median(differences)),
+        "recorded_unreliable": float(np.mean([not row["trusted"] for row in fits])),
+    }
+
+
 def optimum_seconds(records: list[fitact.Record]) -> float:
     """Return the seconds per record for the optimum alone, with known noise."""
     batches = [np.stack([record["Vsc"] for record in records[i : i + 256]]) for i in range(0, len(records) - 255, 256)]
     with jax.enable_x64(True), threadpool_limits(1):
-        together = BatchProblem.from_problem(build_problem([records[0]], [SCENE]))
+        together = StatedDriveProblem.from_problem(build_problem([records[0]], [SCENE]))
         noise, least = np.full(256, NOISE), np.zeros(256)
         jax.block_until_ready(together.find_optima(together.basis.project(batches[0]), noise, least)[0])
         start = time.perf_counter()
@@ -160,4 +228,4 @@ if __name__ == "__main__":
     parser.add_argument("--records", type=int, default=10_000, help="256 or more")
     parser.add_argument("--samples", type=int, default=5_000)
     asked = parser.parse_args()
-    show(measure(asked.records, asked.samples), asked.json)
+    show(measure(asked.records, asked.samples) | measure_recorded(asked.records // 4, asked.samples), asked.json)

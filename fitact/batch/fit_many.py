@@ -16,7 +16,9 @@ import jax
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from fitact.batch.gauss_newton import BatchFit, BatchProblem
+from fitact.batch.batch_problem import BatchFit, BatchProblem
+from fitact.batch.recorded_drive import RecordedDriveProblem
+from fitact.batch.stated_drive import StatedDriveProblem
 from fitact.data.readers.read import read
 from fitact.data.record import Record
 from fitact.errors import InputError
@@ -26,6 +28,7 @@ from fitact.fitting.fit import Fit, fit
 from fitact.fitting.identifiability import information_directions, prior_variance_fraction, verdicts
 from fitact.fitting.laplace import SUCCESS_MESSAGE
 from fitact.fitting.problem import build_problem
+from fitact.model.skin import circuit_parameters
 from fitact.progress import track_progress
 from fitact.scene.scene import Scene
 
@@ -250,7 +253,6 @@ class RecordGroup:
     tries: int = 4
     members: list[Member] = dataclasses.field(default_factory=list)
     batch_problem: BatchProblem | None = None
-    voltage: np.ndarray | None = None
 
     def is_batchable(self, scene: Scene | None) -> bool:
         """Return whether the records can be fitted in batches, as determined from some of them."""
@@ -261,8 +263,7 @@ class RecordGroup:
                 break
             self.tries -= 1
             try:
-                problem = build_problem([record], [scene])
-                self.batch_problem, self.voltage = BatchProblem.from_problem(problem), problem.sources[0].choice.voltage
+                self.batch_problem = _make_batch_problem(record, scene)
             except (InputError, np.linalg.LinAlgError):
                 continue
         return self.batch_problem is not None
@@ -287,22 +288,20 @@ def _group_records(records: Iterable[Member], scene: Scene | None) -> Iterator[B
 
 def _split_group(group: RecordGroup, scene: Scene | None) -> Iterator[Batch]:
     if group.is_batchable(scene):
-        assert group.voltage is not None
-        alike = [_has_same_drive(record, group.voltage) for _, record in group.members]
+        assert group.batch_problem is not None
+        alike = [group.batch_problem.includes(record) for _, record in group.members]
         yield group.batch_problem, list(itertools.compress(group.members, alike))
         group.members = [member for member, same in zip(group.members, alike, strict=True) if not same]
     yield None, group.members
     group.members = []
 
 
-def _has_same_drive(record: Record, voltage: np.ndarray, tolerance: float = 0.01) -> bool:
-    """Return whether the record has no V, or a V equal to the scene's within a relative rms of `tolerance`."""
-    if "Vsc" not in record:
-        return False
-    if "V" not in record:
-        return True
-    difference = record["V"] - voltage
-    return bool(difference @ difference <= tolerance**2 * (voltage @ voltage))
+def _make_batch_problem(record: Record, scene: Scene | None) -> BatchProblem | None:
+    """Return the problem for records like this one, or None if they cannot be fitted in batches."""
+    problem = build_problem([record], [scene])
+    if problem.sources[0].choice.name != "measured":
+        return StatedDriveProblem.from_problem(problem)
+    return RecordedDriveProblem.from_fit(fit(record, scene), problem.sources[0].optional_nuisances)
 
 
 def fit_batch(batch: Batch, whiteness: bool = True) -> tuple[dict[int, Row], BatchFit | None]:
@@ -312,7 +311,7 @@ def fit_batch(batch: Batch, whiteness: bool = True) -> tuple[dict[int, Row], Bat
         return {}, None
     padded = [record for _, record in [*members, *members[-1:] * (_BATCH_RECORDS - len(members))]]
     try:
-        optima = problem.fit([record["Vsc"] for record in padded], whiteness)
+        optima = problem.fit(padded, whiteness)
         columns = {"record": [os.path.basename(record.source) for record in padded]}
         columns |= _fit_columns(problem, optima, SUCCESS_MESSAGE if whiteness else _UNTESTED_MESSAGE)
     except np.linalg.LinAlgError:  # one record may make the joint computation fail
@@ -328,16 +327,18 @@ def fit_batch(batch: Batch, whiteness: bool = True) -> tuple[dict[int, Row], Bat
 
 
 def _fit_columns(problem: BatchProblem, result: BatchFit, message: str) -> dict[str, list[Any]]:
-    free, count, factor = problem.likelihood.names, len(result.theta), result.covariance_factor
+    names, count, factor = problem.likelihood.names, len(result.theta), result.covariance_factor
+    free = [name for name in names if name in circuit_parameters(problem.likelihood.template)]
     force = result.gradients[:, derived.DERIVED_NAMES.index("force_mean")]
-    shares, _, along = information_directions(free, factor, problem.prior_factor, free)
+    shares, _, along = information_directions(names, factor, problem.prior_factor, free)
     values = (
         *([value] * count for value in ("successful", True, message, problem.samples)),
         *(result.sigma, result.figures["chi2_reduced"], result.figures["rms_residual"], verdicts(shares, along)),
-        *(prior_variance_fraction(factor, problem.prior_factor, force), [""] * count),
+        *(prior_variance_fraction(factor, problem.prior_factor, force), result.freed),
     )
     table: dict[str, Any] = dict(zip(_FIT_COLUMNS, values, strict=True))
-    table |= _median_columns(free, np.exp(result.theta).T, np.linalg.norm(factor, axis=2).T)
+    places = [names.index(name) for name in free]
+    table |= _median_columns(free, np.exp(result.theta).T[places], np.linalg.norm(factor, axis=2).T[places])
     log_sds = np.linalg.norm(result.gradients @ factor, axis=2).T
     table |= _median_columns(derived.DERIVED_NAMES, np.exp(result.logs).T, log_sds)
     return {name: values.tolist() if isinstance(values, np.ndarray) else values for name, values in table.items()}

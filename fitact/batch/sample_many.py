@@ -24,6 +24,7 @@ from fitact.batch.fit_many import (
 )
 from fitact.batch.moves import ENSEMBLES, WALKERS, GaussianApproximations, sample_posteriors
 from fitact.batch.shared_basis import RestrictedTables
+from fitact.batch.stated_drive import StatedDriveProblem
 from fitact.compiled import BatchEvaluator, pad_rows
 from fitact.data.record import Record
 from fitact.fitting import derived
@@ -133,7 +134,9 @@ def _make_targets(batch: Batch) -> _Targets | None:
     """Return the accepted records of a batch whose posteriors are nearly normal, or None."""
     (problem, members), (rows, optima) = batch, fit_batch(batch)
     places = [place for place, (number, _) in enumerate(members) if number in rows]
-    if problem is None or optima is None or not places or not _has_tables(problem.likelihood, optima.theta[0]):
+    if not isinstance(problem, StatedDriveProblem) or optima is None or not places:
+        return None
+    if not _has_tables(problem.likelihood, optima.theta[0]):
         return None
     members = [members[place] for place in places]
     theta, sigma, factor = optima.theta[places], optima.sigma[places], optima.covariance_factor[places]

@@ -72,6 +72,12 @@ class DerivedQuantities(eqx.Module):
         return self._force(self.likelihood.circuit(theta), theta, sigma, deviate)
 
     def _force(self, circuit: Circuit, theta: Array, sigma: Array, deviate: Array | None) -> Float[Array, " times"]:
+        return electrostatic_force(self.voltage(circuit, theta, sigma, deviate), self.geometry.contact(circuit))
+
+    def voltage(
+        self, circuit: Circuit, theta: Array, sigma: Array, deviate: Array | None = None
+    ) -> Float[Array, " times"]:
+        """Return the voltage that generates the force at `time`, V; `circuit` is that at theta."""
         contact = self.geometry.contact(circuit)
         if isinstance(self.drive, ResponseTable):
             voltage = self.drive.response(circuit.channel_terms(contact.channel))
@@ -81,7 +87,7 @@ class DerivedQuantities(eqx.Module):
             channel = self.likelihood.channels[0]
             inputs = self.likelihood.make_inputs(circuit, theta, channel)
             voltage = voltage + self._charges(channel, inputs, sigma[0], deviate)
-        return electrostatic_force(voltage, contact)
+        return voltage
 
     def _charges(
         self, channel: ChannelLikelihood, inputs: ChannelInputs, sigma: Array, deviate: Array | None

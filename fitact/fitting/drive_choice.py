@@ -216,7 +216,12 @@ def _mismatch(record: Record, voltage: np.ndarray) -> float:
 
 def has_unresolved_edge(voltage: Float[np.ndarray, " samples"]) -> bool:
     """Return whether a drive jumps by most of its height between two samples."""
-    return bool(np.max(np.abs(np.diff(voltage))) > 0.6 * np.ptp(voltage))
+    return bool(has_unresolved_edges(np.max(np.abs(np.diff(voltage))), np.ptp(voltage)))
+
+
+def has_unresolved_edges(largest_step: ArrayLike, height: ArrayLike) -> Bool[np.ndarray, "*records"]:
+    """Return `has_unresolved_edge` for drives with these largest steps between samples and these heights."""
+    return np.asarray(largest_step) > 0.6 * np.asarray(height)
 
 
 def has_ideal_edges(drive: Drive) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
-from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
+from fitact.data.record import Record, rounding_noise_sd, row_medians, white_noise_sds
 from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.residual_tests import N_TESTS, PhaseBins, ResidualTestStatistics, p_values, runs_z
 
@@ -31,7 +31,7 @@ def channel_statistics(
     `noise` is the model-free noise estimate of the channel. The noise of a measured drive adds to it, multiplied by
     `gain` (unit of the channel per V).
     """
-    measured = choice.name == "measured"
+    measured, V = choice.name == "measured", choice.voltage
     expected = math.hypot(noise, gain * record.noise("V") if measured else 0.0)
     repeats = record.frequency() if choice.periodic else None
     count, square, bins = residuals.size, residuals @ residuals, PhaseBins.from_times(time, repeats)
@@ -41,7 +41,7 @@ def channel_statistics(
     figures = residual_statistics(square, count, structure, np.asarray(expected), count - n_fitted, bins)
     return {name: float(value) for name, value in figures.items()} | {
         "rounding_noise": rounding_noise_sd(record[channel]),
-        "interpolation_error": gain * interpolation_error(record["V"]) if measured else 0.0,
+        "interpolation_error": gain * float(interpolation_errors(V, white_noise_sds(V))) if measured else 0.0,
         "samples": count,
     }
 
@@ -51,7 +51,7 @@ def residual_statistics(
     samples: int,
     test_statistics: ResidualTestStatistics | None,
     expected: Float[np.ndarray, "*records"],
-    freedom: float,
+    freedom: ArrayLike,
     phase_bins: PhaseBins | None,
 ) -> dict[str, Float[np.ndarray, "*records"]]:
     """Return the figures of merit of each record that follow from sums over its residuals.
@@ -126,8 +126,9 @@ def is_undersampled(figures: Mapping[str, ArrayLike]) -> Bool[np.ndarray, "*reco
     return np.asarray(figures["interpolation_error"]) > 0.2 * np.asarray(figures["rms_residual"])
 
 
-def interpolation_error(voltage: Float[np.ndarray, " samples"]) -> float:
-    """Return the error (V) of linear interpolation of a smooth drive, from its second differences less their noise."""
-    bend = float(np.median(np.abs(np.diff(voltage, 2))))
-    noise = 0.6744897501960817 * math.sqrt(6.0) * white_noise_sd(voltage)
-    return math.sqrt(max(bend**2 - 1.5 * noise**2, 0.0)) / 8.0
+def interpolation_errors(
+    voltage: Float[np.ndarray, "*records samples"], noise: Float[np.ndarray, "*records"]
+) -> Float[np.ndarray, "*records"]:
+    """Return the error (V) of linear interpolation of smooth drives, from their second differences less their noise."""
+    bend = row_medians(np.abs(np.diff(voltage, 2)))
+    return np.sqrt(np.maximum(bend**2 - 1.5 * 6.0 * (0.6744897501960817 * noise) ** 2, 0.0)) / 8.0

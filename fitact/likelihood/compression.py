@@ -517,7 +517,7 @@ def _advance_chunk(
         ages = step / table.nodes[:, None]
         u = jax.vmap(recurrence)(jnp.exp(-ages), rise * phi(ages), u)
     else:
-        u = _uniform_recurrence(rise, u, x)
+        u = uniform_recurrence(rise, u, x)
     decays = [] if table.is_grid else [jnp.exp((first - time) / table.nodes[:, None])]
     times, voltages = jnp.append(since, time), jnp.append(before, voltage)
     span = jnp.append(times[2:] - times[:-2], step[-1])
@@ -527,7 +527,7 @@ def _advance_chunk(
     return total, (u[:, -1], time[-1], voltage[-1]), filtering
 
 
-def _uniform_recurrence(
+def uniform_recurrence(
     rise: Float[Array, " n"], u: Float[Array, " nodes"], x: Float[Array, " nodes"], block: int = 64
 ) -> Float[Array, "nodes n"]:
     """Return u[k] = e^{-x} u[k - 1] + phi(x) rise[k], i.e. `recurrence` for a uniform step, in blocks."""

@@ -1,0 +1,138 @@
+"""Common parts of batches: which records can be fitted together, and which of the fits are reliable.
+
+Only clear cases are accepted in a batch. A record that is clipped or rounded, is not described by the model, needs an
+unusual nuisance parameter or does not converge within a few steps is fitted separately.
+"""
+
+import abc
+import dataclasses
+import functools
+import math
+from collections.abc import Iterator, Sequence
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from fitact.batch.gauss_newton import CANDIDATES, GaussNewton
+from fitact.data.record import Record, white_noise_sds
+from fitact.fitting.derived import DerivedQuantities
+from fitact.fitting.least_squares import NUISANCES, bic_decrease
+from fitact.fitting.residual_tests import PhaseBins, count_true
+from fitact.fitting.starting_point import most_probable_skin, prior_skin_moments
+from fitact.likelihood.likelihood import Likelihood
+
+
+class BatchFit(NamedTuple):
+    """Optima of the records of a batch, one in each row.
+
+    Attributes:
+        accepted: whether the fit is reliable; otherwise the other fields are invalid.
+        coordinates: coordinates of the records in the compression.
+        theta, sigma, covariance_factor: see `Fit.theta`, `Fit.sigma` and `Fit.covariance_root`.
+        logs, gradients: see `DerivedQuantities.log_value_and_grad`.
+        figures: see `Fit.figures`.
+        freed: names of the nuisances that were fitted, as in `Fit.model`.
+    """
+
+    accepted: Bool[np.ndarray, " records"]
+    coordinates: Float[np.ndarray, "records coordinates"]
+    theta: Float[np.ndarray, "records parameters"]
+    sigma: Float[np.ndarray, " records"]
+    covariance_factor: Float[np.ndarray, "records parameters parameters"]
+    logs: Float[np.ndarray, "records derived"]
+    gradients: Float[np.ndarray, "records derived parameters"]
+    figures: dict[str, np.ndarray]
+    freed: np.ndarray
+
+
+class Screening(NamedTuple):
+    """Properties of a channel of each record.
+
+    Attributes:
+        noise: model-free noise sd, without rounding.
+        height: peak-to-peak value.
+        fine: whether noise exceeds the steps of the ADC.
+        railed: whether the samples may be saturated.
+    """
+
+    noise: Float[np.ndarray, " records"]
+    height: Float[np.ndarray, " records"]
+    fine: Bool[np.ndarray, " records"]
+    railed: Bool[np.ndarray, " records"]
+
+    @classmethod
+    def from_values(cls, values: Float[np.ndarray, "records samples"], settings: GaussNewton) -> "Screening":
+        noise, low, high = white_noise_sds(values), values.min(axis=1), values.max(axis=1)
+        steps = np.abs(np.diff(values[:, : settings.adc_samples], axis=1))
+        fine = np.any((steps > 0.0) & (steps <= noise[:, None]), axis=1)
+        railed = [count_true(values == extreme[:, None]) > settings.max_rail_samples for extreme in (low, high)]
+        return cls(noise, high - low, fine, np.any(railed, axis=0))
+
+
+@dataclasses.dataclass(frozen=True)
+class BatchProblem(abc.ABC):
+    """Common data of records with the same scene and time grid.
+
+    Attributes:
+        likelihood: likelihood in the coordinates of a compression, some of whose fields differ between records.
+        phases: phase bins of the samples in the drive's period, or None if there are too few periods.
+        samples: number of samples of each record that are fitted.
+        optional_nuisances: nuisances that a record may need.
+    """
+
+    likelihood: Likelihood
+    derive: DerivedQuantities
+    phases: PhaseBins | None
+    samples: int
+    optional_nuisances: tuple[str, ...]
+    settings: ClassVar[GaussNewton] = GaussNewton()
+
+    @abc.abstractmethod
+    def includes(self, record: Record) -> bool:
+        """Return whether the record has the channels and the drive of the batch."""
+
+    @abc.abstractmethod
+    def fit(self, records: Sequence[Record], whiteness: bool = True) -> BatchFit:
+        """Fit records, and optionally test the residuals for structure (`whiteness`), in double precision."""
+
+    @functools.cached_property
+    def prior_factor(self) -> Float[np.ndarray, "parameters parameters"]:
+        """Cached `prior_factor` of the likelihood."""
+        return self.likelihood.prior_factor
+
+    @functools.cached_property
+    def _prior_skin_moments(self) -> tuple[np.ndarray, np.ndarray]:
+        return prior_skin_moments(self.likelihood)
+
+    def starting_points(
+        self, g: Float[np.ndarray, " records"], b: Float[np.ndarray, " records"]
+    ) -> Float[np.ndarray, "records parameters"]:
+        """Return the most probable parameters with divider `g` and time constant `b` (s)."""
+        names, prior = self.likelihood.names, self.likelihood.prior
+        theta = np.tile(np.append(prior.log_mean, np.zeros(len(names) - len(prior.names))), (len(g), 1))
+        ridge = most_probable_skin(g, b, *self._prior_skin_moments)
+        for name, logs in zip(("Rsc", "Csc", "Ci"), ridge.T, strict=True):
+            if name in names:
+                theta[:, names.index(name)] = logs
+        return theta
+
+    def bic_decreases(self, r_squared: Float[np.ndarray, "records candidates"]) -> dict[str, np.ndarray]:
+        """Return the decrease of the BIC of each record that each optional nuisance would cause, by name."""
+        return {
+            name: bic_decrease(fraction, self.samples, len(NUISANCES.get(name, (0,))))
+            + (self.settings.clock_bic_error if name == "clock" else 0.0)
+            for name, fraction in zip(CANDIDATES, r_squared.T, strict=True)
+            if name in self.optional_nuisances
+        }
+
+    def largest_bic_decrease(self, r_squared: Float[np.ndarray, "records candidates"]) -> np.ndarray:
+        """Return the largest of `bic_decreases` of each record."""
+        return np.max(list(self.bic_decreases(r_squared).values()), axis=0, initial=-math.inf)
+
+
+def stack_channel(records: Sequence[Record], channel: str, size: int) -> Iterator[Float[np.ndarray, "some samples"]]:
+    """Yield a channel of `size` records at once, whose samples fit into the processor cache."""
+    for first in range(0, len(records), size):
+        part = [record[channel] for record in records[first : first + size]]
+        yield np.concatenate(part).reshape(len(part), -1)  # faster than `np.stack`

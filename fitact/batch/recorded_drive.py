@@ -1,0 +1,307 @@
+"""Least-squares fits of records on one time grid, each with its own recorded drive, in batches."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from fitact.batch.batch_problem import BatchFit, BatchProblem, Screening, stack_channel
+from fitact.batch.gauss_newton import GaussNewtonResult, RecordInputs, find_optima
+from fitact.batch.recorded_tables import AGES, HALF_WIDTH, SharedFunctions, Tables, to_response_table
+from fitact.compiled import jit
+from fitact.data.record import Record, rounding_noise_sd
+from fitact.fitting.derived import DerivedQuantities
+from fitact.fitting.drive_choice import has_unresolved_edges
+from fitact.fitting.fit import Fit
+from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES
+from fitact.fitting.problem import MIN_RELATIVE_NOISE
+from fitact.fitting.residual_statistics import interpolation_errors, is_misfit, residual_statistics
+from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics
+from fitact.likelihood.channel import CHARGES, LINEAR_NUISANCES
+from fitact.likelihood.compression import BASELINE_NAMES, MAX_DELAY, Compression, is_exactly_uniform
+from fitact.likelihood.likelihood import Likelihood
+from fitact.model.force import force_constant
+from fitact.model.response_table import TABLE_HALF_WIDTH
+from fitact.model.skin import WithSkin
+
+_CHUNK = 32  # records whose samples are processed together
+
+
+class Optimum(NamedTuple):
+    """Model of a record at its optimum; coefficients multiply the functions of `Tables`."""
+
+    fitted: Float[Array, "*records functions"]  # coefficients of the signal with its nuisances
+    voltage: Float[Array, "*records functions"]  # coefficients of the voltage that generates the force
+    voltage_slopes: Float[Array, "*records functions parameters"]  # derivatives of these in theta
+    logs: Float[Array, "*records 3"]  # logarithms of g, of b, and of the force over the voltage squared
+    log_slopes: Float[Array, "*records 3 parameters"]
+    gain: Float[Array, "*records"]  # by which noise of the drive enters the channel
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordedDriveProblem(BatchProblem):
+    """Records with drives of their own, which repeat like that of a first one.
+
+    Attributes:
+        repeat: a multiple of the drive's period, in samples; None if the drive does not repeat.
+    """
+
+    shared: SharedFunctions
+    repeat: int | None
+
+    @classmethod
+    def from_fit(cls, fitted: Fit, optional_nuisances: tuple[str, ...]) -> Self | None:
+        """Make the problem for records like that of a fit, or None if they cannot be fitted in batches.
+
+        A delay is fitted in all records if it was fitted in this one.
+        """
+        likelihood, record, choice = fitted.likelihood, fitted.record, fitted.choice
+        (trace, *others), time, tau = likelihood.channels, record.time, likelihood.evaluate_circuit(fitted.theta).tau
+        if others or not fitted.trusted or choice.name != "measured" or choice.steady_state or choice.warnings:
+            return None
+        is_plain = trace.channel == "Vsc" and trace.noise == "white" and trace.timing in ((), ("delay",))
+        has_other_model = isinstance(likelihood.template, WithSkin) or len(tau) > 1
+        if has_other_model or not is_plain or time.size > cls.settings.max_samples or not is_exactly_uniform(time):
+            return None
+        delay = float(likelihood.to_physical(fitted.theta).get("delay", 0.0))
+        origin, margin = round(delay / float(trace.time_step)), MAX_DELAY if trace.timing else 0
+        shared = SharedFunctions.from_times(time, margin, float(tau[0]), origin)
+        counted = np.flatnonzero(trace.weights[: time.size] == 1.0)
+        if abs(origin) > MAX_DELAY - AGES or not np.array_equal(counted, np.arange(time.size)[shared.used]):
+            return None
+        optional = tuple(name for name in optional_nuisances if name not in trace.timing)
+        places = {len(BASELINE_NAMES), *(place for name in optional for place in NUISANCES.get(name, ()))}
+        frequency = record.frequency()
+        # only the fields that all records share matter
+        fields = dict.fromkeys((field.name for field in dataclasses.fields(Compression)), 0.0)
+        fields |= {"half_width": HALF_WIDTH, "samples": counted.size, "origin": origin, "time_step": shared.time_step}
+        table = Compression(**{name: np.asarray(float(value)) for name, value in fields.items()})
+        trace = dataclasses.replace(trace.shorten(), columns=tuple(sorted(places)), compression=table)
+        return cls(
+            likelihood=likelihood.replace_channel(0, trace),
+            derive=fitted.derive,
+            phases=PhaseBins.from_times(time[shared.used], frequency),
+            samples=counted.size,
+            optional_nuisances=optional,
+            shared=shared,
+            repeat=None if frequency is None else _longest_repeat(time.size, 1.0 / (frequency * shared.time_step)),
+        )
+
+    def includes(self, record: Record) -> bool:
+        """Return whether the record has V and Vsc."""
+        return "V" in record and "Vsc" in record
+
+    def fit(self, records: Sequence[Record], whiteness: bool = True) -> BatchFit:
+        """Fit records, and optionally test the residuals for structure (`whiteness`), in double precision."""
+        channels = (stack_channel(records, name, _CHUNK) for name in ("V", "Vsc"))
+        parts = [self._fit_chunk(V, Vsc, whiteness) for V, Vsc in zip(*channels, strict=True)]
+        return jax.tree.map(lambda *each: np.concatenate(each), *parts)
+
+    def _fit_chunk(
+        self, V: Float[np.ndarray, "records samples"], Vsc: Float[np.ndarray, "records samples"], whiteness: bool
+    ) -> BatchFit:
+        driven, screened = Screening.from_values(V, self.settings), Screening.from_values(Vsc, self.settings)
+        g, b, accepted = self._estimate_start(V, Vsc)
+        tables = Tables.from_records(self.shared, V, Vsc, b)
+        inputs, optima = self._find_optima(tables, self.starting_points(g, b), screened)
+        raw = inputs._replace(table=self._select(tables.fields(in_functions=True)))
+        optimum = _evaluate_optima(self.derive, self.likelihood, inputs, raw, optima.theta, optima.sigma)
+        residuals = tables.residuals(optimum.fitted)
+        square, factor = np.vecdot(residuals, residuals), np.linalg.inv(optima.r_factor)
+        figures = self._figures(V, driven, screened, residuals, square, inputs.linear_sd, optimum.gain, whiteness)
+        loss = np.abs(optima.sum_of_squares - square)
+        accepted &= screened.fine & ~screened.railed & self._is_whole_drive(V, driven)
+        accepted &= optima.converged & (loss <= self.settings.max_rounding_loss * square) & ~is_misfit(figures)
+        accepted &= self.largest_bic_decrease(optima.r_squared) <= MIN_BIC_DECREASE
+        accepted &= self._needs_delay(optima.theta, factor)
+        freed = np.array([self._freed(sd) for sd in inputs.linear_sd])
+        derived = self._derive(tables, optimum)
+        return BatchFit(accepted, tables.observed, optima.theta, optima.sigma, factor, *derived, figures, freed)
+
+    def _figures(
+        self,
+        V: Float[np.ndarray, "records samples"],
+        driven: Screening,
+        screened: Screening,
+        residuals: Float[np.ndarray, "records used"],
+        square: Float[np.ndarray, " records"],
+        linear_sd: Float[np.ndarray, "records nuisances"],
+        gain: Float[np.ndarray, " records"],
+        whiteness: bool,
+    ) -> dict[str, np.ndarray]:
+        """Return the figures of merit; compare `fitact.fitting.residual_statistics.channel_statistics`."""
+        # the ADC's steps, which take long to find, are looked for only where they may exceed the noise
+        rounding = np.array([0.0 if fine else rounding_noise_sd(v) for v, fine in zip(V, driven.fine, strict=True)])
+        expected = np.hypot(screened.noise, gain * np.hypot(driven.noise, rounding))
+        freedom = self.samples - len(self.likelihood.names) - np.count_nonzero(linear_sd, axis=1)
+        tests = ResidualTestStatistics.from_residuals(residuals.astype(np.float32), self.phases) if whiteness else None
+        figures = residual_statistics(square, self.samples, tests, expected, freedom, self.phases)
+        interpolation = gain * interpolation_errors(V, driven.noise)
+        return figures | {"rounding_noise": np.zeros(len(V)), "interpolation_error": interpolation}
+
+    def _is_whole_drive(
+        self, V: Float[np.ndarray, "records samples"], driven: Screening
+    ) -> Bool[np.ndarray, " records"]:
+        """Return which drives are not clipped, have resolved edges and repeat like the first one."""
+        largest = np.max(np.abs(np.diff(V)), axis=1)
+        whole = ~driven.railed | (driven.noise == 0.0)  # flat tops without noise are not regarded as clipped
+        whole &= ~has_unresolved_edges(largest, driven.height)
+        if self.repeat is not None:
+            # `repeat` is rounded, so that V is shifted by up to half a sample
+            change = np.max(np.abs(V[:, self.repeat :] - V[:, : -self.repeat]), axis=1)
+            whole &= change <= largest + 10.0 * driven.noise
+        return whole
+
+    def _estimate_start(
+        self, V: Float[np.ndarray, "records samples"], Vsc: Float[np.ndarray, "records samples"], stride: int = 3
+    ) -> tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"], Bool[np.ndarray, " records"]]:
+        """Estimate g and b (s) from Vsc = g V - (1/b) ∫ Vsc dt + line, with V delayed, and whether it is possible.
+
+        One sample of `stride` suffices; even strides would meet the same phases of most drives again.
+        """
+        integral, origin = np.cumsum(Vsc, axis=1) - 0.5 * Vsc, self.shared.origin
+        inside = slice(MAX_DELAY, V.shape[1] - MAX_DELAY, stride)
+        shifts = (slice(inside.start + k, inside.stop + k, stride) for k in range(-origin - 1, -origin + 2))
+        before, moved, after = (V[:, each] for each in shifts)
+        line = np.broadcast_to(np.linspace(-1.0, 1.0, moved.shape[1]), moved.shape)
+        # steps of the drive around a sample represent a delay by a fraction of a step
+        columns = moved, integral[:, inside], moved - before, after - moved, np.ones_like(line), line, Vsc[:, inside]
+        rows = np.stack(columns, axis=1)
+        products = rows @ np.swapaxes(rows, 1, 2)
+        scale = np.sqrt(np.einsum("rii->ri", products))
+        scale[scale == 0.0] = 1.0
+        products /= scale[:, :, None] * scale[:, None, :]
+        normal = products[:, :-1, :-1] + np.finfo(float).eps * np.eye(len(columns) - 1)
+        solution = np.linalg.solve(normal, products[:, :-1, -1:])[:, :2, 0] * scale[:, -1:] / scale[:, :2]
+        g, rate = solution[:, 0], -solution[:, 1] / self.shared.time_step
+        log_b = -np.log(np.maximum(rate, np.finfo(float).tiny))
+        is_possible = (g > 0.0) & (g < 0.5) & (log_b > math.log(3.0 * self.shared.time_step))
+        is_possible &= np.abs(log_b - self.shared.center) < TABLE_HALF_WIDTH - HALF_WIDTH
+        return np.where(is_possible, g, 0.1), np.exp(np.where(is_possible, log_b, self.shared.center)), is_possible
+
+    def _find_optima(
+        self, tables: Tables, start: Float[np.ndarray, "records parameters"], screened: Screening
+    ) -> tuple[RecordInputs, GaussNewtonResult]:
+        """Solve the least squares, and add nuisances to each record while the BIC favours one."""
+        wide, floor = 10.0 * screened.height, MIN_RELATIVE_NOISE * screened.height  # as for a single record
+        linear_sd, noise = np.zeros((len(start), len(LINEAR_NUISANCES))), np.maximum(screened.noise, floor)
+        linear_sd[:, -len(CHARGES)] = wide
+        fields, clock = self._select(tables.fields()), np.zeros(tables.observed.shape[1])
+        while True:
+            inputs = RecordInputs(fields, linear_sd, floor)
+            optima = find_optima(self.likelihood, self.settings, clock, inputs, start, noise)
+            gains = self.bic_decreases(optima.r_squared)
+            largest, linear_sd = self.largest_bic_decrease(optima.r_squared), linear_sd.copy()
+            for name in NUISANCES.keys() & gains.keys():
+                rows = np.flatnonzero((gains[name] == largest) & (largest > MIN_BIC_DECREASE))
+                linear_sd[np.ix_(rows, np.array(NUISANCES[name]))] = wide[rows, None]
+            if np.array_equal(linear_sd, inputs.linear_sd):
+                return inputs, optima
+            start, noise = optima.theta, optima.sigma  # near the next optimum
+
+    def _select(self, fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return the fields of compressions, without steps if no delay is fitted."""
+        return fields if self.likelihood.channels[0].timing else fields | {"steps": fields["steps"][:, :0]}
+
+    def _needs_delay(
+        self, theta: Float[np.ndarray, "records parameters"], factor: Float[np.ndarray, "records n n"]
+    ) -> Bool[np.ndarray, " records"]:
+        """Return whether a free delay is clearly significant by the BIC, or none is free."""
+        channel = self.likelihood.channels[0]
+        if not channel.timing:
+            return np.ones(len(theta), bool)
+        place = self.likelihood.names.index("delay")
+        delay = float(channel.shift) / float(channel.time_step) + theta[:, place]
+        z_squared = np.square(delay) / np.sum(np.square(factor[:, place]), axis=1)
+        return self.samples * np.log1p(z_squared / self.samples) - math.log(self.samples) > 2.0 * MIN_BIC_DECREASE
+
+    def _freed(self, linear_sd: Float[np.ndarray, " nuisances"]) -> str:
+        """Return the names of the nuisances that were fitted, as in `Fit.model`."""
+        names = [LINEAR_NUISANCES[place] for place in np.flatnonzero(linear_sd)]
+        return ", ".join([*names, *self.likelihood.channels[0].timing])
+
+    def _derive(
+        self, tables: Tables, optimum: Optimum
+    ) -> tuple[Float[np.ndarray, "records derived"], Float[np.ndarray, "records derived parameters"]]:
+        """Return the logarithms of the quantities of `DERIVED_NAMES`, and their gradients in theta."""
+        weight = np.trim_zeros(np.asarray(self.derive.weight), "b")
+        count, size = weight.size, self.shared.size
+        own, shared, records = tables.own[:, :-1, :count], self.shared.functions[:count], np.arange(len(tables.own))
+        voltage = (optimum.voltage[:, None, size:] @ own)[:, 0] + optimum.voltage[:, :size] @ shared.T
+        square = voltage * voltage
+        peak, mean, fourth = np.argmax(square, axis=1), square @ weight, np.square(square) @ weight
+        # inner products of the functions with V and V^3 give the slopes of the means of V^2 and V^4
+        weighted = np.stack([weight * voltage, weight * voltage * square], axis=1)
+        moments = [(weighted.reshape(-1, count) @ shared).reshape(len(own), 2, size), weighted @ np.swapaxes(own, 1, 2)]
+        mean_slope, fourth_slope = np.moveaxis(np.concatenate(moments, axis=2) @ optimum.voltage_slopes, 1, 0)
+        at_peak = np.concatenate([shared[peak], own[records, :, peak]], axis=1)
+        peak_slope = np.einsum("rf,rfp->rp", at_peak, optimum.voltage_slopes) / voltage[records, peak, None]
+        scale, scale_slope = optimum.logs[:, 2], optimum.log_slopes[:, 2]
+        force, force_slope = np.exp(scale) * mean, scale_slope + 2.0 * mean_slope / mean[:, None]
+        total = force + float(self.derive.normal_force)
+        logs = [
+            *optimum.logs[:, :2].T,
+            np.log(force),
+            scale + np.log(square[records, peak]),
+            scale + 0.5 * np.log(fourth),
+            np.log(float(self.derive.coefficient) * total),
+        ]
+        slopes = [
+            *np.moveaxis(optimum.log_slopes[:, :2], 1, 0),
+            force_slope,
+            scale_slope + 2.0 * peak_slope,
+            scale_slope + 2.0 * fourth_slope / fourth[:, None],
+            force_slope * (force / total)[:, None],
+        ]
+        return np.stack(logs, axis=1), np.stack(slopes, axis=1)
+
+
+def _longest_repeat(samples: int, period: float) -> int:
+    """Return the longest multiple of the period (in samples) up to two thirds of the record, rounded."""
+    return round(max(1, math.floor(2.0 / 3.0 * samples / period)) * period)
+
+
+@functools.partial(jit, fast=True)
+def _evaluate_optima(
+    derive: DerivedQuantities,
+    likelihood: Likelihood,
+    inputs: RecordInputs,
+    in_functions: RecordInputs,
+    theta: Float[Array, "records parameters"],
+    sigma: Float[Array, " records"],
+) -> Optimum:
+    """Evaluate the models of records at their optima; `in_functions` are the inputs in terms of the functions."""
+    return jax.vmap(functools.partial(_evaluate_optimum, derive, likelihood))(inputs, in_functions, theta, sigma)
+
+
+def _evaluate_optimum(
+    derive: DerivedQuantities,
+    likelihood: Likelihood,
+    record: RecordInputs,
+    in_functions: RecordInputs,
+    theta: Float[Array, " parameters"],
+    sigma: Float[Array, ""],
+) -> Optimum:
+    model, functions = record.model(likelihood), in_functions.model(likelihood).channels[0]
+    channel, inputs = model.channels[0], model.channel_inputs(theta)
+    _, beta, _ = channel.fit_nuisances(inputs, sigma)
+    remainder, shapes = functions.residuals_and_shapes(inputs)  # of a record that is 0
+    fitted = (beta * channel.linear_sd[np.array(channel.columns, dtype=int)]) @ shapes - remainder
+    assert isinstance(functions.compression, Compression)
+    derive = dataclasses.replace(derive, likelihood=model, drive=to_response_table(functions.compression))
+
+    def quantities(theta: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        circuit = model.circuit(theta)
+        scale = force_constant(derive.geometry.contact(circuit))
+        values = derive.voltage(circuit, theta, sigma[None]), jnp.log(jnp.stack([circuit.g, circuit.b, scale]))
+        return values, values
+
+    (voltage_slopes, log_slopes), (voltage, logs) = jax.jacfwd(quantities, has_aux=True)(theta)
+    gain = jnp.abs(sum(inputs.circuit.channel_terms(channel.channel).weight))
+    return Optimum(fitted, voltage, voltage_slopes, logs, log_slopes, gain)

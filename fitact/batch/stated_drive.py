@@ -1,0 +1,143 @@
+"""Least-squares fits of records with a common scene, stated drive and time grid, in batches."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Sequence
+from typing import Self
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from fitact.batch.batch_problem import BatchFit, BatchProblem, Screening, stack_channel
+from fitact.batch.gauss_newton import GaussNewtonResult, RecordInputs, find_optima
+from fitact.batch.shared_basis import SharedBasis
+from fitact.compiled import jit
+from fitact.data.record import Record
+from fitact.fitting import derived
+from fitact.fitting.derived import DerivedQuantities, log_derivatives
+from fitact.fitting.least_squares import MIN_BIC_DECREASE
+from fitact.fitting.problem import MIN_RELATIVE_NOISE, Problem
+from fitact.fitting.residual_statistics import is_misfit, residual_statistics
+from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics
+from fitact.likelihood.channel import LINEAR_NUISANCES
+from fitact.model.chirp import Chirp
+from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, chebyshev
+from fitact.model.skin import WithSkin
+
+_CHUNK = 64  # records whose samples are processed together, so that they stay in the processor's cache
+
+
+@dataclasses.dataclass(frozen=True)
+class StatedDriveProblem(BatchProblem):
+    """Records under one drive, which share a `basis`; a record that needs a nuisance is fitted separately."""
+
+    basis: SharedBasis
+    voltage: Float[np.ndarray, " samples"]  # drive at the samples, V
+
+    @classmethod
+    def from_problem(cls, problem: Problem) -> Self | None:
+        """Make the problem for records like the one of `problem`, or None if they cannot be fitted in batches.
+
+        Double precision is required.
+        """
+        likelihood, (source, *others) = problem.likelihood, problem.sources
+        (trace, *_), choice, start = likelihood.channels, source.choice, source.start
+        if others or start is None or not math.isfinite(start.b) or trace.n_samples > cls.settings.max_samples:
+            return None
+        is_plain = trace.channel == "Vsc" and trace.noise == "white" and trace.equally_weighted and not trace.timing
+        has_other_model = isinstance(likelihood.template, WithSkin) or isinstance(choice.drive, Chirp)
+        has_nuisances = (
+            bool(np.any(np.asarray(trace.linear_sd))) or bool(choice.notes or choice.warnings) or choice.shift != 0.0
+        )
+        if not is_plain or has_other_model or has_nuisances or choice.name == "measured":
+            return None
+        time = source.record.time
+        basis = SharedBasis.from_drive(choice.drive, time, choice.steady_state, start.b)
+        shared = dataclasses.replace(trace, compression=basis.compression(time.size), columns=()).without_samples()
+        return cls(
+            likelihood=likelihood.replace_channel(0, shared),
+            derive=derived.derived_from_fit(likelihood, source.record, choice, source.scene, start.b),
+            phases=PhaseBins.from_times(time, source.record.frequency() if choice.periodic else None),
+            samples=time.size,
+            optional_nuisances=source.optional_nuisances,
+            basis=basis,
+            voltage=choice.voltage,
+        )
+
+    def includes(self, record: Record, tolerance: float = 0.01) -> bool:
+        """Return whether the record has no V, or a V equal to the drive's within a relative rms of `tolerance`."""
+        if "Vsc" not in record or "V" not in record:
+            return "Vsc" in record
+        difference = record["V"] - self.voltage
+        return bool(difference @ difference <= tolerance**2 * (self.voltage @ self.voltage))
+
+    def fit(self, records: Sequence[Record], whiteness: bool = True) -> BatchFit:
+        """Fit records, and optionally test the residuals for structure (`whiteness`), in double precision."""
+        parts = list(stack_channel(records, "Vsc", _CHUNK))
+        screened = [(*Screening.from_values(part, self.settings), self.basis.project(part)) for part in parts]
+        noise, height, fine, railed, coordinates = map(np.concatenate, zip(*screened, strict=True))
+        optima, accepted = self.find_optima(coordinates, noise, MIN_RELATIVE_NOISE * height)
+        logs, gradients = _log_derived(self.derive, optima.theta, optima.sigma)
+        if whiteness:
+            square, tests = self._residual_statistics(parts, optima.fitted[:, : len(self.basis.signal)])
+            loss = np.abs(optima.sum_of_squares - square)
+        else:
+            square, tests = optima.sum_of_squares, None
+            # relative to the square of the record; 12 eps was observed
+            loss = 32.0 * np.finfo(float).eps * np.vecdot(coordinates, coordinates)
+        freedom = self.samples - optima.theta.shape[1]
+        figures = residual_statistics(square, self.samples, tests, noise, freedom, self.phases)
+        figures |= {"rounding_noise": np.zeros(len(noise)), "interpolation_error": np.zeros(len(noise))}
+        needs_nuisance = self.largest_bic_decrease(optima.r_squared) > MIN_BIC_DECREASE
+        accepted &= optima.converged & fine & ~railed & ~needs_nuisance & ~is_misfit(figures)
+        accepted &= loss <= self.settings.max_rounding_loss * square
+        factor, freed = np.linalg.inv(optima.r_factor), np.full(len(noise), "")
+        return BatchFit(accepted, coordinates, optima.theta, optima.sigma, factor, logs, gradients, figures, freed)
+
+    def _residual_statistics(
+        self, parts: Sequence[np.ndarray], signal: Float[np.ndarray, "records rank"]
+    ) -> tuple[Float[np.ndarray, " records"], ResidualTestStatistics]:
+        """Return the residual sums of squares over the samples, and statistics of the residual tests."""
+        statistics = []
+        for number, part in enumerate(parts):
+            residuals = self.basis.response(signal[number * _CHUNK : (number + 1) * _CHUNK])
+            np.subtract(part, residuals, out=residuals)
+            tests = ResidualTestStatistics.from_residuals(residuals.astype(np.float32), self.phases)
+            statistics.append((np.vecdot(residuals, residuals), *tests))
+        square, *others = map(np.concatenate, zip(*statistics, strict=True))
+        return square, ResidualTestStatistics(*others)
+
+    def find_optima(
+        self,
+        coordinates: Float[np.ndarray, "records coordinates+1"],
+        noise: Float[np.ndarray, " records"],
+        noise_floor: Float[np.ndarray, " records"],
+    ) -> tuple[GaussNewtonResult, Bool[np.ndarray, " records"]]:
+        """Solve the least squares for `coordinates` in `basis`, and return which records the table covers.
+
+        Sigma starts at `noise` and has the lower bound `noise_floor`, V.
+        """
+        tau, signal, size = self._table_responses
+        products = coordinates[:, : len(signal)] @ signal
+        best = np.argmax(np.where(products > 0.0, products**2 / size, -1.0), axis=1)
+        highest = products[np.arange(len(best)), best]
+        in_table = (best > 0) & (best < NODES - 1) & (highest > 0.0)
+        start = self.starting_points(highest / size[best], tau[best])
+        records = RecordInputs({"observed": coordinates}, np.zeros((len(best), len(LINEAR_NUISANCES))), noise_floor)
+        clock = np.append(self.basis.clock, 0.0)
+        noise = np.maximum(noise, noise_floor)
+        return find_optima(self.likelihood, self.settings, clock, records, start, noise), in_table
+
+    @functools.cached_property
+    def _table_responses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Time constants of the nodes (s), their responses to the drive (in columns), and the squared responses."""
+        x, _ = chebyshev(NODES)
+        signal = self.basis.signal @ np.polynomial.chebyshev.chebvander(x, NODES - 1).T
+        return np.exp(self.basis.center + TABLE_HALF_WIDTH * x), signal, np.einsum("ij,ij->j", signal, signal)
+
+
+@functools.partial(jit, fast=True)
+def _log_derived(derive: DerivedQuantities, theta: Array, sigma: Array) -> tuple[Array, Array]:
+    return jax.vmap(lambda theta, sigma: log_derivatives(derive, theta, sigma[None]))(theta, sigma)

@@ -1,0 +1,132 @@
+"""Fits of many records with drives of their own: the same results as one by one, and unusual records among them."""
+
+import jax
+import numpy as np
+import pytest
+import scipy.optimize
+import scipy.signal
+
+import fitact
+from fitact.batch.fit_many import RecordGroup
+
+NAMES = ("Rsc", "Csc", "Ci")
+MEDIANS, RELATIVE_SDS = np.array([130e3, 18e-9, 1.35e-9]), np.array([0.5, 0.5, 0.05])
+PRIOR = {n: {"median": m, "relative_sd": s} for n, m, s in zip(NAMES, MEDIANS.tolist(), RELATIVE_SDS, strict=True)}
+SCENE = fitact.Scene.from_dict({"drive": {"waveform": "measured"}, "prior": PRIOR})
+STEP, SAMPLES, NOISE = 1e-5, 2510, 0.1  # s, of which 2.5 periods, V
+TIME = STEP * np.arange(SAMPLES)
+DRIVE = fitact.Trapezoid(360.0, 100.0, 30e-6)
+
+
+def record(number: int, delay: float = 2.3, offset: float = 0.0, drive: fitact.Trapezoid = DRIVE) -> fitact.Record:
+    """Return a record whose Vsc is late by `delay` steps, with an unknown charge."""
+    random = np.random.default_rng(number)
+    circuit = fitact.FinalCircuit(*MEDIANS * np.exp(0.2 * np.sin(np.arange(3) + number)))
+    v = np.asarray(drive.value(TIME + 1e-3))
+    vsc = fitact.response(circuit, fitact.Sampled(TIME, v), TIME - delay * STEP, steady_state=False)
+    charge = random.standard_normal() * np.exp(-TIME / float(circuit.b))
+    noise = NOISE * random.standard_normal((2, SAMPLES))
+    return fitact.Record.from_arrays(
+        TIME, V=v + noise[0], Vsc=np.asarray(vsc) + charge + offset + noise[1], source=f"finger_{number}.csv"
+    )
+
+
+def change(number: int, **channels: np.ndarray) -> fitact.Record:
+    """Return a record of which some channels are replaced."""
+    made = record(number)
+    return fitact.Record.from_arrays(TIME, **dict(made.channels) | channels, source=made.source)
+
+
+def accepted(records: list[fitact.Record]) -> np.ndarray:
+    """Return which records a batch fits without separate fits."""
+    group = RecordGroup(TIME, members=list(enumerate(records)))
+    with jax.enable_x64(True):
+        assert group.is_batchable(SCENE)
+        assert group.batch_problem is not None
+        return group.batch_problem.fit(records).accepted
+
+
+def assert_equal_to_separate_fit(row: dict, made: fitact.Record) -> None:
+    alone = fitact.fit(made, SCENE)
+    assert (row["result"], row["trusted"], row["samples"]) == (alone.result, alone.trusted, alone.figures["samples"])
+    assert row["verdict"] == alone.identifiability.verdict
+    assert row["freed"] == ", ".join(alone.model()["freed"])
+    for i, name in enumerate(NAMES):
+        assert row[name] == pytest.approx(np.exp(alone.theta[i]), rel=1e-6)
+        assert row[f"{name}_log_sd"] == pytest.approx(alone.sd[i], rel=1e-4)
+    logs, log_sds = alone.laplace.log_derived[0], alone.laplace.derived_log_sd
+    names = ("g", "b", "force_mean", "force_peak", "force_rms", "friction_mean")
+    for name, log, log_sd in zip(names, logs, log_sds, strict=True):
+        assert row[name] == pytest.approx(np.exp(log), rel=1e-6)
+        assert row[f"{name}_log_sd"] == pytest.approx(log_sd, rel=1e-3)
+    assert row["force_from_prior"] == pytest.approx(alone.identifiability.force_from_prior, rel=1e-4)
+    assert row["chi2_reduced"] == pytest.approx(alone.figures["chi2_reduced"], rel=1e-6)
+
+
+@pytest.fixture(scope="module")
+def skewed() -> list[fitact.Record]:
+    """Return records of one skew, with and without an offset, and unusual ones among them."""
+    records = [record(number, offset=0.3 * (number % 2)) for number in range(20)]
+    records[3] = change(3, Vsc=np.minimum(records[3]["Vsc"], 0.6 * records[3]["Vsc"].max()))
+    records[4] = change(4, Vsc=records[4]["Vsc"] + 0.15 * np.sin(2.0 * np.pi * 730.0 * TIME))
+    records[5] = record(5, delay=-2.0)
+    records[6] = record(6, delay=0.0)
+    records[7] = record(7, drive=fitact.Trapezoid(360.0, 103.0, 30e-6))
+    records[8] = record(8, drive=fitact.Trapezoid(360.0, 100.0, 1e-9))
+    records[9] = change(9, V=np.minimum(records[9]["V"], 180.0))
+    return records
+
+
+UNUSUAL = range(3, 10)
+
+
+def test_clear_records_are_fitted_together_and_unusual_ones_are_not(skewed):
+    expected = [number not in UNUSUAL for number in range(20)]
+    np.testing.assert_array_equal(accepted(skewed), expected)
+
+
+def test_each_row_is_the_fit_of_its_record(skewed):
+    rows = fitact.fit_many(skewed, SCENE, progress=False)
+    assert [row["record"] for row in rows] == [each.source for each in skewed]
+    assert rows[0]["freed"] == "charge, delay"
+    assert rows[1]["freed"] == "offset, charge, delay"
+    for number in (0, 1, 4, 5, 6, 7):
+        assert_equal_to_separate_fit(rows[number], skewed[number])
+    assert rows[4]["result"] == "misfit"
+    assert rows[9]["result"] == "refused"
+    assert "clipped" in rows[9]["message"]
+
+
+def test_without_a_skew_no_delay_is_fitted():
+    records = [record(number, delay=0.0) for number in range(16)]
+    assert accepted(records).all()
+    rows = fitact.fit_many(records, SCENE, progress=False)
+    for number in (0, 7):
+        assert rows[number]["freed"] == "charge"
+        assert_equal_to_separate_fit(rows[number], records[number])
+    sigma, voltage, observed = rows[7]["noise"], records[7]["V"], records[7]["Vsc"]
+    log_sds = np.sqrt(np.log1p(np.square(RELATIVE_SDS)))
+
+    def residuals(parameters):
+        """Filter the piecewise linear drive exactly, and use the prior; the first sample is a jump from 0."""
+        R, C, Ci = np.exp(parameters[:3])
+        g, b = Ci / (2.0 * Ci + C), R * (2.0 * Ci + C)
+        x = STEP / b
+        gain = -np.expm1(-x) / x
+        response, _ = scipy.signal.lfilter([gain], [1.0, -np.exp(-x)], np.diff(voltage), zi=[np.exp(-x) * voltage[0]])
+        model = g * np.append(voltage[0], response) + parameters[3] * np.exp(-TIME / b)
+        return np.append((observed - model) / sigma, (parameters[:3] - np.log(MEDIANS)) / log_sds)
+
+    start = np.append(np.log([rows[7][name] for name in NAMES]), 0.0)
+    tight = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
+    optimum = scipy.optimize.least_squares(residuals, start, jac="3-point", x_scale=[0.05, 0.05, 0.05, 0.1], **tight).x
+    np.testing.assert_allclose(start[:3], optimum[:3], rtol=0.0, atol=1e-6)
+
+
+def test_records_of_different_skew_are_fitted_together_within_a_step():
+    """The table of a record reaches one step from the skew of the first."""
+    records = [record(number, delay=2.3 + 0.04 * (number - 8)) for number in range(17)]
+    assert accepted(records).all()
+    rows = fitact.fit_many(records, SCENE, progress=False)
+    for number in (0, 16):
+        assert_equal_to_separate_fit(rows[number], records[number])
