@@ -79,6 +79,7 @@ class BatchProblem(abc.ABC):
         phases: phase bins of the samples in the drive's period, or None if there are too few periods.
         samples: number of samples of each record that are fitted.
         optional_nuisances: nuisances that a record may need.
+        unit: number of records for which programs are compiled; `fit` takes multiples of it.
     """
 
     likelihood: Likelihood
@@ -87,6 +88,7 @@ class BatchProblem(abc.ABC):
     samples: int
     optional_nuisances: tuple[str, ...]
     settings: ClassVar[GaussNewton] = GaussNewton()
+    unit: ClassVar[int]
 
     @abc.abstractmethod
     def includes(self, record: Record) -> bool:

@@ -32,7 +32,7 @@ from fitact.model.skin import circuit_parameters
 from fitact.progress import track_progress
 from fitact.scene.scene import Scene
 
-_BATCH_RECORDS = 256  # records in a batch, padded so that it is compiled once
+_BATCH_RECORDS = 256  # most records in a batch
 _UNTESTED_MESSAGE = (
     "The fit converged, and the residuals are no larger than the noise; they were not tested for structure."
 )
@@ -134,9 +134,9 @@ def fit_many(
 ) -> Fits:
     """Fit each of many records separately, like `fitact.fit`.
 
-    Records of Vsc on a common time grid, with the drive of the scene, are fitted in batches, which takes a hundredth
-    of the time. Doubtful ones among them, and all other records, are fitted one by one. A record that is refused or
-    fails does not affect the others, and its row states the reason.
+    Records of Vsc on a common time grid, with the drive of the scene or with recorded drives, are fitted in batches,
+    which takes a hundredth of the time. Doubtful ones among them, and all other records, are fitted one by one. A
+    record that is refused or fails does not affect the others, and its row states the reason.
 
     Args:
         records: records, or paths of files; consumed one by one.
@@ -309,7 +309,7 @@ def fit_batch(batch: Batch, whiteness: bool = True) -> tuple[dict[int, Row], Bat
     problem, members = batch
     if problem is None or not members:
         return {}, None
-    padded = [record for _, record in [*members, *members[-1:] * (_BATCH_RECORDS - len(members))]]
+    padded = [record for _, record in [*members, *members[-1:] * (-len(members) % problem.unit)]]
     try:
         optima = problem.fit(padded, whiteness)
         columns = {"record": [os.path.basename(record.source) for record in padded]}

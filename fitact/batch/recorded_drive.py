@@ -30,8 +30,6 @@ from fitact.model.force import force_constant
 from fitact.model.response_table import TABLE_HALF_WIDTH
 from fitact.model.skin import WithSkin
 
-_CHUNK = 32  # records whose samples are processed together
-
 
 class Optimum(NamedTuple):
     """Model of a record at its optimum; coefficients multiply the functions of `Tables`."""
@@ -52,6 +50,7 @@ class RecordedDriveProblem(BatchProblem):
         repeat: a multiple of the drive's period, in samples; None if the drive does not repeat.
     """
 
+    unit = 32
     shared: SharedFunctions
     repeat: int | None
 
@@ -99,7 +98,7 @@ class RecordedDriveProblem(BatchProblem):
 
     def fit(self, records: Sequence[Record], whiteness: bool = True) -> BatchFit:
         """Fit records, and optionally test the residuals for structure (`whiteness`), in double precision."""
-        channels = (stack_channel(records, name, _CHUNK) for name in ("V", "Vsc"))
+        channels = (stack_channel(records, name, self.unit) for name in ("V", "Vsc"))
         parts = [self._fit_chunk(V, Vsc, whiteness) for V, Vsc in zip(*channels, strict=True)]
         return jax.tree.map(lambda *each: np.concatenate(each), *parts)
 

@@ -33,6 +33,7 @@ _CHUNK = 64  # records whose samples are processed together, so that they stay i
 class StatedDriveProblem(BatchProblem):
     """Records under one drive, which share a `basis`; a record that needs a nuisance is fitted separately."""
 
+    unit = 256
     basis: SharedBasis
     voltage: Float[np.ndarray, " samples"]  # drive at the samples, V
 
