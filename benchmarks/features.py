@@ -7,7 +7,8 @@ the same kind of drive, in turn (medians). The record is a trapezoid of 100 Hz w
 with 0.06 V of noise; the drive is the recorded one, which begins after a rest, or a stated one. Records with a feature:
 
 - `delay`: Vsc is recorded 2.3 samples late; `clock`: the recorder's clock is off by 3 samples at the end of the record;
-- `ar1`, `spectrum`: noise with a correlation of 0.7, and of a resonance; `student`: one sample in fifty is an outlier;
+- `ar1`, `spectrum`: noise with a correlation of 0.7, and of a resonance; `student`: one sample in fifty is an outlier,
+  `student_and_delay`: the same, 2.3 samples late;
 - `fractional`: a skin with a constant-phase element; `natural_ground`: with the capacitance of Z; `unequal_skins`.
 
 With `--draws`, the posterior is compared with that of the full sum instead, from as many common draws of a proposal
@@ -106,6 +107,10 @@ def cases(samples: int) -> dict[str, tuple[fitact.Record, fitact.Scene]]:
             make_scene(measurement=quiet),
         ),
         "student": (make_record(samples, noise=outliers), make_scene(measurement={"noise_model": "student"})),
+        "student_and_delay": (
+            make_record(samples, delay=2.3, noise=outliers),
+            make_scene(measurement={"noise_model": "student"}),
+        ),
         "natural_ground": (make_record(samples, circuit=natural.make_circuit()), natural),
         "unequal_skins": (make_record(samples, circuit=unequal.make_circuit()), unequal),
         "fractional": (make_record(samples, circuit=cpe.make_circuit(), stated=True), cpe),

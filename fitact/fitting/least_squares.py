@@ -17,8 +17,9 @@ from fitact.fitting.minimum import minimise, result_name
 from fitact.fitting.timing import clock_r_squared, free_timing, orthonormal_basis
 from fitact.likelihood.certificate import can_interpolate, expand_student, interpolate_channel, recompress
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelLikelihood
+from fitact.likelihood.interpolation import Interpolation
 from fitact.likelihood.likelihood import Likelihood
-from fitact.likelihood.noise import fit_ar1, student_curvature, student_weight
+from fitact.likelihood.noise import NoiseModel, fit_ar1, student_curvature, student_weight
 
 # columns of `LINEAR_NUISANCES` that a fit may add as free parameters, by name; it may also add `TIMING_NUISANCES`
 NUISANCES = {"offset": (0,), "drift": (1,), "hum_50Hz": (2, 3), "hum_60Hz": (4, 5)}
@@ -140,6 +141,32 @@ def solve(
 
     `interpolated` states for each channel whether it may be compressed around its optimum if no table serves.
     """
+    students = [i for i, channel in enumerate(likelihood.channels) if channel.noise == "student"]
+    if students:  # samples at edges that a delay moves look like outliers, so normal noise decides on delays
+        normal = _with_noise(likelihood, students, "white")
+        timing = tuple(tuple(name for name in each if name in TIMING_NUISANCES) for each in optional_nuisances)
+        solved = _select_nuisances(normal, start, noise, timing, interpolated)
+        likelihood, start = _with_noise(solved.likelihood, students, "student"), solved.theta
+    return _select_nuisances(likelihood, start, noise, optional_nuisances, interpolated)
+
+
+def _with_noise(likelihood: Likelihood, channels: list[int], noise: NoiseModel) -> Likelihood:
+    """Return the likelihood with another noise model of some channels; an interpolation holds for one model only."""
+    for i in channels:
+        channel = dataclasses.replace(likelihood.channels[i], noise=noise)
+        if isinstance(channel.compression, Interpolation):
+            channel = channel.without_compression()
+        likelihood = likelihood.replace_channel(i, channel)
+    return likelihood
+
+
+def _select_nuisances(
+    likelihood: Likelihood,
+    start: Float[np.ndarray, " parameters"],
+    noise: Float[np.ndarray, " channels"],
+    optional_nuisances: tuple[tuple[str, ...], ...],
+    interpolated: tuple[bool, ...],
+) -> LeastSquaresResult:
     solved = _solve_coloured_noise(likelihood, start, noise, interpolated)
     for _ in range(sum(map(len, optional_nuisances))):
         gains = _bic_decreases(solved, optional_nuisances)
