@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fitact.batch.gauss_newton import CANDIDATES, GaussNewton
+from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record, white_noise_sds
 from fitact.fitting.derived import DerivedQuantities
 from fitact.fitting.least_squares import NUISANCES, bic_decrease
@@ -53,7 +54,7 @@ class Screening(NamedTuple):
         noise: model-free noise sd, without rounding.
         height: peak-to-peak value.
         fine: whether noise exceeds the steps of the ADC.
-        railed: whether the samples may be saturated.
+        railed: whether samples are saturated.
     """
 
     noise: Float[np.ndarray, " records"]
@@ -66,8 +67,10 @@ class Screening(NamedTuple):
         noise, low, high = white_noise_sds(values), values.min(axis=1), values.max(axis=1)
         steps = np.abs(np.diff(values[:, : settings.adc_samples], axis=1))
         fine = np.any((steps > 0.0) & (steps <= noise[:, None]), axis=1)
-        railed = [count_true(values == extreme[:, None]) > settings.max_rail_samples for extreme in (low, high)]
-        return cls(noise, high - low, fine, np.any(railed, axis=0))
+        extremes = [count_true(values == extreme[:, None]) > settings.max_rail_samples for extreme in (low, high)]
+        railed = np.any(extremes, axis=0)
+        railed[railed] = [clipping_mask(row).any() for row in values[railed]]  # takes long, so of few
+        return cls(noise, high - low, fine, railed)
 
 
 @dataclasses.dataclass(frozen=True)

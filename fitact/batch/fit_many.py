@@ -301,7 +301,7 @@ def _make_batch_problem(record: Record, scene: Scene | None) -> BatchProblem | N
     problem = build_problem([record], [scene])
     if problem.sources[0].choice.name != "measured":
         return StatedDriveProblem.from_problem(problem)
-    return RecordedDriveProblem.from_fit(fit(record, scene), problem.sources[0].optional_nuisances)
+    return RecordedDriveProblem.from_fit(fit(record, scene), problem)
 
 
 def fit_batch(batch: Batch, whiteness: bool = True) -> tuple[dict[int, Row], BatchFit | None]:

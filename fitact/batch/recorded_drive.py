@@ -20,18 +20,18 @@ from fitact.fitting.derived import DerivedQuantities
 from fitact.fitting.drive_choice import has_unresolved_edges
 from fitact.fitting.fit import Fit
 from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES
-from fitact.fitting.problem import MIN_RELATIVE_NOISE
+from fitact.fitting.problem import MIN_RELATIVE_NOISE, Problem
 from fitact.fitting.residual_statistics import interpolation_errors, is_misfit, residual_statistics
 from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics
-from fitact.likelihood.channel import CHARGES, LINEAR_NUISANCES
-from fitact.likelihood.compression import BASELINE_NAMES, MAX_DELAY, Compression, is_exactly_uniform
+from fitact.likelihood.channel import LINEAR_NUISANCES
+from fitact.likelihood.compression import MAX_DELAY, Compression, is_exactly_uniform
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.force import force_constant
 from fitact.model.response_table import TABLE_HALF_WIDTH
 from fitact.model.skin import WithSkin
 
 
-class Optimum(NamedTuple):
+class ModelCoefficients(NamedTuple):
     """Model of a record at its optimum; coefficients multiply the functions of `Tables`."""
 
     fitted: Float[Array, "*records functions"]  # coefficients of the signal with its nuisances
@@ -47,16 +47,18 @@ class RecordedDriveProblem(BatchProblem):
     """Records with drives of their own, which repeat like that of a first one.
 
     Attributes:
+        linear_sd: prior sds of the linear nuisances that all records have, relative to the height of Vsc.
         repeat: a multiple of the drive's period, in samples; None if the drive does not repeat.
     """
 
     unit = 32
     shared: SharedFunctions
+    linear_sd: Float[np.ndarray, " nuisances"]
     repeat: int | None
 
     @classmethod
-    def from_fit(cls, fitted: Fit, optional_nuisances: tuple[str, ...]) -> Self | None:
-        """Make the problem for records like that of a fit, or None if they cannot be fitted in batches.
+    def from_fit(cls, fitted: Fit, problem: Problem) -> Self | None:
+        """Make the problem for records like that of a fit to `problem`, or None if they cannot be fitted in batches.
 
         A delay is fitted in all records if it was fitted in this one.
         """
@@ -74,14 +76,20 @@ class RecordedDriveProblem(BatchProblem):
         counted = np.flatnonzero(trace.weights[: time.size] == 1.0)
         if abs(origin) > MAX_DELAY - AGES or not np.array_equal(counted, np.arange(time.size)[shared.used]):
             return None
-        optional = tuple(name for name in optional_nuisances if name not in trace.timing)
-        places = {len(BASELINE_NAMES), *(place for name in optional for place in NUISANCES.get(name, ()))}
+        optional = tuple(name for name in problem.sources[0].optional_nuisances if name not in trace.timing)
+        linear_sd = np.asarray(problem.likelihood.channels[0].linear_sd) / np.ptp(record["Vsc"])
+        places = {
+            *np.flatnonzero(linear_sd).tolist(),
+            *(place for name in optional for place in NUISANCES.get(name, ())),
+        }
         frequency = record.frequency()
         # only the fields that all records share matter
         fields = dict.fromkeys((field.name for field in dataclasses.fields(Compression)), 0.0)
         fields |= {"half_width": HALF_WIDTH, "samples": counted.size, "origin": origin, "time_step": shared.time_step}
         table = Compression(**{name: np.asarray(float(value)) for name, value in fields.items()})
-        trace = dataclasses.replace(trace.shorten(), columns=tuple(sorted(places)), compression=table)
+        trace = dataclasses.replace(
+            trace.shorten(), columns=tuple(sorted(places)), compression=table, shift=np.asarray(delay)
+        )
         return cls(
             likelihood=likelihood.replace_channel(0, trace),
             derive=fitted.derive,
@@ -89,6 +97,7 @@ class RecordedDriveProblem(BatchProblem):
             samples=counted.size,
             optional_nuisances=optional,
             shared=shared,
+            linear_sd=linear_sd,
             repeat=None if frequency is None else _longest_repeat(time.size, 1.0 / (frequency * shared.time_step)),
         )
 
@@ -119,7 +128,7 @@ class RecordedDriveProblem(BatchProblem):
         accepted &= optima.converged & (loss <= self.settings.max_rounding_loss * square) & ~is_misfit(figures)
         accepted &= self.largest_bic_decrease(optima.r_squared) <= MIN_BIC_DECREASE
         accepted &= self._needs_delay(optima.theta, factor)
-        freed = np.array([self._freed(sd) for sd in inputs.linear_sd])
+        freed = np.array([self._nuisance_names(sd) for sd in inputs.linear_sd])
         derived = self._derive(tables, optimum)
         return BatchFit(accepted, tables.observed, optima.theta, optima.sigma, factor, *derived, figures, freed)
 
@@ -189,8 +198,7 @@ class RecordedDriveProblem(BatchProblem):
     ) -> tuple[RecordInputs, GaussNewtonResult]:
         """Solve the least squares, and add nuisances to each record while the BIC favours one."""
         wide, floor = 10.0 * screened.height, MIN_RELATIVE_NOISE * screened.height  # as for a single record
-        linear_sd, noise = np.zeros((len(start), len(LINEAR_NUISANCES))), np.maximum(screened.noise, floor)
-        linear_sd[:, -len(CHARGES)] = wide
+        linear_sd, noise = self.linear_sd * screened.height[:, None], np.maximum(screened.noise, floor)
         fields, clock = self._select(tables.fields()), np.zeros(tables.observed.shape[1])
         while True:
             inputs = RecordInputs(fields, linear_sd, floor)
@@ -220,13 +228,13 @@ class RecordedDriveProblem(BatchProblem):
         z_squared = np.square(delay) / np.sum(np.square(factor[:, place]), axis=1)
         return self.samples * np.log1p(z_squared / self.samples) - math.log(self.samples) > 2.0 * MIN_BIC_DECREASE
 
-    def _freed(self, linear_sd: Float[np.ndarray, " nuisances"]) -> str:
+    def _nuisance_names(self, linear_sd: Float[np.ndarray, " nuisances"]) -> str:
         """Return the names of the nuisances that were fitted, as in `Fit.model`."""
         names = [LINEAR_NUISANCES[place] for place in np.flatnonzero(linear_sd)]
         return ", ".join([*names, *self.likelihood.channels[0].timing])
 
     def _derive(
-        self, tables: Tables, optimum: Optimum
+        self, tables: Tables, optimum: ModelCoefficients
     ) -> tuple[Float[np.ndarray, "records derived"], Float[np.ndarray, "records derived parameters"]]:
         """Return the logarithms of the quantities of `DERIVED_NAMES`, and their gradients in theta."""
         weight = np.trim_zeros(np.asarray(self.derive.weight), "b")
@@ -274,7 +282,7 @@ def _evaluate_optima(
     in_functions: RecordInputs,
     theta: Float[Array, "records parameters"],
     sigma: Float[Array, " records"],
-) -> Optimum:
+) -> ModelCoefficients:
     """Evaluate the models of records at their optima; `in_functions` are the inputs in terms of the functions."""
     return jax.vmap(functools.partial(_evaluate_optimum, derive, likelihood))(inputs, in_functions, theta, sigma)
 
@@ -286,7 +294,7 @@ def _evaluate_optimum(
     in_functions: RecordInputs,
     theta: Float[Array, " parameters"],
     sigma: Float[Array, ""],
-) -> Optimum:
+) -> ModelCoefficients:
     model, functions = record.model(likelihood), in_functions.model(likelihood).channels[0]
     channel, inputs = model.channels[0], model.channel_inputs(theta)
     _, beta, _ = channel.fit_nuisances(inputs, sigma)
@@ -303,4 +311,4 @@ def _evaluate_optimum(
 
     (voltage_slopes, log_slopes), (voltage, logs) = jax.jacfwd(quantities, has_aux=True)(theta)
     gain = jnp.abs(sum(inputs.circuit.channel_terms(channel.channel).weight))
-    return Optimum(fitted, voltage, voltage_slopes, logs, log_slopes, gain)
+    return ModelCoefficients(fitted, voltage, voltage_slopes, logs, log_slopes, gain)

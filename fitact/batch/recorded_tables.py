@@ -107,7 +107,9 @@ class Tables(NamedTuple):
         used = tables.own_used
         across = used.reshape(-1, used.shape[-1]) @ shared.functions[shared.used]
         across = np.swapaxes(across.reshape(*own.shape[:2], size), 1, 2)
-        rest = _factor_products(used @ np.swapaxes(used, 1, 2) - np.swapaxes(across, 1, 2) @ across)
+        products = used @ np.swapaxes(used, 1, 2)
+        scale = np.sqrt(np.einsum("rii->ri", products))
+        rest = _factor_products(products - np.swapaxes(across, 1, 2) @ across, scale)
         columns = np.concatenate([across, rest], axis=1)
         first = np.broadcast_to(np.eye(columns.shape[1], size), (len(V), columns.shape[1], size))
         coordinates = np.concatenate([first, columns[:, :, :-1]], axis=2)
@@ -164,13 +166,13 @@ def to_response_table(table: Compression) -> ResponseTable:
     )
 
 
-def _factor_products(products: Float[np.ndarray, "records n n"]) -> Float[np.ndarray, "records n n"]:
-    """Return coordinates (columns) that have these inner products, to rounding."""
-    scale = np.sqrt(np.maximum(np.einsum("rii->ri", products), np.finfo(float).tiny))
-    scaled = products / (scale[:, :, None] * scale[:, None, :])
-    # rounding must not make a product of dependent functions negative
-    lower = np.linalg.cholesky(scaled + 50.0 * np.finfo(float).eps * np.eye(scale.shape[1]))
-    return np.swapaxes(lower * scale[:, :, None], 1, 2)
+def _factor_products(
+    products: Float[np.ndarray, "records n n"], scale: Float[np.ndarray, "records n"]
+) -> Float[np.ndarray, "records n n"]:
+    """Return coordinates (columns) that have these inner products, to rounding relative to the squares of `scale`."""
+    scale = np.where(scale > 0.0, scale, 1.0)
+    values, vectors = np.linalg.eigh(products / (scale[:, :, None] * scale[:, None, :]))
+    return np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2) * scale[:, None, :]
 
 
 def _filter_drives(

@@ -108,9 +108,10 @@ class Compression(eqx.Module):
         """
         xp, since = array_module(tau), delay - self.origin * self.time_step
         ages = self.time_step * (self.first_age + np.arange(len(self.steps) + 1))
-        ends = xp.clip(ages, xp.minimum(since, 0.0), xp.maximum(since, 0.0))
+        is_later = since > 0.0  # with `minimum` and `maximum`, the derivative would vanish at 0
+        ends = xp.clip(ages, xp.where(is_later, 0.0, since), xp.where(is_later, since, 0.0))
         gained = -tau * xp.exp(-ends[..., :-1] / tau) * xp.expm1(-xp.diff(ends) / tau)
-        return xp.exp(since / tau), xp.where(since > 0.0, -gained, gained)
+        return xp.exp(since / tau), xp.where(is_later, -gained, gained)
 
     def delay_derivative(self, terms: HighpassTerms) -> Float[Array, " rows"]:
         """Return the derivative of the response with respect to a delay (per s): u / tau - V' for each term."""

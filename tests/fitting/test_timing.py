@@ -78,17 +78,35 @@ def test_a_clock_is_sampled():
     np.testing.assert_allclose(np.quantile(clock, [0.025, 0.975]), [low, high], atol=0.2 * np.std(clock))
 
 
+def skewed(delay: float, samples: int = 6000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return time, a recorded drive that begins after a rest, and Vsc without noise, late by `delay` (s)."""
+    time, drive = 1e-5 * np.arange(samples), fitact.Trapezoid(360.0, 100.0, 30e-6)
+    voltage = np.append(np.zeros(500), np.asarray(drive.value(time[:-500])))
+    circuit = fitact.FinalCircuit(RSC, CSC, CI)
+    signal = fitact.response(circuit, fitact.Sampled(time, voltage), time - delay, steady_state=False)
+    return time, voltage, np.asarray(signal)
+
+
+@pytest.mark.parametrize("steps", [0.03, -0.03, 1.02])
+def test_a_skew_of_nearly_whole_steps_is_found(steps: float):
+    """The fit starts where a sample lies on a corner of the drive, on either side of which the slope differs."""
+    time, voltage, signal = skewed(steps * 1e-5)
+    noise = np.random.default_rng(4).standard_normal((2, time.size))
+    record = fitact.Record.from_arrays(time, V=voltage + 0.1 * noise[0], Vsc=signal + 0.02 * noise[1])
+    fit = fitact.fit(record, fitact.Scene.from_dict({"drive": {"waveform": "measured"}}))
+    assert fit.result == "successful"
+    delay = fit.parameters()["delay"]
+    assert delay["sd"] < 1e-7
+    assert abs(delay["q50"] - steps * 1e-5) < 4.0 * delay["sd"]
+
+
 def test_a_skew_is_found_among_outliers():
     """Under Student's t, the samples at edges that a skew moves look like outliers; an unnoticed skew biases g.
 
     The oracle is the fit of the same record without outliers, under normal noise. The bounds are those of samples that
     differ: 5 % of them are outliers, and Student's t weights the others differently.
     """
-    random, time = np.random.default_rng(3), 1e-5 * np.arange(6000)
-    drive = fitact.Trapezoid(360.0, 100.0, 30e-6)
-    voltage = np.append(np.zeros(500), np.asarray(drive.value(time[:-500])))
-    circuit, sampled = fitact.FinalCircuit(RSC, CSC, CI), fitact.Sampled(time, voltage)
-    signal = np.asarray(fitact.response(circuit, sampled, time - 23e-6, steady_state=False))
+    random, (time, voltage, signal) = np.random.default_rng(3), skewed(23e-6)
     noise = 0.1 * random.standard_normal(time.size)
     outliers = np.where(random.uniform(size=time.size) < 0.05, 10.0, 1.0)
     clean, spoilt = (fitact.Record.from_arrays(time, V=voltage, Vsc=signal + noise * each) for each in (1.0, outliers))
