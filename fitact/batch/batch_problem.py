@@ -31,6 +31,7 @@ class BatchFit(NamedTuple):
         accepted: whether the fit is reliable; otherwise the other fields are invalid.
         coordinates: coordinates of the records in the compression.
         theta, sigma, covariance_factor: see `Fit.theta`, `Fit.sigma` and `Fit.covariance_root`.
+        prior_factor: see `Likelihood.prior_factor`.
         logs, gradients: see `DerivedQuantities.log_value_and_grad`.
         figures: see `Fit.figures`.
         freed: names of the nuisances that were fitted, as in `Fit.model`.
@@ -41,6 +42,7 @@ class BatchFit(NamedTuple):
     theta: Float[np.ndarray, "records parameters"]
     sigma: Float[np.ndarray, " records"]
     covariance_factor: Float[np.ndarray, "records parameters parameters"]
+    prior_factor: Float[np.ndarray, "records parameters parameters"]
     logs: Float[np.ndarray, "records derived"]
     gradients: Float[np.ndarray, "records derived parameters"]
     figures: dict[str, np.ndarray]

@@ -334,7 +334,7 @@ def _fit_columns(problem: BatchProblem, result: BatchFit, message: str) -> dict[
     values = (
         *([value] * count for value in ("successful", True, message, problem.samples)),
         *(result.sigma, result.figures["chi2_reduced"], result.figures["rms_residual"], verdicts(shares, along)),
-        *(prior_variance_fraction(factor, problem.prior_factor, force), result.freed),
+        *(prior_variance_fraction(factor, result.prior_factor, force), result.freed),
     )
     table: dict[str, Any] = dict(zip(_FIT_COLUMNS, values, strict=True))
     places = [names.index(name) for name in free]

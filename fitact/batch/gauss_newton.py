@@ -4,6 +4,7 @@ import dataclasses
 import functools
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -54,18 +55,25 @@ class RecordInputs(NamedTuple):
         table: fields of the `Compression`, by name.
         linear_sd: see `ChannelLikelihood`.
         noise_floor: lower bound of sigma.
+        gain_sd: prior sd of log(gain), if a gain is free.
     """
 
     table: dict[str, Array]
     linear_sd: Float[Array, "*records nuisances"]
     noise_floor: Float[Array, "*records"]
+    gain_sd: Float[Array, "*records"] | None = None
 
     def model(self, likelihood: Likelihood) -> Likelihood:
         """Return the likelihood of the record."""
         channel = likelihood.channels[0]
         assert isinstance(channel.compression, Compression)
         table = dataclasses.replace(channel.compression, **self.table)
-        return likelihood.replace_channel(0, dataclasses.replace(channel, compression=table, linear_sd=self.linear_sd))
+        likelihood = likelihood.replace_channel(
+            0, dataclasses.replace(channel, compression=table, linear_sd=self.linear_sd)
+        )
+        if self.gain_sd is None:
+            return likelihood
+        return eqx.tree_at(lambda each: each.prior["gain"].spread, likelihood, self.gain_sd)
 
 
 class GaussNewtonResult(NamedTuple):

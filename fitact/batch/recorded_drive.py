@@ -17,10 +17,10 @@ from fitact.batch.recorded_tables import AGES, HALF_WIDTH, SharedFunctions, Tabl
 from fitact.compiled import jit
 from fitact.data.record import Record, rounding_noise_sd
 from fitact.fitting.derived import DerivedQuantities
-from fitact.fitting.drive_choice import has_unresolved_edges
+from fitact.fitting.drive_choice import has_unresolved_edge, has_unresolved_edges
 from fitact.fitting.fit import Fit
 from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES
-from fitact.fitting.problem import MIN_RELATIVE_NOISE, Problem
+from fitact.fitting.problem import MIN_RELATIVE_NOISE, Problem, edge_gain_sd, log_sd
 from fitact.fitting.residual_statistics import interpolation_errors, is_misfit, residual_statistics
 from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics
 from fitact.likelihood.channel import LINEAR_NUISANCES
@@ -48,12 +48,16 @@ class RecordedDriveProblem(BatchProblem):
 
     Attributes:
         linear_sd: prior sds of the linear nuisances that all records have, relative to the height of Vsc.
+        gain_sd: prior sd of log(gain) that the scene states.
+        unresolved: whether the drives jump between two samples, for which a gain is free.
         repeat: a multiple of the drive's period, in samples; None if the drive does not repeat.
     """
 
     unit = 32
     shared: SharedFunctions
     linear_sd: Float[np.ndarray, " nuisances"]
+    gain_sd: float
+    unresolved: bool
     repeat: int | None
 
     @classmethod
@@ -64,7 +68,7 @@ class RecordedDriveProblem(BatchProblem):
         """
         likelihood, record, choice = fitted.likelihood, fitted.record, fitted.choice
         (trace, *others), time, tau = likelihood.channels, record.time, likelihood.evaluate_circuit(fitted.theta).tau
-        if others or not fitted.trusted or choice.name != "measured" or choice.steady_state or choice.warnings:
+        if others or not fitted.trusted or choice.name != "measured" or choice.steady_state:
             return None
         is_plain = trace.channel == "Vsc" and trace.noise == "white" and trace.timing in ((), ("delay",))
         has_other_model = isinstance(likelihood.template, WithSkin) or len(tau) > 1
@@ -98,6 +102,8 @@ class RecordedDriveProblem(BatchProblem):
             optional_nuisances=optional,
             shared=shared,
             linear_sd=linear_sd,
+            gain_sd=log_sd(fitted.scene.measurement.gain_relative_sd),
+            unresolved=has_unresolved_edge(choice.voltage),
             repeat=None if frequency is None else _longest_repeat(time.size, 1.0 / (frequency * shared.time_step)),
         )
 
@@ -117,7 +123,10 @@ class RecordedDriveProblem(BatchProblem):
         driven, screened = Screening.from_values(V, self.settings), Screening.from_values(Vsc, self.settings)
         g, b, accepted = self._estimate_start(V, Vsc)
         tables = Tables.from_records(self.shared, V, Vsc, b)
-        inputs, optima = self._find_optima(tables, self.starting_points(g, b), screened)
+        gain_sd = None
+        if "gain" in self.likelihood.prior.names:
+            gain_sd = np.hypot(self.gain_sd, edge_gain_sd(self.shared.time_step, b) if self.unresolved else 0.0 * b)
+        inputs, optima = self._find_optima(tables, self.starting_points(g, b), screened, gain_sd)
         raw = inputs._replace(table=self._select(tables.fields(in_functions=True)))
         optimum = _evaluate_optima(self.derive, self.likelihood, inputs, raw, optima.theta, optima.sigma)
         residuals = tables.residuals(optimum.fitted)
@@ -130,7 +139,11 @@ class RecordedDriveProblem(BatchProblem):
         accepted &= self._needs_delay(optima.theta, factor)
         freed = np.array([self._nuisance_names(sd) for sd in inputs.linear_sd])
         derived = self._derive(tables, optimum)
-        return BatchFit(accepted, tables.observed, optima.theta, optima.sigma, factor, *derived, figures, freed)
+        prior = np.array(np.broadcast_to(self.prior_factor, factor.shape))
+        if gain_sd is not None:
+            place = self.likelihood.names.index("gain")
+            prior[:, place, place] = gain_sd
+        return BatchFit(accepted, tables.observed, optima.theta, optima.sigma, factor, prior, *derived, figures, freed)
 
     def _figures(
         self,
@@ -156,10 +169,10 @@ class RecordedDriveProblem(BatchProblem):
     def _is_whole_drive(
         self, V: Float[np.ndarray, "records samples"], driven: Screening
     ) -> Bool[np.ndarray, " records"]:
-        """Return which drives are not clipped, have resolved edges and repeat like the first one."""
+        """Return which drives are not clipped, and have edges and a period like the first one."""
         largest = np.max(np.abs(np.diff(V)), axis=1)
         whole = ~driven.railed | (driven.noise == 0.0)  # flat tops without noise are not regarded as clipped
-        whole &= ~has_unresolved_edges(largest, driven.height)
+        whole &= has_unresolved_edges(largest, driven.height) == self.unresolved
         if self.repeat is not None:
             # `repeat` is rounded, so that V is shifted by up to half a sample
             change = np.max(np.abs(V[:, self.repeat :] - V[:, : -self.repeat]), axis=1)
@@ -194,14 +207,18 @@ class RecordedDriveProblem(BatchProblem):
         return np.where(is_possible, g, 0.1), np.exp(np.where(is_possible, log_b, self.shared.center)), is_possible
 
     def _find_optima(
-        self, tables: Tables, start: Float[np.ndarray, "records parameters"], screened: Screening
+        self,
+        tables: Tables,
+        start: Float[np.ndarray, "records parameters"],
+        screened: Screening,
+        gain_sd: Float[np.ndarray, " records"] | None,
     ) -> tuple[RecordInputs, GaussNewtonResult]:
         """Solve the least squares, and add nuisances to each record while the BIC favours one."""
         wide, floor = 10.0 * screened.height, MIN_RELATIVE_NOISE * screened.height  # as for a single record
         linear_sd, noise = self.linear_sd * screened.height[:, None], np.maximum(screened.noise, floor)
         fields, clock = self._select(tables.fields()), np.zeros(tables.observed.shape[1])
         while True:
-            inputs = RecordInputs(fields, linear_sd, floor)
+            inputs = RecordInputs(fields, linear_sd, floor, gain_sd)
             optima = find_optima(self.likelihood, self.settings, clock, inputs, start, noise)
             gains = self.bic_decreases(optima.r_squared)
             largest, linear_sd = self.largest_bic_decrease(optima.r_squared), linear_sd.copy()
@@ -231,7 +248,7 @@ class RecordedDriveProblem(BatchProblem):
     def _nuisance_names(self, linear_sd: Float[np.ndarray, " nuisances"]) -> str:
         """Return the names of the nuisances that were fitted, as in `Fit.model`."""
         names = [LINEAR_NUISANCES[place] for place in np.flatnonzero(linear_sd)]
-        return ", ".join([*names, *self.likelihood.channels[0].timing])
+        return ", ".join([*names, *(name for name in self.likelihood.names if name in ("gain", "delay"))])
 
     def _derive(
         self, tables: Tables, optimum: ModelCoefficients

@@ -95,7 +95,9 @@ class StatedDriveProblem(BatchProblem):
         accepted &= optima.converged & fine & ~railed & ~needs_nuisance & ~is_misfit(figures)
         accepted &= loss <= self.settings.max_rounding_loss * square
         factor, freed = np.linalg.inv(optima.r_factor), np.full(len(noise), "")
-        return BatchFit(accepted, coordinates, optima.theta, optima.sigma, factor, logs, gradients, figures, freed)
+        prior = np.broadcast_to(self.prior_factor, factor.shape)
+        theta, sigma = optima.theta, optima.sigma
+        return BatchFit(accepted, coordinates, theta, sigma, factor, prior, logs, gradients, figures, freed)
 
     def _residual_statistics(
         self, parts: Sequence[np.ndarray], signal: Float[np.ndarray, "records rank"]

@@ -169,16 +169,16 @@ def _build_channel(
     start: Estimate | None = None
     samples: CurrentSamples | None = None
     if channel == "Vsc":
-        gain, optional = _log_sd(scene.measurement.gain_relative_sd), (*optional, "delay")
+        gain, optional = log_sd(scene.measurement.gain_relative_sd), (*optional, "delay")
         if choice.periodic and choice.steady_state and choice.name != "measured":
             optional = (*optional, "clock")
         plain = constant_skin_circuit(template)
         if not limits_current(template) or taus[-1] < record.time_step:  # Vsc jumps with V
             max_divider = 0.5 if isinstance(plain, FinalCircuit) else 1.0
             start = estimate_from_vsc(record, choice, max_divider * math.exp(3.0 * gain))
-            gain = math.hypot(gain, _edge_gain_sd(record, choice, start))
+            gain = math.hypot(gain, _unresolved_gain_sd(record, choice, start))
     else:
-        gain = _log_sd(scene.measurement.gain_I_relative_sd)
+        gain = log_sd(scene.measurement.gain_I_relative_sd)
         if not limits_current(template):
             samples = select_current_samples(record, choice)
             start = estimate_from_current(record, choice, samples)
@@ -250,7 +250,8 @@ def _noise(record: Record, channel: str, scene: Scene) -> tuple[Autoregression |
     return estimate_quiet_noise(record, channel, quiet)
 
 
-def _log_sd(relative_sd: float) -> float:
+def log_sd(relative_sd: float) -> float:
+    """Return the sd of the logarithm for a relative sd."""
     return LogNormal.with_relative_sd(1.0, relative_sd).spread if relative_sd > 0.0 else 0.0
 
 
@@ -289,8 +290,13 @@ def _hum(record: Record, choice: DriveModel) -> list[str]:
     return [f"hum_{hum:.0f}Hz" for hum in (50.0, 60.0) if is_distinguishable(hum) and hum * record.time_step < 0.5]
 
 
-def _edge_gain_sd(record: Record, choice: DriveModel, start: VscEstimate) -> float:
-    """Return the sd of log(gain) that stands for unresolved edges of a measured drive: their time is uncertain."""
+def _unresolved_gain_sd(record: Record, choice: DriveModel, start: VscEstimate) -> float:
+    """Return the sd of log(gain) that stands for unresolved edges of a measured drive."""
     if choice.name != "measured" or not has_unresolved_edge(choice.voltage) or not math.isfinite(start.b):
         return 0.0
-    return record.time_step / math.sqrt(12.0) / start.b
+    return edge_gain_sd(record.time_step, start.b)
+
+
+def edge_gain_sd(time_step: float, b: Any) -> Any:
+    """Return the sd of log(gain) for edges whose time is uncertain by a time step, with the time constant b (s)."""
+    return time_step / math.sqrt(12.0) / b

@@ -47,7 +47,7 @@ def accepted(records: list[fitact.Record]) -> np.ndarray:
         return group.batch_problem.fit(padded).accepted[: len(records)]
 
 
-def assert_equal_to_separate_fit(row: dict, made: fitact.Record) -> None:
+def assert_equal_to_separate_fit(row: dict, made: fitact.Record, sd_error: float = 1e-3) -> None:
     alone = fitact.fit(made, SCENE)
     assert (row["result"], row["trusted"], row["samples"]) == (alone.result, alone.trusted, alone.figures["samples"])
     assert row["verdict"] == alone.identifiability.verdict
@@ -59,7 +59,7 @@ def assert_equal_to_separate_fit(row: dict, made: fitact.Record) -> None:
     names = ("g", "b", "force_mean", "force_peak", "force_rms", "friction_mean")
     for name, log, log_sd in zip(names, logs, log_sds, strict=True):
         assert row[name] == pytest.approx(np.exp(log), rel=1e-6)
-        assert row[f"{name}_log_sd"] == pytest.approx(log_sd, rel=1e-3)
+        assert row[f"{name}_log_sd"] == pytest.approx(log_sd, rel=sd_error)
     assert row["force_from_prior"] == pytest.approx(alone.identifiability.force_from_prior, rel=1e-4)
     assert row["chi2_reduced"] == pytest.approx(alone.figures["chi2_reduced"], rel=1e-6)
 
@@ -131,3 +131,13 @@ def test_records_of_different_skew_are_fitted_together_within_a_step():
     rows = fitact.fit_many(records, SCENE, progress=False)
     for number in (0, 16):
         assert_equal_to_separate_fit(rows[number], records[number])
+
+
+def test_edges_between_two_samples_free_a_gain():
+    """Its prior sd is the time step over an estimate of b, which a skew makes wrong by some 5 % for a single record."""
+    records = [record(number, drive=fitact.Trapezoid(360.0, 100.0, 5e-6)) for number in range(16)]
+    assert accepted(records).all()
+    rows = fitact.fit_many(records, SCENE, progress=False)
+    for number in (0, 7):
+        assert rows[number]["freed"] == "charge, gain, delay"
+        assert_equal_to_separate_fit(rows[number], records[number], sd_error=0.1)
