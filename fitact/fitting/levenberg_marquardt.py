@@ -140,6 +140,8 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
     rtol: float = 0.0  # only a step without any change meets the Cauchy criterion
     atol: float = 1e-300
     offset_tolerance: float = 1e-4  # accepted distance from the optimum, in standard errors
+    # the same where no step, however short, lowers the cost: a corner of it, e.g. a delay at a sample of the drive
+    corner_tolerance: float = 1.0
     max_rejections: int = 4  # rejected steps in a row near the optimum, where rounding dominates the sum of squares
     min_step: float = 1e-10  # relative to the size of the first step
 
@@ -155,6 +157,7 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         failed = RESULTS.where(result == RESULTS.successful, RESULTS.not_at_optimum, result)
         failed = RESULTS.where(jnp.all(end.theta == start), RESULTS.did_not_move, failed)
         name = RESULTS.where(end.rank < end.theta.size, RESULTS.rank_deficient, RESULTS.successful)
-        name = RESULTS.where(end.offset < self.offset_tolerance, name, failed)
+        is_optimum = end.offset < jnp.where(result == RESULTS.successful, self.corner_tolerance, self.offset_tolerance)
+        name = RESULTS.where(is_optimum, name, failed)
         finite = jnp.all(jnp.isfinite(end.residuals)) & jnp.all(jnp.isfinite(end.jacobian))
         return RESULTS.where(finite, name, RESULTS.nonfinite)

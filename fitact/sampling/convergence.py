@@ -113,7 +113,7 @@ def diagnose_chain(
     ensembles, steps, walkers, _ = points.shape
     if steps < 100:  # too few for any diagnostic
         return Convergence(steps=steps, walkers=walkers, ensembles=ensembles)
-    quantities = {name: points[..., i] for i, name in enumerate(names)} | derived
+    quantities = {name: points[..., i] for i, name in enumerate(names)} | _varying(derived)
     tau = {name: _autocorrelation_time(values[:, steps // 5 :]) for name, values in quantities.items()}
     tau_max = max(tau.values())
     burn = int(min(np.ceil(5.0 * tau_max), steps // 2))
@@ -136,6 +136,11 @@ def diagnose_chain(
         ensembles=ensembles,
         stuck_walkers=stuck,
     )
+
+
+def _varying(quantities: dict[str, np.ndarray], rounding: float = 1e-12) -> dict[str, np.ndarray]:
+    """Return the quantities without those that are constant, such as g if Csc and Ci are fixed: nothing converges."""
+    return {name: x for name, x in quantities.items() if not np.ptp(x) <= rounding * np.max(np.abs(x))}
 
 
 def _autocorrelation_time(values: Float[np.ndarray, "ensembles steps walkers"]) -> float:
@@ -220,7 +225,7 @@ def diagnose_weights(
     criteria: Criteria = CRITERIA,
 ) -> Convergence:
     """Return the effective sizes of `n_resampled` draws, and for "laplace" the errors of the approximation."""
-    shift, widening = {}, {}
+    shift, widening, quantities = {}, {}, _varying(quantities)
     if level == "psis":  # the variances of weighting and of resampling add up
         effective = {name: importance.effective_size(values) for name, values in quantities.items()}
         ess = {name: 1.0 / (1.0 / size + 1.0 / n_resampled) for name, size in effective.items()}

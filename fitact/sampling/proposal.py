@@ -19,6 +19,8 @@ SHARES = (0.7, 0.3)  # fractions of moves that draw from the proposal, and of st
 OVERDISPERSION = 1.5  # factor on the width of the starting points: ensembles must agree in spite of it
 DEGREES_OF_FREEDOM = 8.0  # Student-t with heavier tails than any posterior met so far
 PROBES = np.array([-2.5, -1.0, 0.0, 1.0, 2.5])  # points along an axis, in sd, at which normality is tested
+# points along an axis, in sd, among which the support is searched: 40 on both sides, dense where the density is high
+_SEARCH = np.sinh(np.linspace(-np.arcsinh(40.0), np.arcsinh(40.0), 257))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,10 +75,11 @@ class Proposal:
     ) -> Self:
         """Build a proposal from a Laplace approximation; tabulate the axes along which `log_prob` is not normal."""
         axes, center, tables = principal_axes(covariance_factor), np.array(point, dtype=float), {}
-        for i, axis in enumerate(axes.T):
-            table = _tabulate_axis(center, axis, log_prob)
+        order, center = _enter_support(center, axes, log_prob)
+        for i in order:
+            table = _tabulate_axis(center, axes[:, i], log_prob)
             if table is not None:
-                center = center + table.median * axis
+                center = center + table.median * axes[:, i]
                 tables[i] = dataclasses.replace(table, low=table.low - table.median)
         return cls(center, axes, tables)
 
@@ -144,18 +147,33 @@ def is_normal(log_densities: Float[np.ndarray, "*shape probes"], tolerance: floa
     return np.all(np.abs(departure) < tolerance, axis=-1)
 
 
+def _enter_support(
+    center: Float[np.ndarray, " n"], axes: Float[np.ndarray, "n n"], log_prob: LogProb, draws: int = 4096
+) -> tuple[list[int], Float[np.ndarray, " n"]]:
+    """Return the order in which to tabulate the axes, and the center, or where no axis meets the support, a draw in it.
+
+    Where a bound excludes the center, the axis that leads to the highest density comes first. Along another, the
+    support may begin only far from the data.
+    """
+    order = list(range(center.size))
+    if np.isfinite(log_prob(center[None])[0]):
+        return order, center
+    heights = [float(np.max(log_prob(center + _SEARCH[:, None] * axis))) for axis in axes.T]
+    if max(heights) > -math.inf:
+        order.insert(0, order.pop(int(np.argmax(heights))))
+        return order, center
+    points = center + draw_student_t(np.random.default_rng(0), draws, center.size) @ axes.T
+    values = log_prob(points)
+    return order, points[np.argmax(values)] if np.isfinite(values).any() else center
+
+
 def _tabulate_axis(
-    center: Float[np.ndarray, " n"],
-    axis: Float[np.ndarray, " n"],
-    log_prob: LogProb,
-    search_range: float = 40.0,
-    cells: int = 256,
-    log_density_range: float = 25.0,
+    center: Float[np.ndarray, " n"], axis: Float[np.ndarray, " n"], log_prob: LogProb, log_density_range: float = 25.0
 ) -> TabulatedMarginal | None:
     """Tabulate the density on a line, in lengths of `axis`; return None if it is normal or zero everywhere.
 
-    The search covers `search_range` lengths on both sides. The table ends where the log-density has fallen by
-    `log_density_range` below its maximum.
+    The search covers `_SEARCH`. The table ends where the log-density has fallen by `log_density_range` below its
+    maximum.
     """
 
     def line_log_prob(positions: np.ndarray) -> np.ndarray:
@@ -163,12 +181,10 @@ def _tabulate_axis(
 
     if is_normal(line_log_prob(PROBES)):
         return None
-    limit = np.arcsinh(search_range)
-    positions = np.sinh(np.linspace(-limit, limit, cells + 1))  # dense where the density is high
-    values = line_log_prob(positions)
+    values, cells = line_log_prob(_SEARCH), _SEARCH.size - 1
     if not np.isfinite(values).any():
         return None
     likely = np.flatnonzero(values > np.max(values) - log_density_range)
-    low, high = positions[max(likely[0] - 1, 0)], positions[min(likely[-1] + 1, cells)]
+    low, high = _SEARCH[max(likely[0] - 1, 0)], _SEARCH[min(likely[-1] + 1, cells)]
     edges = np.linspace(low, high, cells + 1)
     return TabulatedMarginal.from_log_density(low, (high - low) / cells, line_log_prob(edges))

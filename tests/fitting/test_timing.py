@@ -100,6 +100,17 @@ def test_a_skew_of_nearly_whole_steps_is_found(steps: float):
     assert abs(delay["q50"] - steps * 1e-5) < 4.0 * delay["sd"]
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_a_skew_of_whole_steps_is_an_optimum_at_a_corner(seed: int):
+    """The fit of some of these records starts at the corner, from where no step lowers the sum of squares."""
+    time, voltage, signal = skewed(2e-5)
+    noise = np.random.default_rng(seed).standard_normal(time.size)
+    record = fitact.Record.from_arrays(time, V=voltage, Vsc=signal + 0.1 * noise)
+    fit = fitact.fit(record, fitact.Scene.from_dict({"drive": {"waveform": "measured"}}))
+    assert fit.result == "successful"
+    assert abs(fit.parameters()["delay"]["q50"] - 2e-5) < 4.0 * fit.parameters()["delay"]["sd"]
+
+
 def test_a_skew_is_found_among_outliers():
     """Under Student's t, the samples at edges that a skew moves look like outliers; an unnoticed skew biases g.
 

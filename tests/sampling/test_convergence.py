@@ -133,6 +133,18 @@ def test_chain_that_is_short_or_parted_is_not_converged(chain: np.ndarray):
     assert not diagnose_chain(("x",), chain, ACCEPTED, {"force_mean": parted[..., :4, 0]}).converged
 
 
+def test_a_constant_quantity_neither_converges_nor_prevents_it(chain: np.ndarray):
+    """Test the divider g where Csc and Ci are fixed, constant to rounding."""
+    g = np.full((4, 2000, 4), 0.0652)
+    for rounding in (0.0, 1e-16):
+        c = diagnose_chain(("x",), chain, ACCEPTED, {"g": g + rounding * chain[..., :4, 0]})
+        assert c.converged
+        assert set(c.tau) == {"x"}
+    x = np.random.default_rng(0).standard_normal(1000)
+    weights = ImportanceWeights(np.full(1000, 1e-3), 0.0)
+    assert set(diagnose_weights("laplace", weights, {"x": x, "g": np.full(1000, 0.0652)}, 500).ess) == {"x"}
+
+
 def test_stuck_walker_is_named(chain: np.ndarray):
     stuck = chain.copy()
     stuck[2, 900:, 7] = stuck[2, 900, 7]
