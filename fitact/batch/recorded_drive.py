@@ -19,7 +19,7 @@ from fitact.data.record import Record, rounding_noise_sd
 from fitact.fitting.derived import DerivedQuantities
 from fitact.fitting.drive_choice import has_unresolved_edge, has_unresolved_edges
 from fitact.fitting.fit import Fit
-from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES
+from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES, bic_decrease
 from fitact.fitting.problem import MIN_RELATIVE_NOISE, Problem, edge_gain_sd, log_sd
 from fitact.fitting.residual_statistics import interpolation_errors, is_misfit, residual_statistics
 from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics
@@ -243,7 +243,7 @@ class RecordedDriveProblem(BatchProblem):
         place = self.likelihood.names.index("delay")
         delay = float(channel.shift) / float(channel.time_step) + theta[:, place]
         z_squared = np.square(delay) / np.sum(np.square(factor[:, place]), axis=1)
-        return self.samples * np.log1p(z_squared / self.samples) - math.log(self.samples) > 2.0 * MIN_BIC_DECREASE
+        return bic_decrease(z_squared / (z_squared + self.samples), self.samples, 1) > 2.0 * MIN_BIC_DECREASE
 
     def _nuisance_names(self, linear_sd: Float[np.ndarray, " nuisances"]) -> str:
         """Return the names of the nuisances that were fitted, as in `Fit.model`."""

@@ -142,12 +142,29 @@ def solve(
     `interpolated` states for each channel whether it may be compressed around its optimum if no table serves.
     """
     students = [i for i, channel in enumerate(likelihood.channels) if channel.noise == "student"]
-    if students:  # samples at edges that a delay moves look like outliers, so normal noise decides on delays
-        normal = _with_noise(likelihood, students, "white")
-        timing = tuple(tuple(name for name in each if name in TIMING_NUISANCES) for each in optional_nuisances)
-        solved = _select_nuisances(normal, start, noise, timing, interpolated)
-        likelihood, start = _with_noise(solved.likelihood, students, "student"), solved.theta
-    return _select_nuisances(likelihood, start, noise, optional_nuisances, interpolated)
+    if not students:
+        return _select_nuisances(likelihood, start, noise, optional_nuisances, interpolated)
+    # samples at edges that a delay moves look like outliers, so normal noise proposes delays, and Student's t decides
+    timing = tuple(tuple(name for name in each if name in TIMING_NUISANCES) for each in optional_nuisances)
+    others = tuple(tuple(name for name in each if name not in TIMING_NUISANCES) for each in optional_nuisances)
+    normal = _select_nuisances(_with_noise(likelihood, students, "white"), start, noise, timing, interpolated)
+    timed = _with_noise(normal.likelihood, students, "student")
+    solved = _select_nuisances(timed, normal.theta, noise, others, interpolated)
+    if timed.names == likelihood.names or _least_timing_gain(solved) > MIN_BIC_DECREASE:
+        return solved
+    return _select_nuisances(likelihood, start, noise, others, interpolated)
+
+
+def _least_timing_gain(solution: LeastSquaresResult) -> float:
+    """Return the decrease of the BIC that the least significant of the free delays and clocks causes."""
+    likelihood, count = solution.likelihood, float(solution.likelihood.count)
+    root = covariance_factor(np.concatenate(solution.jacobian), likelihood.prior_factor)
+    gains = []
+    for name, (origin, unit) in likelihood.timing.items():
+        place = likelihood.names.index(name)
+        z_squared = (origin / unit + solution.theta[place]) ** 2 / float(root[place] @ root[place])
+        gains.append(bic_decrease(z_squared / (z_squared + count), count, 1))
+    return min(gains, default=math.inf)
 
 
 def _with_noise(likelihood: Likelihood, channels: list[int], noise: NoiseModel) -> Likelihood:

@@ -290,7 +290,7 @@ def table_precision(noise: ArrayLike, tolerance: float = TOLERANCE) -> Float[np.
 def _compression_failure(error: float, excess: float, tolerance: float) -> str:
     """Return why a compression fails, from its errors near the optimum and within the prior; "" if it passes."""
     if np.isnan(error):
-        return "the uncertainty of its parameters exceeds the range of the compression"
+        return "its parameters, or their uncertainty, lie outside the range of the compression"
     if not error <= tolerance:
         return f"the error of the compressed log-likelihood is {error:.2g} near the optimum"
     return f"the error of the compressed log-likelihood is {excess:.2g} within the prior" if excess > tolerance else ""

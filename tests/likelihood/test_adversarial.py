@@ -111,10 +111,11 @@ def normal_noise(residuals: np.ndarray, log_sigma: float) -> float:
     return float(gaussian(residuals @ residuals, residuals.size, log_sigma))
 
 
-HEAVY = {
-    ("white", 2000): ("", "misfit"),
-    ("student", 2000): ("error of the compressed log-likelihood", "successful"),
-    ("student", 12_000): ("", "successful"),
+HEAVY = {  # noise model, samples, tolerance: part of the reason for the full sum, result
+    ("white", 2000, 1e-3): ("", "misfit"),
+    ("student", 2000, 1e-3): ("", "successful"),
+    ("student", 2000, 1e-4): ("error of the compressed log-likelihood", "successful"),
+    ("student", 12_000, 1e-3): ("", "successful"),
 }
 
 
@@ -124,13 +125,13 @@ def heavy_record(samples: int) -> fitact.Record:
     return record(rng.standard_normal(samples) * np.where(rng.uniform(size=samples) < 0.05, 10.0, 1.0))
 
 
-@pytest.mark.parametrize(("model", "samples"), HEAVY)
-def test_one_sample_in_twenty_is_an_outlier(model: str, samples: int):
-    """Test Student-t noise, whose expansion holds for long records only, and what normal noise gives."""
-    reason, result = HEAVY[model, samples]
+@pytest.mark.parametrize(("model", "samples", "tolerance"), HEAVY)
+def test_one_sample_in_twenty_is_an_outlier(model: str, samples: int, tolerance: float):
+    """Test Student-t noise, whose expansion must hold to ten tolerances, and what normal noise gives."""
+    reason, result = HEAVY[model, samples, tolerance]
     given = heavy_record(samples)
     time, observed = given.time, given["Vsc"]
-    fit = fitact.fit(given, scene({}, noise_model=model))
+    fit = fitact.fit(given, scene({}, noise_model=model), tolerance=tolerance)
     assert fit.result == result
     assert reason in fit.full_because
     assert (fit.compression_error is None) == bool(reason)

@@ -131,7 +131,7 @@ MEASURED = {
     "half a step": (0.5, 2.0, ""),
     "a whole step": (2.0, 5.0, ""),
     "at the end of the table": (5.8, 3.0, ""),
-    "beyond the table": (8.3, 3.0, "exceeds the range of the compression"),
+    "beyond the table": (8.3, 3.0, "lie outside the range of the compression"),
 }
 
 

@@ -236,7 +236,7 @@ def test_samples_are_summed_where_compression_does_not_hold(made: dict[str, int]
         (0.9e-3, 0.9e-3, "^$"),
         (1.1e-3, 0.0, "is 0.0011 near the optimum"),
         (0.0, 0.01, "is 0.01 within the prior"),
-        (math.nan, 0.0, "its parameters exceeds the range"),
+        (math.nan, 0.0, "outside the range"),
     ],
 )
 def test_what_speaks_against_a_compression(error: float, excess: float, reason: str):

@@ -103,6 +103,7 @@ def test_outliers_cost_student_little_and_white_much():
     clean = fitact.fit(record, scene())
     assert not white.trusted
     assert any("4 samples of Vsc" in warning and "student" in warning for warning in white.warnings)
+    assert not any("outliers" in warning for warning in student.warnings)
     assert student.trusted
     assert "512 samples" in student.full_because
     for name in ("g", "b"):
