@@ -46,7 +46,7 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
             circuits=_CIRCUITS,
             estimate=format_estimate,
             interval=format_interval,
-            advice=[_render_advice(name) for name in result_names(summary)],
+            advice=[Markup(MarkdownIt("js-default").render(explain(name))) for name in result_names(summary)],
             command=_command(summary),
             scene=json.dumps(summary["scene"], indent=2, ensure_ascii=False),
         )
@@ -72,11 +72,6 @@ def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]
         raise InputError(
             f"{directory}: holds no complete results ({error}); make them with: fitact sample RECORD --out {directory}"
         ) from error
-
-
-def _render_advice(name: str) -> Markup:
-    """Return the advice for a result name as HTML."""
-    return Markup(MarkdownIt("js-default").render(explain(name)))
 
 
 def _command(summary: dict[str, Any]) -> str:
