@@ -17,19 +17,12 @@ from fitact.scene.scene import Scene
 
 @dataclasses.dataclass(frozen=True)
 class FingerSample:
-    """Fingers of each of some samples of the population parameters.
+    """Fingers of each of some samples of the population parameters."""
 
-    Attributes:
-        values: Rsc, Csc, Ci and other free parameters of the circuit, SI.
-        source: description of the fingers for people.
-        trusted: whether the population fit is reliable, and most of its fingers are fitted well.
-        warnings: warnings of the population fit.
-    """
-
-    values: dict[str, Float[np.ndarray, "laws fingers"]]
-    source: str
-    trusted: bool = True
-    warnings: tuple[str, ...] = ()
+    values: dict[str, Float[np.ndarray, "laws fingers"]]  # Rsc, Csc, Ci and other free parameters of the circuit, SI
+    source: str  # description of the fingers for people
+    trusted: bool = True  # whether the population fit is reliable, and most of its fingers are fitted well
+    warnings: tuple[str, ...] = ()  # of the population fit
 
     @property
     def shape(self) -> tuple[int, int]:

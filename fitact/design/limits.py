@@ -46,27 +46,16 @@ _NAMES = {"current_rms": "rms current", "current_peak": "peak current"}
 
 @dataclasses.dataclass(frozen=True)
 class LimitComparison:
-    """A quantity at the amplitude of a `DriveOption` beside a limit.
+    """A quantity at the amplitude of a `DriveOption` beside a limit."""
 
-    Attributes:
-        source: standard or scene key that states the limit.
-        name: meaning of the limit.
-        quantity: rms current, peak current, or field in the insulator.
-        value: largest one of the fingers drawn, A or V/m; infinite at ideal edges.
-        limit: in the same unit, or None if the scene states none.
-        unit: of both.
-        frequency_range: frequencies (Hz) for which the limit is published; None for a limit of the scene.
-        in_range: whether the drive's frequency lies there.
-    """
-
-    source: str
-    name: str
-    quantity: str
-    value: float
-    limit: float | None
+    source: str  # standard or scene key that states the limit
+    name: str  # meaning of the limit
+    quantity: str  # rms current, peak current, or field in the insulator
+    value: float  # largest one of the fingers drawn, A or V/m; infinite at ideal edges
+    limit: float | None  # in the same unit, or None if the scene states none
     unit: str
-    frequency_range: tuple[float, float] | None = None
-    in_range: bool = True
+    frequency_range: tuple[float, float] | None = None  # Hz, of a published limit; None for a limit of the scene
+    in_range: bool = True  # whether the drive's frequency lies there
 
     @property
     def ratio(self) -> float | None:
@@ -81,8 +70,7 @@ class LimitComparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Return an entry of `limits` in drive.json; null stands for what is unbounded or not stated."""
-        between = None if self.frequency_range is None else list(self.frequency_range)
-        return dataclasses.asdict(self) | {"ratio": self.ratio, "frequency_range": between}
+        return dataclasses.asdict(self) | {"ratio": self.ratio}
 
     @property
     def row(self) -> tuple[str, ...]:

@@ -25,19 +25,12 @@ _MIN_SINE = 1e-6  # sine of the angle between directions below which they count 
 
 @dataclasses.dataclass(frozen=True)
 class StructuralIdentifiability:
-    """Directions that no record of these channels determines.
+    """Directions that no record of these channels determines."""
 
-    Attributes:
-        names: free parameters.
-        channels: channels recorded in addition to V.
-        directions: unit vectors in the log-parameters, at the circuit's values.
-        is_constant: whether the directions are the same for all values.
-    """
-
-    names: tuple[str, ...]
-    channels: tuple[Channel, ...]
-    directions: Float[np.ndarray, "dimension parameters"]
-    is_constant: bool
+    names: tuple[str, ...]  # free parameters
+    channels: tuple[Channel, ...]  # recorded in addition to V
+    directions: Float[np.ndarray, "dimension parameters"]  # unit vectors in the log-parameters, at the circuit's values
+    is_constant: bool  # whether the directions are the same for all values
 
     @property
     def dimension(self) -> int:

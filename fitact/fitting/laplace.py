@@ -25,22 +25,15 @@ SUCCESS_MESSAGE = "The fit converged, and the residuals are consistent with the 
 
 @dataclasses.dataclass(frozen=True)
 class Laplace:
-    """An optimum and its covariance.
+    """An optimum and its covariance."""
 
-    Attributes:
-        theta: the optimum, in the likelihood's coordinates.
-        covariance_root: factor of `covariance`, i.e. covariance = factor @ factor.T; the more accurate of the two.
-        sigmas: standard deviation of each channel's noise.
-        likelihood: the model that was fitted.
-        derive: the derived quantities as functions of theta.
-        log_derived: logarithms of the derived quantities at the optimum, and their gradients in theta.
-    """
-
-    theta: Float[np.ndarray, " parameters"]
+    theta: Float[np.ndarray, " parameters"]  # the optimum, in the likelihood's coordinates
+    # covariance = root @ root.T; the root is the more accurate of the two
     covariance_root: Float[np.ndarray, "parameters parameters"]
-    sigmas: Float[np.ndarray, " channels"]
-    likelihood: Likelihood
-    derive: derived.DerivedQuantities
+    sigmas: Float[np.ndarray, " channels"]  # standard deviation of each channel's noise
+    likelihood: Likelihood  # the model that was fitted
+    derive: derived.DerivedQuantities  # the derived quantities as functions of theta
+    # logarithms of the derived quantities at the optimum, and their gradients in theta
     log_derived: tuple[Float[np.ndarray, " derived"], Float[np.ndarray, "derived parameters"]]
 
     @property

@@ -16,18 +16,12 @@ _KEY = "record"  # column with the file names of the records
 
 @dataclasses.dataclass(frozen=True)
 class Covariates:
-    """Covariates of the fingers.
-
-    Attributes:
-        names: names of the covariates.
-        mean, sd: mean and standard deviation over the fingers.
-        z_scores: covariates minus their mean, over their standard deviation.
-    """
+    """Covariates of the fingers."""
 
     names: tuple[str, ...]
-    mean: Float[np.ndarray, " covariates"]
+    mean: Float[np.ndarray, " covariates"]  # over the fingers
     sd: Float[np.ndarray, " covariates"]
-    z_scores: Float[np.ndarray, "fingers covariates"]
+    z_scores: Float[np.ndarray, "fingers covariates"]  # covariates minus their mean, over their standard deviation
 
     @classmethod
     def from_values(cls, values: Mapping[str, Sequence[float]], fingers: int) -> Self:

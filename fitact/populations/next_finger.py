@@ -26,20 +26,13 @@ HARMONICS = ("force_at_f", "force_at_2f", "friction_at_f", "friction_at_2f")
 
 
 class NewFingerModel(eqx.Module):
-    """Model of the quantities `names` (SI units) as functions of the logarithms of a finger's `factors`.
+    """Model of the quantities `names` (SI units) as functions of the logarithms of a finger's `factors`."""
 
-    Attributes:
-        derive: derived quantities of a fit, without the record's initial charge.
-        theta, sigma: parameters and noise of the fit; those that are not the finger's stay fixed.
-        factors: subset of `FACTORS`, in that order.
-        frequency: frequency of the drive, Hz; None means that it does not repeat.
-    """
-
-    derive: derived.DerivedQuantities
-    theta: Float[Array, " parameters"]
+    derive: derived.DerivedQuantities  # of a fit, without the record's initial charge
+    theta: Float[Array, " parameters"]  # of the fit; those that are not the finger's stay fixed
     sigma: Float[Array, " traces"]
-    factors: tuple[str, ...] = eqx.field(static=True)
-    frequency: float | None = eqx.field(static=True)
+    factors: tuple[str, ...] = eqx.field(static=True)  # subset of `FACTORS`, in that order
+    frequency: float | None = eqx.field(static=True)  # of the drive, Hz; None means that it does not repeat
 
     @classmethod
     def from_fit(cls, fit: Fit, factors: tuple[str, ...]) -> Self:
@@ -135,15 +128,10 @@ def _force(finger: NewFingerModel, factors: Float[Array, " factors"]) -> Float[A
 
 
 class VarianceDecomposition(NamedTuple):
-    """Variance of a quantity of the next finger, by the law of total variance.
+    """Variance of a quantity of the next finger, by the law of total variance."""
 
-    Attributes:
-        between_finger: E[Var(x | parameters)], the variance between fingers.
-        parameter_uncertainty: Var(E[x | parameters]), from the uncertainty of the population parameters.
-    """
-
-    between_finger: float
-    parameter_uncertainty: float
+    between_finger: float  # E[Var(x | parameters)], the variance between fingers
+    parameter_uncertainty: float  # Var(E[x | parameters]), from the uncertainty of the population parameters
 
     @classmethod
     def from_draws(cls, values: Float[np.ndarray, "laws fingers"]) -> Self:

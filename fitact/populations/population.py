@@ -339,12 +339,8 @@ def variance_sentences(content: dict[str, Any]) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def evaluate_parameters(hierarchy: Hierarchy, points: Float[np.ndarray, "chains draws n"]) -> PopulationParameters:
-    return _evaluate_parameters(hierarchy, points)
-
-
 @jit
-def _evaluate_parameters(hierarchy: Hierarchy, points: Float[Array, "chains draws n"]) -> PopulationParameters:
+def evaluate_parameters(hierarchy: Hierarchy, points: Float[Array, "chains draws n"]) -> PopulationParameters:
     return jax.vmap(jax.vmap(hierarchy.population_parameters))(points)
 
 

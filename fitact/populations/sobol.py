@@ -17,26 +17,16 @@ SobolIndices = dict[str, dict[str, dict[str, float]]]
 
 
 class Surrogate(NamedTuple):
-    """Logarithms of quantities as Hermite polynomials of the whitened factors, by least squares.
-
-    Attributes:
-        mean, covariance_factor: mean and root of the covariance of the factors.
-        tail_scale: width of the evaluated points over the width of the factors; the largest values lie in the tails.
-        powers, coefficients: powers and coefficients of the terms.
-        log_range: smallest and largest logarithm of the evaluated model.
-        cross_validation_error: sqrt(1 - r^2) of each quantity, where r is its correlation with the model at held-out
-            points.
-        evaluations: number of evaluations of the model.
-    """
+    """Logarithms of quantities as Hermite polynomials of the whitened factors, by least squares."""
 
     mean: Float[np.ndarray, " factors"]
-    covariance_factor: Float[np.ndarray, "factors factors"]
-    tail_scale: float
+    covariance_factor: Float[np.ndarray, "factors factors"]  # root of the covariance of the factors
+    tail_scale: float  # width of the evaluated points over the factors'; the largest values lie in the tails
     powers: Int[np.ndarray, "terms factors"]
     coefficients: Float[np.ndarray, "terms quantities"]
-    log_range: Float[np.ndarray, "2 quantities"]
+    log_range: Float[np.ndarray, "2 quantities"]  # smallest and largest logarithm of the evaluated model
+    # sqrt(1 - r^2) of each quantity, where r is its correlation with the model at held-out points
     cross_validation_error: Float[np.ndarray, " quantities"]
-    evaluations: int
 
     @classmethod
     def from_model(
@@ -62,16 +52,15 @@ class Surrogate(NamedTuple):
         points = mean + tail_scale * z @ covariance_factor.T
         logs = np.log(finger.evaluate(points)[:, [finger.names.index(name) for name in names]])
         log_range = np.stack([logs.min(axis=0), logs.max(axis=0)])
-        weight = np.exp(
-            -0.5 * (tail_scale**2 - 1.0) * np.sum(z**2, axis=1)
-        )  # density of the factors over the density of the points
+        # density of the factors over the density of the points
+        weight = np.exp(-0.5 * (tail_scale**2 - 1.0) * np.sum(z**2, axis=1))
         surrogates: list[Self] = []
         for degree in itertools.count(1):
             powers = _powers(size, degree)
             terms = _hermite(z, powers)
             error = _cross_validation_error(terms, logs, weight)
             coefficients = _least_squares(terms, logs)
-            surrogates.append(cls(mean, covariance_factor, tail_scale, powers, coefficients, log_range, error, count))
+            surrogates.append(cls(mean, covariance_factor, tail_scale, powers, coefficients, log_range, error))
             if error.max() <= tolerance or math.comb(size + degree + 1, size) > count / evaluations_per_term:
                 break
         return min(surrogates, key=lambda surrogate: float(surrogate.cross_validation_error.max()))
