@@ -1,10 +1,9 @@
 """Covariates: further numbers about the fingers of the records, such as skin moisture."""
 
 import csv
-import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -14,8 +13,7 @@ from fitact.errors import InputError
 _KEY = "record"  # column with the file names of the records
 
 
-@dataclasses.dataclass(frozen=True)
-class Covariates:
+class Covariates(NamedTuple):
     """Covariates of the fingers."""
 
     names: tuple[str, ...]

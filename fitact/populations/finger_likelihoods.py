@@ -77,12 +77,9 @@ class FingerLikelihoods(eqx.Module):
         draws: int,
         terms: int,
         seed: Sequence[int],
-        max_log_sd_area: float = 1.0,
     ) -> Self:
-        """Tabulate `terms` Chebyshev terms over the log Ci that the records and the panel's `prior` allow.
-
-        `max_log_sd_area` is the largest standard deviation of an area's logarithm that the tables cover.
-        """
+        """Tabulate `terms` Chebyshev terms over the log Ci that the records and the panel's `prior` allow."""
+        max_log_sd_area = 1.0  # largest standard deviation of an area's logarithm that the tables cover
         tables = []
         center, half_width = _log_Ci_interval(fingers, prior.log_mean, prior.log_sd)
         for finger, child in zip(fingers, np.random.SeedSequence(seed).spawn(len(fingers)), strict=True):
