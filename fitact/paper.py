@@ -4,10 +4,9 @@ The reference paper is "Electrostatic Tactile System Analyzing and Modelling" (2
 Ci, and results are given for each. Verdicts apply to 1.35 nF, the value in its text, unless the claim says otherwise.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,8 +37,7 @@ INSULATORS = {
 _SQUARE = Square(peak_to_peak=PEAK_TO_PEAK, frequency=FREQUENCY)
 
 
-@dataclasses.dataclass(frozen=True)
-class Claim:
+class Claim(NamedTuple):
     """A statement of the reference paper, compared with the value computed by fitact."""
 
     id: str  # identifier of the equation or figure
@@ -52,7 +50,7 @@ class Claim:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the claim in the form of reproduction.json."""
-        return dataclasses.asdict(self)
+        return self._asdict()
 
 
 def reproduce() -> tuple[Claim, ...]:

@@ -82,15 +82,10 @@ class Diagram:
 
 
 def lay_out_circuit(values: Mapping[str, str], grounding: Grounding = "direct", current: bool = False) -> Diagram:
-    """Lay out the elements of a circuit.
+    """Lay out the elements of a circuit, with a text for each part by its name in a scene.
 
-    Args:
-        values: text for each part by its name in a scene ("Rsc", "Csc", "Ci", "R_H", "grounding_Rsc", "grounding_Csc",
-            "Z", "Z_capacitance", "series_resistor", "Rgap", "Cgap", "alpha", "probe_resistance",
-            "probe_capacitance"). A part without a value is left out. The grounding skin is equal to the touching one
-            where its own values are absent.
-        grounding: how the body returns the current.
-        current: whether the current is recorded, so that there is a shunt.
+    A part without a value is left out. The grounding skin is equal to the touching one where its own values are absent.
+    If the `current` is recorded, there is a shunt.
     """
     diagram = Diagram()
     bottom = _add_column(diagram, values, grounding)
@@ -207,10 +202,7 @@ def lay_out_wiring(
 ) -> Diagram:
     """Lay out the wiring of a bench: oscilloscope channel 1 on V, 2 on Vsc, and 3 on the current.
 
-    Args:
-        grounding: connection of the body to ground.
-        channels: channels recorded besides V: "Vsc", "I" or both.
-        series_resistor: whether a known resistor is in the lead to the electrode.
+    `channels` are recorded besides V; `series_resistor`: whether a known resistor is in the lead to the electrode.
     """
     diagram, elements, direct = Diagram(), schemdraw.elements, grounding == "direct"
     current = "I" in channels

@@ -156,13 +156,9 @@ def plot(
     x: Axis, *rows: tuple[Axis, Iterable[PlotlyTrace]], heights: Sequence[float] = (1.0,), title: str = "",
     size: int = 320, legend: bool = True, unified_hover: bool = False,
 ) -> Plot:  # fmt: skip
-    """Return a plot of several rows of traces over one x axis.
+    """Return a plot of several rows (y axis, traces) over one x axis, `size` pixels high.
 
-    Args:
-        rows: y axis and traces of each row, from the top.
-        heights: relative heights of the rows.
-        size: height in pixels.
-        unified_hover: whether hovering shows all traces at this x, or only the nearest point.
+    With `unified_hover`, hovering shows all traces at this x, and else only the nearest point.
     """
     data: list[PlotlyTrace] = []
     layout: dict[str, Any] = {

@@ -186,21 +186,11 @@ def rounding_noise_sd(values: Float[np.ndarray, " samples"], min_levels: int = 1
     return step / math.sqrt(12.0) if levels.size >= min_levels else 0.0
 
 
-def fundamental_frequency(
-    time: Float[np.ndarray, " samples"],
-    values: Float[np.ndarray, " samples"],
-    *,
-    min_correlation: float = 0.8,
-    peak_tolerance: float = 0.02,
-    lag_tolerance: int = 4,
-) -> float | None:
-    """Return the fundamental frequency (Hz) of a signal from its autocorrelation, or None if it is not periodic.
-
-    Args:
-        min_correlation: minimum autocorrelation of a periodic signal.
-        peak_tolerance: amount by which the first peak may be lower than a later one.
-        lag_tolerance: error, in samples, of twice a period that is estimated from one.
-    """
+def fundamental_frequency(time: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"]) -> float | None:
+    """Return the fundamental frequency (Hz) of a signal from its autocorrelation, or None if it is not periodic."""
+    min_correlation = 0.8  # least autocorrelation of a periodic signal
+    peak_tolerance = 0.02  # by which the first peak may be lower than a later one
+    lag_tolerance = 4  # error, in samples, of twice a period that is estimated from one
     count = time.size
     correlation = _autocorrelation(resample_uniform(time, values))
     below = np.flatnonzero(correlation < 0.5)

@@ -3,7 +3,6 @@
 The comparison is no safety assessment: the model has no fault, no stored energy and no current limit of an amplifier.
 """
 
-import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -44,8 +43,7 @@ PUBLISHED_LIMITS = (
 _NAMES = {"current_rms": "rms current", "current_peak": "peak current"}
 
 
-@dataclasses.dataclass(frozen=True)
-class LimitComparison:
+class LimitComparison(NamedTuple):
     """A quantity at the amplitude of a `DriveOption` beside a limit."""
 
     source: str  # standard or scene key that states the limit
@@ -70,7 +68,7 @@ class LimitComparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Return an entry of `limits` in drive.json; null stands for what is unbounded or not stated."""
-        return dataclasses.asdict(self) | {"ratio": self.ratio}
+        return self._asdict() | {"ratio": self.ratio}
 
     @property
     def row(self) -> tuple[str, ...]:
@@ -116,14 +114,11 @@ def compare_with_limits(frequency: float, at_amplitude: PeriodQuantities, device
 
 
 def format_quantity(value: ArrayLike, unit: str, error: float | None = None) -> str:
-    """Format a value for people; with an `error`, to the place of the error's second significant digit.
-
-    A field (V/m) is in V/µm, as in data sheets.
-    """
+    """Format a value for people; with an `error`, to the place of the error's second significant digit."""
     if not math.isfinite(value):
         return "unbounded"
     if unit == "V/m":
-        return f"{1e-6 * float(value):.3g} V/µm"
+        return f"{1e-6 * float(value):.3g} V/µm"  # as in data sheets
     if error is None or not 0.0 < error < math.inf:
         return format_engineering(float(value), unit, 3)
     size, symbol = choose_prefixed_unit(float(value), unit)

@@ -37,21 +37,6 @@ class Laplace:
     log_derived: tuple[Float[np.ndarray, " derived"], Float[np.ndarray, "derived parameters"]]
 
     @property
-    def covariance(self) -> Float[np.ndarray, "parameters parameters"]:
-        """Covariance of theta."""
-        return self.covariance_root @ self.covariance_root.T
-
-    @property
-    def sd(self) -> Float[np.ndarray, " parameters"]:
-        """Standard deviations of theta."""
-        return np.linalg.norm(self.covariance_root, axis=1)
-
-    @property
-    def correlation(self) -> Float[np.ndarray, "parameters parameters"]:
-        """Correlations of theta."""
-        return self.covariance / np.outer(self.sd, self.sd)
-
-    @property
     def derived_log_sd(self) -> Float[np.ndarray, " derived"]:
         """Standard deviations of the logarithms of the derived quantities."""
         return np.linalg.norm(self.log_derived[1] @ self.covariance_root, axis=1)
@@ -75,25 +60,15 @@ class Laplace:
 
 @dataclasses.dataclass(frozen=True)
 class FitResult(abc.ABC):
-    """Result of a fit: a Laplace approximation, and whether it is reliable.
+    """Result of a fit: a Laplace approximation, and whether it is reliable."""
 
-    Attributes:
-        laplace: best parameters and derived quantities, with their covariance.
-        result: name of a member of `RESULTS`; `message` is its sentence.
-        figures: chi2_reduced, steps and other statistics.
-        identifiability: which parameters the data determine.
-        scene: scene of the first record, whose circuit and prior were fitted.
-        warnings: sentences on what may change the result.
-        notes: sentences for information.
-    """
-
-    laplace: Laplace
-    result: str
-    figures: dict[str, float]
-    identifiability: Identifiability
-    scene: Scene
-    warnings: tuple[str, ...]
-    notes: tuple[str, ...]
+    laplace: Laplace  # best parameters and derived quantities, with their covariance
+    result: str  # name of a member of `RESULTS`; `message` is its sentence
+    figures: dict[str, float]  # chi2_reduced, steps and other statistics
+    identifiability: Identifiability  # which parameters the data determine
+    scene: Scene  # scene of the first record, whose circuit and prior were fitted
+    warnings: tuple[str, ...]  # sentences on what may change the result
+    notes: tuple[str, ...]  # sentences for information
 
     @property
     def trusted(self) -> bool:
@@ -113,7 +88,7 @@ class FitResult(abc.ABC):
     @property
     def covariance(self) -> Float[np.ndarray, "parameters parameters"]:
         """Covariance of theta, in the Laplace approximation."""
-        return self.laplace.covariance
+        return self.covariance_root @ self.covariance_root.T
 
     @property
     def covariance_root(self) -> Float[np.ndarray, "parameters parameters"]:
@@ -123,12 +98,12 @@ class FitResult(abc.ABC):
     @property
     def sd(self) -> Float[np.ndarray, " parameters"]:
         """Standard deviations of theta."""
-        return self.laplace.sd
+        return np.linalg.norm(self.covariance_root, axis=1)
 
     @property
     def correlation(self) -> Float[np.ndarray, "parameters parameters"]:
         """Correlations of theta."""
-        return self.laplace.correlation
+        return self.covariance / np.outer(self.sd, self.sd)
 
     @property
     def likelihood(self) -> Likelihood:

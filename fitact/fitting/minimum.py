@@ -4,9 +4,8 @@ The solver itself is in `fitact.fitting.levenberg_marquardt`. It is imported onl
 program from the disk does without optimistix.
 """
 
-import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -58,8 +57,7 @@ def minimise(
     return find_minimum(residuals, start, max_steps)
 
 
-@dataclasses.dataclass(frozen=True)
-class Optima:
+class Optima(NamedTuple):
     """Distinct optima from many starting points."""
 
     minima: Minimum  # stacked, lowest cost first; if no start converged, the lowest end point

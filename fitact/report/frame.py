@@ -1,7 +1,6 @@
 """Frame of all result pages: subject, verdict, answers, and how to repeat the result."""
 
 import base64
-import dataclasses
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -22,8 +21,7 @@ from fitact.summary import versions
 from fitact.units import format_engineering
 
 
-@dataclasses.dataclass(frozen=True)
-class Provenance:
+class Provenance(NamedTuple):
     """Origin of a result."""
 
     command: str  # command line that repeats it
@@ -50,8 +48,7 @@ class Answer(NamedTuple):
     note: str
 
 
-@dataclasses.dataclass(frozen=True)
-class PageSummary:
+class PageSummary(NamedTuple):
     """Top of every page."""
 
     title: str
@@ -62,7 +59,6 @@ class PageSummary:
     answers: Sequence[Answer]  # the main numbers
     warnings: Sequence[str]  # sentences on what may change the result
     has_reservation: bool = False  # whether a reliable result is limited, as the verdict states
-    notes: Sequence[str] = ()  # sentences for information
 
 
 def write_page(path: str | os.PathLike[str], template: str, **content: Any) -> None:

@@ -57,11 +57,7 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
 
 
 def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]]:
-    """Read what `write_report` needs from a folder that `fitact sample` or `fitact run` wrote.
-
-    Raises:
-        InputError: a file is missing or damaged.
-    """
+    """Read what `write_report` needs from a folder of results; raise InputError if it is incomplete."""
     import xarray as xr
 
     content = load(directory)

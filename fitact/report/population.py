@@ -182,11 +182,7 @@ def write_population_page(path: str | os.PathLike[str], tree: Any, content: dict
 
 
 def read_population(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]]:
-    """Read what `write_population_page` needs from a folder that `fitact population` wrote.
-
-    Raises:
-        InputError: a file is missing or damaged.
-    """
+    """Read what `write_population_page` needs from a folder of results; raise InputError if it is incomplete."""
     import xarray as xr
 
     try:
