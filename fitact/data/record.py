@@ -172,11 +172,10 @@ def row_medians(values: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*row
     return upper if values.shape[-1] % 2 else 0.5 * (upper + np.max(values[..., :half], axis=-1))
 
 
-def rounding_noise_sd(values: Float[np.ndarray, " samples"], min_levels: int = 12, some: int = 65_536) -> float:
-    """Return the sd due to the resolution (LSB) of the samples, or 0 if white noise exceeds it.
-
-    Fewer levels than `min_levels` indicate an ideal wave, not an ADC. The first `some` samples usually suffice.
-    """
+def rounding_noise_sd(values: Float[np.ndarray, " samples"]) -> float:
+    """Return the sd due to the resolution (LSB) of the samples, or 0 if white noise exceeds it."""
+    min_levels = 12  # fewer indicate an ideal wave, not an ADC
+    some = 65_536  # the first samples, which usually suffice
     noise, step = white_noise_sd(values), math.inf
     for part in (values[:some], values)[values.size <= some :]:
         levels = np.unique(part)

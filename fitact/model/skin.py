@@ -187,14 +187,11 @@ class TimeConstantGrid(eqx.Module):
         return HighpassTerms(fitted[:size], self.tau, fitted[size] if fitted.size > size else None)
 
 
-def _pseudo_inverse(terms: np.ndarray, share: np.ndarray, cutoff: float = 1e-13) -> FactoredMap:
-    """Return the pseudo-inverse of the terms over `share`, in two factors.
-
-    Singular values below `cutoff` times the largest are omitted, since they would produce large cancelling weights.
-    """
+def _pseudo_inverse(terms: np.ndarray, share: np.ndarray) -> FactoredMap:
+    """Return the pseudo-inverse of the terms over `share`, in two factors."""
     scaled = terms / share
     modes, sizes, directions = np.linalg.svd(np.concatenate([scaled.real, scaled.imag]), full_matrices=False)
-    kept = sizes > cutoff * sizes[0]
+    kept = sizes > 1e-13 * sizes[0]  # smaller ones would produce large cancelling weights
     return directions[kept].T / sizes[kept], modes[:, kept].T / np.tile(share[:, 0], 2)
 
 
