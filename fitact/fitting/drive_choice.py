@@ -268,7 +268,8 @@ def _align(record: Record, drive: Drive, frequency: float, steady_state: bool) -
     The drive is compared with V if it was recorded, otherwise its best linear combination with its integral is
     compared with Vsc.
     """
-    min_samples, n_parts = 20_000, 8  # used of a long record, or three periods; parts of all shifted drives, for memory
+    min_samples = 20_000  # used of a long record, or three periods
+    n_parts = 8  # in which the shifted drives are processed, to limit memory
     beginning = slice(0, max(min_samples, math.ceil(3.0 / frequency / record.time_step)))
     if "V" not in record and "Vsc" not in record:
         raise InputError(f"{record.source}: I alone does not determine the start of the drive; record V_V as well")
