@@ -30,6 +30,7 @@ class Surrogate(NamedTuple):
     log_range: Float[np.ndarray, "2 quantities"]  # smallest and largest logarithm of the evaluated model
     # sqrt(1 - r^2) of each quantity, where r is its correlation with the model at held-out points
     cross_validation_error: Float[np.ndarray, " quantities"]
+    evaluations: int  # of the model
 
     @classmethod
     def from_model(cls, finger: NewFingerModel, factors: Factors, names: tuple[str, ...]) -> Self:
@@ -51,7 +52,7 @@ class Surrogate(NamedTuple):
             terms = _hermite(z, powers)
             error = _cross_validation_error(terms, logs, weight)
             coefficients = _least_squares(terms, logs)
-            surrogates.append(cls(mean, covariance_factor, tail_scale, powers, coefficients, log_range, error))
+            surrogates.append(cls(mean, covariance_factor, tail_scale, powers, coefficients, log_range, error, count))
             if error.max() <= tolerance or math.comb(size + degree + 1, size) > count / evaluations_per_term:
                 break
         return min(surrogates, key=lambda surrogate: float(surrogate.cross_validation_error.max()))
