@@ -145,11 +145,18 @@ def is_normal(log_densities: Float[np.ndarray, "*shape probes"], tolerance: floa
 
 
 def _tabulate_axis(
-    center: Float[np.ndarray, " n"], axis: Float[np.ndarray, " n"], log_prob: LogProb
+    center: Float[np.ndarray, " n"],
+    axis: Float[np.ndarray, " n"],
+    log_prob: LogProb,
+    search_range: float = 40.0,
+    cells: int = 256,
+    log_density_range: float = 25.0,
 ) -> TabulatedMarginal | None:
-    """Tabulate the density on a line, in lengths of `axis`; return None if it is normal or zero everywhere."""
-    search_range, cells = 40.0, 256  # lengths on both sides
-    log_density_range = 25.0  # below the maximum, where the table ends
+    """Tabulate the density on a line, in lengths of `axis`; return None if it is normal or zero everywhere.
+
+    The search covers `search_range` lengths on both sides. The table ends where the log-density has fallen by
+    `log_density_range` below its maximum.
+    """
 
     def line_log_prob(positions: np.ndarray) -> np.ndarray:
         return log_prob(center + positions[:, None] * axis)
