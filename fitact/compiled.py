@@ -315,11 +315,11 @@ def _environment() -> str:
         sources.update(str(path.relative_to(root)).encode() + path.read_bytes())
     versions = [sys.version, *map(importlib.metadata.version, _LIBRARIES)]
     matmul = str(jax.config.jax_default_matmul_precision)
-    return "\0".join([sources.hexdigest(), *versions, platform.system(), platform.machine(), matmul, _processor()])
+    return "\0".join([sources.hexdigest(), *versions, platform.system(), platform.machine(), matmul, processor()])
 
 
-def _processor() -> str:
-    """Return the processor with its features, since a program may use instructions that another lacks."""
+def processor() -> str:
+    """Return lines on the processor with its features, since a program may use instructions that another lacks."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
             lines = file.read(16384).partition("\n\n")[0].splitlines()

@@ -4,10 +4,9 @@ The reference paper is "Electrostatic Tactile System Analyzing and Modelling" (2
 Ci, and results are given for each. Verdicts apply to 1.35 nF, the value in its text, unless the claim says otherwise.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,31 +37,20 @@ INSULATORS = {
 _SQUARE = Square(peak_to_peak=PEAK_TO_PEAK, frequency=FREQUENCY)
 
 
-@dataclasses.dataclass(frozen=True)
-class Claim:
-    """A statement of the reference paper, compared with the value computed by fitact.
+class Claim(NamedTuple):
+    """A statement of the reference paper, compared with the value computed by fitact."""
 
-    Attributes:
-        id: identifier of the equation or figure.
-        claim: statement of the reference paper.
-        paper: number in the reference paper, in `unit`, or None.
-        ours: value computed by fitact, or values by Ci if it depends on Ci.
-        unit: SI unit.
-        verdict: "agrees", "differs" or "qualitative".
-        reason: reason for the verdict, and what would make the numbers agree.
-    """
-
-    id: str
-    claim: str
-    paper: float | None
-    ours: Value
-    unit: str
-    verdict: str
-    reason: str
+    id: str  # identifier of the equation or figure
+    claim: str  # statement of the reference paper
+    paper: float | None  # number in the reference paper, in `unit`, or None
+    ours: Value  # value computed by fitact, or values by Ci if it depends on Ci
+    unit: str  # SI unit
+    verdict: str  # "agrees" or "differs"
+    reason: str  # reason for the verdict, and what would make the numbers agree
 
     def to_dict(self) -> dict[str, Any]:
         """Return the claim in the form of reproduction.json."""
-        return dataclasses.asdict(self)
+        return self._asdict()
 
 
 def reproduce() -> tuple[Claim, ...]:

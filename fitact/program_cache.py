@@ -29,10 +29,12 @@ def load(key: str) -> bytes | None:
         return None
     path = folder / (key + _SUFFIX)
     try:
-        digest, content = _split(path.read_bytes())
+        entry = path.read_bytes()
     except OSError:
         return None
-    if hashlib.sha256(content).digest() != digest:
+    size = hashlib.sha256().digest_size
+    content = entry[size:]
+    if hashlib.sha256(content).digest() != entry[:size]:
         remove(key)
         return None
     with contextlib.suppress(OSError):
@@ -99,11 +101,6 @@ def _note(reason: str) -> None:
         f"note: {reason}, so each start compiles them again; FITACT_CACHE names another folder, or is 'off'",
         file=sys.stderr,
     )
-
-
-def _split(entry: bytes) -> tuple[bytes, bytes]:
-    size = hashlib.sha256().digest_size
-    return entry[:size], entry[size:]
 
 
 def _clean_up(folder: Path) -> None:

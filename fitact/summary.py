@@ -79,11 +79,6 @@ def describe_quantity(name: str) -> str:
     return label + (f", record {number}" if number else "")
 
 
-def is_nuisance(name: str) -> bool:
-    """Return whether a quantity belongs to the measurement rather than to the circuit."""
-    return name not in _PARAMETERS | _DERIVED
-
-
 def summarize_draws(name: str, draws: Float[np.ndarray, "*shape"]) -> Summary:
     """Summarize draws of the quantity `name`, in its SI unit."""
     quantiles = np.quantile(draws, list(PROBABILITIES.values())).tolist()
@@ -157,10 +152,9 @@ def quantity_table(content: dict[str, Any]) -> list[tuple[str, ...]]:
     summaries = content["parameters"] | content["derived"]
     groups: dict[str, list[tuple[str, ...]]] = {"circuit": [], "computed, not measured": [], "measurement": []}
     for name, s in summaries.items():
-        if is_nuisance(name):
-            group = "measurement"
-        else:
-            group = "circuit" if name in _PARAMETERS or name in ("g", "b") else "computed, not measured"
+        group = "computed, not measured" if name in _DERIVED else "measurement"
+        if name in _PARAMETERS or name in ("g", "b"):
+            group = "circuit"
         groups[group].append(_quantity_row(name, s, content["force_basis"]))
     for name, s in content.get("nuisances", {}).items():
         value = format_engineering(s["value"], s["unit"], 3)

@@ -10,11 +10,6 @@ def align_row(cells: Sequence[str], widths: Sequence[int]) -> str:
     return (f"{first:{widths[0]}}" + "".join(columns)).rstrip()
 
 
-def align_rows(rows: Iterable[Sequence[str]], widths: Sequence[int]) -> list[str]:
-    """Return a line for each row, see `align_row`."""
-    return [align_row(row, widths) for row in rows]
-
-
 def align_table(rows: Iterable[Sequence[str]], gap: int = 3) -> list[str]:
     """Return a line for each row, as wide as its cells need: the first column to the left, the others to the right.
 

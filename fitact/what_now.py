@@ -17,11 +17,7 @@ def advice_sections() -> dict[str, str]:
 
 
 def explain(name: str) -> str:
-    """Return the advice for a result name, in Markdown.
-
-    Raises:
-        InputError: the page has no section of that name.
-    """
+    """Return the advice for a result name, in Markdown; raise InputError for any other name."""
     sections = advice_sections()
     if name in sections:
         return f"## {name}\n\n{sections[name]}"

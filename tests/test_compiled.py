@@ -132,7 +132,7 @@ def test_a_program_from_the_disk_equals_the_compiled_one_and_a_bad_entry_is_comp
     elif damage == "truncated":
         entry.write_bytes(entry.read_bytes()[: entry.stat().st_size // 2])
     elif damage == "processor":
-        monkeypatch.setattr(compiled, "_processor", lambda: "another one")
+        monkeypatch.setattr(compiled, "processor", lambda: "another one")
         compiled._environment.cache_clear()
     compiled._find_program.cache_clear()
     second = terms(circuit, "Vsc")

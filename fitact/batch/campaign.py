@@ -48,23 +48,15 @@ Batch = tuple[tuple[str, str], ...]  # (key of the journal, path) of each record
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """Input of a worker in addition to the records.
+    """Input of a worker in addition to the records."""
 
-    Attributes:
-        scene: scene as JSON; None means the device of the reference paper.
-        columns: `channels` and `scale` of files, as in `fitact.read`.
-        reports: folder for a posterior and a report of each record, or None.
-        seed: seed of the sampling.
-        posteriors: whether rows are made by `sample_many` instead of `fit_many`.
-        max_maps: number of memory maps above which compiled code is dropped; Linux allows a process 65,530 by default,
-            a new length of records needs some 600, and a batch has 32.
-    """
-
-    scene: str | None
-    columns: dict[str, Any]
-    reports: str | None
-    seed: int
-    posteriors: bool = False
+    scene: str | None  # scene as JSON; None means the device of the reference paper
+    columns: dict[str, Any]  # `channels` and `scale` of files, as in `fitact.read`
+    reports: str | None  # folder for a posterior and a report of each record, or None
+    seed: int  # seed of the sampling
+    posteriors: bool = False  # whether rows are made by `sample_many` instead of `fit_many`
+    # number of memory maps above which compiled code is dropped; Linux allows a process 65,530 by default, a new length
+    # of records needs some 600, and a batch has 32
     max_maps: int = 20_000
 
     @property

@@ -4,7 +4,6 @@ The elements stand in one column: insulator, gap, touching finger, body, and the
 with a value are drawn.
 """
 
-import dataclasses
 import itertools
 from collections.abc import Collection, Mapping
 from html import escape
@@ -22,21 +21,13 @@ _FONT, _SMALL = 13.0, 11.0  # px, at the drawing's own width
 _SOURCE, _CAPTION, _COLUMN, _LEFT, _RIGHT = 0.0, 0.75, 4.75, 4.1, 5.4  # x of what stands above each other
 
 
-@dataclasses.dataclass
 class Diagram:
-    """Diagram and its connections.
+    """Diagram and its connections."""
 
-    Attributes:
-        parts: both ends of each element, by its name in a scene; the second end of `source` is positive.
-        wires: both ends of each straight wire.
-        terminals: points between which Vsc is measured, "Vsc+" and "Vsc-".
-    """
-
-    parts: dict[str, tuple[Point, Point]] = dataclasses.field(default_factory=dict)
-    wires: list[tuple[Point, Point]] = dataclasses.field(default_factory=list)
-    terminals: dict[str, Point] = dataclasses.field(default_factory=dict)
-
-    def __post_init__(self) -> None:
+    def __init__(self) -> None:
+        self.parts: dict[str, tuple[Point, Point]] = {}  # both ends of each element, by its name in a scene
+        self.wires: list[tuple[Point, Point]] = []  # both ends of each straight wire
+        self.terminals: dict[str, Point] = {}  # points between which Vsc is measured, "Vsc+" and "Vsc-"
         style = {"color": "currentColor", "lw": 1.5, "fontsize": _FONT, "margin": 0.25, "inches_per_unit": _PIXELS / 72}
         self._drawing: Any = schemdraw.Drawing(canvas="svg", show=False, font="inherit")
         self._drawing.config(**style)
@@ -91,15 +82,10 @@ class Diagram:
 
 
 def lay_out_circuit(values: Mapping[str, str], grounding: Grounding = "direct", current: bool = False) -> Diagram:
-    """Lay out the elements of a circuit.
+    """Lay out the elements of a circuit, with a text for each part by its name in a scene.
 
-    Args:
-        values: text for each part by its name in a scene ("Rsc", "Csc", "Ci", "R_H", "grounding_Rsc", "grounding_Csc",
-            "Z", "Z_capacitance", "series_resistor", "Rgap", "Cgap", "alpha", "probe_resistance",
-            "probe_capacitance"). A part without a value is left out. The grounding skin is equal to the touching one
-            where its own values are absent.
-        grounding: how the body returns the current.
-        current: whether the current is recorded, so that there is a shunt.
+    A part without a value is left out. The grounding skin is equal to the touching one where its own values are absent.
+    If the `current` is recorded, there is a shunt.
     """
     diagram = Diagram()
     bottom = _add_column(diagram, values, grounding)
@@ -216,10 +202,7 @@ def lay_out_wiring(
 ) -> Diagram:
     """Lay out the wiring of a bench: oscilloscope channel 1 on V, 2 on Vsc, and 3 on the current.
 
-    Args:
-        grounding: connection of the body to ground.
-        channels: channels recorded besides V: "Vsc", "I" or both.
-        series_resistor: whether a known resistor is in the lead to the electrode.
+    `channels` are recorded besides V; `series_resistor`: whether a known resistor is in the lead to the electrode.
     """
     diagram, elements, direct = Diagram(), schemdraw.elements, grounding == "direct"
     current = "I" in channels

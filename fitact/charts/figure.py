@@ -48,11 +48,7 @@ def log_ticks(axis: Axis, unit: str, subs: tuple[float, ...] = (1.0, 2.0, 5.0)) 
 
 
 def write_figure(path: str | os.PathLike[str], draw: Callable[[], Figure], dpi: float | None = None) -> None:
-    """Write a figure in the shared style as PNG or, for any other suffix of `path`, as SVG.
-
-    Raises:
-        InputError: the path cannot be written.
-    """
+    """Write a figure in the shared style as PNG or, for any other suffix of `path`, as SVG."""
     kind = "png" if Path(path).suffix == ".png" else "svg"
     metadata = {"Date": None} if kind == "svg" else {}
     with mpl.rc_context(STYLE), atomic_write(path) as temporary:

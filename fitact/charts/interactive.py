@@ -33,25 +33,15 @@ _LOG_TICKS = 3
 
 @dataclasses.dataclass(frozen=True)
 class Axis:
-    """A quantity along an axis.
+    """A quantity along an axis."""
 
-    Attributes:
-        title: name of the quantity.
-        symbol: displayed unit, with its prefix.
-        size: size of the displayed unit, SI.
-        log: whether the axis is initially logarithmic.
-        limits: initial limits, SI; None means all data.
-        hides_numbers: whether the axis starts at 0 and has no numbers.
-        has_tick_prefixes: whether each tick has its own prefix (for many decades).
-    """
-
-    title: str
-    symbol: str = ""
-    size: float = 1.0
-    log: bool = False
-    limits: tuple[float, float] | None = None
-    hides_numbers: bool = False
-    has_tick_prefixes: bool = False
+    title: str  # name of the quantity
+    symbol: str = ""  # displayed unit, with its prefix
+    size: float = 1.0  # of the displayed unit, SI
+    log: bool = False  # whether the axis is initially logarithmic
+    limits: tuple[float, float] | None = None  # initial limits, SI; None means all data
+    hides_numbers: bool = False  # whether the axis starts at 0 and has no numbers
+    has_tick_prefixes: bool = False  # whether each tick has its own prefix (for many decades)
     log_ticks: int = _LOG_TICKS
 
     @classmethod
@@ -166,13 +156,9 @@ def plot(
     x: Axis, *rows: tuple[Axis, Iterable[PlotlyTrace]], heights: Sequence[float] = (1.0,), title: str = "",
     size: int = 320, legend: bool = True, unified_hover: bool = False,
 ) -> Plot:  # fmt: skip
-    """Return a plot of several rows of traces over one x axis.
+    """Return a plot of several rows (y axis, traces) over one x axis, `size` pixels high.
 
-    Args:
-        rows: y axis and traces of each row, from the top.
-        heights: relative heights of the rows.
-        size: height in pixels.
-        unified_hover: whether hovering shows all traces at this x, or only the nearest point.
+    With `unified_hover`, hovering shows all traces at this x, and else only the nearest point.
     """
     data: list[PlotlyTrace] = []
     layout: dict[str, Any] = {
@@ -255,6 +241,5 @@ def _trace(x: Axis, y: Axis, x_values: ArrayLike, values: ArrayLike, name: str) 
 
 
 def _rgba(color: str, opacity: float = 0.35) -> str:
-    """Return the colour as rgba with this opacity."""
     red, green, blue = (int(color[i : i + 2], 16) for i in (1, 3, 5))
     return f"rgba({red},{green},{blue},{opacity})"

@@ -4,15 +4,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 
-def clipping_mask(
-    values: Float[np.ndarray, " samples"], *, min_run: int = 4, min_count_ratio: float = 8.0, margin: int = 2
-) -> Bool[np.ndarray, " samples"]:
+def clipping_mask(values: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
     """Return a mask of the samples in saturation, or within `margin` samples of saturation.
 
     A saturation level is an extreme value that occurs `min_run` times in a row, and `min_count_ratio` times as often
     as the adjacent level; at a rounded smooth peak this ratio is at most 2.4. A signal with few levels, such as an
     ideal square, has no saturation level. A drive with flat tops cannot be distinguished from a clipped one.
     """
+    min_run, min_count_ratio, margin = 4, 8.0, 2
     railed = np.zeros(values.size, dtype=bool)
     for upward in (values, -values):
         is_extreme = upward == upward.max()

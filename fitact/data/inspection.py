@@ -166,11 +166,9 @@ def _estimate_frequency(time: Samples, values: Samples, max_samples: int = 2_097
     return whole
 
 
-def check_time(time: Samples, frequency: float | None, min_samples_per_period: int = 20) -> list[str]:
-    """Describe doubts about the times (s), and about the sampling rate for a signal of `frequency` (Hz).
-
-    Edges and bends are lost with fewer than `min_samples_per_period` samples.
-    """
+def check_time(time: Samples, frequency: float | None) -> list[str]:
+    """Describe doubts about the times (s), and about the sampling rate for a signal of `frequency` (Hz)."""
+    min_samples_per_period = 20  # with fewer, edges and bends are lost
     found = []
     step = (time[-1] - time[0]) / (time.size - 1)
     if not time[0] <= 0.0 <= time[-1]:
@@ -235,22 +233,12 @@ def check_divider(channels: Mapping[str, Samples], low: float = 2e-2, high: floa
 
 
 def _check_hum_and_drift(
-    time: Samples,
-    values: Samples,
-    value_range: float,
-    frequency: float | None,
-    unit: str,
-    *,
-    min_mains_periods: int = 4,
-    hum_fraction: float = 0.01,
-    drift_fraction: float = 0.02,
-    min_significance: float = 6.0,
+    time: Samples, values: Samples, value_range: float, frequency: float | None, unit: str
 ) -> Iterator[str]:
-    """Describe hum and drift of a periodic signal, found by a spectral line and by the means of the periods.
-
-    Both are reported above a fraction of the channel's range, a drift also only above `min_significance` standard
-    errors. A record shorter than `min_mains_periods` cannot distinguish mains hum from drift.
-    """
+    """Describe hum and drift of a periodic signal, found by a spectral line and by the means of the periods."""
+    min_mains_periods = 4  # a shorter record cannot distinguish mains hum from drift
+    hum_fraction, drift_fraction = 0.01, 0.02  # of the channel's range, above which each is reported
+    min_significance = 6.0  # of a drift, in standard errors
     span = float(time[-1] - time[0])
     if frequency is None or not is_uniform(time) or span * frequency < 3.0:
         return
@@ -268,8 +256,9 @@ def _check_hum_and_drift(
             values = values - np.real(line * np.exp(2j * np.pi * mains * time))
     step = span / (time.size - 1)
     means, centres = _period_means(values, 1.0 / (frequency * step))
-    slope, error = _fit_slope(centres * step, means)
-    if abs(slope * span) > drift_fraction * value_range and abs(slope) > min_significance * error:
+    (slope, _), covariance = np.polyfit(centres * step, means, 1, cov=True)
+    is_significant = abs(slope) > min_significance * math.sqrt(covariance[0, 0])
+    if abs(slope * span) > drift_fraction * value_range and is_significant:
         yield f"drifts by {slope * span:.3g} {unit} over the record; the fit adds a drift if the BIC favours it"
 
 
@@ -278,14 +267,6 @@ def _period_means(values: Samples, samples: float) -> tuple[np.ndarray, np.ndarr
     edges = np.round(np.arange(int(values.size / samples) + 1) * samples).astype(int)
     sums = np.concatenate([[0.0], np.cumsum(values)])
     return np.diff(sums[edges]) / np.diff(edges), 0.5 * (edges[1:] + edges[:-1])
-
-
-def _fit_slope(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Return the slope of a fitted straight line, and its standard error."""
-    x = x - x.mean()
-    slope = float(x @ y / (x @ x))
-    rest = y - y.mean() - slope * x
-    return slope, math.sqrt(float(rest @ rest) / max(y.size - 2, 1) / float(x @ x))
 
 
 def _spectral_line(time: Samples, values: Samples, frequency: float) -> complex:

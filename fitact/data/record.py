@@ -172,11 +172,10 @@ def row_medians(values: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*row
     return upper if values.shape[-1] % 2 else 0.5 * (upper + np.max(values[..., :half], axis=-1))
 
 
-def rounding_noise_sd(values: Float[np.ndarray, " samples"], min_levels: int = 12, some: int = 65_536) -> float:
-    """Return the sd due to the resolution (LSB) of the samples, or 0 if white noise exceeds it.
-
-    Fewer levels than `min_levels` indicate an ideal wave, not an ADC. The first `some` samples usually suffice.
-    """
+def rounding_noise_sd(values: Float[np.ndarray, " samples"]) -> float:
+    """Return the sd due to the resolution (LSB) of the samples, or 0 if white noise exceeds it."""
+    min_levels = 12  # fewer indicate an ideal wave, not an ADC
+    some = 65_536  # the first samples, which usually suffice
     noise, step = white_noise_sd(values), math.inf
     for part in (values[:some], values)[values.size <= some :]:
         levels = np.unique(part)
@@ -186,21 +185,11 @@ def rounding_noise_sd(values: Float[np.ndarray, " samples"], min_levels: int = 1
     return step / math.sqrt(12.0) if levels.size >= min_levels else 0.0
 
 
-def fundamental_frequency(
-    time: Float[np.ndarray, " samples"],
-    values: Float[np.ndarray, " samples"],
-    *,
-    min_correlation: float = 0.8,
-    peak_tolerance: float = 0.02,
-    lag_tolerance: int = 4,
-) -> float | None:
-    """Return the fundamental frequency (Hz) of a signal from its autocorrelation, or None if it is not periodic.
-
-    Args:
-        min_correlation: minimum autocorrelation of a periodic signal.
-        peak_tolerance: amount by which the first peak may be lower than a later one.
-        lag_tolerance: error, in samples, of twice a period that is estimated from one.
-    """
+def fundamental_frequency(time: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"]) -> float | None:
+    """Return the fundamental frequency (Hz) of a signal from its autocorrelation, or None if it is not periodic."""
+    min_correlation = 0.8  # least autocorrelation of a periodic signal
+    peak_tolerance = 0.02  # by which the first peak may be lower than a later one
+    lag_tolerance = 4  # error, in samples, of twice a period that is estimated from one
     count = time.size
     correlation = _autocorrelation(resample_uniform(time, values))
     below = np.flatnonzero(correlation < 0.5)

@@ -5,6 +5,7 @@ finger needs.
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -80,8 +81,7 @@ def design_drive(
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class _DriveEvaluator:
+class _DriveEvaluator(NamedTuple):
     """Evaluator of drives and insulators for the fingers drawn."""
 
     scene: Scene

@@ -37,27 +37,18 @@ def quantile_error(amplitude: Float[np.ndarray, " n"], share: float) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class DriveOption:
-    """A waveform at a frequency on an insulator.
-
-    Attributes:
-        waveform: name, as in the scene's `[drive]`.
-        frequency: of the drive, Hz.
-        device: panel with its limits.
-        amplitude: peak-to-peak amplitude (V) that the required fraction of fingers needs, for each population sample.
-        assured_error: Monte Carlo standard error of `assured`, V, from the finite number of samples.
-        people: peak-to-peak amplitudes (V) up to which `FINGER_QUANTILES` of all fingers feel the drive.
-        at_assured: effects at `assured`: forces and powers of the median finger, the largest voltage and currents.
-    """
+    """A waveform at a frequency on an insulator."""
 
     CRITERIA: ClassVar[dict[str, str]] = {"peak_to_peak": "V", "real_power": "W", "apparent_power": "VA"}
 
-    waveform: str
-    frequency: float
-    device: Device
+    waveform: str  # name, as in the scene's `[drive]`
+    frequency: float  # Hz
+    device: Device  # panel with its limits
+    # peak-to-peak amplitude (V) that the required fraction of fingers needs, for each population sample
     amplitude: Float[np.ndarray, " laws"]
-    assured_error: float
-    people: Float[np.ndarray, " shares"]
-    at_assured: PeriodQuantities
+    assured_error: float  # Monte Carlo standard error of `assured`, V, from the finite number of samples
+    people: Float[np.ndarray, " shares"]  # peak-to-peak V up to which `FINGER_QUANTILES` of all fingers feel it
+    at_assured: PeriodQuantities  # forces and powers of the median finger, the largest voltage and currents
 
     @classmethod
     def from_amplitudes(

@@ -17,19 +17,12 @@ from fitact.scene.scene import Scene
 
 @dataclasses.dataclass(frozen=True)
 class FingerSample:
-    """Fingers of each of some samples of the population parameters.
+    """Fingers of each of some samples of the population parameters."""
 
-    Attributes:
-        values: Rsc, Csc, Ci and other free parameters of the circuit, SI.
-        source: description of the fingers for people.
-        trusted: whether the population fit is reliable, and most of its fingers are fitted well.
-        warnings: warnings of the population fit.
-    """
-
-    values: dict[str, Float[np.ndarray, "laws fingers"]]
-    source: str
-    trusted: bool = True
-    warnings: tuple[str, ...] = ()
+    values: dict[str, Float[np.ndarray, "laws fingers"]]  # Rsc, Csc, Ci and other free parameters of the circuit, SI
+    source: str  # description of the fingers for people
+    trusted: bool = True  # whether the population fit is reliable, and most of its fingers are fitted well
+    warnings: tuple[str, ...] = ()  # of the population fit
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -43,14 +36,12 @@ class FingerSample:
         return self.shape[0] > 1
 
     @classmethod
-    def from_population(
-        cls, population: Population, scene: Scene, seed: int = 0, laws: int = 512, fingers: int = 128
-    ) -> Self:
+    def from_population(cls, population: Population, scene: Scene, seed: int = 0) -> Self:
         """Draw new fingers from a population; a larger contact area raises both capacitances and lowers Rsc.
 
-        Parameters that the scene fixes or ties follow; all others are the scene's. One Sobol sequence covers all
-        fingers, and each population sample evenly if `laws` and `fingers` are powers of 2.
+        Parameters that the scene fixes or ties follow; all others are the scene's.
         """
+        laws, fingers = 512, 128  # powers of 2, so that one Sobol sequence covers each population sample evenly
         uniform = scipy.stats.qmc.Sobol(3, rng=np.random.default_rng([seed, 2])).random(laws * fingers)
         z = scipy.special.ndtri(uniform).reshape(laws, fingers, 3)
         Rsc, Csc, Ci, *areas = np.moveaxis(factors_from_normal(draw_parameters(population, laws), z), -1, 0)

@@ -3,7 +3,6 @@
 The comparison is no safety assessment: the model has no fault, no stored energy and no current limit of an amplifier.
 """
 
-import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -44,29 +43,17 @@ PUBLISHED_LIMITS = (
 _NAMES = {"current_rms": "rms current", "current_peak": "peak current"}
 
 
-@dataclasses.dataclass(frozen=True)
-class LimitComparison:
-    """A quantity at the amplitude of a `DriveOption` beside a limit.
+class LimitComparison(NamedTuple):
+    """A quantity at the amplitude of a `DriveOption` beside a limit."""
 
-    Attributes:
-        source: standard or scene key that states the limit.
-        name: meaning of the limit.
-        quantity: rms current, peak current, or field in the insulator.
-        value: largest one of the fingers drawn, A or V/m; infinite at ideal edges.
-        limit: in the same unit, or None if the scene states none.
-        unit: of both.
-        frequency_range: frequencies (Hz) for which the limit is published; None for a limit of the scene.
-        in_range: whether the drive's frequency lies there.
-    """
-
-    source: str
-    name: str
-    quantity: str
-    value: float
-    limit: float | None
+    source: str  # standard or scene key that states the limit
+    name: str  # meaning of the limit
+    quantity: str  # rms current, peak current, or field in the insulator
+    value: float  # largest one of the fingers drawn, A or V/m; infinite at ideal edges
+    limit: float | None  # in the same unit, or None if the scene states none
     unit: str
-    frequency_range: tuple[float, float] | None = None
-    in_range: bool = True
+    frequency_range: tuple[float, float] | None = None  # Hz, of a published limit; None for a limit of the scene
+    in_range: bool = True  # whether the drive's frequency lies there
 
     @property
     def ratio(self) -> float | None:
@@ -81,8 +68,7 @@ class LimitComparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Return an entry of `limits` in drive.json; null stands for what is unbounded or not stated."""
-        between = None if self.frequency_range is None else list(self.frequency_range)
-        return dataclasses.asdict(self) | {"ratio": self.ratio, "frequency_range": between}
+        return self._asdict() | {"ratio": self.ratio}
 
     @property
     def row(self) -> tuple[str, ...]:
@@ -128,14 +114,11 @@ def compare_with_limits(frequency: float, at_amplitude: PeriodQuantities, device
 
 
 def format_quantity(value: ArrayLike, unit: str, error: float | None = None) -> str:
-    """Format a value for people; with an `error`, to the place of the error's second significant digit.
-
-    A field (V/m) is in V/µm, as in data sheets.
-    """
+    """Format a value for people; with an `error`, to the place of the error's second significant digit."""
     if not math.isfinite(value):
         return "unbounded"
     if unit == "V/m":
-        return f"{1e-6 * float(value):.3g} V/µm"
+        return f"{1e-6 * float(value):.3g} V/µm"  # as in data sheets
     if error is None or not 0.0 < error < math.inf:
         return format_engineering(float(value), unit, 3)
     size, symbol = choose_prefixed_unit(float(value), unit)

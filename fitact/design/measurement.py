@@ -8,17 +8,16 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from fitact.data.record import Record
 from fitact.data.simulate import sample_times
 from fitact.errors import InputError
 from fitact.experiment.blind_directions import gain_names
-from fitact.experiment.experiment import CandidateDesign, DesignOption, evaluate_design
+from fitact.experiment.experiment import CandidateDesign, DesignOption, Gradient, evaluate_design
 from fitact.experiment.fisher import Experiment, force_gradient, signal_spans
 from fitact.experiment.optimise import optimise
 from fitact.experiment.options import Change, changes
-from fitact.fitting.fit import Fit, fit
+from fitact.fitting.fit import fit
 from fitact.model.skin import Dispersive, WithSkin, circuit_parameters
 from fitact.prior.distributions import LogNormal
 from fitact.scene.scene import Scene
@@ -126,7 +125,9 @@ def design_measurement(scene: Scene, records: Record | Sequence[Record] = ()) ->
     records = (records,) if isinstance(records, Record) else tuple(records)
     if records:
         fitted = fit(records, scene)
-        experiment, gradient = fitted.experiment, _force_gradient(fitted)
+        experiment = fitted.experiment
+        free = [fitted.names.index(name) for name in experiment.free]
+        gradient = fitted.laplace.log_gradient("force_mean")[free]
         # the smallest difference between a record's values is the LSB of its ADC, or less
         steps = {name: float(np.diff(np.unique(records[0][name])).min()) for name in experiment.channels}
         judgement = fitted.trusted, (*([] if fitted.trusted else [fitted.message]), *fitted.warnings)
@@ -185,17 +186,8 @@ def experiment_from_scene(scene: Scene) -> Experiment:
     )
 
 
-def _force_gradient(fit_result: Fit) -> Float[np.ndarray, " circuit_parameters"]:
-    """Return the gradient of a fit's log mean force in the free parameters of its experiment."""
-    columns = [fit_result.names.index(name) for name in fit_result.experiment.free]
-    return fit_result.laplace.log_gradient("force_mean")[columns]
-
-
 def _rank_options(
-    trial: CandidateDesign,
-    gradient: Float[np.ndarray, " circuit_parameters"],
-    baseline: DesignOption,
-    candidates: Sequence[Change],
+    trial: CandidateDesign, gradient: Gradient, baseline: DesignOption, candidates: Sequence[Change]
 ) -> tuple[tuple[DesignOption, ...], tuple[SettingCurve, ...]]:
     """Evaluate each change, and the best two together, best first; also return curves along one setting."""
     evaluated = {
@@ -225,7 +217,7 @@ def _combine_changes(trial: CandidateDesign, first: Change, second: Change) -> C
 
 
 def _evaluate_best_settings(
-    trial: CandidateDesign | None, gradient: Float[np.ndarray, " circuit_parameters"], baseline: DesignOption
+    trial: CandidateDesign | None, gradient: Gradient, baseline: DesignOption
 ) -> tuple[DesignOption, SettingCurve | None] | None:
     """Evaluate a design at its best settings, or return None if it cannot be made or computed."""
     if trial is None:

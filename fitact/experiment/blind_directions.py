@@ -5,9 +5,9 @@ function of frequency, and nothing else. A direction in the log-parameters that 
 identified. Such directions are the null space of the first derivatives of the gains' logarithms.
 """
 
-import dataclasses
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,21 +23,13 @@ from fitact.model.skin import circuit_parameters, constant_skin_circuit, with_va
 _MIN_SINE = 1e-6  # sine of the angle between directions below which they count as equal
 
 
-@dataclasses.dataclass(frozen=True)
-class StructuralIdentifiability:
-    """Directions that no record of these channels determines.
+class StructuralIdentifiability(NamedTuple):
+    """Directions that no record of these channels determines."""
 
-    Attributes:
-        names: free parameters.
-        channels: channels recorded in addition to V.
-        directions: unit vectors in the log-parameters, at the circuit's values.
-        is_constant: whether the directions are the same for all values.
-    """
-
-    names: tuple[str, ...]
-    channels: tuple[Channel, ...]
-    directions: Float[np.ndarray, "dimension parameters"]
-    is_constant: bool
+    names: tuple[str, ...]  # free parameters
+    channels: tuple[Channel, ...]  # recorded in addition to V
+    directions: Float[np.ndarray, "dimension parameters"]  # unit vectors in the log-parameters, at the circuit's values
+    is_constant: bool  # whether the directions are the same for all values
 
     @property
     def dimension(self) -> int:
@@ -60,16 +52,14 @@ class StructuralIdentifiability:
         return f"No record of {channels}{' alone' * (len(self.channels) == 1)} can determine {what}{here}."
 
 
-def blind_directions(
-    circuit: Circuit, free: Sequence[str], channels: Sequence[Channel], points: int = 8
-) -> StructuralIdentifiability:
+def blind_directions(circuit: Circuit, free: Sequence[str], channels: Sequence[Channel]) -> StructuralIdentifiability:
     """Find the directions in the logarithms of `free` that no record of `channels` determines.
 
     `free` names fields of the circuit, "gain" (of the channel Vsc) and "gain_I"; all else is known. The circuit's
     values may be special (two equal skins). A direction therefore counts only if it is unidentified there and at
     `points` random values around them, each up to a factor of 10 away.
     """
-    free, channels = tuple(free), tuple(channels)
+    free, channels, points = tuple(free), tuple(channels), 8
     spread = np.array([0.1 if name == "alpha" else math.log(10.0) for name in free])  # alpha is at most 1
     offsets = spread * np.random.default_rng(0).uniform(-1.0, 1.0, (points, len(free)))  # any other points would serve
     thetas = log_values(circuit, free, channels) + np.vstack([np.zeros(len(free)), offsets])
@@ -134,14 +124,10 @@ def _area_power(name: str) -> float:
 
 @jit
 def _log_gain_slopes(
-    circuit: Circuit,
-    thetas: Float[Array, "n parameters"],
-    free: tuple[str, ...],
-    channels: tuple[Channel, ...],
-    frequencies: int = 128,
-    margin: float = 100.0,
+    circuit: Circuit, thetas: Float[Array, "n parameters"], free: tuple[str, ...], channels: tuple[Channel, ...]
 ) -> Complex[Array, "n rows parameters"]:
     """Return derivatives of the log gains, at frequencies up to `margin` times beyond the circuit's at both ends."""
+    frequencies, margin = 128, 100.0
 
     def slopes(theta: Array) -> Array:
         tau = jnp.stack(constant_skin_circuit(with_parameters(circuit, free, channels, theta)[0]).terms().tau)
@@ -158,9 +144,7 @@ def _log_gain_slopes(
     return jax.vmap(slopes)(thetas)
 
 
-def _null_space(
-    sensitivity: Float[np.ndarray, "rows parameters"], rounding: float = 1e-11, gap: float = 1e-3
-) -> Float[np.ndarray, "dimension parameters"]:
+def _null_space(sensitivity: Float[np.ndarray, "rows parameters"]) -> Float[np.ndarray, "dimension parameters"]:
     """Return an orthonormal basis of the directions without effect.
 
     Relative to the largest singular value, rounding leaves 1e-15, and real effects lie above 1e-5. Values below
@@ -168,6 +152,7 @@ def _null_space(
     frequencies cover all corner frequencies of the circuit, so even the smallest resistance has an effect at some.
     Columns are scaled to one length, which removes the parameters' different sizes.
     """
+    rounding, gap = 1e-11, 1e-3
     scale = np.linalg.norm(sensitivity, axis=0)
     scale = np.where(scale > 0.0, scale, 1.0)
     _, sizes, directions = np.linalg.svd(sensitivity / scale, full_matrices=False)

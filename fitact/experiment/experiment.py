@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.linalg
@@ -13,6 +13,8 @@ from fitact.experiment.fisher import FREQUENCY, Experiment, covariance_factor, j
 from fitact.model.drive import Trapezoid
 from fitact.model.skin import with_values
 from fitact.units import format_engineering
+
+Gradient: TypeAlias = Float[np.ndarray, " parameters"]  # of the log mean force, in the free log-parameters
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,15 +87,11 @@ class DesignOption:
 
 
 def evaluate_design(
-    design: CandidateDesign,
-    values: Sequence[float],
-    gradient: Float[np.ndarray, " parameters"],
-    baseline_sd: float | None = None,
+    design: CandidateDesign, values: Sequence[float], gradient: Gradient, baseline_sd: float | None = None
 ) -> DesignOption:
     """Evaluate a candidate with its settings at `values`, rounded to three digits.
 
-    `gradient` is the gradient of the log force in the first experiment's free log-parameters; `baseline_sd` is the
-    standard deviation of the log force without any change.
+    `baseline_sd` is the standard deviation of the log force without any change.
 
     Raises:
         numpy.linalg.LinAlgError: the records have values beyond double precision.

@@ -143,7 +143,6 @@ class _LogTauTerms(NamedTuple):
 
 @jit
 def _term_derivatives(model: _Model, order: int) -> tuple[tuple[_LogTauTerms, ...], ...]:
-    """Return each channel's terms and their derivatives."""
 
     def terms(theta: Array) -> list[_LogTauTerms]:
         circuit, gains = model.circuit_and_gains(theta)

@@ -9,7 +9,7 @@ import scipy.ndimage
 import scipy.optimize
 from jaxtyping import Float
 
-from fitact.experiment.experiment import CandidateDesign, joint_jacobian, joint_prior_factor
+from fitact.experiment.experiment import CandidateDesign, Gradient, joint_jacobian, joint_prior_factor
 from fitact.experiment.fisher import covariance_factor
 from fitact.model.skin import has_time_constants
 
@@ -22,10 +22,8 @@ class Optimum(NamedTuple):
     force_sd: Float[np.ndarray, "*points"]  # at all combinations
 
 
-def optimise(
-    design: CandidateDesign, gradient: Float[np.ndarray, " parameters"], starts: int = 3, min_improvement: float = 1e-3
-) -> Optimum:
-    """Find the settings with the smallest uncertainty of a force with this `gradient` in the free log-parameters.
+def optimise(design: CandidateDesign, gradient: Gradient, starts: int = 3, min_improvement: float = 1e-3) -> Optimum:
+    """Find the settings with the smallest uncertainty of the mean force.
 
     The descent starts from the `starts` lowest points of the grid. It is skipped for a skin without time constants,
     which has no derivatives in the settings. A setting moves only if the uncertainty falls by the
@@ -50,7 +48,7 @@ def optimise(
     return Optimum(tuple(map(float, values)), grid, coarse.reshape(shape))
 
 
-def force_sd(design: CandidateDesign, values: Sequence[float], gradient: Float[np.ndarray, " parameters"]) -> float:
+def force_sd(design: CandidateDesign, values: Sequence[float], gradient: Gradient) -> float:
     """Return the standard deviation of the log mean force with the settings at `values`."""
     experiments = design.make_experiments(values, keep_phase=True)
     root = covariance_factor(joint_jacobian(experiments)[0], joint_prior_factor(experiments))
@@ -58,7 +56,7 @@ def force_sd(design: CandidateDesign, values: Sequence[float], gradient: Float[n
 
 
 def log_force_sd_slope(
-    design: CandidateDesign, values: Sequence[float], gradient: Float[np.ndarray, " parameters"]
+    design: CandidateDesign, values: Sequence[float], gradient: Gradient
 ) -> tuple[float, Float[np.ndarray, " settings"]]:
     """Return the logarithm of `force_sd`, and its derivatives in the logarithms of the settings.
 
@@ -75,7 +73,7 @@ def log_force_sd_slope(
 
 
 def _minimise(
-    design: CandidateDesign, gradient: np.ndarray, start: Sequence[float], bounds: list[tuple[float, float]]
+    design: CandidateDesign, gradient: Gradient, start: Sequence[float], bounds: list[tuple[float, float]]
 ) -> tuple[float, tuple[float, ...]]:
     def objective(logs: np.ndarray) -> tuple[float, np.ndarray]:
         return log_force_sd_slope(design, np.exp(logs), gradient)

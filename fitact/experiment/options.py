@@ -3,13 +3,12 @@
 import contextlib
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
-from fitact.experiment.experiment import CandidateDesign, DesignOption, Setting, evaluate_design
+from fitact.experiment.experiment import CandidateDesign, DesignOption, Gradient, Setting, evaluate_design
 from fitact.experiment.fisher import FREQUENCY, Experiment
 from fitact.model.circuit import RC, Channel, DirectGround, FinalCircuit, Probe
 from fitact.model.drive import Multitone, Periodic, Trapezoid
@@ -56,19 +55,14 @@ def changes(adc_steps: Mapping[Channel, float] | None = None) -> tuple[Change, .
     )
 
 
-def suggest_measurements(
-    experiment: Experiment,
-    gradient: Float[np.ndarray, " circuit_parameters"],
-    names: Sequence[str] = ("current", "series resistor", "better Ci", "longer record"),
-) -> tuple[DesignOption, ...]:
-    """Evaluate the changes of these `names`, best first, if they can be made and computed.
-
-    `gradient` is the gradient of the log force. A failed fit may end at a circuit whose current overflows.
-    """
+def suggest_measurements(experiment: Experiment, gradient: Gradient) -> tuple[DesignOption, ...]:
+    """Evaluate the changes that a fit suggests, best first, if they can be made and computed."""
+    names = ("current", "series resistor", "better Ci", "longer record")
     as_it_is, options = CandidateDesign((experiment,)), []
     for change in changes():
         candidate = change(as_it_is) if change.name in names else None
         if candidate is not None and candidate.experiments[0] is not experiment:
+            # a failed fit may end at a circuit whose current overflows
             with contextlib.suppress(np.linalg.LinAlgError):
                 options.append(evaluate_design(candidate, candidate.start_values, gradient))
     return tuple(sorted(options, key=lambda option: option.force_sd))

@@ -1,6 +1,7 @@
 """Result of a fit for one channel of one record: residuals, nuisances and figures of merit."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import jax.numpy as jnp
@@ -9,15 +10,16 @@ from jaxtyping import Array, Float
 
 from fitact.compiled import jit
 from fitact.data.record import Record
-from fitact.fitting.criteria import criteria, gaussian_log_likelihood, student_log_likelihood
 from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.problem import Source
 from fitact.fitting.residual_statistics import channel_statistics, outliers
 from fitact.likelihood.channel import LINEAR_NUISANCES, ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
-from fitact.likelihood.noise import student_weight
+from fitact.likelihood.noise import STUDENT_DOF, student_weight
 from fitact.model.circuit import Channel, Circuit
 from fitact.model.skin import WithSkin
+
+Samples = Float[np.ndarray, " samples"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,8 +32,8 @@ class ChannelFit:
     choice: DriveModel
     sigma: float  # standard deviation of the noise, estimated from the residuals, V or A
     linear: dict[str, float]  # free offset, drift, hum and charge at the optimum, V or A
-    residuals: Float[np.ndarray, " samples"]  # data minus fit, V or A
-    weight: Float[np.ndarray, " samples"] | None  # relative inverse noise sd; 0 excludes a sample, None means 1
+    residuals: Samples  # data minus fit, V or A
+    weight: Samples | None  # relative inverse noise sd; 0 excludes a sample, None means 1
     log_likelihood: float  # log-likelihood of the samples, including all constants
     figures: dict[str, float]  # figures of merit: chi2_reduced, rms_residual, noise_expected, runs_z, ...
     full_because: str  # reason why the likelihood is not compressed, as a clause; "" if it is
@@ -108,11 +110,34 @@ def _log_likelihood(
     if channel.whitening is None:
         weights = channel.weights[: residuals.size]
         if channel.noise == "student":
-            return student_log_likelihood(residuals, weights, sigma)
+            return _student_log_likelihood(residuals, weights, sigma)
         return gaussian_log_likelihood(residuals, weights)
     used = np.asarray(channel.whitening.mask) > 0.0
     innovations = white_residuals / float(channel.whitening.taps[0])
     return gaussian_log_likelihood(innovations, None) + float(np.sum(np.log(channel.weights[used])))
+
+
+def gaussian_log_likelihood(residuals: Samples, weight: Samples | None) -> float:
+    """Return the Gaussian log-likelihood of residuals at its maximum over the noise sd, including all constants.
+
+    `weight` is the inverse relative noise sd of each sample; 0 excludes a sample, and None means equal weights.
+    """
+    weight = np.ones(residuals.size) if weight is None else weight
+    used = weight > 0.0
+    mean = float(np.mean(np.square(residuals[used] * weight[used])))
+    size = int(np.count_nonzero(used))
+    return -0.5 * size * (math.log(2.0 * math.pi * max(mean, 1e-300)) + 1.0) + float(np.sum(np.log(weight[used])))
+
+
+def _student_log_likelihood(residuals: Samples, weight: Samples, scale: float) -> float:
+    """Return the log-likelihood of residuals under Student's t with `STUDENT_DOF` degrees of freedom and this scale."""
+    used = weight > 0.0
+    z = residuals[used] * weight[used] / scale
+    constant = (
+        math.lgamma(0.5 * (STUDENT_DOF + 1.0)) - math.lgamma(0.5 * STUDENT_DOF) - 0.5 * math.log(STUDENT_DOF * math.pi)
+    )
+    densities = constant - 0.5 * (STUDENT_DOF + 1.0) * np.log1p(z**2 / STUDENT_DOF) + np.log(weight[used] / scale)
+    return float(np.sum(densities))
 
 
 @jit
@@ -128,10 +153,23 @@ def _sample_residuals(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: 
 
 
 def information_criteria(parameters: int, traces: Sequence[ChannelFit]) -> dict[str, float]:
-    """Return the information criteria of a fit.
-
-    `parameters` counts the free parameters without the linear nuisances and the noise of each channel.
-    """
+    """Return the information criteria of a fit with so many `parameters` besides linear nuisances and noise."""
     n_parameters = parameters + sum(1 + len(channel.linear) for channel in traces)
     samples = sum(int(channel.figures["samples"]) for channel in traces)
     return criteria(sum(channel.log_likelihood for channel in traces), n_parameters, samples)
+
+
+def criteria(log_likelihood: float, parameters: int, samples: int) -> dict[str, float]:
+    """Return the information criteria AIC, AICc (AIC for few samples; infinite for too few) and BIC.
+
+    Lower is better; only fits to the same samples can be compared. Sources: Akaike, IEEE Trans. Autom. Control 19
+    (1974) 716; Hurvich and Tsai, Biometrika 76 (1989) 297; Schwarz, Ann. Statist. 6 (1978) 461.
+    """
+    aic, spare = 2.0 * parameters - 2.0 * log_likelihood, samples - parameters - 1
+    return {
+        "log_likelihood": log_likelihood,
+        "parameters_counted": parameters,
+        "aic": aic,
+        "aicc": aic + 2.0 * parameters * (parameters + 1) / spare if spare > 0 else math.inf,
+        "bic": parameters * math.log(samples) - 2.0 * log_likelihood,
+    }

@@ -25,11 +25,9 @@ class CurrentSamples(NamedTuple):
     warnings: tuple[str, ...]  # sentences on what may change the result
 
 
-def select_current_samples(record: Record, choice: DriveModel, max_attenuation: float = 1e-3) -> CurrentSamples:
-    """Exclude the samples at edges, and weight the others by their noise, including that of dV/dt.
-
-    `max_attenuation` is the largest acceptable relative bias of the capacitive current due to noise of V.
-    """
+def select_current_samples(record: Record, choice: DriveModel) -> CurrentSamples:
+    """Exclude the samples at edges, and weight the others by their noise, including that of dV/dt."""
+    max_attenuation = 1e-3  # largest acceptable relative bias of the capacitive current due to noise of V
     noise = record.noise("V") if choice.name == "measured" else 0.0
     used = ~_edge_mask(choice.voltage, noise)
     if choice.name != "measured":
@@ -54,13 +52,11 @@ def select_current_samples(record: Record, choice: DriveModel, max_attenuation: 
     return CurrentSamples(weight, rate, True, (note,), (warning,))
 
 
-def _edge_mask(
-    voltage: Float[np.ndarray, " samples"], noise: float, threshold: float = 8.0, margin: int = 2, block: int = 64
-) -> Bool[np.ndarray, " samples"]:
-    """Return which samples lie within `margin` steps of a sudden change of the drive's slope.
-
-    A change is sudden if it exceeds `threshold` times the median over a `block` of samples, or the effect of noise.
-    """
+def _edge_mask(voltage: Float[np.ndarray, " samples"], noise: float) -> Bool[np.ndarray, " samples"]:
+    """Return which samples lie within `margin` steps of a sudden change of the drive's slope."""
+    margin = 2
+    # a change is sudden if it exceeds so many times the median over a block of samples, or the effect of noise
+    threshold, block = 8.0, 64
     bend = np.abs(np.diff(voltage, 2, prepend=voltage[0], append=voltage[-1]))
     blocks = np.pad(bend, (0, -bend.size % block), mode="edge").reshape(-1, block)
     median = np.repeat(np.median(blocks, axis=1), block)[: bend.size]

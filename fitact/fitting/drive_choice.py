@@ -48,13 +48,7 @@ def choose_drive(record: Record, scene: Scene | None) -> DriveModel:
     """Return the drive of a fit: the recorded V without a scene or if the scene says so, else the scene's waveform.
 
     A scene that names no waveform has the nominal square; if the recorded V differs from it, the recorded V is used.
-    All in double precision.
     """
-    with jax.enable_x64(True):
-        return _choose_drive(record, scene)
-
-
-def _choose_drive(record: Record, scene: Scene | None) -> DriveModel:
     if scene is None or scene.drive.waveform == "measured":
         return _measured_drive(record, scene.steady_state() if scene else None, ())
     drive, slowest = scene.make_drive(), scene.drive.lowest_frequency
@@ -273,15 +267,14 @@ def _slope(drive: Drive, time: ArrayLike, steady_state: bool) -> Array:
 _highpass = jit(highpass)
 
 
-def _align(
-    record: Record, drive: Drive, frequency: float, steady_state: bool, min_samples: int = 20_000, n_parts: int = 8
-) -> float:
+def _align(record: Record, drive: Drive, frequency: float, steady_state: bool) -> float:
     """Return the time shift (s) of the drive that matches the record, 0 unless the record is clearly shifted.
 
     The drive is compared with V if it was recorded, otherwise its best linear combination with its integral is
-    compared with Vsc. Of a long record, only the first `min_samples` or three periods are used. The shifted drives are
-    processed in `n_parts` to limit memory.
+    compared with Vsc.
     """
+    min_samples = 20_000  # used of a long record, or three periods
+    n_parts = 8  # in which the shifted drives are processed, to limit memory
     beginning = slice(0, max(min_samples, math.ceil(3.0 / frequency / record.time_step)))
     if "V" not in record and "Vsc" not in record:
         raise InputError(f"{record.source}: I alone does not determine the start of the drive; record V_V as well")

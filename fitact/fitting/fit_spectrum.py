@@ -129,10 +129,9 @@ def fit_spectrum(spectrum: Spectrum, scene: Scene | None = None) -> SpectrumFit:
     )
 
 
-def _solve(
-    spectrum: Spectrum, likelihood: Likelihood, noise_tolerance: float = 1e-3, max_rounds: int = 20
-) -> tuple[Minimum, Complex[np.ndarray, " points"], float]:
+def _solve(spectrum: Spectrum, likelihood: Likelihood) -> tuple[Minimum, Complex[np.ndarray, " points"], float]:
     """Return optimum, residuals and noise; iterates until the noise changes by less than `noise_tolerance`."""
+    noise_tolerance, max_rounds = 1e-3, 20
     omega, log_z = jnp.asarray(2.0 * np.pi * spectrum.frequency), jnp.asarray(np.log(spectrum.impedance))
     start, noise = jnp.asarray(_start(spectrum, likelihood)), jnp.asarray(1.0)
     for _ in range(max_rounds):
@@ -144,15 +143,13 @@ def _solve(
     return end, np.asarray(residuals), float(noise)
 
 
-def _start(
-    spectrum: Spectrum, likelihood: Likelihood, n_time_constants: int = 400
-) -> Float[np.ndarray, " circuit_parameters"]:
+def _start(spectrum: Spectrum, likelihood: Likelihood) -> Float[np.ndarray, " circuit_parameters"]:
     """Estimate Rsc, Csc and Ci from the best linear fit of 2 Rsc and 1/Ci over many Rsc Csc; others from the prior."""
     omega, z = 2.0 * np.pi * spectrum.frequency, spectrum.impedance
     parts = [np.real, np.imag]
     observed = np.concatenate([part(z / np.abs(z)) for part in parts])
     best = (math.inf, np.ones(2), 1.0)
-    for tau in np.geomspace(0.1 / omega[-1], 10.0 / omega[0], n_time_constants):
+    for tau in np.geomspace(0.1 / omega[-1], 10.0 / omega[0], num=400):
         columns = [1.0 / (1.0 + 1j * omega * tau), 1.0 / (1j * omega)]
         design = np.stack([np.concatenate([part(c / np.abs(z)) for part in parts]) for c in columns], axis=1)
         # equal column norms limit rounding errors

@@ -189,17 +189,10 @@ def information_directions(
     return np.clip(1.0 - shares**2, 0.0, 1.0), blind, along
 
 
-def verdicts(
-    eigenvalues: Float[np.ndarray, "*fits free"],
-    prior_sd: Float[np.ndarray, "*fits"],
-    min_eigenvalue: float = 0.9,
-    max_prior_factor: float = 10.0,
-) -> np.ndarray:
-    """Return "identified", "prior-limited" or "unidentified", from the eigenvalues and `prior_sd`.
-
-    All directions are identified if the smallest prior-whitened eigenvalue is at least `min_eigenvalue`. A prior is
-    informative if its 95 % interval reaches at most a factor of `max_prior_factor` either way.
-    """
+def verdicts(eigenvalues: Float[np.ndarray, "*fits free"], prior_sd: Float[np.ndarray, "*fits"]) -> np.ndarray:
+    """Return "identified", "prior-limited" or "unidentified", from the eigenvalues and `prior_sd`."""
+    min_eigenvalue = 0.9  # least prior-whitened eigenvalue of an identified direction
+    max_prior_factor = 10.0  # a prior is informative if its 95 % interval reaches at most this factor either way
     narrow = prior_sd <= math.log(max_prior_factor) / NormalDist().inv_cdf(0.975)
     limited = np.where(narrow, "prior-limited", "unidentified")
     return np.where(eigenvalues[..., 0] >= min_eigenvalue, "identified", limited)

@@ -25,38 +25,16 @@ SUCCESS_MESSAGE = "The fit converged, and the residuals are consistent with the 
 
 @dataclasses.dataclass(frozen=True)
 class Laplace:
-    """An optimum and its covariance.
+    """An optimum and its covariance."""
 
-    Attributes:
-        theta: the optimum, in the likelihood's coordinates.
-        covariance_root: factor of `covariance`, i.e. covariance = factor @ factor.T; the more accurate of the two.
-        sigmas: standard deviation of each channel's noise.
-        likelihood: the model that was fitted.
-        derive: the derived quantities as functions of theta.
-        log_derived: logarithms of the derived quantities at the optimum, and their gradients in theta.
-    """
-
-    theta: Float[np.ndarray, " parameters"]
+    theta: Float[np.ndarray, " parameters"]  # the optimum, in the likelihood's coordinates
+    # covariance = root @ root.T; the root is the more accurate of the two
     covariance_root: Float[np.ndarray, "parameters parameters"]
-    sigmas: Float[np.ndarray, " channels"]
-    likelihood: Likelihood
-    derive: derived.DerivedQuantities
+    sigmas: Float[np.ndarray, " channels"]  # standard deviation of each channel's noise
+    likelihood: Likelihood  # the model that was fitted
+    derive: derived.DerivedQuantities  # the derived quantities as functions of theta
+    # logarithms of the derived quantities at the optimum, and their gradients in theta
     log_derived: tuple[Float[np.ndarray, " derived"], Float[np.ndarray, "derived parameters"]]
-
-    @property
-    def covariance(self) -> Float[np.ndarray, "parameters parameters"]:
-        """Covariance of theta."""
-        return self.covariance_root @ self.covariance_root.T
-
-    @property
-    def sd(self) -> Float[np.ndarray, " parameters"]:
-        """Standard deviations of theta."""
-        return np.linalg.norm(self.covariance_root, axis=1)
-
-    @property
-    def correlation(self) -> Float[np.ndarray, "parameters parameters"]:
-        """Correlations of theta."""
-        return self.covariance / np.outer(self.sd, self.sd)
 
     @property
     def derived_log_sd(self) -> Float[np.ndarray, " derived"]:
@@ -82,25 +60,15 @@ class Laplace:
 
 @dataclasses.dataclass(frozen=True)
 class FitResult(abc.ABC):
-    """Result of a fit: a Laplace approximation, and whether it is reliable.
+    """Result of a fit: a Laplace approximation, and whether it is reliable."""
 
-    Attributes:
-        laplace: best parameters and derived quantities, with their covariance.
-        result: name of a member of `RESULTS`; `message` is its sentence.
-        figures: chi2_reduced, steps and other statistics.
-        identifiability: which parameters the data determine.
-        scene: scene of the first record, whose circuit and prior were fitted.
-        warnings: sentences on what may change the result.
-        notes: sentences for information.
-    """
-
-    laplace: Laplace
-    result: str
-    figures: dict[str, float]
-    identifiability: Identifiability
-    scene: Scene
-    warnings: tuple[str, ...]
-    notes: tuple[str, ...]
+    laplace: Laplace  # best parameters and derived quantities, with their covariance
+    result: str  # name of a member of `RESULTS`; `message` is its sentence
+    figures: dict[str, float]  # chi2_reduced, steps and other statistics
+    identifiability: Identifiability  # which parameters the data determine
+    scene: Scene  # scene of the first record, whose circuit and prior were fitted
+    warnings: tuple[str, ...]  # sentences on what may change the result
+    notes: tuple[str, ...]  # sentences for information
 
     @property
     def trusted(self) -> bool:
@@ -120,7 +88,7 @@ class FitResult(abc.ABC):
     @property
     def covariance(self) -> Float[np.ndarray, "parameters parameters"]:
         """Covariance of theta, in the Laplace approximation."""
-        return self.laplace.covariance
+        return self.covariance_root @ self.covariance_root.T
 
     @property
     def covariance_root(self) -> Float[np.ndarray, "parameters parameters"]:
@@ -130,12 +98,12 @@ class FitResult(abc.ABC):
     @property
     def sd(self) -> Float[np.ndarray, " parameters"]:
         """Standard deviations of theta."""
-        return self.laplace.sd
+        return np.linalg.norm(self.covariance_root, axis=1)
 
     @property
     def correlation(self) -> Float[np.ndarray, "parameters parameters"]:
         """Correlations of theta."""
-        return self.laplace.correlation
+        return self.covariance / np.outer(self.sd, self.sd)
 
     @property
     def likelihood(self) -> Likelihood:

@@ -97,9 +97,8 @@ class _Descent(optx.AbstractDescent):
     damping: float = 1e-2  # first step, relative to the largest curvature
     # decay of the scale per step: slow enough to cross a plateau, fast enough for a valley
     scale_decay: float = 0.9
-    rank_tolerance: float = (
-        1e-13  # relative to the largest singular value of the scaled Jacobian; smaller ones are rounding
-    )
+    # relative to the largest singular value of the scaled Jacobian; smaller ones are rounding
+    rank_tolerance: float = 1e-13
     rounding: float = 8.0  # rounding error of a parameter, in units of the last place
 
     def init(self, y: Array, f_info_struct: Any) -> _LinearProblem:

@@ -4,9 +4,8 @@ The solver itself is in `fitact.fitting.levenberg_marquardt`. It is imported onl
 program from the disk does without optimistix.
 """
 
-import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -58,8 +57,7 @@ def minimise(
     return find_minimum(residuals, start, max_steps)
 
 
-@dataclasses.dataclass(frozen=True)
-class Optima:
+class Optima(NamedTuple):
     """Distinct optima from many starting points."""
 
     minima: Minimum  # stacked, lowest cost first; if no start converged, the lowest end point
@@ -71,14 +69,10 @@ class Optima:
 def minimise_many(
     residuals: Callable[[Float[Array, " parameters"]], PyTree[Float[Array, "..."]]],
     starts: Float[np.ndarray, "starts parameters"],
-    same_optimum: float = 0.1,
-    log_density_margin: float = 3.0,
 ) -> Optima:
-    """Minimise from all starts at once; with residuals in units of their sd, the cost is -log(probability).
-
-    End points less than `same_optimum` standard errors apart count as one optimum. An optimum whose log-probability
-    is lower by less than `log_density_margin` (a twentieth of the density) counts as competing.
-    """
+    """Minimise from all starts at once; with residuals in units of their sd, the cost is -log(probability)."""
+    same_optimum = 0.1  # standard errors, below which end points count as one optimum
+    log_density_margin = 3.0  # by which the log-probability of a competing optimum is lower, or less
     ends = _minimise_each(residuals, starts)
     theta, jacobian = ends.theta, ends.jacobian
     cost = np.where(np.isfinite(ends.cost), ends.cost, np.inf)

@@ -86,11 +86,7 @@ def _fit_constrained(
 
 
 def profile_intervals(fit: FitResult, names: Sequence[str], level: float, prior: bool) -> dict[str, Interval]:
-    """Return profile-likelihood intervals of the quantities `names`, at the noise of the fit.
-
-    Raises:
-        InputError: `level` is not between 0 and 1, or a name is unknown.
-    """
+    """Return profile-likelihood intervals of the quantities `names`, at the noise of the fit; see `Fit.profile`."""
     if not 0.0 < level < 1.0:
         raise InputError(f"level = {level}: give a probability between 0 and 1, such as 0.95")
     likelihood, timing = fit.likelihood, fit.likelihood.timing
@@ -119,16 +115,14 @@ def interval_bounds(
     sd: Float[np.ndarray, " quantities"],
     indices: Sequence[int],
     level: float,
-    pseudo_datum_sd: float = 0.05,
-    root_tolerance: float = 1e-4,
-    max_rounds: int = 30,
 ) -> Float[np.ndarray, "quantities 2"]:
     """Return the bounds of the intervals of the quantities `indices`; an open bound is not finite.
 
     All bounds are searched in parallel, each between the last value that was too near and the last that was too far.
-    `sd` holds the expected standard errors, and `pseudo_datum_sd` is relative to these. `root_tolerance` is a relative
-    tolerance of the square root of the deviance.
+    `sd` holds the expected standard errors.
     """
+    pseudo_datum_sd = 0.05  # relative to these
+    root_tolerance, max_rounds = 1e-4, 30  # relative, of the square root of the deviance
     z = NormalDist().inv_cdf(0.5 * (1.0 + level))
     rows, side = np.repeat(np.asarray(indices), 2), np.tile([-1.0, 1.0], len(indices))
     expected = np.minimum(sd[rows], UNCONSTRAINED_SD / z)

@@ -55,15 +55,16 @@ def channel_warnings(record: Record, choice: DriveModel, channel: str, figures: 
     return warnings
 
 
-def parameter_warnings(
-    likelihood: Likelihood, theta: Float[np.ndarray, " parameters"], min_tail: float = 0.005
-) -> list[str]:
-    """Return warnings about g and b where less than `min_tail` of the prior probability lies further out."""
+def parameter_warnings(likelihood: Likelihood, theta: Float[np.ndarray, " parameters"]) -> list[str]:
+    """Return warnings about g and b far from the prior."""
+    min_tail = 0.005  # least prior probability further out
+    points = np.vstack([theta, likelihood.sample_prior(theta, 10_000)])
     warnings = []
-    for name, factor, tail in _plausibility(likelihood, theta):
-        if tail < min_tail:
+    for name, x in zip(("the divider g", "the time constant b"), likelihood.evaluate_g_and_b(points), strict=True):
+        fitted, prior = x[0], x[1:]
+        if np.ptp(x) > 0.0 and min(np.mean(prior < fitted), np.mean(prior > fitted)) < min_tail:
             warnings.append(
-                f"{name} is {factor:.3g} times the prior median (prior tail probability below"
+                f"{name} is {fitted / np.median(prior):.3g} times the prior median (prior tail probability below"
                 f" {format_percent(min_tail)}); check the probe attenuation (10x), the units of time and voltage, and"
                 " peak versus peak-to-peak"
             )
@@ -102,14 +103,3 @@ def describe_assumed_Ci(scene: Scene | None, likelihood: Likelihood, prior_sets_
             " your panel and contact area under [prior]",
         )
     )
-
-
-def _plausibility(likelihood: Likelihood, theta: np.ndarray) -> list[tuple[str, float, float]]:
-    """Return for g and b the name, the ratio to the prior median, and the prior probability further out."""
-    points = np.vstack([theta, likelihood.sample_prior(theta, 10_000)])
-    g, b = likelihood.evaluate_g_and_b(points)
-    return [
-        (name, float(x[0] / np.median(x[1:])), float(min(np.mean(x[1:] < x[0]), np.mean(x[1:] > x[0]))))
-        for name, x in (("the divider g", g), ("the time constant b", b))
-        if np.ptp(x) > 0.0
-    ]

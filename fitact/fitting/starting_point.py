@@ -27,12 +27,8 @@ class VscEstimate(NamedTuple):
 Estimate: TypeAlias = VscEstimate | CurrentEstimate
 
 
-def estimate_from_vsc(
-    record: Record, choice: DriveModel, max_divider: float = 0.5, part_size: int = 1 << 20
-) -> VscEstimate:
+def estimate_from_vsc(record: Record, choice: DriveModel, max_divider: float = 0.5) -> VscEstimate:
     """Estimate g and b from Vsc = g V - (1/b) ∫ Vsc dt + line, the circuit's equation integrated once.
-
-    Samples are processed in parts of `part_size`, which limits memory.
 
     Raises:
         InputError: g is not between 0 and `max_divider` (1/2, or slightly more with a free gain), which this circuit
@@ -45,6 +41,7 @@ def estimate_from_vsc(
     else:
         inside = np.ones(time.size, dtype=bool)
     span = time[-1] - time[0]
+    part_size = 1 << 20  # samples, which limits memory
     R = np.zeros((0, 5))
     for first in range(0, time.size, part_size):
         part = slice(first, first + part_size)
@@ -66,7 +63,7 @@ def estimate_from_vsc(
 
 
 def start_from_estimates(
-    likelihood: Likelihood, estimates: Sequence[Estimate | None]
+    likelihood: Likelihood, estimates: Sequence[Estimate | None], draws: int = 255
 ) -> Float[np.ndarray, " circuit_parameters"]:
     """Return the starting point: from the linear fits if they apply to the circuit, else the best draw of the prior."""
     vsc = next((estimate for estimate in estimates if isinstance(estimate, VscEstimate)), None)
@@ -75,7 +72,8 @@ def start_from_estimates(
     if current is not None and not current.capacitance > 0.0 and isinstance(likelihood.template, WithSkin):
         current = None  # at one frequency, the constant skin that fits such a current can be unphysical
     if vsc is None and current is None:
-        return _best_prior_draw(likelihood, theta)
+        points = np.vstack([theta, likelihood.sample_prior(theta, draws)])
+        return points[int(np.argmin(residual_objective(likelihood, points)))]
     mean, sd = prior_skin_moments(likelihood)
     skin, logs = _estimate_skin(vsc, current), mean
     if skin is not None:
@@ -128,14 +126,6 @@ def most_probable_skin(
     point = np.stack([np.log(g * b / ci), np.log((1.0 / g - 2.0) * ci), np.full_like(g, math.log(ci))], axis=-1)
     direction, weight = np.array([-1.0, 1.0, 1.0]), sd**-2.0
     return point + direction * np.sum(weight * direction * (mean - point), axis=-1, keepdims=True) / np.sum(weight)
-
-
-def _best_prior_draw(
-    likelihood: Likelihood, theta: np.ndarray, count: int = 256
-) -> Float[np.ndarray, " circuit_parameters"]:
-    """Return the draw of the prior, of `count`, with the lowest residual objective."""
-    points = np.vstack([theta, likelihood.sample_prior(theta, count - 1)])
-    return points[int(np.argmin(residual_objective(likelihood, points)))]
 
 
 def residual_objective(likelihood: Likelihood, points: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, " n"]:

@@ -22,10 +22,7 @@ def diagnose_fit(
     sources: Sequence[Source],
     optima: Optima | None,
 ) -> str:
-    """Return the name of the first of the `RESULTS` that makes the fit unreliable; "successful" if none does.
-
-    `covariance_factor`: factor of the covariance of theta.
-    """
+    """Return the name of the first of the `RESULTS` that makes the fit unreliable; "successful" if none does."""
     if solution.result != "successful":
         return solution.result
     if is_out_of_bounds(solution.likelihood, solution.theta, solution.sigma, covariance_factor):

@@ -151,9 +151,8 @@ class Chirp(Drive):
 
     def _is_nonzero(self, time: ArrayLike) -> Array:
         """Return whether the wave is nonzero at `time`, so that a start or end there is a jump."""
-        rounding = (
-            64.0 * jnp.finfo(float).eps * (1.0 + jnp.abs(self.cycles(time)))
-        )  # a difference this small is no jump
+        # a difference this small is no jump
+        rounding = 64.0 * jnp.finfo(float).eps * (1.0 + jnp.abs(self.cycles(time)))
         return jnp.abs(self.sweep(time)) > rounding * jnp.abs(jnp.asarray(self.peak_to_peak))
 
 

@@ -250,9 +250,8 @@ class Loop(Circuit):
             return HighpassTerms(tuple(voltages[-1]), tuple(tau))
         share, R0 = self._gap_fraction(), self.resistance()
         others = jnp.sum(voltages, axis=0) + (0.0 if R0 is None else R0 * current)
-        return HighpassTerms(
-            (*(-share * others), share), (*tau, 1e15 * tau[0])
-        )  # so large that an open gap keeps its charge
+        # the last is so long that an open gap keeps its charge
+        return HighpassTerms((*(-share * others), share), (*tau, 1e15 * tau[0]))
 
     def _gap_fraction(self) -> ArrayLike:
         """Return the fraction of the voltage across Ci and a non-conducting gap that is across the gap."""

@@ -302,7 +302,6 @@ class InterpolatedDrive(Drive):
         return piece, jnp.where(since < -slack, since, jnp.maximum(since, 0.0))
 
     def _slack(self, time: Array) -> Array:
-        """Return the rounding error to allow for in a time (s)."""
         return _rounding_error(jnp.maximum(jnp.abs(time), jnp.abs(self.start_time)))
 
     def value(self, time: ArrayLike) -> Float[Array, "*shape"]:

@@ -132,14 +132,13 @@ class Fractional(SkinModel):
 
 
 @functools.cache
-def high_frequency_basis(
-    is_limited: bool, double: bool, decades: int = 8, per_decade: int = 6
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def high_frequency_basis(is_limited: bool, double: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return time constants, frequencies (over omega) and the least-squares map from the gain to the weights.
 
     The fit minimises the absolute error of a limited gain, and the relative error of a gain that grows with the
     frequency. The map omits singular values below the precision, which would produce large cancelling weights.
     """
+    decades, per_decade = 8, 6
     tau = np.logspace(-decades - 1.0, 1.0, per_decade * (decades + 2) + 1)
     x = np.logspace(0.0, decades, 4 * per_decade * decades + 1)
     terms = 1j * x[:, None] * tau / (1.0 + 1j * x[:, None] * tau)
@@ -188,14 +187,11 @@ class TimeConstantGrid(eqx.Module):
         return HighpassTerms(fitted[:size], self.tau, fitted[size] if fitted.size > size else None)
 
 
-def _pseudo_inverse(terms: np.ndarray, share: np.ndarray, cutoff: float = 1e-13) -> FactoredMap:
-    """Return the pseudo-inverse of the terms over `share`, in two factors.
-
-    Singular values below `cutoff` times the largest are omitted, since they would produce large cancelling weights.
-    """
+def _pseudo_inverse(terms: np.ndarray, share: np.ndarray) -> FactoredMap:
+    """Return the pseudo-inverse of the terms over `share`, in two factors."""
     scaled = terms / share
     modes, sizes, directions = np.linalg.svd(np.concatenate([scaled.real, scaled.imag]), full_matrices=False)
-    kept = sizes > cutoff * sizes[0]
+    kept = sizes > 1e-13 * sizes[0]  # smaller ones would produce large cancelling weights
     return directions[kept].T / sizes[kept], modes[:, kept].T / np.tile(share[:, 0], 2)
 
 

@@ -67,7 +67,6 @@ def mean_square(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Flo
 
 
 def _terms_mean_square(terms: HighpassTerms, drive: Drive) -> Float[Array, ""]:
-    """Return the mean square of the sum of the terms."""
     weight, tau = terms.stack()
     products = weight * jax.vmap(lambda t: highpass_mean_square(drive, t))(tau)
     # for a term with itself this is exactly 1 / 2, with zero derivative
@@ -108,13 +107,12 @@ def peak(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Float[Arra
     return largest if terms.rate is None else jnp.where(_has_impulses(drive, terms.rate), jnp.inf, largest)
 
 
-def _largest_sum(
-    phasors: Complex[Array, " tones"], orders: tuple[int, ...], points_per_cycle: int = 32, steps: int = 6
-) -> Float[Array, ""]:
+def _largest_sum(phasors: Complex[Array, " tones"], orders: tuple[int, ...]) -> Float[Array, ""]:
     """Return the maximum of |Im sum_k phasors[k] e^{j orders[k] x}| by Newton's method from many points.
 
-    Each step doubles the number of digits. The position is not differentiated, so only first derivatives are right.
+    The position is not differentiated, so only first derivatives are right.
     """
+    points_per_cycle, steps = 32, 6  # each step doubles the number of digits
     order = jnp.asarray(orders, dtype=float)
     start = jnp.linspace(0.0, 2.0 * np.pi, points_per_cycle * max(orders), endpoint=False)
 

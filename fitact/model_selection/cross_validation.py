@@ -33,11 +33,9 @@ class CrossValidation(NamedTuple):
     folds_failed: int  # number of refits that did not converge
 
 
-def block_indices(record: Record, blocks: int = 40, min_periods: int = 20) -> Int[np.ndarray, " samples"]:
-    """Return the block of each sample: whole periods if there are `min_periods`, else intervals of equal length.
-
-    There are at most 40 `blocks`, which suffice for the standard error of their sum.
-    """
+def block_indices(record: Record) -> Int[np.ndarray, " samples"]:
+    """Return the block of each sample: whole periods if there are `min_periods`, else intervals of equal length."""
+    blocks, min_periods = 40, 20  # so many blocks suffice for the standard error of their sum
     frequency, since = record.frequency(), record.time - record.time[0]
     periods = 0 if frequency is None else math.floor((since[-1] + record.time_step) * frequency + 1e-6)
     if frequency is None or periods < min_periods:

@@ -6,7 +6,6 @@ times as long as a whole plan. Every response is a sum of exponentials on the li
 graded towards the corners, where a small resistance has its effect.
 """
 
-import dataclasses
 import functools
 import itertools
 import math
@@ -75,8 +74,7 @@ class ComparisonGrid(NamedTuple):
         return cls(cycle.ravel(), elapsed.ravel(), (weight / weight.sum()).ravel(), len(stretches))
 
 
-@dataclasses.dataclass(frozen=True)
-class CircuitResponses:
+class CircuitResponses(NamedTuple):
     """Responses of one channel of many circuits to one drive: time constants, and harmonics of a skin."""
 
     drive: Drive
@@ -103,9 +101,8 @@ class CircuitResponses:
             skin = jax.tree.map(pad, circuit.skin) if isinstance(circuit, WithSkin) else None
             complete = jax.tree.map(pad, complete_circuit(scene.make_rc_circuit(dict(values))))
             weight, tau, harmonics = partial_fractions(complete, skin, drive, precision, channel)
-            tau = np.maximum(
-                tau, np.finfo(np.float32).tiny
-            )  # in single precision, the tau of an absent element may be 0
+            # in single precision, the tau of an absent element may be 0
+            tau = np.maximum(tau, np.finfo(np.float32).tiny)
             wave = drive.wave if isinstance(drive, Burst) else drive
             segments, knots = None, np.zeros((*tau.shape, 0), dtype=precision)
             if isinstance(wave, PiecewiseLinear | Sampled):
@@ -162,7 +159,6 @@ class CircuitResponses:
         return float(self.segments.start[piece] + slope * since)
 
     def _steady_state_response(self, cycle: np.ndarray) -> np.ndarray:
-        """Return the steady-state response of each term."""
         tau, cycle = self.tau[..., None], cycle[:, None, :]
         if self.segments is None:
             omega, u = 2.0 * np.pi * self.wave.frequency, np.zeros((1, 1, 1), dtype=tau.dtype)
@@ -217,18 +213,15 @@ class ReferenceModel:
             return vsc, acting, np.broadcast_to(np.asarray(force_constant(contact)), len(vsc[0]))
 
 
-def _voltages(
-    grid: ComparisonGrid, responses: CircuitResponses, candidates: int = 4, points: int = 17, refinements: int = 3
-) -> tuple[Rows, Float[np.ndarray, " circuits"]]:
-    """Return voltages at the nodes, and the maximum, which may lie between nodes.
-
-    The `candidates` intervals with the highest values are refined `refinements` times with `points` nodes.
-    """
+def _voltages(grid: ComparisonGrid, responses: CircuitResponses) -> tuple[Rows, Float[np.ndarray, " circuits"]]:
+    """Return voltages at the nodes, and the maximum, which may lie between nodes."""
     voltage = responses.evaluate(grid.cycle, grid.elapsed)
     if isinstance(responses.drive, Chirp):  # its code is compiled for these nodes
         return voltage, _parabola_vertex(np.abs(voltage))
     if isinstance(responses.drive, Sampled):  # unknown between the samples
         return voltage, np.abs(voltage).max(axis=1)
+    # the intervals with the highest values are refined
+    candidates, points, refinements = 4, 17, 3
     height = np.abs(voltage).reshape(len(voltage), grid.n_intervals, -1)
     highest = np.argsort(-height.max(axis=2), axis=1)[:, :candidates]
     first, last = highest * height.shape[2], (highest + 1) * height.shape[2] - 1

@@ -31,7 +31,7 @@ FLOAT32_SPEEDUP = 1.6  # measured by benchmarks/plan.py for many circuits in one
 
 
 @dataclasses.dataclass(frozen=True)
-class Costs:
+class _Costs:
     """Cost in nanoseconds per sample for many circuits in one compiled program; one exponential takes about 1 ns.
 
     The values were measured once by benchmarks/plan.py, so that a plan does not depend on the load of a machine;
@@ -49,9 +49,6 @@ class Costs:
     burst: float = 1.0  # additional cost per time constant, for a burst
     harmonic: float = 10.0
     fractional_terms: int = 81  # number of time constants of a fractional skin
-
-
-_COSTS = Costs()
 
 
 def applicable_omissions(scene: Scene) -> tuple[str, ...]:
@@ -131,12 +128,12 @@ def drop_parameters(values: Mapping[str, Any], names: tuple[str, ...]) -> dict[s
     return {name: value for name, value in values.items() if name not in omitted}
 
 
-def evaluation_cost(scene: Scene, values: Mapping[str, ArrayLike] | None = None, costs: Costs = _COSTS) -> float:
+def evaluation_cost(scene: Scene, values: Mapping[str, ArrayLike] | None = None) -> float:
     """Return the cost of a sample of Vsc, in exponentials, for many circuits in one program.
 
     `values` holds the parameters that only the scene's prior states.
     """
-    circuit, drive = scene.make_circuit(values), scene.drive
+    circuit, drive, costs = scene.make_circuit(values), scene.drive, _Costs()
     terms, harmonics, tones = count_time_constants(scene.make_rc_circuit(values)), 0, len(drive.frequencies or (1,))
     if isinstance(circuit, WithSkin):
         if drive.waveform in ("sine", "multitone"):

@@ -19,23 +19,14 @@ MAX_P_VALUE = 0.01  # below which the fingers' own estimates disagree
 
 
 class ContactAreaTest(NamedTuple):
-    """Result of a chi-square test that all fingers have the same Ci, and so the same contact area.
+    """Result of a chi-square test that all fingers have the same Ci, and so the same contact area."""
 
-    Attributes:
-        assumption: `[population] contact_area`, "common" or "varies".
-        fingers: number of fingers whose record determines log Ci better than the prior does.
-        chi_square: of their own log Ci about the weighted mean, with `fingers` - 1 degrees of freedom.
-        p_value: probability of a larger one if all have the same Ci; NaN for fewer than two such fingers.
-        log_sd: standard deviation of log Ci between fingers beyond the standard errors (Hedges & Olkin 1985).
-        tolerance: log_sd that changes the force by no more than `[tolerance] force`.
-    """
-
-    assumption: str
-    fingers: int
-    chi_square: float
-    p_value: float
-    log_sd: float
-    tolerance: float
+    assumption: str  # `[population] contact_area`, "common" or "varies"
+    fingers: int  # number of fingers whose record determines log Ci better than the prior does
+    chi_square: float  # of their own log Ci about the weighted mean, with `fingers` - 1 degrees of freedom
+    p_value: float  # probability of a larger one if all have the same Ci; NaN for fewer than two such fingers
+    log_sd: float  # standard deviation of log Ci between fingers beyond the standard errors (Hedges & Olkin 1985)
+    tolerance: float  # log_sd that changes the force by no more than `[tolerance] force`
 
     @classmethod
     def from_fingers(
@@ -85,14 +76,11 @@ class ContactAreaTest(NamedTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry `contact_area` of population.json."""
-        tested = self.is_tested
+        figures = {name: getattr(self, name) for name in ("disagrees", "chi_square", "p_value", "log_sd")}
         return {
             "assumption": self.assumption,
-            "tested": tested,
-            "disagrees": self.disagrees if tested else None,
+            "tested": self.is_tested,
             "fingers": self.fingers,
-            "chi_square": self.chi_square if tested else None,
-            "p_value": self.p_value if tested else None,
-            "log_sd": self.log_sd if tested else None,
+            **(figures if self.is_tested else dict.fromkeys(figures)),
             "sentence": self.sentence,
         }

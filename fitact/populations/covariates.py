@@ -1,10 +1,9 @@
 """Covariates: further numbers about the fingers of the records, such as skin moisture."""
 
 import csv
-import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -14,20 +13,13 @@ from fitact.errors import InputError
 _KEY = "record"  # column with the file names of the records
 
 
-@dataclasses.dataclass(frozen=True)
-class Covariates:
-    """Covariates of the fingers.
-
-    Attributes:
-        names: names of the covariates.
-        mean, sd: mean and standard deviation over the fingers.
-        z_scores: covariates minus their mean, over their standard deviation.
-    """
+class Covariates(NamedTuple):
+    """Covariates of the fingers."""
 
     names: tuple[str, ...]
-    mean: Float[np.ndarray, " covariates"]
+    mean: Float[np.ndarray, " covariates"]  # over the fingers
     sd: Float[np.ndarray, " covariates"]
-    z_scores: Float[np.ndarray, "fingers covariates"]
+    z_scores: Float[np.ndarray, "fingers covariates"]  # covariates minus their mean, over their standard deviation
 
     @classmethod
     def from_values(cls, values: Mapping[str, Sequence[float]], fingers: int) -> Self:

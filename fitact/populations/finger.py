@@ -24,33 +24,21 @@ SHARED_PARAMETER = "Ci"
 
 @dataclasses.dataclass(frozen=True)
 class Finger:
-    """Fitted record with its likelihood around the optimum, normal in the finger's own coordinates given log Ci.
+    """Fitted record with its likelihood around the optimum, normal in the finger's own coordinates given log Ci."""
 
-    Attributes:
-        source, fingerprint: name of the record, and hash of its numbers.
-        result, message, parameters: result of the separate fit, as in `Fit`.
-        likelihood: likelihood with priors of the nuisances only; without samples if it is compressed.
-        names: coordinates of a point; all but Ci are the finger's own.
-        center: log Ci of the optimum.
-        conditional_mean, covariance_factor: mean and root of the covariance of its own coordinates there, given log Ci.
-        slope: derivative of the mean with respect to log Ci.
-        precision: inverse variance of log Ci from the record alone.
-        weighted_offset: `precision` times (log Ci that the record alone gives, minus `center`).
-    """
-
-    source: str
-    fingerprint: str
-    result: str
+    source: str  # name of the record
+    fingerprint: str  # hash of its numbers
+    result: str  # of the separate fit, as the next two, see `Fit`
     message: str
     parameters: dict[str, summary.Summary]
-    likelihood: Likelihood
-    names: tuple[str, ...]
-    center: float
-    conditional_mean: Float[np.ndarray, " own"]
-    slope: Float[np.ndarray, " own"]
-    covariance_factor: Float[np.ndarray, "own own"]
-    precision: float
-    weighted_offset: float
+    likelihood: Likelihood  # with priors of the nuisances only; without samples if it is compressed
+    names: tuple[str, ...]  # coordinates of a point; all but Ci are the finger's own
+    center: float  # log Ci of the optimum
+    conditional_mean: Float[np.ndarray, " own"]  # mean of its own coordinates there, given log Ci
+    slope: Float[np.ndarray, " own"]  # derivative of the mean with respect to log Ci
+    covariance_factor: Float[np.ndarray, "own own"]  # root of their covariance
+    precision: float  # inverse variance of log Ci from the record alone
+    weighted_offset: float  # `precision` times (log Ci that the record alone gives, minus `center`)
 
     @classmethod
     def from_fit(cls, fit: Fit) -> Self:

@@ -30,22 +30,14 @@ TABLE_HALF_WIDTH = 8.0  # half-width of the tables, in standard deviations of lo
 
 
 class PopulationParameters(NamedTuple):
-    """Parameters of the distribution of fingers.
+    """Parameters of the distribution of fingers."""
 
-    Attributes:
-        median: means of log Rsc and log Csc, at the panel's Ci.
-        log_sd: standard deviations of log Rsc and log Csc.
-        correlation: correlation of log Rsc and log Csc.
-        log_Ci: log Ci of the panel, for the median contact area.
-        area: standard deviation of the logarithm of the contact area; None means that all areas are equal.
-        slopes: shift of `median` per standard deviation of each covariate; `median` is at their mean.
-    """
-
-    median: Float[Array, "2"]
-    log_sd: Float[Array, "2"]
-    correlation: Float[Array, ""]
-    log_Ci: Float[Array, ""]
-    area: Float[Array, ""] | None = None
+    median: Float[Array, "2"]  # means of log Rsc and log Csc, at the panel's Ci
+    log_sd: Float[Array, "2"]  # standard deviations of log Rsc and log Csc
+    correlation: Float[Array, ""]  # of log Rsc and log Csc
+    log_Ci: Float[Array, ""]  # log Ci of the panel, for the median contact area
+    area: Float[Array, ""] | None = None  # standard deviation of log contact area; None means that all are equal
+    # shift of `median` per standard deviation of each covariate; `median` is at their mean
     slopes: Float[Array, "covariates 2"] | None = None
 
     def shift_medians(self, covariates: Float[Array, "*shape covariates"]) -> Self:
@@ -61,29 +53,18 @@ class PopulationParameters(NamedTuple):
 
 
 class FingerLikelihoods(eqx.Module):
-    """Weighted draws of several fingers, as tables in log Ci.
+    """Weighted draws of several fingers, as tables in log Ci."""
 
-    Attributes:
-        skin: log Rsc and log Csc of each draw at `center`.
-        slope: their derivatives with respect to log Ci.
-        center, half_width: center and half-width of the tables in log Ci.
-        weight: Chebyshev coefficients of the log-weights.
-        precision, weighted_offset: information of each record alone on log Ci, as in `Finger`.
-        area_deviates: standard normal numbers for the fingers' areas.
-        normal_log_weight: log-weights of the draws under the normal likelihood, at `center`.
-        mean, covariance: moments of log Rsc and log Csc under the normal likelihood.
-    """
-
-    skin: Float[Array, "fingers draws 2"]
-    slope: Float[Array, "fingers 1 2"]
-    center: Float[Array, "fingers 1"]
+    skin: Float[Array, "fingers draws 2"]  # log Rsc and log Csc of each draw at `center`
+    slope: Float[Array, "fingers 1 2"]  # their derivatives with respect to log Ci
+    center: Float[Array, "fingers 1"]  # of the tables in log Ci
     half_width: Float[Array, "fingers 1"]
-    weight: Float[Array, "fingers draws terms"]
-    precision: Float[Array, "fingers 1"]
+    weight: Float[Array, "fingers draws terms"]  # Chebyshev coefficients of the log-weights
+    precision: Float[Array, "fingers 1"]  # information of each record alone on log Ci, as in `Finger`
     weighted_offset: Float[Array, "fingers 1"]
-    area_deviates: Float[Array, "fingers draws"]
-    normal_log_weight: Float[Array, "fingers draws"]
-    mean: Float[Array, "fingers 2"]
+    area_deviates: Float[Array, "fingers draws"]  # standard normal numbers for the fingers' areas
+    normal_log_weight: Float[Array, "fingers draws"]  # log-weights under the normal likelihood, at `center`
+    mean: Float[Array, "fingers 2"]  # moments of log Rsc and log Csc under the normal likelihood
     covariance: Float[Array, "fingers 2 2"]
 
     @classmethod
@@ -96,12 +77,9 @@ class FingerLikelihoods(eqx.Module):
         draws: int,
         terms: int,
         seed: Sequence[int],
-        max_log_sd_area: float = 1.0,
     ) -> Self:
-        """Tabulate `terms` Chebyshev terms over the log Ci that the records and the panel's `prior` allow.
-
-        `max_log_sd_area` is the largest standard deviation of an area's logarithm that the tables cover.
-        """
+        """Tabulate `terms` Chebyshev terms over the log Ci that the records and the panel's `prior` allow."""
+        max_log_sd_area = 1.0  # largest standard deviation of an area's logarithm that the tables cover
         tables = []
         center, half_width = _log_Ci_interval(fingers, prior.log_mean, prior.log_sd)
         for finger, child in zip(fingers, np.random.SeedSequence(seed).spawn(len(fingers)), strict=True):

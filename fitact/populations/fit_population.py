@@ -102,17 +102,10 @@ def delete_chains(folder: str | os.PathLike[str]) -> None:
 
 
 def _sample_hierarchy(
-    hierarchy: Hierarchy,
-    fingerprint: str,
-    seed: int,
-    max_steps: int,
-    chain_file: Path | None,
-    progress: bool,
-    walkers: int = 128,
-    ensembles: int = 4,
-    draws: int = 2500,
+    hierarchy: Hierarchy, fingerprint: str, seed: int, max_steps: int, chain_file: Path | None, progress: bool
 ) -> tuple[np.ndarray, Convergence]:
     """Sample points (ensembles, about `draws`, coordinates), with their diagnostics."""
+    walkers, ensembles, draws = 128, 4, 2500
     rows = hierarchy.fingers.weight.size
     log_prob = reject_nonfinite(BatchEvaluator(Hierarchy.log_prob, hierarchy, rows, walkers // 2))
     target = Target(

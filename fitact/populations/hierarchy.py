@@ -20,23 +20,17 @@ class Hierarchy(eqx.Module):
 
     Medians and slopes are in standard errors from the fingers' regression, which removes their dependence on the
     spread of the fingers and on Ci. Standard deviations are logarithms, the correlation an inverse hyperbolic tangent.
-
-    Attributes:
-        fingers: likelihoods of the records.
-        prior: prior of the medians of Rsc and Csc, and of Ci.
-        area_varies: whether each finger has its own contact area.
-        covariates: covariates of the fingers, standardized.
-        log_sd_scale: scale of the half-normal prior of log-standard deviations; 95 % of it lie below 0.98.
-        slope_sd: prior standard deviation of the change of log Rsc and log Csc per standard deviation of a covariate.
-        lkj: shape of the correlation's density (1 - r^2)^(lkj - 1) (Lewandowski, Kurowicka, Joe 2009).
     """
 
     fingers: FingerLikelihoods
-    prior: Prior
-    area_varies: bool = eqx.field(static=True)
-    covariates: Float[Array, "fingers covariates"]
+    prior: Prior  # of the medians of Rsc and Csc, and of Ci
+    area_varies: bool = eqx.field(static=True)  # whether each finger has its own contact area
+    covariates: Float[Array, "fingers covariates"]  # standardized
+    # scale of the half-normal prior of log-standard deviations; 95 % of it lie below 0.98
     log_sd_scale: float = eqx.field(static=True, default=0.5)
+    # prior standard deviation of the change of log Rsc and log Csc per standard deviation of a covariate
     slope_sd: float = eqx.field(static=True, default=0.5)
+    # shape of the correlation's density (1 - r^2)^(lkj - 1) (Lewandowski, Kurowicka, Joe 2009)
     lkj: float = eqx.field(static=True, default=2.0)
 
     @property

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import NamedTuple, Self
+from typing import Self
 
 import equinox as eqx
 import jax
@@ -26,20 +26,13 @@ HARMONICS = ("force_at_f", "force_at_2f", "friction_at_f", "friction_at_2f")
 
 
 class NewFingerModel(eqx.Module):
-    """Model of the quantities `names` (SI units) as functions of the logarithms of a finger's `factors`.
+    """Model of the quantities `names` (SI units) as functions of the logarithms of a finger's `factors`."""
 
-    Attributes:
-        derive: derived quantities of a fit, without the record's initial charge.
-        theta, sigma: parameters and noise of the fit; those that are not the finger's stay fixed.
-        factors: subset of `FACTORS`, in that order.
-        frequency: frequency of the drive, Hz; None means that it does not repeat.
-    """
-
-    derive: derived.DerivedQuantities
-    theta: Float[Array, " parameters"]
+    derive: derived.DerivedQuantities  # of a fit, without the record's initial charge
+    theta: Float[Array, " parameters"]  # of the fit; those that are not the finger's stay fixed
     sigma: Float[Array, " traces"]
-    factors: tuple[str, ...] = eqx.field(static=True)
-    frequency: float | None = eqx.field(static=True)
+    factors: tuple[str, ...] = eqx.field(static=True)  # subset of `FACTORS`, in that order
+    frequency: float | None = eqx.field(static=True)  # of the drive, Hz; None means that it does not repeat
 
     @classmethod
     def from_fit(cls, fit: Fit, factors: tuple[str, ...]) -> Self:
@@ -56,9 +49,7 @@ class NewFingerModel(eqx.Module):
             frequency = float(derive.drive.frequency)
         elif isinstance(derive.drive, Sampled) and whole_periods(fit.record)[1] is not None:
             frequency = float(fit.record.frequency() or math.nan)
-        with jax.enable_x64(True):
-            sigma = np.array([trace.sigma for trace in fit.traces])
-            return cls(derive, fit.theta, sigma, factors, frequency)
+        return cls(derive, fit.theta, np.array([trace.sigma for trace in fit.traces]), factors, frequency)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -80,7 +71,6 @@ class NewFingerModel(eqx.Module):
         return dataclasses.replace(self.derive, geometry=thicker), self._theta(factors)
 
     def _theta(self, factors: Float[Array, "*shape factors"]) -> Float[Array, "*shape parameters"]:
-        """Return the parameters of fingers."""
         by_name, xp = self._factors_by_name(factors), array_module(factors)
         area, insulator = by_name.get(AREA, 0.0), by_name.get(THICKNESSES[1], 0.0)
         logs = {"Rsc": by_name["Rsc"] - area, "Csc": by_name["Csc"] + area, "Ci": by_name["Ci"] + area - insulator}
@@ -93,7 +83,6 @@ class NewFingerModel(eqx.Module):
         return {name: factors[..., i] for i, name in enumerate(self.factors)}
 
     def __call__(self, factors: Float[Array, " factors"]) -> Float[Array, " names"]:
-        """Compute the quantities `names`."""
         derive, theta = self.apply_factors(factors)
         skin = jnp.exp(theta[np.array([derive.likelihood.names.index(name) for name in SKIN])])
         parts = [skin, derive(theta, self.sigma)]
@@ -134,28 +123,12 @@ def _force(finger: NewFingerModel, factors: Float[Array, " factors"]) -> Float[A
     return derive.force(theta, finger.sigma)
 
 
-class VarianceDecomposition(NamedTuple):
-    """Variance of a quantity of the next finger, by the law of total variance.
-
-    Attributes:
-        between_finger: E[Var(x | parameters)], the variance between fingers.
-        parameter_uncertainty: Var(E[x | parameters]), from the uncertainty of the population parameters.
-    """
-
-    between_finger: float
-    parameter_uncertainty: float
-
-    @classmethod
-    def from_draws(cls, values: Float[np.ndarray, "laws fingers"]) -> Self:
-        """Decompose draws of fingers from each population sample, corrected for the finite number of fingers."""
-        between_finger = float(np.mean(np.var(values, axis=1, ddof=1)))
-        of_means = float(np.var(np.mean(values, axis=1), ddof=1))
-        return cls(between_finger, max(of_means - between_finger / values.shape[1], 0.0))
-
-    @property
-    def between_finger_fraction(self) -> float:
-        """Fraction of the variance that comes from differences between fingers."""
-        return self.between_finger / (self.between_finger + self.parameter_uncertainty)
+def finger_variance_fraction(values: Float[np.ndarray, "laws fingers"]) -> float:
+    """Return the fraction of a variance that comes from differences between fingers, by the law of total variance."""
+    fingers = float(np.mean(np.var(values, axis=1, ddof=1)))  # E[Var(x | parameters)]
+    # Var(E[x | parameters]), corrected for the finite number of fingers
+    parameters = float(np.var(np.mean(values, axis=1), ddof=1)) - fingers / values.shape[1]
+    return fingers / (fingers + max(parameters, 0.0))
 
 
 def draw_factors(

@@ -20,7 +20,7 @@ from fitact.populations.covariates import Covariates
 from fitact.populations.finger import SHARED_PARAMETER, SKIN, Finger
 from fitact.populations.finger_likelihoods import PopulationParameters
 from fitact.populations.hierarchy import Hierarchy
-from fitact.populations.next_finger import AREA, NAMES, NewFingerModel, VarianceDecomposition, draw_factors
+from fitact.populations.next_finger import AREA, NAMES, NewFingerModel, draw_factors, finger_variance_fraction
 from fitact.populations.sobol import SobolIndices, variance_shares
 from fitact.sampling.convergence import Convergence
 from fitact.scene.scene import Scene
@@ -180,7 +180,7 @@ class Population:
         """Return the content of population.json, which `fitact population --json` prints."""
         new: dict[str, dict[str, Any]] = {}
         for name, values in self.new_fingers().items():
-            people = VarianceDecomposition.from_draws(values).between_finger_fraction
+            people = finger_variance_fraction(values)
             shares = {"people": people, "ignorance": 1.0 - people}
             new[name] = summary.summarize_draws(name, values) | {"variance": shares}
         return {
@@ -189,13 +189,8 @@ class Population:
             "variance_shares": self.shares,
             "variance_shares_prior": self.prior_shares,
             "fingers": [
-                {
-                    "record": finger.source,
-                    "sha256": finger.fingerprint,
-                    "result": finger.result,
-                    "message": finger.message,
-                    "parameters": finger.parameters,
-                }
+                {"record": finger.source, "sha256": finger.fingerprint, "result": finger.result}
+                | {"message": finger.message, "parameters": finger.parameters}
                 for finger in self.fingers
             ],
             "convergence": dataclasses.asdict(self.convergence) | {"sentence": str(self.convergence)},
@@ -339,12 +334,8 @@ def variance_sentences(content: dict[str, Any]) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def evaluate_parameters(hierarchy: Hierarchy, points: Float[np.ndarray, "chains draws n"]) -> PopulationParameters:
-    return _evaluate_parameters(hierarchy, points)
-
-
 @jit
-def _evaluate_parameters(hierarchy: Hierarchy, points: Float[Array, "chains draws n"]) -> PopulationParameters:
+def evaluate_parameters(hierarchy: Hierarchy, points: Float[Array, "chains draws n"]) -> PopulationParameters:
     return jax.vmap(jax.vmap(hierarchy.population_parameters))(points)
 
 

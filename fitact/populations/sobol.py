@@ -14,47 +14,29 @@ from scipy.special import ndtri
 from fitact.populations.next_finger import NewFingerModel
 
 SobolIndices = dict[str, dict[str, dict[str, float]]]
+Factors = Float[np.ndarray, "points factors"]
+Quantities = Float[np.ndarray, "points quantities"]
+Terms = Float[np.ndarray, "points terms"]
 
 
 class Surrogate(NamedTuple):
-    """Logarithms of quantities as Hermite polynomials of the whitened factors, by least squares.
-
-    Attributes:
-        mean, covariance_factor: mean and root of the covariance of the factors.
-        tail_scale: width of the evaluated points over the width of the factors; the largest values lie in the tails.
-        powers, coefficients: powers and coefficients of the terms.
-        log_range: smallest and largest logarithm of the evaluated model.
-        cross_validation_error: sqrt(1 - r^2) of each quantity, where r is its correlation with the model at held-out
-            points.
-        evaluations: number of evaluations of the model.
-    """
+    """Logarithms of quantities as Hermite polynomials of the whitened factors, by least squares."""
 
     mean: Float[np.ndarray, " factors"]
-    covariance_factor: Float[np.ndarray, "factors factors"]
-    tail_scale: float
+    covariance_factor: Float[np.ndarray, "factors factors"]  # root of the covariance of the factors
+    tail_scale: float  # width of the evaluated points over the factors'; the largest values lie in the tails
     powers: Int[np.ndarray, "terms factors"]
     coefficients: Float[np.ndarray, "terms quantities"]
-    log_range: Float[np.ndarray, "2 quantities"]
+    log_range: Float[np.ndarray, "2 quantities"]  # smallest and largest logarithm of the evaluated model
+    # sqrt(1 - r^2) of each quantity, where r is its correlation with the model at held-out points
     cross_validation_error: Float[np.ndarray, " quantities"]
-    evaluations: int
+    evaluations: int  # of the model
 
     @classmethod
-    def from_model(
-        cls,
-        finger: NewFingerModel,
-        factors: Float[np.ndarray, "fingers factors"],
-        names: tuple[str, ...],
-        *,
-        tail_scale: float = 1.25,
-        tolerance: float = 5e-3,
-        evaluations_per_term: int = 4,
-    ) -> Self:
-        """Fit the lowest degree within the tolerance at held-out points, or else the best one.
-
-        Args:
-            tolerance: largest cross-validation error, far below the error of the Sobol sequence.
-            evaluations_per_term: smallest ratio of evaluations to terms; with fewer, the tails diverge.
-        """
+    def from_model(cls, finger: NewFingerModel, factors: Factors, names: tuple[str, ...]) -> Self:
+        """Fit the lowest degree within the tolerance at held-out points, or else the best one."""
+        tail_scale, tolerance = 1.25, 5e-3  # largest cross-validation error, far below the error of the Sobol sequence
+        evaluations_per_term = 4  # smallest ratio of evaluations to terms; with fewer, the tails diverge
         size = factors.shape[1]
         mean, covariance_factor = factors.mean(axis=0), np.linalg.cholesky(np.cov(factors.T))
         count = 4096 * (size + 2) * size // 100  # a hundredth of the evaluations in `sobol_indices`
@@ -62,12 +44,11 @@ class Surrogate(NamedTuple):
         points = mean + tail_scale * z @ covariance_factor.T
         logs = np.log(finger.evaluate(points)[:, [finger.names.index(name) for name in names]])
         log_range = np.stack([logs.min(axis=0), logs.max(axis=0)])
-        weight = np.exp(
-            -0.5 * (tail_scale**2 - 1.0) * np.sum(z**2, axis=1)
-        )  # density of the factors over the density of the points
+        # density of the factors over the density of the points
+        weight = np.exp(-0.5 * (tail_scale**2 - 1.0) * np.sum(z**2, axis=1))
         surrogates: list[Self] = []
         for degree in itertools.count(1):
-            powers = _powers(size, degree)
+            powers = np.array([n for n in itertools.product(range(degree + 1), repeat=size) if sum(n) <= degree])
             terms = _hermite(z, powers)
             error = _cross_validation_error(terms, logs, weight)
             coefficients = _least_squares(terms, logs)
@@ -76,9 +57,7 @@ class Surrogate(NamedTuple):
                 break
         return min(surrogates, key=lambda surrogate: float(surrogate.cross_validation_error.max()))
 
-    def predict(
-        self, factors: Float[np.ndarray, "points factors"], chunk: int = 1024
-    ) -> Float[np.ndarray, "points quantities"]:
+    def predict(self, factors: Factors, chunk: int = 1024) -> Quantities:
         """Evaluate the quantities, `chunk` points at a time so that they fit the processor's cache."""
         z = np.linalg.solve(self.tail_scale * self.covariance_factor, (factors - self.mean).T).T
         parts = (z[i : i + chunk] for i in range(0, len(z), chunk))
@@ -90,25 +69,18 @@ def _to_normal(uniform: np.ndarray) -> np.ndarray:
     return ndtri(np.clip(uniform, 1e-12, 1.0 - 1e-12))  # it is infinite at 0 and 1
 
 
-def _least_squares(
-    terms: Float[np.ndarray, "points terms"], logs: Float[np.ndarray, "points quantities"]
-) -> np.ndarray:
+def _least_squares(terms: Terms, logs: Quantities) -> np.ndarray:
     """Solve the normal equations, which are well-conditioned for Hermite polynomials."""
     return np.linalg.solve(terms.T @ terms, terms.T @ logs)
 
 
-def _clip_to_range(
-    reference: Float[np.ndarray, "n quantities"], logs: Float[np.ndarray, "points quantities"]
-) -> np.ndarray:
+def _clip_to_range(reference: Quantities, logs: Quantities) -> Quantities:
     """Clip logarithms to the range of the reference, because a polynomial diverges beyond."""
     return np.clip(logs, reference.min(axis=0), reference.max(axis=0))
 
 
 def _cross_validation_error(
-    terms: Float[np.ndarray, "points terms"],
-    logs: Float[np.ndarray, "points quantities"],
-    weight: Float[np.ndarray, " points"],
-    folds: int = 4,
+    terms: Terms, logs: Quantities, weight: Float[np.ndarray, " points"], folds: int = 4
 ) -> Float[np.ndarray, " quantities"]:
     """Return sqrt(1 - r^2) between each quantity and its prediction at held-out points, weighted to the factors."""
     predictions = np.empty_like(logs)
@@ -123,12 +95,7 @@ def _cross_validation_error(
     return np.sqrt(np.maximum(squares, 0.0))
 
 
-def _powers(size: int, degree: int) -> Int[np.ndarray, "terms factors"]:
-    powers = itertools.product(range(degree + 1), repeat=size)
-    return np.array([term for term in powers if sum(term) <= degree])
-
-
-def _hermite(z: Float[np.ndarray, "points factors"], powers: Int[np.ndarray, "terms factors"]) -> np.ndarray:
+def _hermite(z: Factors, powers: Int[np.ndarray, "terms factors"]) -> Terms:
     """Return products of Hermite polynomials, which have unit variance over normal factors."""
     degree = int(powers.max())
     norm = np.sqrt([float(math.factorial(n)) for n in range(degree + 1)])
@@ -136,9 +103,7 @@ def _hermite(z: Float[np.ndarray, "points factors"], powers: Int[np.ndarray, "te
     return functools.reduce(np.multiply, (single[:, factor, column] for factor, column in enumerate(powers.T)))
 
 
-def variance_shares(
-    finger: NewFingerModel, factors: Float[np.ndarray, "fingers factors"], names: tuple[str, ...], seed: int
-) -> SobolIndices:
+def variance_shares(finger: NewFingerModel, factors: Factors, names: tuple[str, ...], seed: int) -> SobolIndices:
     """Compute `sobol_indices` of quantities `names` from a `Surrogate`.
 
     Each index is the mean square of a projection of y over the mean square of y. A surrogate whose correlation with y
@@ -154,9 +119,9 @@ def variance_shares(
 
 
 def sobol_indices(
-    model: Callable[[np.ndarray], np.ndarray],
+    model: Callable[[Factors], Quantities],
     factor_names: tuple[str, ...],
-    factors: Float[np.ndarray, "fingers factors"],
+    factors: Factors,
     names: tuple[str, ...],
     seed: int,
     count: int = 4096,
@@ -168,10 +133,6 @@ def sobol_indices(
     2012). SALib computes both from independent normal numbers that build the factors one after the other: the
     first-order index with x as the first factor, the total index with x as the last (Mara, Tarantola 2012). The
     interaction is the part of the total index that x contributes only together with others.
-
-    Args:
-        model: function from points (points, factors) to quantities (points, quantities).
-        count: number of points of the Sobol sequence.
     """
     import SALib.analyze.sobol
     import SALib.sample.sobol

@@ -1,6 +1,7 @@
 """HTML reports and figures of results.
 
-Makes self-contained pages; each function is imported at its first use.
+Makes self-contained pages; each function is imported at its first use. Every function that writes raises InputError
+where the path cannot be written.
 """
 
 import lazy_loader

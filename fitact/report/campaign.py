@@ -8,11 +8,7 @@ from fitact.report.frame import Answer, PageSummary, Provenance, write_page
 
 
 def write_campaign(folder: str | os.PathLike[str], fits: Fits, origin: Provenance, max_rows: int = 2000) -> Path:
-    """Write results.parquet, failures.csv and index.html (at most `max_rows` of each), and return the page.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
+    """Write results.parquet, failures.csv and index.html (at most `max_rows` of each), and return the page."""
     out, answered, failures = Path(folder), fits.answered, Fits(fits.failures)
     answered.to_parquet(out / "results.parquet")
     failures.to_csv(out / "failures.csv", ("record", "result", "message"))

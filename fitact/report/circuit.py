@@ -12,11 +12,7 @@ _NOT_PARTS = ("sigma", "sigma_I")
 
 
 def scene_circuit(scene: Scene, values: Mapping[str, float] | None = None, *, is_file: bool = False) -> Markup:
-    """Draw a scene's circuit as an SVG element, or as a file.
-
-    Args:
-        values: values by name, SI, e.g. posterior medians; others are taken from the scene.
-    """
+    """Draw a scene's circuit as an SVG element, or as a file; `values` (by name, SI) replace the scene's."""
     grounding, current = scene.grounding.connection, "I" in scene.measurement.channels
     diagram = lay_out_circuit(describe_parts(scene, values or {}), grounding, current)
     return Markup(diagram.svg(f"The circuit with {grounding} ground", is_file=is_file))

@@ -19,16 +19,11 @@ from fitact.report.frame import Answer, PageSummary, Provenance, image, write_pa
 from fitact.units import format_engineering
 
 _COLORS = {"sine": MODEL, "triangle": GREEN, "square": PINK, "trapezoid": DATA, "multitone": SKY}
-
-
 _VOLTAGES = (
     "Set the amplitude in the first sentence. The table also gives its Monte Carlo error, which says how far another"
-    " seed changes it, and the median and 90 % interval, which say what is known of the amplitude that just suffices."
+    " seed changes it"
 )
-_PRIOR_VOLTAGES = (
-    "Set the amplitude in the first sentence. The table also gives its Monte Carlo error, which says how far another"
-    " seed changes it."
-)
+_INTERVALS = ", and the median and 90 % interval, which say what is known of the amplitude that just suffices"
 
 
 def draw_drive_design(design: DriveDesign) -> Figure:
@@ -138,7 +133,7 @@ def _frame(design: DriveDesign) -> PageSummary:
     findings["Body current and insulator"] = design.exposure
     recommended = design.recommended
     if recommended is not None:
-        findings["Which voltage to set"] = _VOLTAGES if design.people.has_separate_uncertainty else _PRIOR_VOLTAGES
+        findings["Which voltage to set"] = f"{_VOLTAGES}{_INTERVALS * design.people.has_separate_uncertainty}."
         findings |= {f"{name[0].upper()}{name[1:]}": f"{answer}." for name, answer in smallest}
     return PageSummary(
         title=f"The smallest drive that {100.0 * design.share:g} % of fingers feel",
@@ -149,11 +144,7 @@ def _frame(design: DriveDesign) -> PageSummary:
         verdict=design.recommendation.rstrip(".") if design.trusted else f"{'; '.join(design.warnings)}.",
         findings=findings,
         answers=[
-            Answer(
-                f"{name}, peak to peak",
-                format_quantity(option.assured, "V"),
-                _note(option, recommended),
-            )
+            Answer(f"{name}, peak to peak", format_quantity(option.assured, "V"), _note(option, recommended))
             for name, option in design.options.items()
         ],
         warnings=design.warnings,

@@ -33,11 +33,7 @@ _WRITERS: dict[type, tuple[str, Callable[..., Figure], Callable[..., None]]] = {
 def write_folder(
     folder: Path, result: Any, command: str, scene: Scene | None, records: Sequence[Record | Finger] = ()
 ) -> None:
-    """Write a design, a plan or a trade-off into a folder, with its command, scene and records.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
+    """Write a design, a plan or a trade-off into a folder, with its command, scene and records."""
     name, draw, write_page = _WRITERS[type(result)]
     write_json(folder / f"{name}.json", result.to_dict())
     write_figure(folder / f"{name}.svg", lambda: draw(result))

@@ -1,7 +1,6 @@
 """Frame of all result pages: subject, verdict, answers, and how to repeat the result."""
 
 import base64
-import dataclasses
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -22,19 +21,12 @@ from fitact.summary import versions
 from fitact.units import format_engineering
 
 
-@dataclasses.dataclass(frozen=True)
-class Provenance:
-    """Origin of a result.
+class Provenance(NamedTuple):
+    """Origin of a result."""
 
-    Attributes:
-        command: command line that repeats it.
-        scene: stated keys of the scene, SI; {} if none.
-        records: SHA-256 of the data of each record, by name.
-    """
-
-    command: str
-    scene: Mapping[str, Any]
-    records: Mapping[str, str]
+    command: str  # command line that repeats it
+    scene: Mapping[str, Any]  # stated keys of the scene, SI; {} if none
+    records: Mapping[str, str]  # SHA-256 of the data of each record, by name
 
     @classmethod
     def from_inputs(cls, command: str, scene: Scene | None, records: Sequence[Record | Finger] = ()) -> Self:
@@ -56,46 +48,31 @@ class Answer(NamedTuple):
     note: str
 
 
-@dataclasses.dataclass(frozen=True)
-class PageSummary:
-    """Top of every page.
-
-    Attributes:
-        subject: subject of the page.
-        trusted: whether the result is reliable.
-        verdict: one sentence; for an unreliable result, the reason.
-        findings: sentences, by the question that they answer.
-        answers: the main numbers.
-        warnings: sentences on what may change the result.
-        has_reservation: whether a reliable result is limited, as the verdict states.
-        notes: sentences for information.
-    """
+class PageSummary(NamedTuple):
+    """Top of every page."""
 
     title: str
     subject: str
-    trusted: bool
-    verdict: str
-    findings: Mapping[str, str]
-    answers: Sequence[Answer]
-    warnings: Sequence[str]
-    has_reservation: bool = False
-    notes: Sequence[str] = ()
+    trusted: bool  # whether the result is reliable
+    verdict: str  # one sentence; for an unreliable result, the reason
+    findings: Mapping[str, str]  # sentences, by the question that they answer
+    answers: Sequence[Answer]  # the main numbers
+    warnings: Sequence[str]  # sentences on what may change the result
+    has_reservation: bool = False  # whether a reliable result is limited, as the verdict states
 
 
 def write_page(path: str | os.PathLike[str], template: str, **content: Any) -> None:
     """Render a template with `content`: mostly `frame` (a `PageSummary`), `origin` (a `Provenance`) and more.
 
     Raises:
-        InputError: the place cannot be written.
         jinja2.UndefinedError: the template needs a value that is missing.
     """
     loader = jinja2.PackageLoader("fitact.report")
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     environment.globals["engineering"] = format_engineering
     environment.filters["picture"] = lambda chart: image(lambda: draw_chart(chart))
-    environment.globals["verbatim"] = lambda name: Markup(
-        loader.get_source(environment, name)[0]
-    )  # trusted scripts of this package
+    # trusted scripts of this package
+    environment.globals["verbatim"] = lambda name: Markup(loader.get_source(environment, name)[0])
     page = environment.get_template(template).render(content, versions=versions())
     with atomic_write(path) as temporary:
         temporary.write_text(page, encoding="utf-8")

@@ -46,7 +46,7 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
             circuits=_CIRCUITS,
             estimate=format_estimate,
             interval=format_interval,
-            advice=[_render_advice(name) for name in result_names(summary)],
+            advice=[Markup(MarkdownIt("js-default").render(explain(name))) for name in result_names(summary)],
             command=_command(summary),
             scene=json.dumps(summary["scene"], indent=2, ensure_ascii=False),
         )
@@ -57,11 +57,7 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
 
 
 def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]]:
-    """Read what `write_report` needs from a folder that `fitact sample` or `fitact run` wrote.
-
-    Raises:
-        InputError: a file is missing or damaged.
-    """
+    """Read what `write_report` needs from a folder of results; raise InputError if it is incomplete."""
     import xarray as xr
 
     content = load(directory)
@@ -72,11 +68,6 @@ def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]
         raise InputError(
             f"{directory}: holds no complete results ({error}); make them with: fitact sample RECORD --out {directory}"
         ) from error
-
-
-def _render_advice(name: str) -> Markup:
-    """Return the advice for a result name as HTML."""
-    return Markup(MarkdownIt("js-default").render(explain(name)))
 
 
 def _command(summary: dict[str, Any]) -> str:

@@ -51,11 +51,7 @@ _NOT_DRAWN_MESSAGE = "Not drawn: some draws are not finite."
 
 
 def write_population(path: str | os.PathLike[str], tree: Any, content: dict[str, Any]) -> None:
-    """Draw the content of population.nc and population.json as SVG at `path`.
-
-    Raises:
-        InputError: the place cannot be written.
-    """
+    """Draw the content of population.nc and population.json as SVG at `path`."""
     write_figure(path, lambda: _figure(tree, content))
 
 
@@ -168,11 +164,7 @@ _PANELS = {"skin": _draw_skin, "force": _draw_force, "time": _draw_time, "shares
 
 
 def write_population_page(path: str | os.PathLike[str], tree: Any, content: dict[str, Any]) -> None:
-    """Write the page from the content of population.nc and population.json.
-
-    Raises:
-        InputError: the place cannot be written.
-    """
+    """Write the page from the content of population.nc and population.json."""
     content = content | {name: _null_to_nan(content[name]) for name in (*_NUMERIC, "integrals_off")}
     write_page(
         path,
@@ -180,7 +172,7 @@ def write_population_page(path: str | os.PathLike[str], tree: Any, content: dict
         frame=_frame(content),
         origin=_origin(content),
         content=content,
-        **(_figures(tree, content) if _is_drawable(tree) else {"panels": None, "not_drawn": _NOT_DRAWN_MESSAGE}),
+        **_figures(tree, content),
         law=[row for row in population_table(content) if not row[0].startswith("next finger")],
         fingers=tuple(_finger_rows(content)),
         new=tuple(_new_rows(content)),
@@ -190,11 +182,7 @@ def write_population_page(path: str | os.PathLike[str], tree: Any, content: dict
 
 
 def read_population(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]]:
-    """Read what `write_population_page` needs from a folder that `fitact population` wrote.
-
-    Raises:
-        InputError: a file is missing or damaged.
-    """
+    """Read what `write_population_page` needs from a folder of results; raise InputError if it is incomplete."""
     import xarray as xr
 
     try:
@@ -221,11 +209,10 @@ def _null_to_nan(content: Any) -> Any:
 
 
 def _figures(tree: Any, content: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "panels": {name: image(functools.partial(_draw_panel, draw, tree, content)) for name, draw in _PANELS.items()},
-        "skin": _skin_chart(tree, content),
-        "force": _force_chart(tree),
-    }
+    if not _is_drawable(tree):
+        return {"panels": None, "not_drawn": _NOT_DRAWN_MESSAGE}
+    panels = {name: image(functools.partial(_draw_panel, draw, tree, content)) for name, draw in _PANELS.items()}
+    return {"panels": panels, "skin": _skin_chart(tree, content), "force": _force_chart(tree)}
 
 
 def _frame(content: dict[str, Any]) -> PageSummary:

@@ -43,12 +43,9 @@ def _channel_chart(tree: Any, name: str, columns: int) -> Chart:
 def _time_plot(
     series: np.ndarray, quantity: tuple[str, str], columns: int, expected: np.ndarray | None, title: str = ""
 ) -> Plot:
-    """Draw data and fit, with the residuals below.
+    """Draw a `series` (times, data and fit) of a `quantity` (channel and unit), with the residuals below.
 
-    Args:
-        series: times, data and fit, SI.
-        quantity: channel and unit.
-        expected: times, and both ends of the 90 % posterior predictive interval.
+    `expected` holds times, and both ends of the 90 % posterior predictive interval.
     """
     (time, values, fitted), (channel, unit) = series, quantity
     residuals, limits = values - fitted, robust_limits(values)

@@ -17,11 +17,7 @@ _FORMATS = (".html", ".svg", ".png")
 
 
 def write_prior(path: Path, predicted: PriorPredictive) -> None:
-    """Write voltage and force of a prior to `path`: SVG or PNG by its suffix, or HTML with the table.
-
-    Raises:
-        InputError: the suffix is another one, or the path cannot be written.
-    """
+    """Write voltage and force of a prior to `path`: SVG or PNG by its suffix, or HTML with the table."""
     if path.suffix not in _FORMATS:
         raise InputError(f"{path}: the figure can be written as {', '.join(_FORMATS)}; choose one of these suffixes")
     if path.suffix != ".html":

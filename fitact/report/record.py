@@ -16,11 +16,7 @@ from fitact.errors import InputError
 
 
 def write_record(path: str | os.PathLike[str], inspection: Inspection) -> None:
-    """Draw the channels of a record and write SVG or PNG, by the ending of `path`.
-
-    Raises:
-        InputError: the ending is another one, or the file cannot be written.
-    """
+    """Draw the channels of a record and write SVG or PNG, by the ending of `path`."""
     path = Path(path)
     if path.suffix not in (".svg", ".png"):
         raise InputError(f"{path}: the drawing is written as .svg or .png; choose one of these endings")

@@ -29,11 +29,7 @@ _DIRECT = DirectGround(paper.RSC, paper.CSC, paper.CI, R_H=paper.R_H)
 
 
 def write_reproduction(directory: str | os.PathLike[str], claims: tuple[paper.Claim, ...]) -> Path:
-    """Write reproduction.json and reproduction.html, with the figures, into `directory`, and return the page.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
+    """Write reproduction.json and reproduction.html, with the figures, into `directory`, and return the page."""
     directory = Path(directory)
     page = directory / "reproduction.html"
     with jax.enable_x64(True):

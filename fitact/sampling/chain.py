@@ -76,11 +76,7 @@ class Chain:
 
     @classmethod
     def load(cls, path: Path, fingerprint: str) -> Self:
-        """Read the chain of `fingerprint`.
-
-        Raises:
-            InputError: the chain belongs to other inputs, or the file is not a chain.
-        """
+        """Read the chain of `fingerprint`; raise InputError for a chain of other inputs, or another file."""
         try:
             with h5py.File(path, "r") as file:
                 if file.attrs["fingerprint"] != fingerprint:

@@ -218,11 +218,7 @@ def pareto_smooth(log_weights: Float[np.ndarray, " draws"]) -> ImportanceWeights
 
 
 def diagnose_weights(
-    level: str,
-    importance: ImportanceWeights,
-    quantities: dict[str, np.ndarray],
-    n_resampled: int,
-    criteria: Criteria = CRITERIA,
+    level: str, importance: ImportanceWeights, quantities: dict[str, np.ndarray], n_resampled: int
 ) -> Convergence:
     """Return the effective sizes of `n_resampled` draws, and for "laplace" the errors of the approximation."""
     shift, widening, quantities = {}, {}, _varying(quantities)
@@ -236,10 +232,10 @@ def diagnose_weights(
         widening = {name: float(np.std(quantities[name])) / sd - 1.0 for name, (_, sd) in corrected.items()}
     largest_error = max(map(abs, (*shift.values(), *widening.values())), default=0.0)
     forbidden = float(np.mean(importance.weights == 0.0)) if level == "laplace" else 0.0
-    accurate = largest_error <= criteria.laplace_error and forbidden <= criteria.forbidden
+    accurate = largest_error <= CRITERIA.laplace_error and forbidden <= CRITERIA.forbidden
     return Convergence(
         level=level,
-        converged=bool(importance.k_hat <= criteria.k_hat and accurate),
+        converged=bool(importance.k_hat <= CRITERIA.k_hat and accurate),
         ess_min=min(ess.values()),
         ess=ess,
         k_hat=importance.k_hat,

@@ -8,6 +8,7 @@ import importlib.metadata
 import json
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -23,11 +24,11 @@ from fitact.errors import InputError
 from fitact.files import remove_temporary
 from fitact.fitting.fit import Fit
 from fitact.likelihood import certificate
+from fitact.progress import open_bar
 from fitact.sampling import importance
 from fitact.sampling.chain import Chain
 from fitact.sampling.convergence import Convergence, diagnose_chain
 from fitact.sampling.posterior import Posterior
-from fitact.sampling.progress import Reporter
 from fitact.sampling.proposal import OVERDISPERSION, SHARES, LogProb, Proposal
 
 Level = Literal["emcee", "psis", "laplace"]
@@ -121,7 +122,7 @@ def run_ensembles(
 ) -> tuple[Chain, Convergence]:
     """Sample until converged, in double precision; the arguments are those of `sample`."""
     run = _Run.start_or_resume(target, seed, walkers, ensembles, path)
-    convergence = run.sample_until_converged(max_steps, Reporter(progress))
+    convergence = run.sample_until_converged(max_steps, _Reporter(progress))
     return run.chain, convergence
 
 
@@ -138,6 +139,30 @@ def reject_nonfinite(log_prob: LogProb) -> LogProb:
         return np.where(np.isfinite(values), values, -np.inf)
 
     return finite_log_prob
+
+
+class _Reporter:
+    """Progress on standard error: a bar on a terminal, otherwise occasional lines."""
+
+    def __init__(self, show: bool) -> None:
+        self._show, self._lines = show, 0
+        self._bar = open_bar("sampling", status="starting") if show and sys.stderr.isatty() else None
+
+    def __call__(self, steps: int, convergence: Convergence) -> None:
+        if not self._show:
+            return
+        diagnosis = f", tau {convergence.tau_max:.1f}, R-hat {convergence.rhat_max:.4f}" if convergence.ess else ""
+        text = f"{steps} steps{diagnosis}"
+        if self._bar is not None:
+            self._bar.update(self._bar.task_ids[0], completed=convergence.progress, description=text)
+        elif steps == convergence.steps:
+            if self._lines in (0, 1, 2, 5, 10) or self._lines % 20 == 0 or convergence.converged:
+                print(f"sampling: {text}", file=sys.stderr)
+            self._lines += 1
+
+    def close(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
 
 
 @dataclasses.dataclass
@@ -177,7 +202,7 @@ class _Run:
             states.append(emcee.State(points, log_prob=values, random_state=random.get_state()))
         return cls(target, Chain.empty(names, target.fingerprint, states), samplers, path, start_time)
 
-    def sample_until_converged(self, max_steps: int, report: Reporter) -> Convergence:
+    def sample_until_converged(self, max_steps: int, report: _Reporter) -> Convergence:
         """Sample, diagnose and save in turn."""
         steps = self.chain.steps
         is_due = steps == _next_diagnostic_step(steps - 1) or steps >= max_steps

@@ -10,13 +10,9 @@ from fitact.sampling.posterior import Posterior
 from fitact.sampling.proposal import LogProb, Proposal
 
 
-def draw_around_fit(
-    fit: Fit, level: str, log_prob: LogProb, seed: int, *, draws: int = 10_000, oversampling: int = 2
-) -> Posterior:
-    """Draw with method `level`, "laplace" or "psis", and diagnose the draws.
-
-    "psis" makes `oversampling` weighted draws for each of the `draws` that it returns, so that few are duplicates.
-    """
+def draw_around_fit(fit: Fit, level: str, log_prob: LogProb, seed: int) -> Posterior:
+    """Draw with method `level`, "laplace" or "psis", and diagnose the draws."""
+    draws, oversampling = 10_000, 2  # weighted draws of "psis" for each that it returns, so that few are duplicates
     rng = np.random.default_rng([seed, 4])
     if level == "laplace":
         z = rng.standard_normal((draws, fit.point.size))

@@ -20,10 +20,8 @@ class Assumption(NamedTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """Return an entry of `force_basis.assumptions` in fit.json and summary.json."""
-        return {
-            "symbol": self.symbol, "key": self.key, "value": self.value, "unit": self.unit, "text": self.text,
-            "origin": "scene" if self.stated else "default", "affects": self.affects,
-        }  # fmt: skip
+        fields = {name: value for name, value in self._asdict().items() if name != "stated"}
+        return fields | {"origin": "scene" if self.stated else "default"}
 
 
 def list_assumptions(scene: Scene, law: str, *, prior: bool, stated_drive: bool) -> tuple[Assumption, ...]:

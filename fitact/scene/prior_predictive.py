@@ -1,8 +1,6 @@
 """Prior predictive distribution of skin voltage and force for a scene, before any data."""
 
-import dataclasses
-import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +14,11 @@ from fitact.model.drive import Drive, Periodic, PiecewiseLinear
 from fitact.model.force import electrostatic_force, mean_force, peak_force
 from fitact.model.response import response
 from fitact.scene.scene import Scene
-from fitact.tables import align_rows
+from fitact.tables import align_row
 from fitact.units import format_engineering
 
 
-@dataclasses.dataclass(frozen=True)
-class PriorPredictive:
+class PriorPredictive(NamedTuple):
     """Draws from the prior, and the predictions of each draw."""
 
     parameters: dict[str, Float[np.ndarray, " draws"]]  # free, fixed and tied parameters by name, SI
@@ -46,7 +43,7 @@ class PriorPredictive:
         for name, s in (content["parameters"] | content["derived"]).items():
             quantiles = (float(s[key]) for key in ("q05", "q25", "q50", "q75", "q95"))
             rows.append([name, *(format_engineering(x, str(s["unit"]), 3) for x in quantiles)])
-        return "\n".join(align_rows(rows, [18] + 5 * [12]))
+        return "\n".join(align_row(row, [18] + 5 * [12]) for row in rows)
 
 
 def prior_predictive(scene: Scene, draws: int = 2000, seed: int = 0) -> PriorPredictive:
@@ -86,24 +83,21 @@ def sample_prior(scene: Scene, rng: np.random.Generator, size: int) -> dict[str,
 def _predict_draws(
     scene: str, drive: Drive, repeats: bool, time: Float[Array, " times"], values: dict[str, Float[Array, " draws"]]
 ) -> tuple[Float[Array, "draws times"], dict[str, Float[Array, " draws"]]]:
-    predict = functools.partial(_predict_draw, Scene.from_json(scene), drive, repeats, time)
-    # this batch size bounds the memory for draws with many harmonics
-    return jax.lax.map(predict, values, batch_size=100)
+    """Return Vsc over time, and derived quantities, of each draw of a scene (as JSON)."""
+    stated = Scene.from_json(scene)
 
+    def predict(values: dict[str, Array]) -> tuple[Array, dict[str, Any]]:
+        circuit = stated.make_circuit(values)
+        vsc = response(circuit, drive, time, steady_state=repeats)
+        contact = stated.geometry().contact(stated.make_rc_circuit(values))
+        derived = {"g": circuit.g, "b": circuit.b} if isinstance(circuit, FinalCircuit) else {}
+        derived["Vsc_peak_to_peak"] = jnp.ptp(vsc)
+        if repeats and stated.skin.level == "constant":
+            mean, peak = mean_force(circuit, drive, contact), peak_force(circuit, drive, contact)
+        else:
+            acting = response(circuit, drive, time, steady_state=repeats, channel=contact.channel)
+            force = electrostatic_force(acting, contact)
+            mean, peak = jnp.trapezoid(force, time) / time[-1], jnp.max(force)
+        return vsc, derived | {"force_mean": mean, "force_peak": peak}
 
-def _predict_draw(
-    scene: Scene, drive: Drive, repeats: bool, time: Float[Array, " times"], values: dict[str, Array]
-) -> tuple[Float[Array, " times"], dict[str, Array]]:
-    """Return Vsc over time, and derived quantities, for one draw."""
-    circuit = scene.make_circuit(values)
-    vsc = response(circuit, drive, time, steady_state=repeats)
-    contact = scene.geometry().contact(scene.make_rc_circuit(values))
-    derived = {"g": circuit.g, "b": circuit.b} if isinstance(circuit, FinalCircuit) else {}
-    derived["Vsc_peak_to_peak"] = jnp.ptp(vsc)
-    if repeats and scene.skin.level == "constant":
-        mean, peak = mean_force(circuit, drive, contact), peak_force(circuit, drive, contact)
-    else:
-        acting = response(circuit, drive, time, steady_state=repeats, channel=contact.channel)
-        force = electrostatic_force(acting, contact)
-        mean, peak = jnp.trapezoid(force, time) / time[-1], jnp.max(force)
-    return vsc, derived | {"force_mean": mean, "force_peak": peak}
+    return jax.lax.map(predict, values, batch_size=100)  # bounds the memory for draws with many harmonics

@@ -37,19 +37,19 @@ from fitact.scene.scene import Scene
 
 @dataclasses.dataclass(frozen=True)
 class BenchmarkResult:
-    """Error and cost of one method; see `fitact.tradeoff.tradeoff.BenchmarkedMethod`."""
+    """Error and cost of one method."""
 
-    name: str
-    error: float
+    name: str  # "least squares", "exact", "harmonic(100)", "compressed(1e-3)", "psis", ...
+    error: float  # relative to the reference method; see `fitact.tradeoff.tradeoff.Tradeoff`
+    # time of an answer, of one evaluation (of one walker in a batch), or of one effective draw of the mean force
     seconds: float
-    gradient_seconds: float | None = None
-    compile_seconds: float = 0.0
-    memory: int | None = None
-    details: dict[str, Any] = dataclasses.field(default_factory=dict)
+    gradient_seconds: float | None = None  # time of one gradient, or None
+    compile_seconds: float = 0.0  # compilation time; of an answer, what a first process without stored programs adds
+    memory: int | None = None  # bytes for an evaluation, or for the draws; None if unknown
+    details: dict[str, Any] = dataclasses.field(default_factory=dict)  # additional figures of this method
 
 
-@dataclasses.dataclass(frozen=True)
-class _Job:
+class _Job(NamedTuple):
     """Functions to time (value and gradient), evaluations per call, compilation time (s) and memory (bytes)."""
 
     call: Callable[[], Any]
@@ -185,13 +185,9 @@ def _make_ode_solver(case: _Case, rtol: float = 1e-6) -> Callable[[], np.ndarray
     return solve
 
 
-def benchmark_likelihoods(
-    full: Fit, compressed: dict[float, Fit], walkers: int = 128, batch_rows: int = 1_000_000
-) -> list[BenchmarkResult]:
-    """Benchmark methods for the log-posterior at `walkers` points around the optimum, the full sum first.
-
-    A batch holds at most `batch_rows` samples, which bounds the memory. Double precision is required.
-    """
+def benchmark_likelihoods(full: Fit, compressed: dict[float, Fit]) -> list[BenchmarkResult]:
+    """Benchmark methods for the log-posterior around the optimum, the full sum first, in double precision."""
+    walkers, batch_rows = 128, 1_000_000  # points; samples in a batch, which bounds the memory
     models, details = {"full": full.likelihood.without_compression()}, {}
     for name, fit in _distinct_compressions(compressed).items():
         models[name] = fit.likelihood.without_samples()
@@ -324,11 +320,7 @@ result = fitact.sample(fit, level=level, progress=False).summary() if level else
 
 
 def benchmark_answers(
-    record: Record,
-    scene: Scene | None,
-    draws: UncertaintyBenchmark,
-    report: Callable[[str], None],
-    rounds: int = 3,
+    record: Record, scene: Scene | None, draws: UncertaintyBenchmark, report: Callable[[str], None]
 ) -> list[BenchmarkResult]:
     """Measure the wall time from a record to the force, by least squares and by each posterior method.
 
@@ -336,7 +328,7 @@ def benchmark_answers(
     stored program. The error is the largest difference of median, 5 and 95 % quantile of the mean force, relative to
     the median by emcee on the full sum; of several runs, the root mean square.
     """
-    fit_seconds = statistics.median(timeit.timeit(lambda: fit_record(record, scene), number=1) for _ in range(rounds))
+    fit_seconds = statistics.median(timeit.repeat(lambda: fit_record(record, scene), number=1, repeat=3))
     fitted = fit_record(record, scene).derived()["force_mean"]
     reference = np.quantile(np.concatenate(draws.force["emcee, full"]), _FORCE_QUANTILES)
     stated = [np.array([fitted["q50"], fitted["q05"], fitted["q95"]], dtype=float)]

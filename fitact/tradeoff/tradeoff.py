@@ -6,11 +6,11 @@ import platform
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import jax
 
+from fitact.compiled import processor
 from fitact.data.record import Record
 from fitact.data.simulate import simulate
 from fitact.errors import InputError
@@ -34,21 +34,13 @@ KINDS: dict[Kind, str] = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class BenchmarkedMethod:
-    """Error and cost of one method."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BenchmarkedMethod(BenchmarkResult):
+    """Error and cost of one method, compared with the others of its kind."""
 
     kind: Kind
-    name: str  # "least squares", "exact", "harmonic(100)", "compressed(1e-3)", "psis", ...
-    error: float  # relative to the reference method; see `Tradeoff`
-    # time of an answer, of one evaluation (of one walker in a batch), or of one effective draw of the mean force
-    seconds: float
     ratio: float  # `seconds` over the time of the exact method
-    gradient_seconds: float | None  # time of one gradient, or None
-    compile_seconds: float  # compilation time; of an answer, what a first process without stored programs adds
-    memory: int | None  # bytes for an evaluation, or for the draws; None if unknown
     dominated_by: str  # a method that is no less accurate and no slower, and better in one; "" on the Pareto front
-    details: dict[str, Any]  # additional figures of this method
 
     @property
     def cells(self) -> tuple[str, ...]:
@@ -225,8 +217,9 @@ def _notes(full: Fit, fits: dict[float, Fit], converged: bool) -> tuple[str, ...
 
 def describe_machine() -> dict[str, Any]:
     """Return a description of the machine, so that runs can be compared."""
+    model = next((line for line in processor().splitlines() if line.startswith("model name")), "")
     return {
-        "cpu": _cpu(),
+        "cpu": model.partition(":")[2].strip() or platform.machine(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "platform": platform.platform(),
@@ -234,11 +227,3 @@ def describe_machine() -> dict[str, Any]:
         "python": platform.python_version(),
         **{package: version(package) for package in ("fitact", "jax", "jaxlib", "numpy", "scipy", "emcee")},
     }
-
-
-def _cpu() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 import fitact
 from fitact.cli import app
-from fitact.fitting.criteria import criteria, gaussian_log_likelihood
+from fitact.fitting.channel_fit import criteria, gaussian_log_likelihood
 from tests.conftest import SQUARE, square_record
 
 

@@ -50,10 +50,10 @@ def plan() -> Plan:
 
 def tradeoff(trusted: bool = True) -> Tradeoff:
     def levels(kind: Any) -> tuple[BenchmarkedMethod, ...]:
-        best = BenchmarkedMethod(kind, f"best {kind}", 0.0, 2e-6, 1.0, 3e-6, 0.7, 8000, "", {"cold_seconds": 5.0})
-        worse = BenchmarkedMethod(
-            kind, f"worse {kind}", 0.123, 4e-6, 2.0, None, 0.0, None, best.name, {"cold_seconds": 6.0}
-        )
+        cost = {"kind": kind, "ratio": 1.0, "dominated_by": ""}
+        best = BenchmarkedMethod(f"best {kind}", 0.0, 2e-6, 3e-6, 0.7, 8000, {"cold_seconds": 5.0}, **cost)
+        cost |= {"ratio": 2.0, "dominated_by": best.name}
+        worse = BenchmarkedMethod(f"worse {kind}", 0.123, 4e-6, details={"cold_seconds": 6.0}, **cost)
         return best, worse
 
     every = tuple(level for kind in ("answer", "response", "likelihood", "uncertainty") for level in levels(kind))

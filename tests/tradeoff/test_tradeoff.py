@@ -108,16 +108,13 @@ def some(kind: str, points: list[tuple[float, float]]) -> list[BenchmarkedMethod
     names = [f"a level of {kind} {i}" for i in range(len(points))]
     return [
         BenchmarkedMethod(
-            kind,
             name,
             error,
             cost,
-            cost / points[0][0],
-            None,
-            0.0,
-            None,
-            "" if j is None else names[j],
-            {"cold_seconds": 5.0 + cost} if kind == "answer" else {},
+            details={"cold_seconds": 5.0 + cost} if kind == "answer" else {},
+            kind=kind,
+            ratio=cost / points[0][0],
+            dominated_by="" if j is None else names[j],
         )
         for name, (cost, error), j in zip(names, points, by, strict=True)
     ]

@@ -18,16 +18,13 @@ Pick = Callable[[list[str], str], Iterable[str]]  # of the names found, and thei
 
 @dataclasses.dataclass(frozen=True)
 class FileChannel:
-    """One channel of a file, in the SI unit `unit` (V, A; "" if the file states none).
-
-    `unit_text`: unit as written in the file. `attenuation`: probe attenuation that the file states, already applied.
-    """
+    """One channel of a file."""
 
     name: str
-    values: Float[np.ndarray, " samples"]
-    unit: str = ""
-    unit_text: str = ""
-    attenuation: float | None = None
+    values: Float[np.ndarray, " samples"]  # in `unit`
+    unit: str = ""  # SI unit (V, A; "" if the file states none)
+    unit_text: str = ""  # unit as written in the file
+    attenuation: float | None = None  # probe attenuation that the file states, already applied
     location: str = ""  # location of the name, for messages
 
     @classmethod
@@ -46,24 +43,16 @@ class FileChannel:
 
 @dataclasses.dataclass(frozen=True)
 class Capture:
-    """Time (s) and channels of one file.
-
-    Attributes:
-        format: name of the file format, e.g. "Keysight CSV".
-        row_label: function from a sample index to its name in messages, e.g. "line 12".
-        notes: sentences for information.
-        warnings: sentences on what was assumed and may change the result.
-        unread_columns: columns that were not requested, or without numbers.
-    """
+    """Time and channels of one file."""
 
     source: str
-    format: str
-    time: Float[np.ndarray, " samples"]
+    format: str  # name of the file format, e.g. "Keysight CSV"
+    time: Float[np.ndarray, " samples"]  # s
     channels: tuple[FileChannel, ...]
-    row_label: Callable[[int], str] = lambda row: f"sample {row}"
-    notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-    unread_columns: tuple[str, ...] = ()
+    row_label: Callable[[int], str] = lambda row: f"sample {row}"  # name of a sample index in messages, e.g. "line 12"
+    notes: tuple[str, ...] = ()  # sentences for information
+    warnings: tuple[str, ...] = ()  # sentences on what was assumed and may change the result
+    unread_columns: tuple[str, ...] = ()  # columns that were not requested, or without numbers
 
 
 def resolve_channels(names: list[str], channels: Mapping[str, str], source: str, location: str = "") -> dict[str, str]:

@@ -18,11 +18,7 @@ _COMPLEX = 0x0800
 
 
 def read_mat(content: bytes, max_bytes: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield name and array of each numeric or string variable of at most `max_bytes` bytes.
-
-    Raises:
-        ValueError: the file is damaged, or a variable is larger.
-    """
+    """Yield name and array of each numeric or string variable; raise ValueError for damage, or above `max_bytes`."""
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:
         raise ValueError("no byte order in the header")
