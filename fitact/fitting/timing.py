@@ -27,7 +27,7 @@ def free_timing(
     step: float = 1 / 8,
     delay_half_width: float = 5.0,
     clock_half_width: float = 2.0,
-    few: int = 16_384,
+    few: int = 4096,
 ) -> ChannelLikelihood:
     """Return the channel with a free delay or clock error (`name`); `circuit` is that of the `inputs`.
 

@@ -10,13 +10,15 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from fitact.compiled import BatchEvaluator, jit
+from fitact.compiled import BatchEvaluator, jit, pad_samples
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.compression import (
     BASELINE_NAMES,
+    MANY_SAMPLES,
     Compression,
     compress,
     is_exactly_uniform,
+    samples_per_period,
     table_multiple,
 )
 from fitact.likelihood.compression_on_grid import GridCompression
@@ -28,7 +30,6 @@ from fitact.model.skin import WithSkin
 
 TOLERANCE = 1e-3  # error of the log-likelihood
 _TIMING_REASON = "a delay or a clock error is a free parameter"
-_MANY_ROWS = 65_536  # samples, above which a faster program saves more than its compilation takes
 _TRAINING = 63  # points around an optimum whose signals an interpolation represents
 FEW_ROWS = 200  # numbers per evaluation, below which the overhead of the call dominates
 
@@ -65,6 +66,7 @@ def compress_channel(
     }
     terms = start.terms[channel.channel]
     if isinstance(circuit, WithSkin):
+        channel = _fold(channel)
         inputs = ChannelInputs(circuit, *map(np.asarray, (1.0, 0.0, 0.0)))
         signal = _signal(channel, inputs)[samples]
         slope = -np.gradient(signal, arrays[1])
@@ -77,6 +79,15 @@ def compress_channel(
 
 
 _signal = jit(ChannelLikelihood.signal)
+
+
+def _fold(channel: ChannelLikelihood) -> ChannelLikelihood:
+    """Return the channel with its `phases` if drive and samples repeat; a sum over many time constants is costly."""
+    time = np.asarray(channel.time)[: channel.n_samples]
+    period = samples_per_period(channel.drive, time) if channel.steady_state and channel.rate is None else None
+    if period is None:
+        return channel
+    return dataclasses.replace(channel, phases=pad_samples(time[:period]), period=np.asarray(period))
 
 
 def recompress(channel: ChannelLikelihood, circuit: CircuitValues) -> ChannelLikelihood:
@@ -233,7 +244,6 @@ def certify(
         return CertifiedLikelihood(likelihood, None, tuple(r or _TIMING_REASON for r in reasons))
     light, optimum = likelihood.without_samples(), likelihood.evaluate_circuit(theta)
     reach = table_half_width(np.linalg.norm(_log_tau_slopes(light, theta) @ covariance_factor, axis=1))
-    tau_range = float(np.min(optimum.tau) * np.exp(-reach[1])), float(np.max(optimum.tau) * np.exp(reach[0]))
     precisions = table_precision(sigma, tolerance).tolist()
     inputs = [likelihood.make_inputs(optimum.circuit, theta, channel) for channel in likelihood.channels]
     delay_sd = dict(zip(likelihood.names, np.linalg.norm(covariance_factor, axis=1), strict=True))
@@ -242,14 +252,14 @@ def certify(
             channel,
             each,
             optimum.terms.get(channel.channel),
-            tau_range,
+            reach,
             delay_sd.get(channel.qualified_name("delay"), 0.0),
             precision,
         )
         for channel, each, precision in zip(likelihood.channels, inputs, precisions, strict=True)
     )
     deviates = np.random.default_rng(0).standard_normal((check_points, theta.size))  # any reproducible points serve
-    if likelihood.count > _MANY_ROWS:
+    if likelihood.count > MANY_SAMPLES:
         check_points = math.ceil(check_points / 3)
     around = np.vstack([theta, theta + 1.5 * deviates[:check_points] @ covariance_factor.T])
     is_local = any(channel.expansion is not None for channel in likelihood.channels)
@@ -299,7 +309,7 @@ def _compression_failure(error: float, excess: float, tolerance: float) -> str:
 def _prior_points(likelihood: Likelihood, theta: np.ndarray, count: int) -> Float[np.ndarray, "n parameters"]:
     """Return draws from the prior that the tables cover, `count` if there are so many."""
     draws = likelihood.sample_prior(theta, 1000)
-    tau = likelihood.tau_extremes(draws)
+    tau = likelihood.time_constants(draws)
     covered = [channel.compression.covers(tau) for channel in likelihood.channels if channel.compression is not None]
     return draws[np.all(covered, axis=(0, 1))][:count]
 
@@ -309,7 +319,7 @@ def _evaluate_log_likelihoods(
 ) -> np.ndarray:
     """Return the log-likelihood of each channel at points with common sigma, (n, channels)."""
     points = np.column_stack([theta, np.tile(np.log(sigma), (len(theta), 1))])
-    few, many = likelihood.rows <= FEW_ROWS, likelihood.rows > _MANY_ROWS
+    few, many = likelihood.rows <= FEW_ROWS, likelihood.rows > MANY_SAMPLES
     evaluate = batch_log_prob_parts(likelihood, 128 if few else 1, fast=many)
     return evaluate(points, description="checking the compression")[:, :-1]
 
@@ -348,14 +358,14 @@ def _restrict_table(
     channel: ChannelLikelihood,
     inputs: ChannelInputs,
     terms: HighpassTerms | None,
-    tau_range: tuple[float, float],
+    reach: Float[np.ndarray, " taus"],
     delay_sd: float,
     error: float,
 ) -> ChannelLikelihood:
     """Return the channel with its table restricted to the posterior, if the table covers the optimum.
 
-    `inputs` and `terms` are those at the optimum. The restricted table covers `tau_range` (s) as far as the table does,
-    with an `error` of the signal (V or A). `delay_sd` is in time steps.
+    `inputs` and `terms` are those at the optimum. The restricted table covers each log tau within its `reach`, as far
+    as the table does, with an `error` of the signal (V or A). `delay_sd` is in time steps.
     """
     table = channel.compression
     delay = float(channel.shift) + float(inputs.delay)
@@ -366,17 +376,23 @@ def _restrict_table(
     largest = float(np.sum(np.abs(terms.weight)) * inputs.gain)
     has_charge = max(channel.columns, default=0) >= len(BASELINE_NAMES)
     charge = float(np.ptp(channel.observed)) / largest if has_charge else 0.0
-    low, high = (float(table.center + side * table.half_width) for side in (-1.0, 1.0))
-    low, high = max(math.log(tau_range[0]), low), min(math.log(tau_range[1]), high)
-    reach = float(table_half_width(delay_sd)) * float(channel.time_step)
+    ends = (np.log(terms.tau) + side * reach for side in (-1.0, 1.0))
+    low, high = (np.clip(end, table.center - table.half_width, table.center + table.half_width) for end in ends)
+    # time constants that may become equal exchange their places, and need one range
+    group = np.cumsum(np.append(0, high[1:] < low[:-1]))
+    low = np.array([low[group == g].min() for g in group])
+    high = np.array([high[group == g].max() for g in group])
+    since = float(table_half_width(delay_sd)) * float(channel.time_step)
     narrow = table.restrict(
-        0.5 * (low + high), 0.5 * (high - low), error / largest, charge=charge, delay=(delay - reach, delay + reach)
+        0.5 * (low + high), 0.5 * (high - low), error / largest, charge=charge, delay=(delay - since, delay + since)
     )
     return dataclasses.replace(channel, compression=narrow)
 
 
-def _log_tau_slopes(likelihood: Likelihood, theta: np.ndarray, step: float = 1e-4) -> Float[np.ndarray, "2 parameters"]:
-    """Return the gradients of the logarithms of the slowest and the fastest time constant, from differences."""
+def _log_tau_slopes(
+    likelihood: Likelihood, theta: np.ndarray, step: float = 1e-4
+) -> Float[np.ndarray, "taus parameters"]:
+    """Return the gradients of the logarithms of the time constants, from differences."""
     steps = step * np.eye(theta.size)
-    later, earlier = (np.log(likelihood.tau_extremes(theta + side * steps)) for side in (1.0, -1.0))
+    later, earlier = (np.log(likelihood.time_constants(theta + side * steps)) for side in (1.0, -1.0))
     return (later - earlier) / (2.0 * step)

@@ -79,6 +79,9 @@ class ChannelLikelihood(eqx.Module):
     noise: NoiseModel = eqx.field(static=True)  # noise model
     # indices of the `LINEAR_NUISANCES` in use; `linear_sd` of the others is 0
     columns: tuple[int, ...] = eqx.field(static=True)
+    # times of the first period (padded, s) and its number of samples, if the signal need be computed only there
+    phases: Float[Array, " phases"] | None = None
+    period: ArrayLike | None = None
 
     def qualified_name(self, name: str) -> str:
         """Return the name of a nuisance, followed by the channel's label if there are several channels."""
@@ -150,7 +153,7 @@ class ChannelLikelihood(eqx.Module):
         ends, extremes = time[[0, -1]], np.array([observed.min(), observed.max()])
         rate = None if self.rate is None else np.zeros(2)
         return dataclasses.replace(
-            self, time=ends, observed=extremes, drive=drive, weight=None, whitening=None, rate=rate
+            self, time=ends, observed=extremes, drive=drive, weight=None, whitening=None, rate=rate, phases=None
         )
 
     def thin(self, count: int) -> "ChannelLikelihood":
@@ -176,10 +179,14 @@ class ChannelLikelihood(eqx.Module):
             whitening=None,
             compression=None,
             expansion=None,
+            phases=None,
         )
 
     def signal(self, inputs: ChannelInputs, extra_delay: ArrayLike = 0.0) -> Float[Array, " samples"]:
         """Return the modelled signal without linear nuisances and noise; `extra_delay` (s) is added to the delay."""
+        if self.phases is not None and "clock" not in self.timing:
+            folded = dataclasses.replace(self, time=self.phases, phases=None)
+            return folded.signal(inputs, extra_delay)[jnp.arange(self.time.size) % self.period]
         undelayed = not self.timing and isinstance(extra_delay, float) and extra_delay == 0.0
         if undelayed and isinstance(self.drive, Sampled) and self.drive.period is None:
             time = self.drive.time  # identical to the samples of V, so that `highpass` needs no search
@@ -222,7 +229,7 @@ class ChannelLikelihood(eqx.Module):
         shapes = [self.compression.baseline]
         if isinstance(self.compression, Compression) and not isinstance(self.compression, GridCompression):
             taus = inputs.circuit.channel_terms(self.channel).tau
-            shapes += [self.compression.decays(tau)[None] for tau in taus]
+            shapes += [self.compression.decays(tau, index)[None] for index, tau in enumerate(taus)]
         missing = len(LINEAR_NUISANCES) - sum(map(len, shapes))
         shapes.append(jnp.zeros((missing, remainder.size)))
         return remainder, jnp.concatenate(shapes)[self._column_indices]
@@ -232,7 +239,7 @@ class ChannelLikelihood(eqx.Module):
         compression = self.compression
         assert compression is not None
         if isinstance(compression, Interpolation):
-            points = dataclasses.replace(self, time=compression.time, rate=compression.rate)
+            points = dataclasses.replace(self, time=compression.time, rate=compression.rate, phases=None)
             signal, timing = points.signal(inputs), jnp.stack([jnp.asarray(inputs.delay), jnp.asarray(inputs.clock)])
             return compression.to_rows @ signal, compression.holds(signal, timing)
         terms, delay = inputs.circuit.channel_terms(self.channel), self.shift + inputs.delay

@@ -48,6 +48,7 @@ _RATE, _SLOPE, _OBSERVED = -3, -2, -1
 _BASELINE = slice(_RATE - len(BASELINE_NAMES), _RATE)
 
 RANK_TOLERANCE = 1e-13  # relative size of the singular values that are omitted
+MANY_SAMPLES = 65_536  # samples above which a faster program saves more than its compilation takes
 MAX_DELAY = 6  # time steps by which the response to a measured drive may be shifted
 
 
@@ -55,10 +56,12 @@ class Compression(eqx.Module):
     """A record in coordinates of its response table.
 
     A vector of `rows` coordinates represents one value per sample, with the same inner products as over all samples.
+    If `center` and `half_width` are arrays, each time constant of a circuit has its own table, and `signal` and `decay`
+    hold those of the slowest first.
     """
 
-    center: Float[Array, ""]  # the table covers log tau in `center` ± `half_width` (tau in s)
-    half_width: Float[Array, ""]
+    center: Float[Array, "*taus"]  # the table covers log tau in `center` ± `half_width` (tau in s)
+    half_width: Float[Array, "*taus"]
     # Chebyshev coefficients in log tau of the response to the drive (V); rows beyond the rank are 0
     signal: Float[Array, "rank terms"]
     decay: Float[Array, "rows terms"]  # the same for the decay of an unknown charge from 1 V
@@ -90,13 +93,13 @@ class Compression(eqx.Module):
 
     def response(self, terms: HighpassTerms, delay: ArrayLike = 0.0) -> Float[Array, " rows"]:
         """Return the response of a circuit (compare `fitact.response`) with a `delay` (s), if it has `steps`."""
-        total = jnp.zeros(self.signal.shape[0])
-        slopes = jnp.zeros(len(self.steps))
-        for weight, tau in zip(terms.weight, terms.tau, strict=True):
+        series, slopes = [], jnp.zeros(len(self.steps))
+        for index, (weight, tau) in enumerate(zip(terms.weight, terms.tau, strict=True)):
             if len(self.steps):
                 growth, gains = self._shift(delay, tau)
                 weight, slopes = weight * growth, slopes + weight * growth * gains
-            total = total + weight * (self.signal @ self._series(tau))
+            series.append(weight * self._series(tau, index))
+        total = self.signal @ (jnp.concatenate(series) if self.center.ndim else sum(series, jnp.zeros(())))
         total = jnp.pad(total, (0, self.observed.size - total.size)) + slopes @ self.steps
         return total if terms.rate is None else total + terms.rate * self.rate
 
@@ -118,32 +121,39 @@ class Compression(eqx.Module):
         falling = HighpassTerms(tuple(w / t for w, t in zip(terms.weight, terms.tau, strict=True)), terms.tau)
         return self.response(falling) - sum(terms.weight) * self.slope
 
-    def decays(self, tau: Array) -> Float[Array, " rows"]:
-        """Return e^{-(t - t0) / tau}, where t0 is the first sample."""
-        return self.decay @ self._series(tau)
+    def decays(self, tau: Array, index: int = 0) -> Float[Array, " rows"]:
+        """Return e^{-(t - t0) / tau}, where t0 is the first sample; `index` is that of the time constant."""
+        series = self._series(tau, index)
+        first = index * series.size if self.center.ndim else 0
+        return self.decay[:, first : first + series.size] @ series
 
-    def _series(self, tau: Array) -> Float[Array, " terms"]:
-        return chebyshev_polynomials((jnp.log(tau) - self.center) / self.half_width, self.signal.shape[1])
+    def _series(self, tau: Array, index: int) -> Float[Array, " terms"]:
+        center, half_width = (x[index] if x.ndim else x for x in (self.center, self.half_width))
+        return chebyshev_polynomials((jnp.log(tau) - center) / half_width, self.signal.shape[1] // self.center.size)
 
     def restrict(
-        self, center: float, half_width: float, precision: float, charge: float, delay: tuple[float, float]
+        self, center: ArrayLike, half_width: ArrayLike, precision: float, charge: float, delay: tuple[float, float]
     ) -> "Compression":
         """Return the compression for log tau in `center` ± `half_width` only, with fewer terms and rows.
 
+        Both are numbers, or arrays with one for each time constant.
         Omitted terms change no response, and no decay of a `charge` (V), by more than `precision` (V, root of the
         sum of squares). If `charge` is 0, the decay is omitted. `delay` (s) is the range of delays.
         """
-        x, to_series = chebyshev(self.signal.shape[1])
+        x, to_series = chebyshev(min(node_count(float(np.max(half_width))), self.signal.shape[1]))
         # nodes of the narrow table in the wide one, with NumPy because JAX would compile its loop for every record
-        inside = (center + half_width * x - float(self.center)) / float(self.half_width)
+        log_tau = (np.asarray(center)[..., None] + np.multiply.outer(half_width, x)).ravel()
+        inside = (log_tau - float(self.center)) / float(self.half_width)
         polynomials = np.polynomial.chebyshev.chebvander(inside, self.signal.shape[1] - 1).T
         signal = np.asarray(self.signal @ polynomials)
-        signal, steps, origin = self._move_origin(signal, np.exp(center + half_width * x), delay)
-        signal = signal @ to_series.T
-        decay = np.asarray(self.decay @ polynomials) @ to_series.T
+        signal, steps, origin = self._move_origin(signal, np.exp(log_tau), delay)
+        signal, decay = (
+            values.reshape(len(values), -1, x.size) @ to_series.T
+            for values in (signal, np.asarray(self.decay @ polynomials))
+        )
         terms = count_terms(np.linalg.norm(signal, axis=0) + charge * np.linalg.norm(decay, axis=0), precision)
-        basis, series = _significant_modes(signal[:, :terms], precision)
-        charges, charge_series = _significant_modes(charge * decay[:, :terms], precision)
+        basis, series = _significant_modes(signal[..., :terms].reshape(len(signal), -1), precision)
+        charges, charge_series = _significant_modes(charge * decay[..., :terms].reshape(len(decay), -1), precision)
         last = self.baseline.T, *(x[:, None] for x in (self.rate, self.slope, self.observed))
         observed_slope = np.asarray(self.observed_slope)[:, None]
         _, rows = np.linalg.qr(np.hstack([basis, steps.T, charges, observed_slope, *last]))
@@ -228,7 +238,7 @@ def compress(
         parts = _accumulate_measured(table, drive, samples, taps, MAX_DELAY if delayed else 0)
     else:
         is_simple = steady_state and taps is None and student is None
-        period = _samples_per_period(drive, time) if is_simple else None
+        period = samples_per_period(drive, time) if is_simple else None
         rounding = 1e-9 * np.max(np.abs(samples.rate))
         if period and not np.allclose(samples.rate[period:], samples.rate[:-period], rtol=0.0, atol=rounding):
             period = None
@@ -350,8 +360,9 @@ def _accumulate_directly(
     size = samples.time.size
     length = chunk_length(size, 65_536) if isinstance(drive, Chirp) else chunk_length(size)  # of few chirps
     filtering = WhiteningState.start(taps, table.series.shape[0] + len(BASELINE_NAMES) + 3)
+    multiply = jit(_chunk_products, fast=size > MANY_SAMPLES)
     for chunk in chunks(samples, length):
-        total, filtering = _chunk_products(table, drive, chunk, None, steady_state, filtering)
+        total, filtering = multiply(table, drive, chunk, None, steady_state, filtering)
         yield total
 
 
@@ -366,7 +377,6 @@ class WhiteningState(NamedTuple):
         return None if taps is None else cls(taps, np.zeros((functions, taps.size - 1)))
 
 
-@jit
 def _chunk_products(
     table: _TableNodes,
     drive: Drive,
@@ -447,14 +457,14 @@ def _accumulate_folded(table: _TableNodes, drive: Drive, samples: Samples, perio
     time, mean, rate, baseline = map(pad_samples, (time, means[-1] + reference, rate, means[:-1]))
     weight, slope = pad_weight(np.sqrt(count)), None if samples.slope is None else pad_samples(samples.slope[:period])
     folded = Samples(time, mean, weight, rate, weight, slope)
-    total = np.array(_chunk_products(table, drive, folded, baseline, True, None)[0])
+    total = np.array(jit(_chunk_products)(table, drive, folded, baseline, True, None)[0])
     # scatter of the samples of one phase about their mean
     kept = np.r_[_BASELINE, _OBSERVED]
     total[np.ix_(kept, kept)] += squares - means @ sums.T
     yield total
 
 
-def _samples_per_period(
+def samples_per_period(
     drive: Drive, time: np.ndarray, max_samples: int = 65_536, tolerance: float = 1e-9
 ) -> int | None:
     """Return after how many samples drive and grid coincide (to `tolerance` steps), or None if folding is useless."""
@@ -487,9 +497,10 @@ def _accumulate_measured(
     tables = 1 if table.is_grid else 2
     filtering = WhiteningState.start(taps, tables * table.series.shape[0] + len(BASELINE_NAMES) + 3 + 2 * ages)
     voltages = chunks(samples._replace(observed=voltage), length)
+    advance = jit(_advance_chunk, fast=time.size > MANY_SAMPLES)
     for number, (chunk, driven) in enumerate(zip(chunks(samples, length), voltages, strict=True)):
         steps = _drive_steps(voltage, number * length, length, ages) / step
-        total, last, filtering = _advance_chunk(table, chunk, driven.observed, steps, last, time[0], x, filtering)
+        total, last, filtering = advance(table, chunk, driven.observed, steps, last, time[0], x, filtering)
         yield total
 
 
@@ -500,7 +511,6 @@ def _drive_steps(voltage: np.ndarray, first: int, length: int, ages: int) -> Flo
     return np.array([steps[i : i + length] for i in range(2 * ages)][::-1]).reshape(2 * ages, length)
 
 
-@jit
 def _advance_chunk(
     table: _TableNodes,
     chunk: Samples,

@@ -9,6 +9,7 @@ evaluation whether the interpolation holds. Samples that may pass a corner are k
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -214,7 +215,7 @@ def _accumulate(
         yield total
 
 
-@jit
+@functools.partial(jit, fast=True)
 def _chunk_products(
     channel: "ChannelLikelihood",
     training: "ChannelInputs",

@@ -136,19 +136,19 @@ class Likelihood(eqx.Module):
         self, points: Float[np.ndarray, "n parameters"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Return the divider ratio g and the slowest time constant b (s) at many points theta."""
-        g, b, _ = self._evaluate_divider(points)
+        g, b, *_ = self._evaluate_divider(points)
         return g, b
 
-    def tau_extremes(self, points: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, "2 n"]:
-        """Return the slowest and the fastest time constant (s) of the circuits at the points theta."""
-        return self._evaluate_divider(points)[1:]
+    def time_constants(self, points: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, "taus n"]:
+        """Return the time constants (s) of the circuits at the points theta, the slowest first."""
+        return self._evaluate_divider(points)[2:]
 
-    def tau_range(self, points: Float[np.ndarray, "n parameters"]) -> tuple[float, float]:
-        """Return the shortest and the longest time constant (s) of the circuits at the points theta."""
-        slowest, fastest = self.tau_extremes(points)
-        return float(np.min(fastest)), float(np.max(slowest))
+    def tau_range(self, points: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, "2 taus"]:
+        """Return the least and the largest value (s) of each time constant of the circuits at the points theta."""
+        tau = self.time_constants(points)
+        return np.stack([tau.min(axis=1), tau.max(axis=1)])
 
-    def _evaluate_divider(self, points: np.ndarray) -> Float[np.ndarray, "3 n"]:
+    def _evaluate_divider(self, points: np.ndarray) -> Float[np.ndarray, "quantities n"]:
         bare, kept = self._bare()
         return BatchEvaluator(_divider, bare, len(kept), batch=256, fast=False)(points[:, kept]).T
 
@@ -269,7 +269,7 @@ def _evaluate_circuit(likelihood: Likelihood, theta: Float[Array, " circuit_para
     return jax.tree.map(jnp.asarray, CircuitValues(circuit, circuit.b, tau, terms))
 
 
-def _divider(likelihood: Likelihood, theta: Float[Array, " circuit_parameters"]) -> Float[Array, "3"]:
-    """Return g, b, and the fastest time constant (s)."""
+def _divider(likelihood: Likelihood, theta: Float[Array, " circuit_parameters"]) -> Float[Array, " quantities"]:
+    """Return g, b, and all time constants (s)."""
     circuit = likelihood.circuit(theta)
-    return jnp.stack([circuit.g, circuit.b, constant_skin_circuit(circuit).terms().tau[-1]])
+    return jnp.stack([circuit.g, circuit.b, *constant_skin_circuit(circuit).terms().tau])

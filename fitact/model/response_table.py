@@ -7,6 +7,7 @@ exponential is smooth, whatever the age t, and so its Chebyshev series converges
 import functools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -34,11 +35,12 @@ _OPEN = 1e6  # a time constant longer than the table's slowest by this factor co
 class ResponseTable(eqx.Module):
     """Responses to a drive, and decays of an unknown charge, at fixed times."""
 
-    center: Float[Array, ""]  # the table covers log tau in `center` ± `half_width` (tau in s)
+    # the table covers log tau in `center` ± `half_width` (tau in s), for each time constant, or for all if there is one
+    center: Float[Array, " tables"]
     half_width: Float[Array, ""]
     # responses (V) are the product with `series`; the last column is the response for an infinite tau
-    signal: Float[Array, "times rank+1"]
-    decay: Float[Array, "times rank"]  # the same for e^{-(t - t0) / tau}
+    signal: Float[Array, "times tables*rank+1"]
+    decay: Float[Array, "times tables*rank"]  # the same for e^{-(t - t0) / tau}
     series: Float[Array, "rank terms"]  # Chebyshev coefficients in log tau
 
     @classmethod
@@ -47,43 +49,49 @@ class ResponseTable(eqx.Module):
         drive: Drive,
         time: Float[np.ndarray, " times"],
         begin: float,
-        tau_range: tuple[float, float],
+        tau_range: Sequence[float] | Float[np.ndarray, "2 taus"],
         steady_state: bool,
     ) -> "ResponseTable | None":
-        """Tabulate the response to `drive` at `time` (s) for the time constants in `tau_range` (s).
+        """Tabulate the response to `drive` at `time` (s) for time constants within the ends of `tau_range` (s).
 
-        Decays begin at `begin` (s). Returns None if the range, or the number of times, is too large for a table.
+        The ends are arrays if each time constant of a circuit has its own range. Decays begin at `begin` (s). Returns
+        None if the range, or the number of times, is too large for a table.
         """
-        low, high = np.log(tau_range)
-        center, half_width = 0.5 * (low + high), 0.5 * (high - low) + _MARGIN
-        if not half_width < _MAX_HALF_WIDTH or (count := node_count(half_width)) * time.size > _MAX_NUMBERS:
+        low, high = map(np.atleast_1d, np.log(tau_range))
+        half_width, whole = (0.5 * float(np.max(x)) + _MARGIN for x in (high - low, np.max(high) - np.min(low)))
+        if not whole < _MAX_HALF_WIDTH:
+            return None
+        if low.size * node_count(half_width) >= node_count(whole):
+            low, high, half_width = np.min(low, keepdims=True), np.max(high, keepdims=True), whole
+        center, count = 0.5 * (low + high), node_count(half_width)
+        if count * low.size * time.size > _MAX_NUMBERS:
             return None
         relative, combinations, series = exponential_basis(half_width, count)
-        nodes = np.append(math.exp(center) * relative, 10.0 * _OPEN * math.exp(high))
+        nodes = np.append(np.outer(np.exp(center), relative), 10.0 * _OPEN * np.exp(np.max(high)))
         signal = highpass_responses(drive, time, nodes, steady_state)
-        signal, settled = signal[:-1].T @ combinations, signal[-1:].T
-        decay = np.exp(-(time[:, None] - begin) / nodes[:-1]) @ combinations
-        return cls(np.asarray(center), np.asarray(half_width), np.hstack([signal, settled]), decay, series)
+        tables = signal[:-1], np.exp(-(time - begin) / nodes[:-1, None])
+        rows, decay = (np.hstack([each.T @ combinations for each in np.split(x, low.size)]) for x in tables)
+        return cls(center, np.asarray(half_width), np.hstack([rows, signal[-1:].T]), decay, series)
 
     def response(self, terms: HighpassTerms) -> Float[Array, " times"]:
         """Return the response of `terms` without the one in dV/dt; compare `superpose_terms`."""
-        total = jnp.zeros(self.signal.shape[1])
-        for weight, tau in zip(terms.weight, terms.tau, strict=True):
-            x = self._position(tau)
-            is_open = x > 1.0 + math.log(_OPEN) / self.half_width
-            combined = self._combine(jnp.where(is_open, 0.0, x))
-            total += weight * jnp.append(jnp.where(is_open, 0.0, combined), is_open)
-        return self.signal @ total
+        return self.signal @ self._combine(terms.weight, terms.tau)
 
     def decays(self, tau: Sequence[Array], size: Float[Array, " taus"]) -> Float[Array, " times"]:
         """Return the sum of size e^{-(t - t0) / tau}, where t0 is the beginning."""
-        return self.decay @ sum(each * self._combine(self._position(t)) for each, t in zip(size, tau, strict=True))
+        return self.decay @ self._combine(size, tau)[:-1]
 
-    def _combine(self, position: Array) -> Float[Array, " rank"]:
-        return self.series @ chebyshev_polynomials(position, self.series.shape[1])
-
-    def _position(self, tau: Array) -> Array:
-        return (jnp.log(tau) - self.center) / self.half_width
+    def _combine(self, sizes: Any, taus: Any) -> Float[Array, " tables*rank+1"]:
+        """Return the coefficients of the columns of `signal` for the sum of these responses."""
+        tables, settled = [jnp.zeros(len(self.series))] * self.center.size, jnp.zeros(())
+        for index, (size, tau) in enumerate(zip(sizes, taus, strict=True)):
+            index = min(index, len(tables) - 1)
+            x = (jnp.log(tau) - self.center[index]) / self.half_width
+            is_open = x > 1.0 + math.log(_OPEN) / self.half_width
+            polynomials = chebyshev_polynomials(jnp.where(is_open, 0.0, x), self.series.shape[1])
+            tables[index] = tables[index] + jnp.where(is_open, 0.0, size) * (self.series @ polynomials)
+            settled = settled + jnp.where(is_open, size, 0.0)
+        return jnp.append(jnp.concatenate(tables), settled)
 
 
 def node_count(half_width: float) -> int:

@@ -167,6 +167,7 @@ class TimeConstantGrid(eqx.Module):
     unlimited_current_map: FactoredMap  # for unlimited I / V; one more row for the term in dV/dt
 
     @classmethod
+    @functools.lru_cache(maxsize=16)  # the records of a campaign share one
     def from_frequency_range(cls, slowest: float, fastest: float, per_decade: int = 10, margin: float = 10.0) -> Self:
         """Return a grid from `slowest` to `fastest` (rad/s), extended by the factor `margin`. Use double precision."""
         decades = np.log10(fastest / slowest * margin**2)
@@ -177,7 +178,7 @@ class TimeConstantGrid(eqx.Module):
         voltage, limited = _pseudo_inverse(terms, np.ones_like(share)), _pseudo_inverse(terms, share)
         outer, inner = _pseudo_inverse(np.hstack([terms, 1j * share]), share)
         outer[-1] /= fastest
-        return cls(*jax.tree.map(jnp.asarray, (tau, omega, voltage, limited, (outer, inner))))
+        return cls(*jax.tree.map(np.asarray, (tau, omega, voltage, limited, (outer, inner))))
 
     def terms(self, channel: Channel, is_limited: bool, gain: Complex[Array, " frequencies"]) -> HighpassTerms:
         """Return terms that represent the `gain` of a channel at `omega`; `is_limited`: a resistance limits I."""

@@ -173,6 +173,20 @@ def test_several_time_constants_far_apart():
     for tau in terms.tau:
         u = unit_response(time, voltage, tau)
         check(compression, u, np.exp(-time / tau), slow(time), y, tau)
+    # a narrow table for each time constant
+    taus = 1.04 * np.array(terms.tau)
+    narrow = compression.restrict(np.log(terms.tau), np.full(3, 0.05), 1e-7, charge=1.0, delay=(0.0, 0.0))
+    assert narrow.signal.shape[1] < compression.signal.shape[1]
+    assert np.all(narrow.covers(taus))
+    assert not np.any(narrow.covers(1.04 * taus))
+    decays = [np.exp(-time / tau) for tau in taus]
+    summed = sum(w * unit_response(time, voltage, tau) for w, tau in zip(terms.weight, taus, strict=True))
+    expected = products(np.stack([summed, *decays, *slow(time), y]))
+    ours = [narrow.response(HighpassTerms(terms.weight, tuple(taus)))]
+    ours += [narrow.decays(tau, index) for index, tau in enumerate(taus)]
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    found = products(np.stack([*ours, *narrow.baseline, narrow.observed]))
+    np.testing.assert_allclose(found / scale, expected / scale, atol=1e-9)
 
 
 @pytest.mark.thorough

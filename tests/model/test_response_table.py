@@ -36,17 +36,21 @@ def test_any_time_constant_in_the_range_is_scipys(tau_range: tuple[float, float]
         np.testing.assert_allclose(table.decays((tau,), np.ones(1)), np.exp(-UNIFORM / tau), atol=1e-11)
 
 
+@pytest.mark.parametrize("own_ranges", [False, True])
 @pytest.mark.parametrize("steady_state", [False, True])
-def test_terms_are_superposed_like_the_exact_response(steady_state: bool):
+def test_terms_are_superposed_like_the_exact_response(steady_state: bool, own_ranges: bool):
     drive = fitact.Sampled(TIME, VOLTAGE, period=TIME[-1] + 5e-6 if steady_state else None)
     circuit = fitact.DirectGround(160e3, 22e-9, 1.35e-9, R_H=500.0, grounding_Rsc=80e3, Cgap=4e-9)
-    taus = circuit.terms().tau
-    table = ResponseTable.from_drive(drive, TIME, 0.0, (float(min(taus)), float(max(taus))), steady_state)
+    taus = np.array(circuit.terms().tau)
+    tau_range = np.stack([taus, 1.01 * taus]) if own_ranges else (float(min(taus)), float(max(taus)))
+    table = ResponseTable.from_drive(drive, TIME, 0.0, tau_range, steady_state)
     assert table is not None
     for channel in ("Vsc", "Vgap"):  # a gap that does not conduct has a time constant far beyond the table
         exact = fitact.response(circuit, drive, TIME, steady_state=steady_state, channel=channel)
         size = np.max(np.abs(exact))
         np.testing.assert_allclose(table.response(circuit.channel_terms(channel)), exact, atol=1e-11 * size)
+    decays = np.exp(-TIME / taus[:, None])
+    np.testing.assert_allclose(table.decays(tuple(taus), np.ones(3)), decays.sum(axis=0), atol=1e-11)
 
 
 def test_derivatives_in_the_time_constant_are_those_of_the_exact_response():
