@@ -40,7 +40,8 @@ PASSING = re.compile(r"version|seconds|speedup|(^|[._])time(_s)?$|host|date|crea
 ROUNDING = re.compile(
     r"compression_error|eigenvalues|rms_compression"
 )  # rounding errors, compared by order of magnitude
-SINGLE = float(np.finfo(np.float32).eps)  # precision of a model error, which is partly computed in single precision
+# precision of a model error, which is partly computed in single precision, in an order that processors decide
+SINGLE = 4.0 * float(np.finfo(np.float32).eps)
 
 
 def cases() -> Iterator[tuple[str, list[str]]]:
@@ -239,6 +240,8 @@ def _is_close(path: str, a: Any, b: Any, old: dict[str, Any], estimates: bool) -
         return True
     if not estimates:
         return False
+    if path.endswith("_p") and abs(a - b) <= 1e-5 * max(a, b):  # of residuals in single precision
+        return True
     if path.endswith(".steps"):
         return max(a, b) <= 2 * min(a, b)
     sd = old.get(re.sub(r"\.\w+$", ".sd", path))

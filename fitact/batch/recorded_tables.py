@@ -158,7 +158,7 @@ def to_response_table(table: Compression) -> ResponseTable:
     series = chebyshev(_NODES)[1].T
     inverse = np.linalg.inv(series)
     return ResponseTable(
-        center=table.center,
+        center=table.center[None],
         half_width=table.half_width,
         signal=jnp.pad(table.signal @ inverse, ((0, 0), (0, 1))),
         decay=table.decay @ inverse,
