@@ -104,6 +104,11 @@ class BatchProblem(abc.ABC):
         """Fit records, and optionally test the residuals for structure (`whiteness`), in double precision."""
 
     @functools.cached_property
+    def names(self) -> tuple[str, ...]:
+        """Cached `names` of the likelihood."""
+        return self.likelihood.names
+
+    @functools.cached_property
     def prior_factor(self) -> Float[np.ndarray, "parameters parameters"]:
         """Cached `prior_factor` of the likelihood."""
         return self.likelihood.prior_factor
@@ -116,13 +121,17 @@ class BatchProblem(abc.ABC):
         self, g: Float[np.ndarray, " records"], b: Float[np.ndarray, " records"]
     ) -> Float[np.ndarray, "records parameters"]:
         """Return the most probable parameters with divider `g` and time constant `b` (s)."""
-        names, prior = self.likelihood.names, self.likelihood.prior
-        theta = np.tile(np.append(prior.log_mean, np.zeros(len(names) - len(prior.names))), (len(g), 1))
+        theta = np.tile(self._prior_center, (len(g), 1))
         ridge = most_probable_skin(g, b, *self._prior_skin_moments)
         for name, logs in zip(("Rsc", "Csc", "Ci"), ridge.T, strict=True):
-            if name in names:
-                theta[:, names.index(name)] = logs
+            if name in self.names:
+                theta[:, self.names.index(name)] = logs
         return theta
+
+    @functools.cached_property
+    def _prior_center(self) -> Float[np.ndarray, " parameters"]:
+        prior = self.likelihood.prior
+        return np.append(prior.log_mean, np.zeros(len(self.names) - len(prior.names)))
 
     def bic_decreases(self, r_squared: Float[np.ndarray, "records candidates"]) -> dict[str, np.ndarray]:
         """Return the decrease of the BIC of each record that each optional nuisance would cause, by name."""

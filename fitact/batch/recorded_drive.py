@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple, Self
@@ -13,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from fitact.batch.batch_problem import BatchFit, BatchProblem, Screening, stack_channel
 from fitact.batch.gauss_newton import GaussNewtonResult, RecordInputs, find_optima
-from fitact.batch.recorded_tables import AGES, HALF_WIDTH, SharedFunctions, Tables, to_response_table
+from fitact.batch.recorded_tables import AGES, HALF_WIDTH, TABLE_NODES, SharedFunctions, Tables, to_response_table
 from fitact.compiled import jit
 from fitact.data.record import Record, rounding_noise_sd
 from fitact.fitting.derived import DerivedQuantities
@@ -53,7 +54,7 @@ class RecordedDriveProblem(BatchProblem):
         repeat: a multiple of the drive's period, in samples; None if the drive does not repeat.
     """
 
-    unit = 32
+    unit = 64
     shared: SharedFunctions
     linear_sd: Float[np.ndarray, " nuisances"]
     gain_sd: float
@@ -124,7 +125,7 @@ class RecordedDriveProblem(BatchProblem):
         g, b, accepted = self._estimate_start(V, Vsc)
         tables = Tables.from_records(self.shared, V, Vsc, b)
         gain_sd = None
-        if "gain" in self.likelihood.prior.names:
+        if "gain" in self.names:
             gain_sd = np.hypot(self.gain_sd, edge_gain_sd(self.shared.time_step, b) if self.unresolved else 0.0 * b)
         inputs, optima = self._find_optima(tables, self.starting_points(g, b), screened, gain_sd)
         raw = inputs._replace(table=self._select(tables.fields(in_functions=True)))
@@ -137,11 +138,11 @@ class RecordedDriveProblem(BatchProblem):
         accepted &= optima.converged & (loss <= self.settings.max_rounding_loss * square) & ~is_misfit(figures)
         accepted &= self.largest_bic_decrease(optima.r_squared) <= MIN_BIC_DECREASE
         accepted &= self._needs_delay(optima.theta, factor)
-        freed = np.array([self._nuisance_names(sd) for sd in inputs.linear_sd])
+        freed = np.array([self._nuisance_names(free) for free in inputs.linear_sd > 0.0])
         derived = self._derive(tables, optimum)
         prior = np.array(np.broadcast_to(self.prior_factor, factor.shape))
         if gain_sd is not None:
-            place = self.likelihood.names.index("gain")
+            place = self.names.index("gain")
             prior[:, place, place] = gain_sd
         return BatchFit(accepted, tables.observed, optima.theta, optima.sigma, factor, prior, *derived, figures, freed)
 
@@ -160,7 +161,7 @@ class RecordedDriveProblem(BatchProblem):
         # the ADC's steps, which take long to find, are looked for only where they may exceed the noise
         rounding = np.array([0.0 if fine else rounding_noise_sd(v) for v, fine in zip(V, driven.fine, strict=True)])
         expected = np.hypot(screened.noise, gain * np.hypot(driven.noise, rounding))
-        freedom = self.samples - len(self.likelihood.names) - np.count_nonzero(linear_sd, axis=1)
+        freedom = self.samples - len(self.names) - np.count_nonzero(linear_sd, axis=1)
         tests = ResidualTestStatistics.from_residuals(residuals.astype(np.float32), self.phases) if whiteness else None
         figures = residual_statistics(square, self.samples, tests, expected, freedom, self.phases)
         interpolation = gain * interpolation_errors(V, driven.noise)
@@ -240,15 +241,15 @@ class RecordedDriveProblem(BatchProblem):
         channel = self.likelihood.channels[0]
         if not channel.timing:
             return np.ones(len(theta), bool)
-        place = self.likelihood.names.index("delay")
+        place = self.names.index("delay")
         delay = float(channel.shift) / float(channel.time_step) + theta[:, place]
         z_squared = np.square(delay) / np.sum(np.square(factor[:, place]), axis=1)
         return bic_decrease(z_squared / (z_squared + self.samples), self.samples, 1) > 2.0 * MIN_BIC_DECREASE
 
-    def _nuisance_names(self, linear_sd: Float[np.ndarray, " nuisances"]) -> str:
+    def _nuisance_names(self, is_free: Bool[np.ndarray, " nuisances"]) -> str:
         """Return the names of the nuisances that were fitted, as in `Fit.model`."""
-        names = [LINEAR_NUISANCES[place] for place in np.flatnonzero(linear_sd)]
-        return ", ".join([*names, *(name for name in self.likelihood.names if name in ("gain", "delay"))])
+        names = itertools.compress(LINEAR_NUISANCES, is_free)
+        return ", ".join([*names, *(name for name in self.names if name in ("gain", "delay"))])
 
     def _derive(
         self, tables: Tables, optimum: ModelCoefficients
@@ -256,16 +257,19 @@ class RecordedDriveProblem(BatchProblem):
         """Return the logarithms of the quantities of `DERIVED_NAMES`, and their gradients in theta."""
         weight = np.trim_zeros(np.asarray(self.derive.weight), "b")
         count, size = weight.size, self.shared.size
-        own, shared, records = tables.own[:, :-1, :count], self.shared.functions[:count], np.arange(len(tables.own))
-        voltage = (optimum.voltage[:, None, size:] @ own)[:, 0] + optimum.voltage[:, :size] @ shared.T
+        # the voltage is not delayed, so that the steps of the drive have no part in it
+        own, shared, last = tables.own[:, :TABLE_NODES, :count], self.shared.functions[:count], size + TABLE_NODES
+        coefficients, slopes = optimum.voltage[:, :last], optimum.voltage_slopes[:, :last]
+        voltage = (coefficients[:, None, size:] @ own)[:, 0] + coefficients[:, :size] @ shared.T
         square = voltage * voltage
         peak, mean, fourth = np.argmax(square, axis=1), square @ weight, np.square(square) @ weight
         # inner products of the functions with V and V^3 give the slopes of the means of V^2 and V^4
         weighted = np.stack([weight * voltage, weight * voltage * square], axis=1)
         moments = [(weighted.reshape(-1, count) @ shared).reshape(len(own), 2, size), weighted @ np.swapaxes(own, 1, 2)]
-        mean_slope, fourth_slope = np.moveaxis(np.concatenate(moments, axis=2) @ optimum.voltage_slopes, 1, 0)
+        mean_slope, fourth_slope = np.moveaxis(np.concatenate(moments, axis=2) @ slopes, 1, 0)
+        records = np.arange(len(own))
         at_peak = np.concatenate([shared[peak], own[records, :, peak]], axis=1)
-        peak_slope = np.einsum("rf,rfp->rp", at_peak, optimum.voltage_slopes) / voltage[records, peak, None]
+        peak_slope = np.einsum("rf,rfp->rp", at_peak, slopes) / voltage[records, peak, None]
         scale, scale_slope = optimum.logs[:, 2], optimum.log_slopes[:, 2]
         force, force_slope = np.exp(scale) * mean, scale_slope + 2.0 * mean_slope / mean[:, None]
         total = force + float(self.derive.normal_force)
@@ -276,14 +280,14 @@ class RecordedDriveProblem(BatchProblem):
             scale + 0.5 * np.log(fourth),
             np.log(float(self.derive.coefficient) * total),
         ]
-        slopes = [
+        gradients = [
             *np.moveaxis(optimum.log_slopes[:, :2], 1, 0),
             force_slope,
             scale_slope + 2.0 * peak_slope,
             scale_slope + 2.0 * fourth_slope / fourth[:, None],
             force_slope * (force / total)[:, None],
         ]
-        return np.stack(logs, axis=1), np.stack(slopes, axis=1)
+        return np.stack(logs, axis=1), np.stack(gradients, axis=1)
 
 
 def _longest_repeat(samples: int, period: float) -> int:

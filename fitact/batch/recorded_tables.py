@@ -20,7 +20,7 @@ from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, ResponseTable, 
 
 HALF_WIDTH = 0.05  # of a record's table, in log tau
 AGES = 1  # time steps by which the delay of a record may differ from that of the first
-_NODES = 5  # of a record's table, with which its responses are exact to 1e-9
+TABLE_NODES = 5  # of a record's table, with which its responses are exact to 1e-9
 _BLOCK = 50  # samples whose responses are computed one after the other, in parallel with other blocks
 
 
@@ -99,7 +99,7 @@ class Tables(NamedTuple):
         tau: Float[np.ndarray, " records"],
     ) -> Self:
         """Tabulate the responses to V around the time constants `tau` (s)."""
-        nodes, size = tau[:, None] * np.exp(HALF_WIDTH * chebyshev(_NODES)[0]), shared.size
+        nodes, size = tau[:, None] * np.exp(HALF_WIDTH * chebyshev(TABLE_NODES)[0]), shared.size
         inside = (np.log(nodes) - shared.center) / TABLE_HALF_WIDTH
         decay = np.swapaxes(np.polynomial.chebyshev.chebvander(inside, NODES - 1) @ shared.decay.T, 1, 2)
         own = _filter_drives(V, np.roll(Vsc, -shared.origin, axis=1), shared.time_step / nodes)
@@ -130,12 +130,12 @@ class Tables(NamedTuple):
         to_rows = (
             np.broadcast_to(np.eye(functions), (records, functions, functions)) if in_functions else self.coordinates
         )
-        rows, size, series = to_rows.shape[1], self.shared.size, chebyshev(_NODES)[1].T
+        rows, size, series = to_rows.shape[1], self.shared.size, chebyshev(TABLE_NODES)[1].T
         zeros, missing = np.zeros((records, rows)), ((0, 0), (0, rows - size))
-        steps = np.swapaxes(to_rows[:, :, size + _NODES :], 1, 2) / self.shared.time_step
+        steps = np.swapaxes(to_rows[:, :, size + TABLE_NODES :], 1, 2) / self.shared.time_step
         return {
             "center": self.center,
-            "signal": to_rows[:, :, size : size + _NODES] @ series,
+            "signal": to_rows[:, :, size : size + TABLE_NODES] @ series,
             "decay": np.pad(self.decay @ series, (*missing, (0, 0))),
             "baseline": np.tile(np.pad(self.shared.baseline, missing), (records, 1, 1)),
             "rate": zeros,
@@ -155,7 +155,7 @@ class Tables(NamedTuple):
 
 def to_response_table(table: Compression) -> ResponseTable:
     """Return a table of coefficients from a compression in functions; the response is not delayed."""
-    series = chebyshev(_NODES)[1].T
+    series = chebyshev(TABLE_NODES)[1].T
     inverse = np.linalg.inv(series)
     return ResponseTable(
         center=table.center[None],
