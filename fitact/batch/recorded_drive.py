@@ -51,6 +51,7 @@ class RecordedDriveProblem(BatchProblem):
         linear_sd: prior sds of the linear nuisances that all records have, relative to the height of Vsc.
         gain_sd: prior sd of log(gain) that the scene states.
         unresolved: whether the drives jump between two samples, for which a gain is free.
+        evaluated: samples at which the force is evaluated, of a long record the last ones.
         repeat: a multiple of the drive's period, in samples; None if the drive does not repeat.
     """
 
@@ -59,6 +60,7 @@ class RecordedDriveProblem(BatchProblem):
     linear_sd: Float[np.ndarray, " nuisances"]
     gain_sd: float
     unresolved: bool
+    evaluated: slice
     repeat: int | None
 
     @classmethod
@@ -87,7 +89,7 @@ class RecordedDriveProblem(BatchProblem):
             *np.flatnonzero(linear_sd).tolist(),
             *(place for name in optional for place in NUISANCES.get(name, ())),
         }
-        frequency = record.frequency()
+        frequency, begin = record.frequency(), int(np.searchsorted(time, float(fitted.derive.time[0])))
         # only the fields that all records share matter
         fields = dict.fromkeys((field.name for field in dataclasses.fields(Compression)), 0.0)
         fields |= {"half_width": HALF_WIDTH, "samples": counted.size, "origin": origin, "time_step": shared.time_step}
@@ -105,6 +107,7 @@ class RecordedDriveProblem(BatchProblem):
             linear_sd=linear_sd,
             gain_sd=log_sd(fitted.scene.measurement.gain_relative_sd),
             unresolved=has_unresolved_edge(choice.voltage),
+            evaluated=slice(begin, begin + np.trim_zeros(np.asarray(fitted.derive.weight), "b").size),
             repeat=None if frequency is None else _longest_repeat(time.size, 1.0 / (frequency * shared.time_step)),
         )
 
@@ -255,10 +258,11 @@ class RecordedDriveProblem(BatchProblem):
         self, tables: Tables, optimum: ModelCoefficients
     ) -> tuple[Float[np.ndarray, "records derived"], Float[np.ndarray, "records derived parameters"]]:
         """Return the logarithms of the quantities of `DERIVED_NAMES`, and their gradients in theta."""
-        weight = np.trim_zeros(np.asarray(self.derive.weight), "b")
-        count, size = weight.size, self.shared.size
+        size, count = self.shared.size, self.evaluated.stop - self.evaluated.start
+        weight = np.asarray(self.derive.weight)[:count]
         # the voltage is not delayed, so that the steps of the drive have no part in it
-        own, shared, last = tables.own[:, :TABLE_NODES, :count], self.shared.functions[:count], size + TABLE_NODES
+        own, shared = tables.own[:, :TABLE_NODES, self.evaluated], self.shared.functions[self.evaluated]
+        last = size + TABLE_NODES
         coefficients, slopes = optimum.voltage[:, :last], optimum.voltage_slopes[:, :last]
         voltage = (coefficients[:, None, size:] @ own)[:, 0] + coefficients[:, :size] @ shared.T
         square = voltage * voltage

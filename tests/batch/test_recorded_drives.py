@@ -39,7 +39,7 @@ def change(number: int, **channels: np.ndarray) -> fitact.Record:
 
 def accepted(records: list[fitact.Record]) -> np.ndarray:
     """Return which records a batch fits without separate fits."""
-    group = RecordGroup(TIME, members=list(enumerate(records)))
+    group = RecordGroup(records[0].time, members=list(enumerate(records)))
     with jax.enable_x64(True):
         assert group.is_batchable(SCENE)
         assert group.batch_problem is not None
@@ -141,3 +141,17 @@ def test_edges_between_two_samples_free_a_gain():
     for number in (0, 7):
         assert rows[number]["freed"] == "charge, gain, delay"
         assert_equal_to_separate_fit(rows[number], records[number], sd_error=0.1)
+
+
+@pytest.mark.slow  # simulates and fits records of 25,000 samples, for which programs of their own are compiled
+def test_the_force_of_long_records_is_that_of_their_last_periods():
+    time = STEP * np.arange(25_000)
+    v = np.asarray(DRIVE.value(time + 1e-3))
+    circuit = fitact.FinalCircuit(*MEDIANS)
+    vsc = np.asarray(fitact.response(circuit, fitact.Sampled(time, v), time - 2.3 * STEP, steady_state=False))
+    noise = NOISE * np.random.default_rng(1).standard_normal((16, 2, time.size))
+    records = [fitact.Record.from_arrays(time, V=v + each[0], Vsc=vsc + each[1]) for each in noise]
+    assert accepted(records).all()
+    rows = fitact.fit_many(records, SCENE, progress=False)
+    for number in (0, 15):
+        assert_equal_to_separate_fit(rows[number], records[number])
