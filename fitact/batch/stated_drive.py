@@ -26,7 +26,7 @@ from fitact.model.chirp import Chirp
 from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, chebyshev
 from fitact.model.skin import WithSkin
 
-_CHUNK = 64  # records whose samples are processed together, so that they stay in the processor's cache
+_CHUNK = 48  # records whose samples are processed together, so that they stay in the processor's cache
 
 
 @dataclasses.dataclass(frozen=True)
