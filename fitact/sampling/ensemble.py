@@ -333,7 +333,8 @@ def _draw_starting_points(
 
 
 def _fingerprint(fit: Fit, seed: int, walkers: int, ensembles: int) -> str:
-    """Return a hash of all inputs that determine a chain."""
+    """Return a hash of all inputs that determine a chain, and of its optimum without digits that rounding changes."""
     inputs = [[record.fingerprint for record in fit.records], fit.scene.to_json(), [t.choice.name for t in fit.traces]]
-    settings = [fit.likelihood.rows, fit.point_names, fit.theta.tolist(), seed, walkers, ensembles]
+    optimum = [f"{value:.6g}" for value in fit.theta]
+    settings = [fit.likelihood.rows, fit.point_names, optimum, seed, walkers, ensembles]
     return hashlib.sha256(json.dumps([importlib.metadata.version("fitact"), *inputs, *settings]).encode()).hexdigest()
