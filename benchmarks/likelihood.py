@@ -18,9 +18,10 @@ import numpy as np
 from timing import medians, show
 
 import fitact
-from fitact.likelihood import compression
+from fitact.likelihood import projection
 from fitact.likelihood.certificate import batched_log_prob
 from fitact.model.circuit import HighpassTerms
+from fitact.model.response_table import NODES
 
 TRUTH = np.log([160e3, 22e-9, 1.35e-9, 0.1])  # Rsc, Csc, Ci and sigma (V)
 SQUARE = fitact.Scene.from_dict({"drive": {"waveform": "square"}})
@@ -117,7 +118,7 @@ def build_cost(samples: int) -> dict[str, float]:
     }
     columns = np.random.default_rng(2).standard_normal((4, samples))  # as many columns as fit in memory
     jobs: dict[str, Callable[[], object]] = {
-        name: lambda drive=drive, steady=steady: compression.compress(
+        name: lambda drive=drive, steady=steady: projection.compress(
             drive, t, y, steady_state=steady, expected_terms=HighpassTerms((0.05,), (4e-3,))
         )
         for name, (drive, steady) in drives.items()
@@ -126,7 +127,7 @@ def build_cost(samples: int) -> dict[str, float]:
     seconds = medians(jobs, 5)
     dot = seconds["dot"] / len(columns)
     kinds = {"square": 1, "unfolded_square": 1, "measured": 2}  # responses, and decays of an unknown charge
-    return {f"build_{name}_vs_dots": seconds[name] / (dot * kind * compression.NODES) for name, kind in kinds.items()}
+    return {f"build_{name}_vs_dots": seconds[name] / (dot * kind * NODES) for name, kind in kinds.items()}
 
 
 def main() -> None:

@@ -25,8 +25,9 @@ from fitact.fitting.problem import MIN_RELATIVE_NOISE, Problem, edge_gain_sd, lo
 from fitact.fitting.residual_statistics import interpolation_errors, is_misfit, residual_statistics
 from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics
 from fitact.likelihood.channel import LINEAR_NUISANCES
-from fitact.likelihood.compression import MAX_DELAY, Compression, is_exactly_uniform
+from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
+from fitact.likelihood.projection import MAX_DELAY, is_exactly_uniform
 from fitact.model.force import force_constant
 from fitact.model.response_table import TABLE_HALF_WIDTH
 from fitact.model.skin import WithSkin

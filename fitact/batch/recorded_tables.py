@@ -15,7 +15,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from fitact.compiled import jit
-from fitact.likelihood.compression import BASELINE_NAMES, Compression, evaluate_baseline, uniform_recurrence
+from fitact.likelihood.compression import BASELINE_NAMES, Compression
+from fitact.likelihood.projection import evaluate_baseline, uniform_recurrence
 from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, ResponseTable, chebyshev
 
 HALF_WIDTH = 0.05  # of a record's table, in log tau

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitact.compiled import jit, pad_samples
-from fitact.likelihood.compression import RANK_TOLERANCE, Compression, baseline_functions
+from fitact.likelihood.compression import Compression
+from fitact.likelihood.projection import RANK_TOLERANCE, baseline_functions
 from fitact.model.drive import Drive
 from fitact.model.response import highpass
 from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, chebyshev, count_terms, round_up_column_count

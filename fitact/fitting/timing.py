@@ -12,9 +12,9 @@ from fitact.compiled import jit, pad_rows
 from fitact.fitting.drive_choice import has_ideal_edges, ideal_edge_mask
 from fitact.likelihood.certificate import recompress
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
-from fitact.likelihood.compression import MAX_DELAY
 from fitact.likelihood.likelihood import CircuitValues
 from fitact.likelihood.noise import student_weight
+from fitact.likelihood.projection import MAX_DELAY
 from fitact.model.response import highpass
 from fitact.model.skin import constant_skin_circuit
 

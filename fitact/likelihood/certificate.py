@@ -12,19 +12,12 @@ from numpy.typing import ArrayLike
 
 from fitact.compiled import BatchEvaluator, jit, pad_samples
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
-from fitact.likelihood.compression import (
-    BASELINE_NAMES,
-    MANY_SAMPLES,
-    Compression,
-    compress,
-    is_exactly_uniform,
-    samples_per_period,
-    table_multiple,
-)
+from fitact.likelihood.compression import BASELINE_NAMES, Compression
 from fitact.likelihood.compression_on_grid import GridCompression
 from fitact.likelihood.interpolation import interpolate
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import StudentExpansion, fit_student_scale, student_curvature, student_weight
+from fitact.likelihood.projection import MANY_SAMPLES, compress, is_exactly_uniform, samples_per_period, table_multiple
 from fitact.model.circuit import HighpassTerms
 from fitact.model.skin import WithSkin
 

@@ -20,7 +20,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from fitact.compiled import array_module, pad_samples, pad_weight
-from fitact.likelihood.compression import BASELINE_NAMES, Compression, baseline_functions
+from fitact.likelihood.compression import BASELINE_NAMES, Compression
 from fitact.likelihood.compression_on_grid import GridCompression
 from fitact.likelihood.interpolation import Interpolation
 from fitact.likelihood.noise import (
@@ -31,6 +31,7 @@ from fitact.likelihood.noise import (
     student_residual,
     student_weight,
 )
+from fitact.likelihood.projection import baseline_functions
 from fitact.model.circuit import Channel, Circuit
 from fitact.model.drive import Drive, Sampled
 from fitact.model.response import response_and_rate

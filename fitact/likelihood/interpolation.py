@@ -22,8 +22,8 @@ import scipy.linalg
 from jaxtyping import Array, Bool, Float
 
 from fitact.compiled import jit
-from fitact.likelihood.compression import (
-    BASELINE_NAMES,
+from fitact.likelihood.compression import BASELINE_NAMES
+from fitact.likelihood.projection import (
     Samples,
     WhiteningState,
     baseline_functions,

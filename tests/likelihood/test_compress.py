@@ -11,9 +11,9 @@ import scipy.signal
 
 import fitact
 from fitact.likelihood import certificate
-from fitact.likelihood.compression import compress
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import Whitening
+from fitact.likelihood.projection import compress
 from fitact.model.circuit import HighpassTerms
 from tests.conftest import skin_voltage, square_record
 
