@@ -133,18 +133,14 @@ class BatchProblem(abc.ABC):
         prior = self.likelihood.prior
         return np.append(prior.log_mean, np.zeros(len(self.names) - len(prior.names)))
 
-    def bic_decreases(self, r_squared: Float[np.ndarray, "records candidates"]) -> dict[str, np.ndarray]:
-        """Return the decrease of the BIC of each record that each optional nuisance would cause, by name."""
-        return {
-            name: bic_decrease(fraction, self.samples, len(NUISANCES.get(name, (0,))))
-            + (self.settings.clock_bic_error if name == "clock" else 0.0)
-            for name, fraction in zip(CANDIDATES, r_squared.T, strict=True)
-            if name in self.optional_nuisances
-        }
-
-    def largest_bic_decrease(self, r_squared: Float[np.ndarray, "records candidates"]) -> np.ndarray:
-        """Return the largest of `bic_decreases` of each record."""
-        return np.max(list(self.bic_decreases(r_squared).values()), axis=0, initial=-math.inf)
+    def bic_decreases(self, r_squared: Float[np.ndarray, "records candidates"]) -> np.ndarray:
+        """Return the decrease of the BIC that each of `CANDIDATES` would cause; -inf for one that is not optional."""
+        gains = np.full(r_squared.shape, -math.inf)
+        for place, name in enumerate(CANDIDATES):
+            if name in self.optional_nuisances:
+                gain = bic_decrease(r_squared[:, place], self.samples, len(NUISANCES.get(name, (0,))))
+                gains[:, place] = gain + (self.settings.clock_bic_error if name == "clock" else 0.0)
+        return gains
 
 
 def stack_channel(records: Sequence[Record], channel: str, size: int) -> Iterator[Float[np.ndarray, "some samples"]]:

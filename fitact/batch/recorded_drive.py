@@ -20,7 +20,7 @@ from fitact.data.record import Record, rounding_noise_sd
 from fitact.fitting.derived import DerivedQuantities
 from fitact.fitting.drive_choice import has_unresolved_edge, has_unresolved_edges
 from fitact.fitting.fit import Fit
-from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES, bic_decrease
+from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES, bic_decrease_from_z
 from fitact.fitting.problem import MIN_RELATIVE_NOISE, Problem, edge_gain_sd, log_sd
 from fitact.fitting.residual_statistics import interpolation_errors, is_misfit, residual_statistics
 from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics
@@ -140,7 +140,7 @@ class RecordedDriveProblem(BatchProblem):
         loss = np.abs(optima.sum_of_squares - square)
         accepted &= screened.fine & ~screened.railed & self._is_whole_drive(V, driven)
         accepted &= optima.converged & (loss <= self.settings.max_rounding_loss * square) & ~is_misfit(figures)
-        accepted &= self.largest_bic_decrease(optima.r_squared) <= MIN_BIC_DECREASE
+        accepted &= np.max(self.bic_decreases(optima.r_squared), axis=1) <= MIN_BIC_DECREASE
         accepted &= self._needs_delay(optima.theta, factor)
         freed = np.array([self._nuisance_names(free) for free in inputs.linear_sd > 0.0])
         derived = self._derive(tables, optimum)
@@ -225,10 +225,10 @@ class RecordedDriveProblem(BatchProblem):
         while True:
             inputs = RecordInputs(fields, linear_sd, floor, gain_sd)
             optima = find_optima(self.likelihood, self.settings, clock, inputs, start, noise)
-            gains = self.bic_decreases(optima.r_squared)
-            largest, linear_sd = self.largest_bic_decrease(optima.r_squared), linear_sd.copy()
-            for name in NUISANCES.keys() & gains.keys():
-                rows = np.flatnonzero((gains[name] == largest) & (largest > MIN_BIC_DECREASE))
+            gains, linear_sd = self.bic_decreases(optima.r_squared), linear_sd.copy()
+            largest = np.max(gains, axis=1)
+            for name, gain in zip(NUISANCES, gains.T, strict=False):  # delays and clocks, which follow, are not added
+                rows = np.flatnonzero((gain == largest) & (largest > MIN_BIC_DECREASE))
                 linear_sd[np.ix_(rows, np.array(NUISANCES[name]))] = wide[rows, None]
             if np.array_equal(linear_sd, inputs.linear_sd):
                 return inputs, optima
@@ -248,7 +248,7 @@ class RecordedDriveProblem(BatchProblem):
         place = self.names.index("delay")
         delay = float(channel.shift) / float(channel.time_step) + theta[:, place]
         z_squared = np.square(delay) / np.sum(np.square(factor[:, place]), axis=1)
-        return bic_decrease(z_squared / (z_squared + self.samples), self.samples, 1) > 2.0 * MIN_BIC_DECREASE
+        return bic_decrease_from_z(z_squared, self.samples) > 2.0 * MIN_BIC_DECREASE
 
     def _nuisance_names(self, is_free: Bool[np.ndarray, " nuisances"]) -> str:
         """Return the names of the nuisances that were fitted, as in `Fit.model`."""

@@ -69,6 +69,10 @@ class SharedFunctions(NamedTuple):
         """Number of functions."""
         return self.functions.shape[1]
 
+    def select_fitted(self, own: Float[np.ndarray, "records own samples"]) -> Float[np.ndarray, "records own used"]:
+        """Return functions at the times of the drive at the fitted samples, delayed by `origin`."""
+        return own[:, :, self.used.start - self.origin : self.used.stop - self.origin]
+
 
 class Tables(NamedTuple):
     """Compressions of records, in terms of functions of time.
@@ -104,8 +108,7 @@ class Tables(NamedTuple):
         inside = (np.log(nodes) - shared.center) / TABLE_HALF_WIDTH
         decay = np.swapaxes(np.polynomial.chebyshev.chebvander(inside, NODES - 1) @ shared.decay.T, 1, 2)
         own = _filter_drives(V, np.roll(Vsc, -shared.origin, axis=1), shared.time_step / nodes)
-        tables = cls(shared, own, np.log(tau), decay, own, own)
-        used = tables.own_used
+        used = shared.select_fitted(own)
         across = used.reshape(-1, used.shape[-1]) @ shared.functions[shared.used]
         across = np.swapaxes(across.reshape(*own.shape[:2], size), 1, 2)
         products = used @ np.swapaxes(used, 1, 2)
@@ -114,13 +117,7 @@ class Tables(NamedTuple):
         columns = np.concatenate([across, rest], axis=1)
         first = np.broadcast_to(np.eye(columns.shape[1], size), (len(V), columns.shape[1], size))
         coordinates = np.concatenate([first, columns[:, :, :-1]], axis=2)
-        return tables._replace(coordinates=coordinates, observed=columns[:, :, -1])
-
-    @property
-    def own_used(self) -> Float[np.ndarray, "records own used"]:
-        """The own functions at the fitted samples, delayed by `origin`."""
-        used, origin = self.shared.used, self.shared.origin
-        return self.own[:, :, used.start - origin : used.stop - origin]
+        return cls(shared, own, np.log(tau), decay, coordinates, columns[:, :, -1])
 
     def fields(self, *, in_functions: bool = False) -> dict[str, np.ndarray]:
         """Return the fields of `Compression` that differ between records, by name.
@@ -148,7 +145,7 @@ class Tables(NamedTuple):
 
     def residuals(self, fitted: Float[np.ndarray, "records functions"]) -> Float[np.ndarray, "records used"]:
         """Return the records minus a model with these coefficients, at the fitted samples."""
-        size, used = self.shared.size, self.own_used
+        size, used = self.shared.size, self.shared.select_fitted(self.own)
         model = (fitted[:, None, size:] @ used[:, :-1])[:, 0]
         model += fitted[:, :size] @ self.shared.functions[self.shared.used].T
         return np.subtract(used[:, -1], model, out=model)
@@ -156,15 +153,8 @@ class Tables(NamedTuple):
 
 def to_response_table(table: Compression) -> ResponseTable:
     """Return a table of coefficients from a compression in functions; the response is not delayed."""
-    series = chebyshev(TABLE_NODES)[1].T
-    inverse = np.linalg.inv(series)
-    return ResponseTable(
-        center=table.center[None],
-        half_width=table.half_width,
-        signal=jnp.pad(table.signal @ inverse, ((0, 0), (0, 1))),
-        decay=table.decay @ inverse,
-        series=jnp.asarray(series),
-    )
+    signal = jnp.pad(table.signal, ((0, 0), (0, 1)))
+    return ResponseTable(table.center[None], table.half_width, signal, table.decay, jnp.eye(TABLE_NODES))
 
 
 def _factor_products(

@@ -91,7 +91,7 @@ class StatedDriveProblem(BatchProblem):
         freedom = self.samples - optima.theta.shape[1]
         figures = residual_statistics(square, self.samples, tests, noise, freedom, self.phases)
         figures |= {"rounding_noise": np.zeros(len(noise)), "interpolation_error": np.zeros(len(noise))}
-        needs_nuisance = self.largest_bic_decrease(optima.r_squared) > MIN_BIC_DECREASE
+        needs_nuisance = np.max(self.bic_decreases(optima.r_squared), axis=1) > MIN_BIC_DECREASE
         accepted &= optima.converged & fine & ~railed & ~needs_nuisance & ~is_misfit(figures)
         accepted &= loss <= self.settings.max_rounding_loss * square
         factor, freed = np.linalg.inv(optima.r_factor), np.full(len(noise), "")

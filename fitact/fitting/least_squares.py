@@ -163,14 +163,14 @@ def _least_timing_gain(solution: LeastSquaresResult) -> float:
     for name, (origin, unit) in likelihood.timing.items():
         place = likelihood.names.index(name)
         z_squared = (origin / unit + solution.theta[place]) ** 2 / float(root[place] @ root[place])
-        gains.append(bic_decrease(z_squared / (z_squared + count), count, 1))
+        gains.append(bic_decrease_from_z(z_squared, count))
     return min(gains, default=math.inf)
 
 
 def _with_noise(likelihood: Likelihood, channels: list[int], noise: NoiseModel) -> Likelihood:
     """Return the likelihood with another noise model of some channels; an interpolation holds for one model only."""
     for i in channels:
-        channel = dataclasses.replace(likelihood.channels[i], noise=noise)
+        channel = dataclasses.replace(likelihood.channels[i], noise=noise, expansion=None)
         if isinstance(channel.compression, Interpolation):
             channel = channel.without_compression()
         likelihood = likelihood.replace_channel(i, channel)
@@ -230,10 +230,7 @@ def _solve_student(
     ]
     if not which:
         return least_squares(likelihood, start, noise)
-    normal = likelihood
-    for i in which:
-        normal = normal.replace_channel(i, dataclasses.replace(likelihood.channels[i], noise="white", expansion=None))
-    solved, steps, moved = least_squares(normal, start, noise), 0, math.inf
+    solved, steps, moved = least_squares(_with_noise(likelihood, which, "white"), start, noise), 0, math.inf
     for _ in range(max_rounds):
         exact = moved < 1.0  # from further away, Newton's step may lead astray
         theta, sigma, steps = solved.theta, solved.sigma.copy(), steps + solved.steps
@@ -332,3 +329,8 @@ def _bic_decreases(
 def bic_decrease(fraction: ArrayLike, count: float, n_columns: int) -> Any:
     """Return the decrease of the BIC if `n_columns` explain a `fraction` of the sum of squares of `count` samples."""
     return -count * np.log1p(-np.minimum(fraction, 1.0 - 1e-12)) - n_columns * math.log(count)
+
+
+def bic_decrease_from_z(z_squared: ArrayLike, count: float) -> Any:
+    """Return `bic_decrease` of a free parameter from the square of its value over its standard error."""
+    return bic_decrease(z_squared / (z_squared + count), count, 1)
