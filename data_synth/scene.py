@@ -67,6 +67,7 @@ KEYS: Table = {
         "noise_I": Quantity("A", 20e-9, least=True),
         **dict.fromkeys(("gain_relative_sd", "gain_I_relative_sd", "noise_model", "quiet"), IgnoredKey()),
     },
+    "instrument": dict.fromkeys(("V", "Vsc", "I", "own"), IgnoredKey()),
     "friction": dict.fromkeys(("coefficient", "normal_force"), IgnoredKey()),
     "prior": dict.fromkeys(_PRIORS.split(), IgnoredKey()),
     "force": {"model": IgnoredKey()},

@@ -45,6 +45,9 @@ _PARAMETERS = {
 }
 _NUISANCES = {  # quantities of the measurement; {}: the channel
     "gain": "gain of {}",
+    "gain_V": "gain of V",
+    "probe_resistance": "input resistance that loads the skin",
+    "probe_capacitance": "input capacitance that loads the skin",
     "delay": "delay of {} against V",
     "clock": "relative deviation of the drive frequency from the stated one",
     "sigma": "noise of {}, standard deviation",

@@ -72,22 +72,29 @@ class DerivedQuantities(eqx.Module):
         return self._force(self.likelihood.circuit(theta), theta, sigma, deviate)
 
     def _force(self, circuit: Circuit, theta: Array, sigma: Array, deviate: Array | None) -> Float[Array, " times"]:
-        return electrostatic_force(self.voltage(circuit, theta, sigma, deviate), self.geometry.contact(circuit))
+        contact = self.geometry.contact(self.likelihood.finger(circuit))
+        return electrostatic_force(self.voltage(circuit, theta, sigma, deviate), contact)
+
+    def _drive_gain(self, theta: Array) -> ArrayLike:
+        """Return the ratio between indicated and true V."""
+        names, gains = self.likelihood.names, [each.drive_gains for each in self.likelihood.channels[:1]]
+        return jnp.exp(sum(power * theta[names.index(name)] for each in gains for name, power in each))
 
     def voltage(
         self, circuit: Circuit, theta: Array, sigma: Array, deviate: Array | None = None
     ) -> Float[Array, " times"]:
         """Return the voltage that generates the force at `time`, V; `circuit` is that at theta."""
-        contact = self.geometry.contact(circuit)
+        finger = self.likelihood.finger(circuit)
+        acting = self.geometry.contact(finger).channel
         if isinstance(self.drive, ResponseTable):
-            voltage = self.drive.response(circuit.channel_terms(contact.channel))
+            voltage = self.drive.response(finger.channel_terms(acting))
         else:
-            voltage = response(circuit, self.drive, self.time, steady_state=self.steady_state, channel=contact.channel)
+            voltage = response(finger, self.drive, self.time, steady_state=self.steady_state, channel=acting)
         if self.charge:
             channel = self.likelihood.channels[0]
             inputs = self.likelihood.make_inputs(circuit, theta, channel)
             voltage = voltage + self._charges(channel, inputs, sigma[0], deviate)
-        return voltage
+        return voltage / self._drive_gain(theta)
 
     def _charges(
         self, channel: ChannelLikelihood, inputs: ChannelInputs, sigma: Array, deviate: Array | None
@@ -113,13 +120,14 @@ class DerivedQuantities(eqx.Module):
         """Return the quantities of `DERIVED_NAMES`, in SI units."""
         circuit = self.likelihood.circuit(theta)
         force = summarize(self._force(circuit, theta, sigma, deviate), self.weight)
+        finger, scale = self.likelihood.finger(circuit), self._drive_gain(theta) ** -2.0
         if self.steady_state and isinstance(self.drive, Periodic):  # only the rms needs quadrature
-            exact = circuit, self.drive, self.geometry.contact(circuit)
-            force = force._replace(mean=mean_force(*exact))
+            exact = finger, self.drive, self.geometry.contact(finger)
+            force = force._replace(mean=scale * mean_force(*exact))
             if not isinstance(circuit, WithSkin) or isinstance(self.drive, Sine | Multitone):
-                force = force._replace(peak=peak_force(*exact))
+                force = force._replace(peak=scale * peak_force(*exact))
         friction_mean = friction(force.mean, self.coefficient, self.normal_force)
-        return jnp.stack([circuit.g, circuit.b, force.mean, force.peak, force.rms, friction_mean])
+        return jnp.stack([finger.g, finger.b, force.mean, force.peak, force.rms, friction_mean])
 
     def log_value_and_grad(
         self, theta: Float[np.ndarray, " parameters"], sigma: Float[np.ndarray, " channels"]

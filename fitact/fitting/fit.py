@@ -172,8 +172,13 @@ class Fit(FitResult):
 
     def summary(self) -> str:
         """Return a table for people: estimates with errors, what the force rests on, and the verdict."""
-        names, correlation = self.names, self.correlation
-        pairs = [f"{names[j]}-{names[i]} {correlation[i, j]:+.3f}" for i in range(len(names)) for j in range(i)]
+        names, correlation = list(self.identifiability.blind_direction), self.correlation
+        places = [self.names.index(name) for name in names]
+        pairs = [
+            f"{names[j]}-{names[i]} {correlation[places[i], places[j]]:+.3f}"
+            for i in range(len(names))
+            for j in range(i)
+        ]
         chi_square, content = self.figures["chi2_reduced"], self.to_dict()
         rows = [
             *summary.format_table(content),

@@ -13,9 +13,11 @@ from fitact.compiled import MAX_PADDED_LENGTH, as_arrays, pad_samples, pad_weigh
 from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
 from fitact.errors import InputError
+from fitact.experiment.blind_directions import gain_names
 from fitact.experiment.fisher import Experiment
 from fitact.fitting.current import CurrentSamples, estimate_from_current, select_current_samples
 from fitact.fitting.drive_choice import DriveModel, choose_drive, frequency_error, has_ideal_edges, has_unresolved_edge
+from fitact.fitting.gains import GainCoordinate, GainedChannel, apply_gains, collect_gains, largest_gain
 from fitact.fitting.skin_model import apply_skin_model, exclude_jumps, require_skin_response
 from fitact.fitting.starting_point import Estimate, VscEstimate, estimate_from_vsc, start_from_estimates
 from fitact.likelihood import certificate
@@ -24,8 +26,9 @@ from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import Autoregression, estimate_quiet_noise, require_uniform
 from fitact.model.circuit import RC, Channel, Circuit, FinalCircuit
 from fitact.model.skin import WithSkin, circuit_parameters, constant_skin_circuit, limits_current
-from fitact.prior.distributions import LogNormal
+from fitact.prior.distributions import Distribution, LogNormal
 from fitact.prior.prior import Prior
+from fitact.prior.product import multiply
 from fitact.scene.scene import Scene
 
 MIN_RELATIVE_NOISE = 1e-9  # least noise sd assumed, relative to the range of the channel
@@ -46,11 +49,12 @@ class Source(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """Likelihood over the samples, sources of its channels, and starting point."""
+    """Likelihood over the samples, sources of its channels, starting point, and the errors of instruments."""
 
     likelihood: Likelihood
     sources: tuple[Source, ...]
     start: Float[np.ndarray, " circuit_parameters"]
+    gains: tuple[GainCoordinate, ...]  # coordinates of the errors of instruments
 
     def compress_likelihood(self, tolerance: float) -> tuple[Likelihood, tuple[str, ...]]:
         """Return the likelihood with compressed channels, and for each channel the reason if it is not compressed."""
@@ -65,13 +69,13 @@ class Problem(NamedTuple):
         pairs = zip(likelihood.channels, self.sources, strict=True)
         channels = tuple(channel.channel for channel, other in pairs if other.record is source.record)
         fields = circuit_parameters(likelihood.template)
-        gains = ("gain", "gain_I") if records == 1 else ()
+        gains = gain_names(channels)
         free = tuple(name for name in likelihood.prior.names if name in fields or name in gains)
         rows = [likelihood.prior.names.index(name) for name in free]
         factor, measurement = likelihood.prior_factor, source.scene.measurement
         noise = {"Vsc": measurement.noise_Vsc, "I": measurement.noise_I}
         return Experiment(
-            circuit=circuit,
+            circuit=likelihood.finger(circuit),
             free=free,
             prior_factor=np.linalg.cholesky((factor @ factor.T)[np.ix_(rows, rows)]),
             drive=source.choice.drive,
@@ -102,22 +106,39 @@ def build_problem(
         first, prior, lambda values: apply_skin_model(first.make_rc_circuit(values), records, scenes)
     )
     taus = likelihood.evaluate_circuit(likelihood.prior.log_mean).tau
-    parts = []
-    for number, (record, scene, drive) in enumerate(itertools.zip_longest(records, scenes, drives), 1):
-        choice, suffix = drive or choose_drive(record, scene), str(number) * (len(records) > 1)
+    sources, members = [], []
+    for number, (record, scene, drive) in enumerate(itertools.zip_longest(records, scenes, drives)):
+        choice, suffix = drive or choose_drive(record, scene), str(number + 1) * (len(records) > 1)
+        stated = scene or Scene()
         for name in _channels(record, scene):
-            parts.append(_build_channel(record, scene or Scene(), choice, name, suffix, likelihood.template, taus))
-    channels, sources, gains = zip(*parts, strict=True)
-    pairs = zip(channels, gains, strict=True)
-    free_gains = {channel.qualified_name("gain"): LogNormal(1.0, sd) for channel, sd in pairs if sd > 0.0}
+            channel, source, edge_sd = _build_channel(record, stated, choice, name, suffix, likelihood.template, taus)
+            sources.append(source)
+            members.append(GainedChannel(channel, number, stated, edge_sd))
+    gains = collect_gains(members)
+    channels = tuple(apply_gains(gains, i, each) for i, each in enumerate(members))
+    nuisances = {gain.name: gain.distribution() for gain in gains} | _load_priors(scenes)
     likelihood = dataclasses.replace(
         likelihood,
         channels=channels,
-        prior=_prior_as_arrays(likelihood.prior.replace_marginals(**free_gains)),
+        prior=_prior_as_arrays(likelihood.prior.replace_marginals(**nuisances)),
         sigma_prior=tuple(noise.get("sigma" if channel.channel == "Vsc" else "sigma_I") for channel in channels),
         use_prior=use_prior,
     )
-    return Problem(likelihood, sources, start_from_estimates(likelihood, [source.start for source in sources]))
+    start = start_from_estimates(likelihood, [source.start for source in sources])
+    return Problem(likelihood, tuple(sources), start, gains)
+
+
+def _load_priors(scenes: Sequence[Scene | None]) -> dict[str, Distribution]:
+    """Return the priors of the input resistance and capacitance that load the skin."""
+    loads = [scene.find_load() if scene else None for scene in scenes]
+    if len({None if load is None else load.name for load in loads}) > 1:
+        raise InputError(
+            "scenes: [instrument] Vsc loads the skin differently in different records; records that are fitted jointly"
+            " need the same probe"
+        )
+    load = loads[0]
+    stated = {} if load is None else {"probe_resistance": load.resistance, "probe_capacitance": load.capacitance}
+    return {name: multiply([(x, 1.0)]) for name, x in stated.items() if x is not None}
 
 
 def likelihood_without_channels(scene: Scene, prior: Prior, make_circuit: Callable[..., Any]) -> Likelihood:
@@ -157,7 +178,7 @@ def _build_channel(
     template: RC | WithSkin,
     taus: Float[np.ndarray, " time_constants"],
 ) -> tuple[ChannelLikelihood, Source, float]:
-    """Return the likelihood of a channel over its samples, its source, and the sd of log(gain).
+    """Return the likelihood of a channel over its samples, its source, and the sd of log(gain) for unresolved edges.
 
     `taus` are the time constants (s) of the `template`.
     """
@@ -168,29 +189,29 @@ def _build_channel(
     optional = ("offset", "drift", *_hum(record, choice))
     start: Estimate | None = None
     samples: CurrentSamples | None = None
+    edge_sd = 0.0
     if channel == "Vsc":
-        gain, optional = log_sd(scene.measurement.gain_relative_sd), (*optional, "delay")
+        optional = (*optional, "delay")
         if choice.periodic and choice.steady_state and choice.name != "measured":
             optional = (*optional, "clock")
         plain = constant_skin_circuit(template)
         if not limits_current(template) or taus[-1] < record.time_step:  # Vsc jumps with V
             max_divider = 0.5 if isinstance(plain, FinalCircuit) else 1.0
-            start = estimate_from_vsc(record, choice, max_divider * math.exp(3.0 * gain))
-            gain = math.hypot(gain, _unresolved_gain_sd(record, choice, start))
-    else:
-        gain = log_sd(scene.measurement.gain_I_relative_sd)
-        if not limits_current(template):
-            samples = select_current_samples(record, choice)
-            start = estimate_from_current(record, choice, samples)
-            notes, warnings = (*notes, *samples.notes), (*warnings, *samples.warnings)
+            start = estimate_from_vsc(record, choice, max_divider * largest_gain(scene))
+            edge_sd = _unresolved_gain_sd(record, choice, start)
+    elif not limits_current(template):
+        samples = select_current_samples(record, choice)
+        start = estimate_from_current(record, choice, samples)
+        notes, warnings = (*notes, *samples.notes), (*warnings, *samples.warnings)
     weight, clipped = _weight(record, channel, samples)
     weight, at_jumps = exclude_jumps(template, record, choice, weight)
     if weight is None and len(record) <= MAX_PADDED_LENGTH:
         weight = np.ones(len(record))
     weight = None if weight is None else pad_weight(weight)
     colour, noise = _noise(record, channel, scene)
+    nuisances: dict[str, Any] = _prior_of_nuisances(record, choice, channel, len(taus) if choice.unknown_charge else 0)
     likelihood = ChannelLikelihood(
-        **_prior_of_nuisances(record, choice, channel, len(taus) if choice.unknown_charge else 0),
+        **nuisances,
         time=pad_samples(record.time),
         observed=pad_samples(record[channel]),
         weight=weight,
@@ -212,7 +233,7 @@ def _build_channel(
     )
     dominates = samples is not None and samples.drive_noise_dominates
     remarks = (*notes, *at_jumps), (*warnings, *clipped)
-    return likelihood, Source(record, scene, choice, noise, optional, start, *remarks, dominates), gain
+    return likelihood, Source(record, scene, choice, noise, optional, start, *remarks, dominates), edge_sd
 
 
 def _require_whole_drive(record: Record, choice: DriveModel) -> None:
@@ -248,11 +269,6 @@ def _noise(record: Record, channel: str, scene: Scene) -> tuple[Autoregression |
     if quiet is None:
         return Autoregression(np.zeros(1), 1.0), record.noise(channel)
     return estimate_quiet_noise(record, channel, quiet)
-
-
-def log_sd(relative_sd: float) -> float:
-    """Return the sd of the logarithm for a relative sd."""
-    return LogNormal.with_relative_sd(1.0, relative_sd).spread if relative_sd > 0.0 else 0.0
 
 
 def _prior_of_nuisances(

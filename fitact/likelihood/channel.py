@@ -80,6 +80,9 @@ class ChannelLikelihood(eqx.Module):
     noise: NoiseModel = eqx.field(static=True)  # noise model
     # indices of the `LINEAR_NUISANCES` in use; `linear_sd` of the others is 0
     columns: tuple[int, ...] = eqx.field(static=True)
+    # names of the coordinates that act on the channel's gain, each with its power
+    gains: tuple[tuple[str, float], ...] = eqx.field(static=True, default=())
+    drive_gains: tuple[tuple[str, float], ...] = eqx.field(static=True, default=())  # the same for the indicated V
     # times of the first period (padded, s) and its number of samples, if the signal need be computed only there
     phases: Float[Array, " phases"] | None = None
     period: ArrayLike | None = None

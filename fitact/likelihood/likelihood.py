@@ -6,7 +6,7 @@ logarithm of each channel's noise. Linear nuisances are integrated out (`fitact.
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -19,7 +19,15 @@ from jaxtyping import Array, Bool, Float
 from fitact.compiled import BatchEvaluator, array_module, jit
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
 from fitact.model.circuit import RC, Channel, Circuit, HighpassTerms
-from fitact.model.skin import WithSkin, circuit_parameters, constant_skin_circuit, has_time_constants, with_values
+from fitact.model.skin import (
+    WithSkin,
+    circuit_parameters,
+    constant_skin_circuit,
+    has_time_constants,
+    probe_parameters,
+    with_probe,
+    with_values,
+)
 from fitact.prior.distributions import Distribution
 from fitact.prior.prior import Prior
 
@@ -44,7 +52,7 @@ class Likelihood(eqx.Module):
 
     channels: tuple[ChannelLikelihood, ...]  # channels of all records
     template: RC | WithSkin  # the circuit with the values of parameters that are not free
-    prior: Prior  # prior of the free circuit parameters and gains
+    prior: Prior  # prior of the free circuit parameters, gains and the load of a probe
     sigma_prior: tuple[Distribution | None, ...]  # prior of each channel's noise; None means flat in its logarithm
     # parameters proportional to another: (name, name of the other, ratio)
     tied: tuple[tuple[str, str, float], ...] = eqx.field(static=True, default=())
@@ -122,10 +130,16 @@ class Likelihood(eqx.Module):
         # no finger exceeds 1e30 or falls below 1e-30 SI units, where products overflow
         theta = jnp.where(jnp.abs(theta) < 70.0, theta, jnp.nan)
         known = circuit_parameters(self.template)
-        values = {name: jnp.exp(theta[i]) for i, name in enumerate(self.prior.names) if name in known}
+        load = probe_parameters(self.template)
+        values = {name: jnp.exp(theta[i]) for i, name in enumerate(self.prior.names) if name in known or name in load}
         for name, other, ratio in self.tied:
             values[name] = ratio * values.get(other, known[other])
         return with_values(self.template, values)
+
+    def finger(self, circuit: Circuit) -> Circuit:
+        """Return the circuit of the finger alone: without a probe whose load is a nuisance parameter."""
+        is_nuisance = any(name in self.prior.names for name in probe_parameters(circuit))
+        return with_probe(circuit, None) if is_nuisance else circuit
 
     def evaluate_circuit(self, theta: Float[np.ndarray, " circuit_parameters"]) -> CircuitValues:
         """Return the circuit at theta, outside compiled functions."""
@@ -136,28 +150,30 @@ class Likelihood(eqx.Module):
         self, points: Float[np.ndarray, "n parameters"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Return the divider ratio g and the slowest time constant b (s) at many points theta."""
-        g, b, *_ = self._evaluate_divider(points)
+        g, b = self._evaluate_divider(points, _divider)
         return g, b
 
     def time_constants(self, points: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, "taus n"]:
         """Return the time constants (s) of the circuits at the points theta, the slowest first."""
-        return self._evaluate_divider(points)[2:]
+        return self._evaluate_divider(points, _time_constants)
 
     def tau_range(self, points: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, "2 taus"]:
         """Return the least and the largest value (s) of each time constant of the circuits at the points theta."""
         tau = self.time_constants(points)
         return np.stack([tau.min(axis=1), tau.max(axis=1)])
 
-    def _evaluate_divider(self, points: np.ndarray) -> Float[np.ndarray, "quantities n"]:
+    def _evaluate_divider(
+        self, points: np.ndarray, function: Callable[..., Array]
+    ) -> Float[np.ndarray, "quantities n"]:
         bare, kept = self._bare()
-        return BatchEvaluator(_divider, bare, len(kept), batch=256, fast=False)(points[:, kept]).T
+        return BatchEvaluator(function, bare, len(kept), batch=256, fast=False)(points[:, kept]).T
 
     def _bare(self) -> tuple["Likelihood", list[int]]:
         """Return the likelihood without all that the circuit does not depend on, and its coordinates.
 
         One program then serves all likelihoods of a circuit.
         """
-        known = circuit_parameters(self.template)
+        known = circuit_parameters(self.template) | probe_parameters(self.template)
         kept = [i for i, name in enumerate(self.prior.names) if name in known]
         names = tuple(self.prior.names[i] for i in kept)
         return Likelihood((), self.template, Prior(names, ()), (), self.tied), kept
@@ -170,8 +186,8 @@ class Likelihood(eqx.Module):
         """Return the inputs of a channel at theta, where the circuit is `circuit`."""
         places = {name: i for i, name in enumerate(self.names)}
         timing = {n: theta[places[channel.qualified_name(n)]] * channel.timing_unit(n) for n in channel.timing}
-        gain = places.get(channel.qualified_name("gain"))
-        return ChannelInputs(circuit, 1.0 if gain is None else array_module(theta).exp(theta[gain]), **timing)
+        log_gains = [power * theta[places[name]] for name, power in channel.gains]
+        return ChannelInputs(circuit, array_module(theta).exp(sum(log_gains)) if log_gains else 1.0, **timing)
 
     def channels_and_inputs(
         self, theta: Float[Array, " circuit_parameters"]
@@ -269,7 +285,11 @@ def _evaluate_circuit(likelihood: Likelihood, theta: Float[Array, " circuit_para
     return jax.tree.map(jnp.asarray, CircuitValues(circuit, circuit.b, tau, terms))
 
 
-def _divider(likelihood: Likelihood, theta: Float[Array, " circuit_parameters"]) -> Float[Array, " quantities"]:
-    """Return g, b, and all time constants (s)."""
-    circuit = likelihood.circuit(theta)
-    return jnp.stack([circuit.g, circuit.b, *constant_skin_circuit(circuit).terms().tau])
+def _divider(likelihood: Likelihood, theta: Float[Array, " circuit_parameters"]) -> Float[Array, "2"]:
+    """Return g and b (s) of the finger."""
+    finger = likelihood.finger(likelihood.circuit(theta))
+    return jnp.stack([finger.g, finger.b])
+
+
+def _time_constants(likelihood: Likelihood, theta: Float[Array, " circuit_parameters"]) -> Float[Array, " taus"]:
+    return jnp.stack(constant_skin_circuit(likelihood.circuit(theta)).terms().tau)

@@ -20,7 +20,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
 from fitact.errors import InputError
-from fitact.model.circuit import RC, Channel, Circuit, DirectGround, Element, HighpassTerms, Loop
+from fitact.model.circuit import RC, Channel, Circuit, DirectGround, Element, FinalCircuit, HighpassTerms, Loop, Probe
+
+_SKIN = ("Rsc", "Csc", "Ci")
 
 # section 3.1 of the reference paper, with its Rsc, Csc at 100 Hz
 _FREQUENCY = np.array([10.0, 100.0, 1000.0])  # Hz
@@ -272,8 +274,29 @@ def circuit_parameters(circuit: Circuit) -> dict[str, Any]:
     return values
 
 
+def probe_parameters(circuit: Circuit) -> dict[str, ArrayLike]:
+    """Return the parameters of a circuit's probe by name, if it has one."""
+    probe = getattr(constant_skin_circuit(circuit), "probe", None)
+    return {} if probe is None else {"probe_resistance": probe.R, "probe_capacitance": probe.C}
+
+
+def with_probe(circuit: Any, probe: Probe | None) -> Any:
+    """Return the circuit with another probe; without one, a direct ground of equal skins is a `FinalCircuit`."""
+    if isinstance(circuit, WithSkin):
+        return dataclasses.replace(circuit, circuit=with_probe(circuit.circuit, probe))
+    changed = dataclasses.replace(circuit, probe=probe)
+    names = [field.name for field in dataclasses.fields(changed)]
+    if isinstance(changed, DirectGround) and all(getattr(changed, name) is None for name in names if name not in _SKIN):
+        return FinalCircuit(changed.Rsc, changed.Csc, changed.Ci)
+    return changed
+
+
 def with_values(circuit: Circuit, values: Mapping[str, ArrayLike]) -> Circuit:
-    """Return the circuit with some of its `circuit_parameters` replaced."""
+    """Return the circuit with some of its `circuit_parameters` or `probe_parameters` replaced."""
+    if known := probe_parameters(circuit):
+        R, C = (values.get(name, value) for name, value in known.items())
+        circuit = with_probe(circuit, Probe(R, C))
+        values = {name: value for name, value in values.items() if name not in known}
     if not isinstance(circuit, WithSkin):
         return dataclasses.replace(circuit, **values)
     inner, skin = dict(values), circuit.skin

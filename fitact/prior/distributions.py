@@ -168,7 +168,7 @@ class Uniform(Bounded):
 
     def cdf(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """Return (x - low) / (high - low)."""
-        return self.low * jnp.expm1(jnp.asarray(u) - math.log(self.low)) / (self.high - self.low)
+        return self.low * array_module(u).expm1(u - math.log(self.low)) / (self.high - self.low)
 
     def ppf(self, p: ArrayLike) -> Float[Array, "*shape"]:
         """Return log x, the inverse of `cdf`."""
@@ -197,7 +197,7 @@ class LogUniform(Bounded):
 
     def cdf(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """Return log(x / low) / log(high / low)."""
-        return (jnp.asarray(u) - math.log(self.low)) / self._length
+        return (u - math.log(self.low)) / self._length
 
     def ppf(self, p: ArrayLike) -> Float[Array, "*shape"]:
         """Return log x, the inverse of `cdf`."""

@@ -141,9 +141,15 @@ class Prior(eqx.Module):
 
     def residuals(self, u: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         """Return the log-parameters whitened by mean and covariance (residuals of the normal prior)."""
+        scaled = jnp.array([marginal.standardize(u[i]) for i, marginal in enumerate(self.marginals)])
         if not self.pairs:
-            return jnp.array([marginal.standardize(u[i]) for i, marginal in enumerate(self.marginals)])
-        return solve_triangular(np.linalg.cholesky(self.covariance), u - self.log_mean, lower=True)
+            return scaled
+        # only correlated marginals are constants of a compiled program
+        names = {name for name, other, _ in self.pairs} | {other for _, other, _ in self.pairs}
+        places = np.array([place for place, name in enumerate(self.names) if name in names])
+        correlated = Prior(tuple(self.names[i] for i in places), tuple(self.marginals[i] for i in places), self.pairs)
+        root = np.linalg.cholesky(correlated.covariance)
+        return scaled.at[places].set(solve_triangular(root, u[places] - correlated.log_mean, lower=True))
 
     def sample(self, rng: np.random.Generator, size: int) -> dict[str, Float[np.ndarray, " size"]]:
         """Return draws of the parameters by name; raise InputError if almost none satisfy the order constraints."""

@@ -18,6 +18,7 @@ from jax.typing import ArrayLike
 from pydantic import model_validator
 
 from fitact.errors import InputError
+from fitact.instrument.pieces import Piece, find_load
 from fitact.model.circuit import RC, Circuit, DirectGround, FinalCircuit, NaturalGround, Probe
 from fitact.model.drive import Drive
 from fitact.model.force import Geometry, plate_capacitance
@@ -25,6 +26,7 @@ from fitact.model.skin import Dispersive, Fractional, WithSkin
 from fitact.prior.prior import Prior
 from fitact.prior.published import Layer
 from fitact.scene import sections, toml
+from fitact.scene.instrument_section import InstrumentSection
 from fitact.scene.prior_section import PriorSection
 
 _DIRECT_GROUND_KEYS = ("R_H", "grounding_Rsc", "grounding_Csc")  # keys of only one kind of grounding
@@ -48,6 +50,7 @@ class Scene(sections.Section):
     gap: sections.Gap = sections.Gap()
     drive: sections.DriveSection = sections.DriveSection()
     measurement: sections.Measurement = sections.Measurement()
+    instrument: InstrumentSection = InstrumentSection()
     friction: sections.Friction = sections.Friction()
     prior: PriorSection = PriorSection()
     force: sections.ForceSection = sections.ForceSection()
@@ -166,7 +169,13 @@ class Scene(sections.Section):
             return FinalCircuit(*skin)
         return DirectGround(*skin, **extras)
 
+    def find_load(self) -> Piece | None:
+        """Return the piece of [instrument] Vsc that loads the skin, or None."""
+        return find_load(self.instrument.pieces("Vsc"))
+
     def _probe(self) -> Probe | None:
+        if (load := self.find_load()) is not None:
+            return load.nominal_probe()
         resistance, capacitance = self.measurement.probe_resistance, self.measurement.probe_capacitance
         if resistance is None and capacitance is None:
             return None
@@ -211,6 +220,12 @@ class Scene(sections.Section):
         for name in self.prior.specs():
             if name in absent:
                 raise InputError(f"[prior] {name} needs {absent[name]}; leave it out of [prior] otherwise")
+        stated = self.measurement.probe_resistance is not None or self.measurement.probe_capacitance is not None
+        if stated and self.find_load() is not None:
+            raise InputError(
+                "[measurement] probe_resistance and probe_capacitance state the load that a piece of [instrument] Vsc"
+                " has; state it under [instrument.own] only"
+            )
         has = {name for name, value in self.nominal_values().items() if value is not None} | set(self.prior.specs())
         if "Rgap" in has and "Cgap" not in has:
             raise InputError(
@@ -232,7 +247,8 @@ def _sentence(error: Any) -> str:
     if error["type"] == "extra_forbidden":
         model: type[sections.Section] = Scene
         for name in where[:-1]:
-            model = sections.field_section(model.model_fields[name])
+            if name in model.model_fields:  # not a piece of [instrument.own]
+                model = sections.field_section(model.model_fields[name])
         return f"{place} is not a key of a scene; {_suggest_key(where[-1], list(model.model_fields))}"
     message = str(error["msg"]).removeprefix("Value error, ")
     if error["type"] == "model_type":

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from fitact.errors import InputError
-from fitact.scene.prior_section import QUANTITY_KEYS, PriorSpec
+from fitact.scene.prior_section import QUANTITY_KEYS
 from fitact.scene.sections import Section, field_unit
 from fitact.units import format_exact
 
@@ -66,9 +66,10 @@ def to_toml(scene: Section) -> str:
 
 def value_text(value: Any, unit: str | None) -> str:
     """Return a value as TOML; `unit` is the unit of numbers, or None."""
-    if isinstance(value, PriorSpec):
-        stated = {key: x for key, x in value if key in value.model_fields_set}
-        return _inline_table({key: value_text(x, unit if key in QUANTITY_KEYS else None) for key, x in stated.items()})
+    if isinstance(value, Section):
+        fields, stated = type(value).model_fields, {key: x for key, x in value if key in value.model_fields_set}
+        units = {key: unit if key in QUANTITY_KEYS else field_unit(fields[key]) for key in stated}
+        return _inline_table({key: value_text(x, units[key]) for key, x in stated.items()})
     if isinstance(value, dict):
         return _inline_table({key: value_text(x, unit) for key, x in value.items()})
     if isinstance(value, tuple):
@@ -79,7 +80,8 @@ def value_text(value: Any, unit: str | None) -> str:
 
 
 def _inline_table(items: dict[str, str]) -> str:
-    return f"{{{', '.join(f'{key} = {text}' for key, text in items.items())}}}"
+    keys = {key: key if re.fullmatch(r"[\w-]+", key) else json.dumps(key) for key in items}
+    return f"{{{', '.join(f'{keys[key]} = {text}' for key, text in items.items())}}}"
 
 
 def find_line(text: str, sentence: str) -> int | None:

@@ -1,0 +1,124 @@
+"""Section [instrument] of a scene file: the equipment of each channel, and certificates that replace its class."""
+
+import difflib
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from fitact.instrument.classes import CLASSES
+from fitact.instrument.pieces import Piece
+from fitact.prior.distributions import Distribution, LogNormal, Uniform
+from fitact.prior.published import Layer
+from fitact.scene.prior_section import FaradPriorSpec, OhmPriorSpec
+from fitact.scene.sections import Section, Unit
+
+Ratio = Annotated[float, Unit(""), Field(gt=0, lt=1)]
+
+
+class ErrorSpec(Section):
+    """Relative error: limits (uniform), or an expanded uncertainty with its coverage factor (normal)."""
+
+    tolerance: Ratio | None = None
+    expanded: Ratio | None = None
+    k: Annotated[float, Field(gt=0)] | None = None
+
+    @model_validator(mode="after")
+    def _check_form(self) -> Self:
+        if self.model_fields_set not in ({"tolerance"}, {"expanded", "k"}):
+            raise ValueError("write {tolerance} for limits, or {expanded, k} for a certificate")
+        return self
+
+    def distribution(self) -> Distribution:
+        """Return the distribution of the factor between indicated and true values."""
+        if self.expanded is not None and self.k is not None:
+            return LogNormal(1.0, self.expanded / self.k)
+        return Uniform.with_tolerance(1.0, self.tolerance or 0.0)
+
+
+class CertificateSpec(Section):
+    """Errors of one piece, which replace those of its class; `gain_common` is shared by the channels of an instrument.
+
+    `resistance` and `capacitance` are those of its input.
+    """
+
+    gain: ErrorSpec | None = None
+    gain_common: ErrorSpec | None = None
+    resistance: OhmPriorSpec | None = None
+    capacitance: FaradPriorSpec | None = None
+
+
+class InstrumentSection(Section):
+    """Pieces of equipment that each channel passes through, as "class:piece"."""
+
+    V: tuple[str, ...] = ()
+    Vsc: tuple[str, ...] = ()
+    I: tuple[str, ...] = ()  # noqa: E741  (the name of the channel)
+    own: dict[str, CertificateSpec] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _check_pieces(self) -> Self:
+        classes: dict[str, str] = {}
+        for channel in ("V", "Vsc", "I"):
+            for name in getattr(self, channel):
+                kind, colon, piece = name.partition(":")
+                if not colon or not piece:
+                    raise ValueError(
+                        f"[instrument] {channel}: '{name}' is not 'class:piece', such as 'probe-10x:P1'; name the piece"
+                    )
+                if kind not in CLASSES:
+                    near = difflib.get_close_matches(kind, CLASSES, n=1)
+                    hint = f"did you mean '{near[0]}'? " if near else ""
+                    raise ValueError(
+                        f"[instrument] {channel}: '{kind}' is not a class; {hint}known: {', '.join(CLASSES)}"
+                    )
+                if classes.setdefault(piece, kind) != kind:
+                    raise ValueError(
+                        f"[instrument] piece '{piece}' is named with two classes, {classes[piece]} and {kind}; name it"
+                        " with one"
+                    )
+        known = {f"{kind}:{part}" for piece, kind in classes.items() for part in (piece, piece.partition("/")[0])}
+        for name, certificate in self.own.items():
+            if name not in known:
+                raise ValueError(
+                    f"[instrument.own] '{name}' is no piece of a channel; known: {', '.join(sorted(known)) or 'none'}"
+                )
+            for key in ("resistance", "capacitance"):
+                spec = getattr(certificate, key)
+                if spec is not None and (not spec.is_free or spec.table is not None):
+                    raise ValueError(
+                        f"[instrument.own] '{name}' {key}: write {{nominal, tolerance}} or {{median, relative_sd}}"
+                    )
+        return self
+
+    @property
+    def is_stated(self) -> bool:
+        """Whether any channel has a piece."""
+        return bool(self.V or self.Vsc or self.I)
+
+    def describe_channels(self, name: str) -> str:
+        """Return the channels that a piece, or an instrument with such channels, belongs to, as "V and Vsc"."""
+        channels = [
+            c for c in ("V", "Vsc", "I") if any(n in (name, f"{name}/{n.partition('/')[2]}") for n in getattr(self, c))
+        ]
+        return " and ".join(channels)
+
+    def pieces(self, channel: str) -> tuple[Piece, ...]:
+        """Return the pieces of a channel, and what its instruments share, in the order of the file."""
+        found: dict[str, Piece] = {}
+        for name in getattr(self, channel):
+            instrument = name.partition("/")[0]
+            if instrument != name and (shared := self.own.get(instrument)) is not None and shared.gain_common:
+                gain = shared.gain_common.distribution()
+                found[instrument] = Piece(instrument, gain, None, None, "certificate")
+            found[name] = self._apply_certificate(Piece.from_class(name))
+        return tuple(found.values())
+
+    def _apply_certificate(self, piece: Piece) -> Piece:
+        own = self.own.get(piece.name)
+        if own is None:
+            return piece
+        resistance, capacitance = (
+            None if spec is None else spec.distribution(name, None, Layer(1.0, 1.0, 1.0))  # no table, so no layer
+            for name, spec in (("resistance", own.resistance), ("capacitance", own.capacitance))
+        )
+        return piece.replace_errors(None if own.gain is None else own.gain.distribution(), resistance, capacitance)
