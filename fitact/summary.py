@@ -8,7 +8,7 @@ import platform
 import re
 import shlex
 import statistics
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -150,7 +150,8 @@ def quantity_table(content: dict[str, Any]) -> list[tuple[str, ...]]:
     """Return rows of all quantities for people, the first of them titles; a row of one cell is a heading.
 
     `content` is that of fit.json or summary.json. Cells: name, estimate with standard deviation, 90 % interval, the
-    fraction of the variance of the logarithm that comes from the prior, description.
+    combined relative standard uncertainty, the fraction of the variance of the logarithm that comes from the prior,
+    description.
     """
     summaries = content["parameters"] | content["derived"]
     groups: dict[str, list[tuple[str, ...]]] = {"circuit": [], "computed, not measured": [], "measurement": []}
@@ -161,8 +162,8 @@ def quantity_table(content: dict[str, Any]) -> list[tuple[str, ...]]:
         groups[group].append(_quantity_row(name, s, content["force_basis"]))
     for name, s in content.get("nuisances", {}).items():
         value = format_engineering(s["value"], s["unit"], 3)
-        groups["measurement"].append((name, value, "", "", describe_quantity(name)))
-    rows: list[tuple[str, ...]] = [("", "estimate ± 1 sd", "90 % interval", "from the prior")]
+        groups["measurement"].append((name, value, "", "", "", describe_quantity(name)))
+    rows: list[tuple[str, ...]] = [("", "estimate ± 1 sd", "90 % interval", "combined u", "from the prior")]
     for heading, group_rows in groups.items():
         rows += [(heading,), *group_rows] if group_rows else []
     return rows
@@ -174,9 +175,10 @@ def _quantity_row(name: str, summary: Summary, basis: dict[str, Any]) -> tuple[s
     if name == "friction_mean" and defaults:
         value = format_engineering(float(f"{summary['q50']:.2g}"), str(summary["unit"]))
         assumed = ", ".join(f"{a['symbol']} = {a['text']}" for a in defaults)
-        return name, f"about {value}", "", "", f"{remark}; default {assumed}"
+        return name, f"about {value}", "", "", "", f"{remark}; default {assumed}"
     fraction = format_percent(round(float(summary["from_prior"]), 3)) if "from_prior" in summary else ""
-    return name, format_estimate(summary), format_interval(summary), fraction, remark
+    combined = format_percent(u) if math.isfinite(u := float(summary.get("u", math.inf))) else ""
+    return name, format_estimate(summary), format_interval(summary), combined, fraction, remark
 
 
 def force_sentences(basis: dict[str, Any]) -> list[str]:
@@ -196,6 +198,59 @@ def force_sentences(basis: dict[str, Any]) -> list[str]:
     return sentences
 
 
+def budget_sentence(content: dict[str, Any]) -> str:
+    """Return what the stated uncertainties include; `content` is that of fit.json or summary.json."""
+    entries = content.get("budget") or {}
+    if not entries:
+        return ""
+    head = "Uncertainties: noise, priors and the stated instruments; u combines all sources (fitact budget)."
+    if not any(entry["stated"] for entry in entries.values()):
+        head = "Uncertainties: noise and prior only; no instrument stated."
+    missing = entries["g"]["not_stated"]
+    if not missing:
+        return head
+    added = [
+        f"{format_percent(u)} to {name}"
+        for name, entry in entries.items()
+        if name in ("g", "Rsc", "Csc", "Ci", "force_mean")
+        and (u := math.hypot(*(each["u"] for each in entry["not_stated"]))) > 1e-4
+    ]
+    equipment = ", ".join(f"{each['source']} ({each['typical']})" for each in missing)
+    return f"{head} Not stated: {equipment}; usual ones would add {', '.join(added)}. State yours under [instrument]."
+
+
+def budget_table(name: str, entry: dict[str, Any], min_share: float = 0.001) -> list[tuple[str, ...]]:
+    """Return rows of the uncertainty budget of a quantity, titles first, largest component first.
+
+    `entry` is that of the quantity in `budget` of fit.json or summary.json. Sources below `min_share` of the variance
+    are one row.
+    """
+    rows: list[tuple[str, ...]] = [(name, "type", "u(x)", "sensitivity", "component", "share")]
+    small = [each for each in entry["components"] if each["share"] < min_share]
+    for each in entry["components"]:
+        if each["share"] >= min_share:
+            sensitivity = "" if each["type"] == "A" else f"{each['sensitivity']:+.2g}"
+            cells = (each["type"], format_percent(each["input_u"]), sensitivity, format_percent(each["u"]))
+            rows.append((each["source"], *cells, format_percent(each["share"]), each["reduce_by"]))
+    if small:
+        u, share = math.hypot(*(each["u"] for each in small)), sum(each["share"] for each in small)
+        rows.append((f"{len(small)} smaller sources", "", "", "", format_percent(u), format_percent(share), ""))
+    for each in entry["not_stated"]:
+        added = f"usual equipment ({each['typical']}) would add {format_percent(each['u'])}"
+        rows.append((f"{each['source']}: not stated", "", "", "", "none", "", added))
+    low, high = entry["interval95"]
+    interval = format_range(low, high, 0.25 * (high - low), quantity_unit(name))
+    rows.append(("combined", "", "", "", format_percent(entry["u"]), "", f"95 % interval {interval}"))
+    return rows
+
+
+def budget_text(content: dict[str, Any], names: Sequence[str] = ()) -> str:
+    """Return the uncertainty budgets of the quantities `names`, or of all, for people."""
+    entries = content["budget"]
+    tables = ["\n".join(align_table(budget_table(name, entries[name]))) for name in names or entries]
+    return "\n\n".join([budget_sentence(content), *tables])
+
+
 def load(directory: str | os.PathLike[str]) -> dict[str, Any]:
     """Read summary.json from a folder that `fitact sample` or `fitact run` wrote."""
     try:
@@ -211,7 +266,8 @@ def load(directory: str | os.PathLike[str]) -> dict[str, Any]:
 
 def format_table(content: dict[str, Any]) -> list[str]:
     """Return the lines of `quantity_table`, and what the force rests on."""
-    return [*align_table(quantity_table(content)), *force_sentences(content["force_basis"])]
+    sentences = filter(None, (budget_sentence(content), *force_sentences(content["force_basis"])))
+    return [*align_table(quantity_table(content)), *sentences]
 
 
 def result_names(content: dict[str, Any]) -> list[str]:

@@ -11,6 +11,7 @@ from fitact import what_now
 from fitact.cli import internal, options
 from fitact.cli.app import app
 from fitact.cli.terminal import announce, command_line, print_stderr, show
+from fitact.errors import InputError
 from fitact.files import write_json
 
 if TYPE_CHECKING:
@@ -116,6 +117,24 @@ def summary(directory: options.Results, json: options.Json = False) -> None:
     """Print the table of results that `run` or `sample` wrote into DIR."""
     content = internal.summary.load(directory)
     show(internal.summary.table(content), content, json, internal.summary.is_trusted(content))
+
+
+@app.command()
+def budget(
+    directory: options.Results,
+    quantity: Annotated[
+        list[str] | None, typer.Option("--quantity", help="Quantity, e.g. force_mean; repeat for more. Default: all.")
+    ] = None,
+    json: options.Json = False,
+) -> None:
+    """Print the uncertainty budgets of the results in DIR: what each source of error contributes."""
+    content = internal.summary.load(directory)
+    names = quantity or list(content["budget"])
+    for name in names:
+        if name not in content["budget"]:
+            raise InputError(f"--quantity {name}: there is no such budget; known: {', '.join(content['budget'])}")
+    chosen = {name: content["budget"][name] for name in names}
+    show(internal.summary.budget_text(content, names), chosen, json, internal.summary.is_trusted(content))
 
 
 @app.command()

@@ -1,6 +1,7 @@
 """Fit records: parameters, their covariance, and whether the fit is reliable."""
 
 import dataclasses
+import functools
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -17,6 +18,7 @@ from fitact.experiment.fisher import Experiment, covariance_factor
 from fitact.fitting import derived, remarks
 from fitact.fitting.channel_fit import ChannelFit, information_criteria
 from fitact.fitting.drive_choice import DriveModel
+from fitact.fitting.error_sources import list_error_sources
 from fitact.fitting.identifiability import assess_identifiability
 from fitact.fitting.laplace import FitResult, Laplace
 from fitact.fitting.least_squares import LeastSquaresResult, solve
@@ -26,11 +28,14 @@ from fitact.fitting.problem import Problem, build_problem
 from fitact.fitting.profile import PROFILE_QUANTITIES, Interval, profile_intervals
 from fitact.fitting.residual_statistics import pooled_statistics
 from fitact.fitting.verdict import diagnose_fit, misfit_warnings
+from fitact.instrument.classes import TYPICAL, typical_gain_u
 from fitact.likelihood import certificate
+from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import scale_information
 from fitact.model.skin import constant_skin_circuit
 from fitact.scene.scene import Scene
 from fitact.tables import join_lines
+from fitact.uncertainty.budget import Budget, ErrorSource, laplace_components
 
 _SKIN = ("Rsc", "Csc", "Ci")
 _RESPONSE = {
@@ -48,11 +53,49 @@ class Fit(FitResult):
         traces: the fitted channels of each record.
         compression_error: error of the compressed log-likelihood near the optimum; None if all samples are summed.
         experiment: the measurement at the optimum, for designs.
+        error_sources: sources of error of each coordinate of theta.
+        noise_information: root of the Fisher information of each source of noise.
+        gain_shifts: change of theta for a relative error of 1 in the gain of V, Vsc or I that nobody stated.
     """
 
     traces: tuple[ChannelFit, ...]
     compression_error: float | None
     experiment: Experiment
+    error_sources: tuple[tuple[ErrorSource, ...], ...]
+    noise_information: dict[str, Float[np.ndarray, "rows parameters"]]
+    gain_shifts: dict[str, Float[np.ndarray, " parameters"]]
+
+    @functools.cached_property
+    def budgets(self) -> dict[str, Budget]:
+        """Uncertainty budgets of the free parameters of the skin and insulator, and of the derived quantities."""
+        roots = self.covariance_root, self.likelihood.prior_factor
+        return {
+            name: Budget(laplace_components(gradient, *roots, self.error_sources, self.noise_information))
+            for name, gradient in self._gradients.items()
+        }
+
+    @property
+    def _gradients(self) -> dict[str, Float[np.ndarray, " parameters"]]:
+        """Gradients of the logarithms of the quantities with a budget, in theta."""
+        gradients = dict(zip(self.names, np.eye(self.theta.size), strict=True))
+        derivatives = zip(derived.DERIVED_NAMES, self.laplace.log_derived[1], strict=True)
+        return {name: gradients[name] for name in _SKIN if name in gradients} | dict(derivatives)
+
+    def calibration_entry(self, name: str) -> dict[str, Any]:
+        """Return `stated` and `not_stated` of the budget of a quantity: gain errors that nobody stated."""
+        section, measurement = self.scene.instrument, self.scene.measurement
+        stated = {"Vsc": measurement.gain_relative_sd > 0.0, "I": measurement.gain_I_relative_sd > 0.0}
+        gradient, entries = self._gradients[name], []
+        for channel, shift in self.gain_shifts.items():
+            if section.pieces(channel) or stated.get(channel):
+                continue
+            # the force is computed from V, beside the parameters that follow from it
+            direct = 2.0 if channel == "V" and name.startswith("force") else 0.0
+            u = typical_gain_u(channel)
+            typical = " and ".join(TYPICAL[channel])
+            entries.append({"source": f"{channel} gain", "typical": typical, "input_u": u})
+            entries[-1]["u"] = abs(float(gradient @ shift) + direct) * u
+        return {"stated": section.is_stated, "not_stated": entries}
 
     @property
     def record(self) -> Record:
@@ -338,4 +381,31 @@ def _assemble_fit(
         traces=traces,
         compression_error=certified.error,
         experiment=experiment,
+        error_sources=list_error_sources(likelihood, problem.gains, first.scene),
+        noise_information=_noise_information(likelihood, solution),
+        gain_shifts=_gain_shifts(likelihood, solution, root),
     )
+
+
+def _noise_information(
+    likelihood: Likelihood, solution: LeastSquaresResult
+) -> dict[str, Float[np.ndarray, "rows parameters"]]:
+    """Return roots of the Fisher information of the noise of all channels of a kind."""
+    by_kind: dict[str, list[np.ndarray]] = {}
+    for channel, jacobian in zip(likelihood.channels, solution.jacobian, strict=True):
+        by_kind.setdefault(f"noise of {channel.channel}", []).append(np.asarray(np.linalg.qr(jacobian, mode="r")))
+    return {name: np.concatenate(parts) for name, parts in by_kind.items()}
+
+
+def _gain_shifts(
+    likelihood: Likelihood, solution: LeastSquaresResult, root: Float[np.ndarray, "parameters parameters"]
+) -> dict[str, Float[np.ndarray, " parameters"]]:
+    """Return the change of the optimum for a relative error of 1 in the gains of V, Vsc and I, to first order."""
+    shifts = {"V": np.zeros(len(root))}
+    parts = zip(likelihood.channels, solution.jacobian, solution.signal, solution.sigma, strict=True)
+    for channel, jacobian, signal, sigma in parts:
+        # the Jacobian is that of data minus model
+        shift = -root @ (root.T @ (jacobian[: signal.size].T @ signal)) / sigma
+        shifts[channel.channel] = shifts.get(channel.channel, 0.0) + shift
+        shifts["V"] -= shift
+    return shifts

@@ -18,6 +18,7 @@ from fitact.model.force import ForceModel
 from fitact.model.skin import constant_skin_circuit
 from fitact.scene.assumptions import list_assumptions
 from fitact.scene.scene import Scene
+from fitact.uncertainty.budget import Budget
 from fitact.units import quantity_unit
 
 SUCCESS_MESSAGE = "The fit converged, and the residuals are consistent with the noise."
@@ -115,8 +116,25 @@ class FitResult(abc.ABC):
         """The derived quantities as functions of theta."""
         return self.laplace.derive
 
+    @functools.cached_property
+    def budgets(self) -> dict[str, Budget]:
+        """Uncertainty budgets of the circuit's parameters and of the derived quantities; none for a spectrum."""
+        return {}
+
+    def _summarize(self, name: str, value: float, log_sd: float) -> summary.Summary:
+        """Summarize a positive quantity, with the shape of the distributions of its sources of error."""
+        result = summary.summarize_log_normal(name, value, log_sd)
+        budget = self.budgets.get(name)
+        if budget is not None and math.isfinite(log_sd):
+            probabilities = summary.PROBABILITIES
+            factors = budget.quantiles(probabilities.values(), only_posterior=True)
+            result |= dict(zip(probabilities, (value * factors).tolist(), strict=True))
+        return result | {"u": log_sd if budget is None else budget.u}
+
     def parameters(self) -> dict[str, summary.Summary]:
         """Summarize the parameters in the Laplace approximation.
+
+        `u` is the combined relative standard uncertainty; `sd` is that of the posterior alone.
 
         `contraction` is 1 - posterior sd / prior sd of the logarithm; `from_prior` is the fraction of the variance of
         the logarithm that comes from the prior.
@@ -126,9 +144,11 @@ class FitResult(abc.ABC):
         for i, name in enumerate(self.names):
             value, sd = float(values[name]), float(self.sd[i])
             if name in timing:
-                summaries[name] = summary.summarize_normal(name, value, sd * timing[name][1])
+                absolute = sd * timing[name][1]
+                summaries[name] = summary.summarize_normal(name, value, absolute)
+                summaries[name]["u"] = absolute / abs(value) if value else math.inf
             else:
-                summaries[name] = summary.summarize_log_normal(name, value, sd)
+                summaries[name] = self._summarize(name, value, sd)
                 if self.likelihood.use_prior or name.startswith("gain"):
                     summaries[name]["contraction"] = float(1.0 - sd / self.likelihood.prior.log_sd[i])
             summaries[name]["from_prior"] = float(from_prior[i])
@@ -139,9 +159,20 @@ class FitResult(abc.ABC):
         logs, gradients = self.laplace.log_derived
         columns = logs, self.laplace.derived_log_sd, self.laplace.variance_from_prior(gradients)
         return {
-            name: summary.summarize_log_normal(name, math.exp(log), float(sd)) | {"from_prior": float(fraction)}
+            name: self._summarize(name, math.exp(log), float(sd)) | {"from_prior": float(fraction)}
             for name, log, sd, fraction in zip(derived.DERIVED_NAMES, *columns, strict=True)
         }
+
+    def budget_entries(self) -> dict[str, Any]:
+        """Return `budget` of fit.json."""
+        medians = self.likelihood.to_physical(self.theta)
+        medians |= dict(zip(derived.DERIVED_NAMES, np.exp(self.laplace.log_derived[0]), strict=True))
+        budgets = self.budgets.items()
+        return {name: each.to_dict(float(medians[name])) | self.calibration_entry(name) for name, each in budgets}
+
+    def calibration_entry(self, name: str) -> dict[str, Any]:
+        """Return `stated` and `not_stated` of the budget of a quantity: gain errors that nobody stated."""
+        return {"stated": self.scene.instrument.is_stated, "not_stated": []}
 
     @property
     @abc.abstractmethod
@@ -203,6 +234,7 @@ class FitResult(abc.ABC):
             "fit": self.judgement(),
             "model": self.model(),
             "force_basis": self.force_basis,
+            "budget": self.budget_entries(),
             "warnings": list(self.warnings),
             "notes": list(self.notes),
         }

@@ -36,10 +36,11 @@ class LeastSquaresResult:
     result: str  # name of a member of `RESULTS`
     steps: int  # total number of trial steps
     jacobian: tuple[Float[np.ndarray, "rows parameters"], ...]  # Jacobian of the whitened residuals
-    # under Student's t, the residuals, the shapes, the slopes and the Jacobian are reweighted
+    # under Student's t, all of these are reweighted
     residuals: tuple[Float[np.ndarray, " rows"], ...]
     shapes: tuple[Float[np.ndarray, "columns rows"], ...]  # regressors of the linear nuisances
     slope: tuple[Float[np.ndarray, " rows"], ...]  # derivative of the signal with respect to the delay
+    signal: tuple[Float[np.ndarray, " rows"], ...]  # without linear nuisances
 
 
 class _Round(NamedTuple):
@@ -53,6 +54,7 @@ class _Round(NamedTuple):
     residuals: tuple[Array, ...]
     shapes: tuple[Array, ...]
     slope: tuple[Array, ...]
+    signal: tuple[Array, ...]
 
 
 def least_squares(
@@ -82,9 +84,10 @@ def _solve_round(likelihood: Likelihood, start: Array, sigma: Array) -> _Round:
     for (channel, inputs), s in zip(likelihood.channels_and_inputs(theta), sigma, strict=True):
         residuals = channel.fit_nuisances(inputs, s)[0]
         factor = jnp.sqrt(student_weight(residuals / s)) if channel.is_student else 1.0
-        shapes, slope = channel.residuals_and_shapes(inputs)[1], channel.whitened_delay_derivative(inputs)
+        remainder, shapes = channel.residuals_and_shapes(inputs)
+        signal, slope = channel.whitened_observed() - remainder, channel.whitened_delay_derivative(inputs)
         sigma_new = _noise(channel, residuals, fraction) if channel.expansion is None else channel.expansion.sigma
-        parts.append((residuals, sigma_new, factor * residuals, factor * shapes, factor * slope))
+        parts.append((residuals, sigma_new, *(factor * x for x in (residuals, shapes, slope, signal))))
     unweighted, noise, *weighted = zip(*parts, strict=True)
     if any(channel.is_student for channel in likelihood.channels):
         jacobians = _information_jacobian(likelihood, theta, sigma, unweighted)

@@ -1,6 +1,7 @@
 """Classes of instruments with the limits of error that their makers specify."""
 
 import dataclasses
+import math
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,3 +45,12 @@ CLASSES = {
     "shunt-1%": InstrumentClass("the tolerance of the resistor", gain=0.01),
     "shunt-0.1%": InstrumentClass("the tolerance of the resistor", gain=0.001),
 }
+
+# equipment of a channel for which nobody states any, as an example of what it adds
+TYPICAL = {"V": ("scope-8bit", "probe-10x"), "Vsc": ("scope-8bit", "probe-10x"), "I": ("scope-8bit", "shunt-1%")}
+
+
+def typical_gain_u(channel: str) -> float:
+    """Return the relative standard uncertainty of the gain of a channel with `TYPICAL` equipment."""
+    limits = (CLASSES[name].gain or 0.0 for name in TYPICAL[channel])
+    return math.hypot(*limits) / math.sqrt(3.0)  # of uniform distributions

@@ -11,11 +11,21 @@ from markdown_it import MarkdownIt
 from markupsafe import Markup
 
 from fitact.errors import InputError
+from fitact.report.budget import draw_budgets
 from fitact.report.circuit import scene_circuit, scene_wiring
-from fitact.report.frame import write_page
+from fitact.report.frame import image, write_page
 from fitact.report.posterior import CHANNELS, make_charts
 from fitact.scene.scene import Scene
-from fitact.summary import force_sentences, format_estimate, format_interval, load, quantity_table, result_names
+from fitact.summary import (
+    budget_sentence,
+    budget_table,
+    force_sentences,
+    format_estimate,
+    format_interval,
+    load,
+    quantity_table,
+    result_names,
+)
 from fitact.what_now import explain
 
 _CIRCUITS = {
@@ -42,6 +52,9 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
             drawings=(scene_circuit(scene, medians), scene_wiring(scene)),
             table=quantity_table(summary),
             channels=CHANNELS,
+            budgets=[budget_table(name, entry) for name, entry in summary["budget"].items()],
+            budget_note=budget_sentence(summary),
+            budget_picture=image(lambda: draw_budgets(summary["budget"])),
             force=force_sentences(summary["force_basis"]),
             circuits=_CIRCUITS,
             estimate=format_estimate,

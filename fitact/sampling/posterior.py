@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import functools
 import importlib.metadata
+import math
 import os
 from typing import Any, Self
 
@@ -23,6 +24,7 @@ from fitact.likelihood.noise import draw_noise
 from fitact.model_selection.plan import Plan
 from fitact.sampling.chain import Chain
 from fitact.sampling.convergence import Convergence
+from fitact.uncertainty.budget import Budget
 from fitact.units import quantity_unit
 
 
@@ -126,6 +128,11 @@ class Posterior:
         summaries = {name: summary.summarize_draws(name, draws) for name, draws in (drawn | self.derived()).items()}
         for name, fitted in (self.fit.parameters() | self.fit.derived()).items():
             summaries[name]["from_prior"] = fitted["from_prior"]
+        budgets = self._budgets
+        for name, draws in (drawn | self.derived()).items():
+            mean, sd = float(np.mean(draws)), float(np.std(draws, ddof=1))
+            relative = sd / abs(mean) if mean else math.inf
+            summaries[name]["u"] = budgets[name].u if name in budgets else relative
         for name, prior_sd in zip(prior.names, prior.log_sd, strict=True):
             summaries[name]["contraction"] = float(1.0 - np.std(np.log(drawn[name]), ddof=1) / prior_sd)
         return {
@@ -136,6 +143,7 @@ class Posterior:
             "fit": self.fit.judgement(),
             "model": self.fit.model(),
             "force_basis": self.fit.force_basis,
+            "budget": self._budget_entries(),
             "warnings": list(self.warnings),
             "notes": list(self.fit.notes),
             "seed": self.seed,
@@ -143,6 +151,22 @@ class Posterior:
             "scene": self.fit.scene.model_dump(mode="json", exclude_unset=True),
             "versions": summary.versions(),
         }
+
+    @functools.cached_property
+    def _budgets(self) -> dict[str, Budget]:
+        """Budgets of the fit, with the standard deviations of the draws."""
+        draws = self.parameters() | self.derived()
+        budgets = self.fit.budgets.items()
+        return {name: each.scale_posterior(float(np.std(np.log(draws[name]), ddof=1))) for name, each in budgets}
+
+    def _budget_entries(self) -> dict[str, Any]:
+        """Return `budget` of summary.json; its intervals come from the draws."""
+        draws, entries = self.parameters() | self.derived(), {}
+        for name, each in self._budgets.items():
+            factors = each.draw_others(np.random.default_rng([self.seed, 5]), draws[name].shape)
+            low, high = np.quantile(draws[name] * factors, (0.025, 0.975)).tolist()
+            entries[name] = each.to_dict(float(np.median(draws[name])), (low, high)) | self.fit.calibration_entry(name)
+        return entries
 
     def _record(self) -> dict[str, Any]:
         records = self.fit.records

@@ -1,0 +1,165 @@
+"""Uncertainty budget: the contribution of each source of error to the uncertainty of a quantity.
+
+In the Laplace approximation, the error of ln q is a sum of independent errors. The component of an error x with the
+standard uncertainty u(x) is Cov(ln q, x) / u(x), and noise contributes its own. Their squares add up to the square of
+the combined standard uncertainty of ln q, also where the data have determined a part of x.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import scipy.sparse.csgraph
+from jaxtyping import Float
+from scipy.special import ndtri
+
+from fitact.prior.distributions import Distribution, LogNormal
+from fitact.prior.product import multiply
+
+
+class ErrorSource(NamedTuple):
+    """A source of error and the distribution of the factor, or of the quantity, that it makes uncertain."""
+
+    name: str
+    distribution: Distribution
+    reduce_by: str = ""  # cheapest way to reduce it
+    power: float = 1.0  # of the factor in the parameter
+
+
+@dataclasses.dataclass(frozen=True)
+class Component:
+    """Contribution of one source to the uncertainty of the logarithm of a quantity."""
+
+    source: str
+    type: Literal["A", "B"]  # A: from repeated observations; B: from other knowledge (JCGM 100:2008, 3.3.4)
+    input_u: float  # standard uncertainty of the source, relative
+    sensitivity: float  # d ln q / d ln x; the component is its product with `input_u`
+    distribution: Distribution | None = None  # of the source; None means normal
+    reduce_by: str = ""
+    in_posterior: bool = True  # whether the posterior includes it
+
+    @property
+    def u(self) -> float:
+        """Component of the standard uncertainty of ln q."""
+        return abs(self.sensitivity) * self.input_u
+
+
+@dataclasses.dataclass(frozen=True)
+class Budget:
+    """Sources of the uncertainty of one quantity."""
+
+    components: tuple[Component, ...]
+
+    @property
+    def u(self) -> float:
+        """Combined standard uncertainty of the logarithm of the quantity."""
+        return math.hypot(*(component.u for component in self.components))
+
+    def scale_posterior(self, log_sd: float) -> "Budget":
+        """Return the budget with the posterior's components scaled to the standard deviation `log_sd` of its draws."""
+        expected = math.hypot(*(each.u for each in self.components if each.in_posterior))
+        factor = log_sd / expected if expected > 0.0 else 1.0
+        scaled = (
+            dataclasses.replace(each, sensitivity=factor * each.sensitivity) if each.in_posterior else each
+            for each in self.components
+        )
+        return Budget(tuple(scaled))
+
+    def draw_others(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.ndarray, "*shape"]:
+        """Return draws of the factor by which the sources beyond the posterior change the quantity."""
+        logs = np.zeros(shape)
+        for each in self.components:
+            if not each.in_posterior:
+                z = rng.standard_normal(shape)
+                x = each.distribution
+                deviation = each.input_u * z if x is None else np.asarray(x.from_standard_normal(z)) - x.log_mean
+                logs += each.sensitivity * deviation
+        return np.exp(logs)
+
+    def quantiles(
+        self, probabilities: Iterable[float], *, only_posterior: bool = False, min_part: float = 0.1
+    ) -> Float[np.ndarray, " n"]:
+        """Return quantiles of the quantity over its estimate, from the convolution of all components.
+
+        Components below `min_part` of the total hardly change the shape, and count as normal.
+        """
+        chosen = [each for each in self.components if each.in_posterior or not only_posterior]
+        total, z = math.hypot(*(each.u for each in chosen)), ndtri(np.array(list(probabilities)))
+        shaped = [
+            (each.distribution, each.sensitivity)
+            for each in chosen
+            if each.distribution is not None
+            and not isinstance(each.distribution, LogNormal)
+            and each.u > min_part * total
+        ]
+        if not shaped:
+            return np.exp(total * z)
+        rest = math.sqrt(max(total**2 - sum((power * x.log_sd) ** 2 for x, power in shaped), 0.0))
+        normal = [(LogNormal(1.0, rest), 1.0)] if rest > 1e-3 * total else []  # a narrower one has no effect
+        product = multiply([*normal, *shaped])
+        return np.exp(np.asarray(product.from_standard_normal(z)) - product.log_mean)
+
+    def to_dict(self, median: float, interval: tuple[float, float] | None = None) -> dict[str, Any]:
+        """Return the entry of a quantity in `budget` of fit.json and summary.json, largest component first."""
+        total = self.u
+        low, high = interval or (median * self.quantiles((0.025, 0.975))).tolist()
+        rows = [
+            {
+                "source": each.source,
+                "type": each.type,
+                "input_u": each.input_u,
+                "sensitivity": each.sensitivity,
+                "u": each.u,
+                "share": (each.u / total) ** 2 if total > 0.0 else 0.0,
+                "reduce_by": each.reduce_by,
+            }
+            for each in sorted(self.components, key=lambda each: -each.u)
+        ]
+        return {"u": total, "interval95": [low, high], "components": rows}
+
+
+def laplace_components(
+    gradient: Float[np.ndarray, " parameters"],
+    covariance_factor: Float[np.ndarray, "parameters parameters"],
+    prior_factor: Float[np.ndarray, "parameters parameters"],
+    sources: Sequence[Sequence[ErrorSource]],
+    noise: Mapping[str, Float[np.ndarray, "rows parameters"]],
+) -> tuple[Component, ...]:
+    """Return the components of a quantity whose logarithm has this `gradient` in the parameters.
+
+    `sources` holds the errors that each parameter is the product of. Parameters with correlated priors are one source.
+    `noise` holds a root of the information of each source of noise, such as the Jacobian of its whitened residuals.
+    """
+    covariance = covariance_factor @ (covariance_factor.T @ gradient)  # of ln q with each parameter
+    precision = np.linalg.inv(prior_factor @ prior_factor.T)
+    components = [_noise_component(name, float(np.linalg.norm(root @ covariance))) for name, root in noise.items()]
+    for block in _independent_blocks(precision):
+        part = covariance[block]
+        if len(block) > 1:
+            names = [source.name for i in block for source in sources[i]]
+            u = math.sqrt(part @ precision[np.ix_(block, block)] @ part)
+            components.append(Component(f"{' and '.join(names)} (correlated)", "B", u, 1.0))
+            continue
+        place, variance = block[0], 1.0 / precision[block[0], block[0]]
+        stated = sum((each.power * each.distribution.log_sd) ** 2 for each in sources[place])
+        for each in sources[place]:
+            u = float(
+                each.distribution.log_sd * math.sqrt(variance / stated)
+            )  # larger than its own in a fit without prior
+            # the product and each of its factors have the same sensitivity
+            sensitivity = float(each.power * part[0] / variance)
+            components.append(Component(each.name, "B", u, sensitivity, each.distribution, each.reduce_by))
+    return tuple(components)
+
+
+def _noise_component(name: str, u: float) -> Component:
+    return Component(name, "A", u, 1.0, None, "record longer: four times as much data halves it")
+
+
+def _independent_blocks(precision: Float[np.ndarray, "n n"]) -> list[list[int]]:
+    """Return the groups of parameters whose priors are correlated."""
+    root = np.sqrt(np.diagonal(precision))
+    _, labels = scipy.sparse.csgraph.connected_components(np.abs(precision) > 1e-9 * np.outer(root, root))
+    return [np.flatnonzero(labels == label).tolist() for label in np.unique(labels)]
