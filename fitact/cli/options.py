@@ -114,8 +114,16 @@ def column_options(columns: Columns) -> dict[str, Any]:
     return {
         "channels": parse_pairs("--channel Vsc=CH2", channels),
         "scale": parse_numbers("--scale Vsc=10", scale),
-        "rate": None if rate is None else parse_quantity(rate, "Hz"),
+        "rate": None if rate is None else parse_rate(rate),
     }
+
+
+def parse_rate(text: str) -> float:
+    """Parse the sampling rate (Hz) of --rate."""
+    try:
+        return parse_quantity(text, "Hz")
+    except InputError as error:
+        raise InputError(f"--rate: {error}") from error
 
 
 def parse_numbers(example: str, texts: list[str] | None) -> dict[str, float]:
