@@ -51,7 +51,7 @@ class Task:
     """Input of a worker in addition to the records."""
 
     scene: str | None  # scene as JSON; None means the device of the reference paper
-    columns: dict[str, Any]  # `channels` and `scale` of files, as in `fitact.read`
+    columns: dict[str, Any]  # `channels`, `scale` and `rate` of files, as in `fitact.read`
     reports: str | None  # folder for a posterior and a report of each record, or None
     seed: int  # seed of the sampling
     posteriors: bool = False  # whether rows are made by `sample_many` instead of `fit_many`
@@ -134,6 +134,7 @@ def run_campaign(
     *,
     channels: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
+    rate: float | None = None,
     scheduler: str | None = None,
     workers: int | None = None,
     memory: str = "2 GiB",
@@ -152,7 +153,7 @@ def run_campaign(
         records: paths, which must be accessible to workers on other machines.
         folder: folder for the results.
         scene: scene of all records.
-        channels, scale: channels of the files, as in `fitact.read`.
+        channels, scale, rate: channels and sampling rate of the files, as in `fitact.read`.
         scheduler: address of a Dask scheduler; None starts workers on this machine.
         workers: number of these workers, with one thread each; None means one for each core.
         memory: memory limit of each of these workers, above which it is restarted.
@@ -171,7 +172,7 @@ def run_campaign(
         if count > 1:
             raise InputError(f"{path}: is given twice; give each record once")
     out = Path(folder)
-    columns = {"channels": dict(channels or {}), "scale": dict(scale or {})}
+    columns = {"channels": dict(channels or {}), "scale": dict(scale or {}), "rate": rate}
     stated = None if scene is None else scene.to_json()
     task = Task(stated, columns, str(out / "reports") if reports else None, seed, posteriors)
     try:

@@ -129,6 +129,7 @@ def fit_many(
     *,
     channels: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
+    rate: float | None = None,
     whiteness: bool = True,
     progress: bool = True,
 ) -> Fits:
@@ -141,7 +142,7 @@ def fit_many(
     Args:
         records: records, or paths of files; consumed one by one.
         scene: scene of all records.
-        channels, scale: channels of the files, as in `fitact.read`.
+        channels, scale, rate: channels and sampling rate of the files, as in `fitact.read`.
         whiteness: whether to test the residuals of batches for structure. Without this test, a record is trusted if
             its residuals are no larger than its noise, and its `message` mentions the missing test.
         progress: whether to report the progress on standard error.
@@ -151,7 +152,7 @@ def fit_many(
     """
     make_rows = functools.partial(_fit_rows, scene=scene, whiteness=whiteness)
     title = "fitting the records" if progress else ""
-    return tabulate_records(records, scene, {"channels": channels, "scale": scale}, make_rows, title)
+    return tabulate_records(records, scene, {"channels": channels, "scale": scale, "rate": rate}, make_rows, title)
 
 
 def tabulate_records(

@@ -53,6 +53,7 @@ def sample_many(
     *,
     channels: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
+    rate: float | None = None,
     seed: int = 0,
     progress: bool = True,
 ) -> Fits:
@@ -70,7 +71,7 @@ def sample_many(
     Args:
         records: records, or paths of files; consumed one by one.
         scene: scene of all records.
-        channels, scale: channels of the files, as in `fitact.read`.
+        channels, scale, rate: channels and sampling rate of the files, as in `fitact.read`.
         seed: seed of the random numbers; the same seed gives the same rows.
         progress: whether to report the progress on standard error.
 
@@ -79,7 +80,7 @@ def sample_many(
     """
     make_rows = functools.partial(_sample_rows, scene=scene, seed=seed)
     title = "sampling the posteriors" if progress else ""
-    return tabulate_records(records, scene, {"channels": channels, "scale": scale}, make_rows, title)
+    return tabulate_records(records, scene, {"channels": channels, "scale": scale, "rate": rate}, make_rows, title)
 
 
 class _Targets(NamedTuple):

@@ -8,7 +8,7 @@ import typer
 import fitact
 from fitact import report
 from fitact.cli.app import app
-from fitact.cli.options import Channels, CommonScene, Json, Scales, Seed, column_options, load_scene
+from fitact.cli.options import Channels, CommonScene, Json, Rate, Scales, Seed, column_options, load_scene
 from fitact.cli.terminal import announce, command_line, show
 
 
@@ -19,6 +19,7 @@ def campaign(
     scene: CommonScene = None,
     channel: Channels = None,
     scale: Scales = None,
+    rate: Rate = None,
     scheduler: Annotated[
         str | None,
         typer.Option("--scheduler", metavar="ADDRESS", help="Address of a Dask scheduler, e.g. tcp://host:8786."),
@@ -45,7 +46,7 @@ def campaign(
     announce("fitting", records)
     loaded = load_scene(scene)
     fits = fitact.run_campaign(
-        records, out, loaded, **column_options((channel, scale)),
+        records, out, loaded, **column_options((channel, scale, rate)),
         scheduler=scheduler, workers=workers, memory=memory, posteriors=posteriors,
         reports=reports, seed=seed,
     )  # fmt: skip

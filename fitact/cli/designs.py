@@ -9,7 +9,7 @@ import fitact
 from fitact import report
 from fitact.cli import internal
 from fitact.cli.app import app
-from fitact.cli.options import Channels, Json, LazyRecords, Out, Scales, Seed
+from fitact.cli.options import Channels, Json, LazyRecords, Out, Rate, Scales, Seed
 from fitact.cli.terminal import announce, command_line, show
 
 design = typer.Typer(
@@ -29,6 +29,7 @@ def measurement(
     ] = None,
     channel: Channels = None,
     scale: Scales = None,
+    rate: Rate = None,
     out: Out = None,
     json: Json = False,
 ) -> None:
@@ -38,7 +39,7 @@ def measurement(
     """
     announce("ranking measurements for", [scene])
     stated = fitact.Scene.load(scene)
-    measured = list(LazyRecords(record, stated, (channel, scale)))  # refuses bad records before the slow imports
+    measured = list(LazyRecords(record, stated, (channel, scale, rate)))  # refuses bad records before the slow imports
     options = fitact.design_measurement(stated, measured)
     if out is not None:
         report.write_folder(out, options, command_line(), stated, measured)
@@ -57,6 +58,7 @@ def drive(
     share: Annotated[float, typer.Option("--share", help="Fraction of fingers that should feel the drive.")] = 0.95,
     channel: Channels = None,
     scale: Scales = None,
+    rate: Rate = None,
     out: Out = None,
     seed: Seed = 0,
     json: Json = False,
@@ -68,7 +70,7 @@ def drive(
     """
     announce("designing a drive for", [scene])
     stated = fitact.Scene.load(scene)
-    measured = LazyRecords(records, stated, (channel, scale))
+    measured = LazyRecords(records, stated, (channel, scale, rate))
     internal.require_designable(stated, share)  # refuses before the population is sampled
     people = fitact.population(measured, stated, folder=out, seed=seed) if measured else None
     options = fitact.design_drive(stated, people, share, seed=seed)

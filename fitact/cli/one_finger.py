@@ -25,6 +25,7 @@ def run(
     scene: options.SceneFiles = None,
     channel: options.Channels = None,
     scale: options.Scales = None,
+    rate: options.Rate = None,
     out: options.RecordOut = None,
     level: options.Level = "emcee",
     model: options.Model = "planned",
@@ -40,7 +41,7 @@ def run(
     """
     announce("reading", records)
     folder = out or Path(f"{records[0].name.removesuffix('.gz').removesuffix('.csv')}-fitact")
-    planned = _fit_records(records, scene, (channel, scale), model, tolerance)
+    planned = _fit_records(records, scene, (channel, scale, rate), model, tolerance)
     print_stderr(planned.sentence)
     chain = folder / "chain.h5"
     if fresh:
@@ -66,6 +67,7 @@ def fit(
     scene: options.SceneFiles = None,
     channel: options.Channels = None,
     scale: options.Scales = None,
+    rate: options.Rate = None,
     out: options.Out = None,
     model: options.Model = "planned",
     tolerance: options.Tolerance = 1e-3,
@@ -94,7 +96,7 @@ def fit(
         fitted = fitact.fit_spectrum(spectrum, loaded)
         text, content = str(fitted), fitted.to_dict()
     else:
-        planned = _fit_records(records, scene, (channel, scale), model, tolerance, starts)
+        planned = _fit_records(records, scene, (channel, scale, rate), model, tolerance, starts)
         fitted = planned.fit
         text, content = f"{fitted}\n{planned.sentence}", fitted.to_dict() | {"plan": planned.to_dict()}
         if intervals:

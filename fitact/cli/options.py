@@ -8,6 +8,7 @@ import typer
 
 import fitact
 from fitact.errors import InputError
+from fitact.units import parse_quantity
 
 RecordFiles = Annotated[
     list[Path],
@@ -35,6 +36,10 @@ Scales = Annotated[
     typer.Option(
         "--scale", metavar="NAME=FACTOR", help="Factor for V, Vsc or I, e.g. Vsc=10 for a 10x probe. May be repeated."
     ),
+]
+Rate = Annotated[
+    str | None,
+    typer.Option("--rate", metavar="RATE", help="Sampling rate, e.g. 48kHz, for times that were rounded when written."),
 ]
 SceneFiles = Annotated[
     list[Path] | None,
@@ -80,13 +85,13 @@ Model = Annotated[
         " plan`); full: keep every element of the scene.",
     ),
 ]
-Columns = tuple[list[str] | None, list[str] | None]  # --channel and --scale as given
+Columns = tuple[list[str] | None, list[str] | None, str | None]  # --channel, --scale and --rate as given
 Results = Annotated[Path, typer.Argument(metavar="DIR", help="Folder with the results.")]
 Fresh = Annotated[bool, typer.Option("--fresh", help="Start a new chain instead of resuming the one in DIR.")]
 
 
 class LazyRecords(Sequence["fitact.Record"]):
-    """Records of one scene, each read on access, with the columns that --channel and --scale assign."""
+    """Records of one scene, each read on access, with the columns and times of --channel, --scale and --rate."""
 
     def __init__(self, paths: Sequence[Path] | None, scene: "fitact.Scene | None", columns: Columns) -> None:
         self._paths, self._scene, self._columns = paths or (), scene, column_options(columns)
@@ -104,9 +109,21 @@ def load_scene(path: Path | str | None) -> "fitact.Scene | None":
 
 
 def column_options(columns: Columns) -> dict[str, Any]:
-    """Return the values of --channel and --scale as keyword arguments of `fitact.read`."""
-    channels, scale = columns
-    return {"channels": parse_pairs("--channel Vsc=CH2", channels), "scale": parse_numbers("--scale Vsc=10", scale)}
+    """Return the values of --channel, --scale and --rate as keyword arguments of `fitact.read`."""
+    channels, scale, rate = columns
+    return {
+        "channels": parse_pairs("--channel Vsc=CH2", channels),
+        "scale": parse_numbers("--scale Vsc=10", scale),
+        "rate": None if rate is None else parse_rate(rate),
+    }
+
+
+def parse_rate(text: str) -> float:
+    """Parse the sampling rate (Hz) of --rate."""
+    try:
+        return parse_quantity(text, "Hz")
+    except InputError as error:
+        raise InputError(f"--rate: {error}") from error
 
 
 def parse_numbers(example: str, texts: list[str] | None) -> dict[str, float]:

@@ -18,6 +18,7 @@ def inspect(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Record, impedance spectrum or oscilloscope file.")],
     channel: options.Channels = None,
     scale: options.Scales = None,
+    rate: options.Rate = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Plot to write (.svg or .png).")] = None,
     json: options.Json = False,
 ) -> None:
@@ -26,7 +27,7 @@ def inspect(
         spectrum = fitact.read_spectrum(file)
         show(str(spectrum), spectrum.to_dict(), json)
         return
-    inspection = fitact.inspect(file, **options.column_options((channel, scale)))
+    inspection = fitact.inspect(file, **options.column_options((channel, scale, rate)))
     if out is not None:
         report.write_record(out, inspection)
     show(str(inspection), inspection.to_dict(), json)
@@ -41,6 +42,7 @@ def compare(
     ],
     channel: options.Channels = None,
     scale: options.Scales = None,
+    rate: options.Rate = None,
     json: options.Json = False,
 ) -> None:
     """Fit the full model of each scene to the same records, and report which model predicts the data best."""
@@ -49,7 +51,7 @@ def compare(
     models = {str(path) if same_stems else path.stem: fitact.Scene.load(path) for path in scenes}
     for model in models.values():
         model.require_available(fit=True)
-    measured = list(options.LazyRecords(records, next(iter(models.values())), (channel, scale)))
+    measured = list(options.LazyRecords(records, next(iter(models.values())), (channel, scale, rate)))
     comparison = fitact.compare(measured, models)
     show(str(comparison), comparison.to_dict(), json, comparison.trusted)
 
@@ -60,6 +62,7 @@ def population(
     scene: options.CommonScene = None,
     channel: options.Channels = None,
     scale: options.Scales = None,
+    rate: options.Rate = None,
     covariates: Annotated[
         Path | None,
         typer.Option("--covariates", metavar="FILE", help="CSV with a column 'record' and a column per covariate."),
@@ -86,7 +89,7 @@ def population(
     if fresh and out is not None:
         internal.delete_chains(out)
     fitted = fitact.population(
-        options.LazyRecords(records, loaded, (channel, scale)), loaded, covariates=covariate_values,
+        options.LazyRecords(records, loaded, (channel, scale, rate)), loaded, covariates=covariate_values,
         at=options.parse_numbers("--at moisture=0.4", at), folder=out, seed=seed,
     )  # fmt: skip
     content = fitted.to_dict()
@@ -108,6 +111,7 @@ def tradeoff(
     scene: options.CommonScene = None,
     channel: options.Channels = None,
     scale: options.Scales = None,
+    rate: options.Rate = None,
     out: options.Out = None,
     json: options.Json = False,
 ) -> None:
@@ -117,7 +121,7 @@ def tradeoff(
     """
     announce("measuring", [record or scene or "the nominal scene"])
     loaded = options.load_scene(scene)
-    measured = None if record is None else fitact.read(record, loaded, **options.column_options((channel, scale)))
+    measured = None if record is None else fitact.read(record, loaded, **options.column_options((channel, scale, rate)))
     try:
         costs = fitact.measure_tradeoff(measured, loaded)
     except KeyboardInterrupt:

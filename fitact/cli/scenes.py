@@ -9,8 +9,8 @@ import fitact
 from fitact import report
 from fitact.cli import internal
 from fitact.cli.app import app
-from fitact.cli.options import Channels, Json, Out, Scales, SceneFile, Seed, column_options
-from fitact.cli.terminal import announce, command_line, show
+from fitact.cli.options import Channels, Json, Out, Rate, Scales, SceneFile, Seed, column_options
+from fitact.cli.terminal import announce, command_line, print_stderr, show
 
 
 @app.command()
@@ -56,6 +56,7 @@ def plan(
     ] = None,
     channel: Channels = None,
     scale: Scales = None,
+    rate: Rate = None,
     out: Out = None,
     json: Json = False,
 ) -> None:
@@ -66,7 +67,7 @@ def plan(
     """
     announce("planning for", [scene])
     loaded = fitact.Scene.load(scene)
-    measured = None if record is None else fitact.read(record, loaded, **column_options((channel, scale)))
+    measured = None if record is None else fitact.read(record, loaded, **column_options((channel, scale, rate)))
     planned = fitact.plan(loaded) if measured is None else internal.plan_for_record(measured, loaded)
     if out is not None:
         report.write_folder(out, planned, command_line(), loaded, [measured] if measured else [])
@@ -84,6 +85,8 @@ def simulate(
     loaded = fitact.Scene.load(scene)
     record = internal.simulate(loaded, seed)
     internal.write_csv(out, record)
+    for warning in record.warnings:
+        print_stderr(f"warning: {warning}")
     truth = {"Rsc": loaded.skin.Rsc, "Csc": loaded.skin.Csc, "Ci": loaded.device.Ci}
     content = {"file": str(out), "samples": len(record), "channels": list(record.channels), "seed": seed}
     show(f"wrote {out}: {len(record):,} samples of {', '.join(record.channels)}", content | {"truth": truth}, json)

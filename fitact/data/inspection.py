@@ -12,10 +12,12 @@ from jaxtyping import Float
 from fitact.data.clipping import clipping_mask
 from fitact.data.readers.capture import Capture, has_standard_names, to_record
 from fitact.data.readers.read import merge_other_files, read_capture
+from fitact.data.readers.sampling_rate import replace_rounded_times
 from fitact.data.record import (
     CHANNEL_UNITS,
     MINIMUM_SAMPLES,
     OVERFLOW,
+    STATE_RATE,
     fundamental_frequency,
     grid_notes,
     is_uniform,
@@ -28,7 +30,7 @@ from fitact.units import format_engineering
 
 Samples = Float[np.ndarray, " samples"]
 
-_MOST = {"V": 5e3, "A": 0.1}  # largest value on a touch display
+LARGEST_VALUES = {"V": 5e3, "A": 0.1}  # on a touch display, by unit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,13 +102,16 @@ def inspect(
     *,
     channels: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
+    rate: float | None = None,
 ) -> Inspection:
     """Inspect a file without fitting it; channels are V, Vsc and I if known or named, otherwise those of the file.
+
+    `channels`, `scale` and `rate` as in `fitact.read`.
 
     Raises:
         InputError: the file cannot be read, or its V, Vsc or I could not be fitted.
     """
-    capture = merge_other_files(read_capture(path), path, channels or {})
+    capture = replace_rounded_times(merge_other_files(read_capture(path), path, channels or {}), rate)
     if channels or scale or has_standard_names(capture):
         record = to_record(capture, channels or {}, scale or {})
         arrays = {name: (record[name], CHANNEL_UNITS[name]) for name in record.channels}
@@ -114,8 +119,8 @@ def inspect(
     time = capture.time
     if time.size < 2 or not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0.0):
         raise InputError(
-            f"{capture.source}: the times are not increasing, or fewer than two; sort the rows, drop repeated ones, and"
-            " check which column is time"
+            f"{capture.source}: the times are not increasing, or fewer than two; if they were rounded when written,"
+            f" {STATE_RATE}; otherwise sort the rows, drop repeated ones, and check which column is time"
         )
     arrays = {trace.name: (trace.values, trace.unit) for trace in capture.channels}
     names = ", ".join(arrays)
@@ -212,7 +217,7 @@ def check_channel(name: str, unit: str, time: Samples, values: Samples, frequenc
     if rounding_noise_sd(values) > 0.0:
         found.append(f"{name} is rounded to steps larger than its noise; record with a smaller range")
     largest = float(np.max(np.abs(values)))
-    if largest > _MOST.get(unit, math.inf):
+    if largest > LARGEST_VALUES.get(unit, math.inf):
         found.append(
             f"{name} reaches {format_engineering(largest, unit)}, more than a touch display withstands; check the unit"
         )

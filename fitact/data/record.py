@@ -21,6 +21,9 @@ CHANNEL_UNITS = {"V": "V", "Vsc": "V", "I": "A"}
 # times of existing records, so that records on the same grid share one array
 _SHARED_TIMES: weakref.WeakValueDictionary[tuple[float, ...], np.ndarray] = weakref.WeakValueDictionary()
 
+# remedy for times with too few digits
+STATE_RATE = "state the sampling rate (--rate, or [measurement] sampling_rate in a scene)"
+
 _RowLabel = Callable[[int], str]
 
 
@@ -143,11 +146,27 @@ def grid_notes(time: Float[np.ndarray, " samples"], source: str) -> tuple[str, .
     """Return a note if the time steps are not uniform."""
     if is_uniform(time):
         return ()
-    steps = np.diff(time)
+    steps, half = np.diff(time), time.size // 2
+    mean_step = float(np.mean(time[half:] - time[: time.size - half])) / half
+    remedy = f"; if they were rounded when written, {STATE_RATE}" if is_rounded_grid(time, mean_step) else ""
     return (
         f"{source}: the time steps are not uniform ({steps.min():.4g} to {steps.max():.4g} s);"
-        " they are used as they are",
+        f" they are used as they are{remedy}",
     )
+
+
+def is_rounded_grid(time: Float[np.ndarray, " samples"], step: float) -> bool:
+    """Return whether the times are those of a uniform grid of `step` (s), rounded when they were written.
+
+    Rounding changes a time by no more than the difference between the steps that it leaves. The largest and the
+    smallest step do not count, because a single one is a lost or a repeated sample. Steps that hardly ever repeat are
+    those of a clock with jitter.
+    """
+    steps = np.diff(time)
+    smallest, largest = np.partition(steps, (1, -2))[[1, -2]]
+    deviation = time - step * np.arange(time.size)
+    is_near = np.ptp(deviation) <= 1.1 * (largest - smallest) + 1e-2 * step
+    return bool(is_near and steps.min() >= 0.0 and np.unique(np.round(steps / (1e-4 * step))).size <= time.size / 2)
 
 
 def white_noise_sd(values: Float[np.ndarray, " samples"]) -> float:
@@ -301,10 +320,12 @@ def _check_increasing(time: np.ndarray, source: str, where: _RowLabel) -> None:
     bad = np.flatnonzero(np.diff(time) <= 0.0)
     if bad.size:
         row = int(bad[0]) + 1
-        kind = "repeats" if time[row] == time[row - 1] else "goes back before"
+        kind, remedy = "goes back before", "sort the rows and drop repeated ones, or check which column is time"
+        if time[row] == time[row - 1]:
+            kind, remedy = "repeats", f"if the times were rounded when written, {STATE_RATE}; otherwise {remedy}"
         raise InputError(
             f"{source}, {where(row)}: the time {time[row]:.9g} s {kind} the time before it ({bad.size} such rows);"
-            " sort the rows and drop repeated ones, or check which column is time"
+            f" {remedy}"
         )
 
 

@@ -4,8 +4,12 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from fitact.data.plausibility import check_plausibility, insulator_voltage
 from fitact.data.record import MINIMUM_SAMPLES, Record
 from fitact.errors import InputError
+from fitact.model.circuit import Circuit
+from fitact.model.drive import Drive
+from fitact.model.force import electrostatic_force
 from fitact.model.response import response
 from fitact.scene.scene import Scene
 
@@ -20,12 +24,22 @@ def simulate(scene: Scene, seed: int = 0) -> Record:
             clean = np.asarray(response(circuit, drive, time, steady_state=scene.drive.steady_state, channel=channel))
             noise = measured.noise_Vsc if channel == "Vsc" else measured.noise_I
             channels[channel] = clean + noise * rng.standard_normal(time.size)
+        doubts = _check_scene(scene, circuit, drive, time)
     if not np.all(np.isfinite(channels.get("I", 0.0))):
         raise InputError(
             "scene: the current has an impulse at each ideal jump of the drive; give the drive a rise time"
             " (waveform = 'trapezoid'), or the scene an R_H or a series_resistor"
         )
-    return Record.from_arrays(time, V=channels["V"], Vsc=channels.get("Vsc"), I=channels.get("I"), source="simulation")
+    V, Vsc, current = (channels.get(name) for name in ("V", "Vsc", "I"))
+    return Record.from_arrays(time, V=V, Vsc=Vsc, I=current, source="simulation", warnings=tuple(doubts))
+
+
+def _check_scene(scene: Scene, circuit: Circuit, drive: Drive, time: Float[np.ndarray, " samples"]) -> list[str]:
+    contact, plain = scene.geometry().contact(circuit), scene.make_rc_circuit()
+    voltage = response(circuit, drive, time, steady_state=scene.drive.steady_state, channel=contact.channel)
+    peak = float(np.max(np.abs(drive.value(time))))
+    insulator = insulator_voltage(peak, plain.current_terms(), plain.Ci, scene.drive.lowest_frequency)
+    return check_plausibility(scene, peak, insulator, float(np.max(electrostatic_force(voltage, contact))))
 
 
 def sample_times(scene: Scene, max_samples: int = 100_000_000) -> Float[np.ndarray, " samples"]:

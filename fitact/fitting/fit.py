@@ -365,6 +365,8 @@ def _assemble_fit(
         warnings += remarks.channel_warnings(source.record, source.choice, channel.channel, channel.figures)
     warnings += misfit_warnings(traces)
     warnings += remarks.parameter_warnings(likelihood, theta)
+    force_peak = math.exp(laplace.log_derived[0][derived.DERIVED_NAMES.index("force_peak")])
+    warnings += remarks.plausibility_warnings(first.record, first.scene, first.choice, optimum, force_peak)
     assumed = remarks.describe_assumed_Ci(None if without_scene else first.scene, likelihood, laplace.prior_sets_Ci)
     warnings += assumed.warnings
     notes += assumed.notes

@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from fitact.data.clipping import longest_run
-from fitact.data.record import Record, is_uniform
+from fitact.data.record import STATE_RATE, Record, is_uniform
 from fitact.errors import InputError
 from fitact.model.response_table import chebyshev, chebyshev_polynomials
 
@@ -216,6 +216,6 @@ def require_uniform(record: Record, model: NoiseModel) -> None:
     """Raise InputError for a model of coloured noise if the time steps are not uniform."""
     if not is_uniform(record.time):
         raise InputError(
-            f"{record.source}: [measurement] noise_model = '{model}' needs uniform time steps; resample the record, or"
-            " remove noise_model"
+            f"{record.source}: [measurement] noise_model = '{model}' needs uniform time steps; if the times were"
+            f" rounded when written, {STATE_RATE}; otherwise resample the record, or remove noise_model"
         )

@@ -11,6 +11,7 @@ import numpy as np
 from fitact.data.readers.binary import is_known_binary, read_binary
 from fitact.data.readers.capture import Capture, Pick, find_channel, resolve_channels, to_record
 from fitact.data.readers.layouts import is_same_grid
+from fitact.data.readers.sampling_rate import replace_rounded_times
 from fitact.data.readers.text import is_binary, read_text
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.data.spectrum import is_spectrum
@@ -27,14 +28,16 @@ def read(
     *,
     channels: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
+    rate: float | None = None,
 ) -> Record:
     """Read a record: a CSV file with the columns time_s, V_V, Vsc_V and I_A, or a file of an oscilloscope.
 
     `channels` assigns the names in the file, e.g. {"Vsc": "CH2"}; it is not needed for the names V, Vsc and I. If each
     channel has its own file, {"Vsc": "CH2", "V": "C1.trc:CH1"} reads V from another file in the same folder. `scale`
-    multiplies a channel, e.g. {"Vsc": 10} for a 10x probe that was not set on the oscilloscope. Units in the header are
-    applied, and assumptions are listed in the record's notes. With a `scene`, its measured channels are required, and V
-    may be absent if the scene states the drive. docs/input.md lists the layouts.
+    multiplies a channel, e.g. {"Vsc": 10} for a 10x probe that was not set on the oscilloscope. `rate` (Hz), or else a
+    sampling rate that the scene states, replaces times that were rounded when they were written. Units in the header
+    are applied, and assumptions are listed in the record's notes. With a `scene`, its measured channels are required,
+    and V may be absent if the scene states the drive. docs/input.md lists the layouts.
 
     Raises:
         InputError: the file cannot be read, or its data are invalid; the message names the line and a remedy.
@@ -42,7 +45,9 @@ def read(
     source, channels = os.fspath(path), channels or {}
     local_columns = {channel: asked for channel, asked in channels.items() if _locate_file_column(path, asked) is None}
     capture = read_capture(path, lambda names, place: resolve_channels(names, local_columns, source, place).values())
-    capture = merge_other_files(capture, path, channels)
+    stated = scene is not None and "sampling_rate" in scene.measurement.model_fields_set
+    scene_rate = scene.measurement.sampling_rate if scene is not None and stated else None
+    capture = replace_rounded_times(merge_other_files(capture, path, channels), rate, scene_rate)
     record = to_record(capture, channels, scale or {})
     for channel in scene.measurement.channels if scene else ("Vsc",):
         record[channel]  # raises InputError if missing
