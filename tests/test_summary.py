@@ -43,7 +43,7 @@ def test_parameters_of_the_finger_and_of_the_measurement_stand_apart(finger_post
     assert headings == ["circuit", "computed, not measured", "measurement"]
     names = [row[0] for row in rows]
     assert names.index("measurement") < names.index("charge")
-    assert next(row for row in rows if row[0] == "charge")[4].startswith("transient in Vsc at the first sample")
+    assert next(row for row in rows if row[0] == "charge")[5].startswith("transient in Vsc at the first sample")
 
 
 def test_every_result_has_its_advice():

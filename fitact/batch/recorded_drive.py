@@ -20,7 +20,7 @@ from fitact.data.record import Record, rounding_noise_sd
 from fitact.fitting.derived import DerivedQuantities
 from fitact.fitting.drive_choice import has_unresolved_edge, has_unresolved_edges
 from fitact.fitting.fit import Fit
-from fitact.fitting.gains import log_sd
+from fitact.fitting.instrument_errors import log_sd
 from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES, bic_decrease_from_z
 from fitact.fitting.problem import MIN_RELATIVE_NOISE, Problem, edge_gain_sd
 from fitact.fitting.residual_statistics import interpolation_errors, is_misfit, residual_statistics

@@ -53,7 +53,7 @@ class ChannelFit:
         channel = likelihood.channels[index].without_compression()
         inputs = likelihood.make_inputs(optimum.circuit, theta, channel)
         # the noise is passed as an array, because jit would compile again for every new number
-        residuals, white, beta = _sample_residuals(channel, inputs, np.asarray(sigma))
+        residuals, white, beta = sample_residuals(channel, inputs, np.asarray(sigma))
         unpadded = slice(channel.n_samples)
         residuals, weight = residuals[unpadded], None if channel.equally_weighted else channel.weights[unpadded]
         names = [channel.qualified_name(LINEAR_NUISANCES[column]) for column in channel.columns]
@@ -141,7 +141,7 @@ def _student_log_likelihood(residuals: Samples, weight: Samples, scale: float) -
 
 
 @jit
-def _sample_residuals(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: Array) -> tuple[Array, Array, Array]:
+def sample_residuals(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: Array) -> tuple[Array, Array, Array]:
     """Return the residuals, the whitened residuals, and the linear nuisances in units of their prior sd."""
     _, beta, _ = channel.fit_nuisances(inputs, sigma)
     residuals, shapes = dataclasses.replace(channel, weight=None, whitening=None).residuals_and_shapes(inputs)

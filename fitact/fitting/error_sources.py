@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from fitact.fitting.gains import GainCoordinate
+from fitact.fitting.instrument_errors import ErrorCoordinate, InstrumentError
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.skin import probe_parameters
 from fitact.prior.distributions import LogNormal
@@ -21,16 +21,15 @@ _MEASURE = {
 
 
 def list_error_sources(
-    likelihood: Likelihood, gains: Sequence[GainCoordinate], scene: Scene
+    likelihood: Likelihood, coordinates: Sequence[ErrorCoordinate], scene: Scene
 ) -> tuple[tuple[ErrorSource, ...], ...]:
     """Return the sources of error of each coordinate of theta."""
-    by_name = {gain.name: gain for gain in gains}
+    by_name = {each.name: each for each in coordinates}
     load, sources = scene.find_load(), []
     timing_sd = dict(zip(likelihood.timing, map(float, likelihood.timing_sd), strict=True))
     for name in likelihood.names:
         if name in by_name:
-            errors = by_name[name].errors
-            sources.append(tuple(ErrorSource(each.source, each.distribution, _CALIBRATE) for each in errors))
+            sources.append(tuple(map(_instrument_source, by_name[name].errors)))
             continue
         if name in timing_sd:
             remedy = _MEASURE[name.partition("_")[0]]
@@ -41,3 +40,7 @@ def list_error_sources(
             label = f"input {name.removeprefix('probe_')} ({load.name})"
         sources.append((ErrorSource(label, likelihood.prior[name], remedy),))
     return tuple(sources)
+
+
+def _instrument_source(error: InstrumentError) -> ErrorSource:
+    return ErrorSource(error.source, error.distribution, _CALIBRATE, error.power)

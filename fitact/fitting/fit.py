@@ -18,6 +18,7 @@ from fitact.experiment.fisher import Experiment, covariance_factor
 from fitact.fitting import derived, remarks
 from fitact.fitting.channel_fit import ChannelFit, information_criteria
 from fitact.fitting.drive_choice import DriveModel
+from fitact.fitting.effects import fill_effects
 from fitact.fitting.error_sources import list_error_sources
 from fitact.fitting.identifiability import assess_identifiability
 from fitact.fitting.laplace import FitResult, Laplace
@@ -298,6 +299,7 @@ def fit_records(
     with jax.enable_x64(True):
         try:
             problem = build_problem(records, scenes, prior, drives)
+            problem = fill_effects(problem, problem.start)
             solved, certified, root = _solve_problem(problem, tolerance, start)
             optima = find_optima(solved, starts) if starts > 1 else None
             lower = None if optima is None else lower_optimum(optima, solved)
@@ -383,7 +385,7 @@ def _assemble_fit(
         traces=traces,
         compression_error=certified.error,
         experiment=experiment,
-        error_sources=list_error_sources(likelihood, problem.gains, first.scene),
+        error_sources=list_error_sources(likelihood, problem.coordinates, first.scene),
         noise_information=_noise_information(likelihood, solution),
         gain_shifts=_gain_shifts(likelihood, solution, root),
     )

@@ -17,7 +17,14 @@ from fitact.experiment.blind_directions import gain_names
 from fitact.experiment.fisher import Experiment
 from fitact.fitting.current import CurrentSamples, estimate_from_current, select_current_samples
 from fitact.fitting.drive_choice import DriveModel, choose_drive, frequency_error, has_ideal_edges, has_unresolved_edge
-from fitact.fitting.gains import GainCoordinate, GainedChannel, apply_gains, collect_gains, largest_gain
+from fitact.fitting.instrument_errors import (
+    EFFECTS,
+    ErrorCoordinate,
+    Member,
+    apply_coordinates,
+    collect_coordinates,
+    largest_gain,
+)
 from fitact.fitting.skin_model import apply_skin_model, exclude_jumps, require_skin_response
 from fitact.fitting.starting_point import Estimate, VscEstimate, estimate_from_vsc, start_from_estimates
 from fitact.likelihood import certificate
@@ -54,7 +61,7 @@ class Problem(NamedTuple):
     likelihood: Likelihood
     sources: tuple[Source, ...]
     start: Float[np.ndarray, " circuit_parameters"]
-    gains: tuple[GainCoordinate, ...]  # coordinates of the errors of instruments
+    coordinates: tuple[ErrorCoordinate, ...]  # of the errors of instruments
 
     def compress_likelihood(self, tolerance: float) -> tuple[Likelihood, tuple[str, ...]]:
         """Return the likelihood with compressed channels, and for each channel the reason if it is not compressed."""
@@ -113,10 +120,10 @@ def build_problem(
         for name in _channels(record, scene):
             channel, source, edge_sd = _build_channel(record, stated, choice, name, suffix, likelihood.template, taus)
             sources.append(source)
-            members.append(GainedChannel(channel, number, stated, edge_sd))
-    gains = collect_gains(members)
-    channels = tuple(apply_gains(gains, i, each) for i, each in enumerate(members))
-    nuisances = {gain.name: gain.distribution() for gain in gains} | _load_priors(scenes)
+            members.append(Member(channel, number, stated, edge_sd))
+    coordinates = collect_coordinates(members)
+    channels = tuple(_reserve_effects(apply_coordinates(coordinates, i, each)) for i, each in enumerate(members))
+    nuisances = {each.name: each.distribution() for each in coordinates} | _load_priors(scenes)
     likelihood = dataclasses.replace(
         likelihood,
         channels=channels,
@@ -125,7 +132,14 @@ def build_problem(
         use_prior=use_prior,
     )
     start = start_from_estimates(likelihood, [source.start for source in sources])
-    return Problem(likelihood, tuple(sources), start, gains)
+    return Problem(likelihood, tuple(sources), start, coordinates)
+
+
+def _reserve_effects(channel: ChannelLikelihood) -> ChannelLikelihood:
+    """Return the channel with effects of instruments that are 0, if there are any."""
+    if not channel.effect_sizes:
+        return channel
+    return dataclasses.replace(channel, effects=np.zeros((len(EFFECTS), channel.time.size)))
 
 
 def _load_priors(scenes: Sequence[Scene | None]) -> dict[str, Distribution]:

@@ -17,37 +17,39 @@ class Piece:
     Attributes:
         name: "class:piece", as in the scene.
         gain: distribution of the factor between indicated and true values; None means exact.
+        compensation: the same at high frequency, relative to low frequency.
+        nonlinearity: limits of the integral non-linearity, as a factor around 1, relative to the range.
         resistance, capacitance: distributions of its input impedance, ohm and F; None means that it does not load.
         source: where the figures come from.
         is_probe: whether it stands between the circuit and another input, and hides that input's load.
     """
 
     name: str
-    gain: Distribution | None
-    resistance: Distribution | None
-    capacitance: Distribution | None
-    source: str
+    gain: Distribution | None = None
+    compensation: Distribution | None = None
+    nonlinearity: Distribution | None = None
+    resistance: Distribution | None = None
+    capacitance: Distribution | None = None
+    source: str = "certificate"
     is_probe: bool = False
 
     @classmethod
     def from_class(cls, name: str) -> Self:
         """Return a piece with the errors of its class."""
         kind = CLASSES[name.partition(":")[0]]
-        limits = (None if kind.gain is None else (1.0, kind.gain)), kind.resistance, kind.capacitance
-        gain, resistance, capacitance = (None if each is None else Uniform.with_tolerance(*each) for each in limits)
-        return cls(name, gain, resistance, capacitance, kind.source, name.startswith("probe-"))
+        names = "gain", "compensation", "nonlinearity"
+        relative = {name: (1.0, limit) for name in names if (limit := getattr(kind, name))}
+        loads = {key: stated for key in ("resistance", "capacitance") if (stated := getattr(kind, key))}
+        errors = {key: Uniform.with_tolerance(*limits) for key, limits in (relative | loads).items()}
+        return cls(name, **errors, source=kind.source, is_probe=name.startswith("probe-"))
 
-    def replace_errors(
-        self, gain: Distribution | None, resistance: Distribution | None, capacitance: Distribution | None
-    ) -> Self:
-        """Return the piece with errors from a certificate, as far as they are not None."""
-        return dataclasses.replace(
-            self,
-            gain=gain or self.gain,
-            resistance=resistance or self.resistance,
-            capacitance=capacitance or self.capacitance,
-            source="certificate",
-        )
+    def error(self, kind: str) -> Distribution | None:
+        """Return the distribution of an error, by its name or "nonlinearity_even" or "nonlinearity_odd"."""
+        if not kind.startswith("nonlinearity"):
+            return getattr(self, kind)
+        limits = self.nonlinearity
+        # half for each shape, so that their sum stays within the limits
+        return None if limits is None else Uniform.with_tolerance(1.0, 0.5 * math.sqrt(3.0) * limits.log_sd)
 
     def nominal_probe(self) -> Probe:
         """Return the load at its median values."""

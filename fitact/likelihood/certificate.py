@@ -56,6 +56,7 @@ def compress_channel(
         "weight": None if channel.equally_weighted else channel.weights[samples],
         "whitening": channel.whitening and channel.whitening.restrict(samples),
         "rate": None if channel.rate is None else np.asarray(channel.rate)[samples],
+        "effects": None if channel.effects is None else np.asarray(channel.effects)[:, samples],
     }
     terms = start.terms[channel.channel]
     if isinstance(circuit, WithSkin):

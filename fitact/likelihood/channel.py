@@ -50,6 +50,7 @@ class ChannelInputs(eqx.Module):
     delay: ArrayLike = 0.0  # beyond the channel's `shift`, s
     # relative error of the drive's frequency on the recorder's clock; added to the channel's `clock`
     clock: ArrayLike = 0.0
+    effects: Float[Array, " effects"] | None = None  # sizes of the channel's `effects`
 
 
 class ChannelLikelihood(eqx.Module):
@@ -83,6 +84,10 @@ class ChannelLikelihood(eqx.Module):
     # names of the coordinates that act on the channel's gain, each with its power
     gains: tuple[tuple[str, float], ...] = eqx.field(static=True, default=())
     drive_gains: tuple[tuple[str, float], ...] = eqx.field(static=True, default=())  # the same for the indicated V
+    # small errors of the instruments, each in proportion to its size, over the samples (V or A); None means none
+    effects: Float[Array, "effects samples"] | None = None
+    # coordinates whose product (each with its power), minus 1, is the size of each effect
+    effect_sizes: tuple[tuple[tuple[str, float], ...], ...] = eqx.field(static=True, default=())
     # times of the first period (padded, s) and its number of samples, if the signal need be computed only there
     phases: Float[Array, " phases"] | None = None
     period: ArrayLike | None = None
@@ -156,9 +161,9 @@ class ChannelLikelihood(eqx.Module):
             drive = Sampled(np.asarray(drive.time)[:2], np.asarray(drive.samples)[:2], drive.period)
         ends, extremes = time[[0, -1]], np.array([observed.min(), observed.max()])
         rate = None if self.rate is None else np.zeros(2)
-        return dataclasses.replace(
-            self, time=ends, observed=extremes, drive=drive, weight=None, whitening=None, rate=rate, phases=None
-        )
+        effects = None if self.effects is None else np.zeros((len(self.effects), 2))
+        shortened = dataclasses.replace(self, time=ends, observed=extremes, drive=drive, rate=rate, effects=effects)
+        return dataclasses.replace(shortened, weight=None, whitening=None, phases=None)
 
     def thin(self, count: int) -> "ChannelLikelihood":
         """Return the channel with `count` of its samples, the ends among them, and white noise."""
@@ -173,12 +178,15 @@ class ChannelLikelihood(eqx.Module):
     def select(self, part: Int[np.ndarray, " n"], weight: Float[np.ndarray, " n"]) -> "ChannelLikelihood":
         """Return the channel with only the samples `part`, with new weights and white noise."""
         time, observed = (pad_samples(np.asarray(x)[part]) for x in (self.time, self.observed))
-        rate = None if self.rate is None else pad_samples(np.asarray(self.rate)[part])
+        rate, effects = (
+            None if x is None else pad_samples(np.asarray(x)[..., part]) for x in (self.rate, self.effects)
+        )
         return dataclasses.replace(
             self,
             time=time,
             observed=observed,
             rate=rate,
+            effects=effects,
             weight=pad_weight(weight),
             whitening=None,
             compression=None,
@@ -188,9 +196,14 @@ class ChannelLikelihood(eqx.Module):
 
     def signal(self, inputs: ChannelInputs, extra_delay: ArrayLike = 0.0) -> Float[Array, " samples"]:
         """Return the modelled signal without linear nuisances and noise; `extra_delay` (s) is added to the delay."""
+        total = self._response(inputs, extra_delay)
+        return total if inputs.effects is None else total + inputs.effects @ self.effects
+
+    def _response(self, inputs: ChannelInputs, extra_delay: ArrayLike) -> Float[Array, " samples"]:
+        """Return the `signal` without the effects of instruments."""
         if self.phases is not None and "clock" not in self.timing:
             folded = dataclasses.replace(self, time=self.phases, phases=None)
-            return folded.signal(inputs, extra_delay)[jnp.arange(self.time.size) % self.period]
+            return folded._response(inputs, extra_delay)[jnp.arange(self.time.size) % self.period]
         undelayed = not self.timing and isinstance(extra_delay, float) and extra_delay == 0.0
         if undelayed and isinstance(self.drive, Sampled) and self.drive.period is None:
             time = self.drive.time  # identical to the samples of V, so that `highpass` needs no search
@@ -243,12 +256,16 @@ class ChannelLikelihood(eqx.Module):
         compression = self.compression
         assert compression is not None
         if isinstance(compression, Interpolation):
-            points = dataclasses.replace(self, time=compression.time, rate=compression.rate, phases=None)
+            at_points = {"time": compression.time, "rate": compression.rate, "effects": compression.effects}
+            points = dataclasses.replace(self, phases=None, **at_points)
             signal, timing = points.signal(inputs), jnp.stack([jnp.asarray(inputs.delay), jnp.asarray(inputs.clock)])
             return compression.to_rows @ signal, compression.holds(signal, timing)
         terms, delay = inputs.circuit.channel_terms(self.channel), self.shift + inputs.delay
         covered = compression.covers(jnp.stack(jnp.broadcast_arrays(*terms.tau)), delay)
-        return inputs.gain * compression.response(terms, delay), jnp.all(covered)
+        response = inputs.gain * compression.response(terms, delay)
+        if inputs.effects is not None:
+            response = response + inputs.effects @ compression.effects
+        return response, jnp.all(covered)
 
     def apply_whitening(self, values: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
         """Return values over the samples in units of independent noise of equal sd; 0 for excluded samples."""

@@ -5,6 +5,7 @@ these, the difference between record and model has the same length as over all s
 coordinates are Chebyshev series. `fitact.likelihood.projection` computes them.
 """
 
+import dataclasses
 import math
 
 import equinox as eqx
@@ -53,6 +54,7 @@ class Compression(eqx.Module):
     steps: Float[Array, "ages rows"]
     origin: Float[Array, ""]  # delay of `signal`, in time steps
     time_step: Float[Array, ""]  # s
+    effects: Float[Array, "effects rows"] | None = None  # see `ChannelLikelihood.effects`
 
     def covers(self, tau: Array, delay: ArrayLike = 0.0) -> Array:
         """Return whether the table covers the time constant (s) and the delay (s)."""
@@ -133,12 +135,14 @@ class Compression(eqx.Module):
         charges, charge_series = _significant_modes(charge * decay[..., :terms].reshape(len(decay), -1), precision)
         last = self.baseline.T, *(x[:, None] for x in (self.rate, self.slope, self.observed))
         observed_slope = np.asarray(self.observed_slope)[:, None]
-        _, rows = np.linalg.qr(np.hstack([basis, steps.T, charges, observed_slope, *last]))
-        sizes = len(series), len(steps), len(charge_series), 1
-        basis, shifted, charges, observed_slope, _ = np.split(rows, np.cumsum(sizes), axis=1)
+        effects = np.zeros((0, len(observed_slope))) if self.effects is None else np.asarray(self.effects)
+        _, rows = np.linalg.qr(np.hstack([basis, steps.T, charges, observed_slope, effects.T, *last]))
+        sizes = len(series), len(steps), len(charge_series), 1, len(effects)
+        basis, shifted, charges, observed_slope, moved, _ = np.split(rows, np.cumsum(sizes), axis=1)
         table = center, half_width, basis[: len(series)] @ series, charges @ charge_series / (charge or 1.0)
         record = *split_last_functions(rows), observed_slope[:, 0], self.samples
-        return Compression(*map(np.asarray, (*table, *record, shifted.T, origin, self.time_step)))
+        changed = Compression(*map(np.asarray, (*table, *record, shifted.T, origin, self.time_step)))
+        return dataclasses.replace(changed, effects=None if self.effects is None else moved.T)
 
     def _move_origin(
         self, signal: Float[np.ndarray, "rank nodes"], tau: np.ndarray, delay: tuple[float, float]

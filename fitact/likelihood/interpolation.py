@@ -57,6 +57,7 @@ class Interpolation(eqx.Module):
     slope: Float[Array, " rows"]  # derivative of the signal with respect to a delay at the optimum, per s
     observed: Float[Array, " rows"]  # the record, V or A
     samples: Float[Array, ""]  # number of samples
+    effects: Float[Array, "effects points"] | None = None  # `ChannelLikelihood.effects` at the points
 
     def covers(self, tau: Array) -> Bool[Array, "*shape"]:
         """Return False, since the interpolation holds only where `holds` says so."""
@@ -128,6 +129,7 @@ def interpolate(
         ),
         observed=np.append(last[1] + functions.T @ (basis.T @ signals[0]), filtering @ samples.observed[needed]),
         samples=np.asarray(float(np.count_nonzero(samples.mask))),
+        effects=None if samples.effects is None else samples.effects[:, points],
     )
 
 
@@ -135,7 +137,9 @@ def _samples(channel: "ChannelLikelihood") -> Samples:
     part = slice(channel.n_samples)
     time, observed, weight = (np.asarray(x)[part] for x in (channel.time, channel.observed, channel.weights))
     rate = np.zeros(time.size) if channel.rate is None else np.asarray(channel.rate)[part]
-    return Samples(time, observed, weight, rate, weight if channel.whitening is None else channel.whitening.mask[part])
+    mask = weight if channel.whitening is None else channel.whitening.mask[part]
+    effects = None if channel.effects is None else np.asarray(channel.effects)[:, part]
+    return Samples(time, observed, weight, rate, mask, effects=effects)
 
 
 def _passes_corner(
@@ -225,7 +229,7 @@ def _chunk_products(
     filtering: WhiteningState | None,
 ) -> tuple[Array, WhiteningState | None]:
     rate = None if channel.rate is None else chunk.rate
-    channel = dataclasses.replace(channel, time=chunk.time, observed=chunk.observed, rate=rate)
+    channel = dataclasses.replace(channel, time=chunk.time, observed=chunk.observed, rate=rate, effects=chunk.effects)
     signals = jax.vmap(channel.signal)(training)
     baseline = baseline_functions(chunk.time, 0.5 * (ends[0] + ends[1]), 0.5 * (ends[1] - ends[0]))
     slope = _slope(channel, jax.tree.map(lambda leaf: leaf[-1], training))

@@ -186,8 +186,14 @@ class Likelihood(eqx.Module):
         """Return the inputs of a channel at theta, where the circuit is `circuit`."""
         places = {name: i for i, name in enumerate(self.names)}
         timing = {n: theta[places[channel.qualified_name(n)]] * channel.timing_unit(n) for n in channel.timing}
-        log_gains = [power * theta[places[name]] for name, power in channel.gains]
-        return ChannelInputs(circuit, array_module(theta).exp(sum(log_gains)) if log_gains else 1.0, **timing)
+        xp = array_module(theta)
+
+        def log_product(coordinates: tuple[tuple[str, float], ...]) -> Array:
+            return sum(power * theta[places[name]] for name, power in coordinates)
+
+        gain = xp.exp(log_product(channel.gains)) if channel.gains else 1.0
+        sizes = [xp.expm1(xp.asarray(log_product(coordinates), float)) for coordinates in channel.effect_sizes]
+        return ChannelInputs(circuit, gain, **timing, effects=xp.stack(sizes) if sizes else None)
 
     def channels_and_inputs(
         self, theta: Float[Array, " circuit_parameters"]

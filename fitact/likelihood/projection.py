@@ -8,6 +8,7 @@ functions, the shapes and the record. A factor of this matrix gives the coordina
 Coloured noise is whitened by a linear filter, which is applied to all functions and the record during the pass.
 """
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from fractions import Fraction
@@ -63,6 +64,7 @@ def compress(
     delayed: bool = False,
     slope: Float[np.ndarray, " samples"] | None = None,
     student: Float[np.ndarray, "3 samples"] | None = None,
+    effects: Float[np.ndarray, "effects samples"] | None = None,
 ) -> Compression:
     """Project a record on responses to `drive`, for time constants within a factor 9 of the one in `expected_terms`.
 
@@ -76,7 +78,7 @@ def compress(
     to a measured drive on a uniform grid can be shifted by up to `MAX_DELAY` steps; V is then taken as constant before
     the first and after the last sample. `slope` replaces dV/dt in the field of that name. `student`
     holds weights of the squares, and two functions to be projected instead of the record; `observed` and its slope are
-    then without the model at which they were computed.
+    then without the model at which they were computed. `effects` are further functions of the model.
 
     Terms of a grid of time constants have arrays of weights and time constants; the table then holds the responses of
     the grid instead of series.
@@ -85,7 +87,7 @@ def compress(
     one = np.ones(time.size) if weight is None else np.asarray(weight)
     mask = one if whitening is None else np.asarray(whitening.mask)[: time.size]
     samples = Samples(
-        time, observed, one, np.broadcast_to(0.0 if rate is None else rate, time.size), mask, slope, student
+        time, observed, one, np.broadcast_to(0.0 if rate is None else rate, time.size), mask, slope, student, effects
     )
     taps = None if whitening is None else np.asarray(whitening.taps)
     measured = isinstance(drive, Sampled) and not steady_state
@@ -104,7 +106,8 @@ def compress(
     parts = track_progress(parts, "compressing the record", math.ceil(time.size / chunk_length(time.size)))
     ages = 2 * MAX_DELAY if measured and delayed else 0
     count = int(np.count_nonzero(mask))
-    return _assemble(table, sum(parts, np.zeros(())), measured and not table.is_grid, ages, count)
+    n_effects = 0 if effects is None else len(effects)
+    return _assemble(table, sum(parts, np.zeros(())), measured and not table.is_grid, ages, n_effects, count)
 
 
 def table_multiple(tau: Float[np.ndarray, " terms"]) -> int:
@@ -187,6 +190,11 @@ class Samples(NamedTuple):
     mask: np.ndarray  # of the whitening filter
     slope: np.ndarray | None = None  # dV/dt over two samples, or what replaces it; None: computed from the drive
     student: np.ndarray | None = None  # as in `compress`
+    effects: np.ndarray | None = None  # likewise
+
+    @property
+    def n_effects(self) -> int:
+        return 0 if self.effects is None else len(self.effects)
 
 
 def chunks(samples: Samples, length: int) -> Iterator[Samples]:
@@ -214,7 +222,7 @@ def _accumulate_directly(
 ) -> Iterator[np.ndarray]:
     size = samples.time.size
     length = chunk_length(size, 65_536) if isinstance(drive, Chirp) else chunk_length(size)  # of few chirps
-    filtering = WhiteningState.start(taps, table.series.shape[0] + len(BASELINE_NAMES) + 3)
+    filtering = WhiteningState.start(taps, table.series.shape[0] + samples.n_effects + len(BASELINE_NAMES) + 3)
     multiply = jit(_chunk_products, fast=size > MANY_SAMPLES)
     for chunk in chunks(samples, length):
         total, filtering = multiply(table, drive, chunk, None, steady_state, filtering)
@@ -271,7 +279,8 @@ def _inner_products(
         rest = rest - table.expected_rate * chunk.rate
     parts = [table.combinations.T @ response for response in responses]
     slope = slope if chunk.slope is None else chunk.slope
-    rows = jnp.concatenate([*parts, others, chunk.rate[None], slope[None], rest[None]])
+    before = [] if chunk.effects is None else [chunk.effects]
+    rows = jnp.concatenate([*parts, *before, others, chunk.rate[None], slope[None], rest[None]])
     return whitened_products(rows, chunk, filtering)
 
 
@@ -311,7 +320,8 @@ def _accumulate_folded(table: _TableNodes, drive: Drive, samples: Samples, perio
     time, rate = (np.asarray(x[:period]) for x in (samples.time, samples.rate))
     time, mean, rate, baseline = map(pad_samples, (time, means[-1] + reference, rate, means[:-1]))
     weight, slope = pad_weight(np.sqrt(count)), None if samples.slope is None else pad_samples(samples.slope[:period])
-    folded = Samples(time, mean, weight, rate, weight, slope)
+    effects = None if samples.effects is None else pad_samples(samples.effects[:, :period])
+    folded = Samples(time, mean, weight, rate, weight, slope, None, effects)
     total = np.array(jit(_chunk_products)(table, drive, folded, baseline, True, None)[0])
     # scatter of the samples of one phase about their mean
     kept = np.r_[BASELINE_FUNCTIONS, OBSERVED_FUNCTION]
@@ -350,8 +360,9 @@ def _accumulate_measured(
     if x is not None:
         last = first * np.exp(x), np.asarray(time[0] - step), np.asarray(first)
     tables = 1 if table.is_grid else 2
-    filtering = WhiteningState.start(taps, tables * table.series.shape[0] + len(BASELINE_NAMES) + 3 + 2 * ages)
-    voltages = chunks(samples._replace(observed=voltage), length)
+    functions = tables * table.series.shape[0] + samples.n_effects + 2 * ages + len(BASELINE_NAMES) + 3
+    filtering = WhiteningState.start(taps, functions)
+    voltages = chunks(samples._replace(observed=voltage, effects=None), length)
     advance = jit(_advance_chunk, fast=time.size > MANY_SAMPLES)
     for number, (chunk, driven) in enumerate(zip(chunks(samples, length), voltages, strict=True)):
         steps = _drive_steps(voltage, number * length, length, ages) / step
@@ -414,21 +425,24 @@ def uniform_recurrence(
     return gain * (alone.transpose(1, 2, 0) + starts.T[:, :, None] * decays[:, None]).reshape(x.size, -1)
 
 
-def _assemble(table: _TableNodes, total: np.ndarray, decays: bool, ages: int, samples: int) -> Compression:
+def _assemble(
+    table: _TableNodes, total: np.ndarray, decays: bool, ages: int, n_effects: int, samples: int
+) -> Compression:
     """Return coordinates that have the accumulated inner products."""
     rows, projected = factor_products(total)
     size, (rank, terms) = len(rows), table.series.shape
     signal = rows[:, :rank] @ table.series
     decay = rows[:, rank : 2 * rank] @ table.series if decays else np.zeros((size, terms))
-    first = (1 + decays) * rank
-    steps = rows[:, first : first + ages].T
+    first = (1 + decays) * rank + n_effects
+    effects, steps = rows[:, first - n_effects : first].T, rows[:, first : first + ages].T
     baseline, rate, slope, remainder = split_last_functions(rows)
     following = 0.0 if table.expected_rate is None else table.expected_rate * rate
     observed, observed_slope = remainder + signal @ table.expected_series + following, np.zeros(size)
     if projected.size:
         observed, observed_slope = projected.T
     arrays = table.center, table.half_width, signal[:rank], decay, baseline, rate, slope, observed, observed_slope
-    return Compression(*map(np.asarray, (*arrays, float(samples), steps, 0.0, table.step)))
+    compression = Compression(*map(np.asarray, (*arrays, float(samples), steps, 0.0, table.step)))
+    return dataclasses.replace(compression, effects=effects if n_effects else None)
 
 
 def factor_products(

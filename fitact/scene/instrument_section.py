@@ -1,7 +1,8 @@
 """Section [instrument] of a scene file: the equipment of each channel, and certificates that replace its class."""
 
+import dataclasses
 import difflib
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
@@ -9,7 +10,7 @@ from fitact.instrument.classes import CLASSES
 from fitact.instrument.pieces import Piece
 from fitact.prior.distributions import Distribution, LogNormal, Uniform
 from fitact.prior.published import Layer
-from fitact.scene.prior_section import FaradPriorSpec, OhmPriorSpec
+from fitact.scene.prior_section import FaradPriorSpec, OhmPriorSpec, PriorSpec
 from fitact.scene.sections import Section, Unit
 
 Ratio = Annotated[float, Unit(""), Field(gt=0, lt=1)]
@@ -43,6 +44,8 @@ class CertificateSpec(Section):
 
     gain: ErrorSpec | None = None
     gain_common: ErrorSpec | None = None
+    compensation: ErrorSpec | None = None
+    nonlinearity: ErrorSpec | None = None
     resistance: OhmPriorSpec | None = None
     capacitance: FaradPriorSpec | None = None
 
@@ -109,7 +112,7 @@ class InstrumentSection(Section):
             instrument = name.partition("/")[0]
             if instrument != name and (shared := self.own.get(instrument)) is not None and shared.gain_common:
                 gain = shared.gain_common.distribution()
-                found[instrument] = Piece(instrument, gain, None, None, "certificate")
+                found[instrument] = Piece(instrument, gain)
             found[name] = self._apply_certificate(Piece.from_class(name))
         return tuple(found.values())
 
@@ -117,8 +120,10 @@ class InstrumentSection(Section):
         own = self.own.get(piece.name)
         if own is None:
             return piece
-        resistance, capacitance = (
-            None if spec is None else spec.distribution(name, None, Layer(1.0, 1.0, 1.0))  # no table, so no layer
-            for name, spec in (("resistance", own.resistance), ("capacitance", own.capacitance))
-        )
-        return piece.replace_errors(None if own.gain is None else own.gain.distribution(), resistance, capacitance)
+        stated: dict[str, Any] = {}
+        for key, spec in own:
+            if isinstance(spec, ErrorSpec) and key != "gain_common":
+                stated[key] = spec.distribution()
+            elif isinstance(spec, PriorSpec):
+                stated[key] = spec.distribution(key, None, Layer(1.0, 1.0, 1.0))  # no table, so no layer
+        return dataclasses.replace(piece, source="certificate", **stated)

@@ -112,7 +112,7 @@ def test_the_fraction_from_the_prior_is_that_of_the_information(finger_fit: fita
 def test_friction_of_defaults_has_no_five_digits(finger_fit: fitact.Fit, tmp_path):
     row = next(row for row in quantity_table(finger_fit.to_dict()) if row[0] == "friction_mean")
     assert row[1] == "about 250 mN"
-    assert row[4].endswith("default mu = 0.5, fN = 500 mN")
+    assert row[5].endswith("default mu = 0.5, fN = 500 mN")
     stated = fit_with(MEASURED + '[friction]\ncoefficient = 0.4\nnormal_force = "1 N"\n', tmp_path)
     row = next(row for row in quantity_table(stated.to_dict()) if row[0] == "friction_mean")
     assert "±" in row[1]
