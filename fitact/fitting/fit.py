@@ -17,6 +17,7 @@ from fitact.experiment.fisher import Experiment, covariance_factor
 from fitact.fitting import derived, remarks
 from fitact.fitting.channel_fit import ChannelFit, information_criteria
 from fitact.fitting.drive_choice import DriveModel
+from fitact.fitting.geometry import UncertainGeometry
 from fitact.fitting.identifiability import assess_identifiability
 from fitact.fitting.laplace import FitResult, Laplace
 from fitact.fitting.least_squares import LeastSquaresResult, solve
@@ -325,6 +326,7 @@ def _assemble_fit(
     assumed = remarks.describe_assumed_Ci(None if without_scene else first.scene, likelihood, laplace.prior_sets_Ci)
     warnings += assumed.warnings
     notes += assumed.notes
+    notes += UncertainGeometry.from_scene(first.scene, derive.geometry).notes(first.scene, likelihood, theta)
     experiment = problem.experiment(likelihood, optimum.circuit, sigma)
     gradient = laplace.log_gradient("force_mean")
     return Fit(
