@@ -66,6 +66,14 @@ _NUISANCES = {  # quantities of the measurement; {}: the channel
     "charge_3": "third transient in {} at the first sample",
     "charge_4": "fourth transient in {} at the first sample",
 }
+_GEOMETRY = {  # what force and friction rest on beside the circuit
+    "skin_thickness": "skin thickness Tsc",
+    "skin_permittivity": "skin permittivity",
+    "insulator_thickness": "insulator thickness Ti",
+    "insulator_permittivity": "insulator permittivity",
+    "contact_area": "contact area A",
+    "friction_coefficient": "coefficient of friction mu",
+}
 _DERIVED = {
     "g": "divider g = Ci / (2 Ci + Csc)",
     "b": "time constant b = Rsc (2 Ci + Csc)",
@@ -78,7 +86,7 @@ _DERIVED = {
 
 def describe_quantity(name: str) -> str:
     """Return the name of a quantity for people; a nuisance may end in the label of its channel, as "sigma_I_2"."""
-    labels = _PARAMETERS | _NUISANCES | _DERIVED
+    labels = _PARAMETERS | _NUISANCES | _GEOMETRY | _DERIVED
     bare = name if name in labels else re.sub(r"_\d+$", "", name)
     number = name[len(bare) + 1 :]
     label = labels[bare.removesuffix("_I")].format("I" if bare.endswith("_I") else "Vsc")
@@ -157,9 +165,11 @@ def quantity_table(content: dict[str, Any]) -> list[tuple[str, ...]]:
     description.
     """
     summaries = content["parameters"] | content["derived"]
-    groups: dict[str, list[tuple[str, ...]]] = {"circuit": [], "computed, not measured": [], "measurement": []}
+    headings = "circuit", "geometry and friction", "computed, not measured", "measurement"
+    groups: dict[str, list[tuple[str, ...]]] = {heading: [] for heading in headings}
     for name, s in summaries.items():
         group = "computed, not measured" if name in _DERIVED else "measurement"
+        group = "geometry and friction" if name in _GEOMETRY else group
         if name in _PARAMETERS or name in ("g", "b"):
             group = "circuit"
         groups[group].append(_quantity_row(name, s, content["force_basis"]))
@@ -191,9 +201,11 @@ def force_sentences(basis: dict[str, Any]) -> list[str]:
     ]
     if basis["assumptions"]:
         values = ", ".join(f"{a['symbol']} = {a['text']} ({a['origin']})" for a in basis["assumptions"])
+        included = [a["symbol"] for a in basis["assumptions"] if a.get("has_distribution")]
+        exception = "the prior's" + (f" and the stated distributions of {' and '.join(included)}" if included else "")
         sentences.append(
-            f"Force and friction rest on {values}; default means that nobody stated it. The errors above do not include"
-            " an uncertainty of these values, except that of the prior."
+            f"Force and friction rest on {values}; default means that nobody stated it. The errors above include no"
+            f" uncertainty of these values except {exception}."
         )
     if other := basis["other_law"]:
         force = format_estimate(other["force_mean"])

@@ -26,6 +26,8 @@ _UNITS = {
     "offset": "V", "drift": "V", "charge": "V", "charge_2": "V", "charge_3": "V", "charge_4": "V",
     "hum_50Hz_cos": "V", "hum_50Hz_sin": "V", "hum_60Hz_cos": "V", "hum_60Hz_sin": "V",
     "g": "1", "b": "s", "force_mean": "N", "force_peak": "N", "force_rms": "N", "friction_mean": "N",
+    "skin_thickness": "m", "skin_permittivity": "1", "insulator_thickness": "m", "insulator_permittivity": "1",
+    "contact_area": "m^2", "friction_coefficient": "1",
     "force_at_f": "N", "force_at_2f": "N", "friction_at_f": "N", "friction_at_2f": "N",
 }  # fmt: skip
 
@@ -89,8 +91,9 @@ def choose_prefixed_unit(value: float, unit: str) -> tuple[float, str]:
     symbol = _SYMBOLS.get(unit, unit)
     if not math.isfinite(value) or value == 0.0 or not symbol:
         return 1.0, symbol
-    exponent = _prefix_exponent(value)
-    return 10.0**exponent, _PREFIXES[exponent] + symbol
+    power = int(unit.partition("^")[2] or 1)  # which the prefix is raised to, too
+    exponent = _prefix_exponent(math.copysign(abs(value) ** (1.0 / power), value))
+    return 10.0 ** (power * exponent), _PREFIXES[exponent] + symbol
 
 
 def _prefix_exponent(value: float) -> int:

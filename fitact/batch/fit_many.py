@@ -299,6 +299,8 @@ def _split_group(group: RecordGroup, scene: Scene | None) -> Iterator[Batch]:
 
 def _make_batch_problem(record: Record, scene: Scene | None) -> BatchProblem | None:
     """Return the problem for records like this one, or None if they cannot be fitted in batches."""
+    if scene is not None and scene.geometry_distributions():  # which batches do not draw
+        return None
     problem = build_problem([record], [scene])
     if problem.likelihood.channels[0].effect_sizes:  # whose functions differ between records
         return None
@@ -371,7 +373,8 @@ def row_from_fit(fit: Fit) -> Row:
     )
     row = {"record": os.path.basename(fit.record.source)} | dict(zip(_FIT_COLUMNS, values, strict=True))
     row |= _median_columns([fit.names[i] for i in free], np.exp(fit.theta[free]), fit.sd[free])
-    row |= _median_columns(derived.DERIVED_NAMES, np.exp(fit.laplace.log_derived[0]), fit.laplace.derived_log_sd)
+    logs, log_sds, _ = fit.derived_moments()
+    row |= _median_columns(derived.DERIVED_NAMES, np.exp(logs), log_sds)
     return {name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()}
 
 

@@ -206,10 +206,10 @@ class DriveDesign:
             for each in (self.limits if self.recommended else ())
             if each.exceeds_published
         ]
-        thickness = self.scene.population.thickness_sd
+        thickness = self.scene.thickness_sd()
         if thickness:
             sentences.append(
-                f"all fingers and panels have the same thicknesses here, although [population] varies"
+                f"all fingers and panels have the same thicknesses here, although the scene varies"
                 f" {' and '.join(thickness)}"
             )
         return tuple(sentences)

@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 
+from fitact.fitting.geometry import Contribution
 from fitact.fitting.instrument_errors import ErrorCoordinate, InstrumentError
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.skin import probe_parameters
 from fitact.prior.distributions import LogNormal
 from fitact.scene.scene import Scene
-from fitact.uncertainty.budget import ErrorSource
+from fitact.uncertainty.budget import Component, ErrorSource
 
 # cheapest ways to reduce an error
 _CALIBRATE = "record a dummy circuit of known parts, or both channels on one node, with the same pieces and ranges"
@@ -31,6 +32,9 @@ def list_error_sources(
         if name in by_name:
             sources.append(tuple(map(_instrument_source, by_name[name].errors)))
             continue
+        if name in scene.plates():  # it follows from a geometry, which has sources of its own
+            sources.append(())
+            continue
         if name in timing_sd:
             remedy = _MEASURE[name.partition("_")[0]]
             sources.append((ErrorSource(f"prior of the {name}", LogNormal(1.0, timing_sd[name]), remedy),))
@@ -40,6 +44,14 @@ def list_error_sources(
             label = f"input {name.removeprefix('probe_')} ({load.name})"
         sources.append((ErrorSource(label, likelihood.prior[name], remedy),))
     return tuple(sources)
+
+
+def geometry_component(contribution: Contribution) -> Component:
+    """Return the component of a thickness, permittivity, area or friction coefficient in a budget."""
+    each = contribution
+    remedy = "measure it, e.g. by optical coherence tomography" if each.name == "skin_thickness" else "measure it"
+    law, size = each.distribution, (each.relative_sd, each.sensitivity)
+    return Component(each.source, "B", *size, law, remedy, in_posterior=each.stated)
 
 
 def _instrument_source(error: InstrumentError) -> ErrorSource:

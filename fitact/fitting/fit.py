@@ -19,7 +19,8 @@ from fitact.fitting import derived, remarks
 from fitact.fitting.channel_fit import ChannelFit, information_criteria
 from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.effects import fill_effects
-from fitact.fitting.error_sources import list_error_sources
+from fitact.fitting.error_sources import geometry_component, list_error_sources
+from fitact.fitting.geometry import UncertainGeometry
 from fitact.fitting.identifiability import assess_identifiability
 from fitact.fitting.laplace import FitResult, Laplace
 from fitact.fitting.least_squares import LeastSquaresResult, solve
@@ -69,17 +70,19 @@ class Fit(FitResult):
     @functools.cached_property
     def budgets(self) -> dict[str, Budget]:
         """Uncertainty budgets of the free parameters of the skin and insulator, and of the derived quantities."""
-        roots = self.covariance_root, self.likelihood.prior_factor
-        return {
-            name: Budget(laplace_components(gradient, *roots, self.error_sources, self.noise_information))
-            for name, gradient in self._gradients.items()
-        }
+        roots, geometry = (self.covariance_root, self.likelihood.prior_factor), self.geometry_contributions()
+        budgets = {}
+        for name, gradient in self._gradients.items():
+            components = laplace_components(gradient, *roots, self.error_sources, self.noise_information)
+            budgets[name] = Budget((*components, *map(geometry_component, geometry[name])))
+        return budgets
 
     @property
     def _gradients(self) -> dict[str, Float[np.ndarray, " parameters"]]:
         """Gradients of the logarithms of the quantities with a budget, in theta."""
         gradients = dict(zip(self.names, np.eye(self.theta.size), strict=True))
-        derivatives = zip(derived.DERIVED_NAMES, self.laplace.log_derived[1], strict=True)
+        moments = self.geometry.approximate(self.likelihood, self.theta, self.laplace.log_derived)
+        derivatives = zip(derived.DERIVED_NAMES, moments.gradients, strict=True)
         return {name: gradients[name] for name in _SKIN if name in gradients} | dict(derivatives)
 
     def calibration_entry(self, name: str) -> dict[str, Any]:
@@ -372,6 +375,7 @@ def _assemble_fit(
     assumed = remarks.describe_assumed_Ci(None if without_scene else first.scene, likelihood, laplace.prior_sets_Ci)
     warnings += assumed.warnings
     notes += assumed.notes
+    notes += UncertainGeometry.from_scene(first.scene, derive.geometry).notes(first.scene, likelihood, theta)
     experiment = problem.experiment(likelihood, optimum.circuit, sigma)
     gradient = laplace.log_gradient("force_mean")
     return Fit(

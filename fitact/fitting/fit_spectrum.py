@@ -15,6 +15,7 @@ from fitact.compiled import jit
 from fitact.data.spectrum import Spectrum
 from fitact.experiment.fisher import covariance_factor
 from fitact.fitting import derived
+from fitact.fitting.geometry import UncertainGeometry
 from fitact.fitting.identifiability import assess_parameters
 from fitact.fitting.laplace import FitResult, Laplace
 from fitact.fitting.minimum import Minimum, minimise, result_name
@@ -122,7 +123,11 @@ def fit_spectrum(spectrum: Spectrum, scene: Scene | None = None) -> SpectrumFit:
         ),
         scene=stated,
         warnings=assumed.warnings,
-        notes=(*spectrum.notes, *assumed.notes),
+        notes=(
+            *spectrum.notes,
+            *assumed.notes,
+            *UncertainGeometry.from_scene(stated, derive.geometry).notes(stated, likelihood, theta),
+        ),
         spectrum=spectrum,
         noise=sigma,
         residuals=residuals,

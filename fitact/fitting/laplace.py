@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from fitact import summary
 from fitact.fitting import derived
+from fitact.fitting.geometry import Contribution, UncertainGeometry
 from fitact.fitting.identifiability import MIN_PRIOR_FRACTION, Identifiability, prior_variance_fraction
 from fitact.fitting.minimum import result_message
 from fitact.likelihood.likelihood import Likelihood
@@ -155,9 +156,11 @@ class FitResult(abc.ABC):
         return summaries
 
     def derived(self) -> dict[str, summary.Summary]:
-        """Summarize divider, time constant, force and friction in the Laplace approximation."""
-        logs, gradients = self.laplace.log_derived
-        columns = logs, self.laplace.derived_log_sd, self.laplace.variance_from_prior(gradients)
+        """Summarize divider, time constant, force and friction in the Laplace approximation.
+
+        The stated distributions of thicknesses, area and friction are included.
+        """
+        columns = self.derived_moments()
         return {
             name: self._summarize(name, math.exp(log), float(sd)) | {"from_prior": float(fraction)}
             for name, log, sd, fraction in zip(derived.DERIVED_NAMES, *columns, strict=True)
@@ -166,13 +169,35 @@ class FitResult(abc.ABC):
     def budget_entries(self) -> dict[str, Any]:
         """Return `budget` of fit.json."""
         medians = self.likelihood.to_physical(self.theta)
-        medians |= dict(zip(derived.DERIVED_NAMES, np.exp(self.laplace.log_derived[0]), strict=True))
+        medians |= dict(zip(derived.DERIVED_NAMES, np.exp(self.derived_moments()[0]), strict=True))
         budgets = self.budgets.items()
         return {name: each.to_dict(float(medians[name])) | self.calibration_entry(name) for name, each in budgets}
 
     def calibration_entry(self, name: str) -> dict[str, Any]:
         """Return `stated` and `not_stated` of the budget of a quantity: gain errors that nobody stated."""
         return {"stated": self.scene.instrument.is_stated, "not_stated": []}
+
+    def derived_moments(self, laplace: Laplace | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return mean and sd of the logarithms of `DERIVED_NAMES`, and the fraction of the variance from the prior.
+
+        `laplace` is that of another force law.
+        """
+        laplace = laplace or self.laplace
+        geometry = UncertainGeometry.from_scene(self.scene, laplace.derive.geometry)
+        logs, gradients, extra = geometry.approximate(self.likelihood, self.theta, laplace.log_derived)
+        known = np.sum((gradients @ self.covariance_root) ** 2, axis=1)
+        from_prior = laplace.variance_from_prior(gradients) * known + extra
+        whole = known + extra
+        return logs, np.sqrt(whole), from_prior / np.where(whole > 0.0, whole, 1.0)
+
+    @functools.cached_property
+    def geometry(self) -> UncertainGeometry:
+        """Distributions of what force and friction rest on beside the circuit."""
+        return UncertainGeometry.from_scene(self.scene, self.derive.geometry)
+
+    def geometry_contributions(self) -> dict[str, tuple[Contribution, ...]]:
+        """Return what thicknesses, permittivities, area and friction contribute to each quantity's uncertainty."""
+        return self.geometry.contributions(self.likelihood, self.theta, self.laplace.log_derived, self.covariance)
 
     @property
     @abc.abstractmethod
@@ -195,8 +220,9 @@ class FitResult(abc.ABC):
                 self.laplace, derive=derive, log_derived=derive.log_value_and_grad(self.theta, self.laplace.sigmas)
             )
             i = derived.DERIVED_NAMES.index("force_mean")
-            median, sd = math.exp(laplace.log_derived[0][i]), float(laplace.derived_log_sd[i])
-            other = {"law": other_law, "force_mean": summary.summarize_log_normal("force_mean", median, sd)}
+            logs, sds, _ = self.derived_moments(laplace)
+            force = summary.summarize_log_normal("force_mean", math.exp(logs[i]), float(sds[i]))
+            other = {"law": other_law, "force_mean": force}
         return {
             "law": law,
             "measured": False,

@@ -41,7 +41,7 @@ class Contact(eqx.Module):
         cls, Ci: ArrayLike, Csc: ArrayLike, area: ArrayLike, insulator_thickness: ArrayLike, skin_thickness: ArrayLike
     ) -> "Contact":
         """Return the contact whose permittivities give the capacitances `Ci` and `Csc` (F) by eq. (3)."""
-        unit = EPSILON_0 * jnp.asarray(area)
+        unit: Any = EPSILON_0 * area
         return cls(
             area, insulator_thickness, Ci * insulator_thickness / unit, skin_thickness, Csc * skin_thickness / unit
         )
@@ -95,13 +95,14 @@ def electrostatic_force(voltage: ArrayLike, contact: Contact | AirGap) -> Float[
     return force_constant(contact) * voltage * voltage
 
 
-def force_constant(contact: Contact | AirGap) -> Array:
+def force_constant(contact: Contact | AirGap) -> Any:
     """Return force / voltage^2 (N/V^2): eqs. (1) and (22) for a contact, eps0 A / (2 d^2) for a gap."""
     if isinstance(contact, AirGap):
-        thickness = jnp.asarray(contact.thickness)
+        thickness: Any = contact.thickness
         return EPSILON_0 * contact.area / 2.0 / thickness / thickness
-    insulator, skin = jnp.asarray(contact.insulator_permittivity), jnp.asarray(contact.skin_permittivity)
-    gap = jnp.asarray(contact.insulator_thickness) + contact.skin_thickness
+    insulator: Any = contact.insulator_permittivity
+    skin: Any = contact.skin_permittivity
+    gap: Any = contact.insulator_thickness + contact.skin_thickness
     layers = contact.insulator_thickness * skin + contact.skin_thickness * insulator
     return EPSILON_0 * contact.area / (2.0 * gap) * (insulator * (skin / layers))
 

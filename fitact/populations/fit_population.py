@@ -73,7 +73,7 @@ def population(
     standardized = Covariates.from_values(covariates or {}, len(records))
     next_at = standardized.standardize(at or {})
     area_varies = scene.population.contact_area == "varies"
-    factors = (*SKIN, SHARED_PARAMETER, *((AREA,) if area_varies else ()), *scene.population.thickness_sd)
+    factors = (*SKIN, SHARED_PARAMETER, *((AREA,) if area_varies else ()), *scene.thickness_sd())
     fingers, new_finger = _fit_fingers(records, scene, factors, progress)
     make_tables = functools.partial(
         FingerLikelihoods.from_fingers, fingers, medians[SHARED_PARAMETER], area_varies=area_varies

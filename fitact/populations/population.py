@@ -93,10 +93,15 @@ class Population:
         """Sentences that inform."""
         skin = self.scene.skin
         origin = "stated" if "thickness" in skin.model_fields_set else "the default"
+        thickness = f"the skin thickness {format_engineering(skin.thickness, 'm')} ({origin})"
+        excluded = (
+            f"the uncertainty of that law; {thickness} varies between fingers"
+            if "skin_thickness" in self.scene.thickness_sd()
+            else f"the uncertainty of that law and of {thickness}"
+        )
         sentences = [
             f"the force is computed with [force] model = '{self.scene.force.model}', not measured; its intervals"
-            " include neither the uncertainty of that law nor of the skin thickness"
-            f" {format_engineering(skin.thickness, 'm')} ({origin})"
+            f" exclude {excluded}"
         ]
         if "friction" not in self.scene.model_fields_set:
             friction = self.scene.friction
@@ -153,7 +158,7 @@ class Population:
     def _draw_factors(
         self, random: np.random.Generator, parameters: PopulationParameters
     ) -> Float[np.ndarray, "laws fingers factors"]:
-        return draw_factors(parameters, self.scene.population.thickness_sd, self.fingers_per_law, random)
+        return draw_factors(parameters, self.scene.thickness_sd(), self.fingers_per_law, random)
 
     @functools.cached_property
     def _new_predictions(self) -> Float[np.ndarray, "laws fingers names"]:

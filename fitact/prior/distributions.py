@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.special
 from jax.scipy.special import ndtr, ndtri
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
@@ -99,7 +100,7 @@ class LogNormal(Distribution):
 
     def to_standard_normal(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """Return (u - log median) / spread."""
-        return (jnp.asarray(u) - _log(self.median)) / self.spread
+        return (array_module(u).asarray(u) - _log(self.median)) / self.spread
 
     def from_standard_normal(self, z: ArrayLike) -> Float[Array, "*shape"]:
         """Return u = log x, the inverse of `to_standard_normal`."""
@@ -122,7 +123,7 @@ class Bounded(Distribution):
 
     def contains(self, u: ArrayLike) -> Array:
         """Return whether u = log x lies within the bounds."""
-        u = jnp.asarray(u)
+        u = array_module(u).asarray(u)
         low = -math.inf if self.low == 0.0 else math.log(self.low)
         return (u >= low) & (u <= math.log(self.high))
 
@@ -134,7 +135,8 @@ class Bounded(Distribution):
 
     def from_standard_normal(self, z: ArrayLike) -> Float[Array, "*shape"]:
         """Return u = log x, the inverse of `to_standard_normal`."""
-        return self.ppf(ndtr(jnp.asarray(z, dtype=float)))
+        xp = array_module(z)
+        return self.ppf((ndtr if xp is jnp else scipy.special.ndtr)(xp.asarray(z, dtype=float)))
 
 
 class Uniform(Bounded):
@@ -164,7 +166,7 @@ class Uniform(Bounded):
 
     def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """Return log(e^u / (high - low)) within the bounds, -inf outside."""
-        return jnp.where(self.contains(u), jnp.asarray(u) - math.log(self.high - self.low), -jnp.inf)
+        return array_module(u).where(self.contains(u), u - math.log(self.high - self.low), -math.inf)
 
     def cdf(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """Return (x - low) / (high - low)."""
@@ -172,7 +174,7 @@ class Uniform(Bounded):
 
     def ppf(self, p: ArrayLike) -> Float[Array, "*shape"]:
         """Return log x, the inverse of `cdf`."""
-        return math.log(self.low) + jnp.log1p(jnp.asarray(p) * (self.high - self.low) / self.low)
+        return math.log(self.low) + array_module(p).log1p(p * ((self.high - self.low) / self.low))
 
 
 class LogUniform(Bounded):
@@ -193,7 +195,7 @@ class LogUniform(Bounded):
 
     def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """Return -log log(high / low) within the bounds, -inf outside."""
-        return jnp.where(self.contains(u), -math.log(self._length), -jnp.inf)
+        return array_module(u).where(self.contains(u), -math.log(self._length), -math.inf)
 
     def cdf(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """Return log(x / low) / log(high / low)."""
@@ -201,7 +203,7 @@ class LogUniform(Bounded):
 
     def ppf(self, p: ArrayLike) -> Float[Array, "*shape"]:
         """Return log x, the inverse of `cdf`."""
-        return math.log(self.low) + self._length * jnp.asarray(p)
+        return math.log(self.low) + self._length * p
 
 
 class TruncatedLogNormal(Bounded):

@@ -50,17 +50,17 @@ class Product(Distribution):
         return xp.interp(below, self.cumulative, self.edges)
 
 
-def multiply(factors: Sequence[Factor], cells: int = 2048, tails: float = 8.0) -> Distribution:
-    """Return the distribution of the product of x^p for independent x; exactly log-normal if all factors are.
+def multiply(factors: Sequence[Factor], scale: float = 1.0, cells: int = 2048, tails: float = 8.0) -> Distribution:
+    """Return the distribution of `scale` times the product of x^p for independent x; log-normal if all factors are.
 
     `cells` is the size of the table, `tails` (in sd) its reach along factors without bounds.
     """
-    mean = sum(power * x.log_mean for x, power in factors)
+    mean = math.log(scale) + sum(power * x.log_mean for x, power in factors)
     sd = math.sqrt(sum((power * x.log_sd) ** 2 for x, power in factors))
     if all(isinstance(x, LogNormal) for x, _ in factors):
         return LogNormal(math.exp(mean), sd)
     spans = [_span(x, power, tails) for x, power in factors]
-    low, high = (sum(span[side] for span in spans) for side in (0, 1))
+    low, high = (math.log(scale) + sum(span[side] for span in spans) for side in (0, 1))
     width = (high - low) / cells
     mass = np.ones(1)
     for (x, power), (start, end) in zip(factors, spans, strict=True):

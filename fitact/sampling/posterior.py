@@ -18,6 +18,7 @@ from fitact.files import atomic_write
 from fitact.fitting import derived
 from fitact.fitting.channel_fit import ChannelFit
 from fitact.fitting.fit import Fit
+from fitact.fitting.geometry import Capacitances
 from fitact.likelihood.channel import LINEAR_NUISANCES
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import draw_noise
@@ -77,14 +78,14 @@ class Posterior:
             draws |= {
                 channel.qualified_name(LINEAR_NUISANCES[column]): values[..., column] for column in channel.columns
             }
-        return draws
+        return draws | {name: np.exp(logs) for name, logs in self._geometry_logs.items()}
 
     def force(self) -> dict[str, Float[np.ndarray, "ensembles draws"]]:
         """Return mean, peak and rms of the electrostatic force, and mean friction by eq. (2), of each draw, N.
 
         The force is computed with eq. (22), with permittivities from Csc and Ci of each draw by eq. (3), or with the
-        interface-gap law for `[force] model = "gap"`. Thicknesses, area and friction are those of the scene. Means are
-        over whole periods of the drive.
+        interface-gap law for `[force] model = "gap"`. Thicknesses, area and friction are those of the scene; they
+        are drawn where it states a distribution. Means are over whole periods of the drive.
         """
         return {name: values for name, values in self.derived().items() if name not in ("g", "b")}
 
@@ -99,7 +100,19 @@ class Posterior:
 
     @functools.cached_property
     def _derived_draws(self) -> np.ndarray:
-        return derived.draw_derived(self.fit.derive, self.fit.likelihood, self.points, self.seed)
+        drawn = derived.draw_derived(self.fit.derive, self.fit.likelihood, self.points, self.seed)
+        if not self._geometry_logs:
+            return drawn
+        return self.fit.geometry.change_derived(self._capacitances, self._geometry_logs, drawn)
+
+    @functools.cached_property
+    def _geometry_logs(self) -> dict[str, np.ndarray]:
+        """Draws of the logarithms of what force and friction rest on beside the circuit, as far as stated."""
+        return self.fit.geometry.draw_logs(self._capacitances, self.points.shape[:-1], self.seed)
+
+    @property
+    def _capacitances(self) -> Capacitances:
+        return Capacitances.from_theta(self.fit.likelihood, self.points[..., : self.fit.theta.size])
 
     @functools.cached_property
     def _linear_draws(self) -> np.ndarray:
@@ -135,6 +148,8 @@ class Posterior:
             summaries[name]["u"] = budgets[name].u if name in budgets else relative
         for name, prior_sd in zip(prior.names, prior.log_sd, strict=True):
             summaries[name]["contraction"] = float(1.0 - np.std(np.log(drawn[name]), ddof=1) / prior_sd)
+        for name, law in self.fit.geometry.stated.items():
+            summaries[name]["contraction"] = float(1.0 - np.std(np.log(drawn[name]), ddof=1) / law.log_sd)
         return {
             "parameters": {name: summaries[name] for name in drawn},
             "derived": {name: summaries[name] for name in self.derived()},

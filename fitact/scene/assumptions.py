@@ -4,6 +4,7 @@ import math
 from typing import Any, NamedTuple
 
 from fitact.scene.scene import Scene
+from fitact.scene.uncertain_value import UncertainValue
 from fitact.units import format_engineering, format_percent
 
 
@@ -17,6 +18,7 @@ class Assumption(NamedTuple):
     text: str  # the value with its unit, for people
     stated: bool
     affects: str  # "prior", "drive", "force" or "friction"
+    has_distribution: bool = False  # stated; the errors of force and friction include it then
 
     def to_dict(self) -> dict[str, Any]:
         """Return an entry of `force_basis.assumptions` in fit.json and summary.json."""
@@ -42,11 +44,12 @@ def list_assumptions(scene: Scene, law: str, *, prior: bool, stated_drive: bool)
         Assumption(
             symbol,
             f"[{section}] {key}",
-            value,
+            value if isinstance(value, str) else float(value),
             unit,
-            value if isinstance(value, str) else format_engineering(value, unit),
+            value if isinstance(value, str) else _describe_value(value, unit),
             key in getattr(scene, section).model_fields_set,
             affects,
+            isinstance(value, UncertainValue),
         )
         for affects, entries in groups.items()
         for symbol, section, key, unit in entries
@@ -55,14 +58,20 @@ def list_assumptions(scene: Scene, law: str, *, prior: bool, stated_drive: bool)
     return (*(_prior_assumptions(scene) if prior else ()), *assumptions)
 
 
+def _describe_value(value: float, unit: str) -> str:
+    spread = f" ± {format_percent(value.distribution().log_sd)}" if isinstance(value, UncertainValue) else ""
+    return format_engineering(value, unit) + spread
+
+
 def _prior_assumptions(scene: Scene) -> tuple[Assumption, ...]:
     spec = scene.prior.specs()["Ci"]
     if not spec.is_free:
         return ()
     marginal, key = scene.make_prior()["Ci"], "[prior] Ci"
     median, log_sd = math.exp(marginal.log_mean), float(marginal.log_sd)
-    own_spread = "Ci" in scene.prior.model_fields_set and bool(
-        {"factor", "relative_sd", "low", "tolerance"} & scene.prior.Ci.model_fields_set
+    own_spread = "Ci" in scene.plates() or (
+        "Ci" in scene.prior.model_fields_set
+        and bool({"factor", "relative_sd", "low", "tolerance"} & scene.prior.Ci.model_fields_set)
     )
     return (
         Assumption("Ci", key, median, "F", format_engineering(median, "F"), states_Ci(scene), "prior"),

@@ -10,8 +10,8 @@ from fitact.instrument.classes import CLASSES
 from fitact.instrument.pieces import Piece
 from fitact.prior.distributions import Distribution, LogNormal, Uniform
 from fitact.prior.published import Layer
-from fitact.scene.prior_section import FaradPriorSpec, OhmPriorSpec, PriorSpec
-from fitact.scene.sections import Section, Unit
+from fitact.scene.prior_spec import FaradPriorSpec, OhmPriorSpec, PriorSpec
+from fitact.scene.section import Section, Unit
 
 Ratio = Annotated[float, Unit(""), Field(gt=0, lt=1)]
 

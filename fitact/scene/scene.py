@@ -21,19 +21,36 @@ from fitact.errors import InputError
 from fitact.instrument.pieces import Piece, find_load
 from fitact.model.circuit import RC, Circuit, DirectGround, FinalCircuit, NaturalGround, Probe
 from fitact.model.drive import Drive
-from fitact.model.force import Geometry, plate_capacitance
+from fitact.model.force import EPSILON_0, Geometry, plate_capacitance
 from fitact.model.skin import Dispersive, Fractional, WithSkin
+from fitact.prior.distributions import Distribution
 from fitact.prior.prior import Prior
+from fitact.prior.product import multiply
 from fitact.prior.published import Layer
 from fitact.scene import sections, toml
 from fitact.scene.instrument_section import InstrumentSection
 from fitact.scene.prior_section import PriorSection
+from fitact.scene.prior_spec import ORDER_KEYS, PriorSpec
+from fitact.scene.section import Section, field_section
+from fitact.scene.uncertain_value import UncertainValue
 
 _DIRECT_GROUND_KEYS = ("R_H", "grounding_Rsc", "grounding_Csc")  # keys of only one kind of grounding
 _NATURAL_GROUND_KEYS = ("Z", "Z_capacitance")
+_GEOMETRY_KEYS = {  # what force and friction rest on beside the circuit: quantity -> section and key
+    "skin_thickness": ("skin", "thickness"),
+    "skin_permittivity": ("skin", "permittivity"),
+    "insulator_thickness": ("device", "insulator_thickness"),
+    "insulator_permittivity": ("device", "insulator_permittivity"),
+    "contact_area": ("device", "contact_area"),
+    "friction_coefficient": ("friction", "coefficient"),
+}
+PLATES = {  # eq. (3): capacitance -> the powers of the quantities that it follows from
+    "Ci": {"insulator_permittivity": 1.0, "contact_area": 1.0, "insulator_thickness": -1.0},
+    "Csc": {"skin_permittivity": 1.0, "contact_area": 1.0, "skin_thickness": -1.0},
+}
 
 
-class Scene(sections.Section):
+class Scene(Section):
     """Device, skin, grounding, drive, measurement and prior of one case; see the sections.
 
     Attributes:
@@ -142,7 +159,53 @@ class Scene(sections.Section):
         """Return the sizes for the force; the thickness of a gap follows from Cgap unless both are stated."""
         both = self.gap.capacitance is not None and self.gap.thickness is not None
         panel, gap = self.device, self.gap.thickness if both else None
-        return Geometry(panel.contact_area, panel.insulator_thickness, self.skin.thickness, gap, self.force.model)
+        layers = float(panel.insulator_thickness), float(self.skin.thickness)
+        return Geometry(float(panel.contact_area), *layers, gap, self.force.model)
+
+    def geometry_values(self) -> dict[str, float | None]:
+        """Return what force and friction rest on beside the circuit, SI; None if the skin has no permittivity."""
+        return {name: getattr(getattr(self, section), key) for name, (section, key) in _GEOMETRY_KEYS.items()}
+
+    def geometry_distributions(self) -> dict[str, Distribution]:
+        """Return the stated distributions of what force and friction rest on beside the circuit."""
+        values = self.geometry_values().items()
+        return {name: value.distribution() for name, value in values if isinstance(value, UncertainValue)}
+
+    def uncertain_plates(self) -> tuple[str, ...]:
+        """Return the capacitances that follow from stated distributions by eq. (3), unless [prior] overrules that."""
+        is_derived = {"Ci": self.device.derives_Ci, "Csc": self.skin.permittivity is not None}
+        stated = self.geometry_distributions().keys()
+        return tuple(name for name, powers in PLATES.items() if is_derived[name] and stated & powers.keys())
+
+    def plates(self) -> dict[str, tuple[dict[str, float], float]]:
+        """Return the capacitances whose prior follows from stated distributions by eq. (3).
+
+        Each has the powers of the quantities with a distribution, and the factor from all others.
+        """
+        stated, values, found = self.geometry_distributions(), self.geometry_values(), {}
+        for name in self.uncertain_plates():
+            if not self.states_prior(name):
+                powers = {quantity: power for quantity, power in PLATES[name].items() if quantity in stated}
+                exact = [
+                    float(values[other] or 0.0) ** power for other, power in PLATES[name].items() if other not in powers
+                ]
+                found[name] = powers, EPSILON_0 * math.prod(exact)
+        return found
+
+    def states_prior(self, name: str) -> bool:
+        """Return whether [prior] states the density or the value of a parameter, and not only its order."""
+        belief = getattr(self.prior, name)
+        return name in self.prior.model_fields_set and bool(belief.model_fields_set - ORDER_KEYS)
+
+    def thickness_sd(self) -> dict[str, float]:
+        """Return the standard deviations of the logarithms of thicknesses that vary between fingers or panels."""
+        keys = {name: f"{name}_relative_sd" for name in ("skin_thickness", "insulator_thickness")}
+        sds = {name: math.sqrt(math.log1p(getattr(self.population, key) ** 2)) for name, key in keys.items()}
+        if keys["skin_thickness"] not in self.population.model_fields_set and isinstance(
+            self.skin.thickness, UncertainValue
+        ):
+            sds["skin_thickness"] = self.skin.thickness.distribution().log_sd
+        return {name: sd for name, sd in sds.items() if sd > 0.0}
 
     def make_circuit(self, values: Mapping[str, ArrayLike] | None = None) -> Circuit:
         """Make the circuit at the nominal values, or at `values` by name (ohm, F).
@@ -190,7 +253,13 @@ class Scene(sections.Section):
         layer = Layer(self.device.contact_area, self.skin.thickness, self.drive.lowest_frequency)
         nominal, beliefs = self.nominal_values(), self.prior.specs().items()
         marginals = {name: b.distribution(name, nominal[name], layer) for name, b in beliefs if b.is_free}
-        return Prior.of(self.prior.correlations(), self.prior.order_constraints(), **marginals)
+        plates, stated, correlations = self.plates(), self.geometry_distributions(), self.prior.correlations()
+        for name, (powers, factor) in plates.items():
+            marginals[name] = multiply([(stated[quantity], power) for quantity, power in powers.items()], factor)
+        if len(plates) == 2 and "contact_area" in stated and not {("Ci", "Csc"), ("Csc", "Ci")} & correlations.keys():
+            sds = [marginals[name].log_sd for name in plates]
+            correlations["Csc", "Ci"] = stated["contact_area"].log_sd ** 2 / (sds[0] * sds[1])  # they share the area
+        return Prior.of(correlations, self.prior.order_constraints(), **marginals)
 
     def fixed_values(self) -> dict[str, float]:
         """Return the fixed parameters and their values, SI.
@@ -206,6 +275,15 @@ class Scene(sections.Section):
                     raise InputError(f"[prior] {name} is fixed, but the scene has no {name}; write fixed = its value")
                 fixed[name] = float(value)
         return fixed
+
+    @model_validator(mode="after")
+    def _derive_Csc(self) -> Self:
+        if self.skin.permittivity is not None:
+            Csc = plate_capacitance(self.skin.permittivity, self.device.contact_area, self.skin.thickness)
+            skin = self.skin.model_copy()
+            object.__setattr__(skin, "Csc", Csc)  # eq. (3); both are frozen from here on
+            object.__setattr__(self, "skin", skin)
+        return self
 
     @model_validator(mode="after")
     def _check_prior(self) -> Self:
@@ -245,10 +323,10 @@ def _sentence(error: Any) -> str:
     where = [str(part) for part in error["loc"] if part not in ("function-before", "constrained-float")]
     place = f"[{where[0]}] {'.'.join(where[1:])}".strip() if where else "the scene"
     if error["type"] == "extra_forbidden":
-        model: type[sections.Section] = Scene
+        model: type[Section] = Scene
         for name in where[:-1]:
             if name in model.model_fields:  # not a piece of [instrument.own]
-                model = sections.field_section(model.model_fields[name])
+                model = field_section(model.model_fields[name]) or PriorSpec  # the distribution of a number
         return f"{place} is not a key of a scene; {_suggest_key(where[-1], list(model.model_fields))}"
     message = str(error["msg"]).removeprefix("Value error, ")
     if error["type"] == "model_type":

@@ -1,101 +1,67 @@
 """Sections of a scene file: keys, units, defaults and checks. Inside, every number is in SI units."""
 
-import dataclasses
 import math
-from collections.abc import Iterator
 from fractions import Fraction
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Literal, Self
 
-import pydantic
-from pydantic import BeforeValidator, ConfigDict, Field, GetCoreSchemaHandler, model_validator
-from pydantic.fields import FieldInfo
-from pydantic_core import CoreSchema
+from pydantic import Field, model_validator
 
-from fitact import units
 from fitact.errors import InputError
 from fitact.model.chirp import Chirp
 from fitact.model.drive import Burst, Drive, Multitone, Periodic, Sine, Square, Trapezoid, Triangle
 from fitact.model.force import plate_capacitance
-
-
-@dataclasses.dataclass(frozen=True)
-class Unit:
-    """SI unit of a field, as an annotation; "" for a ratio. Text with units is converted."""
-
-    name: str
-
-    def parse(self, value: Any) -> Any:
-        """Return the value in the unit."""
-        return units.parse_quantity(value, self.name)
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return BeforeValidator(self.parse).__get_pydantic_core_schema__(source, handler)
-
-
-Ohm = Annotated[float, Unit("ohm"), Field(gt=0)]
-AnyOhm = Annotated[float, Unit("ohm"), Field(ge=0)]
-Farad = Annotated[float, Unit("F"), Field(gt=0)]
-Meter = Annotated[float, Unit("m"), Field(gt=0)]
-SquareMeter = Annotated[float, Unit("m^2"), Field(gt=0)]
-Second = Annotated[float, Unit("s"), Field(gt=0)]
-AnySecond = Annotated[float, Unit("s")]
-Hertz = Annotated[float, Unit("Hz"), Field(gt=0)]
-Permittivity = Annotated[float, Unit(""), Field(ge=1)]
-Volt = Annotated[float, Unit("V"), Field(gt=0)]
-AnyVolt = Annotated[float, Unit("V")]
-NoiseVolt = Annotated[float, Unit("V"), Field(ge=0)]
-NoiseAmpere = Annotated[float, Unit("A"), Field(ge=0)]
-Ampere = Annotated[float, Unit("A"), Field(gt=0)]
-Angle = Annotated[float, Unit("rad")]
-Newton = Annotated[float, Unit("N"), Field(ge=0)]
-Threshold = Annotated[float, Unit("N"), Field(gt=0)]
-VoltPerMeter = Annotated[float, Unit("V/m"), Field(gt=0)]
-Share = Annotated[float, Field(gt=0, lt=1)]
-RelativeSD = Annotated[float, Field(ge=0, lt=1)]
-
-
-def field_unit(field: FieldInfo) -> str | None:
-    """Return the SI unit of a field; None if it is not a quantity."""
-    parts = _walk_annotations(*field.metadata, field.annotation)
-    return next((part.name for part in parts if isinstance(part, Unit)), None)
-
-
-def field_section(field: FieldInfo) -> type["Section"]:
-    """Return the section class of a field."""
-    parts = _walk_annotations(*field.metadata, field.annotation)
-    return next(part for part in parts if isinstance(part, type) and issubclass(part, Section))
-
-
-def _walk_annotations(*annotations: Any) -> Iterator[Any]:
-    for annotation in annotations:
-        yield annotation
-        yield from _walk_annotations(*get_args(annotation))
-
-
-class Section(pydantic.BaseModel):
-    """Section of a scene: frozen, without unknown keys."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+from fitact.scene.section import (
+    Ampere,
+    Angle,
+    AnyOhm,
+    AnySecond,
+    AnyVolt,
+    Farad,
+    Hertz,
+    Meter,
+    Newton,
+    NoiseAmpere,
+    NoiseVolt,
+    Ohm,
+    RelativeSD,
+    Second,
+    Section,
+    Share,
+    Threshold,
+    Volt,
+    VoltPerMeter,
+)
+from fitact.scene.uncertain_value import (
+    UncertainCoefficient,
+    UncertainMeter,
+    UncertainPermittivity,
+    UncertainSquareMeter,
+)
 
 
 class Device(Section):
     """Panel: insulator and contact area, and limits of field and current."""
 
     Ci: Farad = 1.35e-9
-    insulator_thickness: Meter = 1e-6
-    insulator_permittivity: Permittivity = 3.9
-    contact_area: SquareMeter = 1e-4
+    insulator_thickness: UncertainMeter = 1e-6
+    insulator_permittivity: UncertainPermittivity = 3.9
+    contact_area: UncertainSquareMeter = 1e-4
     breakdown_field: VoltPerMeter | None = None
     current_limit_rms: Ampere | None = None
     current_limit_peak: Ampere | None = None
 
     @model_validator(mode="after")
     def _derive_Ci(self) -> Self:
-        stated = self.model_fields_set
-        if "Ci" not in stated and {"insulator_thickness", "insulator_permittivity"} <= stated:
+        if self.derives_Ci:
             Ci = plate_capacitance(self.insulator_permittivity, self.contact_area, self.insulator_thickness)
             object.__setattr__(self, "Ci", Ci)  # eq. (3); the model is frozen from here on
         return self
+
+    @property
+    def derives_Ci(self) -> bool:
+        """Whether Ci follows from permittivity, area and thickness, eq. (3)."""
+        stated = self.model_fields_set
+        return "Ci" not in stated and {"insulator_thickness", "insulator_permittivity"} <= stated
 
 
 class SkinSection(Section):
@@ -103,14 +69,17 @@ class SkinSection(Section):
 
     Rsc: Ohm = 160e3
     Csc: Farad = 22e-9
-    thickness: Meter = 200e-6
+    thickness: UncertainMeter = 200e-6
+    permittivity: UncertainPermittivity | None = None
     level: Literal["constant", "dispersive", "fractional"] = "constant"
     alpha: Annotated[float, Field(gt=0, le=1)] = 0.8
 
     @model_validator(mode="after")
-    def _check_alpha(self) -> Self:
+    def _check_keys(self) -> Self:
         if "alpha" in self.model_fields_set and self.level != "fractional":
             raise ValueError(f"alpha belongs to level = 'fractional', not to '{self.level}'")
+        if {"Csc", "permittivity"} <= self.model_fields_set:
+            raise ValueError("[skin] Csc and permittivity state the same by eq. (3); leave one of them out")
         return self
 
 
@@ -285,7 +254,7 @@ class Measurement(Section):
 class Friction(Section):
     """Friction coefficient and normal force of eq. (2)."""
 
-    coefficient: Annotated[float, Field(gt=0)] = 0.5
+    coefficient: UncertainCoefficient = 0.5
     normal_force: Newton = 0.5
 
 
@@ -309,12 +278,6 @@ class PopulationSection(Section):
     contact_area: Literal["common", "varies"] = "common"
     skin_thickness_relative_sd: RelativeSD = 0.0
     insulator_thickness_relative_sd: RelativeSD = 0.0
-
-    @property
-    def thickness_sd(self) -> dict[str, float]:
-        """Standard deviations of the logarithms of varying thicknesses."""
-        stated = {name: getattr(self, f"{name}_relative_sd") for name in ("skin_thickness", "insulator_thickness")}
-        return {name: math.sqrt(math.log1p(sd**2)) for name, sd in stated.items() if sd > 0.0}
 
 
 class Tolerance(Section):

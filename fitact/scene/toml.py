@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from fitact.errors import InputError
-from fitact.scene.prior_section import QUANTITY_KEYS
-from fitact.scene.sections import Section, field_unit
+from fitact.scene.prior_spec import QUANTITY_KEYS
+from fitact.scene.section import Section, field_unit
+from fitact.scene.uncertain_value import UncertainValue
 from fitact.units import format_exact
 
 _HEADER = re.compile(r"\s*\[([^\[\]]+)\]\s*(#.*)?$")
@@ -66,6 +67,7 @@ def to_toml(scene: Section) -> str:
 
 def value_text(value: Any, unit: str | None) -> str:
     """Return a value as TOML; `unit` is the unit of numbers, or None."""
+    value = value.spec if isinstance(value, UncertainValue) else value
     if isinstance(value, Section):
         fields, stated = type(value).model_fields, {key: x for key, x in value if key in value.model_fields_set}
         units = {key: unit if key in QUANTITY_KEYS else field_unit(fields[key]) for key in stated}

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import fitact
 from fitact import units
 from fitact.data.simulate import simulate
-from fitact.scene.sections import field_unit
+from fitact.scene.section import field_unit
 from fitact.scene.toml import shipped_scenes, value_text
 
 CONTRACT = """
