@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from fitact import summary
 from fitact.fitting.geometry import Contribution
 from fitact.fitting.instrument_errors import ErrorCoordinate, InstrumentError
 from fitact.likelihood.likelihood import Likelihood
@@ -50,8 +51,9 @@ def geometry_component(contribution: Contribution) -> Component:
     """Return the component of a thickness, permittivity, area or friction coefficient in a budget."""
     each = contribution
     remedy = "measure it, e.g. by optical coherence tomography" if each.name == "skin_thickness" else "measure it"
-    law, size = each.distribution, (each.relative_sd, each.sensitivity)
-    return Component(each.source, "B", *size, law, remedy, in_posterior=each.stated)
+    source = f"{summary.describe_quantity(each.name)}{'' if each.stated else ' (default, from the literature)'}"
+    size = each.relative_sd, each.sensitivity
+    return Component(source, "B", *size, each.distribution, remedy, in_posterior=each.stated)
 
 
 def _instrument_source(error: InstrumentError) -> ErrorSource:

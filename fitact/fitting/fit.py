@@ -162,6 +162,14 @@ class Fit(FitResult):
         root[:size, :size] = self.covariance_root
         return root
 
+    @property
+    def sampling_order(self) -> list[int]:
+        """Coordinates of the posterior, those that the data narrow least first; empty without stated instruments."""
+        if not self.scene.instrument.is_stated:
+            return []
+        ratio = self.sd / np.linalg.norm(self.likelihood.prior_factor, axis=1)
+        return [*np.argsort(-ratio, kind="stable").tolist(), *range(self.theta.size, self.point.size)]
+
     def profile(self, name: str, level: float = 0.95, *, prior: bool = True) -> Interval:
         """Return the profile-likelihood interval of one parameter, or of g, b or force_mean.
 

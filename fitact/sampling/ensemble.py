@@ -98,7 +98,7 @@ def sample(
             posterior = importance.draw_around_fit(fit, level, log_prob, seed)
             timed = dataclasses.replace(posterior.convergence, seconds=time.perf_counter() - start_time)
             return dataclasses.replace(posterior, convergence=timed)
-        proposal = Proposal.from_laplace(fit.point, fit.point_root, log_prob)
+        proposal = Proposal.from_laplace(fit.point, fit.point_root, log_prob, fit.sampling_order)
         track = functools.partial(importance.tracked_quantities, fit)
         target = Target(fit.point_names, log_prob, proposal, track, _fingerprint(fit, seed, walkers, ensembles))
         path = None if chain_file is None else Path(chain_file)

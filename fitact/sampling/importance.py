@@ -18,7 +18,7 @@ def draw_around_fit(fit: Fit, level: str, log_prob: LogProb, seed: int) -> Poste
         z = rng.standard_normal((draws, fit.point.size))
         points, log_density = fit.point + z @ fit.point_root.T, -0.5 * np.sum(z**2, axis=1)
     else:
-        proposal = Proposal.from_laplace(fit.point, fit.point_root, log_prob)
+        proposal = Proposal.from_laplace(fit.point, fit.point_root, log_prob, fit.sampling_order)
         points = proposal.draw(rng, oversampling * draws)
         log_density = proposal.log_density(points)
     values = log_prob(points)

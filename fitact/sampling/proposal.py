@@ -6,7 +6,7 @@ direction, the density on a line through the optimum is tabulated; the other dir
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Self
 
 import numpy as np
@@ -71,10 +71,20 @@ class Proposal:
 
     @classmethod
     def from_laplace(
-        cls, point: Float[np.ndarray, " n"], covariance_factor: Float[np.ndarray, "n n"], log_prob: LogProb
+        cls,
+        point: Float[np.ndarray, " n"],
+        covariance_factor: Float[np.ndarray, "n n"],
+        log_prob: LogProb,
+        order: Sequence[int] = (),
     ) -> Self:
-        """Build a proposal from a Laplace approximation; tabulate the axes along which `log_prob` is not normal."""
-        axes, center, tables = principal_axes(covariance_factor), np.array(point, dtype=float), {}
+        """Build a proposal from a Laplace approximation; tabulate the axes along which `log_prob` is not normal.
+
+        With an `order` of the coordinates, each axis changes one of them, and those after it as the covariance says.
+        If several priors that the data do not narrow have bounds, those coordinates should come first. Otherwise the
+        axes are the principal ones.
+        """
+        axes = triangular_axes(covariance_factor, order) if len(order) else principal_axes(covariance_factor)
+        center, tables = np.array(point, dtype=float), {}
         order, center = _enter_support(center, axes, log_prob)
         for i in order:
             table = _tabulate_axis(center, axes[:, i], log_prob)
@@ -126,6 +136,14 @@ def principal_axes(covariance_factors: Float[np.ndarray, "*any n n"]) -> Float[n
     sizes = np.abs(vectors)
     first = np.argmax(sizes > 0.5 * sizes.max(axis=-2, keepdims=True), axis=-2, keepdims=True)
     return vectors * np.sign(np.take_along_axis(vectors, first, axis=-2)) * lengths[..., None, :]
+
+
+def triangular_axes(covariance_factor: Float[np.ndarray, "n n"], order: Sequence[int]) -> Float[np.ndarray, "n n"]:
+    """Return a factor of the covariance as columns; the k-th changes none of the first k coordinates in `order`."""
+    _, triangle = np.linalg.qr(covariance_factor[list(order)].T)
+    axes = np.empty_like(triangle)
+    axes[list(order)] = triangle.T * np.sign(np.diagonal(triangle))
+    return axes
 
 
 def draw_student_t(random: Random, count: int, size: int) -> Float[np.ndarray, "count size"]:
