@@ -47,6 +47,7 @@ _NUISANCES = {  # quantities of the measurement; {}: the channel
     "gain": "gain of {}",
     "gain_V": "gain of V",
     "compensation": "gain of {} at high frequency over that at low frequency",
+    "compensation_V": "gain of V at high frequency over that at low frequency",
     "nonlinearity_even": "1 + even non-linearity of {}, relative to the range",
     "nonlinearity_odd": "1 + odd non-linearity of {}, relative to the range",
     "probe_resistance": "input resistance that loads the skin",

@@ -1,6 +1,9 @@
 """Small errors of instruments that are not gains: their functions of time, from the signal at the starting point."""
 
 import dataclasses
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy.signal
@@ -9,35 +12,36 @@ from jaxtyping import Float
 from fitact.compiled import pad_samples
 from fitact.fitting.channel_fit import sample_residuals
 from fitact.fitting.drive_choice import DriveModel
-from fitact.fitting.problem import Problem
+from fitact.fitting.problem import Source
 from fitact.likelihood.likelihood import Likelihood
 
 # of 9 Mohm and 12.2 pF of a 10x probe. Source: primidi.com, passive probes; Brüel & Kjær 2125A manual, p. 49
 PROBE_TIME_CONSTANT = 110e-6  # s
 
 
-def fill_effects(problem: Problem, theta: np.ndarray) -> Problem:
-    """Return the problem with the effects of instruments in proportion to the signals at `theta`.
+class FilledEffects(NamedTuple):
+    """Likelihood whose effects of instruments are in proportion to its signals, without compression."""
 
-    The effects are small, so that errors of these signals do not matter.
-    """
-    likelihood = problem.likelihood
-    for i, (channel, source) in enumerate(zip(likelihood.channels, problem.sources, strict=True)):
+    likelihood: Likelihood
+    change: float  # of the fitted signals by the new effects, root of the sum of squares in units of the noise
+
+
+def fill_effects(
+    likelihood: Likelihood, theta: np.ndarray, sigma: Sequence[float], sources: Sequence[Source]
+) -> FilledEffects:
+    """Compute the effects of instruments anew, for the signals at `theta` with the noise `sigma` (V or A)."""
+    likelihood, change = likelihood.without_compression(), 0.0
+    for i, (channel, source, noise) in enumerate(zip(likelihood.channels, sources, sigma, strict=True)):
         if channel.effects is not None:
-            signal = _fitted_signal(likelihood, i, theta, source.noise)
-            effects = effect_functions(signal, source.record.time, source.choice, source.record.frequency())
-            changed = dataclasses.replace(channel, effects=pad_samples(effects))
-            likelihood = likelihood.replace_channel(i, changed)
-    return problem._replace(likelihood=likelihood)
-
-
-def _fitted_signal(
-    likelihood: Likelihood, index: int, theta: np.ndarray, noise: float
-) -> Float[np.ndarray, " samples"]:
-    channel = likelihood.channels[index]
-    inputs = likelihood.make_inputs(likelihood.evaluate_circuit(theta).circuit, theta, channel)
-    residuals, *_ = sample_residuals(channel, inputs, np.asarray(noise))
-    return (np.asarray(channel.observed) - residuals)[: channel.n_samples]
+            inputs = likelihood.make_inputs(likelihood.evaluate_circuit(theta).circuit, theta, channel)
+            residuals, *_ = sample_residuals(channel, inputs, np.asarray(noise))
+            signal = np.asarray(channel.observed) - residuals - np.asarray(inputs.effects) @ channel.effects
+            signal, record = signal[: channel.n_samples], source.record
+            effects = pad_samples(effect_functions(signal, record.time, source.choice, record.frequency()))
+            moved = channel.weights * (np.asarray(inputs.effects) @ (effects - channel.effects))
+            change = math.hypot(change, float(np.linalg.norm(moved[: channel.n_samples])) / noise)
+            likelihood = likelihood.replace_channel(i, dataclasses.replace(channel, effects=effects))
+    return FilledEffects(likelihood, change)
 
 
 def effect_functions(

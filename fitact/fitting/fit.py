@@ -310,7 +310,6 @@ def fit_records(
     with jax.enable_x64(True):
         try:
             problem = build_problem(records, scenes, prior, drives)
-            problem = fill_effects(problem, problem.start)
             solved, certified, root = _solve_problem(problem, tolerance, start)
             optima = find_optima(solved, starts) if starts > 1 else None
             lower = None if optima is None else lower_optimum(optima, solved)
@@ -325,10 +324,31 @@ def fit_records(
 
 
 def _solve_problem(
-    problem: Problem, tolerance: float, start: Mapping[str, float] | None
+    problem: Problem, tolerance: float, start: Mapping[str, float] | None, max_rounds: int = 3, max_change: float = 0.3
+) -> tuple[LeastSquaresResult, certificate.CertifiedLikelihood, np.ndarray]:
+    """Fit, and fit again with effects of instruments for the new optimum until these change the signals little.
+
+    `max_change` is the root of the sum of squares in units of the noise: the parameters then change by less than that
+    many standard errors.
+    """
+    noise, theta = [source.noise for source in problem.sources], choose_start(problem, start)
+    names = problem.likelihood.names
+    filled = fill_effects(problem.likelihood, theta, noise, problem.sources)
+    for _ in range(max_rounds):
+        end = _solve_with_effects(problem._replace(likelihood=filled.likelihood), tolerance, theta)
+        solved = end[0]
+        theta = np.array([dict(zip(solved.likelihood.names, solved.theta, strict=True))[name] for name in names])
+        filled = fill_effects(problem._replace(likelihood=filled.likelihood).likelihood, theta, noise, problem.sources)
+        if filled.change <= max_change:
+            break
+    return end
+
+
+def _solve_with_effects(
+    problem: Problem, tolerance: float, theta_0: np.ndarray
 ) -> tuple[LeastSquaresResult, certificate.CertifiedLikelihood, np.ndarray]:
     """Fit with compression, and again without it for channels where its error exceeds the tolerance."""
-    (likelihood, reasons), theta_0 = problem.compress_likelihood(tolerance), choose_start(problem, start)
+    likelihood, reasons = problem.compress_likelihood(tolerance)
     noise = np.array([source.noise for source in problem.sources])
     freeable = tuple(source.optional_nuisances for source in problem.sources)
     interpolated = [not certificate.reason_against_compression(each, tolerance) for each in likelihood.channels]

@@ -137,6 +137,7 @@ def _name_coordinate(
     acting = [each for each, power in zip(members, in_channels, strict=True) if power]
     records = {each.record for each in acting} | {i for i, power in enumerate(in_drives) if power}
     kinds = {each.channel.channel for each in acting}
-    base = f"{kind}_V" if any(in_drives) else f"{kind}_I" if kinds == {"I"} else kind
+    suffix = "_V" if any(in_drives) or len(kinds) > 1 else "_I" if kinds == {"I"} else ""
+    base = kind + suffix
     count = len({each.record for each in members if not kinds or each.channel.channel in kinds})
     return f"{base}_{min(records) + 1}" if len(records) == 1 and count > 1 else base
