@@ -222,10 +222,7 @@ def test_what_changes_nothing_is_noted_once(plain_fit: fitact.Fit, uncertain_fit
 
 
 def test_the_sentence_names_the_distributions_that_the_errors_include(plain_fit: fitact.Fit, uncertain_fit: fitact.Fit):
-    assert (
-        "except the prior's and the stated distributions of Tsc and mu."
-        in force_sentences(uncertain_fit.force_basis)[1]
-    )
+    assert "except the prior's and the stated distributions (Tsc, mu)." in force_sentences(uncertain_fit.force_basis)[1]
     assert "except the prior's." in force_sentences(plain_fit.force_basis)[1]
     assert "Tsc = 200 µm ± 20 % (scene)" in str(uncertain_fit)
 
