@@ -185,8 +185,9 @@ def quantity_table(content: dict[str, Any]) -> list[tuple[str, ...]]:
 
 def _quantity_row(name: str, summary: Summary, basis: dict[str, Any]) -> tuple[str, ...]:
     remark = "" if name in _PARAMETERS else describe_quantity(name)
-    defaults = [a for a in basis["assumptions"] if a["affects"] == "friction" and a["origin"] == "default"]
-    if name == "friction_mean" and defaults:
+    friction = [a for a in basis["assumptions"] if a["affects"] == "friction"]
+    defaults = [a for a in friction if a["origin"] == "default"]
+    if name == "friction_mean" and defaults and not any(a.get("has_distribution") for a in friction):
         value = format_engineering(float(f"{summary['q50']:.2g}"), str(summary["unit"]))
         assumed = ", ".join(f"{a['symbol']} = {a['text']}" for a in defaults)
         return name, f"about {value}", "", "", "", f"{remark}; default {assumed}"
@@ -203,7 +204,7 @@ def force_sentences(basis: dict[str, Any]) -> list[str]:
     if basis["assumptions"]:
         values = ", ".join(f"{a['symbol']} = {a['text']} ({a['origin']})" for a in basis["assumptions"])
         included = [a["symbol"] for a in basis["assumptions"] if a.get("has_distribution")]
-        exception = "the prior's" + (f" and the stated distributions of {' and '.join(included)}" if included else "")
+        exception = "the prior's" + (f" and the stated distributions ({', '.join(included)})" if included else "")
         sentences.append(
             f"Force and friction rest on {values}; default means that nobody stated it. The errors above include no"
             f" uncertainty of these values except {exception}."

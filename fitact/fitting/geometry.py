@@ -272,21 +272,18 @@ def _draw_by_importance(
 ) -> Float[np.ndarray, "names draws"]:
     """Return draws of the logarithms given `targets`, the values of the linear combinations `powers`.
 
-    Each draw is chosen among `candidates` for all but one variable of each combination. That variable solves the
-    equation, and its density is the weight. It is the one of the largest spread that occurs in one combination only.
+    Each draw is chosen among `candidates` for all variables but the one of the largest spread in each combination,
+    which solves the equation; its density is the weight. No variable is in two combinations.
     """
-    shared = np.count_nonzero(powers, axis=0) > 1
     spreads = np.array([law.log_sd for law in laws])
-    solved = [int(np.argmax(np.where(row != 0.0, np.where(shared, 1e-9, 1.0) * spreads, -1.0))) for row in powers]
-    order = sorted(range(len(powers)), key=lambda row: not shared[solved[row]])  # a shared one enters other equations
+    solved = np.argmax(np.abs(powers) * spreads, axis=1)
     drawn = np.empty((len(laws), targets.shape[1]))
     for start in range(0, targets.shape[1], block):
         goal = targets[:, start : start + block]
         shape = (candidates, goal.shape[1])
         logs = np.stack([law.from_standard_normal(rng.standard_normal(shape)) for law in laws])
         weight = rng.gumbel(size=shape)  # the largest sum of log-weight and Gumbel number is a weighted choice
-        for row in order:
-            name = solved[row]
+        for row, name in enumerate(solved):
             logs[name] = 0.0
             logs[name] = (goal[row] - np.tensordot(powers[row], logs, 1)) / powers[row, name]
             distance = np.abs(logs[name] - laws[name].log_mean) / spreads[name]

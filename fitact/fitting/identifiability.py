@@ -53,7 +53,7 @@ class Identifiability:
         """Suggested next measurement, computed on first access."""
         if self.verdict == "identified":
             return NextMeasurement()
-        force = f"Uncertainty of the mean force: ± {format_percent(self.force_sd)} now"
+        force = f"Uncertainty of the mean force from the circuit: ± {format_percent(self.force_sd)} now"
         experiment = self.experiment
         if experiment is None or self.force_gradient is None:
             return NextMeasurement(remedy=f"{force}; measure from below the corner frequency of the skin to above it.")

@@ -23,7 +23,7 @@ from fitact.model.circuit import RC, Circuit, DirectGround, FinalCircuit, Natura
 from fitact.model.drive import Drive
 from fitact.model.force import EPSILON_0, Geometry, plate_capacitance
 from fitact.model.skin import Dispersive, Fractional, WithSkin
-from fitact.prior.distributions import Distribution
+from fitact.prior.distributions import Distribution, LogNormal
 from fitact.prior.prior import Prior
 from fitact.prior.product import multiply
 from fitact.prior.published import Layer
@@ -253,12 +253,19 @@ class Scene(Section):
         layer = Layer(self.device.contact_area, self.skin.thickness, self.drive.lowest_frequency)
         nominal, beliefs = self.nominal_values(), self.prior.specs().items()
         marginals = {name: b.distribution(name, nominal[name], layer) for name, b in beliefs if b.is_free}
-        plates, stated, correlations = self.plates(), self.geometry_distributions(), self.prior.correlations()
+        correlations, stated = self.prior.correlations(), self.geometry_distributions()
+        plates = self.plates()
         for name, (powers, factor) in plates.items():
             marginals[name] = multiply([(stated[quantity], power) for quantity, power in powers.items()], factor)
-        if len(plates) == 2 and "contact_area" in stated and not {("Ci", "Csc"), ("Csc", "Ci")} & correlations.keys():
-            sds = [marginals[name].log_sd for name in plates]
-            correlations["Csc", "Ci"] = stated["contact_area"].log_sd ** 2 / (sds[0] * sds[1])  # they share the area
+        if len(plates) == 2 and "contact_area" in stated:
+            laws = [marginals[name] for name in plates]
+            correlation = stated["contact_area"].log_sd ** 2 / math.prod(law.log_sd for law in laws)
+            if correlation > 0.999 or not all(isinstance(law, LogNormal) for law in laws):
+                raise InputError(
+                    "[device] contact_area sets Ci and Csc together; write each distribution that they follow from as"
+                    " {median, relative_sd} or {median, factor}, and one of a thickness or permittivity, too"
+                )
+            correlations = {("Csc", "Ci"): correlation} | correlations
         return Prior.of(correlations, self.prior.order_constraints(), **marginals)
 
     def fixed_values(self) -> dict[str, float]:

@@ -149,20 +149,30 @@ def test_bounded_quantities_given_Ci_are_those_of_brute_force_rejection(Ci: floa
 
 
 def test_an_area_that_both_capacitances_share_is_drawn_as_by_rejection():
-    """Uniform area, log-normal thicknesses; rejection within 2 % of an sd of both capacitances."""
+    """Log-normal area and thicknesses; rejection within a tenth of an sd of both capacitances."""
     device = {"insulator_thickness": LAYER["insulator_thickness"], "insulator_permittivity": 3.9}
     skin = {"permittivity": 5000, "thickness": {"median": "200 um", "relative_sd": 0.1}}
-    scene = scene_with(device=device | {"contact_area": UNIFORM_AREA}, skin=skin)
+    scene = scene_with(device=device | {"contact_area": LAYER["contact_area"]}, skin=skin)
     Ci, Csc = 3.6e-9, 24e-9
     logs = draws_given(scene, Ci, Csc, n=4000)
     rng, n = np.random.default_rng(2), 4_000_000
-    area = rng.uniform(0.8e-4, 1.2e-4, n)
-    Ti, Tsc = 1e-6 * np.exp(log_sd(0.05) * rng.standard_normal(n)), 2e-4 * np.exp(log_sd(0.1) * rng.standard_normal(n))
+    area, Ti, Tsc = (
+        median * np.exp(log_sd(spread) * rng.standard_normal(n))
+        for median, spread in ((1e-4, 0.1), (1e-6, 0.05), (2e-4, 0.1))
+    )
     kept = np.abs(np.log(EPSILON_0 * 3.9 * area / Ti / Ci)) < 0.01
     kept &= np.abs(np.log(EPSILON_0 * 5000 * area / Tsc / Csc)) < 0.01
     assert np.count_nonzero(kept) > 2000
     for name, values in {"insulator_thickness": Ti, "skin_thickness": Tsc, "contact_area": area}.items():
         assert scipy.stats.ks_2samp(np.exp(logs[name]), values[kept]).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("area", [UNIFORM_AREA, LAYER["contact_area"]])
+def test_a_shared_area_without_closed_form_is_refused(area: dict):
+    """A uniform area; and one that alone would set both capacitances."""
+    device = {"insulator_thickness": "1 um", "insulator_permittivity": 3.9, "contact_area": area}
+    with pytest.raises(fitact.InputError, match="contact_area sets Ci and Csc together"):
+        scene_with(device=device, skin={"permittivity": 5000})
 
 
 @pytest.fixture(scope="module")
@@ -212,10 +222,7 @@ def test_what_changes_nothing_is_noted_once(plain_fit: fitact.Fit, uncertain_fit
 
 
 def test_the_sentence_names_the_distributions_that_the_errors_include(plain_fit: fitact.Fit, uncertain_fit: fitact.Fit):
-    assert (
-        "except the prior's and the stated distributions of Tsc and mu."
-        in force_sentences(uncertain_fit.force_basis)[1]
-    )
+    assert "except the prior's and the stated distributions (Tsc, mu)." in force_sentences(uncertain_fit.force_basis)[1]
     assert "except the prior's." in force_sentences(plain_fit.force_basis)[1]
     assert "Tsc = 200 µm ± 20 % (scene)" in str(uncertain_fit)
 
@@ -270,7 +277,7 @@ def test_a_stated_prior_of_Ci_wins(record: fitact.Record):
 def test_the_current_updates_the_thickness():
     """The loop current determines Ci, so ln Ti | data has variance u^2 - u^4 / s^2 + (u^2 / s^2)^2 sd(ln Ci)^2, and its
     mean moves by -u^2 / s^2 (ln Ci - ln Ci nominal), with u of ln Ti and s^2 the sum of the three variances."""
-    common = {"measurement": {"channels": ["Vsc", "I"]}, "grounding": {"R_H": "10 kohm"}}
+    common = {"measurement": {"channels": ["Vsc", "I"], "sampling_rate": "50 kHz"}, "grounding": {"R_H": "10 kohm"}}
     record = simulate(fitact.Scene.from_dict(common | {"device": {"Ci": "4 nF"}}), seed=3)
     fit = fitact.fit(record, fitact.Scene.from_dict(common | {"device": LAYER}))
     place = fit.names.index("Ci")
