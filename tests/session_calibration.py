@@ -50,18 +50,23 @@ LOAD_R, LOAD_C = (10e6, 0.02), (12e-12, 0.25)
 
 TONES = np.array([1, 2, 3, 5, 7, 10, 14, 19])  # multiples of the frequency
 FREQUENCY, PER_PERIOD, PERIODS, RISE, HALF = 100.0, 2000, 2, 1e-4, 180.0
+TIME = np.arange(PER_PERIOD) / (FREQUENCY * PER_PERIOD)  # of one period, s
+LAPLACE = 2j * np.pi * np.maximum(np.fft.rfftfreq(PER_PERIOD, TIME[1]), 1e-9)  # j omega, rad/s
 NOISE = {"Vsc": 0.1, "I": 5e-6}  # V, A: about a step of 8 bits
 PRIOR = {"Rsc": ("160 kohm", 1.5), "Csc": ("22 nF", 1.5), "Ci": ("1.35 nF", 1.1)}
 THICKNESS, THICKNESS_SD, PANEL = 200e-6, 0.2, 1e-6
 
 
 def scene(setup: str, suffix: str = "") -> fitact.Scene:
-    """Return the scene of a set-up; a `suffix` gives its pieces other names."""
+    """Return the scene of a set-up; a `suffix` gives the channels of its oscilloscope other names."""
     return fitact.Scene.from_dict(
         {
             "drive": {"waveform": "measured", "steady_state": True},
             "measurement": {"channels": [name for name in SETUPS[setup] if name != "V"]},
-            "instrument": {channel: [f"{p}{suffix}" for p in pieces] for channel, pieces in SETUPS[setup].items()},
+            "instrument": {
+                channel: [p + suffix * p.startswith("scope") for p in pieces]
+                for channel, pieces in SETUPS[setup].items()
+            },
             "prior": {name: {"median": median, "factor": factor} for name, (median, factor) in PRIOR.items()},
             "skin": {"thickness": {"median": f"{THICKNESS} m", "relative_sd": THICKNESS_SD}},
         }
@@ -74,58 +79,57 @@ def simulate(setup: str, seed: int, records: int) -> tuple[list[fitact.Record], 
     z95 = scipy.stats.norm.ppf(0.975)
     medians = {"Rsc": 160e3, "Csc": 22e-9, "Ci": 1.35e-9}
     R, C, Ci = (medians[name] * PRIOR[name][1] ** (rng.standard_normal() / z95) for name in medians)
-    spread = np.sqrt(np.log1p(THICKNESS_SD**2))
-    skin = THICKNESS * np.exp(spread * rng.standard_normal())
-    errors = {
-        piece: {
-            "gain": rng.uniform(-1.0, 1.0) * GAIN[kind],
-            "even": rng.uniform(-0.5, 0.5) * NONLINEARITY.get(kind, 0.0),
-            "odd": rng.uniform(-0.5, 0.5) * NONLINEARITY.get(kind, 0.0),
-            "compensation": rng.uniform(-1.0, 1.0) * COMPENSATION * (kind == "probe-10x"),
-        }
-        for pieces in SETUPS[setup].values()
-        for piece in pieces
-        for kind in [piece.partition(":")[0]]
-    }
-    load_R, load_C = (value * (1.0 + limit * rng.uniform(-1.0, 1.0)) for value, limit in (LOAD_R, LOAD_C))
-
-    step = 1.0 / (FREQUENCY * PER_PERIOD)
-    phase = np.arange(PER_PERIOD) * step
-    V = HALF * wave(setup, phase)
-    s = 2j * np.pi * np.fft.rfftfreq(PER_PERIOD, step)
-    s[0] = 1e-9j
-
-    def loop(R_touching: float, C_touching: float) -> tuple[np.ndarray, np.ndarray]:
-        touching, grounding = R_touching / (1.0 + s * R_touching * C_touching), R / (1.0 + s * R * C)
-        total = touching + grounding + 1.0 / (s * Ci)
-        return touching / total, 1.0 / total
-
-    H, Y = loop(1.0 / (1.0 / R + 1.0 / load_R), C + load_C)
-    unloaded, _ = loop(R, C)
-    true = {"V": V, "Vsc": respond(V, H), "I": respond(V, Y)}
-    recorded: dict[str, np.ndarray] = {}
-    for channel, pieces in SETUPS[setup].items():
-        filtered = np.ones_like(s)
-        gain = 1.0
-        for piece in pieces:
-            gain *= 1.0 + errors[piece]["gain"]
-            filtered = filtered * (1.0 + errors[piece]["compensation"] * s * PROBE_TAU / (1.0 + s * PROBE_TAU))
-        signal = gain * respond(true[channel], filtered)
-        if channel != "V":
-            size = np.ptp(signal) / 0.8
-            x = (2.0 * signal - signal.min() - signal.max()) / size
-            even, odd = sum(errors[p]["even"] for p in pieces), sum(errors[p]["odd"] for p in pieces)
-            signal = signal + size * (even * 0.5 * (3.0 * x**2 - 1.0) + odd * 0.5 * (5.0 * x**3 - 3.0 * x))
-        recorded[channel] = np.tile(signal, PERIODS)
-    time = np.arange(PER_PERIOD * PERIODS) * step
-    found = []
-    for number in range(records):
-        noisy = {c: x + NOISE.get(c, 0.0) * rng.standard_normal(x.size) for c, x in recorded.items()}
-        found.append(fitact.Record.from_arrays(time, **noisy, source=f"record {number}"))
-    vsc = respond(V, unloaded)
+    skin = THICKNESS * np.exp(np.sqrt(np.log1p(THICKNESS_SD**2)) * rng.standard_normal())
+    errors = draw_errors(setup, rng)
+    found = [make_record(setup, (R, C, Ci), errors, rng, f"record {number}") for number in range(records)]
+    vsc = respond(HALF * wave(setup, TIME), loop(R, C, Ci)[0])
     force = np.mean(vsc**2) / (2.0 * (PANEL + skin)) * Ci * C / (Ci + C)  # eq. (22) with eq. (3)
     truth = {"g": Ci / (2.0 * Ci + C), "b": R * (2.0 * Ci + C), "Rsc": R, "Csc": C, "Ci": Ci, "force_mean": force}
     return found, truth
+
+
+def draw_errors(setup: str, rng: np.random.Generator) -> dict[str, Any]:
+    """Draw the errors of each piece within the limits of its class, and the load of the probe on Vsc."""
+    errors: dict[str, Any] = {}
+    for pieces in SETUPS[setup].values():
+        for piece in pieces:
+            kind = piece.partition(":")[0]
+            limits = GAIN[kind], 0.5 * NONLINEARITY.get(kind, 0.0), 0.5 * NONLINEARITY.get(kind, 0.0)
+            drawn = rng.uniform(-1.0, 1.0, 4) * [*limits, COMPENSATION * (kind == "probe-10x")]
+            errors[piece] = dict(zip(("gain", "even", "odd", "compensation"), drawn, strict=True))
+    errors["load"] = [value * (1.0 + limit * rng.uniform(-1.0, 1.0)) for value, limit in (LOAD_R, LOAD_C)]
+    return errors
+
+
+def make_record(
+    setup: str, parts: tuple[float, float, float], errors: dict[str, Any], rng: np.random.Generator, source: str
+) -> fitact.Record:
+    """Simulate a record of a circuit, or a dummy, whose `parts` are Rsc, Csc and Ci."""
+    V = HALF * wave(setup, TIME)
+    H, Y = loop(*parts, *errors["load"])
+    true = {"V": V, "Vsc": respond(V, H), "I": respond(V, Y)}
+    recorded = {}
+    for channel, pieces in SETUPS[setup].items():
+        signal = true[channel]
+        for piece in pieces:
+            compensation = errors[piece]["compensation"] * LAPLACE * PROBE_TAU / (1.0 + LAPLACE * PROBE_TAU)
+            signal = (1.0 + errors[piece]["gain"]) * respond(signal, 1.0 + compensation)
+        if channel != "V":
+            size = np.ptp(signal) / 0.8
+            x = (2.0 * signal - signal.min() - signal.max()) / size
+            even, odd = (sum(errors[piece][shape] for piece in pieces) for shape in ("even", "odd"))
+            signal = signal + size * (even * 0.5 * (3.0 * x**2 - 1.0) + odd * 0.5 * (5.0 * x**3 - 3.0 * x))
+        noise = NOISE.get(channel, 0.0) * rng.standard_normal(PERIODS * PER_PERIOD)
+        recorded[channel] = np.tile(signal, PERIODS) + noise
+    time = np.arange(PERIODS * PER_PERIOD) / (FREQUENCY * PER_PERIOD)
+    return fitact.Record.from_arrays(time, **recorded, source=source)
+
+
+def loop(R: float, C: float, Ci: float, load_R: float = np.inf, load_C: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return Vsc / V and I / V of two equal skins, the first with a load in parallel, in series with Ci."""
+    skins = [1.0 / (1.0 / R + 1.0 / r + LAPLACE * (C + c)) for r, c in ((load_R, load_C), (np.inf, 0.0))]
+    total = skins[0] + skins[1] + 1.0 / (LAPLACE * Ci)
+    return skins[0] / total, 1.0 / total
 
 
 def wave(setup: str, time: np.ndarray) -> np.ndarray:

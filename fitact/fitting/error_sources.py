@@ -2,9 +2,13 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+from jaxtyping import Float
+
 from fitact import summary
 from fitact.fitting.geometry import Contribution
 from fitact.fitting.instrument_errors import ErrorCoordinate, InstrumentError
+from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.skin import probe_parameters
 from fitact.prior.distributions import LogNormal
@@ -58,3 +62,29 @@ def geometry_component(contribution: Contribution) -> Component:
 
 def _instrument_source(error: InstrumentError) -> ErrorSource:
     return ErrorSource(error.source, error.distribution, _CALIBRATE, error.power)
+
+
+def noise_information(
+    likelihood: Likelihood, solution: LeastSquaresResult
+) -> dict[str, Float[np.ndarray, "rows parameters"]]:
+    """Return roots of the Fisher information of the noise of all channels of a kind."""
+    by_kind: dict[str, list[np.ndarray]] = {}
+    for channel, jacobian in zip(likelihood.channels, solution.jacobian, strict=True):
+        by_kind.setdefault(f"noise of {channel.channel}", []).append(np.asarray(np.linalg.qr(jacobian, mode="r")))
+    if likelihood.calibration is not None:
+        by_kind["calibration record (noise, and tolerances of its parts)"] = [likelihood.calibration_jacobian]
+    return {name: np.concatenate(parts) for name, parts in by_kind.items()}
+
+
+def gain_shifts(
+    likelihood: Likelihood, solution: LeastSquaresResult, root: Float[np.ndarray, "parameters parameters"]
+) -> dict[str, Float[np.ndarray, " parameters"]]:
+    """Return the change of the optimum for a relative error of 1 in the gains of V, Vsc and I, to first order."""
+    shifts = {"V": np.zeros(len(root))}
+    parts = zip(likelihood.channels, solution.jacobian, solution.signal, solution.sigma, strict=True)
+    for channel, jacobian, signal, sigma in parts:
+        # the Jacobian is that of data minus model
+        shift = -root @ (root.T @ (jacobian[: signal.size].T @ signal)) / sigma
+        shifts[channel.channel] = shifts.get(channel.channel, 0.0) + shift
+        shifts["V"] -= shift
+    return shifts

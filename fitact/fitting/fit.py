@@ -14,12 +14,13 @@ from jaxtyping import Float
 from fitact import summary
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.experiment.fisher import Experiment, covariance_factor
+from fitact.experiment.fisher import Experiment
 from fitact.fitting import derived, remarks
+from fitact.fitting.calibrate import calibrate
 from fitact.fitting.channel_fit import ChannelFit, information_criteria
 from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.effects import fill_effects
-from fitact.fitting.error_sources import geometry_component, list_error_sources
+from fitact.fitting.error_sources import gain_shifts, geometry_component, list_error_sources, noise_information
 from fitact.fitting.geometry import UncertainGeometry
 from fitact.fitting.identifiability import assess_identifiability
 from fitact.fitting.laplace import FitResult, Laplace
@@ -32,7 +33,6 @@ from fitact.fitting.residual_statistics import pooled_statistics
 from fitact.fitting.verdict import diagnose_fit, misfit_warnings
 from fitact.instrument.classes import TYPICAL, typical_gain_u
 from fitact.likelihood import certificate
-from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import scale_information
 from fitact.model.skin import constant_skin_circuit
 from fitact.scene.scene import Scene
@@ -310,12 +310,21 @@ def fit_records(
     with jax.enable_x64(True):
         try:
             problem = build_problem(records, scenes, prior, drives)
+            calibrated = calibrate(scenes[0], problem.likelihood.prior.names, fit_records)
+            if calibrated.calibration is not None:
+                likelihood = dataclasses.replace(problem.likelihood, calibration=calibrated.calibration)
+                problem = problem._replace(likelihood=likelihood)
             solved, certified, root = _solve_problem(problem, tolerance, start)
             optima = find_optima(solved, starts) if starts > 1 else None
             lower = None if optima is None else lower_optimum(optima, solved)
             if lower is not None:
                 solved, certified, root = _solve_problem(problem, tolerance, lower)
-            return _assemble_fit(problem, solved, certified, root, optima, without_scene=scenes[0] is None)
+            fitted = _assemble_fit(problem, solved, certified, root, optima, without_scene=scenes[0] is None)
+            return dataclasses.replace(
+                fitted,
+                warnings=(*calibrated.warnings, *fitted.warnings),
+                notes=(*calibrated.notes, *fitted.notes),
+            )
         except np.linalg.LinAlgError as error:
             raise InputError(
                 f"{records[0].source}: the channels cannot be computed with ({error}); check for a huge offset or a"
@@ -354,7 +363,7 @@ def _solve_with_effects(
     interpolated = [not certificate.reason_against_compression(each, tolerance) for each in likelihood.channels]
     while True:
         solved = solve(likelihood, theta_0, noise, freeable, tuple(interpolated))
-        root = covariance_factor(np.concatenate(solved.jacobian), solved.likelihood.prior_factor)
+        root = solved.covariance_factor()
         certified = certificate.certify(solved.likelihood, reasons, solved.theta, root, solved.sigma, tolerance)
         pairs = zip(solved.likelihood.channels, certified.reasons, strict=True)
         failed = [bool(reason) and channel.compression is not None for channel, reason in pairs]
@@ -418,30 +427,6 @@ def _assemble_fit(
         compression_error=certified.error,
         experiment=experiment,
         error_sources=list_error_sources(likelihood, problem.coordinates, first.scene),
-        noise_information=_noise_information(likelihood, solution),
-        gain_shifts=_gain_shifts(likelihood, solution, root),
+        noise_information=noise_information(likelihood, solution),
+        gain_shifts=gain_shifts(likelihood, solution, root),
     )
-
-
-def _noise_information(
-    likelihood: Likelihood, solution: LeastSquaresResult
-) -> dict[str, Float[np.ndarray, "rows parameters"]]:
-    """Return roots of the Fisher information of the noise of all channels of a kind."""
-    by_kind: dict[str, list[np.ndarray]] = {}
-    for channel, jacobian in zip(likelihood.channels, solution.jacobian, strict=True):
-        by_kind.setdefault(f"noise of {channel.channel}", []).append(np.asarray(np.linalg.qr(jacobian, mode="r")))
-    return {name: np.concatenate(parts) for name, parts in by_kind.items()}
-
-
-def _gain_shifts(
-    likelihood: Likelihood, solution: LeastSquaresResult, root: Float[np.ndarray, "parameters parameters"]
-) -> dict[str, Float[np.ndarray, " parameters"]]:
-    """Return the change of the optimum for a relative error of 1 in the gains of V, Vsc and I, to first order."""
-    shifts = {"V": np.zeros(len(root))}
-    parts = zip(likelihood.channels, solution.jacobian, solution.signal, solution.sigma, strict=True)
-    for channel, jacobian, signal, sigma in parts:
-        # the Jacobian is that of data minus model
-        shift = -root @ (root.T @ (jacobian[: signal.size].T @ signal)) / sigma
-        shifts[channel.channel] = shifts.get(channel.channel, 0.0) + shift
-        shifts["V"] -= shift
-    return shifts

@@ -42,6 +42,11 @@ class LeastSquaresResult:
     slope: tuple[Float[np.ndarray, " rows"], ...]  # derivative of the signal with respect to the delay
     signal: tuple[Float[np.ndarray, " rows"], ...]  # without linear nuisances
 
+    def covariance_factor(self) -> Float[np.ndarray, "parameters parameters"]:
+        """Return a factor of the covariance of theta in the Laplace approximation."""
+        rows = np.concatenate([*self.jacobian, self.likelihood.calibration_jacobian])
+        return covariance_factor(rows, self.likelihood.prior_factor)
+
 
 class _Round(NamedTuple):
     """End of a round; the fields are those of `LeastSquaresResult`."""
@@ -161,7 +166,7 @@ def solve(
 def _least_timing_gain(solution: LeastSquaresResult) -> float:
     """Return the decrease of the BIC that the least significant of the free delays and clocks causes."""
     likelihood, count = solution.likelihood, float(solution.likelihood.count)
-    root = covariance_factor(np.concatenate(solution.jacobian), likelihood.prior_factor)
+    root = solution.covariance_factor()
     gains = []
     for name, (origin, unit) in likelihood.timing.items():
         place = likelihood.names.index(name)
@@ -264,7 +269,7 @@ def _interpolate(
     for i in chosen:
         thin = thin.replace_channel(i, likelihood.channels[i].thin(few))
     solved = least_squares(thin, start, noise, noise_tolerance=0.1)
-    root = covariance_factor(np.concatenate(solved.jacobian), thin.prior_factor)
+    root = solved.covariance_factor()
     for i in chosen:
         size = likelihood.channels[i].n_samples
         reach = 6.0 + 20.0 * math.sqrt(min(few / size, 1.0))

@@ -17,6 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from fitact.compiled import BatchEvaluator, array_module, jit
+from fitact.likelihood.calibration import Calibration
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
 from fitact.model.circuit import RC, Channel, Circuit, HighpassTerms
 from fitact.model.skin import (
@@ -54,6 +55,7 @@ class Likelihood(eqx.Module):
     template: RC | WithSkin  # the circuit with the values of parameters that are not free
     prior: Prior  # prior of the free circuit parameters, gains and the load of a probe
     sigma_prior: tuple[Distribution | None, ...]  # prior of each channel's noise; None means flat in its logarithm
+    calibration: Calibration | None = eqx.field(default=None, kw_only=True)  # of the errors of instruments
     # parameters proportional to another: (name, name of the other, ratio)
     tied: tuple[tuple[str, str, float], ...] = eqx.field(static=True, default=())
     # whether the prior of the circuit applies, in addition to the priors of gains and delays
@@ -209,13 +211,21 @@ class Likelihood(eqx.Module):
         parts = zip(self.channels_and_inputs(theta), sigma, strict=True)
         return tuple(channel.residuals(inputs, s) for (channel, inputs), s in parts)
 
-    def prior_residuals(self, theta: Float[Array, " circuit_parameters"]) -> Float[Array, " circuit_parameters"]:
-        """Return the prior as residuals, normal in theta with the prior's moments; 0 for parameters without a prior."""
+    def prior_residuals(self, theta: Float[Array, " circuit_parameters"]) -> Float[Array, " rows"]:
+        """Return the prior as residuals, normal in theta with its moments (0 without a prior), then the calibration."""
         size = len(self.prior.names)
         scaled = self.prior.residuals(theta[:size])
         if self._timing:
             scaled = jnp.concatenate([scaled, theta[size:] / jnp.asarray(self.timing_sd)])
-        return scaled if self.use_prior else jnp.where(self._circuit_mask, 0.0, scaled)
+        scaled = scaled if self.use_prior else jnp.where(self._circuit_mask, 0.0, scaled)
+        if self.calibration is None:
+            return scaled
+        return jnp.concatenate([scaled, self.calibration.residuals(theta, self.names)])
+
+    @property
+    def calibration_jacobian(self) -> Float[np.ndarray, "rows parameters"]:
+        """Derivatives of the calibration's residuals in theta; no rows without a calibration."""
+        return np.zeros((0, len(self.names))) if self.calibration is None else self.calibration.jacobian(self.names)
 
     def split(
         self, point: Float[Array, " coordinates"]
@@ -241,6 +251,8 @@ class Likelihood(eqx.Module):
             value = value - 0.5 * jnp.square(off / sd)
         for prior, log in zip(self.sigma_prior, log_sigma, strict=True):
             value = value if prior is None else value + prior.log_density(log)
+        if self.calibration is not None:
+            value = value - 0.5 * jnp.sum(jnp.square(self.calibration.residuals(theta, self.names)))
         return value
 
     def log_prob_parts(self, point: Float[Array, " coordinates"]) -> Float[Array, "channels+1"]:

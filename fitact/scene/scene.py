@@ -28,6 +28,7 @@ from fitact.prior.prior import Prior
 from fitact.prior.product import multiply
 from fitact.prior.published import Layer
 from fitact.scene import sections, toml
+from fitact.scene.calibration_section import CalibrationSection
 from fitact.scene.instrument_section import InstrumentSection
 from fitact.scene.prior_section import PriorSection
 from fitact.scene.prior_spec import ORDER_KEYS, PriorSpec
@@ -61,6 +62,7 @@ class Scene(Section):
     """
 
     description: str = ""
+    calibration: tuple[CalibrationSection, ...] = ()
     device: sections.Device = sections.Device()
     skin: sections.SkinSection = sections.SkinSection()
     grounding: sections.Grounding = sections.Grounding()
@@ -84,7 +86,11 @@ class Scene(Section):
         """
         text = toml.read_scene_text(path)
         try:
-            return cls.model_validate(tomllib.loads(text))
+            content = tomllib.loads(text)
+            for each in content.get("calibration", ()):  # files lie beside the scene
+                if isinstance(each, dict) and isinstance(each.get("record"), str):
+                    each["record"] = str(Path(path).parent / each["record"])
+            return cls.model_validate(content)
         except tomllib.TOMLDecodeError as error:
             raise InputError(f"{path}: not valid TOML: {error}") from error
         except pydantic.ValidationError as error:
