@@ -12,6 +12,7 @@ import fitact
 from fitact.data.simulate import simulate
 from fitact.fitting.geometry import Capacitances, UncertainGeometry
 from fitact.summary import force_sentences
+from fitact.units import format_engineering
 from tests.conftest import RECORDS
 
 EPSILON_0 = 8.85e-12
@@ -334,3 +335,8 @@ def test_a_skin_thickness_that_Csc_updates_moves_force_and_friction(record: fita
         logs, expected = np.log(draws), fit.derived()[name]
         assert np.std(logs) == pytest.approx(relative_sd(expected), rel=0.02)
         assert np.median(logs) == pytest.approx(math.log(expected["q50"]), abs=0.04 * np.std(logs))
+
+
+def test_an_area_is_printed_with_the_prefix_squared():
+    assert format_engineering(1e-4, "m^2") == "100 mm^2"
+    assert format_engineering(2.5, "m^2") == "2.5 m^2"
