@@ -161,8 +161,10 @@ class UncertainGeometry:
         center, gain, rest = self._condition(likelihood, at)
         slopes = self._slopes(at, center, np.exp(log_derived[0]))
         derived = self.change_derived(at, center, np.exp(log_derived[0]))
+        gradients = np.array(log_derived[1])
+        gradients[_FRICTION] = derived[_MEAN] / (derived[_MEAN] + self.normal_force) * gradients[_MEAN]
         variance = np.einsum("qi,ij,qj->q", slopes, rest, slopes)
-        return DerivedMoments(np.log(derived), log_derived[1] + slopes @ gain, variance)
+        return DerivedMoments(np.log(derived), gradients + slopes @ gain, variance)
 
     def _condition(
         self, likelihood: Likelihood, at: Capacitances

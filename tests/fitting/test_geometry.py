@@ -12,6 +12,7 @@ import fitact
 from fitact.data.simulate import simulate
 from fitact.fitting.geometry import Capacitances, UncertainGeometry
 from fitact.summary import force_sentences
+from fitact.units import format_engineering
 from tests.conftest import RECORDS
 
 EPSILON_0 = 8.85e-12
@@ -315,3 +316,27 @@ def test_a_population_varies_the_skin_by_its_distribution():
     assert scene_with(population={"skin_thickness_relative_sd": 0.3}).thickness_sd() == {
         "skin_thickness": pytest.approx(log_sd(0.3))
     }
+
+
+def test_a_skin_thickness_that_Csc_updates_moves_force_and_friction(record: fitact.Record):
+    """The scene's layers give a Csc of half of what the record has, so the thickness is a third below its median.
+
+    Laplace and emcee agree: sds within 2 % (10,000 draws: 0.7 %) and medians within 4 % of an sd (draws: 1.3 %).
+    """
+    skin = {"permittivity": {"median": 5000, "relative_sd": 0.2}, "thickness": {"median": "200 um", "relative_sd": 0.2}}
+    device = LAYER | {"insulator_permittivity": 3.9}
+    fit = fitact.fit(record, scene_with(device=device, skin=skin, friction={"normal_force": "1 mN"}))
+    posterior = fitact.sample(fit, seed=0, progress=False)
+    drawn = posterior.parameters()
+    capacitance = EPSILON_0 * drawn["skin_permittivity"] * drawn["contact_area"] / drawn["skin_thickness"]
+    assert np.allclose(capacitance, drawn["Csc"], rtol=1e-9)
+    assert np.median(drawn["skin_thickness"]) < 160e-6
+    for name, draws in posterior.derived().items():
+        logs, expected = np.log(draws), fit.derived()[name]
+        assert np.std(logs) == pytest.approx(relative_sd(expected), rel=0.02)
+        assert np.median(logs) == pytest.approx(math.log(expected["q50"]), abs=0.04 * np.std(logs))
+
+
+def test_an_area_is_printed_with_the_prefix_squared():
+    assert format_engineering(1e-4, "m^2") == "100 mm^2"
+    assert format_engineering(2.5, "m^2") == "2.5 m^2"
