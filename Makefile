@@ -9,7 +9,7 @@ export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS = 0
 TEST_XLA_FLAGS = --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0
 PYTEST = XLA_FLAGS="$(TEST_XLA_FLAGS)" $(PY) -m pytest -n auto
 .DEFAULT_GOAL = help
-.PHONY: help env demo test test-slow test-slow-quick notebooks peers docs extremes calibration calibration-quick fuzz check lock plotly clean
+.PHONY: help env demo test test-slow test-slow-quick notebooks peers docs extremes calibration calibration-quick session-calibration fuzz check lock plotly clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -57,6 +57,10 @@ extremes: env
 # make calibration   1,000 simulated records through fit and sampler: are the posteriors right? (goes on where it ended)
 calibration: env
 	$(PY) -m tests.calibration --records 1000 --out out/calibration
+
+# make session-calibration   1,000 simulated sessions with errors of instruments: are the stated uncertainties right?
+session-calibration: env
+	$(PY) -m tests.session_calibration --sessions 1000 --out out/session_calibration
 
 # make calibration-quick   the same with the first 100 of them
 calibration-quick: env

@@ -24,7 +24,7 @@ TYPES: dict[str, tuple[type, ...]] = {
     "list": (list,),
     "object": (dict, type(None)),
 }
-SUMMARY = ("unit", "mean", "sd", "q025", "q05", "q25", "q50", "q75", "q95", "q975", "contraction", "from_prior")
+SUMMARY = ("unit", "mean", "sd", "q025", "q05", "q25", "q50", "q75", "q95", "q975", "contraction", "from_prior", "u")
 
 
 class Stated(NamedTuple):
@@ -49,7 +49,7 @@ def stated(command: str) -> list[Stated]:
             always = not meaning.startswith("where ")
             if types == "summary":
                 found += [
-                    Stated(f"{key}.{name}", _part(name), always and name not in ("contraction", "from_prior"))
+                    Stated(f"{key}.{name}", _part(name), always and name not in ("contraction", "from_prior", "u"))
                     for name in SUMMARY
                 ]
             else:

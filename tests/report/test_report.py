@@ -56,7 +56,7 @@ def test_page_is_one_self_contained_file(path: Path):
     assert all(address.startswith(("data:", "#")) for address in page.addresses)
     assert page.styles
     assert not re.search(r"@import|url\(", page.styles)
-    assert len(page.images) == 3
+    assert len(page.images) == 4
     assert all(len(image["alt"] or "") > 40 for image in page.images)
     assert path.stat().st_size < 5e6
 
