@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from fitact import summary
 from fitact.fitting.geometry import Contribution
-from fitact.fitting.instrument_errors import ErrorCoordinate, InstrumentError
+from fitact.fitting.instrument_errors import UNRESOLVED_EDGES, ErrorCoordinate, InstrumentError
 from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.skin import probe_parameters
@@ -45,9 +45,10 @@ def list_error_sources(
             sources.append((ErrorSource(f"prior of the {name}", LogNormal(1.0, timing_sd[name]), remedy),))
             continue
         label, remedy = f"prior of {name}", _MEASURE.get(name, "state a narrower prior, if you know more")
-        if name in probe_parameters(likelihood.template) and load is not None:
+        is_load = name in probe_parameters(likelihood.template) and load is not None
+        if is_load and load is not None:
             label = f"input {name.removeprefix('probe_')} ({load.name})"
-        sources.append((ErrorSource(label, likelihood.prior[name], remedy),))
+        sources.append((ErrorSource(label, likelihood.prior[name], remedy, is_shared=is_load),))
     return tuple(sources)
 
 
@@ -61,7 +62,8 @@ def geometry_component(contribution: Contribution) -> Component:
 
 
 def _instrument_source(error: InstrumentError) -> ErrorSource:
-    return ErrorSource(error.source, error.distribution, _CALIBRATE, error.power)
+    is_own = error.source.startswith(UNRESOLVED_EDGES)
+    return ErrorSource(error.source, error.distribution, _CALIBRATE, error.power, is_shared=not is_own)
 
 
 def noise_information(

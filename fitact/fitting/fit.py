@@ -19,10 +19,10 @@ from fitact.fitting import derived, remarks
 from fitact.fitting.calibrate import calibrate
 from fitact.fitting.channel_fit import ChannelFit, information_criteria
 from fitact.fitting.drive_choice import DriveModel
-from fitact.fitting.effects import fill_effects
 from fitact.fitting.error_sources import gain_shifts, geometry_component, list_error_sources, noise_information
 from fitact.fitting.geometry import UncertainGeometry
 from fitact.fitting.identifiability import assess_identifiability
+from fitact.fitting.instrument_effects import fill_effects
 from fitact.fitting.laplace import FitResult, Laplace
 from fitact.fitting.least_squares import LeastSquaresResult, solve
 from fitact.fitting.minimum import Optima
@@ -407,6 +407,8 @@ def _assemble_fit(
         warnings += remarks.channel_warnings(source.record, source.choice, channel.channel, channel.figures)
     warnings += misfit_warnings(traces)
     warnings += remarks.parameter_warnings(likelihood, theta)
+    stated = [each.name for each in problem.coordinates if each.is_stated]
+    warnings += remarks.instrument_warnings(likelihood, theta, np.linalg.norm(root, axis=1), stated)
     force_peak = math.exp(laplace.log_derived[0][derived.DERIVED_NAMES.index("force_peak")])
     warnings += remarks.plausibility_warnings(first.record, first.scene, first.choice, optimum, force_peak)
     assumed = remarks.describe_assumed_Ci(None if without_scene else first.scene, likelihood, laplace.prior_sets_Ci)

@@ -14,6 +14,7 @@ from fitact.prior.product import multiply
 from fitact.scene.scene import Scene
 
 GAIN = "gain"
+UNRESOLVED_EDGES = "edges of V between two samples"
 EFFECTS = ("compensation", "nonlinearity_even", "nonlinearity_odd")  # small errors in proportion to a function of time
 
 
@@ -43,6 +44,11 @@ class ErrorCoordinate:
     errors: tuple[InstrumentError, ...]
     channel_powers: tuple[float, ...]
     drive_powers: tuple[float, ...]  # of the ratio between indicated and true V
+
+    @property
+    def is_stated(self) -> bool:
+        """Whether the scene states an instrument's error, and it does not only stand for unresolved edges."""
+        return any(not error.source.startswith(UNRESOLVED_EDGES) for error in self.errors)
 
     def distribution(self) -> Distribution:
         return multiply([(error.distribution, error.power) for error in self.errors])
@@ -126,7 +132,7 @@ def _channel_errors(member: Member, kind: str) -> Iterable[tuple[str, Distributi
         key = "gain_relative_sd" if name == "Vsc" else "gain_I_relative_sd"
         yield f"{name} gain ([measurement] {key} = {stated:g})", LogNormal(1.0, log_sd(stated)), 1.0, 0.0
     if member.edge_sd > 0.0:
-        label = member.channel.qualified_name("edges of V between two samples")
+        label = member.channel.qualified_name(UNRESOLVED_EDGES)
         yield label, LogNormal(1.0, member.edge_sd), 1.0, 0.0
 
 

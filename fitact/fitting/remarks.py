@@ -86,6 +86,33 @@ def plausibility_warnings(
     return check_plausibility(scene, peak, insulator_peak, force_peak)
 
 
+def instrument_warnings(
+    likelihood: Likelihood,
+    theta: Float[np.ndarray, " parameters"],
+    sd: Float[np.ndarray, " parameters"],
+    names: Collection[str],
+    max_pull: float = 3.0,
+) -> list[str]:
+    """Return warnings about errors of instruments, the coordinates `names`, that the data put beyond their limits.
+
+    `sd` are the standard errors. A pull is the distance from the middle of the limits over its standard deviation,
+    the root of the difference of prior and posterior variance.
+    """
+    warnings = []
+    for name in names:
+        place, marginal = likelihood.names.index(name), likelihood.prior[name]
+        value, spread = float(theta[place]), float(marginal.log_sd)
+        learned = math.sqrt(max(spread**2 - float(sd[place]) ** 2, 1e-4 * spread**2))
+        pull = (value - float(marginal.log_mean)) / learned
+        if abs(pull) > max_pull:
+            warnings.append(
+                f"the data put {name} at {math.exp(value):.4g}, {abs(pull):.1f} standard deviations from what the"
+                " stated instruments allow; check the scale of the channels, the probe's attenuation and the class under"
+                " [instrument]"
+            )
+    return warnings
+
+
 class Remarks(NamedTuple):
     """Sentences for information, and on what may change the result."""
 

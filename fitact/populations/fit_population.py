@@ -74,7 +74,8 @@ def population(
     next_at = standardized.standardize(at or {})
     area_varies = scene.population.contact_area == "varies"
     factors = (*SKIN, SHARED_PARAMETER, *((AREA,) if area_varies else ()), *scene.thickness_sd())
-    fingers, new_finger = _fit_fingers(records, scene, factors, progress)
+    # errors of the instruments are the same for all fingers, so that they do not make these differ
+    fingers, new_finger = _fit_fingers(records, scene.without_instrument_errors(), factors, progress)
     make_tables = functools.partial(
         FingerLikelihoods.from_fingers, fingers, medians[SHARED_PARAMETER], area_varies=area_varies
     )

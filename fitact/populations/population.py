@@ -109,6 +109,12 @@ class Population:
                 f"friction uses the default coefficient {friction.coefficient:g} and normal force"
                 f" {format_engineering(friction.normal_force, 'N')}, which the scene does not state"
             )
+        measured = self.scene.measurement
+        if self.scene.instrument.is_stated or measured.gain_relative_sd or measured.gain_I_relative_sd:
+            sentences.append(
+                "errors of the instruments are the same for all fingers: they do not add to the differences between"
+                " fingers, and the medians and forces do not include them (fitact fit of one record gives their size)"
+            )
         area = self.contact_area
         return tuple(sentences) if area.disagrees else (*sentences, area.sentence)
 

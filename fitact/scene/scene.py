@@ -250,6 +250,17 @@ class Scene(Section):
             return None
         return Probe(math.inf if resistance is None else resistance, capacitance or 0.0)
 
+    def without_instrument_errors(self) -> Self:
+        """Return the scene with instruments that have no errors, but the load of their input."""
+        load = self.find_load()
+        exact: dict[str, Any] = {"gain_relative_sd": 0.0, "gain_I_relative_sd": 0.0}
+        if load is not None:
+            probe = load.nominal_probe()
+            exact |= {"probe_resistance": float(probe.R), "probe_capacitance": float(probe.C) or None}
+        measurement = self.measurement.model_copy(update=exact)
+        changes = {"measurement": measurement, "instrument": InstrumentSection(), "calibration": ()}
+        return self.model_copy(update=changes)
+
     def make_drive(self) -> Drive:
         """Make the drive; refused if the waveform is 'measured', which only a record has."""
         return self.drive.make()

@@ -26,6 +26,7 @@ class ErrorSource(NamedTuple):
     distribution: Distribution
     reduce_by: str = ""  # cheapest way to reduce it
     power: float = 1.0  # of the factor in the parameter
+    is_shared: bool = False  # whether it is the same error in all records of a session
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +40,7 @@ class Component:
     distribution: Distribution | None = None  # of the source; None means normal
     reduce_by: str = ""
     in_posterior: bool = True  # whether the posterior includes it
+    is_shared: bool = False  # whether it is the same error in all records of a session
 
     @property
     def u(self) -> float:
@@ -66,6 +68,18 @@ class Budget:
             for each in self.components
         )
         return Budget(tuple(scaled))
+
+    def subtract(self, other: "Budget") -> "Budget":
+        """Return the budget of the ratio to another quantity of the same session, in which shared errors cancel."""
+        shared = {each.source: each for each in other.components if each.is_shared}
+        rows = []
+        for each in self.components:
+            twin = shared.pop(each.source, None) if each.is_shared else None
+            change = 0.0 if twin is None else twin.sensitivity
+            rows.append(dataclasses.replace(each, sensitivity=each.sensitivity - change))
+        rest = [*shared.values(), *(each for each in other.components if not each.is_shared)]
+        rows += [dataclasses.replace(each, sensitivity=-each.sensitivity) for each in rest]
+        return Budget(tuple(rows))
 
     def draw_others(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.ndarray, "*shape"]:
         """Return draws of the factor by which the sources beyond the posterior change the quantity."""
@@ -150,7 +164,8 @@ def laplace_components(
             )  # larger than its own in a fit without prior
             # the product and each of its factors have the same sensitivity
             sensitivity = float(each.power * part[0] / variance)
-            components.append(Component(each.name, "B", u, sensitivity, each.distribution, each.reduce_by))
+            row = Component(each.name, "B", u, sensitivity, each.distribution, each.reduce_by)
+            components.append(dataclasses.replace(row, is_shared=each.is_shared))
     return tuple(components)
 
 
