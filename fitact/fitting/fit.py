@@ -1,6 +1,7 @@
 """Fit records: parameters, their covariance, and whether the fit is reliable."""
 
 import dataclasses
+import functools
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -17,6 +18,7 @@ from fitact.experiment.fisher import Experiment, covariance_factor
 from fitact.fitting import derived, remarks
 from fitact.fitting.channel_fit import ChannelFit, information_criteria
 from fitact.fitting.drive_choice import DriveModel
+from fitact.fitting.effects import assess_fit, describe_alternatives, describe_structure, is_tolerable
 from fitact.fitting.identifiability import assess_identifiability
 from fitact.fitting.laplace import FitResult, Laplace
 from fitact.fitting.least_squares import LeastSquaresResult, solve
@@ -24,13 +26,14 @@ from fitact.fitting.minimum import Optima
 from fitact.fitting.multistart import choose_start, find_optima, lower_optimum
 from fitact.fitting.problem import Problem, build_problem
 from fitact.fitting.profile import PROFILE_QUANTITIES, Interval, profile_intervals
-from fitact.fitting.residual_statistics import pooled_statistics
+from fitact.fitting.residual_statistics import is_undersampled, pooled_statistics
 from fitact.fitting.verdict import diagnose_fit, misfit_warnings
 from fitact.likelihood import certificate
 from fitact.likelihood.noise import scale_information
 from fitact.model.skin import constant_skin_circuit
 from fitact.scene.scene import Scene
 from fitact.tables import join_lines
+from fitact.uncertainty.effect_size import NO_EFFECTS, EffectSizes
 
 _SKIN = ("Rsc", "Csc", "Ci")
 _RESPONSE = {
@@ -48,11 +51,13 @@ class Fit(FitResult):
         traces: the fitted channels of each record.
         compression_error: error of the compressed log-likelihood near the optimum; None if all samples are summed.
         experiment: the measurement at the optimum, for designs.
+        misfit_effects: effects of what the model lacks, where the verdict needed them.
     """
 
     traces: tuple[ChannelFit, ...]
     compression_error: float | None
     experiment: Experiment
+    misfit_effects: EffectSizes | None = None
 
     @property
     def record(self) -> Record:
@@ -115,6 +120,26 @@ class Fit(FitResult):
         root[:size, :size] = self.covariance_root
         return root
 
+    @functools.cached_property
+    def effects(self) -> EffectSizes:
+        """How far the results may move because of what the model lacks; empty if that cannot be computed."""
+        if self.misfit_effects is not None:
+            return self.misfit_effects
+        usable = self.result in ("successful", "misfit", "structure")
+        return (assess_fit(self.laplace, self.traces, has_structure=False) if usable else None) or NO_EFFECTS
+
+    @property
+    def effect_notes(self) -> tuple[str, ...]:
+        """Sentences on nuisances that may really be something else."""
+        return describe_alternatives(self.effects, self.laplace)
+
+    @property
+    def message(self) -> str:
+        """Sentence for the result, and what the residuals look like."""
+        if self.result not in ("misfit", "structure"):
+            return super().message
+        return describe_structure(self.result, super().message, self.effects)
+
     def profile(self, name: str, level: float = 0.95, *, prior: bool = True) -> Interval:
         """Return the profile-likelihood interval of one parameter, or of g, b or force_mean.
 
@@ -167,6 +192,11 @@ class Fit(FitResult):
         ]
         return super().judgement() | {"traces": traces}
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of fit.json, which `fitact fit --json` prints."""
+        content = super().to_dict()
+        return content | self.effects.to_dict() | {"notes": [*self.notes, *self.effect_notes]}
+
     def _nuisances(self) -> dict[str, float]:
         return dict(zip(self.likelihood.sigma_names, self.laplace.sigmas.tolist(), strict=True)) | self.linear
 
@@ -183,7 +213,7 @@ class Fit(FitResult):
             str(self.identifiability),
             *summary.advice_line(content),
         ]
-        return join_lines(rows, self.warnings, self.notes)
+        return join_lines(rows, self.warnings, content["notes"])
 
     __str__ = summary
 
@@ -322,9 +352,17 @@ def _assemble_fit(
     notes += assumed.notes
     experiment = problem.experiment(likelihood, optimum.circuit, sigma)
     gradient = laplace.log_gradient("force_mean")
+    result, effects = diagnose_fit(solution, root, traces, problem.sources, optima), None
+    if result == "misfit":
+        effects = assess_fit(laplace, traces, has_structure=True)
+        may_move = any(s.drive_noise_dominates for s in problem.sources) or any(
+            is_undersampled(t.figures) for t in traces
+        )
+        if effects is not None and not may_move and is_tolerable(effects, laplace, first.scene.tolerance.force):
+            result = "structure"
     return Fit(
         laplace,
-        result=diagnose_fit(solution, root, traces, problem.sources, optima),
+        result=result,
         figures=figures,
         identifiability=assess_identifiability(likelihood.names, root, likelihood.prior_factor, gradient, experiment),
         scene=first.scene,
@@ -333,4 +371,5 @@ def _assemble_fit(
         traces=traces,
         compression_error=certified.error,
         experiment=experiment,
+        misfit_effects=effects,
     )
