@@ -59,6 +59,7 @@ class ChannelSeries:
     weight: Rows  # inverse noise sd of each row, relative to the noise of the channel
     is_circular: bool  # whether the rows are whole periods of a steady state
     kind: Literal["samples", "blocks", "period"]  # whether rows are samples, or means of blocks or over periods
+    jump: float = 0.0  # of V at the first sample, which stands for the unknown charge, V
 
     @property
     def step(self) -> float:
@@ -90,11 +91,23 @@ class ChannelSeries:
         s = self.frequencies
         return gain + gain[-1].imag / s[-1].imag * (self.difference - s)
 
-    def response(self, gain: Spectrum, input_rows: Rows, start: float = 0.0) -> Rows:
-        """Return an input after a filter; before the record the input is `start`."""
-        before = self._length - input_rows.size
-        padded = np.concatenate([np.full(before, start), input_rows]) if before else input_rows
-        return scipy.fft.irfft(scipy.fft.rfft(padded) * gain, self._length)[before:]
+    @property
+    def repeats(self) -> bool:
+        """Whether V is taken to have repeated before a record that begins with an unknown charge."""
+        frequency, span = self.samples.frequency, float(self.time[-1] - self.time[0])
+        return self.samples.unknown_charge and frequency is not None and span * frequency >= 1.5
+
+    def response(self, gain: Spectrum, rows: Rows, jump: float = 0.0) -> Rows:
+        """Return an input after a filter; before the record it repeats, or is 0, less `jump`."""
+        count = self._length - rows.size
+        if not count:
+            return scipy.fft.irfft(scipy.fft.rfft(rows) * gain, self._length)
+        before = np.zeros(count)
+        if self.repeats:
+            assert self.samples.frequency is not None
+            phase = np.mod(-self.step * np.arange(count, 0.0, -1.0), 1.0 / self.samples.frequency)
+            before = np.interp(phase, self.time - self.time[0], rows)
+        return scipy.fft.irfft(scipy.fft.rfft(np.concatenate([before - jump, rows])) * gain, self._length)[count:]
 
     def shapes(self) -> dict[str, Rows]:
         """Return the shapes of the free linear nuisances, each of height 1; none that means over periods hide."""

@@ -48,7 +48,8 @@ class EffectSizes:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entries of fit.json and summary.json."""
-        return dataclasses.asdict(self)
+        names = ("effect_size", "rivals", "blind_table", "structure")
+        return {name: getattr(self, name) for name in names}
 
 
 NO_EFFECTS = EffectSizes({}, (), (), {})
@@ -75,17 +76,16 @@ def assess_effects(
     effect = structure = np.zeros(len(posterior.quantities))
     fits: list[RivalFit] = []
     names_of: dict[str, tuple[str, ...]] = {}
-    for model in models if has_structure or added else ():
+    for model in models:
         alternatives = [nuisance_alternatives(model, each, rivals) for each in added]
         if has_structure:
             found = fit_rivals(model, model.residuals, rival_columns(model, rivals))
             found += [each for others in alternatives for each in others if is_significant(each)]
-            best = max((each.delta_chi2 for each in found), default=0.0)
-            likely = [each.shift for each in found if each.delta_chi2 >= MIN_LIKENESS * best]
-            parts = [split_difference(model), random_phase(model), *map(np.abs, likely)]
+            parts = [split_difference(model), random_phase(model), likely_shift(model, found)]
             effect, fits = np.maximum(effect, np.max(parts, axis=0)), [*fits, *found]
         else:
-            for nuisance, others in zip(added, alternatives, strict=True):
+            alternatives.append(hints(model, rivals))
+            for nuisance, others in zip([*added, Nuisance(0, "residuals")], alternatives, strict=True):
                 word = nuisance.name.partition("_")[0]
                 if causes := tuple(each.rival.name for each in others if word not in each.rival.name):
                     names_of[nuisance.name] = causes
@@ -128,14 +128,16 @@ def fit_rivals(
     The best few are fitted by steps of Gauss and Newton.
     """
     linear = [fit_rival(model, residuals, each) for each in columns]
-    order = sorted((each for each in linear if each is not None), key=lambda each: -each.delta_chi2)
+    order = sorted(
+        (each for each in linear if each is not None and is_significant(each)), key=lambda each: -each.delta_chi2
+    )
     found = [refine(model, residuals, each) for each in order[:refined]] + order[refined:]
     found = [each for each in found if is_possible(each)]
     return sorted(found, key=lambda each: -each.delta_chi2)
 
 
 def fit_rival(model: LinearModel, residuals: Rows, each: RivalColumns) -> RivalFit | None:
-    """Return the rival fitted to residuals to first order; None if it is invisible or insignificant."""
+    """Return the rival fitted to residuals to first order; None if it is invisible."""
     rival, columns = each
     left = model.remainder(columns)
     modes, sizes, directions = np.linalg.svd(left, full_matrices=False)
@@ -150,8 +152,41 @@ def fit_rival(model: LinearModel, residuals: Rows, each: RivalColumns) -> RivalF
     shift = -(model.shifts(columns) @ amplitudes)
     errors = np.sqrt(np.square(directions.T / sizes) @ variance)
     visible = float(np.linalg.norm(left @ amplitudes) / np.linalg.norm(columns @ amplitudes))
-    fitted = RivalFit(rival, delta_chi2, shift, visible, amplitudes, errors, modes @ projections)
-    return fitted if is_significant(fitted) else None
+    return RivalFit(rival, delta_chi2, shift, visible, amplitudes, errors, modes @ projections)
+
+
+def likely_shift(model: LinearModel, found: Sequence[RivalFit], explained: float = 0.9, wider: float = 0.5) -> Shifts:
+    """Return the largest shift by the rivals that explain the residuals about as well as the best.
+
+    If the best explains less than the fraction `explained` of what is more than noise, the cause may not be known, and
+    rivals with the fraction `wider` of its decrease of chi-square count as well.
+    """
+    best = max((each.delta_chi2 for each in found), default=0.0)
+    rows = slice(0, model.rows)
+    variance = model.noise_variance[rows]
+    excess = float(np.sum(model.residuals[rows] ** 2 / variance)) - np.count_nonzero(model.residuals[rows])
+    least = (MIN_LIKENESS if best > explained * excess else wider) * best
+    shifts = [np.abs(each.shift) for each in found if each.delta_chi2 >= least]
+    return np.max([np.zeros(len(model.posterior.quantities)), *shifts], axis=0)
+
+
+def hints(model: LinearModel, rivals: Sequence[Rival]) -> list[RivalFit]:
+    """Return the rivals that the data ask for although the residuals pass their tests.
+
+    A rival counts if the BIC favours it as it would a nuisance, or if it is certain to exist and beyond two standard
+    errors. Only those count that explain the residuals about as well as the best.
+    """
+    linear = (fit_rival(model, model.residuals, each) for each in rival_columns(model, rivals))
+    size = math.log(sum(np.count_nonzero(each.samples.weight) for each in model.series))
+    found = [
+        each
+        for each in linear
+        if each is not None
+        and is_possible(each)
+        and each.delta_chi2 > (4.0 if each.rival.is_certain else 10.0 + each.amplitudes.size * size)
+    ]
+    best = max((each.delta_chi2 for each in found), default=0.0)
+    return [each for each in found if each.delta_chi2 >= MIN_LIKENESS * best]
 
 
 def is_significant(fitted: RivalFit) -> bool:
@@ -304,7 +339,7 @@ def nuisance_alternatives(model: LinearModel, nuisance: Nuisance, rivals: Sequen
     chosen = fit_rival(
         simpler, residuals, RivalColumns(Rival(nuisance.name, 1.0, lambda each, _: each.signal), columns)
     )
-    if chosen is None:
+    if chosen is None or not is_significant(chosen):
         return []
     alternatives = []
     for each in rival_columns(simpler, rivals):

@@ -38,7 +38,9 @@ class LinearModel:
 
     def __init__(self, posterior: Posterior, series: Sequence[ChannelSeries], without: Nuisance | None = None) -> None:
         """Compute the sensitivities; the nuisance `without` is left out of the model."""
-        self.posterior, self.series, self.without = posterior, tuple(series), without
+        self.posterior, self.without = posterior, without
+        self.series = tuple(series)
+        self.series = tuple(model.with_charge() for model in self.models(posterior.theta))
         timing = {} if without is None else series[without.channel].samples.timing
         dropped = [t.place for name, t in timing.items() if without is not None and name == without.name]
         self.kept = [i for i in range(posterior.theta.size) if i not in dropped]

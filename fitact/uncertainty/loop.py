@@ -1,5 +1,6 @@
 """Transfer functions of the circuit's loop in NumPy, also with what the model of a fit lacks."""
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -142,22 +143,32 @@ class ChannelModel:
         """Return the signal behind a filter, V or A."""
         return self._respond(self.parts, gain(self.s))
 
-    def record(self, gain: Spectrum, rows: Rows, start: float = 0.0) -> Rows:
-        """Return rows after a filter, as the instrument records them; before the record they are `start`."""
+    def record(self, gain: Spectrum, rows: Rows, jump: float = 0.0) -> Rows:
+        """Return rows after a filter, as the instrument records them."""
         series, (factor, delay, clock) = self.series, self.instrument
         gain = factor * gain * (np.exp(-delay * series.difference) if delay else 1.0)
-        signal = series.response(gain, rows, start)
+        signal = series.response(gain, rows, jump)
         if not clock:
             return signal
-        return signal + clock * series.time * series.response(gain * series.difference, rows, start)
+        return signal + clock * series.time * series.response(gain * series.difference, rows, jump)
+
+    def with_charge(self) -> ChannelSeries:
+        """Return the rows with the jump of V at the first sample that stands for the unknown charge there.
+
+        The jump divides as any other. The transient of a fit is relative to a V that was 0 before the record.
+        """
+        series = self.series
+        if not series.samples.unknown_charge or series.samples.channel == "I":
+            return series
+        gain = self.parts.touching * self.parts.admittance
+        high = abs(gain[-1])
+        first = high * float(series.voltage[0]) + series.samples.transient
+        if series.repeats:
+            return dataclasses.replace(series, jump=(first - float(series.response(gain, series.voltage)[0])) / high)
+        return dataclasses.replace(series, jump=series.samples.transient / high)
 
     def _respond(self, parts: LoopImpedances, filter_gain: Spectrum | float = 1.0) -> Rows:
         series, gain = self.series, parts.gain(self.series.samples.channel)
-        start = 0.0
-        if series.samples.unknown_charge:
-            # the unknown charge is that of a jump of V at the first sample, which divides as any other
-            jump = series.samples.transient / abs(gain[-1]) if series.samples.channel == "Vsc" else 0.0
-            start = float(series.voltage[0]) - jump
         if series.samples.channel == "I":
             gain = series.regular_gain(gain)
-        return self.record(gain * filter_gain, series.voltage, start)
+        return self.record(gain * filter_gain, series.voltage, series.jump)

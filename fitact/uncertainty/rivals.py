@@ -24,6 +24,7 @@ class Rival(NamedTuple):
     effect: Effect  # signal with this cause
     amplitudes: int = 1  # number of amplitudes
     is_positive: bool = False  # whether a negative amplitude is impossible
+    is_certain: bool = False  # whether it always exists to some degree
 
 
 def known_rivals() -> tuple[Rival, ...]:
@@ -44,7 +45,7 @@ def known_rivals() -> tuple[Rival, ...]:
         # palm, forearm or a wet finger: resistances differ by a factor of two
         Rival("unequal skins", 1.0, _circuit("inequality")),
         # two layers whose time constants differ by a factor of four about their mean
-        Rival("a skin of two layers", 0.4, _circuit("layers"), is_positive=True),
+        Rival("a skin of two layers", 0.4, _circuit("layers"), is_positive=True, is_certain=True),
         # exponents of skin in the literature: 0.75 to 1
         Rival("a constant-phase skin", 0.25, _circuit("dispersion"), is_positive=True),
         # an interface gap of a few Mohm
@@ -100,13 +101,13 @@ def _nonlinear_skin(model: ChannelModel, a: Amplitudes) -> Rows:
     series, parts, signal = model.series, model.parts, model.signal
     if series.samples.channel == "I":
         ways = (parts.touching * parts.admittance, parts.grounding * parts.admittance)
-        voltages = [series.response(way, series.voltage, float(series.voltage[0])) for way in ways]
+        voltages = [series.response(way, series.voltage, series.jump) for way in ways]
     else:
         ways = (
             -parts.touching * (1.0 - parts.admittance * parts.touching),
             parts.touching * parts.grounding * parts.admittance,
         )
-        other = series.response(parts.grounding * parts.admittance, series.voltage, float(series.voltage[0]))
+        other = series.response(parts.grounding * parts.admittance, series.voltage, series.jump)
         voltages = [signal, other]
     for way, voltage, resistance in zip(ways, voltages, parts.skin_resistances, strict=True):
         peak = float(np.max(np.abs(voltage)))
