@@ -23,26 +23,36 @@ from fitact.units import format_percent
 
 def assess_fit(laplace: Laplace, traces: Sequence[ChannelFit], has_structure: bool) -> EffectSizes | None:
     """Return the effect sizes of a fit; None if they cannot be computed."""
-    likelihood = laplace.likelihood
-    loop = LoopModel.from_likelihood(likelihood)
-    if loop is None:
+    posterior, channels = linear_posterior(laplace), channel_samples(laplace, traces)
+    if posterior is None:
         return None
-    circuit = [name for name in likelihood.prior.names if name in circuit_parameters(likelihood.template)]
-    with jax.enable_x64(True):
-        taus = np.asarray(likelihood.evaluate_circuit(laplace.theta).tau)
-    places = [likelihood.names.index(name) for name in circuit]
-    gradients = np.concatenate([laplace.log_derived[1], np.eye(laplace.theta.size)[places]])
-    posterior = Posterior(loop, laplace.theta, likelihood.prior_factor, (*derived.DERIVED_NAMES, *circuit), gradients)
-    channels = [
-        _channel_samples(laplace, channel, fitted, taus)
-        for channel, fitted in zip(likelihood.channels, traces, strict=True)
-    ]
     added = [Nuisance(i, name) for i, each in enumerate(channels) for name in _added_nuisances(each)]
     try:
         effects = assess_effects(channels, posterior, has_structure, added)
     except np.linalg.LinAlgError:
         return None
     return effects if all(map(math.isfinite, effects.effect_size.values())) else None
+
+
+def linear_posterior(laplace: Laplace) -> Posterior | None:
+    """Return what `fitact.uncertainty` needs of a posterior; None for a circuit that it does not know."""
+    likelihood = laplace.likelihood
+    loop = LoopModel.from_likelihood(likelihood)
+    if loop is None:
+        return None
+    circuit = [name for name in likelihood.prior.names if name in circuit_parameters(likelihood.template)]
+    places = [likelihood.names.index(name) for name in circuit]
+    gradients = np.concatenate([laplace.log_derived[1], np.eye(laplace.theta.size)[places]])
+    names = (*derived.DERIVED_NAMES, *circuit)
+    return Posterior(loop, laplace.theta, likelihood.prior_factor, names, gradients)
+
+
+def channel_samples(laplace: Laplace, traces: Sequence[ChannelFit]) -> list[ChannelSamples]:
+    """Return the residuals of all channels, with what is known of their noise and nuisances."""
+    with jax.enable_x64(True):
+        taus = np.asarray(laplace.likelihood.evaluate_circuit(laplace.theta).tau)
+    pairs = zip(laplace.likelihood.channels, traces, strict=True)
+    return [_channel_samples(laplace, channel, fitted, taus) for channel, fitted in pairs]
 
 
 def _channel_samples(

@@ -94,7 +94,7 @@ def assess_effects(
     names, columns = posterior.quantities, list(rival_columns(models[0], rivals))
     return EffectSizes(
         dict(zip(names, effect.tolist(), strict=True)),
-        describe_rivals(fits, names),
+        describe_rivals([each for each in fits if is_possible(each)], names),
         blind_table(models[0], columns, names),
         dict(zip(names, structure.tolist(), strict=True)),
         names_of,
@@ -131,8 +131,8 @@ def fit_rivals(
     order = sorted(
         (each for each in linear if each is not None and is_significant(each)), key=lambda each: -each.delta_chi2
     )
-    found = [refine(model, residuals, each) for each in order[:refined]] + order[refined:]
-    found = [each for each in found if is_possible(each)]
+    possible = [each for each in order if is_possible(each)]
+    found = [refine(model, residuals, each) for each in possible[:refined]] + possible[refined:]
     return sorted(found, key=lambda each: -each.delta_chi2)
 
 
@@ -230,10 +230,9 @@ def refine(
             left = left - nuisances @ np.linalg.lstsq(nuisances, left, rcond=1e-12)[0]
     variance, reference = model.noise_variance[: model.rows], residuals if reference is None else reference
     delta_chi2 = float(np.sum((reference[: model.rows] ** 2 - left[: model.rows] ** 2) / variance))
-    if not delta_chi2 > fitted.delta_chi2 - 0.1 * abs(fitted.delta_chi2):
-        return fitted
     shift = model.posterior.gradients @ (theta - origin)
-    return fitted._replace(delta_chi2=delta_chi2, shift=shift, amplitudes=amplitudes, explained=residuals - left)
+    far = fitted._replace(delta_chi2=delta_chi2, shift=shift, amplitudes=amplitudes, explained=residuals - left)
+    return far if delta_chi2 > fitted.delta_chi2 - 0.1 * abs(fitted.delta_chi2) and is_possible(far) else fitted
 
 
 def _rival_signals(model: LinearModel, rival: Rival, theta: np.ndarray, amplitudes: np.ndarray) -> Rows:
@@ -257,10 +256,8 @@ def split_difference(model: LinearModel) -> Shifts:
         (one, variance), (other, more) = (
             model.shift_of_part(design[part], residuals[part], noise[part]) for part in (mask, ~mask)
         )
-        # the whole is their mean, weighted by information; parts of equal information count half their difference
-        share = np.sqrt(variance * more) / np.maximum(variance + more, 1e-300)
         square = (one - other) ** 2 - variance - more
-        largest = np.maximum(largest, share * np.sqrt(np.maximum(square, 0.0)))
+        largest = np.maximum(largest, 0.5 * np.sqrt(np.maximum(square, 0.0)))
     return largest
 
 

@@ -1,4 +1,4 @@
-"""What a model may lack: effects of the circuit, the skin and the instruments, with the sizes that are plausible."""
+"""Effects that a model may lack, of the circuit, the skin and the instruments, with their plausible sizes."""
 
 import functools
 import math
@@ -54,8 +54,8 @@ def known_rivals() -> tuple[Rival, ...]:
         Rival("a non-linear skin", 0.3, _nonlinear_skin),
         # an 8-bit converter: one step is 0.4 % of the range; 2 % for a bad one
         *(Rival("the non-linearity of the ADC", 0.02, _adc(shape, n), n) for shape, n in _ADC_SHAPES),
-        # hum of a twentieth of the signal
-        *(Rival(f"hum at {f:g} Hz", 0.05, functools.partial(_hum, f), 2) for f in _hum_frequencies()),
+        # hum of a tenth of the signal
+        *(Rival(f"hum at {f:g} Hz", 0.1, functools.partial(_hum, f), 2) for f in _hum_frequencies()),
         # a thermal drift of 1 % of the signal
         Rival("a drift", 0.01, _drift),
         # instruments warm up by 1 %
