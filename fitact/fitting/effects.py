@@ -18,17 +18,20 @@ from fitact.uncertainty.channel_series import ChannelSamples, Timing
 from fitact.uncertainty.effect_size import EffectSizes, assess_effects
 from fitact.uncertainty.linear_model import Nuisance, Posterior
 from fitact.uncertainty.loop import LoopModel
+from fitact.uncertainty.rivals import Rival
 from fitact.units import format_percent
 
 
-def assess_fit(laplace: Laplace, traces: Sequence[ChannelFit], has_structure: bool) -> EffectSizes | None:
-    """Return the effect sizes of a fit; None if they cannot be computed."""
+def assess_fit(
+    laplace: Laplace, traces: Sequence[ChannelFit], has_structure: bool, rivals: Sequence[Rival] = ()
+) -> EffectSizes | None:
+    """Return the effect sizes of a fit; None if they cannot be computed. By default all known rivals are considered."""
     posterior, channels = linear_posterior(laplace), channel_samples(laplace, traces)
     if posterior is None:
         return None
     added = [Nuisance(i, name) for i, each in enumerate(channels) for name in _added_nuisances(each)]
     try:
-        effects = assess_effects(channels, posterior, has_structure, added)
+        effects = assess_effects(channels, posterior, has_structure, added, rivals)
     except np.linalg.LinAlgError:
         return None
     return effects if all(map(math.isfinite, effects.effect_size.values())) else None
