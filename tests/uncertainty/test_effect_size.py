@@ -27,7 +27,7 @@ from tests.uncertainty.simulation import (
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What a fit says about its bias in g and b."""
+    """Result of a fit, and its bias in g and b."""
 
     case: Case
     result: str
