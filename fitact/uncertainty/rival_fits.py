@@ -95,6 +95,7 @@ def is_possible(fitted: RivalFit, excess: float = 2.0) -> bool:
     return bool(np.linalg.norm(fitted.amplitudes) < excess * fitted.rival.size)
 
 
+@np.errstate(all="ignore")  # a step may lead beyond what numbers can hold
 def refine(
     model: LinearModel, residuals: Rows, fitted: RivalFit, reference: Rows | None = None, steps: int = 5
 ) -> RivalFit:
@@ -111,6 +112,8 @@ def refine(
         columns = np.concatenate([model.sensitivities(theta), _rival_at(model, rival, theta, amplitudes)], axis=1)
         below = np.pad(prior, ((0, 0), (0, rival.amplitudes)))
         design = np.concatenate([np.concatenate([columns, below]), nuisances], axis=1)
+        if not np.all(np.isfinite(design)):
+            return fitted
         scale = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
         step = np.linalg.lstsq(design / scale, left, rcond=1e-12)[0] / scale
         theta[model.kept] += step[:width]
@@ -120,6 +123,8 @@ def refine(
             return fitted
         change = _rival_signals(model, rival, theta, amplitudes) - start
         left = residuals - np.concatenate([change, prior @ (theta - origin)[model.kept]])
+        if not np.all(np.isfinite(left)):
+            return fitted
         if nuisances.shape[1]:  # which take up what they can
             left = left - nuisances @ np.linalg.lstsq(nuisances, left, rcond=1e-12)[0]
     variance, reference = model.noise_variance[: model.rows], residuals if reference is None else reference
