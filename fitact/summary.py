@@ -25,6 +25,7 @@ PROBABILITIES = {f"q{digits}": float(f"0.{digits}") for digits in ("025", "05", 
 _NORMAL = {key: statistics.NormalDist().inv_cdf(p) for key, p in PROBABILITIES.items()}  # standard normal quantiles
 
 Summary = dict[str, float | str]
+TRUSTED_RESULTS = ("successful", "structure")  # results of reliable fits
 FORCE_LAWS = {  # by [force] model
     "paper": "from Vsc with eq. (22) of the reference paper",
     "gap": "from the voltage across the interface gap, eps0 A Vgap^2 / (2 d^2)",
@@ -318,4 +319,4 @@ def versions() -> dict[str, str]:
 
 def is_trusted(content: dict[str, Any]) -> bool:
     """Return whether the answer that summary.json holds is reliable."""
-    return bool(content["convergence"]["converged"]) and content["fit"]["result"] == "successful"
+    return bool(content["convergence"]["converged"]) and content["fit"]["result"] in TRUSTED_RESULTS

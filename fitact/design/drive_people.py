@@ -13,6 +13,7 @@ from fitact.populations.next_finger import factors_from_normal
 from fitact.populations.population import Population, draw_parameters
 from fitact.scene.prior_predictive import sample_prior
 from fitact.scene.scene import Scene
+from fitact.summary import TRUSTED_RESULTS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +53,7 @@ class FingerSample:
         tied = {name: ratio * known[other] for name, (other, ratio) in scene.prior.ties().items()}
         contact = "each with its own contact area" if areas else "assumed to have the same contact area"
         source = f"the population of {len(population.fingers)} fingers, {contact}"
-        poor = sum(finger.result != "successful" for finger in population.fingers)
+        poor = sum(finger.result not in TRUSTED_RESULTS for finger in population.fingers)
         trusted = population.trusted and 2 * poor <= len(population.fingers)
         return cls(_circuit_values(fixed | tied | values), source, trusted)
 

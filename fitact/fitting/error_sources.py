@@ -14,6 +14,7 @@ from fitact.model.skin import probe_parameters
 from fitact.prior.distributions import LogNormal
 from fitact.scene.scene import Scene
 from fitact.uncertainty.budget import Component, ErrorSource
+from fitact.uncertainty.effect_size import EffectSizes
 
 # cheapest ways to reduce an error
 _CALIBRATE = "record a dummy circuit of known parts, or both channels on one node, with the same pieces and ranges"
@@ -59,6 +60,16 @@ def geometry_component(contribution: Contribution) -> Component:
     source = f"{summary.describe_quantity(each.name)}{'' if each.stated else ' (default, from the literature)'}"
     size = each.relative_sd, each.sensitivity
     return Component(source, "B", *size, each.distribution, remedy, in_posterior=each.stated)
+
+
+def structure_components(effects: EffectSizes, quantity: str) -> tuple[Component, ...]:
+    """Return the components of a quantity that stand for what the model lacks, as far as they are not 0."""
+    found = (
+        ("structure of the residuals", effects.effect_size.get(quantity, 0.0)),
+        ("other causes that fit as well", effects.structure.get(quantity, 0.0)),
+    )
+    remedy = "see the rivals of the fit, and test the likely one"
+    return tuple(Component(name, "B", u, 1.0, None, remedy, in_posterior=False) for name, u in found if u > 0.0)
 
 
 def _instrument_source(error: InstrumentError) -> ErrorSource:

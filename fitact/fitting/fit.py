@@ -19,7 +19,14 @@ from fitact.fitting import derived, remarks
 from fitact.fitting.calibrate import calibrate
 from fitact.fitting.channel_fit import ChannelFit, information_criteria
 from fitact.fitting.drive_choice import DriveModel
-from fitact.fitting.error_sources import gain_shifts, geometry_component, list_error_sources, noise_information
+from fitact.fitting.effects import assess_fit, describe_alternatives, describe_structure, is_tolerable
+from fitact.fitting.error_sources import (
+    gain_shifts,
+    geometry_component,
+    list_error_sources,
+    noise_information,
+    structure_components,
+)
 from fitact.fitting.geometry import UncertainGeometry
 from fitact.fitting.identifiability import assess_identifiability
 from fitact.fitting.instrument_effects import fill_effects
@@ -29,7 +36,7 @@ from fitact.fitting.minimum import Optima
 from fitact.fitting.multistart import choose_start, find_optima, lower_optimum
 from fitact.fitting.problem import Problem, build_problem
 from fitact.fitting.profile import PROFILE_QUANTITIES, Interval, profile_intervals
-from fitact.fitting.residual_statistics import pooled_statistics
+from fitact.fitting.residual_statistics import is_undersampled, pooled_statistics
 from fitact.fitting.verdict import diagnose_fit, misfit_warnings
 from fitact.instrument.classes import TYPICAL, typical_gain_u
 from fitact.likelihood import certificate
@@ -38,6 +45,7 @@ from fitact.model.skin import constant_skin_circuit
 from fitact.scene.scene import Scene
 from fitact.tables import join_lines
 from fitact.uncertainty.budget import Budget, ErrorSource, laplace_components
+from fitact.uncertainty.effect_size import NO_EFFECTS, EffectSizes
 
 _SKIN = ("Rsc", "Csc", "Ci")
 _RESPONSE = {
@@ -58,6 +66,7 @@ class Fit(FitResult):
         error_sources: sources of error of each coordinate of theta.
         noise_information: root of the Fisher information of each source of noise.
         gain_shifts: change of theta for a relative error of 1 in the gain of V, Vsc or I that nobody stated.
+        misfit_effects: effects of what the model lacks, where the verdict needed them.
     """
 
     traces: tuple[ChannelFit, ...]
@@ -66,6 +75,7 @@ class Fit(FitResult):
     error_sources: tuple[tuple[ErrorSource, ...], ...]
     noise_information: dict[str, Float[np.ndarray, "rows parameters"]]
     gain_shifts: dict[str, Float[np.ndarray, " parameters"]]
+    misfit_effects: EffectSizes | None = None
 
     @functools.cached_property
     def budgets(self) -> dict[str, Budget]:
@@ -74,7 +84,8 @@ class Fit(FitResult):
         budgets = {}
         for name, gradient in self._gradients.items():
             components = laplace_components(gradient, *roots, self.error_sources, self.noise_information)
-            budgets[name] = Budget((*components, *map(geometry_component, geometry[name])))
+            others = (*map(geometry_component, geometry[name]), *structure_components(self.effects, name))
+            budgets[name] = Budget((*components, *others))
         return budgets
 
     @property
@@ -170,6 +181,26 @@ class Fit(FitResult):
         ratio = self.sd / np.linalg.norm(self.likelihood.prior_factor, axis=1)
         return [*np.argsort(-ratio, kind="stable").tolist(), *range(self.theta.size, self.point.size)]
 
+    @functools.cached_property
+    def effects(self) -> EffectSizes:
+        """How far the results may move because of what the model lacks; empty if that cannot be computed."""
+        if self.misfit_effects is not None:
+            return self.misfit_effects
+        usable = self.result in ("successful", "misfit", "structure")
+        return (assess_fit(self.laplace, self.traces, has_structure=False) if usable else None) or NO_EFFECTS
+
+    @property
+    def effect_notes(self) -> tuple[str, ...]:
+        """Sentences on nuisances that may really be something else."""
+        return describe_alternatives(self.effects, self.laplace)
+
+    @property
+    def message(self) -> str:
+        """Sentence for the result, and what the residuals look like."""
+        if self.result not in ("misfit", "structure"):
+            return super().message
+        return describe_structure(self.result, super().message, self.effects)
+
     def profile(self, name: str, level: float = 0.95, *, prior: bool = True) -> Interval:
         """Return the profile-likelihood interval of one parameter, or of g, b or force_mean.
 
@@ -222,6 +253,11 @@ class Fit(FitResult):
         ]
         return super().judgement() | {"traces": traces}
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of fit.json, which `fitact fit --json` prints."""
+        content = super().to_dict()
+        return content | self.effects.to_dict() | {"notes": [*self.notes, *self.effect_notes]}
+
     def _nuisances(self) -> dict[str, float]:
         return dict(zip(self.likelihood.sigma_names, self.laplace.sigmas.tolist(), strict=True)) | self.linear
 
@@ -243,7 +279,7 @@ class Fit(FitResult):
             str(self.identifiability),
             *summary.advice_line(content),
         ]
-        return join_lines(rows, self.warnings, self.notes)
+        return join_lines(rows, self.warnings, content["notes"])
 
     __str__ = summary
 
@@ -417,9 +453,17 @@ def _assemble_fit(
     notes += UncertainGeometry.from_scene(first.scene, derive.geometry).notes(first.scene, likelihood, theta)
     experiment = problem.experiment(likelihood, optimum.circuit, sigma)
     gradient = laplace.log_gradient("force_mean")
+    result, effects = diagnose_fit(solution, root, traces, problem.sources, optima), None
+    if result == "misfit":
+        effects = assess_fit(laplace, traces, has_structure=True)
+        may_move = any(s.drive_noise_dominates for s in problem.sources) or any(
+            is_undersampled(t.figures) for t in traces
+        )
+        if effects is not None and not may_move and is_tolerable(effects, laplace, first.scene.tolerance.force):
+            result = "structure"
     return Fit(
         laplace,
-        result=diagnose_fit(solution, root, traces, problem.sources, optima),
+        result=result,
         figures=figures,
         identifiability=assess_identifiability(likelihood.names, root, likelihood.prior_factor, gradient, experiment),
         scene=first.scene,
@@ -431,4 +475,5 @@ def _assemble_fit(
         error_sources=list_error_sources(likelihood, problem.coordinates, first.scene),
         noise_information=noise_information(likelihood, solution),
         gain_shifts=gain_shifts(likelihood, solution, root),
+        misfit_effects=effects,
     )

@@ -13,10 +13,8 @@ from fitact.compiled import pad_samples
 from fitact.fitting.channel_fit import sample_residuals
 from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.problem import Source
+from fitact.instrument.effects import PROBE_TIME_CONSTANT, nonlinearity_shapes
 from fitact.likelihood.likelihood import Likelihood
-
-# of 9 Mohm and 12.2 pF of a 10x probe. Source: primidi.com, passive probes; Brüel & Kjær 2125A manual, p. 49
-PROBE_TIME_CONSTANT = 110e-6  # s
 
 
 class FilledEffects(NamedTuple):
@@ -49,20 +47,11 @@ def effect_functions(
     time: Float[np.ndarray, " samples"],
     choice: DriveModel,
     frequency: float | None,
-    fill: float = 0.8,
 ) -> Float[np.ndarray, "effects samples"]:
-    """Return the functions of `EFFECTS`: the error of the signal (V or A) for an error of 1.
-
-    The range, to which a non-linearity is relative, is taken to be `fill`ed by the signal.
-    """
+    """Return the error of the signal (V or A) for an error of 1 of each of the `EFFECTS`."""
     settled = choice.steady_state or choice.unknown_charge
     compensation = _highpass(signal, time, frequency if settled else None, settled=settled)
-    low, high = float(signal.min()), float(signal.max())
-    size = (high - low) / fill
-    x = (2.0 * signal - low - high) / size
-    # Legendre polynomials, i.e. beside offset and gain
-    even, odd = size * (0.5 * (3.0 * x**2 - 1.0)), size * (0.5 * (5.0 * x**3 - 3.0 * x))
-    return np.stack([compensation, even, odd])  # in the order of `EFFECTS`
+    return np.vstack([compensation, nonlinearity_shapes(signal)])
 
 
 def _highpass(

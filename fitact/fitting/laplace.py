@@ -75,7 +75,7 @@ class FitResult(abc.ABC):
     @property
     def trusted(self) -> bool:
         """Whether the fit is reliable."""
-        return self.result == "successful"
+        return self.result in summary.TRUSTED_RESULTS
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -234,7 +234,7 @@ class FitResult(abc.ABC):
     @property
     def message(self) -> str:
         """Sentence for the result."""
-        return SUCCESS_MESSAGE if self.trusted else result_message(self.result)
+        return SUCCESS_MESSAGE if self.result == "successful" else result_message(self.result)
 
     def judgement(self) -> dict[str, Any]:
         """Return the result and the figures of merit."""

@@ -37,6 +37,7 @@ class RESULTS(optx.RESULTS):
         "Poor fit: the residuals are larger than the noise or correlated. Inspect them in the report, then fit with the"
         " measured drive or add the missing circuit element (a gap, R_H, …) to the scene."
     )
+    structure = "The residuals are more than noise, but can hardly move the results."
 
 
 def _result_index(result: Any) -> Int[Array, ""]:

@@ -17,7 +17,7 @@ from fitact.compiled import jit
 
 RESULT_NAMES = (
     "successful", "did_not_move", "not_at_optimum", "rank_deficient", "on_bound", "several_optima", "misfit",
-    "nonfinite", "nonlinear_max_steps_reached", "nonlinear_divergence",
+    "structure", "nonfinite", "nonlinear_max_steps_reached", "nonlinear_divergence",
 )  # fmt: skip
 
 

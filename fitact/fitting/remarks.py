@@ -107,8 +107,8 @@ def instrument_warnings(
         if abs(pull) > max_pull:
             warnings.append(
                 f"the data put {name} at {math.exp(value):.4g}, {abs(pull):.1f} standard deviations from what the"
-                " stated instruments allow; check the scale of the channels, the probe's attenuation and the class under"
-                " [instrument]"
+                " stated instruments allow; check the scale of the channels, the attenuation of probes, and the classes"
+                " under [instrument]"
             )
     return warnings
 

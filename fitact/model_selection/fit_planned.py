@@ -15,7 +15,8 @@ from fitact.scene.scene import Scene
 
 Model: TypeAlias = Literal["planned", "full"]
 
-_FAILED_RESULTS = ("misfit", "not_at_optimum")  # results of a fit whose model is too simple
+# results of a fit whose model is too simple, the worst last
+_FAILED_RESULTS = ("structure", "misfit", "not_at_optimum")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +57,7 @@ def fit_planned(records: Sequence[Record], scenes: Sequence[Scene], model: Model
     fitted = fit_records(records, (reduced,) * len(records), drives if same else (), **options)
     if planned.left_out and fitted.result in _FAILED_RESULTS:
         whole = _fit_full_model(records, scenes[0], drives, options)
-        if whole is not None and whole.result not in _FAILED_RESULTS:
+        if whole is not None and _failure_rank(whole) < _failure_rank(fitted):
             warning = (
                 f"the record contradicts the planned model, which neglects {', '.join(planned.left_out)}: only the"
                 " full model describes the record, so the full model was fitted"
@@ -64,6 +65,10 @@ def fit_planned(records: Sequence[Record], scenes: Sequence[Scene], model: Model
             whole = dataclasses.replace(whole, warnings=(*whole.warnings, warning))
             return PlannedFit(whole, "full", f"{warning[0].upper()}{warning[1:]}.", planned)
     return PlannedFit(fitted, "planned", planned.sentence, planned)
+
+
+def _failure_rank(fitted: Fit) -> int:
+    return _FAILED_RESULTS.index(fitted.result) if fitted.result in _FAILED_RESULTS else -1
 
 
 def plan_for_record(record: Record, scene: Scene) -> Plan:

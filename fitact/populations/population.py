@@ -72,7 +72,11 @@ class Population:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences on conditions that may change the result."""
-        sentences = [f"{finger.source}: {finger.message}" for finger in self.fingers if finger.result != "successful"]
+        sentences = [
+            f"{finger.source}: {finger.message}"
+            for finger in self.fingers
+            if finger.result not in summary.TRUSTED_RESULTS
+        ]
         if self.convergence.warning:
             sentences.append(self.convergence.warning)
         if not self.off <= MAX_INTEGRATION_ERROR:

@@ -1,4 +1,5 @@
-"""How uncertain is each quantity, all sources of error together, and which source contributes how much?
+"""How uncertain is each quantity, all sources of error together, and how far can what the model lacks move it?
 
-Takes sensitivities, residuals and the distributions of errors. Gives budgets, effect sizes and rival explanations.
+Takes sensitivities, distributions of errors, residuals and V(t). Gives budgets, the shift that structure in the
+residuals could stand for, the causes that would explain it, and what no residual could reveal.
 """

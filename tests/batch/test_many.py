@@ -107,7 +107,7 @@ def test_without_tests_of_whiteness_only_size_is_judged():
     given[2], given[3] = with_line(given[2], 0.35), with_line(given[3], 1.5)
     tested = fitact.fit_many(given, SCENE, progress=False)
     untested = fitact.fit_many(given, SCENE, whiteness=False, progress=False)
-    assert [tested[2]["result"], tested[3]["result"]] == ["misfit", "misfit"]
+    assert [tested[2]["result"], tested[3]["result"]] == ["structure", "misfit"]
     assert [untested[2]["result"], untested[3]["result"]] == ["successful", "misfit"]
     assert "not tested" in untested[2]["message"]
     for quick, whole in zip(untested[4:], tested[4:], strict=True):

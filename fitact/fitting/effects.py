@@ -1,0 +1,152 @@
+"""Effects of what the model of a fit lacks: the inputs of `fitact.uncertainty`, and the verdict that follows."""
+
+import math
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from fitact.fitting import derived
+from fitact.fitting.channel_fit import ChannelFit
+from fitact.fitting.laplace import Laplace
+from fitact.fitting.least_squares import NUISANCES
+from fitact.likelihood.channel import TIMING_NUISANCES, ChannelLikelihood
+from fitact.likelihood.noise import student_weight
+from fitact.model.skin import circuit_parameters
+from fitact.uncertainty.channel_series import ChannelSamples, Timing
+from fitact.uncertainty.effect_size import EffectSizes, assess_effects
+from fitact.uncertainty.linear_model import Nuisance, Posterior
+from fitact.uncertainty.loop import LoopModel
+from fitact.uncertainty.rivals import Rival
+from fitact.units import format_percent
+
+
+def assess_fit(
+    laplace: Laplace, traces: Sequence[ChannelFit], has_structure: bool, rivals: Sequence[Rival] = ()
+) -> EffectSizes | None:
+    """Return the effect sizes of a fit; None if they cannot be computed. By default all known rivals are considered."""
+    posterior, channels = linear_posterior(laplace), channel_samples(laplace, traces)
+    if posterior is None:
+        return None
+    added = [Nuisance(i, name) for i, each in enumerate(channels) for name in _added_nuisances(each)]
+    try:
+        effects = assess_effects(channels, posterior, has_structure, added, rivals)
+    except np.linalg.LinAlgError:
+        return None
+    return effects if all(map(math.isfinite, effects.effect_size.values())) else None
+
+
+def linear_posterior(laplace: Laplace) -> Posterior | None:
+    """Return what `fitact.uncertainty` needs of a posterior; None for a circuit that it does not know."""
+    likelihood = laplace.likelihood
+    loop = LoopModel.from_likelihood(likelihood)
+    if loop is None:
+        return None
+    circuit = [name for name in likelihood.prior.names if name in circuit_parameters(likelihood.template)]
+    places = [likelihood.names.index(name) for name in circuit]
+    gradients = np.concatenate([laplace.log_derived[1], np.eye(laplace.theta.size)[places]])
+    names = (*derived.DERIVED_NAMES, *circuit)
+    return Posterior(loop, laplace.theta, likelihood.prior_factor, names, gradients)
+
+
+def channel_samples(laplace: Laplace, traces: Sequence[ChannelFit]) -> list[ChannelSamples]:
+    """Return the residuals of all channels, with what is known of their noise and nuisances."""
+    with jax.enable_x64(True):
+        taus = np.asarray(laplace.likelihood.evaluate_circuit(laplace.theta).tau)
+    pairs = zip(laplace.likelihood.channels, traces, strict=True)
+    return [_channel_samples(laplace, channel, fitted, taus) for channel, fitted in pairs]
+
+
+def _channel_samples(
+    laplace: Laplace, channel: ChannelLikelihood, fitted: ChannelFit, taus: Float[np.ndarray, " taus"]
+) -> ChannelSamples:
+    likelihood, record, choice = laplace.likelihood, fitted.record, fitted.choice
+    values, timing = likelihood.to_physical(laplace.theta), {}
+    for name in channel.timing:
+        key = channel.qualified_name(name)
+        total = float(values[key]) - (choice.shift if name == "delay" else 0.0)
+        timing[name] = Timing(likelihood.names.index(key), likelihood.timing[key][1], total)
+    weight = np.ones(len(record)) if fitted.weight is None else fitted.weight
+    if channel.noise == "student":
+        weight = weight * np.sqrt(np.asarray(student_weight(weight * fitted.residuals / fitted.sigma)))
+    suffix = f"_{channel.label}" if channel.label else ""
+    linear = {name.removesuffix(suffix): value for name, value in fitted.linear.items()}
+    places = {name: place for place, name in enumerate(likelihood.names)}
+    gains, *effects = (
+        tuple((places[name], power) for name, power in each) for each in (channel.gains, *channel.effect_sizes)
+    )
+    return ChannelSamples(
+        channel=fitted.channel,
+        time=record.time,
+        voltage=choice.voltage,
+        residuals=fitted.residuals,
+        weight=weight,
+        sigma=fitted.sigma,
+        noise=fitted.figures["noise_expected"],
+        taps=np.ones(1) if channel.whitening is None else np.trim_zeros(np.asarray(channel.whitening.taps), "b"),
+        frequency=record.frequency() if choice.periodic else None,
+        steady_state=choice.steady_state,
+        unknown_charge=choice.unknown_charge,
+        transient=sum(value for name, value in linear.items() if name.startswith("charge")),
+        taus=taus,
+        nuisances=linear,
+        timing=timing,
+        gains=gains,
+        effects=tuple(effects),
+    )
+
+
+def _components(group: str) -> tuple[str, ...]:
+    return (f"{group}_cos", f"{group}_sin") if group.startswith("hum") else (group,)
+
+
+def _added_nuisances(samples: ChannelSamples) -> list[str]:
+    """Return the nuisances of a channel that the data asked for; every channel has an offset, which tells nothing."""
+    found = (group for group in NUISANCES if any(name in samples.nuisances for name in _components(group)))
+    linear = [group for group in found if group != "offset"]
+    return linear + [name for name in TIMING_NUISANCES if name in samples.timing]
+
+
+def is_tolerable(effects: EffectSizes, laplace: Laplace, force: float, others: float = 0.05) -> bool:
+    """Return whether structure can move the mean force by no more than `force`, and all else by no more than `others`.
+
+    Only the divider, the time constant and the parameters that the data determine count.
+    """
+    from_prior = laplace.variance_from_prior(np.eye(laplace.theta.size))
+    determined = [n for n, part in zip(laplace.likelihood.names, from_prior, strict=True) if part < 0.5]
+    sizes = effects.effect_size
+    return sizes["force_mean"] <= force and all(sizes.get(n, 0.0) <= others for n in ("g", "b", *determined))
+
+
+def describe_structure(result: str, message: str, effects: EffectSizes, negligible: float = 1e-5) -> str:
+    """Return the sentence for residuals that are more than noise, with what they look like and may move."""
+    sizes = {name: effects.effect_size.get(name, 0.0) for name in ("g", "b", "force_mean")}
+    if max(sizes.values()) < negligible:
+        return message
+    moved = " and ".join(
+        f"{name.replace('force_mean', 'the mean force')} by {format_percent(float(f'{size:.1g}'))}"
+        for name, size in sizes.items()
+        if size >= negligible
+    )
+    like = f" (like {' or '.join(effects.causes)})" if effects.causes else ""
+    found = f"the residuals show structure{like}; it could move {moved}."
+    return f"{message} {found[0].upper()}{found[1:]}" if result == "misfit" else f"{found[0].upper()}{found[1:]}"
+
+
+def describe_alternatives(effects: EffectSizes, laplace: Laplace, min_ratio: float = 0.5) -> tuple[str, ...]:
+    """Return a note on each added nuisance whose alternatives move a result by `min_ratio` of its error or more."""
+    if not effects.alternatives:
+        return ()
+    sd = dict(zip(derived.DERIVED_NAMES, laplace.derived_log_sd, strict=True))
+    moved = [name for name in ("g", "b", "force_mean") if effects.structure[name] > min_ratio * sd[name]]
+    if not moved:
+        return ()
+    sizes = " and ".join(
+        f"{name.replace('force_mean', 'the mean force')} by {format_percent(float(f'{effects.structure[name]:.1g}'))}"
+        for name in moved
+    )
+    return tuple(
+        f"the {name} that was added may as well be {' or '.join(others)}; this could move {sizes}"
+        for name, others in effects.alternatives.items()
+    )

@@ -1,0 +1,177 @@
+"""Linearised fit: sensitivities of the data to parameters and nuisances, and the estimator that follows."""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+
+from fitact.uncertainty.channel_series import ChannelSeries, Rows
+from fitact.uncertainty.loop import ChannelModel, Instrument, LoopModel
+
+Columns = Float[np.ndarray, "rows columns"]
+
+
+class Nuisance(NamedTuple):
+    """A nuisance of one channel."""
+
+    channel: int  # index of the channel
+    name: str  # "delay", "clock", or the name of a linear nuisance without "_cos" and "_sin"
+
+
+@dataclasses.dataclass(frozen=True)
+class Posterior:
+    """Coordinates of a fit, their optimum and prior, and the quantities that are reported."""
+
+    loop: LoopModel
+    theta: Float[np.ndarray, " parameters"]
+    prior_factor: Float[np.ndarray, "parameters parameters"]
+    quantities: tuple[str, ...]
+    gradients: Float[np.ndarray, "quantities parameters"]  # of the logarithms of the quantities
+
+
+class LinearModel:
+    """Whitened sensitivities of all channels at the optimum, followed by a row for the prior of each coordinate."""
+
+    def __init__(self, posterior: Posterior, series: Sequence[ChannelSeries], without: Nuisance | None = None) -> None:
+        """Compute the sensitivities; the nuisance `without` is left out of the model."""
+        self.posterior, self.without = posterior, without
+        self.series = tuple(series)
+        self.series = tuple(model.with_charge() for model in self.models(posterior.theta))
+        timing = {} if without is None else series[without.channel].samples.timing
+        dropped = [t.place for name, t in timing.items() if without is not None and name == without.name]
+        self.kept = [i for i in range(posterior.theta.size) if i not in dropped]
+        sensitivities, nuisances = self.sensitivities(posterior.theta), self._nuisance_columns()
+        width = nuisances.shape[1]
+        prior = np.linalg.inv(posterior.prior_factor)
+        prior = np.delete(prior, [i for i in range(len(prior)) if i not in self.kept], axis=0)
+        self.design = np.block(
+            [
+                [sensitivities, nuisances],
+                [prior[:, self.kept], np.zeros((len(prior), width))],
+                # keeps nuisances apart that look alike
+                [np.zeros((width, len(self.kept))), 1e-6 * np.eye(width)],
+            ]
+        )
+        self.basis, self.triangle = np.linalg.qr(self.design)
+
+    @functools.cached_property
+    def rows(self) -> int:
+        """Number of rows of data."""
+        return sum(each.time.size for each in self.series)
+
+    @functools.cached_property
+    def residuals(self) -> Rows:
+        """Whitened residuals orthogonal to all sensitivities; the rows of the prior follow."""
+        return self.remainder(np.concatenate([each.whiten(each.residuals) for each in self.series])[:, None])[:, 0]
+
+    @functools.cached_property
+    def noise_variance(self) -> Rows:
+        """Variance of the noise alone in each row; 0 in the rows of the prior."""
+        parts, start = [], 0
+        for each in self.series:
+            rows = self.residuals[start : start + each.time.size]
+            parts.append(np.full(each.time.size, _noise_variance(rows, each)))
+            start += each.time.size
+        return self.extend(np.concatenate(parts)[:, None])[:, 0]
+
+    def extend(self, columns: Columns) -> Columns:
+        """Return columns with zeros in the rows of the prior."""
+        return np.pad(columns, ((0, len(self.design) - len(columns)), (0, 0)))
+
+    def remainder(self, columns: Columns) -> Columns:
+        """Return the part of columns that is orthogonal to all sensitivities."""
+        columns = self.extend(columns) if len(columns) == self.rows else columns
+        return columns - self.basis @ (self.basis.T @ columns)
+
+    def shifts(self, columns: Columns) -> Float[np.ndarray, "quantities columns"]:
+        """Return how a fit moves the logarithms of the quantities if the data contain each of the columns."""
+        solved = scipy.linalg.solve_triangular(self.triangle, self.basis[: self.rows].T @ columns[: self.rows])
+        return self._gradients @ solved[: len(self.kept)]
+
+    def shift_of_part(
+        self, design: Columns, residuals: Rows, noise: Rows
+    ) -> tuple[Float[np.ndarray, " quantities"], Float[np.ndarray, " quantities"]]:
+        """Return the shifts of a fit to a part of the data, with the whole prior, and their variances from noise."""
+        basis, triangle = np.linalg.qr(np.concatenate([design, self.design[self.rows :]]))
+        estimator = np.linalg.pinv(triangle, rcond=1e-12) @ basis[: len(design)].T
+        weights = self._gradients @ estimator[: len(self.kept)]
+        return weights @ residuals, np.square(weights) @ noise
+
+    @functools.cached_property
+    def weights(self) -> Float[np.ndarray, "quantities rows"]:
+        """Weight of each row in the estimates of the quantities."""
+        solved = scipy.linalg.solve_triangular(self.triangle, self.basis[: self.rows].T)
+        return self._gradients @ solved[: len(self.kept)]
+
+    @property
+    def _gradients(self) -> Float[np.ndarray, "quantities parameters"]:
+        return self.posterior.gradients[:, self.kept]
+
+    def models(self, theta: Float[np.ndarray, " parameters"]) -> list[ChannelModel]:
+        """Return the models of all channels at theta."""
+        values, move = self.posterior.loop.values(theta), theta - self.posterior.theta
+        models = []
+        for i, each in enumerate(self.series):
+            timing = {
+                name: t.total + t.unit * float(move[t.place])
+                for name, t in each.samples.timing.items()
+                if self.without != (i, name)
+            }
+            gain, *effects = (
+                float(np.exp(sum(power * theta[place] for place, power in places)))
+                for places in (each.samples.gains, *each.samples.effects)
+            )
+            instrument = Instrument(gain, **timing, effects=tuple(effect - 1.0 for effect in effects))
+            models.append(ChannelModel(each, self.posterior.loop, values, instrument))
+        return models
+
+    def signals(self, theta: Float[np.ndarray, " parameters"]) -> Rows:
+        """Return the whitened signals of all channels at theta."""
+        return np.concatenate([model.series.whiten(model.signal) for model in self.models(theta)])
+
+    def sensitivities(self, theta: Float[np.ndarray, " parameters"], step: float = 1e-4) -> Columns:
+        """Return the derivatives of the whitened signals in the coordinates that are kept, by central differences."""
+        changes = step * np.eye(theta.size)[self.kept]
+        columns = [self.signals(theta + change) - self.signals(theta - change) for change in changes]
+        return np.stack(columns, axis=1) / (2.0 * step)
+
+    def _place(self, channel: int, values: Rows) -> Rows:
+        """Return values of one channel among the whitened rows of all."""
+        rows = [np.zeros(each.time.size) for each in self.series]
+        rows[channel] = self.series[channel].whiten(values)
+        return np.concatenate(rows)
+
+    def _nuisance_columns(self) -> Columns:
+        columns = []
+        for i, each in enumerate(self.series):
+            for name, shape in each.shapes().items():
+                if self.without is None or (i, name.rsplit("_", name.startswith("hum"))[0]) != self.without:
+                    column = self._place(i, shape)
+                    columns.append(column / max(float(np.linalg.norm(column)), 1e-300))
+        return np.stack(columns, axis=1) if columns else np.zeros((self.rows, 0))
+
+    def nuisance_part(self, simpler: "LinearModel", nuisance: Nuisance) -> tuple[Columns, Rows]:
+        """Return the whitened columns of a nuisance, which a `simpler` model lacks, and what it adds at the optimum."""
+        series = self.series[nuisance.channel]
+        if nuisance.name in series.samples.timing:
+            place = self.kept.index(series.samples.timing[nuisance.name].place)
+            theta = self.posterior.theta
+            return self.design[: self.rows, [place]], self.signals(theta) - simpler.signals(theta)
+        shapes = {name: shape for name, shape in series.shapes().items() if name.startswith(nuisance.name)}
+        columns = np.stack([self._place(nuisance.channel, shape) for shape in shapes.values()], axis=1)
+        return columns, columns @ np.array([series.samples.nuisances[name] for name in shapes])
+
+
+def _noise_variance(rows: Rows, series: ChannelSeries, quantile: float = 0.25) -> float:
+    """Return the variance of white noise: that of the model-free estimate, or of the quiet lines if that is larger.
+
+    Noise that is larger than estimated raises all lines, and structure only some.
+    """
+    power = np.sort(np.square(np.abs(np.fft.rfft(rows)[1:])))
+    counted = np.count_nonzero(series.weight)
+    quiet = power[int(quantile * power.size)] / (-np.log1p(-quantile) * max(counted, 1))
+    return float(np.clip((series.samples.noise / series.samples.sigma) ** 2, quiet, max(1.0, quiet)))

@@ -1,0 +1,183 @@
+"""Transfer functions of the circuit's loop in NumPy, also with what the model of a fit lacks."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from fitact.instrument.effects import PROBE_TIME_CONSTANT, nonlinearity_shapes
+from fitact.likelihood.likelihood import Likelihood
+from fitact.model.circuit import FinalCircuit, NaturalGround
+from fitact.model.skin import Fractional, WithSkin, circuit_parameters, constant_skin_circuit
+from fitact.uncertainty.channel_series import ChannelSeries, Rows, Spectrum
+
+
+class Addition(NamedTuple):
+    """Circuit elements that a model lacks, by their amplitude; 0 omits each."""
+
+    probe: float = 0.0  # probes of 10 Mohm || 12 pF across the touching skin
+    resistor: float = 0.0  # in series, ohm
+    inequality: float = 0.0  # relative excess of the resistance of the grounding skin
+    layers: float = 0.0  # relative variance of the time constants of two layers in each skin
+    dispersion: float = 0.0  # 1 - exponent of the skins
+    gap: float = 0.0  # interface gaps of 1 Mohm || 5 nF
+
+
+NOTHING = Addition()
+
+
+class LoopImpedances(NamedTuple):
+    """Impedances of the loop, ohm."""
+
+    touching: Spectrum  # touching skin with its probe
+    grounding: Spectrum  # grounding skin, or the environment
+    skin_resistances: tuple[float, float]  # of the touching and the grounding skin
+    admittance: Spectrum  # of the whole loop, S
+
+    def gain(self, channel: str) -> Spectrum:
+        """Return the ratio of a channel to V."""
+        return self.admittance if channel == "I" else self.touching * self.admittance
+
+
+class LoopModel(NamedTuple):
+    """A circuit as the values of its parameters."""
+
+    kind: type  # class of the circuit with constant skins
+    known: dict[str, float | None]  # all parameters of the template
+    probe: tuple[float, float] | None  # the probe's resistance (ohm) and capacitance (F)
+    free: tuple[str, ...]  # parameters whose logarithms are the first coordinates of theta
+    tied: tuple[tuple[str, str, float], ...]
+
+    @classmethod
+    def from_likelihood(cls, likelihood: Likelihood) -> "LoopModel | None":
+        """Return the circuit of a likelihood; None for a skin that is known by tabulated values only."""
+        template = likelihood.template
+        if isinstance(template, WithSkin) and not isinstance(template.skin, Fractional):
+            return None
+        inner: Any = constant_skin_circuit(template)
+        values = {name: None if x is None else float(np.asarray(x)) for name, x in circuit_parameters(template).items()}
+        probe = getattr(inner, "probe", None)
+        loads = None if probe is None else (float(np.asarray(probe.R)), float(np.asarray(probe.C)))
+        return cls(type(inner), values, loads, likelihood.prior.names, likelihood.tied)
+
+    def values(self, theta: Float[np.ndarray, " parameters"]) -> dict[str, float | None]:
+        """Return the parameters of the circuit at theta, in SI units."""
+        values = self.known | {name: float(np.exp(x)) for name, x in zip(self.free, theta, strict=False)}
+        for name, other, ratio in self.tied:
+            value = values[other]
+            assert value is not None
+            values[name] = ratio * value
+        return values
+
+    def impedances(self, values: Mapping[str, float | None], s: Spectrum, added: Addition = NOTHING) -> LoopImpedances:
+        """Return the impedances at complex frequencies `s` (rad/s), with what is `added`."""
+        get = values.get
+        R, C, Ci = (float(values[name] or 0.0) for name in ("Rsc", "Csc", "Ci"))
+        alpha = (get("alpha") or 1.0) - added.dispersion
+        touching = _skin(R, C, s, alpha, added.layers)
+        load = added.probe * (1e-7 + s * 12e-12)
+        if self.probe is not None:
+            loads = zip(("probe_resistance", "probe_capacitance"), self.probe, strict=True)
+            resistance, capacitance = (get(name) or value for name, value in loads)
+            load = load + 1.0 / resistance + s * capacitance
+        touching = touching / (1.0 + touching * load)
+        grounding, R2 = np.zeros_like(s), 0.0
+        series: Any = added.resistor + (get("R_H") or 0.0) + (get("series_resistor") or 0.0)
+        if self.kind is not NaturalGround:
+            equal = self.kind is FinalCircuit
+            R2 = (R if equal else get("grounding_Rsc") or R) * (1.0 + added.inequality)
+            grounding = _skin(R2, C if equal else get("grounding_Csc") or C, s, alpha, added.layers)
+        elif Z := get("Z"):
+            grounding = Z / (1.0 + s * Z * (get("Z_capacitance") or 0.0))
+        if Cgap := get("Cgap"):
+            Rgap = get("Rgap")
+            Ci = Ci if Rgap else Ci * Cgap / (Ci + Cgap)
+            series = series + (Rgap / (1.0 + s * Rgap * Cgap) if Rgap else 0.0)
+        series = series + added.gap * 1e6 / (1.0 + s * 5e-3)
+        admittance = s * Ci / (1.0 + s * Ci * (touching + grounding + series))
+        return LoopImpedances(touching, grounding, (R, R2), admittance)
+
+
+def _skin(R: float, C: float, s: Spectrum, alpha: float, layers: float) -> Spectrum:
+    """Return the impedance of a skin of total resistance R and series capacitance C, ohm.
+
+    `layers` is the relative variance of the time constants of two layers of equal resistance.
+    """
+    x = (s * (R * C / (1.0 - layers))) ** alpha
+    return R * (1.0 + x) / ((1.0 + x) ** 2 - layers * x * x)
+
+
+class Instrument(NamedTuple):
+    """How a channel is recorded."""
+
+    gain: float = 1.0
+    delay: float = 0.0  # s
+    clock: float = 0.0  # relative deviation of the drive's frequency
+    effects: tuple[float, ...] = ()  # compensation, even and odd non-linearity
+
+
+class ChannelModel:
+    """Signal of one channel at one set of parameter values, and with changes of the circuit or the instrument."""
+
+    def __init__(
+        self, series: ChannelSeries, loop: LoopModel, values: Mapping[str, float | None], instrument: Instrument
+    ) -> None:
+        """Set the rows, the circuit and its values, and the instrument."""
+        self.series, self.loop, self.values, self.instrument = series, loop, values, instrument
+        self.s = series.frequencies
+
+    @functools.cached_property
+    def parts(self) -> LoopImpedances:
+        """Impedances at the frequencies of the FFT."""
+        return self.loop.impedances(self.values, self.s)
+
+    @functools.cached_property
+    def signal(self) -> Rows:
+        """Signal of the circuit as it is, V or A."""
+        if not self.instrument.effects:
+            return self._respond(self.parts)
+        compensation, *nonlinearity = self.instrument.effects
+        x = self.s * PROBE_TIME_CONSTANT
+        signal = self._respond(self.parts, 1.0 + compensation * x / (1.0 + x))
+        return signal + np.array(nonlinearity) @ nonlinearity_shapes(signal)
+
+    def signal_with(self, added: Addition) -> Rows:
+        """Return the signal of a circuit with what is `added`, V or A."""
+        return self._respond(self.loop.impedances(self.values, self.s, added))
+
+    def filtered(self, gain: Callable[[Spectrum], Spectrum]) -> Rows:
+        """Return the signal behind a filter, V or A."""
+        return self._respond(self.parts, gain(self.s))
+
+    def record(self, gain: Spectrum, rows: Rows, jump: float = 0.0) -> Rows:
+        """Return rows after a filter, as the instrument records them."""
+        series, (factor, delay, clock, _) = self.series, self.instrument
+        gain = factor * gain * (np.exp(-delay * series.difference) if delay else 1.0)
+        signal = series.response(gain, rows, jump)
+        if not clock:
+            return signal
+        return signal + clock * series.time * series.response(gain * series.difference, rows, jump)
+
+    def with_charge(self) -> ChannelSeries:
+        """Return the rows with the jump of V at the first sample that stands for the unknown charge there.
+
+        The jump divides as any other. The transient of a fit is relative to a V that was 0 before the record.
+        """
+        series = self.series
+        if not series.samples.unknown_charge or series.samples.channel == "I":
+            return series
+        gain = self.parts.touching * self.parts.admittance
+        high = abs(gain[-1])
+        first = high * float(series.voltage[0]) + series.samples.transient
+        if series.repeats:
+            return dataclasses.replace(series, jump=(first - float(series.response(gain, series.voltage)[0])) / high)
+        return dataclasses.replace(series, jump=series.samples.transient / high)
+
+    def _respond(self, parts: LoopImpedances, filter_gain: Spectrum | float = 1.0) -> Rows:
+        series, gain = self.series, parts.gain(self.series.samples.channel)
+        if series.samples.channel == "I":
+            gain = series.regular_gain(gain)
+        return self.record(gain * filter_gain, series.voltage, series.jump)
