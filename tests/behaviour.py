@@ -183,7 +183,10 @@ def run(arguments: list[str]) -> dict[str, Any]:
             code = end.code
     text = out.getvalue()
     said = [line for line in err.getvalue().splitlines() if not re.search(r"\r|\x1b|it/s| s$|: \d+%$", line)]
-    result = {"code": code, "json": json.loads(text) if text.strip() else None, "said": said}
+    content = json.loads(text) if text.strip() else None
+    if isinstance(content, dict):  # long, and in an order that rounding may change; other tests look at them
+        content = {key: value for key, value in content.items() if key not in ("budget", "blind_table", "rivals")}
+    result = {"code": code, "json": content, "said": said}
     if "simulated.csv" in arguments:
         result["columns"] = _columns(np.genfromtxt("simulated.csv", delimiter=",", names=True))
     table = Path("out", "results.parquet")

@@ -6,7 +6,7 @@ logarithm of each channel's noise. Linear nuisances are integrated out (`fitact.
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -152,23 +152,22 @@ class Likelihood(eqx.Module):
         self, points: Float[np.ndarray, "n parameters"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Return the divider ratio g and the slowest time constant b (s) at many points theta."""
-        g, b = self._evaluate_divider(points, _divider)
+        finger = dataclasses.replace(self, template=self.finger(self.template))  # whose g and b cost less
+        g, b, *_ = finger._evaluate_divider(points)
         return g, b
 
     def time_constants(self, points: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, "taus n"]:
         """Return the time constants (s) of the circuits at the points theta, the slowest first."""
-        return self._evaluate_divider(points, _time_constants)
+        return self._evaluate_divider(points)[2:]
 
     def tau_range(self, points: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, "2 taus"]:
         """Return the least and the largest value (s) of each time constant of the circuits at the points theta."""
         tau = self.time_constants(points)
         return np.stack([tau.min(axis=1), tau.max(axis=1)])
 
-    def _evaluate_divider(
-        self, points: np.ndarray, function: Callable[..., Array]
-    ) -> Float[np.ndarray, "quantities n"]:
+    def _evaluate_divider(self, points: np.ndarray) -> Float[np.ndarray, "quantities n"]:
         bare, kept = self._bare()
-        return BatchEvaluator(function, bare, len(kept), batch=256, fast=False)(points[:, kept]).T
+        return BatchEvaluator(_divider, bare, len(kept), batch=256, fast=False)(points[:, kept]).T
 
     def _bare(self) -> tuple["Likelihood", list[int]]:
         """Return the likelihood without all that the circuit does not depend on, and its coordinates.
@@ -303,11 +302,7 @@ def _evaluate_circuit(likelihood: Likelihood, theta: Float[Array, " circuit_para
     return jax.tree.map(jnp.asarray, CircuitValues(circuit, circuit.b, tau, terms))
 
 
-def _divider(likelihood: Likelihood, theta: Float[Array, " circuit_parameters"]) -> Float[Array, "2"]:
-    """Return g and b (s) of the finger."""
-    finger = likelihood.finger(likelihood.circuit(theta))
-    return jnp.stack([finger.g, finger.b])
-
-
-def _time_constants(likelihood: Likelihood, theta: Float[Array, " circuit_parameters"]) -> Float[Array, " taus"]:
-    return jnp.stack(constant_skin_circuit(likelihood.circuit(theta)).terms().tau)
+def _divider(likelihood: Likelihood, theta: Float[Array, " circuit_parameters"]) -> Float[Array, " quantities"]:
+    """Return g, b, and all time constants (s)."""
+    circuit = likelihood.circuit(theta)
+    return jnp.stack([circuit.g, circuit.b, *constant_skin_circuit(circuit).terms().tau])
