@@ -29,7 +29,7 @@ from fitact.fitting.error_sources import (
 )
 from fitact.fitting.geometry import UncertainGeometry
 from fitact.fitting.identifiability import assess_identifiability
-from fitact.fitting.instrument_effects import fill_effects
+from fitact.fitting.instrument_effects import effects_would_change, fill_effects
 from fitact.fitting.laplace import FitResult, Laplace
 from fitact.fitting.least_squares import LeastSquaresResult, solve
 from fitact.fitting.minimum import Optima
@@ -371,21 +371,17 @@ def fit_records(
 def _solve_problem(
     problem: Problem, tolerance: float, start: Mapping[str, float] | None, max_rounds: int = 3, max_change: float = 0.3
 ) -> tuple[LeastSquaresResult, certificate.CertifiedLikelihood, np.ndarray]:
-    """Fit, and fit again with effects of instruments for the new optimum until these change the signals little.
-
-    `max_change` is the root of the sum of squares in units of the noise: the parameters then change by less than that
-    many standard errors.
-    """
+    """Fit, and fit again while effects of instruments for the new optimum would differ by more than `max_change`."""
     noise, theta = [source.noise for source in problem.sources], choose_start(problem, start)
-    names = problem.likelihood.names
-    filled = fill_effects(problem.likelihood, theta, noise, problem.sources)
+    likelihood, end = problem.likelihood, None
     for _ in range(max_rounds):
-        end = _solve_with_effects(problem._replace(likelihood=filled.likelihood), tolerance, theta)
-        solved = end[0]
-        theta = np.array([dict(zip(solved.likelihood.names, solved.theta, strict=True))[name] for name in names])
-        filled = fill_effects(problem._replace(likelihood=filled.likelihood).likelihood, theta, noise, problem.sources)
-        if filled.change <= max_change:
+        before, likelihood = theta, fill_effects(likelihood, theta, noise, problem.sources)
+        end = _solve_with_effects(problem._replace(likelihood=likelihood), tolerance, theta)
+        places = dict(zip(end[0].likelihood.names, end[0].theta, strict=True))
+        theta = np.array([places[name] for name in likelihood.names])
+        if effects_would_change(likelihood, before, theta, end[0].sigma) <= max_change:
             break
+    assert end is not None
     return end
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import scipy.signal
@@ -17,29 +16,42 @@ from fitact.instrument.effects import PROBE_TIME_CONSTANT, nonlinearity_shapes
 from fitact.likelihood.likelihood import Likelihood
 
 
-class FilledEffects(NamedTuple):
-    """Likelihood whose effects of instruments are in proportion to its signals, without compression."""
-
-    likelihood: Likelihood
-    change: float  # of the fitted signals by the new effects, root of the sum of squares in units of the noise
-
-
 def fill_effects(
-    likelihood: Likelihood, theta: np.ndarray, sigma: Sequence[float], sources: Sequence[Source]
-) -> FilledEffects:
-    """Compute the effects of instruments anew, for the signals at `theta` with the noise `sigma` (V or A)."""
-    likelihood, change = likelihood.without_compression(), 0.0
-    for i, (channel, source, noise) in enumerate(zip(likelihood.channels, sources, sigma, strict=True)):
+    likelihood: Likelihood, theta: np.ndarray, noise: Sequence[float], sources: Sequence[Source]
+) -> Likelihood:
+    """Return the likelihood without compression, and with effects of instruments for the signals at `theta`.
+
+    `noise` is the noise sd of each channel, V or A.
+    """
+    likelihood = likelihood.without_compression()
+    for i, (channel, source, sigma) in enumerate(zip(likelihood.channels, sources, noise, strict=True)):
         if channel.effects is not None:
             inputs = likelihood.make_inputs(likelihood.evaluate_circuit(theta).circuit, theta, channel)
-            residuals, *_ = sample_residuals(channel, inputs, np.asarray(noise))
+            residuals, *_ = sample_residuals(channel, inputs, np.asarray(sigma))
             signal = np.asarray(channel.observed) - residuals - np.asarray(inputs.effects) @ channel.effects
             signal, record = signal[: channel.n_samples], source.record
             effects = pad_samples(effect_functions(signal, record.time, source.choice, record.frequency()))
-            moved = channel.weights * (np.asarray(inputs.effects) @ (effects - channel.effects))
-            change = math.hypot(change, float(np.linalg.norm(moved[: channel.n_samples])) / noise)
             likelihood = likelihood.replace_channel(i, dataclasses.replace(channel, effects=effects))
-    return FilledEffects(likelihood, change)
+    return likelihood
+
+
+def effects_would_change(
+    likelihood: Likelihood, start: np.ndarray, theta: np.ndarray, sigma: Float[np.ndarray, " channels"]
+) -> float:
+    """Return by how much the effects for the signals at `theta` differ from those at `start`, at most.
+
+    This is a root of the sum of squares in units of the noise: no parameter moves by more standard errors.
+    """
+    total, ends = 0.0, [likelihood.evaluate_circuit(point) for point in (start, theta)]
+    for channel, noise in zip(likelihood.channels, sigma, strict=True):
+        if channel.effects is not None and ends[0].terms:  # no time constants, no estimate
+            inputs = [likelihood.make_inputs(e.circuit, x, channel) for e, x in zip(ends, (start, theta), strict=True)]
+            terms = [end.terms[channel.channel] for end in ends]
+            heights = [float(i.gain) * float(np.sum(t.weight)) for i, t in zip(inputs, terms, strict=True)]
+            moved = abs(math.log(heights[1] / heights[0])) + abs(math.log(terms[1].tau[0] / terms[0].tau[0]))
+            added = channel.weights * (np.asarray(inputs[1].effects) @ channel.effects)
+            total = math.hypot(total, moved * float(np.linalg.norm(added[: channel.n_samples])) / float(noise))
+    return total
 
 
 def effect_functions(

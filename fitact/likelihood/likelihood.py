@@ -7,7 +7,7 @@ logarithm of each channel's noise. Linear nuisances are integrated out (`fitact.
 import dataclasses
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -138,7 +138,7 @@ class Likelihood(eqx.Module):
             values[name] = ratio * values.get(other, known[other])
         return with_values(self.template, values)
 
-    def finger(self, circuit: Circuit) -> Circuit:
+    def finger(self, circuit: Any) -> Any:
         """Return the circuit of the finger alone: without a probe whose load is a nuisance parameter."""
         is_nuisance = any(name in self.prior.names for name in probe_parameters(circuit))
         return with_probe(circuit, None) if is_nuisance else circuit

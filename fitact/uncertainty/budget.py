@@ -6,9 +6,10 @@ the combined standard uncertainty of ln q, also where the data have determined a
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import scipy.sparse.csgraph
@@ -19,7 +20,8 @@ from fitact.prior.distributions import Distribution, LogNormal
 from fitact.prior.product import multiply
 
 
-class ErrorSource(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class ErrorSource:
     """A source of error and the distribution of the factor, or of the quantity, that it makes uncertain."""
 
     name: str
@@ -27,6 +29,11 @@ class ErrorSource(NamedTuple):
     reduce_by: str = ""  # cheapest way to reduce it
     power: float = 1.0  # of the factor in the parameter
     is_shared: bool = False  # whether it is the same error in all records of a session
+
+    @functools.cached_property
+    def u(self) -> float:
+        """Standard uncertainty of the logarithm of the factor."""
+        return float(self.distribution.log_sd)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,28 +99,22 @@ class Budget:
                 logs += each.sensitivity * deviation
         return np.exp(logs)
 
-    def quantiles(
-        self, probabilities: Iterable[float], *, only_posterior: bool = False, min_part: float = 0.1
-    ) -> Float[np.ndarray, " n"]:
-        """Return quantiles of the quantity over its estimate, from the convolution of all components.
-
-        Components below `min_part` of the total hardly change the shape, and count as normal.
-        """
-        chosen = [each for each in self.components if each.in_posterior or not only_posterior]
-        total, z = math.hypot(*(each.u for each in chosen)), ndtri(np.array(list(probabilities)))
-        shaped = [
-            (each.distribution, each.sensitivity)
-            for each in chosen
-            if each.distribution is not None
-            and not isinstance(each.distribution, LogNormal)
-            and each.u > min_part * total
-        ]
-        if not shaped:
-            return np.exp(total * z)
-        rest = math.sqrt(max(total**2 - sum((power * x.log_sd) ** 2 for x, power in shaped), 0.0))
-        normal = [(LogNormal(1.0, rest), 1.0)] if rest > 1e-3 * total else []  # a narrower one has no effect
-        product = multiply([*normal, *shaped])
+    def quantiles(self, probabilities: Iterable[float], *, only_posterior: bool = False) -> Float[np.ndarray, " n"]:
+        """Return quantiles of the quantity over its estimate, from the convolution of all components."""
+        z = ndtri(np.array(list(probabilities)))
+        product = self._posterior_factor if only_posterior else self._factor
         return np.exp(np.asarray(product.from_standard_normal(z)) - product.log_mean)
+
+    @functools.cached_property
+    def _factor(self) -> Distribution:
+        """Distribution of the quantity over its estimate, by all components."""
+        return _convolve(self.components)
+
+    @functools.cached_property
+    def _posterior_factor(self) -> Distribution:
+        """The same by those components that the posterior includes."""
+        chosen = tuple(each for each in self.components if each.in_posterior)
+        return self._factor if len(chosen) == len(self.components) else _convolve(chosen)
 
     def to_dict(self, median: float, interval: tuple[float, float] | None = None) -> dict[str, Any]:
         """Return the entry of a quantity in `budget` of fit.json and summary.json, largest component first."""
@@ -132,6 +133,23 @@ class Budget:
             for each in sorted(self.components, key=lambda each: -each.u)
         ]
         return {"u": total, "interval95": [low, high], "components": rows}
+
+
+def _convolve(components: Sequence[Component], min_part: float = 0.1, cells: int = 1024) -> Distribution:
+    """Return the distribution of a quantity over its estimate; `cells` is the size of its table.
+
+    Components below `min_part` of the total hardly change the shape, and count as normal.
+    """
+    total = math.hypot(*(each.u for each in components))
+    shaped = [
+        each for each in components if each.u > min_part * total and not isinstance(each.distribution, LogNormal | None)
+    ]
+    if not shaped:
+        return LogNormal(1.0, max(total, 1e-300))
+    rest = math.sqrt(max(total**2 - sum(each.u**2 for each in shaped), 0.0))
+    normal = [(LogNormal(1.0, rest), 1.0)] if rest > 1e-3 * total else []  # a narrower one has no effect
+    factors = [(each.distribution, each.sensitivity) for each in shaped if each.distribution is not None]
+    return multiply([*normal, *factors], cells=cells)
 
 
 def laplace_components(
@@ -157,7 +175,7 @@ def laplace_components(
             components.append(Component(f"{' and '.join(names)} (correlated)", "B", u, 1.0))
             continue
         place, variance = block[0], 1.0 / precision[block[0], block[0]]
-        stated = sum((each.power * each.distribution.log_sd) ** 2 for each in sources[place])
+        stated = sum((each.power * each.u) ** 2 for each in sources[place])
         for each in sources[place]:
             u = float(
                 each.distribution.log_sd * math.sqrt(variance / stated)

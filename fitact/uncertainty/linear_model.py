@@ -89,8 +89,7 @@ class LinearModel:
 
     def shifts(self, columns: Columns) -> Float[np.ndarray, "quantities columns"]:
         """Return how a fit moves the logarithms of the quantities if the data contain each of the columns."""
-        solved = scipy.linalg.solve_triangular(self.triangle, self.basis[: self.rows].T @ columns[: self.rows])
-        return self._gradients @ solved[: len(self.kept)]
+        return self._estimator @ (self.basis[: self.rows].T @ columns[: self.rows])
 
     def shift_of_part(
         self, design: Columns, residuals: Rows, noise: Rows
@@ -104,8 +103,14 @@ class LinearModel:
     @functools.cached_property
     def weights(self) -> Float[np.ndarray, "quantities rows"]:
         """Weight of each row in the estimates of the quantities."""
-        solved = scipy.linalg.solve_triangular(self.triangle, self.basis[: self.rows].T)
-        return self._gradients @ solved[: len(self.kept)]
+        return self._estimator @ self.basis[: self.rows].T
+
+    @functools.cached_property
+    def _estimator(self) -> Float[np.ndarray, "quantities columns"]:
+        """Estimates of the quantities from the coordinates of the data in `basis`."""
+        return (
+            self._gradients @ scipy.linalg.solve_triangular(self.triangle, np.eye(len(self.triangle)))[: len(self.kept)]
+        )
 
     @property
     def _gradients(self) -> Float[np.ndarray, "quantities parameters"]:
