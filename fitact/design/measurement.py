@@ -12,12 +12,13 @@ import numpy as np
 from fitact.data.record import Record
 from fitact.data.simulate import sample_times
 from fitact.errors import InputError
-from fitact.experiment.blind_directions import gain_names
+from fitact.experiment.blind_directions import GAIN_CHANNELS, gain_names
 from fitact.experiment.experiment import CandidateDesign, DesignOption, Gradient, evaluate_design
 from fitact.experiment.fisher import Experiment, force_gradient, signal_spans
 from fitact.experiment.optimise import optimise
 from fitact.experiment.options import Change, changes
 from fitact.fitting.fit import fit
+from fitact.instrument.classes import typical_gain_u
 from fitact.model.skin import Dispersive, WithSkin, circuit_parameters
 from fitact.prior.distributions import LogNormal
 from fitact.scene.scene import Scene
@@ -169,7 +170,8 @@ def experiment_from_scene(scene: Scene) -> Experiment:
         skin = Dispersive(circuit.skin.harmonic_count(scene.drive.lowest_frequency))
         circuit = dataclasses.replace(circuit, skin=skin)
     prior = prior.drop_marginals(*(name for name in prior.names if name not in circuit_parameters(circuit)))
-    gain_sd = {"gain": measured.gain_relative_sd, "gain_I": measured.gain_I_relative_sd}
+    anonymous = {"gain": measured.gain_relative_sd, "gain_I": measured.gain_I_relative_sd}
+    gain_sd = {name: math.hypot(anonymous[name], scene.gain_u(channel)) for name, channel in GAIN_CHANNELS.items()}
     gains = [name for name in gain_names(measured.channels) if gain_sd[name] > 0.0]
     prior = prior.replace_marginals(**{name: LogNormal.with_relative_sd(1.0, gain_sd[name]) for name in gains})
     return Experiment(
@@ -183,6 +185,7 @@ def experiment_from_scene(scene: Scene) -> Experiment:
         steady_state=scene.drive.steady_state,
         geometry=scene.geometry(),
         ties=tied,
+        new_gain_sd={c: scene.gain_u(c) or typical_gain_u(c) for c in ("Vsc", "I") if scene.instrument.is_stated},
     )
 
 

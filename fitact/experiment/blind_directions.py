@@ -20,6 +20,7 @@ from fitact.errors import InputError
 from fitact.model.circuit import Channel, Circuit
 from fitact.model.skin import circuit_parameters, constant_skin_circuit, with_values
 
+GAIN_CHANNELS: dict[str, Channel] = {"gain": "Vsc", "gain_I": "I"}  # channels by the names of their gains
 _MIN_SINE = 1e-6  # sine of the angle between directions below which they count as equal
 
 
@@ -77,8 +78,7 @@ def blind_directions(circuit: Circuit, free: Sequence[str], channels: Sequence[C
 
 def gain_names(channels: Sequence[Channel]) -> dict[str, Channel]:
     """Return the channels by the parameter names of their gains."""
-    names: dict[str, Channel] = {"gain": "Vsc", "gain_I": "I"}
-    return {name: channel for name, channel in names.items() if channel in channels}
+    return {name: channel for name, channel in GAIN_CHANNELS.items() if channel in channels}
 
 
 def log_values(

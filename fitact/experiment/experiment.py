@@ -100,6 +100,7 @@ def evaluate_design(
     experiments = design.make_experiments(values)
     free, prior = experiments[0].free, experiments[0].prior_factor
     root = covariance_factor(joint_jacobian(experiments)[0], joint_prior_factor(experiments))[: len(free)]
+    gradient = np.pad(gradient, (0, len(free) - len(gradient)))  # the force does not depend on an added gain
     sd, prior_sd = np.linalg.norm(root, axis=1), np.linalg.norm(prior, axis=1)
     force_sd = float(np.linalg.norm(gradient @ root))
     return DesignOption(

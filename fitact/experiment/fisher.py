@@ -44,6 +44,8 @@ class Experiment:
     geometry: Geometry = Geometry()  # noqa: RUF009  (a frozen Module; areas are factors only)
     own_parameters: tuple[str, ...] = ()  # parameters in `free` that no other experiment shares
     ties: Ties = ()  # between fields of the circuit
+    # relative sd of the gain that a channel would have if it was also recorded; a channel without one is exact
+    new_gain_sd: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
 def force_gradient(experiment: Experiment) -> Float[np.ndarray, " circuit_parameters"]:

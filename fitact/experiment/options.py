@@ -7,7 +7,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.linalg
 
+from fitact.experiment.blind_directions import gain_names
 from fitact.experiment.experiment import CandidateDesign, DesignOption, Gradient, Setting, evaluate_design
 from fitact.experiment.fisher import FREQUENCY, Experiment
 from fitact.model.circuit import RC, Channel, DirectGround, FinalCircuit, Probe
@@ -173,7 +175,13 @@ def _add_channel(design: CandidateDesign, channel: Channel, what: str, default_n
     noise = design.experiments[0].noise.get(channel) or default_noise
 
     def record_channel(e: Experiment) -> Experiment:
-        return dataclasses.replace(e, channels=(*e.channels, channel), noise={**e.noise, channel: noise})
+        recorded = dataclasses.replace(e, channels=(*e.channels, channel), noise={**e.noise, channel: noise})
+        gain_sd = e.new_gain_sd.get(channel, 0.0)
+        if not gain_sd:
+            return recorded
+        (name,) = (name for name, gained in gain_names((channel,)).items() if gained == channel)
+        prior_factor = scipy.linalg.block_diag(e.prior_factor, gain_sd)
+        return dataclasses.replace(recorded, free=(*e.free, name), prior_factor=prior_factor)
 
     shown = format_engineering(noise, _UNITS[channel])
     return _apply_to_all(design, f"{what} also recorded ({shown} rms noise)", record_channel)

@@ -112,6 +112,22 @@ class Fit(FitResult):
             entries[-1]["u"] = abs(float(gradient @ shift) + direct) * u
         return {"stated": section.is_stated, "not_stated": entries}
 
+    def unchanged_force_u(self) -> tuple[float, float, str]:
+        """Return u of the log mean force from what no suggested measurement changes, now and after it, and the sources.
+
+        The uncertainty of the fit already contains stated gains.
+        """
+        name, V = "force_mean", self.scene.gain_u("V")
+        geometry = math.hypot(*(each.relative_sd * each.sensitivity for each in self.geometry_contributions()[name]))
+        missing = self.calibration_entry(name)["not_stated"]
+        unstated = math.hypot(*(each["u"] for each in missing))
+        sources = ["thickness, area and friction"] if geometry else []
+        if missing:
+            sources.append(f"usual gain errors of {' and '.join(each['source'][:-5] for each in missing)}")
+        if V:
+            sources.append("the gain of V")
+        return math.hypot(geometry, unstated), math.hypot(geometry, unstated, V), " and ".join(sources)
+
     @property
     def record(self) -> Record:
         """The record, or the first of several."""
@@ -457,7 +473,7 @@ def _assemble_fit(
         )
         if effects is not None and not may_move and is_tolerable(effects, laplace, first.scene.tolerance.force):
             result = "structure"
-    return Fit(
+    whole = Fit(
         laplace,
         result=result,
         figures=figures,
@@ -473,3 +489,6 @@ def _assemble_fit(
         gain_shifts=gain_shifts(likelihood, solution, root),
         misfit_effects=effects,
     )
+    now, after, sources = whole.unchanged_force_u()
+    judgement = dataclasses.replace(whole.identifiability, unchanged_u=(now, after), unchanged_sources=sources)
+    return dataclasses.replace(whole, identifiability=judgement)

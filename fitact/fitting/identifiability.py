@@ -47,26 +47,31 @@ class Identifiability:
     experiment: Experiment | None = dataclasses.field(default=None, repr=False, compare=False)
     # gradient of the logarithm of the mean force in the free parameters of `experiment`
     force_gradient: Float[np.ndarray, " free"] | None = dataclasses.field(default=None, repr=False, compare=False)
+    # standard uncertainty of the log mean force from what no suggested measurement changes, now and after one
+    unchanged_u: tuple[float, float] = (0.0, 0.0)
+    unchanged_sources: str = ""  # names of these sources
 
     @functools.cached_property
     def next_measurement(self) -> NextMeasurement:
         """Suggested next measurement, computed on first access."""
         if self.verdict == "identified":
             return NextMeasurement()
-        force = f"Uncertainty of the mean force from the circuit: ± {format_percent(self.force_sd)} now"
+        now, after = self.unchanged_u
+
+        def show(circuit: float, others: float) -> str:
+            alone = f" ({format_percent(circuit)})" if others > 0.0 else ""
+            return f"± {format_percent(math.hypot(circuit, others))}{alone}"
+
+        brackets = f", in brackets without {self.unchanged_sources}" if after > 0.0 else ""
+        force = f"Uncertainty of the mean force{brackets}: {show(self.force_sd, now)} now"
         experiment = self.experiment
         if experiment is None or self.force_gradient is None:
             return NextMeasurement(remedy=f"{force}; measure from below the corner frequency of the skin to above it.")
         with jax.enable_x64(True):
             structure = blind_directions(experiment.circuit, experiment.free, experiment.channels)
             options = suggest_measurements(experiment, self.force_gradient)
-        calibration = "Only the gain errors that the scene states are included."
-        if not set(experiment.free) & set(gain_names(experiment.channels)):
-            calibration = (
-                "Calibration errors are not included: a gain that is wrong by 2 % changes the force by 2 to 4 %."
-            )
-        figures = [f"± {format_percent(option.force_sd)} with {option.text}" for option in options]
-        remedy = f"{force}. Expected after one change: {', '.join(figures)}. {calibration}"
+        figures = [f"{show(option.force_sd, after)} with {option.text}" for option in options]
+        remedy = f"{force}. Expected after one change: {', '.join(figures)}."
         if self.verdict == "unidentified":
             remedy = (
                 f"No prior constrains that direction; state one for Ci and this contact area under [prior]. {remedy}"

@@ -27,6 +27,7 @@ from fitact.fitting.instrument_errors import (
 )
 from fitact.fitting.skin_model import apply_skin_model, exclude_jumps, require_skin_response
 from fitact.fitting.starting_point import Estimate, VscEstimate, estimate_from_vsc, start_from_estimates
+from fitact.instrument.classes import typical_gain_u
 from fitact.likelihood import certificate
 from fitact.likelihood.channel import CHARGES, LINEAR_NUISANCES, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
@@ -93,6 +94,7 @@ class Problem(NamedTuple):
             records=float(records),
             geometry=source.scene.geometry(),
             ties=likelihood.tied,
+            new_gain_sd={name: source.scene.gain_u(name) or typical_gain_u(name) for name in ("Vsc", "I")},
         )
 
 

@@ -250,6 +250,11 @@ class Scene(Section):
             return None
         return Probe(math.inf if resistance is None else resistance, capacitance or 0.0)
 
+    def gain_u(self, channel: str) -> float:
+        """Return the relative standard uncertainty of a channel's gain by the stated pieces; 0 if none is stated."""
+        gains = (piece.gain for piece in self.instrument.pieces(channel))
+        return math.hypot(*(float(gain.log_sd) for gain in gains if gain is not None))
+
     def without_instrument_errors(self) -> Self:
         """Return the scene with instruments that have no errors, but the load of their input."""
         load = self.find_load()

@@ -64,7 +64,7 @@ def test_no_record_of_vsc_alone():
     assert found.structural
     text = str(found)
     assert "Vsc alone cannot determine the contact area" in text
-    assert "mean force from the circuit: ± 4.9 % now. Expected after one change: ± 0.023 % with " in text
+    assert "mean force: ± 4.9 % now. Expected after one change: ± 0.023 % with " in text
     assert "± 4.9 % with four times " in text
     assert found.to_dict()["remedies"][0]["force_sd"] == found.remedies[0].force_sd
 
