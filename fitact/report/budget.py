@@ -12,7 +12,7 @@ def draw_budgets(entries: dict[str, Any], bars: int = 5) -> Figure:
     columns, rows = 2, -(-len(entries) // 2)
     figure = Figure(figsize=(9.0, 0.6 + 1.5 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).flat
-    for axes, (name, entry) in zip(panels, entries.items(), strict=False):
+    for (name, entry), axes in zip(entries.items(), panels, strict=False):
         largest = [each for each in entry["components"] if each["share"] >= 0.001][:bars][::-1]
         sources, sizes = [each["source"] for each in largest], [100.0 * each["u"] for each in largest]
         axes.barh(sources, sizes, color=[ALERT if each["type"] == "A" else MODEL for each in largest])

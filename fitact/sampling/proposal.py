@@ -67,6 +67,8 @@ class Proposal:
     axes: Float[np.ndarray, "n n"]  # principal axes as columns, one standard deviation long
     # densities along some axes, by index of the axis, in standard deviations from the center
     tables: dict[int, TabulatedMarginal] = dataclasses.field(default_factory=dict)
+    # by tabulated axis, how far the other axes bend with the square of the position along it
+    bends: dict[int, Float[np.ndarray, " n"]] = dataclasses.field(default_factory=dict)
     student_share: float = 0.1  # fraction drawn from the Student-t alone, so that the support has no bounds
 
     @classmethod
@@ -91,7 +93,8 @@ class Proposal:
             if table is not None:
                 center = center + table.median * axes[:, i]
                 tables[i] = dataclasses.replace(table, low=table.low - table.median)
-        return cls(center, axes, tables)
+        bends = {i: _bend(center, axes, i, [k for k in order if k not in tables], log_prob) for i in tables}
+        return cls(center, axes, tables, bends)
 
     def scale_width(self, factor: float) -> Self:
         """Widen the Student-t by `factor`, and the tables as far as their limits allow."""
@@ -104,11 +107,16 @@ class Proposal:
         tabulated = random.uniform(size=count) >= self.student_share
         for i, table in self.tables.items():
             z[:, i] = np.where(tabulated, table.draw(random, count), z[:, i])
-        return self.center + z @ self.axes.T
+        return self.center + (z + self._bend(z)) @ self.axes.T
+
+    def _bend(self, z: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count n"]:
+        """Return the bend of the axes without tables, which changes no volume."""
+        return sum((np.outer(z[:, i] ** 2, bend) for i, bend in self.bends.items()), np.zeros_like(z))
 
     def log_density(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, " count"]:
         """Return the logarithm of the density, up to a constant."""
         z = np.linalg.solve(self.axes, (points - self.center).T).T
+        z = z - self._bend(z)
         if not self.tables:
             return student_log_density(z)
         others = [i for i in range(self.center.size) if i not in self.tables]
@@ -183,6 +191,34 @@ def _enter_support(
     points = center + draw_student_t(np.random.default_rng(0), draws, center.size) @ axes.T
     values = log_prob(points)
     return order, points[np.argmax(values)] if np.isfinite(values).any() else center
+
+
+def _bend(
+    center: Float[np.ndarray, " n"],
+    axes: Float[np.ndarray, "n n"],
+    along: int,
+    others: list[int],
+    log_prob: LogProb,
+    position: float = 1.0,
+    step: float = 0.5,
+) -> Float[np.ndarray, " n"]:
+    """Return by how much the most probable values on the axes `others` move with the square of the position on `along`.
+
+    All are in lengths of the axes, along which the density is nearly normal: the gradient is then the distance. The
+    positions are in the middle and on both sides; a bound within them leaves 0.
+    """
+    if not others:
+        return np.zeros(len(center))
+    ends = np.zeros((3, len(others), 2, len(center)))  # position, other axis, direction
+    ends[..., along] = position * np.array([-1.0, 0.0, 1.0])[:, None, None]
+    for place, other in enumerate(others):
+        ends[:, place, :, other] = step * np.array([-1.0, 1.0])
+    values = log_prob(center + ends.reshape(-1, len(center)) @ axes.T).reshape(ends.shape[:-1])
+    bend = np.zeros(len(center))
+    if np.all(np.isfinite(values)):
+        below, middle, above = np.diff(values, axis=2)[..., 0] / (2.0 * step)
+        bend[others] = (0.5 * (below + above) - middle) / position**2
+    return bend
 
 
 def _tabulate_axis(

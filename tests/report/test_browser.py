@@ -139,7 +139,7 @@ def test_charts_take_the_place_of_the_pictures(browser: Browser, page: Path):
     browser.open(page)
     browser.whole()
     assert len([plot for plot in browser.all(".plot") if plot.is_displayed()]) == PLOTS
-    assert not any(image.is_displayed() for image in browser.all("img"))
+    assert not any(image.is_displayed() for image in browser.all("figure.chart img"))
 
 
 def test_without_script_the_pictures_stay(browser: Browser, page: Path):
