@@ -90,7 +90,8 @@ def make_scene(content: Mapping[str, Any], truth: Mapping[str, Any], place: str)
     Raises:
         RecipeError: an unknown key, an impossible value, or a missing key.
     """
-    content = {name: section for name, section in content.items() if name != "description"}  # text for people
+    ignored = ("description", "calibration")  # text for people, and other records
+    content = {name: section for name, section in content.items() if name not in ignored}
     merged = {name: {**content.get(name, {}), **truth.get(name, {})} for name in {**content, **truth}}
     scene = validate_sections(merged, KEYS, place)
     device, drive, skin = scene["device"], scene["drive"], scene["skin"]

@@ -262,11 +262,27 @@ def budget_table(name: str, entry: dict[str, Any], min_share: float = 0.001) -> 
     return rows
 
 
+def blind_table(content: dict[str, Any], names: Sequence[str] = ("g", "b", "force_mean"), count: int = 8) -> list[Any]:
+    """Return rows of the causes that may shift the quantities `names` most without a trace in the residuals.
+
+    Titles come first. A cause of a plausible size is meant.
+    """
+    titles = ("what the residuals would not show", "visible", *names)
+    causes = [each for each in content.get("blind_table", []) if all(name in each["shift"] for name in names)]
+    causes.sort(key=lambda each: -max(each["shift"][name] for name in names))
+    shown = [
+        (each["name"], format_percent(each["visible"]), *(format_percent(each["shift"][name]) for name in names))
+        for each in causes[:count]
+    ]
+    return [titles, *shown] if shown else []
+
+
 def budget_text(content: dict[str, Any], names: Sequence[str] = ()) -> str:
     """Return the uncertainty budgets of the quantities `names`, or of all, for people."""
     entries = content["budget"]
-    tables = ["\n".join(align_table(budget_table(name, entries[name]))) for name in names or entries]
-    return "\n\n".join([budget_sentence(content), *tables])
+    tables = [budget_table(name, entries[name]) for name in names or entries]
+    tables += [rows] if (rows := blind_table(content)) else []
+    return "\n\n".join([budget_sentence(content), *("\n".join(align_table(table)) for table in tables)])
 
 
 def load(directory: str | os.PathLike[str]) -> dict[str, Any]:

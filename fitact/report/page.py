@@ -17,6 +17,7 @@ from fitact.report.frame import image, write_page
 from fitact.report.posterior import CHANNELS, make_charts
 from fitact.scene.scene import Scene
 from fitact.summary import (
+    blind_table,
     budget_sentence,
     budget_table,
     force_sentences,
@@ -53,6 +54,7 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
             table=quantity_table(summary),
             channels=CHANNELS,
             budgets=[budget_table(name, entry) for name, entry in summary["budget"].items()],
+            blind=blind_table(summary),
             budget_note=budget_sentence(summary),
             budget_picture=image(lambda: draw_budgets(summary["budget"])),
             force=force_sentences(summary["force_basis"]),
