@@ -25,6 +25,7 @@ KEYS: Table = {
         "Rsc": Quantity("ohm", 160e3),
         "Csc": Quantity("F", 22e-9),
         "thickness": Quantity("m", 200e-6),
+        "permittivity": IgnoredKey(),
         "level": Choice(("constant", "dispersive", "fractional")),
         "alpha": Quantity("", 0.8),
     },

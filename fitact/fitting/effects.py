@@ -16,7 +16,7 @@ from fitact.likelihood.noise import student_weight
 from fitact.model.skin import circuit_parameters
 from fitact.uncertainty.channel_series import ChannelSamples, Timing
 from fitact.uncertainty.effect_size import EffectSizes, assess_effects
-from fitact.uncertainty.linear_model import Nuisance, Posterior
+from fitact.uncertainty.linear_model import LinearPosterior, Nuisance
 from fitact.uncertainty.loop import LoopModel
 from fitact.uncertainty.rivals import Rival
 from fitact.units import format_percent
@@ -37,7 +37,7 @@ def assess_fit(
     return effects if all(map(math.isfinite, effects.effect_size.values())) else None
 
 
-def linear_posterior(laplace: Laplace) -> Posterior | None:
+def linear_posterior(laplace: Laplace) -> LinearPosterior | None:
     """Return what `fitact.uncertainty` needs of a posterior; None for a circuit that it does not know."""
     likelihood = laplace.likelihood
     loop = LoopModel.from_likelihood(likelihood)
@@ -47,7 +47,7 @@ def linear_posterior(laplace: Laplace) -> Posterior | None:
     places = [likelihood.names.index(name) for name in circuit]
     gradients = np.concatenate([laplace.log_derived[1], np.eye(laplace.theta.size)[places]])
     names = (*derived.DERIVED_NAMES, *circuit)
-    return Posterior(loop, laplace.theta, likelihood.prior_factor, names, gradients)
+    return LinearPosterior(loop, laplace.theta, likelihood.prior_factor, names, gradients)
 
 
 def channel_samples(laplace: Laplace, traces: Sequence[ChannelFit]) -> list[ChannelSamples]:

@@ -10,7 +10,7 @@ import scipy.fft
 from jaxtyping import Bool
 
 from fitact.uncertainty.channel_series import ChannelSamples, ChannelSeries, Rows, channel_series
-from fitact.uncertainty.linear_model import Columns, LinearModel, Nuisance, Posterior
+from fitact.uncertainty.linear_model import Columns, LinearModel, LinearPosterior, Nuisance
 from fitact.uncertainty.rival_fits import (
     MIN_LIKENESS,
     RivalColumns,
@@ -53,7 +53,7 @@ NO_EFFECTS = EffectSizes({}, (), (), {})
 
 def assess_effects(
     channels: Sequence[ChannelSamples],
-    posterior: Posterior,
+    posterior: LinearPosterior,
     has_structure: bool,
     added: Sequence[Nuisance],
     rivals: Sequence[Rival] = (),

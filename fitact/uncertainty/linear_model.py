@@ -23,7 +23,7 @@ class Nuisance(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Posterior:
+class LinearPosterior:
     """Coordinates of a fit, their optimum and prior, and the quantities that are reported."""
 
     loop: LoopModel
@@ -36,7 +36,9 @@ class Posterior:
 class LinearModel:
     """Whitened sensitivities of all channels at the optimum, followed by a row for the prior of each coordinate."""
 
-    def __init__(self, posterior: Posterior, series: Sequence[ChannelSeries], without: Nuisance | None = None) -> None:
+    def __init__(
+        self, posterior: LinearPosterior, series: Sequence[ChannelSeries], without: Nuisance | None = None
+    ) -> None:
         """Compute the sensitivities; the nuisance `without` is left out of the model."""
         self.posterior, self.without = posterior, without
         self.series = tuple(series)
