@@ -1,4 +1,4 @@
-"""What records of dummy circuits tell about the errors of instruments, as a quadratic form in their coordinates."""
+"""Information on the errors of instruments from records of dummy circuits, as a quadratic form in their coordinates."""
 
 from collections.abc import Sequence
 
