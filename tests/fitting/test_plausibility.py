@@ -60,7 +60,7 @@ def test_the_voltage_over_the_insulator_is_that_of_the_impedances(ground: str, f
 
 
 def test_simulations_and_fits_warn_of_the_insulator():
-    """At 100 Hz, the skins take 9 % of 180 V: the insulator of 1 um has 163 V/um."""
+    """The skins take, at 100 Hz, 9 % of 180 V: the insulator of 1 um has 163 V/um."""
     for limit, doubted in (("150 V/um", True), ("175 V/um", False)):
         scene = fitact.Scene.from_dict({"drive": {"waveform": "square"}, "device": {"breakdown_field": limit}})
         fit = fitact.fit(square_record(), scene)
