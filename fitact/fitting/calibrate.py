@@ -23,7 +23,7 @@ _SKIN = ("Rsc", "Csc", "Ci")
 
 
 class CalibratedInstruments(NamedTuple):
-    """What the calibration records of a scene tell, and sentences on them."""
+    """Information from the calibration records of a scene, and sentences on them."""
 
     calibration: Calibration | None = None
     notes: tuple[str, ...] = ()

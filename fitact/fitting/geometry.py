@@ -66,7 +66,7 @@ class DerivedMoments(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class UncertainGeometry:
-    """What force and friction rest on beside the circuit, with stated and assumed distributions.
+    """Quantities that force and friction rest on beside the circuit, with stated and assumed distributions.
 
     Attributes:
         geometry: nominal sizes and the force law.
