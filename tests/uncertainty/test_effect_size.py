@@ -163,7 +163,7 @@ def all_cases(**options: object) -> list[Case]:
 @pytest.mark.parametrize(
     ("options", "least_without_cause"),
     [
-        ({}, 0.9),
+        pytest.param({}, 0.9, marks=pytest.mark.thorough),
         # with the cause taken off the list, these fall short of the 90 % that are wanted: seen were 88, 84 and 89 %
         pytest.param({"noise": 0.01}, 0.8, marks=pytest.mark.thorough),
         pytest.param({"noise": 1.0}, 0.8, marks=pytest.mark.thorough),
