@@ -32,13 +32,14 @@ def list_error_sources(
 ) -> tuple[tuple[ErrorSource, ...], ...]:
     """Return the sources of error of each coordinate of theta."""
     by_name = {each.name: each for each in coordinates}
-    load, sources = scene.find_load(), []
+    load, plates, sources = scene.find_load(), scene.plates(), []
+    loads = () if load is None else probe_parameters(likelihood.template)
     timing_sd = dict(zip(likelihood.timing, map(float, likelihood.timing_sd), strict=True))
     for name in likelihood.names:
         if name in by_name:
             sources.append(tuple(map(_instrument_source, by_name[name].errors)))
             continue
-        if name in scene.plates():  # it follows from a geometry, which has sources of its own
+        if name in plates:  # it follows from a geometry, which has sources of its own
             sources.append(())
             continue
         if name in timing_sd:
@@ -46,10 +47,9 @@ def list_error_sources(
             sources.append((ErrorSource(f"prior of the {name}", LogNormal(1.0, timing_sd[name]), remedy),))
             continue
         label, remedy = f"prior of {name}", _MEASURE.get(name, "state a narrower prior, if you know more")
-        is_load = name in probe_parameters(likelihood.template) and load is not None
-        if is_load and load is not None:
+        if load is not None and name in loads:
             label = f"input {name.removeprefix('probe_')} ({load.name})"
-        sources.append((ErrorSource(label, likelihood.prior[name], remedy, is_shared=is_load),))
+        sources.append((ErrorSource(label, likelihood.prior[name], remedy, is_shared=name in loads),))
     return tuple(sources)
 
 

@@ -88,7 +88,7 @@ class Fit(FitResult):
             budgets[name] = Budget((*components, *others))
         return budgets
 
-    @property
+    @functools.cached_property
     def _gradients(self) -> dict[str, Float[np.ndarray, " parameters"]]:
         """Gradients of the logarithms of the quantities with a budget, in theta."""
         gradients = dict(zip(self.names, np.eye(self.theta.size), strict=True))

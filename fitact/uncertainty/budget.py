@@ -177,13 +177,11 @@ def laplace_components(
         place, variance = block[0], 1.0 / precision[block[0], block[0]]
         stated = sum((each.power * each.u) ** 2 for each in sources[place])
         for each in sources[place]:
-            u = float(
-                each.distribution.log_sd * math.sqrt(variance / stated)
-            )  # larger than its own in a fit without prior
+            u = each.u * math.sqrt(variance / stated)  # larger than its own in a fit without prior
             # the product and each of its factors have the same sensitivity
             sensitivity = float(each.power * part[0] / variance)
-            row = Component(each.name, "B", u, sensitivity, each.distribution, each.reduce_by)
-            components.append(dataclasses.replace(row, is_shared=each.is_shared))
+            known = each.distribution, each.reduce_by
+            components.append(Component(each.name, "B", u, sensitivity, *known, is_shared=each.is_shared))
     return tuple(components)
 
 
