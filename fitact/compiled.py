@@ -333,7 +333,8 @@ class BatchEvaluator:
     """Evaluation of `function(model, *rows)` over the rows of arrays of equal length, in batches.
 
     Batches are padded to one size, so that they compile once. The size is limited such that size x `rows` (numbers per
-    evaluation) does not exceed `max_numbers`, which bounds the memory. The model is copied to the device only once.
+    evaluation) does not exceed `max_numbers`, which bounds the memory. A model that serves more than once is copied to
+    the device.
     """
 
     def __init__(
@@ -346,8 +347,8 @@ class BatchEvaluator:
         fast: bool = True,
     ) -> None:
         self._arguments, self._fast = (function, model), fast
-        with jax.enable_x64(True):
-            self._arrays = jax.device_put(list(filter(is_array, jax.tree.leaves(self._arguments))))
+        self._arrays = list(map(_as_argument, filter(is_array, jax.tree.leaves(self._arguments))))
+        self._is_used = self._is_copied = False
         self._programs: dict[tuple[_Shape | _Static, ...], _Program] = {}
         self._batch = max(1, min(batch, max_numbers // rows))
 
@@ -358,6 +359,9 @@ class BatchEvaluator:
         starts = range(0, count, batch)
         with jax.enable_x64(True):
             program = self._find_program(*(a[:batch] for a in arrays))
+            if (self._is_used or len(starts) > 1) and not self._is_copied:
+                self._arrays, self._is_copied = jax.device_put(self._arrays), True
+            self._is_used = True
             parts = [
                 program(*self._arrays, *(a[i : i + batch] for a in arrays))
                 for i in (track_progress(starts, description, len(starts)) if description else starts)

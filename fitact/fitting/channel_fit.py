@@ -143,9 +143,10 @@ def _student_log_likelihood(residuals: Samples, weight: Samples, scale: float) -
 @jit
 def sample_residuals(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: Array) -> tuple[Array, Array, Array]:
     """Return the residuals, the whitened residuals, and the linear nuisances in units of their prior sd."""
-    _, beta, _ = channel.fit_nuisances(inputs, sigma)
-    residuals, shapes = dataclasses.replace(channel, weight=None, whitening=None).residuals_and_shapes(inputs)
-    residuals = residuals - beta @ (channel.linear_sd[np.array(channel.columns, dtype=int), None] * shapes)
+    residuals, beta, _ = channel.fit_nuisances(inputs, sigma)
+    if channel.weight is not None or channel.whitening is not None:
+        residuals, shapes = dataclasses.replace(channel, weight=None, whitening=None).residuals_and_shapes(inputs)
+        residuals = residuals - beta @ (channel.linear_sd[np.array(channel.columns, dtype=int), None] * shapes)
     white = channel.apply_whitening(residuals)
     if channel.noise == "student":
         white = white * jnp.sqrt(student_weight(white / sigma))

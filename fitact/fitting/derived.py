@@ -133,7 +133,7 @@ class DerivedQuantities(eqx.Module):
         self, theta: Float[np.ndarray, " parameters"], sigma: Float[np.ndarray, " channels"]
     ) -> tuple[Float[np.ndarray, " derived"], Float[np.ndarray, "derived parameters"]]:
         """Return the logarithms of the quantities of `DERIVED_NAMES`, and their gradients in theta."""
-        return log_derivatives(self.tabulate(theta[None]), theta, sigma)
+        return log_derivatives(self, theta, sigma)
 
 
 @jit

@@ -27,7 +27,7 @@ def fill_effects(
     for i, (channel, source, sigma) in enumerate(zip(likelihood.channels, sources, noise, strict=True)):
         if channel.effects is not None:
             inputs = likelihood.make_inputs(likelihood.evaluate_circuit(theta).circuit, theta, channel)
-            residuals, *_ = sample_residuals(channel, inputs, np.asarray(sigma))
+            residuals, *_ = sample_residuals(channel.drop_unused_columns(), inputs, np.asarray(sigma))
             signal = np.asarray(channel.observed) - residuals - np.asarray(inputs.effects) @ channel.effects
             signal, record = signal[: channel.n_samples], source.record
             effects = pad_samples(effect_functions(signal, record.time, source.choice, record.frequency()))

@@ -71,8 +71,8 @@ def least_squares(
     """
     reduced, steps = likelihood.without_samples(), 0
     theta, sigma = start, noise
-    for _ in range(max_rounds):
-        solved = _solve_round(reduced, theta, sigma)
+    for damping in [1e-2, *[1e-9] * (max_rounds - 1)]:  # later rounds start at the optimum of another noise
+        solved = _solve_round(reduced, theta, sigma, np.asarray(damping))
         change = np.max(np.abs(solved.sigma / sigma - 1.0))
         theta, sigma, steps = solved.theta, solved.sigma, steps + int(solved.steps)
         if not change > noise_tolerance:
@@ -82,8 +82,11 @@ def least_squares(
 
 
 @jit
-def _solve_round(likelihood: Likelihood, start: Array, sigma: Array) -> _Round:
-    minimum = minimise(lambda theta: (likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)), start)
+def _solve_round(likelihood: Likelihood, start: Array, sigma: Array, damping: Array) -> _Round:
+    def with_prior(theta: Array) -> tuple[Any, Array]:
+        return likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)
+
+    minimum = minimise(with_prior, start, damping=damping)
     theta, fraction = minimum.theta, minimum.theta.size / likelihood.count  # parameters per sample
     parts = []
     for (channel, inputs), s in zip(likelihood.channels_and_inputs(theta), sigma, strict=True):

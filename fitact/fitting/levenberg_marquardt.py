@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PyTree
 
 from fitact.fitting.minimum import RESULT_NAMES, Minimum
@@ -52,6 +53,7 @@ def find_minimum(
     residuals: Callable[[Float[Array, " parameters"]], PyTree[Float[Array, "..."]]],
     start: Float[Array, " parameters"],
     max_steps: int,
+    damping: ArrayLike,
 ) -> Minimum:
     """Find a minimum as `fitact.fitting.minimum.minimise` does."""
     start = jnp.asarray(start)
@@ -61,7 +63,7 @@ def find_minimum(
         return ravel_pytree(residuals(theta))[0]
 
     solver: Any = LevenbergMarquardt(
-        descent=_Descent(rows=jax.eval_shape(flat_residuals, start, None).size),
+        descent=_Descent(rows=jax.eval_shape(flat_residuals, start, None).size, damping=damping),
         search=optx.ClassicalTrustRegion(high_cutoff=0.75, low_cutoff=1e-3, high_constant=3.0),
         norm=optx.max_norm,
         verbose=lambda **_: None,
@@ -95,7 +97,7 @@ class _Descent(optx.AbstractDescent):
     """Damped Gauss-Newton steps."""
 
     rows: int = eqx.field(static=True)  # number of residuals
-    damping: float = 1e-2  # first step, relative to the largest curvature
+    damping: ArrayLike  # of the first step, relative to the largest curvature
     # decay of the scale per step: slow enough to cross a plateau, fast enough for a valley
     scale_decay: float = 0.9
     # relative to the largest singular value of the scaled Jacobian; smaller ones are rounding

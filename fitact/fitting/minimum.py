@@ -47,14 +47,16 @@ def minimise(
     residuals: Callable[[Float[Array, " parameters"]], PyTree[Float[Array, "..."]]],
     start: Float[Array, " parameters"],
     max_steps: int = 1000,
+    damping: ArrayLike = 1e-2,
 ) -> Minimum:
     """Find the least-squares optimum nearest to `start`; pure, for use within jit and vmap, in double precision.
 
-    Steps are damped in units of the Jacobian's columns (Marquardt 1963).
+    Steps are damped in units of the Jacobian's columns (Marquardt 1963). `damping` is that of the first step, relative
+    to the largest curvature.
     """
     from fitact.fitting.levenberg_marquardt import find_minimum
 
-    return find_minimum(residuals, start, max_steps)
+    return find_minimum(residuals, start, max_steps, damping)
 
 
 class Optima(NamedTuple):

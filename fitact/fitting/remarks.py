@@ -61,7 +61,7 @@ def channel_warnings(record: Record, choice: DriveModel, channel: str, figures: 
 def parameter_warnings(likelihood: Likelihood, theta: Float[np.ndarray, " parameters"]) -> list[str]:
     """Return warnings about g and b far from the prior."""
     min_tail = 0.005  # least prior probability further out
-    points = np.vstack([theta, likelihood.sample_prior(theta, 10_000)])
+    points = np.vstack([theta, likelihood.sample_prior(theta, 2_000, circuit_only=True)])
     warnings = []
     for name, x in zip(("the divider g", "the time constant b"), likelihood.evaluate_g_and_b(points), strict=True):
         fitted, prior = x[0], x[1:]

@@ -13,6 +13,7 @@ from fitact.fitting.minimum import Optima
 from fitact.fitting.problem import Source
 from fitact.fitting.residual_statistics import is_misfit
 from fitact.likelihood.likelihood import Likelihood
+from fitact.prior.distributions import Bounded
 from fitact.prior.product import Product
 
 
@@ -48,10 +49,14 @@ def is_out_of_bounds(
     within `half_width` standard deviations, is allowed. An exponent of 1 is a constant skin: where noise alone
     explains an exponent above 1, the line goes through 1.
     """
+    prior = likelihood.prior
+    is_bounded = any(isinstance(each, Bounded) for each in (*prior.marginals, *likelihood.sigma_prior))
+    if not is_bounded and not prior.order_constraints:
+        return False
     axes, sizes, _ = np.linalg.svd(covariance_factor)
     along = np.linspace(-half_width, half_width, 241)[:, None] * (axes[:, 0] * sizes[0])
     points = np.hstack([_clip_exponent(likelihood, theta, covariance_factor) + along, np.tile(np.log(sigma), (241, 1))])
-    for i, marginal in enumerate(likelihood.prior.marginals):
+    for i, marginal in enumerate(prior.marginals):
         if isinstance(marginal, Product):  # limits of an instrument, which bound no parameter of the circuit
             points[:, i] = np.clip(points[:, i], marginal.edges[0], marginal.edges[-1])
     evaluate = BatchEvaluator(Likelihood.log_prior, likelihood.without_samples(), points.shape[1], 256, fast=False)

@@ -1,6 +1,7 @@
 """Pieces of equipment and the distributions of their errors."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Iterable
 from typing import Self
@@ -34,6 +35,7 @@ class Piece:
     is_probe: bool = False
 
     @classmethod
+    @functools.cache
     def from_class(cls, name: str) -> Self:
         """Return a piece with the errors of its class."""
         kind = CLASSES[name.partition(":")[0]]

@@ -103,6 +103,10 @@ class ChannelLikelihood(eqx.Module):
     def without_compression(self) -> "ChannelLikelihood":
         return dataclasses.replace(self, compression=None, expansion=None)
 
+    def drop_unused_columns(self) -> "ChannelLikelihood":
+        """Return the channel without the columns of linear nuisances that are not free."""
+        return dataclasses.replace(self, columns=tuple(np.flatnonzero(np.asarray(self.linear_sd)).tolist()))
+
     @property
     def follows_samples(self) -> bool:
         """Whether the response follows a measured drive from sample to sample."""

@@ -277,12 +277,18 @@ class Likelihood(eqx.Module):
         return self.combine_log_prob(point, self.log_prob_parts(point))
 
     def sample_prior(
-        self, theta: Float[np.ndarray, " circuit_parameters"], count: int
+        self, theta: Float[np.ndarray, " circuit_parameters"], count: int, *, circuit_only: bool = False
     ) -> Float[np.ndarray, "count parameters"]:
-        """Return deterministic draws from the prior, with the delays and clocks of `theta`."""
-        points = np.tile(theta, (count, 1))
-        draws = self.prior.sample(np.random.default_rng(0), count)
-        points[:, : len(draws)] = np.log(list(draws.values())).T
+        """Return deterministic draws from the prior, with the delays and clocks of `theta`.
+
+        With `circuit_only`, the errors of instruments are those of `theta`, too.
+        """
+        prior, points = self.prior, np.tile(theta, (count, 1))
+        if circuit_only:
+            others = set(prior.names) - set(circuit_parameters(self.template))
+            prior = prior.drop_marginals(*others) if others < set(prior.names) else prior
+        for name, draws in prior.sample(np.random.default_rng(0), count).items():
+            points[:, self.names.index(name)] = np.log(draws)
         return points
 
     def to_physical(self, theta: Float[np.ndarray, "*shape parameters"]) -> dict[str, Float[np.ndarray, "*shape"]]:

@@ -27,17 +27,18 @@ class Distribution(eqx.Module):
     """Prior for one positive parameter."""
 
     @abc.abstractmethod
-    def _log_moments(self) -> tuple[float, float]: ...
+    def log_moments(self) -> tuple[float, float]:
+        """Return mean and standard deviation of log x."""
 
     @property
     def log_mean(self) -> float:
         """Mean of log x."""
-        return self._log_moments()[0]
+        return type(self).log_moments(self)[0]  # Equinox takes long to bind a method
 
     @property
     def log_sd(self) -> float:
         """Standard deviation of log x."""
-        return self._log_moments()[1]
+        return type(self).log_moments(self)[1]
 
     @abc.abstractmethod
     def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
@@ -87,7 +88,7 @@ class LogNormal(Distribution):
             raise InputError(f"relative_sd = {relative_sd:g} must be above 0")
         return cls(median, math.sqrt(math.log1p(relative_sd**2)))
 
-    def _log_moments(self) -> tuple[float, float]:
+    def log_moments(self) -> tuple[float, float]:
         return math.log(self.median), float(self.spread)
 
     def standardize(self, u: ArrayLike) -> Float[Array, "*shape"]:
@@ -158,7 +159,7 @@ class Uniform(Bounded):
             raise InputError(f"tolerance = {tolerance:g} must lie between 0 and 1, such as 0.1 or '10 %'")
         return cls(nominal * (1.0 - tolerance), nominal * (1.0 + tolerance))
 
-    def _log_moments(self) -> tuple[float, float]:
+    def log_moments(self) -> tuple[float, float]:
         """Return mean and sd of u; the sd is sqrt(1 - q L^2 / (1 - q)^2) with L = log(high / low), q = low / high."""
         mean = (self.high * math.log(self.high) - self.low * math.log(self.low)) / (self.high - self.low) - 1.0
         q = self.low / self.high
@@ -190,7 +191,7 @@ class LogUniform(Bounded):
     def _length(self) -> float:
         return math.log(self.high / self.low)
 
-    def _log_moments(self) -> tuple[float, float]:
+    def log_moments(self) -> tuple[float, float]:
         return math.log(self.low) + 0.5 * self._length, self._length / math.sqrt(12.0)
 
     def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
@@ -245,7 +246,7 @@ class TruncatedLogNormal(Bounded):
     def _mass(self) -> float:
         return _normal_cdf(self._limits[1]) - self._cdf_low
 
-    def _log_moments(self) -> tuple[float, float]:
+    def log_moments(self) -> tuple[float, float]:
         """Return mean and standard deviation of u by quadrature; the closed form cancels if the bounds are close."""
         low, high = np.clip(self._limits, -10.0, 10.0)  # omits a probability of 1e-23
         nodes, weights = np.polynomial.legendre.leggauss(128)

@@ -2,14 +2,15 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.fft
 import scipy.special
 from jax.scipy.special import ndtr, ndtri
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
-from scipy.signal import fftconvolve
 
 from fitact.compiled import array_module
 from fitact.prior.distributions import Bounded, Distribution, LogNormal
@@ -28,7 +29,7 @@ class Product(Distribution):
     mean: ArrayLike  # of u
     sd: ArrayLike  # of u
 
-    def _log_moments(self) -> tuple[float, float]:
+    def log_moments(self) -> tuple[float, float]:
         return self.mean, self.sd
 
     def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
@@ -55,26 +56,32 @@ def multiply(factors: Sequence[Factor], scale: float = 1.0, cells: int = 2048, t
 
     `cells` is the size of the table, `tails` (in sd) its reach along factors without bounds.
     """
-    mean = math.log(scale) + sum(power * x.log_mean for x, power in factors)
-    sd = math.sqrt(sum((power * x.log_sd) ** 2 for x, power in factors))
+    moments = [(x.log_mean, x.log_sd) for x, _ in factors]
+    mean = math.log(scale) + sum(power * center for (_, power), (center, _) in zip(factors, moments, strict=True))
+    sd = math.hypot(*(power * spread for (_, power), (_, spread) in zip(factors, moments, strict=True)))
     if all(isinstance(x, LogNormal) for x, _ in factors):
         return LogNormal(math.exp(mean), sd)
-    spans = [_span(x, power, tails) for x, power in factors]
+    spans = [
+        _span(x, power, center, tails * spread) for (x, power), (center, spread) in zip(factors, moments, strict=True)
+    ]
     low, high = (math.log(scale) + sum(span[side] for span in spans) for side in (0, 1))
     width = (high - low) / cells
-    mass = np.ones(1)
-    for (x, power), (start, end) in zip(factors, spans, strict=True):
-        count = max(round((end - start) / width), 1)
-        mass = fftconvolve(mass, _masses(x, power, np.linspace(start, end, count + 1)))
-    mass = np.maximum(mass, 0.0)  # rounding of the convolution
+    counts = [max(round((end - start) / width), 1) for start, end in spans]
+    size = sum(counts) - len(counts) + 1
+    length = scipy.fft.next_fast_len(size, real=True)
+    spectrum: Any = 1.0
+    for (x, power), ends, count in zip(factors, spans, counts, strict=True):
+        spectrum = spectrum * scipy.fft.rfft(_masses(x, power, np.linspace(*ends, count + 1)), length)
+    mass = np.maximum(
+        scipy.fft.irfft(spectrum, length)[:size], 0.0
+    )  # of the convolution, whose rounding may be negative
     edges, cumulative = np.linspace(low, high, mass.size + 1), np.append(0.0, np.cumsum(mass))
     table = np.linspace(low, high, cells + 1)
     return Product(table, np.interp(table, edges, cumulative / cumulative[-1]), np.asarray(mean), np.asarray(sd))
 
 
-def _span(x: Distribution, power: float, tails: float) -> tuple[float, float]:
-    """Return the ends of the support of log(x^power), at most `tails` standard deviations from its mean."""
-    center, reach = x.log_mean, tails * x.log_sd
+def _span(x: Distribution, power: float, center: float, reach: float) -> tuple[float, float]:
+    """Return the ends of the support of log(x^power), at most `reach` from the `center` of log x."""
     low, high = (x.low, x.high) if isinstance(x, Bounded) else (0.0, math.inf)
     ends = (max(math.log(low) if low > 0.0 else -math.inf, center - reach), min(math.log(high), center + reach))
     start, end = sorted(power * end for end in ends)
@@ -84,6 +91,9 @@ def _span(x: Distribution, power: float, tails: float) -> tuple[float, float]:
 def _masses(x: Distribution, power: float, edges: Float[np.ndarray, " cells+1"]) -> Float[np.ndarray, " cells"]:
     """Return the probabilities of log(x^power) between the edges, by NumPy, since JAX would compile each operation."""
     inner = edges[1:-1] / power  # at the ends, rounding may lie outside the support
-    below = x.cdf(inner) if isinstance(x, Bounded) else scipy.special.ndtr((inner - x.log_mean) / x.log_sd)
+    if isinstance(x, Bounded):
+        below = type(x).cdf(x, inner)  # Equinox takes long to bind a method
+    else:
+        below = scipy.special.ndtr((inner - x.log_mean) / x.log_sd)
     below = np.asarray(below) if power > 0.0 else 1.0 - np.asarray(below)
     return np.diff(below, prepend=0.0, append=1.0)

@@ -1,6 +1,7 @@
 """Channels of records as uniform series of bounded length, whose modelled signals are computed by FFT."""
 
 import dataclasses
+import functools
 import math
 from typing import Literal, NamedTuple
 
@@ -78,12 +79,12 @@ class ChannelSeries:
             else weighted * taps.sum()
         )
 
-    @property
+    @functools.cached_property
     def frequencies(self) -> Spectrum:
         """Complex frequencies of the FFT, rad/s."""
         return 2j * math.pi * np.fft.rfftfreq(self._length, self.step)
 
-    @property
+    @functools.cached_property
     def difference(self) -> Spectrum:
         """Gain of the difference over two rows divided by their distance, 1/s: a derivative that does not ring."""
         return 1j * np.sin(self.frequencies.imag * self.step) / self.step
@@ -101,15 +102,23 @@ class ChannelSeries:
 
     def response(self, gain: Spectrum, rows: Rows, jump: float = 0.0) -> Rows:
         """Return an input after a filter; before the record it repeats, or is 0, less `jump`."""
+        of_drive = rows is self.voltage and jump == self.jump
+        spectrum = self._drive_spectrum if of_drive else self._spectrum(rows, jump)
+        return scipy.fft.irfft(spectrum * gain, self._length)[self._length - rows.size :]
+
+    @functools.cached_property
+    def _drive_spectrum(self) -> Spectrum:
+        return self._spectrum(self.voltage, self.jump)
+
+    def _spectrum(self, rows: Rows, jump: float) -> Spectrum:
+        """Return the FFT of an input and of what precedes it."""
         count = self._length - rows.size
-        if not count:
-            return scipy.fft.irfft(scipy.fft.rfft(rows) * gain, self._length)
         before = np.zeros(count)
-        if self.repeats:
+        if count and self.repeats:
             assert self.samples.frequency is not None
             phase = np.mod(-self.step * np.arange(count, 0.0, -1.0), 1.0 / self.samples.frequency)
             before = np.interp(phase, self.time - self.time[0], rows)
-        return scipy.fft.irfft(scipy.fft.rfft(np.concatenate([before - jump, rows])) * gain, self._length)[count:]
+        return scipy.fft.rfft(np.concatenate([before - jump, rows]))
 
     def shapes(self) -> dict[str, Rows]:
         """Return the shapes of the free linear nuisances, each of height 1; none that means over periods hide."""
@@ -125,7 +134,7 @@ class ChannelSeries:
                 all_shapes[name] = np.exp(-(self.time - self.time[0]) / tau)
         return {name: shape for name, shape in all_shapes.items() if name in self.samples.nuisances}
 
-    @property
+    @functools.cached_property
     def _length(self) -> int:
         """Number of rows of an FFT, of which those before the record let decays end."""
         n = self.time.size

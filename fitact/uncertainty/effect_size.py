@@ -65,12 +65,12 @@ def assess_effects(
     Without either, only the blind table is computed. At most `max_rows` rows of data are used, of all channels.
     """
     rivals = rivals or known_rivals()
-    rows = max(1024, max_rows // (1 if has_structure or added else 4) // len(channels))
+    rows = max(1024, max_rows // (1 if has_structure or added else 8) // len(channels))
     views = [channel_series(each, rows) for each in channels]
     chosen = [[view[0] for view in views], [view[-1] for view in views]]
     count = 1 + ((has_structure or bool(added)) and any(len(view) > 1 for view in views))
     models = [LinearModel(posterior, series) for series in chosen[:count]]
-    columns = [list(rival_columns(model, rivals)) for model in models]
+    columns = [rival_columns(model, rivals) for model in models]
     effect = structure = np.zeros(len(posterior.quantities))
     fits: list[RivalFit] = []
     names_of: dict[str, tuple[str, ...]] = {}
@@ -235,8 +235,7 @@ def blind_table(
     """
     table: dict[str, tuple[Shifts, float]] = {}
     noise = math.sqrt(float(np.max(model.noise_variance)))
-    for rival, effect in columns:
-        left, per_unit = model.remainder(effect), model.shifts(effect)
+    for rival, effect, left, per_unit in columns:
         _, sizes, directions = np.linalg.svd(left, full_matrices=False)
         unseen = np.minimum(3.0 * noise / np.maximum(sizes, 1e-300), rival.size)
         shift = np.linalg.norm(per_unit @ directions.T * unseen, axis=1)

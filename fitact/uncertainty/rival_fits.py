@@ -1,7 +1,7 @@
 """Fits of rivals, i.e. of what a model may lack, to the residuals of a fit."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,22 +30,35 @@ class RivalFit(NamedTuple):
 
 
 class RivalColumns(NamedTuple):
-    """First-order effect of a rival on the whitened data."""
+    """First-order effect of a rival on the whitened data, and on a fit to them."""
 
     rival: Rival
     columns: Columns
+    left: Columns  # part that parameters cannot imitate
+    shifts: Float[np.ndarray, "quantities amplitudes"]  # of the fit
 
 
-def rival_columns(model: LinearModel, rivals: Sequence[Rival], step: float = 1e-4) -> Iterator[RivalColumns]:
-    """Yield the derivatives of the whitened data in the amplitudes of each rival that has an effect."""
-    models = model.models(model.posterior.theta)
+def rival_columns(model: LinearModel, rivals: Sequence[Rival], step: float = 1e-4) -> list[RivalColumns]:
+    """Return the derivatives of the whitened data in the amplitudes of each rival that has an effect."""
+    models, found = model.models(model.posterior.theta), []
     for rival in rivals:
         columns = np.zeros((model.rows, rival.amplitudes))
         for k, unit in enumerate(np.eye(rival.amplitudes) * step * rival.size):
             parts = [each.series.whiten(rival.effect(each, unit) - rival.effect(each, -unit)) for each in models]
             columns[:, k] = np.concatenate(parts) / (2.0 * step * rival.size)
         if np.all(np.isfinite(columns)) and np.linalg.norm(columns) * rival.size > 1e-6:
-            yield RivalColumns(rival, columns)
+            found.append((rival, columns))
+    return _project_columns(model, found)
+
+
+def _project_columns(model: LinearModel, effects: Sequence[tuple[Rival, Columns]]) -> list[RivalColumns]:
+    """Return effects with what they do to a fit."""
+    if not effects:
+        return []
+    together = np.concatenate([columns for _, columns in effects], axis=1)
+    ends = np.cumsum([columns.shape[1] for _, columns in effects])[:-1]
+    parts = (np.split(x, ends, axis=1) for x in (model.remainder(together), model.shifts(together)))
+    return [RivalColumns(*effect, *projected) for effect, *projected in zip(effects, *parts, strict=True)]
 
 
 def fit_rivals(model: LinearModel, columns: Sequence[RivalColumns], refined: int = 8) -> list[RivalFit]:
@@ -65,8 +78,7 @@ def fit_rivals(model: LinearModel, columns: Sequence[RivalColumns], refined: int
 
 def fit_rival(model: LinearModel, residuals: Rows, each: RivalColumns) -> RivalFit | None:
     """Return the rival fitted to residuals to first order; None if it is invisible."""
-    rival, columns = each
-    left = model.remainder(columns)
+    rival, columns, left, shifts = each
     modes, sizes, directions = np.linalg.svd(left, full_matrices=False)
     kept = sizes > 1e-6 * np.linalg.norm(columns)
     if not kept.any():
@@ -76,7 +88,7 @@ def fit_rival(model: LinearModel, residuals: Rows, each: RivalColumns) -> RivalF
     variance = model.noise_variance @ modes**2
     delta_chi2 = float(np.sum(projections**2 / variance))
     amplitudes = directions.T @ (projections / sizes)
-    shift = -(model.shifts(columns) @ amplitudes)
+    shift = -(shifts @ amplitudes)
     explained = modes @ projections
     errors = np.sqrt(np.square(directions.T / sizes) @ variance)
     visible = float(np.linalg.norm(left @ amplitudes) / np.linalg.norm(columns @ amplitudes))
@@ -161,9 +173,8 @@ def nuisance_alternatives(model: LinearModel, nuisance: Nuisance, rivals: Sequen
         return []
     residuals = model.residuals + np.pad(part, (0, len(model.residuals) - model.rows))
     residuals = np.concatenate([residuals[: model.rows], np.zeros(len(simpler.design) - model.rows)])
-    chosen = fit_rival(
-        simpler, residuals, RivalColumns(Rival(nuisance.name, 1.0, lambda each, _: each.signal), columns)
-    )
+    itself = Rival(nuisance.name, 1.0, lambda each, _: each.signal)
+    chosen = fit_rival(simpler, residuals, *_project_columns(simpler, [(itself, columns)]))
     if chosen is None or not is_significant(chosen):
         return []
     alternatives = []
