@@ -51,6 +51,8 @@ _NUISANCES = {  # quantities of the measurement; {}: the channel
     "compensation_V": "gain of V at high frequency over that at low frequency",
     "nonlinearity_even": "1 + even non-linearity of {}, relative to the range",
     "nonlinearity_odd": "1 + odd non-linearity of {}, relative to the range",
+    "nonlinearity_V_even": "1 + even non-linearity of V, relative to the range",
+    "nonlinearity_V_odd": "1 + odd non-linearity of V, relative to the range",
     "probe_resistance": "input resistance that loads the skin",
     "probe_capacitance": "input capacitance that loads the skin",
     "delay": "delay of {} against V",

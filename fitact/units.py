@@ -20,7 +20,7 @@ _UNITS = {
     "Rsc": "ohm", "Csc": "F", "Ci": "F", "R_H": "ohm", "grounding_Rsc": "ohm", "grounding_Csc": "F",
     "Z": "ohm", "Z_capacitance": "F", "series_resistor": "ohm", "Rgap": "ohm", "Cgap": "F",
     "gain_V": "1", "compensation": "1", "nonlinearity_even": "1", "nonlinearity_odd": "1", "compensation_V": "1",
-    "probe_resistance": "ohm", "probe_capacitance": "F",
+    "nonlinearity_V_even": "1", "nonlinearity_V_odd": "1", "probe_resistance": "ohm", "probe_capacitance": "F",
     "gain": "1", "relative_noise": "1", "delay": "s", "clock": "1", "sigma": "V",
     "alpha": "1", "Vsc_peak_to_peak": "V", "log_sd": "1", "slope": "1", "correlation": "1",
     "offset": "V", "drift": "V", "charge": "V", "charge_2": "V", "charge_3": "V", "charge_4": "V",

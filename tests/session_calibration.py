@@ -46,6 +46,7 @@ SETUPS: dict[str, dict[str, list[str]]] = {
 GAIN = {"scope-8bit": 0.03, "daq-16bit": 0.0005, "probe-10x": 0.02, "shunt-1%": 0.01}
 NONLINEARITY = {"scope-8bit": 1.0 / 256.0, "daq-16bit": 80e-6}
 COMPENSATION, PROBE_TAU = 0.02, 110e-6
+SKEW = {"daq-16bit": 1.0}  # sampling intervals
 LOAD_R, LOAD_C = (10e6, 0.02), (12e-12, 0.25)
 
 TONES = np.array([1, 2, 3, 5, 7, 10, 14, 19])  # multiples of the frequency
@@ -97,6 +98,8 @@ def draw_errors(setup: str, rng: np.random.Generator) -> dict[str, Any]:
             limits = GAIN[kind], 0.5 * NONLINEARITY.get(kind, 0.0), 0.5 * NONLINEARITY.get(kind, 0.0)
             drawn = rng.uniform(-1.0, 1.0, 4) * [*limits, COMPENSATION * (kind == "probe-10x")]
             errors[piece] = dict(zip(("gain", "even", "odd", "compensation"), drawn, strict=True))
+    limit = max(SKEW.get(piece.partition(":")[0], 0.0) for piece in SETUPS[setup]["Vsc"]) * TIME[1]
+    errors["skew"] = limit * rng.uniform(-1.0, 1.0)
     errors["load"] = [value * (1.0 + limit * rng.uniform(-1.0, 1.0)) for value, limit in (LOAD_R, LOAD_C)]
     return errors
 
@@ -114,11 +117,12 @@ def make_record(
         for piece in pieces:
             compensation = errors[piece]["compensation"] * LAPLACE * PROBE_TAU / (1.0 + LAPLACE * PROBE_TAU)
             signal = (1.0 + errors[piece]["gain"]) * respond(signal, 1.0 + compensation)
-        if channel != "V":
-            size = np.ptp(signal) / 0.8
-            x = (2.0 * signal - signal.min() - signal.max()) / size
-            even, odd = (sum(errors[piece][shape] for piece in pieces) for shape in ("even", "odd"))
-            signal = signal + size * (even * 0.5 * (3.0 * x**2 - 1.0) + odd * 0.5 * (5.0 * x**3 - 3.0 * x))
+        if channel == "Vsc":
+            signal = respond(signal, np.exp(-LAPLACE * errors["skew"]))
+        size = np.ptp(signal) / 0.8
+        x = (2.0 * signal - signal.min() - signal.max()) / size
+        even, odd = (sum(errors[piece][shape] for piece in pieces) for shape in ("even", "odd"))
+        signal = signal + size * (even * 0.5 * (3.0 * x**2 - 1.0) + odd * 0.5 * (5.0 * x**3 - 3.0 * x))
         noise = NOISE.get(channel, 0.0) * rng.standard_normal(PERIODS * PER_PERIOD)
         recorded[channel] = np.tile(signal, PERIODS) + noise
     time = np.arange(PERIODS * PER_PERIOD) / (FREQUENCY * PER_PERIOD)

@@ -73,9 +73,10 @@ def _channel_samples(
     suffix = f"_{channel.label}" if channel.label else ""
     linear = {name.removesuffix(suffix): value for name, value in fitted.linear.items()}
     places = {name: place for place, name in enumerate(likelihood.names)}
-    gains, *effects = (
-        tuple((places[name], power) for name, power in each) for each in (channel.gains, *channel.effect_sizes)
-    )
+
+    def located(coordinates: tuple[tuple[str, float], ...]) -> tuple[tuple[int, float], ...]:
+        return tuple((places[name], power) for name, power in coordinates)
+
     return ChannelSamples(
         channel=fitted.channel,
         time=record.time,
@@ -92,8 +93,8 @@ def _channel_samples(
         taus=taus,
         nuisances=linear,
         timing=timing,
-        gains=gains,
-        effects=tuple(effects),
+        gains=located(channel.gains),
+        effects={name: located(coordinates) for name, coordinates in channel.effect_sizes},
     )
 
 

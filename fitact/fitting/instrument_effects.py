@@ -3,17 +3,20 @@
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 import scipy.signal
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from fitact.compiled import pad_samples
+from fitact.compiled import jit, pad_samples
 from fitact.fitting.channel_fit import sample_residuals
-from fitact.fitting.drive_choice import DriveModel
+from fitact.fitting.instrument_errors import EFFECTS, V_NONLINEARITY
 from fitact.fitting.problem import Source
-from fitact.instrument.effects import PROBE_TIME_CONSTANT, nonlinearity_shapes
+from fitact.instrument.effects import PROBE_TIME_CONSTANT, nonlinearity_shapes, nonlinearity_slopes
+from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
+from fitact.model.drive import Sampled
 
 
 def fill_effects(
@@ -29,8 +32,7 @@ def fill_effects(
             inputs = likelihood.make_inputs(likelihood.evaluate_circuit(theta).circuit, theta, channel)
             residuals, *_ = sample_residuals(channel.drop_unused_columns(), inputs, np.asarray(sigma))
             signal = np.asarray(channel.observed) - residuals - np.asarray(inputs.effects) @ channel.effects
-            signal, record = signal[: channel.n_samples], source.record
-            effects = pad_samples(effect_functions(signal, record.time, source.choice, record.frequency()))
+            effects = _effect_functions(channel, inputs, signal[: channel.n_samples], source)
             likelihood = likelihood.replace_channel(i, dataclasses.replace(channel, effects=effects))
     return likelihood
 
@@ -54,16 +56,37 @@ def effects_would_change(
     return total
 
 
-def effect_functions(
-    signal: Float[np.ndarray, " samples"],
-    time: Float[np.ndarray, " samples"],
-    choice: DriveModel,
-    frequency: float | None,
+def _effect_functions(
+    channel: ChannelLikelihood, inputs: ChannelInputs, signal: Float[np.ndarray, " samples"], source: Source
 ) -> Float[np.ndarray, "effects samples"]:
-    """Return the error of the signal (V or A) for an error of 1 of each of the `EFFECTS`."""
-    settled = choice.steady_state or choice.unknown_charge
-    compensation = _highpass(signal, time, frequency if settled else None, settled=settled)
-    return np.vstack([compensation, nonlinearity_shapes(signal)])
+    """Return the error of the signal (V or A) for an error of 1 of each effect of the channel, padded."""
+    names, choice, record = [name for name, _ in channel.effect_sizes], source.choice, source.record
+    functions = dict(zip(EFFECTS[1:3], pad_samples(nonlinearity_shapes(signal)), strict=True))
+    if "compensation" in names:
+        settled = choice.steady_state or choice.unknown_charge
+        frequency = record.frequency() if settled else None
+        functions["compensation"] = pad_samples(_highpass(signal, record.time, frequency, settled=settled))
+    if not set(V_NONLINEARITY).isdisjoint(names):
+        shapes = nonlinearity_shapes(np.asarray(cast(Sampled, channel.drive).samples))
+        rates = pad_samples(nonlinearity_slopes(record["V"])) if channel.rate is not None else shapes
+        functions |= zip(V_NONLINEARITY, _respond(channel, inputs, shapes, rates), strict=True)
+    return np.stack([functions[name] for name in names])
+
+
+@jit
+def _respond(
+    channel: ChannelLikelihood,
+    inputs: ChannelInputs,
+    voltages: Float[Array, "n times"],
+    rates: Float[Array, "n samples"],
+) -> list[Float[Array, " samples"]]:
+    """Return the signal for each of these drives (V), whose dV/dt is `rates` times that of the channel's drive."""
+    signals = []
+    for voltage, rate in zip(voltages, rates, strict=True):
+        drive = dataclasses.replace(channel.drive, samples=voltage)  # type: ignore[call-arg]
+        changed = dataclasses.replace(channel, drive=drive, rate=None if channel.rate is None else rate * channel.rate)
+        signals.append(changed.signal(dataclasses.replace(inputs, effects=None)))
+    return signals
 
 
 def _highpass(

@@ -9,13 +9,16 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from fitact.likelihood.channel import ChannelLikelihood
+from fitact.model.drive import Sampled
 from fitact.prior.distributions import Distribution, LogNormal
 from fitact.prior.product import multiply
 from fitact.scene.scene import Scene
 
 GAIN = "gain"
 UNRESOLVED_EDGES = "edges of V between two samples"
-EFFECTS = ("compensation", "nonlinearity_even", "nonlinearity_odd")  # small errors in proportion to a function of time
+# small errors in proportion to a function of time; those of V reach the channels through the circuit
+V_NONLINEARITY = ("nonlinearity_V_even", "nonlinearity_V_odd")
+EFFECTS = ("compensation", "nonlinearity_even", "nonlinearity_odd", *V_NONLINEARITY)
 
 
 class Member(NamedTuple):
@@ -69,13 +72,13 @@ def largest_gain(scene: Scene, sds: float = 3.0) -> float:
 def apply_coordinates(coordinates: Sequence[ErrorCoordinate], index: int, member: Member) -> ChannelLikelihood:
     """Return the channel of this index with the coordinates that act on it, and on the V of its record."""
     acting = [(each, each.channel_powers[index]) for each in coordinates if each.channel_powers[index]]
-    effects = (tuple((each.name, power) for each, power in acting if each.kind == kind) for kind in EFFECTS)
+    effects = ((kind, tuple((each.name, power) for each, power in acting if each.kind == kind)) for kind in EFFECTS)
     in_drive = [(each.name, power) for each in coordinates if (power := each.drive_powers[member.record])]
     return dataclasses.replace(
         member.channel,
         gains=tuple((each.name, power) for each, power in acting if each.kind == GAIN),
         drive_gains=tuple(in_drive),
-        effect_sizes=tuple(effects) if any(each.kind in EFFECTS for each, _ in acting) else (),
+        effect_sizes=tuple((kind, sizes) for kind, sizes in effects if sizes),
     )
 
 
@@ -84,6 +87,9 @@ def collect_coordinates(members: Sequence[Member]) -> tuple[ErrorCoordinate, ...
     coordinates: dict[str, ErrorCoordinate] = {}
     for kind in (GAIN, *EFFECTS):
         for (in_channels, in_drives), errors in _group_errors(members, kind).items():
+            sign = math.copysign(1.0, errors[0].power)  # the coordinate has that of its first error
+            in_channels, in_drives = (tuple(sign * power for power in each) for each in (in_channels, in_drives))
+            errors = [each._replace(power=sign * each.power) for each in errors]
             name = _name_coordinate(kind, members, in_channels, in_drives)
             if name in coordinates:
                 name = f"{name}_{sum(other.startswith(name) for other in coordinates) + 1}"
@@ -117,14 +123,20 @@ def _group_errors(members: Sequence[Member], kind: str) -> dict[_Powers, list[In
 def _channel_errors(member: Member, kind: str) -> Iterable[tuple[str, Distribution, float, float]]:
     """Yield the source and distribution of each error of a kind, and its powers in the channel and in V."""
     name, section, measurement = member.channel.channel, member.scene.instrument, member.scene.measurement
+    is_nonlinear, of_V = kind.startswith("nonlinearity"), kind in V_NONLINEARITY
+    field = "nonlinearity" if is_nonlinear else kind
     for channel, power in ((name, 1.0), ("V", -1.0)):
+        if (is_nonlinear and of_V != (channel == "V")) or (of_V and not isinstance(member.channel.drive, Sampled)):
+            continue
         for piece in section.pieces(channel):
-            distribution = piece.error(kind)
-            # the channels follow V linearly, so that its non-linearity is not seen as their own
-            if distribution is not None and not (channel == "V" and kind.startswith("nonlinearity")):
+            distribution = getattr(piece, field)
+            if distribution is not None:
+                # half the non-linearity for each of its shapes, so that their sum stays within the limits
+                share = 0.5 if is_nonlinear else 1.0
+                label = kind.replace("_V", "").replace("_", ", ")
                 in_drive = 1.0 if channel == "V" and kind == GAIN else 0.0
-                label = kind.replace("_", ", ")
-                yield f"{section.describe_channels(piece.name)} {label} ({piece.name})", distribution, power, in_drive
+                source = f"{section.describe_channels(piece.name)} {label} ({piece.name})"
+                yield source, distribution, share * power, in_drive
     if kind != GAIN:
         return
     stated = measurement.gain_relative_sd if name == "Vsc" else measurement.gain_I_relative_sd
@@ -144,6 +156,6 @@ def _name_coordinate(
     records = {each.record for each in acting} | {i for i, power in enumerate(in_drives) if power}
     kinds = {each.channel.channel for each in acting}
     suffix = "_V" if any(in_drives) or len(kinds) > 1 else "_I" if kinds == {"I"} else ""
-    base = kind + suffix
+    base = kind if kind in V_NONLINEARITY else kind + suffix
     count = len({each.record for each in members if not kinds or each.channel.channel in kinds})
     return f"{base}_{min(records) + 1}" if len(records) == 1 and count > 1 else base

@@ -18,7 +18,6 @@ from fitact.experiment.fisher import Experiment
 from fitact.fitting.current import CurrentSamples, estimate_from_current, select_current_samples
 from fitact.fitting.drive_choice import DriveModel, choose_drive, frequency_error, has_ideal_edges, has_unresolved_edge
 from fitact.fitting.instrument_errors import (
-    EFFECTS,
     ErrorCoordinate,
     Member,
     apply_coordinates,
@@ -141,7 +140,7 @@ def _reserve_effects(channel: ChannelLikelihood) -> ChannelLikelihood:
     """Return the channel with effects of instruments that are 0, if there are any."""
     if not channel.effect_sizes:
         return channel
-    return dataclasses.replace(channel, effects=np.zeros((len(EFFECTS), channel.time.size)))
+    return dataclasses.replace(channel, effects=np.zeros((len(channel.effect_sizes), channel.time.size)))
 
 
 def _load_priors(scenes: Sequence[Scene | None]) -> dict[str, Distribution]:
@@ -225,7 +224,9 @@ def _build_channel(
         weight = np.ones(len(record))
     weight = None if weight is None else pad_weight(weight)
     colour, noise = _noise(record, channel, scene)
-    nuisances: dict[str, Any] = _prior_of_nuisances(record, choice, channel, len(taus) if choice.unknown_charge else 0)
+    nuisances = _prior_of_nuisances(record, choice, scene, channel, len(taus) if choice.unknown_charge else 0)
+    # edges of a shifted drive are known only to within a step, which affects g; samples of I there are excluded
+    timing = ("delay",) if channel == "Vsc" and (choice.shift != 0.0 or _has_skew(record, scene)) else ()
     likelihood = ChannelLikelihood(
         **nuisances,
         time=pad_samples(record.time),
@@ -242,11 +243,12 @@ def _build_channel(
         label=label,
         channel=channel,
         steady_state=choice.steady_state,
-        # edges of a shifted drive are known only to within a step, which affects g; samples of I there are excluded
-        timing=("delay",) if choice.shift != 0.0 and channel == "Vsc" else (),
+        timing=timing,
         noise=scene.measurement.noise_model,
         columns=tuple(range(len(LINEAR_NUISANCES))),
     )
+    if timing:
+        likelihood = likelihood.exclude_unknown_drive()
     dominates = samples is not None and samples.drive_noise_dominates
     remarks = (*notes, *at_jumps), (*warnings, *clipped)
     return likelihood, Source(record, scene, choice, noise, optional, start, *remarks, dominates), edge_sd
@@ -287,9 +289,14 @@ def _noise(record: Record, channel: str, scene: Scene) -> tuple[Autoregression |
     return estimate_quiet_noise(record, channel, quiet)
 
 
+def _has_skew(record: Record, scene: Scene, min_part: float = 0.01) -> bool:
+    """Return whether the stated instruments may delay Vsc against V by more than `min_part` of a time step."""
+    return scene.skew_limit("Vsc", record.time_step) > min_part * record.time_step
+
+
 def _prior_of_nuisances(
-    record: Record, choice: DriveModel, channel: str, n_charges: int
-) -> dict[str, Float[np.ndarray, "..."]]:
+    record: Record, choice: DriveModel, scene: Scene, channel: str, n_charges: int
+) -> dict[str, Any]:
     """Return the noise floor and the prior sds of linear nuisances, delay and clock, by their field in a channel."""
     peak_to_peak = float(np.ptp(record[channel]))
     linear_sd = np.zeros(len(LINEAR_NUISANCES))
@@ -297,12 +304,17 @@ def _prior_of_nuisances(
     linear_sd[first_charge : first_charge + n_charges] = 10.0 * peak_to_peak  # wide
     # a fraction of a period cannot determine an offset, so its prior is the accuracy of an oscilloscope (2 %)
     linear_sd[0] = 0.02 * peak_to_peak if record.frequency() is None and choice.periodic else 0.0
+    # the range is taken to be 1.25 times the signal
+    linear_sd[0] = max(linear_sd[0], 1.25 * peak_to_peak * scene.offset_limit(channel) / math.sqrt(3.0))
     # in time steps at the ends of the record; the frequency of the drive is known to one or two steps
     clock_sd = 5.0
     if channel == "Vsc" and choice.name != "measured":
         clock_sd = max(clock_sd, frequency_error(record, choice.name) * record.time.size)
     # samples near an ideal edge determine the delay only to within one step, in the middle of which it starts
     delay_sd = math.sqrt(1.0 / 12.0) if has_ideal_edges(choice.drive) else 5.0
+    if _has_skew(record, scene):
+        step_sd = delay_sd if choice.shift != 0.0 else 0.0
+        delay_sd = math.hypot(step_sd, scene.skew_limit("Vsc", record.time_step) / record.time_step / math.sqrt(3.0))
     return {
         "noise_floor": np.asarray(max(MIN_RELATIVE_NOISE * peak_to_peak, rounding_noise_sd(record[channel]))),
         "linear_sd": linear_sd,

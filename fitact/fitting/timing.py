@@ -14,7 +14,6 @@ from fitact.likelihood.certificate import recompress
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import CircuitValues
 from fitact.likelihood.noise import student_weight
-from fitact.likelihood.projection import MAX_DELAY
 from fitact.model.response import highpass
 from fitact.model.skin import constant_skin_circuit
 
@@ -41,10 +40,7 @@ def free_timing(
     units = np.array([float(channel.timing_unit(n)) for n in names])
     timing = tuple(n for n in TIMING_NUISANCES if n in names or n in channel.timing)
     channel = dataclasses.replace(channel, timing=timing)
-    if channel.follows_samples:  # V is not known beyond the record
-        index = np.arange(channel.time.size)
-        channel = channel.exclude_samples((index < MAX_DELAY) | (index >= channel.n_samples - MAX_DELAY))
-    channel = recompress(channel, circuit)
+    channel = recompress(channel.exclude_unknown_drive(), circuit)
     half_widths = {"delay": 1.0 if len(names) > 1 else delay_half_width, "clock": clock_half_width}
     axes = [step * np.arange(-int(w / step), int(w / step) + 1) for w in map(half_widths.__getitem__, names)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(names))

@@ -12,7 +12,8 @@ class InstrumentClass:
     gain: float | None = None  # relative
     offset: float | None = None  # relative to the range
     nonlinearity: float | None = None  # integral non-linearity, relative to the range
-    skew: float | None = None  # s
+    skew: float | None = None  # between its channels, s
+    skew_intervals: float | None = None  # the same in sampling intervals
     compensation: float | None = None  # error of the high-frequency gain relative to that at low frequency
     # value and relative limits of the input resistance (ohm) and capacitance (F)
     resistance: tuple[float, float] | None = None
@@ -34,6 +35,7 @@ CLASSES = {
         gain=0.0005,
         offset=0.00035,
         nonlinearity=80e-6,
+        skew_intervals=1.0,  # of a converter that scans its channels
     ),
     "probe-10x": InstrumentClass(
         "attenuation: 1 % resistors in probe and oscilloscope, at most 1.8 %; load: Tektronix probe manuals",

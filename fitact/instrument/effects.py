@@ -7,12 +7,23 @@ from jaxtyping import Float
 PROBE_TIME_CONSTANT = 110e-6  # s
 
 
-def nonlinearity_shapes(signal: Float[np.ndarray, " samples"], fill: float = 0.8) -> Float[np.ndarray, "2 samples"]:
+def nonlinearity_shapes(signal: Float[np.ndarray, " samples"]) -> Float[np.ndarray, "2 samples"]:
     """Return the even and the odd error of a signal (V or A) for a non-linearity of 1, relative to the range.
 
-    The range is taken to be `fill`ed by the signal. The shapes are Legendre polynomials, i.e. beside offset and gain.
+    The range is taken to be 1.25 times the signal. The shapes are Legendre polynomials, i.e. beside offset and gain.
     """
-    low, high = float(signal.min()), float(signal.max())
-    size = (high - low) / fill
-    x = (2.0 * signal - low - high) / (size or 1.0)
+    size, x = _range_and_place(signal)
     return size * np.stack([0.5 * (3.0 * x**2 - 1.0), 0.5 * (5.0 * x**3 - 3.0 * x)])
+
+
+def nonlinearity_slopes(signal: Float[np.ndarray, " samples"]) -> Float[np.ndarray, "2 samples"]:
+    """Return the derivatives of `nonlinearity_shapes` in the signal."""
+    _, x = _range_and_place(signal)
+    return 2.0 * np.stack([3.0 * x, 0.5 * (15.0 * x**2 - 3.0)])
+
+
+def _range_and_place(signal: Float[np.ndarray, " samples"]) -> tuple[float, Float[np.ndarray, " samples"]]:
+    """Return the range of an input (V or A), and the place of the signal in it from -1 to 1."""
+    low, high = float(signal.min()), float(signal.max())
+    size = 1.25 * (high - low)
+    return size, (2.0 * signal - low - high) / (size or 1.0)

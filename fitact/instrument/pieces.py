@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Iterable
-from typing import Self
+from typing import Any, Self
 
 from fitact.instrument.classes import CLASSES
 from fitact.model.circuit import Probe
@@ -19,7 +19,10 @@ class Piece:
         name: "class:piece", as in the scene.
         gain: distribution of the factor between indicated and true values; None means exact.
         compensation: the same at high frequency, relative to low frequency.
-        nonlinearity: limits of the integral non-linearity, as a factor around 1, relative to the range.
+        nonlinearity: integral non-linearity, as a factor around 1, relative to the range.
+        offset: largest offset, relative to the range.
+        skew: largest delay against another channel of the instrument, s.
+        skew_intervals: the same in sampling intervals.
         resistance, capacitance: distributions of its input impedance, ohm and F; None means that it does not load.
         source: where the figures come from.
         is_probe: whether it stands between the circuit and another input, and hides that input's load.
@@ -29,6 +32,9 @@ class Piece:
     gain: Distribution | None = None
     compensation: Distribution | None = None
     nonlinearity: Distribution | None = None
+    offset: float = 0.0
+    skew: float = 0.0
+    skew_intervals: float = 0.0
     resistance: Distribution | None = None
     capacitance: Distribution | None = None
     source: str = "certificate"
@@ -39,19 +45,14 @@ class Piece:
     def from_class(cls, name: str) -> Self:
         """Return a piece with the errors of its class."""
         kind = CLASSES[name.partition(":")[0]]
-        names = "gain", "compensation", "nonlinearity"
-        relative = {name: (1.0, limit) for name in names if (limit := getattr(kind, name))}
-        loads = {key: stated for key in ("resistance", "capacitance") if (stated := getattr(kind, key))}
-        errors = {key: Uniform.with_tolerance(*limits) for key, limits in (relative | loads).items()}
-        return cls(name, **errors, source=kind.source, is_probe=name.startswith("probe-"))
-
-    def error(self, kind: str) -> Distribution | None:
-        """Return the distribution of an error, by its name or "nonlinearity_even" or "nonlinearity_odd"."""
-        if not kind.startswith("nonlinearity"):
-            return getattr(self, kind)
-        limits = self.nonlinearity
-        # half for each shape, so that their sum stays within the limits
-        return None if limits is None else Uniform.with_tolerance(1.0, 0.5 * math.sqrt(3.0) * limits.log_sd)
+        stated: dict[str, Any] = {key: getattr(kind, key) or 0.0 for key in ("offset", "skew", "skew_intervals")}
+        for key in ("gain", "compensation", "nonlinearity"):
+            if limit := getattr(kind, key):
+                stated[key] = Uniform.with_tolerance(1.0, limit)
+        for key in ("resistance", "capacitance"):
+            if limits := getattr(kind, key):
+                stated[key] = Uniform.with_tolerance(*limits)
+        return cls(name, **stated, source=kind.source, is_probe=name.startswith("probe-"))
 
     def nominal_probe(self) -> Probe:
         """Return the load at its median values."""

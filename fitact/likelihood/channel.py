@@ -31,7 +31,7 @@ from fitact.likelihood.noise import (
     student_residual,
     student_weight,
 )
-from fitact.likelihood.projection import baseline_functions
+from fitact.likelihood.projection import MAX_DELAY, baseline_functions
 from fitact.model.circuit import Channel, Circuit
 from fitact.model.drive import Drive, Sampled
 from fitact.model.response import response_and_rate
@@ -86,8 +86,8 @@ class ChannelLikelihood(eqx.Module):
     drive_gains: tuple[tuple[str, float], ...] = eqx.field(static=True, default=())  # the same for the indicated V
     # small errors of the instruments, each in proportion to its size, over the samples (V or A); None means none
     effects: Float[Array, "effects samples"] | None = None
-    # coordinates whose product (each with its power), minus 1, is the size of each effect
-    effect_sizes: tuple[tuple[tuple[str, float], ...], ...] = eqx.field(static=True, default=())
+    # name of each effect, and coordinates whose product (each with its power), minus 1, is its size
+    effect_sizes: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = eqx.field(static=True, default=())
     # times of the first period (padded, s) and its number of samples, if the signal need be computed only there
     phases: Float[Array, " phases"] | None = None
     period: ArrayLike | None = None
@@ -149,6 +149,13 @@ class ChannelLikelihood(eqx.Module):
         """Return the channel without some of its samples; a compression must be made anew."""
         weight, whitening = np.where(excluded, 0.0, self.weights), self.whitening
         return dataclasses.replace(self, weight=weight, whitening=whitening and whitening.exclude(excluded))
+
+    def exclude_unknown_drive(self) -> "ChannelLikelihood":
+        """Return the channel without the samples at the ends that may follow, by a delay, a V beyond the record."""
+        if not self.follows_samples:
+            return self
+        index = np.arange(self.time.size)
+        return self.exclude_samples((index < MAX_DELAY) | (index >= self.n_samples - MAX_DELAY))
 
     def without_samples(self) -> "ChannelLikelihood":
         """Return the channel with only two samples if it has a compression.

@@ -193,7 +193,7 @@ class Likelihood(eqx.Module):
             return sum(power * theta[places[name]] for name, power in coordinates)
 
         gain = xp.exp(log_product(channel.gains)) if channel.gains else 1.0
-        sizes = [xp.expm1(xp.asarray(log_product(coordinates), float)) for coordinates in channel.effect_sizes]
+        sizes = [xp.expm1(xp.asarray(log_product(coordinates), float)) for _, coordinates in channel.effect_sizes]
         return ChannelInputs(circuit, gain, **timing, effects=xp.stack(sizes) if sizes else None)
 
     def channels_and_inputs(

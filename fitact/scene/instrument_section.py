@@ -39,13 +39,14 @@ class ErrorSpec(Section):
 class CertificateSpec(Section):
     """Errors of one piece, which replace those of its class; `gain_common` is shared by the channels of an instrument.
 
-    `resistance` and `capacitance` are those of its input.
+    `skew` is the largest delay (s) between its channels, `resistance` and `capacitance` are those of its input.
     """
 
     gain: ErrorSpec | None = None
     gain_common: ErrorSpec | None = None
     compensation: ErrorSpec | None = None
     nonlinearity: ErrorSpec | None = None
+    skew: Annotated[float, Unit("s"), Field(ge=0)] | None = None
     resistance: OhmPriorSpec | None = None
     capacitance: FaradPriorSpec | None = None
 
@@ -121,6 +122,8 @@ class InstrumentSection(Section):
         if own is None:
             return piece
         stated: dict[str, Any] = {}
+        if own.skew is not None:
+            stated = {"skew": own.skew, "skew_intervals": 0.0}
         for key, spec in own:
             if isinstance(spec, ErrorSpec) and key != "gain_common":
                 stated[key] = spec.distribution()

@@ -255,6 +255,15 @@ class Scene(Section):
         gains = (piece.gain for piece in self.instrument.pieces(channel))
         return math.hypot(*(float(gain.log_sd) for gain in gains if gain is not None))
 
+    def offset_limit(self, channel: str) -> float:
+        """Return the largest offset of a channel by the stated pieces, relative to its range."""
+        return sum(piece.offset for piece in self.instrument.pieces(channel))
+
+    def skew_limit(self, channel: str, time_step: float) -> float:
+        """Return the largest delay (s) of a channel against V by the stated pieces; `time_step` is that of samples."""
+        pieces = (*self.instrument.pieces("V"), *self.instrument.pieces(channel))
+        return max((piece.skew + piece.skew_intervals * time_step for piece in pieces), default=0.0)
+
     def without_instrument_errors(self) -> Self:
         """Return the scene with instruments that have no errors, but the load of their input."""
         load = self.find_load()

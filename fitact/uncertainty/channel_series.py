@@ -3,6 +3,8 @@
 import dataclasses
 import functools
 import math
+import types
+from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -45,7 +47,8 @@ class ChannelSamples(NamedTuple):
     timing: dict[str, "Timing"]  # free delay and clock
     # coordinates of theta whose sum, each times its power, is the logarithm of the gain
     gains: tuple[tuple[int, float], ...] = ()
-    effects: tuple[tuple[tuple[int, float], ...], ...] = ()  # the same for 1 + each effect of the instruments
+    # the same for 1 + each effect of the instruments, by its name
+    effects: Mapping[str, tuple[tuple[int, float], ...]] = types.MappingProxyType({})
 
 
 @dataclasses.dataclass(frozen=True)

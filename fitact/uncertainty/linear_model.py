@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -128,11 +129,12 @@ class LinearModel:
                 for name, t in each.samples.timing.items()
                 if self.without != (i, name)
             }
-            gain, *effects = (
-                float(np.exp(sum(power * theta[place] for place, power in places)))
-                for places in (each.samples.gains, *each.samples.effects)
-            )
-            instrument = Instrument(gain, **timing, effects=tuple(effect - 1.0 for effect in effects))
+            sizes = {
+                name: math.exp(sum(power * theta[place] for place, power in places))
+                for name, places in {"gain": each.samples.gains, **each.samples.effects}.items()
+            }
+            gain = sizes.pop("gain")
+            instrument = Instrument(gain, **timing, effects={name: size - 1.0 for name, size in sizes.items()})
             models.append(ChannelModel(each, self.posterior.loop, values, instrument))
         return models
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import types
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -116,7 +117,7 @@ class Instrument(NamedTuple):
     gain: float = 1.0
     delay: float = 0.0  # s
     clock: float = 0.0  # relative deviation of the drive's frequency
-    effects: tuple[float, ...] = ()  # compensation, even and odd non-linearity
+    effects: Mapping[str, float] = types.MappingProxyType({})  # size of each error, by name
 
 
 class ChannelModel:
@@ -137,12 +138,17 @@ class ChannelModel:
     @functools.cached_property
     def signal(self) -> Rows:
         """Signal of the circuit as it is, V or A."""
-        if not self.instrument.effects:
-            return self._respond(self.parts)
-        compensation, *nonlinearity = self.instrument.effects
-        x = self.s * PROBE_TIME_CONSTANT
-        signal = self._respond(self.parts, 1.0 + compensation * x / (1.0 + x))
-        return signal + np.array(nonlinearity) @ nonlinearity_shapes(signal)
+        effects, x = self.instrument.effects, self.s * PROBE_TIME_CONSTANT
+        signal = self._respond(self.parts, 1.0 + effects.get("compensation", 0.0) * x / (1.0 + x))
+        own, of_V = (
+            np.array([effects.get(f"{name}_{shape}", 0.0) for shape in ("even", "odd")])
+            for name in ("nonlinearity", "nonlinearity_V")
+        )
+        if own.any():
+            signal = signal + own @ nonlinearity_shapes(signal)
+        if of_V.any():
+            signal = signal + self._respond(self.parts, change=of_V @ nonlinearity_shapes(self.series.voltage))
+        return signal
 
     def signal_with(self, added: Addition) -> Rows:
         """Return the signal of a circuit with what is `added`, V or A."""
@@ -176,8 +182,10 @@ class ChannelModel:
             return dataclasses.replace(series, jump=(first - float(series.response(gain, series.voltage)[0])) / high)
         return dataclasses.replace(series, jump=series.samples.transient / high)
 
-    def _respond(self, parts: LoopImpedances, filter_gain: Spectrum | float = 1.0) -> Rows:
+    def _respond(self, parts: LoopImpedances, filter_gain: Spectrum | float = 1.0, change: Rows | None = None) -> Rows:
+        """Return the response to V, or to a `change` of it, behind a filter."""
         series, gain = self.series, parts.gain(self.series.samples.channel)
         if series.samples.channel == "I":
             gain = series.regular_gain(gain)
-        return self.record(gain * filter_gain, series.voltage, series.jump)
+        drive = (series.voltage, series.jump) if change is None else (change, 0.0)
+        return self.record(gain * filter_gain, *drive)

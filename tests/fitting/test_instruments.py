@@ -20,11 +20,11 @@ NO_ERROR = {"gain": 0.0, "even": 0.0, "odd": 0.0, "compensation": 0.0}
 
 
 def make(setup: str = "Vsc", seed: int = 0, parts: tuple[float, float, float] = PARTS, **changes: Any) -> fitact.Record:
-    """Simulate a record without errors but those of `changes`: by piece, and `load`."""
+    """Simulate a record without errors but those of `changes`: by piece, `load` and `skew` (s)."""
     pieces = [piece for channel in session.SETUPS[setup].values() for piece in channel]
-    errors: dict[str, Any] = {piece: dict(NO_ERROR) for piece in pieces} | {"load": [10e6, 12e-12]}
+    errors: dict[str, Any] = {piece: dict(NO_ERROR) for piece in pieces} | {"load": [10e6, 12e-12], "skew": 0.0}
     for name, change in changes.items():
-        errors[name] = change if name == "load" else errors[name] | change
+        errors[name] = change if name in ("load", "skew") else errors[name] | change
     return session.make_record(setup, parts, errors, np.random.default_rng(seed), f"record {seed}")
 
 
@@ -182,6 +182,44 @@ def test_compression_keeps_the_effects(setup: str):
         compressed.sd[compressed.names.index("compensation")]
     )
     assert compressed.result == "successful"
+
+
+@pytest.mark.parametrize("setup", ["Vsc", "Vsc and I"])
+@pytest.mark.parametrize("shape", ["even", "odd"])
+def test_nonlinearity_of_V_is_an_error_of_all_channels(setup: str, shape: str):
+    """The true size lies within four standard errors, as g and b do; without a word of it they do not."""
+    record = make(setup, **{"scope-8bit:A/CH1": {shape: 0.0018}})
+    fit = fitact.fit(record, session.scene(setup))
+    place = fit.names.index(f"nonlinearity_V_{shape}")
+    assert abs(fit.theta[place] - math.log(1.0018)) < 4.0 * fit.sd[place]
+    assert max(map(abs, errors_of(fit).values())) < 2.0
+    assert any(each.source == f"V nonlinearity, {shape} (scope-8bit:A/CH1)" for each in fit.budgets["b"].components)
+
+
+def test_a_certificate_of_nonlinearity_keeps_its_distribution():
+    own = {"scope-8bit:A/CH2": {"nonlinearity": {"expanded": "0.2 %", "k": 2}}}
+    scene = plain(instrument=INSTRUMENT | {"own": own}, measurement={"channels": ["Vsc"]})
+    prior = fitact.fit(make(), scene).likelihood.prior
+    assert isinstance(prior["nonlinearity_odd"], fitact.LogNormal)
+    assert float(prior["nonlinearity_odd"].spread) == pytest.approx(0.0005)  # half for each shape
+    assert float(prior["nonlinearity_V_odd"].log_sd) == pytest.approx(0.5 / 256.0 / math.sqrt(3.0), rel=1e-3)
+
+
+def test_a_scanning_converter_delays_channels():
+    """Up to a sampling interval of 5 us, of which 3 us move b by 0.7 %."""
+    stated = session.scene("DAQ").model_dump(mode="json", exclude_unset=True) | {"drive": {"waveform": "measured"}}
+    fit = fitact.fit(make("DAQ", skew=3e-6), fitact.Scene.from_dict(stated))
+    delay = fit.parameters()["delay"]
+    assert delay["q50"] == pytest.approx(3e-6, abs=4.0 * float(delay["sd"]))
+    assert abs(errors_of(fit)["b"]) < 3.0
+    assert fit.compression_error is not None
+    stated["instrument"]["own"] = {f"daq-16bit:D/{i}": {"skew": "0 s"} for i in (0, 1)}
+    assert "delay" not in fitact.fit(make("DAQ"), fitact.Scene.from_dict(stated)).names
+
+
+def test_an_offset_within_the_limits_is_free(fit: fitact.Fit):
+    assert "offset" in fit.linear
+    assert "offset" not in fitact.fit(make(), plain()).linear
 
 
 @pytest.mark.parametrize("noise", ["ar1", "student"])
