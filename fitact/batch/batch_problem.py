@@ -22,6 +22,7 @@ from fitact.fitting.least_squares import NUISANCES, bic_decrease
 from fitact.fitting.residual_tests import PhaseBins, count_true
 from fitact.fitting.starting_point import most_probable_skin, prior_skin_moments
 from fitact.likelihood.likelihood import Likelihood
+from fitact.model.circuit import FINGER_PARAMETERS
 
 
 class BatchFit(NamedTuple):
@@ -123,7 +124,7 @@ class BatchProblem(abc.ABC):
         """Return the most probable parameters with divider `g` and time constant `b` (s)."""
         theta = np.tile(self._prior_center, (len(g), 1))
         ridge = most_probable_skin(g, b, *self._prior_skin_moments)
-        for name, logs in zip(("Rsc", "Csc", "Ci"), ridge.T, strict=True):
+        for name, logs in zip(FINGER_PARAMETERS, ridge.T, strict=True):
             if name in self.names:
                 theta[:, self.names.index(name)] = logs
         return theta

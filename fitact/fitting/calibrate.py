@@ -11,6 +11,7 @@ import numpy as np
 from fitact.data.readers.read import read
 from fitact.errors import InputError
 from fitact.likelihood.calibration import Calibration
+from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.scene.prior_section import PriorSection
 from fitact.scene.scene import Scene
 from fitact.units import format_engineering, format_percent, quantity_unit
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from fitact.fitting.fit import Fit
 
 FitRecords = Callable[..., "Fit"]  # `fitact.fitting.fit.fit_records`
-_SKIN = ("Rsc", "Csc", "Ci")
 
 
 class CalibratedInstruments(NamedTuple):
@@ -52,7 +52,7 @@ def _calibrate(
     parts, notes, warnings = [], [], []
     for each in stated.calibration:
         record = read(each.record)
-        prior = PriorSection(**{name: getattr(each.circuit, name) for name in _SKIN})
+        prior = PriorSection(**{name: getattr(each.circuit, name) for name in FINGER_PARAMETERS})
         dummy = Scene(drive=stated.drive, measurement=stated.measurement, instrument=stated.instrument, prior=prior)
         fitted = fit_records((record,), (dummy,))
         parts.append(_marginal_calibration(fitted, names))
@@ -67,7 +67,7 @@ def _calibrate(
 def _dummy_warnings(fitted: "Fit", max_pull: float = 3.0) -> list[str]:
     """Return warnings about a record that does not fit its dummy circuit, or parts that are not as stated."""
     warnings = [] if fitted.trusted else [fitted.message]
-    for name in _SKIN:
+    for name in FINGER_PARAMETERS:
         if name in fitted.names:
             marginal, theta = fitted.likelihood.prior[name], fitted.theta[fitted.names.index(name)]
             pull = (theta - marginal.log_mean) / marginal.log_sd
@@ -83,7 +83,7 @@ def _dummy_warnings(fitted: "Fit", max_pull: float = 3.0) -> list[str]:
 
 def _marginal_calibration(fitted: "Fit", names: tuple[str, ...]) -> Calibration:
     """Return what a fit tells about those of the coordinates `names` that it has, whatever its other parameters are."""
-    names = tuple(name for name in fitted.likelihood.prior.names if name in names and name not in _SKIN)
+    names = tuple(name for name in fitted.likelihood.prior.names if name in names and name not in FINGER_PARAMETERS)
     shared = [fitted.names.index(name) for name in names]
     own = [i for i in range(len(fitted.names)) if i not in shared]
     precision = np.linalg.inv(fitted.likelihood.prior_factor @ fitted.likelihood.prior_factor.T)

@@ -29,9 +29,13 @@ def assess_fit(
     posterior, channels = linear_posterior(laplace), channel_samples(laplace, traces)
     if posterior is None:
         return None
-    added = [Nuisance(i, name) for i, each in enumerate(channels) for name in _added_nuisances(each)]
+    added: dict[tuple[str, str], list[int]] = {}
+    for i, each in enumerate(channels):
+        for name in _added_nuisances(each):
+            added.setdefault((each.channel, name), []).append(i)
+    groups = [Nuisance(tuple(places), name) for (_, name), places in added.items()]
     try:
-        effects = assess_effects(channels, posterior, has_structure, added, rivals)
+        effects = assess_effects(channels, posterior, has_structure, groups, rivals)
     except np.linalg.LinAlgError:
         return None
     return effects if all(map(math.isfinite, effects.effect_size.values())) else None

@@ -41,13 +41,13 @@ from fitact.fitting.verdict import diagnose_fit, misfit_warnings
 from fitact.instrument.classes import TYPICAL, typical_gain_u
 from fitact.likelihood import certificate
 from fitact.likelihood.noise import scale_information
+from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.model.skin import constant_skin_circuit
 from fitact.scene.scene import Scene
 from fitact.tables import join_lines
 from fitact.uncertainty.budget import Budget, ErrorSource, laplace_components
 from fitact.uncertainty.effect_size import NO_EFFECTS, EffectSizes
 
-_SKIN = ("Rsc", "Csc", "Ci")
 _RESPONSE = {
     "constant": "exact",
     "dispersive": "harmonics and time constants",
@@ -94,7 +94,7 @@ class Fit(FitResult):
         gradients = dict(zip(self.names, np.eye(self.theta.size), strict=True))
         moments = self.geometry.approximate(self.likelihood, self.theta, self.laplace.log_derived)
         derivatives = zip(derived.DERIVED_NAMES, moments.gradients, strict=True)
-        return {name: gradients[name] for name in _SKIN if name in gradients} | dict(derivatives)
+        return {name: gradients[name] for name in FINGER_PARAMETERS if name in gradients} | dict(derivatives)
 
     def calibration_entry(self, name: str) -> dict[str, Any]:
         """Return `stated` and `not_stated` of the budget of a quantity: gain errors that nobody stated."""
@@ -247,7 +247,7 @@ class Fit(FitResult):
             "steady_state": self.choice.steady_state,
             "channels": [channel.channel for channel in self.traces],
             "force": self.derive.geometry.model,
-            "freed": [*self.linear, *(name for name in self.names if name not in _SKIN)],
+            "freed": [*self.linear, *(name for name in self.names if name not in FINGER_PARAMETERS)],
             "likelihood": "full" if self.compression_error is None else "compressed",
             "compression_error": self.compression_error,
             "full_because": self.full_because,

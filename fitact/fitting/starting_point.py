@@ -14,6 +14,7 @@ from fitact.errors import InputError
 from fitact.fitting.current import CurrentEstimate
 from fitact.fitting.drive_choice import DriveModel, has_ideal_edges
 from fitact.likelihood.likelihood import Likelihood
+from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.model.skin import WithSkin, circuit_parameters
 
 
@@ -80,7 +81,7 @@ def start_from_estimates(
         logs = np.log(skin)
     elif vsc is not None:
         logs = most_probable_skin(np.asarray(vsc.g), np.asarray(vsc.b), mean, sd)
-    for name, value in zip(("Rsc", "Csc", "Ci"), logs, strict=True):
+    for name, value in zip(FINGER_PARAMETERS, logs, strict=True):
         if name in likelihood.prior.names:
             theta[likelihood.prior.names.index(name)] = value
     return theta
@@ -107,7 +108,7 @@ def prior_skin_moments(likelihood: Likelihood) -> tuple[np.ndarray, np.ndarray]:
     prior, known = likelihood.prior, circuit_parameters(likelihood.template)
     pairs = [
         (prior[name].log_mean, prior[name].log_sd) if name in prior.names else (math.log(float(known[name])), 1e-6)
-        for name in ("Rsc", "Csc", "Ci")
+        for name in FINGER_PARAMETERS
     ]
     mean, sd = np.array(pairs).T
     return mean, sd

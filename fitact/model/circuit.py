@@ -27,6 +27,7 @@ from jaxtyping import Array, Complex, Float
 
 from fitact.errors import InputError
 
+FINGER_PARAMETERS = ("Rsc", "Csc", "Ci")  # of every circuit
 Channel: TypeAlias = Literal["Vsc", "I", "Vgap"]  # Vgap is not recorded; the force may come from it
 
 

@@ -20,9 +20,18 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
 from fitact.errors import InputError
-from fitact.model.circuit import RC, Channel, Circuit, DirectGround, Element, FinalCircuit, HighpassTerms, Loop, Probe
-
-_SKIN = ("Rsc", "Csc", "Ci")
+from fitact.model.circuit import (
+    FINGER_PARAMETERS,
+    RC,
+    Channel,
+    Circuit,
+    DirectGround,
+    Element,
+    FinalCircuit,
+    HighpassTerms,
+    Loop,
+    Probe,
+)
 
 # section 3.1 of the reference paper, with its Rsc, Csc at 100 Hz
 _FREQUENCY = np.array([10.0, 100.0, 1000.0])  # Hz
@@ -285,8 +294,8 @@ def with_probe(circuit: Any, probe: Probe | None) -> Any:
     if isinstance(circuit, WithSkin):
         return dataclasses.replace(circuit, circuit=with_probe(circuit.circuit, probe))
     changed = dataclasses.replace(circuit, probe=probe)
-    names = [field.name for field in dataclasses.fields(changed)]
-    if isinstance(changed, DirectGround) and all(getattr(changed, name) is None for name in names if name not in _SKIN):
+    extras = [field.name for field in dataclasses.fields(changed) if field.name not in FINGER_PARAMETERS]
+    if isinstance(changed, DirectGround) and all(getattr(changed, name) is None for name in extras):
         return FinalCircuit(changed.Rsc, changed.Csc, changed.Ci)
     return changed
 

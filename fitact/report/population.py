@@ -18,6 +18,7 @@ from fitact.charts import interactive
 from fitact.charts.figure import ALERT, DATA, MODEL, PRIOR, log_ticks, write_figure
 from fitact.charts.interactive import Axis
 from fitact.errors import InputError
+from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.populations.population import (
     MAX_INTEGRATION_ERROR,
     SHARES_LEGEND,
@@ -271,7 +272,7 @@ def _origin(content: dict[str, Any]) -> Provenance:
 def _finger_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
     yield ("finger", "Rsc ± 1 sd", "Csc ± 1 sd", "Ci ± 1 sd", "fit")
     for each in content["fingers"]:
-        cells = (format_estimate(each["parameters"][name]) for name in ("Rsc", "Csc", "Ci"))
+        cells = (format_estimate(each["parameters"][name]) for name in FINGER_PARAMETERS)
         yield (each["record"], *cells, each["result"])
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from fitact.charts import interactive
 from fitact.charts.figure import ALERT, DATA, MODEL, PRIOR, robust_limits
 from fitact.charts.interactive import Axis, Chart, Plot, PlotlyTrace
+from fitact.model.circuit import FINGER_PARAMETERS
 
 CHANNELS = {"Vsc": "skin voltage Vsc", "I": "loop current I"}
 _FORCES = {"force_mean": "mean force", "force_rms": "rms force", "force_peak": "peak force"}
@@ -78,7 +79,7 @@ def _corner_chart(tree: Any) -> Chart:
         traces = [interactive.density(x, draws[name], label, color) for draws, label, color in both]
         plots.append(interactive.plot(x, (_DENSITY, traces), size=230, unified_hover=True))
     clouds = []
-    for a, b in itertools.combinations([name for name in ("Rsc", "Csc", "Ci") if name in axes], 2):
+    for a, b in itertools.combinations([name for name in FINGER_PARAMETERS if name in axes], 2):
         traces = []
         for draws, label, color in both:
             shown = slice(None, None, max(1, draws[a].size // 300))  # 300 points show the shape and keep the page small

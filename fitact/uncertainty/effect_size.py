@@ -83,7 +83,7 @@ def assess_effects(
             effect, fits = np.maximum(effect, np.max(parts, axis=0)), [*fits, *found]
         else:
             alternatives.append(hints(model, effects))
-            for nuisance, others in zip([*added, Nuisance(0, "residuals")], alternatives, strict=True):
+            for nuisance, others in zip([*added, Nuisance((), "residuals")], alternatives, strict=True):
                 word = nuisance.name.partition("_")[0]
                 if causes := tuple(each.rival.name for each in others if word not in each.rival.name):
                     names_of[nuisance.name] = causes

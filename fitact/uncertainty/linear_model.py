@@ -17,9 +17,9 @@ Columns = Float[np.ndarray, "rows columns"]
 
 
 class Nuisance(NamedTuple):
-    """A nuisance of one channel."""
+    """A nuisance that channels of several records have, each its own."""
 
-    channel: int  # index of the channel
+    channels: tuple[int, ...]  # indices of the channels
     name: str  # "delay", "clock", or the name of a linear nuisance without "_cos" and "_sin"
 
 
@@ -44,8 +44,9 @@ class LinearModel:
         self.posterior, self.without = posterior, without
         self.series = tuple(series)
         self.series = tuple(model.with_charge() for model in self.models(posterior.theta))
-        timing = {} if without is None else series[without.channel].samples.timing
-        dropped = [t.place for name, t in timing.items() if without is not None and name == without.name]
+        dropped = [
+            t.place for i, each in enumerate(series) for n, t in each.samples.timing.items() if self._lacks(i, n)
+        ]
         self.kept = [i for i in range(posterior.theta.size) if i not in dropped]
         sensitivities, nuisances = self.sensitivities(posterior.theta), self._nuisance_columns()
         width = nuisances.shape[1]
@@ -60,6 +61,10 @@ class LinearModel:
             ]
         )
         self.basis, self.triangle = np.linalg.qr(self.design)
+
+    def _lacks(self, channel: int, name: str) -> bool:
+        """Return whether a nuisance of a channel is left out."""
+        return self.without is not None and channel in self.without.channels and name == self.without.name
 
     @functools.cached_property
     def rows(self) -> int:
@@ -127,7 +132,7 @@ class LinearModel:
             timing = {
                 name: t.total + t.unit * float(move[t.place])
                 for name, t in each.samples.timing.items()
-                if self.without != (i, name)
+                if not self._lacks(i, name)
             }
             sizes = {
                 name: math.exp(sum(power * theta[place] for place, power in places))
@@ -158,21 +163,28 @@ class LinearModel:
         columns = []
         for i, each in enumerate(self.series):
             for name, shape in each.shapes().items():
-                if self.without is None or (i, name.rsplit("_", name.startswith("hum"))[0]) != self.without:
+                if not self._lacks(i, name.rsplit("_", name.startswith("hum"))[0]):
                     column = self._place(i, shape)
                     columns.append(column / max(float(np.linalg.norm(column)), 1e-300))
         return np.stack(columns, axis=1) if columns else np.zeros((self.rows, 0))
 
     def nuisance_part(self, simpler: "LinearModel", nuisance: Nuisance) -> tuple[Columns, Rows]:
         """Return the whitened columns of a nuisance, which a `simpler` model lacks, and what it adds at the optimum."""
-        series = self.series[nuisance.channel]
-        if nuisance.name in series.samples.timing:
-            place = self.kept.index(series.samples.timing[nuisance.name].place)
-            theta = self.posterior.theta
-            return self.design[: self.rows, [place]], self.signals(theta) - simpler.signals(theta)
-        shapes = {name: shape for name, shape in series.shapes().items() if name.startswith(nuisance.name)}
-        columns = np.stack([self._place(nuisance.channel, shape) for shape in shapes.values()], axis=1)
-        return columns, columns @ np.array([series.samples.nuisances[name] for name in shapes])
+        chosen = [(i, self.series[i]) for i in nuisance.channels]
+        timing = [each.samples.timing[nuisance.name] for _, each in chosen if nuisance.name in each.samples.timing]
+        if timing:
+            places, theta = [self.kept.index(t.place) for t in timing], self.posterior.theta
+            return self.design[: self.rows, places], self.signals(theta) - simpler.signals(theta)
+        shapes = [
+            (self._place(i, shape), each.samples.nuisances[name])
+            for i, each in chosen
+            for name, shape in each.shapes().items()
+            if name.startswith(nuisance.name)
+        ]
+        if not shapes:
+            return np.zeros((self.rows, 0)), np.zeros(self.rows)
+        columns, values = zip(*shapes, strict=True)
+        return np.stack(columns, axis=1), np.stack(columns, axis=1) @ np.array(values)
 
 
 def _noise_variance(rows: Rows, series: ChannelSeries, quantile: float = 0.25) -> float:

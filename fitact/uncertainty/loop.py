@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from fitact.instrument.effects import PROBE_TIME_CONSTANT, nonlinearity_shapes
 from fitact.likelihood.likelihood import Likelihood
-from fitact.model.circuit import FinalCircuit, NaturalGround
+from fitact.model.circuit import FINGER_PARAMETERS, FinalCircuit, NaturalGround
 from fitact.model.skin import Fractional, WithSkin, circuit_parameters, constant_skin_circuit
 from fitact.uncertainty.channel_series import ChannelSeries, Rows, Spectrum
 
@@ -76,7 +76,7 @@ class LoopModel(NamedTuple):
     def impedances(self, values: Mapping[str, float | None], s: Spectrum, added: Addition = NOTHING) -> LoopImpedances:
         """Return the impedances at complex frequencies `s` (rad/s), with what is `added`."""
         get = values.get
-        R, C, Ci = (float(values[name] or 0.0) for name in ("Rsc", "Csc", "Ci"))
+        R, C, Ci = (float(values[name] or 0.0) for name in FINGER_PARAMETERS)
         alpha = (get("alpha") or 1.0) - added.dispersion
         touching = _skin(R, C, s, alpha, added.layers)
         load = added.probe * (1e-7 + s * 12e-12)

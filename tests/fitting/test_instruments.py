@@ -207,12 +207,12 @@ def test_a_certificate_of_nonlinearity_keeps_its_distribution():
 
 def test_a_scanning_converter_delays_channels():
     """Up to a sampling interval of 5 us, of which 3 us move b by 0.7 %."""
-    stated = session.scene("DAQ").model_dump(mode="json", exclude_unset=True) | {"drive": {"waveform": "measured"}}
-    fit = fitact.fit(make("DAQ", skew=3e-6), fitact.Scene.from_dict(stated))
+    fit = fitact.fit(make("DAQ", skew=3e-6), session.scene("DAQ"))
     delay = fit.parameters()["delay"]
     assert delay["q50"] == pytest.approx(3e-6, abs=4.0 * float(delay["sd"]))
     assert abs(errors_of(fit)["b"]) < 3.0
     assert fit.compression_error is not None
+    stated = session.scene("DAQ").model_dump(mode="json", exclude_unset=True)
     stated["instrument"]["own"] = {f"daq-16bit:D/{i}": {"skew": "0 s"} for i in (0, 1)}
     assert "delay" not in fitact.fit(make("DAQ"), fitact.Scene.from_dict(stated)).names
 
