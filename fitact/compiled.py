@@ -348,8 +348,7 @@ class BatchEvaluator:
     ) -> None:
         self._arguments, self._fast = (function, model), fast
         self._arrays = list(map(_as_argument, filter(is_array, jax.tree.leaves(self._arguments))))
-        self._is_used = self._is_copied = False
-        self._programs: dict[tuple[_Shape | _Static, ...], _Program] = {}
+        self._is_copied, self._programs = False, dict[tuple[_Shape | _Static, ...], _Program]()
         self._batch = max(1, min(batch, max_numbers // rows))
 
     def __call__(self, *arrays: np.ndarray, description: str = "") -> np.ndarray:
@@ -358,10 +357,9 @@ class BatchEvaluator:
         arrays = tuple(pad_rows(a, batch) for a in arrays)
         starts = range(0, count, batch)
         with jax.enable_x64(True):
-            program = self._find_program(*(a[:batch] for a in arrays))
-            if (self._is_used or len(starts) > 1) and not self._is_copied:
+            if (self._programs or len(starts) > 1) and not self._is_copied:
                 self._arrays, self._is_copied = jax.device_put(self._arrays), True
-            self._is_used = True
+            program = self._find_program(*(a[:batch] for a in arrays))
             parts = [
                 program(*self._arrays, *(a[i : i + batch] for a in arrays))
                 for i in (track_progress(starts, description, len(starts)) if description else starts)

@@ -78,7 +78,7 @@ def _channel_samples(
     linear = {name.removesuffix(suffix): value for name, value in fitted.linear.items()}
     places = {name: place for place, name in enumerate(likelihood.names)}
 
-    def located(coordinates: tuple[tuple[str, float], ...]) -> tuple[tuple[int, float], ...]:
+    def find_places(coordinates: tuple[tuple[str, float], ...]) -> tuple[tuple[int, float], ...]:
         return tuple((places[name], power) for name, power in coordinates)
 
     return ChannelSamples(
@@ -97,8 +97,8 @@ def _channel_samples(
         taus=taus,
         nuisances=linear,
         timing=timing,
-        gains=located(channel.gains),
-        effects={name: located(coordinates) for name, coordinates in channel.effect_sizes},
+        gains=find_places(channel.gains),
+        effects={name: find_places(coordinates) for name, coordinates in channel.effect_sizes},
     )
 
 

@@ -123,10 +123,10 @@ def _group_errors(members: Sequence[Member], kind: str) -> dict[_Powers, list[In
 def _channel_errors(member: Member, kind: str) -> Iterable[tuple[str, Distribution, float, float]]:
     """Yield the source and distribution of each error of a kind, and its powers in the channel and in V."""
     name, section, measurement = member.channel.channel, member.scene.instrument, member.scene.measurement
-    is_nonlinear, of_V = kind.startswith("nonlinearity"), kind in V_NONLINEARITY
+    is_nonlinear, in_V = kind.startswith("nonlinearity"), kind in V_NONLINEARITY
     field = "nonlinearity" if is_nonlinear else kind
     for channel, power in ((name, 1.0), ("V", -1.0)):
-        if (is_nonlinear and of_V != (channel == "V")) or (of_V and not isinstance(member.channel.drive, Sampled)):
+        if (is_nonlinear and in_V != (channel == "V")) or (in_V and not isinstance(member.channel.drive, Sampled)):
             continue
         for piece in section.pieces(channel):
             distribution = getattr(piece, field)

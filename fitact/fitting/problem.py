@@ -27,6 +27,7 @@ from fitact.fitting.instrument_errors import (
 from fitact.fitting.skin_model import apply_skin_model, exclude_jumps, require_skin_response
 from fitact.fitting.starting_point import Estimate, VscEstimate, estimate_from_vsc, start_from_estimates
 from fitact.instrument.classes import typical_gain_u
+from fitact.instrument.effects import INPUT_RANGE
 from fitact.likelihood import certificate
 from fitact.likelihood.channel import CHARGES, LINEAR_NUISANCES, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
@@ -304,8 +305,7 @@ def _prior_of_nuisances(
     linear_sd[first_charge : first_charge + n_charges] = 10.0 * peak_to_peak  # wide
     # a fraction of a period cannot determine an offset, so its prior is the accuracy of an oscilloscope (2 %)
     linear_sd[0] = 0.02 * peak_to_peak if record.frequency() is None and choice.periodic else 0.0
-    # the range is taken to be 1.25 times the signal
-    linear_sd[0] = max(linear_sd[0], 1.25 * peak_to_peak * scene.offset_limit(channel) / math.sqrt(3.0))
+    linear_sd[0] = max(linear_sd[0], INPUT_RANGE * peak_to_peak * scene.offset_limit(channel) / math.sqrt(3.0))
     # in time steps at the ends of the record; the frequency of the drive is known to one or two steps
     clock_sd = 5.0
     if channel == "Vsc" and choice.name != "measured":

@@ -5,12 +5,13 @@ from jaxtyping import Float
 
 # of 9 Mohm and 12.2 pF of a 10x probe. Source: primidi.com, passive probes; Brüel & Kjær 2125A manual, p. 49
 PROBE_TIME_CONSTANT = 110e-6  # s
+INPUT_RANGE = 1.25  # assumed range of an input, relative to its signal
 
 
 def nonlinearity_shapes(signal: Float[np.ndarray, " samples"]) -> Float[np.ndarray, "2 samples"]:
     """Return the even and the odd error of a signal (V or A) for a non-linearity of 1, relative to the range.
 
-    The range is taken to be 1.25 times the signal. The shapes are Legendre polynomials, i.e. beside offset and gain.
+    The shapes are Legendre polynomials, i.e. beside offset and gain.
     """
     size, x = _range_and_place(signal)
     return size * np.stack([0.5 * (3.0 * x**2 - 1.0), 0.5 * (5.0 * x**3 - 3.0 * x)])
@@ -25,5 +26,5 @@ def nonlinearity_slopes(signal: Float[np.ndarray, " samples"]) -> Float[np.ndarr
 def _range_and_place(signal: Float[np.ndarray, " samples"]) -> tuple[float, Float[np.ndarray, " samples"]]:
     """Return the range of an input (V or A), and the place of the signal in it from -1 to 1."""
     low, high = float(signal.min()), float(signal.max())
-    size = 1.25 * (high - low)
+    size = INPUT_RANGE * (high - low)
     return size, (2.0 * signal - low - high) / (size or 1.0)

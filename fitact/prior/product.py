@@ -72,9 +72,7 @@ def multiply(factors: Sequence[Factor], scale: float = 1.0, cells: int = 2048, t
     spectrum: Any = 1.0
     for (x, power), ends, count in zip(factors, spans, counts, strict=True):
         spectrum = spectrum * scipy.fft.rfft(_masses(x, power, np.linspace(*ends, count + 1)), length)
-    mass = np.maximum(
-        scipy.fft.irfft(spectrum, length)[:size], 0.0
-    )  # of the convolution, whose rounding may be negative
+    mass = np.maximum(scipy.fft.irfft(spectrum, length)[:size], 0.0)  # rounding may make it negative
     edges, cumulative = np.linspace(low, high, mass.size + 1), np.append(0.0, np.cumsum(mass))
     table = np.linspace(low, high, cells + 1)
     return Product(table, np.interp(table, edges, cumulative / cumulative[-1]), np.asarray(mean), np.asarray(sd))

@@ -105,8 +105,8 @@ class ChannelSeries:
 
     def response(self, gain: Spectrum, rows: Rows, jump: float = 0.0) -> Rows:
         """Return an input after a filter; before the record it repeats, or is 0, less `jump`."""
-        of_drive = rows is self.voltage and jump == self.jump
-        spectrum = self._drive_spectrum if of_drive else self._spectrum(rows, jump)
+        is_drive = rows is self.voltage and jump == self.jump
+        spectrum = self._drive_spectrum if is_drive else self._spectrum(rows, jump)
         return scipy.fft.irfft(spectrum * gain, self._length)[self._length - rows.size :]
 
     @functools.cached_property

@@ -140,14 +140,14 @@ class ChannelModel:
         """Signal of the circuit as it is, V or A."""
         effects, x = self.instrument.effects, self.s * PROBE_TIME_CONSTANT
         signal = self._respond(self.parts, 1.0 + effects.get("compensation", 0.0) * x / (1.0 + x))
-        own, of_V = (
+        own_sizes, drive_sizes = (
             np.array([effects.get(f"{name}_{shape}", 0.0) for shape in ("even", "odd")])
             for name in ("nonlinearity", "nonlinearity_V")
         )
-        if own.any():
-            signal = signal + own @ nonlinearity_shapes(signal)
-        if of_V.any():
-            signal = signal + self._respond(self.parts, change=of_V @ nonlinearity_shapes(self.series.voltage))
+        if own_sizes.any():
+            signal = signal + own_sizes @ nonlinearity_shapes(signal)
+        if drive_sizes.any():
+            signal = signal + self._respond(self.parts, change=drive_sizes @ nonlinearity_shapes(self.series.voltage))
         return signal
 
     def signal_with(self, added: Addition) -> Rows:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from fitact.instrument.effects import PROBE_TIME_CONSTANT
 from fitact.uncertainty.channel_series import ChannelSeries, Rows, Spectrum
 from fitact.uncertainty.loop import Addition, ChannelModel
 
@@ -86,8 +87,8 @@ def _delay(s: Spectrum, a: float, series: ChannelSeries) -> Spectrum:
     return np.exp(-a * series.difference)
 
 
-def _compensation(s: Spectrum, a: float, series: ChannelSeries, time_constant: float = 110e-6) -> Spectrum:
-    x = s * time_constant
+def _compensation(s: Spectrum, a: float, series: ChannelSeries) -> Spectrum:
+    x = s * PROBE_TIME_CONSTANT
     return 1.0 + a * x / (1.0 + x)
 
 
