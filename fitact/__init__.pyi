@@ -3,14 +3,14 @@ from .batch.fit_many import Fits, fit_many
 from .batch.sample_many import sample_many
 from .data.inspection import Inspection, inspect
 from .data.readers.read import read
+from .data.readers.spectrum import read_spectra, read_spectrum
 from .data.record import Record
-from .data.spectrum import Spectrum, read_spectrum
+from .data.spectrum import Spectrum
 from .design.drive import design_drive
 from .design.drive_design import DriveDesign
 from .design.measurement import MeasurementDesign, design_measurement
 from .errors import InputError
 from .fitting.fit import Fit, fit
-from .fitting.fit_spectrum import SpectrumFit, fit_spectrum
 from .fitting.levenberg_marquardt import RESULTS
 from .model.chirp import Chirp
 from .model.circuit import DirectGround, FinalCircuit, NaturalGround, Probe
@@ -62,7 +62,6 @@ __all__ = [
     "Scene",
     "Sine",
     "Spectrum",
-    "SpectrumFit",
     "Square",
     "Tradeoff",
     "Trapezoid",
@@ -77,7 +76,6 @@ __all__ = [
     "electrostatic_force",
     "fit",
     "fit_many",
-    "fit_spectrum",
     "friction",
     "harmonic_error",
     "harmonic_response",
@@ -91,6 +89,7 @@ __all__ = [
     "population",
     "quality_factor",
     "read",
+    "read_spectra",
     "read_spectrum",
     "response",
     "run_campaign",

@@ -58,7 +58,8 @@ _NUISANCES = {  # quantities of the measurement; {}: the channel
     "delay": "delay of {} against V",
     "clock": "relative deviation of the drive frequency from the stated one",
     "sigma": "noise of {}, standard deviation",
-    "relative_noise": "noise of |Z|, relative standard deviation",
+    "sigma_Z": "noise of the impedance, relative standard deviation",
+    "sigma_H": "noise of the gain Vsc/V, relative standard deviation",
     "offset": "constant offset of {}",
     "drift": "drift of {} over half the record",
     "hum_50Hz_cos": "50 Hz hum in {}, cosine part",
@@ -70,6 +71,7 @@ _NUISANCES = {  # quantities of the measurement; {}: the channel
     "charge_3": "third transient in {} at the first sample",
     "charge_4": "fourth transient in {} at the first sample",
 }
+_CHANNELS = {"": "Vsc", "I": "I", "Z": "the impedance", "H": "Vsc/V"}  # by the end of a name
 _GEOMETRY = {  # what force and friction rest on beside the circuit
     "skin_thickness": "skin thickness Tsc",
     "skin_permittivity": "skin permittivity",
@@ -93,8 +95,14 @@ def describe_quantity(name: str) -> str:
     labels = _PARAMETERS | _NUISANCES | _GEOMETRY | _DERIVED
     bare = name if name in labels else re.sub(r"_\d+$", "", name)
     number = name[len(bare) + 1 :]
-    label = labels[bare.removesuffix("_I")].format("I" if bare.endswith("_I") else "Vsc")
+    letter = "" if bare in labels else bare[-1]
+    label = labels[bare if bare in labels else bare[:-2]].format(describe_channel(letter))
     return label + (f", record {number}" if number else "")
+
+
+def describe_channel(letter: str) -> str:
+    """Return the name of a channel by the end of the names of its nuisances: "" means Vsc."""
+    return _CHANNELS[letter]
 
 
 def summarize_draws(name: str, draws: Float[np.ndarray, "*shape"]) -> Summary:

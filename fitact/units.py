@@ -21,7 +21,7 @@ _UNITS = {
     "Z": "ohm", "Z_capacitance": "F", "series_resistor": "ohm", "Rgap": "ohm", "Cgap": "F",
     "gain_V": "1", "compensation": "1", "nonlinearity_even": "1", "nonlinearity_odd": "1", "compensation_V": "1",
     "nonlinearity_V_even": "1", "nonlinearity_V_odd": "1", "probe_resistance": "ohm", "probe_capacitance": "F",
-    "gain": "1", "relative_noise": "1", "delay": "s", "clock": "1", "sigma": "V",
+    "gain": "1", "delay": "s", "clock": "1", "sigma": "V", "sigma_Z": "1", "sigma_H": "1",
     "alpha": "1", "Vsc_peak_to_peak": "V", "log_sd": "1", "slope": "1", "correlation": "1",
     "offset": "V", "drift": "V", "charge": "V", "charge_2": "V", "charge_3": "V", "charge_4": "V",
     "hum_50Hz_cos": "V", "hum_50Hz_sin": "V", "hum_60Hz_cos": "V", "hum_60Hz_sin": "V",
@@ -103,7 +103,7 @@ def _prefix_exponent(value: float) -> int:
 def quantity_unit(name: str) -> str:
     """Return the SI unit of a quantity; the name of a nuisance may end in a channel label, e.g. "sigma_I_2"."""
     bare = name if name in _UNITS else re.sub(r"_\d+$", "", name)
-    unit = _UNITS[bare.removesuffix("_I")]
+    unit = _UNITS[bare if bare in _UNITS else re.sub("_[IZH]$", "", bare)]
     return "A" if bare.endswith("_I") and unit == "V" else unit
 
 

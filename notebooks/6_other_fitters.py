@@ -88,7 +88,7 @@ scene = fitact.Scene.from_dict({"prior": prior})
 rows = []
 for case in cases:
     z = np.array(case["real"]) + 1j * np.array(case["imag"])
-    found = fitact.fit_spectrum(fitact.Spectrum.from_arrays(frequency, z), scene)
+    found = fitact.fit(fitact.Spectrum.from_arrays(frequency, z), scene)
     parts = [found.parameters()[name] for name in ("Rsc", "Csc", "Ci")]
     values, errors = (np.array([part[key] for part in parts]) * [2.0, 0.5, 1.0] for key in ("q50", "sd"))
     rows.append({"values": values.tolist(), "errors": errors.tolist(), "said": found.result})

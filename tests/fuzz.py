@@ -1,4 +1,4 @@
-"""Damage oscilloscope files at random: each must give a record or a one-line error, quickly and in little memory.
+"""Damage files at random: each must give a record, spectra or a one-line error, quickly and in little memory.
 
     python -m tests.fuzz --count 20000 --seed 0
 
@@ -22,8 +22,10 @@ import numpy as np
 import fitact
 from fitact.data.readers.capture import resolve_channels
 from fitact.data.readers.read import read_capture
+from fitact.data.readers.spectrum import is_spectrum
 
 SCOPE = Path(__file__).parent / "data" / "scope"
+REAL = Path(__file__).parents[2] / "shared" / "real"  # files of others' instruments, which are not shipped
 SECONDS = 10.0  # time limit for one file, s
 MEGABYTES = 1000.0  # limit on the rise of peak memory by one file, MB; a string of damaged length in HDF5 takes 800
 TOKENS = (
@@ -36,12 +38,16 @@ TOKENS = (
 def samples() -> dict[str, bytes]:
     """Return the files to damage: the shipped ones, and one of each kind with named arrays."""
     from tests.data.test_scope_files import NAMED
+    from tests.data.test_spectrum import write_layouts
 
     found = {path.name: path.read_bytes() for path in sorted(SCOPE.iterdir()) if path.suffix != ".md"}
     with tempfile.TemporaryDirectory() as folder:
         for name, write in NAMED.items():
             write(Path(folder) / name)
             found[name] = (Path(folder) / name).read_bytes()
+        spectra = write_layouts(Path(folder))
+        spectra += [path for kind in ("bode", "impedance_py", "pyimpspec") for path in sorted((REAL / kind).glob("*"))]
+        found |= {f"spectrum {path.name}": path.read_bytes() for path in spectra}
     return found
 
 
@@ -110,8 +116,13 @@ def _swap_lines(rng: random.Random, content: bytearray, other: bytes) -> None:
 
 
 def outcome(path: Path) -> str:
-    """Return "record", "capture" or "refused" for a file; any other exception is raised."""
+    """Return "spectrum", "record", "capture" or "refused" for a file; any other exception is raised."""
     try:
+        if is_spectrum(path):
+            for spectrum in fitact.read_spectra(path):
+                assert np.all(np.isfinite(spectrum.values) & np.isfinite(spectrum.frequency))
+                assert np.all(np.diff(spectrum.frequency) > 0.0)
+            return "spectrum"
         capture = read_capture(path)
         assert len({trace.values.size for trace in capture.channels} | {capture.time.size}) == 1
         fitact.inspect(path)

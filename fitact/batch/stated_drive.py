@@ -21,6 +21,7 @@ from fitact.fitting.least_squares import MIN_BIC_DECREASE
 from fitact.fitting.problem import MIN_RELATIVE_NOISE, Problem
 from fitact.fitting.residual_statistics import is_misfit, residual_statistics
 from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics
+from fitact.fitting.starting_point import VscEstimate
 from fitact.likelihood.channel import LINEAR_NUISANCES
 from fitact.model.chirp import Chirp
 from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, chebyshev
@@ -45,7 +46,12 @@ class StatedDriveProblem(BatchProblem):
         """
         likelihood, (source, *others) = problem.likelihood, problem.sources
         (trace, *_), choice, start = likelihood.channels, source.choice, source.start
-        if others or start is None or not math.isfinite(start.b) or trace.n_samples > cls.settings.max_samples:
+        if (
+            others
+            or not isinstance(start, VscEstimate)
+            or not math.isfinite(start.b)
+            or trace.n_samples > cls.settings.max_samples
+        ):
             return None
         is_plain = trace.channel == "Vsc" and trace.noise == "white" and trace.equally_weighted and not trace.timing
         has_other_model = isinstance(likelihood.template, WithSkin) or isinstance(choice.drive, Chirp)
@@ -54,13 +60,14 @@ class StatedDriveProblem(BatchProblem):
         )
         if not is_plain or has_other_model or has_nuisances or choice.name == "measured":
             return None
-        time = source.record.time
+        record = source.in_time
+        time = record.time
         basis = SharedBasis.from_drive(choice.drive, time, choice.steady_state, start.b)
         shared = dataclasses.replace(trace, compression=basis.compression(time.size), columns=()).without_samples()
         return cls(
             likelihood=likelihood.replace_channel(0, shared),
-            derive=derived.derived_from_fit(likelihood, source.record, choice, source.scene, start.b),
-            phases=PhaseBins.from_times(time, source.record.frequency() if choice.periodic else None),
+            derive=derived.derived_from_fit(likelihood, record, choice, source.scene, start.b),
+            phases=PhaseBins.from_times(time, record.frequency() if choice.periodic else None),
             samples=time.size,
             optional_nuisances=source.optional_nuisances,
             basis=basis,

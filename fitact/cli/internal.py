@@ -8,7 +8,8 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "data.readers.read": ["write_csv"],
         "data.simulate": ["simulate"],
-        "data.spectrum": ["is_spectrum"],
+        "data.kramers_kronig": ["check_kramers_kronig"],
+        "data.readers.spectrum": ["is_spectrum"],
         "design.drive": ["require_designable"],
         "fitting.profile": ["table"],
         "model_selection.fit_planned": ["fit_planned", "plan_for_record"],

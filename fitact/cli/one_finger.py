@@ -26,6 +26,9 @@ def run(
     channel: options.Channels = None,
     scale: options.Scales = None,
     rate: options.Rate = None,
+    spectrum: options.SpectrumNumber = None,
+    shunt: options.Shunt = None,
+    band: options.Band = None,
     out: options.RecordOut = None,
     level: options.Level = "emcee",
     model: options.Model = "planned",
@@ -34,14 +37,15 @@ def run(
     fresh: options.Fresh = False,
     json: options.Json = False,
 ) -> None:
-    """Fit records, sample the posterior and write a report, all into one folder.
+    """Fit records and spectra, sample the posterior and write a report, all into one folder.
 
     Writes fit.json, summary.json, posterior.nc (for ArviZ), chain.h5 (to resume sampling) and report.html into DIR.
-    Several records are fitted jointly.
+    Several records or spectra are fitted jointly.
     """
     announce("reading", records)
     folder = out or Path(f"{records[0].name.removesuffix('.gz').removesuffix('.csv')}-fitact")
-    planned = _fit_records(records, scene, (channel, scale, rate), model, tolerance)
+    choice = spectrum, shunt, band
+    planned = _fit_records(records, scene, (channel, scale, rate), choice, model, tolerance)
     print_stderr(planned.sentence)
     chain = folder / "chain.h5"
     if fresh:
@@ -68,6 +72,9 @@ def fit(
     channel: options.Channels = None,
     scale: options.Scales = None,
     rate: options.Rate = None,
+    spectrum: options.SpectrumNumber = None,
+    shunt: options.Shunt = None,
+    band: options.Band = None,
     out: options.Out = None,
     model: options.Model = "planned",
     tolerance: options.Tolerance = 1e-3,
@@ -85,27 +92,22 @@ def fit(
     ] = False,
     json: options.Json = False,
 ) -> None:
-    """Fit records, or an impedance spectrum, by least squares; print parameters, standard errors and identifiability.
+    """Fit records and spectra by least squares; print parameters, standard errors and identifiability.
 
-    With --out, writes fit.json into DIR. Several records are fitted jointly.
+    With --out, writes fit.json into DIR. Several records or spectra are fitted jointly.
     """
-    fitted: fitact.SpectrumFit | fitact.Fit
     announce("reading", records)
-    if len(records) == 1 and internal.is_spectrum(records[0]):
-        loaded, spectrum = options.load_scene(scene[0] if scene else None), fitact.read_spectrum(records[0])
-        fitted = fitact.fit_spectrum(spectrum, loaded)
-        text, content = str(fitted), fitted.to_dict()
-    else:
-        planned = _fit_records(records, scene, (channel, scale, rate), model, tolerance, starts)
-        fitted = planned.fit
-        text, content = f"{fitted}\n{planned.sentence}", fitted.to_dict() | {"plan": planned.to_dict()}
-        if intervals:
-            with_prior, without = fitted.intervals(), fitted.intervals(prior=False)
-            text = f"{text}\n{internal.table(with_prior, without)}"
-            content["intervals"] = {
-                name: {"with_prior": interval.to_dict(), "without_prior": without[name].to_dict()}
-                for name, interval in with_prior.items()
-            }
+    choice = spectrum, shunt, band
+    planned = _fit_records(records, scene, (channel, scale, rate), choice, model, tolerance, starts)
+    fitted = planned.fit
+    text, content = f"{fitted}\n{planned.sentence}", fitted.to_dict() | {"plan": planned.to_dict()}
+    if intervals:
+        with_prior, without = fitted.intervals(), fitted.intervals(prior=False)
+        text = f"{text}\n{internal.table(with_prior, without)}"
+        content["intervals"] = {
+            name: {"with_prior": interval.to_dict(), "without_prior": without[name].to_dict()}
+            for name, interval in with_prior.items()
+        }
     if out is not None:
         write_json(out / "fit.json", content)
     show(text, content, json, fitted.trusted)
@@ -171,6 +173,7 @@ def _fit_records(
     records: list[Path],
     scenes: list[Path] | None,
     columns: options.Columns,
+    choice: options.SpectrumChoice,
     model: options.Model,
     tolerance: float,
     starts: int = 1,
@@ -181,7 +184,16 @@ def _fit_records(
     paired = loaded if len(loaded) == len(records) else [loaded[0] if loaded else None] * len(records)
     column_kwargs = options.column_options(columns)
     # invalid files are refused before the slow imports
-    measured = [fitact.read(path, scene, **column_kwargs) for path, scene in zip(records, paired, strict=True)]
-    for path, record in zip(records, measured, strict=True):
-        print_stderr(f"fitting {path} ({len(record):,} samples)")
-    return internal.fit_planned(measured, loaded, model, starts=starts, tolerance=tolerance)
+    measured: list[fitact.Record | fitact.Spectrum] = []
+    given = []
+    for path, stated in zip(records, paired, strict=True):
+        found: list[fitact.Record | fitact.Spectrum]
+        if internal.is_spectrum(path):
+            found, unit = [*options.read_spectra(path, choice)], "points"
+        else:
+            found, unit = [fitact.read(path, stated, **column_kwargs)], "samples"
+        print_stderr(f"fitting {path} ({', '.join(f'{len(each):,} {unit}' for each in found)})")
+        measured += found
+        given += [stated] * len(found)
+    scenes_given = [each for each in given if each is not None] if len(loaded) > 1 else loaded
+    return internal.fit_planned(measured, scenes_given, model, starts=starts, tolerance=tolerance)

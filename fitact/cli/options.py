@@ -41,6 +41,19 @@ Rate = Annotated[
     str | None,
     typer.Option("--rate", metavar="RATE", help="Sampling rate, e.g. 48kHz, for times that were rounded when written."),
 ]
+SpectrumNumber = Annotated[
+    str | None,
+    typer.Option("--spectrum", metavar="N", help="Number of a spectrum in a file that holds several, from 1, or all."),
+]
+Shunt = Annotated[
+    str | None,
+    typer.Option(
+        "--shunt", metavar="R", help="Resistor, e.g. 1kohm, over which a gain was recorded: gives an impedance."
+    ),
+]
+Band = Annotated[
+    str | None, typer.Option("--band", metavar="LOW..HIGH", help="Frequencies of a spectrum to use, e.g. 10Hz..100kHz.")
+]
 SceneFiles = Annotated[
     list[Path] | None,
     typer.Option(
@@ -86,6 +99,7 @@ Model = Annotated[
     ),
 ]
 Columns = tuple[list[str] | None, list[str] | None, str | None]  # --channel, --scale and --rate as given
+SpectrumChoice = tuple[str | None, str | None, str | None]  # --spectrum, --shunt and --band as given
 Results = Annotated[Path, typer.Argument(metavar="DIR", help="Folder with the results.")]
 Fresh = Annotated[bool, typer.Option("--fresh", help="Start a new chain instead of resuming the one in DIR.")]
 
@@ -114,16 +128,34 @@ def column_options(columns: Columns) -> dict[str, Any]:
     return {
         "channels": parse_pairs("--channel Vsc=CH2", channels),
         "scale": parse_numbers("--scale Vsc=10", scale),
-        "rate": None if rate is None else parse_rate(rate),
+        "rate": None if rate is None else parse_option("--rate", rate, "Hz"),
     }
 
 
-def parse_rate(text: str) -> float:
-    """Parse the sampling rate (Hz) of --rate."""
+def parse_option(name: str, text: str, unit: str) -> float:
+    """Parse the quantity of an option."""
     try:
-        return parse_quantity(text, "Hz")
+        return parse_quantity(text, unit)
     except InputError as error:
-        raise InputError(f"--rate: {error}") from error
+        raise InputError(f"{name}: {error}") from error
+
+
+def read_spectra(path: Path, choice: SpectrumChoice) -> list["fitact.Spectrum"]:
+    """Read the spectra of a file that --spectrum chooses, with --shunt and --band; all of them for "all"."""
+    number, resistor, band = choice
+    shunt = None if resistor is None else parse_option("--shunt", resistor, "ohm")
+    if number == "all":
+        spectra = list(fitact.read_spectra(path, shunt))
+    elif number is None or number.isdecimal():
+        spectra = [fitact.read_spectrum(path, None if number is None else int(number), shunt)]
+    else:
+        raise InputError(f"--spectrum {number}: write a number from 1, or all")
+    if band is None:
+        return spectra
+    ends = [parse_option("--band", end, "Hz") for end in band.split("..")]
+    if len(ends) != 2 or not ends[0] < ends[1]:
+        raise InputError(f"--band {band}: write two frequencies, the lower first, e.g. 10Hz..100kHz")
+    return [spectrum.select_band(*ends) for spectrum in spectra]
 
 
 def parse_numbers(example: str, texts: list[str] | None) -> dict[str, float]:

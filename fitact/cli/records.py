@@ -19,13 +19,21 @@ def inspect(
     channel: options.Channels = None,
     scale: options.Scales = None,
     rate: options.Rate = None,
+    spectrum: options.SpectrumNumber = "all",
+    shunt: options.Shunt = None,
+    band: options.Band = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Plot to write (.svg or .png).")] = None,
     json: options.Json = False,
 ) -> None:
     """Show the channels, units, sampling rate, noise, clipping and frequency of a file, and list possible problems."""
     if internal.is_spectrum(file):
-        spectrum = fitact.read_spectrum(file)
-        show(str(spectrum), spectrum.to_dict(), json)
+        spectra = options.read_spectra(file, (spectrum, shunt, band))
+        tests = [internal.check_kramers_kronig(each) for each in spectra]
+        text = "\n".join(f"{each}\n{test}" for each, test in zip(spectra, tests, strict=True))
+        entries = [
+            each.to_dict() | {"kramers_kronig": test.to_dict()} for each, test in zip(spectra, tests, strict=True)
+        ]
+        show(text, entries[0] if len(entries) == 1 else {"source": str(file), "spectra": entries}, json)
         return
     inspection = fitact.inspect(file, **options.column_options((channel, scale, rate)))
     if out is not None:

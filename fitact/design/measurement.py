@@ -18,8 +18,9 @@ from fitact.experiment.fisher import Experiment, force_gradient, signal_spans
 from fitact.experiment.optimise import optimise
 from fitact.experiment.options import Change, changes
 from fitact.fitting.fit import fit
+from fitact.fitting.skin_model import count_harmonics
 from fitact.instrument.classes import typical_gain_u
-from fitact.model.skin import Dispersive, WithSkin, circuit_parameters
+from fitact.model.skin import circuit_parameters
 from fitact.prior.distributions import LogNormal
 from fitact.scene.scene import Scene
 from fitact.tables import align_row, join_lines
@@ -127,6 +128,7 @@ def design_measurement(scene: Scene, records: Record | Sequence[Record] = ()) ->
     if records:
         fitted = fit(records, scene)
         experiment = fitted.experiment
+        assert experiment is not None  # which only spectra have not
         free = [fitted.names.index(name) for name in experiment.free]
         gradient = fitted.laplace.log_gradient("force_mean")[free]
         # the smallest difference between a record's values is the LSB of its ADC, or less
@@ -164,11 +166,7 @@ def experiment_from_scene(scene: Scene) -> Experiment:
         raise InputError(f"scene: [measurement] noise_{silent[0]} is 0, so the data would be exact; state the noise")
     if not prior.names:
         raise InputError("scene: [prior] frees no parameter, so there is nothing to estimate; give a parameter a prior")
-    circuit = scene.make_circuit(values)
-    if isinstance(circuit, WithSkin) and isinstance(circuit.skin, Dispersive):
-        # the number of harmonics must be known before compilation
-        skin = Dispersive(circuit.skin.harmonic_count(scene.drive.lowest_frequency))
-        circuit = dataclasses.replace(circuit, skin=skin)
+    circuit = count_harmonics(scene.make_circuit(values), scene.drive.lowest_frequency)
     prior = prior.drop_marginals(*(name for name in prior.names if name not in circuit_parameters(circuit)))
     anonymous = {"gain": measured.gain_relative_sd, "gain_I": measured.gain_I_relative_sd}
     gain_sd = {name: math.hypot(anonymous[name], scene.gain_u(channel)) for name, channel in GAIN_CHANNELS.items()}

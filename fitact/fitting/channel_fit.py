@@ -6,13 +6,15 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from fitact.compiled import jit
 from fitact.data.record import Record
+from fitact.data.spectrum import Spectrum
 from fitact.fitting.drive_choice import DriveModel
-from fitact.fitting.problem import Source
 from fitact.fitting.residual_statistics import channel_statistics, outliers
+from fitact.fitting.source import Source
+from fitact.fitting.spectra import spectrum_statistics
 from fitact.likelihood.channel import LINEAR_NUISANCES, ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import STUDENT_DOF, student_weight
@@ -27,12 +29,13 @@ class ChannelFit:
     """Result of a fit for one channel of one record."""
 
     label: str  # name among the channels of the fit, e.g. "I_2"; "" for Vsc of a single record
-    channel: str  # "Vsc" or "I"
-    record: Record
+    channel: str  # "Vsc", "I" or "impedance"
+    record: Record | Spectrum
     choice: DriveModel
-    sigma: float  # standard deviation of the noise, estimated from the residuals, V or A
+    # standard deviation of the noise, estimated from the residuals, V or A; for a spectrum relative to the magnitude
+    sigma: float
     linear: dict[str, float]  # free offset, drift, hum and charge at the optimum, V or A
-    residuals: Samples  # data minus fit, V or A
+    residuals: Samples  # data minus fit, V or A; of a spectrum real and imaginary parts in turn
     weight: Samples | None  # relative inverse noise sd; 0 excludes a sample, None means 1
     log_likelihood: float  # log-likelihood of the samples, including all constants
     figures: dict[str, float]  # figures of merit: chi2_reduced, rms_residual, noise_expected, runs_z, ...
@@ -61,21 +64,15 @@ class ChannelFit:
         counted = (channel.weights if channel.whitening is None else np.asarray(channel.whitening.mask))[unpadded] > 0.0
         white = white[unpadded][counted]
         n_fitted = theta.size * white.size / float(likelihood.count) + len(linear)
-        gain = _gain(optimum, channel)
-        noise = sigma if channel.noise == "ar1" else source.noise  # AR(1) noise is estimated only from the residuals
-        time = source.record.time[counted]
-        figures = channel_statistics(white, time, noise, n_fitted, gain, source.record, channel.channel, source.choice)
-        # samples with weights below 0.7 have mostly noise from the drive's slope, which is not white
-        if weight is not None and np.mean((weight > 0.0) & (weight < 0.7)) > 0.01:
-            figures |= {"spectrum_p": 1.0, "line_p": 1.0}
-        weighted = residuals if weight is None else residuals * weight
-        if channel.whitening is not None:  # rms of the residuals before the whitening filter
-            figures["rms_residual"] = float(np.sqrt(np.mean(weighted[counted] ** 2)))
-        if channel.noise == "spectrum":
-            figures["quiet_noise"] = source.noise
-        figures |= {"outliers": 0}
-        if channel.noise != "student":  # which expects them
-            figures |= outliers(weighted, source.record.time, source.noise)
+        if isinstance(source.record, Spectrum):
+            figures = spectrum_statistics(white, n_fitted)
+        else:
+            noise = (
+                sigma if channel.noise == "ar1" else source.noise
+            )  # AR(1) noise is estimated only from the residuals
+            whole = white, source.record.time[counted], noise, n_fitted, _gain(optimum, channel)
+            figures = channel_statistics(*whole, source.record, channel.channel, source.choice)
+            figures |= _weighted_statistics(channel, residuals, weight, counted, source.record.time, source.noise)
         return cls(
             label=channel.label,
             channel=channel.channel,
@@ -89,6 +86,29 @@ class ChannelFit:
             figures=figures,
             full_because=reason,
         )
+
+
+def _weighted_statistics(
+    channel: ChannelLikelihood,
+    residuals: Samples,
+    weight: Samples | None,
+    counted: Bool[np.ndarray, " samples"],
+    time: Samples,
+    noise: float,
+) -> dict[str, float]:
+    """Return figures that depend on the weights of the samples and on the noise model."""
+    figures: dict[str, float] = {"outliers": 0}
+    # samples with weights below 0.7 have mostly noise from the drive's slope, which is not white
+    if weight is not None and np.mean((weight > 0.0) & (weight < 0.7)) > 0.01:
+        figures |= {"spectrum_p": 1.0, "line_p": 1.0}
+    weighted = residuals if weight is None else residuals * weight
+    if channel.whitening is not None:  # rms of the residuals before the whitening filter
+        figures["rms_residual"] = float(np.sqrt(np.mean(weighted[counted] ** 2)))
+    if channel.noise == "spectrum":
+        figures["quiet_noise"] = noise
+    if channel.noise != "student":  # which expects them
+        figures |= outliers(weighted, time, noise)
+    return figures
 
 
 def _gain(optimum: CircuitValues, channel: ChannelLikelihood) -> float:

@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
+from fitact.data.spectrum import Spectrum
 from fitact.fitting import derived
 from fitact.fitting.channel_fit import ChannelFit
 from fitact.fitting.laplace import Laplace
@@ -66,12 +68,7 @@ def _channel_samples(
     laplace: Laplace, channel: ChannelLikelihood, fitted: ChannelFit, taus: Float[np.ndarray, " taus"]
 ) -> ChannelSamples:
     likelihood, record, choice = laplace.likelihood, fitted.record, fitted.choice
-    values, timing = likelihood.to_physical(laplace.theta), {}
-    for name in channel.timing:
-        key = channel.qualified_name(name)
-        total = float(values[key]) - (choice.shift if name == "delay" else 0.0)
-        timing[name] = Timing(likelihood.names.index(key), likelihood.timing[key][1], total)
-    weight = np.ones(len(record)) if fitted.weight is None else fitted.weight
+    weight = np.ones(fitted.residuals.size) if fitted.weight is None else fitted.weight
     if channel.noise == "student":
         weight = weight * np.sqrt(np.asarray(student_weight(weight * fitted.residuals / fitted.sigma)))
     suffix = f"_{channel.label}" if channel.label else ""
@@ -81,25 +78,40 @@ def _channel_samples(
     def find_places(coordinates: tuple[tuple[str, float], ...]) -> tuple[tuple[int, float], ...]:
         return tuple((places[name], power) for name, power in coordinates)
 
+    rows: dict[str, Any] = {"residuals": fitted.residuals, "weight": weight}
+    if isinstance(record, Spectrum):  # real parts, then imaginary parts
+        rows = {name: np.concatenate([x[::2], x[1::2]]) for name, x in rows.items()}
+        zeros = np.zeros(2 * len(record))
+        rows |= {"time": zeros, "voltage": zeros, "frequency": None, "omega": 2.0 * math.pi * record.frequency}
+    else:
+        frequency = record.frequency() if choice.periodic else None
+        rows |= {"time": record.time, "voltage": choice.voltage, "frequency": frequency}
     return ChannelSamples(
+        **rows,
         channel=fitted.channel,
-        time=record.time,
-        voltage=choice.voltage,
-        residuals=fitted.residuals,
-        weight=weight,
         sigma=fitted.sigma,
         noise=fitted.figures["noise_expected"],
         taps=np.ones(1) if channel.whitening is None else np.trim_zeros(np.asarray(channel.whitening.taps), "b"),
-        frequency=record.frequency() if choice.periodic else None,
         steady_state=choice.steady_state,
         unknown_charge=choice.unknown_charge,
         transient=sum(value for name, value in linear.items() if name.startswith("charge")),
         taus=taus,
         nuisances=linear,
-        timing=timing,
+        timing=_free_timing(laplace, channel, choice.shift),
         gains=find_places(channel.gains),
         effects={name: find_places(coordinates) for name, coordinates in channel.effect_sizes},
     )
+
+
+def _free_timing(laplace: Laplace, channel: ChannelLikelihood, shift: float) -> dict[str, Timing]:
+    """Return the free delay and clock of a channel; `shift` (s) is that of the drive before the fit."""
+    likelihood, timing = laplace.likelihood, {}
+    values = likelihood.to_physical(laplace.theta)
+    for name in channel.timing:
+        key = channel.qualified_name(name)
+        total = float(values[key]) - (shift if name == "delay" else 0.0)
+        timing[name] = Timing(likelihood.names.index(key), likelihood.timing[key][1], total)
+    return timing
 
 
 def _components(group: str) -> tuple[str, ...]:

@@ -83,7 +83,8 @@ def noise_information(
     """Return roots of the Fisher information of the noise of all channels of a kind."""
     by_kind: dict[str, list[np.ndarray]] = {}
     for channel, jacobian in zip(likelihood.channels, solution.jacobian, strict=True):
-        by_kind.setdefault(f"noise of {channel.channel}", []).append(np.asarray(np.linalg.qr(jacobian, mode="r")))
+        root = np.asarray(np.linalg.qr(jacobian, mode="r"))
+        by_kind.setdefault(f"noise of {summary.describe_channel(channel.letter)}", []).append(root)
     if likelihood.calibration is not None:
         by_kind["calibration record (noise, and tolerances of its parts)"] = [likelihood.calibration_jacobian]
     return {name: np.concatenate(parts) for name, parts in by_kind.items()}
@@ -92,12 +93,14 @@ def noise_information(
 def gain_shifts(
     likelihood: Likelihood, solution: LeastSquaresResult, root: Float[np.ndarray, "parameters parameters"]
 ) -> dict[str, Float[np.ndarray, " parameters"]]:
-    """Return the change of the optimum for a relative error of 1 in the gains of V, Vsc and I, to first order."""
+    """Return the change of the optimum for a relative error of 1 in the gains of V, Vsc, I and Z, to first order."""
     shifts = {"V": np.zeros(len(root))}
     parts = zip(likelihood.channels, solution.jacobian, solution.signal, solution.sigma, strict=True)
     for channel, jacobian, signal, sigma in parts:
         # the Jacobian is that of data minus model
         shift = -root @ (root.T @ (jacobian[: signal.size].T @ signal)) / sigma
-        shifts[channel.channel] = shifts.get(channel.channel, 0.0) + shift
-        shifts["V"] -= shift
+        name = "Z" if channel.channel == "impedance" else channel.channel
+        shifts[name] = shifts.get(name, 0.0) + shift
+        if name != "Z":
+            shifts["V"] -= shift
     return shifts

@@ -12,7 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact import summary
+from fitact.data.kramers_kronig import KramersKronig, check_kramers_kronig
 from fitact.data.record import Record
+from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
 from fitact.experiment.fisher import Experiment
 from fitact.fitting import derived, remarks
@@ -28,21 +30,23 @@ from fitact.fitting.error_sources import (
     structure_components,
 )
 from fitact.fitting.geometry import UncertainGeometry
-from fitact.fitting.identifiability import assess_identifiability
-from fitact.fitting.instrument_effects import effects_would_change, fill_effects
+from fitact.fitting.identifiability import assess_identifiability, assess_parameters
 from fitact.fitting.laplace import FitResult, Laplace
-from fitact.fitting.least_squares import LeastSquaresResult, solve
+from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.fitting.minimum import Optima
-from fitact.fitting.multistart import choose_start, find_optima, lower_optimum
+from fitact.fitting.multistart import find_optima, lower_optimum
 from fitact.fitting.problem import Problem, build_problem
 from fitact.fitting.profile import PROFILE_QUANTITIES, Interval, profile_intervals
 from fitact.fitting.residual_statistics import is_undersampled, pooled_statistics
+from fitact.fitting.solution import solve_problem
+from fitact.fitting.source import require_record
 from fitact.fitting.verdict import diagnose_fit, misfit_warnings
 from fitact.instrument.classes import TYPICAL, typical_gain_u
 from fitact.likelihood import certificate
+from fitact.likelihood.likelihood import CircuitValues
 from fitact.likelihood.noise import scale_information
 from fitact.model.circuit import FINGER_PARAMETERS
-from fitact.model.skin import constant_skin_circuit
+from fitact.model.skin import circuit_parameters, constant_skin_circuit
 from fitact.scene.scene import Scene
 from fitact.tables import join_lines
 from fitact.uncertainty.budget import Budget, ErrorSource, laplace_components
@@ -62,20 +66,22 @@ class Fit(FitResult):
     Attributes:
         traces: the fitted channels of each record.
         compression_error: error of the compressed log-likelihood near the optimum; None if all samples are summed.
-        experiment: the measurement at the optimum, for designs.
+        experiment: the measurement at the optimum, for designs; None with a spectrum.
         error_sources: sources of error of each coordinate of theta.
         noise_information: root of the Fisher information of each source of noise.
         gain_shifts: change of theta for a relative error of 1 in the gain of V, Vsc or I that nobody stated.
         misfit_effects: effects of what the model lacks, where the verdict needed them.
+        kramers_kronig: the worst of the tests of the spectra; None without spectra.
     """
 
     traces: tuple[ChannelFit, ...]
     compression_error: float | None
-    experiment: Experiment
+    experiment: Experiment | None
     error_sources: tuple[tuple[ErrorSource, ...], ...]
     noise_information: dict[str, Float[np.ndarray, "rows parameters"]]
     gain_shifts: dict[str, Float[np.ndarray, " parameters"]]
     misfit_effects: EffectSizes | None = None
+    kramers_kronig: KramersKronig | None = None
 
     @functools.cached_property
     def budgets(self) -> dict[str, Budget]:
@@ -102,7 +108,7 @@ class Fit(FitResult):
         stated = {"Vsc": measurement.gain_relative_sd > 0.0, "I": measurement.gain_I_relative_sd > 0.0}
         gradient, entries = self._gradients[name], []
         for channel, shift in self.gain_shifts.items():
-            if section.pieces(channel) or stated.get(channel):
+            if section.pieces(channel) or stated.get(channel) or (channel == "Z" and section.pieces("I")):
                 continue
             # the force is computed from V, beside the parameters that follow from it
             direct = 2.0 if channel == "V" and name.startswith("force") else 0.0
@@ -130,12 +136,12 @@ class Fit(FitResult):
 
     @property
     def record(self) -> Record:
-        """The record, or the first of several."""
-        return self.traces[0].record
+        """The record, or the first of several; InputError if there are only spectra."""
+        return require_record(self.traces[0].record)
 
     @property
-    def records(self) -> tuple[Record, ...]:
-        """All records."""
+    def records(self) -> tuple[Record | Spectrum, ...]:
+        """All records and spectra."""
         return tuple({id(channel.record): channel.record for channel in self.traces}.values())
 
     @property
@@ -239,6 +245,7 @@ class Fit(FitResult):
     def model(self) -> dict[str, Any]:
         """Return the fitted model by name."""
         circuit = type(constant_skin_circuit(self.likelihood.template)).__name__
+        has_spectrum = any(isinstance(record, Spectrum) for record in self.records)
         return {
             "circuit": {"FinalCircuit": "final", "DirectGround": "direct", "NaturalGround": "natural"}[circuit],
             "skin": self.scene.skin.level,
@@ -251,6 +258,7 @@ class Fit(FitResult):
             "likelihood": "full" if self.compression_error is None else "compressed",
             "compression_error": self.compression_error,
             "full_because": self.full_because,
+            **({"weighting": self.scene.measurement.weighting} if has_spectrum else {}),
         }
 
     def _likelihood(self) -> str:
@@ -271,8 +279,12 @@ class Fit(FitResult):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of fit.json, which `fitact fit --json` prints."""
-        content = super().to_dict()
-        return content | self.effects.to_dict() | {"notes": [*self.notes, *self.effect_notes]}
+        content = super().to_dict() | self.effects.to_dict() | self.validity()
+        return content | {"notes": [*self.notes, *self.effect_notes]}
+
+    def validity(self) -> dict[str, Any]:
+        """Return `kramers_kronig` of fit.json, for spectra only."""
+        return {} if self.kramers_kronig is None else {"kramers_kronig": self.kramers_kronig.to_dict()}
 
     def _nuisances(self) -> dict[str, float]:
         return dict(zip(self.likelihood.sigma_names, self.laplace.sigmas.tolist(), strict=True)) | self.linear
@@ -301,7 +313,7 @@ class Fit(FitResult):
 
 
 def fit(
-    record: Record | Sequence[Record],
+    record: Record | Spectrum | Sequence[Record | Spectrum],
     scene: Scene | Sequence[Scene] | None = None,
     *,
     prior: bool = True,
@@ -309,7 +321,7 @@ def fit(
     starts: int = 1,
     tolerance: float = certificate.TOLERANCE,
 ) -> Fit:
-    """Fit one circuit to a record, or to several jointly, by Levenberg-Marquardt in log-parameters with their prior.
+    """Fit one circuit to records and spectra, jointly, by Levenberg-Marquardt in log-parameters with their prior.
 
     The (first) scene gives the circuit, the prior and the device. The drive is the recorded V if there is no scene or
     its waveform is "measured", otherwise the waveform of the record's scene. Each channel has its own noise. Offset,
@@ -318,7 +330,8 @@ def fit(
     leaves the setting of JAX unchanged.
 
     Args:
-        record: record, or several, with the channels of the scene; V too, unless the scene states the drive.
+        record: record or spectrum, or several. A record has the channels of the scene; V too, unless the scene states
+            the drive. The force is that of the first record's drive, or of the scene's if there are only spectra.
         scene: device, circuit and prior; one for all records, or one for each.
         prior: whether to use the prior of the circuit; gains, delays and clocks always keep theirs.
         start: parameter values (SI) to start from instead of the estimate from the data.
@@ -331,13 +344,13 @@ def fit(
         InputError: a record is impossible for this circuit, the scene needs a model that is not available, `start`
             names an unknown parameter, or the tolerance is negative or not a number.
     """
-    records = (record,) if isinstance(record, Record) else tuple(record)
+    records = (record,) if isinstance(record, Record | Spectrum) else tuple(record)
     scenes = (scene,) * len(records) if scene is None or isinstance(scene, Scene) else tuple(scene)
     return fit_records(records, scenes, prior=prior, start=start, starts=starts, tolerance=tolerance)
 
 
 def fit_records(
-    records: tuple[Record, ...],
+    records: tuple[Record | Spectrum, ...],
     scenes: tuple[Scene | None, ...],
     drives: Sequence[DriveModel | None] = (),
     *,
@@ -359,6 +372,8 @@ def fit_records(
         )
     for scene in scenes:
         (scene or Scene()).require_available(fit=True)
+    pairs = sorted(zip(records, scenes, strict=True), key=lambda pair: isinstance(pair[0], Spectrum))  # records first
+    records, scenes = (tuple(each) for each in zip(*pairs, strict=True))
     with jax.enable_x64(True):
         try:
             problem = build_problem(records, scenes, prior, drives)
@@ -366,11 +381,11 @@ def fit_records(
             if calibrated.calibration is not None:
                 likelihood = dataclasses.replace(problem.likelihood, calibration=calibrated.calibration)
                 problem = problem._replace(likelihood=likelihood)
-            solved, certified, root = _solve_problem(problem, tolerance, start)
+            solved, certified, root = solve_problem(problem, tolerance, start)
             optima = find_optima(solved, starts) if starts > 1 else None
             lower = None if optima is None else lower_optimum(optima, solved)
             if lower is not None:
-                solved, certified, root = _solve_problem(problem, tolerance, lower)
+                solved, certified, root = solve_problem(problem, tolerance, lower)
             fitted = _assemble_fit(problem, solved, certified, root, optima, without_scene=scenes[0] is None)
             return dataclasses.replace(
                 fitted,
@@ -384,45 +399,6 @@ def fit_records(
             ) from error
 
 
-def _solve_problem(
-    problem: Problem, tolerance: float, start: Mapping[str, float] | None, max_rounds: int = 3, max_change: float = 0.3
-) -> tuple[LeastSquaresResult, certificate.CertifiedLikelihood, np.ndarray]:
-    """Fit, and fit again while effects of instruments for the new optimum would differ by more than `max_change`."""
-    noise, theta = [source.noise for source in problem.sources], choose_start(problem, start)
-    likelihood, end = problem.likelihood, None
-    for _ in range(max_rounds):
-        before, likelihood = theta, fill_effects(likelihood, theta, noise, problem.sources)
-        end = _solve_with_effects(problem._replace(likelihood=likelihood), tolerance, theta)
-        places = dict(zip(end[0].likelihood.names, end[0].theta, strict=True))
-        theta = np.array([places[name] for name in likelihood.names])
-        if effects_would_change(likelihood, before, theta, end[0].sigma) <= max_change:
-            break
-    assert end is not None
-    return end
-
-
-def _solve_with_effects(
-    problem: Problem, tolerance: float, theta_0: np.ndarray
-) -> tuple[LeastSquaresResult, certificate.CertifiedLikelihood, np.ndarray]:
-    """Fit with compression, and again without it for channels where its error exceeds the tolerance."""
-    likelihood, reasons = problem.compress_likelihood(tolerance)
-    noise = np.array([source.noise for source in problem.sources])
-    freeable = tuple(source.optional_nuisances for source in problem.sources)
-    interpolated = [not certificate.reason_against_compression(each, tolerance) for each in likelihood.channels]
-    while True:
-        solved = solve(likelihood, theta_0, noise, freeable, tuple(interpolated))
-        root = solved.covariance_factor()
-        certified = certificate.certify(solved.likelihood, reasons, solved.theta, root, solved.sigma, tolerance)
-        pairs = zip(solved.likelihood.channels, certified.reasons, strict=True)
-        failed = [bool(reason) and channel.compression is not None for channel, reason in pairs]
-        if not any(failed):
-            return solved, certified, root
-        reasons = certified.reasons
-        for i in (i for i, each in enumerate(failed) if each):
-            interpolated[i] = False
-            likelihood = likelihood.replace_channel(i, likelihood.channels[i].without_compression())
-
-
 def _assemble_fit(
     problem: Problem,
     solution: LeastSquaresResult,
@@ -434,7 +410,10 @@ def _assemble_fit(
     likelihood, theta, sigma = certified.likelihood, solution.theta, solution.sigma
     first = problem.sources[0]
     optimum = likelihood.evaluate_circuit(theta)
-    derive = derived.derived_from_fit(likelihood, first.record, first.choice, first.scene, float(optimum.b))
+    if isinstance(first.record, Spectrum):
+        derive = derived.derived_from_scene(likelihood, first.scene)
+    else:
+        derive = derived.derived_from_fit(likelihood, first.record, first.choice, first.scene, float(optimum.b))
     laplace = Laplace(theta, root, sigma, likelihood, derive, derive.log_value_and_grad(theta, sigma))
     traces = tuple(
         ChannelFit.from_optimum(likelihood, i, theta, float(sigma[i]), optimum, source, certified.reasons[i])
@@ -444,27 +423,16 @@ def _assemble_fit(
     figures |= information_criteria(theta.size, traces)
     if optima is not None:
         figures |= {"optima": len(optima.start_counts), "starts_failed": optima.n_failed}
-    warnings: list[str] = []
-    notes = [source.scene.description for source in problem.sources if source.scene.description]
-    for source in problem.sources:
-        fitted = {channel.channel for channel in traces if channel.record is source.record}
-        notes += remarks.unfitted_channel_notes(source.record, fitted)
-    for source, channel in zip(problem.sources, traces, strict=True):
-        warnings += source.warnings
-        notes += source.notes
-        warnings += remarks.channel_warnings(source.record, source.choice, channel.channel, channel.figures)
-    warnings += misfit_warnings(traces)
-    warnings += remarks.parameter_warnings(likelihood, theta)
-    stated = [each.name for each in problem.coordinates if each.is_stated]
-    warnings += remarks.instrument_warnings(likelihood, theta, np.linalg.norm(root, axis=1), stated)
-    force_peak = math.exp(laplace.log_derived[0][derived.DERIVED_NAMES.index("force_peak")])
-    warnings += remarks.plausibility_warnings(first.record, first.scene, first.choice, optimum, force_peak)
-    assumed = remarks.describe_assumed_Ci(None if without_scene else first.scene, likelihood, laplace.prior_sets_Ci)
-    warnings += assumed.warnings
-    notes += assumed.notes
-    notes += UncertainGeometry.from_scene(first.scene, derive.geometry).notes(first.scene, likelihood, theta)
+    said = _collect_remarks(problem, laplace, traces, optimum, without_scene)
+    tests = [check_kramers_kronig(each.record) for each in traces if isinstance(each.record, Spectrum)]
     experiment = problem.experiment(likelihood, optimum.circuit, sigma)
-    gradient = laplace.log_gradient("force_mean")
+    evidence = likelihood.names, root, likelihood.prior_factor, laplace.log_gradient("force_mean")
+    if experiment is None:
+        free = [name for name in likelihood.names if name in circuit_parameters(likelihood.template)]
+        channels = tuple(dict.fromkeys(channel.channel for channel in traces))
+        identifiability = assess_parameters(*evidence, free, channels)
+    else:
+        identifiability = assess_identifiability(*evidence, experiment)
     result, effects = diagnose_fit(solution, root, traces, problem.sources, optima), None
     if result == "misfit":
         effects = assess_fit(laplace, traces, has_structure=True)
@@ -477,10 +445,10 @@ def _assemble_fit(
         laplace,
         result=result,
         figures=figures,
-        identifiability=assess_identifiability(likelihood.names, root, likelihood.prior_factor, gradient, experiment),
+        identifiability=identifiability,
         scene=first.scene,
-        warnings=tuple(dict.fromkeys(warnings)),
-        notes=tuple(dict.fromkeys(notes)),
+        warnings=tuple(dict.fromkeys([*said.warnings, *(test.doubt for test in tests if test.doubt)])),
+        notes=tuple(dict.fromkeys(said.notes)),
         traces=traces,
         compression_error=certified.error,
         experiment=experiment,
@@ -488,7 +456,41 @@ def _assemble_fit(
         noise_information=noise_information(likelihood, solution),
         gain_shifts=gain_shifts(likelihood, solution, root),
         misfit_effects=effects,
+        kramers_kronig=max(tests, key=lambda test: (not test.passed, test.worst_residual), default=None),
     )
     now, after, sources = whole.unchanged_force_u()
     judgement = dataclasses.replace(whole.identifiability, unchanged_u=(now, after), unchanged_sources=sources)
     return dataclasses.replace(whole, identifiability=judgement)
+
+
+def _collect_remarks(
+    problem: Problem,
+    laplace: Laplace,
+    traces: tuple[ChannelFit, ...],
+    optimum: CircuitValues,
+    without_scene: bool,
+) -> remarks.Remarks:
+    """Return what is to be said of the records, the parameters and the scene."""
+    likelihood, theta, first = laplace.likelihood, laplace.theta, problem.sources[0]
+    warnings: list[str] = []
+    notes = [source.scene.description for source in problem.sources if source.scene.description]
+    for source in problem.sources:
+        fitted = {channel.channel for channel in traces if channel.record is source.record}
+        if isinstance(source.record, Record):
+            notes += remarks.unfitted_channel_notes(source.record, fitted)
+    for source, channel in zip(problem.sources, traces, strict=True):
+        warnings += source.warnings
+        notes += source.notes
+        if isinstance(source.record, Record):
+            warnings += remarks.channel_warnings(source.record, source.choice, channel.channel, channel.figures)
+    warnings += misfit_warnings(traces)
+    warnings += remarks.parameter_warnings(likelihood, theta)
+    stated = [each.name for each in problem.coordinates if each.is_stated]
+    spread = np.linalg.norm(laplace.covariance_root, axis=1)
+    warnings += remarks.instrument_warnings(likelihood, theta, spread, stated)
+    force_peak = math.exp(laplace.log_derived[0][derived.DERIVED_NAMES.index("force_peak")])
+    warnings += remarks.plausibility_warnings(first.record, first.scene, first.choice, optimum, force_peak)
+    assumed = remarks.describe_assumed_Ci(None if without_scene else first.scene, likelihood, laplace.prior_sets_Ci)
+    notes += assumed.notes
+    notes += UncertainGeometry.from_scene(first.scene, laplace.derive.geometry).notes(first.scene, likelihood, theta)
+    return remarks.Remarks(tuple(notes), (*warnings, *assumed.warnings))

@@ -43,7 +43,7 @@ class Identifiability:
     force_sd: float  # standard deviation of the mean force, in its logarithm
     force_contraction: float  # 1 - force_sd / prior sd of the same logarithm
     channels: tuple[str, ...]  # channels recorded beside V
-    # the measurement of the data; None for a spectrum
+    # the measurement of the data; None with a spectrum
     experiment: Experiment | None = dataclasses.field(default=None, repr=False, compare=False)
     # gradient of the logarithm of the mean force in the free parameters of `experiment`
     force_gradient: Float[np.ndarray, " free"] | None = dataclasses.field(default=None, repr=False, compare=False)
@@ -66,6 +66,8 @@ class Identifiability:
         force = f"Uncertainty of the mean force{brackets}: {show(self.force_sd, now)} now"
         experiment = self.experiment
         if experiment is None or self.force_gradient is None:
+            if self.channels == ("Vsc",):
+                return NextMeasurement(True, f"{force}; measure the impedance, or record the current I beside Vsc.")
             return NextMeasurement(remedy=f"{force}; measure from below the corner frequency of the skin to above it.")
         with jax.enable_x64(True):
             structure = blind_directions(experiment.circuit, experiment.free, experiment.channels)

@@ -12,10 +12,11 @@ from jaxtyping import Array, Float
 from fitact.compiled import jit, pad_samples
 from fitact.fitting.channel_fit import sample_residuals
 from fitact.fitting.instrument_errors import EFFECTS, V_NONLINEARITY
-from fitact.fitting.problem import Source
+from fitact.fitting.source import Source
 from fitact.instrument.effects import PROBE_TIME_CONSTANT, nonlinearity_shapes, nonlinearity_slopes
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
+from fitact.likelihood.spectrum_channel import SpectrumChannel
 from fitact.model.drive import Sampled
 
 
@@ -30,6 +31,9 @@ def fill_effects(
     for i, (channel, source, sigma) in enumerate(zip(likelihood.channels, sources, noise, strict=True)):
         if channel.effects is not None:
             inputs = likelihood.make_inputs(likelihood.evaluate_circuit(theta).circuit, theta, channel)
+            if isinstance(channel, SpectrumChannel):
+                likelihood = likelihood.replace_channel(i, channel.with_compensation(inputs))
+                continue
             residuals, *_ = sample_residuals(channel.drop_unused_columns(), inputs, np.asarray(sigma))
             signal = np.asarray(channel.observed) - residuals - np.asarray(inputs.effects) @ channel.effects
             effects = _effect_functions(channel, inputs, signal[: channel.n_samples], source)
@@ -46,7 +50,8 @@ def effects_would_change(
     """
     total, ends = 0.0, [likelihood.evaluate_circuit(point) for point in (start, theta)]
     for channel, noise in zip(likelihood.channels, sigma, strict=True):
-        if channel.effects is not None and ends[0].terms:  # no time constants, no estimate
+        # no estimate without time constants
+        if channel.effects is not None and channel.channel in ends[0].terms:
             inputs = [likelihood.make_inputs(e.circuit, x, channel) for e, x in zip(ends, (start, theta), strict=True)]
             terms = [end.terms[channel.channel] for end in ends]
             heights = [float(i.gain) * float(np.sum(t.weight)) for i, t in zip(inputs, terms, strict=True)]
@@ -60,7 +65,7 @@ def _effect_functions(
     channel: ChannelLikelihood, inputs: ChannelInputs, signal: Float[np.ndarray, " samples"], source: Source
 ) -> Float[np.ndarray, "effects samples"]:
     """Return the error of the signal (V or A) for an error of 1 of each effect of the channel, padded."""
-    names, choice, record = [name for name, _ in channel.effect_sizes], source.choice, source.record
+    names, choice, record = [name for name, _ in channel.effect_sizes], source.choice, source.in_time
     functions = dict(zip(EFFECTS[1:3], pad_samples(nonlinearity_shapes(signal)), strict=True))
     if "compensation" in names:
         settled = choice.steady_state or choice.unknown_charge

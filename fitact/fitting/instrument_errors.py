@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from fitact.likelihood.channel import ChannelLikelihood
+from fitact.likelihood.spectrum_channel import SpectrumChannel
 from fitact.model.drive import Sampled
 from fitact.prior.distributions import Distribution, LogNormal
 from fitact.prior.product import multiply
@@ -124,8 +125,11 @@ def _channel_errors(member: Member, kind: str) -> Iterable[tuple[str, Distributi
     """Yield the source and distribution of each error of a kind, and its powers in the channel and in V."""
     name, section, measurement = member.channel.channel, member.scene.instrument, member.scene.measurement
     is_nonlinear, in_V = kind.startswith("nonlinearity"), kind in V_NONLINEARITY
-    field = "nonlinearity" if is_nonlinear else kind
-    for channel, power in ((name, 1.0), ("V", -1.0)):
+    field, is_spectrum = "nonlinearity" if is_nonlinear else kind, isinstance(member.channel, SpectrumChannel)
+    if is_nonlinear and is_spectrum:  # an analyser filters out the harmonics
+        return
+    impedance, signal = (("Z", 1.0), ("V", 1.0), ("I", -1.0)), ((name, 1.0), ("V", -1.0))
+    for channel, power in impedance if name == "impedance" else signal:
         if (is_nonlinear and in_V != (channel == "V")) or (in_V and not isinstance(member.channel.drive, Sampled)):
             continue
         for piece in section.pieces(channel):
@@ -134,7 +138,7 @@ def _channel_errors(member: Member, kind: str) -> Iterable[tuple[str, Distributi
                 # half the non-linearity for each of its shapes, so that their sum stays within the limits
                 share = 0.5 if is_nonlinear else 1.0
                 label = kind.replace("_V", "").replace("_", ", ")
-                in_drive = 1.0 if channel == "V" and kind == GAIN else 0.0
+                in_drive = 1.0 if channel == "V" and kind == GAIN and not is_spectrum else 0.0
                 source = f"{section.describe_channels(piece.name)} {label} ({piece.name})"
                 yield source, distribution, share * power, in_drive
     if kind != GAIN:
@@ -154,8 +158,8 @@ def _name_coordinate(
     """Return a name such as "gain", "gain_I" or "gain_V", with the record's number if it is one of several."""
     acting = [each for each, power in zip(members, in_channels, strict=True) if power]
     records = {each.record for each in acting} | {i for i, power in enumerate(in_drives) if power}
-    kinds = {each.channel.channel for each in acting}
-    suffix = "_V" if any(in_drives) or len(kinds) > 1 else "_I" if kinds == {"I"} else ""
+    kinds = {each.channel.letter for each in acting}
+    suffix = "_V" if any(in_drives) or len(kinds) > 1 else "".join(f"_{kind}" for kind in kinds if kind)
     base = kind if kind in V_NONLINEARITY else kind + suffix
-    count = len({each.record for each in members if not kinds or each.channel.channel in kinds})
+    count = len({each.record for each in members if not kinds or each.channel.letter in kinds})
     return f"{base}_{min(records) + 1}" if len(records) == 1 and count > 1 else base

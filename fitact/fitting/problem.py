@@ -12,6 +12,7 @@ from jaxtyping import Float
 from fitact.compiled import MAX_PADDED_LENGTH, as_arrays, pad_samples, pad_weight
 from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
+from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
 from fitact.experiment.blind_directions import gain_names
 from fitact.experiment.fisher import Experiment
@@ -24,7 +25,9 @@ from fitact.fitting.instrument_errors import (
     collect_coordinates,
     largest_gain,
 )
-from fitact.fitting.skin_model import apply_skin_model, exclude_jumps, require_skin_response
+from fitact.fitting.skin_model import apply_skin_model, count_harmonics, exclude_jumps, require_skin_response
+from fitact.fitting.source import Source
+from fitact.fitting.spectra import build_spectrum_channel
 from fitact.fitting.starting_point import Estimate, VscEstimate, estimate_from_vsc, start_from_estimates
 from fitact.instrument.classes import typical_gain_u
 from fitact.instrument.effects import INPUT_RANGE
@@ -42,20 +45,6 @@ from fitact.scene.scene import Scene
 MIN_RELATIVE_NOISE = 1e-9  # least noise sd assumed, relative to the range of the channel
 
 
-class Source(NamedTuple):
-    """Record, scene and drive of a channel, with estimates made before the fit."""
-
-    record: Record
-    scene: Scene
-    choice: DriveModel
-    noise: float  # model-free standard deviation of the channel
-    optional_nuisances: tuple[str, ...]  # nuisances that the BIC may select
-    start: Estimate | None  # estimate from a linear fit, or None
-    notes: tuple[str, ...]  # sentences for information
-    warnings: tuple[str, ...]  # sentences on what may change the result
-    drive_noise_dominates: bool  # whether noise of the drive dominates the channel and biases the fit
-
-
 class Problem(NamedTuple):
     """Likelihood over the samples, sources of its channels, starting point, and the errors of instruments."""
 
@@ -71,11 +60,17 @@ class Problem(NamedTuple):
         channels, reasons = zip(*pairs, strict=True)
         return dataclasses.replace(self.likelihood, channels=channels), reasons
 
-    def experiment(self, likelihood: Likelihood, circuit: Circuit, sigma: np.ndarray) -> Experiment:
-        """Return the measurement at `circuit` as an experiment; several records are repetitions of the first."""
-        source, records = self.sources[0], len({id(source.record) for source in self.sources})
+    def experiment(self, likelihood: Likelihood, circuit: Circuit, sigma: np.ndarray) -> Experiment | None:
+        """Return the measurement at `circuit` as an experiment; several records are repetitions of the first.
+
+        None with a spectrum, whose information no experiment in time has.
+        """
+        source, record = self.sources[0], self.sources[0].record
+        if isinstance(record, Spectrum) or isinstance(self.sources[-1].record, Spectrum):
+            return None
+        records = len({id(source.record) for source in self.sources})
         pairs = zip(likelihood.channels, self.sources, strict=True)
-        channels = tuple(channel.channel for channel, other in pairs if other.record is source.record)
+        channels = tuple(channel.channel for channel, other in pairs if other.record is record)
         fields = circuit_parameters(likelihood.template)
         gains = gain_names(channels)
         free = tuple(name for name in likelihood.prior.names if name in fields or name in gains)
@@ -87,7 +82,7 @@ class Problem(NamedTuple):
             free=free,
             prior_factor=np.linalg.cholesky((factor @ factor.T)[np.ix_(rows, rows)]),
             drive=source.choice.drive,
-            time=source.record.time - source.choice.shift,
+            time=record.time - source.choice.shift,
             channels=channels,
             noise=noise | dict(zip(channels, map(float, sigma), strict=False)),
             steady_state=source.choice.steady_state,
@@ -99,26 +94,36 @@ class Problem(NamedTuple):
 
 
 def build_problem(
-    records: Sequence[Record],
+    records: Sequence[Record | Spectrum],
     scenes: Sequence[Scene | None],
     use_prior: bool = True,
     drives: Sequence[DriveModel | None] = (),
 ) -> Problem:
     """Build the problem with the circuit and prior of the first scene, and a drive and nuisances for each record.
 
-    `drives` holds the drives of the first records, if they are already chosen.
+    Spectra follow the records. `drives` holds the drives of the first records, if they are already chosen.
     """
     first = scenes[0] or Scene()
     prior = first.make_prior()
-    noise = {name: prior[name] for name in ("sigma", "sigma_I") if name in prior.names}
-    likelihood = likelihood_without_channels(
-        first, prior, lambda values: apply_skin_model(first.make_rc_circuit(values), records, scenes)
-    )
+    noise: dict[str, Distribution] = {name: prior[name] for name in ("sigma", "sigma_I") if name in prior.names}
+    in_time = [each for each in records if isinstance(each, Record)]
+
+    def make_circuit(values: dict[str, float]) -> Circuit:
+        if not in_time:
+            return count_harmonics(first.make_circuit(values), first.drive.lowest_frequency)
+        return apply_skin_model(first.make_rc_circuit(values), in_time, scenes[: len(in_time)])
+
+    likelihood = likelihood_without_channels(first, prior, make_circuit)
     taus = likelihood.evaluate_circuit(likelihood.prior.log_mean).tau
     sources, members = [], []
     for number, (record, scene, drive) in enumerate(itertools.zip_longest(records, scenes, drives)):
-        choice, suffix = drive or choose_drive(record, scene), str(number + 1) * (len(records) > 1)
-        stated = scene or Scene()
+        stated, suffix = scene or Scene(), str(number + 1) * (len(records) > 1)
+        if isinstance(record, Spectrum):
+            spectrum, source = build_spectrum_channel(record, stated, suffix)
+            sources.append(source)
+            members.append(Member(spectrum, number, stated, 0.0))
+            continue
+        choice = drive or choose_drive(record, scene)
         for name in _channels(record, scene):
             channel, source, edge_sd = _build_channel(record, stated, choice, name, suffix, likelihood.template, taus)
             sources.append(source)
@@ -130,7 +135,7 @@ def build_problem(
         likelihood,
         channels=channels,
         prior=_prior_as_arrays(likelihood.prior.replace_marginals(**nuisances)),
-        sigma_prior=tuple(noise.get("sigma" if channel.channel == "Vsc" else "sigma_I") for channel in channels),
+        sigma_prior=tuple(noise.get(f"sigma_{each.letter}".rstrip("_")) for each in channels),
         use_prior=use_prior,
     )
     start = start_from_estimates(likelihood, [source.start for source in sources])

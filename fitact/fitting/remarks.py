@@ -10,6 +10,7 @@ from jaxtyping import Float
 from fitact.data.inspection import check_divider
 from fitact.data.plausibility import check_plausibility, insulator_voltage
 from fitact.data.record import CHANNEL_UNITS, Record
+from fitact.data.spectrum import Spectrum
 from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.residual_statistics import is_undersampled
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
@@ -75,12 +76,15 @@ def parameter_warnings(likelihood: Likelihood, theta: Float[np.ndarray, " parame
 
 
 def plausibility_warnings(
-    record: Record, scene: Scene, choice: DriveModel, optimum: CircuitValues, force_peak: float
+    record: Record | Spectrum, scene: Scene, choice: DriveModel, optimum: CircuitValues, force_peak: float
 ) -> list[str]:
     """Return a warning if the drive, the contact area, the insulator's field or the force (N) is implausible."""
     peak, insulator_peak = float(np.max(np.abs(choice.voltage))), math.nan
     if "I" in optimum.terms:
-        frequency = record.frequency() or 1.0 / float(record.time[-1] - record.time[0])
+        if isinstance(record, Spectrum):
+            frequency = scene.drive.lowest_frequency
+        else:
+            frequency = record.frequency() or 1.0 / float(record.time[-1] - record.time[0])
         circuit = cast(RC, constant_skin_circuit(optimum.circuit))
         insulator_peak = insulator_voltage(peak, optimum.terms["I"], circuit.Ci, frequency)
     return check_plausibility(scene, peak, insulator_peak, force_peak)

@@ -1,5 +1,6 @@
 """Fits with frequency-dependent skins: the circuit for given records, and the drives that are refused."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -9,7 +10,7 @@ from jaxtyping import Float
 from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.fitting.drive_choice import DriveModel, has_ideal_edges, ideal_edge_mask
-from fitact.model.circuit import RC
+from fitact.model.circuit import RC, Circuit
 from fitact.model.drive import Periodic
 from fitact.model.skin import MAX_DISPERSION_FREQUENCY, Dispersive, Fractional, TimeConstantGrid, WithSkin
 from fitact.scene.scene import Scene
@@ -28,6 +29,13 @@ def apply_skin_model(circuit: RC, records: Sequence[Record], scenes: Sequence[Sc
     fastest = 100.0 / min(record.time_step for record in records)
     alpha = np.asarray(scene.fixed_values().get("alpha", scene.skin.alpha))
     return WithSkin(circuit, Fractional(alpha), TimeConstantGrid.from_frequency_range(0.3 * slowest, fastest))
+
+
+def count_harmonics(circuit: Circuit, frequency: float) -> Circuit:
+    """Return the circuit with the number of harmonics of a dispersive skin, which compiled functions need to know."""
+    if not (isinstance(circuit, WithSkin) and isinstance(circuit.skin, Dispersive)):
+        return circuit
+    return dataclasses.replace(circuit, skin=Dispersive(circuit.skin.harmonic_count(frequency)))
 
 
 def _lowest_omega(record: Record, scene: Scene) -> float:

@@ -25,7 +25,15 @@ class VscEstimate(NamedTuple):
     b: float
 
 
-Estimate: TypeAlias = VscEstimate | CurrentEstimate
+class SkinEstimate(NamedTuple):
+    """Rsc (ohm), Csc and Ci (F) from linear fits."""
+
+    Rsc: float
+    Csc: float
+    Ci: float
+
+
+Estimate: TypeAlias = VscEstimate | CurrentEstimate | SkinEstimate
 
 
 def estimate_from_vsc(record: Record, choice: DriveModel, max_divider: float = 0.5) -> VscEstimate:
@@ -72,11 +80,12 @@ def start_from_estimates(
     theta = np.concatenate([likelihood.prior.log_mean, np.zeros(len(likelihood.names) - len(likelihood.prior.names))])
     if current is not None and not current.capacitance > 0.0 and isinstance(likelihood.template, WithSkin):
         current = None  # at one frequency, the constant skin that fits such a current can be unphysical
-    if vsc is None and current is None:
+    known = next((estimate for estimate in estimates if isinstance(estimate, SkinEstimate)), None)
+    if vsc is None and current is None and known is None:
         points = np.vstack([theta, likelihood.sample_prior(theta, draws)])
         return points[int(np.argmin(residual_objective(likelihood, points)))]
     mean, sd = prior_skin_moments(likelihood)
-    skin, logs = _estimate_skin(vsc, current), mean
+    skin, logs = known or _estimate_skin(vsc, current), mean
     if skin is not None:
         logs = np.log(skin)
     elif vsc is not None:

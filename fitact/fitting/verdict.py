@@ -10,8 +10,8 @@ from fitact.compiled import BatchEvaluator
 from fitact.fitting.channel_fit import ChannelFit
 from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.fitting.minimum import Optima
-from fitact.fitting.problem import Source
 from fitact.fitting.residual_statistics import is_misfit
+from fitact.fitting.source import Source
 from fitact.likelihood.likelihood import Likelihood
 from fitact.prior.distributions import Bounded
 from fitact.prior.product import Product

@@ -44,12 +44,20 @@ CLASSES = {
         resistance=(10e6, 0.02),
         capacitance=(12e-12, 0.25),
     ),
+    "impedance-analyser": InstrumentClass(
+        "Gamry, application note on accurate EIS: 99 % accuracy within the contour of the Interface 1010", gain=0.01
+    ),
     "shunt-1%": InstrumentClass("the tolerance of the resistor", gain=0.01),
     "shunt-0.1%": InstrumentClass("the tolerance of the resistor", gain=0.001),
 }
 
 # equipment of a channel for which nobody states any, as an example of what it adds
-TYPICAL = {"V": ("scope-8bit", "probe-10x"), "Vsc": ("scope-8bit", "probe-10x"), "I": ("scope-8bit", "shunt-1%")}
+TYPICAL = {
+    "V": ("scope-8bit", "probe-10x"),
+    "Vsc": ("scope-8bit", "probe-10x"),
+    "I": ("scope-8bit", "shunt-1%"),
+    "Z": ("impedance-analyser",),
+}
 
 
 def typical_gain_u(channel: str) -> float:

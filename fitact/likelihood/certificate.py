@@ -18,6 +18,7 @@ from fitact.likelihood.interpolation import interpolate
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import StudentExpansion, fit_student_scale, student_curvature, student_weight
 from fitact.likelihood.projection import MANY_SAMPLES, compress, is_exactly_uniform, samples_per_period, table_multiple
+from fitact.likelihood.spectrum_channel import SpectrumChannel
 from fitact.model.circuit import HighpassTerms
 from fitact.model.skin import WithSkin
 
@@ -91,6 +92,8 @@ def recompress(channel: ChannelLikelihood, circuit: CircuitValues) -> ChannelLik
 
 def reason_against_compression(channel: ChannelLikelihood, tolerance: float, min_samples: int = 512) -> str:
     """Return why a channel may not be compressed at all, or ""."""
+    if isinstance(channel, SpectrumChannel):
+        return "a spectrum has few points"
     if tolerance == 0.0:
         return "the full sum was requested"
     if channel.n_samples < min_samples:  # compression would save nothing
@@ -269,6 +272,9 @@ def certify(
     excesses = np.where(is_expanded, errors, excesses)
     failures = []
     for i, channel in enumerate(restricted):
+        if isinstance(channel, SpectrumChannel):  # exact
+            failures.append("")
+            continue
         allowed = tolerance / len(restricted) * (expanded_factor if is_expanded[i] else 1.0)
         failure = _compression_failure(errors[i], excesses[i], allowed)
         failures.append((reasons[i] or _TIMING_REASON) if channel.compression is None else failure)

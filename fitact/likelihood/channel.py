@@ -96,6 +96,11 @@ class ChannelLikelihood(eqx.Module):
         """Return the name of a nuisance, followed by the channel's label if there are several channels."""
         return f"{name}_{self.label}" if self.label else name
 
+    @property
+    def letter(self) -> str:
+        """The label without the number of the record: "" for Vsc, "I", "Z" for an impedance, "H" for a gain."""
+        return self.label.rstrip("_0123456789")
+
     def timing_unit(self, name: str) -> ArrayLike:
         """Return the unit of a coordinate of `TIMING_NUISANCES`: in s for a delay, relative for a clock."""
         return self.time_step if name == "delay" else 2.0 * self.time_step / (self.time[-1] - self.time[0])

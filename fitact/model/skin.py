@@ -293,6 +293,8 @@ def with_probe(circuit: Any, probe: Probe | None) -> Any:
     """Return the circuit with another probe; without one, a direct ground of equal skins is a `FinalCircuit`."""
     if isinstance(circuit, WithSkin):
         return dataclasses.replace(circuit, circuit=with_probe(circuit.circuit, probe))
+    if probe is None and isinstance(circuit, FinalCircuit):
+        return circuit
     changed = dataclasses.replace(circuit, probe=probe)
     extras = [field.name for field in dataclasses.fields(changed) if field.name not in FINGER_PARAMETERS]
     if isinstance(changed, DirectGround) and all(getattr(changed, name) is None for name in extras):

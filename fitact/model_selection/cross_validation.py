@@ -20,6 +20,7 @@ from fitact.compiled import jit, pad_samples
 from fitact.data.record import Record
 from fitact.fitting.fit import Fit
 from fitact.fitting.least_squares import least_squares
+from fitact.fitting.source import require_record
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import STUDENT_DOF, student_curvature, student_weight
@@ -52,10 +53,12 @@ def likelihood_mask(trace: ChannelLikelihood) -> Bool[np.ndarray, " samples"]:
 def cross_validate(fit: Fit, folds: int = 10) -> CrossValidation:
     """Return log densities of the blocks of a fit's records, each predicted from the samples outside its fold."""
     starts, total = {}, 0
-    for record in fit.records:
+    for record in map(require_record, fit.records):
         starts[id(record)] = total
         total += int(block_indices(record)[-1]) + 1
-    blocks = [pad_samples(starts[id(trace.record)] + block_indices(trace.record)) for trace in fit.traces]
+    blocks = [
+        pad_samples(starts[id(trace.record)] + block_indices(require_record(trace.record))) for trace in fit.traces
+    ]
     # random folds, so that no fold holds the same part of every period; any seed serves
     folds = min(folds, total)
     fold = np.random.default_rng(0).permutation(total) % folds

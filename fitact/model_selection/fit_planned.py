@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any, Literal, TypeAlias
 
 from fitact.data.record import Record
+from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
 from fitact.fitting.drive_choice import DriveModel, choose_drive, whole_periods
 from fitact.fitting.fit import Fit, fit_records
@@ -34,29 +35,33 @@ class PlannedFit:
         return entry if self.plan is None else entry | self.plan.to_dict()
 
 
-def fit_planned(records: Sequence[Record], scenes: Sequence[Scene], model: Model, **options: Any) -> PlannedFit:
+def fit_planned(
+    records: Sequence[Record | Spectrum], scenes: Sequence[Scene], model: Model, **options: Any
+) -> PlannedFit:
     """Fit with the planned model of a scene, or with the full model if only that describes the records.
 
     If the recorded V drives the fit, the plan is made for the recorded V. `scenes` holds no scene, one for all records,
     or one for each record. Several scenes would have different plans, so they get the full model. `options` as in
     `fitact.fit`.
     """
-    records = tuple(records)
     full: tuple[Scene | None, ...] = tuple(scenes) if len(scenes) > 1 else (*scenes, None)[:1] * len(records)
-    why = _reason_for_full_model(scenes, model)
+    why = _reason_for_full_model(records, scenes, model)
     drives: tuple[DriveModel, ...] = ()
+    in_time = tuple(record for record in records if isinstance(record, Record))
     if not why:  # the drive is needed only for a plan
-        drives = (choose_drive(records[0], scenes[0]),)
+        drives = (choose_drive(in_time[0], scenes[0]),)
         if drives[0].name == "measured" and scenes[0].skin.level != "constant":
             why = "a frequency-dependent skin cannot be planned with a measured drive"
     if why:
-        return PlannedFit(fit_records(records, full, drives, **options), "full", f"Fitted the full model: {why}.")
-    planned = plan(scenes[0], _measured_part(records[0], drives[0]))
+        return PlannedFit(
+            fit_records(tuple(records), full, drives, **options), "full", f"Fitted the full model: {why}."
+        )
+    planned = plan(scenes[0], _measured_part(in_time[0], drives[0]))
     reduced = reduce_scene(scenes[0], planned.left_out)
     same = reduced.drive == scenes[0].drive and reduced.drive.model_fields_set == scenes[0].drive.model_fields_set
-    fitted = fit_records(records, (reduced,) * len(records), drives if same else (), **options)
+    fitted = fit_records(in_time, (reduced,) * len(records), drives if same else (), **options)
     if planned.left_out and fitted.result in _FAILED_RESULTS:
-        whole = _fit_full_model(records, scenes[0], drives, options)
+        whole = _fit_full_model(in_time, scenes[0], drives, options)
         if whole is not None and _failure_rank(whole) < _failure_rank(fitted):
             warning = (
                 f"the record contradicts the planned model, which neglects {', '.join(planned.left_out)}: only the"
@@ -76,8 +81,10 @@ def plan_for_record(record: Record, scene: Scene) -> Plan:
     return plan(scene, _measured_part(record, choose_drive(record, scene)))
 
 
-def _reason_for_full_model(scenes: Sequence[Scene], model: Model) -> str:
+def _reason_for_full_model(records: Sequence[Record | Spectrum], scenes: Sequence[Scene], model: Model) -> str:
     """Return why the full model is fitted without a plan, as a clause; "" if a plan is made."""
+    if any(isinstance(record, Spectrum) for record in records):
+        return "a spectrum shows elements that hardly matter to the force"
     if model == "full":
         return "it was requested"
     if not scenes:

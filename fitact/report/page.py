@@ -45,12 +45,14 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
     try:
         scene = Scene.from_dict(summary["scene"])
         medians = {name: each["q50"] for name, each in summary["parameters"].items()}
+        only_impedance = set(summary["model"]["channels"]) == {"impedance"}
+        wirings = () if only_impedance else (scene_wiring(scene),)
         write_page(
             path,
             "report.html",
             summary=summary,
             charts=make_charts(tree),
-            drawings=(scene_circuit(scene, medians), scene_wiring(scene)),
+            drawings=(scene_circuit(scene, medians), *wirings),
             table=quantity_table(summary),
             channels=CHANNELS,
             budgets=[budget_table(name, entry) for name, entry in summary["budget"].items()],

@@ -10,16 +10,19 @@ from fitact.charts.figure import ALERT, DATA, MODEL, PRIOR, robust_limits
 from fitact.charts.interactive import Axis, Chart, Plot, PlotlyTrace
 from fitact.model.circuit import FINGER_PARAMETERS
 
-CHANNELS = {"Vsc": "skin voltage Vsc", "I": "loop current I"}
+CHANNELS = {"Vsc": "skin voltage Vsc", "I": "loop current I", "impedance": "impedance"}
 _FORCES = {"force_mean": "mean force", "force_rms": "rms force", "force_peak": "peak force"}
 _DENSITY = Axis("density", hides_numbers=True)  # each density is scaled to its own maximum
 
 
 def make_charts(tree: Any, page_columns: int = 10_000) -> dict[str, Chart]:
     """Make the charts of the DataTree of a posterior, by name; `page_columns`: columns for all records of a page."""
-    records = [str(name) for name in tree["observed_data"].data_vars]
-    columns = min(2000, page_columns // len(records))  # screens have no more columns
-    charts = {f"trace_{i}": _channel_chart(tree, name, columns) for i, name in enumerate(records)}
+    names = [str(name) for name in tree["observed_data"].data_vars if not str(name).endswith("_imag")]
+    columns = min(2000, page_columns // len(names))  # screens have no more columns
+    charts = {
+        f"trace_{i}": _spectrum_chart(tree, name) if name.endswith("_real") else _channel_chart(tree, name, columns)
+        for i, name in enumerate(names)
+    }
     return charts | {"corner": _corner_chart(tree), "force": _force_chart(tree)}
 
 
@@ -39,6 +42,35 @@ def _channel_chart(tree: Any, name: str, columns: int) -> Chart:
         _time_plot(series, quantity, columns, expected, f"whole record: minimum and maximum in {columns:,} intervals"),
         _time_plot(series[:, :count], quantity, columns, None, f"first {count:,} samples"),
     )
+
+
+def _spectrum_chart(tree: Any, name: str) -> Chart:
+    """Draw magnitude and phase of a spectrum over frequency, and the relative residuals."""
+
+    def join(group: str, end: str = "") -> np.ndarray:
+        real, imag = (tree[group][f"{name.removesuffix('real')}{part}{end}"].values for part in ("real", "imag"))
+        return real + 1j * imag
+
+    observed = tree["observed_data"][name]
+    (axis,) = observed.dims
+    frequency, values, fitted = observed[axis].values, join("observed_data"), join("constant_data", "_fit")
+    drawn = join("posterior_predictive").reshape(-1, frequency.size)
+    letter, unit = ("|Z|", "Ω") if name.startswith("Z") else ("|Vsc / V|", "")
+    x = Axis.from_values("frequency", "Hz", frequency, log=True)
+    size = Axis.from_values(letter, unit, np.abs(values), log=True)
+    phase, rest = Axis("phase", "°"), Axis("|data / fit − 1|", "%", 0.01)
+    edges = ("5 % predictive", "95 % predictive", "90 % predictive interval")
+    rows = []
+    for y, part in ((size, np.abs), (phase, lambda z: np.angle(z, deg=True))):
+        low, high = np.quantile(part(drawn), [0.05, 0.95], axis=0)
+        band = interactive.band(x, y, frequency, low, high, edges)
+        marks = interactive.points(x, y, frequency, part(values), "data", DATA, size=4.0)
+        rows.append((y, [*band, marks, interactive.line(x, y, frequency, part(fitted), "fit", MODEL)]))
+    for more in rows[1][1]:
+        more["showlegend"] = False
+    left = interactive.points(x, rest, frequency, np.abs(values / fitted - 1.0), "residual", ALERT, size=4.0)
+    below = (rest, [left | {"showlegend": False}])
+    return interactive.chart(interactive.plot(x, *rows, below, heights=(1.6, 1.2, 1.0), size=560, unified_hover=True))
 
 
 def _time_plot(

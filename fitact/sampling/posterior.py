@@ -10,10 +10,11 @@ from typing import Any, Self
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from fitact import summary
 from fitact.data.record import CHANNEL_UNITS
+from fitact.data.spectrum import Spectrum
 from fitact.files import atomic_write
 from fitact.fitting import derived
 from fitact.fitting.channel_fit import ChannelFit
@@ -22,6 +23,7 @@ from fitact.fitting.geometry import Capacitances
 from fitact.likelihood.channel import LINEAR_NUISANCES
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import draw_noise
+from fitact.likelihood.spectrum_channel import join_complex
 from fitact.model_selection.plan import Plan
 from fitact.sampling.chain import Chain
 from fitact.sampling.convergence import Convergence
@@ -160,6 +162,7 @@ class Posterior:
             "force_basis": self.fit.force_basis,
             "budget": self._budget_entries(),
             **self.fit.effects.to_dict(),
+            **self.fit.validity(),
             "warnings": list(self.warnings),
             "notes": [*self.fit.notes, *self.fit.effect_notes],
             "seed": self.seed,
@@ -211,6 +214,12 @@ class Posterior:
         prior = {name: draws.reshape(ensembles, count) for name, draws in prior_draws.items()}
         observed, constant = xr.Dataset(), xr.Dataset()
         for channel in self.fit.traces:
+            if isinstance(channel.record, Spectrum):
+                axis, variables = _spectrum_axis(channel), _spectrum_variables(channel, channel.record.values)
+                fits = channel.record.values - join_complex(channel.residuals)
+                observed = observed.merge(xr.Dataset(variables, coords=axis))
+                constant = constant.merge(xr.Dataset(_spectrum_variables(channel, fits, "_fit"), coords=axis))
+                continue
             time, name = _time_axis_name(channel), _variable_name(channel)
             unit = {"units": CHANNEL_UNITS[channel.channel]}
             coords = {time: (time, channel.record.time, {"units": "s"})}
@@ -225,7 +234,7 @@ class Posterior:
             "level": self.convergence.level,
             "inference_library_version": importlib.metadata.version("fitact"),
             "record": self._record()["source"],
-            "record_sha256": self.fit.record.fingerprint,
+            "record_sha256": self.fit.records[0].fingerprint,
             "scene": self.fit.scene.to_json(),
             "seed": self.seed,
         }
@@ -254,12 +263,18 @@ class Posterior:
         for i, (channel, model) in enumerate(zip(self.fit.traces, self.fit.likelihood.channels, strict=True)):
             stride = -(-len(channel.record) // 4000)
             signal = functools.partial(_predict_signal, i, stride)
-            time = channel.record.time[::stride]
+            sd = _relative_noise_sd(channel)[::stride]
             chosen = self.points[:, draws], self._deviates[:, draws]
-            mean = derived.evaluate_draws(signal, self.fit.likelihood, model.time.size, *chosen)[..., : time.size]
+            mean = derived.evaluate_draws(signal, self.fit.likelihood, model.time.size, *chosen)[..., : sd.size]
             sigma = np.exp(self.points[:, draws, self.fit.theta.size + i, None])
             noise = draw_noise(rng, model.noise, model.whitening, mean.shape, stride)
-            noisy = mean + sigma * _relative_noise_sd(channel)[::stride] * noise
+            noisy = mean + sigma * sd * noise
+            if isinstance(channel.record, Spectrum):
+                shape = "chain", "draw", *_spectrum_axis(channel)
+                variables = _spectrum_variables(channel, join_complex(noisy), dims=shape)
+                predicted = predicted.assign_coords(_spectrum_axis(channel)).merge(variables)
+                continue
+            time = channel.record.time[::stride]
             axis, unit = _time_axis_name(channel), {"units": CHANNEL_UNITS[channel.channel]}
             predicted[_variable_name(channel)] = ("chain", "draw", axis), noisy.astype(np.float32), unit
             predicted = predicted.assign_coords({axis: (axis, time, {"units": "s"})})
@@ -284,14 +299,32 @@ class Posterior:
 def _relative_noise_sd(channel: ChannelFit) -> Float[np.ndarray, " samples"]:
     """Standard deviation of each sample's noise over the channel's; NaN where a sample was excluded."""
     if channel.weight is None:
-        return np.ones(len(channel.record))
+        return np.ones(channel.residuals.size)
     counts = channel.weight > 0.0
     return np.where(counts, 1.0 / np.where(counts, channel.weight, 1.0), np.nan)
 
 
-def _time_axis_name(channel: ChannelFit) -> str:
+def _time_axis_name(channel: ChannelFit, name: str = "time") -> str:
     number = channel.label.rpartition("_")[2]
-    return f"time_{number}" if number.isdigit() else "time"
+    return f"{name}_{number}" if number.isdigit() else name
+
+
+def _spectrum_axis(channel: ChannelFit) -> dict[str, Any]:
+    """Return the frequencies of a spectrum by the name of their axis."""
+    assert isinstance(channel.record, Spectrum)
+    name = _time_axis_name(channel, "frequency")
+    return {name: (name, channel.record.frequency, {"units": "Hz"})}
+
+
+def _spectrum_variables(
+    channel: ChannelFit, values: Complex[np.ndarray, "*n points"], suffix: str = "", dims: tuple[str, ...] | None = None
+) -> dict[str, Any]:
+    """Return real and imaginary part of a spectrum as variables, since NetCDF has no complex numbers."""
+    letter, unit = ("Z", "ohm") if channel.channel == "impedance" else ("H", "1")
+    name = _time_axis_name(channel, letter)
+    parts = {"real": values.real, "imag": values.imag}
+    dims = dims or tuple(_spectrum_axis(channel))
+    return {f"{name}_{part}{suffix}": (dims, x, {"units": unit}) for part, x in parts.items()}
 
 
 def _variable_name(trace: ChannelFit, channel: str = "") -> str:

@@ -57,12 +57,13 @@ class InstrumentSection(Section):
     V: tuple[str, ...] = ()
     Vsc: tuple[str, ...] = ()
     I: tuple[str, ...] = ()  # noqa: E741  (the name of the channel)
+    Z: tuple[str, ...] = ()
     own: dict[str, CertificateSpec] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _check_pieces(self) -> Self:
         classes: dict[str, str] = {}
-        for channel in ("V", "Vsc", "I"):
+        for channel in ("V", "Vsc", "I", "Z"):
             for name in getattr(self, channel):
                 kind, colon, piece = name.partition(":")
                 if not colon or not piece:
@@ -97,12 +98,14 @@ class InstrumentSection(Section):
     @property
     def is_stated(self) -> bool:
         """Whether any channel has a piece."""
-        return bool(self.V or self.Vsc or self.I)
+        return bool(self.V or self.Vsc or self.I or self.Z)
 
     def describe_channels(self, name: str) -> str:
         """Return the channels that a piece, or an instrument with such channels, belongs to, as "V and Vsc"."""
         channels = [
-            c for c in ("V", "Vsc", "I") if any(n in (name, f"{name}/{n.partition('/')[2]}") for n in getattr(self, c))
+            c
+            for c in ("V", "Vsc", "I", "Z")
+            if any(n in (name, f"{name}/{n.partition('/')[2]}") for n in getattr(self, c))
         ]
         return " and ".join(channels)
 

@@ -236,6 +236,9 @@ class Measurement(Section):
     noise_I: NoiseAmpere = 20e-9
     gain_relative_sd: RelativeSD = 0.0
     gain_I_relative_sd: RelativeSD = 0.0
+    weighting: Literal["estimated", "modulus", "unit", "stated"] = "estimated"
+    spectrum_relative_sd: RelativeSD = 0.0
+    spectrum_floor_sd: AnyOhm = 0.0
     noise_model: Literal["white", "student", "ar1", "spectrum"] = "white"
     quiet: tuple[AnySecond, AnySecond] | None = None
 
@@ -245,6 +248,11 @@ class Measurement(Section):
             raise ValueError(
                 '[measurement] noise_model = \'spectrum\' and quiet = ["0 ms", "5 ms"], the stretch in which the drive'
                 " rests, go together; give both or neither"
+            )
+        if (self.weighting == "stated") != (self.spectrum_relative_sd > 0.0 or self.spectrum_floor_sd > 0.0):
+            raise ValueError(
+                "[measurement] weighting = 'stated' needs spectrum_relative_sd, the standard deviation relative to the"
+                " magnitude, or spectrum_floor_sd (ohm), which belong to it; give both or neither"
             )
         if self.quiet is not None and not self.quiet[0] < self.quiet[1]:
             raise ValueError("[measurement] quiet ends before it begins; write the earlier time first")

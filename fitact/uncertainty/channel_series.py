@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import scipy.fft
 import scipy.signal
-from jaxtyping import Complex, Float
+from jaxtyping import Bool, Complex, Float
 
 from fitact.data.record import is_uniform
 from fitact.likelihood.channel import CHARGES
@@ -30,7 +30,7 @@ class Timing(NamedTuple):
 class ChannelSamples(NamedTuple):
     """Residuals of one channel of one record, with what is known of its noise and its nuisances."""
 
-    channel: str  # "Vsc" or "I"
+    channel: str  # "Vsc", "I" or "impedance"
     time: Rows  # s
     voltage: Rows  # drive at these times, V
     residuals: Rows  # data minus fit, V or A
@@ -49,6 +49,7 @@ class ChannelSamples(NamedTuple):
     gains: tuple[tuple[int, float], ...] = ()
     # the same for 1 + each effect of the instruments, by its name
     effects: Mapping[str, tuple[tuple[int, float], ...]] = types.MappingProxyType({})
+    omega: Rows | None = None  # of a spectrum, rad/s; its rows are all real parts, then all imaginary parts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +67,11 @@ class ChannelSeries:
     is_circular: bool  # whether the rows are whole periods of a steady state
     kind: Literal["samples", "blocks", "period"]  # whether rows are samples, or means of blocks or over periods
     jump: float = 0.0  # of V at the first sample, which stands for the unknown charge, V
+
+    @property
+    def is_early(self) -> Bool[np.ndarray, " rows"]:
+        """Mask of the first half of the record."""
+        return np.arange(self.time.size) < self.time.size // 2
 
     @property
     def step(self) -> float:
@@ -147,8 +153,40 @@ class ChannelSeries:
         return int(scipy.fft.next_fast_len(n + math.ceil(before), real=True))
 
 
+class SpectrumSeries(ChannelSeries):
+    """A spectrum: its rows are the real parts of the response to a drive of 1 V, then the imaginary parts."""
+
+    @property
+    def is_early(self) -> Bool[np.ndarray, " rows"]:
+        """Mask of the lower half of the frequencies."""
+        points = self.time.size // 2
+        return np.tile(np.arange(points) < points // 2, 2)
+
+    @property
+    def frequencies(self) -> Spectrum:
+        """Complex frequencies of the points, rad/s."""
+        assert self.samples.omega is not None
+        return 1j * self.samples.omega
+
+    @property
+    def difference(self) -> Spectrum:
+        """Gain of the derivative, 1/s."""
+        return self.frequencies
+
+    def response(self, gain: Spectrum, rows: Rows, jump: float = 0.0) -> Rows:
+        """Return the gain, whatever the input."""
+        return np.concatenate([gain.real, gain.imag])
+
+    def shapes(self) -> dict[str, Rows]:
+        """Return no shapes: a spectrum has no linear nuisances."""
+        return {}
+
+
 def channel_series(samples: ChannelSamples, max_rows: int) -> tuple[ChannelSeries, ...]:
     """Return the channel as its samples, or as means over periods (if it repeats) and means of blocks."""
+    if samples.omega is not None:
+        columns = samples.time, samples.voltage, samples.residuals, samples.weight
+        return (SpectrumSeries(samples, *columns, is_circular=True, kind="period"),)
     samples = _uniform(samples)
     n, step = samples.time.size, float(samples.time[-1] - samples.time[0]) / (samples.time.size - 1)
     steady, frequency = samples.steady_state, samples.frequency

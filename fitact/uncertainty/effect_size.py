@@ -142,8 +142,7 @@ def _splits(model: LinearModel) -> Iterator[tuple[Columns, Rows, Rows, Bool[np.n
     rows = slice(0, model.rows)
     design, residuals, noise = model.design[rows], model.residuals[rows], model.noise_variance[rows]
     phases = [_drive_phase(each) for each in model.series]
-    halves = np.concatenate([np.arange(each.time.size) < each.time.size // 2 for each in model.series])
-    masks = [halves]
+    masks = [np.concatenate([each.is_early for each in model.series])]
     if all(phase is not None for phase in phases):
         phase = np.concatenate([each for each in phases if each is not None])
         masks += [np.mod(2.0 * phase, 1.0) < 0.5, phase < 0.5]  # early and late in each half-period, rising and falling

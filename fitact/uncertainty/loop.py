@@ -25,6 +25,7 @@ class Addition(NamedTuple):
     layers: float = 0.0  # relative variance of the time constants of two layers in each skin
     dispersion: float = 0.0  # 1 - exponent of the skins
     gap: float = 0.0  # interface gaps of 1 Mohm || 5 nF
+    leads: float = 0.0  # stray capacitances of 10 pF between the terminals of an analyser
 
 
 NOTHING = Addition()
@@ -37,9 +38,12 @@ class LoopImpedances(NamedTuple):
     grounding: Spectrum  # grounding skin, or the environment
     skin_resistances: tuple[float, float]  # of the touching and the grounding skin
     admittance: Spectrum  # of the whole loop, S
+    leads: Spectrum  # admittance between the terminals of an analyser, S
 
     def gain(self, channel: str) -> Spectrum:
-        """Return the ratio of a channel to V."""
+        """Return the ratio of a channel to V, or the impedance (ohm)."""
+        if channel == "impedance":
+            return 1.0 / (self.admittance + self.leads)
         return self.admittance if channel == "I" else self.touching * self.admittance
 
 
@@ -99,7 +103,7 @@ class LoopModel(NamedTuple):
             series = series + (Rgap / (1.0 + s * Rgap * Cgap) if Rgap else 0.0)
         series = series + added.gap * 1e6 / (1.0 + s * 5e-3)
         admittance = s * Ci / (1.0 + s * Ci * (touching + grounding + series))
-        return LoopImpedances(touching, grounding, (R, R2), admittance)
+        return LoopImpedances(touching, grounding, (R, R2), admittance, added.leads * 10e-12 * s)
 
 
 def _skin(R: float, C: float, s: Spectrum, alpha: float, layers: float) -> Spectrum:
@@ -127,7 +131,9 @@ class ChannelModel:
         self, series: ChannelSeries, loop: LoopModel, values: Mapping[str, float | None], instrument: Instrument
     ) -> None:
         """Set the rows, the circuit and its values, and the instrument."""
-        self.series, self.loop, self.values, self.instrument = series, loop, values, instrument
+        self.series, self.values, self.instrument = series, values, instrument
+        # an analyser is connected without the probe
+        self.loop = loop._replace(probe=None) if series.samples.channel == "impedance" else loop
         self.s = series.frequencies
 
     @functools.cached_property

@@ -39,6 +39,8 @@ def known_rivals() -> tuple[Rival, ...]:
         Rival("a series resistor", 100e3, _circuit("resistor"), is_positive=True),
         # one passive probe of 10 Mohm || 12 pF (Tektronix: 8 to 12 pF)
         Rival("the load of a probe", 1.5, _circuit("probe"), is_positive=True),
+        # a few pF remain of unshielded leads after an open compensation
+        Rival("the stray capacitance of leads", 1.0, _circuit("leads")),
         # a trimmer that is off by a tenth; the time constant of a passive probe is 9 Mohm x 12.2 pF
         Rival("the compensation of a probe", 0.1, _filter(_compensation)),
         # the corner of an oscilloscope's AC coupling: 5 to 10 Hz; 20 Hz with a 10x probe's divider undone
@@ -93,6 +95,8 @@ def _compensation(s: Spectrum, a: float, series: ChannelSeries) -> Spectrum:
 
 
 def _ac_coupling(s: Spectrum, a: float, series: ChannelSeries) -> Spectrum:
+    if series.samples.channel == "impedance":
+        return np.ones_like(s)
     corner = 2.0 * math.pi * a
     return np.where(s == 0.0, 0.0, s / np.where(s == 0.0, 1.0, s + corner))
 
@@ -100,6 +104,8 @@ def _ac_coupling(s: Spectrum, a: float, series: ChannelSeries) -> Spectrum:
 def _nonlinear_skin(model: ChannelModel, a: Amplitudes) -> Rows:
     """Return the signal if the conductance of each skin grows by `a` at the peak of the voltage, to first order."""
     series, parts, signal = model.series, model.parts, model.signal
+    if series.samples.omega is not None:
+        return signal
     if series.samples.channel == "I":
         ways = (parts.touching * parts.admittance, parts.grounding * parts.admittance)
         voltages = [series.response(way, series.voltage, series.jump) for way in ways]
@@ -141,6 +147,8 @@ _ADC_SHAPES: tuple[tuple[Callable[[Rows], Float[np.ndarray, "amplitudes rows"]],
 def _adc(shape: Callable[[Rows], Float[np.ndarray, "amplitudes rows"]], amplitudes: int) -> Effect:
     def effect(model: ChannelModel, a: Amplitudes) -> Rows:
         signal = model.signal
+        if model.series.samples.omega is not None:  # the harmonics are no part of a spectrum
+            return signal
         full_scale = 1.2 * float(np.max(np.abs(signal)))
         return signal + full_scale * (a @ shape(signal / full_scale))
 

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 import typer
 
@@ -82,6 +83,7 @@ OWN = pytest.mark.thorough  # commands that other tests also run
 CASES = [
     pytest.param("fit", [*FINGER], id="fit"),
     pytest.param("fit", [*FINGER, "--intervals"], id="fit --intervals", marks=OWN),
+    pytest.param("fit", ["z.csv"], id="fit a spectrum"),
     pytest.param("inspect", [FINGER[0]], id="inspect"),
     pytest.param("plan", ["natural-ground"], id="plan"),
     pytest.param("simulate", ["phone", "--out", "phone.csv"], id="simulate"),
@@ -112,6 +114,9 @@ CASES = [
 def test_keys_are_those_of_the_page(command, arguments, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("felt.toml").write_text('[perception]\nthreshold_force = "0.1 mN"\n')
+    frequency = np.geomspace(1.0, 1e5, 30)
+    z = 3e5 / (1.0 + 1j * frequency / 50.0) - 1e8j / frequency
+    np.savetxt("z.csv", np.column_stack([frequency, z.real, z.imag]), delimiter=",", header="f,Z',Z''", comments="")
     monkeypatch.setattr(sys, "argv", ["fitact", *command.split(), *arguments, "--json"])
     with contextlib.redirect_stdout(io.StringIO()) as printed, pytest.raises(SystemExit) as end:
         fitact.cli.main()

@@ -76,6 +76,20 @@ def edited(row: int, column: int, text: str) -> Callable[[Rows], Rows]:
     return edit
 
 
+def test_gw_instek_states_the_step_beside_a_nameless_time(tmp_path: Path):
+    time, values = np.arange(4000) * 1e-5 - 0.02, np.sin(np.arange(4000))
+    header = ["Memory Length,4000,", "Source,CH1,", "Vertical Units,V,", "Sampling Period,1.00000e-05,", "Time, ,"]
+    rows = [f"{t:.6e},{v:.6e}," for t, v in zip(time, values, strict=True)]
+    path = tmp_path / "A0000CH1.CSV"
+    path.write_text("\r\n".join([*header, "Mode,Detail,", "Waveform Data,", *rows, ""]))
+    record = fitact.read(path, fitact.Scene.from_dict({"drive": {"waveform": "sine"}}), channels={"Vsc": "CH1"})
+    np.testing.assert_allclose(record.time, time, atol=1e-12)
+    np.testing.assert_allclose(record["Vsc"], values, atol=1e-6)
+    path.write_text("\r\n".join([*header, "Waveform Data,", *rows[:1000], ""]))
+    with pytest.raises(fitact.InputError, match=r"states 4,000 rows, but the file has 1,000"):
+        fitact.read(path, channels={"Vsc": "CH1"})
+
+
 BAD = {
     "text cell": (edited(101, 1, "abc"), ["line 102", "column 2", "abc"]),
     "empty cell": (edited(101, 1, ""), ["line 102", "column 2", "empty"]),

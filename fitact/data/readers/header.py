@@ -271,6 +271,14 @@ class Header:
         below = self.units.cells[column.place] if self.units else ""
         return not layouts.INDEX_NAMES.isdisjoint((below.lower(), column.name.lower()))
 
+    def _has_stated_step(self, place: int) -> bool:
+        """Return whether a column advances by the time step that the header states."""
+        step, cells = self.time_grid[1], [row.cells[place] for row in self.data_rows[:3] if len(row.cells) > place]
+        numbers = [parse_number(cell, self.decimal_comma) for cell in cells]
+        if step is None or len(numbers) < 2 or numbers[0] is None or numbers[1] is None:
+            return False
+        return abs(numbers[1] - numbers[0] - step) < 1e-3 * step
+
     @functools.cached_property
     def time(self) -> Column | None:
         """Time column, found by name, by unit, or as the first under a header; None if `time_grid` gives the time."""
@@ -279,7 +287,8 @@ class Header:
         times += [c for c in candidates if (layouts.parse_unit(c.unit) or ("",))[0] == "s"]
         times += [c for c in candidates if c.name.lower() in layouts.TIME_NAMES]
         stated = self.find_values(layouts.TIME_UNIT_KEYS)
-        if not self.names and not self.units and min(self.numeric) > 1 and stated and len(candidates) > 1:
+        unnamed = not self.names and not self.units and min(self.numeric) > 1 and stated
+        if len(candidates) > 1 and (unnamed or self._has_stated_step(candidates[0].place)):
             times += candidates[:1]
         return times[0]._replace(unit=times[0].unit or next(iter(stated), "")) if times else None
 

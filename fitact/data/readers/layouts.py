@@ -21,6 +21,7 @@ MAKERS: tuple[tuple[str, re.Pattern[str]], ...] = tuple(
         ("Keysight", r"^x-axis,"),
         ("PicoScope", r"^\W*\((?:[fpnuµμm]?s)\)[,;\t]"),
         ("Saleae", r"^Time \[s\][,;\t]Channel \d"),
+        ("GW Instek", r"^Memory Length,"),
         ("Rohde & Schwarz", r"^in s[,;\t]"),
     )
 )
@@ -37,10 +38,17 @@ NOT_UNITS = frozenset((
 ))  # fmt: skip
 
 # keys of a header, in lower case without blanks or punctuation
-COUNT_KEYS = ("signalhardwarerecordlength", "recordlength", "numberofdatapoints", "segmentsize", "samples")
+COUNT_KEYS = (
+    "signalhardwarerecordlength",
+    "recordlength",
+    "memorylength",
+    "numberofdatapoints",
+    "segmentsize",
+    "samples",
+)
 STEP_KEYS = (
     "sampleinterval", "increment", "tinc", "timestep", "dt", "tinterval", "xinc", "xincrement", "wfincrement",
-    "signalresolution", "resolution",
+    "signalresolution", "resolution", "samplingperiod",
 )  # fmt: skip
 RATE_KEYS = ("samplerate", "samplingrate", "fs", "rate", "samplefrequency", "samplingfrequency")
 START_KEYS = ("start", "t0", "tstart", "xorg", "xorigin", "starttime", "wfstartoffset", "hardwarexstart", "xstart")

@@ -12,9 +12,9 @@ from fitact.data.readers.binary import is_known_binary, read_binary
 from fitact.data.readers.capture import Capture, Pick, find_channel, resolve_channels, to_record
 from fitact.data.readers.layouts import is_same_grid
 from fitact.data.readers.sampling_rate import replace_rounded_times
+from fitact.data.readers.spectrum import is_spectrum
 from fitact.data.readers.text import is_binary, read_text
 from fitact.data.record import CHANNEL_UNITS, Record
-from fitact.data.spectrum import is_spectrum
 from fitact.errors import InputError
 from fitact.files import atomic_write, read_error
 
@@ -77,7 +77,7 @@ def read_capture(path: str | os.PathLike[str], pick: Pick = lambda names, place:
     if is_binary(head) or is_known_binary(head, path.suffix):
         return read_binary(path, source, head, pick)
     if is_spectrum(path):
-        raise InputError(f"{source}: is an impedance spectrum without time; use fitact fit (fit_spectrum)")
+        raise InputError(f"{source}: is a spectrum, without time; give it to fitact run, fit or inspect")
     return read_text(path, source, pick)
 
 

@@ -1,0 +1,337 @@
+"""Impedance spectra and frequency responses from the files of analysers, oscilloscopes and programs."""
+
+import dataclasses
+import itertools
+import os
+import re
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from fitact.data.readers.header import parse_number, split_cells
+from fitact.data.spectrum import MINIMUM_POINTS, Spectrum
+from fitact.errors import InputError
+from fitact.files import read_error
+from fitact.units import PREFIX_FACTORS, format_engineering
+
+_DELIMITERS = ("\t", ";", ",", " ")
+_FREQUENCY = re.compile(r"^f(req|(?![a-z]))", re.IGNORECASE)
+_REAL = re.compile(r"^-?(re\s*\(?z|z?\s*_?re(al)?\b|zre|z_re|z['’′])(?!['’′])", re.IGNORECASE)
+_IMAGINARY = re.compile(r"^-?(im\s*\(?z|z?\s*_?im(ag(inary)?)?\b|zim|z_im|z['’′]{2}|z[\"”″])", re.IGNORECASE)
+_MAGNITUDE = re.compile(r"^(\|z\||z\s*_?mod|abs\s*\(?z|z_abs|z_magnitude|magnitude)", re.IGNORECASE)
+_GAIN = re.compile(r"^(?P<channel>.*?)\s*(magnitude|gain|\|h\||ratio)", re.IGNORECASE)
+_PHASE = re.compile(r"^(?P<sign>-?)(?P<channel>.*?)\s*(phase|ph[zi]\b|theta|arg\s*\(?z)", re.IGNORECASE)
+_OHM = re.compile(r"[(/_\[\s]([kKMGm]?)\s*(?:(?i:ohms?)|Ω|Ω)")
+_HERTZ = re.compile(r"[(/_\[\s]([kKM]?)(?i:hz)")
+_LATE_TABLES = re.compile(r"^(EXPLAIN|EC-Lab|<Application>|\"?ZPLOT|\"?Z60W|\0)")  # first lines of long headers
+
+Rows = Float[np.ndarray, "points columns"]
+
+
+class _Layout(NamedTuple):
+    """Meaning of the columns of a table."""
+
+    channel: Literal["impedance", "Vsc"]
+    places: tuple[int, ...]  # columns that must be numbers
+    convert: Callable[[Rows], tuple[np.ndarray, np.ndarray]]  # of these columns to frequency (Hz) and response
+    doubt: str = ""  # why the table might be two things
+
+
+class _Table(NamedTuple):
+    """The header of a table, with how the rows below it are written."""
+
+    end: int  # index of the first line below
+    delimiter: str  # of the rows
+    layout: _Layout
+
+
+def is_spectrum(path: str | os.PathLike[str], head_size: int = 16_384, size: int = 2**22) -> bool:
+    """Return whether a file holds a spectrum, by its layout; the numbers are bytes that are read."""
+    try:
+        content = _read_start(path, head_size)
+        lines = _split_lines(content)
+        lines = lines[:-1] if len(content) == head_size else lines
+        if _LATE_TABLES.search(lines[0] if lines else ""):
+            lines = _split_lines(_read_start(path, size))
+        return any(True for find in (_find_headers, _find_listings, _find_blocks) for _ in find(lines))
+    except OSError:
+        return False
+
+
+def read_spectrum(path: str | os.PathLike[str], number: int | None = None, shunt: float | None = None) -> Spectrum:
+    """Read one spectrum of a file, the only one or that with this `number`, from 1; see `read_spectra`.
+
+    Raises:
+        InputError: as `read_spectra`; also if the file holds different spectra and no number is given.
+    """
+    spectra = read_spectra(path, shunt)
+    if number is None and len({spectrum.fingerprint for spectrum in spectra}) > 1:
+        raise InputError(
+            f"{os.fspath(path)}: holds {len(spectra)} spectra; choose one (--spectrum 1 to {len(spectra)})"
+        )
+    if not 1 <= (number or 1) <= len(spectra):
+        raise InputError(f"{os.fspath(path)}: holds {len(spectra)} spectra, so there is no number {number}")
+    return spectra[(number or 1) - 1]
+
+
+def read_spectra(path: str | os.PathLike[str], shunt: float | None = None) -> tuple[Spectrum, ...]:
+    """Read all spectra of a file, by its layout and not by its suffix.
+
+    The header of a table must name a frequency and an impedance (in parts, or as magnitude and phase), or a gain (dB)
+    and a phase: of one channel over another, of Vsc over V. A leading minus in a column's name, as in -Im(Z)/Ohm,
+    changes the sign. Three columns without a header are frequency, real and imaginary part. docs/spectra.md lists the
+    layouts. With a `shunt` (ohm), a gain is that of the voltage over a resistor between the load and ground, over the
+    voltage of both, and the spectrum is the load's impedance.
+
+    Raises:
+        InputError: the file cannot be read, or holds no spectrum; the message names the line and a remedy.
+    """
+    source = os.fspath(path)
+    try:
+        lines = _split_lines(_read_start(path, 2**26))  # bytes, more than any spectrum has
+    except OSError as error:
+        raise read_error(source, error) from error
+    spectra: list[Spectrum] = []
+    for header in _find_headers(lines):
+        if header.layout.doubt:
+            raise InputError(f"{source}, line {header.end}: {header.layout.doubt}")
+        spectra += _to_spectra(header.layout, np.array(list(_parse_rows(lines, header, source))), source, shunt)
+    for find in (_find_listings, _find_blocks):
+        for block in [] if spectra else find(lines):
+            spectra += _to_spectra(_parts_layout((0, 1, 2), ("f", "Z'", "Z''")), block, source, shunt)
+    if not spectra:
+        raise InputError(
+            f"{source}: no line names a frequency and an impedance or gain above rows of as many numbers; write a"
+            " header such as frequency_Hz,Z_real_ohm,Z_imag_ohm"
+        )
+    return tuple(spectra)
+
+
+def _read_start(path: str | os.PathLike[str], size: int) -> bytes:
+    with Path(path).open("rb") as file:
+        return file.read(size)
+
+
+def _split_lines(content: bytes) -> list[str]:
+    encodings = ("utf-16",) if content[:2] in (b"\xff\xfe", b"\xfe\xff") else ("utf-8-sig",)
+    for encoding in encodings:
+        try:
+            return content.decode(encoding).splitlines()
+        except UnicodeDecodeError:
+            continue
+    return content.decode("latin-1").splitlines()
+
+
+def _find_listings(lines: Sequence[str]) -> Iterator[Rows]:
+    """Yield frequency, real and imaginary part of spectra that Ecochemie (.dfr) and Ivium (.idf, .ids) list."""
+    if lines and re.match(r"VERSION\d", lines[0]):  # nine lines for each point: f, Z', -Z'', and others
+        numbers = [parse_number(line, True) for line in lines[3:]]
+        count = next((i for i, number in enumerate(numbers) if number is None), len(numbers)) // 9
+        yield np.array(numbers[: 9 * count], dtype=float).reshape(-1, 9)[:, :3] * [1.0, 1.0, -1.0]
+    for place, line in enumerate(lines):
+        if line.strip() == "primary_data":  # the numbers of columns and points, then Z', Z'' and f of each point
+            rows = [[parse_number(cell, True) for cell in split_cells(each, " ")] for each in lines[place + 3 :]]
+            rows = list(itertools.takewhile(lambda row: len(row) == 3 and None not in row, rows))
+            yield np.array(rows, dtype=float).reshape(-1, 3)[:, [2, 0, 1]]
+
+
+def _find_headers(lines: Sequence[str]) -> Iterator[_Table]:
+    """Yield the headers of tables, each with rows of as many numbers below it."""
+    for place, line in enumerate(lines):
+        text = re.sub(r"^\s*[#%;]*\s*(Definition=)?", "", line)
+        if "req" not in text.lower() and not text.lower().startswith("f"):
+            continue
+        found = [_match_rows(lines, place + 1, names) for names in _split_names(text)]
+        header = next((each for each in found if each is not None), None)
+        if header is not None:
+            yield header
+
+
+def _split_names(text: str) -> Iterator[list[str]]:
+    """Yield the possible lists of names in a header."""
+    bare = text.strip()
+    if bare[:1] == bare[-1:] == '"' and bare.count('"') == 2:
+        bare = bare[1:-1].strip()
+    for delimiter in (r"\t", ";", ",", r"\s{2,}", r"\s+"):
+        yield [re.sub(r'^"(.*)"$', r"\1", name.strip()).strip() for name in re.split(delimiter, bare)]
+
+
+def _match_rows(lines: Sequence[str], start: int, names: list[str], max_lines: int = 4) -> _Table | None:
+    """Return the header with these names if one of the lines below has as many cells, with numbers where it should."""
+    layout = _find_layout(names)
+    if layout is None:
+        return None
+    while names and not names[-1].strip("0123456789"):  # VersaStudio's end in 0
+        names = names[:-1]
+    for line in lines[start : start + max_lines]:
+        for delimiter in _DELIMITERS:
+            cells = split_cells(line.strip("\r\n"), delimiter)
+            while len(cells) > len(names) and not cells[-1]:
+                cells = cells[:-1]
+            if len(cells) == len(names) and None not in _parse_cells(cells, layout.places, delimiter):
+                return _Table(start, delimiter, layout)
+    return None
+
+
+def _parse_cells(cells: Sequence[str], places: Sequence[int], delimiter: str) -> list[float | None]:
+    """Return the numbers in some cells; where a comma does not separate them, it may be decimal."""
+    return [parse_number(cells[i], delimiter != ",") if i < len(cells) else None for i in places]
+
+
+def _parse_rows(lines: Sequence[str], header: _Table, source: str, max_lines: int = 4) -> Iterator[list[float]]:
+    """Yield the rows of numbers below a header and lines of units."""
+    begun = False
+    for line, text in enumerate(lines[header.end :], header.end + 1):
+        numbers = _parse_cells(split_cells(text, header.delimiter), header.layout.places, header.delimiter)
+        values = [number for number in numbers if number is not None]
+        if len(values) == len(numbers):
+            begun = True
+            yield values
+        elif begun and text.strip() and text.lstrip()[0] in "0123456789+-.":
+            raise InputError(f"{source}, line {line}: '{text.strip()[:40]}' is not a row of numbers; remove it")
+        elif begun or line - header.end > max_lines:
+            return  # the table has ended
+
+
+def _find_blocks(lines: Sequence[str]) -> Iterator[Rows]:
+    """Yield blocks of three numbers in each line, without names above, whose first sweeps like a frequency."""
+    for delimiter in _DELIMITERS:
+        block: list[list[float]] = []
+        above = 0  # cells of the line above the block
+        for line in (*lines, ""):
+            cells = split_cells(line, delimiter)
+            numbers = [parse_number(cell, delimiter != ",") for cell in cells]
+            if len(cells) == 3 and None not in numbers:
+                block.append([number for number in numbers if number is not None])
+                continue
+            if len(block) >= MINIMUM_POINTS and above != 3 and _is_swept(np.array(block)[:, 0]):
+                yield np.array(block)
+            block, above = [], len(cells)
+
+
+def _is_swept(frequency: np.ndarray, min_ratio: float = 3.0) -> bool:
+    """Return whether positive numbers change by steps of very different size, as times do not."""
+    steps = np.abs(np.diff(frequency))
+    return bool(np.all(frequency > 0.0) and np.max(steps) > min_ratio * np.min(steps))
+
+
+def _find_layout(names: list[str]) -> _Layout | None:
+    """Return the meaning of the columns with these names, or None if they are no spectrum."""
+    frequency, real, imaginary = (_find_name(pattern, names) for pattern in (_FREQUENCY, _REAL, _IMAGINARY))
+    if frequency is None:
+        return None
+    if real is not None and imaginary is not None:
+        return _parts_layout((frequency, real, imaginary), [names[i] for i in (frequency, real, imaginary)])
+    size, phases = _find_name(_MAGNITUDE, names), [i for i, name in enumerate(names) if _PHASE.search(name)]
+    if not phases:
+        return None
+    hertz = _find_factor(_HERTZ, names[frequency])
+    if size is not None and (_OHM.search(names[size]) or "z" in names[size].lower()):
+        factor, turn = _find_factor(_OHM, names[size]), _find_turn(names[phases[0]])
+        places = frequency, size, phases[0]
+        return _Layout("impedance", places, lambda x: (hertz * x[:, 0], factor * x[:, 1] * np.exp(turn * x[:, 2])))
+    return _gain_layout(names, frequency, phases, hertz)
+
+
+def _find_name(pattern: re.Pattern[str], names: Sequence[str]) -> int | None:
+    return next((place for place, name in enumerate(names) if pattern.search(name)), None)
+
+
+def _find_factor(pattern: re.Pattern[str], name: str) -> float:
+    prefix = pattern.search(name)
+    return PREFIX_FACTORS[prefix[1]] if prefix else 1.0
+
+
+def _find_turn(name: str) -> complex:
+    """Return the imaginary unit times the unit of a phase in radians, with its sign."""
+    return (-1j if name.startswith("-") else 1j) * (1.0 if "rad" in name.lower() else np.pi / 180.0)
+
+
+def _parts_layout(places: tuple[int, ...], names: Sequence[str]) -> _Layout:
+    """Return the layout of real and imaginary part of an impedance."""
+    hertz, ohm = _find_factor(_HERTZ, names[0]), _find_factor(_OHM, names[1])
+    signs = [-1.0 if name.startswith("-") else 1.0 for name in names[1:]]
+    return _Layout(
+        "impedance", places, lambda x: (hertz * x[:, 0], ohm * (signs[0] * x[:, 1] + 1j * signs[1] * x[:, 2]))
+    )
+
+
+def _gain_layout(names: Sequence[str], frequency: int, phases: Sequence[int], hertz: float) -> _Layout | None:
+    """Return the layout of the gain of one channel over another: one gain, or the magnitudes of two channels."""
+    matches = [(i, match["channel"].strip().lower()) for i, name in enumerate(names) if (match := _GAIN.search(name))]
+    gains = [(i, channel) for i, channel in matches if not channel.startswith("math")] or matches
+    if not gains:
+        return None
+    decibels = ["db" in names[i].lower() for i, _ in gains]
+    linear = [re.search(r"v\s*/\s*v|ratio|\|h\|", names[i], re.IGNORECASE) for i, _ in gains]
+    if not all(d or r for d, r in zip(decibels, linear, strict=True)):
+        doubt = f"the column '{names[gains[0][0]]}' may be an impedance in ohm, or a gain in dB or as a ratio; write"
+        doubt += " its unit in its name, such as |Z| (ohm), Gain (dB) or Gain (V/V)"
+        return _Layout("Vsc", (frequency,), lambda x: (x[:, 0], x[:, 0]), doubt)
+    chosen = gains[:2] if len(gains) > 1 else gains
+    by_channel = {match["channel"].strip().lower(): i for i in phases if (match := _PHASE.search(names[i]))}
+    places, parts = [frequency], []
+    for (i, channel), in_decibels in zip(chosen, decibels, strict=False):
+        phase = by_channel.get(channel, phases[0] if len(chosen) == 1 else None)
+        parts.append((len(places), None if phase is None else len(places) + 1, in_decibels, phase))
+        places += [i] if phase is None else [i, phase]
+    turns = [None if phase is None else _find_turn(names[phase]) for *_, phase in parts]
+
+    def convert(x: Rows) -> tuple[np.ndarray, np.ndarray]:
+        values = []
+        for (i, j, in_decibels, _), turn in zip(parts, turns, strict=True):
+            size = 10.0 ** (x[:, i] / 20.0) if in_decibels else x[:, i]
+            values.append(size if j is None or turn is None else size * np.exp(turn * x[:, j]))
+        return hertz * x[:, 0], np.asarray(values[-1] / values[0] if len(values) > 1 else values[0], dtype=complex)
+
+    return _Layout("Vsc", tuple(places), convert)
+
+
+def _to_spectra(layout: _Layout, rows: Rows, source: str, shunt: float | None) -> Iterator[Spectrum]:
+    """Yield the sweeps of a table; rows at frequencies of 0 or less, in which nothing was measured, are left out."""
+    if not rows.size:
+        return
+    with np.errstate(all="ignore"):  # what is not finite is refused below
+        frequency, values = layout.convert(rows)
+    kept = ~(frequency <= 0.0)
+    notes = (f"{np.count_nonzero(~kept)} rows without a frequency are left out",) if not kept.all() else ()
+    for part in _split_sweeps(frequency[kept]):
+        yield _make_spectrum(layout.channel, frequency[kept][part], values[kept][part], source, notes, shunt)
+
+
+def _split_sweeps(frequency: np.ndarray) -> list[slice]:
+    """Return the parts between jumps back against the direction of the sweep, if each has enough points."""
+    steps = np.sign(np.diff(frequency))
+    direction = np.sign(np.sum(steps)) or 1.0
+    ends = [0, *(np.flatnonzero(steps == -direction) + 1).tolist(), frequency.size]
+    parts = [slice(*pair) for pair in itertools.pairwise(ends)]
+    return parts if all(part.stop - part.start >= MINIMUM_POINTS for part in parts) else [slice(0, frequency.size)]
+
+
+def _make_spectrum(
+    channel: Literal["impedance", "Vsc"],
+    frequency: np.ndarray,
+    values: Complex[np.ndarray, " points"],
+    source: str,
+    notes: tuple[str, ...],
+    shunt: float | None,
+) -> Spectrum:
+    if channel == "impedance":
+        return Spectrum.from_arrays(frequency, values, source, notes)
+    warnings: tuple[Any, ...] = ()
+    if np.median(np.abs(values)) > 1.0:
+        values = 1.0 / values
+        warnings = (
+            f"{source}: the second channel is the larger, which no circuit of resistors and capacitors gives, so the"
+            " gain is taken to be that of the first over the second; check which channel is V",
+        )
+    gain = Spectrum.from_arrays(frequency, values, source, notes, "Vsc", warnings)
+    if shunt is None:
+        return gain
+    note = f"the impedance follows from the gain over a shunt of {format_engineering(shunt, 'ohm')}"
+    with np.errstate(all="ignore"):
+        load = shunt * (1.0 / gain.values - 1.0)
+    return dataclasses.replace(gain, values=load, channel="impedance", notes=(*notes, note))

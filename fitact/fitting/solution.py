@@ -1,0 +1,58 @@
+"""Optimum of a problem: fits with compression, until effects of instruments and weights of spectra no longer change."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from fitact.fitting.instrument_effects import effects_would_change, fill_effects
+from fitact.fitting.least_squares import LeastSquaresResult, solve
+from fitact.fitting.multistart import choose_start
+from fitact.fitting.problem import Problem
+from fitact.fitting.spectra import update_weights
+from fitact.likelihood import certificate
+
+
+def solve_problem(
+    problem: Problem, tolerance: float, start: Mapping[str, float] | None, max_rounds: int = 8, max_change: float = 0.3
+) -> tuple[LeastSquaresResult, certificate.CertifiedLikelihood, np.ndarray]:
+    """Fit, and fit again while effects of instruments for the new optimum would differ by more than `max_change`.
+
+    Also while weights of spectra change by more than a thousandth.
+    """
+    noise, theta = [source.noise for source in problem.sources], choose_start(problem, start)
+    likelihood, end = problem.likelihood, None
+    for _ in range(max_rounds):
+        before, likelihood = theta, fill_effects(likelihood, theta, noise, problem.sources)
+        end = _solve_with_effects(problem._replace(likelihood=likelihood), tolerance, theta)
+        places = dict(zip(end[0].likelihood.names, end[0].theta, strict=True))
+        theta = np.array([places[name] for name in likelihood.names])
+        if effects_would_change(likelihood, before, theta, end[0].sigma) > max_change:
+            continue
+        influences = [jacobian @ end[2] for jacobian in end[0].jacobian]
+        likelihood, change = update_weights(likelihood, theta, problem.sources, influences)
+        if change <= 1e-3:
+            break
+    assert end is not None
+    return end
+
+
+def _solve_with_effects(
+    problem: Problem, tolerance: float, theta_0: np.ndarray
+) -> tuple[LeastSquaresResult, certificate.CertifiedLikelihood, np.ndarray]:
+    """Fit with compression, and again without it for channels where its error exceeds the tolerance."""
+    likelihood, reasons = problem.compress_likelihood(tolerance)
+    noise = np.array([source.noise for source in problem.sources])
+    freeable = tuple(source.optional_nuisances for source in problem.sources)
+    interpolated = [not certificate.reason_against_compression(each, tolerance) for each in likelihood.channels]
+    while True:
+        solved = solve(likelihood, theta_0, noise, freeable, tuple(interpolated))
+        root = solved.covariance_factor()
+        certified = certificate.certify(solved.likelihood, reasons, solved.theta, root, solved.sigma, tolerance)
+        pairs = zip(solved.likelihood.channels, certified.reasons, strict=True)
+        failed = [bool(reason) and channel.compression is not None for channel, reason in pairs]
+        if not any(failed):
+            return solved, certified, root
+        reasons = certified.reasons
+        for i in (i for i, each in enumerate(failed) if each):
+            interpolated[i] = False
+            likelihood = likelihood.replace_channel(i, likelihood.channels[i].without_compression())
