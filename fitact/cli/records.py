@@ -59,7 +59,11 @@ def compare(
     models = {str(path) if same_stems else path.stem: fitact.Scene.load(path) for path in scenes}
     for model in models.values():
         model.require_available(fit=True)
-    measured = list(options.LazyRecords(records, next(iter(models.values())), (channel, scale, rate)))
+    first, columns = next(iter(models.values())), options.column_options((channel, scale, rate))
+    measured = [
+        fitact.read_spectrum(path) if internal.is_spectrum(path) else fitact.read(path, first, **columns)
+        for path in records
+    ]
     comparison = fitact.compare(measured, models)
     show(str(comparison), comparison.to_dict(), json, comparison.trusted)
 

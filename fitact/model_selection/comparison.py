@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.data.record import Record
+from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
 from fitact.fitting.fit import Fit, fit
 from fitact.model_selection.cross_validation import CrossValidation, cross_validate, likelihood_mask
@@ -157,15 +158,17 @@ class Comparison:
     __str__ = summary
 
 
-def compare(records: Record | Sequence[Record], scenes: Mapping[str, Scene] | Sequence[Scene]) -> Comparison:
+def compare(
+    records: Record | Spectrum | Sequence[Record | Spectrum], scenes: Mapping[str, Scene] | Sequence[Scene]
+) -> Comparison:
     """Fit the model of each scene to the same records, and determine which the data prefer.
 
     The score is the elpd, i.e. the log predictive density of blocks of samples given all samples outside their fold.
-    Blocks are whole periods if a record has twenty, else contiguous intervals. If elpds differ by less than 2 standard
-    errors, a BIC that is lower by 10 decides. Each scene applies to all records.
+    Blocks are whole periods if a record has twenty, else contiguous intervals, or points of a spectrum. If elpds differ
+    by less than 2 standard errors, a BIC that is lower by 10 decides. Each scene applies to all records.
 
     Args:
-        records: one record, or several of one finger.
+        records: one record or spectrum, or several of one finger.
         scenes: two or more scenes, by name; without names they are "scene 1", "scene 2", ...
 
     Raises:

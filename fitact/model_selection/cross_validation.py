@@ -18,9 +18,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from fitact.compiled import jit, pad_samples
 from fitact.data.record import Record
+from fitact.data.spectrum import Spectrum
 from fitact.fitting.fit import Fit
 from fitact.fitting.least_squares import least_squares
-from fitact.fitting.source import require_record
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import STUDENT_DOF, student_curvature, student_weight
@@ -34,8 +34,13 @@ class CrossValidation(NamedTuple):
     folds_failed: int  # number of refits that did not converge
 
 
-def block_indices(record: Record) -> Int[np.ndarray, " samples"]:
-    """Return the block of each sample: whole periods if there are `min_periods`, else intervals of equal length."""
+def block_indices(record: Record | Spectrum) -> Int[np.ndarray, " samples"]:
+    """Return the block of each sample: whole periods if there are `min_periods`, else intervals of equal length.
+
+    Each point of a spectrum is a block, of real and imaginary part.
+    """
+    if isinstance(record, Spectrum):
+        return np.repeat(np.arange(len(record)), 2)
     blocks, min_periods = 40, 20  # so many blocks suffice for the standard error of their sum
     frequency, since = record.frequency(), record.time - record.time[0]
     periods = 0 if frequency is None else math.floor((since[-1] + record.time_step) * frequency + 1e-6)
@@ -53,12 +58,10 @@ def likelihood_mask(trace: ChannelLikelihood) -> Bool[np.ndarray, " samples"]:
 def cross_validate(fit: Fit, folds: int = 10) -> CrossValidation:
     """Return log densities of the blocks of a fit's records, each predicted from the samples outside its fold."""
     starts, total = {}, 0
-    for record in map(require_record, fit.records):
+    for record in fit.records:
         starts[id(record)] = total
         total += int(block_indices(record)[-1]) + 1
-    blocks = [
-        pad_samples(starts[id(trace.record)] + block_indices(require_record(trace.record))) for trace in fit.traces
-    ]
+    blocks = [pad_samples(starts[id(trace.record)] + block_indices(trace.record)) for trace in fit.traces]
     # random folds, so that no fold holds the same part of every period; any seed serves
     folds = min(folds, total)
     fold = np.random.default_rng(0).permutation(total) % folds
