@@ -323,11 +323,11 @@ def fit(
 ) -> Fit:
     """Fit one circuit to records and spectra, jointly, by Levenberg-Marquardt in log-parameters with their prior.
 
-    The (first) scene gives the circuit, the prior and the device. The drive is the recorded V if there is no scene or
-    its waveform is "measured", otherwise the waveform of the record's scene. Each channel has its own noise. Offset,
-    drift, mains hum and (for Vsc) delay and clock error are added as free parameters if the BIC favours them; a gain
-    is free only with a prior in the scene. The start is estimated from the records. Computes in double precision and
-    leaves the setting of JAX unchanged.
+    The scene of the first record (or spectrum, without records) gives the circuit, the prior and the device. The drive
+    is the recorded V if there is no scene or its waveform is "measured", otherwise the waveform of the record's scene.
+    Each channel has its own noise. Offset, drift, mains hum and (for Vsc) delay and clock error are added as free
+    parameters if the BIC favours them; a gain is free only with a prior in the scene. The start is estimated from the
+    records. Computes in double precision and leaves the setting of JAX unchanged.
 
     Args:
         record: record or spectrum, or several. A record has the channels of the scene; V too, unless the scene states

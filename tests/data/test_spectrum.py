@@ -65,6 +65,8 @@ FILES = {
     ),
     "ecochemie.dfr": ("VERSION8.0\n 41\n 1", " {f:.9g}\n {re:.9g}\n {minus:.9g}\n 0\n 0\n 0\n 0\n 0\n 0"),
     "ivium.idf": ("\0\0H\nstarttime=\nprimary_data    \n3         \n41        ", "{re:.9g}  {im:.9g}\t{f:.9g} "),
+    "lcr.csv": ("FREQUENCY[Hz],Rs[ohm],Xs[ohm]", "{f:.9g},{re:.9g},{im:.9g}"),
+    "lcr polar.csv": ("Freq (Hz);Z (ohm);θ (deg)", "{f:.9g};{size:.9g};{deg_point}"),
     "radians.csv": ("f (Hz),|Z| (ohm),phase (rad)", "{f:.9g},{size:.9g},{radians:.12g}"),
     "chi.txt": (
         "A.C. Impedance\nInit E (V) = 0\n\nFreq/Hz, Z'/ohm, Z\"/ohm, Z/ohm, Phase/deg\n",
@@ -160,9 +162,12 @@ DIGILENT = "Frequency (Hz),Channel 1 Magnitude (dB),Channel 2 Magnitude (dB)"
         ),
         ("in Sa,Frequency in Hz,Gain in dB,Phase in °,Amplitude in Vpp", "1,{f},{gain},{deg},1", 1.0),
         ("f (kHz);Gain (V/V);Phase (rad)", "{f};{ratio};{rad}", 1e3),
+        ("#,Frequency (Hz),Amplitude (Vpp),Gain (dB),Phase (°)", "1,{f},1,{gain},{deg}", 1.0),
+        ("Frequency(Hz),Amplitude(dB),Phase(deg)", "{f},{gain},{deg}", 1.0),
+        ("Frequency Log(Hz), Gain (dB), Phase (deg)", "{log}, {gain}, {deg}", 1.0),
         (f"{DIGILENT},Channel 1 Phase (deg)", "{f},{two},{one},{deg}", 1.0),
     ],
-    ids=["Digilent", "Moku", "R&S", "ratio", "swapped"],
+    ids=["Digilent", "Moku", "R&S", "ratio", "Keysight", "Siglent", "PicoScope", "swapped"],
 )  # fmt: skip
 def test_frequency_responses(tmp_path: Path, header: str, row: str, scale: float):
     frequency = np.geomspace(10.0, 1e5, 30)
@@ -170,7 +175,14 @@ def test_frequency_responses(tmp_path: Path, header: str, row: str, scale: float
     lines = [header]
     for f, h in zip(frequency, gain_over_shunt, strict=True):
         gain, degrees = 20.0 * math.log10(abs(h)), math.degrees(np.angle(h))
-        cells = {"one": -3.0, "two": gain - 3.0, "gain": gain, "deg": degrees, "later": degrees + 10.0}
+        cells = {
+            "one": -3.0,
+            "two": gain - 3.0,
+            "gain": gain,
+            "deg": degrees,
+            "later": degrees + 10.0,
+            "log": math.log10(f),
+        }
         lines.append(row.format(f=f / scale, ratio=abs(h), rad=math.radians(degrees), **cells))
     path = tmp_path / "bode.csv"
     path.write_text("\n".join(lines), encoding="latin-1")

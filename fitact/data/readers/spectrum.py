@@ -21,9 +21,15 @@ _DELIMITERS = ("\t", ";", ",", " ")
 _FREQUENCY = re.compile(r"^f(req|(?![a-z]))", re.IGNORECASE)
 _REAL = re.compile(r"^-?(re\s*\(?z|z?\s*_?re(al)?\b|zre|z_re|z['’′])(?!['’′])", re.IGNORECASE)
 _IMAGINARY = re.compile(r"^-?(im\s*\(?z|z?\s*_?im(ag(inary)?)?\b|zim|z_im|z['’′]{2}|z[\"”″])", re.IGNORECASE)
-_MAGNITUDE = re.compile(r"^(\|z\||z\s*_?mod|abs\s*\(?z|z_abs|z_magnitude|magnitude)", re.IGNORECASE)
-_GAIN = re.compile(r"^(?P<channel>.*?)\s*(magnitude|gain|\|h\||ratio)", re.IGNORECASE)
-_PHASE = re.compile(r"^(?P<sign>-?)(?P<channel>.*?)\s*(phase|ph[zi]\b|theta|arg\s*\(?z)", re.IGNORECASE)
+_RESISTANCE = re.compile(r"^(r|rs|resistance)(?![a-z])", re.IGNORECASE)  # in the words of LCR meters
+_REACTANCE = re.compile(r"^-?(x|xs|reactance)(?![a-z])", re.IGNORECASE)
+_MAGNITUDE = re.compile(
+    r"^(\|z\||z\s*_?mod|abs\s*\(?z|z_abs|z_magnitude|magnitude|(z|impedance)\s*([(/\[]|$))", re.IGNORECASE
+)
+_GAIN = re.compile(r"^(?P<channel>.*?)\s*(magnitude|gain|amplitude(?=.*db)|\|h\||ratio)", re.IGNORECASE)
+_PHASE = re.compile(r"^-?(?P<channel>.*?)\s*(phase|ph[zi]\b|theta|θ|arg\s*\(?z)", re.IGNORECASE)
+_DECIBEL = re.compile(r"db", re.IGNORECASE)
+_RATIO = re.compile(r"v\s*/\s*v|ratio|\|h\|", re.IGNORECASE)
 _OHM = re.compile(r"[(/_\[\s]([kKMGm]?)\s*(?:(?i:ohms?)|Ω|Ω)")
 _HERTZ = re.compile(r"[(/_\[\s]([kKM]?)(?i:hz)")
 _LATE_TABLES = re.compile(r"^(EXPLAIN|EC-Lab|<Application>|\"?ZPLOT|\"?Z60W|\0)")  # first lines of long headers
@@ -220,20 +226,21 @@ def _is_swept(frequency: np.ndarray, min_ratio: float = 3.0) -> bool:
 
 def _find_layout(names: list[str]) -> _Layout | None:
     """Return the meaning of the columns with these names, or None if they are no spectrum."""
-    frequency, real, imaginary = (_find_name(pattern, names) for pattern in (_FREQUENCY, _REAL, _IMAGINARY))
+    frequency = _find_name(_FREQUENCY, names)
     if frequency is None:
         return None
-    if real is not None and imaginary is not None:
-        return _parts_layout((frequency, real, imaginary), [names[i] for i in (frequency, real, imaginary)])
+    for patterns in ((_REAL, _IMAGINARY), (_RESISTANCE, _REACTANCE)):
+        real, imaginary = (_find_name(pattern, names) for pattern in patterns)
+        if real is not None and imaginary is not None:
+            return _parts_layout((frequency, real, imaginary), [names[i] for i in (frequency, real, imaginary)])
     size, phases = _find_name(_MAGNITUDE, names), [i for i, name in enumerate(names) if _PHASE.search(name)]
     if not phases:
         return None
-    hertz = _find_factor(_HERTZ, names[frequency])
     if size is not None and (_OHM.search(names[size]) or "z" in names[size].lower()):
-        factor, turn = _find_factor(_OHM, names[size]), _find_turn(names[phases[0]])
+        factor, turn, hertz = _find_factor(_OHM, names[size]), _find_turn(names[phases[0]]), _to_hertz(names[frequency])
         places = frequency, size, phases[0]
-        return _Layout("impedance", places, lambda x: (hertz * x[:, 0], factor * x[:, 1] * np.exp(turn * x[:, 2])))
-    return _gain_layout(names, frequency, phases, hertz)
+        return _Layout("impedance", places, lambda x: (hertz(x[:, 0]), factor * x[:, 1] * np.exp(turn * x[:, 2])))
+    return _gain_layout(names, frequency, phases)
 
 
 def _find_name(pattern: re.Pattern[str], names: Sequence[str]) -> int | None:
@@ -245,6 +252,14 @@ def _find_factor(pattern: re.Pattern[str], name: str) -> float:
     return PREFIX_FACTORS[prefix[1]] if prefix else 1.0
 
 
+def _to_hertz(name: str) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the conversion of a column of frequencies to Hz; PicoScope's FRA writes their logarithms."""
+    if re.search(r"\blog\b", name, re.IGNORECASE):
+        return lambda x: 10.0**x
+    factor = _find_factor(_HERTZ, name)
+    return lambda x: factor * x
+
+
 def _find_turn(name: str) -> complex:
     """Return the imaginary unit times the unit of a phase in radians, with its sign."""
     return (-1j if name.startswith("-") else 1j) * (1.0 if "rad" in name.lower() else np.pi / 180.0)
@@ -252,42 +267,43 @@ def _find_turn(name: str) -> complex:
 
 def _parts_layout(places: tuple[int, ...], names: Sequence[str]) -> _Layout:
     """Return the layout of real and imaginary part of an impedance."""
-    hertz, ohm = _find_factor(_HERTZ, names[0]), _find_factor(_OHM, names[1])
+    hertz, ohm = _to_hertz(names[0]), _find_factor(_OHM, names[1])
     signs = [-1.0 if name.startswith("-") else 1.0 for name in names[1:]]
     return _Layout(
-        "impedance", places, lambda x: (hertz * x[:, 0], ohm * (signs[0] * x[:, 1] + 1j * signs[1] * x[:, 2]))
+        "impedance", places, lambda x: (hertz(x[:, 0]), ohm * (signs[0] * x[:, 1] + 1j * signs[1] * x[:, 2]))
     )
 
 
-def _gain_layout(names: Sequence[str], frequency: int, phases: Sequence[int], hertz: float) -> _Layout | None:
+def _gain_layout(names: Sequence[str], frequency: int, phases: Sequence[int]) -> _Layout | None:
     """Return the layout of the gain of one channel over another: one gain, or the magnitudes of two channels."""
-    matches = [(i, match["channel"].strip().lower()) for i, name in enumerate(names) if (match := _GAIN.search(name))]
-    gains = [(i, channel) for i, channel in matches if not channel.startswith("math")] or matches
-    if not gains:
-        return None
-    decibels = ["db" in names[i].lower() for i, _ in gains]
-    linear = [re.search(r"v\s*/\s*v|ratio|\|h\|", names[i], re.IGNORECASE) for i, _ in gains]
-    if not all(d or r for d, r in zip(decibels, linear, strict=True)):
-        doubt = f"the column '{names[gains[0][0]]}' may be an impedance in ohm, or a gain in dB or as a ratio; write"
-        doubt += " its unit in its name, such as |Z| (ohm), Gain (dB) or Gain (V/V)"
+    sizes = {i: match["channel"].strip().lower() for i, name in enumerate(names) if (match := _GAIN.search(name))}
+    known = {i: channel for i, channel in sizes.items() if _DECIBEL.search(names[i]) or _RATIO.search(names[i])}
+    if sizes and not known:
+        doubt = (
+            f"the column '{names[next(iter(sizes))]}' may be an impedance in ohm, or a gain in dB or as a ratio; write"
+            " its unit in its name, such as |Z| (ohm), Gain (dB) or Gain (V/V)"
+        )
         return _Layout("Vsc", (frequency,), lambda x: (x[:, 0], x[:, 0]), doubt)
-    chosen = gains[:2] if len(gains) > 1 else gains
+    measured = [i for i, channel in known.items() if not channel.startswith("math")] or list(known)
+    if not measured:
+        return None
     by_channel = {match["channel"].strip().lower(): i for i in phases if (match := _PHASE.search(names[i]))}
-    places, parts = [frequency], []
-    for (i, channel), in_decibels in zip(chosen, decibels, strict=False):
-        phase = by_channel.get(channel, phases[0] if len(chosen) == 1 else None)
-        parts.append((len(places), None if phase is None else len(places) + 1, in_decibels, phase))
-        places += [i] if phase is None else [i, phase]
-    turns = [None if phase is None else _find_turn(names[phase]) for *_, phase in parts]
+    chosen = measured[:2]
+    angles = [by_channel.get(known[i], phases[0] if len(chosen) == 1 else None) for i in chosen]
+    columns = [frequency, *chosen, *(i for i in angles if i is not None)]
+    hertz = _to_hertz(names[frequency])
+
+    def respond(x: Rows, size: int, angle: int | None) -> np.ndarray:
+        values = x[:, columns.index(size)]
+        values = 10.0 ** (values / 20.0) if _DECIBEL.search(names[size]) else values
+        return values if angle is None else values * np.exp(_find_turn(names[angle]) * x[:, columns.index(angle)])
 
     def convert(x: Rows) -> tuple[np.ndarray, np.ndarray]:
-        values = []
-        for (i, j, in_decibels, _), turn in zip(parts, turns, strict=True):
-            size = 10.0 ** (x[:, i] / 20.0) if in_decibels else x[:, i]
-            values.append(size if j is None or turn is None else size * np.exp(turn * x[:, j]))
-        return hertz * x[:, 0], np.asarray(values[-1] / values[0] if len(values) > 1 else values[0], dtype=complex)
+        responses = [respond(x, *pair) for pair in zip(chosen, angles, strict=True)]
+        gain = responses[-1] / (responses[0] if len(responses) > 1 else 1.0)
+        return hertz(x[:, 0]), np.asarray(gain, dtype=complex)
 
-    return _Layout("Vsc", tuple(places), convert)
+    return _Layout("Vsc", tuple(columns), convert)
 
 
 def _to_spectra(layout: _Layout, rows: Rows, source: str, shunt: float | None) -> Iterator[Spectrum]:
@@ -325,8 +341,8 @@ def _make_spectrum(
     if np.median(np.abs(values)) > 1.0:
         values = 1.0 / values
         warnings = (
-            f"{source}: the second channel is the larger, which no circuit of resistors and capacitors gives, so the"
-            " gain is taken to be that of the first over the second; check which channel is V",
+            f"{source}: the gain is above 1, which no circuit of resistors and capacitors gives, so the channels are"
+            " exchanged; check which of them is V",
         )
     gain = Spectrum.from_arrays(frequency, values, source, notes, "Vsc", warnings)
     if shunt is None:
