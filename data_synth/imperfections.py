@@ -11,7 +11,15 @@ import numpy as np
 
 from data_synth.recipe import UNITS
 
-_STREAMS = ("population", "clock", "hum", "pink", "white", "missing")  # append only: the index seeds the random numbers
+_STREAMS = (
+    "population",
+    "clock",
+    "hum",
+    "pink",
+    "white",
+    "missing",
+    "change",
+)  # append only: the index seeds the random numbers
 _CHANNELS = tuple(UNITS)
 
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from data_synth import imperfections
+from data_synth.changing import Course, changing_response, make_course
 from data_synth.drive import Drive, make_drive
 from data_synth.errors import RecipeError
 from data_synth.keys import default_value
@@ -81,9 +82,13 @@ def _record(recipe: Recipe, scene: Scene, finger: int) -> Synthetic:
     time = np.arange(count) / measured["sampling_rate"]
     taken = imperfections.sampling_times(time, parts["clock"], recipe.seed, finger)
     area = scene["device"]["contact_area"] / recipe.scene["device"]["contact_area"]
-    found = dict(
-        zip(UNITS, simulate_response(scene, taken, _scale_second_layer(parts["skin"], area), recipe.route), strict=True)
-    )
+    course = None
+    if "change" in recipe.given:
+        values = scene["skin"]["Rsc"], scene["skin"]["Csc"], scene["device"]["Ci"]
+        rng = imperfections.generator(recipe.seed, finger, "change")
+        course = make_course(parts["change"], values, measured["duration"], rng)
+    skin = _scale_second_layer(parts["skin"], area)
+    found = dict(zip(UNITS, simulate_response(scene, taken, skin, recipe.route, course), strict=True))
     wanted = [name for name in UNITS if name == "V" or name in measured["channels"]]
     if "I" in wanted and not np.all(np.isfinite(found["I"])):
         raise RecipeError(
@@ -93,7 +98,16 @@ def _record(recipe: Recipe, scene: Scene, finger: int) -> Synthetic:
     channels = {n: imperfections.add_imperfections(found[n], n, time, parts, recipe.seed, finger) for n in wanted}
     there = imperfections.sample_mask(count, parts["missing"]["share"], recipe.seed, finger)
     channels = {name: values[there] for name, values in channels.items()}
-    return Synthetic(time[there], channels, _truth(recipe, scene, parts))
+    return Synthetic(time[there], channels, _truth(recipe, scene, parts) | _describe_course(course, time[-1]))
+
+
+def _describe_course(course: Course | None, end: float) -> dict[str, Any]:
+    """Return `course` of the truth: the values of a changing finger at 301 times, s, ohm and F."""
+    if course is None:
+        return {}
+    time = np.linspace(0.0, end, 301)
+    values = dict(zip(("Rsc", "Csc", "Ci"), course.values(time).tolist(), strict=True))
+    return {"course": {"time_s": time.tolist(), **values}}
 
 
 def _scale_second_layer(skin: Mapping[str, Any], area: float) -> Mapping[str, Any]:
@@ -109,9 +123,15 @@ def _resolve_noise(recipe: Recipe) -> dict[str, dict[str, Any]]:
 
 
 def simulate_response(
-    scene: Scene, time: np.ndarray, skin: Mapping[str, Any] | None = None, route: str = "scipy"
+    scene: Scene,
+    time: np.ndarray,
+    skin: Mapping[str, Any] | None = None,
+    route: str = "scipy",
+    course: Course | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return V, Vsc (V) and I (A) at `time` (s) without imperfections; `skin` is the recipe's section [skin].
+
+    A `course` gives the values of a changing finger.
 
     Raises:
         RecipeError: the route does not support this skin, or ngspice is not installed.
@@ -126,7 +146,9 @@ def simulate_response(
 
         if level != "constant":
             raise RecipeError(f"[skin] level = '{level}' is not available with ngspice; use route = 'scipy'")
-        return spice_response(circuit, law, drive, time)
+        return spice_response(circuit, law, drive, time, course)
+    if course is not None:
+        return changing_response(course, drive, time)
     return _scipy_response(circuit, law, scene["skin"], drive, time)
 
 

@@ -39,6 +39,13 @@ KEYS: Table = {
         "correlation": Quantity("", 0.0, low=-1.0),
         "log_sd_area": Quantity("", 0.0, least=True),
     },
+    # factors of the contact area, of Rsc and of Csc at `time`; random walks in their logarithms, per root of a second
+    "change": {
+        "time": ListKey(Quantity("s", least=True)),
+        **dict.fromkeys(("area", "Rsc", "Csc"), ListKey(Quantity(""))),
+        **dict.fromkeys(("walk_area", "walk_Rsc", "walk_Csc"), Quantity("", 0.0, least=True)),
+        "lifted": ListKey(Quantity("s")),
+    },
     # in the order in which they act
     "clock": {"jitter": Quantity("s", 0.0, least=True), "trigger_error": Quantity("s", 0.0, -math.inf)},
     "gain": dict.fromkeys(UNITS, Quantity("", 1.0, -math.inf)),
@@ -102,12 +109,12 @@ def load(path: Path) -> Recipe:
     top = validate_sections({"recipe": {k: content[k] for k in _RECIPE["recipe"] if k in content}}, _RECIPE, str(path))[
         "recipe"
     ]
-    _check(parts, scene, str(path))
+    _check(parts, scene, tuple(rest), str(path))
     name = path.name.removesuffix(".toml").removesuffix(_SUFFIX)
     return Recipe(name, scene_path.name, scene, parts, tuple(rest), top["seed"], top["route"])
 
 
-def _check(parts: dict[str, dict[str, Any]], scene: Scene, place: str) -> None:
+def _check(parts: dict[str, dict[str, Any]], scene: Scene, given: tuple[str, ...], place: str) -> None:
     skin = parts["skin"]
     needed = _MODELS.get(skin["model"], ())
     for key in itertools.chain(*_MODELS.values()):
@@ -116,6 +123,11 @@ def _check(parts: dict[str, dict[str, Any]], scene: Scene, place: str) -> None:
             raise RecipeError(f"{place}: [skin] model = '{skin['model']}' {what} {key}; correct one of them")
     if needed and scene["skin"]["level"] != "constant":
         raise RecipeError(f"{place}: [skin] model = '{skin['model']}' needs a scene with [skin] level = 'constant'")
+    added = *(scene["grounding"][key] for key in ("R_H", "grounding_Rsc", "grounding_Csc")), *scene["gap"].values()
+    loads = (scene["measurement"][key] for key in ("series_resistor", "probe_resistance", "probe_capacitance"))
+    others = scene["skin"]["level"] != "constant" or scene["grounding"]["connection"] != "direct" or needed
+    if "change" in given and (others or any(added) or any(loads)):
+        raise RecipeError(f"{place}: [change] needs two equal skins in series with Ci; leave out all other elements")
     if not -1.0 < parts["population"]["correlation"] < 1.0:
         raise RecipeError(f"{place}: [population] correlation must lie between -1 and 1")
     if parts["missing"]["share"] > 0.9:

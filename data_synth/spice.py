@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from data_synth.changing import Course
 from data_synth.drive import Drive, end_values
 from data_synth.errors import RecipeError
 from data_synth.network import Network, state_space
@@ -33,9 +34,11 @@ def ngspice_version() -> str:
 
 
 def spice_response(
-    circuit: Network, law: Mapping[str, Any] | None, drive: Drive, time: np.ndarray
+    circuit: Network, law: Mapping[str, Any] | None, drive: Drive, time: np.ndarray, course: Course | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return V, Vsc (V) and I (A) at `time` (s): periodic drives after many periods, others from rest.
+
+    A changing finger is two equal skins and Ci, whose values follow voltage sources with the `course`.
 
     Raises:
         RecipeError: ngspice is not installed, failed, or does not support the skin.
@@ -52,7 +55,10 @@ def spice_response(
     kept = max(float(time.min()) - begin - 2.0 * step, 0.0)
     skin = ",".join(str(node) for node in circuit.skin if node)
     deck = ["* a finger", f"Vdrive 99 0 PWL({_source_points(drive, begin, end)})", "Vmeter 99 1 0"]
-    deck += [f"{each.kind}{n} {each.start} {each.end} {each.value:.15g}" for n, each in enumerate(circuit.branches)]
+    if course is None:
+        deck += [f"{each.kind}{n} {each.start} {each.end} {each.value:.15g}" for n, each in enumerate(circuit.branches)]
+    else:
+        deck += _changing_sources(circuit, course, begin)
     deck += _nonlinear_sources(circuit, law)
     deck += [".options reltol=1e-6 abstol=1e-15 vntol=1e-9 trtol=1 method=gear", ".control"]
     deck += ["set wr_vecnames", "set wr_singlescale", "set numdgt=12"]
@@ -80,6 +86,27 @@ def _source_points(drive: Drive, begin: float, end: float) -> str:
         points += [(time + _JUMP, right)] if abs(right - left) > 1e-3 else []
     points.append((corners[-1] - begin, before[-1]))
     return "\n+ ".join(f"{time:.15g} {voltage:.12g}" for time, voltage in points)
+
+
+def _changing_sources(circuit: Network, course: Course, begin: float, points: int = 400) -> list[str]:
+    """Return the branches with the values of the start, and sources for what the course adds to current and charge."""
+    time = np.unique(np.concatenate([[begin], course.time, np.linspace(course.time[0], course.time[-1], points)]))
+    time = time[np.append(True, np.diff(time) > _JUMP)]
+    values = dict(zip(("R", "outer", ""), course.values(time) ** [[-1.0], [1.0], [1.0]], strict=True))
+    lines = []
+    for n, each in enumerate(circuit.branches):
+        across = f"v({each.start},{each.end})" if each.end else f"v({each.start})"
+        value = values["R" if each.kind == "R" else each.layer]  # conductance or capacitance
+        start = 1.0 / value[0] if each.kind == "R" else value[0]
+        added = zip(time - begin, value / value[0] - 1.0, strict=True)
+        table = "\n+ ".join(f"{t:.15g} {v:.12g}" for t, v in added)
+        lines += [f"{each.kind}{n} {each.start} {each.end} {start:.15g}", f"Vadded{n} added{n} 0 PWL({table})"]
+        if each.kind == "R":
+            lines.append(f"B{n} {each.start} {each.end} I={across}*v(added{n})/{start:.15g}")
+        else:  # the current into another capacitance with the added charge is repeated
+            lines += [f"B{n} q{n} 0 V={across}*v(added{n})", f"Vq{n} q{n} p{n} 0", f"Cq{n} p{n} 0 {start:.15g}"]
+            lines.append(f"F{n} {each.start} {each.end} Vq{n} 1")
+    return lines
 
 
 def _nonlinear_sources(circuit: Network, law: Mapping[str, Any] | None) -> list[str]:

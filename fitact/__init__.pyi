@@ -29,6 +29,8 @@ from .prior.prior import Prior
 from .sampling.ensemble import sample
 from .sampling.posterior import Posterior
 from .scene.scene import Scene
+from .tracking.track import Track
+from .tracking.track_record import track
 from .tradeoff.tradeoff import Tradeoff, measure_tradeoff
 
 __all__ = [
@@ -63,6 +65,7 @@ __all__ = [
     "Sine",
     "Spectrum",
     "Square",
+    "Track",
     "Tradeoff",
     "Trapezoid",
     "Triangle",
@@ -96,6 +99,7 @@ __all__ = [
     "sample",
     "sample_many",
     "series_equivalent",
+    "track",
 ]
 
 __version__: str

@@ -115,6 +115,52 @@ def population(
 
 
 @app.command()
+def track(
+    record: Annotated[
+        str,
+        typer.Argument(
+            metavar="RECORD", help="Long record with V and the channels of the scene; - reads CSV from standard input."
+        ),
+    ],
+    scene: options.CommonScene = None,
+    channel: options.Channels = None,
+    scale: options.Scales = None,
+    rate: options.Rate = None,
+    out: options.Out = None,
+    window: Annotated[
+        str | None,
+        typer.Option("--window", metavar="TIME", help="Length of a window, e.g. 50ms.", show_default="5 periods of V"),
+    ] = None,
+    follow: Annotated[
+        str,
+        typer.Option("--follow", metavar="TIME", help="Wait so long for more samples of a file that is being written."),
+    ] = "0 s",
+    json: options.Json = False,
+) -> None:
+    """Follow a finger along a long record: parameters, contact area and force over time, and lift-offs.
+
+    With --out, writes track.parquet, summary.json and report.html into DIR; after an interruption, run the same command
+    again. With --follow, or from standard input, prints a line about every second while the record grows.
+    """
+    announce("tracking", [record])
+    loaded = options.load_scene(scene)
+    patience = options.parse_option("--follow", follow, "s")
+    live = not json and (patience > 0.0 or record == "-")
+    found = fitact.track(
+        record, loaded, window=None if window is None else options.parse_option("--window", window, "s"),
+        follow=patience, folder=out, update=(lambda track: print(track.describe_last(), flush=True)) if live else None,
+        **options.column_options((channel, scale, rate)),
+    )  # fmt: skip
+    content = found.to_dict() | {"command": command_line()}
+    if out is not None:
+        found.to_parquet(out / "track.parquet")
+        write_json(out / "summary.json", content)
+        report.write_track(out / "report.html", found, report.Provenance.from_inputs(command_line(), loaded))
+    end = "" if out is None else f"\nopen {out / 'report.html'}"
+    show(f"{found}{end}", content, json, found.trusted)
+
+
+@app.command()
 def tradeoff(
     record: Annotated[
         Path | None,

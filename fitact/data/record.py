@@ -201,7 +201,19 @@ def rounding_noise_sd(values: Float[np.ndarray, " samples"]) -> float:
         step = float(np.diff(levels).min(initial=math.inf))
         if step <= noise:
             return 0.0
-    return step / math.sqrt(12.0) if levels.size >= min_levels else 0.0
+    return step / math.sqrt(12.0) if levels.size >= min_levels and not _is_ramp_on_levels(values, step) else 0.0
+
+
+def _is_ramp_on_levels(values: Float[np.ndarray, " samples"], step: float) -> bool:
+    """Return whether an ideal wave has few levels because its ramps rise by the same step from sample to sample.
+
+    A converter repeats a level, or skips one, on almost any ramp.
+    """
+    changes = np.abs(np.diff(values))
+    rises = changes > 0.5 * step
+    alike = np.abs(changes[rises] - step) < 1e-3 * step
+    neighbours = rises & (np.append(rises[1:], False) | np.append(False, rises[:-1]))
+    return bool(np.mean(alike) > 0.9 and np.count_nonzero(neighbours) > 0.9 * np.count_nonzero(rises))
 
 
 def fundamental_frequency(time: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"]) -> float | None:

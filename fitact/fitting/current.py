@@ -29,7 +29,7 @@ def select_current_samples(record: Record, choice: DriveModel) -> CurrentSamples
     """Exclude the samples at edges, and weight the others by their noise, including that of dV/dt."""
     max_attenuation = 1e-3  # largest acceptable relative bias of the capacitive current due to noise of V
     noise = record.noise("V") if choice.name == "measured" else 0.0
-    used = ~_edge_mask(choice.voltage, noise)
+    used = ~edge_mask(choice.voltage, noise)
     if choice.name != "measured":
         slope = drive_slope(choice, record.time)
         used &= np.isfinite(slope)  # a record may begin at a jump
@@ -37,11 +37,10 @@ def select_current_samples(record: Record, choice: DriveModel) -> CurrentSamples
     if choice.name != "measured":
         return CurrentSamples(used.astype(float), np.where(used, slope, 0.0), False, (note,), ())
     rate = np.gradient(choice.voltage) / np.gradient(record.time)  # over two steps, which halves the noise
-    capacitance = abs(float(record["I"][used] @ rate[used]) / max(float(rate[used] @ rate[used]), 1e-300))
-    # a V that stays at one level has no noise there that a derivative could see
-    spread = noise / (math.sqrt(2.0) * record.time_step) * (np.gradient(choice.voltage) != 0.0)
-    weight = used / np.hypot(1.0, capacitance * spread / record.noise("I"))
+    spread = noise / (math.sqrt(2.0) * record.time_step)
+    weight = used * weigh_current_samples(record["I"], rate, spread / record.noise("I"), used)
     # what noise in a regressor takes off its coefficient
+    spread = spread * (rate != 0.0)
     attenuation = float(np.sum((weight * spread) ** 2) / max(float(np.sum((weight * rate) ** 2)), 1e-300))
     if attenuation <= max_attenuation:
         return CurrentSamples(weight, rate, False, (note,), ())
@@ -52,7 +51,19 @@ def select_current_samples(record: Record, choice: DriveModel) -> CurrentSamples
     return CurrentSamples(weight, rate, True, (note,), (warning,))
 
 
-def _edge_mask(voltage: Float[np.ndarray, " samples"], noise: float) -> Bool[np.ndarray, " samples"]:
+def weigh_current_samples(
+    current: Float[np.ndarray, " samples"],
+    rate: Float[np.ndarray, " samples"],
+    spread: float,
+    used: Bool[np.ndarray, " samples"],
+) -> Float[np.ndarray, " samples"]:
+    """Return the weights of samples of I whose dV/dt has noise; `spread` is its sd (V/s) over the sd of I's noise."""
+    capacitance = abs(float(current[used] @ rate[used]) / max(float(rate[used] @ rate[used]), 1e-300))
+    # a V that stays at one level has no noise there that a derivative could see
+    return 1.0 / np.hypot(1.0, capacitance * spread * (rate != 0.0))
+
+
+def edge_mask(voltage: Float[np.ndarray, " samples"], noise: float) -> Bool[np.ndarray, " samples"]:
     """Return which samples lie within `margin` steps of a sudden change of the drive's slope."""
     margin = 2
     # a change is sudden if it exceeds so many times the median over a block of samples, or the effect of noise

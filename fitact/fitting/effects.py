@@ -20,7 +20,7 @@ from fitact.uncertainty.channel_series import ChannelSamples, Timing
 from fitact.uncertainty.effect_size import EffectSizes, assess_effects
 from fitact.uncertainty.linear_model import LinearPosterior, Nuisance
 from fitact.uncertainty.loop import LoopModel
-from fitact.uncertainty.rivals import Rival
+from fitact.uncertainty.rivals import CHANGE, Rival
 from fitact.units import format_percent
 
 
@@ -147,8 +147,19 @@ def describe_structure(result: str, message: str, effects: EffectSizes, negligib
         if size >= negligible
     )
     like = f" (like {' or '.join(effects.causes)})" if effects.causes else ""
-    found = f"the residuals show structure{like}; it could move {moved}."
+    found = f"the residuals show structure{like}; it could move {moved}.{_advise_track(effects)}"
     return f"{message} {found[0].upper()}{found[1:]}" if result == "misfit" else f"{found[0].upper()}{found[1:]}"
+
+
+def _advise_track(effects: EffectSizes) -> str:
+    """Return a sentence on a finger that changes during the record, if that is the best explanation."""
+    best = effects.rivals[0] if effects.rivals else None
+    if best is None or not best["name"].startswith(CHANGE):
+        return ""
+    change = math.expm1(2.0 * best["amplitudes"][0])
+    what = best["name"].removeprefix(CHANGE)
+    direction = "falls" if change < 0.0 else "rises"
+    return f" {what[0].upper()}{what[1:]} {direction} by {format_percent(abs(change))} during the record: use track."
 
 
 def describe_alternatives(effects: EffectSizes, laplace: Laplace, min_ratio: float = 0.5) -> tuple[str, ...]:

@@ -83,7 +83,7 @@ def compress(
     Terms of a grid of time constants have arrays of weights and time constants; the table then holds the responses of
     the grid instead of series.
     """
-    table = _TableNodes.from_terms(expected_terms, time, narrow=student is not None)
+    table = TableNodes.from_terms(expected_terms, time, narrow=student is not None)
     one = np.ones(time.size) if weight is None else np.asarray(weight)
     mask = one if whitening is None else np.asarray(whitening.mask)[: time.size]
     samples = Samples(
@@ -107,7 +107,7 @@ def compress(
     ages = 2 * MAX_DELAY if measured and delayed else 0
     count = int(np.count_nonzero(mask))
     n_effects = 0 if effects is None else len(effects)
-    return _assemble(table, sum(parts, np.zeros(())), measured and not table.is_grid, ages, n_effects, count)
+    return assemble_compression(table, sum(parts, np.zeros(())), measured and not table.is_grid, ages, n_effects, count)
 
 
 def table_multiple(tau: Float[np.ndarray, " terms"]) -> int:
@@ -115,7 +115,7 @@ def table_multiple(tau: Float[np.ndarray, " terms"]) -> int:
     return max(1, math.ceil((0.5 * float(np.ptp(np.log(tau))) + math.log(3.0)) / TABLE_HALF_WIDTH))
 
 
-class _TableNodes(eqx.Module):
+class TableNodes(eqx.Module):
     """Response table during the pass: its nodes, and the few significant combinations of their responses."""
 
     center: Array
@@ -132,7 +132,7 @@ class _TableNodes(eqx.Module):
     is_grid: bool = eqx.field(static=True)
 
     @classmethod
-    def from_terms(cls, expected_terms: HighpassTerms, time: np.ndarray, *, narrow: bool) -> "_TableNodes":
+    def from_terms(cls, expected_terms: HighpassTerms, time: np.ndarray, *, narrow: bool) -> "TableNodes":
         tau, weight = (np.asarray(x, dtype=float) for x in (expected_terms.tau, expected_terms.weight))
         log_tau = np.log(tau)
         center = 0.5 * (np.min(log_tau) + np.max(log_tau))
@@ -218,7 +218,7 @@ def chunk_length(samples: int, longest: int = 8_192) -> int:
 
 
 def _accumulate_directly(
-    table: _TableNodes, drive: Drive, samples: Samples, steady_state: bool, taps: np.ndarray | None
+    table: TableNodes, drive: Drive, samples: Samples, steady_state: bool, taps: np.ndarray | None
 ) -> Iterator[np.ndarray]:
     size = samples.time.size
     length = chunk_length(size, 65_536) if isinstance(drive, Chirp) else chunk_length(size)  # of few chirps
@@ -241,7 +241,7 @@ class WhiteningState(NamedTuple):
 
 
 def _chunk_products(
-    table: _TableNodes,
+    table: TableNodes,
     drive: Drive,
     chunk: Samples,
     baseline: Array | None,
@@ -266,7 +266,7 @@ def _chunk_products(
 
 
 def _inner_products(
-    table: _TableNodes,
+    table: TableNodes,
     responses: list[Array],
     others: Float[Array, "functions n"],
     slope: Array,
@@ -301,7 +301,7 @@ def whitened_products(
     return rows @ rows.T, filtering
 
 
-def _accumulate_folded(table: _TableNodes, drive: Drive, samples: Samples, period: int) -> Iterator[np.ndarray]:
+def _accumulate_folded(table: TableNodes, drive: Drive, samples: Samples, period: int) -> Iterator[np.ndarray]:
     """Yield the inner products from folded periods; the response is computed for one period only."""
     periods = max(1, chunk_length(samples.time.size) // period)
     reference = np.asarray(samples.observed[:period])
@@ -350,7 +350,7 @@ def is_exactly_uniform(time: np.ndarray, tolerance: float = 1e-9) -> bool:
 
 
 def _accumulate_measured(
-    table: _TableNodes, drive: Sampled, samples: Samples, taps: np.ndarray | None, ages: int
+    table: TableNodes, drive: Sampled, samples: Samples, taps: np.ndarray | None, ages: int
 ) -> Iterator[np.ndarray]:
     """Yield the inner products of each chunk for a measured drive; `ages` steps before and after a sample."""
     time, voltage = samples.time, np.asarray(drive.samples)[: samples.time.size]
@@ -365,12 +365,12 @@ def _accumulate_measured(
     voltages = chunks(samples._replace(observed=voltage, effects=None), length)
     advance = jit(_advance_chunk, fast=time.size > MANY_SAMPLES)
     for number, (chunk, driven) in enumerate(zip(chunks(samples, length), voltages, strict=True)):
-        steps = _drive_steps(voltage, number * length, length, ages) / step
+        steps = drive_steps(voltage, number * length, length, ages) / step
         total, last, filtering = advance(table, chunk, driven.observed, steps, last, time[0], x, filtering)
         yield total
 
 
-def _drive_steps(voltage: np.ndarray, first: int, length: int, ages: int) -> Float[np.ndarray, "ages samples"]:
+def drive_steps(voltage: np.ndarray, first: int, length: int, ages: int) -> Float[np.ndarray, "ages samples"]:
     """Return the step of V from sample k - i - 1 to k - i, for i from -`ages` to `ages` - 1, at `length` samples k."""
     indices = np.clip(np.arange(first - ages, first + length + ages + 1), 0, voltage.size - 1)
     steps = np.diff(voltage[indices])
@@ -378,7 +378,7 @@ def _drive_steps(voltage: np.ndarray, first: int, length: int, ages: int) -> Flo
 
 
 def _advance_chunk(
-    table: _TableNodes,
+    table: TableNodes,
     chunk: Samples,
     voltage: Array,
     steps: Float[Array, "ages n"],
@@ -425,8 +425,8 @@ def uniform_recurrence(
     return gain * (alone.transpose(1, 2, 0) + starts.T[:, :, None] * decays[:, None]).reshape(x.size, -1)
 
 
-def _assemble(
-    table: _TableNodes, total: np.ndarray, decays: bool, ages: int, n_effects: int, samples: int
+def assemble_compression(
+    table: TableNodes, total: np.ndarray, decays: bool, ages: int, n_effects: int, samples: int
 ) -> Compression:
     """Return coordinates that have the accumulated inner products."""
     rows, projected = factor_products(total)

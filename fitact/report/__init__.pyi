@@ -6,6 +6,7 @@ from .population import read_population, write_population, write_population_page
 from .prior import write_prior
 from .record import write_record
 from .reproduction import write_reproduction
+from .track import write_track
 
 __all__ = [
     "Provenance",
@@ -19,4 +20,5 @@ __all__ = [
     "write_record",
     "write_report",
     "write_reproduction",
+    "write_track",
 ]

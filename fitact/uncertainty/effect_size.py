@@ -214,6 +214,7 @@ def describe_rivals(
                 "delta_chi2": each.delta_chi2,
                 "shift": dict(zip(quantities, each.shift.tolist(), strict=True)),
                 "visible": each.visible,
+                "amplitudes": each.amplitudes.tolist(),
             }
         )
     return tuple(entries)

@@ -160,6 +160,10 @@ class ChannelModel:
         """Return the signal of a circuit with what is `added`, V or A."""
         return self._respond(self.loop.impedances(self.values, self.s, added))
 
+    def signal_at(self, values: Mapping[str, float | None]) -> Rows:
+        """Return the signal of the circuit with other values of its parameters, V or A."""
+        return self._respond(self.loop.impedances(values, self.s))
+
     def filtered(self, gain: Callable[[Spectrum], Spectrum]) -> Rows:
         """Return the signal behind a filter, V or A."""
         return self._respond(self.parts, gain(self.s))

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +11,9 @@ from jaxtyping import Float
 from fitact.instrument.effects import PROBE_TIME_CONSTANT
 from fitact.uncertainty.channel_series import ChannelSeries, Rows, Spectrum
 from fitact.uncertainty.loop import Addition, ChannelModel
+
+CHANGE = "a change during the record of "  # begins the names of changes of the finger, which a track follows
+_CHANGES = {"Rsc": {"Rsc": 1.0}, "Csc": {"Csc": 1.0}, "the contact area": {"Rsc": -1.0, "Csc": 1.0, "Ci": 1.0}}
 
 Amplitudes = Float[np.ndarray, " amplitudes"]
 # the change of a channel by amplitudes
@@ -61,6 +64,8 @@ def known_rivals() -> tuple[Rival, ...]:
         *(Rival(f"hum at {f:g} Hz", 0.1, functools.partial(_hum, f), 2) for f in _hum_frequencies()),
         # a thermal drift of 1 % of the signal
         Rival("a drift", 0.01, _drift),
+        # the skin moistens, and the contact grows or shrinks, by a factor of two while a finger slides
+        *(Rival(f"{CHANGE}{name}", 0.35, functools.partial(_change, powers)) for name, powers in _CHANGES.items()),
         # instruments warm up by 1 %
         Rival("a change of gain during the record", 0.02, _warm_up),
     )
@@ -175,3 +180,9 @@ def _drift(model: ChannelModel, a: Amplitudes) -> Rows:
 
 def _warm_up(model: ChannelModel, a: Amplitudes) -> Rows:
     return model.signal * (1.0 + a[0] * _progress(model.series))
+
+
+def _change(powers: Mapping[str, float], model: ChannelModel, a: Amplitudes) -> Rows:
+    """Return the signal if parameters of the finger, with these `powers`, go from e^-a to e^a over the record."""
+    changed = {name: (model.values[name] or 0.0) * math.exp(power * float(a[0])) for name, power in powers.items()}
+    return model.signal + (model.signal_at({**model.values, **changed}) - model.signal) * _progress(model.series)

@@ -223,3 +223,22 @@ def test_what_shows_only_further_down_is_read(tmp_path: Path):
 
 def test_nothing_shows_no_noise():
     assert np.isnan(white_noise_sd(np.zeros(3)))
+
+
+def test_large_blocks_are_read_like_small_ones(tmp_path: Path):
+    """Blocks above a megabyte are parsed by pandas; every digit and every refusal is that of the other path."""
+    time = np.arange(40_000) * 5e-6
+    rng = np.random.default_rng(0)  # any numbers
+    table = np.column_stack(
+        [time, 180.0 * np.sin(628.0 * time), 9.0 * np.cos(628.0 * time) + rng.standard_normal(time.size)]
+    )
+    path = tmp_path / "large.csv"
+    np.savetxt(path, table, delimiter=",", header="time_s,V_V,Vsc_V", comments="", fmt="%.17g")
+    assert path.stat().st_size > 1_048_576
+    record = fitact.read(path)
+    np.testing.assert_array_equal(np.column_stack([record.time, record["V"], record["Vsc"]]), table)
+    lines = path.read_text().splitlines()
+    lines[30_000] = lines[30_000].rsplit(",", 1)[0] + ",oops"
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(fitact.InputError, match="line 30001, column 3: 'oops' is not a number"):
+        fitact.read(path)

@@ -12,7 +12,8 @@ import scipy.integrate
 import scipy.signal
 
 import fitact
-from data_synth import keys, make, scene
+from data_synth import keys, make, recipe, scene
+from data_synth.changing import make_course
 from data_synth.errors import RecipeError
 from data_synth.network import network, state_space
 from data_synth.response import frequency_response
@@ -313,3 +314,77 @@ def test_shipped_scenes_give_what_fitact_simulates(name: str):
     ours = dict(zip(["V", "Vsc", "I"], respond(theirs.time, **tables), strict=True))
     for channel, values in theirs.channels.items():
         np.testing.assert_allclose(ours[channel], values, atol=1e-10 * np.ptp(values))
+
+
+CHANGE = {
+    "time": (0.0, 4e-3, 2e-2), "area": (1.0, 1.3, 0.8), "Rsc": (1.0, 0.6, 0.9), "Csc": (1.0, 1.2, 1.1),
+    "walk_area": 0.0, "walk_Rsc": 0.0, "walk_Csc": 0.0, "lifted": (8e-3, 12e-3),
+}  # fmt: skip
+TRAPEZOID = {"waveform": "trapezoid", "rise_time": "200 us"}
+
+
+def changing(at: np.ndarray, route: str, waveform: dict[str, Any], **change: Any) -> tuple[np.ndarray, ...]:
+    course = make_course(CHANGE | change, (R, C, CI), 0.02, np.random.default_rng(0))
+    return make.simulate_response(scene_of(drive=waveform), at, None, route, course)
+
+
+@needs_ngspice
+def test_changing_finger_equals_ngspice_with_changing_parts():
+    time = even(1000, 2e-5)
+    ours, theirs = (changing(time, route, TRAPEZOID) for route in ("scipy", "ngspice"))
+    assert np.max(np.abs(ours[1] - theirs[1])) < 2e-3 * np.ptp(ours[1])
+    # at corners of the drive and of Ci, ngspice takes steps of the current over a few time steps
+    difference = np.abs(ours[2] - theirs[2]) / np.ptp(ours[2])
+    assert np.quantile(difference, 0.8) < 1e-5
+
+
+@pytest.mark.parametrize("waveform", [TRAPEZOID, {"waveform": "sine"}], ids=["trapezoid", "sine"])
+def test_finger_that_does_not_change_is_the_usual_one(waveform):
+    time = even()
+    still = changing(time, "scipy", waveform, time=None, area=None, Rsc=None, Csc=None, lifted=())
+    usual = make.simulate_response(scene_of(drive=waveform), time)
+    for ours, theirs in zip(still, usual, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=2e-6 * np.ptp(theirs))
+
+
+def test_changing_finger_solves_the_equation_of_its_charges():
+    time = even()
+    course = make_course(CHANGE | {"lifted": ()}, (R, C, CI), 0.02, np.random.default_rng(0))
+    drive = make.make_drive(scene_of(drive=TRAPEZOID)["drive"])
+
+    def change(at: float, y: np.ndarray) -> np.ndarray:
+        Rsc, Csc, Ci = course.values(np.array(at))
+        return -(y + Ci * drive.value(np.array(at))) / (Rsc * (Csc + 2.0 * Ci))
+
+    _, Csc, Ci = course.values(time)
+    V, Vsc, current = make.simulate_response(scene_of(drive=TRAPEZOID), time, None, "scipy", course)
+    start = (Csc[0] + 2.0 * Ci[0]) * Vsc[0] - Ci[0] * V[0]
+    solved = scipy.integrate.solve_ivp(
+        change, (0.0, time[-1]), [start], t_eval=time, rtol=1e-9, atol=1e-16, max_step=5e-5
+    ).y[0]
+    np.testing.assert_allclose(Vsc, (solved + Ci * V) / (Csc + 2.0 * Ci), atol=1e-5 * np.ptp(Vsc))
+    # the current charges Ci: its integral is the change of the charge Ci (V - 2 Vsc)
+    V, Vsc, current = make.simulate_response(scene_of(drive={"waveform": "sine"}), time, None, "scipy", course)
+    charge = Ci * (V - 2.0 * Vsc)
+    flown = scipy.integrate.cumulative_trapezoid(current, time, initial=0.0)
+    np.testing.assert_allclose(flown, charge - charge[0], atol=3e-4 * np.ptp(charge))
+
+
+def test_change_is_refused_with_other_elements(tmp_path: Path):
+    (tmp_path / "scene.toml").write_text('[grounding]\nR_H = "500 ohm"\n')
+    path = tmp_path / "slide.recipe.toml"
+    path.write_text('scene = "scene.toml"\n[change]\ntime = ["0 s", "1 s"]\narea = [1.0, 1.3]\n')
+    with pytest.raises(RecipeError, match=r"\[change\] needs two equal skins"):
+        recipe.load(path)
+
+
+def test_truth_of_a_recipe_holds_the_course(tmp_path: Path):
+    (tmp_path / "scene.toml").write_text(
+        '[drive]\nwaveform = "trapezoid"\nrise_time = "200 us"\n[measurement]\nduration = "0.1 s"\n'
+    )
+    path = tmp_path / "slide.recipe.toml"
+    path.write_text('scene = "scene.toml"\n[change]\ntime = ["0 s", "0.1 s"]\narea = [1.0, 1.3]\n')
+    (made,) = make.make(recipe.load(path)).values()
+    course = made.truth["course"]
+    assert course["Ci"][-1] == pytest.approx(1.3 * CI, rel=1e-3)
+    assert len(course["time_s"]) == len(course["Rsc"]) == 301

@@ -96,8 +96,10 @@ def has_standard_names(capture: Capture) -> bool:
     return any(trace.name.lower() in known for trace in capture.channels)
 
 
-def to_record(capture: Capture, channels: Mapping[str, str], scale: Mapping[str, float]) -> Record:
-    """Convert the contents of a file to a record, with the assigned channels and scale factors."""
+def channel_arrays(
+    capture: Capture, channels: Mapping[str, str], scale: Mapping[str, float]
+) -> tuple[dict[str, Float[np.ndarray, " samples"]], dict[str, str], list[str]]:
+    """Return V, Vsc and I in SI units, the names of their columns, and notes on how they were converted."""
     for channel, factor in scale.items():
         if channel not in CHANNEL_UNITS:
             raise InputError(f"{capture.source}: '{channel}' is no channel of fitact; scale {', '.join(CHANNEL_UNITS)}")
@@ -109,13 +111,20 @@ def to_record(capture: Capture, channels: Mapping[str, str], scale: Mapping[str,
     known = resolve_channels(names, channels, capture.source, capture.channels[0].location if capture.channels else "")
     if unused := sorted(set(scale) - set(known)):
         raise InputError(f"{capture.source}: {unused[0]} is scaled but not there; name its column with --channel")
-    arrays, notes = {}, list(capture.notes)
+    arrays, notes = {}, list[str]()
     for channel, name in known.items():
         trace = capture.channels[names.index(name)]
         _check_unit(trace, channel, channel in scale, capture.source)
         arrays[channel] = trace.values * scale.get(channel, 1.0)
         if channels or scale:
             notes.append(f"{capture.source}: {_describe_conversion(trace, channel, scale.get(channel, 1.0))}")
+    return arrays, known, notes
+
+
+def to_record(capture: Capture, channels: Mapping[str, str], scale: Mapping[str, float]) -> Record:
+    """Convert the contents of a file to a record, with the assigned channels and scale factors."""
+    arrays, known, conversions = channel_arrays(capture, channels, scale)
+    names, notes = [trace.name for trace in capture.channels], [*capture.notes, *conversions]
     if channels or scale:
         first = format_engineering(float(capture.time[0]), "s") if capture.time.size else "nowhere"
         notes.append(f"{capture.source}: time axis taken from the file (format: {capture.format}), starting at {first}")

@@ -1,0 +1,121 @@
+"""Compression of many windows of one record at once, which is the cost of following a finger over time.
+
+All windows have the same length and time step, so that slow shapes and the decays of an unknown charge are common to
+all. The responses to the recorded drive are first-order recursive filters, whose state goes on from window to window.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+import jax
+import numpy as np
+import scipy.signal
+from jaxtyping import Float
+
+from fitact.likelihood.channel import ChannelLikelihood
+from fitact.likelihood.compression import Compression
+from fitact.likelihood.likelihood import CircuitValues
+from fitact.likelihood.projection import (
+    MAX_DELAY,
+    TableNodes,
+    assemble_compression,
+    drive_steps,
+    evaluate_baseline,
+)
+
+
+class FilterState(NamedTuple):
+    """State of the responses at the end of a window, from which the next one goes on."""
+
+    end: float  # time of the first sample after the window, s
+    voltage: float  # last V
+    memory: Float[np.ndarray, "nodes 1"]  # of the filters
+    age: float  # time since the drive was first known, s
+
+
+@dataclasses.dataclass(frozen=True)
+class WindowCompressor:
+    """Compresses windows of `time.size` samples; `channels` are those of a fit to one of them."""
+
+    channels: tuple[ChannelLikelihood, ...]
+    tables: tuple[TableNodes, ...]  # of the channels
+    time: Float[np.ndarray, " samples"]  # from the start of a window, s
+    shared: Float[np.ndarray, "functions samples"]  # decays in the combinations of the table, and slow shapes
+
+    @classmethod
+    def from_channels(
+        cls, channels: Sequence[ChannelLikelihood], circuit: CircuitValues, samples: int, step: float
+    ) -> Self:
+        """Make the tables around the time constants of a circuit, a factor 9 either way."""
+        time = step * np.arange(samples)
+        tables = [TableNodes.from_terms(circuit.terms[each.channel], time, narrow=False) for each in channels]
+        first = tables[0]
+        decays = first.combinations.T @ np.exp(-time / first.nodes[:, None])
+        baseline = evaluate_baseline(time, first.middle, first.half)
+        return cls(tuple(channels), tuple(tables), time, np.concatenate([decays, baseline]))
+
+    def compress(
+        self,
+        V: Float[np.ndarray, " samples"],
+        observed: Sequence[Float[np.ndarray, " samples"]],
+        rates: Sequence[Float[np.ndarray, " samples"] | None],
+        weights: Sequence[Float[np.ndarray, " samples"] | None],
+        responses: Float[np.ndarray, "nodes samples"],
+        has_charge: bool,
+    ) -> tuple[tuple[Compression, ...], Float[np.ndarray, " samples"]]:
+        """Compress a window with the drive `V`: each channel's samples, dV/dt where it follows that, and weights.
+
+        `responses` are those of `respond`. With `has_charge`, the charge at the first sample is unknown. Also returns
+        the signal that the first channel would have at the circuit of the tables, without its charge.
+        """
+        table, step = self.tables[0], self.time[1]
+        combined = table.combinations.T @ responses
+        ages = MAX_DELAY if any(channel.timing for channel in self.channels) else 0
+        steps, zero = drive_steps(V, 0, V.size, ages) / step, np.zeros(V.size)
+        rests = [each - x.expected @ responses for each, x in zip(observed, self.tables, strict=True)]
+        for i, (x, rate) in enumerate(zip(self.tables, rates, strict=True)):
+            if x.expected_rate is not None and rate is not None:
+                rests[i] = rests[i] - x.expected_rate * rate
+        followed = [zero if rate is None else rate for rate in rates]
+        shared = self.shared.copy()
+        shared[: len(combined)] *= has_charge
+        # all channels with the same weights share the products of what they share
+        rows = np.concatenate([combined, shared, steps, [zero, np.gradient(V, step)], followed, rests])
+        begin = len(combined) + len(self.shared)
+        last, products, parts = begin + len(steps), dict[int, np.ndarray](), []
+        for i, (channel, weight) in enumerate(zip(self.channels, weights, strict=True)):
+            if id(weight) not in products:
+                weighted = rows if weight is None else rows * weight
+                products[id(weight)] = weighted @ weighted.T
+            own = steps[: 2 * MAX_DELAY * bool(channel.timing)]
+            places = [*range(2 * len(combined)), *[last] * len(channel.effect_sizes), *range(begin, begin + len(own))]
+            places += [*range(2 * len(combined), begin), last + 2 + i, last + 1, last + 2 + len(followed) + i]
+            total = products[id(weight)][np.ix_(places, places)]
+            count = V.size if weight is None else int(np.count_nonzero(weight))
+            effects = len(channel.effect_sizes)
+            parts.append(assemble_compression(self.tables[i], total, True, len(own), effects, count))
+        return tuple(parts), observed[0] - rests[0]
+
+    def respond(
+        self, V: Float[np.ndarray, " samples"], start: float, before: FilterState | None
+    ) -> tuple[Float[np.ndarray, "nodes samples"], FilterState]:
+        """Return the responses at the nodes to the V of a window from `start` (s) on, and their state at its end.
+
+        u[k] = e^{-x} u[k - 1] + phi(x) (V[k] - V[k - 1]). Without a state `before`, V was constant before the window.
+        """
+        step = float(self.time[1])
+        rise = np.diff(V, prepend=V[0] if before is None else before.voltage)
+        nodes = self.tables[0].nodes
+        memory = np.zeros((nodes.size, 1)) if before is None else before.memory
+        responses, left = np.empty((nodes.size, V.size)), np.empty((nodes.size, 1))
+        for i, x in enumerate(step / nodes):
+            responses[i], left[i] = scipy.signal.lfilter([-np.expm1(-x) / x], [1.0, -np.exp(-x)], rise, zi=memory[i])
+        length = step * V.size
+        age = length + (0.0 if before is None else before.age)
+        return responses, FilterState(start + length, float(V[-1]), left, age)
+
+
+def stack_compressions(windows: Sequence[tuple[Compression, ...]]) -> tuple[Compression, ...]:
+    """Return the compressions of each channel, with a leading dimension over the windows."""
+    return tuple(jax.tree.map(lambda *leaves: np.stack(leaves), *each) for each in zip(*windows, strict=True))

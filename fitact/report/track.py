@@ -1,0 +1,103 @@
+"""A track as a page: values over time with their bands."""
+
+import os
+from collections.abc import Iterator
+
+import numpy as np
+
+from fitact.charts import interactive
+from fitact.charts.figure import ALERT, MODEL
+from fitact.charts.interactive import Axis
+from fitact.report.frame import Answer, PageSummary, Provenance, write_page
+from fitact.summary import describe_quantity
+from fitact.tracking.track import Track
+from fitact.units import format_engineering, format_percent, quantity_unit
+
+_CHARTS = (("Rsc", "Csc"), ("contact_area", "force_mean"), ("g", "b"))
+_MAX_POINTS = 4_000  # of a curve
+
+
+def write_track(path: str | os.PathLike[str], track: Track, origin: Provenance) -> None:
+    """Write the page of a track at `path`."""
+    charts = [(names, _chart(track, names)) for names in _CHARTS if all(name in track.values for name in names)]
+    rows: list[tuple[str, ...]] = [
+        ("", "median at the start", "at the end", "variation (sd of the logarithm)", "alike over")
+    ]
+    state = track.to_dict()
+    for name, within in track.within_finger.items():
+        unit = quantity_unit(name)
+        cells = [
+            f"{format_engineering(state[end][name]['median'], unit)} ± {format_percent(state[end][name]['u'])}"
+            if state[end]
+            else ""
+            for end in ("start", "end")
+        ]
+        scale = format_engineering(within["time_scale_s"], "s", 2)
+        rows.append((describe_quantity(name), *cells, format_percent(within["log_sd"]), scale))
+    rates = [("walk", "log-sd after 1 s", "95 % interval")]
+    for name, rate in state["rates"].items():
+        interval = f"{format_percent(rate['lower'])} to {format_percent(rate['upper'])}"
+        rates.append((name.replace("_", " "), format_percent(rate["log_sd_per_root_s"]), interval))
+    names = [" and ".join(describe_quantity(name) for name in pair) for pair, _ in charts]
+    panels = [(title, chart) for title, (_, chart) in zip(names, charts, strict=True)]
+    write_page(path, "track.html", frame=_frame(track), origin=origin, panels=panels, table=rows, rates=rates)
+
+
+def _frame(track: Track) -> PageSummary:
+    answers = []
+    for name in ("contact_area", "Rsc", "force_mean"):
+        if name in track.within_finger:
+            state = track.to_dict()
+            change = state["end"][name]["median"] / state["start"][name]["median"] - 1.0 if state["end"] else np.nan
+            value = f"{change:+.3g}".replace("nan", "?")
+            value = f"{100.0 * change:+.3g} %" if np.isfinite(change) else value
+            spread = format_percent(track.within_finger[name]["log_sd"])
+            answers.append(Answer(describe_quantity(name), value, f"from start to end; varies by {spread}"))
+    findings = {"Identifiability": str(track.fit.identifiability)}
+    if track.lifted:
+        spans = ", ".join(f"{begin:.4g} to {end:.4g} s" for begin, end in track.lifted)
+        findings["No contact"] = f"{spans}; these windows are left out."
+    if track.jumps:
+        findings["Jumps"] = f"at {', '.join(f'{jump:.4g} s' for jump in track.jumps)}; nothing is smoothed over them."
+    count = int(np.count_nonzero(track.reliable))
+    return PageSummary(
+        title="A finger over time",
+        subject=f"{count:,} windows of {format_engineering(track.window, 's')}, joined by random walks.",
+        trusted=track.trusted,
+        verdict="The finger is followed along the record" if track.trusted else f"{track.fit.message}",
+        findings=findings,
+        answers=answers,
+        warnings=track.warnings,
+        has_reservation=track.fit.identifiability.verdict != "identified",
+    )
+
+
+def _chart(track: Track, names: tuple[str, ...]) -> interactive.Chart:
+    plots = []
+    for name in names:
+        values, spread = track.values[name], track.sd[name]
+        finite = np.isfinite(values)
+        x = Axis.from_values("time", "s", track.time)
+        y = Axis.from_values(describe_quantity(name), quantity_unit(name), values[finite])
+        traces = []
+        for number, part in enumerate(_stretches(finite)):
+            time, middle = track.time[part], values[part]
+            low, high = (middle * np.exp(sign * 1.96 * spread[part]) for sign in (-1.0, 1.0))
+            edges = interactive.band(x, y, time, low, high, ("2.5 %", "97.5 %", "95 % band"), MODEL)
+            curve = interactive.line(x, y, time, middle, "median", MODEL)
+            shown = [*edges, curve]
+            traces += [each | ({"showlegend": False} if number else {}) for each in shown]
+        for jump in track.jumps:
+            ends = np.nanmin(values), np.nanmax(values)
+            traces.append(interactive.line(x, y, (jump, jump), ends, "jump", ALERT, dash="dot"))
+        plots.append(interactive.plot(x, (y, traces), legend=False))
+    return interactive.chart(*plots)
+
+
+def _stretches(shown: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the places of each stretch without a gap, at most `_MAX_POINTS` of all."""
+    places = np.flatnonzero(shown)
+    stride = -(-places.size // _MAX_POINTS)
+    for part in np.split(places, np.flatnonzero(np.diff(places) > 1) + 1):
+        if part.size:
+            yield part[::stride]

@@ -1,0 +1,149 @@
+"""Windows of a record, compressed: a fit to a first window in contact gives the model, which all others share."""
+
+import dataclasses
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from fitact.data.record import Record
+from fitact.errors import InputError
+from fitact.fitting.current import edge_mask, weigh_current_samples
+from fitact.fitting.fit import Fit, fit
+from fitact.likelihood.compression import Compression
+from fitact.likelihood.window_compression import FilterState, WindowCompressor, stack_compressions
+from fitact.scene.scene import Scene
+from fitact.tracking.windows import AROUND, Window
+
+NO_CONTACT = 0.1  # part of the usual signal below which the finger is not in contact
+_WHOLE = 0.5  # least signal of a part of a window over its largest; otherwise contact was made or lost within it
+_SETTLED = 12.0  # time constants after which an unknown charge has decayed to 6e-6
+_DRIVEN = 1e-3  # least rms of V over its usual one
+
+
+class CompressedWindow(NamedTuple):
+    """A window's data, or None without data, and what is known of the contact."""
+
+    start: float  # s
+    compressions: tuple[Compression, ...] | None
+    lowest: float  # least and largest signal of the window's parts over that of the model's circuit; NaN without drive
+    highest: float
+
+
+@dataclasses.dataclass(frozen=True)
+class CompressedWindows:
+    """Windows of one length; values of windows without data are those of another and are not to be used."""
+
+    start: Float[np.ndarray, " windows"]
+    compressions: tuple[Compression, ...]  # of each channel, stacked
+    has_data: Bool[np.ndarray, " windows"]
+    contact: Bool[np.ndarray, " windows"]
+
+    @classmethod
+    def from_windows(cls, windows: Sequence[CompressedWindow]) -> "CompressedWindows":
+        """Stack the windows, and decide where the finger is in contact with the panel for a whole window."""
+        lowest, highest = (np.array([getattr(each, name) for each in windows]) for name in ("lowest", "highest"))
+        known = np.isfinite(lowest)
+        usual = float(np.median(highest[known & (highest > NO_CONTACT)])) if np.any(known) else 1.0
+        contact = ~known | ((lowest > NO_CONTACT * usual) & (lowest > _WHOLE * highest))
+        filled = next(each.compressions for each in windows if each.compressions is not None)
+        has_data = np.array([each.compressions is not None for each in windows])
+        stacked = stack_compressions([each.compressions or filled for each in windows])
+        return cls(np.array([each.start for each in windows]), stacked, has_data & contact, contact)
+
+
+class WindowModel(NamedTuple):
+    """Model of all windows, from a fit to one of them."""
+
+    fit: Fit
+    compressor: WindowCompressor
+    parts: int  # parts of a window in which the signal is compared
+    drive_rms: float  # V
+    noise: dict[str, float]
+    time_constants: Float[np.ndarray, " taus"]  # s
+
+    def compress_windows(
+        self, windows: Iterable[Window], done: Sequence[CompressedWindow] = ()
+    ) -> Iterator[CompressedWindow]:
+        """Compress windows but for the first, if these are `done`; one with lost samples or no drive has no data.
+
+        Responses go on from window to window, so that the charge at the start is known, where the finger touched all
+        the time.
+        """
+        step, settled = float(self.compressor.time[1]), _SETTLED * float(np.max(self.time_constants))
+        state: FilterState | None = None
+        for number, window in enumerate(windows):
+            V = window.channels["V"]
+            if not window.is_whole or float(np.std(V)) < _DRIVEN * self.drive_rms:
+                state = None
+                yield CompressedWindow(window.start, None, math.nan, math.nan)
+                continue
+            if state is not None and abs(window.start - state.end) > 0.5 * step:
+                state = None
+            has_charge = state is None or state.age < settled
+            responses, state = self.compressor.respond(V, window.start, state)
+            each = done[number] if number < len(done) else self._compress(window, responses, has_charge)
+            if not (each.lowest > NO_CONTACT and each.lowest > _WHOLE * each.highest):
+                state = None
+            yield each
+
+    def _compress(self, window: Window, responses: np.ndarray, has_charge: bool) -> CompressedWindow:
+        V = window.channels["V"]
+        observed, rates, weights, step = [], [], [], float(self.compressor.time[1])
+        for channel in self.fit.likelihood.channels:
+            values = window.channels[channel.channel]
+            observed.append(values)
+            rate = weight = None
+            if channel.rate is not None:
+                inside = slice(AROUND, -AROUND)
+                rate, used = np.gradient(window.V, step)[inside], ~edge_mask(window.V, self.noise["V"])[inside]
+                spread = self.noise["V"] / (math.sqrt(2.0) * step * self.noise["I"])
+                weight = used * weigh_current_samples(values, rate, spread, used)
+                weight = None if np.all(weight == 1.0) else weight
+            rates.append(rate)
+            weights.append(weight)
+        compressions, expected = self.compressor.compress(V, observed, rates, weights, responses, has_charge)
+        products = np.array_split(np.stack([observed[0] * expected, expected * expected]), self.parts, axis=1)
+        sizes = np.array([part.sum(axis=1) for part in products])
+        driven = sizes[:, 1] > 1e-2 * sizes[:, 1].max()
+        signal = sizes[driven, 0] / sizes[driven, 1]
+        return CompressedWindow(window.start, compressions, float(signal.min()), float(signal.max()))
+
+
+def find_model(windows: Sequence[Window], scene: Scene, step: float, source: str) -> WindowModel:
+    """Fit the window whose Vsc (or I) is nearest to the upper quartile over V, and make the tables of its model.
+
+    Raises:
+        InputError: no window can be fitted, or the noise model or the drive is not one that windows can have.
+    """
+    channels = scene.measurement.channels
+    if scene.measurement.noise_model != "white":
+        raise InputError("scene: [measurement] noise_model: a track needs white noise; leave the key out")
+    whole = [each for each in windows if each.is_whole and np.ptp(each.channels["V"]) > 0.0]
+    if not whole:
+        raise InputError(f"{source}: there is no window with a drive and all samples; record V_V beside {channels[0]}")
+    ratio = np.array([np.std(each.channels[channels[0]]) / np.std(each.channels["V"]) for each in whole])
+    order = np.argsort(np.abs(ratio - np.quantile(ratio, 0.75)))
+    first = whole[int(order[0])]
+    time = step * np.arange(first.channels["V"].size)
+    record = Record.from_arrays(time, **first.channels, source=source)  # type: ignore[arg-type]
+    if not np.std(record[channels[0]]) > 3.0 * record.noise(channels[0]):
+        raise InputError(
+            f"{source}: {channels[0]} shows no signal above its noise in any window; check its column and its unit"
+        )
+    frequency = record.frequency()
+    if frequency is None:
+        raise InputError(
+            f"{source}: a window of {time[-1] + step:.4g} s holds no period of V_V; give a longer one, as --window"
+            f" {10.0 * time[-1]:.2g}, for a drive that repeats"
+        )
+    fitted = fit(record, scene)
+    with jax.enable_x64(True):
+        circuit = fitted.likelihood.evaluate_circuit(fitted.theta)
+        compressor = WindowCompressor.from_channels(fitted.likelihood.channels, circuit, time.size, step)
+    noise = {name: record.noise(name) for name in record.channels}
+    parts = max(1, math.floor((time[-1] + step) * frequency))
+    return WindowModel(fitted, compressor, parts, float(np.std(first.channels["V"])), noise, circuit.tau)

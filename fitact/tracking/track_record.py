@@ -1,0 +1,269 @@
+"""Track of a record: reading, windows, and the random walk that joins them."""
+
+import dataclasses
+import hashlib
+import itertools
+import math
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from fitact.data.readers.stream import Block, stream_record
+from fitact.data.record import Record, fundamental_frequency
+from fitact.errors import InputError
+from fitact.files import atomic_write
+from fitact.progress import track_progress
+from fitact.scene.scene import Scene
+from fitact.scene.sections import DriveSection
+from fitact.tracking.compressed_windows import CompressedWindow, CompressedWindows, WindowModel, find_model
+from fitact.tracking.track import Track, solve_windows
+from fitact.tracking.windows import Window, split_windows
+
+CHECKPOINT = "windows.npz"
+_HEAD_SAMPLES = 65_536  # from which the time step and the period are taken
+_MIN_PERIODS, _MIN_SAMPLES = 5, 4_000  # of a default window
+UPDATE_INTERVAL = 1.0  # s, between tracks of a record that is being followed
+_TRIED = 8  # windows among which one is fitted
+
+
+class _Head(NamedTuple):
+    """Sampling of a record, from its first samples."""
+
+    step: float  # s
+    samples: int  # in a window
+    notes: tuple[str, ...]
+
+
+def track(
+    record: Record | str | os.PathLike[str],
+    scene: Scene | None = None,
+    *,
+    window: float | None = None,
+    channels: Mapping[str, str] | None = None,
+    scale: Mapping[str, float] | None = None,
+    rate: float | None = None,
+    follow: float = 0.0,
+    folder: str | os.PathLike[str] | None = None,
+    update: Callable[[Track], None] | None = None,
+    rates: Sequence[float] | None = None,
+) -> Track:
+    """Follow a finger along a record of any length: Rsc, Csc, Ci, contact area and force over time.
+
+    The record is cut into windows, each of which is compressed to a few numbers as it is read. One window is fitted;
+    its model, with the recorded V as its drive, serves all. Random walks in the logarithms join the windows: in the
+    contact area, in the skin's resistance times the area, and in its capacitance over the area. Their rates are
+    estimated, with half-normal priors. What else is free (gains of instruments, R_H, ...) is constant. Windows in which
+    the finger does not touch the panel are left out, and lost samples are bridged with growing uncertainty.
+
+    Args:
+        record: a record, the path of one, or "-" for standard input; V and the channels of the scene are needed.
+        scene: device, circuit and prior. A waveform that it states is not used.
+        window: length of a window, s; default: five periods of the drive, at least 4,000 samples.
+        channels, scale, rate: as in `fitact.read`, for a path.
+        follow: seconds to wait for more samples at the end of a text file that is still being written.
+        folder: folder in which an interrupted run leaves what it has compressed, and from which it goes on.
+        update: called with the track so far, about once a second, while the record is followed.
+        rates: standard deviations of the walks' logarithms after 1 s, instead of their estimates; 0 for constants.
+
+    Raises:
+        InputError: the record is refused, lacks V, changes its sampling rate, or a window is shorter than a period.
+    """
+    if isinstance(record, Record):
+        blocks: Iterator[Block] = iter([Block(record.time, record.channels, float(len(record)))])
+        source, total = record.source, float(len(record))
+    else:
+        blocks = stream_record(record, channels=channels, scale=scale, rate=rate, follow=follow)
+        source = os.fspath(record)
+        total = float(os.path.getsize(source)) if os.path.isfile(source) else math.inf
+    return track_blocks(blocks, source, total, scene, window=window, folder=folder, update=update, rates=rates)
+
+
+def track_blocks(
+    blocks: Iterator[Block],
+    source: str,
+    total: float,
+    scene: Scene | None = None,
+    *,
+    window: float | None = None,
+    folder: str | os.PathLike[str] | None = None,
+    update: Callable[[Track], None] | None = None,
+    rates: Sequence[float] | None = None,
+) -> Track:
+    """Follow a finger along blocks of samples, as `track` does; `total` is the last block's position, for progress."""
+    stated = scene or Scene()
+    followed = stated.model_copy(update={"drive": DriveSection(waveform="measured")})
+    first, blocks = _read_head(blocks, followed, source)
+    head = _describe_head(first, window, source)
+    position = [0.0]
+    windows = split_windows(_watch(blocks, position), head.step, head.samples, source)
+    model, begun = _find_first_model(windows, followed, head.step, source)
+    checkpoint = None if folder is None else _Checkpoint(Path(folder) / CHECKPOINT, model, followed)
+    done = checkpoint.load(begun) if checkpoint else []
+    compressed: list[CompressedWindow] = []
+    everything = track_progress(
+        itertools.chain(begun, windows), f"tracking {source}", max(total, 1.0), lambda: position[0]
+    )
+    last = time.monotonic()
+    try:
+        with jax.enable_x64(True):
+            for each in model.compress_windows(everything, done):
+                compressed.append(each)
+                if update is not None and time.monotonic() - last > UPDATE_INTERVAL:
+                    update(_solve(model, compressed, stated, head.notes, rates))
+                    last = time.monotonic()
+    except KeyboardInterrupt:
+        if checkpoint:
+            checkpoint.store(compressed)
+        raise
+    found = _solve(model, compressed, stated, head.notes, rates)
+    if checkpoint:
+        checkpoint.path.unlink(missing_ok=True)
+    return found
+
+
+def _solve(
+    model: WindowModel,
+    compressed: list[CompressedWindow],
+    scene: Scene,
+    notes: tuple[str, ...],
+    rates: Sequence[float] | None,
+) -> Track:
+    found, _ = solve_windows(model, CompressedWindows.from_windows(compressed), rates=rates)
+    if scene.states_waveform() and scene.drive.waveform != "measured":
+        notes = (*notes, f"the recorded V is the drive of a track, not the {scene.drive.waveform} of the scene")
+    return dataclasses.replace(found, notes=tuple(dict.fromkeys([*found.notes, *notes])))
+
+
+def _watch(blocks: Iterable[Block], position: list[float]) -> Iterator[Block]:
+    for block in blocks:
+        position[0] = block.position
+        yield block
+
+
+def _read_head(blocks: Iterator[Block], scene: Scene, source: str) -> tuple[list[Block], Iterator[Block]]:
+    """Return the first blocks, and all of them; refuse a record without the channels that are needed."""
+    first, count = [], 0
+    for block in blocks:
+        for name in ("V", *scene.measurement.channels):
+            if name not in block.channels:
+                unit = "A" if name == "I" else "V"
+                raise InputError(
+                    f"{source}: the channel {name}_{unit} is missing; a track needs the recorded drive and the"
+                    f" channels of the scene ({', '.join(scene.measurement.channels)})"
+                )
+        first.append(block)
+        count += block.time.size
+        if count >= _HEAD_SAMPLES or (count >= _MIN_SAMPLES and _find_frequency(first)[0] is not None):
+            break
+    if count < 20:
+        raise InputError(f"{source}: holds {count} samples, too few for a track; record several periods of the drive")
+    needed = ("V", *scene.measurement.channels)
+
+    def select(block: Block) -> Block:
+        return block._replace(channels={name: block.channels[name] for name in needed})
+
+    return first, map(select, itertools.chain(first, blocks))
+
+
+def _find_frequency(first: list[Block]) -> tuple[float | None, np.ndarray]:
+    """Return the frequency of V (Hz), or None if it does not repeat, and the times of the samples (s)."""
+    time = np.concatenate([block.time for block in first])[:_HEAD_SAMPLES]
+    voltage = np.concatenate([block.channels["V"] for block in first])[:_HEAD_SAMPLES]
+    finite = np.isfinite(voltage)
+    if not finite.any() or not np.ptp(voltage[finite]) > 0.0:
+        return None, time
+    return fundamental_frequency(time[finite], voltage[finite]), time
+
+
+def _describe_head(first: list[Block], window: float | None, source: str) -> _Head:
+    """Return the time step and the number of samples in a window, from the first samples."""
+    frequency, times = _find_frequency(first)
+    steps = np.diff(times)
+    usual = float(np.median(steps))
+    if not usual > 0.0:
+        raise InputError(f"{source}: the time does not increase; state the sampling rate (--rate) if it was rounded")
+    whole = steps[(steps > 0.5 * usual) & (steps < 1.5 * usual)]
+    step = float(np.mean(whole))
+    notes = tuple(dict.fromkeys(note for block in first for note in block.notes))
+    if window is None:
+        periods = 0 if frequency is None else math.ceil(_MIN_PERIODS / (frequency * step) - 0.5)
+        return _Head(step, max(periods, _MIN_SAMPLES), notes)
+    samples = round(window / step) if 0.0 < window < math.inf else 0
+    if samples < 20:
+        raise InputError(f"window = {window:g} s holds {samples} samples of {step:.3g} s; give at least 20 samples")
+    if frequency is not None and samples * step < (1.0 - 1e-3) / frequency:
+        raise InputError(
+            f"window = {window:g} s is shorter than a period of V_V ({1.0 / frequency:.4g} s); give at least one"
+            f" period, better {_MIN_PERIODS}"
+        )
+    return _Head(step, samples, notes)
+
+
+def _find_first_model(
+    windows: Iterator[Window], scene: Scene, step: float, source: str, rounds: int = 250
+) -> tuple[WindowModel, list[Window]]:
+    """Return the model of the first windows that can be fitted, and all windows read for that."""
+    begun: list[Window] = []
+    for number in range(rounds):
+        part = list(itertools.islice(windows, _TRIED))
+        begun += part
+        if not part:
+            if number == 0:
+                raise InputError(f"{source}: is shorter than one window; give a shorter one with --window")
+            break
+        try:
+            return find_model(part, scene, step, source), begun
+        except InputError as error:  # perhaps the finger does not touch yet
+            refusal = error
+    raise refusal
+
+
+class _Checkpoint:
+    """Compressed windows of an interrupted run, with what they depend on."""
+
+    def __init__(self, path: Path, model: WindowModel, scene: Scene) -> None:
+        self.path, self._model, self._scene = path, model, scene
+
+    def _key(self) -> str:
+        parts = self._scene.to_json(), str(self._model.compressor.time.size), self._model.fit.record.fingerprint
+        return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+    def store(self, windows: list[CompressedWindow]) -> None:
+        filled = [each for each in windows if each.compressions is not None]
+        if not filled:
+            return
+        leaves = [jax.tree.leaves(each.compressions or filled[0].compressions) for each in windows]
+        arrays: dict[str, Any] = {f"leaf{i}": np.stack(each) for i, each in enumerate(zip(*leaves, strict=True))}
+        for name in ("start", "lowest", "highest"):
+            arrays[name] = np.array([getattr(each, name) for each in windows])
+        arrays["has_data"] = np.array([each.compressions is not None for each in windows])
+        with atomic_write(self.path) as temporary, temporary.open("wb") as file:
+            np.savez(file, key=np.array(self._key()), **arrays)
+
+    def load(self, begun: list[Window]) -> list[CompressedWindow]:
+        """Return the windows of an interrupted run with the same scene, window and first samples."""
+        if not self.path.is_file():
+            return []
+        with np.load(self.path, allow_pickle=False) as stored:
+            if str(stored["key"]) != self._key():
+                return []
+            with jax.enable_x64(True):
+                whole = next(each for each in begun if each.is_whole)
+                example = next(self._model.compress_windows([whole])).compressions
+            count, structure = len(jax.tree.leaves(example)), jax.tree.structure(example)
+            leaves = [stored[f"leaf{i}"] for i in range(count)]
+            rest = zip(stored["start"], stored["lowest"], stored["highest"], stored["has_data"], strict=True)
+            return [
+                CompressedWindow(
+                    float(start),
+                    jax.tree.unflatten(structure, [leaf[k] for leaf in leaves]) if has_data else None,
+                    float(low),
+                    float(high),
+                )
+                for k, (start, low, high, has_data) in enumerate(rest)
+            ]

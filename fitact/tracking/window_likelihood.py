@@ -1,0 +1,121 @@
+"""Likelihoods of windows, linearised in the parameters, and quantities that follow from these in a window."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitact.compiled import jit, pad_rows
+from fitact.fitting.derived import DerivedQuantities
+from fitact.likelihood.channel import CHARGES
+from fitact.likelihood.compression import Compression
+from fitact.likelihood.likelihood import Likelihood
+from fitact.model.force import force_constant
+
+QUANTITIES = ("g", "b", "force_mean")
+
+
+class Linearization(NamedTuple):
+    """Residuals of windows at points theta, and their derivatives."""
+
+    residuals: Float[np.ndarray, "windows rows"]
+    jacobian: Float[np.ndarray, "windows rows parameters"]
+    squares: Float[np.ndarray, "windows channels"]  # sum of squares of each channel's residuals, in units of sigma
+
+
+def linearize(
+    likelihood: Likelihood,
+    windows: tuple[Compression, ...],
+    theta: Float[np.ndarray, "windows parameters"],
+    sigma: Float[np.ndarray, " channels"],
+    batch: int = 64,
+) -> Linearization:
+    """Linearise the likelihoods of windows; `windows` has the compressions of each channel, stacked."""
+    return Linearization(*_map_windows(_linearize_batch, likelihood, windows, theta, sigma, batch))
+
+
+def evaluate_quantities(
+    derive: DerivedQuantities,
+    likelihood: Likelihood,
+    windows: tuple[Compression, ...],
+    theta: Float[np.ndarray, "windows parameters"],
+    sigma: Float[np.ndarray, " channels"],
+    batch: int = 64,
+) -> tuple[Float[np.ndarray, "windows quantities"], Float[np.ndarray, "windows quantities parameters"]]:
+    """Return the logarithms of `QUANTITIES` in each window, and their gradients in theta."""
+    model = dataclasses.replace(derive, likelihood=likelihood)
+    return _map_windows(_quantities_batch, model, windows, theta, sigma, batch)
+
+
+def _map_windows(function: Any, model: Any, windows: Any, theta: np.ndarray, sigma: np.ndarray, batch: int) -> Any:
+    padded = jax.tree.map(lambda leaf: pad_rows(leaf, batch), (windows, theta))
+    parts = []
+    for first in range(0, len(padded[1]), batch):
+        here = jax.tree.map(lambda leaf, first=first: leaf[first : first + batch], padded)
+        parts.append(function(model, *here, sigma))
+    return tuple(np.concatenate(each)[: len(theta)] for each in zip(*parts, strict=True))
+
+
+def _insert(likelihood: Likelihood, compressions: tuple[Compression, ...]) -> Likelihood:
+    pairs = zip(likelihood.channels, compressions, strict=True)
+    return dataclasses.replace(likelihood, channels=tuple(dataclasses.replace(c, compression=x) for c, x in pairs))
+
+
+@jit
+def _linearize_batch(likelihood: Likelihood, windows: Any, theta: Array, sigma: Array) -> tuple[Array, Array, Array]:
+    def one(compressions: tuple[Compression, ...], theta: Array) -> tuple[Array, Array, Array]:
+        model = _insert(likelihood, compressions)
+
+        def residuals(theta: Array) -> tuple[Array, tuple[Array, Array]]:
+            parts = model.residuals(theta, sigma)
+            values = jnp.concatenate(parts)
+            return values, (values, jnp.stack([jnp.sum(jnp.square(part)) for part in parts]))
+
+        jacobian, (values, squares) = jax.jacfwd(residuals, has_aux=True)(theta)
+        return values, jacobian, squares
+
+    return jax.vmap(one)(windows, theta)
+
+
+@jit
+def _quantities_batch(derive: DerivedQuantities, windows: Any, theta: Array, sigma: Array) -> tuple[Array, Array]:
+    def one(compressions: tuple[Compression, ...], theta: Array) -> tuple[Array, Array]:
+        model = _insert(derive.likelihood, compressions)
+
+        def logs(theta: Array) -> tuple[Array, Array]:
+            circuit = model.circuit(theta)
+            finger = model.finger(circuit)
+            contact = derive.geometry.contact(finger)
+            square = _mean_square(model, circuit, theta, sigma, contact.channel)
+            values = jnp.stack([finger.g, finger.b, force_constant(contact) * square])
+            return jnp.log(values), jnp.log(values)
+
+        gradients, values = jax.jacfwd(logs, has_aux=True)(theta)
+        return values, gradients
+
+    return jax.vmap(one)(windows, theta)
+
+
+def _mean_square(model: Likelihood, circuit: Any, theta: Array, sigma: Array, acting: Any) -> Array:
+    """Return the mean square of the voltage that generates the force, V^2, from inner products over the window."""
+    channel = model.channels[0]
+    compression, inputs = channel.compression, model.make_inputs(circuit, theta, channel)
+    assert isinstance(compression, Compression)
+    terms = model.finger(circuit).channel_terms(acting)
+    voltage = compression.response(terms)
+    # the effect of a charge scales between channels like the response to the drive
+    _, beta, _ = channel.fit_nuisances(inputs, sigma[0])
+    sizes = dict(zip(channel.columns, beta * channel.linear_sd[np.array(channel.columns, dtype=int)], strict=True))
+    first = len(channel.linear_sd) - len(CHARGES)
+    recorded = circuit.channel_terms(channel.channel)
+    for index, (weight, other, tau) in enumerate(zip(terms.weight, recorded.weight, recorded.tau, strict=False)):
+        if first + index in sizes:
+            size = sizes[first + index] / inputs.gain * weight / jnp.where(other == 0.0, 1.0, other)
+            voltage = voltage + size * compression.decays(tau, index)
+    names, gains = model.names, channel.drive_gains
+    scale = jnp.exp(sum((power * theta[names.index(name)] for name, power in gains), jnp.zeros(())))
+    ones = compression.baseline[0]
+    return jnp.sum(jnp.square(voltage)) / jnp.sum(jnp.square(ones)) / jnp.square(scale)

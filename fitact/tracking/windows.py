@@ -1,0 +1,75 @@
+"""Windows of a long record, from blocks of samples that arrive one after another."""
+
+import itertools
+from collections.abc import Iterable, Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from fitact.data.readers.stream import Block
+from fitact.errors import InputError
+
+AROUND = 3  # samples of V that a window has on either side, for its slope and edges
+
+
+class Window(NamedTuple):
+    """Consecutive samples of all channels."""
+
+    start: float  # time of the first sample, s
+    channels: Mapping[str, Float[np.ndarray, " samples"]]
+    V: Float[np.ndarray, " samples+around"]  # with its neighbours; after lost samples, the first or last is repeated
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all samples are numbers."""
+        return all(bool(np.isfinite(values).all()) for values in self.channels.values())
+
+
+def split_windows(
+    blocks: Iterable[Block], step: float, samples: int, source: str, max_change: float = 0.01
+) -> Iterator[Window]:
+    """Yield windows of `samples` samples, `step` s apart; after lost samples, a new window begins.
+
+    Raises:
+        InputError: times that do not increase, or steps that differ from `step` by more than `max_change`.
+    """
+    time, channels = np.empty(0), dict[str, np.ndarray]()
+    done = 0  # samples at the beginning that are in windows, and are kept as neighbours of the next one
+    for block in itertools.chain(blocks, [None]):
+        if block is not None:
+            time = np.concatenate([time, block.time])
+            channels = {n: np.concatenate([channels.get(n, np.empty(0)), v]) for n, v in block.channels.items()}
+        steps = np.diff(time)
+        _check_steps(time, steps, step, source, max_change)
+        begin, first = done, 0
+        for end in [*(np.flatnonzero(steps > 1.5 * step) + 1).tolist(), time.size]:
+            is_open = end == time.size and block is not None  # more samples may follow
+            while end - begin >= samples + AROUND * is_open:
+                last = begin + samples
+                V = channels["V"][max(first, begin - AROUND) : min(end, last + AROUND)]
+                around = (AROUND - min(AROUND, begin - first), AROUND - min(AROUND, end - last))
+                values = {name: each[begin:last] for name, each in channels.items()}
+                yield Window(float(time[begin]), values, np.pad(V, around, mode="edge"))
+                begin = last
+            if end < time.size:
+                begin = first = end
+        kept = max(first, begin - AROUND)
+        time, channels, done = time[kept:], {name: each[kept:] for name, each in channels.items()}, begin - kept
+
+
+def _check_steps(time: np.ndarray, steps: np.ndarray, step: float, source: str, max_change: float) -> None:
+    if not np.all(steps > 0.0):
+        row = int(np.argmin(steps > 0.0))
+        raise InputError(
+            f"{source}: the time does not increase after {time[row]:.9g} s; a track needs samples in order, so export"
+            " the record again"
+        )
+    run = 100  # steps of which more than half differ where the rate has changed
+    for first in range(0, steps.size - run, run):
+        usual = float(np.median(steps[first : first + run]))
+        if abs(usual / step - 1.0) > max_change:
+            raise InputError(
+                f"{source}: the time step changes from {step:.4g} s to {usual:.4g} s near {time[first]:.4g} s; track"
+                " each part with one rate by itself"
+            )

@@ -1,0 +1,273 @@
+"""Tracks of simulated fingers that change, by the route of data_synth, against their true courses."""
+
+import io
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas
+import pytest
+
+import fitact
+from data_synth.changing import Course, make_course
+from data_synth.make import simulate_response
+from data_synth.scene import make_scene
+from fitact.tracking import track_record
+
+RATE, DURATION, WINDOW = 50e3, 3.0, 0.08
+START = (160e3, 22e-9, 1.35e-9)
+SCENE = fitact.Scene.from_dict({"drive": {"waveform": "measured"}, "measurement": {"channels": ["Vsc", "I"]}})
+ALONE = fitact.Scene.from_dict({"drive": {"waveform": "measured"}})
+STILL: dict[str, Any] = {
+    "time": None, "area": None, "Rsc": None, "Csc": None,
+    "walk_area": 0.0, "walk_Rsc": 0.0, "walk_Csc": 0.0, "lifted": (),
+}  # fmt: skip
+SLIDE = {"time": (0.0, 3.0), "area": (1.0, 1.3), "Rsc": (1.0, 0.6), "lifted": (1.53, 1.71)}
+
+
+def simulate(seed: int = 0, duration: float = DURATION, **change: Any) -> tuple[fitact.Record, Course]:
+    """Return a record of a finger that changes, with noise of 0.1 V and 20 nA, and its course."""
+    drive = {"waveform": "trapezoid", "rise_time": "200 us"}
+    scene = make_scene({"drive": drive, "measurement": {"channels": ["Vsc", "I"]}}, {}, "scene")
+    rng = np.random.default_rng(seed)
+    course = make_course(STILL | change, START, duration, rng)
+    time = np.arange(round(duration * RATE)) / RATE
+    V, Vsc, current = simulate_response(scene, time, None, "scipy", course)
+    Vsc, current = Vsc + 0.1 * rng.standard_normal(time.size), current + 20e-9 * rng.standard_normal(time.size)
+    return fitact.Record.from_arrays(time, V=V, Vsc=Vsc, I=current), course
+
+
+def errors(track: fitact.Track, course: Course) -> dict[str, np.ndarray]:
+    """Return the errors of reliable values in standard uncertainties."""
+    Rsc, Csc, Ci = course.values(track.time)
+    truth = {"Rsc": Rsc, "Csc": Csc, "Ci": Ci, "g": Ci / (2.0 * Ci + Csc), "b": Rsc * (2.0 * Ci + Csc)}
+    truth["contact_area"] = 1e-4 * Ci / START[2]
+    return {
+        name: (np.log(track.values[name] / values) / track.u[name])[track.reliable]
+        for name, values in truth.items()
+        if name in track.values
+    }
+
+
+@pytest.fixture(scope="module")
+def slide() -> tuple[fitact.Track, Course, fitact.Record]:
+    record, course = simulate(**SLIDE)
+    return fitact.track(record, SCENE), course, record
+
+
+def test_slide_is_followed_within_its_bands(slide):
+    track, course, _ = slide
+    for name, z in errors(track, course).items():
+        assert np.mean(np.abs(z) < 1.96) >= 0.93, name
+    assert track.trusted
+    # values are of use: far narrower than the change
+    assert np.nanmedian(track.u["contact_area"]) < 4e-3 < 0.1 < track.within_finger["Rsc"]["log_sd"]
+    assert set(track.verdict[track.reliable]) == {"identified"}
+
+
+def test_lift_off_is_found_within_one_window(slide):
+    track, *_ = slide
+    ((begin, end),) = track.lifted
+    assert 0.0 <= 1.53 - begin <= WINDOW
+    assert 0.0 <= end - 1.71 <= WINDOW + 2e-3
+    assert np.isnan(track.values["Rsc"][~track.contact]).all()
+    assert track.jumps == ()  # a new contact is no jump
+
+
+def test_force_is_that_of_the_true_voltage(slide):
+    track, course, _ = slide
+    scene = make_scene({"drive": {"waveform": "trapezoid", "rise_time": "200 us"}}, {}, "scene")
+    for k in (2, 15, 30):
+        time = track.time[k] + np.linspace(-0.5, 0.5, 4000, endpoint=False) * track.window
+        _, Vsc, _ = simulate_response(scene, time, None, "scipy", course)
+        _, Csc, Ci = course.values(track.time[k : k + 1])[:, 0]
+        contact = fitact.Contact(1e-4, 1e-6, Ci * 1e-6 / (8.85e-12 * 1e-4), 200e-6, Csc * 200e-6 / (8.85e-12 * 1e-4))
+        expected = float(np.mean(fitact.electrostatic_force(Vsc, contact)))
+        # values of the middle with the voltage of the whole window, over which Rsc changes by 1 %
+        assert track.values["force_mean"][k] == pytest.approx(expected, rel=2e-3)
+
+
+def test_columns_and_summary_of_the_contract(slide, tmp_path: Path):
+    track, *_ = slide
+    track.to_parquet(tmp_path / "track.parquet")
+    table = pandas.read_parquet(tmp_path / "track.parquet")
+    names = ("Rsc", "Csc", "Ci", "g", "b", "force_mean")
+    assert {"time_s", "reliable", "contact", *names, *(f"{name}_u" for name in names)} <= set(table.columns)
+    assert len(table) == track.time.size
+    content = track.to_dict()
+    assert content["within_finger"]["Rsc"].keys() == {"log_sd", "time_scale_s"}
+    assert "no contact from 1.5" in str(track)
+
+
+def test_fit_of_a_constant_finger_names_the_change(slide):
+    *_, record = slide
+    part = slice(0, 25_000)  # 0.5 s, in which Rsc falls by 8 % for the area and by 5 % more for the skin
+    channels = {name: values[part] for name, values in record.channels.items()}
+    fitted = fitact.fit(fitact.Record.from_arrays(record.time[part], **channels), SCENE)
+    assert fitted.result in ("misfit", "structure")
+    assert fitted.effects.rivals[0]["group"].startswith("a change during the record of")
+    assert "during the record: use track" in fitted.message
+
+
+def test_stationary_record_gives_the_answer_of_a_fit():
+    record, course = simulate(duration=1.0)
+    fitted, found = fitact.fit(record, SCENE), fitact.track(record, SCENE)
+    for i, name in enumerate(fitted.names):
+        # the walk's rate is not exactly zero, so that the bands are a little wider
+        assert np.max(np.abs(np.log(found.values[name]) - fitted.theta[i])) < 2.0 * np.max(found.sd[name])
+        assert np.max(found.sd[name]) < 2.0 * fitted.sd[i]
+    assert np.all(found.rates.lower == 0.0)
+    for z in errors(found, course).values():
+        assert np.max(np.abs(z)) < 3.5
+
+
+def test_walk_fixed_at_zero_gives_the_answer_of_a_fit():
+    record, _ = simulate(duration=0.96)  # a whole number of windows
+    fitted = fitact.fit(record, SCENE)
+    found = fitact.track(record, SCENE, rates=(0.0, 0.0, 0.0))
+    for i, name in enumerate(fitted.names):
+        # the first windows have a few samples at edges more or less than the whole record
+        assert np.log(found.values[name]) == pytest.approx(fitted.theta[i], abs=0.05 * fitted.sd[i])
+        assert found.sd[name] == pytest.approx(fitted.sd[i], rel=0.02)
+
+
+def test_vsc_alone_leaves_the_area_to_the_prior():
+    record, course = simulate(**SLIDE)
+    track = fitact.track(record, ALONE)
+    assert set(track.verdict[track.reliable]) == {"prior-limited"}
+    found = errors(track, course)
+    for name in ("g", "b"):
+        assert np.mean(np.abs(found[name]) < 1.96) >= 0.93, name
+    assert np.min(track.u["contact_area"][track.reliable]) > 0.04  # the prior of Ci, ± 5 %
+    assert track.u["g"][track.reliable].max() < 2e-3
+
+
+def test_random_walk_is_recovered_with_its_rates():
+    # three records, since one may have a rare walk; any seeds would do at these limits
+    inside, rates = [], []
+    for seed in (1, 2, 3):
+        record, course = simulate(seed, walk_area=0.02, walk_Rsc=0.05, walk_Csc=0.01)
+        track = fitact.track(record, SCENE)
+        inside += [np.mean(np.abs(z) < 1.96) for z in errors(track, course).values()]
+        rates.append(track.rates.rate)
+        assert np.all(track.rates.lower > 0.0)
+    assert 0.9 < np.mean(inside) <= 1.0
+    assert np.mean(rates, axis=0) == pytest.approx([0.02, 0.05, 0.01], rel=0.35)
+
+
+def test_lost_samples_are_bridged_and_a_jump_is_found():
+    walks = {"walk_area": 0.02, "walk_Rsc": 0.02, "walk_Csc": 0.01}  # what is lost of them is uncertain for any seed
+    record, course = simulate(4, time=(0.0, 1.8, 1.8004, 3.0), Rsc=(1.0, 1.0, 1.3, 1.3), **walks)
+    channels = {name: np.array(values) for name, values in record.channels.items()}
+    channels["Vsc"][30_000:36_000] = np.nan  # lost by one channel
+    keep = np.ones(record.time.size, bool)
+    keep[50_000:60_000] = False  # lost by all, with their times
+    blocks = [fitact.data.readers.stream.Block(record.time[keep], {n: v[keep] for n, v in channels.items()}, 0.0)]
+    track = track_record.track_blocks(iter(blocks), "record", 0.0, SCENE)
+    lost = ~track.reliable & (track.time < 1.0)  # the window with the jump is none of either state
+    assert lost.any()
+    assert np.all(np.abs(track.time[lost] - 0.66) < 0.15)
+    assert np.max(track.sd["Rsc"][lost]) > 1.05 * np.median(track.sd["Rsc"])
+    assert np.any(np.diff(track.time) > 0.2)
+    assert [jump for jump in track.jumps if abs(jump - 1.8) <= WINDOW]
+    for name in ("Rsc", "b"):
+        z = errors(track, course)[name]
+        assert np.mean(np.abs(z) < 1.96) > 0.85, name
+
+
+def write_csv(path: Path, record: fitact.Record) -> None:
+    table = {"time_s": record.time, "V_V": record["V"], "Vsc_V": record["Vsc"], "I_A": record["I"]}
+    pandas.DataFrame(table).to_csv(path, index=False)
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory) -> tuple[Path, fitact.Record]:
+    record, _ = simulate(duration=1.0, time=(0.0, 1.0), area=(1.0, 1.1))
+    path = tmp_path_factory.mktemp("track") / "long.csv"
+    write_csv(path, record)
+    return path, record
+
+
+def test_file_and_standard_input_give_the_same_as_arrays(short, monkeypatch):
+    path, record = short
+    expected, from_file = fitact.track(record, SCENE), fitact.track(path, SCENE)
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(path.read_bytes())))
+    from_stream = fitact.track("-", SCENE)
+    for found in (from_file, from_stream):
+        assert found.time == pytest.approx(expected.time, abs=1e-12)
+        for name, values in expected.values.items():
+            assert found.values[name] == pytest.approx(values, rel=1e-9, nan_ok=True), name
+
+
+def test_interrupted_run_goes_on_to_the_same_result(short, tmp_path: Path, monkeypatch):
+    path, _ = short
+    whole = fitact.track(path, SCENE)
+    compress, count = track_record.WindowModel._compress, 0
+
+    def interrupt(*args: Any) -> Any:
+        nonlocal count
+        count += 1
+        if count == 7:
+            raise KeyboardInterrupt
+        return compress(*args)
+
+    monkeypatch.setattr(track_record.WindowModel, "_compress", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        fitact.track(path, SCENE, folder=tmp_path)
+    assert (tmp_path / track_record.CHECKPOINT).is_file()
+    count = 100
+    resumed = fitact.track(path, SCENE, folder=tmp_path)
+    assert count < 100 + whole.time.size  # six windows were not compressed again, one is for the shapes
+    assert not (tmp_path / track_record.CHECKPOINT).exists()
+    for name, values in whole.values.items():
+        np.testing.assert_array_equal(resumed.values[name], values)
+
+
+def test_file_that_is_still_written_is_followed(short, tmp_path: Path):
+    path, _ = short
+    lines = path.read_bytes().splitlines(keepends=True)
+    growing, seen = tmp_path / "growing.csv", []
+    growing.write_bytes(b"".join(lines[:40_000]))
+
+    def update(track: fitact.Track) -> None:
+        seen.append(track.time[-1])
+        if len(seen) == 1:
+            with growing.open("ab") as file:
+                file.write(b"".join(lines[40_000:]))
+
+    update_soon = track_record.UPDATE_INTERVAL
+    try:
+        track_record.UPDATE_INTERVAL = 0.0
+        track = fitact.track(growing, SCENE, follow=1.0, update=update)
+    finally:
+        track_record.UPDATE_INTERVAL = update_soon
+    assert seen == sorted(seen)
+    assert track.time[-1] > 0.9 > 0.8 > seen[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"window": 0.005}, "shorter than a period"),
+        ({"window": 1e-4}, "at least 20 samples"),
+        ({"scene": {"measurement": {"noise_model": "student"}}}, "white noise"),
+    ],
+)
+def test_refusals(short, change, sentence):
+    path, _ = short
+    scene = fitact.Scene.from_dict(change.pop("scene", {}))
+    with pytest.raises(fitact.InputError, match=sentence):
+        fitact.track(path, scene, **change)
+
+
+def test_refuses_a_record_without_v_or_with_another_rate(short, tmp_path: Path):
+    _, record = short
+    table = pandas.DataFrame({"time_s": record.time, "Vsc_V": record["Vsc"]})
+    table.to_csv(tmp_path / "no_v.csv", index=False)
+    with pytest.raises(fitact.InputError, match="V_V is missing"):
+        fitact.track(tmp_path / "no_v.csv")
+    time = np.where(np.arange(record.time.size) < 35_000, record.time, record.time[35_000] + 2.0 * (record.time - 0.7))
+    changed = fitact.Record.from_arrays(time, **record.channels)
+    with pytest.raises(fitact.InputError, match="time step changes"):
+        fitact.track(changed, SCENE)
