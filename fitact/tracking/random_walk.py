@@ -14,7 +14,7 @@ _WINDOW = np.array([[1.0, 1.0 / 2.0, 1.0 / 2.0], [1.0 / 2.0, 1.0 / 3.0, 3.0 / 8.
 
 
 class WindowInformation(NamedTuple):
-    """Information of each window on averages of the walk and on the constants: `factor @ (walk, constants) ~ N(target, 1)`.
+    """Information of windows: `factor @ (average of the walk, constants) ~ N(target, 1)`.
 
     A direction that a window does not see has a zero in the factor; a window without data has zeros only.
     """
