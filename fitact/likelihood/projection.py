@@ -132,14 +132,17 @@ class TableNodes(eqx.Module):
     is_grid: bool = eqx.field(static=True)
 
     @classmethod
-    def from_terms(cls, expected_terms: HighpassTerms, time: np.ndarray, *, narrow: bool) -> "TableNodes":
+    def from_terms(
+        cls, expected_terms: HighpassTerms, time: np.ndarray, *, narrow: bool, reach: tuple[float, int] | None = None
+    ) -> "TableNodes":
+        """Make the table of these terms at `time`; `reach`: its half-width in log tau, and the nodes that it needs."""
         tau, weight = (np.asarray(x, dtype=float) for x in (expected_terms.tau, expected_terms.weight))
         log_tau = np.log(tau)
         center = 0.5 * (np.min(log_tau) + np.max(log_tau))
         if isinstance(expected_terms.tau, tuple):
             # a wide table has functions of few samples, which Student's t may weight negatively
             half_width = 0.5 * np.ptp(log_tau) + NARROW if narrow else table_multiple(tau) * TABLE_HALF_WIDTH
-            count = node_count(half_width)
+            half_width, count = reach or (half_width, node_count(half_width))
             relative, mix, series = exponential_basis(half_width, count)
             nodes, (_, to_series) = np.exp(center) * relative, chebyshev(count)
             expected = weight @ np.polynomial.chebyshev.chebvander((log_tau - center) / half_width, count - 1)

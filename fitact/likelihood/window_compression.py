@@ -5,6 +5,7 @@ all. The responses to the recorded drive are first-order recursive filters, whos
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import NamedTuple, Self
 
@@ -22,7 +23,11 @@ from fitact.likelihood.projection import (
     assemble_compression,
     drive_steps,
     evaluate_baseline,
+    table_multiple,
 )
+
+REACH = 4.0  # factor by which b may change
+REACH_NODES = 29  # of the table, whose series then ends at 1e-12
 
 
 class FilterState(NamedTuple):
@@ -47,9 +52,13 @@ class WindowCompressor:
     def from_channels(
         cls, channels: Sequence[ChannelLikelihood], circuit: CircuitValues, samples: int, step: float
     ) -> Self:
-        """Make the tables around the time constants of a circuit, a factor 9 either way."""
+        """Make the tables around the time constants of a circuit, a factor `REACH` either way."""
         time = step * np.arange(samples)
-        tables = [TableNodes.from_terms(circuit.terms[each.channel], time, narrow=False) for each in channels]
+        wide = table_multiple(np.asarray(circuit.tau)) > 1 or np.ptp(np.log(circuit.tau)) > 0.0
+        reach = None if wide else (math.log(REACH), REACH_NODES)
+        tables = [
+            TableNodes.from_terms(circuit.terms[each.channel], time, narrow=False, reach=reach) for each in channels
+        ]
         first = tables[0]
         decays = first.combinations.T @ np.exp(-time / first.nodes[:, None])
         baseline = evaluate_baseline(time, first.middle, first.half)

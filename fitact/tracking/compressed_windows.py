@@ -137,10 +137,15 @@ def find_model(windows: Sequence[Window], scene: Scene, step: float, source: str
     frequency = record.frequency()
     if frequency is None:
         raise InputError(
-            f"{source}: a window of {time[-1] + step:.4g} s holds no period of V_V; give a longer one, as --window"
-            f" {10.0 * time[-1]:.2g}, for a drive that repeats"
+            f"{source}: a window of {time[-1] + step:.4g} s holds less than 1.5 periods of V_V; give a longer one, as"
+            f" --window {10.0 * time[-1]:.2g}s, and a drive that repeats"
         )
     fitted = fit(record, scene)
+    if fitted.full_because:
+        raise InputError(
+            f"{source}: windows cannot be represented by a few numbers, because {fitted.full_because}; leave out a"
+            " small resistance in series (R_H; `fitact plan` states its effect), or give longer windows (--window)"
+        )
     with jax.enable_x64(True):
         circuit = fitted.likelihood.evaluate_circuit(fitted.theta)
         compressor = WindowCompressor.from_channels(fitted.likelihood.channels, circuit, time.size, step)

@@ -165,7 +165,7 @@ class Track:
                 f"{summary.format_engineering(each[name]['median'], unit)} ± {format_percent(each[name]['u'])}"
                 for each in (first, last)
             ]
-            rows.append([name, *cells, format_percent(within["log_sd"])])
+            rows.append([name, *cells, format_percent(within["log_sd"]) if math.isfinite(within["log_sd"]) else ""])
         parts = align_table(rows) if first else []
         for name, rate, low, high in zip(
             self.rates.names, self.rates.rate, self.rates.lower, self.rates.upper, strict=True
@@ -264,7 +264,9 @@ def _fit_alone(
         theta = np.where((windows.has_data & finite)[:, None], theta + step, theta)
     ratio = squares / _counts(windows)
     usual = np.median(ratio[windows.has_data], axis=0)
-    fits = np.all(ratio < max_ratio * usual, axis=1) & finite
+    tau, table = likelihood.time_constants(theta), windows.compressions[0]
+    covered = np.all(np.abs(np.log(tau) - table.center) <= table.half_width, axis=0)
+    fits = np.all(ratio < max_ratio * usual, axis=1) & finite & covered
     kept = windows.has_data & fits
     theta = np.where(kept[:, None], theta, np.median(theta[kept], axis=0))
     # beside a window without contact, contact was made or lost within the window

@@ -310,8 +310,11 @@ def test_a_common_gain_of_an_oscilloscope_cancels_in_the_ratio():
     assert force[0].u == pytest.approx(2.0 * 0.03 / math.sqrt(3.0), rel=0.01)  # the force goes as the square of V
 
 
-@pytest.mark.slow  # 240 fits of simulated sessions
-@pytest.mark.parametrize("setup", list(session.SETUPS))
+# 240 fits of simulated sessions; the other set-ups have the same code with more coordinates
+@pytest.mark.parametrize(
+    "setup",
+    [pytest.param(name, marks=pytest.mark.slow if name == "Vsc" else pytest.mark.thorough) for name in session.SETUPS],
+)
 def test_intervals_contain_the_truth(setup: str):
     """The seeds were not chosen: the first 80 of the run that `make session-calibration` makes."""
     rows = [session.evaluate(setup, 1_000_000 + number, 1) for number in range(80)]

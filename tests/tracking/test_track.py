@@ -26,13 +26,15 @@ STILL: dict[str, Any] = {
 SLIDE = {"time": (0.0, 3.0), "area": (1.0, 1.3), "Rsc": (1.0, 0.6), "lifted": (1.53, 1.71)}
 
 
-def simulate(seed: int = 0, duration: float = DURATION, **change: Any) -> tuple[fitact.Record, Course]:
+def simulate(
+    seed: int = 0, duration: float = DURATION, rate: float = RATE, **change: Any
+) -> tuple[fitact.Record, Course]:
     """Return a record of a finger that changes, with noise of 0.1 V and 20 nA, and its course."""
     drive = {"waveform": "trapezoid", "rise_time": "200 us"}
     scene = make_scene({"drive": drive, "measurement": {"channels": ["Vsc", "I"]}}, {}, "scene")
     rng = np.random.default_rng(seed)
     course = make_course(STILL | change, START, duration, rng)
-    time = np.arange(round(duration * RATE)) / RATE
+    time = np.arange(round(duration * rate)) / rate
     V, Vsc, current = simulate_response(scene, time, None, "scipy", course)
     Vsc, current = Vsc + 0.1 * rng.standard_normal(time.size), current + 20e-9 * rng.standard_normal(time.size)
     return fitact.Record.from_arrays(time, V=V, Vsc=Vsc, I=current), course
@@ -251,6 +253,7 @@ def test_file_that_is_still_written_is_followed(short, tmp_path: Path):
     [
         ({"window": 0.005}, "shorter than a period"),
         ({"window": 1e-4}, "at least 20 samples"),
+        ({"window": 0.01}, "less than 1.5 periods"),
         ({"scene": {"measurement": {"noise_model": "student"}}}, "white noise"),
     ],
 )
@@ -271,3 +274,28 @@ def test_refuses_a_record_without_v_or_with_another_rate(short, tmp_path: Path):
     changed = fitact.Record.from_arrays(time, **record.channels)
     with pytest.raises(fitact.InputError, match="time step changes"):
         fitact.track(changed, SCENE)
+
+
+@pytest.mark.thorough  # 30 records of the model's own law
+def test_bands_hold_what_they_state_for_random_walks():
+    inside: dict[str, list[float]] = {}
+    for seed in range(30):
+        record, course = simulate(seed, 6.0, 200e3, walk_area=0.02, walk_Rsc=0.05, walk_Csc=0.01)
+        for name, z in errors(fitact.track(record, SCENE), course).items():
+            inside.setdefault(name, []).append(float(np.mean(np.abs(z) < 1.96)))
+    for name, shares in inside.items():
+        # times of a record are alike, so that the records tell the error of the mean
+        margin = 2.0 * np.std(shares) / np.sqrt(len(shares))
+        assert 0.93 - margin < np.mean(shares) < 0.97 + margin, name
+
+
+@pytest.mark.thorough  # 6 million samples
+def test_slide_of_thirty_seconds_is_within_its_bands():
+    change = {"time": (0.0, 30.0), "area": (1.0, 1.3), "Rsc": (1.0, 0.6), "lifted": (17.03, 17.6)}
+    record, course = simulate(0, 30.0, 200e3, **change)
+    track = fitact.track(record, SCENE)
+    for name, z in errors(track, course).items():
+        assert np.mean(np.abs(z) < 1.96) >= 0.93, name
+    ((begin, end),) = track.lifted
+    assert 0.0 <= 17.03 - begin <= track.window
+    assert 0.0 <= end - 17.602 <= track.window
