@@ -46,7 +46,7 @@ def compress_channel(
     it needs an expansion (`expand_student`); `student` is as in `compress`.
     """
     circuit, channel = start.circuit, channel.without_compression()
-    reason = _reason_against_table(channel, start, tolerance)
+    reason = reason_against_table(channel, start, tolerance)
     if reason:
         return channel, reason
     samples = slice(channel.n_samples)
@@ -101,7 +101,7 @@ def reason_against_compression(channel: ChannelLikelihood, tolerance: float, min
     return ""
 
 
-def _reason_against_table(
+def reason_against_table(
     channel: ChannelLikelihood, start: CircuitValues, tolerance: float, max_multiple: int = 4
 ) -> str:
     """Return why there is no table of responses for a channel, or ""."""

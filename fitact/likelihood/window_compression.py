@@ -7,7 +7,7 @@ all. The responses to the recorded drive are first-order recursive filters, whos
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import jax
 import numpy as np
@@ -72,11 +72,11 @@ class WindowCompressor:
         weights: Sequence[Float[np.ndarray, " samples"] | None],
         responses: Float[np.ndarray, "nodes samples"],
         has_charge: bool,
-    ) -> tuple[tuple[Compression, ...], Float[np.ndarray, " samples"]]:
+    ) -> tuple[tuple[Compression, ...], tuple[Float[np.ndarray, " rows"], ...], Float[np.ndarray, " samples"]]:
         """Compress a window with the drive `V`: each channel's samples, dV/dt where it follows that, and weights.
 
-        `responses` are those of `respond`. With `has_charge`, the charge at the first sample is unknown. Also returns
-        the signal that the first channel would have at the circuit of the tables, without its charge.
+        `responses` are those of `respond`. With `has_charge`, the charge at the first sample is unknown. Also returns V
+        in the coordinates of each, and the signal of the first at the circuit of the tables, without its charge.
         """
         table, step = self.tables[0], self.time[1]
         combined = table.combinations.T @ responses
@@ -90,21 +90,29 @@ class WindowCompressor:
         shared = self.shared.copy()
         shared[: len(combined)] *= has_charge
         # all channels with the same weights share the products of what they share
-        rows = np.concatenate([combined, shared, steps, [zero, np.gradient(V, step)], followed, rests])
+        rows = np.concatenate([combined, shared, steps, [zero, np.gradient(V, step)], followed, rests, [V]])
         begin = len(combined) + len(self.shared)
-        last, products, parts = begin + len(steps), dict[int, np.ndarray](), []
+        last, products, parts, driven = begin + len(steps), dict[int, np.ndarray](), [], []
         for i, (channel, weight) in enumerate(zip(self.channels, weights, strict=True)):
             if id(weight) not in products:
                 weighted = rows if weight is None else rows * weight
                 products[id(weight)] = weighted @ weighted.T
             own = steps[: 2 * MAX_DELAY * bool(channel.timing)]
-            places = [*range(2 * len(combined)), *[last] * len(channel.effect_sizes), *range(begin, begin + len(own))]
+            places = [
+                *range(2 * len(combined)),
+                *[last] * len(channel.effect_sizes),
+                len(rows) - 1,
+                *range(begin, begin + len(own)),
+            ]
             places += [*range(2 * len(combined), begin), last + 2 + i, last + 1, last + 2 + len(followed) + i]
             total = products[id(weight)][np.ix_(places, places)]
             count = V.size if weight is None else int(np.count_nonzero(weight))
             effects = len(channel.effect_sizes)
-            parts.append(assemble_compression(self.tables[i], total, True, len(own), effects, count))
-        return tuple(parts), observed[0] - rests[0]
+            whole = assemble_compression(self.tables[i], total, True, len(own), effects + 1, count)
+            assert whole.effects is not None
+            driven.append(whole.effects[-1])
+            parts.append(dataclasses.replace(whole, effects=whole.effects[:-1] if effects else None))
+        return tuple(parts), tuple(driven), observed[0] - rests[0]
 
     def respond(
         self, V: Float[np.ndarray, " samples"], start: float, before: FilterState | None
@@ -125,6 +133,6 @@ class WindowCompressor:
         return responses, FilterState(start + length, float(V[-1]), left, age)
 
 
-def stack_compressions(windows: Sequence[tuple[Compression, ...]]) -> tuple[Compression, ...]:
-    """Return the compressions of each channel, with a leading dimension over the windows."""
+def stack_windows(windows: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
+    """Return the compressions, or other values, of each channel, with a leading dimension over the windows."""
     return tuple(jax.tree.map(lambda *leaves: np.stack(leaves), *each) for each in zip(*windows, strict=True))

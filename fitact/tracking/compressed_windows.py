@@ -13,8 +13,9 @@ from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.fitting.current import edge_mask, weigh_current_samples
 from fitact.fitting.fit import Fit, fit
+from fitact.likelihood.certificate import TOLERANCE, reason_against_table
 from fitact.likelihood.compression import Compression
-from fitact.likelihood.window_compression import FilterState, WindowCompressor, stack_compressions
+from fitact.likelihood.window_compression import FilterState, WindowCompressor, stack_windows
 from fitact.scene.scene import Scene
 from fitact.tracking.windows import AROUND, Window
 
@@ -29,6 +30,7 @@ class CompressedWindow(NamedTuple):
 
     start: float  # s
     compressions: tuple[Compression, ...] | None
+    drive: tuple[np.ndarray, ...] | None  # V in the coordinates of each channel
     lowest: float  # least and largest signal of the window's parts over that of the model's circuit; NaN without drive
     highest: float
 
@@ -39,6 +41,7 @@ class CompressedWindows:
 
     start: Float[np.ndarray, " windows"]
     compressions: tuple[Compression, ...]  # of each channel, stacked
+    drive: tuple[Float[np.ndarray, "windows rows"], ...]  # V in the coordinates of each channel
     has_data: Bool[np.ndarray, " windows"]
     contact: Bool[np.ndarray, " windows"]
 
@@ -49,10 +52,11 @@ class CompressedWindows:
         known = np.isfinite(lowest)
         usual = float(np.median(highest[known & (highest > NO_CONTACT)])) if np.any(known) else 1.0
         contact = ~known | ((lowest > NO_CONTACT * usual) & (lowest > _WHOLE * highest))
-        filled = next(each.compressions for each in windows if each.compressions is not None)
+        filled = next(each for each in windows if each.compressions is not None)
         has_data = np.array([each.compressions is not None for each in windows])
-        stacked = stack_compressions([each.compressions or filled for each in windows])
-        return cls(np.array([each.start for each in windows]), stacked, has_data & contact, contact)
+        stacked = stack_windows([each.compressions or filled.compressions or () for each in windows])
+        drive = stack_windows([each.drive or filled.drive or () for each in windows])
+        return cls(np.array([each.start for each in windows]), stacked, drive, has_data & contact, contact)
 
 
 class WindowModel(NamedTuple):
@@ -79,7 +83,7 @@ class WindowModel(NamedTuple):
             V = window.channels["V"]
             if not window.is_whole or float(np.std(V)) < _DRIVEN * self.drive_rms:
                 state = None
-                yield CompressedWindow(window.start, None, math.nan, math.nan)
+                yield CompressedWindow(window.start, None, None, math.nan, math.nan)
                 continue
             if state is not None and abs(window.start - state.end) > 0.5 * step:
                 state = None
@@ -105,12 +109,12 @@ class WindowModel(NamedTuple):
                 weight = None if np.all(weight == 1.0) else weight
             rates.append(rate)
             weights.append(weight)
-        compressions, expected = self.compressor.compress(V, observed, rates, weights, responses, has_charge)
+        compressions, drive, expected = self.compressor.compress(V, observed, rates, weights, responses, has_charge)
         products = np.array_split(np.stack([observed[0] * expected, expected * expected]), self.parts, axis=1)
         sizes = np.array([part.sum(axis=1) for part in products])
         driven = sizes[:, 1] > 1e-2 * sizes[:, 1].max()
         signal = sizes[driven, 0] / sizes[driven, 1]
-        return CompressedWindow(window.start, compressions, float(signal.min()), float(signal.max()))
+        return CompressedWindow(window.start, compressions, drive, float(signal.min()), float(signal.max()))
 
 
 def find_model(windows: Sequence[Window], scene: Scene, step: float, source: str) -> WindowModel:
@@ -141,13 +145,14 @@ def find_model(windows: Sequence[Window], scene: Scene, step: float, source: str
             f" --window {10.0 * time[-1]:.2g}s, and a drive that repeats"
         )
     fitted = fit(record, scene)
-    if fitted.full_because:
-        raise InputError(
-            f"{source}: windows cannot be represented by a few numbers, because {fitted.full_because}; leave out a"
-            " small resistance in series (R_H; `fitact plan` states its effect), or give longer windows (--window)"
-        )
     with jax.enable_x64(True):
         circuit = fitted.likelihood.evaluate_circuit(fitted.theta)
+        pairs = (reason_against_table(each, circuit, TOLERANCE) for each in fitted.likelihood.channels)
+        if reason := next(filter(None, pairs), ""):
+            raise InputError(
+                f"{source}: windows cannot be represented by a few numbers, because {reason}; leave out a small"
+                " resistance in series (R_H; `fitact plan` states its effect), or give longer windows (--window)"
+            )
         compressor = WindowCompressor.from_channels(fitted.likelihood.channels, circuit, time.size, step)
     noise = {name: record.noise(name) for name in record.channels}
     parts = max(1, math.floor((time[-1] + step) * frequency))

@@ -203,8 +203,9 @@ def solve_windows(
     found: WalkRates | None = None
     with jax.enable_x64(True):
         theta, windows = _fit_alone(likelihood, windows, theta, sigma, prior, order)
+        change = np.zeros((windows.start.size, 3))
         for round_number in range(max_rounds):
-            information, squares, _ = _linear_information(likelihood, windows, theta, sigma, order)
+            information, squares, _ = _linear_information(likelihood, windows, theta, sigma, order, change)
             sigma = sigma * np.sqrt(_noise_ratio(windows, squares))
             if round_number == 0:
                 jumps = find_jumps(information, windows.has_data, windows.contact, walk_matrix(walking)[1])
@@ -218,6 +219,7 @@ def solve_windows(
             assert found is not None
             walk = smooth(information, timing, found.covariance, prior)
             theta = walk.average[:, back]
+            change = _change_rates(windows, theta, names, jumps)
             if round_number > 1 and before is not None:
                 sd = np.sqrt(np.maximum(np.diagonal(walk.covariance, axis1=1, axis2=2), 1e-300))
                 if np.max(np.abs(walk.average - before.average) / sd) < 0.005:
@@ -254,9 +256,9 @@ def _fit_alone(
     So is a window in which contact was made or lost, or samples were lost.
     """
     root = np.linalg.cholesky(np.linalg.inv(prior[1])).T
-    back = np.argsort(order)
+    back, still = np.argsort(order), np.zeros((len(theta), 3))
     for _ in range(rounds):
-        information, squares, finite = _linear_information(likelihood, windows, theta, sigma, order)
+        information, squares, finite = _linear_information(likelihood, windows, theta, sigma, order, still)
         factor = np.concatenate([information.factor, np.tile(root, (len(theta), 1, 1))], axis=1)
         target = np.concatenate([information.target, np.tile(root @ prior[0], (len(theta), 1))], axis=1)
         solved = np.einsum("kij,kj->ki", np.linalg.pinv(factor), target)[:, back]
@@ -275,15 +277,35 @@ def _fit_alone(
     return theta, dataclasses.replace(windows, has_data=kept, contact=windows.contact & (kept | ~beside))
 
 
+def _change_rates(
+    windows: CompressedWindows, theta: np.ndarray, names: Sequence[str], jumps: Bool[np.ndarray, " windows"]
+) -> Float[np.ndarray, "windows rates"]:
+    """Return the rates of log(Ci), log(Csc) and log(Rsc), 1/s, from window to window; 0 beside lift-offs and jumps."""
+    broken = ~windows.contact | jumps
+    beside = broken | np.append(broken[1:], False) | np.append(False, broken[:-1])
+    rates = [
+        np.gradient(theta[:, names.index(name)], windows.start)
+        if name in names and len(theta) > 1
+        else np.zeros(len(theta))
+        for name in ("Ci", "Csc", "Rsc")
+    ]
+    return np.where(beside[:, None], 0.0, np.stack(rates, axis=1))
+
+
 def _counts(windows: CompressedWindows) -> Float[np.ndarray, "windows channels"]:
     return np.stack([np.asarray(each.samples) for each in windows.compressions], axis=1)
 
 
 def _linear_information(
-    likelihood: Likelihood, windows: CompressedWindows, theta: np.ndarray, sigma: np.ndarray, order: list[int]
+    likelihood: Likelihood,
+    windows: CompressedWindows,
+    theta: np.ndarray,
+    sigma: np.ndarray,
+    order: list[int],
+    change: Float[np.ndarray, "windows rates"],
 ) -> tuple[WindowInformation, np.ndarray, Bool[np.ndarray, " windows"]]:
     """Return the information of each window in square-root form, squares of residuals, and whether all is finite."""
-    linear = linearize(likelihood, windows.compressions, theta, sigma)
+    linear = linearize(likelihood, windows.compressions, theta, sigma, windows.drive, change)
     finite = np.isfinite(linear.residuals).all(axis=1) & np.isfinite(linear.jacobian).all(axis=(1, 2))
     used = windows.has_data & finite
     jacobian = np.where(used[:, None, None], linear.jacobian, 0.0)
@@ -323,11 +345,12 @@ def _make_track(
     effects = {**found.structure, **({} if follows_structure(fitted) else found.effect_size)}
     geometry = fitted.geometry_contributions()
 
-    lag = _lag_uncertainty(theta, names, np.exp(logs[:, QUANTITIES.index("b")]), rates, time, length)
+    b = np.exp(logs[:, QUANTITIES.index("b")])
+    trend = _trend_uncertainty(b, windows.has_data, time, length / model.parts)
 
     def add(name: str, log: np.ndarray, spread: np.ndarray, shown: np.ndarray) -> None:
         others = [each.relative_sd * each.sensitivity for each in geometry.get(name, ()) if name not in names]
-        spread = np.hypot(spread, lag)
+        spread = np.hypot(spread, trend)
         whole = np.sqrt(np.square(spread) + sum(x**2 for x in (*others, effects.get(name, 0.0))))
         values[name], u[name] = np.where(shown, np.exp(log), np.nan), np.where(shown, whole, np.nan)
         alone[name] = np.where(shown, spread, np.nan)
@@ -365,18 +388,17 @@ def _make_track(
     )  # fmt: skip
 
 
-def _lag_uncertainty(
-    theta: np.ndarray, names: Sequence[str], b: np.ndarray, rates: WalkRates, time: np.ndarray, length: float
-) -> Float[np.ndarray, " windows"]:
-    """Return the relative error of taking the circuit as constant over its time constant b, while its charges lag.
+def _trend_uncertainty(
+    b: Float[np.ndarray, " windows"], used: Bool[np.ndarray, " windows"], time: np.ndarray, period: float
+) -> float:
+    """Return the relative error that a trend of b leaves in a window: its change over a period of the drive.
 
-    A capacitance C that grows carries i = d(C v)/dt, so that 1/b appears as 1/b + C'/C: about half of b C'/C in g and
-    in what follows from it. C' is that of the smoothed Ci, and what the walk may do within a window.
+    Lags of charges are corrected for. What remains is that different samples of a period determine different
+    combinations of the values, which then belong to times that differ by a part of a period.
     """
-    if "Ci" not in names or time.size < 2:
-        return np.zeros(time.size)
-    rate = np.gradient(theta[:, names.index("Ci")], time)
-    return 0.5 * b * np.sqrt(np.square(rate) + rates.rate[0] ** 2 / length)
+    if np.count_nonzero(used) < 3:
+        return 0.0
+    return float(period * abs(np.polyfit(time[used], np.log(b[used]), 1)[0]))
 
 
 def follows_structure(fitted: Fit, min_part: float = 0.5) -> bool:

@@ -237,7 +237,8 @@ class _Checkpoint:
         filled = [each for each in windows if each.compressions is not None]
         if not filled:
             return
-        leaves = [jax.tree.leaves(each.compressions or filled[0].compressions) for each in windows]
+        parts = [each if each.compressions is not None else filled[0] for each in windows]
+        leaves = [jax.tree.leaves((each.compressions, each.drive)) for each in parts]
         arrays: dict[str, Any] = {f"leaf{i}": np.stack(each) for i, each in enumerate(zip(*leaves, strict=True))}
         for name in ("start", "lowest", "highest"):
             arrays[name] = np.array([getattr(each, name) for each in windows])
@@ -254,16 +255,13 @@ class _Checkpoint:
                 return []
             with jax.enable_x64(True):
                 whole = next(each for each in begun if each.is_whole)
-                example = next(self._model.compress_windows([whole])).compressions
+                each = next(self._model.compress_windows([whole]))
+                example = each.compressions, each.drive
             count, structure = len(jax.tree.leaves(example)), jax.tree.structure(example)
             leaves = [stored[f"leaf{i}"] for i in range(count)]
             rest = zip(stored["start"], stored["lowest"], stored["highest"], stored["has_data"], strict=True)
-            return [
-                CompressedWindow(
-                    float(start),
-                    jax.tree.unflatten(structure, [leaf[k] for leaf in leaves]) if has_data else None,
-                    float(low),
-                    float(high),
-                )
-                for k, (start, low, high, has_data) in enumerate(rest)
-            ]
+            done = []
+            for k, (start, low, high, has_data) in enumerate(rest):
+                parts = jax.tree.unflatten(structure, [leaf[k] for leaf in leaves]) if has_data else (None, None)
+                done.append(CompressedWindow(float(start), parts[0], parts[1], float(low), float(high)))
+            return done

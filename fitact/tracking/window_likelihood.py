@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from fitact.compiled import jit, pad_rows
@@ -13,6 +14,7 @@ from fitact.fitting.derived import DerivedQuantities
 from fitact.likelihood.channel import CHARGES
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
+from fitact.model.circuit import FinalCircuit, HighpassTerms
 from fitact.model.force import force_constant
 
 QUANTITIES = ("g", "b", "force_mean")
@@ -31,10 +33,15 @@ def linearize(
     windows: tuple[Compression, ...],
     theta: Float[np.ndarray, "windows parameters"],
     sigma: Float[np.ndarray, " channels"],
+    drive: tuple[Float[np.ndarray, "windows rows"], ...],
+    change: Float[np.ndarray, "windows rates"],
     batch: int = 64,
 ) -> Linearization:
-    """Linearise the likelihoods of windows; `windows` has the compressions of each channel, stacked."""
-    return Linearization(*_map_windows(_linearize_batch, likelihood, windows, theta, sigma, batch))
+    """Linearise the likelihoods of windows; `windows` has the compressions of each channel, stacked.
+
+    `drive` is V in the coordinates of each channel, and `change` the rates of log(Ci), log(Csc), log(Rsc), 1/s.
+    """
+    return Linearization(*_map_windows(_linearize_batch, likelihood, (windows, drive, change), theta, sigma, batch))
 
 
 def evaluate_quantities(
@@ -66,8 +73,9 @@ def _insert(likelihood: Likelihood, compressions: tuple[Compression, ...]) -> Li
 
 @jit
 def _linearize_batch(likelihood: Likelihood, windows: Any, theta: Array, sigma: Array) -> tuple[Array, Array, Array]:
-    def one(compressions: tuple[Compression, ...], theta: Array) -> tuple[Array, Array, Array]:
-        model = _insert(likelihood, compressions)
+    def one(window: Any, theta: Array) -> tuple[Array, Array, Array]:
+        compressions, drive, change = window
+        model = _insert(likelihood, _subtract_lags(_insert(likelihood, compressions), drive, change, theta))
 
         def residuals(theta: Array) -> tuple[Array, tuple[Array, Array]]:
             parts = model.residuals(theta, sigma)
@@ -78,6 +86,40 @@ def _linearize_batch(likelihood: Likelihood, windows: Any, theta: Array, sigma: 
         return values, jacobian, squares
 
     return jax.vmap(one)(windows, theta)
+
+
+def _subtract_lags(model: Likelihood, drive: tuple[Array, ...], change: Array, theta: Array) -> tuple[Any, ...]:
+    """Return the compressions without what a changing finger adds, to first order, in the final circuit.
+
+    Charges lag behind values that change, and i = d(C v)/dt. With a = Ci'/Ci, r = b'/b, u the response to V, u1 and u2
+    its derivatives in log b, the voltage v exceeds g u by b g (a (V - u - u1) - r (u1 + u2) / 2).
+    """
+    found = []
+    for channel, V in zip(model.channels, drive, strict=True):
+        compression, inputs = channel.compression, model.make_inputs(model.circuit(theta), theta, channel)
+        circuit = inputs.circuit
+        if not (isinstance(circuit, FinalCircuit) and isinstance(compression, Compression)):
+            return tuple(each.compression for each in model.channels)
+        g, b, Ci = circuit.g, circuit.b, circuit.Ci
+
+        def respond(log_tau: Array, compression: Compression = compression) -> Array:
+            return compression.response(HighpassTerms((1.0,), (jnp.exp(log_tau),)))
+
+        def respond_slope(log_tau: Array, respond: Any = respond) -> tuple[Array, Array]:
+            return jax.jvp(respond, (log_tau,), (jnp.ones(()),))
+
+        (u, u1), (_, u2) = jax.jvp(respond_slope, (jnp.log(b),), (jnp.ones(()),))
+        a, skin, resistance = change
+        whole = 2.0 * g * a + (1.0 - 2.0 * g) * skin  # of 2 Ci + Csc
+        r = resistance + whole
+        if channel.channel == "Vsc":
+            added = b * g * (a * (V - u - u1) - 0.5 * r * (u1 + u2))
+        else:
+            slope = g * ((a - whole) * u + r * u1 + a * u1 - 0.5 * r * (u1 - u2))  # of v, beyond that of g u
+            added = -2.0 * Ci * slope + a * Ci * (V - 2.0 * g * u)
+        observed = compression.observed - inputs.gain * added
+        found.append(dataclasses.replace(compression, observed=lax.stop_gradient(observed)))
+    return tuple(found)
 
 
 @jit
