@@ -78,7 +78,8 @@ def _chart(track: Track, names: tuple[str, ...]) -> interactive.Chart:
         values, spread = track.values[name], track.sd[name]
         finite = np.isfinite(values)
         x = Axis.from_values("time", "s", track.time)
-        y = Axis.from_values(describe_quantity(name), quantity_unit(name), values[finite])
+        title = name if name in ("g", "b") else describe_quantity(name)  # their names are long
+        y = Axis.from_values(title, quantity_unit(name), values[finite])
         traces = []
         for number, part in enumerate(_stretches(finite)):
             time, middle = track.time[part], values[part]
