@@ -6,7 +6,7 @@ y = (Csc + 2 Ci) Vsc - Ci V the equation is y' = -Vsc / Rsc, for any Rsc(t), Csc
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,29 +60,25 @@ def make_course(
         logs[name] = np.log(factors)
     if np.any(np.diff(times) <= 0.0):
         raise RecipeError("[change] time does not increase; sort it")
-    grid = np.unique(np.concatenate([times, np.linspace(0.0, duration, _WALK_STEPS + 1), _lift_times(change)]))
+    lift_times, lift_logs = _lifts(change["lifted"] or ())
+    grid = np.unique(np.concatenate([times, np.linspace(0.0, duration, _WALK_STEPS + 1), lift_times]))
     found = {name: np.interp(grid, times, each) for name, each in logs.items()}
     steps_between = np.sqrt(np.diff(grid, prepend=grid[0]))
     for name in found:
         found[name] += change[f"walk_{name}"] * np.cumsum(steps_between * rng.standard_normal(grid.size))
-    lift = np.interp(grid, *_lifts(change)) if change["lifted"] else 0.0
+    lift = np.interp(grid, lift_times, lift_logs) if lift_times.size else 0.0
     area = found["area"]
     skin = np.log(start[0]) + found["Rsc"] - area, np.log(start[1]) + found["Csc"] + area
     return Course(grid, np.array([*skin, np.log(start[2]) + area + lift]))
 
 
-def _lifts(change: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+def _lifts(ends: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
     """Return times (s), and the logarithm of what is left of Ci, for a finger that is lifted in pairs of times."""
-    ends = change["lifted"]
     if len(ends) % 2 or any(b <= a + _LIFT_TIME for a, b in itertools.pairwise(ends)):
         raise RecipeError("[change] lifted is not a list of increasing times, lift-off and touch in turn; correct it")
     low = math.log(_LIFTED)
     levels = [(0.0, low) if n % 2 == 0 else (low, 0.0) for n in range(len(ends))]
     return np.ravel([[end, end + _LIFT_TIME] for end in ends]), np.ravel(levels)
-
-
-def _lift_times(change: Mapping[str, Any]) -> np.ndarray:
-    return _lifts(change)[0] if change["lifted"] else np.empty(0)
 
 
 def changing_response(course: Course, drive: Drive, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

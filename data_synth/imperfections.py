@@ -11,15 +11,8 @@ import numpy as np
 
 from data_synth.recipe import UNITS
 
-_STREAMS = (
-    "population",
-    "clock",
-    "hum",
-    "pink",
-    "white",
-    "missing",
-    "change",
-)  # append only: the index seeds the random numbers
+# append only: the index seeds the random numbers
+_STREAMS = ("population", "clock", "hum", "pink", "white", "missing", "change")
 _CHANNELS = tuple(UNITS)
 
 

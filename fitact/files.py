@@ -4,7 +4,7 @@ import contextlib
 import json
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,36 @@ def read_error(source: str, error: Exception) -> InputError:
     """Return the error for a file that cannot be read."""
     reason = getattr(error, "strerror", None) or str(error)
     return InputError(f"{source}: cannot be read ({reason.lower()}); check the path and the file")
+
+
+def write_parquet(path: str | os.PathLike[str], columns: Mapping[str, Any]) -> None:
+    """Write columns of equal length as Parquet; needs `pip install 'fitact[campaign]'`.
+
+    Raises:
+        InputError: the path cannot be written, or pyarrow is not installed.
+    """
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ImportError as error:
+        raise InputError(f"{path}: Parquet needs pyarrow; pip install 'fitact[campaign]', or write CSV") from error
+    with atomic_write(path) as temporary:
+        pq.write_table(pa.table(columns), temporary)
+
+
+def read_head(path: str | os.PathLike[str], size: int = 4096) -> bytes:
+    """Return the first bytes of a file.
+
+    Raises:
+        InputError: the path is a directory, or cannot be read.
+    """
+    if Path(path).is_dir():
+        raise InputError(f"{path}: is a directory; give the path of a file")
+    try:
+        with Path(path).open("rb") as file:
+            return file.read(size)
+    except OSError as error:
+        raise read_error(os.fspath(path), error) from error
 
 
 def to_json(content: Any, indent: int | None = 2) -> str:

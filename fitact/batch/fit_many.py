@@ -22,7 +22,7 @@ from fitact.batch.stated_drive import StatedDriveProblem
 from fitact.data.readers.read import read
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.files import atomic_write
+from fitact.files import atomic_write, write_parquet
 from fitact.fitting import derived
 from fitact.fitting.fit import Fit, fit
 from fitact.fitting.identifiability import information_directions, prior_variance_fraction, verdicts
@@ -107,15 +107,7 @@ class Fits(Sequence[Row]):
         Raises:
             InputError: the path cannot be written, or pyarrow is not installed.
         """
-        try:
-            import pyarrow as pa
-            import pyarrow.parquet as pq
-        except ImportError as error:
-            raise InputError(f"{path}: Parquet needs pyarrow; pip install 'fitact[campaign]', or write CSV") from error
-        with atomic_write(path) as temporary:
-            pq.write_table(
-                pa.table({name: [row.get(name) for row in self.rows] for name in self._column_names}), temporary
-            )
+        write_parquet(path, {name: [row.get(name) for row in self.rows] for name in self._column_names})
 
     def __str__(self) -> str:
         trusted = sum(bool(row["trusted"]) for row in self.rows)

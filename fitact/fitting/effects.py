@@ -151,6 +151,12 @@ def describe_structure(result: str, message: str, effects: EffectSizes, negligib
     return f"{message} {found[0].upper()}{found[1:]}" if result == "misfit" else f"{found[0].upper()}{found[1:]}"
 
 
+def is_change_of_finger(effects: EffectSizes, min_part: float = 0.5) -> bool:
+    """Return whether a finger that changes during the record explains at least `min_part` as much as the best cause."""
+    changes = (each["delta_chi2"] for each in effects.rivals if each["name"].startswith(CHANGE))
+    return any(change >= min_part * effects.rivals[0]["delta_chi2"] for change in changes)
+
+
 def _advise_track(effects: EffectSizes) -> str:
     """Return a sentence on a finger that changes during the record, if that is the best explanation."""
     best = effects.rivals[0] if effects.rivals else None

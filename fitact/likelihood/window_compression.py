@@ -7,9 +7,8 @@ all. The responses to the recorded drive are first-order recursive filters, whos
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
-import jax
 import numpy as np
 import scipy.signal
 from jaxtyping import Float
@@ -23,7 +22,6 @@ from fitact.likelihood.projection import (
     assemble_compression,
     drive_steps,
     evaluate_baseline,
-    table_multiple,
 )
 
 REACH = 4.0  # factor by which b may change
@@ -54,8 +52,7 @@ class WindowCompressor:
     ) -> Self:
         """Make the tables around the time constants of a circuit, a factor `REACH` either way."""
         time = step * np.arange(samples)
-        wide = table_multiple(np.asarray(circuit.tau)) > 1 or np.ptp(np.log(circuit.tau)) > 0.0
-        reach = None if wide else (math.log(REACH), REACH_NODES)
+        reach = (math.log(REACH), REACH_NODES) if len(circuit.tau) == 1 else None
         tables = [
             TableNodes.from_terms(circuit.terms[each.channel], time, narrow=False, reach=reach) for each in channels
         ]
@@ -131,8 +128,3 @@ class WindowCompressor:
         length = step * V.size
         age = length + (0.0 if before is None else before.age)
         return responses, FilterState(start + length, float(V[-1]), left, age)
-
-
-def stack_windows(windows: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
-    """Return the compressions, or other values, of each channel, with a leading dimension over the windows."""
-    return tuple(jax.tree.map(lambda *leaves: np.stack(leaves), *each) for each in zip(*windows, strict=True))

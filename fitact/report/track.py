@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,8 @@ _MAX_POINTS = 4_000  # of a curve
 
 def write_track(path: str | os.PathLike[str], track: Track, origin: Provenance) -> None:
     """Write the page of a track at `path`."""
-    charts = [(names, _chart(track, names)) for names in _CHARTS if all(name in track.values for name in names)]
+    pairs = [names for names in _CHARTS if all(name in track.values for name in names)]
+    panels = [(" and ".join(map(describe_quantity, names)), _chart(track, names)) for names in pairs]
     rows: list[tuple[str, ...]] = [
         ("", "median at the start", "at the end", "variation (sd of the logarithm)", "alike over")
     ]
@@ -38,21 +40,17 @@ def write_track(path: str | os.PathLike[str], track: Track, origin: Provenance) 
     for name, rate in state["rates"].items():
         interval = f"{format_percent(rate['lower'])} to {format_percent(rate['upper'])}"
         rates.append((name.replace("_", " "), format_percent(rate["log_sd_per_root_s"]), interval))
-    names = [" and ".join(describe_quantity(name) for name in pair) for pair, _ in charts]
-    panels = [(title, chart) for title, (_, chart) in zip(names, charts, strict=True)]
-    write_page(path, "track.html", frame=_frame(track), origin=origin, panels=panels, table=rows, rates=rates)
+    write_page(path, "track.html", frame=_frame(track, state), origin=origin, panels=panels, table=rows, rates=rates)
 
 
-def _frame(track: Track) -> PageSummary:
-    answers = []
+def _frame(track: Track, state: dict[str, Any]) -> PageSummary:
+    answers, start, end = [], state["start"], state["end"]
     for name in ("contact_area", "Rsc", "force_mean"):
-        if name in track.within_finger:
-            state = track.to_dict()
-            change = state["end"][name]["median"] / state["start"][name]["median"] - 1.0 if state["end"] else np.nan
-            value = f"{change:+.3g}".replace("nan", "?")
-            value = f"{100.0 * change:+.3g} %" if np.isfinite(change) else value
+        if name in start:
+            change = 100.0 * (end[name]["median"] / start[name]["median"] - 1.0)
             spread = format_percent(track.within_finger[name]["log_sd"])
-            answers.append(Answer(describe_quantity(name), value, f"from start to end; varies by {spread}"))
+            note = f"from start to end; varies by {spread}"
+            answers.append(Answer(describe_quantity(name), f"{change:+.3g} %", note))
     findings = {"Identifiability": str(track.fit.identifiability)}
     if track.lifted:
         spans = ", ".join(f"{begin:.4g} to {end:.4g} s" for begin, end in track.lifted)

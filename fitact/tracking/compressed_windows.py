@@ -15,7 +15,7 @@ from fitact.fitting.current import edge_mask, weigh_current_samples
 from fitact.fitting.fit import Fit, fit
 from fitact.likelihood.certificate import TOLERANCE, reason_against_table
 from fitact.likelihood.compression import Compression
-from fitact.likelihood.window_compression import FilterState, WindowCompressor, stack_windows
+from fitact.likelihood.window_compression import FilterState, WindowCompressor
 from fitact.scene.scene import Scene
 from fitact.tracking.windows import AROUND, Window
 
@@ -25,12 +25,18 @@ _SETTLED = 12.0  # time constants after which an unknown charge has decayed to 6
 _DRIVEN = 1e-3  # least rms of V over its usual one
 
 
+class WindowData(NamedTuple):
+    """Each channel of a window, or of windows with a leading dimension, in its coordinates."""
+
+    compressions: tuple[Compression, ...]
+    drive: tuple[Float[np.ndarray, "*windows rows"], ...]  # V
+
+
 class CompressedWindow(NamedTuple):
     """A window's data, or None without data, and what is known of the contact."""
 
     start: float  # s
-    compressions: tuple[Compression, ...] | None
-    drive: tuple[np.ndarray, ...] | None  # V in the coordinates of each channel
+    data: WindowData | None
     lowest: float  # least and largest signal of the window's parts over that of the model's circuit; NaN without drive
     highest: float
 
@@ -40,8 +46,7 @@ class CompressedWindows:
     """Windows of one length; values of windows without data are those of another and are not to be used."""
 
     start: Float[np.ndarray, " windows"]
-    compressions: tuple[Compression, ...]  # of each channel, stacked
-    drive: tuple[Float[np.ndarray, "windows rows"], ...]  # V in the coordinates of each channel
+    data: WindowData  # stacked
     has_data: Bool[np.ndarray, " windows"]
     contact: Bool[np.ndarray, " windows"]
 
@@ -52,11 +57,8 @@ class CompressedWindows:
         known = np.isfinite(lowest)
         usual = float(np.median(highest[known & (highest > NO_CONTACT)])) if np.any(known) else 1.0
         contact = ~known | ((lowest > NO_CONTACT * usual) & (lowest > _WHOLE * highest))
-        filled = next(each for each in windows if each.compressions is not None)
-        has_data = np.array([each.compressions is not None for each in windows])
-        stacked = stack_windows([each.compressions or filled.compressions or () for each in windows])
-        drive = stack_windows([each.drive or filled.drive or () for each in windows])
-        return cls(np.array([each.start for each in windows]), stacked, drive, has_data & contact, contact)
+        has_data = np.array([each.data is not None for each in windows])
+        return cls(np.array([each.start for each in windows]), stack_data(windows), has_data & contact, contact)
 
 
 class WindowModel(NamedTuple):
@@ -83,7 +85,7 @@ class WindowModel(NamedTuple):
             V = window.channels["V"]
             if not window.is_whole or float(np.std(V)) < _DRIVEN * self.drive_rms:
                 state = None
-                yield CompressedWindow(window.start, None, None, math.nan, math.nan)
+                yield CompressedWindow(window.start, None, math.nan, math.nan)
                 continue
             if state is not None and abs(window.start - state.end) > 0.5 * step:
                 state = None
@@ -114,18 +116,23 @@ class WindowModel(NamedTuple):
         sizes = np.array([part.sum(axis=1) for part in products])
         driven = sizes[:, 1] > 1e-2 * sizes[:, 1].max()
         signal = sizes[driven, 0] / sizes[driven, 1]
-        return CompressedWindow(window.start, compressions, drive, float(signal.min()), float(signal.max()))
+        data = WindowData(compressions, drive)
+        return CompressedWindow(window.start, data, float(signal.min()), float(signal.max()))
+
+
+def stack_data(windows: Sequence[CompressedWindow]) -> WindowData:
+    """Return the data of windows with a leading dimension; a window without data has those of another."""
+    filled = next(each.data for each in windows if each.data is not None)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *(each.data or filled for each in windows))
 
 
 def find_model(windows: Sequence[Window], scene: Scene, step: float, source: str) -> WindowModel:
     """Fit the window whose Vsc (or I) is nearest to the upper quartile over V, and make the tables of its model.
 
     Raises:
-        InputError: no window can be fitted, or the noise model or the drive is not one that windows can have.
+        InputError: no window can be fitted, or the drive does not repeat.
     """
     channels = scene.measurement.channels
-    if scene.measurement.noise_model != "white":
-        raise InputError("scene: [measurement] noise_model: a track needs white noise; leave the key out")
     whole = [each for each in windows if each.is_whole and np.ptp(each.channels["V"]) > 0.0]
     if not whole:
         raise InputError(f"{source}: there is no window with a drive and all samples; record V_V beside {channels[0]}")
@@ -147,13 +154,19 @@ def find_model(windows: Sequence[Window], scene: Scene, step: float, source: str
     fitted = fit(record, scene)
     with jax.enable_x64(True):
         circuit = fitted.likelihood.evaluate_circuit(fitted.theta)
-        pairs = (reason_against_table(each, circuit, TOLERANCE) for each in fitted.likelihood.channels)
-        if reason := next(filter(None, pairs), ""):
-            raise InputError(
-                f"{source}: windows cannot be represented by a few numbers, because {reason}; leave out a small"
-                " resistance in series (R_H; `fitact plan` states its effect), or give longer windows (--window)"
-            )
         compressor = WindowCompressor.from_channels(fitted.likelihood.channels, circuit, time.size, step)
     noise = {name: record.noise(name) for name in record.channels}
     parts = max(1, math.floor((time[-1] + step) * frequency))
     return WindowModel(fitted, compressor, parts, float(np.std(first.channels["V"])), noise, circuit.tau)
+
+
+def require_table(model: WindowModel, source: str) -> None:
+    """Refuse a circuit whose responses have no table, so that windows cannot be compressed."""
+    likelihood = model.fit.likelihood
+    circuit = likelihood.evaluate_circuit(model.fit.theta)
+    reasons = (reason_against_table(each, circuit, TOLERANCE) for each in likelihood.channels)
+    if reason := next(filter(None, reasons), ""):
+        raise InputError(
+            f"{source}: windows cannot be represented by a few numbers, because {reason}; leave out a small resistance"
+            " in series (R_H; `fitact plan` states its effect), or give longer windows (--window)"
+        )

@@ -4,6 +4,7 @@ A window sees the average of the walk, not its value at one time. End, average a
 states of their own, whose joint distribution, given the end of the window before, is that of Brownian motion.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +24,7 @@ class WindowInformation(NamedTuple):
     target: Float[np.ndarray, "windows rows"]
 
 
-class Timing(NamedTuple):
+class WindowTimes(NamedTuple):
     """Lengths of the windows and of the gaps before them, s, and additional variance where the walk may jump."""
 
     length: Float[np.ndarray, " windows"]
@@ -49,7 +50,7 @@ class _Pass(NamedTuple):
 
 def log_likelihood(
     information: WindowInformation,
-    timing: Timing,
+    timing: WindowTimes,
     walk_covariance: Float[np.ndarray, "*batch walk walk"],
     prior: tuple[Float[np.ndarray, " states"], Float[np.ndarray, "states states"]],
 ) -> Float[np.ndarray, "*batch"]:
@@ -59,7 +60,7 @@ def log_likelihood(
 
 def smooth(
     information: WindowInformation,
-    timing: Timing,
+    timing: WindowTimes,
     walk_covariance: Float[np.ndarray, "walk walk"],
     prior: tuple[Float[np.ndarray, " states"], Float[np.ndarray, "states states"]],
 ) -> SmoothedWalk:
@@ -70,9 +71,7 @@ def smooth(
     transition = _transition(walk, size)
     middle = [*range(2 * walk, 3 * walk), *range(3 * walk, size)]
     average = [*range(walk, 2 * walk), *range(3 * walk, size)]
-    identity, noise = np.eye(size), np.zeros((size, size))
-    noise[: 3 * walk, : 3 * walk] = np.kron(_WINDOW, walk_covariance)
-    added = _variances_before(walk_covariance, size)
+    identity, noise = np.eye(size), _walk_noise(walk_covariance, size)
     # what later windows tell, in information form, which sums without cancellation even where nothing is known
     M, m = np.zeros((size, size)), np.zeros(size)
     means, covariances = np.empty((count, size)), np.empty((count, size, size))
@@ -82,8 +81,7 @@ def smooth(
         covariances[k] = 0.5 * (V + V.T)
         means[k] = x + covariances[k] @ (m - M @ x)
         known, toward = H.T @ H + M, H.T @ information.target[k] + m
-        Q = timing.length[k] * noise + timing.gap[k] * added[0] + timing.jump_variance[k] * added[1]
-        through = np.linalg.solve(identity + known @ Q, np.column_stack([known, toward]))
+        through = np.linalg.solve(identity + known @ noise(timing, k), np.column_stack([known, toward]))
         M, m = transition.T @ through[:, :size] @ transition, transition.T @ through[:, size]
         M = 0.5 * (M + M.T)
     covariance = covariances[:, middle][:, :, middle]
@@ -129,17 +127,23 @@ def _transition(walk: int, size: int) -> np.ndarray:
     return matrix
 
 
-def _variances_before(walk_covariance: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the covariances of all states of a window for a gap of 1 s before it, and for jumps of variance 1."""
+def _walk_noise(walk_covariance: np.ndarray, size: int) -> Callable[[WindowTimes, int], np.ndarray]:
+    """Return the covariance that a window, with the gap and the jump before it, adds to all states, as a function."""
     walk, batch = walk_covariance.shape[-1], walk_covariance.shape[:-2]
-    gap, jump = np.zeros((*batch, size, size)), np.zeros((size, size))
-    gap[..., : 3 * walk, : 3 * walk] = np.kron(np.ones((3, 3)), walk_covariance)
-    jump[: 3 * walk, : 3 * walk] = np.kron(np.ones((3, 3)), np.eye(walk))
-    return gap, jump
+
+    def expand(times: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+        whole = np.zeros((*batch, size, size))
+        whole[..., : 3 * walk, : 3 * walk] = np.kron(times, covariance)
+        return whole
+
+    everywhere = np.ones((3, 3))
+    within, gap = expand(_WINDOW, walk_covariance), expand(everywhere, walk_covariance)
+    jump = expand(everywhere, np.eye(walk))
+    return lambda timing, k: timing.length[k] * within + timing.gap[k] * gap + timing.jump_variance[k] * jump
 
 
 def _filter(
-    information: WindowInformation, timing: Timing, walk_covariance: np.ndarray, prior: tuple, keep: bool
+    information: WindowInformation, timing: WindowTimes, walk_covariance: np.ndarray, prior: tuple, keep: bool
 ) -> _Pass:
     mean, covariance = prior
     walk, batch = walk_covariance.shape[-1], walk_covariance.shape[:-2]
@@ -154,17 +158,11 @@ def _filter(
     factor[..., walk : 2 * walk] = information.factor[..., :walk]
     if constants:
         factor[..., 3 * walk :] = information.factor[..., walk:]
-    noise = np.zeros((*batch, size, size))
-    noise[..., : 3 * walk, : 3 * walk] = np.kron(_WINDOW, walk_covariance)
-    before, everywhere = _variances_before(walk_covariance, size)
+    noise = _walk_noise(walk_covariance, size)
     total, kept = np.zeros(batch), []
     identity = np.eye(information.factor.shape[1])
     for k, H in enumerate(factor):
-        x, P = x @ transition.T, transition @ P @ transition.T + timing.length[k] * noise
-        if timing.gap[k] > 0.0:
-            P = P + timing.gap[k] * before
-        if timing.jump_variance[k] > 0.0:
-            P = P + timing.jump_variance[k] * everywhere
+        x, P = x @ transition.T, transition @ P @ transition.T + noise(timing, k)
         cross = P @ H.T
         F = np.linalg.inv(H @ cross + identity)
         v = information.target[k] - x @ H.T

@@ -20,8 +20,16 @@ from fitact.files import atomic_write
 from fitact.progress import track_progress
 from fitact.scene.scene import Scene
 from fitact.scene.sections import DriveSection
-from fitact.tracking.compressed_windows import CompressedWindow, CompressedWindows, WindowModel, find_model
-from fitact.tracking.track import Track, solve_windows
+from fitact.tracking.compressed_windows import (
+    CompressedWindow,
+    CompressedWindows,
+    WindowModel,
+    find_model,
+    require_table,
+    stack_data,
+)
+from fitact.tracking.solve_windows import solve_windows
+from fitact.tracking.track import Track
 from fitact.tracking.windows import Window, split_windows
 
 CHECKPOINT = "windows.npz"
@@ -97,11 +105,14 @@ def track_blocks(
     """Follow a finger along blocks of samples, as `track` does; `total` is the last block's position, for progress."""
     stated = scene or Scene()
     followed = stated.model_copy(update={"drive": DriveSection(waveform="measured")})
-    first, blocks = _read_head(blocks, followed, source)
-    head = _describe_head(first, window, source)
+    if stated.measurement.noise_model != "white":
+        raise InputError("scene: [measurement] noise_model: a track needs white noise; leave the key out")
+    first, frequency, blocks = _read_head(blocks, followed, source)
+    head = _describe_head(first, frequency, window, source)
     position = [0.0]
     windows = split_windows(_watch(blocks, position), head.step, head.samples, source)
     model, begun = _find_first_model(windows, followed, head.step, source)
+    require_table(model, source)
     checkpoint = None if folder is None else _Checkpoint(Path(folder) / CHECKPOINT, model, followed)
     done = checkpoint.load(begun) if checkpoint else []
     compressed: list[CompressedWindow] = []
@@ -133,7 +144,7 @@ def _solve(
     notes: tuple[str, ...],
     rates: Sequence[float] | None,
 ) -> Track:
-    found, _ = solve_windows(model, CompressedWindows.from_windows(compressed), rates=rates)
+    found = solve_windows(model, CompressedWindows.from_windows(compressed), rates=rates)
     if scene.states_waveform() and scene.drive.waveform != "measured":
         notes = (*notes, f"the recorded V is the drive of a track, not the {scene.drive.waveform} of the scene")
     return dataclasses.replace(found, notes=tuple(dict.fromkeys([*found.notes, *notes])))
@@ -145,11 +156,11 @@ def _watch(blocks: Iterable[Block], position: list[float]) -> Iterator[Block]:
         yield block
 
 
-def _read_head(blocks: Iterator[Block], scene: Scene, source: str) -> tuple[list[Block], Iterator[Block]]:
-    """Return the first blocks, and all of them; refuse a record without the channels that are needed."""
-    first, count = [], 0
+def _read_head(blocks: Iterator[Block], scene: Scene, source: str) -> tuple[list[Block], float | None, Iterator[Block]]:
+    """Return the first blocks, the frequency of V in them, and all; refuse a record that lacks a needed channel."""
+    first, count, frequency, needed = list[Block](), 0, None, ("V", *scene.measurement.channels)
     for block in blocks:
-        for name in ("V", *scene.measurement.channels):
+        for name in needed:
             if name not in block.channels:
                 unit = "A" if name == "I" else "V"
                 raise InputError(
@@ -158,31 +169,31 @@ def _read_head(blocks: Iterator[Block], scene: Scene, source: str) -> tuple[list
                 )
         first.append(block)
         count += block.time.size
-        if count >= _HEAD_SAMPLES or (count >= _MIN_SAMPLES and _find_frequency(first)[0] is not None):
+        frequency = _find_frequency(first) if count >= _MIN_SAMPLES else None
+        if count >= _HEAD_SAMPLES or frequency is not None:
             break
     if count < 20:
         raise InputError(f"{source}: holds {count} samples, too few for a track; record several periods of the drive")
-    needed = ("V", *scene.measurement.channels)
 
     def select(block: Block) -> Block:
         return block._replace(channels={name: block.channels[name] for name in needed})
 
-    return first, map(select, itertools.chain(first, blocks))
+    return first, frequency or _find_frequency(first), map(select, itertools.chain(first, blocks))
 
 
-def _find_frequency(first: list[Block]) -> tuple[float | None, np.ndarray]:
-    """Return the frequency of V (Hz), or None if it does not repeat, and the times of the samples (s)."""
+def _find_frequency(first: list[Block]) -> float | None:
+    """Return the frequency of V (Hz), or None if it does not repeat."""
     time = np.concatenate([block.time for block in first])[:_HEAD_SAMPLES]
     voltage = np.concatenate([block.channels["V"] for block in first])[:_HEAD_SAMPLES]
     finite = np.isfinite(voltage)
     if not finite.any() or not np.ptp(voltage[finite]) > 0.0:
-        return None, time
-    return fundamental_frequency(time[finite], voltage[finite]), time
+        return None
+    return fundamental_frequency(time[finite], voltage[finite])
 
 
-def _describe_head(first: list[Block], window: float | None, source: str) -> _Head:
+def _describe_head(first: list[Block], frequency: float | None, window: float | None, source: str) -> _Head:
     """Return the time step and the number of samples in a window, from the first samples."""
-    frequency, times = _find_frequency(first)
+    times = np.concatenate([block.time for block in first])[:_HEAD_SAMPLES]
     steps = np.diff(times)
     usual = float(np.median(steps))
     if not usual > 0.0:
@@ -234,15 +245,13 @@ class _Checkpoint:
         return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
     def store(self, windows: list[CompressedWindow]) -> None:
-        filled = [each for each in windows if each.compressions is not None]
-        if not filled:
+        if all(each.data is None for each in windows):
             return
-        parts = [each if each.compressions is not None else filled[0] for each in windows]
-        leaves = [jax.tree.leaves((each.compressions, each.drive)) for each in parts]
-        arrays: dict[str, Any] = {f"leaf{i}": np.stack(each) for i, each in enumerate(zip(*leaves, strict=True))}
+        leaves = jax.tree.leaves(stack_data(windows))
+        arrays: dict[str, Any] = {f"leaf{i}": leaf for i, leaf in enumerate(leaves)}
         for name in ("start", "lowest", "highest"):
             arrays[name] = np.array([getattr(each, name) for each in windows])
-        arrays["has_data"] = np.array([each.compressions is not None for each in windows])
+        arrays["has_data"] = np.array([each.data is not None for each in windows])
         with atomic_write(self.path) as temporary, temporary.open("wb") as file:
             np.savez(file, key=np.array(self._key()), **arrays)
 
@@ -255,13 +264,15 @@ class _Checkpoint:
                 return []
             with jax.enable_x64(True):
                 whole = next(each for each in begun if each.is_whole)
-                each = next(self._model.compress_windows([whole]))
-                example = each.compressions, each.drive
-            count, structure = len(jax.tree.leaves(example)), jax.tree.structure(example)
-            leaves = [stored[f"leaf{i}"] for i in range(count)]
+                structure = jax.tree.structure(next(self._model.compress_windows([whole])).data)
+            leaves = [stored[f"leaf{i}"] for i in range(structure.num_leaves)]
             rest = zip(stored["start"], stored["lowest"], stored["highest"], stored["has_data"], strict=True)
-            done = []
-            for k, (start, low, high, has_data) in enumerate(rest):
-                parts = jax.tree.unflatten(structure, [leaf[k] for leaf in leaves]) if has_data else (None, None)
-                done.append(CompressedWindow(float(start), parts[0], parts[1], float(low), float(high)))
-            return done
+            return [
+                CompressedWindow(
+                    float(start),
+                    jax.tree.unflatten(structure, [leaf[k] for leaf in leaves]) if has_data else None,
+                    float(low),
+                    float(high),
+                )
+                for k, (start, low, high, has_data) in enumerate(rest)
+            ]

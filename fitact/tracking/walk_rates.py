@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.model.circuit import FINGER_PARAMETERS
-from fitact.tracking.random_walk import Timing, WindowInformation, log_likelihood
+from fitact.tracking.random_walk import WindowInformation, WindowTimes, log_likelihood
 
 WALKS = {  # name of a walk -> its powers of the parameters
     "contact_area": {"Ci": 1.0},
@@ -50,7 +50,7 @@ def walk_covariance(to_walks: np.ndarray, rate: Float[np.ndarray, "*batch walks"
 
 def estimate_rates(
     information: WindowInformation,
-    timing: Timing,
+    timing: WindowTimes,
     prior: tuple[np.ndarray, np.ndarray],
     parameters: tuple[str, ...],
     *,

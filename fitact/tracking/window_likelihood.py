@@ -10,12 +10,12 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from fitact.compiled import jit, pad_rows
-from fitact.fitting.derived import DerivedQuantities
 from fitact.likelihood.channel import CHARGES
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.circuit import FinalCircuit, HighpassTerms
-from fitact.model.force import force_constant
+from fitact.model.force import Geometry, force_constant
+from fitact.tracking.compressed_windows import WindowData
 
 QUANTITIES = ("g", "b", "force_mean")
 
@@ -30,22 +30,18 @@ class Linearization(NamedTuple):
 
 def linearize(
     likelihood: Likelihood,
-    windows: tuple[Compression, ...],
+    windows: WindowData,
     theta: Float[np.ndarray, "windows parameters"],
     sigma: Float[np.ndarray, " channels"],
-    drive: tuple[Float[np.ndarray, "windows rows"], ...],
     change: Float[np.ndarray, "windows rates"],
     batch: int = 64,
 ) -> Linearization:
-    """Linearise the likelihoods of windows; `windows` has the compressions of each channel, stacked.
-
-    `drive` is V in the coordinates of each channel, and `change` the rates of log(Ci), log(Csc), log(Rsc), 1/s.
-    """
-    return Linearization(*_map_windows(_linearize_batch, likelihood, (windows, drive, change), theta, sigma, batch))
+    """Linearise the likelihoods of windows; `change` has the rates of log(Ci), log(Csc) and log(Rsc), 1/s."""
+    return Linearization(*_map_windows(_linearize_batch, likelihood, (windows, change), theta, sigma, batch))
 
 
 def evaluate_quantities(
-    derive: DerivedQuantities,
+    geometry: Geometry,
     likelihood: Likelihood,
     windows: tuple[Compression, ...],
     theta: Float[np.ndarray, "windows parameters"],
@@ -53,8 +49,7 @@ def evaluate_quantities(
     batch: int = 64,
 ) -> tuple[Float[np.ndarray, "windows quantities"], Float[np.ndarray, "windows quantities parameters"]]:
     """Return the logarithms of `QUANTITIES` in each window, and their gradients in theta."""
-    model = dataclasses.replace(derive, likelihood=likelihood)
-    return _map_windows(_quantities_batch, model, windows, theta, sigma, batch)
+    return _map_windows(_quantities_batch, (likelihood, geometry), windows, theta, sigma, batch)
 
 
 def _map_windows(function: Any, model: Any, windows: Any, theta: np.ndarray, sigma: np.ndarray, batch: int) -> Any:
@@ -74,7 +69,7 @@ def _insert(likelihood: Likelihood, compressions: tuple[Compression, ...]) -> Li
 @jit
 def _linearize_batch(likelihood: Likelihood, windows: Any, theta: Array, sigma: Array) -> tuple[Array, Array, Array]:
     def one(window: Any, theta: Array) -> tuple[Array, Array, Array]:
-        compressions, drive, change = window
+        (compressions, drive), change = window
         model = _insert(likelihood, _subtract_lags(_insert(likelihood, compressions), drive, change, theta))
 
         def residuals(theta: Array) -> tuple[Array, tuple[Array, Array]]:
@@ -123,14 +118,18 @@ def _subtract_lags(model: Likelihood, drive: tuple[Array, ...], change: Array, t
 
 
 @jit
-def _quantities_batch(derive: DerivedQuantities, windows: Any, theta: Array, sigma: Array) -> tuple[Array, Array]:
+def _quantities_batch(
+    model_and_geometry: tuple[Likelihood, Geometry], windows: Any, theta: Array, sigma: Array
+) -> tuple[Array, Array]:
+    likelihood, geometry = model_and_geometry
+
     def one(compressions: tuple[Compression, ...], theta: Array) -> tuple[Array, Array]:
-        model = _insert(derive.likelihood, compressions)
+        model = _insert(likelihood, compressions)
 
         def logs(theta: Array) -> tuple[Array, Array]:
             circuit = model.circuit(theta)
             finger = model.finger(circuit)
-            contact = derive.geometry.contact(finger)
+            contact = geometry.contact(finger)
             square = _mean_square(model, circuit, theta, sigma, contact.channel)
             values = jnp.stack([finger.g, finger.b, force_constant(contact) * square])
             return jnp.log(values), jnp.log(values)

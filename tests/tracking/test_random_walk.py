@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fitact.tracking.random_walk import SmoothedWalk, Timing, WindowInformation, find_jumps, log_likelihood, smooth
+from fitact.tracking.random_walk import SmoothedWalk, WindowInformation, WindowTimes, find_jumps, log_likelihood, smooth
 
 WINDOWS, FINE, LENGTH, GAP = 24, 60, 0.5, 0.7
 WALK = np.array([[0.04, 0.01], [0.01, 0.09]])  # covariance per second
@@ -22,7 +22,7 @@ class Case:
         self.target = rng.standard_normal((WINDOWS, 3)) * (np.abs(self.factor).sum(axis=2) > 0.0)
         gap = np.zeros(WINDOWS)
         gap[GAP_BEFORE] = GAP
-        self.timing = Timing(np.full(WINDOWS, LENGTH), gap, np.zeros(WINDOWS))
+        self.timing = WindowTimes(np.full(WINDOWS, LENGTH), gap, np.zeros(WINDOWS))
         self.information = WindowInformation(self.factor, self.target)
 
     def exact(self) -> tuple[np.ndarray, np.ndarray, float]:

@@ -16,7 +16,7 @@ from fitact.data.readers.spectrum import is_spectrum
 from fitact.data.readers.text import is_binary, read_text
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.errors import InputError
-from fitact.files import atomic_write, read_error
+from fitact.files import atomic_write, read_head
 
 if TYPE_CHECKING:
     from fitact.scene.scene import Scene  # would import JAX
@@ -63,13 +63,7 @@ def read(
 def read_capture(path: str | os.PathLike[str], pick: Pick = lambda names, place: names) -> Capture:
     """Return time and channels of a file, by the names in the file; `pick` may select some of them."""
     source, path = os.fspath(path), Path(path)
-    if path.is_dir():
-        raise InputError(f"{source}: is a directory; give the path of a file")
-    try:
-        with path.open("rb") as file:
-            head = file.read(4096)
-    except OSError as error:
-        raise read_error(source, error) from error
+    head = read_head(path)
     if not head.strip():
         raise InputError(f"{source}: the file holds no data; expected a header such as time_s,V_V,Vsc_V,I_A")
     if head[:2] == b"\x1f\x8b":

@@ -3,7 +3,7 @@
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -14,8 +14,7 @@ from fitact.data.readers.binary import is_known_binary
 from fitact.data.readers.capture import channel_arrays, resolve_channels
 from fitact.data.readers.read import read
 from fitact.data.readers.text import is_binary, read_sidecar, stream_text
-from fitact.errors import InputError
-from fitact.files import read_error
+from fitact.files import read_error, read_head
 
 _BLOCK = 8_388_608  # bytes
 _SAMPLES = 262_144  # in a block of a record that was read at once
@@ -54,13 +53,17 @@ def stream_record(
             values = {name: each[part] for name, each in record.channels.items()}
             yield Block(record.time[part], values, float(first), record.notes)
         return
-    source = "standard input" if source == "-" else source
+    is_standard = source == "-"
+    source = "standard input" if is_standard else source
+
+    def pick(names: list[str], place: str) -> Iterable[str]:
+        return resolve_channels(names, channels, source, place).values()
+
     try:
-        with sys.stdin.buffer if os.fspath(path) == "-" else Path(path).open("rb") as file:
-            sidecar = "" if os.fspath(path) == "-" else read_sidecar(Path(path))
-            names = lambda found, place: resolve_channels(found, channels, source, place).values()  # noqa: E731
+        with sys.stdin.buffer if is_standard else Path(path).open("rb") as file:
+            sidecar = "" if is_standard else read_sidecar(Path(path))
             count, begin = 0, None
-            for capture in stream_text(_chunks(file, follow), source, names, sidecar):
+            for capture in stream_text(_chunks(file, follow), source, pick, sidecar):
                 arrays, _, notes = channel_arrays(capture, channels, scale)
                 times = capture.time
                 begin = float(times[0]) if begin is None else begin
@@ -75,13 +78,7 @@ def stream_record(
 
 def _is_plain_text(path: Path) -> bool:
     """Return whether a file is text that can be read in blocks: not packed, and with lines of ASCII or UTF-8."""
-    if path.is_dir():
-        raise InputError(f"{path}: is a directory; give the path of a file")
-    try:
-        with path.open("rb") as file:
-            head = file.read(4096)
-    except OSError as error:
-        raise read_error(str(path), error) from error
+    head = read_head(path)
     packed, wide = head[:2] == b"\x1f\x8b", head[:2] in (b"\xff\xfe", b"\xfe\xff")
     return not (packed or wide or is_binary(head) or is_known_binary(head, path.suffix) or b"\n" not in head)
 

@@ -2,9 +2,10 @@
 
 import bisect
 import contextlib
+import dataclasses
 import gzip
 import io
-import itertools
+import math
 import re
 import zlib
 from collections.abc import Iterator, Sequence
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import IO, cast
 
 import numpy as np
+from jaxtyping import Float
 
 from fitact.data.readers import layouts
 from fitact.data.readers.capture import Capture, FileChannel, Pick
@@ -32,18 +34,13 @@ def read_text(path: Path, source: str, pick: Pick) -> Capture:
         with _open_text(path) as (stream, file):
             head = stream.read(_HEAD_BYTES)
             stream.seek(0)
-            text = _decode(head, source)
-            text = text if len(head) < _HEAD_BYTES else text.rpartition("\n")[0]
-            header = read_header(text, source, read_sidecar(path))
-            names = [column.name for column in header.channels]
-            wanted = set(pick(names, header.location))
-            table = _TableParser(header, [column for column in header.channels if column.name in wanted], source)
-            blocks = _blocks(stream, source)
+            table = _TableParser.from_head(head, source, pick, read_sidecar(path))
+            blocks = _blocks(iter(lambda: stream.read(_BLOCK), b""), source, _MAX_BYTES)
             for block in track_progress(blocks, f"reading {source}", path.stat().st_size, file.tell):
                 table.add(block)
     except (OSError, EOFError, zlib.error) as error:
         raise read_error(source, error) from error
-    return table.to_capture([*(name for name in names if name not in wanted), *header.non_numeric_columns()])
+    return table.to_capture()
 
 
 def stream_text(
@@ -53,26 +50,24 @@ def stream_text(
 
     The header is read from the first `min_lines` lines, or from all if there are fewer.
     """
-    rest, table, names, taken = b"", None, list[str](), 0
-    for chunk in itertools.chain(chunks, [b""]):
-        whole, newline, left = (rest + chunk).rpartition(b"\n")
-        is_last = not chunk
-        block, rest = (rest, b"") if is_last else (whole, left) if newline else (b"", rest + chunk)
-        if table is None and not is_last and block.count(b"\n") < min_lines:
-            rest = block + newline + rest if block else rest
-            continue
-        if not block.strip():
-            continue
-        if table is None:
-            header = read_header(_decode(block[:_HEAD_BYTES].rpartition(b"\n")[0], source), source, sidecar_text)
-            names = [column.name for column in header.channels]
-            wanted = set(pick(names, header.location))
-            table = _TableParser(header, [column for column in header.channels if column.name in wanted], source)
+    table, taken = None, 0
+    for block in _join_first(_blocks(chunks, source, math.inf), min_lines):
+        table = table or _TableParser.from_head(block[:_HEAD_BYTES], source, pick, sidecar_text)
         table.add(block)
         capture = table.take_capture(taken)
         if capture is not None:
             taken += capture.time.size
             yield capture
+
+
+def _join_first(blocks: Iterator[bytes], min_lines: int) -> Iterator[bytes]:
+    """Yield the blocks, the first of them joined until they have `min_lines` lines."""
+    first = next(blocks, b"")
+    while first.count(b"\n") < min_lines and (more := next(blocks, b"")):
+        first += b"\n" + more
+    if first.strip():
+        yield first
+    yield from blocks
 
 
 def is_binary(head: bytes) -> bool:
@@ -119,12 +114,13 @@ def _decode(head: bytes, source: str) -> str:
         return head[: error.start].decode("utf-8-sig") if cut else head.decode("cp1252", errors="replace")
 
 
-def _blocks(stream: IO[bytes], source: str) -> Iterator[bytes]:
+def _blocks(parts: Iterator[bytes], source: str, max_bytes: float) -> Iterator[bytes]:
+    """Yield whole lines, without the last line feed, from parts that may break lines."""
     rest, size = b"", 0
-    while part := stream.read(_BLOCK):
+    for part in parts:
         size += len(part)
-        if size > _MAX_BYTES:
-            raise InputError(f"{source}: has more than {_MAX_BYTES // 2**30} GB of uncompressed text; shorten it")
+        if size > max_bytes:
+            raise InputError(f"{source}: has more than {max_bytes / 2**30:.0f} GB of uncompressed text; shorten it")
         whole, newline, rest = (rest + part).rpartition(b"\n")
         if newline:
             yield whole
@@ -145,6 +141,15 @@ class _TableParser:
         self._starts = [0]  # number of rows before each part
         self._blank_rows: list[int] = []  # rows with a time but no values
         self._next_line = 1
+
+    @classmethod
+    def from_head(cls, head: bytes, source: str, pick: Pick, sidecar_text: str) -> "_TableParser":
+        """Make the parser of the columns that `pick` selects, by the header in the first `_HEAD_BYTES` of a text."""
+        text = _decode(head, source)
+        text = text if len(head) < _HEAD_BYTES else text.rpartition("\n")[0]
+        header = read_header(text, source, sidecar_text)
+        wanted = set(pick([column.name for column in header.channels], header.location))
+        return cls(header, [column for column in header.channels if column.name in wanted], source)
 
     def add(self, block: bytes) -> None:
         first, skipped = self._next_line, max(0, self._header.data_rows[0].number - self._next_line)
@@ -238,22 +243,43 @@ class _TableParser:
         part = bisect.bisect_right(self._starts, row) - 1
         return f"line {self._lines[part][row - self._starts[part]]}"
 
-    def to_capture(self, unread_columns: Sequence[str]) -> Capture:
-        """Return the columns that were read; `unread_columns` were not selected, or hold no numbers."""
-        header, rows, announced = self._header, self._starts[-1], self._header.count_rows()
+    def to_capture(self) -> Capture:
+        """Return the columns that were read."""
+        rows, announced = self._starts[-1], self._header.count_rows()
         if announced is not None and rows < announced - 2:  # some manufacturers' counts are off by 2
             raise InputError(
                 f"{self._source}: the header states {announced:,} rows, but the file has {rows:,}, so it is"
                 " truncated; export it again"
             )
         kept, notes = self._trim_blank_rows(rows)
-        columns = [np.concatenate([part[:, i] for part in self._parts])[kept] for i in range(len(self._column_indices))]
-        self._parts.clear()  # `row_label` keeps a reference to the parser
-        if self._has_time:
-            time, *values = columns
-        else:
-            time, values = np.arange(rows, dtype=float)[kept], columns
-        time, timing, warnings = self._time_in_seconds(time)
+        columns = [column[kept] for column in self._take_columns()]  # `row_label` keeps a reference to the parser
+        capture = self._make_capture(columns, np.arange(rows, dtype=float)[kept])
+        return dataclasses.replace(
+            capture,
+            row_label=lambda row: self._line_label(row + (kept.start or 0)),
+            notes=(*capture.notes, *notes),
+        )
+
+    def take_capture(self, before: int) -> Capture | None:
+        """Return the rows since the last call, or None without any; `before` is the number of rows before them."""
+        rows = self._starts[-1]
+        if not rows:
+            return None
+        capture = self._make_capture(self._take_columns(), before + np.arange(rows, dtype=float))
+        self._lines, self._starts, self._blank_rows = [], [0], []
+        return capture
+
+    def _take_columns(self) -> list[np.ndarray]:
+        columns = [np.concatenate([part[:, i] for part in self._parts]) for i in range(len(self._column_indices))]
+        self._parts.clear()
+        return columns
+
+    def _make_capture(self, columns: Sequence[np.ndarray], index: Float[np.ndarray, " rows"]) -> Capture:
+        """Return a capture of columns with times, or, without these, with the `index` of each row."""
+        header, chosen = self._header, {column.name for column in self._columns}
+        time, values = (columns[0], columns[1:]) if self._has_time else (index, columns)
+        time, notes, warnings = self._time_in_seconds(time)
+        others = [column.name for column in header.channels if column.name not in chosen]
         return Capture(
             source=self._source,
             format=header.maker,
@@ -262,26 +288,10 @@ class _TableParser:
                 FileChannel.from_file(column.name, array, column.unit, column.attenuation, header.location)
                 for column, array in zip(self._columns, values, strict=True)
             ),
-            row_label=lambda row: self._line_label(row + (kept.start or 0)),
-            notes=(*timing, *notes),
+            notes=tuple(notes),
             warnings=tuple(warnings),
-            unread_columns=tuple(unread_columns),
+            unread_columns=(*others, *header.non_numeric_columns()),
         )
-
-    def take_capture(self, before: int) -> Capture | None:
-        """Return the rows since the last call, or None without any; `before` is the number of rows before them."""
-        if not self._starts[-1]:
-            return None
-        header = self._header
-        columns = [np.concatenate([part[:, i] for part in self._parts]) for i in range(len(self._column_indices))]
-        self._parts, self._lines, self._starts, self._blank_rows = [], [], [0], []
-        time, values = (columns[0], columns[1:]) if self._has_time else (before + np.arange(columns[0].size), columns)
-        seconds, notes, warnings = self._time_in_seconds(time)
-        channels = tuple(
-            FileChannel.from_file(column.name, array, column.unit, column.attenuation, header.location)
-            for column, array in zip(self._columns, values, strict=True)
-        )
-        return Capture(self._source, header.maker, seconds, channels, notes=tuple(notes), warnings=tuple(warnings))
 
     def _trim_blank_rows(self, rows: int) -> tuple[slice, list[str]]:
         """Return the rows without empty rows at either end, and a note on these."""
