@@ -17,7 +17,7 @@ _UNITS = {"time": "s", **UNITS}
 
 
 def write_record(path: Path, time: np.ndarray, channels: Columns) -> None:
-    """Write time (s) and channels (V, V, A); the suffix selects .csv, .csv.gz, .npz, .mat or .h5.
+    """Write time (s) and channels (V, V, A, N); the suffix selects .csv, .csv.gz, .npz, .mat or .h5.
 
     Raises:
         RecipeError: another suffix.

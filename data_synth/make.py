@@ -11,6 +11,7 @@ from data_synth import imperfections
 from data_synth.changing import Course, changing_response, make_course
 from data_synth.drive import Drive, make_drive
 from data_synth.errors import RecipeError
+from data_synth.friction import friction
 from data_synth.keys import default_value
 from data_synth.network import Network, network, state_space
 from data_synth.recipe import AS_IT_IS, KEYS, UNITS, Recipe
@@ -31,13 +32,17 @@ _VALUES = {  # name -> section of the scene, key, unit
     "series_resistor": ("measurement", "series_resistor", "ohm"),
     "probe_resistance": ("measurement", "probe_resistance", "ohm"),
     "probe_capacitance": ("measurement", "probe_capacitance", "F"),
+    "mu": ("friction", "coefficient", "1"),
+    "fN": ("friction", "normal_force", "N"),
+    "sensor_frequency": ("friction", "sensor_frequency", "Hz"),
+    "sensor_damping": ("friction", "sensor_damping", "1"),
     "Rgap": ("gap", "resistance", "ohm"),
     "Cgap": ("gap", "capacitance", "F"),
 }
 
 
 class Synthetic(NamedTuple):
-    """Record (s, V, V, A) with its true values."""
+    """Record (s, V, V, A, N) with its true values."""
 
     time: np.ndarray
     channels: dict[str, np.ndarray]
@@ -88,8 +93,14 @@ def _record(recipe: Recipe, scene: Scene, finger: int) -> Synthetic:
         rng = imperfections.generator(recipe.seed, finger, "change")
         course = make_course(parts["change"], values, measured["duration"], rng)
     skin = _scale_second_layer(parts["skin"], area)
-    found = dict(zip(UNITS, simulate_response(scene, taken, skin, recipe.route, course), strict=True))
+
+    def waves(times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return simulate_response(scene, times, skin, recipe.route, course)
+
+    found = dict(zip(("V", "Vsc", "I"), waves(taken), strict=True))
     wanted = [name for name in UNITS if name == "V" or name in measured["channels"]]
+    if "Ft" in wanted:
+        found["Ft"] = friction(scene, waves, taken, parts["friction"])
     if "I" in wanted and not np.all(np.isfinite(found["I"])):
         raise RecipeError(
             f"{recipe.name}: the current has an impulse at each ideal jump of the drive; give the drive a rise time, or"
@@ -118,7 +129,7 @@ def _scale_second_layer(skin: Mapping[str, Any], area: float) -> Mapping[str, An
 def _resolve_noise(recipe: Recipe) -> dict[str, dict[str, Any]]:
     """Return the recipe's sections, with the scene's white noise if the recipe states none."""
     measured, white = recipe.scene["measurement"], recipe.parts["white"]
-    stated = {"V": 0.0, "Vsc": measured["noise_Vsc"], "I": measured["noise_I"]}
+    stated = {"V": 0.0, "Vsc": measured["noise_Vsc"], "I": measured["noise_I"], "Ft": measured["noise_Ft"]}
     return {**recipe.parts, "white": {n: stated[n] if white[n] is None else white[n] for n in UNITS}}
 
 
@@ -173,6 +184,10 @@ def _truth(recipe: Recipe, scene: Scene, parts: dict[str, dict[str, Any]]) -> di
     values = {name: (scene[section][key], unit) for name, (section, key, unit) in _VALUES.items()}
     if scene["skin"]["level"] != "fractional":
         del values["alpha"]
+    if "Ft" not in scene["measurement"]["channels"]:
+        values = {name: value for name, value in values.items() if _VALUES[name][0] != "friction"}
+    else:
+        values["force_scale"] = parts["friction"]["force_scale"], "1"
     values |= {f"noise_{name}": (parts["white"][name], UNITS[name]) for name in scene["measurement"]["channels"]}
     stated = {key: value for key, value in scene["drive"].items() if value != default_value(SCENE["drive"][key])}
     added = {name: parts[name] for name in KEYS if name in recipe.given}

@@ -10,7 +10,7 @@ from data_synth.keys import Choice, Key, ListKey, Quantity, Table, WholeNumber, 
 from data_synth.scene import KEYS as SCENE
 from data_synth.scene import Scene, make_scene
 
-UNITS = {"V": "V", "Vsc": "V", "I": "A"}
+UNITS = {"V": "V", "Vsc": "V", "I": "A", "Ft": "N"}
 AS_IT_IS = "as the scene says"  # skin model of a recipe that states none
 _SUFFIX = ".recipe"
 
@@ -46,6 +46,8 @@ KEYS: Table = {
         **dict.fromkeys(("walk_area", "walk_Rsc", "walk_Csc"), Quantity("", 0.0, least=True)),
         "lifted": ListKey(Quantity("s")),
     },
+    # electrostatic force over the computed one, and cross-talk of the drive in the friction, N/V
+    "friction": {"force_scale": Quantity("", 1.0), "crosstalk": Quantity("N/V", 0.0, -math.inf)},
     # in the order in which they act
     "clock": {"jitter": Quantity("s", 0.0, least=True), "trigger_error": Quantity("s", 0.0, -math.inf)},
     "gain": dict.fromkeys(UNITS, Quantity("", 1.0, -math.inf)),

@@ -12,7 +12,7 @@ Scene = dict[str, dict[str, Any]]
 
 _ANY = -math.inf
 _PRIORS = """Rsc Csc Ci R_H grounding_Rsc grounding_Csc Z Z_capacitance series_resistor Rgap Cgap alpha sigma sigma_I
-correlation"""
+sigma_Ft mu fN force_scale sensor_frequency sensor_damping correlation"""
 KEYS: Table = {
     "device": {
         "Ci": Quantity("F", 1.35e-9),
@@ -58,7 +58,7 @@ KEYS: Table = {
         "steady_state": Choice((True, False)),
     },
     "measurement": {
-        "channels": ListKey(Choice(("Vsc", "I")), ("Vsc",)),
+        "channels": ListKey(Choice(("Vsc", "I", "Ft")), ("Vsc",)),
         "series_resistor": Quantity("ohm", 0.0, least=True),
         "probe_resistance": Quantity("ohm"),
         "probe_capacitance": Quantity("F"),
@@ -66,13 +66,19 @@ KEYS: Table = {
         "duration": Quantity("s", 20e-3),
         "noise_Vsc": Quantity("V", 0.1, least=True),
         "noise_I": Quantity("A", 20e-9, least=True),
+        "noise_Ft": Quantity("N", 2e-3, least=True),
         **dict.fromkeys(("gain_relative_sd", "gain_I_relative_sd", "noise_model", "quiet", "weighting"), IgnoredKey()),
         **dict.fromkeys(("spectrum_relative_sd", "spectrum_floor_sd"), IgnoredKey()),
     },
-    "instrument": dict.fromkeys(("V", "Vsc", "I", "Z", "own"), IgnoredKey()),
-    "friction": dict.fromkeys(("coefficient", "normal_force"), IgnoredKey()),
+    "instrument": dict.fromkeys(("V", "Vsc", "I", "Z", "Ft", "own"), IgnoredKey()),
+    "friction": {
+        "coefficient": Quantity("", 0.5),
+        "normal_force": Quantity("N", 0.5, least=True),
+        "sensor_frequency": Quantity("Hz"),
+        "sensor_damping": Quantity(""),
+    },
     "prior": dict.fromkeys(_PRIORS.split(), IgnoredKey()),
-    "force": {"model": IgnoredKey()},
+    "force": {"model": Choice(("paper", "gap"))},
     "perception": dict.fromkeys(("threshold_force", "friction_change", "source"), IgnoredKey()),
     "population": dict.fromkeys(
         ("contact_area", "skin_thickness_relative_sd", "insulator_thickness_relative_sd"), IgnoredKey()

@@ -43,6 +43,9 @@ _PARAMETERS = {
     "Rgap": "gap resistance Rgap",
     "Cgap": "gap capacitance Cgap",
     "alpha": "exponent of the fractional skin",
+    "mu": "coefficient of friction mu",
+    "fN": "normal force fN",
+    "force_scale": "measured electrostatic force over the computed one",
 }
 _NUISANCES = {  # quantities of the measurement; {}: the channel
     "gain": "gain of {}",
@@ -70,8 +73,14 @@ _NUISANCES = {  # quantities of the measurement; {}: the channel
     "charge_2": "second transient in {} at the first sample",
     "charge_3": "third transient in {} at the first sample",
     "charge_4": "fourth transient in {} at the first sample",
+    "ringing": "state of the force sensor at the first sample",
+    "ringing_2": "rate of the force sensor at the first sample",
+    "crosstalk": "part of {} in proportion to V, at the largest V",
+    "crosstalk_2": "part of {} in proportion to dV/dt, at the largest dV/dt",
+    "sensor_frequency": "natural frequency of the force sensor",
+    "sensor_damping": "damping ratio of the force sensor",
 }
-_CHANNELS = {"": "Vsc", "I": "I", "Z": "the impedance", "H": "Vsc/V"}  # by the end of a name
+_CHANNELS = {"": "Vsc", "I": "I", "Z": "the impedance", "H": "Vsc/V", "Ft": "the friction"}  # by the end of a name
 _GEOMETRY = {  # what force and friction rest on beside the circuit
     "skin_thickness": "skin thickness Tsc",
     "skin_permittivity": "skin permittivity",
@@ -95,8 +104,8 @@ def describe_quantity(name: str) -> str:
     labels = _PARAMETERS | _NUISANCES | _GEOMETRY | _DERIVED
     bare = name if name in labels else re.sub(r"_\d+$", "", name)
     number = name[len(bare) + 1 :]
-    letter = "" if bare in labels else bare[-1]
-    label = labels[bare if bare in labels else bare[:-2]].format(describe_channel(letter))
+    stem, _, letter = (bare, "", "") if bare in labels else bare.rpartition("_")
+    label = labels[stem].format(describe_channel(letter))
     return label + (f", record {number}" if number else "")
 
 
@@ -207,11 +216,14 @@ def _quantity_row(name: str, summary: Summary, basis: dict[str, Any]) -> tuple[s
     return name, format_estimate(summary), format_interval(summary), combined, fraction, remark
 
 
-def force_sentences(basis: dict[str, Any]) -> list[str]:
-    """Return what a force rests on, in sentences; `basis` is `force_basis` of fit.json or summary.json."""
-    sentences = [
-        f"Force: computed {FORCE_LAWS[basis['law']]}; it was not measured, and these data do not test that law."
-    ]
+def force_sentences(content: dict[str, Any]) -> list[str]:
+    """Return what a force rests on, in sentences; `content` is that of fit.json or summary.json."""
+    basis = content["force_basis"]
+    law = f"Force: computed {FORCE_LAWS[basis['law']]}"
+    if "force_scale" in content["parameters"]:
+        sentences = [f"{law}. {_compare_with_friction(content['parameters']['force_scale'], content)}"]
+    else:
+        sentences = [f"{law}; it was not measured, and these data do not test that law."]
     if basis["assumptions"]:
         values = ", ".join(f"{a['symbol']} = {a['text']} ({a['origin']})" for a in basis["assumptions"])
         included = [a["symbol"] for a in basis["assumptions"] if a.get("has_distribution")]
@@ -224,6 +236,24 @@ def force_sentences(basis: dict[str, Any]) -> list[str]:
         force = format_estimate(other["force_mean"])
         sentences.append(f"Mean force by the other law ({FORCE_LAWS[other['law']]}): {force}, for the same data.")
     return sentences
+
+
+def _compare_with_friction(scale: Summary, content: dict[str, Any]) -> str:
+    """Return what the measured friction says about the computed force."""
+    ratio, u = float(scale["q50"]), float(scale.get("u", math.inf))
+    sentence = f"The force in the measured friction is {format_estimate(scale)} times as large (force_scale"
+    if not math.isfinite(u):
+        sentence += ")."
+    elif abs(math.log(ratio)) <= 2.0 * u:
+        sentence += f", combined u {format_percent(u)}): they agree."
+    else:
+        sentence += (
+            f", combined u {format_percent(u)}): they differ, so the law, the contact area or a thickness is wrong."
+        )
+    sentence += " This rests on mu, which follows from the mean friction and the normal force."
+    if content["identifiability"]["verdict"] != "identified":
+        sentence += " The electrical channels do not determine the contact area, whose error force_scale contains."
+    return sentence
 
 
 def budget_sentence(content: dict[str, Any]) -> str:
@@ -310,7 +340,7 @@ def load(directory: str | os.PathLike[str]) -> dict[str, Any]:
 
 def format_table(content: dict[str, Any]) -> list[str]:
     """Return the lines of `quantity_table`, and what the force rests on."""
-    sentences = filter(None, (budget_sentence(content), *force_sentences(content["force_basis"])))
+    sentences = filter(None, (budget_sentence(content), *force_sentences(content)))
     return [*align_table(quantity_table(content)), *sentences]
 
 

@@ -24,10 +24,12 @@ _UNITS = {
     "gain": "1", "delay": "s", "clock": "1", "sigma": "V", "sigma_Z": "1", "sigma_H": "1",
     "alpha": "1", "Vsc_peak_to_peak": "V", "log_sd": "1", "slope": "1", "correlation": "1",
     "offset": "V", "drift": "V", "charge": "V", "charge_2": "V", "charge_3": "V", "charge_4": "V",
+    "ringing": "V", "ringing_2": "V", "crosstalk": "V", "crosstalk_2": "V",
     "hum_50Hz_cos": "V", "hum_50Hz_sin": "V", "hum_60Hz_cos": "V", "hum_60Hz_sin": "V",
     "g": "1", "b": "s", "force_mean": "N", "force_peak": "N", "force_rms": "N", "friction_mean": "N",
     "skin_thickness": "m", "skin_permittivity": "1", "insulator_thickness": "m", "insulator_permittivity": "1",
     "contact_area": "m^2", "friction_coefficient": "1",
+    "mu": "1", "fN": "N", "force_scale": "1", "sensor_frequency": "Hz", "sensor_damping": "1",
     "force_at_f": "N", "force_at_2f": "N", "friction_at_f": "N", "friction_at_2f": "N",
 }  # fmt: skip
 
@@ -103,8 +105,10 @@ def _prefix_exponent(value: float) -> int:
 def quantity_unit(name: str) -> str:
     """Return the SI unit of a quantity; the name of a nuisance may end in a channel label, e.g. "sigma_I_2"."""
     bare = name if name in _UNITS else re.sub(r"_\d+$", "", name)
-    unit = _UNITS[bare if bare in _UNITS else re.sub("_[IZH]$", "", bare)]
-    return "A" if bare.endswith("_I") and unit == "V" else unit
+    unit = _UNITS[bare if bare in _UNITS else re.sub("_(I|Z|H|Ft)$", "", bare)]
+    if unit != "V" or not bare.endswith(("_I", "_Ft")):
+        return unit
+    return "A" if bare.endswith("_I") else "N"
 
 
 def format_percent(fraction: float) -> str:

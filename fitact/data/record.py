@@ -16,7 +16,7 @@ from fitact.errors import InputError
 
 MINIMUM_SAMPLES = 20
 OVERFLOW = 9e36  # oscilloscopes write 9.9E+37 or more for a value out of range
-CHANNEL_UNITS = {"V": "V", "Vsc": "V", "I": "A"}
+CHANNEL_UNITS = {"V": "V", "Vsc": "V", "I": "A", "Ft": "N"}
 
 # times of existing records, so that records on the same grid share one array
 _SHARED_TIMES: weakref.WeakValueDictionary[tuple[float, ...], np.ndarray] = weakref.WeakValueDictionary()
@@ -53,18 +53,19 @@ class Record:
         V: Float[np.ndarray, " samples"] | None = None,
         Vsc: Float[np.ndarray, " samples"] | None = None,
         I: Float[np.ndarray, " samples"] | None = None,  # noqa: E741  (the field's symbol for current)
+        Ft: Float[np.ndarray, " samples"] | None = None,
         source: str = "record",
         notes: tuple[str, ...] = (),
         warnings: tuple[str, ...] = (),
         where: _RowLabel = lambda row: f"sample {row}",
     ) -> "Record":
-        """Make a record from arrays of equal length (s, V, V, A) after checks; `where` names a row in errors.
+        """Make a record from arrays of equal length (s, V, V, A, N) after checks; `where` names a row in errors.
 
         Raises:
             InputError: the samples are too few, not finite or not increasing in time, or a channel has no signal.
         """
         time = _aligned_copy(time)
-        given = {"V": V, "Vsc": Vsc, "I": I}
+        given = {"V": V, "Vsc": Vsc, "I": I, "Ft": Ft}
         channels = {name: _aligned_copy(values) for name, values in given.items() if values is not None}
         _check_shapes(time, channels, source)
         for name, values in {"time": time, **channels}.items():
@@ -349,8 +350,9 @@ def _check_signal(values: np.ndarray, name: str, source: str) -> None:
     middle = np.median(values)
     if np.max(np.abs(values - middle)) > 7.0 * np.median(np.abs(values - middle)) / 0.6744897501960817:
         return  # the channel has an edge
-    if white_noise_sd(values) < 0.3 * np.std(values):
-        return  # a smooth signal, e.g. a sweep, which has no spectral line
+    # a smooth signal, e.g. a sweep, has no spectral line; and friction may have no electrostatic part
+    if name == "Ft" or white_noise_sd(values) < 0.3 * np.std(values):
+        return
     power = np.abs(np.fft.rfft(values - values.mean())[1:]) ** 2
     # Fisher's test: for white noise, the power fraction of the largest of m lines exceeds x with p < m (1 - x)^(m - 1)
     share, lines = power.max() / power.sum(), power.size

@@ -1,15 +1,20 @@
 """Simulated records of a scene, for trials by the user; `data_synth` makes the data of the tests independently."""
 
+import math
+from typing import Any
+
 import jax
 import numpy as np
-from jaxtyping import Float
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
 from fitact.data.plausibility import check_plausibility, insulator_voltage
 from fitact.data.record import MINIMUM_SAMPLES, Record
 from fitact.errors import InputError
 from fitact.model.circuit import Circuit
 from fitact.model.drive import Drive
-from fitact.model.force import electrostatic_force
+from fitact.model.force import electrostatic_force, force_constant, friction
+from fitact.model.force_sensor import ForceSensor, mean_square_over_step
 from fitact.model.response import response
 from fitact.scene.scene import Scene
 
@@ -19,10 +24,14 @@ def simulate(scene: Scene, seed: int = 0) -> Record:
     circuit, drive, measured, time = scene.make_circuit(), scene.make_drive(), scene.measurement, sample_times(scene)
     rng = np.random.default_rng(seed)
     with jax.enable_x64(True):
-        channels = {"V": np.asarray(drive.value(time))}
+        channels: dict[str, Any] = {"V": np.asarray(drive.value(time))}
         for channel in measured.channels:
-            clean = np.asarray(response(circuit, drive, time, steady_state=scene.drive.steady_state, channel=channel))
-            noise = measured.noise_Vsc if channel == "Vsc" else measured.noise_I
+            if channel == "Ft":
+                clean = _simulate_friction(scene, circuit, drive, time)
+            else:
+                steady_state = scene.drive.steady_state
+                clean = np.asarray(response(circuit, drive, time, steady_state=steady_state, channel=channel))
+            noise = {"Vsc": measured.noise_Vsc, "I": measured.noise_I, "Ft": measured.noise_Ft}[channel]
             channels[channel] = clean + noise * rng.standard_normal(time.size)
         doubts = _check_scene(scene, circuit, drive, time)
     if not np.all(np.isfinite(channels.get("I", 0.0))):
@@ -30,8 +39,31 @@ def simulate(scene: Scene, seed: int = 0) -> Record:
             "scene: the current has an impulse at each ideal jump of the drive; give the drive a rise time"
             " (waveform = 'trapezoid'), or the scene an R_H or a series_resistor"
         )
-    V, Vsc, current = (channels.get(name) for name in ("V", "Vsc", "I"))
-    return Record.from_arrays(time, V=V, Vsc=Vsc, I=current, source="simulation", warnings=tuple(doubts))
+    return Record.from_arrays(time, **channels, source="simulation", warnings=tuple(doubts))
+
+
+def _simulate_friction(
+    scene: Scene, circuit: Circuit, drive: Drive, time: Float[np.ndarray, " samples"]
+) -> Float[np.ndarray, " samples"]:
+    """Return the friction by eq. (2) as the sensor of the scene reads it, N."""
+    stated, step = scene.friction, float(time[1] - time[0])
+    sensor, lead = None, 0
+    if stated.sensor_frequency is not None:
+        sensor = ForceSensor(stated.sensor_frequency, stated.sensor_damping)
+        # so that the sensor has settled at the first sample
+        lead = math.ceil(4.0 / (stated.sensor_frequency * (stated.sensor_damping or 1.0)) / step)
+    early, contact = time[0] + step * np.arange(-lead, time.size), scene.geometry().contact(circuit)
+
+    def voltage(delay: ArrayLike) -> Array:
+        steady_state = scene.drive.steady_state
+        return response(circuit, drive, early - delay, steady_state=steady_state, channel=contact.channel)
+
+    if sensor is None:
+        square = voltage(0.0) ** 2
+    else:
+        square = sensor.respond(mean_square_over_step(voltage, step), step)[lead:]
+    force = force_constant(contact) * square
+    return np.asarray(friction(force, float(stated.coefficient), stated.normal_force))
 
 
 def _check_scene(scene: Scene, circuit: Circuit, drive: Drive, time: Float[np.ndarray, " samples"]) -> list[str]:

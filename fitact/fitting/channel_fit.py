@@ -15,7 +15,7 @@ from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.residual_statistics import channel_statistics, outliers
 from fitact.fitting.source import Source
 from fitact.fitting.spectra import spectrum_statistics
-from fitact.likelihood.channel import LINEAR_NUISANCES, ChannelInputs, ChannelLikelihood
+from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import STUDENT_DOF, student_weight
 from fitact.model.circuit import Channel, Circuit
@@ -59,7 +59,7 @@ class ChannelFit:
         residuals, white, beta = sample_residuals(channel, inputs, np.asarray(sigma))
         unpadded = slice(channel.n_samples)
         residuals, weight = residuals[unpadded], None if channel.equally_weighted else channel.weights[unpadded]
-        names = [channel.qualified_name(LINEAR_NUISANCES[column]) for column in channel.columns]
+        names = [channel.qualified_name(channel.linear_names[column]) for column in channel.columns]
         linear = dict(zip(names, (beta * np.asarray(channel.linear_sd)[list(channel.columns)]).tolist(), strict=True))
         counted = (channel.weights if channel.whitening is None else np.asarray(channel.whitening.mask))[unpadded] > 0.0
         white = white[unpadded][counted]
@@ -113,6 +113,8 @@ def _weighted_statistics(
 
 def _gain(optimum: CircuitValues, channel: ChannelLikelihood) -> float:
     """Return the factor by which noise of a measured drive enters the channel."""
+    if channel.channel == "Ft":  # whose sensor hardly follows noise
+        return 0.0
     if isinstance(optimum.circuit, WithSkin):  # the gain falls with frequency, and most of the noise is fast
         return float(np.abs(_channel_gain(optimum.circuit, channel.channel, 1.0 / channel.time_step)))
     return abs(float(np.sum(optimum.terms[channel.channel].weight)))

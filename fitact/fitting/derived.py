@@ -26,6 +26,7 @@ from fitact.model.response_table import ResponseTable
 from fitact.model.skin import WithSkin
 from fitact.scene.scene import Scene
 
+_FREE_FRICTION = {"mu", "fN", "force_scale"}  # parameters of eq. (2) where the friction is measured
 DERIVED_NAMES = ("g", "b", "force_mean", "force_peak", "force_rms", "friction_mean")
 
 
@@ -126,7 +127,12 @@ class DerivedQuantities(eqx.Module):
             force = force._replace(mean=scale * mean_force(*exact))
             if not isinstance(circuit, WithSkin) or isinstance(self.drive, Sine | Multitone):
                 force = force._replace(peak=scale * peak_force(*exact))
-        friction_mean = friction(force.mean, self.coefficient, self.normal_force)
+        free = {
+            name: jnp.exp(theta[self.likelihood.names.index(name)])
+            for name in _FREE_FRICTION & {*self.likelihood.names}
+        }
+        scaled = force.mean * free.get("force_scale", 1.0)
+        friction_mean = friction(scaled, free.get("mu", self.coefficient), free.get("fN", self.normal_force))
         return jnp.stack([finger.g, finger.b, force.mean, force.peak, force.rms, friction_mean])
 
     def log_value_and_grad(

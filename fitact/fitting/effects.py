@@ -61,7 +61,8 @@ def channel_samples(laplace: Laplace, traces: Sequence[ChannelFit]) -> list[Chan
     with jax.enable_x64(True):
         taus = np.asarray(laplace.likelihood.evaluate_circuit(laplace.theta).tau)
     pairs = zip(laplace.likelihood.channels, traces, strict=True)
-    return [_channel_samples(laplace, channel, fitted, taus) for channel, fitted in pairs]
+    electrical = [(channel, fitted) for channel, fitted in pairs if fitted.channel != "Ft"]
+    return [_channel_samples(laplace, channel, fitted, taus) for channel, fitted in electrical]
 
 
 def _channel_samples(

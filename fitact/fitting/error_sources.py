@@ -101,6 +101,9 @@ def gain_shifts(
         shift = -root @ (root.T @ (jacobian[: signal.size].T @ signal)) / sigma
         name = "Z" if channel.channel == "impedance" else channel.channel
         shifts[name] = shifts.get(name, 0.0) + shift
-        if name != "Z":
+        if name in ("Vsc", "I"):
             shifts["V"] -= shift
+        elif name == "Ft" and "force_scale" in likelihood.names:  # its electrostatic part goes with V^2
+            column = jacobian[:, likelihood.names.index("force_scale")]
+            shifts["V"] -= 2.0 * root @ (root.T @ (jacobian.T @ column))
     return shifts

@@ -90,7 +90,9 @@ class Fit(FitResult):
         budgets = {}
         for name, gradient in self._gradients.items():
             components = laplace_components(gradient, *roots, self.error_sources, self.noise_information)
-            others = (*map(geometry_component, geometry[name]), *structure_components(self.effects, name))
+            # the scale of a force has the uncertainty of the force that it scales
+            in_geometry = geometry["force_mean" if name == "force_scale" else name]
+            others = (*map(geometry_component, in_geometry), *structure_components(self.effects, name))
             budgets[name] = Budget((*components, *others))
         return budgets
 
@@ -100,7 +102,8 @@ class Fit(FitResult):
         gradients = dict(zip(self.names, np.eye(self.theta.size), strict=True))
         moments = self.geometry.approximate(self.likelihood, self.theta, self.laplace.log_derived)
         derivatives = zip(derived.DERIVED_NAMES, moments.gradients, strict=True)
-        return {name: gradients[name] for name in FINGER_PARAMETERS if name in gradients} | dict(derivatives)
+        names = (*FINGER_PARAMETERS, "force_scale")
+        return {name: gradients[name] for name in names if name in gradients} | dict(derivatives)
 
     def calibration_entry(self, name: str) -> dict[str, Any]:
         """Return `stated` and `not_stated` of the budget of a quantity: gain errors that nobody stated."""
@@ -111,7 +114,7 @@ class Fit(FitResult):
             if section.pieces(channel) or stated.get(channel) or (channel == "Z" and section.pieces("I")):
                 continue
             # the force is computed from V, beside the parameters that follow from it
-            direct = 2.0 if channel == "V" and name.startswith("force") else 0.0
+            direct = 2.0 if channel == "V" and name in derived.DERIVED_NAMES and name.startswith("force") else 0.0
             u = typical_gain_u(channel)
             typical = " and ".join(TYPICAL[channel])
             entries.append({"source": f"{channel} gain", "typical": typical, "input_u": u})

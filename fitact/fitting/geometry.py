@@ -75,6 +75,7 @@ class UncertainGeometry:
         stated: distributions that the scene states.
         assumed: distributions from the literature where it states none, with their sources.
         plates: capacitances that follow from `stated`, as in `Scene.plates`.
+        friction_is_measured: whether the friction is a channel, so that it does not depend on this geometry.
     """
 
     geometry: Geometry
@@ -83,6 +84,7 @@ class UncertainGeometry:
     stated: Mapping[str, Distribution]
     assumed: Mapping[str, tuple[Distribution, str]]
     plates: Mapping[str, tuple[dict[str, float], float]]
+    friction_is_measured: bool
 
     @classmethod
     def from_scene(cls, scene: Scene, geometry: Geometry | None = None) -> Self:
@@ -98,6 +100,7 @@ class UncertainGeometry:
             stated,
             {name: each for name, each in assumed.items() if name not in stated},
             scene.plates(),
+            "Ft" in scene.measurement.channels,
         )
 
     def draw_logs(
@@ -143,6 +146,8 @@ class UncertainGeometry:
         ]
         changed = np.array(derived)
         changed[..., _FORCE] *= (constants[1] / constants[0])[..., None]
+        if self.friction_is_measured:
+            return changed
         name = "friction_coefficient"
         coefficient = np.exp(logs[name]) if name in logs else self.values[name]
         changed[..., _FRICTION] = coefficient * (changed[..., _MEAN] + self.normal_force)
@@ -162,7 +167,8 @@ class UncertainGeometry:
         slopes = self._slopes(at, center, np.exp(log_derived[0]))
         derived = self.change_derived(at, center, np.exp(log_derived[0]))
         gradients = np.array(log_derived[1])
-        gradients[_FRICTION] = derived[_MEAN] / (derived[_MEAN] + self.normal_force) * gradients[_MEAN]
+        if not self.friction_is_measured:
+            gradients[_FRICTION] = derived[_MEAN] / (derived[_MEAN] + self.normal_force) * gradients[_MEAN]
         variance = np.einsum("qi,ij,qj->q", slopes, rest, slopes)
         return DerivedMoments(np.log(derived), gradients + slopes @ gain, variance)
 

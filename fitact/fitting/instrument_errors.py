@@ -129,7 +129,8 @@ def _channel_errors(member: Member, kind: str) -> Iterable[tuple[str, Distributi
     if is_nonlinear and is_spectrum:  # an analyser filters out the harmonics
         return
     impedance, signal = (("Z", 1.0), ("V", 1.0), ("I", -1.0)), ((name, 1.0), ("V", -1.0))
-    for channel, power in impedance if name == "impedance" else signal:
+    friction = (("Ft", 1.0), ("V", 0.0))  # V acts through the square of the voltage
+    for channel, power in {"impedance": impedance, "Ft": friction}.get(name, signal):
         if (is_nonlinear and in_V != (channel == "V")) or (in_V and not isinstance(member.channel.drive, Sampled)):
             continue
         for piece in section.pieces(channel):
@@ -143,7 +144,7 @@ def _channel_errors(member: Member, kind: str) -> Iterable[tuple[str, Distributi
                 yield source, distribution, share * power, in_drive
     if kind != GAIN:
         return
-    stated = measurement.gain_relative_sd if name == "Vsc" else measurement.gain_I_relative_sd
+    stated = {"Vsc": measurement.gain_relative_sd, "I": measurement.gain_I_relative_sd}.get(name, 0.0)
     if stated > 0.0:
         key = "gain_relative_sd" if name == "Vsc" else "gain_I_relative_sd"
         yield f"{name} gain ([measurement] {key} = {stated:g})", LogNormal(1.0, log_sd(stated)), 1.0, 0.0

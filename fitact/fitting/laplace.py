@@ -225,10 +225,11 @@ class FitResult(abc.ABC):
             other = {"law": other_law, "force_mean": force}
         return {
             "law": law,
-            "measured": False,
-            "tested_by_data": False,
+            **dict.fromkeys(("measured", "tested_by_data"), "force_scale" in self.names),
             "other_law": other,
-            "assumptions": [each.to_dict() for each in assumptions],
+            "assumptions": [
+                each.to_dict() for each in assumptions if each.affects != "friction" or each.symbol not in self.names
+            ],
         }
 
     @property

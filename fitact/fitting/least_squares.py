@@ -22,7 +22,7 @@ from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import NoiseModel, fit_ar1, student_curvature, student_weight
 
 # columns of `LINEAR_NUISANCES` that a fit may add as free parameters, by name; it may also add `TIMING_NUISANCES`
-NUISANCES = {"offset": (0,), "drift": (1,), "hum_50Hz": (2, 3), "hum_60Hz": (4, 5)}
+NUISANCES = {"offset": (0,), "drift": (1,), "hum_50Hz": (2, 3), "hum_60Hz": (4, 5), "crosstalk": (8, 9)}
 MIN_BIC_DECREASE = 10.0  # least decrease of the BIC for which a nuisance is added as a free parameter
 
 

@@ -18,6 +18,7 @@ from fitact.experiment.blind_directions import gain_names
 from fitact.experiment.fisher import Experiment
 from fitact.fitting.current import CurrentSamples, estimate_from_current, select_current_samples
 from fitact.fitting.drive_choice import DriveModel, choose_drive, frequency_error, has_ideal_edges, has_unresolved_edge
+from fitact.fitting.friction import make_friction_channel
 from fitact.fitting.instrument_errors import (
     ErrorCoordinate,
     Member,
@@ -42,6 +43,7 @@ from fitact.prior.prior import Prior
 from fitact.prior.product import multiply
 from fitact.scene.scene import Scene
 
+NOISE_PRIORS = ("sigma", "sigma_I", "sigma_Ft")
 MIN_RELATIVE_NOISE = 1e-9  # least noise sd assumed, relative to the range of the channel
 
 
@@ -70,7 +72,8 @@ class Problem(NamedTuple):
             return None
         records = len({id(source.record) for source in self.sources})
         pairs = zip(likelihood.channels, self.sources, strict=True)
-        channels = tuple(channel.channel for channel, other in pairs if other.record is record)
+        electrical = [each for each, other in pairs if other.record is record and each.channel != "Ft"]
+        channels = tuple(each.channel for each in electrical)
         fields = circuit_parameters(likelihood.template)
         gains = gain_names(channels)
         free = tuple(name for name in likelihood.prior.names if name in fields or name in gains)
@@ -105,7 +108,7 @@ def build_problem(
     """
     first = scenes[0] or Scene()
     prior = first.make_prior()
-    noise: dict[str, Distribution] = {name: prior[name] for name in ("sigma", "sigma_I") if name in prior.names}
+    noise: dict[str, Distribution] = {name: prior[name] for name in NOISE_PRIORS if name in prior.names}
     in_time = [each for each in records if isinstance(each, Record)]
 
     def make_circuit(values: dict[str, float]) -> Circuit:
@@ -164,7 +167,7 @@ def _load_priors(scenes: Sequence[Scene | None]) -> dict[str, Distribution]:
 
 def likelihood_without_channels(scene: Scene, prior: Prior, make_circuit: Callable[..., Any]) -> Likelihood:
     """Return the likelihood of a scene before any record; `make_circuit` builds the circuit from values by name."""
-    prior, tied, values = prior.drop_marginals("sigma", "sigma_I"), scene.prior.ties(), scene.fixed_values()
+    prior, tied, values = prior.drop_marginals(*NOISE_PRIORS), scene.prior.ties(), scene.fixed_values()
     values |= {name: math.exp(prior[name].log_mean) for name in prior.names}
     for name, (other, ratio) in tied.items():
         value = values.get(other, scene.nominal_values()[other])
@@ -187,7 +190,7 @@ def _channels(record: Record, scene: Scene | None) -> tuple[Channel, ...]:
     """Return the channels to fit: those of the scene; without a scene Vsc, or I if there is no Vsc."""
     if scene is None:
         return ("I",) if "I" in record and "Vsc" not in record else ("Vsc",)
-    return tuple(channel for channel in ("Vsc", "I") if channel in scene.measurement.channels)
+    return tuple(channel for channel in ("Vsc", "I", "Ft") if channel in scene.measurement.channels)
 
 
 def _build_channel(
@@ -207,7 +210,8 @@ def _build_channel(
     require_skin_response(template, record, choice)
     label = "_".join(filter(None, ("" if channel == "Vsc" else channel, number)))
     notes, warnings = (*record.notes, *choice.notes), (*record.warnings, *choice.warnings)
-    optional = ("offset", "drift", *_hum(record, choice))
+    # an offset of the friction would be mistaken for the normal force
+    optional = ("drift", *_hum(record, choice), "crosstalk" if channel == "Ft" else "offset")
     start: Estimate | None = None
     samples: CurrentSamples | None = None
     edge_sd = 0.0
@@ -220,7 +224,7 @@ def _build_channel(
             max_divider = 0.5 if isinstance(plain, FinalCircuit) else 1.0
             start = estimate_from_vsc(record, choice, max_divider * largest_gain(scene))
             edge_sd = _unresolved_gain_sd(record, choice, start)
-    elif not limits_current(template):
+    elif channel == "I" and not limits_current(template):
         samples = select_current_samples(record, choice)
         start = estimate_from_current(record, choice, samples)
         notes, warnings = (*notes, *samples.notes), (*warnings, *samples.warnings)
@@ -253,6 +257,8 @@ def _build_channel(
         noise=scene.measurement.noise_model,
         columns=tuple(range(len(LINEAR_NUISANCES))),
     )
+    if channel == "Ft":
+        likelihood = make_friction_channel(likelihood, record, scene, choice, float(taus[0]))
     if timing:
         likelihood = likelihood.exclude_unknown_drive()
     dominates = samples is not None and samples.drive_noise_dominates

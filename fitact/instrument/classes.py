@@ -47,6 +47,7 @@ CLASSES = {
     "impedance-analyser": InstrumentClass(
         "Gamry, application note on accurate EIS: 99 % accuracy within the contour of the Interface 1010", gain=0.01
     ),
+    "force-sensor": InstrumentClass("no limits: its certificate states them, under [instrument.own]"),
     "shunt-1%": InstrumentClass("the tolerance of the resistor", gain=0.01),
     "shunt-0.1%": InstrumentClass("the tolerance of the resistor", gain=0.001),
 }
@@ -57,6 +58,7 @@ TYPICAL = {
     "Vsc": ("scope-8bit", "probe-10x"),
     "I": ("scope-8bit", "shunt-1%"),
     "Z": ("impedance-analyser",),
+    "Ft": ("force-sensor",),
 }
 
 

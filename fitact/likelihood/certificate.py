@@ -14,6 +14,7 @@ from fitact.compiled import BatchEvaluator, jit, pad_samples
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.compression import BASELINE_NAMES, Compression
 from fitact.likelihood.compression_on_grid import GridCompression
+from fitact.likelihood.friction_channel import FrictionChannel
 from fitact.likelihood.interpolation import interpolate
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import StudentExpansion, fit_student_scale, student_curvature, student_weight
@@ -61,8 +62,8 @@ def compress_channel(
     }
     terms = start.terms[channel.channel]
     if isinstance(circuit, WithSkin):
-        channel = _fold(channel)
-        inputs = ChannelInputs(circuit, *map(np.asarray, (1.0, 0.0, 0.0)))
+        channel = fold(channel)
+        inputs = ChannelInputs(circuit, np.asarray(1.0), np.asarray(0.0), np.asarray(0.0))
         signal = _signal(channel, inputs)[samples]
         slope = -np.gradient(signal, arrays[1])
         compression = compress(*arrays, expected_terms=terms, slope=slope, **how)
@@ -76,8 +77,8 @@ def compress_channel(
 _signal = jit(ChannelLikelihood.signal)
 
 
-def _fold(channel: ChannelLikelihood) -> ChannelLikelihood:
-    """Return the channel with its `phases` if drive and samples repeat; a sum over many time constants is costly."""
+def fold(channel: ChannelLikelihood) -> ChannelLikelihood:
+    """Return the channel with its `phases` if drive and samples repeat, where a response is costly."""
     time = np.asarray(channel.time)[: channel.n_samples]
     period = samples_per_period(channel.drive, time) if channel.steady_state and channel.rate is None else None
     if period is None:
@@ -94,6 +95,8 @@ def reason_against_compression(channel: ChannelLikelihood, tolerance: float, min
     """Return why a channel may not be compressed at all, or ""."""
     if isinstance(channel, SpectrumChannel):
         return "a spectrum has few points"
+    if isinstance(channel, FrictionChannel):
+        return "the sensor of the friction has a memory"
     if tolerance == 0.0:
         return "the full sum was requested"
     if channel.n_samples < min_samples:  # compression would save nothing
@@ -206,6 +209,8 @@ def _inputs(likelihood: Likelihood, points: Array) -> tuple[ChannelInputs, ...]:
 
 def can_interpolate(channel: ChannelLikelihood) -> bool:
     """Return whether a channel without a table may be interpolated, i.e. few samples of a signal cost less than all."""
+    if isinstance(channel, FrictionChannel):  # a sample depends on those before it
+        return False
     return channel.compression is None and channel.noise != "student" and not channel.follows_samples
 
 

@@ -51,6 +51,8 @@ class ChannelInputs(eqx.Module):
     # relative error of the drive's frequency on the recorder's clock; added to the channel's `clock`
     clock: ArrayLike = 0.0
     effects: Float[Array, " effects"] | None = None  # sizes of the channel's `effects`
+    friction: dict[str, ArrayLike] | None = None  # free parameters of a `FrictionChannel`, SI
+    drive_gain: ArrayLike = 1.0  # ratio between indicated and true V, where it does not act through `gain`
 
 
 class ChannelLikelihood(eqx.Module):
@@ -75,7 +77,7 @@ class ChannelLikelihood(eqx.Module):
     compression: Compression | Interpolation | None  # projection of the record; None means that all samples are summed
     expansion: StudentExpansion | None  # of Student-t noise around an optimum; the compression has weighted samples
     label: str = eqx.field(static=True)  # "", or a name that distinguishes it from other channels, e.g. "I_2"
-    channel: Channel = eqx.field(static=True)  # "Vsc" or "I"
+    channel: Channel = eqx.field(static=True)  # "Vsc", "I" or "Ft"
     steady_state: bool = eqx.field(static=True)  # or from rest
     timing: tuple[str, ...] = eqx.field(static=True)  # the `TIMING_NUISANCES` that are parameters, in their order
     noise: NoiseModel = eqx.field(static=True)  # noise model
@@ -92,13 +94,18 @@ class ChannelLikelihood(eqx.Module):
     phases: Float[Array, " phases"] | None = None
     period: ArrayLike | None = None
 
+    @property
+    def linear_names(self) -> tuple[str, ...]:
+        """Names of the linear nuisances, in the order of `LINEAR_NUISANCES`."""
+        return LINEAR_NUISANCES
+
     def qualified_name(self, name: str) -> str:
         """Return the name of a nuisance, followed by the channel's label if there are several channels."""
         return f"{name}_{self.label}" if self.label else name
 
     @property
     def letter(self) -> str:
-        """The label without the number of the record: "" for Vsc, "I", "Z" for an impedance, "H" for a gain."""
+        """The label without the number of the record: "" for Vsc, "I", "Ft", "Z" for an impedance, "H" for a gain."""
         return self.label.rstrip("_0123456789")
 
     def timing_unit(self, name: str) -> ArrayLike:
@@ -239,7 +246,11 @@ class ChannelLikelihood(eqx.Module):
     def shapes(self, inputs: ChannelInputs) -> Float[Array, "10 samples"]:
         """Return the shapes in time of the linear nuisances, each of height 1."""
         middle, half = 0.5 * (self.time[0] + self.time[-1]), 0.5 * (self.time[-1] - self.time[0])
-        return jnp.concatenate([baseline_functions(self.time, middle, half), self.decays(inputs.circuit, self.time)])
+        return jnp.concatenate([baseline_functions(self.time, middle, half), self.linear_shapes(inputs)])
+
+    def linear_shapes(self, inputs: ChannelInputs) -> Float[Array, "4 samples"]:
+        """Return the shapes that follow those of the baseline."""
+        return self.decays(inputs.circuit, self.time)
 
     def decays(self, circuit: Circuit, time: Float[Array, " times"]) -> Float[Array, "4 times"]:
         """Return the decays of unknown charges at the first sample, padded with 0 (constant skins only)."""

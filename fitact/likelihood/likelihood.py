@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 from fitact.compiled import BatchEvaluator, array_module, jit
 from fitact.likelihood.calibration import Calibration
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
+from fitact.likelihood.friction_channel import FRICTION_PARAMETERS, FrictionChannel
 from fitact.model.circuit import RC, Channel, Circuit, HighpassTerms
 from fitact.model.skin import (
     WithSkin,
@@ -194,7 +195,11 @@ class Likelihood(eqx.Module):
 
         gain = xp.exp(log_product(channel.gains)) if channel.gains else 1.0
         sizes = [xp.expm1(xp.asarray(log_product(coordinates), float)) for _, coordinates in channel.effect_sizes]
-        return ChannelInputs(circuit, gain, **timing, effects=xp.stack(sizes) if sizes else None)
+        inputs = ChannelInputs(circuit, gain, **timing, effects=xp.stack(sizes) if sizes else None)
+        if not isinstance(channel, FrictionChannel):
+            return inputs
+        free = {name: xp.exp(theta[places[name]]) for name in FRICTION_PARAMETERS if name in places}
+        return dataclasses.replace(inputs, friction=free, drive_gain=xp.exp(log_product(channel.drive_gains)))
 
     def channels_and_inputs(
         self, theta: Float[Array, " circuit_parameters"]

@@ -28,7 +28,8 @@ from jaxtyping import Array, Complex, Float
 from fitact.errors import InputError
 
 FINGER_PARAMETERS = ("Rsc", "Csc", "Ci")  # of every circuit
-Channel: TypeAlias = Literal["Vsc", "I", "Vgap"]  # Vgap is not recorded; the force may come from it
+# Vgap is not recorded, but the force may come from it; Ft is no voltage or current of the circuit
+Channel: TypeAlias = Literal["Vsc", "I", "Vgap", "Ft"]
 
 
 class HighpassTerms(NamedTuple):

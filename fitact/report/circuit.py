@@ -5,10 +5,11 @@ from collections.abc import Mapping
 from markupsafe import Markup
 
 from fitact.charts.circuit_diagram import lay_out_circuit, lay_out_wiring
+from fitact.likelihood.friction_channel import FRICTION_PARAMETERS
 from fitact.scene.scene import Scene
 from fitact.units import format_engineering, quantity_unit
 
-_NOT_PARTS = ("sigma", "sigma_I")
+_NOT_PARTS = {"sigma", "sigma_I", "sigma_Ft", *FRICTION_PARAMETERS}
 
 
 def scene_circuit(scene: Scene, values: Mapping[str, float] | None = None, *, is_file: bool = False) -> Markup:

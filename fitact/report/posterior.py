@@ -10,7 +10,7 @@ from fitact.charts.figure import ALERT, DATA, MODEL, PRIOR, robust_limits
 from fitact.charts.interactive import Axis, Chart, Plot, PlotlyTrace
 from fitact.model.circuit import FINGER_PARAMETERS
 
-CHANNELS = {"Vsc": "skin voltage Vsc", "I": "loop current I", "impedance": "impedance"}
+CHANNELS = {"Vsc": "skin voltage Vsc", "I": "loop current I", "Ft": "friction Ft", "impedance": "impedance"}
 _FORCES = {"force_mean": "mean force", "force_rms": "rms force", "force_peak": "peak force"}
 _DENSITY = Axis("density", hides_numbers=True)  # each density is scaled to its own maximum
 

@@ -20,7 +20,6 @@ from fitact.fitting import derived
 from fitact.fitting.channel_fit import ChannelFit
 from fitact.fitting.fit import Fit
 from fitact.fitting.geometry import Capacitances
-from fitact.likelihood.channel import LINEAR_NUISANCES
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import draw_noise
 from fitact.likelihood.spectrum_channel import join_complex
@@ -78,7 +77,7 @@ class Posterior:
         for channel, drawn in zip(likelihood.channels, np.moveaxis(self._linear_draws, -2, 0), strict=True):
             values = drawn * np.asarray(channel.linear_sd)
             draws |= {
-                channel.qualified_name(LINEAR_NUISANCES[column]): values[..., column] for column in channel.columns
+                channel.qualified_name(channel.linear_names[column]): values[..., column] for column in channel.columns
             }
         return draws | {name: np.exp(logs) for name, logs in self._geometry_logs.items()}
 

@@ -13,6 +13,7 @@ from fitact.prior.published import Layer
 from fitact.scene.prior_spec import FaradPriorSpec, OhmPriorSpec, PriorSpec
 from fitact.scene.section import Section, Unit
 
+_CHANNELS = ("V", "Vsc", "I", "Z", "Ft")
 Ratio = Annotated[float, Unit(""), Field(gt=0, lt=1)]
 
 
@@ -58,12 +59,13 @@ class InstrumentSection(Section):
     Vsc: tuple[str, ...] = ()
     I: tuple[str, ...] = ()  # noqa: E741  (the name of the channel)
     Z: tuple[str, ...] = ()
+    Ft: tuple[str, ...] = ()
     own: dict[str, CertificateSpec] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _check_pieces(self) -> Self:
         classes: dict[str, str] = {}
-        for channel in ("V", "Vsc", "I", "Z"):
+        for channel in _CHANNELS:
             for name in getattr(self, channel):
                 kind, colon, piece = name.partition(":")
                 if not colon or not piece:
@@ -98,15 +100,11 @@ class InstrumentSection(Section):
     @property
     def is_stated(self) -> bool:
         """Whether any channel has a piece."""
-        return bool(self.V or self.Vsc or self.I or self.Z)
+        return any(getattr(self, channel) for channel in _CHANNELS)
 
     def describe_channels(self, name: str) -> str:
         """Return the channels that a piece, or an instrument with such channels, belongs to, as "V and Vsc"."""
-        channels = [
-            c
-            for c in ("V", "Vsc", "I", "Z")
-            if any(n in (name, f"{name}/{n.partition('/')[2]}") for n in getattr(self, c))
-        ]
+        channels = [c for c in _CHANNELS if any(n in (name, f"{name}/{n.partition('/')[2]}") for n in getattr(self, c))]
         return " and ".join(channels)
 
     def pieces(self, channel: str) -> tuple[Piece, ...]:

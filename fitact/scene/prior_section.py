@@ -12,6 +12,8 @@ from fitact.scene.prior_spec import (
     ORDER_KEYS,
     AmperePriorSpec,
     FaradPriorSpec,
+    HertzPriorSpec,
+    NewtonPriorSpec,
     OhmPriorSpec,
     PlainPriorSpec,
     PriorSpec,
@@ -19,6 +21,8 @@ from fitact.scene.prior_spec import (
 )
 from fitact.scene.section import Section
 
+# of the friction, if it is measured and nothing is stated
+FRICTION_PRIORS = {"mu": PriorSpec(factor=10.0), "force_scale": PriorSpec(factor=1e4)}
 _SKIN_PARAMETERS = ("Rsc", "Csc", "grounding_Rsc", "grounding_Csc")  # parameters in the published tables
 
 
@@ -27,7 +31,9 @@ class PriorSection(Section):
 
     The 95 % intervals of the default skin priors extend from the values of the reference paper to published values of
     whole skin (10 kohm and 5 nF dry, 4.3 kohm and 200 nF wet). The default of the insulator, ± 5 %, is an assumption.
-    Noise standard deviations (`sigma` of Vsc, `sigma_I` of I) have priors flat in their logarithm unless specified.
+    With the channel Ft, mu and force_scale are free within factors of 10 and 10,000 unless specified.
+    Noise standard deviations (`sigma` of Vsc, `sigma_I` of I, `sigma_Ft` of Ft) have priors flat in their logarithm
+    unless specified.
     """
 
     Rsc: OhmPriorSpec = PriorSpec(factor=50.0)
@@ -44,6 +50,12 @@ class PriorSection(Section):
     alpha: PlainPriorSpec | None = None
     sigma: VoltPriorSpec | None = None
     sigma_I: AmperePriorSpec | None = None
+    sigma_Ft: NewtonPriorSpec | None = None
+    mu: PlainPriorSpec | None = None
+    fN: NewtonPriorSpec | None = None
+    force_scale: PlainPriorSpec | None = None
+    sensor_frequency: HertzPriorSpec | None = None
+    sensor_damping: PlainPriorSpec | None = None
     correlation: dict[str, Annotated[float, Field(gt=-1, lt=1)]] = Field(default_factory=dict)
 
     @model_validator(mode="after")

@@ -30,7 +30,7 @@ from fitact.prior.published import Layer
 from fitact.scene import sections, toml
 from fitact.scene.calibration_section import CalibrationSection
 from fitact.scene.instrument_section import InstrumentSection
-from fitact.scene.prior_section import PriorSection
+from fitact.scene.prior_section import FRICTION_PRIORS, PriorSection
 from fitact.scene.prior_spec import ORDER_KEYS, PriorSpec
 from fitact.scene.section import Section, field_section
 from fitact.scene.uncertain_value import UncertainValue
@@ -152,7 +152,20 @@ class Scene(Section):
             "Cgap": self._gap_capacitance(),
             "sigma": measured.noise_Vsc or None,
             "sigma_I": measured.noise_I or None,
+            "sigma_Ft": measured.noise_Ft or None,
+        } | self._friction_values()
+
+    def _friction_values(self) -> dict[str, float | None]:
+        """Return the nominal values of a measured friction; None for what a scene without the channel Ft has not."""
+        stated = self.friction
+        values = {
+            "mu": stated.coefficient,
+            "fN": stated.normal_force or None,
+            "force_scale": 1.0,
+            "sensor_frequency": stated.sensor_frequency,
+            "sensor_damping": stated.sensor_damping,
         }
+        return values if "Ft" in self.measurement.channels else dict.fromkeys(values)
 
     def _gap_capacitance(self) -> float | None:
         """Return the stated capacitance, or that of air with the stated thickness, eq. (3)."""
@@ -282,7 +295,8 @@ class Scene(Section):
     def make_prior(self) -> Prior:
         """Make the prior of the free parameters, without gains."""
         layer = Layer(self.device.contact_area, self.skin.thickness, self.drive.lowest_frequency)
-        nominal, beliefs = self.nominal_values(), self.prior.specs().items()
+        default = FRICTION_PRIORS if "Ft" in self.measurement.channels else {}
+        nominal, beliefs = self.nominal_values(), (default | self.prior.specs()).items()
         marginals = {name: b.distribution(name, nominal[name], layer) for name, b in beliefs if b.is_free}
         correlations, stated = self.prior.correlations(), self.geometry_distributions()
         plates = self.plates()
@@ -330,12 +344,14 @@ class Scene(Section):
             absent = dict.fromkeys(_NATURAL_GROUND_KEYS, "[grounding] connection = 'natural'")
         if self.skin.level != "fractional":
             absent["alpha"] = "[skin] level = 'fractional'"
-        for name, channel in {"sigma": "Vsc", "sigma_I": "I"}.items():
+        of_channels = {"sigma": "Vsc", "sigma_I": "I"} | dict.fromkeys(("sigma_Ft", *self._friction_values()), "Ft")
+        for name, channel in of_channels.items():
             if channel not in self.measurement.channels:
                 absent[name] = f"'{channel}' among [measurement] channels"
         for name in self.prior.specs():
             if name in absent:
                 raise InputError(f"[prior] {name} needs {absent[name]}; leave it out of [prior] otherwise")
+        self._check_friction()
         stated = self.measurement.probe_resistance is not None or self.measurement.probe_capacitance is not None
         if stated and self.find_load() is not None:
             raise InputError(
@@ -354,6 +370,22 @@ class Scene(Section):
         self.make_prior()
         self.fixed_values()
         return self
+
+    def _check_friction(self) -> None:
+        """Raise InputError if the friction is measured and what it needs is not stated."""
+        if "Ft" not in self.measurement.channels:
+            return
+        has_load = self.friction.normal_force > 0.0 and "normal_force" in self.friction.model_fields_set
+        if not has_load and self.prior.fN is None:
+            raise InputError(
+                "[measurement] channel Ft needs the normal force, because friction is mu (force + fN); give [friction]"
+                " normal_force, or a prior for it as [prior] fN"
+            )
+        if isinstance(self.friction.coefficient, UncertainValue):
+            raise InputError(
+                "[friction] coefficient has a distribution, and the channel Ft measures it; write the distribution as"
+                " [prior] mu"
+            )
 
 
 def _sentence(error: Any) -> str:

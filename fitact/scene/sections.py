@@ -226,7 +226,7 @@ class DriveSection(Section):
 class Measurement(Section):
     """Recorded channels, their noise and gain errors, series resistor and probe."""
 
-    channels: tuple[Literal["Vsc", "I"], ...] = Field(default=("Vsc",), min_length=1)
+    channels: tuple[Literal["Vsc", "I", "Ft"], ...] = Field(default=("Vsc",), min_length=1)
     series_resistor: AnyOhm = 0.0
     probe_resistance: Ohm | None = None
     probe_capacitance: Farad | None = None
@@ -234,6 +234,7 @@ class Measurement(Section):
     duration: Second = 20e-3
     noise_Vsc: NoiseVolt = 0.1
     noise_I: NoiseAmpere = 20e-9
+    noise_Ft: Newton = 2e-3
     gain_relative_sd: RelativeSD = 0.0
     gain_I_relative_sd: RelativeSD = 0.0
     weighting: Literal["estimated", "modulus", "unit", "stated"] = "estimated"
@@ -260,10 +261,18 @@ class Measurement(Section):
 
 
 class Friction(Section):
-    """Friction coefficient and normal force of eq. (2)."""
+    """Friction coefficient and normal force of eq. (2), and the sensor that records the friction (channel Ft)."""
 
     coefficient: UncertainCoefficient = 0.5
     normal_force: Newton = 0.5
+    sensor_frequency: Hertz | None = None
+    sensor_damping: Share | None = None
+
+    @model_validator(mode="after")
+    def _check_sensor(self) -> Self:
+        if self.sensor_damping is not None and self.sensor_frequency is None:
+            raise ValueError("[friction] sensor_damping belongs to sensor_frequency; give both, or leave it out")
+        return self
 
 
 class ForceSection(Section):

@@ -56,7 +56,7 @@ class Capture:
 
 
 def resolve_channels(names: list[str], channels: Mapping[str, str], source: str, location: str = "") -> dict[str, str]:
-    """Return the column name of each of V, Vsc and I that the user assigned or that has its standard name."""
+    """Return the column name of each of V, Vsc, I and Ft that the user assigned or that has its standard name."""
     known: dict[str, str] = {}
     for channel in CHANNEL_UNITS:
         own = [name for name in names if name.lower() == channel.lower()]
@@ -99,7 +99,7 @@ def has_standard_names(capture: Capture) -> bool:
 def channel_arrays(
     capture: Capture, channels: Mapping[str, str], scale: Mapping[str, float]
 ) -> tuple[dict[str, Float[np.ndarray, " samples"]], dict[str, str], list[str]]:
-    """Return V, Vsc and I in SI units, the names of their columns, and notes on how they were converted."""
+    """Return V, Vsc, I and Ft in SI units, the names of their columns, and notes on how they were converted."""
     for channel, factor in scale.items():
         if channel not in CHANNEL_UNITS:
             raise InputError(f"{capture.source}: '{channel}' is no channel of fitact; scale {', '.join(CHANNEL_UNITS)}")

@@ -33,7 +33,7 @@ TIME_NAMES = frozenset((
 INDEX_NAMES = frozenset(["sample", "samples", "index", "sequence", "nr", "no", "n", "point", "row"])
 # entries in a row of units that are no units, or other units
 NOT_UNITS = frozenset((
-    "", "sequence", "value", "none", "unknown", "ohm", "w", "watt", "hz", "khz", "db", "dbm", "pa", "n", "%", "°c",
+    "", "sequence", "value", "none", "unknown", "ohm", "w", "watt", "hz", "khz", "db", "dbm", "pa", "%", "°c",
     "deg", "u",
 ))  # fmt: skip
 
@@ -64,6 +64,7 @@ _UNIT_SYMBOLS = {
     "s": "s", "S": "s", "sec": "s", "second": "s", "seconds": "s",
     "V": "V", "v": "V", "volt": "V", "volts": "V",
     "A": "A", "amp": "A", "amps": "A", "ampere": "A", "amperes": "A",
+    "N": "N", "newton": "N", "newtons": "N",
 }  # fmt: skip
 
 
@@ -73,7 +74,7 @@ def normalize_key(text: str) -> str:
 
 
 def parse_unit(text: str) -> tuple[str, float] | None:
-    """Return the SI unit (s, V or A) and the factor of a unit as written, e.g. ("s", 1e-3) for "(ms)", or None."""
+    """Return the SI unit (s, V, A or N) and the factor of a unit as written, e.g. ("s", 1e-3) for "(ms)", or None."""
     bare = text.strip().strip("()[]").strip()
     for length in (0, 1):
         prefix, symbol = bare[:length], bare[length:]
@@ -103,7 +104,7 @@ _NAME_AND_UNIT = (
     re.compile(r"^(?P<name>.*\S)\s+/\s+(?P<unit>\S+)$"),  # Time / s
     re.compile(r"^(?P<name>.*)_(?P<unit>[^_]+)$"),  # time_ms
 )
-_STANDARD_NAME = re.compile(r"^(?P<name>time|V|Vsc|I)(?:_(?P<unit>.+))?$", re.IGNORECASE)
+_STANDARD_NAME = re.compile(r"^(?P<name>time|V|Vsc|I|Ft)(?:_(?P<unit>.+))?$", re.IGNORECASE)
 
 
 def split_name_and_unit(cell: str) -> tuple[str, str]:

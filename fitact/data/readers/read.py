@@ -30,9 +30,9 @@ def read(
     scale: Mapping[str, float] | None = None,
     rate: float | None = None,
 ) -> Record:
-    """Read a record: a CSV file with the columns time_s, V_V, Vsc_V and I_A, or a file of an oscilloscope.
+    """Read a record: a CSV file with the columns time_s, V_V, Vsc_V, I_A and Ft_N, or a file of an oscilloscope.
 
-    `channels` assigns the names in the file, e.g. {"Vsc": "CH2"}; it is not needed for the names V, Vsc and I. If each
+    `channels` assigns the names in the file, e.g. {"Vsc": "CH2"}; the names V, Vsc, I and Ft need none. If each
     channel has its own file, {"Vsc": "CH2", "V": "C1.trc:CH1"} reads V from another file in the same folder. `scale`
     multiplies a channel, e.g. {"Vsc": 10} for a 10x probe that was not set on the oscilloscope. `rate` (Hz), or else a
     sampling rate that the scene states, replaces times that were rounded when they were written. Units in the header
