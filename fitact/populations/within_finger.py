@@ -144,8 +144,8 @@ class WithinFinger(NamedTuple):
             )
         if fingers > self.tracked:
             sentences.append(
-                f"{fingers - self.tracked} records were not tracked; each shows its finger at one moment, from whose"
-                " differences the changes within a finger are subtracted"
+                f"{self.tracked} of {fingers} records were tracked; each other shows its finger at one moment, and the"
+                " changes within a finger are subtracted from its part in the differences between fingers"
             )
         return sentences
 

@@ -1,4 +1,4 @@
-"""What a record says of its finger's time average and of the variation about it, without the prior and the walk.
+"""Statement of a record on its finger's time average and on the variation about it, without the prior and the walk.
 
 Every window gives its own values, as if nothing joined the windows, so neither a rate nor its prior enters. The mean of
 these values estimates the time average. Their covariance about it, less the mean covariance of their errors, estimates

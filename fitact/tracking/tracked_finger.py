@@ -16,7 +16,7 @@ SUMMARY, WINDOW = "summary.json", "window.csv"
 
 
 class TrackedFinger(NamedTuple):
-    """What a population needs of a track."""
+    """Part of a track that a population needs."""
 
     source: str  # name of the record, or of the folder
     average: TimeAverage
