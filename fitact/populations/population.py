@@ -33,7 +33,7 @@ from fitact.populations.within_finger import WithinFinger
 from fitact.sampling.convergence import Convergence
 from fitact.scene.scene import Scene
 from fitact.tables import align_table, join_lines
-from fitact.units import choose_prefixed_unit, format_engineering, quantity_unit
+from fitact.units import choose_prefixed_unit, format_engineering, format_percent, quantity_unit
 
 QUANTILES = tuple(summary.PROBABILITIES.values())  # of the force in time
 MAX_INTEGRATION_ERROR = 0.1  # largest shift of a mean by the fingers' tables, in posterior standard deviations
@@ -364,17 +364,24 @@ def format_quantiles(s: dict[str, Any], keys: Sequence[str] = ("q50", "q025", "q
     return [f"{float(s[key]) / size:.{places}f} {symbol}".rstrip() for key in keys]
 
 
+def format_variance_part(fraction: float) -> str:
+    """Format a part of a variance in whole per cent, and a smaller one with two digits."""
+    return format_percent(fraction) if 0.0 < fraction < 0.01 else f"{100.0 * fraction:.0f} %"
+
+
 def variance_sentences(content: dict[str, Any]) -> tuple[str, ...]:
     """Return sentences on the sources of variance of the next finger's force, from population.json."""
     sentences = []
     for name in VARIANCE_QUANTITIES:
-        variance = {part: 100.0 * value for part, value in content["new_finger"][name]["variance"].items()}
+        variance = content["new_finger"][name]["variance"]
         sources = {
             "within_finger": "from changes within a finger",
             "between_fingers" if "within_finger" in variance else "people": "from differences between fingers",
             "ignorance": "from uncertainty of the population parameters",
         }
-        sizes = ", ".join(f"{variance[part]:.0f} % {text}" for part, text in sources.items() if part in variance)
+        sizes = ", ".join(
+            f"{format_variance_part(variance[part])} {text}" for part, text in sources.items() if part in variance
+        )
         parts = (
             f"{factor} {round(100.0 * share['first'])} % ({round(100.0 * share['total'])} %)"
             for factor, share in content["variance_shares"][name].items()

@@ -24,6 +24,7 @@ from fitact.populations.population import (
     SHARES_LEGEND,
     VARIANCE_QUANTITIES,
     format_quantiles,
+    format_variance_part,
     population_table,
     variance_sentences,
 )
@@ -287,7 +288,7 @@ def _new_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
             format_engineering(s[key] if s["unit"] != "N" or s["q975"] > none else 0.0, s["unit"], 3)
             for key in _QUANTILES
         )
-        yield (_NAMES[name], *values, *(f"{100.0 * s['variance'][key]:.0f} %" for key in parts))
+        yield (_NAMES[name], *values, *(format_variance_part(s["variance"][key]) for key in parts))
 
 
 def _share_rows(content: dict[str, Any], name: str) -> Iterator[tuple[str, ...]]:
