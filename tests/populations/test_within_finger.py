@@ -89,23 +89,23 @@ def test_population_of_complete_tracks_covers():
         assert 0.005 < place < 0.995, name
 
 
-@pytest.mark.thorough  # a command for each of three tracks
+@pytest.mark.thorough  # a command for each of four tracks
 def test_command_takes_folders_of_tracks_beside_records(tmp_path: Path):
     rng = np.random.default_rng(5)
     law = Law.draw(rng, CHANGE)
     law = law._replace(change=np.array([0.1, 0.06]))
     command = [sys.executable, "-c", "from fitact.cli import main; main()"]
     scene = tmp_path / "scene.toml"
-    scene.write_text('[drive]\nwaveform = "triangle"\n')
+    scene.write_text('[drive]\nwaveform = "triangle"\nfrequency = "100 Hz"\n')
     given = []
-    for number, record in enumerate(records_of_changing_fingers(law.fingers(4, rng), law.log_Ci, rng)):
+    for number, record in enumerate(records_of_changing_fingers(law.fingers(5, rng), law.log_Ci, rng)):
         path = tmp_path / f"{number}.csv"
         write_csv(path, record)
-        if number < 3:
+        if number < 4:
             folder = tmp_path / f"track {number}"
             options = ["--scene", str(scene), "--window", "250ms", "--out", str(folder)]
             subprocess.run([*command, "track", str(path), *options], check=True, capture_output=True)
-            path = (folder, folder / "track.parquet", folder / "summary.json")[number]
+            path = (folder, folder / "track.parquet", folder, folder / "summary.json")[number]
         given.append(str(path))
     done = subprocess.run(
         [*command, "population", *given, "--scene", str(scene), "--seed", "1"], capture_output=True, text=True
@@ -113,8 +113,8 @@ def test_command_takes_folders_of_tracks_beside_records(tmp_path: Path):
     assert done.returncode == 0, done.stderr
     assert "within a finger, force_mean, log_sd" in done.stdout
     assert "% from changes within a finger" in done.stdout
-    assert "3 of 4 records were tracked" in done.stdout
-    assert "3.csv: " in done.stdout
+    assert "4 of 5 records were tracked" in done.stdout
+    assert "4.csv: " in done.stdout
     assert "use track" in done.stdout  # of the record that was not tracked
 
 
