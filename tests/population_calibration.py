@@ -15,6 +15,7 @@ seed, so the first 20 are the same in every run.
 import argparse
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -97,6 +98,25 @@ def coverage(found: np.ndarray, share: float) -> tuple[float, float]:
     return covered, float((covered - share) / np.sqrt(share * (1.0 - share) / found.size))
 
 
+def show_coverage(rows: list[dict[str, Any]], quantities: Sequence[str]) -> bool:
+    """Print the coverage of each quantity; return whether all intervals cover, and no population was refused."""
+    refused = [row["refused"] for row in rows if "refused" in row]
+    answered = [row for row in rows if "refused" not in row]
+    passed = not refused
+    print(f"{'':18}" + "".join(f"{f'{100 * share:.0f} %':>8}{'off by':>8}" for share in INTERVALS) + f"{'KS p':>8}")
+    for name in quantities:
+        found = np.array([row["places"][name] for row in answered])
+        covered = [coverage(found, share) for share in INTERVALS]
+        passed &= all(abs(off) <= SIGMAS for _, off in covered)
+        cells = "".join(f"{100.0 * each:8.1f}{off:+8.1f}" for each, off in covered)
+        print(f"{name:18}{cells}{scipy.stats.kstest(found, 'uniform').pvalue:8.3f}")
+    print(f"not trusted: {sum(not row['trusted'] for row in answered)} of {len(rows)}; refused: {len(refused)}")
+    for sentence in [*refused, *(w for row in answered for w in row["warnings"])]:
+        print(sentence)
+    print("passed" if passed else "FAILED")
+    return passed
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--populations", type=int, default=100)
@@ -105,21 +125,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("out/population"))
     chosen = parser.parse_args()
     rows = collect(chosen.out / "places.jsonl", chosen.populations, chosen.seed, chosen.workers, places)
-    refused = [row["refused"] for row in rows if "refused" in row]
-    answered = [row for row in rows if "refused" not in row]
-    passed = not refused
-    print(f"{'':12}" + "".join(f"{f'{100 * share:.0f} %':>8}{'off by':>8}" for share in INTERVALS) + f"{'KS p':>8}")
-    for name in QUANTITIES:
-        found = np.array([row["places"][name] for row in answered])
-        covered = [coverage(found, share) for share in INTERVALS]
-        passed &= all(abs(off) <= SIGMAS for _, off in covered)
-        cells = "".join(f"{100.0 * each:8.1f}{off:+8.1f}" for each, off in covered)
-        print(f"{name:12}{cells}{scipy.stats.kstest(found, 'uniform').pvalue:8.3f}")
-    print(f"not trusted: {sum(not row['trusted'] for row in answered)} of {len(rows)}; refused: {len(refused)}")
-    for sentence in [*refused, *(w for row in answered for w in row["warnings"])]:
-        print(sentence)
-    print("passed" if passed else "FAILED")
-    return 0 if passed else 1
+    return 0 if show_coverage(rows, QUANTITIES) else 1
 
 
 if __name__ == "__main__":

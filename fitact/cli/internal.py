@@ -17,5 +17,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "populations.covariates": ["read_covariates"],
         "populations.fit_population": ["delete_chains"],
         "scene.prior_predictive": ["prior_predictive"],
+        "tracking.tracked_finger": ["TrackedFinger"],
     },
 )

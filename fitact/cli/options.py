@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 import fitact
+from fitact.cli import internal
 from fitact.errors import InputError
 from fitact.units import parse_quantity
 
@@ -105,7 +106,10 @@ Fresh = Annotated[bool, typer.Option("--fresh", help="Start a new chain instead 
 
 
 class LazyRecords(Sequence["fitact.Record"]):
-    """Records of one scene, each read on access, with the columns and times of --channel, --scale and --rate."""
+    """Records of one scene, each read on access, with the columns and times of --channel, --scale and --rate.
+
+    A folder stands for the track that `fitact track` left there, and so do its files.
+    """
 
     def __init__(self, paths: Sequence[Path] | None, scene: "fitact.Scene | None", columns: Columns) -> None:
         self._paths, self._scene, self._columns = paths or (), scene, column_options(columns)
@@ -114,7 +118,10 @@ class LazyRecords(Sequence["fitact.Record"]):
         return len(self._paths)
 
     def __getitem__(self, index: Any) -> Any:
-        return fitact.read(self._paths[index], self._scene, **self._columns)
+        path = self._paths[index]
+        if path.is_dir() or path.name in ("track.parquet", "summary.json"):
+            return internal.TrackedFinger.from_folder(path)
+        return fitact.read(path, self._scene, **self._columns)
 
 
 def load_scene(path: Path | str | None) -> "fitact.Scene | None":

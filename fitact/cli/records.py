@@ -70,7 +70,12 @@ def compare(
 
 @app.command()
 def population(
-    records: Annotated[list[Path], typer.Argument(metavar="RECORD...", help="Records on one panel, one per finger.")],
+    records: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RECORD...", help="Records on one panel, one per finger, or folders that fitact track left."
+        ),
+    ],
     scene: options.CommonScene = None,
     channel: options.Channels = None,
     scale: options.Scales = None,
@@ -139,8 +144,10 @@ def track(
 ) -> None:
     """Follow a finger along a long record: parameters, contact area and force over time, and lift-offs.
 
-    With --out, writes track.parquet, summary.json and report.html into DIR; after an interruption, run the same command
-    again. With --follow, or from standard input, prints a line about every second while the record grows.
+    With --out, writes track.parquet, summary.json, window.csv and report.html into DIR, which fitact population takes.
+    After an interruption, run the same command again.
+
+    With --follow, or from standard input, prints a line about every second while the record grows.
     """
     announce("tracking", [record])
     loaded = options.load_scene(scene)
@@ -155,6 +162,7 @@ def track(
     if out is not None:
         found.to_parquet(out / "track.parquet")
         write_json(out / "summary.json", content)
+        internal.write_csv(out / "window.csv", found.fit.record)
         report.write_track(out / "report.html", found, report.Provenance.from_inputs(command_line(), loaded))
     end = "" if out is None else f"\nopen {out / 'report.html'}"
     show(f"{found}{end}", content, json, found.trusted)

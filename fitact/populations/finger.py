@@ -17,6 +17,7 @@ from fitact.fitting.fit import Fit
 from fitact.likelihood.likelihood import Likelihood
 from fitact.prior.distributions import LogNormal
 from fitact.prior.prior import Prior
+from fitact.tracking.tracked_finger import TrackedFinger
 
 SKIN = ("Rsc", "Csc")
 SHARED_PARAMETER = "Ci"
@@ -31,7 +32,8 @@ class Finger:
     result: str  # of the separate fit, as the next two, see `Fit`
     message: str
     parameters: dict[str, summary.Summary]
-    likelihood: Likelihood  # with priors of the nuisances only; without samples if it is compressed
+    # with priors of the nuisances only; without samples if it is compressed; None means that it is normal
+    likelihood: Likelihood | None
     names: tuple[str, ...]  # coordinates of a point; all but Ci are the finger's own
     center: float  # log Ci of the optimum
     conditional_mean: Float[np.ndarray, " own"]  # mean of its own coordinates there, given log Ci
@@ -66,6 +68,60 @@ class Finger:
             covariance_factor=scipy.linalg.block_diag(root, np.diag(noise)),
             precision=float(R[n, n] ** 2),
             weighted_offset=float(-R[n, n] * R[n, n + 1]),
+        )
+
+    @classmethod
+    def from_track(cls, tracked: TrackedFinger, prior: Prior) -> Self:
+        """Make the finger from its time averages; `prior` (of Rsc, Csc, Ci) serves for `parameters` only."""
+        R, target = tracked.average.factor, tracked.average.target
+        precision = np.linalg.inv(prior.covariance)
+        covariance = np.linalg.inv(R.T @ R + precision)
+        log_mean = covariance @ (R.T @ target + precision @ np.asarray(prior.log_mean))
+        log_sd = np.sqrt(np.diag(covariance))
+        root, center = np.linalg.inv(R[:2, :2]), float(log_mean[2])
+        return cls(
+            source=os.path.basename(tracked.source),
+            fingerprint=tracked.fingerprint,
+            result="misfit" if tracked.message else "successful",
+            message=tracked.message,
+            parameters={
+                name: summary.summarize_log_normal(name, float(np.exp(mean)), float(sd))
+                for name, mean, sd in zip(prior.names, log_mean, log_sd, strict=True)
+            },
+            likelihood=None,
+            names=prior.names,
+            center=center,
+            conditional_mean=root @ (target[:2] - R[:2, 2] * center),
+            slope=-root @ R[:2, 2],
+            covariance_factor=root,
+            precision=float(R[2, 2] ** 2),
+            weighted_offset=float(R[2, 2] * (target[2] - R[2, 2] * center)),
+        )
+
+    def blur(self, within: Float[np.ndarray, "3 3"]) -> Self:
+        """Return the finger's time average, of which the record of one moment deviates by the covariance `within`.
+
+        `within` is that of log Rsc, log Csc and log Ci. The likelihood is taken as normal.
+        """
+        own = [name for name in self.names if name != SHARED_PARAMETER]
+        skin = [own.index(name) for name in SKIN]
+        flat = 1e-6  # information of log Ci that stands for none
+        variance = 1.0 / (self.precision + flat)
+        slope = np.append(self.slope[skin], 1.0)
+        whole = variance * np.outer(slope, slope) + within
+        whole[:2, :2] += (self.covariance_factor @ self.covariance_factor.T)[np.ix_(skin, skin)]
+        mean = np.append(self.conditional_mean[skin], self.center) + slope * variance * self.weighted_offset
+        precision = 1.0 / whole[2, 2]
+        along = whole[:2, 2] * precision
+        return dataclasses.replace(
+            self,
+            likelihood=None,
+            names=(*SKIN, SHARED_PARAMETER),
+            conditional_mean=mean[:2] + along * (self.center - mean[2]),
+            slope=along,
+            covariance_factor=np.linalg.cholesky(whole[:2, :2] - np.outer(along, whole[:2, 2])),
+            precision=max(precision - flat, 0.0),
+            weighted_offset=precision * (mean[2] - self.center),
         )
 
     def from_standard_normal(

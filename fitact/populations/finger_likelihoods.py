@@ -173,10 +173,15 @@ def _tabulate_finger(
     own, draws = finger.conditional_mean.size, len(deviates)
     z, shared = deviates[:, :own], finger.names.index(SHARED_PARAMETER)
     nodes = np.cos(np.pi * (np.arange(terms) + 0.5) / terms)
-    points = np.stack([finger.from_standard_normal(center + half_width * x, z) for x in nodes])
-    log_prob = BatchEvaluator(Likelihood.log_prob, finger.likelihood, finger.likelihood.rows, batch=128)
     log_density = student_log_density(deviates)
-    values = log_prob(points.reshape(-1, points.shape[-1])).reshape(terms, draws) - log_density
+    normal = -0.5 * np.sum(np.square(z), axis=1) - log_density
+    if finger.likelihood is None:
+        away = center + half_width * nodes[:, None] - finger.center
+        values = normal + finger.weighted_offset * away - 0.5 * finger.precision * np.square(away)
+    else:
+        points = np.stack([finger.from_standard_normal(center + half_width * x, z) for x in nodes])
+        log_prob = BatchEvaluator(Likelihood.log_prob, finger.likelihood, finger.likelihood.rows, batch=128)
+        values = log_prob(points.reshape(-1, points.shape[-1])).reshape(terms, draws) - log_density
     possible = np.isfinite(values).all(axis=0)
     if not possible.any():
         raise InputError(
@@ -197,7 +202,7 @@ def _tabulate_finger(
         precision=np.array([finger.precision]),
         weighted_offset=np.array([finger.weighted_offset - finger.precision * off]),
         area_deviates=deviates[:, -1] if deviates.shape[1] > own else np.zeros(draws),
-        normal_log_weight=-0.5 * np.sum(np.square(z), axis=1) - log_density,
+        normal_log_weight=normal,
         mean=at_center[0],
         covariance=factor @ factor.T,
     )

@@ -15,26 +15,30 @@ from jaxtyping import Float
 from fitact.compiled import BatchEvaluator
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.fitting.fit import fit
+from fitact.fitting.fit import Fit, fit
 from fitact.populations.covariates import Covariates
 from fitact.populations.finger import SHARED_PARAMETER, SKIN, Finger
 from fitact.populations.finger_likelihoods import FingerLikelihoods
 from fitact.populations.hierarchy import Hierarchy, laplace
 from fitact.populations.next_finger import AREA, NewFingerModel
 from fitact.populations.population import MAX_INTEGRATION_ERROR, Population, evaluate_parameters, log_medians
+from fitact.populations.within_finger import WithinFinger
 from fitact.prior.prior import Prior
 from fitact.progress import track_progress
 from fitact.sampling.convergence import Convergence
 from fitact.sampling.ensemble import Target, reject_nonfinite, run_ensembles
 from fitact.sampling.proposal import Proposal
 from fitact.scene.scene import Scene
+from fitact.scene.sections import DriveSection
+from fitact.tracking.track import Track
+from fitact.tracking.tracked_finger import TrackedFinger
 
 # by the number of draws in the fingers' tables; the second is used where the first is too coarse
 _CHAIN_FILES = {64: "chain.h5", 1024: "chain_1024.h5"}
 
 
 def population(
-    records: Sequence[Record],
+    records: Sequence[Record | Track | TrackedFinger],
     scene: Scene | None = None,
     *,
     covariates: Mapping[str, Sequence[float]] | None = None,
@@ -52,7 +56,8 @@ def population(
     r has the density 3/4 (1 - r^2). Each finger's own parameters are integrated out.
 
     Args:
-        records: one record of each finger, on one panel; they are read one after the other and not kept.
+        records: one record or track of each finger, on one panel; they are read one after the other and not kept. A
+            finger of a track is its average over time; the tracks together give the variation within fingers.
         scene: scene of all records; its prior of Rsc and Csc is the prior of their medians.
         covariates: one number per finger under each name, such as skin moisture; the medians of log Rsc and log Csc
             change linearly with each, with a normal prior of scale 0.5 per standard deviation of the covariate.
@@ -75,9 +80,15 @@ def population(
     area_varies = scene.population.contact_area == "varies"
     factors = (*SKIN, SHARED_PARAMETER, *((AREA,) if area_varies else ()), *scene.thickness_sd())
     # errors of the instruments are the same for all fingers, so that they do not make these differ
-    fingers, new_finger = _fit_fingers(records, scene.without_instrument_errors(), factors, progress)
+    exact = scene.without_instrument_errors()
+    fingers, new_finger, tracked = _fit_fingers(records, exact, medians, factors, progress)
+    within = _pool_tracks(fingers, tracked, new_finger, seed)
+    averages = [
+        finger if within is None or finger.fingerprint in tracked else finger.blur(within.mean_covariance)
+        for finger in fingers
+    ]
     make_tables = functools.partial(
-        FingerLikelihoods.from_fingers, fingers, medians[SHARED_PARAMETER], area_varies=area_varies
+        FingerLikelihoods.from_fingers, averages, medians[SHARED_PARAMETER], area_varies=area_varies
     )
     with jax.enable_x64(True):
 
@@ -88,12 +99,14 @@ def population(
         for draws, name in _CHAIN_FILES.items():
             sampled = hierarchy(draws, terms=9, purpose=2)
             chain_file = None if folder is None else Path(folder) / name
-            fingerprint = _fingerprint(fingers, standardized, scene, seed, draws)
+            fingerprint = _fingerprint(averages, standardized, scene, seed, draws)
             points, convergence = _sample_hierarchy(sampled, fingerprint, seed, max_steps, chain_file, progress)
             error = _integration_error(sampled, hierarchy(max(draws, 256), terms=13, purpose=3), points)
             if error <= MAX_INTEGRATION_ERROR or not convergence.converged:
                 break
-    return Population(fingers, sampled, points, convergence, error, new_finger, standardized, next_at, scene, seed)
+    return Population(
+        fingers, sampled, points, convergence, error, new_finger, standardized, next_at, scene, seed, within
+    )
 
 
 def delete_chains(folder: str | os.PathLike[str]) -> None:
@@ -135,21 +148,27 @@ def _prior(scene: Scene) -> Prior:
 
 
 def _fit_fingers(
-    records: Sequence[Record], scene: Scene, factors: tuple[str, ...], progress: bool
-) -> tuple[tuple[Finger, ...], NewFingerModel]:
-    """Fit each record by itself, and model the next finger under the first record's drive."""
+    records: Sequence[Record | Track | TrackedFinger],
+    scene: Scene,
+    prior: Prior,
+    factors: tuple[str, ...],
+    progress: bool,
+) -> tuple[tuple[Finger, ...], NewFingerModel, dict[str, TrackedFinger]]:
+    """Fit each record by itself, and model the next finger under the first record's drive; also return the tracks."""
     if len(records) < 2:
         raise InputError(f"{len(records)} records: a population needs one record of each of two or more fingers")
     fingers: dict[str, Finger] = {}
+    tracks: dict[str, TrackedFinger] = {}
     refusals: list[InputError] = []
     new_finger = None
     numbers = range(len(records))
     for number in track_progress(numbers, "fitting the fingers", len(records)) if progress else numbers:
         try:
-            record = records[number]
+            item = records[number]
+            record = TrackedFinger.from_track(item) if isinstance(item, Track) else item
             twin = fingers.get(record.fingerprint)
-            if twin is None:
-                result = fit(record, scene)
+            if twin is None and not (isinstance(record, TrackedFinger) and new_finger):
+                fitted = _fit_one(record, scene)
         except InputError as error:
             refusals.append(error)
             continue
@@ -158,11 +177,34 @@ def _fit_fingers(
                 f"{record.source} holds the same record as {twin.source}, whose finger would count twice; drop one"
             )
         with jax.enable_x64(True):
-            fingers[record.fingerprint] = Finger.from_fit(result)
-            new_finger = new_finger or NewFingerModel.from_fit(result, factors)
+            new_finger = new_finger or NewFingerModel.from_fit(fitted, factors)
+            if isinstance(record, TrackedFinger):
+                tracks[record.fingerprint] = record
+                fingers[record.fingerprint] = Finger.from_track(record, prior)
+            else:
+                fingers[record.fingerprint] = Finger.from_fit(fitted)
     if refusals or new_finger is None:
         raise _refusal(refusals)
-    return tuple(fingers.values()), new_finger
+    return tuple(fingers.values()), new_finger, tracks
+
+
+def _fit_one(record: Record | TrackedFinger, scene: Scene) -> Fit:
+    """Fit a record, or the window of a track under its recorded drive."""
+    if isinstance(record, Record):
+        return fit(record, scene)
+    return fit(record.window, scene.model_copy(update={"drive": DriveSection(waveform="measured")}))
+
+
+def _pool_tracks(
+    fingers: Sequence[Finger], tracks: Mapping[str, TrackedFinger], new_finger: NewFingerModel, seed: int
+) -> WithinFinger | None:
+    """Pool the variation within tracked fingers; None means that no finger was tracked."""
+    if not tracks:
+        return None
+    ordered = [finger for finger in fingers if finger.fingerprint in tracks]
+    logs = np.log([[finger.parameters[name]["q50"] for name in (*SKIN, SHARED_PARAMETER)] for finger in ordered])
+    random = np.random.default_rng([seed, 5])
+    return WithinFinger.from_tracks([tracks[finger.fingerprint] for finger in ordered], logs, new_finger, random)
 
 
 def _refusal(errors: Sequence[InputError], max_named: int = 5) -> InputError:

@@ -131,6 +131,15 @@ def finger_variance_fraction(values: Float[np.ndarray, "laws fingers"]) -> float
     return fingers / (fingers + max(parameters, 0.0))
 
 
+def within_variance_fraction(moments: Float[np.ndarray, "2 laws fingers"]) -> float:
+    """Return the variance within fingers over that of all fingers of the same population parameters, from two moments.
+
+    Half the mean square of the difference of two moments of a finger is the variance within it.
+    """
+    whole = float(np.mean(np.var(moments, axis=2, ddof=1)))
+    return min(0.5 * float(np.mean(np.square(moments[1] - moments[0]))) / whole, 1.0)
+
+
 def draw_factors(
     parameters: PopulationParameters, thickness_sd: dict[str, float], fingers: int, random: np.random.Generator
 ) -> Float[np.ndarray, "laws fingers factors"]:

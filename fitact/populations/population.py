@@ -20,16 +20,25 @@ from fitact.populations.covariates import Covariates
 from fitact.populations.finger import SHARED_PARAMETER, SKIN, Finger
 from fitact.populations.finger_likelihoods import PopulationParameters
 from fitact.populations.hierarchy import Hierarchy
-from fitact.populations.next_finger import AREA, NAMES, NewFingerModel, draw_factors, finger_variance_fraction
+from fitact.populations.next_finger import (
+    AREA,
+    NAMES,
+    NewFingerModel,
+    draw_factors,
+    finger_variance_fraction,
+    within_variance_fraction,
+)
 from fitact.populations.sobol import SobolIndices, variance_shares
+from fitact.populations.within_finger import WithinFinger
 from fitact.sampling.convergence import Convergence
 from fitact.scene.scene import Scene
 from fitact.tables import align_table, join_lines
-from fitact.units import choose_prefixed_unit, format_engineering, quantity_unit
+from fitact.units import choose_prefixed_unit, format_engineering, format_percent, quantity_unit
 
 QUANTILES = tuple(summary.PROBABILITIES.values())  # of the force in time
 MAX_INTEGRATION_ERROR = 0.1  # largest shift of a mean by the fingers' tables, in posterior standard deviations
 VARIANCE_QUANTITIES = ("force_mean", "force_peak")  # quantities with Sobol indices
+ADVICE = "use track"  # in the message of a fit that shows a finger that changes
 SHARES_LEGEND = "Parameters: Sobol indices, first-order (total)."
 
 
@@ -48,6 +57,7 @@ class Population:
         at: covariates of the next finger, in standard deviations from the mean.
         scene: scene of all records.
         seed: seed of all random numbers.
+        within: variation within tracked fingers; None means that none was tracked.
         laws, fingers_per_law: number of population samples for new fingers, and of new fingers for each.
     """
 
@@ -61,6 +71,7 @@ class Population:
     at: Float[np.ndarray, " covariates"]
     scene: Scene
     seed: int
+    within: WithinFinger | None = None
     laws: int = 1000
     fingers_per_law: int = 32
 
@@ -75,7 +86,7 @@ class Population:
         sentences = [
             f"{finger.source}: {finger.message}"
             for finger in self.fingers
-            if finger.result not in summary.TRUSTED_RESULTS
+            if finger.result not in summary.TRUSTED_RESULTS or ADVICE in finger.message
         ]
         if self.convergence.warning:
             sentences.append(self.convergence.warning)
@@ -119,6 +130,8 @@ class Population:
                 "errors of the instruments are the same for all fingers: they do not add to the differences between"
                 " fingers, and the medians and forces do not include them (fitact fit of one record gives their size)"
             )
+        if self.within is not None:
+            sentences += self.within.describe_assumptions(len(self.fingers))
         area = self.contact_area
         return tuple(sentences) if area.disagrees else (*sentences, area.sentence)
 
@@ -151,12 +164,23 @@ class Population:
 
     def new_fingers(self) -> dict[str, Float[np.ndarray, "laws fingers"]]:
         """Return draws of new fingers from each population sample: Rsc, Csc, g, b, force and friction, SI units."""
-        return {name: self._new_predictions[..., i] for i, name in enumerate(self.finger.names)}
+        return {name: self._new_predictions[0, ..., i] for i, name in enumerate(self.finger.names)}
+
+    @property
+    def factors(self) -> Float[np.ndarray, "laws fingers factors"]:
+        """Logarithms of the factors of new fingers, in the order of `finger.factors`; of tracked ones at one moment."""
+        return self._moments[0]
 
     @functools.cached_property
-    def factors(self) -> Float[np.ndarray, "laws fingers factors"]:
-        """Logarithms of the factors of new fingers, in the order of `finger.factors`."""
-        return self._draw_factors(np.random.default_rng([self.seed, 1]), draw_parameters(self, self.laws))
+    def _moments(self) -> Float[np.ndarray, "moments laws fingers factors"]:
+        """Factors of new fingers at one moment, and of the same fingers at another one if fingers were tracked."""
+        random = np.random.default_rng([self.seed, 1])
+        factors = self._draw_factors(random, draw_parameters(self, self.laws))
+        if self.within is None:
+            return factors[None]
+        moments = np.stack([factors, factors])
+        moments[..., :3] += self.within.draw_deviations(moments.shape[:3], random)
+        return moments
 
     @property
     def prior_factors(self) -> Float[np.ndarray, "laws fingers factors"]:
@@ -171,8 +195,8 @@ class Population:
         return draw_factors(parameters, self.scene.thickness_sd(), self.fingers_per_law, random)
 
     @functools.cached_property
-    def _new_predictions(self) -> Float[np.ndarray, "laws fingers names"]:
-        return self.finger.evaluate(self.factors)
+    def _new_predictions(self) -> Float[np.ndarray, "moments laws fingers names"]:
+        return self.finger.evaluate(self._moments)
 
     @functools.cached_property
     def _prior_predictions(self) -> Float[np.ndarray, "laws fingers names"]:
@@ -194,13 +218,18 @@ class Population:
     def to_dict(self) -> dict[str, Any]:
         """Return the content of population.json, which `fitact population --json` prints."""
         new: dict[str, dict[str, Any]] = {}
-        for name, values in self.new_fingers().items():
+        for i, (name, values) in enumerate(self.new_fingers().items()):
             people = finger_variance_fraction(values)
             shares = {"people": people, "ignorance": 1.0 - people}
+            if self.within is not None:
+                within = people * within_variance_fraction(self._new_predictions[..., i])
+                shares |= {"within_finger": within, "between_fingers": people - within}
+                shares |= {"population_parameters": 1.0 - people}
             new[name] = summary.summarize_draws(name, values) | {"variance": shares}
         return {
             "population": self._parameter_summaries(),
             "new_finger": new,
+            **({} if self.within is None else self.within.to_dict()),
             "variance_shares": self.shares,
             "variance_shares_prior": self.prior_shares,
             "fingers": [
@@ -311,6 +340,8 @@ def population_table(content: dict[str, Any]) -> tuple[tuple[str, ...], ...]:
     if AREA in law:
         shown["contact area, log_sd"] = law[AREA]["log_sd"]
     shown |= {f"{skin}, slope in {name}": x[skin]["slope"] for name, x in law["covariates"].items() for skin in SKIN}
+    within = content.get("within_finger", {})
+    shown |= {f"within a finger, {name}, log_sd": each["log_sd"] for name, each in within.items()}
     shown |= {f"next finger, {name}": new[name] for name in NAMES}
     rows = [(name, *format_quantiles(s)) for name, s in shown.items()]
     if "friction" not in content["scene"]:  # two defaults give it, so more digits would mislead
@@ -333,19 +364,29 @@ def format_quantiles(s: dict[str, Any], keys: Sequence[str] = ("q50", "q025", "q
     return [f"{float(s[key]) / size:.{places}f} {symbol}".rstrip() for key in keys]
 
 
+def format_variance_part(fraction: float) -> str:
+    """Format a part of a variance in whole per cent, and a smaller one with two digits."""
+    return format_percent(fraction) if 0.0 < fraction < 0.01 else f"{100.0 * fraction:.0f} %"
+
+
 def variance_sentences(content: dict[str, Any]) -> tuple[str, ...]:
     """Return sentences on the sources of variance of the next finger's force, from population.json."""
     sentences = []
     for name in VARIANCE_QUANTITIES:
-        people = 100.0 * content["new_finger"][name]["variance"]["people"]
+        variance = content["new_finger"][name]["variance"]
+        sources = {
+            "within_finger": "from changes within a finger",
+            "between_fingers" if "within_finger" in variance else "people": "from differences between fingers",
+            "ignorance": "from uncertainty of the population parameters",
+        }
+        sizes = ", ".join(
+            f"{format_variance_part(variance[part])} {text}" for part, text in sources.items() if part in variance
+        )
         parts = (
             f"{factor} {round(100.0 * share['first'])} % ({round(100.0 * share['total'])} %)"
             for factor, share in content["variance_shares"][name].items()
         )
-        sentences.append(
-            f"Variance of {name}: {people:.0f} % from differences between fingers, {100.0 - people:.0f} % from"
-            f" uncertainty of the population parameters; Sobol indices {', '.join(parts)}"
-        )
+        sentences.append(f"Variance of {name}: {sizes}; Sobol indices {', '.join(parts)}")
     return tuple(sentences)
 
 

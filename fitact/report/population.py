@@ -24,6 +24,7 @@ from fitact.populations.population import (
     SHARES_LEGEND,
     VARIANCE_QUANTITIES,
     format_quantiles,
+    format_variance_part,
     population_table,
     variance_sentences,
 )
@@ -277,14 +278,17 @@ def _finger_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
 
 
 def _new_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
-    yield ("next finger", *_QUANTILES.values(), "between fingers", "parameters")
+    parts = {"people": "between fingers", "ignorance": "parameters"}
+    if "within_finger" in content:
+        parts = {"within_finger": "within a finger", "between_fingers": "between fingers", "ignorance": "parameters"}
+    yield ("next finger", *_QUANTILES.values(), *parts.values())
     none = 1e-12 * content["new_finger"]["force_mean"]["q50"]  # smaller forces are rounding errors
     for name, s in content["new_finger"].items():
         values = (
             format_engineering(s[key] if s["unit"] != "N" or s["q975"] > none else 0.0, s["unit"], 3)
             for key in _QUANTILES
         )
-        yield (_NAMES[name], *values, *(f"{100.0 * s['variance'][key]:.0f} %" for key in ("people", "ignorance")))
+        yield (_NAMES[name], *values, *(format_variance_part(s["variance"][key]) for key in parts))
 
 
 def _share_rows(content: dict[str, Any], name: str) -> Iterator[tuple[str, ...]]:

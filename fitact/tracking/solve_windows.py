@@ -14,8 +14,10 @@ from fitact.fitting.identifiability import information_directions, verdicts
 from fitact.fitting.verdict import misfit_warnings
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.circuit import FINGER_PARAMETERS
+from fitact.model.skin import circuit_parameters
 from fitact.tracking.compressed_windows import CompressedWindows, WindowModel
 from fitact.tracking.random_walk import SmoothedWalk, WindowInformation, WindowTimes, find_jumps, smooth
+from fitact.tracking.time_average import TimeAverage, average_windows
 from fitact.tracking.track import Track
 from fitact.tracking.walk_rates import WalkRates, estimate_rates, walk_matrix
 from fitact.tracking.window_likelihood import QUANTITIES, evaluate_quantities, linearize
@@ -66,7 +68,25 @@ def solve_windows(
         middle = walk.middle[:, back]
         quantities = evaluate_quantities(fitted.derive.geometry, likelihood, windows.data.compressions, middle, sigma)
     covariance = walk.covariance[:, back][:, :, back]
-    return _make_track(model, windows, (middle, covariance), quantities, sigma, found, jumps, length)
+    average = _average(likelihood, windows, information, walk, order, prior, length)
+    return _make_track(model, windows, (middle, covariance), quantities, sigma, found, jumps, length, average)
+
+
+def _average(
+    likelihood: Likelihood,
+    windows: CompressedWindows,
+    information: WindowInformation,
+    walk: SmoothedWalk,
+    order: list[int],
+    prior: tuple[np.ndarray, np.ndarray],
+    length: float,
+) -> TimeAverage | None:
+    """Return the averages over time without the prior of the finger and the walk."""
+    used, names = windows.has_data, [likelihood.names[i] for i in order]
+    kept = {*circuit_parameters(likelihood.template), *likelihood.timing}
+    errors = [name for name in names if name not in kept]
+    span = float(np.ptp(windows.start[used])) + length
+    return average_windows(information, used, names, prior, errors, walk.average[used].mean(axis=0), span)
 
 
 def _window_times(windows: CompressedWindows, length: float, jumps: Bool[np.ndarray, " windows"]) -> WindowTimes:
@@ -167,6 +187,7 @@ def _make_track(
     rates: WalkRates,
     jumps: np.ndarray,
     length: float,
+    average: TimeAverage | None,
 ) -> Track:
     fitted, likelihood, scene = model.fit, model.fit.likelihood, model.fit.scene
     theta, covariance = state
@@ -220,8 +241,8 @@ def _make_track(
     noise = dict(zip(likelihood.sigma_names, map(float, sigma), strict=True))
     return Track(
         time, values, u, alone, contact, reliable, verdicts(shares, along),
-        tuple(map(float, time[jumps] - 0.5 * length)), rates, length, fitted, constants, noise, tuple(warnings),
-        tuple(dict.fromkeys(notes)),
+        tuple(map(float, time[jumps] - 0.5 * length)), rates, length, fitted, constants, noise, average,
+        tuple(warnings), tuple(dict.fromkeys(notes)),
     )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from fitact.files import write_parquet
 from fitact.fitting.effects import is_change_of_finger
 from fitact.fitting.fit import Fit
 from fitact.tables import align_table, join_lines
+from fitact.tracking.time_average import TimeAverage
 from fitact.tracking.walk_rates import WalkRates
 from fitact.units import format_percent, quantity_unit
 
@@ -36,6 +37,7 @@ class Track:
         fit: the fit to one window, which gave the model.
         constants: what does not change, by name: (median, relative standard uncertainty).
         noise: sd of each channel's noise, V or A.
+        average: averages over time for a population; None means that Rsc, Csc and Ci are not all free.
     """
 
     time: Float[np.ndarray, " windows"]
@@ -51,6 +53,7 @@ class Track:
     fit: Fit
     constants: dict[str, tuple[float, float]]
     noise: dict[str, float]
+    average: TimeAverage | None
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -104,6 +107,8 @@ class Track:
             "lifted_s": [list(pair) for pair in self.lifted],
             "fit": {"result": self.fit.result, "model": self.fit.model()},
             "identifiability": self.fit.identifiability.to_dict(),
+            "time_average": self.average and self.average.to_dict(),
+            "trusted": self.trusted,
             "warnings": list(self.warnings),
             "notes": list(self.notes),
         }

@@ -102,6 +102,18 @@ def test_columns_and_summary_of_the_contract(slide, tmp_path: Path):
     assert "no contact from 1.5" in str(track)
 
 
+def test_time_average_is_that_of_the_course(slide):
+    track, course, _ = slide
+    logs = np.log(course.values(track.time[track.reliable]))
+    average = track.average
+    assert average.sees_area
+    error = np.linalg.solve(average.factor, average.target) - logs.mean(axis=1)
+    sd = np.sqrt(np.diag(np.linalg.inv(average.factor.T @ average.factor)))
+    assert np.all(np.abs(error) < 4.0 * sd + 5e-4)  # windows see averages, of which these are the middles
+    np.testing.assert_allclose(average.within, np.cov(logs, ddof=0), rtol=0.03)
+    assert average.duration == pytest.approx(np.ptp(track.time[track.reliable]) + track.window)
+
+
 def test_fit_of_a_constant_finger_names_the_change(slide):
     *_, record = slide
     part = slice(0, 25_000)  # 0.5 s, in which Rsc falls by 8 % for the area and by 5 % more for the skin
