@@ -34,6 +34,7 @@ _PARAMETERS = {
     "Rsc": "skin resistance Rsc",
     "Csc": "skin capacitance Csc",
     "Ci": "insulator capacitance Ci",
+    "Ri": "leak resistance of the insulator Ri",
     "R_H": "body resistance R_H",
     "grounding_Rsc": "resistance of the grounding skin",
     "grounding_Csc": "capacitance of the grounding skin",
