@@ -83,7 +83,7 @@ _GEOMETRY = {  # what force and friction rest on beside the circuit
 }
 _DERIVED = {
     "g": "divider g = Ci / (2 Ci + Csc)",
-    "b": "time constant b = Rsc (2 Ci + Csc)",
+    "b": "time constant b, without a leak Rsc (2 Ci + Csc)",
     "force_mean": "electrostatic force, mean",
     "force_peak": "electrostatic force, peak",
     "force_rms": "electrostatic force, rms",
