@@ -23,6 +23,7 @@ _VALUES = {  # name -> section of the scene, key, unit
     "Rsc": ("skin", "Rsc", "ohm"),
     "Csc": ("skin", "Csc", "F"),
     "Ci": ("device", "Ci", "F"),
+    "Ri": ("device", "Ri", "ohm"),
     "alpha": ("skin", "alpha", "1"),
     "R_H": ("grounding", "R_H", "ohm"),
     "grounding_Rsc": ("grounding", "grounding_Rsc", "ohm"),
@@ -75,6 +76,8 @@ def _population(recipe: Recipe) -> list[Scene]:
         own = {"skin": {**scene["skin"], "Rsc": Rsc, "Csc": Csc}}
         own["device"] = {**scene["device"], "Ci": scene["device"]["Ci"] * area}
         own["device"]["contact_area"] *= area
+        if scene["device"]["Ri"]:
+            own["device"]["Ri"] = scene["device"]["Ri"] / area
         found.append({**scene, **own})
     return found
 

@@ -45,7 +45,11 @@ def network(scene: Mapping[str, Mapping[str, Any]], second: tuple[float, float] 
     """Return the scene's circuit from drive to ground; `second` is R (ohm) and C (F) of a deeper layer in each skin."""
     skin, measured = scene["skin"], scene["measurement"]
     touching = [(skin["Rsc"], skin["Csc"], "outer"), *([(*second, "")] if second else [])]
-    before = [(measured["series_resistor"], None, ""), (None, scene["device"]["Ci"], ""), (*_gap(scene), "")]
+    before = [
+        (measured["series_resistor"], None, ""),
+        (scene["device"]["Ri"], scene["device"]["Ci"], ""),
+        (*_gap(scene), ""),
+    ]
     before, after = (list(filter(_has_impedance, part)) for part in (before, _ground_elements(scene, second)))
     branches = []
     for node, (R, C, layer) in enumerate([*before, *touching, *after]):

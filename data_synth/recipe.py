@@ -125,7 +125,11 @@ def _check(parts: dict[str, dict[str, Any]], scene: Scene, given: tuple[str, ...
             raise RecipeError(f"{place}: [skin] model = '{skin['model']}' {what} {key}; correct one of them")
     if needed and scene["skin"]["level"] != "constant":
         raise RecipeError(f"{place}: [skin] model = '{skin['model']}' needs a scene with [skin] level = 'constant'")
-    added = *(scene["grounding"][key] for key in ("R_H", "grounding_Rsc", "grounding_Csc")), *scene["gap"].values()
+    added = (
+        *(scene["grounding"][key] for key in ("R_H", "grounding_Rsc", "grounding_Csc")),
+        *scene["gap"].values(),
+        scene["device"]["Ri"],
+    )
     loads = (scene["measurement"][key] for key in ("series_resistor", "probe_resistance", "probe_capacitance"))
     others = scene["skin"]["level"] != "constant" or scene["grounding"]["connection"] != "direct" or needed
     if "change" in given and (others or any(added) or any(loads)):

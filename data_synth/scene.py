@@ -11,11 +11,12 @@ from data_synth.network import EPS0
 Scene = dict[str, dict[str, Any]]
 
 _ANY = -math.inf
-_PRIORS = """Rsc Csc Ci R_H grounding_Rsc grounding_Csc Z Z_capacitance series_resistor Rgap Cgap alpha sigma sigma_I
-sigma_Ft mu fN force_scale sensor_frequency sensor_damping correlation"""
+_PRIORS = """Rsc Csc Ci R_H grounding_Rsc grounding_Csc Z Z_capacitance series_resistor Ri Rgap Cgap alpha sigma
+sigma_I sigma_Ft mu fN force_scale sensor_frequency sensor_damping correlation"""
 KEYS: Table = {
     "device": {
         "Ci": Quantity("F", 1.35e-9),
+        "Ri": Quantity("ohm"),
         "insulator_thickness": Quantity("m", 1e-6),
         "insulator_permittivity": Quantity("", 3.9),
         "contact_area": Quantity("m^2", 1e-4),

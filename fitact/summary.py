@@ -34,6 +34,7 @@ _PARAMETERS = {
     "Rsc": "skin resistance Rsc",
     "Csc": "skin capacitance Csc",
     "Ci": "insulator capacitance Ci",
+    "Ri": "leak resistance of the insulator Ri",
     "R_H": "body resistance R_H",
     "grounding_Rsc": "resistance of the grounding skin",
     "grounding_Csc": "capacitance of the grounding skin",
@@ -91,7 +92,7 @@ _GEOMETRY = {  # what force and friction rest on beside the circuit
 }
 _DERIVED = {
     "g": "divider g = Ci / (2 Ci + Csc)",
-    "b": "time constant b = Rsc (2 Ci + Csc)",
+    "b": "time constant b, without a leak Rsc (2 Ci + Csc)",
     "force_mean": "electrostatic force, mean",
     "force_peak": "electrostatic force, peak",
     "force_rms": "electrostatic force, rms",

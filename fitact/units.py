@@ -18,7 +18,7 @@ _SYMBOLS = {"ohm": "Ω", "1": ""}
 
 _UNITS = {
     "Rsc": "ohm", "Csc": "F", "Ci": "F", "R_H": "ohm", "grounding_Rsc": "ohm", "grounding_Csc": "F",
-    "Z": "ohm", "Z_capacitance": "F", "series_resistor": "ohm", "Rgap": "ohm", "Cgap": "F",
+    "Z": "ohm", "Z_capacitance": "F", "series_resistor": "ohm", "Ri": "ohm", "Rgap": "ohm", "Cgap": "F",
     "gain_V": "1", "compensation": "1", "nonlinearity_even": "1", "nonlinearity_odd": "1", "compensation_V": "1",
     "nonlinearity_V_even": "1", "nonlinearity_V_odd": "1", "probe_resistance": "ohm", "probe_capacitance": "F",
     "gain": "1", "delay": "s", "clock": "1", "sigma": "V", "sigma_Z": "1", "sigma_H": "1",

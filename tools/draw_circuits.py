@@ -17,6 +17,7 @@ _UNEQUAL = Scene.from_dict({"grounding": {"R_H": "500 ohm", "grounding_Rsc": "80
 _NATURAL = Scene.from_dict({"grounding": {"connection": "natural", "Z": "14.5 Mohm"}, "measurement": _BOTH})
 _EVERYTHING = Scene.from_dict(
     {
+        "device": {"Ri": "50 Mohm"},
         "gap": {"resistance": "1 Mohm", "thickness": "2 um"},
         "measurement": {"series_resistor": "100 kohm", "probe_resistance": "10 Mohm", "probe_capacitance": "10 pF"},
     }

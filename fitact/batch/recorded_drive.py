@@ -29,6 +29,7 @@ from fitact.likelihood.channel import LINEAR_NUISANCES
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.projection import MAX_DELAY, is_exactly_uniform
+from fitact.model.circuit import passes_direct_current
 from fitact.model.force import force_constant
 from fitact.model.response_table import TABLE_HALF_WIDTH
 from fitact.model.skin import WithSkin
@@ -77,6 +78,7 @@ class RecordedDriveProblem(BatchProblem):
             return None
         is_plain = trace.channel == "Vsc" and trace.noise == "white" and trace.timing in ((), ("delay",))
         has_other_model = isinstance(likelihood.template, WithSkin) or len(tau) > 1
+        has_other_model |= passes_direct_current(likelihood.template)
         if has_other_model or not is_plain or time.size > cls.settings.max_samples or not is_exactly_uniform(time):
             return None
         delay = float(likelihood.to_physical(fitted.theta).get("delay", 0.0))

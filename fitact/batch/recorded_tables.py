@@ -154,7 +154,7 @@ class Tables(NamedTuple):
 def to_response_table(table: Compression) -> ResponseTable:
     """Return a table of coefficients from a compression in functions; the response is not delayed."""
     signal = jnp.pad(table.signal, ((0, 0), (0, 1)))
-    return ResponseTable(table.center[None], table.half_width, signal, table.decay, jnp.eye(TABLE_NODES))
+    return ResponseTable(table.center[None], table.half_width, signal, table.decay, jnp.eye(TABLE_NODES), 0.0)
 
 
 def _factor_products(

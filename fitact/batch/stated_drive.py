@@ -24,6 +24,7 @@ from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics
 from fitact.fitting.starting_point import VscEstimate
 from fitact.likelihood.channel import LINEAR_NUISANCES
 from fitact.model.chirp import Chirp
+from fitact.model.circuit import passes_direct_current
 from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, chebyshev
 from fitact.model.skin import WithSkin
 
@@ -55,6 +56,7 @@ class StatedDriveProblem(BatchProblem):
             return None
         is_plain = trace.channel == "Vsc" and trace.noise == "white" and trace.equally_weighted and not trace.timing
         has_other_model = isinstance(likelihood.template, WithSkin) or isinstance(choice.drive, Chirp)
+        has_other_model |= passes_direct_current(likelihood.template)
         has_nuisances = (
             bool(np.any(np.asarray(trace.linear_sd))) or bool(choice.notes or choice.warnings) or choice.shift != 0.0
         )

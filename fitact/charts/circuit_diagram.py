@@ -111,7 +111,11 @@ def lay_out_circuit(values: Mapping[str, str], grounding: Grounding = "direct", 
 
 def _add_column(diagram: Diagram, values: Mapping[str, str], grounding: Grounding) -> float:
     """Draw from the insulator down to the body's last part; return the height at which the column ends."""
-    y = _add_single(diagram, "Ci", schemdraw.elements.Capacitor(), values, 0.0, "insulator")
+    if "Ri" in values:
+        diagram.wire((_COLUMN, 0.0), (_COLUMN, -0.5))
+        y = _add_layer(diagram, ("Ri", "Ci"), values, -0.5, "insulator")
+    else:
+        y = _add_single(diagram, "Ci", schemdraw.elements.Capacitor(), values, 0.0, "insulator")
     if "Cgap" in values:
         y = _add_layer(diagram, ("Rgap", "Cgap"), values, y, "gap")
     y = _add_touching_skin(diagram, values, y)

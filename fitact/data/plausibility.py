@@ -1,22 +1,22 @@
 """Plausibility of what a force is computed from: one warning with the likely cause, most often a wrong unit."""
 
 import numpy as np
-from jax.typing import ArrayLike
 
 from fitact.data.inspection import LARGEST_VALUES
-from fitact.model.circuit import HighpassTerms
+from fitact.model.circuit import RC, HighpassTerms
 from fitact.scene.scene import Scene
 from fitact.units import format_engineering
 
 
-def insulator_voltage(drive_peak: float, current: HighpassTerms, Ci: ArrayLike, frequency: float) -> float:
-    """Return the peak voltage (V) across the insulator Ci (F) for a drive of this peak (V) and frequency (Hz).
+def insulator_voltage(drive_peak: float, current: HighpassTerms, circuit: RC, frequency: float) -> float:
+    """Return the peak voltage (V) across the insulator for a drive of this peak (V) and frequency (Hz).
 
-    The charge follows from the `current` terms of the circuit. The drive counts as a sine.
+    It follows from the `current` terms of the circuit. The drive counts as a sine.
     """
-    tau, weight = np.asarray(current.tau), np.asarray(current.weight)
-    charge = np.sum(weight * tau / (1.0 + 2j * np.pi * frequency * tau)) + (current.rate or 0.0)
-    return drive_peak * float(abs(charge) / np.asarray(Ci))
+    s, tau, weight = 2j * np.pi * frequency, np.asarray(current.tau), np.asarray(current.weight)
+    admittance = (current.direct or 0.0) + s * (current.rate or 0.0) + np.sum(weight * s * tau / (1.0 + s * tau))
+    leak = 0.0 if circuit.Ri is None else 1.0 / np.asarray(circuit.Ri)
+    return drive_peak * float(abs(admittance) / abs(leak + s * np.asarray(circuit.Ci)))
 
 
 def check_plausibility(

@@ -70,7 +70,7 @@ def _check_scene(scene: Scene, circuit: Circuit, drive: Drive, time: Float[np.nd
     contact, plain = scene.geometry().contact(circuit), scene.make_rc_circuit()
     voltage = response(circuit, drive, time, steady_state=scene.drive.steady_state, channel=contact.channel)
     peak = float(np.max(np.abs(drive.value(time))))
-    insulator = insulator_voltage(peak, plain.current_terms(), plain.Ci, scene.drive.lowest_frequency)
+    insulator = insulator_voltage(peak, plain.current_terms(), plain, scene.drive.lowest_frequency)
     return check_plausibility(scene, peak, insulator, float(np.max(electrostatic_force(voltage, contact))))
 
 

@@ -115,6 +115,10 @@ class _DriveEvaluator(NamedTuple):
         """Compute the effects of 1 Vpp on each finger, with its Ci times `ratio`: arrays (laws, fingers)."""
         flat = {name: values.reshape(-1) for name, values in self.people.values.items()}
         flat["Ci"] = ratio * flat["Ci"]
+        leak = flat.get("Ri", self.scene.nominal_values()["Ri"])
+        if leak is not None:  # eq. (4), for an insulator of the same resistivity
+            thicker = thickness / self.scene.device.insulator_thickness
+            flat["Ri"] = np.broadcast_to(thicker * np.asarray(leak), flat["Ci"].shape)
         template = self.scene.make_rc_circuit({name: values[0] for name, values in flat.items()})
         geometry = dataclasses.replace(self.scene.geometry(), insulator_thickness=thickness)
         with jax.enable_x64(True):

@@ -17,7 +17,7 @@ from jaxtyping import Array, Complex, Float
 
 from fitact.compiled import as_arrays, jit
 from fitact.errors import InputError
-from fitact.model.circuit import Channel, Circuit
+from fitact.model.circuit import Channel, Circuit, passes_direct_current
 from fitact.model.skin import circuit_parameters, constant_skin_circuit, with_values
 
 GAIN_CHANNELS: dict[str, Channel] = {"gain": "Vsc", "gain_I": "I"}  # channels by the names of their gains
@@ -130,8 +130,11 @@ def _log_gain_slopes(
     frequencies, margin = 128, 100.0
 
     def slopes(theta: Array) -> Array:
-        tau = jnp.stack(constant_skin_circuit(with_parameters(circuit, free, channels, theta)[0]).terms().tau)
+        plain = constant_skin_circuit(with_parameters(circuit, free, channels, theta)[0])
+        tau = jnp.stack(plain.terms().tau)
         omega = jnp.geomspace(1.0 / (margin * jnp.max(tau)), margin / jnp.min(tau), frequencies)
+        if passes_direct_current(plain):  # however small the leak, a constant drive shows it
+            omega = jnp.append(0.0, omega)
 
         def gain(theta: Array) -> tuple[Array, Array]:
             there, gains = with_parameters(circuit, free, channels, theta)

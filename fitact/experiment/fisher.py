@@ -21,7 +21,7 @@ from fitact.experiment.blind_directions import log_values, with_parameters
 from fitact.model.circuit import Channel, Circuit
 from fitact.model.drive import Drive, Periodic, Sampled
 from fitact.model.force import Geometry, force_constant
-from fitact.model.response import highpass, response_and_rate
+from fitact.model.response import drive_voltage, highpass, response_and_rate
 from fitact.model.skin import circuit_parameters, has_time_constants, limits_current, with_values
 
 FREQUENCY = "frequency"  # name of the setting for the drive's frequency
@@ -141,6 +141,7 @@ class _LogTauTerms(NamedTuple):
     weight: Array
     log_tau: Array
     rate: Array
+    direct: Array
 
 
 @jit
@@ -152,9 +153,10 @@ def _term_derivatives(model: _Model, order: int) -> tuple[tuple[_LogTauTerms, ..
         faster = theta[-1] if FREQUENCY in model.names else jnp.zeros(())
         of_channels = []
         for gain, channel in zip(gains, model.channels, strict=True):
-            weight, tau, rate = circuit.channel_terms(channel)
-            log_tau, rate = jnp.log(jnp.stack(tau)) + faster, jnp.asarray(0.0 if rate is None else rate)
-            of_channels.append(_LogTauTerms(gain * jnp.stack(weight), log_tau, gain * rate * jnp.exp(faster)))
+            weight, tau, *others = circuit.channel_terms(channel)
+            log_tau = jnp.log(jnp.stack(tau)) + faster
+            rate, direct = (gain * jnp.asarray(0.0 if each is None else each) for each in others)
+            of_channels.append(_LogTauTerms(gain * jnp.stack(weight), log_tau, rate * jnp.exp(faster), direct))
         return of_channels
 
     orders, derivative = [terms(model.theta)], terms
@@ -181,6 +183,7 @@ class _Sampling(NamedTuple):
     steady_state: bool
     time: Float[np.ndarray, " times"]  # s
     slope: Float[np.ndarray, " times"]  # dV/dt there, V/s
+    voltage: Float[np.ndarray, " times"]  # V there
     sample_weight: Float[np.ndarray, " times"]  # square root of the number of samples that each time represents
     off_edge_weight: Float[np.ndarray, " times"]  # same, but 0 near the drive's edges
     force_weight: Float[np.ndarray, " times"]  # weights of the times in the mean force
@@ -207,10 +210,11 @@ def _sampling(e: Experiment, max_samples: int = 4096, period_times: int = 1024, 
     around = time[chosen][:, None] + (np.arange(-2, 3) + 0.25) * float(np.median(np.diff(time)))
     if isinstance(drive, Sampled) and drive.period is None:
         # by NumPy, which is faster; the slope is mostly noise, so a signal that follows it counts as uninformative
-        voltage, slope = np.interp(around, drive.time, drive.samples), np.zeros_like(times)
+        near, voltage = (np.interp(each, drive.time, drive.samples) for each in (around, times))
+        slope = np.zeros_like(times)
     else:
-        voltage, slope = _evaluate_drive(drive, around, times, e.steady_state)
-    step = np.abs(np.diff(voltage, axis=1))
+        near, slope, voltage = _evaluate_drive(drive, around, times, e.steady_state)
+    step = np.abs(np.diff(near, axis=1))
     off_edge = step.max(axis=1) <= edge_ratio * step[:used].mean()
     outside = np.zeros(period_times)
     return _Sampling(
@@ -218,6 +222,7 @@ def _sampling(e: Experiment, max_samples: int = 4096, period_times: int = 1024, 
         e.steady_state,
         times,
         slope,
+        voltage,
         sample_weight=np.append(represented, outside),
         off_edge_weight=np.append(off_edge * represented, outside),
         force_weight=np.append(np.zeros(max_samples), 1.0 + outside) if periodic else np.append(k < used, outside),
@@ -236,11 +241,12 @@ def _pad_drive(drive: Drive, time: np.ndarray, samples: int = 8192) -> tuple[Dri
 
 
 @jit
-def _evaluate_drive(drive: Drive, around: Array, time: Array, steady_state: bool) -> tuple[Array, Array]:
-    """Return the drive at the times `around`, and its slope at `time`, 0 at jumps."""
+def _evaluate_drive(drive: Drive, around: Array, time: Array, steady_state: bool) -> tuple[Array, Array, Array]:
+    """Return the drive at the times `around`, its slope at `time`, 0 at jumps, and the drive at `time`."""
+    voltage = drive_voltage(drive, time, steady_state=steady_state)
     if isinstance(drive, Sampled):  # its slope is mostly noise, so a signal that follows it counts as uninformative
-        return drive.value(around), jnp.zeros_like(time)
-    return drive.value(around), jnp.nan_to_num(drive.slope(time, steady_state=steady_state))
+        return drive.value(around), jnp.zeros_like(time), voltage
+    return drive.value(around), jnp.nan_to_num(drive.slope(time, steady_state=steady_state)), voltage
 
 
 @jit
@@ -283,7 +289,10 @@ def _signal_derivatives(terms: Sequence[_LogTauTerms], sampling: _Sampling) -> l
 
     The sum runs term by term, because one compiled function for all takes ten times as long to compile.
     """
-    signals = [np.multiply.outer(sampling.slope, order.rate) for order in terms]
+    signals = [
+        np.multiply.outer(sampling.slope, order.rate) + np.multiply.outer(sampling.voltage, order.direct)
+        for order in terms
+    ]
     for k, (weight, log_tau) in enumerate(zip(terms[0].weight, terms[0].log_tau, strict=True)):
         derivatives = _highpass_derivatives(
             sampling.drive, sampling.time, log_tau, sampling.steady_state, len(terms) - 1

@@ -12,7 +12,7 @@ import scipy.linalg
 from fitact.experiment.blind_directions import gain_names
 from fitact.experiment.experiment import CandidateDesign, DesignOption, Gradient, Setting, evaluate_design
 from fitact.experiment.fisher import FREQUENCY, Experiment
-from fitact.model.circuit import RC, Channel, DirectGround, FinalCircuit, Probe
+from fitact.model.circuit import RC, Channel, FinalCircuit, Probe
 from fitact.model.drive import Multitone, Periodic, Trapezoid
 from fitact.model.skin import WithSkin, circuit_parameters, constant_skin_circuit, has_time_constants, with_values
 from fitact.units import format_engineering
@@ -136,7 +136,7 @@ def _series_resistor(design: CandidateDesign, default: float = 100e3) -> Candida
             return e
         circuit, inner = e.circuit, constant_skin_circuit(e.circuit)
         if isinstance(inner, FinalCircuit):
-            inner = DirectGround(inner.Rsc, inner.Csc, inner.Ci)
+            inner = inner.as_loop()
             circuit = dataclasses.replace(circuit, circuit=inner) if isinstance(circuit, WithSkin) else inner
         return _with_fields(dataclasses.replace(e, circuit=circuit), series_resistor=default)
 

@@ -54,7 +54,9 @@ def effects_would_change(
         if channel.effects is not None and channel.channel in ends[0].terms:
             inputs = [likelihood.make_inputs(e.circuit, x, channel) for e, x in zip(ends, (start, theta), strict=True)]
             terms = [end.terms[channel.channel] for end in ends]
-            heights = [float(i.gain) * float(np.sum(t.weight)) for i, t in zip(inputs, terms, strict=True)]
+            # weights of both signs may cancel in a sum
+            sizes = [float(np.sum(np.abs(t.weight))) + abs(float(t.direct or 0.0)) for t in terms]
+            heights = [float(i.gain) * size for i, size in zip(inputs, sizes, strict=True)]
             moved = abs(math.log(heights[1] / heights[0])) + abs(math.log(terms[1].tau[0] / terms[0].tau[0]))
             added = channel.weights * (np.asarray(inputs[1].effects) @ channel.effects)
             total = math.hypot(total, moved * float(np.linalg.norm(added[: channel.n_samples])) / float(noise))

@@ -36,7 +36,7 @@ from fitact.likelihood import certificate
 from fitact.likelihood.channel import CHARGES, LINEAR_NUISANCES, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import Autoregression, estimate_quiet_noise, require_uniform
-from fitact.model.circuit import RC, Channel, Circuit, FinalCircuit
+from fitact.model.circuit import RC, Channel, Circuit, FinalCircuit, passes_direct_current
 from fitact.model.skin import WithSkin, circuit_parameters, constant_skin_circuit, limits_current
 from fitact.prior.distributions import Distribution, LogNormal
 from fitact.prior.prior import Prior
@@ -222,11 +222,13 @@ def _build_channel(
         plain = constant_skin_circuit(template)
         if not limits_current(template) or taus[-1] < record.time_step:  # Vsc jumps with V
             max_divider = 0.5 if isinstance(plain, FinalCircuit) else 1.0
-            start = estimate_from_vsc(record, choice, max_divider * largest_gain(scene))
+            leaks = passes_direct_current(plain)
+            start = estimate_from_vsc(record, choice, max_divider * largest_gain(scene), has_leak=leaks)
             edge_sd = _unresolved_gain_sd(record, choice, start)
     elif channel == "I" and not limits_current(template):
         samples = select_current_samples(record, choice)
-        start = estimate_from_current(record, choice, samples)
+        # the estimate knows no leak; without it, the start comes from Vsc or from draws of the prior
+        start = None if passes_direct_current(template) else estimate_from_current(record, choice, samples)
         notes, warnings = (*notes, *samples.notes), (*warnings, *samples.warnings)
     weight, clipped = _weight(record, channel, samples)
     weight, at_jumps = exclude_jumps(template, record, choice, weight)

@@ -86,7 +86,7 @@ def plausibility_warnings(
         else:
             frequency = record.frequency() or 1.0 / float(record.time[-1] - record.time[0])
         circuit = cast(RC, constant_skin_circuit(optimum.circuit))
-        insulator_peak = insulator_voltage(peak, optimum.terms["I"], circuit.Ci, frequency)
+        insulator_peak = insulator_voltage(peak, optimum.terms["I"], circuit, frequency)
     return check_plausibility(scene, peak, insulator_peak, force_peak)
 
 

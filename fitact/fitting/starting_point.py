@@ -19,10 +19,11 @@ from fitact.model.skin import WithSkin, circuit_parameters
 
 
 class VscEstimate(NamedTuple):
-    """Divider g and time constant b (s) from a linear fit."""
+    """Divider g, time constant b (s) and, with a leak, the gain at zero frequency, from a linear fit."""
 
     g: float
     b: float
+    direct: float = 0.0
 
 
 class SkinEstimate(NamedTuple):
@@ -36,15 +37,21 @@ class SkinEstimate(NamedTuple):
 Estimate: TypeAlias = VscEstimate | CurrentEstimate | SkinEstimate
 
 
-def estimate_from_vsc(record: Record, choice: DriveModel, max_divider: float = 0.5) -> VscEstimate:
+def estimate_from_vsc(
+    record: Record, choice: DriveModel, max_divider: float = 0.5, *, has_leak: bool = False
+) -> VscEstimate:
     """Estimate g and b from Vsc = g V - (1/b) ∫ Vsc dt + line, the circuit's equation integrated once.
+
+    With a leak, (d/b) ∫ V dt with the gain d at zero frequency takes the place of the line's slope.
 
     Raises:
         InputError: g is not between 0 and `max_divider` (1/2, or slightly more with a free gain), which this circuit
             cannot give.
     """
     time, vsc, voltage = record.time, record["Vsc"], choice.voltage
-    integral = np.concatenate([[0.0], np.cumsum(0.5 * np.diff(time) * (vsc[1:] + vsc[:-1]))])
+    integral, driven = (
+        np.concatenate([[0.0], np.cumsum(0.5 * np.diff(time) * (x[1:] + x[:-1]))]) for x in (vsc, voltage)
+    )
     if has_ideal_edges(choice.drive):  # the trapezoid rule fails at samples next to an ideal edge
         inside = np.abs(np.diff(voltage, prepend=voltage[0])) < 1e-9 * np.ptp(voltage)
     else:
@@ -54,10 +61,10 @@ def estimate_from_vsc(record: Record, choice: DriveModel, max_divider: float = 0
     R = np.zeros((0, 5))
     for first in range(0, time.size, part_size):
         part = slice(first, first + part_size)
-        line = (time[part] - time[0]) / span
+        line = driven[part] / span if has_leak else (time[part] - time[0]) / span
         rows = np.stack([voltage[part], integral[part] / span, np.ones_like(line), line, vsc[part]], axis=1)
         R = np.asarray(np.linalg.qr(np.vstack([R, rows[inside[part]]]), mode="r"))
-    (g, slope, _, _), *_ = np.linalg.lstsq(R[:, :4], R[:, 4], rcond=None)
+    (g, slope, _, direct), *_ = np.linalg.lstsq(R[:, :4], R[:, 4], rcond=None)
     if g >= max_divider:
         raise InputError(
             f"{record.source}: Vsc is {g:.3g} times V at a step, but this circuit excludes 1/2 or more;"
@@ -68,7 +75,9 @@ def estimate_from_vsc(record: Record, choice: DriveModel, max_divider: float = 0
             f"{record.source}: Vsc steps against V (divider g = {g:.3g}); check the polarity of the probes, and that"
             " V_V and Vsc_V belong to the same record"
         )
-    return VscEstimate(float(g), float(span / -slope) if slope < 0.0 else float("inf"))
+    if not slope < 0.0:
+        return VscEstimate(float(g), float("inf"))
+    return VscEstimate(float(g), float(span / -slope), float(direct / -slope) if has_leak else 0.0)
 
 
 def start_from_estimates(
@@ -85,11 +94,17 @@ def start_from_estimates(
         points = np.vstack([theta, likelihood.sample_prior(theta, draws)])
         return points[int(np.argmin(residual_objective(likelihood, points)))]
     mean, sd = prior_skin_moments(likelihood)
+    ratio = 0.0  # of Rsc to the leak Ri
+    if vsc is not None and 0.0 < vsc.direct < 0.5:
+        ratio = vsc.direct / (1.0 - 2.0 * vsc.direct)
+        vsc = vsc._replace(b=vsc.b * (1.0 + 2.0 * ratio))  # without the leak
     skin, logs = known or _estimate_skin(vsc, current), mean
     if skin is not None:
         logs = np.log(skin)
     elif vsc is not None:
         logs = most_probable_skin(np.asarray(vsc.g), np.asarray(vsc.b), mean, sd)
+    if ratio > 0.0 and "Ri" in likelihood.prior.names:
+        theta[likelihood.prior.names.index("Ri")] = float(logs[0]) - math.log(ratio)
     for name, value in zip(FINGER_PARAMETERS, logs, strict=True):
         if name in likelihood.prior.names:
             theta[likelihood.prior.names.index(name)] = value
@@ -101,7 +116,7 @@ def _estimate_skin(vsc: VscEstimate | None, current: CurrentEstimate | None) -> 
     if current is None or not current.weight > 0.0:
         return None
     if vsc is not None and math.isfinite(vsc.b):
-        g, b = vsc
+        g, b, _ = vsc
     elif vsc is None and current.capacitance > 0.0:
         # weight = 2 g^2 / Rsc, capacitance = g Csc = b g (1 - 2 g) / Rsc
         ratio = current.weight * current.b / current.capacitance

@@ -116,7 +116,8 @@ def reason_against_table(
         if channel.channel == "I" and not channel.follows_samples:  # inner products would lose digits of large weights
             return "the current of a fractional skin is not tabulated"
         return "a dispersive skin has no time constants" if start.circuit.grid is None else ""
-    if channel.timing and not can_delay(channel, start.tau):
+    is_direct = start.terms[channel.channel].direct is not None  # its table has V, which is not delayed
+    if channel.timing and (is_direct or not can_delay(channel, start.tau)):
         return _TIMING_REASON
     if table_multiple(start.tau) > max_multiple:
         return "the time constants of the circuit are too far apart"

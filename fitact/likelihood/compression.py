@@ -55,6 +55,7 @@ class Compression(eqx.Module):
     origin: Float[Array, ""]  # delay of `signal`, in time steps
     time_step: Float[Array, ""]  # s
     effects: Float[Array, "effects rows"] | None = None  # see `ChannelLikelihood.effects`
+    voltage: Float[Array, " rows"] | None = None  # V, for circuits on whose skin a constant V acts
 
     def covers(self, tau: Array, delay: ArrayLike = 0.0) -> Array:
         """Return whether the table covers the time constant (s) and the delay (s)."""
@@ -80,6 +81,10 @@ class Compression(eqx.Module):
             series.append(weight * self._series(tau, index))
         total = self.signal @ (jnp.concatenate(series) if self.center.ndim else sum(series, jnp.zeros(())))
         total = jnp.pad(total, (0, self.observed.size - total.size)) + slopes @ self.steps
+        if terms.direct is not None:
+            if self.voltage is None or len(self.steps):
+                raise TypeError("this compression holds no V, or delays it; a leak of the insulator needs V undelayed")
+            total = total + terms.direct * self.voltage
         return total if terms.rate is None else total + terms.rate * self.rate
 
     def _shift(self, delay: ArrayLike, tau: ArrayLike) -> tuple[Array, Float[Array, "*nodes ages"]]:
@@ -98,7 +103,8 @@ class Compression(eqx.Module):
     def delay_derivative(self, terms: HighpassTerms) -> Float[Array, " rows"]:
         """Return the derivative of the response with respect to a delay (per s): u / tau - V' for each term."""
         falling = HighpassTerms(tuple(w / t for w, t in zip(terms.weight, terms.tau, strict=True)), terms.tau)
-        return self.response(falling) - sum(terms.weight) * self.slope
+        jump = sum(terms.weight) + (0.0 if terms.direct is None else terms.direct)
+        return self.response(falling) - jump * self.slope
 
     def decays(self, tau: Array, index: int = 0) -> Float[Array, " rows"]:
         """Return e^{-(t - t0) / tau}, where t0 is the first sample; `index` is that of the time constant."""
@@ -135,14 +141,21 @@ class Compression(eqx.Module):
         charges, charge_series = _significant_modes(charge * decay[..., :terms].reshape(len(decay), -1), precision)
         last = self.baseline.T, *(x[:, None] for x in (self.rate, self.slope, self.observed))
         observed_slope = np.asarray(self.observed_slope)[:, None]
-        effects = np.zeros((0, len(observed_slope))) if self.effects is None else np.asarray(self.effects)
+        functions = [*([] if self.effects is None else self.effects), *([] if self.voltage is None else [self.voltage])]
+        effects = np.reshape(functions, (-1, len(observed_slope)))
         _, rows = np.linalg.qr(np.hstack([basis, steps.T, charges, observed_slope, effects.T, *last]))
         sizes = len(series), len(steps), len(charge_series), 1, len(effects)
         basis, shifted, charges, observed_slope, moved, _ = np.split(rows, np.cumsum(sizes), axis=1)
         table = center, half_width, basis[: len(series)] @ series, charges @ charge_series / (charge or 1.0)
         record = *split_last_functions(rows), observed_slope[:, 0], self.samples
         changed = Compression(*map(np.asarray, (*table, *record, shifted.T, origin, self.time_step)))
-        return dataclasses.replace(changed, effects=None if self.effects is None else moved.T)
+        return changed.with_functions(moved.T, self.voltage is not None)
+
+    def with_functions(self, rows: Float[np.ndarray, "functions rows"], has_voltage: bool) -> "Compression":
+        """Return the compression with the coordinates of effects, and of V as the last of these functions."""
+        effects = rows[: len(rows) - has_voltage]
+        voltage = rows[-1] if has_voltage else None
+        return dataclasses.replace(self, effects=effects if len(effects) else None, voltage=voltage)
 
     def _move_origin(
         self, signal: Float[np.ndarray, "rank nodes"], tau: np.ndarray, delay: tuple[float, float]

@@ -21,6 +21,8 @@ class GridCompression(Compression):
 
     def response(self, terms: HighpassTerms, delay: ArrayLike = 0.0) -> Float[Array, " rows"]:
         """Return the response of a circuit, undelayed; compare `fitact.response`."""
+        if terms.direct is not None:
+            raise TypeError("a compression on a grid holds no V, which a leak of the insulator needs")
         total = self.signal @ jnp.asarray(terms.weight)
         total = jnp.pad(total, (0, self.observed.size - total.size))
         return total if terms.rate is None else total + terms.rate * self.rate

@@ -8,7 +8,6 @@ functions, the shapes and the record. A factor of this matrix gives the coordina
 Coloured noise is whitened by a linear filter, which is applied to all functions and the record during the pass.
 """
 
-import dataclasses
 import math
 from collections.abc import Iterator
 from fractions import Fraction
@@ -35,7 +34,7 @@ from fitact.likelihood.noise import Whitening
 from fitact.model.chirp import Chirp
 from fitact.model.circuit import HighpassTerms
 from fitact.model.drive import Drive, Periodic, Sampled
-from fitact.model.response import highpass, phi, recurrence
+from fitact.model.response import drive_voltage, highpass, phi, recurrence
 from fitact.model.response_table import (
     NARROW,
     TABLE_HALF_WIDTH,
@@ -84,6 +83,9 @@ def compress(
     the grid instead of series.
     """
     table = TableNodes.from_terms(expected_terms, time, narrow=student is not None)
+    if table.expected_direct is not None:  # V is one more function, the last of the effects
+        voltage = evaluate_voltage(drive, time, steady_state)[None]
+        effects = voltage if effects is None else np.concatenate([effects, voltage])
     one = np.ones(time.size) if weight is None else np.asarray(weight)
     mask = one if whitening is None else np.asarray(whitening.mask)[: time.size]
     samples = Samples(
@@ -126,6 +128,7 @@ class TableNodes(eqx.Module):
     expected_series: Float[Array, " terms"]  # the expected response is the product of the series with this
     expected: Float[Array, " nodes"]  # the same for the responses of the nodes
     expected_rate: ArrayLike | None  # F
+    expected_direct: ArrayLike | None  # None means that V is not among the functions
     middle: Array  # of the record, s
     half: Array  # half the length of the record, s
     step: Array  # mean time step, s
@@ -160,6 +163,7 @@ class TableNodes(eqx.Module):
             expected_series=expected,
             expected=expected @ to_series,
             expected_rate=None if expected_terms.rate is None else np.asarray(expected_terms.rate),
+            expected_direct=None if expected_terms.direct is None else np.asarray(expected_terms.direct),
             middle=np.asarray(0.5 * (time[0] + time[-1])),
             half=np.asarray(0.5 * (time[-1] - time[0])),
             step=np.asarray((time[-1] - time[0]) / (time.size - 1)),
@@ -181,6 +185,20 @@ def evaluate_baseline(time: np.ndarray, middle: ArrayLike, half: ArrayLike) -> F
 
 
 _baseline_functions = jit(baseline_functions)
+
+
+def evaluate_voltage(
+    drive: Drive, time: Float[np.ndarray, " samples"], steady_state: bool
+) -> Float[np.ndarray, " samples"]:
+    """Return `drive_voltage` at any number of times without compilation; a `Sampled` drive has these times."""
+    if isinstance(drive, Sampled) and not steady_state:
+        return np.asarray(drive.samples)[: time.size]
+    return _voltage(drive, pad_samples(time), steady_state)[: time.size]
+
+
+@jit
+def _voltage(drive: Drive, time: Array, steady_state: bool) -> Float[Array, " n"]:
+    return jnp.asarray(drive_voltage(drive, time, steady_state=steady_state))
 
 
 class Samples(NamedTuple):
@@ -280,6 +298,8 @@ def _inner_products(
     rest = chunk.observed - table.expected @ responses[0]
     if table.expected_rate is not None:
         rest = rest - table.expected_rate * chunk.rate
+    if table.expected_direct is not None and chunk.effects is not None:
+        rest = rest - table.expected_direct * chunk.effects[-1]
     parts = [table.combinations.T @ response for response in responses]
     slope = slope if chunk.slope is None else chunk.slope
     before = [] if chunk.effects is None else [chunk.effects]
@@ -440,12 +460,14 @@ def assemble_compression(
     effects, steps = rows[:, first - n_effects : first].T, rows[:, first : first + ages].T
     baseline, rate, slope, remainder = split_last_functions(rows)
     following = 0.0 if table.expected_rate is None else table.expected_rate * rate
+    if table.expected_direct is not None:
+        following = following + table.expected_direct * effects[-1]
     observed, observed_slope = remainder + signal @ table.expected_series + following, np.zeros(size)
     if projected.size:
         observed, observed_slope = projected.T
     arrays = table.center, table.half_width, signal[:rank], decay, baseline, rate, slope, observed, observed_slope
     compression = Compression(*map(np.asarray, (*arrays, float(samples), steps, 0.0, table.step)))
-    return dataclasses.replace(compression, effects=effects if n_effects else None)
+    return compression.with_functions(effects, table.expected_direct is not None)
 
 
 def factor_products(

@@ -3,22 +3,20 @@
 An RC circuit has simple, real, negative poles, so the transfer function from the drive to the skin
 voltage is, exactly,
 
-    H(s) = sum_k weight_k  s tau_k / (1 + s tau_k),
+    H(s) = direct + sum_k weight_k  s tau_k / (1 + s tau_k),
 
 The admittance has the same form, plus a term s C if no resistance limits the current. The time response
-follows from these terms (`response.py`). The terms are high-pass, not low-pass, because the insulator
-blocks direct current: a sum of low-pass terms would need a constant that cancels at zero frequency.
+follows from these terms (`response.py`). The terms are high-pass, not low-pass, because an insulator without a
+leak blocks direct current: a sum of low-pass terms would need a constant that cancels at zero frequency. With
+a leak, `direct` is the divider of the resistances.
 
-All circuits here are one loop of the drive, the insulator Ci, optionally a resistance R0, and parallel
-elements R‖C, one of which may be an interface gap. Scaled by square roots, the equations have a symmetric
-matrix whose eigenvalues are the time constants. The eigenvalues remain distinct if two elements are equal:
-the mode that these share then has weight zero.
+All circuits here are one loop of the drive, the insulator Ci, optionally with a leak Ri in parallel, optionally a
+resistance R0, and parallel elements R‖C, one of which may be an interface gap (`loop_modes.py`).
 """
 
 from typing import Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -26,26 +24,11 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
 from fitact.errors import InputError
+from fitact.model.loop_modes import HighpassTerms, Modes, modes_with_resistance, modes_without_resistance
 
 FINGER_PARAMETERS = ("Rsc", "Csc", "Ci")  # of every circuit
 # Vgap is not recorded, but the force may come from it; Ft is no voltage or current of the circuit
 Channel: TypeAlias = Literal["Vsc", "I", "Vgap", "Ft"]
-
-
-class HighpassTerms(NamedTuple):
-    """sum_k weight[k] s tau[k] / (1 + s tau[k]) + rate s."""
-
-    weight: tuple[ArrayLike, ...] | Array
-    tau: tuple[ArrayLike, ...] | Array  # s
-    rate: ArrayLike | None = None  # s times the weight's unit; None means no such term
-
-    def stack(self) -> tuple[Array, Array]:
-        """Return the weights and the time constants as arrays."""
-        weight, tau = (
-            jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, x))) if isinstance(x, tuple) else x
-            for x in (self.weight, self.tau)
-        )
-        return weight, tau
 
 
 class Circuit(eqx.Module):
@@ -90,6 +73,10 @@ class Circuit(eqx.Module):
     def _gap_missing(self) -> InputError:
         return InputError(f"this {type(self).__name__} has no gap between finger and panel; Vgap needs Cgap")
 
+    def insulator_terms(self) -> HighpassTerms:
+        """Return the high-pass terms of the voltage across the insulator over V; its `direct` is 1 without a leak."""
+        raise NotImplementedError
+
     def transfer_function(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
         """Return Vsc / V at the angular frequency `omega` (rad/s, >= 0)."""
         return self.channel_gain("Vsc", omega)
@@ -123,17 +110,21 @@ def _normalize_magnitude(gain: Array) -> tuple[Array, Array]:
 class FinalCircuit(Circuit):
     """Final circuit of the reference paper (Fig. 11): two equal skin layers Rsc‖Csc in series with Ci.
 
-    H(s) = a s / (1 + b s) with a = Rsc Ci and b = Rsc (2 Ci + Csc), eqs. (20)-(21).
+    H(s) = a s / (1 + b s) with a = Rsc Ci and b = Rsc (2 Ci + Csc), eqs. (20)-(21). With a leak Ri,
+    H(s) = d + (g - d) b s / (1 + b s) with d = Rsc / (2 Rsc + Ri), g = Ci / (2 Ci + Csc) and
+    b = Rsc Ri (2 Ci + Csc) / (2 Rsc + Ri).
 
     Attributes:
         Rsc: resistance of one skin layer, ohm.
         Csc: capacitance of one skin layer, F.
         Ci: capacitance of the insulator, F.
+        Ri: leak of the insulator, in parallel with Ci, ohm, keyword-only; None means none.
     """
 
     Rsc: ArrayLike
     Csc: ArrayLike
     Ci: ArrayLike
+    Ri: ArrayLike | None = eqx.field(default=None, kw_only=True)
 
     @property
     def g(self) -> ArrayLike:
@@ -147,23 +138,49 @@ class FinalCircuit(Circuit):
 
     @property
     def b(self) -> ArrayLike:
-        """Time constant Rsc (2 Ci + Csc), s."""
-        return self.Rsc * (2.0 * self.Ci + self.Csc)
+        """Time constant Rsc (2 Ci + Csc), s; a leak shortens it by the factor 1 + 2 Rsc / Ri."""
+        b = self.Rsc * (2.0 * self.Ci + self.Csc)
+        return b if self.Ri is None else b / (1.0 + 2.0 * (self.Rsc / jnp.asarray(self.Ri)))
+
+    def channel_gain(self, channel: Channel, omega: ArrayLike) -> Complex[Array, "*shape"]:
+        """Return the ratio of a channel to V at `omega` (rad/s, >= 0); with a leak from impedances."""
+        leaky = self.Ri is not None and channel != "Vgap"
+        return self.as_loop().channel_gain(channel, omega) if leaky else super().channel_gain(channel, omega)
 
     def channel_terms(self, channel: Channel) -> HighpassTerms:
-        """Return one term with time constant b; the weight for Vsc is g, and I has a term in dV/dt."""
+        """Return one term with time constant b; without a leak the weight for Vsc is g. I has a term in dV/dt."""
+        weight, inverse, direct, current = self.g, 1.0 / self.Rsc, None, None
+        if self.Ri is not None:
+            share = self.Rsc / jnp.asarray(self.Ri)
+            direct, growth = 1.0 / (2.0 + self.Ri / jnp.asarray(self.Rsc)), 1.0 + 2.0 * share
+            # g - d = (Ri Ci - Rsc Csc) / ((2 Ci + Csc) (2 Rsc + Ri)), whose difference is that of two time constants
+            weight = (self.g - share * (self.Csc / (2.0 * self.Ci + jnp.asarray(self.Csc)))) / growth
+            inverse, current = growth / self.Rsc, 1.0 / (2.0 * self.Rsc + self.Ri)
         if channel == "Vsc":
-            return HighpassTerms((self.g,), (self.b,))
-        if channel == "I":  # g s (1 + s Rsc Csc) / Rsc, split into a high-pass of b and its limit at high frequency
-            return HighpassTerms((2.0 * self.g * self.g / self.Rsc,), (self.b,), self.g * self.Csc)
+            return HighpassTerms((weight,), (self.b,), None, direct)
+        if channel == "I":  # Vsc (1 + s Rsc Csc) / Rsc, split into direct, a high-pass of b, and the limit of the rest
+            return HighpassTerms((2.0 * weight * weight * inverse,), (self.b,), self.g * self.Csc, current)
         raise self._gap_missing()
+
+    def insulator_terms(self) -> HighpassTerms:
+        """Return the terms of the insulator's voltage over V."""
+        (weight,), tau, _, direct = self.channel_terms("Vsc")
+        return HighpassTerms((-2.0 * weight,), tau, None, 1.0 if direct is None else 1.0 - 2.0 * direct)
+
+    def as_loop(self) -> "DirectGround":
+        """Return the same circuit as a direct ground of equal skins."""
+        return DirectGround(self.Rsc, self.Csc, self.Ci, Ri=self.Ri)
 
     def amplitude(self, omega: ArrayLike) -> Float[Array, "*shape"]:
         """Return |Vsc / V| at the angular frequency `omega` (rad/s, >= 0), eq. (25)."""
+        if self.Ri is not None:
+            return super().amplitude(omega)
         return self.g * highpass_amplitude(jnp.asarray(omega) * self.b)
 
     def phase(self, omega: ArrayLike) -> Float[Array, "*shape"]:
         """Return the phase lead (rad) of Vsc over V at the angular frequency `omega` (rad/s, >= 0), eq. (26)."""
+        if self.Ri is not None:
+            return super().phase(omega)
         return jnp.arctan2(1.0, jnp.asarray(omega) * self.b)
 
 
@@ -174,17 +191,8 @@ class Element(NamedTuple):
     C: ArrayLike
 
 
-class _Modes(NamedTuple):
-    """Time constants, their weights in the element voltages and in the current, and the rate of the current (F)."""
-
-    tau: Array
-    voltages: Float[Array, "elements modes"]
-    current: Array
-    rate: ArrayLike | None = None
-
-
 class Loop(Circuit):
-    """Loop of Ci, parallel elements, and optionally a gap and a resistance; Vsc is across the first element."""
+    """Loop of Ci, parallel elements, and optionally a leak, a gap and a resistance; Vsc is across the first element."""
 
     Rsc: ArrayLike  # the touching skin, ohm
     Csc: ArrayLike  # F
@@ -192,14 +200,23 @@ class Loop(Circuit):
     # the interface gap between finger and panel. Source: Shultz, Peshkin, Colgate, Haptics Symposium 2018
     Rgap: ArrayLike | None = eqx.field(default=None, kw_only=True)  # ohm, larger while sliding; None: non-conducting
     Cgap: ArrayLike | None = eqx.field(default=None, kw_only=True)  # F, in parallel with Rgap; None: no gap
+    Ri: ArrayLike | None = eqx.field(default=None, kw_only=True)  # leak of the insulator, in parallel with Ci, ohm
 
     def __check_init__(self) -> None:
         if self.Rgap is not None and self.Cgap is None:
             raise InputError("Rgap is given without Cgap; give both, or Cgap alone")
 
+    @property
+    def _has_open_gap(self) -> bool:
+        return self.Cgap is not None and self.Rgap is None
+
     def insulator(self) -> ArrayLike:
-        """Return the capacitance of Ci in series with a non-conducting gap, F."""
-        return self.Ci if self.Cgap is None or self.Rgap is not None else self._gap_fraction() * self.Cgap
+        """Return the capacitance of Ci in series with a non-conducting gap, F; of the gap alone if Ci has a leak."""
+        return self._gap_fraction() * self.Cgap if self._has_open_gap else self.Ci
+
+    def leak(self) -> ArrayLike | None:
+        """Return the resistance in parallel with `insulator`, ohm, or None; a non-conducting gap has none."""
+        return None if self._has_open_gap else self.Ri
 
     def resistance(self) -> ArrayLike | None:
         """Return the resistance in the loop, ohm, or None."""
@@ -210,10 +227,10 @@ class Loop(Circuit):
         raise NotImplementedError
 
     def elements(self) -> tuple[Element, ...]:
-        """Return the elements of the body, followed by a conducting gap."""
-        if self.Rgap is None or self.Cgap is None:
-            return self.body()
-        return (*self.body(), Element(self.Rgap, self.Cgap))
+        """Return the elements of the body, followed by a conducting gap, or by Ri‖Ci behind a non-conducting one."""
+        if self.Rgap is not None:
+            return (*self.body(), Element(self.Rgap, self.Cgap))
+        return (*self.body(), Element(self.Ri, self.Ci)) if self._has_open_gap and self.Ri is not None else self.body()
 
     @property
     def g(self) -> ArrayLike:
@@ -227,95 +244,67 @@ class Loop(Circuit):
         if channel == "Vsc":
             return ratios[0] / (1.0 + sum(ratios))
         if channel == "I":
-            return 1j * jnp.asarray(omega) * self.insulator() / (1.0 + sum(ratios))
+            return self._insulator_admittance(omega) / (1.0 + sum(ratios))
         gap = self._gap_fraction() if self.Rgap is None else ratios[len(self.elements()) - 1]
         return gap / (1.0 + sum(ratios))
 
+    def _insulator_admittance(self, omega: ArrayLike) -> Array:
+        charging, Ri = 1j * jnp.asarray(omega) * self.insulator(), self.leak()
+        return charging if Ri is None else charging + 1.0 / jnp.asarray(Ri)
+
     def _impedance_ratios(self, omega: ArrayLike) -> list[Array]:
         """Return the loop's impedances over the insulator's, touching skin first; their real parts are >= 0."""
-        charging = jnp.asarray(omega) * self.insulator()
+        admittance = self._insulator_admittance(omega)
         ratios = []
         for R, C in self.elements():
             x = jnp.asarray(omega) * R * C
-            ratios.append(charging * R / (1.0 + x**2) * (x + 1j))
+            ratios.append(admittance * R / (1.0 + x**2) * (1.0 - 1j * x))
         R0 = self.resistance()
-        return ratios if R0 is None else [*ratios, 1j * charging * R0]
+        return ratios if R0 is None else [*ratios, admittance * R0]
 
     def channel_terms(self, channel: Channel) -> HighpassTerms:
         """Return as many terms for each channel, but one more with a non-conducting gap; I may have a rate."""
-        tau, voltages, current, rate = self._modes()
+        modes = self._modes()
         if channel == "I":
-            return HighpassTerms(tuple(current), tuple(tau), rate)
+            return HighpassTerms(tuple(modes.current), tuple(modes.tau), modes.rate, modes.direct_current)
         if channel == "Vsc":
-            return HighpassTerms(tuple(voltages[0]), tuple(tau))
+            return modes.element_terms(0)
         if self.Rgap is not None:
-            return HighpassTerms(tuple(voltages[-1]), tuple(tau))
-        share, R0 = self._gap_fraction(), self.resistance()
-        others = jnp.sum(voltages, axis=0) + (0.0 if R0 is None else R0 * current)
+            return modes.element_terms(len(self.elements()) - 1)
+        share, rest = self._gap_fraction(), self._rest_terms(modes)
         # the last is so long that an open gap keeps its charge
-        return HighpassTerms((*(-share * others), share), (*tau, 1e15 * tau[0]))
+        return HighpassTerms((*(share * jnp.stack(rest.weight)), share), (*rest.tau, 1e15 * rest.tau[0]))
+
+    def insulator_terms(self) -> HighpassTerms:
+        """Return the terms of the insulator's voltage over V."""
+        modes = self._modes()
+        if not self._has_open_gap:
+            return self._rest_terms(modes)
+        if self.Ri is not None:
+            return modes.element_terms(len(self.elements()) - 1)
+        rest, gap = self._rest_terms(modes), self.channel_terms("Vgap")
+        weights = (w - other for w, other in zip((*rest.weight, 0.0), gap.weight, strict=True))
+        return HighpassTerms(tuple(weights), gap.tau, None, 1.0)
+
+    def _rest_terms(self, modes: Modes) -> HighpassTerms:
+        """Return the terms of V minus the voltages across all elements and the resistance, over V."""
+        R0, direct = self.resistance(), 1.0 if modes.direct is None else modes.direct[-1]
+        others = jnp.sum(modes.voltages, axis=0) + (0.0 if R0 is None else R0 * modes.current)
+        return HighpassTerms(tuple(-others), tuple(modes.tau), None, direct)
 
     def _gap_fraction(self) -> ArrayLike:
-        """Return the fraction of the voltage across Ci and a non-conducting gap that is across the gap."""
+        """Return the fraction of the voltage across `insulator` and a non-conducting gap that is across the gap."""
         if self.Cgap is None:
             raise self._gap_missing()
+        if self.Ri is not None:
+            return jnp.ones(())
         return self.Ci / (self.Ci + jnp.asarray(self.Cgap))
 
-    def _modes(self) -> _Modes:
-        Ci, R0 = self.insulator(), self.resistance()
+    def _modes(self) -> Modes:
+        Ci, R0, Ri = self.insulator(), self.resistance(), self.leak()
         R, C = (jnp.stack(jnp.broadcast_arrays(*x)) for x in zip(*self.elements(), strict=True))
         C = jnp.maximum(C, 1e-12 * Ci)  # a skin without capacitance gets this one, so that its time constant is not 0
-        return _modes_without_resistance(Ci, R, C) if R0 is None else _modes_with_resistance(Ci, R0, R, C)
-
-
-def _modes_without_resistance(Ci: ArrayLike, R: Array, C: Array) -> _Modes:
-    """Solve T x' + x = Ci sqrt(R) V',  T = diag(R C) + Ci sqrt(R) sqrt(R)^T,  with x = v / sqrt(R)."""
-    root = jnp.sqrt(R)
-    tau, modes = _gram_eigenmodes(jnp.vstack([jnp.diag(jnp.sqrt(R * C)), jnp.sqrt(Ci) * root]))
-    drive = Ci * (modes.T @ root) / tau
-    rate = Ci
-    for capacitance in C:
-        rate = rate * (capacitance / (rate + capacitance))
-    return _Modes(tau, root[:, None] * modes * drive, drive**2, rate)
-
-
-def _modes_with_resistance(Ci: ArrayLike, R0: ArrayLike, R: Array, C: Array) -> _Modes:
-    """Solve T x' + x = sqrt(Ci) V e_i,  T = sqrt(C) P sqrt(C),  with x = sqrt(C) v over the elements and Ci.
-
-    P holds the resistance between the terminals of each capacitor: its own R, and for Ci that of the whole loop.
-    """
-    root = jnp.sqrt(jnp.append(C, Ci))
-    # each row is the current of one resistance times its square root
-    in_elements = jnp.vstack([jnp.diag(root[:-1]), jnp.zeros_like(C)])
-    in_Ci = jnp.append(jnp.full_like(R, -1.0), 1.0)[:, None] * root[-1]
-    tau, modes = _gram_eigenmodes(jnp.sqrt(jnp.append(R, R0))[:, None] * jnp.hstack([in_elements, in_Ci]))
-    voltages = -modes[:-1] * modes[-1] * (root[-1] / root[:-1, None])
-    return _Modes(tau, voltages, Ci * modes[-1] ** 2 / tau)
-
-
-@jax.custom_jvp
-def _gram_eigenmodes(factor: Array) -> tuple[Array, Array]:
-    """Return eigenvalues and eigenvectors of factor^T factor; using the factor doubles the digits of small ones."""
-    _, sigma, modes = jnp.linalg.svd(factor, full_matrices=False)
-    return sigma * sigma, modes.T
-
-
-@_gram_eigenmodes.defjvp
-def _gram_eigenmodes_jvp(
-    primals: tuple[Array], tangents: tuple[Array]
-) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Return the derivative of the singular value decomposition, finite also where modes differ only by rounding.
-
-    Such modes have one time constant, and only their sum matters, which is invariant under their rotation.
-    """
-    left, sigma, right = jnp.linalg.svd(primals[0], full_matrices=False)
-    modes, slope = right.T, left.T @ tangents[0] @ right.T
-    gaps = sigma - sigma[:, None]
-    distinct = jnp.abs(gaps) > 4.0 * jnp.finfo(sigma.dtype).eps * sigma[0]  # equal ones differ by rounding
-    turn = jnp.where(distinct, 1.0 / jnp.where(distinct, gaps * (sigma + sigma[:, None]), 1.0), 0.0)
-    scaled = sigma[:, None] * slope
-    changes = 2.0 * sigma * jnp.diagonal(slope), modes @ (turn * (scaled + scaled.T))
-    return (sigma * sigma, modes), changes
+        return modes_without_resistance(Ci, Ri, R, C) if R0 is None else modes_with_resistance(Ci, Ri, R0, R, C)
 
 
 class Probe(eqx.Module):
@@ -342,6 +331,7 @@ class DirectGround(Loop):
         series_resistor: a known resistor in series, ohm, or None.
         probe: the load across the touching skin; None means an ideal probe.
         Rgap, Cgap: the interface gap, ohm and F, keyword-only; None means no gap (see `Loop`).
+        Ri: leak of the insulator, in parallel with Ci, ohm, keyword-only; None means none.
     """
 
     R_H: ArrayLike | None = None
@@ -374,6 +364,7 @@ class NaturalGround(Loop):
         series_resistor: a known resistor in series, ohm, or None.
         probe: the load across the touching skin; None means an ideal probe.
         Rgap, Cgap: the interface gap, ohm and F, keyword-only; None means no gap (see `Loop`).
+        Ri: leak of the insulator, in parallel with Ci, ohm, keyword-only; None means none.
     """
 
     Z: ArrayLike | None
@@ -394,6 +385,11 @@ class NaturalGround(Loop):
 RC: TypeAlias = FinalCircuit | DirectGround | NaturalGround  # circuits with constant skins, which can be fitted
 
 
+def passes_direct_current(circuit: Circuit) -> bool:
+    """Return whether the insulator has a leak and no open gap blocks it, so that a constant V acts on the skin."""
+    return (circuit.leak() if isinstance(circuit, Loop) else getattr(circuit, "Ri", None)) is not None
+
+
 def _series_resistance(*resistances: ArrayLike | None) -> ArrayLike | None:
     stated = [jnp.asarray(r) for r in resistances if r is not None]
     return sum(stated[1:], stated[0]) if stated else None
@@ -403,6 +399,8 @@ def gain_at(terms: HighpassTerms, omega: ArrayLike) -> Complex[Array, "*shape"]:
     """Return the sum of `terms` at s = j omega (rad/s, >= 0)."""
     omega = jnp.asarray(omega)
     total = jnp.zeros_like(omega, dtype=complex) if terms.rate is None else 1j * omega * terms.rate
+    if terms.direct is not None:
+        total = total + terms.direct
     for weight, tau in zip(terms.weight, terms.tau, strict=True):
         total = total + weight * highpass_gain(omega * tau)
     return total

@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
 from fitact.errors import InputError
-from fitact.model.circuit import Channel, Circuit
+from fitact.model.circuit import Channel, Circuit, passes_direct_current
 from fitact.model.drive import Drive, InterpolatedDrive, Multitone, Periodic, PiecewiseLinear, Sine
 
 
@@ -29,7 +29,8 @@ def harmonic_response(
         InputError: the drive is not periodic.
     """
     omega = angular_frequency(drive) * jnp.arange(1, harmonics + 1)
-    return harmonic_sum(fourier_coefficients(drive, harmonics) * circuit.channel_gain(channel, omega), drive, time)
+    amplitude = fourier_coefficients(drive, harmonics) * circuit.channel_gain(channel, omega)
+    return mean_response(circuit, drive, channel) + harmonic_sum(amplitude, drive, time)
 
 
 def harmonic_error(circuit: Circuit, drive: Drive, harmonics: int, *, channel: Channel = "Vsc") -> Float[Array, ""]:
@@ -49,7 +50,8 @@ def harmonic_error(circuit: Circuit, drive: Drive, harmonics: int, *, channel: C
     # the response to jumps converges most slowly, and loses half of its power per octave
     ratio = jnp.minimum(octave / jnp.where(before > 0.0, before, 1.0), 0.5)
     left_out = jnp.sum(power[harmonics:]) + octave * ratio / (1.0 - ratio)
-    share = left_out / (jnp.sum(power[:harmonics]) + left_out)
+    mean_power = 0.5 * jnp.square(mean_response(circuit, drive, channel))
+    share = left_out / (mean_power + jnp.sum(power[:harmonics]) + left_out)
     return jnp.where(share > 0.0, jnp.sqrt(jnp.where(share > 0.0, share, 1.0)), 0.0)
 
 
@@ -89,6 +91,23 @@ def fourier_coefficients(drive: Drive, harmonics: int) -> Complex[Array, " harmo
         return (jumps + rises) / (2j * np.pi * k)
 
     return lax.map(coefficient, order)
+
+
+def mean_voltage(drive: Drive) -> Array:
+    """Return the mean of a periodic drive over its period, V."""
+    if isinstance(drive, Sine | Multitone):
+        return jnp.asarray(drive.offset, dtype=float)
+    drive_frequency(drive)  # raises if the drive is not periodic
+    assert isinstance(drive, PiecewiseLinear | InterpolatedDrive)
+    knots, start, end = drive.pieces()
+    return jnp.sum(0.5 * (start + end) * jnp.diff(knots)) / (knots[-1] - knots[0])
+
+
+def mean_response(circuit: Circuit, drive: Drive, channel: Channel) -> Array:
+    """Return the mean over a period, in the channel's unit; 0 unless the insulator has a leak."""
+    if not passes_direct_current(circuit):
+        return jnp.zeros(())
+    return circuit.channel_gain(channel, 0.0).real * mean_voltage(drive)
 
 
 def angular_frequency(drive: Drive) -> Array:

@@ -97,6 +97,9 @@ def superpose_terms(
     terms: HighpassTerms, drive: Drive, time: ArrayLike, *, steady_state: bool = True
 ) -> Float[Array, "*shape"]:
     """Return the response of the `terms`, without the term in dV/dt; other arguments as in `response`."""
+    if terms.direct is not None:
+        rest = superpose_terms(terms._replace(direct=None), drive, time, steady_state=steady_state)
+        return rest + terms.direct * drive_voltage(drive, time, steady_state=steady_state)
     time = jnp.asarray(time, dtype=float)
     if len(terms.tau) <= 8:  # an unrolled sum, which XLA fuses
         total = jnp.zeros_like(time)
@@ -108,6 +111,16 @@ def superpose_terms(
         return total + term[0] * highpass(drive, time, term[1], steady_state=steady_state), None
 
     return lax.scan(add, jnp.zeros_like(time), terms.stack())[0]
+
+
+def drive_voltage(drive: Drive, time: ArrayLike, *, steady_state: bool = True) -> Float[Array, "*shape"]:
+    """Return V(t) as the response takes it: from rest it is 0 before the start, unless the drive was measured."""
+    if isinstance(drive, Sampled) and drive.period is None and time is drive.time:
+        return jnp.asarray(drive.samples, dtype=float)  # they need no search
+    time = jnp.asarray(time, dtype=float)
+    if steady_state or isinstance(drive, Sampled):
+        return drive.value(time)
+    return jnp.where(time >= drive.start_time, drive.value(time), 0.0)
 
 
 class Harmonics(NamedTuple):

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from fitact.compiled import BatchEvaluator
 from fitact.model.circuit import HighpassTerms
 from fitact.model.drive import Drive
+from fitact.model.harmonic import mean_voltage
 from fitact.model.response import highpass
 
 NODES = 41  # odd, so that the middle of the table is a node
@@ -30,6 +31,7 @@ _MAX_HALF_WIDTH = 4.0 * TABLE_HALF_WIDTH  # beyond it, a table costs more than i
 _MAX_NUMBERS = 4_000_000  # responses of all nodes at all times, which bounds the memory
 _PRECISION = 1e-13  # of a `ResponseTable`, relative to the largest response
 _OPEN = 1e6  # a time constant longer than the table's slowest by this factor counts as infinite
+_INFINITE = 1e15  # the time constant that represents an infinite one, over the table's slowest
 
 
 class ResponseTable(eqx.Module):
@@ -42,6 +44,7 @@ class ResponseTable(eqx.Module):
     signal: Float[Array, "times tables*rank+1"]
     decay: Float[Array, "times tables*rank"]  # the same for e^{-(t - t0) / tau}
     series: Float[Array, "rank terms"]  # Chebyshev coefficients in log tau
+    mean: ArrayLike  # of the drive, V, which the response for an infinite tau lacks; 0 from rest
 
     @classmethod
     def from_drive(
@@ -67,15 +70,17 @@ class ResponseTable(eqx.Module):
         if count * low.size * time.size > _MAX_NUMBERS:
             return None
         relative, combinations, series = exponential_basis(half_width, count)
-        nodes = np.append(np.outer(np.exp(center), relative), 10.0 * _OPEN * np.exp(np.max(high)))
+        nodes = np.append(np.outer(np.exp(center), relative), _INFINITE * np.exp(np.max(high)))
         signal = highpass_responses(drive, time, nodes, steady_state)
         tables = signal[:-1], np.exp(-(time - begin) / nodes[:-1, None])
         rows, decay = (np.hstack([each.T @ combinations for each in np.split(x, low.size)]) for x in tables)
-        return cls(center, np.asarray(half_width), np.hstack([rows, signal[-1:].T]), decay, series)
+        mean = np.asarray(mean_voltage(drive) if steady_state else 0.0)
+        return cls(center, np.asarray(half_width), np.hstack([rows, signal[-1:].T]), decay, series, mean)
 
     def response(self, terms: HighpassTerms) -> Float[Array, " times"]:
         """Return the response of `terms` without the one in dV/dt; compare `superpose_terms`."""
-        return self.signal @ self._combine(terms.weight, terms.tau)
+        total = self.signal @ self._combine(terms.weight, terms.tau)
+        return total if terms.direct is None else total + terms.direct * (self.signal[:, -1] + self.mean)
 
     def decays(self, tau: Sequence[Array], size: Float[Array, " taus"]) -> Float[Array, " times"]:
         """Return the sum of size e^{-(t - t0) / tau}, where t0 is the beginning."""

@@ -31,6 +31,7 @@ from fitact.model.circuit import (
     HighpassTerms,
     Loop,
     Probe,
+    passes_direct_current,
 )
 
 # section 3.1 of the reference paper, with its Rsc, Csc at 100 Hz
@@ -220,6 +221,13 @@ class WithSkin(Circuit):
     skin: SkinModel
     grid: TimeConstantGrid | None = None
 
+    def __check_init__(self) -> None:
+        if passes_direct_current(self.circuit):
+            raise InputError(
+                f"a leak of the insulator (Ri) is not modelled with a {type(self.skin).__name__.lower()} skin; use"
+                " constant skins, or leave Ri out"
+            )
+
     @property
     def g(self) -> ArrayLike:
         """Capacitive divider ratio of the constant values."""
@@ -296,9 +304,9 @@ def with_probe(circuit: Any, probe: Probe | None) -> Any:
     if probe is None and isinstance(circuit, FinalCircuit):
         return circuit
     changed = dataclasses.replace(circuit, probe=probe)
-    extras = [field.name for field in dataclasses.fields(changed) if field.name not in FINGER_PARAMETERS]
+    extras = [field.name for field in dataclasses.fields(changed) if field.name not in (*FINGER_PARAMETERS, "Ri")]
     if isinstance(changed, DirectGround) and all(getattr(changed, name) is None for name in extras):
-        return FinalCircuit(changed.Rsc, changed.Csc, changed.Ci)
+        return FinalCircuit(changed.Rsc, changed.Csc, changed.Ci, Ri=changed.Ri)
     return changed
 
 

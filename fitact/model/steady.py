@@ -31,6 +31,7 @@ from fitact.model.drive import (
     Trapezoid,
     Triangle,
 )
+from fitact.model.harmonic import mean_response
 from fitact.model.response import (
     coth_fraction,
     half_langevin,
@@ -72,6 +73,8 @@ def _terms_mean_square(terms: HighpassTerms, drive: Drive) -> Float[Array, ""]:
     # for a term with itself this is exactly 1 / 2, with zero derivative
     share = jnp.where(jnp.eye(tau.size, dtype=bool), 0.5, tau[:, None] / (tau[:, None] + tau))
     total = 2.0 * jnp.sum(weight[:, None] * share * products)
+    if terms.direct is not None:  # mean(V u) = mean(u^2)
+        total = total + 2.0 * terms.direct * jnp.sum(products) + terms.direct**2 * voltage_mean_square(drive)
     if terms.rate is None:
         return jnp.maximum(total, 0.0)  # the terms of Vsc may cancel to within rounding
     total = total + 2.0 * terms.rate * jnp.sum(products / tau)
@@ -96,19 +99,20 @@ def peak(circuit: Circuit, drive: Drive, channel: Channel = "Vsc") -> Float[Arra
     if isinstance(drive, Sine):
         omega = 2.0 * np.pi * jnp.asarray(drive.frequency)
         amplitude = circuit.amplitude(omega) if channel == "Vsc" else abs(circuit.channel_gain(channel, omega))
-        return abs(0.5 * jnp.asarray(drive.peak_to_peak)) * amplitude
+        return abs(0.5 * jnp.asarray(drive.peak_to_peak)) * amplitude + abs(mean_response(circuit, drive, channel))
     if isinstance(drive, Multitone):
         omega = 2.0 * np.pi * jnp.asarray(drive.frequency) * jnp.asarray(drive.orders)
-        return _largest_sum(drive.phasors() * circuit.channel_gain(channel, omega), drive.orders)
+        phasors, mean = drive.phasors() * circuit.channel_gain(channel, omega), mean_response(circuit, drive, channel)
+        return _largest_sum(phasors, drive.orders, mean)
     terms = circuit.channel_terms(channel)
-    if isinstance(drive, Square | Triangle) and len(terms.tau) == 1 and terms.rate is None:
+    if isinstance(drive, Square | Triangle) and len(terms.tau) == 1 and terms.rate is None and terms.direct is None:
         return abs(terms.weight[0] * jnp.asarray(drive.peak_to_peak)) * _unit_peak(drive, drive.period / terms.tau[0])
     largest = jnp.max(jnp.abs(_extremes(terms, _period_pieces(drive))))
     return largest if terms.rate is None else jnp.where(_has_impulses(drive, terms.rate), jnp.inf, largest)
 
 
-def _largest_sum(phasors: Complex[Array, " tones"], orders: tuple[int, ...]) -> Float[Array, ""]:
-    """Return the maximum of |Im sum_k phasors[k] e^{j orders[k] x}| by Newton's method from many points.
+def _largest_sum(phasors: Complex[Array, " tones"], orders: tuple[int, ...], mean: ArrayLike) -> Float[Array, ""]:
+    """Return the maximum of |mean + Im sum_k phasors[k] e^{j orders[k] x}| by Newton's method from many points.
 
     The position is not differentiated, so only first derivatives are right.
     """
@@ -125,7 +129,7 @@ def _largest_sum(phasors: Complex[Array, " tones"], orders: tuple[int, ...]) -> 
         return x + jnp.clip(step, -start[1], start[1])
 
     extremes = lax.stop_gradient(lax.fori_loop(0, steps, newton, lax.stop_gradient(start)))
-    return jnp.maximum(jnp.max(jnp.abs(phasor_sum(start))), jnp.max(jnp.abs(phasor_sum(extremes))))
+    return jnp.max(jnp.abs(mean + phasor_sum(jnp.concatenate([start, extremes]))))
 
 
 def body_current(circuit: Circuit, drive: Drive) -> BodyCurrent:
@@ -250,6 +254,16 @@ def _half_langevin_ratio(x: Array) -> Array:
     return jnp.where(x < 2.0, 0.25 / coth_fraction(0.25 * few * few), half_langevin(many) / many)
 
 
+def voltage_mean_square(drive: Drive) -> Array:
+    """Return the mean square of V over a period, V^2."""
+    if isinstance(drive, Sine):
+        return jnp.square(jnp.asarray(drive.offset)) + 0.125 * jnp.square(jnp.asarray(drive.peak_to_peak))
+    if isinstance(drive, Multitone):
+        return jnp.square(jnp.asarray(drive.offset)) + sum(map(voltage_mean_square, drive.tones()))
+    knots, start, end = _period_pieces(drive)
+    return jnp.sum(jnp.diff(knots) * (start * start + start * end + end * end)) / (3.0 * (knots[-1] - knots[0]))
+
+
 def _slope_mean_square(drive: Drive) -> Array:
     """Return the mean square of dV/dt between jumps, V^2/s^2."""
     if isinstance(drive, Sine):
@@ -282,13 +296,16 @@ def _extremes(terms: HighpassTerms, pieces: LinearPieces) -> Array:
         total = 0.0 if terms.rate is None else terms.rate * slopes
         for weight, t, first in zip(terms.weight, terms.tau, u, strict=True):
             total = total + weight * (first * jnp.exp(-since / t) + slopes * since * phi(since / t))
-        return total
+        return total if terms.direct is None else total + terms.direct * (pieces.start + slopes * since)
 
     # the derivative is a sum of exponentials; a shift of an extreme changes its value only in second order
-    fall = weights[:, None] * (slopes - u / tau[:, None])
-    inside = _zeros(*lax.stop_gradient((fall, 1.0 / tau, length)))
+    fall, rates = weights[:, None] * (slopes - u / tau[:, None]), 1.0 / tau
+    if terms.direct is not None:
+        fall, rates = jnp.vstack([fall, terms.direct * slopes]), jnp.append(rates, 0.0)
+    inside = _zeros(*lax.stop_gradient((fall, rates, length)))
     start, end = piece_response(jnp.zeros_like(length)), piece_response(length)
-    if len(terms.tau) == 1:  # a constant piece only decays; rounding may make its ends equal, but not their derivatives
+    # a constant piece only decays; rounding may make its ends equal, but not their derivatives
+    if len(terms.tau) == 1 and terms.direct is None:
         end = jnp.where(rise == 0.0, 0.0, end)
     return jnp.stack([start, end, *map(piece_response, inside)])
 

@@ -1,7 +1,8 @@
 """Quantities over one period of the steady state: AC force, insulator voltage, power and body current.
 
-The power follows from the high-pass responses u alone, because mean(V u) = mean(u^2): P = sum_k weight_k S(tau_k),
-where S is the mean square and the weights belong to the current. So P is finite even if the current has impulses.
+The power follows from the high-pass responses u, because mean(V u) = mean(u^2): P = sum_k weight_k S(tau_k), where S
+is the mean square and the weights belong to the current. So P is finite even if the current has impulses. A leak adds
+its conductance times mean(V^2).
 """
 
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from fitact.model.circuit import RC, HighpassTerms
 from fitact.model.drive import Multitone, Periodic, PiecewiseLinear, Sine
 from fitact.model.force import AirGap, Contact, electrostatic_force
 from fitact.model.response import highpass, phi, steady_knot_values
-from fitact.model.steady import highpass_mean_square, mean_square
+from fitact.model.steady import highpass_mean_square, mean_square, voltage_mean_square
 
 HARMONICS = 4  # number of harmonics at which the force is computed
 
@@ -61,18 +62,14 @@ def real_power(circuit: RC, drive: Periodic) -> Float[Array, ""]:
     """
     terms = circuit.current_terms()
     parts = (weight * highpass_mean_square(drive, tau) for weight, tau in zip(terms.weight, terms.tau, strict=True))
-    return sum(parts, jnp.zeros(()))
+    direct = jnp.zeros(()) if terms.direct is None else terms.direct * voltage_mean_square(drive)
+    return sum(parts, direct)
 
 
 def insulator_peak(circuit: RC, drive: Periodic) -> Float[Array, ""]:
-    """Return the maximum |voltage| (V) across the insulator, edges included; it carries the whole mean of the drive."""
-    period, (weight, tau, rate) = PeriodGrid.from_drive(drive), circuit.current_terms()
-    mean = period.weight @ period.voltage
-    alternating = period.voltage - mean
-    charge = jnp.zeros_like(alternating) if rate is None else rate * alternating
-    for w, t in zip(weight, tau, strict=True):  # tau times the low-pass response
-        charge = charge + w * t * (alternating - period.highpass(t))
-    return period.max_abs(mean + charge / circuit.Ci)
+    """Return the maximum |voltage| (V) across the insulator, edges included; without a leak it has the mean of V."""
+    period = PeriodGrid.from_drive(drive)
+    return period.max_abs(period.response(circuit.insulator_terms()))
 
 
 class PeriodGrid(eqx.Module):
@@ -114,6 +111,8 @@ class PeriodGrid(eqx.Module):
     def response(self, terms: HighpassTerms) -> Float[Array, " points"]:
         """Return the response of the terms of a circuit, in their unit."""
         total = jnp.zeros_like(self.voltage) if terms.rate is None else terms.rate * self.slope
+        if terms.direct is not None:
+            total = total + terms.direct * self.voltage
         for weight, tau in zip(terms.weight, terms.tau, strict=True):
             total = total + weight * self.highpass(tau)
         return total

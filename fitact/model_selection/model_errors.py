@@ -18,9 +18,10 @@ from jaxtyping import Array, Complex, Float
 
 from fitact.compiled import jit, pad_rows
 from fitact.model.chirp import Chirp
-from fitact.model.circuit import Channel
+from fitact.model.circuit import Channel, passes_direct_current
 from fitact.model.drive import Burst, Drive, LinearPieces, Multitone, Periodic, PiecewiseLinear, Sampled, Sine
 from fitact.model.force import force_constant
+from fitact.model.harmonic import mean_voltage
 from fitact.model.response import highpass, knot_values, steady_knot_values
 from fitact.model.skin import WithSkin
 from fitact.model_selection.partial_fractions import ROWS, complete_circuit, partial_fractions
@@ -84,6 +85,7 @@ class CircuitResponses(NamedTuple):
     tau: Float[np.ndarray, "circuits terms"]  # s
     knots: Float[np.ndarray, "circuits terms pieces"]  # steady state of each term at the starts of the pieces, V
     harmonics: Complex[np.ndarray, "circuits harmonics"]  # amplitudes not covered by the terms, V
+    mean: Float[np.ndarray, " circuits"]  # of the response in the steady state, which no term has, V
 
     @classmethod
     def from_scene(
@@ -101,6 +103,11 @@ class CircuitResponses(NamedTuple):
             skin = jax.tree.map(pad, circuit.skin) if isinstance(circuit, WithSkin) else None
             complete = jax.tree.map(pad, complete_circuit(scene.make_rc_circuit(dict(values))))
             weight, tau, harmonics = partial_fractions(complete, skin, drive, precision, channel)
+            repeats = scene.drive.steady_state and isinstance(drive, Periodic)
+            repeats |= isinstance(drive, Sampled) and drive.period is not None
+            mean = np.zeros(len(weight), dtype=precision)
+            if repeats and passes_direct_current(complete):
+                mean = weight[:, -1] * np.asarray(mean_voltage(drive))
             # in single precision, the tau of an absent element may be 0
             tau = np.maximum(tau, np.finfo(np.float32).tiny)
             wave = drive.wave if isinstance(drive, Burst) else drive
@@ -111,10 +118,10 @@ class CircuitResponses(NamedTuple):
                 rounded = jax.tree.map(precision, segments)
                 # column by column, so that one program serves any number of terms
                 knots = np.stack([np.asarray(_column_knots(rounded, column, settled)) for column in tau.T], axis=1)
-        weight, tau, knots, harmonics = (
-            x[:count] for x in (weight.astype(precision), tau.astype(precision), knots, harmonics)
+        weight, tau, knots, harmonics, mean = (
+            x[:count] for x in (weight.astype(precision), tau.astype(precision), knots, harmonics, mean)
         )
-        return cls(drive, scene.drive.steady_state, segments, weight, tau, knots, harmonics)
+        return cls(drive, scene.drive.steady_state, segments, weight, tau, knots, harmonics, mean)
 
     @property
     def wave(self) -> Any:
@@ -132,7 +139,7 @@ class CircuitResponses(NamedTuple):
             u = self._steady_state_response(cycle)
         else:
             u = self._transient_response(cycle, elapsed)
-        total = np.einsum("rk,rkn->rn", self.weight, u)
+        total = np.einsum("rk,rkn->rn", self.weight, u) + self.mean[:, None]
         if not self.harmonics.shape[1]:
             return total
         assert isinstance(self.drive, Periodic)

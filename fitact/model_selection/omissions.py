@@ -14,6 +14,7 @@ from fitact.scene.scene import Scene
 
 # keys of a scene that each omission changes, and their new values (None removes a key)
 _KEYS: dict[str, dict[tuple[str, str], Any]] = {
+    "leak": {("device", "Ri"): None},
     "R_H": {("grounding", "R_H"): None},
     "grounding skin": {("grounding", "grounding_Rsc"): None, ("grounding", "grounding_Csc"): None},
     "Z": {("grounding", "Z"): 0.0, ("grounding", "Z_capacitance"): None},
@@ -56,6 +57,7 @@ def applicable_omissions(scene: Scene) -> tuple[str, ...]:
     ground, drive = scene.grounding, scene.drive
     has = dict.fromkeys(scene.prior.specs(), 1.0) | {k: v for k, v in scene.nominal_values().items() if v is not None}
     present = {
+        "leak": "Ri" in has,
         "R_H": "R_H" in has,
         "grounding skin": "grounding_Rsc" in has or "grounding_Csc" in has,
         "Z": ground.connection == "natural" and "Z" in has,
@@ -72,9 +74,8 @@ def applicable_omissions(scene: Scene) -> tuple[str, ...]:
 
 def omitted_parameters(name: str) -> set[str]:
     """Return the circuit parameters that an omission removes."""
-    keys = {
-        key for section, key in _KEYS[name] if section in ("grounding", "gap") or key in ("series_resistor", "alpha")
-    }
+    others = "series_resistor", "alpha", "Ri"
+    keys = {key for section, key in _KEYS[name] if section in ("grounding", "gap") or key in others}
     return {_PARAMETERS.get(key, key) for key in keys if key != "thickness"}
 
 

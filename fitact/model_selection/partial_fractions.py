@@ -18,6 +18,7 @@ from fitact.model.harmonic import fourier_coefficients
 from fitact.model.skin import Fractional, SkinModel, WithSkin, high_frequency_basis
 
 ROWS = 128  # circuits in one evaluation; fewer are padded, so that each program is compiled once
+INFINITE = 1e12  # the time constant that represents an infinite one, over the slowest of the circuit
 _BLOCK = 64  # frequencies in one program
 
 _fourier_coefficients = jit(fourier_coefficients)
@@ -32,9 +33,9 @@ def complete_circuit(circuit: RC) -> DirectGround | NaturalGround:
         return sum((part for part in parts if part is not None), start=absent)
 
     if isinstance(circuit, FinalCircuit):
-        circuit = DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci)
+        circuit = circuit.as_loop()
     skin, probe = (circuit.Rsc, circuit.Csc, circuit.Ci), circuit.probe or Probe(math.inf, 0.0)
-    gap, series = {"Rgap": circuit.Rgap, "Cgap": circuit.Cgap}, circuit.series_resistor
+    gap, series = {"Rgap": circuit.Rgap, "Cgap": circuit.Cgap, "Ri": circuit.Ri}, circuit.series_resistor
     if isinstance(circuit, DirectGround):
         return DirectGround(*skin, resistance(circuit.R_H, series), *circuit.body()[1], None, probe, **gap)
     if circuit.Z_capacitance is None:
@@ -51,6 +52,7 @@ def partial_fractions(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return weights, time constants, and amplitudes of the harmonics that these do not cover, for `ROWS` circuits.
 
+    With a leak, the last time constant is infinite: its weight is that of V, but for its mean in the steady state.
     Gains are computed in blocks, since a vmapped `harmonic_decomposition` takes 3 to 12 times as long to compile.
     """
     if skin is None:
@@ -100,13 +102,16 @@ def _constant_skin_terms(circuit: Any, channel: Channel) -> tuple[np.ndarray, np
     """Return the terms for constant skins; Z takes the place of a grounding skin, so that one program serves both."""
     if isinstance(circuit, NaturalGround):
         loop = circuit.series_resistor, circuit.Z, circuit.Z_capacitance
-        gap = {"Rgap": circuit.Rgap, "Cgap": circuit.Cgap}
+        gap = {"Rgap": circuit.Rgap, "Cgap": circuit.Cgap, "Ri": circuit.Ri}
         circuit = DirectGround(circuit.Rsc, circuit.Csc, circuit.Ci, *loop, None, circuit.probe, **gap)
-    weight, tau = _batch_terms(circuit, channel)
-    return np.asarray(weight), np.asarray(tau)
+    *terms, direct = _batch_terms(circuit, channel)
+    weight, tau = map(np.asarray, terms)
+    if direct is None:
+        return weight, tau
+    return np.column_stack([weight, direct]), np.column_stack([tau, INFINITE * tau.max(axis=1)])
 
 
 @jit
-def _batch_terms(circuit: DirectGround, channel: Channel) -> tuple[Array, Array]:
+def _batch_terms(circuit: DirectGround, channel: Channel) -> tuple[Array, Array, Array | None]:
     terms = jax.vmap(lambda one: one.channel_terms(channel))(circuit)
-    return jnp.stack(terms.weight, axis=1), jnp.stack(terms.tau, axis=1)
+    return jnp.stack(terms.weight, axis=1), jnp.stack(terms.tau, axis=1), terms.direct

@@ -75,6 +75,11 @@ def population(
     """
     scene = scene or Scene()
     medians = _prior(scene)
+    if "Ri" in scene.prior.specs() or scene.device.Ri is not None:
+        raise InputError(
+            "scene: a population has no leak of the insulator yet, whose Ri goes as 1 / area; leave [device] Ri and"
+            " [prior] Ri out, or fit the fingers one by one"
+        )
     standardized = Covariates.from_values(covariates or {}, len(records))
     next_at = standardized.standardize(at or {})
     area_varies = scene.population.contact_area == "varies"

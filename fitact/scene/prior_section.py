@@ -45,6 +45,7 @@ class PriorSection(Section):
     Z: OhmPriorSpec | None = None
     Z_capacitance: FaradPriorSpec | None = None
     series_resistor: OhmPriorSpec | None = None
+    Ri: OhmPriorSpec | None = None
     Rgap: OhmPriorSpec | None = None
     Cgap: FaradPriorSpec | None = None
     alpha: PlainPriorSpec | None = None

@@ -144,6 +144,7 @@ class Scene(Section):
             "Rsc": self.skin.Rsc,
             "Csc": self.skin.Csc,
             "Ci": self.device.Ci,
+            "Ri": self.device.Ri,
             **{name: getattr(ground, name) for name in (*_DIRECT_GROUND_KEYS, *_NATURAL_GROUND_KEYS)},
             "Z": ground.Z or None,  # 0 means that the body is at earth
             "series_resistor": measured.series_resistor or None,
@@ -244,12 +245,13 @@ class Scene(Section):
         at: dict[str, Any] = self.nominal_values() | dict(values or {})
         skin, names = (at["Rsc"], at["Csc"], at["Ci"]), ("series_resistor", "Rgap", "Cgap")
         common = {name: at[name] for name in names} | {"probe": self._probe()}
+        Ri: Any = at["Ri"]
         if self.grounding.connection == "natural":
-            return NaturalGround(*skin, at["Z"], at["Z_capacitance"], **common)
+            return NaturalGround(*skin, at["Z"], at["Z_capacitance"], **common, Ri=Ri)
         extras = common | {name: at[name] for name in _DIRECT_GROUND_KEYS}
         if all(extra is None for extra in extras.values()):
-            return FinalCircuit(*skin)
-        return DirectGround(*skin, **extras)
+            return FinalCircuit(*skin, Ri=Ri)
+        return DirectGround(*skin, **extras, Ri=Ri)
 
     def find_load(self) -> Piece | None:
         """Return the piece of [instrument] Vsc that loads the skin, or None."""
@@ -359,6 +361,11 @@ class Scene(Section):
                 " has; state it under [instrument.own] only"
             )
         has = {name for name, value in self.nominal_values().items() if value is not None} | set(self.prior.specs())
+        if "Ri" in has and self.skin.level != "constant":
+            raise InputError(
+                f"[device] Ri, a leak, is not modelled with [skin] level = '{self.skin.level}'; use level = 'constant',"
+                " or leave Ri out"
+            )
         if "Rgap" in has and "Cgap" not in has:
             raise InputError(
                 "[gap] resistance needs what lies in parallel with it; give capacitance, or the thickness of air, too"

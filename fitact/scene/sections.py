@@ -40,9 +40,10 @@ from fitact.scene.uncertain_value import (
 
 
 class Device(Section):
-    """Panel: insulator and contact area, and limits of field and current."""
+    """Panel: insulator with its leak Ri (None means none), contact area, and limits of field and current."""
 
     Ci: Farad = 1.35e-9
+    Ri: Ohm | None = None
     insulator_thickness: UncertainMeter = 1e-6
     insulator_permittivity: UncertainPermittivity = 3.9
     contact_area: UncertainSquareMeter = 1e-4

@@ -16,6 +16,7 @@ from fitact.fitting.fit import Fit, fit
 from fitact.likelihood.certificate import TOLERANCE, reason_against_table
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.window_compression import FilterState, WindowCompressor
+from fitact.model.circuit import passes_direct_current
 from fitact.scene.scene import Scene
 from fitact.tracking.windows import AROUND, Window
 
@@ -133,6 +134,11 @@ def find_model(windows: Sequence[Window], scene: Scene, step: float, source: str
         InputError: no window can be fitted, or the drive does not repeat.
     """
     channels = scene.measurement.channels
+    if passes_direct_current(scene.make_rc_circuit()) or "Ri" in scene.prior.specs():
+        raise InputError(
+            f"{source}: a track has no leak of the insulator; leave [device] Ri and [prior] Ri out of the scene, or fit"
+            " each part of the record on its own"
+        )
     whole = [each for each in windows if each.is_whole and np.ptp(each.channels["V"]) > 0.0]
     if not whole:
         raise InputError(f"{source}: there is no window with a drive and all samples; record V_V beside {channels[0]}")

@@ -171,8 +171,12 @@ def _response_job(level: Callable[[RC, Drive, Array], Array], case: _Case) -> _J
 
 
 def _make_ode_solver(case: _Case, rtol: float = 1e-6) -> Callable[[], np.ndarray]:
-    """Return a solver (LSODA of SciPy) of x' = (V - x) / tau for each time constant, with Vsc = sum weight (V - x)."""
-    weight, tau = (np.array(x, dtype=float) for x in case.circuit.terms()[:2])
+    """Return a solver (LSODA of SciPy) of x' = (V - x) / tau for each time constant.
+
+    Vsc is direct V + sum weight (V - x).
+    """
+    terms = case.circuit.terms()
+    weight, tau, direct = (np.array(x, dtype=float) for x in (terms.weight, terms.tau, terms.direct or 0.0))
     voltage, step = np.asarray(case.drive.value(case.time)), float(np.median(np.diff(case.time)))
 
     def slope(t: float, x: np.ndarray) -> np.ndarray:
@@ -180,7 +184,7 @@ def _make_ode_solver(case: _Case, rtol: float = 1e-6) -> Callable[[], np.ndarray
 
     def solve() -> np.ndarray:
         x = scipy.integrate.odeint(slope, -case.charges, case.time, rtol=rtol, hmax=step, tfirst=True)
-        return (voltage[:, None] - x) @ weight
+        return (voltage[:, None] - x) @ weight + direct * voltage
 
     return solve
 

@@ -97,12 +97,14 @@ class LoopModel(NamedTuple):
             grounding = _skin(R2, C if equal else get("grounding_Csc") or C, s, alpha, added.layers)
         elif Z := get("Z"):
             grounding = Z / (1.0 + s * Z * (get("Z_capacitance") or 0.0))
+        insulator: Any = s * Ci + (1.0 / Ri if (Ri := get("Ri")) else 0.0)  # its admittance, S
         if Cgap := get("Cgap"):
             Rgap = get("Rgap")
-            Ci = Ci if Rgap else Ci * Cgap / (Ci + Cgap)
+            if not Rgap:  # the insulator, in series with an open gap
+                insulator = s * Cgap * insulator / (insulator + s * Cgap) if Ri else s * (Ci * Cgap / (Ci + Cgap))
             series = series + (Rgap / (1.0 + s * Rgap * Cgap) if Rgap else 0.0)
         series = series + added.gap * 1e6 / (1.0 + s * 5e-3)
-        admittance = s * Ci / (1.0 + s * Ci * (touching + grounding + series))
+        admittance = insulator / (1.0 + insulator * (touching + grounding + series))
         return LoopImpedances(touching, grounding, (R, R2), admittance, added.leads * 10e-12 * s)
 
 
@@ -187,10 +189,12 @@ class ChannelModel:
             return series
         gain = self.parts.touching * self.parts.admittance
         high = abs(gain[-1])
+        decaying = (high - abs(gain[0])) or high  # what remains of a jump, with a leak, decays to the gain at zero
         first = high * float(series.voltage[0]) + series.samples.transient
         if series.repeats:
-            return dataclasses.replace(series, jump=(first - float(series.response(gain, series.voltage)[0])) / high)
-        return dataclasses.replace(series, jump=series.samples.transient / high)
+            before = float(series.response(gain, series.voltage)[0])
+            return dataclasses.replace(series, jump=(first - before) / decaying)
+        return dataclasses.replace(series, jump=series.samples.transient / decaying)
 
     def _respond(self, parts: LoopImpedances, filter_gain: Spectrum | float = 1.0, change: Rows | None = None) -> Rows:
         """Return the response to V, or to a `change` of it, behind a filter."""

@@ -13,7 +13,8 @@ from fitact.uncertainty.channel_series import ChannelSeries, Rows, Spectrum
 from fitact.uncertainty.loop import Addition, ChannelModel
 
 CHANGE = "a change during the record of "  # begins the names of changes of the finger, which a track follows
-_CHANGES = {"Rsc": {"Rsc": 1.0}, "Csc": {"Csc": 1.0}, "the contact area": {"Rsc": -1.0, "Csc": 1.0, "Ci": 1.0}}
+_AREA = {"Rsc": -1.0, "Csc": 1.0, "Ci": 1.0, "Ri": -1.0}
+_CHANGES = {"Rsc": {"Rsc": 1.0}, "Csc": {"Csc": 1.0}, "the contact area": _AREA}
 
 Amplitudes = Float[np.ndarray, " amplitudes"]
 # the change of a channel by amplitudes

@@ -25,6 +25,7 @@ SCENES = {
         "measurement": MEASURED,
     },
     "all direct": {
+        "device": {"Ri": "50 Mohm"},
         "grounding": {"R_H": 500.0},
         "gap": {"resistance": "1.2 Mohm", "thickness": "2 um"},
         "measurement": MEASURED,
@@ -51,7 +52,7 @@ def admittances(scene: Scene, omega: float) -> dict[str, complex]:
     values |= {"grounding_Rsc": values["Rsc"], "grounding_Csc": values["Csc"]} | values
     values |= {"shunt": SHUNT, "probe_resistance": measured.probe_resistance}
     values |= {"probe_capacitance": measured.probe_capacitance}
-    resistances = {"Rsc", "grounding_Rsc", "R_H", "Z", "series_resistor", "Rgap", "shunt", "probe_resistance"}
+    resistances = {"Rsc", "grounding_Rsc", "R_H", "Z", "series_resistor", "Ri", "Rgap", "shunt", "probe_resistance"}
     return {n: 1 / v if n in resistances else 1j * omega * v for n, v in values.items() if v is not None}
 
 
@@ -101,11 +102,13 @@ def test_drawing_is_the_circuit_that_is_fitted(name: str):
 def test_parts_have_their_values_and_no_others_are_drawn(name: str):
     scene = Scene.from_dict(SCENES[name])
     shown = texts(scene_circuit(scene, {"Rsc": 123456.0}))
-    expected = {"Ci 1.35 nF", "Rsc\n123 kΩ", "Csc\n22 nF", "V", "Vsc", "I", "+", "−"}
+    leaks = scene.device.Ri is not None
+    expected = {"Ci\n1.35 nF" if leaks else "Ci 1.35 nF", "Rsc\n123 kΩ", "Csc\n22 nF", "V", "Vsc", "I", "+", "−"}
     assert expected <= set(shown)
     everything = " ".join(shown)
     natural = scene.grounding.connection == "natural"
     for part, present in {
+        "Ri\n50 MΩ": leaks,
         "R_H 500 Ω": scene.grounding.R_H is not None,
         "Rsc\n80 kΩ": scene.grounding.grounding_Rsc is not None,
         "Csc\n44 nF": scene.grounding.grounding_Csc is not None,

@@ -55,7 +55,7 @@ def test_the_voltage_over_the_insulator_is_that_of_the_impedances(ground: str, f
         "natural": (fitact.NaturalGround(160e3, 22e-9, 1.35e-9, 14.5e6), skin + 14.5e6),
         "resistor": (fitact.DirectGround(160e3, 22e-9, 1.35e-9, 500.0, series_resistor=1e5), 2.0 * skin + 100.5e3),
     }[ground]
-    found = insulator_voltage(180.0, circuit.current_terms(), circuit.Ci, frequency)
+    found = insulator_voltage(180.0, circuit.current_terms(), circuit, frequency)
     assert found == pytest.approx(180.0 * abs(insulator / (insulator + others)), rel=1e-6)
 
 
