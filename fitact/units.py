@@ -26,6 +26,7 @@ _UNITS = {
     "offset": "V", "drift": "V", "charge": "V", "charge_2": "V", "charge_3": "V", "charge_4": "V",
     "hum_50Hz_cos": "V", "hum_50Hz_sin": "V", "hum_60Hz_cos": "V", "hum_60Hz_sin": "V",
     "g": "1", "b": "s", "force_mean": "N", "force_peak": "N", "force_rms": "N", "friction_mean": "N",
+    "times_threshold": "1", "sensation_level": "dB",
     "skin_thickness": "m", "skin_permittivity": "1", "insulator_thickness": "m", "insulator_permittivity": "1",
     "contact_area": "m^2", "friction_coefficient": "1",
     "force_at_f": "N", "force_at_2f": "N", "friction_at_f": "N", "friction_at_2f": "N",
