@@ -51,12 +51,14 @@ class FeltDrive:
         frequency: of the friction that is felt most, Hz.
         outside: median fraction of the mean square of the alternating force at frequencies outside the table.
         table: range and source of the table, for people.
+        reason: why none is stated, for people.
     """
 
     times_threshold: Float[np.ndarray, "ensembles draws"] | None
     frequency: float
     outside: float
     table: str
+    reason: str = "the force has no frequency in the table of thresholds"
 
     @classmethod
     def from_draws(
@@ -77,7 +79,7 @@ class FeltDrive:
         table = scene.perception.thresholds
         text = f"{table.range_text}; {scene.perception.threshold_source or 'no source stated'}"
         if frequency is None:
-            return cls(None, 0.0, 1.0, text)
+            return cls(None, 0.0, 1.0, text, "the drive does not repeat")
         sensitivity = table.harmonic_sensitivity(frequency, float(scene.friction.coefficient))
         with jax.enable_x64(True):
             force = ForceSensation.from_fit(
@@ -95,10 +97,7 @@ class FeltDrive:
     def sentence(self) -> str:
         """The sensation for people, with the table that it rests on."""
         if self.times_threshold is None:
-            return (
-                "Felt: no detection is stated, because the force has no frequency in the table of thresholds"
-                f" ({self.table})."
-            )
+            return f"Felt: no detection is stated, because {self.reason} ({self.table})."
         level = _level(self.times_threshold)
         low, median, high = (f"{level[key]:.1f}" for key in ("q05", "q50", "q95"))
         most = format_engineering(self.frequency, "Hz", 3)

@@ -10,6 +10,7 @@ import pytest
 
 import fitact
 from fitact.files import to_json
+from fitact.fitting.sensation import FeltDrive
 from fitact.summary import format_sd, summarize_log_normal
 
 
@@ -69,6 +70,20 @@ def test_a_table_of_thresholds_gives_the_sensation_of_each_draw(finger_posterior
     assert summary["sensation"]["sentence"] in str(felt)
     assert "times_threshold" not in felt.force()
     assert "sensation" not in finger_posterior.summary()
+
+
+def test_no_sensation_is_stated_without_a_frequency_in_the_table(finger_posterior: fitact.Posterior):
+    fit, table = finger_posterior.fit, {"frequencies": [1.0, 50.0], "forces": [2e-3, 1e-3]}
+    scene = fitact.Scene.from_dict({"perception": {"thresholds": table}})
+    felt = dataclasses.replace(finger_posterior, fit=dataclasses.replace(fit, scene=scene))
+    assert felt.sensation.sentence == (
+        "Felt: no detection is stated, because the force has no frequency in the table of thresholds (1 Hz to 50 Hz;"
+        " no source stated)."
+    )
+    assert felt.sensation.to_dict().keys() == {"table", "sentence"}
+    assert "times_threshold" not in felt.derived()
+    alone = FeltDrive.from_draws(fit.derive, fit.likelihood, scene, None, finger_posterior.points, 1)
+    assert "because the drive does not repeat" in alone.sentence
 
 
 def test_scene_drives_force_is_that_of_one_steady_period():
