@@ -9,7 +9,7 @@ export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS = 0
 TEST_XLA_FLAGS = --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0
 PYTEST = XLA_FLAGS="$(TEST_XLA_FLAGS)" $(PY) -m pytest -n auto
 .DEFAULT_GOAL = help
-.PHONY: help env demo test test-slow test-slow-quick notebooks peers docs extremes calibration calibration-quick session-calibration fuzz check lock plotly clean
+.PHONY: help env demo test test-slow test-slow-quick notebooks peers docs wheel extremes calibration calibration-quick session-calibration fuzz check lock plotly clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -50,6 +50,10 @@ docs: env $(patsubst notebooks/%.py,out/notebooks/%.ipynb,$(filter-out notebooks
 out/notebooks/%.ipynb: notebooks/%.py | env
 	$(PY) tools/run_notebooks.py $<
 
+# make wheel   out/wheel, tried alone in an empty environment; `make wheel EXTRA=arviz` with an extra, for its size
+wheel: env
+	sh tools/try_wheel.sh $(EXTRA)
+
 # make extremes   the worst point of every quantity over the whole range of parameters, against mpmath
 extremes: env
 	$(PY) -m tests.extremes
@@ -73,6 +77,7 @@ fuzz: env
 # make check   style, types, the order of the layers, and how docstrings begin
 check: env
 	.venv/bin/ruff check .
+	.venv/bin/ruff check --preview --select PLW1514 fitact data_synth tools benchmarks  # UTF-8 on every system
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 	.venv/bin/lint-imports

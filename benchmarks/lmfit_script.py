@@ -15,7 +15,7 @@ MEANS = np.log([160e3, 22e-9, 1.35e-9])
 SDS = np.sqrt(np.log1p(np.square([0.3, 0.3, 0.05])))
 
 path, steps, figure = sys.argv[1], int(sys.argv[2]), sys.argv[3]
-with open(path) as file:
+with open(path, encoding="utf-8") as file:
     header = file.readline().strip().split(",")
 table = np.loadtxt(path, delimiter=",", skiprows=1)
 drive, observed = table[:, header.index("V_V")], table[:, header.index("Vsc_V")]

@@ -36,7 +36,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         file, scene = Path(folder, "slide.csv"), Path(folder, "scene.toml")
         write_slide(file, given.duration)
-        scene.write_text(SCENE)
+        scene.write_text(SCENE, encoding="utf-8")
         command = [
             str(Path(sys.executable).with_name("fitact")),
             "track",

@@ -125,7 +125,7 @@ def _nonlinear_sources(circuit: Network, law: Mapping[str, Any] | None) -> list[
 def _run_ngspice(deck: list[str], end: float) -> np.ndarray:
     """Run the deck and return its output table, which must reach `end` (s)."""
     with tempfile.TemporaryDirectory() as folder:
-        Path(folder, "deck.cir").write_text("\n".join(deck) + "\n")
+        Path(folder, "deck.cir").write_text("\n".join(deck) + "\n", encoding="utf-8")
         try:
             ran = subprocess.run(
                 ["ngspice", "-b", "deck.cir"], cwd=folder, capture_output=True, text=True, timeout=_LONG

@@ -329,6 +329,11 @@ def processor() -> str:
     return "\n".join(line for line in lines if line.lower().startswith(kept))
 
 
+def available_cores() -> int:
+    """Return the number of cores that this process may use, as far as the system tells."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class BatchEvaluator:
     """Evaluation of `function(model, *rows)` over the rows of arrays of equal length, in batches.
 

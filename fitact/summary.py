@@ -97,6 +97,7 @@ _DERIVED = {
     "force_peak": "electrostatic force, peak",
     "force_rms": "electrostatic force, rms",
     "friction_mean": "friction mu (force + fN), mean",
+    "times_threshold": "alternating friction over its detection threshold",
 }
 
 
@@ -257,6 +258,12 @@ def _compare_with_friction(scale: Summary, content: dict[str, Any]) -> str:
     return sentence
 
 
+def result_sentences(content: dict[str, Any]) -> list[str]:
+    """Return what the force rests on, and how far it is felt if the scene has a table of thresholds."""
+    felt = content.get("sensation")
+    return [*force_sentences(content), *([felt["sentence"]] if felt else [])]
+
+
 def budget_sentence(content: dict[str, Any]) -> str:
     """Return what the stated uncertainties include; `content` is that of fit.json or summary.json."""
     entries = content.get("budget") or {}
@@ -341,7 +348,7 @@ def load(directory: str | os.PathLike[str]) -> dict[str, Any]:
 
 def format_table(content: dict[str, Any]) -> list[str]:
     """Return the lines of `quantity_table`, and what the force rests on."""
-    sentences = filter(None, (budget_sentence(content), *force_sentences(content)))
+    sentences = filter(None, (budget_sentence(content), *result_sentences(content)))
     return [*align_table(quantity_table(content)), *sentences]
 
 

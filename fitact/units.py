@@ -27,6 +27,7 @@ _UNITS = {
     "ringing": "V", "ringing_2": "V", "crosstalk": "V", "crosstalk_2": "V",
     "hum_50Hz_cos": "V", "hum_50Hz_sin": "V", "hum_60Hz_cos": "V", "hum_60Hz_sin": "V",
     "g": "1", "b": "s", "force_mean": "N", "force_peak": "N", "force_rms": "N", "friction_mean": "N",
+    "times_threshold": "1", "sensation_level": "dB",
     "skin_thickness": "m", "skin_permittivity": "1", "insulator_thickness": "m", "insulator_permittivity": "1",
     "contact_area": "m^2", "friction_coefficient": "1",
     "mu": "1", "fN": "N", "force_scale": "1", "sensor_frequency": "Hz", "sensor_damping": "1",

@@ -23,6 +23,7 @@ import jax
 
 from fitact.batch.fit_many import Fits, Row, fit_many
 from fitact.batch.sample_many import add_posterior, sample_many
+from fitact.compiled import available_cores
 from fitact.data.readers.read import read
 from fitact.errors import InputError
 from fitact.files import to_json
@@ -306,7 +307,7 @@ def _open_client(
         **{f"distributed.worker.memory.{name}": False for name in ("target", "spill", "pause")},
         "distributed.admin.log-format": "",
     }
-    count = workers or len(os.sched_getaffinity(0))
+    count = workers or available_cores()
     with (
         distributed.dask.config.set(settings),
         distributed.LocalCluster(

@@ -19,6 +19,7 @@ from threadpoolctl import threadpool_limits
 from fitact.batch.batch_problem import BatchFit, BatchProblem
 from fitact.batch.recorded_drive import RecordedDriveProblem
 from fitact.batch.stated_drive import StatedDriveProblem
+from fitact.compiled import available_cores
 from fitact.data.readers.read import read
 from fitact.data.record import Record
 from fitact.errors import InputError
@@ -216,7 +217,7 @@ def run_in_threads(
     `jobs_per_core` jobs are in flight for each core, so that a record that is fitted separately delays no others.
     """
     requested = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
-    cores = int(requested) if requested.isdigit() else len(os.sched_getaffinity(0))
+    cores = int(requested) if requested.isdigit() else available_cores()
     under_way: collections.deque[tuple[_Job, Future[_Done]]] = collections.deque()
 
     def run_job(job: _Job) -> _Done:

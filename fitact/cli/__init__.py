@@ -1,5 +1,7 @@
 """Command line. Heavy imports are deferred until a command needs them."""
 
+import _thread
+import io
 import os
 import signal
 import sys
@@ -23,6 +25,9 @@ from fitact.cli import one_finger, records, scenes, campaigns, designs  # noqa: 
 def main() -> None:
     """Run the command line; report every error in one line and by the exit status."""
     sys.unraisablehook = _resend_interrupt
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(encoding="utf-8")  # units and JSON, whatever the system's own encoding is
     raise SystemExit(_run_command(lambda: app(standalone_mode=False)))
 
 
@@ -31,9 +36,16 @@ def _resend_interrupt(unraisable: "sys.UnraisableHookArgs") -> None:
     if issubclass(unraisable.exc_type, KeyboardInterrupt):
         main = threading.main_thread().ident or 0
         # 0.01 s later, when Python has left the place that discarded it
-        threading.Timer(0.01, signal.pthread_kill, (main, signal.SIGINT)).start()
+        threading.Timer(0.01, _interrupt, (main,)).start()
     else:
         sys.__unraisablehook__(unraisable)
+
+
+def _interrupt(main: int) -> None:
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(main, signal.SIGINT)
+    else:  # Windows; a waiting call of the system ends first there
+        _thread.interrupt_main()
 
 
 def _run_command(command: Callable[[], Any]) -> int:

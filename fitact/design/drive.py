@@ -22,7 +22,7 @@ from fitact.model.circuit import RC
 from fitact.model.drive import Periodic
 from fitact.model.force import Geometry
 from fitact.model.skin import with_values
-from fitact.model.steady_cycle import PeriodQuantities, period_quantities
+from fitact.model.steady_cycle import PeriodQuantities, Sensation, period_quantities, sensation
 from fitact.populations.population import Population
 from fitact.scene.scene import Scene
 
@@ -35,8 +35,9 @@ def design_drive(
     """Find the smallest amplitude at which a fraction `share` of fingers feel the drive on the scene's panel.
 
     The scene's `[perception]` states the threshold, for the alternating part of the force: the amplitude of the sine
-    with the same root mean square. Sine, triangle and square, the trapezoid if the scene has a rise time, and the
-    scene's own drive are compared in the steady state. A drive's offset scales with it. No probe is connected.
+    with the same root mean square, or a table of thresholds for the friction's harmonics, see `Sensation`. Sine,
+    triangle and square, the trapezoid if the scene has a rise time, and the scene's own drive are compared in the
+    steady state. A drive's offset scales with it. No probe is connected.
 
     Args:
         scene: panel, drive, threshold and, in `[device]`, the limits to keep.
@@ -46,7 +47,7 @@ def design_drive(
         seed: the same seed gives the same fingers.
 
     Raises:
-        InputError: the scene states no threshold, or two; its drive is measured or has no steady state; its skin
+        InputError: the scene states no threshold, or several; its drive is measured or has no steady state; its skin
             depends on the frequency; `share` is out of range.
     """
     require_designable(scene, share)
@@ -102,16 +103,18 @@ class _DriveEvaluator(NamedTuple):
         drive = normalize_drive(self.scene.drive).model_copy(update={"waveform": waveform}).make()
         assert isinstance(drive, Periodic)
         drive = eqx.tree_at(lambda wave: wave.frequency, drive, frequency)
-        quantities = self._unit_quantities(drive, thickness, ratio)
-        needed = _required_amplitudes(self.scene, quantities)
-        return DriveOption.from_amplitudes(waveform, frequency, device, needed, quantities, self.share), needed
+        quantities, felt = self._unit_quantities(drive, thickness, ratio)
+        needed = _required_amplitudes(self.scene, quantities, felt)
+        return DriveOption.from_amplitudes(waveform, frequency, device, needed, quantities, self.share, felt), needed
 
     def has_room(self, waveform: str, frequency: float) -> bool:
         """Return whether the period has room for both edges."""
         drive = self.scene.drive
         return waveform != "trapezoid" or (drive.rise_time or 0.0) < min(drive.duty, 1.0 - drive.duty) / frequency
 
-    def _unit_quantities(self, drive: Periodic, thickness: float, ratio: float) -> PeriodQuantities:
+    def _unit_quantities(
+        self, drive: Periodic, thickness: float, ratio: float
+    ) -> tuple[PeriodQuantities, Sensation | None]:
         """Compute the effects of 1 Vpp on each finger, with its Ci times `ratio`: arrays (laws, fingers)."""
         flat = {name: values.reshape(-1) for name, values in self.people.values.items()}
         flat["Ci"] = ratio * flat["Ci"]
@@ -121,30 +124,42 @@ class _DriveEvaluator(NamedTuple):
             flat["Ri"] = np.broadcast_to(thicker * np.asarray(leak), flat["Ci"].shape)
         template = self.scene.make_rc_circuit({name: values[0] for name, values in flat.items()})
         geometry = dataclasses.replace(self.scene.geometry(), insulator_thickness=thickness)
+        table, coefficient = self.scene.perception.thresholds, float(self.scene.friction.coefficient)
+        sensitivity = table and table.harmonic_sensitivity(float(np.asarray(drive.frequency)), coefficient)
         with jax.enable_x64(True):
-            quantities = _map_fingers(*jax.tree.map(jnp.asarray, (template, geometry, drive, flat)))
-            return PeriodQuantities(*(np.asarray(x).reshape(*self.people.shape, *x.shape[1:]) for x in quantities))
+            effects = _map_fingers(*jax.tree.map(jnp.asarray, (template, geometry, drive, flat, sensitivity)))
+            return jax.tree.map(lambda x: np.asarray(x).reshape(*self.people.shape, *x.shape[1:]), effects)
 
 
 @jit
 def _map_fingers(
-    template: RC, geometry: Geometry, drive: Periodic, values: dict[str, Float[Array, " fingers"]]
-) -> PeriodQuantities:
-    def evaluate_finger(finger_values: dict[str, Array]) -> PeriodQuantities:
+    template: RC,
+    geometry: Geometry,
+    drive: Periodic,
+    values: dict[str, Float[Array, " fingers"]],
+    sensitivity: Float[Array, " harmonics"] | None,
+) -> tuple[PeriodQuantities, Sensation | None]:
+    def evaluate_finger(finger_values: dict[str, Array]) -> tuple[PeriodQuantities, Sensation | None]:
         circuit = with_values(template, finger_values)
         assert isinstance(circuit, RC)
-        return period_quantities(circuit, drive, geometry.contact(circuit))
+        contact = geometry.contact(circuit)
+        felt = None if sensitivity is None else sensation(circuit, drive, contact, sensitivity)
+        return period_quantities(circuit, drive, contact), felt
 
     return jax.lax.map(evaluate_finger, values, batch_size=1024)  # the batch bounds memory
 
 
-def _required_amplitudes(scene: Scene, unit_quantities: PeriodQuantities) -> Float[np.ndarray, "laws fingers"]:
-    """Return the peak-to-peak amplitude (V) at which each finger feels a drive with `unit_quantities` at 1 Vpp."""
+def _required_amplitudes(
+    scene: Scene, unit_quantities: PeriodQuantities, felt: Sensation | None
+) -> Float[np.ndarray, "laws fingers"]:
+    """Return the peak-to-peak amplitude (V) at which each finger feels a drive with these effects at 1 Vpp."""
     alternating, perception = np.asarray(unit_quantities.force_alternating), scene.perception
     with np.errstate(divide="ignore"):
+        if felt is not None:
+            return np.sqrt(1.0 / np.asarray(felt.times_threshold))
         if perception.threshold_force is not None:
             return np.sqrt(perception.threshold_force / alternating)
-        assert perception.friction_change is not None  # one of the two is required
+        assert perception.friction_change is not None  # one of the three is required
         # alternating A^2 = change (mean A^2 + fN) has no solution if the mean force rises too fast
         reachable = np.maximum(alternating - perception.friction_change * np.asarray(unit_quantities.force_mean), 0.0)
         return np.sqrt(perception.friction_change * scene.friction.normal_force / reachable)
@@ -155,10 +170,11 @@ def require_designable(scene: Scene, share: float) -> None:
     perception, drive = scene.perception, scene.drive
     if not 0.01 <= share <= 0.99:  # beyond, the answer is the assumed tail of the distribution
         raise InputError(f"share = {share:g}: give a fraction of fingers from 0.01 to 0.99, such as 0.95")
-    if (perception.threshold_force is None) == (perception.friction_change is None):
+    stated = perception.threshold_force, perception.friction_change, perception.thresholds
+    if sum(each is not None for each in stated) != 1:
         raise InputError(
             "scene: [perception] must state one threshold, because fitact knows no generally valid one; write"
-            " threshold_force = '...' or friction_change = ..., and its source"
+            " threshold_force = '...' or friction_change = ..., and its source, or thresholds = 'file.csv'"
         )
     if perception.friction_change is not None and scene.friction.normal_force == 0.0:
         raise InputError(

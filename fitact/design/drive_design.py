@@ -16,6 +16,7 @@ from fitact.units import format_engineering
 
 _STATED_LIMITS = ("breakdown_field", "current_limit_rms", "current_limit_peak")  # keys of [device]
 _UNBOUNDED = "the current is unbounded at ideal edges"
+_ALL = ", the same at all frequencies"
 _LEGEND = (
     "* waveform of the scene. Set: the peak-to-peak amplitude to set, {set}; ±: Monte Carlo error of this number only."
     " {others} Other columns, at the amplitude to set: power for the median finger; largest body current and insulator"
@@ -149,7 +150,11 @@ class DriveDesign:
             "recommendation": self._recommendation_content(),
             "share": self.share,
             "threshold": self.scene.perception.model_dump(exclude_none=True, exclude={"source"})
-            | {"source": self.scene.perception.source, "frequency": "all", "sentence": self.threshold},
+            | {
+                "source": self.scene.perception.threshold_source,
+                "frequency": "all" if self.scene.perception.thresholds is None else "table",
+                "sentence": self.threshold,
+            },
             "people": {"source": self.people.source, "laws": laws, "fingers": fingers},
             "options": [option.to_dict() for option in self.options.values()],
             "limits": [each.to_dict() for each in self.limits],
@@ -190,9 +195,9 @@ class DriveDesign:
                 "the population fit is not reliable, or most fingers are fitted poorly; see fitact population"
             )
         sentences += self.people.warnings
-        if self.scene.perception.source is None:
+        if self.scene.perception.threshold_source is None:
             sentences.append(
-                f"the threshold ({self._threshold_value}, the same at all frequencies) is an example, because"
+                f"the threshold ({self._threshold_value}) is an example, because"
                 " [perception] states no source; state your own threshold, and where it comes from as source = '...'"
             )
         if not self.people.has_separate_uncertainty:
@@ -223,6 +228,14 @@ class DriveDesign:
         return (
             f"the force is computed with [force] model = '{self.scene.force.model}', not measured; the amplitude to"
             " set is proportional to 1 / sqrt(force).",
+            *(
+                [
+                    "the friction is taken as [friction] coefficient ="
+                    f" {float(self.scene.friction.coefficient):.3g} times the force at each frequency."
+                ]
+                if self.scene.perception.thresholds is not None
+                else []
+            ),
             f"{NO_SAFETY_ASSESSMENT}.",
             *([f"{unstated} {'it' if len(absent) == 1 else 'them'}."] if absent else []),
             *(f"{name}: not recommended, {_UNBOUNDED}; state [drive] rise_time." for name in unbounded),
@@ -240,16 +253,18 @@ class DriveDesign:
     @property
     def _threshold_value(self) -> str:
         force, change = self.scene.perception.threshold_force, self.scene.perception.friction_change
+        if (table := self.scene.perception.thresholds) is not None:
+            return f"harmonics of the friction against a table of thresholds from {table.range_text}"
         if force is not None:
-            return f"{format_engineering(force, 'N')} amplitude of the alternating electrostatic force"
-        return f"friction that alternates by {100.0 * (change or 0.0):.3g} % of its mean"
+            return f"{format_engineering(force, 'N')} amplitude of the alternating electrostatic force{_ALL}"
+        return f"friction that alternates by {100.0 * (change or 0.0):.3g} % of its mean{_ALL}"
 
     @property
     def threshold(self) -> str:
         """Threshold with its source and frequency, for people."""
-        source = self.scene.perception.source
+        source = self.scene.perception.threshold_source
         origin = "example: [perception] states no source" if source is None else f"source: {source}"
-        return f"{self._threshold_value}, the same at all frequencies ({origin})"
+        return f"{self._threshold_value} ({origin})"
 
     @property
     def question(self) -> str:
@@ -288,13 +303,21 @@ class DriveDesign:
             f"{name} {format_engineering(o.frequency, 'Hz', 3)} ({format_quantity(o.assured, 'V')})"
             for name, o in best.items()
         )
-        sentences.append(
-            "frequency with the lowest amplitude to set, 10 Hz to 1 kHz, for a frequency-independent threshold:"
-            f" {easiest}"
-        )
+        table = self.scene.perception.thresholds
+        kind = "a frequency-independent threshold" if table is None else "these thresholds"
+        sentences.append(f"frequency with the lowest amplitude to set, 10 Hz to 1 kHz, for {kind}: {easiest}")
+        if table is not None:
+            felt = ", ".join(f"{name} {_strongest(o)}" for name, o in self.options.items())
+            sentences.append(f"frequency of the force that is felt most: {felt}")
         if all(getattr(self.scene.device, name) is None for name in _STATED_LIMITS):
             return tuple(sentences)
         return *sentences, f"{self.scene_waveform}, {_thinnest_insulator(self.by_thickness)}"
+
+
+def _strongest(option: DriveOption) -> str:
+    outside = f"{100.0 * (option.outside or 0.0):.2g} % of the alternating power is outside the table, not counted"
+    frequency = "none" if option.strongest is None else format_engineering(option.strongest, "Hz", 3)
+    return f"{frequency} ({outside})"
 
 
 def _cells(name: str, option: DriveOption, is_scene_waveform: bool) -> tuple[str, ...]:

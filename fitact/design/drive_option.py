@@ -10,7 +10,7 @@ import scipy.stats
 from jaxtyping import Float
 
 from fitact.design.limits import LimitComparison, compare_with_limits, format_quantity
-from fitact.model.steady_cycle import PeriodQuantities
+from fitact.model.steady_cycle import PeriodQuantities, Sensation
 from fitact.scene.sections import Device, DriveSection
 from fitact.units import format_engineering
 
@@ -49,6 +49,10 @@ class DriveOption:
     assured_error: float  # Monte Carlo standard error of `assured`, V, from the finite number of samples
     people: Float[np.ndarray, " shares"]  # peak-to-peak V up to which `FINGER_QUANTILES` of all fingers feel it
     at_assured: PeriodQuantities  # forces and powers of the median finger, the largest voltage and currents
+    # with a table of thresholds: frequency of the force that most fingers feel most (Hz; None if none is in the table),
+    # and the median fraction of the alternating force's mean square at frequencies outside the table
+    strongest: float | None = None
+    outside: float | None = None
 
     @classmethod
     def from_amplitudes(
@@ -59,6 +63,7 @@ class DriveOption:
         required_amplitudes: Float[np.ndarray, "laws fingers"],
         unit_quantities: PeriodQuantities,
         share: float,
+        felt: Sensation | None = None,
     ) -> Self:
         """Make an option from the amplitude that each finger needs, and the effects of a drive of 1 Vpp on it."""
         amplitude = quantile(required_amplitudes, share, axis=1)
@@ -66,7 +71,11 @@ class DriveOption:
         error = quantile_error(required_amplitudes[0], share) if one_law else quantile_error(amplitude, ASSURANCE)
         people = np.array([quantile(required_amplitudes, q) for q in FINGER_QUANTILES])
         used = _scale_to_amplitude(unit_quantities, float(quantile(amplitude, ASSURANCE)))
-        return cls(waveform, frequency, device, amplitude, error, people, used)
+        if felt is None:
+            return cls(waveform, frequency, device, amplitude, error, people, used)
+        order, outside = np.bincount(felt.strongest.ravel()).argmax(), float(np.median(felt.outside))
+        strongest = float(order * frequency) if order else None
+        return cls(waveform, frequency, device, amplitude, error, people, used, strongest, outside)
 
     @property
     def assured(self) -> float:
@@ -91,6 +100,8 @@ class DriveOption:
     @property
     def violations(self) -> tuple[str, ...]:
         """Limits of the scene that the option exceeds at the assured amplitude, as phrases."""
+        if self.outside is not None and self.strongest is None:
+            return ("its force has no frequency in the table of thresholds, so no detection is stated",)
         if not math.isfinite(self.assured):
             return ("too few fingers feel it at any amplitude",)
         checked = (
@@ -122,7 +133,7 @@ class DriveOption:
             "insulator_field": float(self.at_assured.insulator_peak) / self.device.insulator_thickness,
             "breakdown_voltage": self.breakdown_voltage,
             "violations": list(self.violations),
-        }
+        } | ({} if self.outside is None else {"strongest": self.strongest, "outside": self.outside})
 
 
 def _scale_to_amplitude(unit_quantities: PeriodQuantities, amplitude: float) -> PeriodQuantities:

@@ -72,6 +72,49 @@ def insulator_peak(circuit: RC, drive: Periodic) -> Float[Array, ""]:
     return period.max_abs(period.response(circuit.insulator_terms()))
 
 
+class Sensation(NamedTuple):
+    """How far a drive is above the detection threshold, from the harmonics that a table of thresholds covers."""
+
+    times_threshold: Array  # root sum of squares of the harmonics' amplitudes over their thresholds
+    strongest: Array  # order of the harmonic that contributes most; 0 if the table covers none
+    outside: Array  # fraction of the mean square of the alternating force at frequencies outside the table
+
+    @classmethod
+    def from_force(
+        cls,
+        force: Float[Array, " points"],
+        weight: Float[Array, " points"],
+        cycles: Float[Array, " points"],
+        sensitivity: Float[Array, " harmonics"],
+    ) -> "Sensation":
+        """Compute it from a force at points of a period (N), with their quadrature weights and their places in it.
+
+        `sensitivity` is 1 / threshold (1/N) at multiples 1, 2, ... of the frequency; 0 excludes one.
+        """
+        turns = jnp.exp(-2j * np.pi * jnp.arange(1, sensitivity.size + 1)[:, None] * cycles)
+        amplitude = 2.0 * jnp.abs(turns @ (weight * force))
+        power = 2.0 * (weight @ jnp.square(force - weight @ force))
+        rounding = 1e-9  # relative amplitude; below it a harmonic is absent
+        covered = (sensitivity > 0.0) & (jnp.square(amplitude) > rounding**2 * power)
+        ratio = jnp.where(covered, sensitivity * amplitude, 0.0)
+        total = jnp.sum(jnp.square(ratio))
+        inside = jnp.sum(jnp.where(covered, jnp.square(amplitude), 0.0))
+        return cls(
+            jnp.sqrt(total),
+            jnp.where(total > 0.0, jnp.argmax(ratio) + 1, 0),
+            jnp.clip(1.0 - inside / jnp.where(power > 0.0, power, 1.0), 0.0, 1.0),
+        )
+
+
+def sensation(
+    circuit: RC, drive: Periodic, contact: Contact | AirGap, sensitivity: Float[Array, " harmonics"]
+) -> Sensation:
+    """Compute the `Sensation` of the electrostatic force in the steady state; `sensitivity` as in `from_force`."""
+    period = PeriodGrid.from_drive(drive, sensitivity.size)
+    force = electrostatic_force(period.response(circuit.channel_terms(contact.channel)), contact)
+    return Sensation.from_force(force, period.weight, period.cycles, sensitivity)
+
+
 class PeriodGrid(eqx.Module):
     """Points and quadrature weights over one period of a drive."""
 
@@ -83,16 +126,18 @@ class PeriodGrid(eqx.Module):
     slope: Float[Array, " points"]  # of the drive between its jumps, V/s
 
     @classmethod
-    def from_drive(cls, drive: Periodic) -> "PeriodGrid":
+    def from_drive(cls, drive: Periodic, harmonics: int = HARMONICS) -> "PeriodGrid":
+        """Make a grid on which the amplitudes of so many harmonics of a squared response are accurate."""
         if not isinstance(drive, PiecewiseLinear):
-            # points per cycle of the fastest sine; the mean of Vsc^4 is exact from 5 on
-            count = 32 * (max(drive.orders) if isinstance(drive, Multitone) else 1)
+            fastest = max(drive.orders) if isinstance(drive, Multitone) else 1
+            # points per cycle of the fastest sine; the mean of Vsc^4 is exact from 5 on. Vsc^2 has twice its order
+            count = max(32 * fastest, 2 * fastest + harmonics + 1)
             cycles = jnp.arange(count) / count
             time = cycles * drive.period
             weight = jnp.full(count, 1.0 / count)
             return cls(drive, time[None], cycles, weight, drive.value(time), drive.slope(time))
         pieces = drive.pieces()
-        nodes, weight = _quadrature_rule()
+        nodes, weight = _quadrature_rule(harmonics)
         length = jnp.diff(pieces.knots)[:, None]
         slope = jnp.broadcast_to(pieces.slopes()[:, None], (length.size, nodes.size))
         local_time, period = length * nodes, pieces.knots[-1]
@@ -132,10 +177,12 @@ class PeriodGrid(eqx.Module):
         return highest - jnp.where(bend < 0.0, rise, 0.0)
 
 
-def _quadrature_rule(nodes: int = 10, parts: int = 10) -> tuple[np.ndarray, np.ndarray]:
+def _quadrature_rule(harmonics: int, nodes: int = 10, parts: int = 10) -> tuple[np.ndarray, np.ndarray]:
     """Return nodes and weights on a piece of length 1: Gauss-Legendre with `nodes` points in each part."""
     # the parts grow by a factor 4 from the start of the piece, where transients of any length begin
     ends = 4.0 ** -np.arange(parts - 1.0, -1.0, -1.0)
+    if harmonics > HARMONICS:  # and none is longer than a cycle of the fastest harmonic, if the piece is a period
+        ends = np.union1d(ends, np.arange(1, harmonics + 1) / harmonics)
     x, weights = np.polynomial.legendre.leggauss(nodes)
     length = np.diff(ends, prepend=0.0)[:, None]
     places, inside = ends[:, None] - length * 0.5 * (1.0 - x), 0.5 * length * weights

@@ -117,6 +117,7 @@ def write_drive_design_page(path: str | os.PathLike[str], design: DriveDesign, o
         legend=design.legend,
         excluded=design.excluded,
         separated=design.people.has_separate_uncertainty,
+        has_table=design.scene.perception.thresholds is not None,
         people=people,
         limits=design.limits_table,
         no_safety_assessment=NO_SAFETY_ASSESSMENT,

@@ -20,12 +20,12 @@ from fitact.summary import (
     blind_table,
     budget_sentence,
     budget_table,
-    force_sentences,
     format_estimate,
     format_interval,
     load,
     quantity_table,
     result_names,
+    result_sentences,
 )
 from fitact.what_now import explain
 
@@ -59,7 +59,7 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
             blind=blind_table(summary),
             budget_note=budget_sentence(summary),
             budget_picture=image(lambda: draw_budgets(summary["budget"])),
-            force=force_sentences(summary),
+            force=result_sentences(summary),
             circuits=_CIRCUITS,
             estimate=format_estimate,
             interval=format_interval,

@@ -20,9 +20,11 @@ from fitact.fitting import derived
 from fitact.fitting.channel_fit import ChannelFit
 from fitact.fitting.fit import Fit
 from fitact.fitting.geometry import Capacitances
+from fitact.fitting.sensation import FeltDrive
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import draw_noise
 from fitact.likelihood.spectrum_channel import join_complex
+from fitact.model.drive import Periodic
 from fitact.model_selection.plan import Plan
 from fitact.sampling.chain import Chain
 from fitact.sampling.convergence import Convergence
@@ -88,11 +90,34 @@ class Posterior:
         interface-gap law for `[force] model = "gap"`. Thicknesses, area and friction are those of the scene; they
         are drawn where it states a distribution. Means are over whole periods of the drive.
         """
-        return {name: values for name, values in self.derived().items() if name not in ("g", "b")}
+        return {name: x for name, x in self.derived().items() if name.startswith(("force", "friction"))}
 
     def derived(self) -> dict[str, Float[np.ndarray, "ensembles draws"]]:
-        """Return draws of divider, time constant, force and friction, SI units."""
-        return {name: self._derived_draws[..., i] for i, name in enumerate(derived.DERIVED_NAMES)}
+        """Return draws of divider, time constant, force and friction, SI units.
+
+        With a table of thresholds in the scene also `times_threshold`, see `sensation`.
+        """
+        draws = {name: self._derived_draws[..., i] for i, name in enumerate(derived.DERIVED_NAMES)}
+        felt = self.sensation
+        return (
+            draws if felt is None or felt.times_threshold is None else draws | {"times_threshold": felt.times_threshold}
+        )
+
+    @functools.cached_property
+    def sensation(self) -> FeltDrive | None:
+        """How far the drive is felt, by the scene's table of thresholds; None if it states none."""
+        fit, record, drive = self.fit, self.fit.records[0], self.fit.derive.drive
+        frequency = None if isinstance(record, Spectrum) else record.frequency()
+        if fit.derive.steady_state and isinstance(drive, Periodic):
+            frequency = float(np.asarray(drive.frequency))
+        felt = FeltDrive.from_draws(fit.derive, fit.likelihood, fit.scene, frequency, self.points, self.seed)
+        if felt is None or felt.times_threshold is None or not self._geometry_logs:
+            return felt
+        mean, logs = derived.DERIVED_NAMES.index("force_mean"), self._geometry_logs
+        scale = self._derived_draws[..., mean] / self._nominal_draws[..., mean]
+        if "friction_coefficient" in logs:
+            scale = scale * np.exp(logs["friction_coefficient"]) / float(fit.scene.friction.coefficient)
+        return dataclasses.replace(felt, times_threshold=scale * felt.times_threshold)
 
     @functools.cached_property
     def _deviates(self) -> np.ndarray:
@@ -100,11 +125,15 @@ class Posterior:
         return derived.nuisance_deviates(self.fit.likelihood, self.points, self.seed)
 
     @functools.cached_property
+    def _nominal_draws(self) -> np.ndarray:
+        """Draws of the derived quantities at the nominal geometry."""
+        return derived.draw_derived(self.fit.derive, self.fit.likelihood, self.points, self.seed)
+
+    @functools.cached_property
     def _derived_draws(self) -> np.ndarray:
-        drawn = derived.draw_derived(self.fit.derive, self.fit.likelihood, self.points, self.seed)
         if not self._geometry_logs:
-            return drawn
-        return self.fit.geometry.change_derived(self._capacitances, self._geometry_logs, drawn)
+            return self._nominal_draws
+        return self.fit.geometry.change_derived(self._capacitances, self._geometry_logs, self._nominal_draws)
 
     @functools.cached_property
     def _geometry_logs(self) -> dict[str, np.ndarray]:
@@ -146,7 +175,9 @@ class Posterior:
         for name, draws in (drawn | self.derived()).items():
             mean, sd = float(np.mean(draws)), float(np.std(draws, ddof=1))
             relative = sd / abs(mean) if mean else math.inf
-            summaries[name]["u"] = budgets[name].u if name in budgets else relative
+            # the felt friction is proportional to the force, whose other sources of error it shares
+            budget = budgets.get("force_mean" if name == "times_threshold" else name)
+            summaries[name]["u"] = relative if budget is None else budget.u
         for name, prior_sd in zip(prior.names, prior.log_sd, strict=True):
             summaries[name]["contraction"] = float(1.0 - np.std(np.log(drawn[name]), ddof=1) / prior_sd)
         for name, law in self.fit.geometry.stated.items():
@@ -159,6 +190,7 @@ class Posterior:
             "fit": self.fit.judgement(),
             "model": self.fit.model(),
             "force_basis": self.fit.force_basis,
+            **({} if self.sensation is None else {"sensation": self.sensation.to_dict()}),
             "budget": self._budget_entries(),
             **self.fit.effects.to_dict(),
             **self.fit.validity(),

@@ -33,6 +33,7 @@ from fitact.scene.instrument_section import InstrumentSection
 from fitact.scene.prior_section import FRICTION_PRIORS, PriorSection
 from fitact.scene.prior_spec import ORDER_KEYS, PriorSpec
 from fitact.scene.section import Section, field_section
+from fitact.scene.threshold_table import resolve_table_path
 from fitact.scene.uncertain_value import UncertainValue
 
 _DIRECT_GROUND_KEYS = ("R_H", "grounding_Rsc", "grounding_Csc")  # keys of only one kind of grounding
@@ -90,6 +91,9 @@ class Scene(Section):
             for each in content.get("calibration", ()):  # files lie beside the scene
                 if isinstance(each, dict) and isinstance(each.get("record"), str):
                     each["record"] = str(Path(path).parent / each["record"])
+            perception = content.get("perception")
+            if isinstance(perception, dict) and isinstance(name := perception.get("thresholds"), str):
+                perception["thresholds"] = resolve_table_path(name, Path(path).parent)
             return cls.model_validate(content)
         except tomllib.TOMLDecodeError as error:
             raise InputError(f"{path}: not valid TOML: {error}") from error

@@ -31,6 +31,7 @@ from fitact.scene.section import (
     Volt,
     VoltPerMeter,
 )
+from fitact.scene.threshold_table import ThresholdTable
 from fitact.scene.uncertain_value import (
     UncertainCoefficient,
     UncertainMeter,
@@ -283,11 +284,17 @@ class ForceSection(Section):
 
 
 class Perception(Section):
-    """Perception threshold."""
+    """Perception threshold, the same at all frequencies, or a table of thresholds over the frequency."""
 
     threshold_force: Threshold | None = None
+    thresholds: ThresholdTable | None = None
     friction_change: Annotated[float, Field(gt=0)] | None = None
     source: str | None = None
+
+    @property
+    def threshold_source(self) -> str | None:
+        """Where the threshold comes from, as stated here or in its table."""
+        return self.source or (None if self.thresholds is None else self.thresholds.source)
 
 
 class PopulationSection(Section):

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeAlias
 
 import jax
 
-from fitact.compiled import processor
+from fitact.compiled import available_cores, processor
 from fitact.data.record import Record
 from fitact.data.simulate import simulate
 from fitact.errors import InputError
@@ -220,7 +220,7 @@ def describe_machine() -> dict[str, Any]:
     model = next((line for line in processor().splitlines() if line.startswith("model name")), "")
     return {
         "cpu": model.partition(":")[2].strip() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": available_cores(),
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "platform": platform.platform(),
         "device": jax.devices()[0].device_kind,

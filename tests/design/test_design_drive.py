@@ -22,7 +22,8 @@ import fitact
 from fitact.charts.figure import write_figure
 from fitact.cli import _run_command
 from fitact.cli.app import app
-from fitact.design.drive_option import quantile, quantile_error
+from fitact.design.drive import _DriveEvaluator
+from fitact.design.drive_option import DriveOption, quantile, quantile_error
 from fitact.design.drive_people import FingerSample
 from fitact.model.steady_cycle import period_quantities
 from fitact.populations.finger_likelihoods import PopulationParameters
@@ -467,6 +468,31 @@ def test_a_multitone_of_one_tone_is_a_sine(one):
     assert found.options["multitone"].assured == pytest.approx(one.options["sine"].assured, rel=1e-6)
 
 
+TABLE = {"frequencies": [20.0, 250.0], "forces": [1e-2, 1e-3], "source": "test"}
+
+
+def felt(waveform: str, frequency: float) -> DriveOption:
+    stated = fitact.Scene.from_dict({"perception": {"thresholds": TABLE}, "friction": {"coefficient": 0.4}})
+    return _DriveEvaluator(stated, one_finger(), 0.5).evaluate(waveform, frequency)[0]
+
+
+def test_a_table_of_thresholds_gives_the_amplitude_of_a_sine():
+    """Friction of amplitude mu per_square (|H| A)^2 / 2 at 2 f, against a threshold that is linear in log-log."""
+    s, option = 2j * np.pi * F, felt("sine", F)
+    gain = abs(s * R * CI / (1.0 + s * R * (2.0 * CI + C)))
+    threshold = 1e-2 * 10.0 ** (-math.log(2.0 * F / 20.0) / math.log(250.0 / 20.0))
+    assert option.assured == pytest.approx(2.0 * math.sqrt(2.0 * threshold / (0.4 * per_square())) / gain, rel=1e-12)
+    assert (option.strongest, option.violations) == (2.0 * F, ())
+    assert option.to_dict()["outside"] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_no_detection_is_stated_where_the_table_has_none_of_the_force():
+    option = felt("sine", 200.0)
+    assert math.isinf(option.assured)
+    assert option.violations == ("its force has no frequency in the table of thresholds, so no detection is stated",)
+    assert option.to_dict()["strongest"] is None
+
+
 def test_no_probe_is_connected_to_what_is_designed(one):
     probe = {"probe_resistance": 1e5, "probe_capacitance": 1e-9}
     found = fitact.design_drive(scene(drive=TRAPEZOID, measurement=probe), one_finger())
@@ -478,6 +504,7 @@ def test_no_probe_is_connected_to_what_is_designed(one):
     [
         ({"perception": {}}, 0.95, r"\[perception\] must state one threshold, .*; write threshold_force = "),
         ({"perception": {"threshold_force": 1.0, "friction_change": 0.1}}, 0.95, "one threshold"),
+        ({"perception": {"threshold_force": 1.0, "thresholds": TABLE}}, 0.95, "one threshold"),
         ({"perception": {"friction_change": 0.1}, "friction": {"normal_force": 0.0}}, 0.95, "normal_force"),
         (
             {"drive": {"waveform": "measured"}},

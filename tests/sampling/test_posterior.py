@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import subprocess
 import sys
@@ -9,6 +10,7 @@ import pytest
 
 import fitact
 from fitact.files import to_json
+from fitact.fitting.sensation import FeltDrive
 from fitact.summary import format_sd, summarize_log_normal
 
 
@@ -34,6 +36,54 @@ def test_force_of_a_draw_by_hand(finger_posterior: fitact.Posterior):
         assert force["force_rms"][1, draw] == pytest.approx(np.sqrt(np.mean(fe**2)), rel=1e-6)
         assert force["force_peak"][1, draw] == pytest.approx(fe.max(), rel=1e-9)
         assert force["friction_mean"][1, draw] == pytest.approx(0.5 * (fe.mean() + 0.5), rel=1e-9)
+
+
+def test_a_table_of_thresholds_gives_the_sensation_of_each_draw(finger_posterior: fitact.Posterior):
+    """The Fourier sum of mu fe over the record, at the multiples of its frequency that the table has."""
+    table = {"frequencies": [90.0, 500.0], "forces": [2e-3, 1e-3], "source": "test"}
+    content = {"perception": {"thresholds": table}, "friction": {"coefficient": {"median": 0.4, "relative_sd": 0.2}}}
+    scene = fitact.Scene.from_dict(finger_posterior.fit.scene.model_dump(exclude_unset=True) | content)
+    felt = dataclasses.replace(finger_posterior, fit=dataclasses.replace(finger_posterior.fit, scene=scene))
+    draws, record, frequency = felt.parameters(), felt.fit.record, felt.fit.record.frequency()
+    for draw in (0, 1000):
+        Rsc, Csc, Ci, charge, mu = (
+            draws[name][1, draw] for name in ("Rsc", "Csc", "Ci", "charge", "friction_coefficient")
+        )
+        with jax.enable_x64(True):
+            vsc = fitact.response(
+                fitact.FinalCircuit(Rsc, Csc, Ci), felt.fit.choice.drive, record.time, steady_state=False
+            )
+        vsc = np.asarray(vsc) + charge * np.exp(-record.time / (Rsc * (2.0 * Ci + Csc)))
+        friction = mu * vsc**2 / (2.0 * (1.0 / Ci + 1.0 / Csc) * (1e-6 + 200e-6))
+        at = frequency * np.arange(1, 6)
+        kept = at[at <= 500.0]
+        amplitude = 2.0 * np.abs(np.mean(friction * np.exp(-2j * np.pi * kept[:, None] * record.time), axis=1))
+        ratio = amplitude / np.exp(np.interp(np.log(kept), np.log([90.0, 500.0]), np.log([2e-3, 1e-3])))
+        assert felt.derived()["times_threshold"][1, draw] == pytest.approx(np.hypot.reduce(ratio), rel=1e-6)
+    assert felt.sensation.frequency == pytest.approx(frequency * (1 + np.argmax(ratio)))
+    summary = felt.summary()
+    level = summary["sensation"]["level"]
+    assert level["unit"] == "dB"
+    assert level["q50"] == pytest.approx(20.0 * np.log10(summary["derived"]["times_threshold"]["q50"]), abs=1e-3)
+    assert summary["derived"]["times_threshold"]["u"] == summary["derived"]["force_mean"]["u"]
+    assert "these data do not test that law" in str(felt)
+    assert summary["sensation"]["sentence"] in str(felt)
+    assert "times_threshold" not in felt.force()
+    assert "sensation" not in finger_posterior.summary()
+
+
+def test_no_sensation_is_stated_without_a_frequency_in_the_table(finger_posterior: fitact.Posterior):
+    fit, table = finger_posterior.fit, {"frequencies": [1.0, 50.0], "forces": [2e-3, 1e-3]}
+    scene = fitact.Scene.from_dict({"perception": {"thresholds": table}})
+    felt = dataclasses.replace(finger_posterior, fit=dataclasses.replace(fit, scene=scene))
+    assert felt.sensation.sentence == (
+        "Felt: no detection is stated, because the force has no frequency in the table of thresholds (1 Hz to 50 Hz;"
+        " no source stated)."
+    )
+    assert felt.sensation.to_dict().keys() == {"table", "sentence"}
+    assert "times_threshold" not in felt.derived()
+    alone = FeltDrive.from_draws(fit.derive, fit.likelihood, scene, None, finger_posterior.points, 1)
+    assert "because the drive does not repeat" in alone.sentence
 
 
 def test_scene_drives_force_is_that_of_one_steady_period():
