@@ -54,7 +54,7 @@ def draw_plots(figure: FigureBase, plots: Sequence[Plot]) -> None:
         draw_plot(plot, *rows)
         if part.get_layout_engine() is None:
             left, right, bottom, top = _MARGINS
-            width, height = part.bbox.width / figure.dpi, part.bbox.height / figure.dpi
+            width, height = part.bbox.width / part.dpi, part.bbox.height / part.dpi
             ends = {"left": left / width, "right": 1.0 - right / width}
             part.subplots_adjust(**ends, bottom=bottom / height, top=1.0 - top / height, hspace=0.15)
 

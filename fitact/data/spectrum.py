@@ -142,6 +142,15 @@ class Spectrum(Display):
         kind = "impedance spectrum" if is_impedance else "gain of Vsc over V"
         return f"{self.source} ({kind}): {len(self)} points, {low} to {high}, {self.symbol[0]} {small} to {large}"
 
+    def _rows(self) -> list[tuple[str, ...]]:
+        name, unit = self.symbol
+        rows: list[tuple[str, ...]] = [("frequency", name, "phase")]
+        for i in (0, -1):
+            size = format_engineering(abs(self.values[i]), unit)
+            frequency = format_engineering(float(self.frequency[i]), "Hz")
+            rows.append((frequency, size, f"{np.angle(self.values[i], deg=True):.1f}°"))
+        return rows
+
     def _sentences(self) -> tuple[str, ...]:
         sign = "negative (capacitive)" if np.mean(self.values.imag) < 0.0 else "positive"
         return (f"The imaginary part is mostly {sign}.",)
