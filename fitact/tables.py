@@ -36,7 +36,7 @@ def html_table(rows: Sequence[Sequence[str]]) -> str:
     """Return an HTML table of `rows`, titles first, in the colours of its page; a row of one cell is a heading."""
     lines = []
     for number, row in enumerate(rows):
-        tag, sides = "td" if number else "th", ["left", *["right"] * (len(rows[0]) - 1), *["left"] * len(row)]
+        tag, sides = "td" if number else "th", ["left", *["right;white-space:nowrap"] * (len(rows[0]) - 1), "left"]
         if len(row) == 1:
             lines.append(f'<tr><th colspan="{len(rows[0])}" style="text-align:left">{escape(row[0])}</th></tr>')
             continue
@@ -44,7 +44,7 @@ def html_table(rows: Sequence[Sequence[str]]) -> str:
             f'<{tag} style="text-align:{side}">{escape(cell)}</{tag}>' for cell, side in zip(row, sides, strict=False)
         )
         lines.append(f"<tr>{''.join(cells)}</tr>")
-    return f"<table>{''.join(lines)}</table>"
+    return f'<table style="color:inherit">{"".join(lines)}</table>'
 
 
 class Display:

@@ -85,10 +85,11 @@ assert fit.identifiability.verdict == "prior-limited"
 fit
 
 # %% [markdown]
-# `print(fit)` adds what the force rests on and what to measure next. The verdict matters more than the numbers: "prior-limited". The data determine the divider g and the time constant b
-# to a few parts in ten thousand, but not the contact area. So Rsc, Csc and the force are as uncertain as the prior on
-# Ci. The force is computed with eq. (22) of the reference paper; these data do not test that law. The residuals below
-# are consistent with noise, also at the edges, so the circuit describes the record.
+# `print(fit)` adds what the force rests on and what to measure next. The verdict matters more than the numbers:
+# "prior-limited". The data determine the divider g and the time constant b to a few parts in ten thousand, but not the
+# contact area. So Rsc, Csc and the force are as uncertain as the prior on Ci. The force is computed with eq. (22) of
+# the reference paper; these data do not test that law. The residuals below are consistent with noise, also at the
+# edges, so the circuit describes the record.
 
 # %%
 fit.plot()

@@ -165,7 +165,9 @@ def test_long_record_is_drawn_with_its_extremes_and_clipped_samples_are_marked()
     vsc = np.clip(10.0 * np.sin(2.0 * np.pi * 50.0 * time) + 0.1 * random.standard_normal(time.size), -9.0, 9.0)
     (axes,) = [fitact.Record.from_arrays(time, Vsc=vsc).plot()]
     assert numbers(axes, "data").size <= 4000
-    assert np.all(np.abs(numbers(axes, "clipped")) > 8.8)
+    clipped = np.abs(numbers(axes, "clipped"))
+    assert clipped.min() > 8.5
+    assert np.mean(clipped == 9.0) > 0.9
 
 
 def test_fit_is_drawn_with_its_residuals(finger_fit: fitact.Fit):
