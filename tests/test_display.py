@@ -136,6 +136,7 @@ def test_unreliable_results_say_so(finger_fit: fitact.Fit, finger_posterior: fit
     assert "unreliable (misfit)" in repr(misfit)
     assert "unreliable" in repr(dataclasses.replace(finger_posterior, fit=misfit))
     assert "unreliable" not in repr(finger_fit)
+    assert len(repr(test_pages.drive(trusted=False))) < 150
 
 
 def test_table_has_headings_and_cells_in_order():

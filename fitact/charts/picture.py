@@ -81,7 +81,8 @@ def draw_plot(plot: Plot, *rows: Axes) -> None:
             label: handle for axes in rows for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
         }
         named = list(entries.values()), list(entries)
-        rows[0].legend(*named, **above, title=plot["title"], ncols=len(entries), fontsize=9.0, columnspacing=1.0)
+        columns = len(entries) if len(entries) <= 3 else 2
+        rows[0].legend(*named, **above, title=plot["title"], ncols=columns, fontsize=9.0, columnspacing=1.0)
     else:
         rows[0].set_title(plot["title"], fontsize=10.0)
 

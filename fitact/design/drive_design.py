@@ -236,13 +236,13 @@ class DriveDesign(Display):
 
     @property
     def _headline(self) -> str:
-        return self.recommendation
+        return self.recommendation if self.recommended else self.recommendation.partition(" (")[0]
 
     def _rows(self) -> tuple[tuple[str, ...], ...]:
         return self.table
 
     def _sentences(self) -> tuple[str, ...]:
-        return self.question, self.exposure, self.legend
+        return self.recommendation, self.question, self.exposure, self.legend
 
     def summary(self) -> str:
         """Return the recommendation, the tables for people, and notes and warnings."""
