@@ -8,7 +8,7 @@ import platform
 import re
 import shlex
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -158,6 +158,11 @@ def format_estimate(summary: Summary) -> str:
         return f"{median / size:.{2 if spread else 4}g} {symbol}".rstrip() + spread
     value, spread = round_to_sd((median / size, sd / size), sd / size)
     return f"{value} ± {spread} {symbol}".rstrip()
+
+
+def format_estimates(summaries: Mapping[str, Summary]) -> str:
+    """Return several estimates in a line: "Rsc 160.1 ± 8.1 kΩ, Ci 1.35 ± 0.068 nF"."""
+    return ", ".join(f"{name} {format_estimate(each)}" for name, each in summaries.items())
 
 
 def format_interval(summary: Summary, low: str = "q05", high: str = "q95") -> str:

@@ -1,6 +1,7 @@
-"""Rows of text as aligned columns; knows no result class."""
+"""Rows of text as aligned columns or as HTML, and how a result looks in a notebook; knows no result class."""
 
 from collections.abc import Iterable, Sequence
+from html import escape
 
 
 def align_row(cells: Sequence[str], widths: Sequence[int]) -> str:
@@ -29,3 +30,54 @@ def join_lines(rows: Iterable[str], warnings: Iterable[str] = (), notes: Iterabl
     """Return the text of a result: its rows, then its notes and its warnings, a line each."""
     remarks = [*(f"note: {note}" for note in notes), *(f"warning: {warning}" for warning in warnings)]
     return "\n".join([*rows, *remarks])
+
+
+def html_table(rows: Sequence[Sequence[str]]) -> str:
+    """Return an HTML table of `rows`, titles first, in the colours of its page; a row of one cell is a heading."""
+    lines = []
+    for number, row in enumerate(rows):
+        tag, sides = "td" if number else "th", ["left", *["right;white-space:nowrap"] * (len(rows[0]) - 1), "left"]
+        if len(row) == 1:
+            lines.append(f'<tr><th colspan="{len(rows[0])}" style="text-align:left">{escape(row[0])}</th></tr>')
+            continue
+        cells = (
+            f'<{tag} style="text-align:{side}">{escape(cell)}</{tag}>' for cell, side in zip(row, sides, strict=False)
+        )
+        lines.append(f"<tr>{''.join(cells)}</tr>")
+    return f'<table style="color:inherit">{"".join(lines)}</table>'
+
+
+class Display:
+    """Appearance of a result in a console and in a notebook, and a `dir()` of public names.
+
+    A class states its `_headline`, and may state rows, sentences and `warnings`.
+    """
+
+    @property
+    def _headline(self) -> str:
+        """One line, which costs little to compute."""
+        raise NotImplementedError
+
+    def _rows(self) -> Sequence[Sequence[str]]:
+        """Return rows of text for a notebook, titles first."""
+        return ()
+
+    def _sentences(self) -> Iterable[str]:
+        """Return what a notebook writes below the rows."""
+        return ()
+
+    def __repr__(self) -> str:
+        return f"<fitact.{type(self).__name__}: {self._headline}>"
+
+    def _repr_html_(self) -> str:
+        rows, name = self._rows(), type(self).__name__
+        parts = [f"<p><b>{name}</b>: {escape(self._headline)}</p>", html_table(rows) if rows else ""]
+        parts += [f"<p>{escape(sentence)}</p>" for sentence in self._sentences()]
+        # the one colour is legible on white and on black
+        border = "border-left:4px solid #D55E00;padding-left:.6em"
+        warnings: Iterable[str] = getattr(self, "warnings", ())
+        parts += [f'<p style="{border}"><b>warning</b>: {escape(warning)}</p>' for warning in warnings]
+        return f"<div>{''.join(parts)}</div>"
+
+    def __dir__(self) -> list[str]:
+        return [name for name in super().__dir__() if not name.startswith("_")]

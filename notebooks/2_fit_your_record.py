@@ -72,31 +72,27 @@ scene = fitact.Scene.from_dict(
 )
 record = fitact.read(captured, scene, channels=channels, scale={"Vsc": 10})
 print(*record.notes, sep="\n")
+record.plot()
+plt.show()
 
 # %% [markdown]
 # ## Fit
 
 # %%
 fit = fitact.fit(record, scene)
-print(fit)
 assert fit.trusted
 assert fit.identifiability.verdict == "prior-limited"
+fit
 
 # %% [markdown]
-# The verdict matters more than the numbers: "prior-limited". The data determine the divider g and the time constant b
-# to a few parts in ten thousand, but not the contact area. So Rsc, Csc and the force are as uncertain as the prior on
-# Ci. The force is computed with eq. (22) of the reference paper; these data do not test that law. The residuals below
-# are consistent with noise, also at the edges, so the circuit describes the record.
+# `print(fit)` adds what the force rests on and what to measure next. The verdict matters more than the numbers:
+# "prior-limited". The data determine the divider g and the time constant b to a few parts in ten thousand, but not the
+# contact area. So Rsc, Csc and the force are as uncertain as the prior on Ci. The force is computed with eq. (22) of
+# the reference paper; these data do not test that law. The residuals below are consistent with noise, also at the
+# edges, so the circuit describes the record.
 
 # %%
-figure, (above, below) = plt.subplots(2, 1, figsize=(9, 4.6), sharex=True, height_ratios=[2, 1])
-above.plot(1e3 * record.time, record["Vsc"], ".", ms=2, color="#333333", label="record")
-above.plot(1e3 * record.time, record["Vsc"] - fit.residuals, lw=1, label="fit")
-below.plot(1e3 * record.time, fit.residuals, ".", ms=2, color="C1")
-above.set(ylabel="Vsc (V)", title="The record and the fit")
-above.legend(ncols=2, loc="upper right", markerscale=4)
-above.set_ylim(-18, 22)
-below.set(xlabel="time (ms)", ylabel="record − fit (V)")
+fit.plot()
 plt.show()
 
 # %% [markdown]
@@ -106,21 +102,22 @@ plt.show()
 
 # %%
 posterior = fitact.sample(fit, seed=1, progress=False)
-print(posterior.convergence)
 assert posterior.trusted
+posterior
 
 # %%
-draws, force = posterior.parameters(), posterior.force()
-figure, axes = plt.subplots(1, 3, figsize=(12, 3.6))
-every = slice(None, None, 5)
-for here, name, scale, unit in ((axes[0], "Rsc", 1e-3, "kΩ"), (axes[1], "Csc", 1e9, "nF")):
-    here.plot(1e9 * draws["Ci"].ravel()[every], scale * draws[name].ravel()[every], ".", ms=1)
-    here.set(xlabel="Ci (nF)", ylabel=f"{name} ({unit})", title=f"{name} and Ci: not separated by Vsc")
-axes[2].hist(1e6 * force["force_mean"].ravel(), bins=40, color="C2")
-axes[2].set(xlabel="mean force (µN)", ylabel="draws", title="Mean force")
+posterior.plot()
+plt.show()
+
+# %% [markdown]
+# Vsc does not separate Ci from Rsc and Csc, so the posterior is a line in the last two pairs. The force over time:
+
+# %%
+posterior.plot_force()
 plt.show()
 
 # %%
+draws = posterior.parameters()
 quantities = draws | posterior.derived()
 spread = {name: np.std(np.log(quantities[name])) for name in ("Rsc", "Csc", "Ci", "force_mean", "g", "b")}
 for name, sd in spread.items():

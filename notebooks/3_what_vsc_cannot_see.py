@@ -146,10 +146,12 @@ assert errors["g"][0] / errors["g"][-1] > 7  # sqrt(100) = 10
 assert errors["force_mean"][-1] > 0.9 * errors["force_mean"][0]
 assert eigenvalues[0] < 1e-3
 assert eigenvalues[1] > 0.99
+fit.plot_identifiability()
+plt.show()
 
 # %% [markdown]
 # The smallest eigenvalue, 0, belongs to the unidentified direction: there the posterior equals the prior, and the error
-# of the force stays at the 5 % of Ci.
+# of the force stays at the 5 % of Ci. The posterior is a line, as long as the prior.
 #
 # ## Which measurement helps
 #
@@ -159,7 +161,9 @@ assert eigenvalues[1] > 0.99
 # %%
 scene = fitact.Scene.from_dict({"prior": prior})
 design = fitact.design_measurement(scene)
-print(design)
+design.plot()
+plt.show()
+design
 
 # %% [markdown]
 # To check these predictions, six fingers drawn from the prior are measured in three ways and fitted, and the results

@@ -191,24 +191,11 @@ lab = fitact.Scene.from_dict(
     }
 )
 plan = fitact.plan(lab)
-figure, here = plt.subplots(figsize=(8, 3.2))
-for row, omission in enumerate(plan.omissions):
-    color = "C1" if omission.kept else "C2"
-    nominal, wide = 100 * omission.nominal.force, 100 * omission.q95.force
-    here.plot([nominal, wide], [row, row], "-", color=color)
-    here.plot(nominal, row, "o", color=color)
-    here.plot(wide, row, "|", ms=12, color=color)
-    here.text(120, row, "kept" if omission.kept else "left out", va="center", color=color)
-here.axvline(100 * lab.tolerance.force, ls="--", color="0.4")
-here.set_yticks(range(len(plan.omissions)), [omission.name for omission in plan.omissions])
-here.set(xscale="log", xlim=(5e-5, 1e3), xlabel="error of the force if omitted (%); |: 95 % quantile over the prior")
-here.margins(y=0.12)
-here.set_title("The plan, for a tolerance of 1 %")
+plan.plot()
 plt.show()
-for omission in plan.omissions:
-    print(f"{omission.name:16} {omission.speedup:.2f} times faster if omitted; {omission.because}")
 assert plan.nominal.force <= 0.01
 assert "grounding skin" not in plan.left_out
+plan
 
 # %% [markdown]
 # For some fingers of the prior, the omissions exceed the tolerance, although they keep it at the nominal values. The

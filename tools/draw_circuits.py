@@ -7,7 +7,7 @@ import functools
 from collections.abc import Callable
 from pathlib import Path
 
-from fitact.report.circuit import scene_circuit, scene_wiring
+from fitact.scene.diagrams import scene_circuit, scene_wiring
 from fitact.scene.scene import Scene
 
 ROOT = Path(__file__).parents[1]

@@ -18,7 +18,7 @@ Point: TypeAlias = tuple[float, float]
 
 _PIXELS = 36.0  # of one unit of length
 _FONT, _SMALL = 13.0, 11.0  # px, at the drawing's own width
-_SOURCE, _CAPTION, _COLUMN, _LEFT, _RIGHT = 0.0, 0.75, 4.75, 4.1, 5.4  # x of what stands above each other
+_SOURCE, _CAPTION, _COLUMN, _LEFT, _RIGHT = 0.0, 0.6, 4.75, 4.1, 5.4  # x of what stands above each other
 
 
 class Diagram:
@@ -133,7 +133,7 @@ def _add_column(diagram: Diagram, values: Mapping[str, str], grounding: Groundin
 
 def _add_single(diagram: Diagram, name: str, kind: Any, values: Mapping[str, str], y: float, caption: str) -> float:
     """Draw a part alone in the column from the height `y` on; return the height at which it ends."""
-    end = y - 1.5
+    end = y - 1.7
     diagram.part(name, kind, (_COLUMN, y), (_COLUMN, end), f"{name} {values[name]}".strip())
     diagram.text(caption, (_CAPTION, (y + end) / 2), size=_SMALL)
     return end
@@ -168,7 +168,7 @@ def _add_touching_skin(diagram: Diagram, values: Mapping[str, str], y: float) ->
         shown["Csc"] += f"\nalpha {values['alpha']}"
     below = _add_layer(diagram, ("Rsc", "Csc"), shown, y, "touching\nfinger", height=2.4)
     probe = [name for name in ("probe_resistance", "probe_capacitance") if name in values]
-    end, x = y - 2.4, 7.75 if probe else 7.2
+    end, x = y - 2.4, 8.1 if probe else 7.6
     for name in probe:
         kind = schemdraw.elements.ResistorIEC() if name == "probe_resistance" else schemdraw.elements.Capacitor()
         diagram.part(name, kind, (x, y), (x, end))

@@ -4,7 +4,7 @@ import io
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import matplotlib as mpl
 import numpy as np
@@ -13,6 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
 from fitact.files import atomic_write
+
+FigureMaker: TypeAlias = Callable[..., Figure]  # takes `figsize` and `layout`
 
 # distinguishable by the colour-blind (Okabe & Ito 2008)
 DATA, MODEL, PRIOR, ALERT = "#333333", "#0072B2", "#999999", "#D55E00"
@@ -25,9 +27,15 @@ STYLE: Any = {  # style of all figures, for `matplotlib.rc_context`
     "grid.alpha": 0.25,
     "svg.fonttype": "path",
     "svg.hashsalt": "fitact",
-    "savefig.bbox": "tight",
     "path.simplify_threshold": 0.5,
 }
+
+
+def pyplot_figure(**options: Any) -> Figure:
+    """Return a new figure that notebooks and `pyplot.show` display."""
+    import matplotlib.pyplot as plt
+
+    return plt.figure(**options)
 
 
 def robust_limits(values: np.ndarray) -> tuple[float, float]:

@@ -7,20 +7,36 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, NullLocator
 
-from fitact.charts.figure import MODEL, log_ticks
+from fitact.charts.figure import MODEL, log_ticks, pyplot_figure
 from fitact.charts.interactive import Chart, Plot, PlotlyTrace
 
 _DASHES = {"solid": "-", "dash": "--", "dot": ":"}
 _POINTS_PER_PIXEL = 0.75
+_MARGINS = 0.8, 0.15, 0.6, 0.4  # left, right, bottom and top of the axes, inches
 
 
 def draw_chart(chart: Chart) -> Figure:
-    """Draw all plots of a chart."""
-    figure = Figure(figsize=(9.0, sum(_line_heights(chart["plots"]))), layout="constrained")
+    """Draw all plots of a chart, with fixed margins, since to compute them takes most of the time of a drawing."""
+    figure = Figure(figsize=(9.0, sum(_line_heights(chart["plots"]))))
     draw_plots(figure, chart["plots"])
     return figure
+
+
+def show_plots(*plots: Plot, ax: Axes | None = None, caption: str = "") -> Any:
+    """Draw plots on a new figure of pyplot, or a plot of one row on `ax`; return the axes, an array of several.
+
+    The `caption` is written below a new figure.
+    """
+    if ax is None:
+        figure = pyplot_figure(figsize=(9.0, sum(_line_heights(plots))), layout="constrained")
+        draw_plots(figure, plots)
+        if caption:
+            figure.supxlabel(caption, fontsize=9.0)
+        return figure.axes[0] if len(figure.axes) == 1 else np.array(figure.axes)
+    draw_plot(plots[0], ax)
+    return ax
 
 
 def _line_heights(plots: Sequence[Plot]) -> list[float]:
@@ -34,7 +50,13 @@ def draw_plots(figure: FigureBase, plots: Sequence[Plot]) -> None:
     parts = figure.subfigures(len(heights), min(len(plots), 3), squeeze=False, height_ratios=heights).flat
     for part, plot in zip(parts, plots, strict=False):
         domains = [np.ptp(axis["domain"]) for name, axis in plot["layout"].items() if name.startswith("yaxis")]
-        draw_plot(plot, *part.subplots(len(domains), 1, sharex=True, squeeze=False, height_ratios=domains)[:, 0])
+        rows = part.subplots(len(domains), 1, sharex=True, squeeze=False, height_ratios=domains)[:, 0]
+        draw_plot(plot, *rows)
+        if part.get_layout_engine() is None:
+            left, right, bottom, top = _MARGINS
+            width, height = part.bbox.width / part.dpi, part.bbox.height / part.dpi
+            ends = {"left": left / width, "right": 1.0 - right / width}
+            part.subplots_adjust(**ends, bottom=bottom / height, top=1.0 - top / height, hspace=0.15)
 
 
 def draw_plot(plot: Plot, *rows: Axes) -> None:
@@ -55,7 +77,12 @@ def draw_plot(plot: Plot, *rows: Axes) -> None:
     _format_axis(rows[-1], "x", layout["xaxis"])
     if layout["showlegend"]:
         above: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "frameon": False}
-        rows[0].legend(**above, title=plot["title"], ncols=2, fontsize=9.0, columnspacing=1.0)
+        entries = {
+            label: handle for axes in rows for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+        }
+        named = list(entries.values()), list(entries)
+        columns = len(entries) if len(entries) <= 3 else 2
+        rows[0].legend(*named, **above, title=plot["title"], ncols=columns, fontsize=9.0, columnspacing=1.0)
     else:
         rows[0].set_title(plot["title"], fontsize=10.0)
 
@@ -101,6 +128,7 @@ def _format_axis(axes: Axes, letter: str, layout: dict[str, Any]) -> None:
     if is_log:
         low, high = axis.get_view_interval()
         log_ticks(axis, "", (1.0, 2.0, 5.0) if high < 100.0 * low else (1.0,))
+        axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(_format_tick)
 
 

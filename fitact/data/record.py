@@ -11,12 +11,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from fitact import charts
 from fitact.data.clipping import clipping_mask
 from fitact.errors import InputError
+from fitact.tables import Display
+from fitact.units import format_engineering
 
 MINIMUM_SAMPLES = 20
 OVERFLOW = 9e36  # oscilloscopes write 9.9E+37 or more for a value out of range
 CHANNEL_UNITS = {"V": "V", "Vsc": "V", "I": "A", "Ft": "N"}
+CHANNEL_TITLES = {"V": "drive V", "Vsc": "skin voltage Vsc", "I": "loop current I", "Ft": "friction Ft"}
 
 # times of existing records, so that records on the same grid share one array
 _SHARED_TIMES: weakref.WeakValueDictionary[tuple[float, ...], np.ndarray] = weakref.WeakValueDictionary()
@@ -27,8 +31,8 @@ STATE_RATE = "state the sampling rate (--rate, or [measurement] sampling_rate in
 _RowLabel = Callable[[int], str]
 
 
-@dataclasses.dataclass(frozen=True)
-class Record:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Record(Display):
     """Time and channels of one measurement, in SI units.
 
     Attributes:
@@ -125,6 +129,37 @@ class Record:
         if ("frequency", channel) not in self._known:
             self._known["frequency", channel] = fundamental_frequency(self.time, self[channel])
         return self._known["frequency", channel]
+
+    def plot(self) -> Any:
+        """Draw V, Vsc and I on one time axis, and return the axes, one for each channel."""
+        series = [
+            charts.Series(title, CHANNEL_UNITS[name], self[name], clipped=clipping_mask(self[name]))
+            for name, title in CHANNEL_TITLES.items()
+            if name in self
+        ]
+        return charts.show_plots(charts.time_plot(self.time, series))
+
+    def to_dataframe(self) -> Any:
+        """Return a pandas DataFrame with the columns of a record file: time_s, V_V, Vsc_V, I_A."""
+        import pandas as pd
+
+        columns = {f"{name}_{CHANNEL_UNITS[name]}": values for name, values in self.channels.items()}
+        return pd.DataFrame({"time_s": self.time} | columns)
+
+    @property
+    def _headline(self) -> str:
+        span, rate = (
+            format_engineering(self.time[-1] - self.time[0], "s"),
+            format_engineering(1.0 / self.time_step, "Hz"),
+        )
+        return f"{self.source}, {', '.join(self.channels)}, {len(self):,} samples, {span} at {rate}"
+
+    def _rows(self) -> list[tuple[str, ...]]:
+        rows: list[tuple[str, ...]] = [("channel", "minimum", "maximum", "noise")]
+        for name, values in self.channels.items():
+            numbers = (float(values.min()), float(values.max()), self.noise(name))
+            rows.append((name, *(format_engineering(number, CHANNEL_UNITS[name]) for number in numbers)))
+        return rows
 
     @functools.cached_property
     def _known(self) -> dict[tuple[str, str], Any]:

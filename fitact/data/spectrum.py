@@ -7,16 +7,17 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from jaxtyping import Complex, Float
 
+from fitact import charts
 from fitact.errors import InputError
-from fitact.tables import join_lines
+from fitact.tables import Display, join_lines
 from fitact.units import format_engineering
 
 MINIMUM_POINTS = 5
 ChannelName: TypeAlias = Literal["impedance", "Vsc"]
 
 
-@dataclasses.dataclass(frozen=True)
-class Spectrum:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Spectrum(Display):
     """Impedance V / I between the drive electrode and ground, or gain Vsc / V.
 
     Attributes:
@@ -115,14 +116,44 @@ class Spectrum:
             "warnings": list(self.warnings),
         }
 
-    def __str__(self) -> str:
+    def plot(self) -> Any:
+        """Draw magnitude and phase over frequency (a Bode diagram), and return the two axes."""
+        return charts.show_plots(charts.spectrum_plot(self.frequency, *self.symbol, self.values))
+
+    @property
+    def symbol(self) -> tuple[str, str]:
+        """Symbol of the magnitude, and its unit."""
+        return ("|Z|", "ohm") if self.channel == "impedance" else ("|Vsc / V|", "1")
+
+    def to_dataframe(self) -> Any:
+        """Return a pandas DataFrame with a row a frequency: frequency_Hz, real, imag (ohm, or 1 for a gain)."""
+        import pandas as pd
+
+        return pd.DataFrame({"frequency_Hz": self.frequency, "real": self.values.real, "imag": self.values.imag})
+
+    @property
+    def _headline(self) -> str:
         low, high = (format_engineering(float(f), "Hz") for f in self.frequency[[0, -1]])
         is_impedance = self.channel == "impedance"
         small, large = (
             format_engineering(float(z), "ohm") if is_impedance else f"{z:.3g}"
             for z in np.sort(np.abs(self.values))[[0, -1]]
         )
-        kind, name = ("impedance spectrum", "|Z|") if is_impedance else ("gain of Vsc over V", "|Vsc / V|")
+        kind = "impedance spectrum" if is_impedance else "gain of Vsc over V"
+        return f"{self.source} ({kind}): {len(self)} points, {low} to {high}, {self.symbol[0]} {small} to {large}"
+
+    def _rows(self) -> list[tuple[str, ...]]:
+        name, unit = self.symbol
+        rows: list[tuple[str, ...]] = [("frequency", name, "phase")]
+        for i in (0, -1):
+            size = format_engineering(abs(self.values[i]), unit)
+            frequency = format_engineering(float(self.frequency[i]), "Hz")
+            rows.append((frequency, size, f"{np.angle(self.values[i], deg=True):.1f}°"))
+        return rows
+
+    def _sentences(self) -> tuple[str, ...]:
         sign = "negative (capacitive)" if np.mean(self.values.imag) < 0.0 else "positive"
-        first = f"{self.source} ({kind}): {len(self)} points, {low} to {high}, {name} {small} to {large}"
-        return join_lines([first, f"The imaginary part is mostly {sign}."], self.warnings, self.notes)
+        return (f"The imaginary part is mostly {sign}.",)
+
+    def __str__(self) -> str:
+        return join_lines([self._headline, *self._sentences()], self.warnings, self.notes)

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from fitact import charts
 from fitact.design.drive_option import ASSURANCE, DriveOption, normalize_drive, quantile
 from fitact.design.drive_people import FingerSample
 from fitact.design.limits import AC_3, ES1, NO_SAFETY_ASSESSMENT, LimitComparison, format_quantity
 from fitact.scene.scene import Scene
-from fitact.tables import align_table, join_lines
+from fitact.tables import Display, align_table, join_lines
 from fitact.units import format_engineering
 
 _STATED_LIMITS = ("breakdown_field", "current_limit_rms", "current_limit_peak")  # keys of [device]
@@ -24,8 +25,8 @@ _LEGEND = (
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class DriveDesign:
+@dataclasses.dataclass(frozen=True, repr=False)
+class DriveDesign(Display):
     """Drives that a given fraction of fingers feel on a panel.
 
     Attributes:
@@ -240,6 +241,21 @@ class DriveDesign:
             *([f"{unstated} {'it' if len(absent) == 1 else 'them'}."] if absent else []),
             *(f"{name}: not recommended, {_UNBOUNDED}; state [drive] rise_time." for name in unbounded),
         )
+
+    def plot(self) -> Any:
+        """Draw who feels an amplitude, and the amplitude over frequency and insulator, and return the axes."""
+        figure = charts.draw_drive_design(self.to_dict(), self.scene_waveform, make=charts.pyplot_figure)
+        return np.array(figure.axes)
+
+    @property
+    def _headline(self) -> str:
+        return self.recommendation if self.recommended else self.recommendation.partition(" (")[0]
+
+    def _rows(self) -> tuple[tuple[str, ...], ...]:
+        return self.table
+
+    def _sentences(self) -> tuple[str, ...]:
+        return self.recommendation, self.question, self.exposure, self.legend
 
     def summary(self) -> str:
         """Return the recommendation, the tables for people, and notes and warnings."""

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from fitact import charts
 from fitact.data.record import Record
 from fitact.data.simulate import sample_times
 from fitact.errors import InputError
@@ -23,7 +24,7 @@ from fitact.instrument.classes import typical_gain_u
 from fitact.model.skin import circuit_parameters
 from fitact.prior.distributions import LogNormal
 from fitact.scene.scene import Scene
-from fitact.tables import align_row, join_lines
+from fitact.tables import Display, align_row, join_lines
 from fitact.units import format_percent
 
 _MIN_GAIN = math.log(1.01)  # smallest gain that counts as an improvement
@@ -39,8 +40,8 @@ class SettingCurve:
     force_sd: tuple[float, ...]  # as in `DesignOption`
 
 
-@dataclasses.dataclass(frozen=True)
-class MeasurementDesign:
+@dataclasses.dataclass(frozen=True, repr=False)
+class MeasurementDesign(Display):
     """Possible changes of a measurement, and the expected uncertainty of the mean force.
 
     Attributes:
@@ -80,6 +81,23 @@ class MeasurementDesign:
             "trusted": self.trusted,
             "warnings": list(self.warnings),
         }
+
+    def plot(self) -> Any:
+        """Draw the expected uncertainty of the mean force for each option, and along each setting; return the axes."""
+        return np.array(charts.draw_design(self.to_dict(), make=charts.pyplot_figure).axes)
+
+    @property
+    def _headline(self) -> str:
+        best, now = self.best_for_effort, format_percent(self.now.force_sd)
+        after = "no change gains 1 %" if best is None else f"± {format_percent(best.force_sd)} with {best.text}"
+        return f"mean force ± {now} as it stands, {after}"
+
+    def _rows(self) -> tuple[tuple[str, ...], ...]:
+        (_, *titles), *rows = self.table
+        return ("what is measured", *titles), *rows
+
+    def _sentences(self) -> tuple[str, ...]:
+        return self.sentences
 
     def __str__(self) -> str:
         """Return the table for people, the option with the largest gain per effort, and the options without gain."""

@@ -18,6 +18,7 @@ from fitact.fitting.spectra import spectrum_statistics
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import STUDENT_DOF, student_weight
+from fitact.likelihood.spectrum_channel import join_complex
 from fitact.model.circuit import Channel, Circuit
 from fitact.model.skin import WithSkin
 
@@ -40,6 +41,22 @@ class ChannelFit:
     log_likelihood: float  # log-likelihood of the samples, including all constants
     figures: dict[str, float]  # figures of merit: chi2_reduced, rms_residual, noise_expected, runs_z, ...
     full_because: str  # reason why the likelihood is not compressed, as a clause; "" if it is
+
+    @property
+    def relative_noise_sd(self) -> Samples:
+        """Standard deviation of each sample's noise over the channel's; NaN where a sample was excluded."""
+        if self.weight is None:
+            return np.ones(self.residuals.size)
+        counts = self.weight > 0.0
+        return np.where(counts, 1.0 / np.where(counts, self.weight, 1.0), np.nan)
+
+    @property
+    def fitted(self) -> np.ndarray:
+        """Data minus residuals, V or A, or complex for a spectrum; NaN where a sample was excluded."""
+        if isinstance(self.record, Spectrum):
+            return self.record.values - join_complex(self.residuals)
+        counts = np.isfinite(self.relative_noise_sd)
+        return np.where(counts, self.record[self.channel] - self.residuals, np.nan)
 
     @classmethod
     def from_optimum(

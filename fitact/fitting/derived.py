@@ -161,6 +161,23 @@ def draw_derived(
     return evaluate_draws(_derive_draw, derive, derive.time.size, points, deviates)
 
 
+def draw_force(
+    derive: DerivedQuantities,
+    likelihood: Likelihood,
+    points: Float[np.ndarray, "*draws coordinates"],
+    deviates: Float[np.ndarray, "*draws channels nuisances"],
+    span: float = math.inf,
+    count: int = 2000,
+) -> tuple[Float[np.ndarray, " count"], Float[np.ndarray, "*draws count"]]:
+    """Return times (s), at most the last `span` of those of the means, and the force (N) at points of a posterior."""
+    used = np.asarray(derive.time)[np.asarray(derive.weight) > 0.0]
+    first, last = float(used.min()), float(used.max())
+    time = np.linspace(max(first, last - span), last, count)
+    theta = points[..., : -len(likelihood.channels)].reshape(-1, points.shape[-1] - len(likelihood.channels))
+    derive = dataclasses.replace(derive, time=time, weight=np.full(count, 1.0 / count)).tabulate(theta)
+    return time, evaluate_draws(_draw_force, derive, count, points, deviates)
+
+
 def nuisance_deviates(
     likelihood: Likelihood, points: Float[np.ndarray, "*draws coordinates"], seed: int
 ) -> Float[np.ndarray, "*draws channels nuisances"]:
@@ -184,6 +201,11 @@ def evaluate_draws(
 def _derive_draw(derive: DerivedQuantities, point: Array, deviate: Array) -> Array:
     theta, log_sigma = derive.likelihood.split(point)
     return derive(theta, jnp.exp(log_sigma), deviate)
+
+
+def _draw_force(derive: DerivedQuantities, point: Array, deviate: Array) -> Array:
+    theta, log_sigma = derive.likelihood.split(point)
+    return derive.force(theta, jnp.exp(log_sigma), deviate)
 
 
 def derived_from_fit(

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from fitact import summary
+from fitact import charts, summary
 from fitact.data.kramers_kronig import KramersKronig, check_kramers_kronig
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
@@ -29,6 +29,7 @@ from fitact.fitting.error_sources import (
     noise_information,
     structure_components,
 )
+from fitact.fitting.fit_figures import plot_fit, plot_identifiability
 from fitact.fitting.geometry import UncertainGeometry
 from fitact.fitting.identifiability import assess_identifiability, assess_parameters
 from fitact.fitting.laplace import FitResult, Laplace
@@ -59,7 +60,7 @@ _RESPONSE = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Fit(FitResult):
     """Fit of one circuit to records: best parameters, their Laplace approximation, and whether it is reliable.
 
@@ -244,6 +245,59 @@ class Fit(FitResult):
             InputError: the level is not between 0 and 1.
         """
         return profile_intervals(self, (*self.names, *PROFILE_QUANTITIES), level, prior)
+
+    def plot(self, record: int = 0) -> Any:
+        """Draw V, and each fitted channel with its fit and residuals, on one axis of time or frequency.
+
+        `record` counts the records and spectra. Returns the axes, from top to bottom.
+        """
+        return plot_fit(self, record)
+
+    def plot_budget(self) -> Any:
+        """Draw the largest components of each quantity's combined uncertainty, and return the axes."""
+        return np.array(charts.draw_budgets(self.budget_entries(), make=charts.pyplot_figure).axes)
+
+    def plot_identifiability(self, ax: Any = None) -> Any:
+        """Draw the 95 % regions of two parameters before and after the data, in the Laplace approximation.
+
+        They are the two that change most in the direction that the data constrain least. Returns the axes.
+        """
+        return plot_identifiability(self, ax)
+
+    def to_dataframe(self) -> Any:
+        """Return a pandas DataFrame with a row for each parameter and derived quantity, by name, in SI units.
+
+        Columns are those of `parameters()`: unit, mean, sd, quantiles, u, contraction and from_prior.
+        """
+        import pandas as pd
+
+        return pd.DataFrame.from_dict(self.parameters() | self.derived(), orient="index")
+
+    @property
+    def _headline(self) -> str:
+        values, sd = self.likelihood.to_physical(self.theta), dict(zip(self.names, self.sd, strict=True))
+        estimates = {
+            name: summary.summarize_log_normal(name, float(values[name]), float(sd[name]))
+            for name in FINGER_PARAMETERS
+            if name in sd
+        }
+        return f"{self._describe_records()}, {summary.format_estimates(estimates)}, {self._describe_verdict()}"
+
+    def _describe_records(self) -> str:
+        others = len(self.records) - 1
+        return os.path.basename(self.records[0].source) + (f" and {others} more" if others else "")
+
+    def _describe_verdict(self) -> str:
+        return f"{self.identifiability.verdict}, {'reliable' if self.trusted else f'unreliable ({self.result})'}"
+
+    def _rows(self) -> list[tuple[str, ...]]:
+        content = {"parameters": self.parameters(), "derived": self.derived(), "force_basis": self.force_basis}
+        return summary.quantity_table(content)
+
+    def _sentences(self) -> list[str]:
+        law = summary.force_sentences(self.force_basis)[0]
+        share = 100.0 * self.identifiability.force_from_prior
+        return [self.message, f"The prior contributes {share:.3g} % of the variance of the force.", law]
 
     def model(self) -> dict[str, Any]:
         """Return the fitted model by name."""

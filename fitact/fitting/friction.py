@@ -12,7 +12,8 @@ from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.starting_point import estimate_from_vsc
 from fitact.likelihood import certificate
 from fitact.likelihood.channel import CHARGES, LINEAR_NUISANCES, ChannelLikelihood
-from fitact.likelihood.friction_channel import FRICTION_PARAMETERS, FrictionChannel
+from fitact.likelihood.friction_channel import FrictionChannel
+from fitact.model.force import FRICTION_PARAMETERS
 from fitact.scene.scene import Scene
 
 

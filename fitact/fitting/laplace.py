@@ -19,6 +19,7 @@ from fitact.model.force import ForceModel
 from fitact.model.skin import constant_skin_circuit
 from fitact.scene.assumptions import list_assumptions
 from fitact.scene.scene import Scene
+from fitact.tables import Display
 from fitact.uncertainty.budget import Budget
 from fitact.units import quantity_unit
 
@@ -60,8 +61,8 @@ class Laplace:
         return self.log_derived[1][derived.DERIVED_NAMES.index(name)]
 
 
-@dataclasses.dataclass(frozen=True)
-class FitResult(abc.ABC):
+@dataclasses.dataclass(frozen=True, repr=False)
+class FitResult(Display, abc.ABC):
     """Result of a fit: a Laplace approximation, and whether it is reliable."""
 
     laplace: Laplace  # best parameters and derived quantities, with their covariance

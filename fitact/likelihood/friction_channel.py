@@ -13,8 +13,6 @@ from fitact.likelihood.compression import BASELINE_NAMES
 from fitact.model.force import Geometry, electrostatic_force, friction
 from fitact.model.force_sensor import ForceSensor, mean_square_over_step
 
-# coefficient, normal force (N) and force scale of eq. (2), and the sensor's natural frequency (Hz) and damping ratio
-FRICTION_PARAMETERS = ("mu", "fN", "force_scale", "sensor_frequency", "sensor_damping")
 # of a friction channel, in the place of the decays of charges: state of the sensor at the first sample, and parts of
 # the reading in proportion to V and dV/dt
 _NUISANCES = ("ringing", "ringing_2", "crosstalk", "crosstalk_2")

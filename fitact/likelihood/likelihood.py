@@ -19,8 +19,9 @@ from jaxtyping import Array, Bool, Float
 from fitact.compiled import BatchEvaluator, array_module, jit
 from fitact.likelihood.calibration import Calibration
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
-from fitact.likelihood.friction_channel import FRICTION_PARAMETERS, FrictionChannel
+from fitact.likelihood.friction_channel import FrictionChannel
 from fitact.model.circuit import RC, Channel, Circuit, HighpassTerms
+from fitact.model.force import FRICTION_PARAMETERS
 from fitact.model.skin import (
     WithSkin,
     circuit_parameters,

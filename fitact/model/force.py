@@ -15,6 +15,8 @@ from fitact.model.steady import mean_square, peak
 
 EPSILON_0 = 8.85e-12  # F/m, as in the reference paper
 
+# coefficient, normal force (N) and force scale of eq. (2), and the sensor's natural frequency (Hz) and damping ratio
+FRICTION_PARAMETERS = ("mu", "fN", "force_scale", "sensor_frequency", "sensor_damping")
 ForceModel: TypeAlias = Literal["paper", "gap"]
 
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from fitact import charts
 from fitact.model.circuit import FinalCircuit, NaturalGround
 from fitact.model.drive import Sampled
 from fitact.model_selection import omissions
@@ -19,7 +20,7 @@ from fitact.model_selection.model_errors import ReferenceModel
 from fitact.model_selection.omissions import drop_parameters
 from fitact.model_selection.partial_fractions import ROWS
 from fitact.scene.scene import Scene
-from fitact.tables import align_row, join_lines
+from fitact.tables import Display, align_row, join_lines
 from fitact.units import format_engineering, format_percent
 
 _TITLES = ("Vsc rms", "Vsc peak", "mean force", "peak force")
@@ -59,8 +60,8 @@ class Omission:
         return {"name": self.name} | errors | {"speedup": self.speedup, "kept": self.kept, "because": self.because}
 
 
-@dataclasses.dataclass(frozen=True)
-class Plan:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Plan(Display):
     """Planned model of a scene.
 
     Attributes:
@@ -119,6 +120,21 @@ class Plan:
         """Return the JSON output of `fitact plan`."""
         rows = [omission.to_dict() for omission in self.omissions]
         return {"omissions": rows, "model": self.model(), "warnings": list(self.warnings)}
+
+    def plot(self) -> Any:
+        """Draw the force errors of each omission beside the tolerance, and return the axes."""
+        return charts.draw_plan(self.to_dict(), make=charts.pyplot_figure).axes[0]
+
+    @property
+    def _headline(self) -> str:
+        left_out = f"neglects {', '.join(self.left_out)}" if self.left_out else "neglects nothing"
+        return f"{left_out}, force error {format_percent(self.nominal.force)}, {self.speedup:.2g} times faster"
+
+    def _rows(self) -> tuple[tuple[str, ...], ...]:
+        return self.table
+
+    def _sentences(self) -> tuple[str, ...]:
+        return LEGEND, self.sentence
 
     def summary(self) -> str:
         """Return the text table, the neglected elements, and warnings."""

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitact import summary
+from fitact import charts, summary
 from fitact.compiled import jit
 from fitact.files import atomic_write
 from fitact.populations.contact_area import ContactAreaTest
@@ -31,8 +31,9 @@ from fitact.populations.next_finger import (
 from fitact.populations.sobol import SobolIndices, variance_shares
 from fitact.populations.within_finger import WithinFinger
 from fitact.sampling.convergence import Convergence
+from fitact.sampling.posterior import convert_to_arviz
 from fitact.scene.scene import Scene
-from fitact.tables import align_table, join_lines
+from fitact.tables import Display, align_table, join_lines
 from fitact.units import choose_prefixed_unit, format_engineering, format_percent, quantity_unit
 
 QUANTILES = tuple(summary.PROBABILITIES.values())  # of the force in time
@@ -42,8 +43,8 @@ ADVICE = "use track"  # in the message of a fit that shows a finger that changes
 SHARES_LEGEND = "Parameters: Sobol indices, first-order (total)."
 
 
-@dataclasses.dataclass(frozen=True)
-class Population:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Population(Display):
     """Draws of the population parameters, and of new fingers.
 
     Attributes:
@@ -325,6 +326,49 @@ class Population:
                 "force_in_time": in_time,
             }
         )
+
+    def to_arviz(self) -> Any:
+        """Return ArviZ's object of `to_datatree()`: an `InferenceData`, or from ArviZ 1 on the DataTree itself."""
+        return convert_to_arviz(self.to_datatree())
+
+    def to_dataframe(self) -> Any:
+        """Return a pandas DataFrame with a row for each finger, fitted by itself.
+
+        The index is the record; columns are the result, and for Rsc, Csc and Ci the median (SI) and, with the ending
+        _sd, the standard deviation.
+        """
+        import pandas as pd
+
+        rows = {}
+        for finger in self.fingers:
+            estimates = {name: finger.parameters[name] for name in (*SKIN, SHARED_PARAMETER)}
+            columns = [(name, each["q50"], each["sd"]) for name, each in estimates.items()]
+            values = {key: x for name, median, sd in columns for key, x in ((name, median), (f"{name}_sd", sd))}
+            rows[finger.source] = {"result": finger.result, **values}
+        return pd.DataFrame.from_dict(rows, orient="index")
+
+    def plot(self) -> Any:
+        """Draw the fingers, the force on the next one and over time, and the sources of variance; return the axes."""
+        figure = charts.draw_population(self.to_datatree(), self.to_dict(), make=charts.pyplot_figure)
+        figure.supxlabel(f"Force: {self._force_law}.", fontsize=9.0)
+        return np.array(figure.axes)
+
+    @property
+    def _force_law(self) -> str:
+        return f"computed {summary.FORCE_LAWS[self.scene.force.model]} and not measured"
+
+    @property
+    def _headline(self) -> str:
+        law = self._parameter_draws
+        medians = {name: summary.summarize_draws(name, np.exp(x)) for name, x in log_medians(law).items()}
+        state = "reliable" if self.trusted else "unreliable"
+        return f"{len(self.fingers)} fingers, medians {summary.format_estimates(medians)}, {state}"
+
+    def _rows(self) -> tuple[tuple[str, ...], ...]:
+        return population_table(self.to_dict())
+
+    def _sentences(self) -> tuple[str, ...]:
+        return str(self.convergence), f"Force on the next finger: {self._force_law}."
 
     def to_netcdf(self, path: str | os.PathLike[str]) -> None:
         """Write `to_datatree()` as NetCDF."""

@@ -10,13 +10,14 @@ import jinja2
 from markdown_it import MarkdownIt
 from markupsafe import Markup
 
+from fitact.charts.budget import draw_budgets
 from fitact.errors import InputError
-from fitact.report.budget import draw_budgets
-from fitact.report.circuit import scene_circuit, scene_wiring
 from fitact.report.frame import image, write_page
-from fitact.report.posterior import CHANNELS, make_charts
+from fitact.report.posterior import make_charts
+from fitact.scene.diagrams import scene_circuit, scene_wiring
 from fitact.scene.scene import Scene
 from fitact.summary import (
+    FORCE_LAWS,
     blind_table,
     budget_sentence,
     budget_table,
@@ -44,7 +45,6 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
     """
     try:
         scene = Scene.from_dict(summary["scene"])
-        medians = {name: each["q50"] for name, each in summary["parameters"].items()}
         only_impedance = set(summary["model"]["channels"]) == {"impedance"}
         wirings = () if only_impedance else (scene_wiring(scene),)
         write_page(
@@ -52,14 +52,15 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
             "report.html",
             summary=summary,
             charts=make_charts(tree),
-            drawings=(scene_circuit(scene, medians), *wirings),
+            drawings=(scene_circuit(scene, summary["parameters"]), *wirings),
             table=quantity_table(summary),
-            channels=CHANNELS,
+            panels=_panels(summary["fit"]["traces"]),
             budgets=[budget_table(name, entry) for name, entry in summary["budget"].items()],
             blind=blind_table(summary),
             budget_note=budget_sentence(summary),
             budget_picture=image(lambda: draw_budgets(summary["budget"])),
             force=result_sentences(summary),
+            law=f"computed {FORCE_LAWS[summary['force_basis']['law']]}",
             circuits=_CIRCUITS,
             estimate=format_estimate,
             interval=format_interval,
@@ -85,6 +86,16 @@ def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]
         raise InputError(
             f"{directory}: holds no complete results ({error}); make them with: fitact sample RECORD --out {directory}"
         ) from error
+
+
+def _panels(traces: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    """Return the fitted channels of each record or spectrum, by the name of its chart."""
+    panels: dict[str, list[dict[str, Any]]] = {}
+    for trace in traces:
+        number = trace["label"].rpartition("_")[2]
+        axis = "frequency" if "structure_z" in trace else "time"
+        panels.setdefault(f"{axis}_{number}" if number.isdigit() else axis, []).append(trace)
+    return panels
 
 
 def _command(summary: dict[str, Any]) -> str:

@@ -1,27 +1,31 @@
 """A track as a page: values over time with their bands."""
 
 import os
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from fitact.charts import interactive
-from fitact.charts.figure import ALERT, MODEL
-from fitact.charts.interactive import Axis
+from fitact.charts.track import track_plot
 from fitact.report.frame import Answer, PageSummary, Provenance, write_page
 from fitact.summary import describe_quantity
 from fitact.tracking.track import Track
 from fitact.units import format_engineering, format_percent, quantity_unit
 
-_CHARTS = (("Rsc", "Csc"), ("contact_area", "force_mean"), ("g", "b"))
-_MAX_POINTS = 4_000  # of a curve
+_PAIRS = (("Rsc", "Csc"), ("contact_area", "force_mean"), ("g", "b"))
 
 
 def write_track(path: str | os.PathLike[str], track: Track, origin: Provenance) -> None:
     """Write the page of a track at `path`."""
-    pairs = [names for names in _CHARTS if all(name in track.values for name in names)]
-    panels = [(" and ".join(map(describe_quantity, names)), _chart(track, names)) for names in pairs]
+    columns = track.to_columns()
+    panels = [
+        (
+            " and ".join(map(describe_quantity, names)),
+            interactive.chart(*(track_plot(columns, name, track.jumps) for name in names)),
+        )
+        for names in _PAIRS
+        if all(name in track.values for name in names)
+    ]
     rows: list[tuple[str, ...]] = [
         ("", "median at the start", "at the end", "variation (sd of the logarithm)", "alike over")
     ]
@@ -68,35 +72,3 @@ def _frame(track: Track, state: dict[str, Any]) -> PageSummary:
         warnings=track.warnings,
         has_reservation=track.fit.identifiability.verdict != "identified",
     )
-
-
-def _chart(track: Track, names: tuple[str, ...]) -> interactive.Chart:
-    plots = []
-    for name in names:
-        values, spread = track.values[name], track.sd[name]
-        finite = np.isfinite(values)
-        x = Axis.from_values("time", "s", track.time)
-        title = name if name in ("g", "b") else describe_quantity(name)  # their names are long
-        y = Axis.from_values(title, quantity_unit(name), values[finite])
-        traces = []
-        for number, part in enumerate(_stretches(finite)):
-            time, middle = track.time[part], values[part]
-            low, high = (middle * np.exp(sign * 1.96 * spread[part]) for sign in (-1.0, 1.0))
-            edges = interactive.band(x, y, time, low, high, ("2.5 %", "97.5 %", "95 % band"), MODEL)
-            curve = interactive.line(x, y, time, middle, "median", MODEL)
-            shown = [*edges, curve]
-            traces += [each | ({"showlegend": False} if number else {}) for each in shown]
-        for jump in track.jumps:
-            ends = np.nanmin(values), np.nanmax(values)
-            traces.append(interactive.line(x, y, (jump, jump), ends, "jump", ALERT, dash="dot"))
-        plots.append(interactive.plot(x, (y, traces), legend=False))
-    return interactive.chart(*plots)
-
-
-def _stretches(shown: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the places of each stretch without a gap, at most `_MAX_POINTS` of all."""
-    places = np.flatnonzero(shown)
-    stride = -(-places.size // _MAX_POINTS)
-    for part in np.split(places, np.flatnonzero(np.diff(places) > 1) + 1):
-        if part.size:
-            yield part[::stride]

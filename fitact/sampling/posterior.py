@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from fitact import summary
-from fitact.data.record import CHANNEL_UNITS
+from fitact import charts, summary
+from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.data.spectrum import Spectrum
+from fitact.errors import InputError
 from fitact.files import atomic_write
 from fitact.fitting import derived
 from fitact.fitting.channel_fit import ChannelFit
@@ -24,16 +25,18 @@ from fitact.fitting.sensation import FeltDrive
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import draw_noise
 from fitact.likelihood.spectrum_channel import join_complex
+from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.model.drive import Periodic
 from fitact.model_selection.plan import Plan
 from fitact.sampling.chain import Chain
 from fitact.sampling.convergence import Convergence
+from fitact.tables import Display
 from fitact.uncertainty.budget import Budget
 from fitact.units import quantity_unit
 
 
-@dataclasses.dataclass(frozen=True)
-class Posterior:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Posterior(Display):
     """Draws of the parameters and of the derived quantities.
 
     Attributes:
@@ -230,6 +233,74 @@ class Posterior:
     def __str__(self) -> str:
         return summary.table(self._summary)
 
+    def plot(self) -> Any:
+        """Draw parameters (with their prior), pairs of Rsc, Csc and Ci, and the force, and return the axes."""
+        pages = charts.corner_plots(self.parameters(), self._prior_draws, FINGER_PARAMETERS)
+        return charts.show_plots(*pages[0], *pages[1], *charts.force_plots(self.force()), caption=self._force_law)
+
+    def plot_force(self, ax: Any = None) -> Any:
+        """Draw the force over time with its 90 % interval, and return the axes."""
+        time, force = self.force_in_time
+        quantiles = dict(zip(summary.PROBABILITIES.values(), force, strict=True))
+        return charts.show_plots(charts.force_in_time_plot(time, quantiles), ax=ax, caption=self._force_law)
+
+    def plot_budget(self) -> Any:
+        """Draw the largest components of each quantity's combined uncertainty, and return the axes."""
+        return np.array(charts.draw_budgets(self._budget_entries(), make=charts.pyplot_figure).axes)
+
+    @property
+    def _force_law(self) -> str:
+        return summary.force_sentences(self.fit.force_basis)[0]
+
+    @functools.cached_property
+    def force_in_time(self) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "quantiles times"]]:
+        """Times (s), and the quantiles 2.5, 5, 25, 50, 75, 95 and 97.5 % of the force (N) at each.
+
+        The times are one period of a stated drive, the last two of a measured one, or the whole of an aperiodic one.
+        The force is that of `force()`, for up to 100 draws of each ensemble.
+        """
+        first = self.fit.records[0]
+        frequency = None if isinstance(first, Spectrum) else first.frequency()
+        draws = np.linspace(0, self.points.shape[1] - 1, min(100, self.points.shape[1])).astype(int)
+        chosen = self.points[:, draws], self._deviates[:, draws]
+        span = math.inf if frequency is None else 2.0 / frequency
+        time, force = derived.draw_force(self.fit.derive, self.fit.likelihood, *chosen, span)
+        mean = derived.DERIVED_NAMES.index("force_mean")
+        force *= (self._derived_draws[:, draws, mean] / self._nominal_draws[:, draws, mean])[..., None]
+        return time, np.quantile(force.reshape(-1, time.size), list(summary.PROBABILITIES.values()), axis=0)
+
+    def to_dataframe(self) -> Any:
+        """Return a pandas DataFrame with a row a draw and a column a parameter or derived quantity, in SI units.
+
+        The index holds the chain (independent ensemble) and the draw.
+        """
+        import pandas as pd
+
+        index = pd.MultiIndex.from_product(map(range, self.points.shape[:2]), names=["chain", "draw"])
+        columns = {name: values.ravel() for name, values in (self.parameters() | self.derived()).items()}
+        return pd.DataFrame(columns, index=index)
+
+    def to_arviz(self) -> Any:
+        """Return ArviZ's object: an `InferenceData`, or from ArviZ 1 on the `xarray.DataTree` itself.
+
+        Raises:
+            InputError: ArviZ is not installed.
+        """
+        return convert_to_arviz(self.to_datatree())
+
+    @property
+    def _headline(self) -> str:
+        values = self.fit.likelihood.to_physical(self.points[..., : self.fit.theta.size])
+        estimates = {name: summary.summarize_draws(name, values[name]) for name in FINGER_PARAMETERS if name in values}
+        state = self.fit.identifiability.verdict, "reliable" if self.trusted else "unreliable"
+        return ", ".join((self._record()["source"], summary.format_estimates(estimates), *state))
+
+    def _rows(self) -> list[tuple[str, ...]]:
+        return summary.quantity_table(self._summary)
+
+    def _sentences(self) -> tuple[str, ...]:
+        return str(self.convergence), self._force_law
+
     def to_datatree(self) -> Any:
         """Return an `xarray.DataTree` in ArviZ's groups; chain: the independent ensembles."""
         import xarray as xr
@@ -239,27 +310,30 @@ class Posterior:
             variables = {name: (dims, values, {"units": quantity_unit(name)}) for name, values in draws.items()}
             return xr.Dataset(variables, coords=coords)
 
-        rng = np.random.default_rng([self.seed, 2])
         ensembles, count = self.points.shape[:2]
-        prior_draws = self.fit.likelihood.prior.sample(rng, ensembles * count)
-        prior = {name: draws.reshape(ensembles, count) for name, draws in prior_draws.items()}
+        prior, (instants, force) = self._prior_draws, self.force_in_time
+        in_time = xr.Dataset(
+            {"force": (("quantile", "time"), force, {"units": "N"})},
+            {"quantile": list(summary.PROBABILITIES.values()), "time": ("time", instants, {"units": "s"})},
+            {"law": self._force_law},
+        )
         observed, constant = xr.Dataset(), xr.Dataset()
         for channel in self.fit.traces:
             if isinstance(channel.record, Spectrum):
                 axis, variables = _spectrum_axis(channel), _spectrum_variables(channel, channel.record.values)
-                fits = channel.record.values - join_complex(channel.residuals)
                 observed = observed.merge(xr.Dataset(variables, coords=axis))
-                constant = constant.merge(xr.Dataset(_spectrum_variables(channel, fits, "_fit"), coords=axis))
+                constant = constant.merge(xr.Dataset(_spectrum_variables(channel, channel.fitted, "_fit"), coords=axis))
                 continue
             time, name = _time_axis_name(channel), _variable_name(channel)
             unit = {"units": CHANNEL_UNITS[channel.channel]}
             coords = {time: (time, channel.record.time, {"units": "s"})}
             values = channel.record[channel.channel]
             observed = observed.merge(xr.Dataset({name: (time, values, unit)}, coords=coords))
-            counts = np.isfinite(_relative_noise_sd(channel))
-            fitted = {f"{name}_fit": (time, np.where(counts, values - channel.residuals, np.nan), unit)}
+            fitted = {f"{name}_fit": (time, channel.fitted, unit)}
             drive = {_variable_name(channel, "V"): (time, channel.choice.voltage, {"units": "V"})}
-            constant = constant.merge(xr.Dataset(fitted | drive, coords=coords))
+            constant = constant.merge(
+                xr.Dataset(fitted | drive | self._unfitted(channel, channel.record, time), coords=coords)
+            )
         attributes = {
             "inference_library": "fitact",
             "level": self.convergence.level,
@@ -279,8 +353,26 @@ class Posterior:
                 "observed_data": observed,
                 "constant_data": constant,
                 "prior": dataset(prior),
+                "force_in_time": in_time,
             }
         )
+
+    def _unfitted(self, trace: ChannelFit, record: Record, time: str) -> dict[str, Any]:
+        """Return the channels of a fitted channel's record that were recorded but not fitted, as variables."""
+        fitted = {each.channel for each in self.fit.traces if each.record is record}
+        others = [name for name in record.channels if name not in fitted]
+        if np.array_equal(trace.choice.voltage, record.channels.get("V", trace.choice.voltage)):
+            others = [name for name in others if name != "V"]  # which is the drive
+        return {
+            f"{_variable_name(trace, name)}_recorded": (time, record[name], {"units": CHANNEL_UNITS[name]})
+            for name in others
+        }
+
+    @functools.cached_property
+    def _prior_draws(self) -> dict[str, Float[np.ndarray, "ensembles draws"]]:
+        ensembles, count = self.points.shape[:2]
+        draws = self.fit.likelihood.prior.sample(np.random.default_rng([self.seed, 2]), ensembles * count)
+        return {name: each.reshape(ensembles, count) for name, each in draws.items()}
 
     @functools.cached_property
     def _posterior_predictive(self) -> Any:
@@ -294,7 +386,7 @@ class Posterior:
         for i, (channel, model) in enumerate(zip(self.fit.traces, self.fit.likelihood.channels, strict=True)):
             stride = -(-len(channel.record) // 4000)
             signal = functools.partial(_predict_signal, i, stride)
-            sd = _relative_noise_sd(channel)[::stride]
+            sd = channel.relative_noise_sd[::stride]
             chosen = self.points[:, draws], self._deviates[:, draws]
             mean = derived.evaluate_draws(signal, self.fit.likelihood, model.time.size, *chosen)[..., : sd.size]
             sigma = np.exp(self.points[:, draws, self.fit.theta.size + i, None])
@@ -327,12 +419,16 @@ class Posterior:
         write_report(path, self.to_datatree(), self.summary() | stated)
 
 
-def _relative_noise_sd(channel: ChannelFit) -> Float[np.ndarray, " samples"]:
-    """Standard deviation of each sample's noise over the channel's; NaN where a sample was excluded."""
-    if channel.weight is None:
-        return np.ones(channel.residuals.size)
-    counts = channel.weight > 0.0
-    return np.where(counts, 1.0 / np.where(counts, channel.weight, 1.0), np.nan)
+def convert_to_arviz(tree: Any) -> Any:
+    """Return a DataTree as ArviZ's object; InputError if ArviZ is not installed."""
+    try:
+        import arviz
+    except ImportError as error:
+        raise InputError("ArviZ is not installed; install it with: pip install 'fitact[arviz]'") from error
+    if not hasattr(arviz, "InferenceData"):  # ArviZ 1 takes the tree as it is
+        return tree
+    groups = {name: node.to_dataset() for name, node in tree.children.items()}
+    return arviz.InferenceData(attrs=tree.attrs, **groups)
 
 
 def _time_axis_name(channel: ChannelFit, name: str = "time") -> str:

@@ -27,7 +27,7 @@ from fitact.prior.distributions import Distribution, LogNormal
 from fitact.prior.prior import Prior
 from fitact.prior.product import multiply
 from fitact.prior.published import Layer
-from fitact.scene import sections, toml
+from fitact.scene import diagrams, sections, toml
 from fitact.scene.calibration_section import CalibrationSection
 from fitact.scene.instrument_section import InstrumentSection
 from fitact.scene.prior_section import FRICTION_PRIORS, PriorSection
@@ -35,6 +35,7 @@ from fitact.scene.prior_spec import ORDER_KEYS, PriorSpec
 from fitact.scene.section import Section, field_section
 from fitact.scene.threshold_table import resolve_table_path
 from fitact.scene.uncertain_value import UncertainValue
+from fitact.tables import Display
 
 _DIRECT_GROUND_KEYS = ("R_H", "grounding_Rsc", "grounding_Csc")  # keys of only one kind of grounding
 _NATURAL_GROUND_KEYS = ("Z", "Z_capacitance")
@@ -52,7 +53,7 @@ PLATES = {  # eq. (3): capacitance -> the powers of the quantities that it follo
 }
 
 
-class Scene(Section):
+class Scene(Section, Display):
     """Device, skin, grounding, drive, measurement and prior of one case; see the sections.
 
     Attributes:
@@ -113,6 +114,22 @@ class Scene(Section):
     def __str__(self) -> str:
         """Return the scene as TOML: every key with its unit, defaults as comments. It loads to an equal scene."""
         return toml.to_toml(self)
+
+    __repr__ = Display.__repr__
+
+    @property
+    def _headline(self) -> str:
+        sections = [name for name in type(self).model_fields if name in self.model_fields_set]
+        return f"states {', '.join(sections)}" if sections else "the nominal device of the reference paper"
+
+    def _rows(self) -> list[tuple[str, ...]]:
+        stated = [line for line in str(self).splitlines() if line and not line.startswith("#")]
+        rows = [("key", "value"), *(tuple(line.split(" = ", 1)) for line in stated)]
+        # a section without stated keys is the default
+        return [row for row, after in zip(rows, [*rows[1:], ("",)], strict=True) if len(row) == 2 or len(after) == 2]
+
+    def _repr_html_(self) -> str:
+        return super()._repr_html_() + str(diagrams.scene_circuit(self))
 
     def to_json(self) -> str:
         """Return the stated keys as JSON, in SI units; `from_json` reads it."""

@@ -68,3 +68,6 @@ class Section(pydantic.BaseModel):
     """Section of a scene: frozen, without unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    def __dir__(self) -> list[str]:
+        return sorted({name for name in super().__dir__() if name[0] != "_"} - set(dir(pydantic.BaseModel)))

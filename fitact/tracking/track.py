@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fitact import summary
+from fitact import charts, summary
 from fitact.files import write_parquet
 from fitact.fitting.effects import is_change_of_finger
 from fitact.fitting.fit import Fit
-from fitact.tables import align_table, join_lines
+from fitact.tables import Display, align_table, join_lines
 from fitact.tracking.time_average import TimeAverage
 from fitact.tracking.walk_rates import WalkRates
-from fitact.units import format_percent, quantity_unit
+from fitact.units import format_engineering, format_percent, quantity_unit
 
 
-@dataclasses.dataclass(frozen=True)
-class Track:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Track(Display):
     """Values over time, one for each window of a record.
 
     Attributes:
@@ -76,6 +76,21 @@ class Track:
         for name, values in self.values.items():
             columns |= {name: values, f"{name}_u": self.u[name], f"{name}_sd": self.sd[name]}
         return columns | {"reliable": self.reliable, "contact": self.contact, "verdict": self.verdict}
+
+    def to_dataframe(self) -> Any:
+        """Return a pandas DataFrame with the columns of track.parquet, a row for each window."""
+        import pandas as pd
+
+        return pd.DataFrame(self.to_columns())
+
+    def plot(self, *names: str, ax: Any = None) -> Any:
+        """Draw quantities over time with their 95 % bands, all of `values` by default; return the axes.
+
+        `ax`: axes to draw a single quantity on.
+        """
+        columns = self.to_columns()
+        plots = [charts.track_plot(columns, name, self.jumps) for name in names or self.values]
+        return charts.show_plots(*plots, ax=ax, caption=summary.force_sentences(self.fit.force_basis)[0])
 
     @functools.cached_property
     def within_finger(self) -> dict[str, dict[str, float]]:
@@ -135,25 +150,36 @@ class Track:
         if not state:
             return "no window with contact yet"
         cells = [
-            f"{name} {summary.format_engineering(state[name]['median'], quantity_unit(name))}"
+            f"{name} {format_engineering(state[name]['median'], quantity_unit(name))}"
             f" ± {format_percent(state[name]['u'])}"
             for name in self.values
         ]
         return f"{state['time_s']:.4g} s: {', '.join(cells)}" + ("" if self.contact[-1] else "; no contact now")
 
-    def __str__(self) -> str:
+    @property
+    def _headline(self) -> str:
+        windows = f"{self.time.size:,} windows of {format_engineering(self.window, 's')}"
+        state = self.fit.identifiability.verdict, "reliable" if self.trusted else "unreliable"
+        return ", ".join((os.path.basename(self.fit.record.source), windows, *state))
+
+    def _rows(self) -> list[tuple[str, ...]]:
         first, last = self._state(0), self._state(-1)
-        rows = [["", "at the start", "at the end", "variation"]]
-        for name in self.values:
-            if not first:
-                break
+        rows: list[tuple[str, ...]] = [("", "at the start", "at the end", "variation")]
+        for name in self.values if first else ():
             unit, within = quantity_unit(name), self.within_finger[name]
-            cells = [
-                f"{summary.format_engineering(each[name]['median'], unit)} ± {format_percent(each[name]['u'])}"
+            cells = (
+                f"{format_engineering(each[name]['median'], unit)} ± {format_percent(each[name]['u'])}"
                 for each in (first, last)
-            ]
-            rows.append([name, *cells, format_percent(within["log_sd"]) if math.isfinite(within["log_sd"]) else ""])
-        parts = align_table(rows) if first else []
+            )
+            rows.append((name, *cells, format_percent(within["log_sd"]) if math.isfinite(within["log_sd"]) else ""))
+        return rows if first else []
+
+    def _sentences(self) -> list[str]:
+        return [self.fit.message, summary.force_sentences(self.fit.force_basis)[0]]
+
+    def __str__(self) -> str:
+        rows = self._rows()
+        parts = align_table(rows) if rows else []
         for name, rate, low, high in zip(
             self.rates.names, self.rates.rate, self.rates.lower, self.rates.upper, strict=True
         ):

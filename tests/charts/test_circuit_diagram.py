@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from fitact.charts.circuit_diagram import Diagram, lay_out_circuit
-from fitact.report.circuit import describe_parts, scene_circuit, scene_wiring
+from fitact.scene.diagrams import describe_parts, scene_circuit, scene_wiring
 from fitact.scene.scene import Scene
+from fitact.summary import summarize_log_normal
 
 ROOT = Path(__file__).parents[2]
 DRAWINGS = runpy.run_path(str(ROOT / "tools" / "draw_circuits.py"))["DRAWINGS"]
@@ -101,9 +102,18 @@ def test_drawing_is_the_circuit_that_is_fitted(name: str):
 @pytest.mark.parametrize("name", SCENES)
 def test_parts_have_their_values_and_no_others_are_drawn(name: str):
     scene = Scene.from_dict(SCENES[name])
-    shown = texts(scene_circuit(scene, {"Rsc": 123456.0}))
+    shown = texts(scene_circuit(scene, {"Rsc": summarize_log_normal("Rsc", 123456.0, 0.05)}))
     leaks = scene.device.Ri is not None
-    expected = {"Ci\n1.35 nF" if leaks else "Ci 1.35 nF", "Rsc\n123 kΩ", "Csc\n22 nF", "V", "Vsc", "I", "+", "−"}
+    expected = {
+        "Ci\n1.35 nF" if leaks else "Ci 1.35 nF",
+        "Rsc\n123.5\n± 6.2 kΩ",
+        "Csc\n22 nF",
+        "V",
+        "Vsc",
+        "I",
+        "+",
+        "−",
+    }
     assert expected <= set(shown)
     everything = " ".join(shown)
     natural = scene.grounding.connection == "natural"
@@ -128,8 +138,9 @@ def test_parts_have_their_values_and_no_others_are_drawn(name: str):
 
 def test_tied_and_fixed_parts_have_the_values_that_the_fit_gives_them():
     prior = {"grounding_Rsc": {"tied": "Rsc", "ratio": 2.0}, "R_H": {"fixed": 700.0}, "Rgap": {"low": 1e5, "high": 1e6}}
-    parts = describe_parts(Scene.from_dict({"prior": prior, "gap": {"thickness": "2 um"}}), {"Rsc": 100e3})
-    assert (parts["grounding_Rsc"], parts["R_H"], parts["Rgap"]) == ("200 kΩ", "700 Ω", "")
+    fitted = {"Rsc": summarize_log_normal("Rsc", 100e3, 0.05)}
+    parts = describe_parts(Scene.from_dict({"prior": prior, "gap": {"thickness": "2 um"}}), fitted)
+    assert (parts["grounding_Rsc"], parts["R_H"], parts["Rgap"]) == ("200\n± 10 kΩ", "700 Ω", "")
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -19,6 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import fitact
+from fitact.charts import draw_drive_design
 from fitact.charts.figure import write_figure
 from fitact.cli import _run_command
 from fitact.cli.app import app
@@ -27,7 +28,6 @@ from fitact.design.drive_option import DriveOption, quantile, quantile_error
 from fitact.design.drive_people import FingerSample
 from fitact.model.steady_cycle import period_quantities
 from fitact.populations.finger_likelihoods import PopulationParameters
-from fitact.report.drive_design import draw_drive_design
 
 EPS0, AREA, TI, TSC = 8.85e-12, 1e-4, 1e-6, 200e-6
 R, C, CI, F, RISE = 160e3, 22e-9, 1.35e-9, 100.0, 50e-6
@@ -335,7 +335,7 @@ def test_friction_changes_by_a_share_of_itself(tmp_path: Path):
     assert never.smallest()["peak_to_peak"] == "triangle"  # whose force is more pointed
     nobody = fitact.design_drive(scene(perception={"friction_change": 5.0}), one_finger())
     assert nobody.smallest() == {"peak_to_peak": None, "real_power": None, "apparent_power": None}
-    write_figure(tmp_path / "nobody.svg", lambda: draw_drive_design(nobody))
+    write_figure(tmp_path / "nobody.svg", lambda: draw_drive_design(nobody.to_dict(), nobody.scene_waveform))
     assert (tmp_path / "nobody.svg").stat().st_size > 0
 
 

@@ -271,7 +271,7 @@ def test_posterior_and_its_files(tmp_path: Path):
     posterior.report(tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
     assert "phase" in page
-    assert "Impedance of spectrum" in page
+    assert "Magnitude and phase of the impedance against frequency, of spectrum." in page
 
 
 def test_command_line(tmp_path: Path, capfd):

@@ -15,9 +15,9 @@ import scipy.signal
 import scipy.stats
 
 import fitact
+from fitact.charts import draw_plan
 from fitact.charts.figure import write_figure
 from fitact.model_selection import omissions
-from fitact.report.plan import draw_plan
 from tests.model.test_ngspice import JUMP, simulate
 
 PAPER = {"grounding": {"R_H": "500 ohm"}}
@@ -395,7 +395,7 @@ def test_contract_and_picture(tmp_path: Path):
     assert json.loads(json.dumps(content)) == content
     assert len(content["warnings"]) == 1  # one warning, because the default prior is wide
     assert "0.14 %" in str(plan)
-    write_figure(tmp_path / "plan.svg", lambda: draw_plan(plan))
+    write_figure(tmp_path / "plan.svg", lambda: draw_plan(plan.to_dict()))
     assert "<svg" in (tmp_path / "plan.svg").read_text()
 
 

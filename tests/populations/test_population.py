@@ -10,6 +10,8 @@ from pathlib import Path
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import matplotlib as mpl
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import scipy.special
@@ -409,6 +411,25 @@ def test_a_misfit_is_named_and_the_population_stays_trusted():
     assert [finger.result for finger in found.fingers] == ["misfit", *["successful"] * 3]
     assert [warning.partition(":")[0] for warning in found.warnings] == ["finger 0 of population 0"]
     assert found.trusted
+    _check_display(found)
+
+
+def _check_display(found: fitact.Population) -> None:
+    """Assert that a population shows itself in a line and in a notebook, draws itself, and has a table of fingers."""
+    assert repr(found).startswith("<fitact.Population: 4 fingers, medians Rsc ")
+    assert "\n" not in repr(found)
+    page = found._repr_html_()
+    assert "from Vsc with eq. (22) of the reference paper" in page
+    assert "Array(" not in page
+    table = found.to_dataframe()
+    assert list(table) == ["result", "Rsc", "Rsc_sd", "Csc", "Csc_sd", "Ci", "Ci_sd"]
+    assert table["Csc"].tolist() == [finger.parameters["Csc"]["q50"] for finger in found.fingers]
+    with mpl.rc_context({"backend": "agg"}):
+        axes = found.plot()
+        assert {"Fingers", "Sources of variance"} <= {each.get_title() for each in axes}
+        plt.close("all")
+    data = found.to_arviz()
+    np.testing.assert_array_equal(data["posterior"]["Rsc"].values, found.parameters()["Rsc"])
 
 
 @pytest.fixture(scope="module")

@@ -35,7 +35,7 @@ SAME_TEXT = ("--font-render-hinting=none", "--disable-lcd-text")  # independent 
 SHRUNK = 8  # pixels of the page per pixel of a reference picture
 BLOCK = 8  # size of a compared block in pixels of the reference picture
 ALIKE = 6.0  # allowed difference in grey levels
-PLOTS = 1 + 6 + 3  # record; three parameters and their pairs; forces
+PLOTS = 1 + 6 + 3 + 1  # record; three parameters and their pairs; forces; force over time
 
 
 class Browser:

@@ -91,15 +91,32 @@ def test_a_long_record_is_drawn_whole_and_its_beginning_sample_by_sample():
             "posterior": xr.Dataset(drawn | skin),
             "prior": xr.Dataset(skin),
             "observed_data": xr.Dataset(seen, {"time": time}),
-            "constant_data": xr.Dataset({"Vsc_fit": ("time", np.zeros(time.size))}, {"time": time}),
+            "constant_data": xr.Dataset(
+                {
+                    "Vsc_fit": ("time", np.zeros(time.size)),
+                    "V": ("time", 100.0 * np.sign(vsc), {"units": "V"}),
+                    "I_recorded": ("time", 1e-6 * vsc, {"units": "A"}),
+                },
+                {"time": time},
+            ),
+            "force_in_time": xr.Dataset(
+                {"force": (("quantile", "time"), np.ones((3, 5)))},
+                {"quantile": [0.05, 0.5, 0.95], "time": np.arange(5.0)},
+            ),
             "posterior_predictive": xr.Dataset(predicted, {"time": time[::250]}),
         }
     )
     found = make_charts(tree)
-    whole, beginning = ({trace["name"]: trace for trace in each["data"]} for each in found["trace_0"]["plots"])
-    assert numbers(whole["data"]["y"]).max() == 40.0
-    np.testing.assert_allclose(numbers(beginning["data"]["x"]), 1e3 * time[:4000], rtol=1e-12)
-    np.testing.assert_array_equal(numbers(beginning["data"]["y"]), vsc[:4000].astype("f4"))
+    whole, beginning = (
+        {(trace["yaxis"], trace["name"]): trace for trace in each["data"]} for each in found["time"]["plots"]
+    )
+    titles = [found["time"]["plots"][0]["layout"][f"yaxis{row}"]["title"]["text"] for row in ("", 2, 3, 4)]
+    assert titles == ["drive V / V", "skin voltage Vsc / V", "data − fit / V", "loop current I / µA"]
+    assert numbers(whole["y2", "data"]["y"]).max() == 40.0
+    np.testing.assert_allclose(numbers(beginning["y2", "data"]["x"]), 1e3 * time[:4000], rtol=1e-12)
+    np.testing.assert_array_equal(numbers(beginning["y2", "data"]["y"]), vsc[:4000].astype("f4"))
+    np.testing.assert_allclose(numbers(beginning["y4", "data"]["y"]), vsc[:4000], rtol=1e-6)
+    assert {name for _, name in whole} == {"data", "fit", "5 % predictive", "90 % predictive interval", "data − fit"}
     assert len(json.dumps(found)) < 1e6
 
 

@@ -6,7 +6,7 @@ import pytest
 
 import fitact
 from fitact.scene.prior_section import PriorSection
-from fitact.summary import describe_quantity
+from fitact.summary import describe_quantity, format_estimate
 
 
 class Page(HTMLParser):
@@ -56,7 +56,7 @@ def test_page_is_one_self_contained_file(path: Path):
     assert all(address.startswith(("data:", "#")) for address in page.addresses)
     assert page.styles
     assert not re.search(r"@import|url\(", page.styles)
-    assert len(page.images) == 4
+    assert len(page.images) == 5
     assert all(len(image["alt"] or "") > 40 for image in page.images)
     assert path.stat().st_size < 5e6
 
@@ -75,6 +75,15 @@ def test_page_says_the_verdict_first_and_how_to_repeat_it(path: Path):
     ]
     assert places == sorted(places)
     assert "Unreliable" not in words
+
+
+def test_force_law_stands_beside_every_force_and_estimates_stand_in_the_circuit(path: Path, finger_posterior):
+    words = " ".join(" ".join(Page(path.read_text()).words).split())
+    force = words[words.index("Electrostatic force on the finger") : words.index("Uncertainty budget")]
+    assert force.count("computed from Vsc with eq. (22) of the reference paper") >= 2
+    Rsc = finger_posterior.summary()["parameters"]["Rsc"]
+    median, _, sd = format_estimate(Rsc).partition(" ±")
+    assert f"Rsc {median} ±{sd}" in words  # in the drawing
 
 
 def test_untrusted_answers_say_so_at_the_top(finger_fit: fitact.Fit, tmp_path):

@@ -22,6 +22,23 @@ def arviz() -> Any:
         return pytest.importorskip("arviz")
 
 
+def test_object_in_memory_is_that_of_the_file(arviz: Any, finger_posterior: fitact.Posterior, tmp_path: Path):
+    """And ArviZ's summary has the means and standard deviations of ours."""
+    data = finger_posterior.to_arviz()
+    finger_posterior.to_netcdf(tmp_path / "posterior.nc")
+    stored = arviz.from_netcdf(tmp_path / "posterior.nc")
+    assert type(data) is type(stored)
+    for name in ("Rsc", "force_mean"):
+        np.testing.assert_array_equal(data["posterior"][name].values, stored["posterior"][name].values)
+        assert data["posterior"][name].attrs["units"] == stored["posterior"][name].attrs["units"]
+    np.testing.assert_array_equal(data["force_in_time"]["force"].values, finger_posterior.force_in_time[1])
+    table, ours = arviz.summary(data, var_names=NAMES), finger_posterior.summary()
+    for name, summary in (ours["parameters"] | ours["derived"]).items():
+        if name in ("Rsc", "Csc", "Ci"):
+            assert float(table["mean"][name]) == pytest.approx(summary["mean"], rel=1e-2, abs=1e-3)
+            assert float(table["sd"][name]) == pytest.approx(summary["sd"], rel=1e-2, abs=1e-3)
+
+
 @pytest.fixture(scope="module", params=["emcee", pytest.param("psis", marks=pytest.mark.slow)])
 def data(request, arviz: Any, finger_fit: fitact.Fit, tmp_path_factory) -> Any:
     path: Path = tmp_path_factory.mktemp(request.param) / "posterior.nc"

@@ -135,6 +135,7 @@ def test_netcdf_has_arviz_groups_with_units(netcdf: Path, finger_posterior: fita
             "observed_data",
             "prior",
             "constant_data",
+            "force_in_time",
         }
         assert groups == set(tree.children)
         posterior = tree["posterior"]

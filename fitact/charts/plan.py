@@ -1,0 +1,36 @@
+"""Picture of a plan: the error of each omission, compared with the tolerance."""
+
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+
+from fitact.charts.figure import ALERT, DATA, MODEL, PRIOR, FigureMaker
+
+
+def draw_plan(content: dict[str, Any], make: FigureMaker = Figure) -> Figure:
+    """Draw the force errors of each omission; `content` is that of plan.json."""
+    model = content["model"]
+    rows = [*content["omissions"], *([model | {"name": "planned model", "kept": False}] if model["left_out"] else [])]
+    names, kept, speedup = ([row[key] for row in reversed(rows)] for key in ("name", "kept", "speedup"))
+    nominal, q95 = (
+        [max(row[f"error_force_mean{end}"], row[f"error_force_peak{end}"]) for row in reversed(rows)]
+        for end in ("", "_q95")
+    )
+    least = 1e-8  # lower end of the logarithmic axis; smaller errors are negligible
+    positions, shown = np.arange(len(rows)), np.maximum(nominal, least)
+    figure = make(figsize=(9.0, 1.6 + 0.45 * len(rows)), layout="constrained")
+    axes = figure.add_subplot()
+    axes.barh(positions, shown, left=0.0, color=[PRIOR if each else MODEL for each in kept], height=0.6)
+    axes.plot(np.maximum(q95, least), positions, "|", color=DATA, ms=14, mew=2, label="95 % quantile over the prior")
+    axes.axvline(model["tolerance"], color=ALERT, label="tolerance")
+    for at, error, faster in zip(positions, np.maximum(nominal, q95), speedup, strict=True):
+        axes.annotate(f"{faster:.3g}×", (max(error, least), at), (8, 0), textcoords="offset points", va="center")
+    axes.set(xscale="log", xlim=(0.3 * min(shown), 5.0 * max(*nominal, *q95, model["tolerance"])))
+    axes.set_yticks(positions, names)
+    axes.grid(axis="y", visible=False)
+    axes.set_xlabel("relative error of the force (larger of mean and peak), and speed-up factor of the model")
+    handles = [mpl.patches.Patch(color=MODEL, label="neglected"), mpl.patches.Patch(color=PRIOR, label="kept")]
+    figure.legend(handles=[*handles, *axes.get_legend_handles_labels()[0]], loc="outside upper center", ncols=4)
+    return figure
