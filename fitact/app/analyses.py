@@ -56,7 +56,7 @@ class Analysis:
         for folder in sorted(root.iterdir(), reverse=True):
             try:
                 yield cls(folder)
-            except (OSError, ValueError, KeyError):
+            except (OSError, ValueError, KeyError, TypeError):
                 continue
 
     @property

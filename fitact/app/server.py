@@ -116,7 +116,7 @@ def make_app(root: Path, uploads: Path, token: str, port: int) -> Starlette:
 
 async def _refuse(_: Request, error: Exception) -> Response:
     if isinstance(error, HTTPException):
-        return PlainTextResponse(_TOO_LARGE if error.status_code == 413 else error.detail, error.status_code)
+        return PlainTextResponse(error.detail, error.status_code)
     if isinstance(error, InputError):
         return PlainTextResponse(str(error), 422)
     return PlainTextResponse(f"internal error of the page ({type(error).__name__}: {error}); please report it", 500)

@@ -4,7 +4,7 @@
   const { root, largest, tooLarge, analysis, state } = document.body.dataset;
   const find = (id) => document.getElementById(id);
   const set = (id, text) => { if (find(id)) find(id).textContent = text; };
-  const pollInterval = 1000; // ms
+  const pollInterval = 500; // ms
 
   function show(error) {
     set("alert", error.message);
@@ -19,6 +19,7 @@
     } catch {
       throw new Error("fitact app does not answer; start it again, and open the address that it prints");
     }
+    if (response.status === 413) throw new Error(tooLarge);
     if (!response.ok) throw new Error(await response.text());
     return response;
   }
@@ -75,6 +76,8 @@
     const answer = await (await ask(`${analysis}/set-up`, new URLSearchParams(new FormData(find("set-up"))))).json();
     if (find("inspected").innerHTML !== answer.files) find("inspected").innerHTML = answer.files;
     set("command", answer.command);
+    set("status", find("inspected").querySelector(".refusal") ? "A file is refused, see above."
+      : find("inspected").querySelector(".warnings") ? "There are warnings, see above." : "");
     set("alert", "");
     showErrors(answer.errors);
     return Object.keys(answer.errors);
