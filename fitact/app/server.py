@@ -14,7 +14,7 @@ import tempfile
 import threading
 import time
 import webbrowser
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterable
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -59,7 +59,7 @@ def serve(root: Path, port: int, browser: bool) -> None:
     token = secrets.token_urlsafe(24)
     try:
         root = root.expanduser().absolute()
-        root.mkdir(parents=True, exist_ok=True)
+        root.mkdir(mode=0o700, parents=True, exist_ok=True)
         uploads = tempfile.TemporaryDirectory(prefix=".upload-", dir=root)
     except OSError as error:
         raise InputError(f"{root}: cannot be written ({error.strerror}); choose another folder with --out") from error
@@ -76,7 +76,9 @@ def serve(root: Path, port: int, browser: bool) -> None:
     print(address, flush=True)
     print(f"results go to {root}; Ctrl-C ends the page", file=sys.stderr, flush=True)
     if browser:
-        threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+        opener = Path(uploads.name) / "open.html"  # other users see the arguments of a browser, but not this file
+        opener.write_text(f'<meta http-equiv="refresh" content="0; url={address}">', encoding="utf-8")
+        threading.Thread(target=webbrowser.open, args=(opener.as_uri(),), daemon=True).start()
     level = "warning" if os.environ.get("FITACT_DEBUG") else "critical"  # of errors, the page shows a sentence
     config = uvicorn.Config(
         make_app(root, Path(uploads.name), token, port),
@@ -236,9 +238,8 @@ class Page:
         return JSONResponse({"state": state, "messages": messages, "percent": percent and int(percent[1])})
 
     async def send_picture(self, request: Request) -> Response:
-        """Send the picture that `fitact inspect` drew of a file."""
-        analysis = self._find(request)
-        return _send_one_of(analysis.folder / "pictures", request)
+        """Send a picture that `fitact inspect` drew of a file."""
+        return _send_one_of((self._find(request).folder / "pictures").glob("*.png"), request)
 
     async def send_report(self, request: Request) -> Response:
         """Send the report, sandboxed."""
@@ -249,11 +250,7 @@ class Page:
 
     async def send_result(self, request: Request) -> Response:
         """Send a result file, the scene or the command, for download."""
-        analysis = self._find(request)
-        for path in analysis.result_files():
-            if path.name == request.path_params["file"]:
-                return FileResponse(path, filename=path.name)
-        raise HTTPException(404, "there is no such file")
+        return _send_one_of(self._find(request).result_files(), request, is_download=True)
 
     async def send_archive(self, request: Request) -> Response:
         """Send everything as one file."""
@@ -325,8 +322,9 @@ def _mark_code(text: str) -> Markup:
     return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", html.escape(text)))
 
 
-def _send_one_of(folder: Path, request: Request) -> Response:
-    for path in folder.iterdir() if folder.exists() else ():
+def _send_one_of(paths: Iterable[Path], request: Request, is_download: bool = False) -> Response:
+    """Send the file whose name is asked for, so that a name is never used as a path."""
+    for path in paths:
         if path.name == request.path_params["file"]:
-            return FileResponse(path)
-    raise HTTPException(404, "there is no such picture")
+            return FileResponse(path, filename=path.name if is_download else None)
+    raise HTTPException(404, "there is no such file")

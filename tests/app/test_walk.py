@@ -130,10 +130,11 @@ def walked(browser: Browser, server: Server, scope_file: Path) -> tuple[Person, 
     person.press("Stop")
     browser.wait(f"{STATE} === 'stopped' || document.getElementById('start') !== null")
     person.press("Start" if browser.all("#start") else "Go on")
+    person.wait_state("running")
     browser.driver.close()
     browser.driver.switch_to.window(first)
-    browser.wait(f"['running', 'finished'].includes({STATE}) || document.getElementById('start')")
     person.open(address)
+    server.wait(address.rpartition("/")[2], "finished")
     person.wait_state("finished")
     return person, address
 
