@@ -4,7 +4,7 @@ from .frame import Provenance
 from .page import read_results, write_report
 from .population import read_population, write_population, write_population_page
 from .prior import write_prior
-from .record import write_record
+from .record import write_record, write_spectra
 from .reproduction import write_reproduction
 from .track import write_track
 
@@ -18,6 +18,7 @@ __all__ = [
     "write_population_page",
     "write_prior",
     "write_record",
+    "write_spectra",
     "write_report",
     "write_reproduction",
     "write_track",

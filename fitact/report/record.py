@@ -1,6 +1,7 @@
-"""Picture of a record: its channels over time."""
+"""Picture of a file before a fit: channels over time, or spectra over frequency."""
 
 import os
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +13,41 @@ from fitact.charts.figure import ALERT, DATA, write_figure
 from fitact.charts.interactive import extremes
 from fitact.data.clipping import clipping_mask
 from fitact.data.inspection import Channel, Inspection
+from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
 
 
 def write_record(path: str | os.PathLike[str], inspection: Inspection) -> None:
     """Draw the channels of a record and write SVG or PNG, by the ending of `path`."""
+    _write(path, lambda: _figure(inspection))
+
+
+def write_spectra(path: str | os.PathLike[str], spectra: Sequence[Spectrum]) -> None:
+    """Draw magnitude and phase of spectra and write SVG or PNG, by the ending of `path`."""
+    _write(path, lambda: _spectrum_figure(spectra))
+
+
+def _write(path: str | os.PathLike[str], draw: Callable[[], Figure]) -> None:
     path = Path(path)
     if path.suffix not in (".svg", ".png"):
         raise InputError(f"{path}: the drawing is written as .svg or .png; choose one of these endings")
-    write_figure(path, lambda: _figure(inspection), dpi=150)
+    write_figure(path, draw, dpi=150)
+
+
+def _spectrum_figure(spectra: Sequence[Spectrum]) -> Figure:
+    figure = Figure(figsize=(9.0, 4.8), layout="constrained")
+    size, phase = figure.subplots(2, 1, sharex=True)
+    for spectrum in spectra:
+        size.loglog(spectrum.frequency, np.abs(spectrum.values), ".-", ms=4.0, lw=0.8)
+        phase.plot(spectrum.frequency, np.degrees(np.angle(spectrum.values)), ".-", ms=4.0, lw=0.8)
+    is_impedance = spectra[0].channel == "impedance"
+    size.set_ylabel("|Z|" if is_impedance else "|Vsc / V|")
+    size.yaxis.set_major_formatter(EngFormatter("Ω" if is_impedance else ""))
+    phase.set_ylabel("phase / °")
+    phase.xaxis.set_major_formatter(EngFormatter("Hz"))
+    phase.set_xlabel("frequency")
+    figure.suptitle(os.path.basename(spectra[0].source))
+    return figure
 
 
 def _figure(inspection: Inspection) -> Figure:

@@ -173,6 +173,16 @@ def test_a_refused_file_has_the_sentence_of_the_command_line(server: Server, mon
     assert f'<p class="refusal">{sentence}</p>' in page
 
 
+def test_records_and_spectra_are_drawn(server: Server):
+    spectrum = b"f,Z',Z''\n" + b"".join(b"%d,%d,%d\n" % (10**i, 900 - 100 * i, -900 + 100 * i) for i in range(8))
+    for content, count in ((SMALL, "60 samples"), (spectrum, "Impedance spectrum: 8 points")):
+        analysis = server.upload("a.csv", content)
+        page = server.ask("GET", f"analyses/{analysis}").text
+        assert count in page
+        picture = server.ask("GET", re.search(r'class="picture" src="([^"]+)"', page)[1])
+        assert picture.body.startswith(b"\x89PNG")
+
+
 def test_the_form_becomes_the_command(server: Server):
     analysis = server.upload("a.csv", SMALL.replace(b"V_V,Vsc_V", b"CH1,CH2"))
     form = {"column.V": "CH2", "column.Vsc": "CH1", "factor.Vsc": "0.001", "rate": "1Hz", "scene.drive.duty": "2"}
