@@ -18,8 +18,8 @@ __all__ = [
     "write_population_page",
     "write_prior",
     "write_record",
-    "write_spectra",
     "write_report",
     "write_reproduction",
+    "write_spectra",
     "write_track",
 ]
