@@ -73,9 +73,16 @@ class Analysis:
             del _processes[self.folder]
             self.code = process.returncode
             self.save()
-        if (self.results / "report.html").exists():
+        if (self.results / "report.html").exists() and not self._is_preliminary():
             return "finished"
         return "stopped" if self.results.exists() else "set-up"
+
+    def _is_preliminary(self) -> bool:
+        """Return whether the results are those of a chain that was interrupted, which the same command resumes."""
+        for path in (self.results / "summary.json", self.results / "population.json"):
+            if path.exists():
+                return bool(json.loads(path.read_text(encoding="utf-8")).get("convergence", {}).get("interrupted"))
+        return False
 
     def save(self) -> None:
         content = {"files": self.files, "options": self.options, "code": self.code}

@@ -22,6 +22,7 @@ import fitact
 import fitact.cli
 from fitact.app import scene_form
 from fitact.app import server as module
+from fitact.app.analyses import Analysis
 from fitact.scene.fields import describe_fields
 from fitact.scene.toml import shipped_scenes
 from tests.app.server import Server
@@ -213,6 +214,19 @@ def test_a_run_is_stopped_by_ctrl_c_and_a_refusal_returns_to_the_form(server: Se
     assert (server.folder / copy / "records" / "a.csv").read_bytes() == record
     archive = zipfile.ZipFile(BytesIO(server.ask("GET", f"analyses/{analysis}/everything.zip").body))
     assert {f"{analysis}/command.txt", f"{analysis}/records/a.csv"} <= set(archive.namelist())
+
+
+@pytest.mark.parametrize(("interrupted", "state"), [(True, "stopped"), (False, "finished"), (None, "finished")])
+def test_results_of_an_interrupted_chain_can_go_on(tmp_path: Path, interrupted: bool | None, state: str):
+    analysis = Analysis.create(tmp_path)
+    assert analysis.state == "set-up"
+    analysis.results.mkdir()
+    assert analysis.state == "stopped"
+    (analysis.results / "report.html").touch()
+    if interrupted is not None:
+        summary = {"convergence": {"interrupted": interrupted}}
+        (analysis.results / "summary.json").write_text(json.dumps(summary))
+    assert Analysis.find(tmp_path, analysis.name).state == state
 
 
 def test_the_server_imports_no_jax():

