@@ -9,7 +9,7 @@ export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS = 0
 TEST_XLA_FLAGS = --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0
 PYTEST = XLA_FLAGS="$(TEST_XLA_FLAGS)" $(PY) -m pytest -n auto
 .DEFAULT_GOAL = help
-.PHONY: help env demo test test-slow test-slow-quick notebooks peers docs wheel extremes calibration calibration-quick session-calibration fuzz check lock plotly clean
+.PHONY: help env demo test test-slow test-slow-quick notebooks peers docs wheel extremes calibration calibration-quick session-calibration fuzz check lock plotly axe clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -93,6 +93,10 @@ lock: env
 plotly:
 	cd fitact/report/templates && npm pack --silent plotly.js-basic-dist-min && tar -xzf plotly.js-*.tgz --strip-components=1 \
 	  package/plotly-basic.min.js package/LICENSE && mv LICENSE plotly-basic.LICENSE && rm plotly.js-*.tgz
+
+# make axe   fetch axe-core, the accessibility checks of the page's tests, from npm; it is not part of fitact
+axe:
+	mkdir -p out && cd out && npm pack --silent axe-core && tar -xzf axe-core-*.tgz --strip-components=1 package/axe.min.js && rm axe-core-*.tgz
 
 # make clean   remove what the above made
 clean:

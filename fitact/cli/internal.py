@@ -6,6 +6,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     "fitact",
     submodules={"summary"},
     submod_attrs={
+        "app.server": ["serve"],
         "data.readers.read": ["write_csv"],
         "data.simulate": ["simulate"],
         "data.kramers_kronig": ["check_kramers_kronig"],

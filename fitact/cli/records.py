@@ -33,6 +33,8 @@ def inspect(
         entries = [
             each.to_dict() | {"kramers_kronig": test.to_dict()} for each, test in zip(spectra, tests, strict=True)
         ]
+        if out is not None:
+            report.write_spectra(out, spectra)
         show(text, entries[0] if len(entries) == 1 else {"source": str(file), "spectra": entries}, json)
         return
     inspection = fitact.inspect(file, **options.column_options((channel, scale, rate)))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.data.clipping import clipping_mask
-from fitact.data.readers.capture import Capture, has_standard_names, to_record
+from fitact.data.readers.capture import Capture, FileChannel, has_standard_names, to_record
 from fitact.data.readers.read import merge_other_files, read_capture
 from fitact.data.readers.sampling_rate import replace_rounded_times
 from fitact.data.record import (
@@ -52,10 +52,14 @@ class Channel:
 
 @dataclasses.dataclass(frozen=True)
 class Inspection:
-    """Channels of a file, time (s), dominant frequency (Hz, or None), notes and warnings."""
+    """Channels of a file, time (s), dominant frequency (Hz, or None), notes and warnings.
+
+    `columns` holds all columns with numbers, by their names in the file.
+    """
 
     source: str
     format: str
+    columns: tuple[FileChannel, ...]
     time: Samples
     channels: tuple[Channel, ...]
     frequency: float | None
@@ -67,6 +71,10 @@ class Inspection:
         return {
             "source": self.source,
             "format": self.format,
+            "columns": [
+                {"name": column.name, "unit": column.unit_text, "attenuation": column.attenuation}
+                for column in self.columns
+            ],
             "channels": [channel.to_dict() for channel in self.channels],
             "samples": self.time.size,
             "time_step": float(np.median(np.diff(self.time))),
@@ -143,7 +151,9 @@ def _inspect_channels(
     warnings += check_divider({name: values for name, (values, _) in arrays.items()})
     inspected = tuple(_inspect_channel(name, unit, values) for name, (values, unit) in arrays.items())
     notes = (*notes, *describe_rounded_time(time))
-    return Inspection(capture.source, capture.format, time, inspected, frequency, notes, tuple(warnings))
+    return Inspection(
+        capture.source, capture.format, capture.channels, time, inspected, frequency, notes, tuple(warnings)
+    )
 
 
 def _inspect_channel(name: str, unit: str, values: Samples) -> Channel:

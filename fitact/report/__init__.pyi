@@ -4,7 +4,7 @@ from .frame import Provenance
 from .page import read_results, write_report
 from .population import read_population, write_population, write_population_page
 from .prior import write_prior
-from .record import write_record
+from .record import write_record, write_spectra
 from .reproduction import write_reproduction
 from .track import write_track
 
@@ -20,5 +20,6 @@ __all__ = [
     "write_record",
     "write_report",
     "write_reproduction",
+    "write_spectra",
     "write_track",
 ]
