@@ -76,7 +76,7 @@ def test_scale_and_sensor_are_recovered(tmp_path: Path, is_measured: bool) -> No
 
 
 def test_friction_determines_what_the_electrical_channels_do_not(tmp_path: Path) -> None:
-    """With a known law, the size of the force determines the contact area and thus Ci."""
+    """If the law is known, the size of the force determines the contact area and thus Ci."""
     record, text = simulate(tmp_path)
     fit = fitact.fit(record, load(tmp_path, text + "force_scale = {fixed = true}\nmu = {fixed = true}\n"))
     sd = dict(zip(fit.names, np.linalg.norm(fit.laplace.covariance_root, axis=1), strict=True))
@@ -112,7 +112,7 @@ def test_crosstalk_of_the_drive_is_freed(tmp_path: Path) -> None:
 
 
 def test_the_law_of_the_gap_is_preferred_where_it_holds(tmp_path: Path) -> None:
-    """With free scales, only the shape of the force in time tells the laws apart."""
+    """Where scales are free, only the shape of the force in time tells the laws apart."""
     gap = GAP.format(law="gap")
     record, text = simulate(tmp_path, law=gap, noise="1 mN")  # the force is a hundred times as large
     right = fitact.fit(record, load(tmp_path, text + gap))

@@ -13,7 +13,7 @@ STEP, COUNT = 2e-5, 4096
 @pytest.mark.parametrize("damping", [0.02, 0.3, 0.9, None])
 @pytest.mark.parametrize("frequency", [3.0, 400.0, 9e3])
 def test_reading_follows_the_differential_equation(frequency: float, damping: float | None) -> None:
-    """With its ringing, the reading is that of a sensor in any state at the first sample."""
+    """Together with its ringing, the reading is that of a sensor in any state at the first sample."""
     w = 2.0 * np.pi * frequency
     denominator = [1.0, w] if damping is None else [1.0, 2.0 * damping * w, w * w]
     system = scipy.signal.StateSpace(*scipy.signal.tf2ss([denominator[-1]], denominator))
