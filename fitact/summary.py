@@ -223,12 +223,11 @@ def _quantity_row(name: str, summary: Summary, basis: dict[str, Any]) -> tuple[s
     return name, format_estimate(summary), format_interval(summary), combined, fraction, remark
 
 
-def force_sentences(content: dict[str, Any]) -> list[str]:
-    """Return what a force rests on, in sentences; `content` is that of fit.json or summary.json."""
-    basis = content["force_basis"]
+def force_sentences(basis: dict[str, Any]) -> list[str]:
+    """Return what a force rests on, in sentences; `basis` is `force_basis` of fit.json or summary.json."""
     law = f"Force: computed {FORCE_LAWS[basis['law']]}"
-    if "force_scale" in content["parameters"]:
-        sentences = [f"{law}. {_compare_with_friction(content['parameters']['force_scale'], content)}"]
+    if basis["tested_by_data"]:
+        sentences = [f"{law}, which the measured friction tests."]
     else:
         sentences = [f"{law}; it was not measured, and these data do not test that law."]
     if basis["assumptions"]:
@@ -245,28 +244,31 @@ def force_sentences(content: dict[str, Any]) -> list[str]:
     return sentences
 
 
-def _compare_with_friction(scale: Summary, content: dict[str, Any]) -> str:
-    """Return what the measured friction says about the computed force."""
+def _compare_with_friction(content: dict[str, Any]) -> list[str]:
+    """Return what a measured friction says about the computed force, in a sentence."""
+    scale = content["parameters"].get("force_scale")
+    if scale is None:
+        return []
     ratio, u = float(scale["q50"]), float(scale.get("u", math.inf))
-    sentence = f"The force in the measured friction is {format_estimate(scale)} times as large (force_scale"
+    sentence = f"The force in the measured friction is {format_estimate(scale)} times the computed one (force_scale"
     if not math.isfinite(u):
         sentence += ")."
     elif abs(math.log(ratio)) <= 2.0 * u:
         sentence += f", combined u {format_percent(u)}): they agree."
     else:
-        sentence += (
-            f", combined u {format_percent(u)}): they differ, so the law, the contact area or a thickness is wrong."
-        )
+        sentence += f", combined u {format_percent(u)}): they differ, so the law, the contact area, a thickness or"
+        sentence += " the normal force is wrong."
     sentence += " This rests on mu, which follows from the mean friction and the normal force."
     if content["identifiability"]["verdict"] != "identified":
         sentence += " The electrical channels do not determine the contact area, whose error force_scale contains."
-    return sentence
+    return [sentence]
 
 
 def result_sentences(content: dict[str, Any]) -> list[str]:
     """Return what the force rests on, and how far it is felt if the scene has a table of thresholds."""
     felt = content.get("sensation")
-    return [*force_sentences(content), *([felt["sentence"]] if felt else [])]
+    friction = _compare_with_friction(content)
+    return [*force_sentences(content["force_basis"]), *friction, *([felt["sentence"]] if felt else [])]
 
 
 def budget_sentence(content: dict[str, Any]) -> str:

@@ -89,7 +89,7 @@ def test_tables_say_whether_the_law_holds(tmp_path: Path) -> None:
     record, text = simulate(tmp_path, "[friction]\nforce_scale = 3.0\n")
     fit = fitact.fit(record, load(tmp_path, text))
     summary, content = " ".join(fit.summary().split()), fit.to_dict()
-    assert "they differ, so the law, the contact area or a thickness is wrong" in summary
+    assert "they differ, so the law, the contact area, a thickness or the normal force is wrong" in summary
     assert "do not test that law" not in summary
     assert content["force_basis"]["tested_by_data"]
     # the thickness of the skin, which nobody stated, is as uncertain for the scale as for the force
