@@ -16,7 +16,7 @@ from pathlib import Path
 from fitact.errors import InputError
 from fitact.files import write_json
 
-CHANNELS = {"V": "drive voltage", "Vsc": "voltage across the skin", "I": "loop current"}
+CHANNELS = {"V": "drive voltage", "Vsc": "voltage across the skin", "I": "loop current", "Ft": "friction"}
 _OPTIONS = ("rate", "spectrum", "shunt", "band")
 _NAME_LENGTH = 80  # characters of a file name on disk, below the limits of all file systems
 _processes: dict[Path, subprocess.Popen[bytes]] = {}  # that this server started, by the analysis's folder

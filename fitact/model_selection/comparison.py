@@ -52,11 +52,13 @@ class Comparison:
         models: models in the order of decreasing elpd.
         elpd_threshold: minimum significant difference of the elpd, in standard errors.
         bic_threshold: minimum significant difference of the BIC.
+        note: what the comparison rests on, as a sentence after a blank, or "".
     """
 
     models: tuple[ModelScore, ...]
     elpd_threshold: float = 2.0
     bic_threshold: float = 10.0
+    note: str = ""
 
     @property
     def _candidates(self) -> list[ModelScore]:
@@ -85,7 +87,7 @@ class Comparison:
         """Preferred model and the difference to the next, or that none is preferred, in a sentence."""
         leading, preference = self._leading_model, self._describe_preference()
         doubt = "" if self.trusted else f" The fit of {leading.name} is unreliable: {leading.fit.message}"
-        return preference + doubt
+        return f"{preference}{self.note}{doubt}"
 
     def _describe_preference(self) -> str:
         first, *others = self._candidates
@@ -188,7 +190,10 @@ def compare(
     fits = {name: fit(records, scene) for name, scene in scenes.items()}
     _require_same_samples(fits)
     scores = [ModelScore(name, fitted, cross_validate(fitted)) for name, fitted in fits.items()]
-    return Comparison(tuple(sorted(scores, key=lambda model: -model.elpd)))
+    note, laws = "", {scene.force.model for scene in scenes.values()}
+    if len(laws) > 1 and all("force_scale" in fitted.names for fitted in fits.values()):
+        note = " As force_scale is free, only the shape of the force in time tells the force laws apart."
+    return Comparison(tuple(sorted(scores, key=lambda model: -model.elpd)), note=note)
 
 
 def _require_same_samples(fits: Mapping[str, Fit]) -> None:
