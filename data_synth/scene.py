@@ -80,7 +80,7 @@ KEYS: Table = {
     },
     "prior": dict.fromkeys(_PRIORS.split(), IgnoredKey()),
     "force": {"model": Choice(("paper", "gap"))},
-    "perception": dict.fromkeys(("threshold_force", "friction_change", "source"), IgnoredKey()),
+    "perception": dict.fromkeys(("threshold_force", "friction_change", "thresholds", "source"), IgnoredKey()),
     "population": dict.fromkeys(
         ("contact_area", "skin_thickness_relative_sd", "insulator_thickness_relative_sd"), IgnoredKey()
     ),

@@ -40,7 +40,8 @@ def track(finger_fit: fitact.Fit) -> fitact.Track:
     there = np.array([True, False, True])
     verdict = np.full(3, "prior-limited")
     times = np.array([0.5, 1.5, 2.5])
-    return fitact.Track(times, values, u, u, there, there, verdict, (2.0,), rates, 1.0, finger_fit, {}, {"Vsc": 0.1})
+    shared = (2.0,), rates, 1.0, finger_fit, {}, {"Vsc": 0.1}
+    return fitact.Track(times, values, u, u, there, there, verdict, *shared, average=None)
 
 
 @pytest.fixture(scope="module")
