@@ -14,7 +14,7 @@ from fitact.errors import InputError
 from fitact.model.circuit import Circuit
 from fitact.model.drive import Drive
 from fitact.model.force import electrostatic_force, force_constant, friction
-from fitact.model.force_sensor import ForceSensor, mean_square_over_step
+from fitact.model.force_sensor import ForceSensor, square_over_steps
 from fitact.model.response import response
 from fitact.scene.scene import Scene
 
@@ -61,7 +61,7 @@ def _simulate_friction(
     if sensor is None:
         square = voltage(0.0) ** 2
     else:
-        square = sensor.respond(mean_square_over_step(voltage, step), step)[lead:]
+        square = sensor.respond(square_over_steps(voltage, step), step)[lead:]
     force = force_constant(contact) * square
     return np.asarray(friction(force, float(stated.coefficient), stated.normal_force))
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.compression import BASELINE_NAMES
 from fitact.model.force import Geometry, electrostatic_force, friction
-from fitact.model.force_sensor import ForceSensor, mean_square_over_step
+from fitact.model.force_sensor import ForceSensor, StepForce, square_over_steps
 
 # of a friction channel, in the place of the decays of charges: state of the sensor at the first sample, and parts of
 # the reading in proportion to V and dV/dt
@@ -52,13 +52,13 @@ class FrictionChannel(ChannelLikelihood):
         def voltage(delay: ArrayLike) -> Array:
             return acting.signal(alone, extra_delay + delay)
 
+        def repeat(square: Array) -> Array:
+            return square if self.phases is None else square[jnp.arange(self.time.size) % self.period]
+
         if sensor is None:
-            square = jnp.square(voltage(0.0))
-        else:
-            square = mean_square_over_step(voltage, self.time_step, follows_samples=self.follows_samples)
-        if self.phases is not None:
-            square = square[jnp.arange(self.time.size) % self.period]
-        return square if sensor is None else sensor.respond(square, self.time_step)
+            return repeat(jnp.square(voltage(0.0)))
+        squares = square_over_steps(voltage, self.time_step, follows_samples=self.follows_samples)
+        return sensor.respond(StepForce(*map(repeat, squares)), self.time_step)
 
     def _response(self, inputs: ChannelInputs, extra_delay: ArrayLike) -> Float[Array, " samples"]:
         values, contact = self._values(inputs), self.geometry.contact(inputs.circuit)
