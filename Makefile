@@ -30,7 +30,7 @@ test-slow: env
 # make test-slow-quick   the same with only a part of the thorough ones, another for every change that landed
 LANDED = $(shell git rev-list --first-parent --count HEAD 2>/dev/null || date +%j)
 test-slow-quick: env
-	$(PYTEST) -m slow --rotate $(LANDED)/17
+	$(PYTEST) -m slow --rotate $(LANDED)/25
 
 # make notebooks   run the notebooks; executed copies in out/notebooks
 notebooks: env

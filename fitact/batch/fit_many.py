@@ -292,8 +292,8 @@ def _split_group(group: RecordGroup, scene: Scene | None) -> Iterator[Batch]:
 
 def _make_batch_problem(record: Record, scene: Scene | None) -> BatchProblem | None:
     """Return the problem for records like this one, or None if they cannot be fitted in batches."""
-    if scene is not None and scene.geometry_distributions():  # which batches do not draw
-        return None
+    if scene is not None and (scene.geometry_distributions() or "Ft" in scene.measurement.channels):
+        return None  # batches draw no geometry, and have no friction
     problem = build_problem([record], [scene])
     if problem.likelihood.channels[0].effect_sizes:  # whose functions differ between records
         return None

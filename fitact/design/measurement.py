@@ -173,6 +173,8 @@ def design_measurement(scene: Scene, records: Record | Sequence[Record] = ()) ->
 def experiment_from_scene(scene: Scene) -> Experiment:
     """Make the experiment that a scene states, at its own values."""
     scene.require_available()
+    if "Ft" in scene.measurement.channels:
+        raise InputError("scene: a design does not count the friction; leave 'Ft' out of [measurement] channels")
     measured, prior, nominal = scene.measurement, scene.make_prior(), scene.nominal_values()
     values = {name: math.exp(prior[name].log_mean) for name in prior.names if nominal[name] is None}
     values |= scene.fixed_values()

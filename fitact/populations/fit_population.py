@@ -80,6 +80,11 @@ def population(
             "scene: a population has no leak of the insulator yet, whose Ri goes as 1 / area; leave [device] Ri and"
             " [prior] Ri out, or fit the fingers one by one"
         )
+    if "Ft" in scene.measurement.channels:
+        raise InputError(
+            "scene: a population does not use the friction yet; leave 'Ft' out of [measurement] channels, or fit the"
+            " fingers one by one"
+        )
     standardized = Covariates.from_values(covariates or {}, len(records))
     next_at = standardized.standardize(at or {})
     area_varies = scene.population.contact_area == "varies"

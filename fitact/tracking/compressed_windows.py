@@ -139,6 +139,11 @@ def find_model(windows: Sequence[Window], scene: Scene, step: float, source: str
             f"{source}: a track has no leak of the insulator; leave [device] Ri and [prior] Ri out of the scene, or fit"
             " each part of the record on its own"
         )
+    if "Ft" in channels:
+        raise InputError(
+            f"{source}: a track does not use the friction; leave 'Ft' out of [measurement] channels, or fit each part"
+            " of the record on its own"
+        )
     whole = [each for each in windows if each.is_whole and np.ptp(each.channels["V"]) > 0.0]
     if not whole:
         raise InputError(f"{source}: there is no window with a drive and all samples; record V_V beside {channels[0]}")

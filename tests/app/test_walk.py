@@ -202,6 +202,7 @@ def test_axe_finds_no_serious_fault(walked, server: Server, colours: str):
         person.browser.command("Emulation.setEmulatedMedia", features=[])
 
 
+@pytest.mark.thorough  # samples a posterior twice
 def test_after_the_server_is_killed_the_command_line_goes_on(tmp_path: Path):
     server = Server(tmp_path / "results")
     try:

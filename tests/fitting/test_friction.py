@@ -10,6 +10,7 @@ import fitact
 from data_synth import make, recipe
 from fitact import Fit, Record, Scene
 from fitact.data.simulate import simulate as simulate_scene
+from fitact.design.measurement import experiment_from_scene
 from fitact.errors import InputError
 
 SCENE = """
@@ -149,7 +150,19 @@ def test_records_that_cannot_serve_are_refused(tmp_path: Path) -> None:
         fitact.fit(short, load(tmp_path, replace_drive(text)))
 
 
-@pytest.mark.slow  # a fit for each of many records
+def test_what_does_not_use_the_friction_refuses_it(tmp_path: Path) -> None:
+    record, text = simulate(tmp_path)
+    scene = load(tmp_path, text)
+    other = Record.from_arrays(record.time, **{name: 1.01 * record[name] for name in record.channels})
+    with pytest.raises(InputError, match="a population does not use the friction"):
+        fitact.population([record, other], scene)
+    with pytest.raises(InputError, match="a design does not count the friction"):
+        experiment_from_scene(scene)
+    with pytest.raises(InputError, match="a track does not use the friction"):
+        fitact.track(record, load(tmp_path, replace_drive(text)), window=0.02)
+
+
+@pytest.mark.thorough  # a fit for each of 40 records
 def test_errors_of_mu_and_scale_are_those_stated(tmp_path: Path) -> None:
     """Sums of squared pulls over 40 records stay within the 99.99 % range of chi-squared, for any seeds."""
     found = []
