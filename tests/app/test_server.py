@@ -200,12 +200,13 @@ def test_the_form_becomes_the_command(server: Server):
 
 
 def test_a_run_is_stopped_by_ctrl_c_and_a_refusal_returns_to_the_form(server: Server):
+    long = server.upload("long.csv", (Path(__file__).parents[2] / "data_synth/records/finger_direct.csv").read_bytes())
+    server.act(long, "start")
+    assert server.ask("POST", f"analyses/{long}/set-up", "").status == 422  # it is running, in another tab perhaps
+    server.act(long, "stop")
+    assert server.wait(long, "set-up", "stopped")["messages"][-1].startswith("fitact: interrupted")
     record = SMALL.replace(b"Vsc_V", b"other_V")  # refused when it is read
     analysis = server.upload("a.csv", record)
-    server.act(analysis, "start")
-    assert server.ask("POST", f"analyses/{analysis}/set-up", "").status == 422  # it is running, in another tab perhaps
-    server.act(analysis, "stop")
-    assert server.wait(analysis, "set-up")["messages"][-1].startswith("fitact: interrupted")
     server.act(analysis, "start")
     said = server.wait(analysis, "set-up")["messages"][-1]
     assert "The last run was refused" in server.ask("GET", f"analyses/{analysis}").text
