@@ -36,7 +36,7 @@ from starlette.staticfiles import StaticFiles
 from fitact.app import scene_form
 from fitact.app.analyses import CHANNELS, Analysis
 from fitact.app.guard import REPORT_POLICY, Guard
-from fitact.app.warm_commands import Answer, WarmCommands
+from fitact.app.warm_commands import CommandResult, WarmCommands
 from fitact.errors import InputError
 from fitact.units import format_engineering
 
@@ -130,7 +130,7 @@ class Page:
     def __init__(self, root: Path, uploads: Path, token: str) -> None:
         self._root, self._uploads = root, uploads
         self._commands = WarmCommands()
-        self._inspections: dict[tuple[str, ...], Answer] = {}
+        self._inspections: dict[tuple[str, ...], CommandResult] = {}
         self._templates = jinja2.Environment(
             loader=jinja2.PackageLoader("fitact.app"), autoescape=True, undefined=jinja2.StrictUndefined,
             trim_blocks=True, lstrip_blocks=True,
@@ -298,7 +298,7 @@ class Page:
             }  # fmt: skip
         return found
 
-    async def _inspect(self, analysis: Analysis, own: str, options: list[str]) -> Answer:
+    async def _inspect(self, analysis: Analysis, own: str, options: list[str]) -> CommandResult:
         key = (analysis.name, own, *options)
         if key not in self._inspections:
             picture = f"pictures/{_picture_name(own, options)}"

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 _LONGEST_ANSWER = 2**26  # bytes of one line; an inspection has some kilobytes
 
 
-class Answer(NamedTuple):
+class CommandResult(NamedTuple):
     """Exit status and output of a command."""
 
     code: int
@@ -37,15 +37,17 @@ class WarmCommands:
             await self._start()
             return self._greeting
 
-    async def run(self, folder: Path, *arguments: str) -> Answer:
+    async def run(self, folder: Path, *arguments: str) -> CommandResult:
         """Run `fitact ARGUMENTS` in a folder."""
         async with self._lock:
             process = await self._start()
             try:
-                return Answer(**await _ask(process, {"folder": str(folder), "arguments": arguments}))
+                return CommandResult(**await _ask(process, {"folder": str(folder), "arguments": arguments}))
             except (ConnectionError, json.JSONDecodeError):  # killed, e.g. for its memory
                 self._process = None
-                return Answer(3, "", f"fitact: the process that read {arguments[1]} has died; try the command line")
+                return CommandResult(
+                    3, "", f"fitact: the process that read {arguments[1]} has died; try the command line"
+                )
 
     def stop(self) -> None:
         """End the process."""

@@ -26,7 +26,6 @@ from fitact.model.response_table import ResponseTable
 from fitact.model.skin import WithSkin
 from fitact.scene.scene import Scene
 
-_FREE_FRICTION = {"mu", "fN", "force_scale"}  # parameters of eq. (2) where the friction is measured
 DERIVED_NAMES = ("g", "b", "force_mean", "force_peak", "force_rms", "friction_mean")
 
 
@@ -127,10 +126,7 @@ class DerivedQuantities(eqx.Module):
             force = force._replace(mean=scale * mean_force(*exact))
             if not isinstance(circuit, WithSkin) or isinstance(self.drive, Sine | Multitone):
                 force = force._replace(peak=scale * peak_force(*exact))
-        free = {
-            name: jnp.exp(theta[self.likelihood.names.index(name)])
-            for name in _FREE_FRICTION & {*self.likelihood.names}
-        }
+        free = self.likelihood.friction_parameters(theta)
         scaled = force.mean * free.get("force_scale", 1.0)
         friction_mean = friction(scaled, free.get("mu", self.coefficient), free.get("fN", self.normal_force))
         return jnp.stack([finger.g, finger.b, force.mean, force.peak, force.rms, friction_mean])

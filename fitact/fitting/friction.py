@@ -20,10 +20,10 @@ from fitact.scene.scene import Scene
 def make_friction_channel(
     channel: ChannelLikelihood, record: Record, scene: Scene, choice: DriveModel, tau: float
 ) -> FrictionChannel:
-    """Return the channel with the friction that the scene describes; `tau` (s) is the slowest time constant of the
-    prior.
+    """Return the channel with the friction that the scene describes.
 
-    The samples that the unknown charge of the skin still moves are excluded.
+    The samples that the unknown charge of the skin still moves are excluded; `tau` (s) is the slowest time constant of
+    the prior.
 
     Raises:
         InputError: the time steps are not uniform, or the record is too short for the charge to decay.

@@ -49,20 +49,19 @@ def estimate_from_vsc(
             cannot give.
     """
     time, vsc, voltage = record.time, record["Vsc"], choice.voltage
-    integral, driven = (
-        np.concatenate([[0.0], np.cumsum(0.5 * np.diff(time) * (x[1:] + x[:-1]))]) for x in (vsc, voltage)
-    )
+    span = time[-1] - time[0]
+    integral = _integrate(vsc, time) / span
+    line = (_integrate(voltage, time) if has_leak else time - time[0]) / span
     if has_ideal_edges(choice.drive):  # the trapezoid rule fails at samples next to an ideal edge
         inside = np.abs(np.diff(voltage, prepend=voltage[0])) < 1e-9 * np.ptp(voltage)
     else:
         inside = np.ones(time.size, dtype=bool)
-    span = time[-1] - time[0]
     part_size = 1 << 20  # samples, which limits memory
     R = np.zeros((0, 5))
     for first in range(0, time.size, part_size):
         part = slice(first, first + part_size)
-        line = driven[part] / span if has_leak else (time[part] - time[0]) / span
-        rows = np.stack([voltage[part], integral[part] / span, np.ones_like(line), line, vsc[part]], axis=1)
+        ones = np.ones_like(time[part])
+        rows = np.stack([voltage[part], integral[part], ones, line[part], vsc[part]], axis=1)
         R = np.asarray(np.linalg.qr(np.vstack([R, rows[inside[part]]]), mode="r"))
     (g, slope, _, direct), *_ = np.linalg.lstsq(R[:, :4], R[:, 4], rcond=None)
     if g >= max_divider:
@@ -78,6 +77,11 @@ def estimate_from_vsc(
     if not slope < 0.0:
         return VscEstimate(float(g), float("inf"))
     return VscEstimate(float(g), float(span / -slope), float(direct / -slope) if has_leak else 0.0)
+
+
+def _integrate(values: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Return the integral from the first sample to each, by the trapezoid rule."""
+    return np.concatenate([[0.0], np.cumsum(0.5 * np.diff(time) * (values[1:] + values[:-1]))])
 
 
 def start_from_estimates(

@@ -199,8 +199,13 @@ class Likelihood(eqx.Module):
         inputs = ChannelInputs(circuit, gain, **timing, effects=xp.stack(sizes) if sizes else None)
         if not isinstance(channel, FrictionChannel):
             return inputs
-        free = {name: xp.exp(theta[places[name]]) for name in FRICTION_PARAMETERS if name in places}
-        return dataclasses.replace(inputs, friction=free, drive_gain=xp.exp(log_product(channel.drive_gains)))
+        drive_gain = xp.exp(log_product(channel.drive_gains))
+        return dataclasses.replace(inputs, friction=self.friction_parameters(theta), drive_gain=drive_gain)
+
+    def friction_parameters(self, theta: Array) -> dict[str, Array]:
+        """Return the values of those `FRICTION_PARAMETERS` that are free."""
+        xp, names = array_module(theta), self.names
+        return {name: xp.exp(theta[names.index(name)]) for name in FRICTION_PARAMETERS if name in names}
 
     def channels_and_inputs(
         self, theta: Float[Array, " circuit_parameters"]
