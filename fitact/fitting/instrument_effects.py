@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
-import scipy.signal
+import scipy.linalg
 from jaxtyping import Array, Float
 
 from fitact.compiled import jit, pad_samples
@@ -113,5 +113,7 @@ def _highpass(
     before = uniform[:period] if 0 < period <= time.size else np.full(1, uniform[0] if settled else 0.0)
     x = step / PROBE_TIME_CONSTANT
     gain = -np.expm1(-x) / x
-    filtered = scipy.signal.lfilter([gain, -gain], [1.0, -np.exp(-x)], np.append(before, uniform) - before[0])
+    rise = np.diff(np.append(before, uniform), prepend=before[0])
+    # filtered[k] - exp(-x) filtered[k - 1] = gain rise[k]
+    filtered = scipy.linalg.solve_banded((1, 0), np.outer([1.0, -np.exp(-x)], np.ones(rise.size)), gain * rise)
     return np.interp(time, time[0] + step * np.arange(time.size), filtered[before.size :])

@@ -7,6 +7,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -87,7 +88,9 @@ def track(
     else:
         blocks = stream_record(record, channels=channels, scale=scale, rate=rate, follow=follow)
         source = os.fspath(record)
-        total = float(os.path.getsize(source)) if os.path.isfile(source) else math.inf
+        is_file = os.path.isfile(source)
+        blocks = _read_ahead(blocks) if is_file and follow == 0.0 else blocks
+        total = float(os.path.getsize(source)) if is_file else math.inf
     return track_blocks(blocks, source, total, scene, window=window, folder=folder, update=update, rates=rates)
 
 
@@ -154,6 +157,15 @@ def _watch(blocks: Iterable[Block], position: list[float]) -> Iterator[Block]:
     for block in blocks:
         position[0] = block.position
         yield block
+
+
+def _read_ahead(blocks: Iterator[Block]) -> Iterator[Block]:
+    """Yield blocks; the next one is read while one is used."""
+    with ThreadPoolExecutor(1) as reader:
+        following = reader.submit(next, blocks, None)
+        while (block := following.result()) is not None:
+            following = reader.submit(next, blocks, None)
+            yield block
 
 
 def _read_head(blocks: Iterator[Block], scene: Scene, source: str) -> tuple[list[Block], float | None, Iterator[Block]]:

@@ -55,7 +55,7 @@ def estimate_rates(
     parameters: tuple[str, ...],
     *,
     prior_rate: float = 0.1,
-    sweeps: int = 4,
+    sweeps: int = 6,
     points: int = 15,
 ) -> WalkRates:
     """Estimate the rates from the windows, with half-normal priors of scale `prior_rate` (1 per root of a second).
@@ -66,10 +66,10 @@ def estimate_rates(
     """
     names, to_walks = walk_matrix(parameters)
     size, low, high = len(names), math.log(1e-6), math.log(1.0)
-    centers, half = np.full(size, math.log(prior_rate) - 1.5), 0.5 * (high - low)
+    centers, half = np.full(size, math.log(prior_rate) - 1.5), np.full(size, 0.5 * (high - low))
     rate = lower = upper = np.zeros(size)
-    for sweep in range(sweeps):
-        grid = np.clip(centers[:, None] + np.linspace(-half, half, points), low, high)
+    for _ in range(sweeps):
+        grid = np.clip(centers[:, None] + half[:, None] * np.linspace(-1.0, 1.0, points), low, high)
         grid = np.concatenate([grid, np.full((size, 1), -np.inf)], axis=1)  # and one that does not change
         candidates = np.tile(np.exp(centers), (size, points + 1, 1))
         for i in range(size):
@@ -78,12 +78,16 @@ def estimate_rates(
         logs = log_likelihood(information, timing, covariances, prior).reshape(size, points + 1)
         rates = np.exp(grid)
         within = logs > np.max(logs, axis=1, keepdims=True) - 1.92  # half of the 95 % quantile of chi-squared
-        lower = np.where(within[:, -1], 0.0, np.min(np.where(within, rates, np.inf), axis=1))
-        upper = np.max(np.where(within, rates, 0.0), axis=1)
+        bounds = within[:, :-1].copy()  # and the next point on either side
+        bounds[:, 1:] |= within[:, :-2]
+        bounds[:, :-1] |= within[:, 1:-1]
+        lower = np.where(within[:, -1], 0.0, np.min(np.where(bounds, rates[:, :-1], np.inf), axis=1))
+        upper = np.max(np.where(bounds, rates[:, :-1], 0.0), axis=1)
         posterior = (logs - 0.5 * np.square(rates / prior_rate))[:, :-1] + grid[:, :-1]  # per log(rate)
         weight = np.exp(posterior - np.max(posterior, axis=1, keepdims=True))
         mean = np.sum(weight * rates[:, :-1], axis=1) / np.sum(weight, axis=1)
         spread = np.sqrt(np.sum(weight * np.square(grid[:, :-1] - np.log(mean)[:, None]), axis=1) / weight.sum(axis=1))
         rate, centers = mean, np.log(mean)
-        half = max(min(0.5 * half, 4.0 * float(np.max(spread))), 1.0) if sweep < sweeps - 2 else half
+        is_inside = np.argmax(posterior, axis=1) % (points - 1) > 0
+        half = np.where(is_inside, np.clip(4.0 * spread, 4.0 * half / (points - 1), half), half)
     return WalkRates(names, to_walks, rate, lower, upper)

@@ -66,10 +66,9 @@ def _check_steps(time: np.ndarray, steps: np.ndarray, step: float, source: str, 
             " the record again"
         )
     run = 100  # steps of which more than half differ where the rate has changed
-    for first in range(0, steps.size - run, run):
-        usual = float(np.median(steps[first : first + run]))
-        if abs(usual / step - 1.0) > max_change:
-            raise InputError(
-                f"{source}: the time step changes from {step:.4g} s to {usual:.4g} s near {time[first]:.4g} s; track"
-                " each part with one rate by itself"
-            )
+    usual = np.median(steps[: steps.size // run * run].reshape(-1, run), axis=1)
+    for place in np.flatnonzero(np.abs(usual / step - 1.0) > max_change)[:1].tolist():
+        raise InputError(
+            f"{source}: the time step changes from {step:.4g} s to {usual[place]:.4g} s near {time[run * place]:.4g} s;"
+            " track each part with one rate by itself"
+        )

@@ -9,7 +9,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import scipy.fft
-import scipy.signal
 from jaxtyping import Bool, Complex, Float
 
 from fitact.data.record import is_uniform
@@ -82,11 +81,9 @@ class ChannelSeries:
         """Return rows in units of independent noise of sd 1."""
         taps, weighted = self.samples.taps, rows * (self.weight / self.samples.sigma)
         # means of many samples hold only slow changes, which the filter multiplies by the sum of its taps
-        return (
-            scipy.signal.lfilter(taps, [1.0], weighted)
-            if self.kind == "samples" and taps.size > 1
-            else weighted * taps.sum()
-        )
+        if self.kind != "samples" or taps.size == 1:
+            return weighted * taps.sum()
+        return np.apply_along_axis(lambda row: np.convolve(row, taps)[: row.size], -1, weighted)
 
     @functools.cached_property
     def frequencies(self) -> Spectrum:

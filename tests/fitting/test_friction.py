@@ -123,6 +123,31 @@ def test_the_law_of_the_gap_is_preferred_where_it_holds(tmp_path: Path) -> None:
     assert wrong.figures["bic"] - right.figures["bic"] > 100.0
 
 
+def test_current_beside_the_friction_leaves_the_scale_to_the_noise(tmp_path: Path) -> None:
+    """With I, the scale no longer rests on the prior of Ci."""
+    form = {"channels": '["Vsc", "I", "Ft"]'}
+    record, text = simulate(tmp_path, "[friction]\nforce_scale = 3.0\n", **form)
+    fit = fitact.fit(record, load(tmp_path, text))
+    assert fit.result == "successful"
+    assert fit.identifiability.verdict == "identified"
+    sd = dict(zip(fit.names, np.linalg.norm(fit.laplace.covariance_root, axis=1), strict=True))
+    assert sd["force_scale"] < 0.02
+    assert max(map(abs, pulls(fit, mu=0.6, force_scale=3.0, Ci=1.35e-9, Rsc=160e3, Csc=22e-9).values())) < 4.0
+
+
+@pytest.mark.slow  # two models, each fitted again without a tenth of the record, ten times
+@pytest.mark.parametrize(("noise", "preferred"), [("1 mN", "gap"), ("3 N", None)])
+def test_laws_are_told_apart_only_where_they_differ_by_more_than_the_noise(
+    tmp_path: Path, noise: str, preferred: str | None
+) -> None:
+    record, text = simulate(tmp_path, law=GAP.format(law="gap"), noise=noise)
+    laws = {law: load(tmp_path, text + GAP.format(law=law)) for law in ("gap", "paper")}
+    found = fitact.compare(record, laws)
+    assert found.preferred == preferred
+    assert ("cannot be distinguished" in found.verdict) == (preferred is None)
+    assert "only the shape of the force in time tells the force laws apart" in found.verdict
+
+
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [

@@ -75,6 +75,21 @@ def test_the_compression_is_the_sum_over_the_samples(kind: str):
             assert found == pytest.approx(exact, rel=1e-9, abs=1e-3)
 
 
+@pytest.mark.slow  # a chain of four parameters to the end
+def test_posterior_of_a_leaky_panel_holds_the_truth():
+    """The 99.9 % intervals hold the truth, for nearly every seed of the noise."""
+    record, scene = leaky_record(MEAN, TRUTH["Ri"]), leaky_scene(MEAN, 1.5e6)
+    fit = fitact.fit(record, scene)
+    posterior = fitact.sample(fit, seed=1)
+    assert posterior.trusted
+    draws = posterior.to_dataframe()
+    for name, value in TRUTH.items():
+        low, high = np.quantile(draws[name], [0.0005, 0.9995])
+        assert low < value < high, name
+        # the data determine the rest so well that the posterior is that of the Laplace approximation
+        assert np.std(np.log(draws[name])) == pytest.approx(fit.sd[fit.names.index(name)], rel=0.1), name
+
+
 def test_what_knows_no_leak_refuses_it():
     record, scene = leaky_record(MEAN, TRUTH["Ri"]), leaky_scene(MEAN, 2e6)
     with pytest.raises(fitact.InputError, match="a track has no leak"):
