@@ -9,11 +9,12 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
-from fitact.experiment.fisher import FREQUENCY, Experiment, covariance_factor, jacobian
+from fitact.experiment.fisher import Experiment, covariance_factor, jacobian
 from fitact.model.drive import Trapezoid
 from fitact.model.skin import with_values
 from fitact.units import format_engineering
 
+FREQUENCY = "frequency"  # name of the setting for the drive's frequency
 Gradient: TypeAlias = Float[np.ndarray, " parameters"]  # of the log mean force, in the free log-parameters
 
 
@@ -99,7 +100,7 @@ def evaluate_design(
     values = [float(f"{value:.3g}") for value in values]
     experiments = design.make_experiments(values)
     free, prior = experiments[0].free, experiments[0].prior_factor
-    root = covariance_factor(joint_jacobian(experiments)[0], joint_prior_factor(experiments))[: len(free)]
+    root = covariance_factor(joint_jacobian(experiments), joint_prior_factor(experiments))[: len(free)]
     gradient = np.pad(gradient, (0, len(free) - len(gradient)))  # the force does not depend on an added gain
     sd, prior_sd = np.linalg.norm(root, axis=1), np.linalg.norm(prior, axis=1)
     force_sd = float(np.linalg.norm(gradient @ root))
@@ -116,25 +117,21 @@ def evaluate_design(
     )
 
 
-def joint_jacobian(
-    experiments: Sequence[Experiment], settings: Sequence[Setting] = ()
-) -> Float[np.ndarray, "1+settings rows parameters"]:
+def joint_jacobian(experiments: Sequence[Experiment]) -> Float[np.ndarray, "rows parameters"]:
     """Return the `jacobian` of experiments on one finger; each one's own parameters follow the shared ones."""
     free, blocks = experiments[0].free, []
     next_own = len(free)
     total = next_own + sum(len(e.own_parameters) for e in experiments)
-    for i, e in enumerate(experiments):
+    for e in experiments:
         columns = np.arange(len(free))
         for name in e.own_parameters:
             columns[free.index(name)] = next_own
             next_own += 1
-        here = [k for k, setting in enumerate(settings) if i in setting.experiment_indices]
-        derivatives = jacobian(e, [settings[k].field for k in here])
-        block = np.zeros((1 + len(settings), derivatives.shape[1], total))
-        for k, derivative in zip((0, *(1 + k for k in here)), derivatives, strict=True):
-            block[k][:, columns] = derivative
+        own = jacobian(e)
+        block = np.zeros((len(own), total))
+        block[:, columns] = own
         blocks.append(block)
-    return np.concatenate(blocks, axis=1)
+    return np.concatenate(blocks)
 
 
 def joint_prior_factor(experiments: Sequence[Experiment]) -> Float[np.ndarray, "parameters parameters"]:
