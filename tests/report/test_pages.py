@@ -369,32 +369,6 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("arguments", "title"),
-    [
-        (("plan", "scene.toml"), "Simplest model of the scene"),
-        pytest.param(("design", "measurement", "scene.toml"), "What to measure next", marks=pytest.mark.thorough),
-        pytest.param(
-            ("design", "drive", "scene.toml"),
-            "The smallest drive that 95 % of fingers feel",
-            marks=pytest.mark.thorough,
-        ),
-    ],
-)
-def test_a_command_leaves_a_page(arguments: tuple[str, ...], title: str, tmp_path: Path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("scene.toml").write_text('[grounding]\nR_H = "500 ohm"\n[perception]\nthreshold_force = "0.1 mN"\n')
-    done = run(*arguments, "--out", "out")
-    assert done.returncode == 0, done.stderr
-    page = Page(Path("out/report.html").read_text())
-    text = words(page)
-    assert page.open == []
-    assert title in text
-    assert f"fitact {' '.join(arguments)} --out out" in text
-    assert '"R_H": 500.0' in text
-
-
 @pytest.mark.thorough
 def test_a_population_leaves_a_page_that_report_writes_again(tmp_path: Path):
     scene = tmp_path / "scene.toml"
