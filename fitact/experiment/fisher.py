@@ -192,9 +192,9 @@ def _sampling(e: Experiment, max_samples: int = 4096, period_times: int = 1024, 
     # two samples on either side of an edge carry no information on a current that follows dV/dt; the quarter step keeps
     # rounding from deciding where edges coincide with samples
     around = time[chosen][:, None] + (np.arange(-2, 3) + 0.25) * float(np.median(np.diff(time)))
-    if isinstance(drive, Sampled) and drive.period is None:
+    if isinstance(drive, Sampled):
         # by NumPy, which is faster; the slope is mostly noise, so a signal that follows it counts as uninformative
-        near, voltage = (np.interp(each, drive.time, drive.samples) for each in (around, times))
+        near, voltage = (np.interp(each, drive.time, drive.samples, period=drive.period) for each in (around, times))
         slope = np.zeros_like(times)
     else:
         near, slope, voltage = _evaluate_drive(drive, around, times, e.steady_state)
@@ -228,8 +228,6 @@ def _pad_drive(drive: Drive, time: np.ndarray, samples: int = 8192) -> tuple[Dri
 def _evaluate_drive(drive: Drive, around: Array, time: Array, steady_state: bool) -> tuple[Array, Array, Array]:
     """Return the drive at the times `around`, its slope at `time`, 0 at jumps, and the drive at `time`."""
     voltage = drive_voltage(drive, time, steady_state=steady_state)
-    if isinstance(drive, Sampled):  # its slope is mostly noise, so a signal that follows it counts as uninformative
-        return drive.value(around), jnp.zeros_like(time), voltage
     return drive.value(around), jnp.nan_to_num(drive.slope(time, steady_state=steady_state)), voltage
 
 

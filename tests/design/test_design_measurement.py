@@ -15,9 +15,8 @@ import scipy.signal
 import fitact
 from fitact.cli import main
 from fitact.design.measurement import experiment_from_scene
-from fitact.experiment.experiment import CandidateDesign, DesignOption, evaluate_design
+from fitact.experiment.experiment import CandidateDesign, DesignOption, evaluate_design, force_sd, optimise
 from fitact.experiment.fisher import Experiment, force_gradient
-from fitact.experiment.optimise import force_sd, optimise
 from fitact.experiment.options import changes, suggest_measurements
 from tests.experiment.test_expected import BOTH, NOMINAL, PRIOR_SD, RESISTOR
 
