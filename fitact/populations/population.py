@@ -299,7 +299,8 @@ class Population(Display):
         import xarray as xr
 
         def dataset(draws: dict[str, np.ndarray], dims: tuple[str, str]) -> xr.Dataset:
-            return xr.Dataset({name: (dims, values, {"units": _unit(name)}) for name, values in draws.items()})
+            units = {name: "1" if name.startswith(("log_sd", "slope")) else quantity_unit(name) for name in draws}
+            return xr.Dataset({name: (dims, values, {"units": units[name]}) for name, values in draws.items()})
 
         new_fingers = dataset(self.new_fingers(), ("law", "finger"))
         new_fingers["log_factors"] = ("law", "finger", "factor"), self.factors
@@ -452,7 +453,3 @@ def draw_parameters(population: Population, count: int) -> PopulationParameters:
 
 def log_medians(parameters: PopulationParameters) -> dict[str, np.ndarray]:
     return {"Rsc": parameters.median[..., 0], "Csc": parameters.median[..., 1], SHARED_PARAMETER: parameters.log_Ci}
-
-
-def _unit(name: str) -> str:
-    return "1" if name.startswith(("log_sd", "slope")) else quantity_unit(name)
