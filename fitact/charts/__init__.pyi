@@ -5,8 +5,7 @@ from .figure import pyplot_figure
 from .picture import show_plots
 from .population import draw_population
 from .posterior import corner_plots, ellipse_plot, force_in_time_plot, force_plots
-from .series import Series, spectrum_plot, time_plot
-from .track import track_plot
+from .series import Series, spectrum_plot, time_plot, track_plot
 
 __all__ = [
     "Series",

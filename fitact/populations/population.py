@@ -26,7 +26,7 @@ from fitact.populations.next_finger import (
     NewFingerModel,
     draw_factors,
     finger_variance_fraction,
-    within_variance_fraction,
+    intrafinger_variance_fraction,
 )
 from fitact.populations.sobol import SobolIndices, sobol_indices
 from fitact.populations.within_finger import WithinFinger
@@ -227,7 +227,7 @@ class Population(Display):
             people = finger_variance_fraction(values)
             shares = {"people": people, "ignorance": 1.0 - people}
             if self.within is not None:
-                within = people * within_variance_fraction(self._new_predictions[..., i])
+                within = people * intrafinger_variance_fraction(self._new_predictions[..., i])
                 shares |= {"within_finger": within, "between_fingers": people - within}
                 shares |= {"population_parameters": 1.0 - people}
             new[name] = summary.summarize_draws(name, values) | {"variance": shares}
