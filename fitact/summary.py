@@ -17,7 +17,16 @@ from jaxtyping import Float
 
 from fitact.errors import InputError
 from fitact.tables import align_table, join_lines
-from fitact.units import choose_prefixed_unit, format_engineering, format_percent, quantity_unit
+from fitact.units import (
+    DERIVED,
+    GEOMETRY,
+    NUISANCES,
+    PARAMETERS,
+    choose_prefixed_unit,
+    format_engineering,
+    format_percent,
+    quantity_unit,
+)
 
 _PACKAGES = ("fitact", "jax", "equinox", "optimistix", "emcee", "numpy", "xarray")
 _SECTIONS = {"parameters", "derived", "identifiability", "convergence", "fit", "model", "warnings", "record"}
@@ -30,84 +39,16 @@ FORCE_LAWS = {  # by [force] model
     "paper": "from Vsc with eq. (22) of the reference paper",
     "gap": "from the voltage across the interface gap, eps0 A Vgap^2 / (2 d^2)",
 }
-_PARAMETERS = {
-    "Rsc": "skin resistance Rsc",
-    "Csc": "skin capacitance Csc",
-    "Ci": "insulator capacitance Ci",
-    "Ri": "leak resistance of the insulator Ri",
-    "R_H": "body resistance R_H",
-    "grounding_Rsc": "resistance of the grounding skin",
-    "grounding_Csc": "capacitance of the grounding skin",
-    "Z": "resistance to earth Z",
-    "Z_capacitance": "capacitance to earth",
-    "series_resistor": "series resistor",
-    "Rgap": "gap resistance Rgap",
-    "Cgap": "gap capacitance Cgap",
-    "alpha": "exponent of the fractional skin",
-    "mu": "coefficient of friction mu",
-    "fN": "normal force fN",
-    "force_scale": "measured electrostatic force over the computed one",
-}
-_NUISANCES = {  # quantities of the measurement; {}: the channel
-    "gain": "gain of {}",
-    "gain_V": "gain of V",
-    "compensation": "gain of {} at high frequency over that at low frequency",
-    "compensation_V": "gain of V at high frequency over that at low frequency",
-    "nonlinearity_even": "1 + even non-linearity of {}, relative to the range",
-    "nonlinearity_odd": "1 + odd non-linearity of {}, relative to the range",
-    "nonlinearity_V_even": "1 + even non-linearity of V, relative to the range",
-    "nonlinearity_V_odd": "1 + odd non-linearity of V, relative to the range",
-    "probe_resistance": "input resistance that loads the skin",
-    "probe_capacitance": "input capacitance that loads the skin",
-    "delay": "delay of {} against V",
-    "clock": "relative deviation of the drive frequency from the stated one",
-    "sigma": "noise of {}, standard deviation",
-    "sigma_Z": "noise of the impedance, relative standard deviation",
-    "sigma_H": "noise of the gain Vsc/V, relative standard deviation",
-    "offset": "constant offset of {}",
-    "drift": "drift of {} over half the record",
-    "hum_50Hz_cos": "50 Hz hum in {}, cosine part",
-    "hum_50Hz_sin": "50 Hz hum in {}, sine part",
-    "hum_60Hz_cos": "60 Hz hum in {}, cosine part",
-    "hum_60Hz_sin": "60 Hz hum in {}, sine part",
-    "charge": "transient in {} at the first sample, from the unknown initial charge",
-    "charge_2": "second transient in {} at the first sample",
-    "charge_3": "third transient in {} at the first sample",
-    "charge_4": "fourth transient in {} at the first sample",
-    "ringing": "state of the force sensor at the first sample",
-    "ringing_2": "rate of the force sensor at the first sample",
-    "crosstalk": "part of {} in proportion to V, at the largest V",
-    "crosstalk_2": "part of {} in proportion to dV/dt, at the largest dV/dt",
-    "sensor_frequency": "natural frequency of the force sensor",
-    "sensor_damping": "damping ratio of the force sensor",
-}
 _CHANNELS = {"": "Vsc", "I": "I", "Z": "the impedance", "H": "Vsc/V", "Ft": "the friction"}  # by the end of a name
-_GEOMETRY = {  # what force and friction rest on beside the circuit
-    "skin_thickness": "skin thickness Tsc",
-    "skin_permittivity": "skin permittivity",
-    "insulator_thickness": "insulator thickness Ti",
-    "insulator_permittivity": "insulator permittivity",
-    "contact_area": "contact area A",
-    "friction_coefficient": "coefficient of friction mu",
-}
-_DERIVED = {
-    "g": "divider g = Ci / (2 Ci + Csc)",
-    "b": "time constant b, without a leak Rsc (2 Ci + Csc)",
-    "force_mean": "electrostatic force, mean",
-    "force_peak": "electrostatic force, peak",
-    "force_rms": "electrostatic force, rms",
-    "friction_mean": "friction mu (force + fN), mean",
-    "times_threshold": "alternating friction over its detection threshold",
-}
 
 
 def describe_quantity(name: str) -> str:
     """Return the name of a quantity for people; a nuisance may end in the label of its channel, as "sigma_I_2"."""
-    labels = _PARAMETERS | _NUISANCES | _GEOMETRY | _DERIVED
+    labels = PARAMETERS | NUISANCES | GEOMETRY | DERIVED
     bare = name if name in labels else re.sub(r"_\d+$", "", name)
     number = name[len(bare) + 1 :]
     stem, _, letter = (bare, "", "") if bare in labels else bare.rpartition("_")
-    label = labels[stem].format(describe_channel(letter))
+    label = labels[stem][1].format(describe_channel(letter))
     return label + (f", record {number}" if number else "")
 
 
@@ -196,9 +137,9 @@ def quantity_table(content: dict[str, Any]) -> list[tuple[str, ...]]:
     headings = "circuit", "geometry and friction", "computed, not measured", "measurement"
     groups: dict[str, list[tuple[str, ...]]] = {heading: [] for heading in headings}
     for name, s in summaries.items():
-        group = "computed, not measured" if name in _DERIVED else "measurement"
-        group = "geometry and friction" if name in _GEOMETRY else group
-        if name in _PARAMETERS or name in ("g", "b"):
+        group = "computed, not measured" if name in DERIVED else "measurement"
+        group = "geometry and friction" if name in GEOMETRY else group
+        if name in PARAMETERS or name in ("g", "b"):
             group = "circuit"
         groups[group].append(_quantity_row(name, s, content["force_basis"]))
     for name, s in content.get("nuisances", {}).items():
@@ -211,7 +152,7 @@ def quantity_table(content: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def _quantity_row(name: str, summary: Summary, basis: dict[str, Any]) -> tuple[str, ...]:
-    remark = "" if name in _PARAMETERS else describe_quantity(name)
+    remark = "" if name in PARAMETERS else describe_quantity(name)
     friction = [a for a in basis["assumptions"] if a["affects"] == "friction"]
     defaults = [a for a in friction if a["origin"] == "default"]
     if name == "friction_mean" and defaults and not any(a.get("has_distribution") for a in friction):

@@ -16,21 +16,78 @@ _PREFIXES = {-15: "f", -12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "
 PREFIX_FACTORS = {symbol: float(f"1e{n}") for n, symbol in (*_PREFIXES.items(), (-6, "u"), (-6, "μ"), (3, "K"))}
 _SYMBOLS = {"ohm": "Ω", "1": ""}
 
-_UNITS = {
-    "Rsc": "ohm", "Csc": "F", "Ci": "F", "R_H": "ohm", "grounding_Rsc": "ohm", "grounding_Csc": "F",
-    "Z": "ohm", "Z_capacitance": "F", "series_resistor": "ohm", "Ri": "ohm", "Rgap": "ohm", "Cgap": "F",
-    "gain_V": "1", "compensation": "1", "nonlinearity_even": "1", "nonlinearity_odd": "1", "compensation_V": "1",
-    "nonlinearity_V_even": "1", "nonlinearity_V_odd": "1", "probe_resistance": "ohm", "probe_capacitance": "F",
-    "gain": "1", "delay": "s", "clock": "1", "sigma": "V", "sigma_Z": "1", "sigma_H": "1",
-    "alpha": "1", "Vsc_peak_to_peak": "V", "log_sd": "1", "slope": "1", "correlation": "1",
-    "offset": "V", "drift": "V", "charge": "V", "charge_2": "V", "charge_3": "V", "charge_4": "V",
-    "ringing": "V", "ringing_2": "V", "crosstalk": "V", "crosstalk_2": "V",
-    "hum_50Hz_cos": "V", "hum_50Hz_sin": "V", "hum_60Hz_cos": "V", "hum_60Hz_sin": "V",
-    "g": "1", "b": "s", "force_mean": "N", "force_peak": "N", "force_rms": "N", "friction_mean": "N",
-    "times_threshold": "1", "sensation_level": "dB",
-    "skin_thickness": "m", "skin_permittivity": "1", "insulator_thickness": "m", "insulator_permittivity": "1",
-    "contact_area": "m^2", "friction_coefficient": "1",
-    "mu": "1", "fN": "N", "force_scale": "1", "sensor_frequency": "Hz", "sensor_damping": "1",
+# unit and meaning of each quantity
+PARAMETERS = {  # of the circuit and the friction
+    "Rsc": ("ohm", "skin resistance Rsc"),
+    "Csc": ("F", "skin capacitance Csc"),
+    "Ci": ("F", "insulator capacitance Ci"),
+    "Ri": ("ohm", "leak resistance of the insulator Ri"),
+    "R_H": ("ohm", "body resistance R_H"),
+    "grounding_Rsc": ("ohm", "resistance of the grounding skin"),
+    "grounding_Csc": ("F", "capacitance of the grounding skin"),
+    "Z": ("ohm", "resistance to earth Z"),
+    "Z_capacitance": ("F", "capacitance to earth"),
+    "series_resistor": ("ohm", "series resistor"),
+    "Rgap": ("ohm", "gap resistance Rgap"),
+    "Cgap": ("F", "gap capacitance Cgap"),
+    "alpha": ("1", "exponent of the fractional skin"),
+    "mu": ("1", "coefficient of friction mu"),
+    "fN": ("N", "normal force fN"),
+    "force_scale": ("1", "measured electrostatic force over the computed one"),
+}
+NUISANCES = {  # quantities of the measurement; {}: the channel
+    "gain": ("1", "gain of {}"),
+    "gain_V": ("1", "gain of V"),
+    "compensation": ("1", "gain of {} at high frequency over that at low frequency"),
+    "compensation_V": ("1", "gain of V at high frequency over that at low frequency"),
+    "nonlinearity_even": ("1", "1 + even non-linearity of {}, relative to the range"),
+    "nonlinearity_odd": ("1", "1 + odd non-linearity of {}, relative to the range"),
+    "nonlinearity_V_even": ("1", "1 + even non-linearity of V, relative to the range"),
+    "nonlinearity_V_odd": ("1", "1 + odd non-linearity of V, relative to the range"),
+    "probe_resistance": ("ohm", "input resistance that loads the skin"),
+    "probe_capacitance": ("F", "input capacitance that loads the skin"),
+    "delay": ("s", "delay of {} against V"),
+    "clock": ("1", "relative deviation of the drive frequency from the stated one"),
+    "sigma": ("V", "noise of {}, standard deviation"),
+    "sigma_Z": ("1", "noise of the impedance, relative standard deviation"),
+    "sigma_H": ("1", "noise of the gain Vsc/V, relative standard deviation"),
+    "offset": ("V", "constant offset of {}"),
+    "drift": ("V", "drift of {} over half the record"),
+    "hum_50Hz_cos": ("V", "50 Hz hum in {}, cosine part"),
+    "hum_50Hz_sin": ("V", "50 Hz hum in {}, sine part"),
+    "hum_60Hz_cos": ("V", "60 Hz hum in {}, cosine part"),
+    "hum_60Hz_sin": ("V", "60 Hz hum in {}, sine part"),
+    "charge": ("V", "transient in {} at the first sample, from the unknown initial charge"),
+    "charge_2": ("V", "second transient in {} at the first sample"),
+    "charge_3": ("V", "third transient in {} at the first sample"),
+    "charge_4": ("V", "fourth transient in {} at the first sample"),
+    "ringing": ("V", "state of the force sensor at the first sample"),
+    "ringing_2": ("V", "rate of the force sensor at the first sample"),
+    "crosstalk": ("V", "part of {} in proportion to V, at the largest V"),
+    "crosstalk_2": ("V", "part of {} in proportion to dV/dt, at the largest dV/dt"),
+    "sensor_frequency": ("Hz", "natural frequency of the force sensor"),
+    "sensor_damping": ("1", "damping ratio of the force sensor"),
+}
+GEOMETRY = {  # what force and friction rest on beside the circuit
+    "skin_thickness": ("m", "skin thickness Tsc"),
+    "skin_permittivity": ("1", "skin permittivity"),
+    "insulator_thickness": ("m", "insulator thickness Ti"),
+    "insulator_permittivity": ("1", "insulator permittivity"),
+    "contact_area": ("m^2", "contact area A"),
+    "friction_coefficient": ("1", "coefficient of friction mu"),
+}
+DERIVED = {
+    "g": ("1", "divider g = Ci / (2 Ci + Csc)"),
+    "b": ("s", "time constant b, without a leak Rsc (2 Ci + Csc)"),
+    "force_mean": ("N", "electrostatic force, mean"),
+    "force_peak": ("N", "electrostatic force, peak"),
+    "force_rms": ("N", "electrostatic force, rms"),
+    "friction_mean": ("N", "friction mu (force + fN), mean"),
+    "times_threshold": ("1", "alternating friction over its detection threshold"),
+}
+_UNITS = {name: unit for table in (PARAMETERS, NUISANCES, GEOMETRY, DERIVED) for name, (unit, _) in table.items()}
+_UNITS |= {
+    "Vsc_peak_to_peak": "V", "log_sd": "1", "slope": "1", "correlation": "1", "sensation_level": "dB",
     "force_at_f": "N", "force_at_2f": "N", "friction_at_f": "N", "friction_at_2f": "N",
 }  # fmt: skip
 

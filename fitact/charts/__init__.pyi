@@ -1,13 +1,11 @@
-from .budget import draw_budgets
+from .bars import draw_budgets, draw_plan
 from .design import draw_design
 from .drive_design import draw_drive_design
 from .figure import pyplot_figure
 from .picture import show_plots
-from .plan import draw_plan
 from .population import draw_population
 from .posterior import corner_plots, ellipse_plot, force_in_time_plot, force_plots
-from .series import Series, spectrum_plot, time_plot
-from .track import track_plot
+from .series import Series, spectrum_plot, time_plot, track_plot
 
 __all__ = [
     "Series",

@@ -12,6 +12,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
+from fitact.errors import InputError
 from fitact.files import atomic_write
 
 FigureMaker: TypeAlias = Callable[..., Figure]  # takes `figsize` and `layout`
@@ -55,12 +56,14 @@ def log_ticks(axis: Axis, unit: str, subs: tuple[float, ...] = (1.0, 2.0, 5.0)) 
     axis.set_minor_formatter(NullFormatter())
 
 
-def write_figure(path: str | os.PathLike[str], draw: Callable[[], Figure], dpi: float | None = None) -> None:
-    """Write a figure in the shared style as PNG or, for any other suffix of `path`, as SVG."""
-    kind = "png" if Path(path).suffix == ".png" else "svg"
+def write_figure(path: str | os.PathLike[str], draw: Callable[[], Figure]) -> None:
+    """Write a figure in the shared style as SVG or PNG, by the suffix of `path`; refuse any other."""
+    kind = Path(path).suffix[1:]
+    if kind not in ("svg", "png"):
+        raise InputError(f"{path}: the figure is written as .svg or .png; choose one of these endings")
     metadata = {"Date": None} if kind == "svg" else {}
     with mpl.rc_context(STYLE), atomic_write(path) as temporary:
-        draw().savefig(temporary, format=kind, dpi=dpi, metadata=metadata)
+        draw().savefig(temporary, format=kind, dpi=150, metadata=metadata)
 
 
 def svg(figure: Figure) -> str:

@@ -17,7 +17,7 @@ from fitact.errors import InputError
 
 # `fitact --help` lists the commands in the order of this import
 # isort: off
-from fitact.cli import one_finger, records, scenes, campaigns, designs, page  # noqa: F401
+from fitact.cli import one_finger, records, scenes, page  # noqa: F401
 
 # isort: on
 

@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.data.clipping import clipping_mask
-from fitact.data.readers.capture import Capture, FileChannel, has_standard_names, to_record
+from fitact.data.readers.capture import Capture, FileChannel, has_standard_names, replace_rounded_times, to_record
 from fitact.data.readers.read import merge_other_files, read_capture
-from fitact.data.readers.sampling_rate import replace_rounded_times
 from fitact.data.record import (
     CHANNEL_UNITS,
     MINIMUM_SAMPLES,

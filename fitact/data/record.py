@@ -113,10 +113,10 @@ class Record(Display):
 
     def noise(self, channel: str) -> float:
         """Return a model-free estimate of the channel's noise sd: white noise and rounding."""
-        if ("noise", channel) not in self._known:
+        if ("noise", channel) not in self._estimates:
             values = self[channel] if channel == "V" else self[channel][~clipping_mask(self[channel])]
-            self._known["noise", channel] = math.hypot(white_noise_sd(values), rounding_noise_sd(values))
-        return self._known["noise", channel]
+            self._estimates["noise", channel] = math.hypot(white_noise_sd(values), rounding_noise_sd(values))
+        return self._estimates["noise", channel]
 
     @property
     def leading(self) -> str:
@@ -126,9 +126,9 @@ class Record(Display):
     def frequency(self, channel: str | None = None) -> float | None:
         """Return the fundamental frequency (Hz) of a channel (default V, else Vsc), or None below 1.5 periods."""
         channel = channel or self.leading
-        if ("frequency", channel) not in self._known:
-            self._known["frequency", channel] = fundamental_frequency(self.time, self[channel])
-        return self._known["frequency", channel]
+        if ("frequency", channel) not in self._estimates:
+            self._estimates["frequency", channel] = fundamental_frequency(self.time, self[channel])
+        return self._estimates["frequency", channel]
 
     def plot(self) -> Any:
         """Draw V, Vsc and I on one time axis, and return the axes, one for each channel."""
@@ -162,7 +162,7 @@ class Record(Display):
         return rows
 
     @functools.cached_property
-    def _known(self) -> dict[tuple[str, str], Any]:
+    def _estimates(self) -> dict[tuple[str, str], Any]:
         """Cache of noise estimates and frequencies, since each takes a pass over the record."""
         return {}
 

@@ -69,7 +69,7 @@ class DriveDesign(Display):
         }
 
     @property
-    def recommended(self) -> DriveOption | None:
+    def recommended_option(self) -> DriveOption | None:
         """Option to set: the smallest amplitude within the stated limits at a finite current; None if there is none."""
         settable = [option for option in self.options.values() if not _obstacles(option)]
         return min(settable, key=lambda option: option.assured, default=None) if self.trusted else None
@@ -77,7 +77,7 @@ class DriveDesign(Display):
     @property
     def recommendation(self) -> str:
         """Sentence that says which amplitude to set, for whom and with which assurance."""
-        option, fraction = self.recommended, f"{100.0 * self.share:g} %"
+        option, fraction = self.recommended_option, f"{100.0 * self.share:g} %"
         if not self.trusted:
             return "No amplitude is recommended, because the population is not reliable (its warnings say why)."
         if option is None:
@@ -104,7 +104,7 @@ class DriveDesign(Display):
 
     @property
     def _shown(self) -> DriveOption:
-        return self.recommended or self.options[self.scene_waveform]
+        return self.recommended_option or self.options[self.scene_waveform]
 
     @property
     def exposure(self) -> str:
@@ -112,7 +112,8 @@ class DriveDesign(Display):
         option = self._shown
         if not math.isfinite(option.assured):
             return "No amplitude suffices, so there are no body current and insulator field to compare."
-        at, where = option.at_assured, "this amplitude" if self.recommended else f"the {option.waveform}'s amplitude"
+        at, is_set = option.at_assured, option is self.recommended_option
+        where = "this amplitude" if is_set else f"the {option.waveform}'s amplitude"
         current = "the body current is unbounded, because the edges are ideal; state [drive] rise_time"
         if math.isfinite(at.current_rms):
             rms, peak = (format_quantity(float(x), "A") for x in (at.current_rms, at.current_peak))
@@ -171,7 +172,7 @@ class DriveDesign(Display):
         }
 
     def _recommendation_content(self) -> dict[str, Any]:
-        option = self.recommended
+        option = self.recommended_option
         volts = None if option is None else option.assured
         offset = normalize_drive(self.scene.drive).offset
         return {
@@ -209,7 +210,7 @@ class DriveDesign(Display):
         sentences += [
             f"at the recommended amplitude the {each.quantity} is {each.ratio:.2g} times the limit of {each.source}"
             f" ({each.name})"
-            for each in (self.limits if self.recommended else ())
+            for each in (self.limits if self.recommended_option else ())
             if each.exceeds_published
         ]
         thickness = self.scene.thickness_sd()
@@ -249,7 +250,7 @@ class DriveDesign(Display):
 
     @property
     def _headline(self) -> str:
-        return self.recommendation if self.recommended else self.recommendation.partition(" (")[0]
+        return self.recommendation if self.recommended_option else self.recommendation.partition(" (")[0]
 
     def _rows(self) -> tuple[tuple[str, ...], ...]:
         return self.table
@@ -261,7 +262,7 @@ class DriveDesign(Display):
         """Return the recommendation, the tables for people, and notes and warnings."""
         lines = [self.recommendation, self.question, self.exposure, "", *align_table(self.table), self.legend]
         limits = align_table([(source, *cells) for source, _, *cells in self.limits_table])
-        lines += ["", *limits, "", *self.excluded, *self.sentences]
+        lines += ["", *limits, "", *self.exclusions, *self.sentences]
         return join_lines(lines, self.warnings, self.notes)
 
     __str__ = summary
@@ -302,7 +303,7 @@ class DriveDesign(Display):
         return titles, *(each.row for each in self.limits)
 
     @property
-    def excluded(self) -> tuple[str, ...]:
+    def exclusions(self) -> tuple[str, ...]:
         """Waveforms that exceed a limit of the scene, with that limit."""
         return tuple(f"{name}: excluded, {phrase}" for name, o in self.options.items() for phrase in o.violations)
 

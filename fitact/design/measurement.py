@@ -14,9 +14,8 @@ from fitact.data.record import Record
 from fitact.data.simulate import sample_times
 from fitact.errors import InputError
 from fitact.experiment.blind_directions import GAIN_CHANNELS, gain_names
-from fitact.experiment.experiment import CandidateDesign, DesignOption, Gradient, evaluate_design
+from fitact.experiment.experiment import CandidateDesign, DesignOption, Gradient, evaluate_design, optimise
 from fitact.experiment.fisher import Experiment, force_gradient, signal_spans
-from fitact.experiment.optimise import optimise
 from fitact.experiment.options import Change, changes
 from fitact.fitting.fit import fit
 from fitact.fitting.skin_model import count_harmonics

@@ -1,19 +1,23 @@
-"""A candidate measurement: its records and its expected uncertainties."""
+"""A candidate measurement: its records, its expected uncertainties, and its best settings."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import scipy.linalg
+import scipy.ndimage
+import scipy.optimize
 from jaxtyping import Float
 
-from fitact.experiment.fisher import FREQUENCY, Experiment, covariance_factor, jacobian
+from fitact.experiment.fisher import Experiment, covariance_factor, jacobian
 from fitact.model.drive import Trapezoid
 from fitact.model.skin import with_values
 from fitact.units import format_engineering
 
+FREQUENCY = "frequency"  # name of the setting for the drive's frequency
 Gradient: TypeAlias = Float[np.ndarray, " parameters"]  # of the log mean force, in the free log-parameters
 
 
@@ -99,7 +103,7 @@ def evaluate_design(
     values = [float(f"{value:.3g}") for value in values]
     experiments = design.make_experiments(values)
     free, prior = experiments[0].free, experiments[0].prior_factor
-    root = covariance_factor(joint_jacobian(experiments)[0], joint_prior_factor(experiments))[: len(free)]
+    root = covariance_factor(_joint_jacobian(experiments), _joint_prior_factor(experiments))[: len(free)]
     gradient = np.pad(gradient, (0, len(free) - len(gradient)))  # the force does not depend on an added gain
     sd, prior_sd = np.linalg.norm(root, axis=1), np.linalg.norm(prior, axis=1)
     force_sd = float(np.linalg.norm(gradient @ root))
@@ -116,28 +120,69 @@ def evaluate_design(
     )
 
 
-def joint_jacobian(
-    experiments: Sequence[Experiment], settings: Sequence[Setting] = ()
-) -> Float[np.ndarray, "1+settings rows parameters"]:
+class Optimum(NamedTuple):
+    """Best settings, and the standard deviation of the log mean force on the grid."""
+
+    values: tuple[float, ...]  # of the settings, SI
+    grid: tuple[Float[np.ndarray, " points"], ...]  # along each setting
+    force_sd: Float[np.ndarray, "*points"]  # at all combinations
+
+
+def optimise(design: CandidateDesign, gradient: Gradient, starts: int = 3, min_improvement: float = 1e-3) -> Optimum:
+    """Find the settings with the smallest uncertainty of the mean force.
+
+    The descent starts from the `starts` lowest points of the grid. A setting moves only if the uncertainty falls by
+    the fraction `min_improvement`.
+    """
+    bounds = [(setting.low, setting.high) for setting in design.settings]
+    count = {1: 33, 2: 6}.get(len(bounds), 4)  # grid points along each setting, by the number of settings
+    grid = tuple(np.geomspace(*pair, count) for pair in bounds)
+    points = list(itertools.product(*grid))
+    coarse = np.array([force_sd(design, point, gradient) for point in points])
+    shape = (count,) * len(bounds)
+    lowest = scipy.ndimage.minimum_filter(coarse.reshape(shape), 3, mode="nearest").ravel() == coarse
+    order = [i for i in np.argsort(coarse) if lowest[i]][:starts]
+
+    def log_sd(logs: np.ndarray) -> float:
+        return float(np.log(force_sd(design, np.exp(logs), gradient)))
+
+    optima = [(np.log(coarse[i]), points[i]) for i in order]
+    for i in order:
+        end = scipy.optimize.minimize(log_sd, np.log(points[i]), method="L-BFGS-B", bounds=np.log(bounds))
+        optima.append((end.fun, tuple(np.exp(end.x))))
+    best, values = min(optima)
+    if force_sd(design, design.start_values, gradient) < (1.0 + min_improvement) * np.exp(best):
+        values = design.start_values
+    if len({setting.field for setting in design.settings}) == 1:  # the records are interchangeable
+        values = sorted(values)
+    return Optimum(tuple(map(float, values)), grid, coarse.reshape(shape))
+
+
+def force_sd(design: CandidateDesign, values: Sequence[float], gradient: Gradient) -> float:
+    """Return the standard deviation of the log mean force with the settings at `values`."""
+    experiments = design.make_experiments(values, keep_phase=True)
+    root = covariance_factor(_joint_jacobian(experiments), _joint_prior_factor(experiments))
+    return float(np.linalg.norm(gradient @ root[: gradient.size]))
+
+
+def _joint_jacobian(experiments: Sequence[Experiment]) -> Float[np.ndarray, "rows parameters"]:
     """Return the `jacobian` of experiments on one finger; each one's own parameters follow the shared ones."""
     free, blocks = experiments[0].free, []
     next_own = len(free)
     total = next_own + sum(len(e.own_parameters) for e in experiments)
-    for i, e in enumerate(experiments):
+    for e in experiments:
         columns = np.arange(len(free))
         for name in e.own_parameters:
             columns[free.index(name)] = next_own
             next_own += 1
-        here = [k for k, setting in enumerate(settings) if i in setting.experiment_indices]
-        derivatives = jacobian(e, [settings[k].field for k in here])
-        block = np.zeros((1 + len(settings), derivatives.shape[1], total))
-        for k, derivative in zip((0, *(1 + k for k in here)), derivatives, strict=True):
-            block[k][:, columns] = derivative
+        own = jacobian(e)
+        block = np.zeros((len(own), total))
+        block[:, columns] = own
         blocks.append(block)
-    return np.concatenate(blocks, axis=1)
+    return np.concatenate(blocks)
 
 
-def joint_prior_factor(experiments: Sequence[Experiment]) -> Float[np.ndarray, "parameters parameters"]:
+def _joint_prior_factor(experiments: Sequence[Experiment]) -> Float[np.ndarray, "parameters parameters"]:
     """Return a root of the prior's covariance; an experiment's own parameters are independent of the others."""
     own = [np.linalg.norm(e.prior_factor[e.free.index(name)]) for e in experiments for name in e.own_parameters]
     return scipy.linalg.block_diag(experiments[0].prior_factor, np.diag(own))

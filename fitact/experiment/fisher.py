@@ -6,7 +6,7 @@ offset, drift, delay or initial charge is taken to be unknown.
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -24,7 +24,6 @@ from fitact.model.force import Geometry, force_constant
 from fitact.model.response import drive_voltage, highpass, response_and_rate
 from fitact.model.skin import circuit_parameters, has_time_constants, limits_current, with_values
 
-FREQUENCY = "frequency"  # name of the setting for the drive's frequency
 Ties: TypeAlias = tuple[tuple[str, str, float], ...]  # (name, other, ratio): name = ratio * other
 
 
@@ -51,36 +50,30 @@ class Experiment:
 def force_gradient(experiment: Experiment) -> Float[np.ndarray, " circuit_parameters"]:
     """Return the gradient of the log mean force of an experiment in its log-parameters."""
     with jax.enable_x64(True):
-        sampling, model = _sampling(experiment), _Model.from_experiment(experiment, experiment.free)
+        sampling, model = _sampling(experiment), _Model.from_experiment(experiment)
         ((voltage, slope),) = _derivatives(model, sampling, slice(-1, None))
         constant = _force_constant_slope(model, as_arrays(experiment.geometry))
     weight = sampling.force_weight * voltage
     return constant + 2.0 * (weight @ slope) / (weight @ voltage)
 
 
-def jacobian(experiment: Experiment, settings: Sequence[str] = ()) -> Float[np.ndarray, "1+settings rows parameters"]:
-    """Return the Jacobian of the signals in units of their noise, and its derivatives in the log of `settings`.
-
-    A setting is a field of the circuit or `FREQUENCY`, along which samples and edges keep their phase in the period.
-    Settings need a circuit with time constants.
-    """
-    e, names = experiment, tuple(dict.fromkeys([*experiment.free, *sorted(settings, key=FREQUENCY.__eq__)]))
+def jacobian(experiment: Experiment) -> Float[np.ndarray, "rows parameters"]:
+    """Return the Jacobian of the signals in units of their noise, in the logarithms of the free parameters."""
     with jax.enable_x64(True):
-        sampling, model = _sampling(e), _Model.from_experiment(e, names)
-        signals = _derivatives(model, sampling, slice(-1), order=2 if settings else 1)
+        sampling, model = _sampling(experiment), _Model.from_experiment(experiment)
+        signals = _derivatives(model, sampling, slice(-1))
     blocks = []
-    for channel, (_, slope, *curvature) in zip(e.channels, signals, strict=True):
-        follows_slope = channel == "I" and not limits_current(e.circuit)
+    for channel, (_, slope) in zip(experiment.channels, signals, strict=True):
+        follows_slope = channel == "I" and not limits_current(experiment.circuit)
         weight = sampling.off_edge_weight if follows_slope else sampling.sample_weight
-        parts = [slope, *(curvature[0][..., names.index(name)] for name in settings)]
-        blocks.append(np.stack(parts)[..., : len(e.free)] * (weight / e.noise[channel])[:, None])
-    return np.concatenate(blocks, axis=1)
+        blocks.append(slope * (weight / experiment.noise[channel])[:, None])
+    return np.concatenate(blocks)
 
 
 def signal_spans(experiment: Experiment) -> dict[Channel, float]:
     """Return the range of each channel's samples, V and A, without a current's samples at edges."""
     with jax.enable_x64(True):
-        sampling, model = _sampling(experiment), _Model.from_experiment(experiment, experiment.free)
+        sampling, model = _sampling(experiment), _Model.from_experiment(experiment)
         signals = _derivatives(model, sampling, slice(-1))
     kept, channels = sampling.off_edge_weight > 0.0, experiment.channels
     return {channel: float(np.ptp(value[kept])) for channel, (value, _) in zip(channels, signals, strict=True)}
@@ -105,34 +98,31 @@ class _Model(eqx.Module):
 
     circuit: Circuit
     theta: Float[Array, " parameters"]  # present values
-    names: tuple[str, ...] = eqx.field(static=True)  # parameters; `FREQUENCY` comes last
+    names: tuple[str, ...] = eqx.field(static=True)  # parameters
     channels: tuple[Channel, ...] = eqx.field(static=True)  # recorded channels, then the voltage that causes the force
     ties: Ties = eqx.field(static=True)
 
     @classmethod
-    def from_experiment(cls, e: Experiment, names: tuple[str, ...]) -> "_Model":
-        fields = [name for name in names if name != FREQUENCY]
-        theta = np.append(log_values(e.circuit, fields, e.channels), np.zeros(len(names) - len(fields)))
+    def from_experiment(cls, e: Experiment) -> "_Model":
+        theta = log_values(e.circuit, e.free, e.channels)
         circuit = as_arrays(e.circuit)  # plain numbers would become constants of the compiled program
         channels: tuple[Channel, ...] = (*e.channels, "Vsc" if e.geometry.model == "paper" else "Vgap")
-        return cls(circuit, theta, names, channels, e.ties)
+        return cls(circuit, theta, e.free, channels, e.ties)
 
     def circuit_and_gains(self, theta: Array) -> tuple[Circuit, list[ArrayLike]]:
         """Return the circuit and the gain of each channel at `theta`."""
-        fields = [name for name in self.names if name != FREQUENCY]
-        circuit, gains = with_parameters(self.circuit, fields, self.channels[:-1], theta[: len(fields)])
+        circuit, gains = with_parameters(self.circuit, self.names, self.channels[:-1], theta)
         known = circuit_parameters(circuit)
         return with_values(circuit, {name: ratio * known[other] for name, other, ratio in self.ties}), [*gains, 1.0]
 
 
-def _derivatives(model: _Model, sampling: "_Sampling", selection: slice, order: int = 1) -> list[list[np.ndarray]]:
-    """Return the signal of each channel in `selection`, and its derivatives in the parameters up to `order`."""
+def _derivatives(model: _Model, sampling: "_Sampling", selection: slice) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the signal of each channel in `selection`, and its derivatives in the parameters."""
     if has_time_constants(model.circuit):
-        terms = _term_derivatives(model, order)
-        return [_signal_derivatives(orders, sampling) for orders in terms[selection]]
+        pairs = list(zip(*_term_derivatives(model), strict=True))[selection]
+        return [_signal_derivatives(terms, slopes, sampling) for terms, slopes in pairs]
     times = sampling.time, sampling.slope
-    values, slopes = _predicted_signals(model, sampling.drive, *times, sampling.steady_state)
-    return [list(pair) for pair in zip(values, slopes, strict=True)][selection]
+    return list(zip(*_predicted_signals(model, sampling.drive, *times, sampling.steady_state), strict=True))[selection]
 
 
 class _LogTauTerms(NamedTuple):
@@ -145,25 +135,19 @@ class _LogTauTerms(NamedTuple):
 
 
 @jit
-def _term_derivatives(model: _Model, order: int) -> tuple[tuple[_LogTauTerms, ...], ...]:
+def _term_derivatives(model: _Model) -> tuple[list[_LogTauTerms], list[_LogTauTerms]]:
+    """Return the terms of each channel, and their derivatives in the parameters."""
 
     def terms(theta: Array) -> list[_LogTauTerms]:
         circuit, gains = model.circuit_and_gains(theta)
-        # a change of the frequency has the same effect in the period as a change of all time constants
-        faster = theta[-1] if FREQUENCY in model.names else jnp.zeros(())
         of_channels = []
         for gain, channel in zip(gains, model.channels, strict=True):
             weight, tau, *others = circuit.channel_terms(channel)
-            log_tau = jnp.log(jnp.stack(tau)) + faster
             rate, direct = (gain * jnp.asarray(0.0 if each is None else each) for each in others)
-            of_channels.append(_LogTauTerms(gain * jnp.stack(weight), log_tau, rate * jnp.exp(faster), direct))
+            of_channels.append(_LogTauTerms(gain * jnp.stack(weight), jnp.log(jnp.stack(tau)), rate, direct))
         return of_channels
 
-    orders, derivative = [terms(model.theta)], terms
-    for _ in range(order):
-        derivative = jax.jacfwd(derivative)
-        orders.append(derivative(model.theta))
-    return tuple(zip(*orders, strict=True))
+    return terms(model.theta), jax.jacfwd(terms)(model.theta)
 
 
 @jit
@@ -208,9 +192,9 @@ def _sampling(e: Experiment, max_samples: int = 4096, period_times: int = 1024, 
     # two samples on either side of an edge carry no information on a current that follows dV/dt; the quarter step keeps
     # rounding from deciding where edges coincide with samples
     around = time[chosen][:, None] + (np.arange(-2, 3) + 0.25) * float(np.median(np.diff(time)))
-    if isinstance(drive, Sampled) and drive.period is None:
+    if isinstance(drive, Sampled):
         # by NumPy, which is faster; the slope is mostly noise, so a signal that follows it counts as uninformative
-        near, voltage = (np.interp(each, drive.time, drive.samples) for each in (around, times))
+        near, voltage = (np.interp(each, drive.time, drive.samples, period=drive.period) for each in (around, times))
         slope = np.zeros_like(times)
     else:
         near, slope, voltage = _evaluate_drive(drive, around, times, e.steady_state)
@@ -244,28 +228,17 @@ def _pad_drive(drive: Drive, time: np.ndarray, samples: int = 8192) -> tuple[Dri
 def _evaluate_drive(drive: Drive, around: Array, time: Array, steady_state: bool) -> tuple[Array, Array, Array]:
     """Return the drive at the times `around`, its slope at `time`, 0 at jumps, and the drive at `time`."""
     voltage = drive_voltage(drive, time, steady_state=steady_state)
-    if isinstance(drive, Sampled):  # its slope is mostly noise, so a signal that follows it counts as uninformative
-        return drive.value(around), jnp.zeros_like(time), voltage
     return drive.value(around), jnp.nan_to_num(drive.slope(time, steady_state=steady_state)), voltage
 
 
 @jit
-def _highpass_derivatives(
-    drive: Drive, time: Array, log_tau: Array, steady_state: bool, order: int
-) -> tuple[Array, ...]:
-    """Return the response of one term, and its derivatives in log tau up to `order`, 1 or 2."""
-    one = jnp.ones_like(log_tau)
+def _highpass_and_slope(drive: Drive, time: Array, log_tau: Array, steady_state: bool) -> tuple[Array, Array]:
+    """Return the response of one term, and its derivative in log tau."""
 
     def response(log_tau: Array) -> Array:
         return highpass(drive, time, jnp.exp(log_tau), steady_state=steady_state)
 
-    def first(log_tau: Array) -> tuple[Array, ...]:
-        return jax.jvp(response, (log_tau,), (one,))
-
-    if order == 1:
-        return first(log_tau)
-    values, slopes = jax.jvp(first, (log_tau,), (one,))
-    return (*values, slopes[1])
+    return jax.jvp(response, (log_tau,), (jnp.ones_like(log_tau),))
 
 
 @jit
@@ -284,26 +257,19 @@ def _predicted_signals(
     return values, slopes
 
 
-def _signal_derivatives(terms: Sequence[_LogTauTerms], sampling: _Sampling) -> list[np.ndarray]:
+def _signal_derivatives(
+    terms: _LogTauTerms, slopes: _LogTauTerms, sampling: _Sampling
+) -> tuple[np.ndarray, np.ndarray]:
     """Return a channel's signal and its derivatives in the log-parameters, from the terms and their derivatives.
 
     The sum runs term by term, because one compiled function for all takes ten times as long to compile.
     """
-    signals = [
+    value, slope = (
         np.multiply.outer(sampling.slope, order.rate) + np.multiply.outer(sampling.voltage, order.direct)
-        for order in terms
-    ]
-    for k, (weight, log_tau) in enumerate(zip(terms[0].weight, terms[0].log_tau, strict=True)):
-        derivatives = _highpass_derivatives(
-            sampling.drive, sampling.time, log_tau, sampling.steady_state, len(terms) - 1
-        )
-        u, du, *ddu = derivatives
-        w, tau = terms[1].weight[k], terms[1].log_tau[k]
-        signals[0] += weight * u
-        signals[1] += np.outer(u, w) + np.outer(weight * du, tau)
-        if ddu:
-            both = np.outer(w, tau)
-            mixed = both + both.T + weight * terms[2].log_tau[k]
-            signals[2] += np.multiply.outer(u, terms[2].weight[k]) + np.multiply.outer(du, mixed)
-            signals[2] += np.multiply.outer(weight * ddu[0], np.outer(tau, tau))
-    return signals
+        for order in (terms, slopes)
+    )
+    for weight, log_tau, w, tau in zip(terms.weight, terms.log_tau, slopes.weight, slopes.log_tau, strict=True):
+        u, du = _highpass_and_slope(sampling.drive, sampling.time, log_tau, sampling.steady_state)
+        value += weight * u
+        slope += np.outer(u, w) + np.outer(weight * du, tau)
+    return value, slope

@@ -10,8 +10,8 @@ import numpy as np
 import scipy.linalg
 
 from fitact.experiment.blind_directions import gain_names
-from fitact.experiment.experiment import CandidateDesign, DesignOption, Gradient, Setting, evaluate_design
-from fitact.experiment.fisher import FREQUENCY, Experiment
+from fitact.experiment.experiment import FREQUENCY, CandidateDesign, DesignOption, Gradient, Setting, evaluate_design
+from fitact.experiment.fisher import Experiment
 from fitact.model.circuit import RC, Channel, FinalCircuit, Probe
 from fitact.model.drive import Multitone, Periodic, Trapezoid
 from fitact.model.skin import WithSkin, circuit_parameters, constant_skin_circuit, has_time_constants, with_values

@@ -149,21 +149,15 @@ class CircuitResponses(NamedTuple):
     def _transient_response(self, cycle: np.ndarray, elapsed: np.ndarray) -> np.ndarray:
         begin = np.full((1, 1), _phase_offset(self.wave), dtype=cycle.dtype)
         tau, since = self.tau[..., None], elapsed[:, None, :]
-        difference = self._initial_voltage() - self._steady_state_response(begin)
+        with jax.enable_x64(True):
+            initial = float(self.wave.value(0.0))
+        difference = initial - self._steady_state_response(begin)
         u = self._steady_state_response(cycle) + difference * np.exp(-since / tau)
         if not isinstance(self.drive, Burst):
             return u
         end = self.drive.cycles / self.wave.frequency
         after = difference * np.expm1(-end / tau) * np.exp(-np.maximum(since - end, 0.0) / tau)
         return np.where(since > end, after, u)
-
-    def _initial_voltage(self) -> float:
-        """Return V at t = 0, from the right."""
-        if self.segments is None:
-            with jax.enable_x64(True):
-                return float(self.wave.value(0.0))
-        piece, since, slope = _locate_segment(self.segments, np.array(_phase_offset(self.wave)))
-        return float(self.segments.start[piece] + slope * since)
 
     def _steady_state_response(self, cycle: np.ndarray) -> np.ndarray:
         tau, cycle = self.tau[..., None], cycle[:, None, :]

@@ -215,12 +215,9 @@ def _cheapest_omissions(
     combinations = [c for size in range(len(names) + 1) for c in itertools.combinations(names, size)]
     scenes = {c: omissions.reduce_scene(scene, c, prior=False) for c in combinations}
     rank = {c: (omissions.evaluation_cost(scenes[c], drop_parameters(nominal, c)), len(c)) for c in combinations}
-
-    def force_error(c: tuple[str, ...]) -> float:
-        return _summarize_errors(reference.compare(scenes[c], drop_parameters(nominal, c)))[0].force
-
     for _, group in itertools.groupby(sorted(combinations, key=rank.__getitem__), key=rank.__getitem__):
-        errors = {c: force_error(c) for c in group}
+        compared = {c: reference.compare(scenes[c], drop_parameters(nominal, c)) for c in group}
+        errors = {c: _summarize_errors(each)[0].force for c, each in compared.items()}
         best = min(errors, key=errors.__getitem__)
         if errors[best] <= tolerance:
             return best

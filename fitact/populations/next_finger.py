@@ -131,7 +131,7 @@ def finger_variance_fraction(values: Float[np.ndarray, "laws fingers"]) -> float
     return fingers / (fingers + max(parameters, 0.0))
 
 
-def within_variance_fraction(moments: Float[np.ndarray, "2 laws fingers"]) -> float:
+def intrafinger_variance_fraction(moments: Float[np.ndarray, "2 laws fingers"]) -> float:
     """Return the variance within fingers over that of all fingers of the same population parameters, from two moments.
 
     Half the mean square of the difference of two moments of a finger is the variance within it.

@@ -26,9 +26,9 @@ from fitact.populations.next_finger import (
     NewFingerModel,
     draw_factors,
     finger_variance_fraction,
-    within_variance_fraction,
+    intrafinger_variance_fraction,
 )
-from fitact.populations.sobol import SobolIndices, variance_shares
+from fitact.populations.sobol import SobolIndices, sobol_indices
 from fitact.populations.within_finger import WithinFinger
 from fitact.sampling.convergence import Convergence
 from fitact.sampling.posterior import convert_to_arviz
@@ -205,7 +205,7 @@ class Population(Display):
 
     @functools.cached_property
     def shares(self) -> SobolIndices:
-        """Sobol indices of the next finger's force; see `variance_shares`."""
+        """Sobol indices of the next finger's force; see `sobol_indices`."""
         return self._sobol_indices(self.factors)
 
     @functools.cached_property
@@ -214,7 +214,11 @@ class Population(Display):
         return self._sobol_indices(self.prior_factors)
 
     def _sobol_indices(self, factors: Float[np.ndarray, "laws fingers factors"]) -> SobolIndices:
-        return variance_shares(self.finger, factors.reshape(-1, factors.shape[-1]), VARIANCE_QUANTITIES, self.seed)
+        columns = [self.finger.names.index(name) for name in VARIANCE_QUANTITIES]
+        points = factors.reshape(-1, factors.shape[-1])
+        return sobol_indices(
+            lambda x: self.finger.evaluate(x)[:, columns], self.finger.factors, points, VARIANCE_QUANTITIES, self.seed
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of population.json, which `fitact population --json` prints."""
@@ -223,7 +227,7 @@ class Population(Display):
             people = finger_variance_fraction(values)
             shares = {"people": people, "ignorance": 1.0 - people}
             if self.within is not None:
-                within = people * within_variance_fraction(self._new_predictions[..., i])
+                within = people * intrafinger_variance_fraction(self._new_predictions[..., i])
                 shares |= {"within_finger": within, "between_fingers": people - within}
                 shares |= {"population_parameters": 1.0 - people}
             new[name] = summary.summarize_draws(name, values) | {"variance": shares}
@@ -295,7 +299,8 @@ class Population(Display):
         import xarray as xr
 
         def dataset(draws: dict[str, np.ndarray], dims: tuple[str, str]) -> xr.Dataset:
-            return xr.Dataset({name: (dims, values, {"units": _unit(name)}) for name, values in draws.items()})
+            units = {name: "1" if name.startswith(("log_sd", "slope")) else quantity_unit(name) for name in draws}
+            return xr.Dataset({name: (dims, values, {"units": units[name]}) for name, values in draws.items()})
 
         new_fingers = dataset(self.new_fingers(), ("law", "finger"))
         new_fingers["log_factors"] = ("law", "finger", "factor"), self.factors
@@ -448,7 +453,3 @@ def draw_parameters(population: Population, count: int) -> PopulationParameters:
 
 def log_medians(parameters: PopulationParameters) -> dict[str, np.ndarray]:
     return {"Rsc": parameters.median[..., 0], "Csc": parameters.median[..., 1], SHARED_PARAMETER: parameters.log_Ci}
-
-
-def _unit(name: str) -> str:
-    return "1" if name.startswith(("log_sd", "slope")) else quantity_unit(name)

@@ -34,7 +34,7 @@ def write_drive_design_page(path: str | os.PathLike[str], design: DriveDesign, o
         origin=origin,
         table=design.table,
         legend=design.legend,
-        excluded=design.excluded,
+        excluded=design.exclusions,
         separated=design.people.has_separate_uncertainty,
         has_table=design.scene.perception.thresholds is not None,
         people=people,
@@ -51,7 +51,7 @@ def _frame(design: DriveDesign) -> PageSummary:
     smallest, findings = [sentence.split(": ", 1) for sentence in design.sentences], {}
     findings["What counts as felt"] = design.question
     findings["Body current and insulator"] = design.exposure
-    recommended = design.recommended
+    recommended = design.recommended_option
     if recommended is not None:
         findings["Which voltage to set"] = f"{_VOLTAGES}{_INTERVALS * design.people.has_separate_uncertainty}."
         findings |= {f"{name[0].upper()}{name[1:]}": f"{answer}." for name, answer in smallest}

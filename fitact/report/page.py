@@ -10,7 +10,7 @@ import jinja2
 from markdown_it import MarkdownIt
 from markupsafe import Markup
 
-from fitact.charts.budget import draw_budgets
+from fitact.charts.bars import draw_budgets
 from fitact.errors import InputError
 from fitact.report.frame import image, write_page
 from fitact.report.posterior import make_charts

@@ -13,15 +13,13 @@ from fitact.errors import InputError
 from fitact.files import atomic_write
 from fitact.scene.prior_predictive import PriorPredictive
 
-_FORMATS = (".html", ".svg", ".png")
-
 
 def write_prior(path: Path, predicted: PriorPredictive) -> None:
     """Write voltage and force of a prior to `path`: SVG or PNG by its suffix, or HTML with the table."""
-    if path.suffix not in _FORMATS:
-        raise InputError(f"{path}: the figure can be written as {', '.join(_FORMATS)}; choose one of these suffixes")
+    if path.suffix not in (".html", ".svg", ".png"):
+        raise InputError(f"{path}: the figure can be written as .html, .svg or .png; choose one of these suffixes")
     if path.suffix != ".html":
-        write_figure(path, lambda: _figure(predicted), dpi=150)
+        write_figure(path, lambda: _figure(predicted))
     else:
         with mpl.rc_context(STYLE), atomic_write(path) as temporary:
             temporary.write_text(_page(_figure(predicted), predicted), encoding="utf-8")

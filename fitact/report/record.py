@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Sequence
-from pathlib import Path
 
 from fitact.charts import interactive
 from fitact.charts.figure import write_figure
@@ -12,7 +11,6 @@ from fitact.charts.series import Series, spectrum_plot, time_plot
 from fitact.data.clipping import clipping_mask
 from fitact.data.inspection import Inspection
 from fitact.data.spectrum import Spectrum
-from fitact.errors import InputError
 
 
 def write_record(path: str | os.PathLike[str], inspection: Inspection) -> None:
@@ -30,7 +28,4 @@ def write_spectra(path: str | os.PathLike[str], spectra: Sequence[Spectrum]) -> 
 
 
 def _write(path: str | os.PathLike[str], *plots: Plot) -> None:
-    path = Path(path)
-    if path.suffix not in (".svg", ".png"):
-        raise InputError(f"{path}: the drawing is written as .svg or .png; choose one of these endings")
-    write_figure(path, lambda: draw_chart(interactive.chart(*plots)), dpi=150)
+    write_figure(path, lambda: draw_chart(interactive.chart(*plots)))

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from fitact.charts import interactive
-from fitact.charts.track import track_plot
+from fitact.charts.series import track_plot
 from fitact.report.frame import Answer, PageSummary, Provenance, write_page
 from fitact.summary import describe_quantity
 from fitact.tracking.track import Track

@@ -1,16 +1,12 @@
 """Picture and page of accuracy against run time, with the Pareto front."""
 
 import functools
-import itertools
 import os
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.transforms import Bbox
 
 from fitact.charts import interactive
 from fitact.charts.figure import ALERT, DATA, MODEL, PRIOR
@@ -31,15 +27,10 @@ _ZERO_RATIO = 30.0  # an error of 0 is drawn at the smallest error over this rat
 
 def draw_tradeoff(tradeoff: Tradeoff, kinds: Sequence[Kind] = tuple(_TITLES)) -> Figure:
     """Draw the methods of some kinds."""
-    figure = Figure(figsize=(max(9.0, 4.4 * len(kinds)), 4.8), layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    panels = dict(zip(kinds, figure.subplots(1, len(kinds), squeeze=False)[0], strict=True))
-    for kind, axes in panels.items():
+    columns, rows = min(len(kinds), 2), -(-len(kinds) // 2)
+    figure = Figure(figsize=(max(9.0, 7.0 * columns), 4.8 * rows), layout="constrained")
+    for kind, axes in zip(kinds, figure.subplots(rows, columns, squeeze=False).flat, strict=True):
         _draw_panel(axes, kind, tradeoff)
-    canvas.draw()  # fixes the positions of everything
-    figure.set_layout_engine("none")  # keeps these positions
-    for kind, axes in panels.items():
-        _annotate_names(axes, tradeoff.of(kind), _plot(tradeoff, kind)[1], canvas)
     return figure
 
 
@@ -59,51 +50,21 @@ def _draw_panel(axes: Axes, kind: Kind, tradeoff: Tradeoff) -> None:
     bare = plot["layout"] | {"showlegend": False}  # the names of the methods replace a legend
     draw_plot(plot | {"layout": bare, "title": _TITLES[kind][0]}, axes)
     axes.grid(visible=False)
-    heights, seconds = _heights(tradeoff.of(kind)).values(), [x / size for x in _all_seconds(tradeoff.of(kind))]
+    levels = sorted(tradeoff.methods(kind), key=lambda level: level.error)
+    heights, seconds = _heights(levels).values(), [x / size for x in _all_seconds(levels)]
     zero, margin = min(heights), 1.5 * (max(seconds) / min(seconds)) ** 0.25
     axes.axhline(zero, color=DATA, lw=0.8, ls=":")
     axes.set(xlim=(min(seconds) / margin, max(seconds) * margin), ylim=(zero / 6.0, 10.0 * max(heights)))
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:.0e}" if value > 2.0 * zero else "")
     zero_label: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
     axes.annotate("0", (0.0, zero), (-6, 0), ha="right", va="center", **zero_label)
-
-
-def _front_points(places: dict[str, np.ndarray], levels: tuple[BenchmarkedMethod, ...]) -> list[np.ndarray]:
-    front = sorted((x for x in levels if not x.dominated_by), key=lambda x: x.seconds)
-    pairs = itertools.pairwise(places[x.name] for x in front)
-    return [end + share * (start - end) for start, end in pairs for share in np.linspace(0.0, 1.0, 40)]
-
-
-def _annotate_names(axes: Axes, levels: tuple[BenchmarkedMethod, ...], size: float, canvas: FigureCanvasAgg) -> None:
-    """Write the name of each method next to its point without overlaps; `size` is the unit of x."""
-    points = {x.name: (x.seconds / size, y) for x, y in zip(levels, _heights(levels).values(), strict=True)}
-    places = {name: axes.transData.transform(point) for name, point in points.items()}
-    taken = [
-        Bbox.from_extents(x - 8, y - 8, x + 8, y + 8) for x, y in [*places.values(), *_front_points(places, levels)]
-    ]
-    inside = axes.get_window_extent()
-    sides = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1)]  # the preferred side first
-    for level in levels:
+    # the names stand beside the axes in the order of the errors, so that none covers another
+    for row, level in enumerate(levels):
         color = ALERT if level.dominated_by else MODEL
-        for distance, (right, up) in itertools.product((9, 18, 30, 44), sides):
-            text = axes.annotate(
-                level.name,
-                points[level.name],
-                xytext=(distance * right, distance * up),
-                textcoords="offset points",
-                ha={-1: "right", 0: "center", 1: "left"}[right],
-                va={-1: "top", 0: "center", 1: "bottom"}[up],
-                color=color,
-                fontsize=9,
-            )
-            box = text.get_window_extent(canvas.get_renderer())
-            free = not any(box.overlaps(other) for other in taken)
-            if free and inside.contains(box.x0, box.y0) and inside.contains(box.x1, box.y1):
-                break
-            text.remove()
-        else:
-            axes.add_artist(text)
-        taken.append(box)
+        point, place = (level.seconds / size, level.error or zero), (1.04, (row + 0.5) / len(levels))
+        leader: dict[str, Any] = {"arrowstyle": "-", "color": color, "lw": 0.6, "shrinkB": 4.0}
+        label: dict[str, Any] = {"color": color, "fontsize": 9, "va": "center", "arrowprops": leader}
+        axes.annotate(level.name, point, place, textcoords="axes fraction", **label)
 
 
 def write_tradeoff_page(path: str | os.PathLike[str], tradeoff: Tradeoff, origin: Provenance) -> None:
@@ -139,7 +100,7 @@ def write_tradeoff_page(path: str | os.PathLike[str], tradeoff: Tradeoff, origin
         charts={kind: interactive.chart(_plot(tradeoff, kind)[0]) for kind in KINDS},
         pictures={kind: image(functools.partial(draw_tradeoff, tradeoff, (kind,))) for kind in KINDS},
         tables={
-            kind: [(*COLUMNS, "dominated by"), *((*each.cells, each.dominated_by) for each in tradeoff.of(kind))]
+            kind: [(*COLUMNS, "dominated by"), *((*each.cells, each.dominated_by) for each in tradeoff.methods(kind))]
             for kind in KINDS
         },
         resolved=tradeoff.resolved,
@@ -153,7 +114,7 @@ def _describe_level(level: BenchmarkedMethod) -> str:
 
 def _plot(tradeoff: Tradeoff, kind: Kind) -> tuple[interactive.Plot, float]:
     """Return the plot of one kind, and the unit of its time axis (s)."""
-    levels, height = tradeoff.of(kind), _heights(tradeoff.of(kind))
+    levels, height = tradeoff.methods(kind), _heights(tradeoff.methods(kind))
     _, cost, error = _TITLES[kind]
     seconds = [level.seconds for level in levels]
     x, y = Axis.from_values(f"time of {cost}", "s", _all_seconds(levels), log=True), Axis(error, log=True)

@@ -1,4 +1,7 @@
-"""Section [instrument] of a scene file: the equipment of each channel, and certificates that replace its class."""
+"""Sections [instrument] and [[calibration]] of a scene file: the equipment of each channel, and records of dummies.
+
+Certificates replace what the class of a piece of equipment says. A dummy is a circuit of known parts.
+"""
 
 import dataclasses
 import difflib
@@ -131,3 +134,39 @@ class InstrumentSection(Section):
             elif isinstance(spec, PriorSpec):
                 stated[key] = spec.distribution(key, None, Layer(1.0, 1.0, 1.0))  # no table, so no layer
         return dataclasses.replace(piece, source="certificate", **stated)
+
+
+class DummyCircuit(Section):
+    """Known parts of a dummy: two parallel circuits Rsc‖Csc in series with Ci."""
+
+    Rsc: OhmPriorSpec
+    Csc: FaradPriorSpec
+    Ci: FaradPriorSpec
+
+    @model_validator(mode="before")
+    @classmethod
+    def _require_parts(cls, content: Any) -> Any:
+        missing = [name for name in cls.model_fields if not isinstance(content, dict) or name not in content]
+        if missing:
+            raise ValueError(
+                f"[[calibration]] circuit lacks {' and '.join(missing)}; write a value with its tolerance, such as"
+                ' {nominal = "160 kohm", tolerance = "0.1 %"}'
+            )
+        return content
+
+
+class CalibrationSection(Section):
+    """A record of a dummy circuit, made with the instruments of the scene."""
+
+    record: str
+    circuit: DummyCircuit
+
+    @model_validator(mode="before")
+    @classmethod
+    def _require_both(cls, content: Any) -> Any:
+        if isinstance(content, dict) and not {"record", "circuit"} <= set(content):
+            raise ValueError(
+                '[[calibration]] needs a record and its circuit: record = "dummy.csv" and circuit = {Rsc = {nominal ='
+                ' "160 kohm", tolerance = "0.1 %"}, Csc = ..., Ci = ...}'
+            )
+        return content

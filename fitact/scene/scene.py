@@ -28,8 +28,7 @@ from fitact.prior.prior import Prior
 from fitact.prior.product import multiply
 from fitact.prior.published import Layer
 from fitact.scene import diagrams, sections, toml
-from fitact.scene.calibration_section import CalibrationSection
-from fitact.scene.instrument_section import InstrumentSection
+from fitact.scene.instrument_section import CalibrationSection, InstrumentSection
 from fitact.scene.prior_section import FRICTION_PRIORS, PriorSection
 from fitact.scene.prior_spec import ORDER_KEYS, PriorSpec
 from fitact.scene.section import Section, field_section

@@ -87,13 +87,13 @@ class Tradeoff:
     machine: dict[str, Any]
     notes: tuple[str, ...]
 
-    def of(self, kind: Kind) -> tuple[BenchmarkedMethod, ...]:
+    def methods(self, kind: Kind) -> tuple[BenchmarkedMethod, ...]:
         """Return the methods of one kind."""
         return tuple(level for level in self.levels if level.kind == kind)
 
     def front(self, kind: Kind) -> tuple[BenchmarkedMethod, ...]:
         """Return the Pareto front of one kind, fastest first."""
-        return tuple(sorted((level for level in self.of(kind) if not level.dominated_by), key=lambda x: x.seconds))
+        return tuple(sorted((level for level in self.methods(kind) if not level.dominated_by), key=lambda x: x.seconds))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON output of `fitact tradeoff`, also written to tradeoff.json."""
@@ -102,7 +102,7 @@ class Tradeoff:
     def __str__(self) -> str:
         rows = [f"{self.record}; {self.machine['cpu']}, {self.machine['cores']} cores", ""]
         for kind, title in KINDS.items():
-            rows += [f"{kind}: {title}", align_row(COLUMNS, _WIDTHS), *map(str, self.of(kind)), ""]
+            rows += [f"{kind}: {title}", align_row(COLUMNS, _WIDTHS), *map(str, self.methods(kind)), ""]
         return "\n".join([*rows, self.resolved, *self.notes])
 
     @property

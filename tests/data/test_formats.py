@@ -62,20 +62,6 @@ def test_units_in_the_name_or_in_a_row(write, finger_path: Path, rows: Rows, hea
         np.testing.assert_allclose(record[channel], plain[channel], rtol=1e-12)
 
 
-def test_uneven_times_are_kept_and_named(write, rows: Rows):
-    record = fitact.read(write([rows[0]] + [row for i, row in enumerate(rows[1:]) if i % 7]))
-    assert any("not uniform" in note for note in record.notes)
-
-
-def edited(row: int, column: int, text: str) -> Callable[[Rows], Rows]:
-    def edit(rows: Rows) -> Rows:
-        rows = [list(r) for r in rows]
-        rows[row][column] = text
-        return rows
-
-    return edit
-
-
 def test_gw_instek_states_the_step_beside_a_nameless_time(tmp_path: Path):
     time, values = np.arange(4000) * 1e-5 - 0.02, np.sin(np.arange(4000))
     header = ["Memory Length,4000,", "Source,CH1,", "Vertical Units,V,", "Sampling Period,1.00000e-05,", "Time, ,"]
@@ -90,42 +76,6 @@ def test_gw_instek_states_the_step_beside_a_nameless_time(tmp_path: Path):
         fitact.read(path, channels={"Vsc": "CH1"})
 
 
-BAD = {
-    "text cell": (edited(101, 1, "abc"), ["line 102", "column 2", "abc"]),
-    "empty cell": (edited(101, 1, ""), ["line 102", "column 2", "empty"]),
-    "nan": (edited(101, 2, "NaN"), ["line 102", "Vsc", "nan"]),
-    "inf": (edited(101, 1, "-inf"), ["line 102", "V", "inf"]),
-    "ragged row": (lambda rows: [*rows[:101], rows[101][:2], *rows[102:]], ["line 102", "2 values", "3"]),
-    "long row": (lambda rows: [*rows[:101], rows[101] + ["1"], *rows[102:]], ["line 102", "4 values", "3"]),
-    "repeated time": (lambda rows: rows[:101] + rows[100:], ["line 102", "repeats"]),
-    "time goes back": (lambda rows: rows[:101] + rows[50:], ["line 102", "goes back"]),
-    "no time": (lambda rows: [r[1:] for r in rows], ["line 1", "time_s"]),
-    "no Vsc": (lambda rows: [r[:2] for r in rows], ["Vsc_V", "missing"]),
-    "no V": (lambda rows: [[r[0], r[2]] for r in rows], ["V_V", "missing", "scene"]),
-    "no header": (lambda rows: rows[1:], ["line 1", "time_s"]),
-    "two headers of one name": (edited(0, 1, "Vsc_V"), ["line 1", "Vsc"]),
-    "unknown unit": (edited(0, 1, "V_ohm"), ["line 1", "ohm", "V"]),
-    "units disagree": (lambda rows: [rows[0], ["ms", "V", "V"], *rows[1:]], ["line 2", "time", "ms"]),
-    "header only": (lambda rows: rows[:1], ["no rows"]),
-    "too few samples": (lambda rows: rows[:20], ["19 samples"]),
-    "constant": (lambda rows: [rows[0]] + [[a, "180", c] for a, _, c in rows[1:]], ["V is constant at 180"]),
-    "zero": (lambda rows: [rows[0]] + [[a, b, "0"] for a, b, _ in rows[1:]], ["Vsc is zero"]),
-    "plateau": (lambda rows: rows[:1] + rows[300:700], ["V holds nothing but noise"]),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_bad_files_are_refused_with_the_place(write, rows: Rows, name: str):
-    make, words = BAD[name]
-    with pytest.raises(fitact.InputError) as error:
-        fitact.read(write(make(rows)))
-    message = str(error.value)
-    assert "record.csv" in message
-    assert "\n" not in message
-    for word in words:
-        assert word in message
-
-
 def test_pure_noise_is_refused_and_a_single_edge_is_not():
     time, rng = np.arange(400) * 5e-6, np.random.default_rng(3)
     noise = rng.normal(size=400)  # any seed; the significance level of the test is 1e-4
@@ -133,21 +83,6 @@ def test_pure_noise_is_refused_and_a_single_edge_is_not():
         fitact.Record.from_arrays(time, V=np.sin(time * 1e3), Vsc=noise)
     edge = np.where(np.arange(400) < 3, -180.0, 180.0) + 0.4 * noise
     assert "V" in fitact.Record.from_arrays(time, V=edge, Vsc=np.sin(time * 1e3))
-
-
-@pytest.mark.parametrize("content", [b"", b"\n\n", bytes(range(256)) * 50, b"\x1f\x8b broken", b"\x00" * 500])
-def test_not_a_csv(tmp_path: Path, content: bytes):
-    path = tmp_path / "record.csv"
-    path.write_bytes(content)
-    with pytest.raises(fitact.InputError, match=r"record\.csv"):
-        fitact.read(path)
-
-
-def test_directory_and_missing_file(tmp_path: Path):
-    with pytest.raises(fitact.InputError, match="is a directory"):
-        fitact.read(tmp_path)
-    with pytest.raises(fitact.InputError, match="no such file"):
-        fitact.read(tmp_path / "nothing.csv")
 
 
 def test_what_is_written_is_read_again(tmp_path: Path):
@@ -160,13 +95,6 @@ def test_what_is_written_is_read_again(tmp_path: Path):
     np.testing.assert_array_equal(record.time, time)
     for name, values in waves.items():
         np.testing.assert_allclose(record[name], values, rtol=6e-12)
-
-
-def test_noise_and_frequency_are_judged_without_a_model(finger_path: Path, finger_truth: dict[str, float]):
-    record = fitact.read(finger_path)
-    assert record.noise("V") == pytest.approx(finger_truth["noise_V"], rel=0.05)
-    assert record.noise("Vsc") == pytest.approx(finger_truth["noise_Vsc"], rel=0.05)
-    assert record.frequency() == pytest.approx(100.0, rel=1e-4)
 
 
 @pytest.mark.parametrize("wave", [np.sin, lambda x: np.sign(np.sin(x)), lambda x: np.sin(x) + 0.8 * np.sin(2 * x)])

@@ -71,20 +71,6 @@ def test_inspect_shows_all_channels_and_draws_them(command, tmp_path: Path):
     assert "choose one of these endings" in done.stderr
 
 
-def test_a_long_and_clipped_record_is_drawn(tmp_path: Path):
-    from fitact.report.record import write_record
-
-    time = np.arange(50_000) * 1e-5
-    values = np.clip(np.sin(2e2 * np.pi * time) + 0.01 * np.random.default_rng(0).normal(size=time.size), -0.9, 0.9)
-    path = tmp_path / "record.csv"
-    np.savetxt(path, np.c_[time, values], delimiter=",", header="time_s,Vsc_V", comments="", fmt="%.6g")
-    seen = fitact.inspect(path)
-    assert seen.channels[0].clipped > 10_000
-    write_record(tmp_path / "record.svg", seen)
-    assert "clipped" in str(seen)
-    assert (tmp_path / "record.svg").stat().st_size < 1_000_000
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -375,11 +375,8 @@ def test_the_mapping_is_asked_for_and_noted():
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
-        ({"channels": {"Vsc": "CH3"}}, "no column 'CH3'; the file has 1, 2"),
-        ({"channels": {"V": "1", "Vsc": "CH1"}}, r"one column is to be two channels"),
         ({"channels": {"U": "1"}}, "'U' is no channel of fitact"),
         ({"channels": {"I": "1"}}, r"1 is in V and I in A; give the factor between them, as --scale I="),
-        ({"channels": SKIN, "scale": {"Vsc": 0.0}}, "the scale 0.0 of Vsc"),
         ({"channels": SKIN, "scale": {"I": 2.0}}, "I is scaled but not there"),
     ],
 )

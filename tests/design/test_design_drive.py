@@ -353,7 +353,7 @@ def test_what_breaks_a_limit_is_named_and_not_the_smallest(one):
 def test_no_amplitude_above_a_published_limit_is_recommended(laws):
     """The sine needs a current above class ES1, which no scene has to state."""
     assert laws.options["sine"].at_assured.current_rms > 0.5e-3
-    assert laws.recommended is None
+    assert laws.recommended_option is None
     assert "times the limit of IEC 62368-1, class ES1" in laws.recommendation
     assert laws.to_dict()["recommendation"]["peak_to_peak"] is None
 
@@ -415,7 +415,7 @@ def test_current_and_field_stand_beside_published_limits_though_none_was_stated(
         drive={"waveform": "sine", "frequency": frequency}, device={"insulator_thickness": thickness, "Ci": CI}
     )
     design = fitact.design_drive(stated, one_finger())
-    assert design.recommended is design.options["sine"]
+    assert design.recommended_option is design.options["sine"]
     s = 2j * np.pi * frequency
     peak = 0.5 * design.options["sine"].assured / abs(2.0 * R / (1.0 + s * R * C) + 1.0 / (s * CI))
     found = {(each["source"], each["quantity"]): each for each in design.to_dict()["limits"]}
@@ -449,7 +449,7 @@ def test_an_ideal_edge_s_current_is_unbounded_and_said_to_be():
     limits = square.options["square"].limits
     assert all(math.isinf(each.value) for each in limits if each.unit == "A")
     assert all(each.row[3] == "unbounded" for each in limits if each.unit == "A")
-    assert square.recommended is not square.options["square"]
+    assert square.recommended_option is not square.options["square"]
     assert "square: not recommended, the current is unbounded at ideal edges; state [drive] rise_time." in square.notes
 
 

@@ -15,9 +15,8 @@ import scipy.signal
 import fitact
 from fitact.cli import main
 from fitact.design.measurement import experiment_from_scene
-from fitact.experiment.experiment import CandidateDesign, DesignOption, evaluate_design
+from fitact.experiment.experiment import CandidateDesign, DesignOption, evaluate_design, force_sd, optimise
 from fitact.experiment.fisher import Experiment, force_gradient
-from fitact.experiment.optimise import force_sd, log_force_sd_slope, optimise
 from fitact.experiment.options import changes, suggest_measurements
 from tests.experiment.test_expected import BOTH, NOMINAL, PRIOR_SD, RESISTOR
 
@@ -175,18 +174,6 @@ def trial_of(experiment: Experiment, *names: str, steps: dict | None = None) -> 
         if change.name in names:
             trial = change(trial)
     return trial
-
-
-@pytest.mark.parametrize("names", [("series resistor", "current"), ("two frequencies", "current"), ("second panel",)])
-def test_slopes_of_what_is_to_be_expected(names: tuple[str, ...]):
-    """Central differences away from the best settings."""
-    trial, gradient = trial_of(NOMINAL, *names), force_gradient(NOMINAL)
-    at = np.array(trial.start_values) * [1.7, 0.6][: len(trial.settings)]
-    value, slope = log_force_sd_slope(trial, at, gradient)
-    assert value == pytest.approx(math.log(force_sd(trial, at, gradient)), rel=1e-12)
-    h = 1e-4 * np.eye(len(at))
-    ends = [[math.log(force_sd(trial, at * np.exp(sign * row), gradient)) for row in h] for sign in (1.0, -1.0)]
-    np.testing.assert_allclose(slope, np.subtract(*ends) / 2e-4, rtol=1e-5, atol=1e-8)
 
 
 PROBED = fitact.Scene.from_dict(PAPER | {"measurement": PAPER["measurement"] | {"probe_resistance": "1 Mohm"}})

@@ -1,10 +1,6 @@
 """Comparison of models by their data. References: records and refits by scipy; chi-square, normal and Student's t."""
 
-import json
 import math
-import subprocess
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -203,25 +199,3 @@ def test_nested_models_differ_by_the_chi_square_law():
         assert large["parameters_counted"] == small["parameters_counted"] + 1
     # false-alarm probability 1e-4
     assert scipy.stats.kstest(gains, scipy.stats.chi2(1).cdf).pvalue > 1e-4
-
-
-@pytest.mark.thorough
-def test_command(tmp_path: Path):
-    made = sine_record(0)
-    table = np.column_stack([made.time, made["V"], made["Vsc"]])
-    np.savetxt(tmp_path / "r.csv", table, delimiter=",", header="time_s,V_V,Vsc_V", comments="")
-    (tmp_path / "wide.toml").write_text(str(sine_scene()))
-    wrong = sine_scene().model_dump(mode="json", exclude_unset=True)
-    wrong["prior"] = {"Rsc": {"fixed": 1e3}, "Csc": {"fixed": 1e-9}}
-    (tmp_path / "wrong.toml").write_text(str(fitact.Scene.from_dict(wrong)))
-    call = [sys.executable, "-c", "from fitact.cli import main; main()", "compare", "r.csv", "--scene", "wide.toml"]
-    alone = subprocess.run(call, capture_output=True, text=True, cwd=tmp_path)
-    assert alone.returncode == 2
-    assert "1 scene to compare" in alone.stderr
-    both = subprocess.run([*call, "--scene", "wrong.toml", "--json"], capture_output=True, text=True, cwd=tmp_path)
-    assert both.returncode == 0
-    found = json.loads(both.stdout)
-    assert found["preferred"] == "wide"
-    assert [model["name"] for model in found["models"]] == ["wide", "wrong"]
-    assert (found["blocks"], found["folds"], found["samples"]) == (40, 10, SAMPLES)
-    assert found["models"][1]["elpd_below_best"] > 2.0 * found["models"][1]["elpd_below_best_se"] > 0.0

@@ -11,7 +11,7 @@ import scipy.stats
 import fitact
 from fitact.data.readers.read import write_csv
 from fitact.populations.finger import Finger
-from fitact.populations.next_finger import within_variance_fraction
+from fitact.populations.next_finger import intrafinger_variance_fraction
 from fitact.populations.within_finger import PooledVariance, WithinFinger, pool_variances
 from tests.within_calibration import CHANGE, Law, complete_places, records_of_changing_fingers
 
@@ -77,7 +77,7 @@ def test_deviations_have_the_pooled_covariance_and_their_part_of_the_variance():
     np.testing.assert_allclose(np.cov(moves.reshape(-1, 3).T), 2.0 * covariance, atol=0.003)
     # an additive quantity: variances of 0.08 within, and of 0.24 between fingers
     moments = moves[..., 0] + np.sqrt(0.24) * rng.standard_normal((laws, fingers))
-    assert within_variance_fraction(moments) == pytest.approx(0.25, abs=0.015)
+    assert intrafinger_variance_fraction(moments) == pytest.approx(0.25, abs=0.015)
 
 
 @pytest.mark.thorough  # eight tracks of 10 s

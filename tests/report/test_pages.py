@@ -4,8 +4,6 @@ import dataclasses
 import json
 import math
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ import pytest
 import xarray as xr
 
 import fitact
+from fitact.cli.app import app
 from fitact.design.drive_design import DriveDesign
 from fitact.design.drive_option import DriveOption
 from fitact.design.drive_people import FingerSample
@@ -32,7 +31,6 @@ from fitact.report.tradeoff import write_tradeoff_page
 from fitact.tradeoff.tradeoff import BenchmarkedMethod, Tradeoff
 from tests.report.test_report import Page
 
-ROOT = Path(__file__).parents[2]
 HOSTILE = "<script>alert(1).csv"
 DIGEST = "0123456789abcdef" * 4
 ORIGIN = Provenance("fitact something scene.toml --out out", {"device": {"Ci": 1.35e-9}}, {HOSTILE: DIGEST})
@@ -341,6 +339,8 @@ def test_a_population_is_read_again(tmp_path: Path):
     write_population_page(tmp_path / "first.html", tree, content)
     write_population_page(tmp_path / "again.html", *read_population(tmp_path))
     assert (tmp_path / "again.html").read_text() == (tmp_path / "first.html").read_text()
+    assert app(["report", str(tmp_path), "--json"], standalone_mode=False) is None
+    assert (tmp_path / "report.html").read_text() == (tmp_path / "first.html").read_text()
     (tmp_path / "population.json").write_text('{"population": {}}')
     with pytest.raises(fitact.InputError, match="not this version's"):
         read_population(tmp_path)
@@ -362,51 +362,3 @@ def test_a_chain_cut_short_is_told_without_figures(tmp_path: Path):
     tree.to_netcdf(tmp_path / "population.nc", engine="h5netcdf")
     write_population_page(tmp_path / "again.html", *read_population(tmp_path))
     assert (tmp_path / "again.html").read_text() == (tmp_path / "first.html").read_text()
-
-
-def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", "from fitact.cli import main; main()", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("arguments", "title"),
-    [
-        (("plan", "scene.toml"), "Simplest model of the scene"),
-        pytest.param(("design", "measurement", "scene.toml"), "What to measure next", marks=pytest.mark.thorough),
-        pytest.param(
-            ("design", "drive", "scene.toml"),
-            "The smallest drive that 95 % of fingers feel",
-            marks=pytest.mark.thorough,
-        ),
-    ],
-)
-def test_a_command_leaves_a_page(arguments: tuple[str, ...], title: str, tmp_path: Path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("scene.toml").write_text('[grounding]\nR_H = "500 ohm"\n[perception]\nthreshold_force = "0.1 mN"\n')
-    done = run(*arguments, "--out", "out")
-    assert done.returncode == 0, done.stderr
-    page = Page(Path("out/report.html").read_text())
-    text = words(page)
-    assert page.open == []
-    assert title in text
-    assert f"fitact {' '.join(arguments)} --out out" in text
-    assert '"R_H": 500.0' in text
-
-
-@pytest.mark.thorough
-def test_a_population_leaves_a_page_that_report_writes_again(tmp_path: Path):
-    scene = tmp_path / "scene.toml"
-    scene.write_text('[drive]\nwaveform = "trapezoid"\nrise_time = "50 us"\n[measurement]\nchannels = ["Vsc", "I"]\n')
-    fingers = sorted((ROOT / "data_synth" / "records" / "fingers").glob("*.csv.gz"))[:4]
-    done = run("population", *fingers, "--scene", scene, "--seed", 1, "--out", tmp_path / "out")
-    assert done.returncode == 0, done.stderr
-    page = tmp_path / "out" / "report.html"
-    text = words(Page(page.read_text()))
-    assert all(finger.name in text for finger in fingers)
-    first = page.read_text()
-    page.unlink()
-    again = run("report", tmp_path / "out", "--json")
-    assert json.loads(again.stdout) == {"report": str(page), "trusted": True}
-    assert page.read_text() == first

@@ -1,12 +1,11 @@
 """The pages of test_pages.py in Chromium, tested like the report in test_browser.py."""
 
-import itertools
 from pathlib import Path
 
 import pytest
 
 pytest.importorskip("selenium.webdriver", reason="selenium is not installed (pip install fitact[test])")
-from tests.report.test_browser import CONTRASTS, Browser, browser, pytestmark
+from tests.report.test_browser import Browser, browser, check_legible, pytestmark
 from tests.report.test_pages import WRITE
 
 __all__ = ["browser"]  # a fixture
@@ -34,16 +33,7 @@ def test_it_opens_alone_draws_its_charts_and_fits_its_window(browser: Browser, p
 
 
 def test_it_reads_aloud_and_is_legible(browser: Browser, page: Path):
-    browser.open(page)
-    browser.whole()
-    assert all(button.accessible_name for button in browser.all("button"))
-    levels = [int(heading.tag_name[1]) for heading in browser.all("h1, h2, h3, h4")]
-    assert levels[0] == 1
-    assert levels.count(1) == 1
-    assert all(after - before <= 1 for before, after in itertools.pairwise(levels))
-    contrasts = browser.ask(CONTRASTS)
-    assert len(contrasts) > 30
-    assert [each for each in contrasts if each[1] < 4.5] == []
+    check_legible(browser, page, texts=30)
 
 
 # pairs of labels of one axis that overlap, by a pixel or more each way

@@ -184,12 +184,6 @@ def test_published_tables(tmp_path: Path, table: str, frequency: float, Rsc: flo
     assert wider["Rsc"].median == pytest.approx(0.5 * prior["Rsc"].median)
 
 
-def test_paper_table_is_its_box(tmp_path: Path):
-    prior = load(tmp_path, '[prior]\nRsc = {table = "paper"}\nCsc = {table = "paper"}').make_prior()
-    assert (prior["Rsc"].low, prior["Rsc"].high) == pytest.approx((80e3, 200e3))
-    assert (prior["Csc"].low, prior["Csc"].high) == pytest.approx((8.85e-9, 44.25e-9))
-
-
 def test_circuit_at_other_values(tmp_path: Path):
     scene = fitact.Scene()
     assert scene.make_circuit({"Rsc": 1e5}) == fitact.FinalCircuit(1e5, 22e-9, 1.35e-9)
@@ -236,13 +230,6 @@ def test_quantities_are_written_as_people_do():
         units.format_exact(*quantity) for quantity in ((160e3, "ohm"), (1.35e-9, "F"), (1e-6, "m"), (1e-4, "m^2"))
     ]
     assert written == ["160 kohm", "1.35 nF", "1 um", "0.0001 m^2"]
-
-
-@pytest.mark.parametrize("text", [f"{wrong}\n{rest}" for wrong, rest in [("[device]", "Ci = -1"), ("", "[skn]")]])
-def test_errors_name_the_line(tmp_path: Path, text: str):
-    for before in range(3):
-        with pytest.raises(fitact.InputError, match=f"scene.toml, line {before + 2}: "):
-            load(tmp_path, "# a comment with Ci = 1\n" * before + text)
 
 
 @pytest.mark.parametrize(
@@ -342,11 +329,6 @@ def test_what_is_not_understood_is_refused_by_name(tmp_path: Path, text: str, na
         assert name in message
 
 
-def test_missing_scene_file_is_refused(tmp_path: Path):
-    with pytest.raises(fitact.InputError, match=r"nowhere\.toml.*no such file"):
-        fitact.Scene.load(tmp_path / "nowhere.toml")
-
-
 def test_circuit_is_the_simplest_that_has_what_the_scene_names(tmp_path: Path):
     assert type(fitact.Scene().make_circuit()) is fitact.FinalCircuit
     direct = load(tmp_path, '[grounding]\nR_H = "500 ohm"\n[measurement]\nseries_resistor = "100 kohm"').make_circuit()
@@ -404,13 +386,6 @@ def test_phase_of_a_wave(tmp_path: Path, waveform: str):
         time = np.arange(17) * 1.1e-3
         ahead = unshifted.make_drive().value(time + 2.5e-3)
         np.testing.assert_allclose(scene.make_drive().value(time), ahead, atol=1e-9)
-
-
-@pytest.mark.parametrize("text", [BURST, CHIRP])
-def test_burst_and_chirp_are_simulated(tmp_path: Path, text: str):
-    record = simulate(load(tmp_path, text + '[measurement]\nduration = "50 ms"'), seed=1)
-    assert np.ptp(record["V"]) > 300.0
-    assert 5.0 < np.ptp(record["Vsc"]) < 50.0
 
 
 def test_tones_of_a_scene(tmp_path: Path):

@@ -135,11 +135,14 @@ def made_up() -> Tradeoff:
 
 def test_labels_do_not_overlap(made_up: Tradeoff):
     figure = draw_tradeoff(made_up)
-    renderer = FigureCanvasAgg(figure).get_renderer()
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    renderer = canvas.get_renderer()
     for axes in figure.axes:
         names = [text for text in axes.texts if text.get_text() != "0"]
         assert all(isinstance(text, matplotlib.text.Annotation) for text in names)
-        boxes = [text.get_window_extent(renderer) for text in names]
+        boxes = [matplotlib.text.Text.get_window_extent(text, renderer) for text in names]  # without the leaders
+        assert all(figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1 for box in boxes)
         assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
     assert sum(len(axes.texts) - 1 for axes in figure.axes) == len(made_up.levels)
 
@@ -171,22 +174,22 @@ def test_whole(record: fitact.Record, capsys: pytest.CaptureFixture[str]):
     found = fitact.measure_tradeoff(record, fitact.Scene.load("paper"), tolerances=(1e-1, 1e-3), runs=1)
     assert found.trusted
     for kind, reference in {"response": "exact", "likelihood": "full", "uncertainty": "emcee, full"}.items():
-        first, *others = found.of(kind)
+        first, *others = found.methods(kind)
         assert (first.name, first.error, first.ratio) == (reference, 0.0, 1.0)
         assert all(level.error > 0.0 and level.ratio == level.seconds / first.seconds for level in others)
-        assert found.front(kind)[0].seconds == min(level.seconds for level in found.of(kind))
-    for level in found.of("likelihood")[1:]:
+        assert found.front(kind)[0].seconds == min(level.seconds for level in found.methods(kind))
+    for level in found.methods("likelihood")[1:]:
         assert level.error < 1e-1
-        assert level.seconds < 0.2 * found.of("likelihood")[0].seconds
-    answers = {level.name: level for level in found.of("answer")}
+        assert level.seconds < 0.2 * found.methods("likelihood")[0].seconds
+    answers = {level.name: level for level in found.methods("answer")}
     assert list(answers) == ["least squares", "laplace", "psis", "emcee"]
     for level in answers.values():
         assert level.error < 5e-3  # a tenth of the force's standard deviation of 5 %
         # a new process imports and compiles
         assert level.details["cold_seconds"] == pytest.approx(level.seconds + level.compile_seconds)
         assert level.compile_seconds > 1.0
-    assert all(level.seconds > answers["least squares"].seconds for level in found.of("answer")[1:])
-    assert all(level.error < 0.1 for level in found.of("uncertainty"))  # the posterior is nearly normal
+    assert all(level.seconds > answers["least squares"].seconds for level in found.methods("answer")[1:])
+    assert all(level.error < 0.1 for level in found.methods("uncertainty"))  # the posterior is nearly normal
     out = capsys.readouterr()
     assert out.out == ""
     assert "tradeoff: posterior methods, round 2 of 2" in out.err

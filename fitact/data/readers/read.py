@@ -9,9 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fitact.data.readers.binary import is_known_binary, read_binary
-from fitact.data.readers.capture import Capture, Pick, find_channel, resolve_channels, to_record
+from fitact.data.readers.capture import (
+    Capture,
+    Pick,
+    find_channel,
+    replace_rounded_times,
+    resolve_channels,
+    to_record,
+)
 from fitact.data.readers.layouts import is_same_grid
-from fitact.data.readers.sampling_rate import replace_rounded_times
 from fitact.data.readers.spectrum import is_spectrum
 from fitact.data.readers.text import is_binary, read_text
 from fitact.data.record import CHANNEL_UNITS, Record

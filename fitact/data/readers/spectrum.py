@@ -5,8 +5,7 @@ import itertools
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -14,7 +13,7 @@ from jaxtyping import Complex, Float
 from fitact.data.readers.header import parse_number, split_cells
 from fitact.data.spectrum import MINIMUM_POINTS, Spectrum
 from fitact.errors import InputError
-from fitact.files import read_error
+from fitact.files import read_head
 from fitact.units import PREFIX_FACTORS, format_engineering
 
 _DELIMITERS = ("\t", ";", ",", " ")
@@ -57,13 +56,13 @@ class _Table(NamedTuple):
 def is_spectrum(path: str | os.PathLike[str], head_size: int = 16_384, size: int = 2**22) -> bool:
     """Return whether a file holds a spectrum, by its layout; the numbers are bytes that are read."""
     try:
-        content = _read_start(path, head_size)
+        content = read_head(path, head_size)
         lines = _split_lines(content)
         lines = lines[:-1] if len(content) == head_size else lines
         if _LATE_TABLES.search(lines[0] if lines else ""):
-            lines = _split_lines(_read_start(path, size))
+            lines = _split_lines(read_head(path, size))
         return any(True for find in (_find_headers, _find_listings, _find_blocks) for _ in find(lines))
-    except OSError:
+    except InputError:
         return False
 
 
@@ -95,11 +94,7 @@ def read_spectra(path: str | os.PathLike[str], shunt: float | None = None) -> tu
     Raises:
         InputError: the file cannot be read, or holds no spectrum; the message names the line and a remedy.
     """
-    source = os.fspath(path)
-    try:
-        lines = _split_lines(_read_start(path, 2**26))  # bytes, more than any spectrum has
-    except OSError as error:
-        raise read_error(source, error) from error
+    source, lines = os.fspath(path), _split_lines(read_head(path, 2**26))  # bytes, more than any spectrum has
     spectra: list[Spectrum] = []
     for header in _find_headers(lines):
         if header.layout.doubt:
@@ -116,19 +111,11 @@ def read_spectra(path: str | os.PathLike[str], shunt: float | None = None) -> tu
     return tuple(spectra)
 
 
-def _read_start(path: str | os.PathLike[str], size: int) -> bytes:
-    with Path(path).open("rb") as file:
-        return file.read(size)
-
-
 def _split_lines(content: bytes) -> list[str]:
-    encodings = ("utf-16",) if content[:2] in (b"\xff\xfe", b"\xfe\xff") else ("utf-8-sig",)
-    for encoding in encodings:
-        try:
-            return content.decode(encoding).splitlines()
-        except UnicodeDecodeError:
-            continue
-    return content.decode("latin-1").splitlines()
+    try:
+        return content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        return content.decode("latin-1").splitlines()
 
 
 def _find_listings(lines: Sequence[str]) -> Iterator[Rows]:
@@ -315,7 +302,12 @@ def _to_spectra(layout: _Layout, rows: Rows, source: str, shunt: float | None) -
     kept = ~(frequency <= 0.0)
     notes = (f"{np.count_nonzero(~kept)} rows without a frequency are left out",) if not kept.all() else ()
     for part in _split_sweeps(frequency[kept]):
-        yield _make_spectrum(layout.channel, frequency[kept][part], values[kept][part], source, notes, shunt)
+        swept, response = frequency[kept][part], values[kept][part]
+        if layout.channel == "impedance":
+            yield Spectrum.from_arrays(swept, response, source, notes)
+        else:
+            gain = _orient_gain(swept, response, source, notes)
+            yield gain if shunt is None else _gain_to_impedance(gain, shunt)
 
 
 def _split_sweeps(frequency: np.ndarray) -> list[slice]:
@@ -327,27 +319,22 @@ def _split_sweeps(frequency: np.ndarray) -> list[slice]:
     return parts if all(part.stop - part.start >= MINIMUM_POINTS for part in parts) else [slice(0, frequency.size)]
 
 
-def _make_spectrum(
-    channel: Literal["impedance", "Vsc"],
-    frequency: np.ndarray,
-    values: Complex[np.ndarray, " points"],
-    source: str,
-    notes: tuple[str, ...],
-    shunt: float | None,
+def _orient_gain(
+    frequency: np.ndarray, values: Complex[np.ndarray, " points"], source: str, notes: tuple[str, ...]
 ) -> Spectrum:
-    if channel == "impedance":
-        return Spectrum.from_arrays(frequency, values, source, notes)
-    warnings: tuple[Any, ...] = ()
+    """Return the gain, inverted if it is above 1."""
+    warnings: tuple[str, ...] = ()
     if np.median(np.abs(values)) > 1.0:
         values = 1.0 / values
         warnings = (
             f"{source}: the gain is above 1, which no circuit of resistors and capacitors gives, so the channels are"
             " exchanged; check which of them is V",
         )
-    gain = Spectrum.from_arrays(frequency, values, source, notes, "Vsc", warnings)
-    if shunt is None:
-        return gain
+    return Spectrum.from_arrays(frequency, values, source, notes, "Vsc", warnings)
+
+
+def _gain_to_impedance(gain: Spectrum, shunt: float) -> Spectrum:
     note = f"the impedance follows from the gain over a shunt of {format_engineering(shunt, 'ohm')}"
     with np.errstate(all="ignore"):
         load = shunt * (1.0 / gain.values - 1.0)
-    return dataclasses.replace(gain, values=load, channel="impedance", notes=(*notes, note))
+    return dataclasses.replace(gain, values=load, channel="impedance", notes=(*gain.notes, note))
