@@ -1,4 +1,4 @@
-"""Cost of a population of 1,000 fingers, and memory against record length.
+"""Cost of a population of 1,000 fingers, memory against record length, and cost of Sobol indices.
 
 Each run is a separate process, to measure its peak memory; records are made on demand.
 
@@ -17,9 +17,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from timing import show
+from timing import medians, show
 
 import fitact
+from fitact.populations.sobol import Surrogate, sobol_indices
 
 SAMPLES = 500
 LONGER = 10  # factor in record length
@@ -32,6 +33,7 @@ SCENE: dict[str, Any] = {
         "Ci": {"median": 1.35e-9, "factor": 1.2},
     },
 }
+NAMES = ("force_mean", "force_peak")
 
 
 class SimulatedRecords(Sequence[fitact.Record]):
@@ -78,6 +80,37 @@ def run_in_process(fingers: int, samples: int) -> dict[str, float]:
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 
+def shares() -> dict[str, float]:
+    """Return the time of Saltelli's design on the model relative to the surrogate, for the posterior's factors."""
+    population = fit_simulated(12, SAMPLES)
+    factors = population.factors.reshape(-1, len(population.finger.factors))
+    columns = [population.finger.names.index(name) for name in NAMES]
+    count = {"exact": 0}
+
+    def exact(points: np.ndarray) -> np.ndarray:
+        count["exact"] += len(points)
+        return population.finger.evaluate(points)[:, columns]
+
+    surrogate = Surrogate.from_model(population.finger, factors, NAMES)
+    named = population.finger.factors, factors, NAMES, 1
+    brute, near = sobol_indices(exact, *named), sobol_indices(surrogate.predict, *named)
+    shifts = [
+        abs(brute[name][factor][key] - near[name][factor][key])
+        for name in NAMES
+        for factor in brute[name]
+        for key in ("first", "total")
+    ]
+    rng = np.random.default_rng(2)
+    points = {n: factors[rng.integers(len(factors), size=n)] for n in (count["exact"], surrogate.evaluations)}
+    seconds = medians({str(n): lambda at=at: population.finger.evaluate(at) for n, at in points.items()}, 5)
+    return {
+        "shares_evaluations_exact_vs_surrogate": count["exact"] / surrogate.evaluations,
+        "shares_model_seconds_exact_vs_surrogate": seconds[str(count["exact"])] / seconds[str(surrogate.evaluations)],
+        "shares_largest_shift": max(shifts),
+        "shares_shift_certified": float(np.max(surrogate.cross_validation_error)),
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -97,7 +130,8 @@ def main() -> None:
             "seconds_vs_a_tenth_of_the_fingers": whole["seconds"] / tenth["seconds"],
             "memory_vs_a_tenth_of_the_fingers": whole["memory"] / tenth["memory"],
             "memory_vs_a_tenth_of_the_samples": longer["memory"] / tenth["memory"],
-        },
+        }
+        | shares(),
         given.json,
     )
 

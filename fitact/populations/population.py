@@ -28,7 +28,7 @@ from fitact.populations.next_finger import (
     finger_variance_fraction,
     intrafinger_variance_fraction,
 )
-from fitact.populations.sobol import SobolIndices, sobol_indices
+from fitact.populations.sobol import SobolIndices, variance_shares
 from fitact.populations.within_finger import WithinFinger
 from fitact.sampling.convergence import Convergence
 from fitact.sampling.posterior import convert_to_arviz
@@ -205,7 +205,7 @@ class Population(Display):
 
     @functools.cached_property
     def shares(self) -> SobolIndices:
-        """Sobol indices of the next finger's force; see `sobol_indices`."""
+        """Sobol indices of the next finger's force; see `variance_shares`."""
         return self._sobol_indices(self.factors)
 
     @functools.cached_property
@@ -214,11 +214,7 @@ class Population(Display):
         return self._sobol_indices(self.prior_factors)
 
     def _sobol_indices(self, factors: Float[np.ndarray, "laws fingers factors"]) -> SobolIndices:
-        columns = [self.finger.names.index(name) for name in VARIANCE_QUANTITIES]
-        points = factors.reshape(-1, factors.shape[-1])
-        return sobol_indices(
-            lambda x: self.finger.evaluate(x)[:, columns], self.finger.factors, points, VARIANCE_QUANTITIES, self.seed
-        )
+        return variance_shares(self.finger, factors.reshape(-1, factors.shape[-1]), VARIANCE_QUANTITIES, self.seed)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of population.json, which `fitact population --json` prints."""

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import equinox as eqx
@@ -24,7 +25,7 @@ from fitact.populations.finger import Finger
 from fitact.populations.finger_likelihoods import FingerLikelihoods, PopulationParameters
 from fitact.populations.hierarchy import Hierarchy
 from fitact.populations.next_finger import FACTORS, NewFingerModel, finger_variance_fraction
-from fitact.populations.sobol import sobol_indices
+from fitact.populations.sobol import Surrogate, sobol_indices, variance_shares
 from fitact.prior.prior import Prior
 from tests.population_calibration import FREQUENCY, simulate, steady, vsc, wave
 
@@ -182,18 +183,44 @@ def test_variance_shares_of_correlated_factors_are_those_of_the_closed_form():
         assert found[name]["first_error"] < 0.1
 
 
+@dataclasses.dataclass
+class Known:
+    """A finger of one quantity; counts how often it is asked."""
+
+    quantity: Callable[[np.ndarray], np.ndarray]
+    factors: tuple[str, ...]
+    names: tuple[str, ...] = ("force_mean",)
+    evaluations: int = 0
+
+    def evaluate(self, factors: np.ndarray) -> np.ndarray:
+        self.evaluations += len(factors)
+        return self.quantity(factors)[:, None]
+
+
 def test_variance_shares_of_a_product_are_those_of_the_closed_form():
     """y = exp(x . slope), x independent, s = slope sd: first (e^(s_i^2) - 1) over e^(sum s^2) - 1, total likewise."""
     s = np.array([0.3, 0.5, 0.4])
     factors = np.random.default_rng(4).standard_normal((4000, 3))
     factors = (factors - factors.mean(axis=0)) @ np.linalg.inv(np.linalg.cholesky(np.cov(factors.T))).T
-    found = sobol_indices(lambda x: np.exp(x @ s)[:, None], FACTORS[:3], factors, ("force_mean",), seed=0)["force_mean"]
+    finger = Known(lambda x: np.exp(x @ s), FACTORS[:3])
+    found = variance_shares(finger, factors, finger.names, seed=0)["force_mean"]
+    assert finger.evaluations <= 4096 * 3 * 5 // 100
     whole = np.expm1(s @ s)
     for name, square in zip(FACTORS[:3], s**2, strict=True):
         first, total = np.expm1(square) / whole, np.expm1(square) * np.exp(s @ s - square) / whole
         for key, value in {"first": first, "total": total, "interaction": total - first}.items():
             assert found[name][key] == pytest.approx(value, abs=2.0 * found[name][f"{key}_error"])
             assert found[name][f"{key}_error"] < 0.12
+
+
+def test_a_surrogate_that_is_off_says_by_how_much():
+    """A quantity with a kink, which no polynomial has: the error is the correlation at 100,000 other points."""
+    finger = Known(lambda x: np.exp(np.abs(x[:, 0] - 0.5) + 0.3 * x[:, 1]), FACTORS[:2])
+    surrogate = Surrogate.from_model(finger, np.random.default_rng(5).standard_normal((4000, 2)), finger.names)
+    points = surrogate.mean + np.random.default_rng(6).standard_normal((100_000, 2)) @ surrogate.covariance_factor.T
+    r = np.corrcoef(finger.evaluate(points)[:, 0], surrogate.predict(points)[:, 0])[0, 1]
+    assert np.sqrt(1.0 - r**2) > 0.05
+    assert surrogate.cross_validation_error[0] == pytest.approx(np.sqrt(1.0 - r**2), rel=0.5)
 
 
 def test_what_makes_no_population_is_refused():
