@@ -21,10 +21,12 @@ from typing import Any
 
 from fitact.cli import run_command
 from fitact.cli.app import app
+from fitact.scene.fields import describe_fields
+from fitact.scene.toml import shipped_scenes
 
-# in the order in which a page needs them: the form, the pictures, `fitact run`, `fitact population`
+# in the order in which a page needs them: pictures, `fitact run`, `fitact population`
 _SLOW_IMPORTS = (
-    "fitact.scene.fields", "fitact.report.record", "scipy.signal", "scipy.stats", "optimistix", "fitact.fitting.fit",
+    "fitact.report.record", "scipy.signal", "scipy.stats", "optimistix", "fitact.fitting.fit",
     "fitact.model_selection.fit_planned", "xarray", "fitact.sampling.ensemble", "fitact.report.page", "h5netcdf",
     "fitact.populations.fit_population",
 )  # fmt: skip
@@ -42,7 +44,8 @@ def main() -> None:
         question = json.loads(line)
         if question.pop("last", False):
             raise SystemExit(_run_last(**question))
-        print(json.dumps(_answer(**question) if question else _describe_scenes()), file=answers, flush=True)
+        answer = _answer(**question) if question else {"fields": describe_fields(), "scenes": sorted(shipped_scenes())}
+        print(json.dumps(answer), file=answers, flush=True)
 
 
 def _read_questions() -> None:
@@ -63,13 +66,6 @@ def _next_question() -> bytes:
             break
         importlib.import_module(module)
     return _questions.get()
-
-
-def _describe_scenes() -> dict[str, Any]:
-    from fitact.scene.fields import describe_fields
-    from fitact.scene.toml import shipped_scenes
-
-    return {"fields": describe_fields(), "scenes": sorted(shipped_scenes())}
 
 
 def _answer(folder: str, arguments: list[str]) -> dict[str, Any]:
