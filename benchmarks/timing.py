@@ -37,13 +37,17 @@ def _call_seconds(
     return taken
 
 
-def process_seconds(command: list[str], folder: Path, cache: Path) -> float:
-    """Return the seconds of a process in `folder` whose caches are in `cache`."""
+def program_environment(cache: Path) -> dict[str, str]:
+    """Return the environment of a process whose caches are in `cache`."""
     left_out = ("JAX_", "PYTHONDONTWRITEBYTECODE")
     kept = {name: value for name, value in os.environ.items() if not name.startswith(left_out)}
-    caches = {"FITACT_CACHE": str(cache), "XDG_CACHE_HOME": str(cache)}
+    return kept | {"FITACT_CACHE": str(cache), "XDG_CACHE_HOME": str(cache)}
+
+
+def process_seconds(command: list[str], folder: Path, cache: Path) -> float:
+    """Return the seconds of a process in `folder` whose caches are in `cache`."""
     start = time.perf_counter()
-    subprocess.run(command, env=kept | caches, cwd=folder, check=True, capture_output=True)
+    subprocess.run(command, env=program_environment(cache), cwd=folder, check=True, capture_output=True)
     return time.perf_counter() - start
 
 

@@ -7,12 +7,12 @@ import secrets
 import shlex
 import shutil
 import subprocess
-import sys
 import time
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from fitact.app.warm_commands import WarmCommands
 from fitact.errors import InputError
 from fitact.files import write_json
 
@@ -137,16 +137,13 @@ class Analysis:
     def command(self) -> str:
         return shlex.join(["fitact", *self.arguments()])
 
-    def start(self) -> None:
+    def start(self, commands: WarmCommands) -> None:
         """Start the command, or resume it: the same one in the same folder."""
         if self.state not in ("set-up", "stopped") or not self.files:
             return
         (self.folder / "command.txt").write_text(f"{self.command}\n", encoding="utf-8")
-        with (self.folder / "output.txt").open("wb") as out, (self.folder / "messages.txt").open("wb") as messages:
-            _processes[self.folder] = subprocess.Popen(
-                [sys.executable, "-P", "-m", "fitact.cli.attached", *self.arguments()],
-                cwd=self.folder, stdin=subprocess.PIPE, stdout=out, stderr=messages, start_new_session=True,
-            )  # fmt: skip
+        (self.folder / "messages.txt").unlink(missing_ok=True)  # of a run before
+        _processes[self.folder] = commands.start(self.folder, self.arguments())
 
     def stop(self) -> None:
         """Interrupt the command as Ctrl-C does, so that it can resume."""

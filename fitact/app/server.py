@@ -142,7 +142,8 @@ class Page:
 
     @contextlib.asynccontextmanager
     async def live(self, _: Starlette) -> AsyncIterator[None]:
-        """Remove what a server that was killed left, and end the process for quick commands with this server."""
+        """Prepare a process for commands, which ends with the server; remove what a killed server left."""
+        self._commands.prepare()
         for old in self._root.glob(".upload-*"):
             if time.time() - old.stat().st_mtime > _STALE_UPLOAD:
                 shutil.rmtree(old, ignore_errors=True)
@@ -151,9 +152,8 @@ class Page:
 
     async def show_home(self, _: Request) -> Response:
         """Show where to drop files, and all analyses."""
-        page = self._render("home.html", analyses=list(Analysis.iterate(self._root)), folder=self._root)
-        page.background = BackgroundTask(self._commands.describe_scenes)  # its imports shall not delay this page
-        return page
+        self._commands.prepare()  # for the next file
+        return self._render("home.html", analyses=list(Analysis.iterate(self._root)), folder=self._root)
 
     async def show_analysis(self, request: Request) -> Response:
         """Show the set-up, the progress or the results of an analysis."""
@@ -220,7 +220,7 @@ class Page:
         """Start or resume, stop, copy an analysis, or remove one of its files."""
         analysis, action = self._find(request), request.path_params["action"]
         if action == "start":
-            analysis.start()
+            analysis.start(self._commands)
         elif action == "stop":
             analysis.stop()
         elif action == "copy":

@@ -1,13 +1,14 @@
-"""Command lines that answer at once: they run in a process that has the slow imports done (`fitact.cli.warm`)."""
+"""Processes for commands, one of which waits with its slow imports done (`fitact.cli.warm`)."""
 
-import asyncio
-import contextlib
 import json
+import subprocess
 import sys
+import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-_LONGEST_ANSWER = 2**26  # bytes of one line; an inspection has some kilobytes
+from starlette.concurrency import run_in_threadpool
 
 
 class CommandResult(NamedTuple):
@@ -24,52 +25,76 @@ class CommandResult(NamedTuple):
 
 
 class WarmCommands:
-    """Process that runs commands one after the other; it starts on first use, and anew after it has died."""
+    """Process that runs quick commands one after the other, and at last one whose results take long.
+
+    Another process takes its place when it is needed, also after it has died.
+    """
 
     def __init__(self) -> None:
-        self._lock = asyncio.Lock()
-        self._process: asyncio.subprocess.Process | None = None
-        self._greeting: dict[str, Any] = {}
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._scenes: dict[str, Any] = {}
+
+    def prepare(self) -> None:
+        """Start the process if there is none."""
+        if self._lock.acquire(blocking=False):
+            self._find_process()
+            self._lock.release()
 
     async def describe_scenes(self) -> dict[str, Any]:
         """Return `fields`, the keys of a scene (`describe_fields`), and `scenes`, the names of shipped scenes."""
-        async with self._lock:
-            await self._start()
-            return self._greeting
+        if not self._scenes:
+            self._scenes = await run_in_threadpool(self._ask, {})
+        return self._scenes
 
     async def run(self, folder: Path, *arguments: str) -> CommandResult:
         """Run `fitact ARGUMENTS` in a folder."""
-        async with self._lock:
-            process = await self._start()
-            try:
-                return CommandResult(**await _ask(process, {"folder": str(folder), "arguments": arguments}))
-            except (ConnectionError, json.JSONDecodeError):  # killed, e.g. for its memory
-                self._process = None
-                return CommandResult(
-                    3, "", f"fitact: the process that read {arguments[1]} has died; try the command line"
-                )
+        try:
+            question = {"folder": str(folder), "arguments": arguments}
+            return CommandResult(**await run_in_threadpool(self._ask, question))
+        except (ConnectionError, json.JSONDecodeError):  # killed, e.g. for its memory
+            sentence = f"fitact: the process that read {arguments[1]} has died; try the command line"
+            return CommandResult(3, "", sentence)
+
+    def start(self, folder: Path, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
+        """Start `fitact ARGUMENTS` in a process of its own, which ends with it; closing its input interrupts it.
+
+        Its output goes to `output.txt` and `messages.txt` in the folder.
+        """
+        if self._lock.acquire(blocking=False):
+            process, self._process = self._find_process(), None
+            self._lock.release()
+        else:  # it is busy
+            process = _start_process()
+        _send(process, {"folder": str(folder), "arguments": arguments, "last": True})
+        return process
 
     def stop(self) -> None:
         """End the process."""
         if self._process is not None:
-            with contextlib.suppress(ProcessLookupError):
-                self._process.kill()
+            self._process.kill()
 
-    async def _start(self) -> asyncio.subprocess.Process:
-        if self._process is None or self._process.returncode is not None:
-            pipe = asyncio.subprocess.PIPE
-            self._process = await asyncio.create_subprocess_exec(
-                sys.executable, "-P", "-m", "fitact.cli.warm", stdin=pipe, stdout=pipe,
-                stderr=asyncio.subprocess.DEVNULL, limit=_LONGEST_ANSWER, start_new_session=True,
-            )  # fmt: skip
-            self._greeting = await _ask(self._process)
+    def _ask(self, question: dict[str, Any]) -> Any:
+        with self._lock:
+            process = self._find_process()
+            _send(process, question)
+            assert process.stdout is not None
+            return json.loads(process.stdout.readline())
+
+    def _find_process(self) -> subprocess.Popen[bytes]:
+        if self._process is None or self._process.poll() is not None:
+            self._process = _start_process()
         return self._process
 
 
-async def _ask(process: asyncio.subprocess.Process, question: dict[str, Any] | None = None) -> dict[str, Any]:
+def _start_process() -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-P", "-m", "fitact.cli.warm"],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True,
+    )  # fmt: skip
+
+
+def _send(process: subprocess.Popen[bytes], question: dict[str, Any]) -> None:
     assert process.stdin is not None
-    assert process.stdout is not None
-    if question is not None:
-        process.stdin.write(json.dumps(question).encode() + b"\n")
-        await process.stdin.drain()
-    return json.loads(await process.stdout.readline())
+    process.stdin.write(json.dumps(question).encode() + b"\n")
+    process.stdin.flush()

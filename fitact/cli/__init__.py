@@ -23,12 +23,8 @@ from fitact.cli import one_finger, records, scenes, page  # noqa: F401
 
 
 def main() -> None:
-    """Run the command line; report every error in one line and by the exit status."""
-    sys.unraisablehook = _resend_interrupt
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(encoding="utf-8")  # units and JSON, whatever the system's own encoding is
-    raise SystemExit(_run_command(lambda: app(standalone_mode=False)))
+    """Run the command line and end the process."""
+    raise SystemExit(run_command(lambda: app(standalone_mode=False)))
 
 
 def _resend_interrupt(unraisable: "sys.UnraisableHookArgs") -> None:
@@ -48,7 +44,12 @@ def _interrupt(main: int) -> None:
         _thread.interrupt_main()
 
 
-def _run_command(command: Callable[[], Any]) -> int:
+def run_command(command: Callable[[], Any]) -> int:
+    """Return the exit status of a command; report every error in one line."""
+    sys.unraisablehook = _resend_interrupt
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(encoding="utf-8")  # units and JSON, whatever the system's own encoding is
     try:
         result = command()
         return result if isinstance(result, int) else 0

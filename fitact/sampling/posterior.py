@@ -425,7 +425,7 @@ def convert_to_arviz(tree: Any) -> Any:
         import arviz
     except ImportError as error:
         raise InputError("ArviZ is not installed; install it with: pip install 'fitact[arviz]'") from error
-    if not hasattr(arviz, "InferenceData"):  # ArviZ 1 takes the tree as it is
+    if int(arviz.__version__.partition(".")[0]) >= 1:  # takes the tree as it is; its `InferenceData` is DataTree
         return tree
     groups = {name: node.to_dataset() for name, node in tree.children.items()}
     return arviz.InferenceData(attrs=tree.attrs, **groups)

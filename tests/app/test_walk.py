@@ -2,7 +2,7 @@
 
 import contextlib
 import json
-import shutil
+import os
 import signal
 import subprocess
 import sys
@@ -179,6 +179,37 @@ def test_a_gigabyte_is_refused_with_a_sentence(walked, server: Server, tmp_path:
     assert sorted(server.folder.iterdir()) == before
 
 
+def test_a_run_stopped_while_sampling_goes_on_to_the_same_results(walked, server: Server):
+    person, address = walked
+    first = server.folder / address.rpartition("/")[2]
+    copy = json.loads(server.act(first.name, "copy").body)["analysis"]
+    folder = server.folder / copy
+    person.open(f"{server.address}analyses/{copy}")
+    person.press("Start")
+    person.wait_state("running")
+    process = halt_sampling(server, copy)
+    person.press("Stop")
+    person.wait_state("stopping")
+    os.kill(process, signal.SIGCONT)
+    person.wait_state("stopped")
+    before = h5_points(folder / "results" / "chain.h5")
+    interrupted = json.loads((folder / "results" / "summary.json").read_text())
+    assert interrupted["convergence"]["interrupted"]
+    assert person.driver.find_element("partial link text", "preliminary report")
+    person.press("Go on")
+    person.wait_state("finished")
+    person.driver.switch_to.frame(person.driver.find_element("tag name", "iframe"))
+    person.browser.wait("document.querySelector('.verdict h2') !== null")
+    person.driver.switch_to.default_content()
+    after = h5_points(folder / "results" / "chain.h5")
+    assert 0 < len(before) < len(after)
+    assert (after[: len(before)] == before).all()
+    assert (after == h5_points(first / "results" / "chain.h5")).all()
+    again, once = (json.loads((each / "results" / "summary.json").read_text()) for each in (folder, first))
+    for name in ("parameters", "derived", "identifiability", "fit", "seed"):
+        assert again[name] == once[name]
+
+
 @pytest.mark.skipif(not AXE.exists(), reason="axe-core is not there (make axe)")
 @pytest.mark.parametrize("colours", ["light", "dark"])
 def test_axe_finds_no_serious_fault(walked, server: Server, colours: str):
@@ -202,43 +233,50 @@ def test_axe_finds_no_serious_fault(walked, server: Server, colours: str):
         person.browser.command("Emulation.setEmulatedMedia", features=[])
 
 
-@pytest.mark.thorough  # samples a posterior twice
 def test_after_the_server_is_killed_the_command_line_goes_on(tmp_path: Path):
     server = Server(tmp_path / "results")
     try:
-        analysis = server.upload("finger00.csv.gz", (RECORDS / "fingers" / "finger00.csv.gz").read_bytes())
-        other = (RECORDS / "fingers" / "finger01.csv.gz").read_bytes()
-        server.ask("POST", f"analyses/{analysis}/files?name=finger01.csv.gz", other)
+        analysis = server.upload("finger.csv", (RECORDS / "finger_direct.csv").read_bytes())
         server.ask("POST", f"analyses/{analysis}/scene", (RECORDS / "finger_direct.toml").read_bytes())
         folder = server.folder / analysis
         server.act(analysis, "start")
-        assert server.wait(analysis, "stopped", "running", timeout=1)["state"] == "running"
-        while not (folder / "results" / "chain.h5").exists():
-            assert server.progress(analysis)["state"] == "running"
+        process = halt_sampling(server, analysis)
     finally:
         server.process.send_signal(signal.SIGKILL)
         server.process.wait()
-    while runs_in(folder):  # the command notices, and ends
+    os.kill(process, signal.SIGCONT)
+    while find_processes(folder):  # the command notices, and ends
         time.sleep(0.1)
-    shutil.copy(folder / "results" / "chain.h5", tmp_path / "before.h5")
+    assert json.loads((folder / "results" / "summary.json").read_text())["convergence"]["interrupted"]
+    before = h5_points(folder / "results" / "chain.h5")
     command = (folder / "command.txt").read_text().split()[1:]
     done = subprocess.run([sys.executable, "-c", START, *command], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert (folder / "results" / "report.html").exists()
-    before, after = (h5_points(path) for path in (tmp_path / "before.h5", folder / "results" / "chain.h5"))
+    after = h5_points(folder / "results" / "chain.h5")
+    assert 0 < len(before) < len(after)
     assert (after[: len(before)] == before).all()
     again = Server(server.folder)
     assert again.progress(analysis)["state"] == "finished"
     assert again.close() == 0
 
 
-def runs_in(folder: Path) -> bool:
-    """Return whether a process has this working folder (on Linux)."""
+def halt_sampling(server: Server, analysis: str) -> int:
+    """Halt the command when its first checkpoint is there, so that what follows always finds it sampling."""
+    while not (server.folder / analysis / "results" / "chain.h5").exists():
+        assert server.progress(analysis)["state"] == "running"
+    (process,) = find_processes(server.folder / analysis)
+    os.kill(process, signal.SIGSTOP)
+    return process
+
+
+def find_processes(folder: Path) -> list[int]:
+    """Return the processes with this working folder (on Linux)."""
+    found = []
     for link in Path("/proc").glob("[0-9]*/cwd"):
         with contextlib.suppress(OSError):
             if link.readlink() == folder:
-                return True
-    return False
+                found.append(int(link.parent.name))
+    return found
 
 
 def h5_points(path: Path):

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 import fitact
 from fitact.charts import draw_drive_design
 from fitact.charts.figure import write_figure
-from fitact.cli import _run_command
+from fitact.cli import run_command
 from fitact.cli.app import app
 from fitact.design.drive import _DriveEvaluator
 from fitact.design.drive_option import DriveOption, quantile, quantile_error
@@ -525,7 +525,7 @@ def test_what_cannot_be_designed_is_refused(sections: dict, share: float, senten
 
 
 def command(*arguments: object) -> int:
-    return _run_command(lambda: app([*map(str, arguments)], standalone_mode=False))
+    return run_command(lambda: app([*map(str, arguments)], standalone_mode=False))
 
 
 @pytest.mark.slow

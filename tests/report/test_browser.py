@@ -355,6 +355,17 @@ def test_it_looks_as_it_did(browser: Browser, page: Path, width: int):
     assert browser.ask("document.documentElement.scrollWidth") > width
 
 
+def test_tables_are_not_cut(browser: Browser, page: Path):
+    browser.open(page, 1100)
+    for closed in browser.all("details"):
+        browser.ask("arguments[0].setAttribute('open', '')", closed)
+    assert browser.all("details table th.text")
+    widths = browser.ask(
+        "[...document.querySelectorAll('.scroll:has(table)')].map((e) => [e.scrollWidth, e.clientWidth])"
+    )
+    assert [each for each in widths if each[0] > each[1] > 0] == []
+
+
 @pytest.mark.slow
 def test_the_reproduction_opens_and_draws_every_figure(browser: Browser, tmp_path: Path):
     browser.open(write_reproduction(tmp_path, ()))

@@ -4,7 +4,7 @@
   const { root, largest, tooLarge, analysis, state } = document.body.dataset;
   const find = (id) => document.getElementById(id);
   const set = (id, text) => { if (find(id)) find(id).textContent = text; };
-  const pollInterval = 500; // ms
+  const pollInterval = 200; // ms
 
   function show(error) {
     set("alert", error.message);
