@@ -243,8 +243,11 @@ def _compile(
     return _Program(compiled, result), compiled
 
 
-# Options of XLA for the CPU. Without its newer way to compile loops, programs compile in half the time and run as fast.
-_XLA_OPTIONS = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
+# Options of XLA for the CPU. Without its newer way to compile loops, programs compile in half the time and run as fast;
+# later versions have only that way.
+_XLA_OPTIONS: dict[str, Any] = {"xla_cpu_parallel_codegen_split_count": 1}
+if jax.__version_info__ < (0, 11):
+    _XLA_OPTIONS |= {"xla_cpu_use_fusion_emitters": False}
 _FAST_COMPILATION = {"xla_backend_optimization_level": 0}
 
 

@@ -136,7 +136,7 @@ def test_current_beside_the_friction_leaves_the_scale_to_the_noise(tmp_path: Pat
 
 
 @pytest.mark.slow  # two models, each fitted again without a tenth of the record, ten times
-@pytest.mark.parametrize(("noise", "preferred"), [("1 mN", "gap"), ("3 N", None)])
+@pytest.mark.parametrize(("noise", "preferred"), [("1 mN", "gap"), ("30 N", None)])
 def test_laws_are_told_apart_only_where_they_differ_by_more_than_the_noise(
     tmp_path: Path, noise: str, preferred: str | None
 ) -> None:
