@@ -22,7 +22,7 @@ from fitact.batch.fit_many import (
     run_in_threads,
     tabulate_records,
 )
-from fitact.batch.moves import ENSEMBLES, WALKERS, GaussianApproximations, sample_posteriors
+from fitact.batch.metropolis import WALKERS, GaussianApproximations, sample_posteriors
 from fitact.batch.shared_basis import RestrictedTables
 from fitact.batch.stated_drive import StatedDriveProblem
 from fitact.compiled import BatchEvaluator, pad_rows
@@ -57,16 +57,16 @@ def sample_many(
     seed: int = 0,
     progress: bool = True,
 ) -> Fits:
-    """Fit each of many records separately and sample its posterior by emcee, like `fitact.sample`.
+    """Fit each of many records separately and sample its posterior, like `fitact.sample`.
 
     Rows of `fit_many` are extended by the posterior quantiles of each parameter, each derived quantity and the noise
     (e.g. `Rsc_q05`, `force_mean_q975`), and by `converged`, `rhat_max`, `ess_min`, `tau_max`, `acceptance`, `steps`
     and `walkers` of each ensemble. Rows that have not converged are not `trusted`.
 
-    Records that are fitted in a batch and have a posterior near its Laplace approximation are sampled together, 32 in
-    one run of emcee. The random numbers of each record depend on `seed` and its content only, so that other records
-    hardly affect it. Records that have not converged, and all others, are sampled separately, like `fitact.sample`
-    with this seed.
+    Records that are fitted in a batch and have a posterior near its Laplace approximation are sampled together, 32 at
+    once, by Metropolis-Hastings moves that propose from this approximation. The random numbers of each record depend on
+    `seed` and its content only, so that other records hardly affect it. Records that have not converged, and all
+    others, are sampled separately, like `fitact.sample` with this seed.
 
     Args:
         records: records, or paths of files; consumed one by one.
@@ -187,10 +187,10 @@ def _probe_axes(targets: _Targets) -> Float[np.ndarray, "records n probes"]:
 class _LogProbs:
     """Log-posteriors of points of each record; -inf outside its table, which is recorded.
 
-    `chunk_points` of each record are evaluated at once, i.e. half of its walkers, so that one size is compiled.
+    `chunk_points` of each record are evaluated at once, so that one size is compiled.
     """
 
-    def __init__(self, targets: _Targets, chunk_points: int = ENSEMBLES * WALKERS // 2) -> None:
+    def __init__(self, targets: _Targets, chunk_points: int = 64) -> None:
         self._tables, self._chunk_points = tuple(targets.tables), chunk_points
         rows = chunk_points * targets.tables.signal.shape[-1]
         self._evaluate = BatchEvaluator(_log_probs, targets.likelihood, rows, _BLOCK)
@@ -243,7 +243,7 @@ def _sample_block(
     full = targets.subset([*range(len(members)), *[len(members) - 1] * (_BLOCK - len(members))])
     log_probs = _LogProbs(full)
     seeds = [[seed, int(record.fingerprint, 16)] for _, record in full.members]
-    sampled = sample_posteriors(log_probs, full.approximations, steps, seeds, seed)
+    sampled = sample_posteriors(log_probs, full.approximations, steps, seeds)
     tracked = _evaluate_draws(_derive_tracked, full.derive, sampled.points[:, :, :, :TRACKED_WALKERS])
     names = (*full.likelihood.names, "sigma")
     rows = {}
