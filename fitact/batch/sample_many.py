@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple, Self
 
 import jax
@@ -39,7 +39,7 @@ from fitact.scene.scene import Scene
 from fitact.summary import PROBABILITIES
 
 _BLOCK = 32  # records sampled together, padded to this number; 16 MB of draws
-_TRACKED = derived.DERIVED_NAMES[:3]  # g, b, force_mean
+_TRACKED = ("g", "b", "force_mean")
 _CONVERGENCE_COLUMNS = ("converged", "rhat_max", "ess_min", "tau_max", "acceptance", "steps", "walkers", "ensembles")
 
 
@@ -210,43 +210,26 @@ def _sample_block(
     log_probs = _LogProbs(full)
     seeds = [[seed, int(record.fingerprint, 16)] for _, record in full.members]
     sampled = sample_posteriors(log_probs, full.approximations, steps, seeds)
-    tracked = _evaluate_draws(_derive_tracked, full.derive, sampled.points[:, :, :, :TRACKED_WALKERS])
+    # derived quantities cost more than the draws, so only some draws are used
+    points = sampled.points[:, :, :, :TRACKED_WALKERS]
+    evaluator = BatchEvaluator(_derive, full.derive, full.derive.time.size, batch=1024)
+    derived_draws = evaluator.map_over(points.shape[:-1], points)
     names = (*full.likelihood.names, "sigma")
     rows = {}
     for i, ((number, _), row) in enumerate(zip(members, targets.rows, strict=True)):
-        tracked_draws = dict(zip(_TRACKED, np.moveaxis(tracked[i], -1, 0), strict=True))
-        convergence = diagnose_chain(names, sampled.points[i], sampled.accepted[i], tracked_draws, rhat_draws)
+        quantities = dict(zip(derived.DERIVED_NAMES, np.moveaxis(derived_draws[i], -1, 0), strict=True))
+        tracked = {name: quantities[name] for name in _TRACKED}
+        convergence = diagnose_chain(names, sampled.points[i], sampled.accepted[i], tracked, rhat_draws)
         if convergence.converged and not log_probs.outside_table[i]:
-            draws = _draws_by_name(names, full.derive, sampled.points[i, :, convergence.burn :])
+            draws = dict(zip(names, np.moveaxis(np.exp(sampled.points[i]), -1, 0), strict=True)) | quantities
+            draws = {name: values[:, convergence.burn :] for name, values in draws.items()}
             rows[number] = row | _posterior_columns(row, draws, convergence)
     return rows
 
 
-def _draws_by_name(
-    names: tuple[str, ...],
-    derive: DerivedQuantities,
-    points: Float[np.ndarray, "ensembles steps walkers n"],
-    thin: int = 4,
-) -> dict[str, np.ndarray]:
-    """Return draws by name in SI units; derived quantities, which cost more, from every `thin`-th step only."""
-    derived_draws = _evaluate_draws(_derive_quantities, derive, points[:, ::thin])
-    draws = dict(zip(names, np.moveaxis(np.exp(points), -1, 0), strict=True))
-    return draws | dict(zip(derived.DERIVED_NAMES, np.moveaxis(derived_draws, -1, 0), strict=True))
-
-
-def _evaluate_draws(
-    function: Callable[..., Array], derive: DerivedQuantities, points: Float[np.ndarray, "*shape n"]
-) -> Float[np.ndarray, "*shape some"]:
-    return BatchEvaluator(function, derive, derive.time.size, batch=1024).map_over(points.shape[:-1], points)
-
-
-def _derive_quantities(derive: DerivedQuantities, point: Array) -> Float[Array, " derived"]:
+def _derive(derive: DerivedQuantities, point: Array) -> Float[Array, " derived"]:
     theta, log_sigma = derive.likelihood.split(point)
     return derive(theta, jnp.exp(log_sigma))
-
-
-def _derive_tracked(derive: DerivedQuantities, point: Array) -> Float[Array, " tracked"]:
-    return _derive_quantities(derive, point)[: len(_TRACKED)]
 
 
 def _posterior_columns(row: Row, draws: Mapping[str, np.ndarray], convergence: Convergence) -> Row:

@@ -42,8 +42,9 @@ class SharedBasis(NamedTuple):
     ) -> "SharedBasis":
         """Return a basis for time constants within a factor 9 of `tau` (s). Double precision is required."""
         x, to_series = chebyshev(NODES)
-        nodes = jnp.asarray(tau * np.exp(TABLE_HALF_WIDTH * x))
-        u, baseline, slope = _basis_functions(drive, time, nodes, steady_state)
+        nodes, step = tau * np.exp(TABLE_HALF_WIDTH * x), np.asarray((time[-1] - time[0]) / (time.size - 1))
+        padded = _evaluate_basis_functions(drive, pad_samples(time), step, nodes, steady_state)
+        u, baseline, slope = (values[..., : time.size] for values in padded)
         clock = (time - 0.5 * (time[0] + time[-1])) * slope
         _, sizes, spanning = np.linalg.svd(u, full_matrices=False)
         rank = round_up_column_count(np.count_nonzero(sizes > RANK_TOLERANCE * sizes[0]), len(spanning))
@@ -85,17 +86,11 @@ class SharedBasis(NamedTuple):
         return signal @ self.functions[:, : signal.shape[1]].T
 
 
-def _basis_functions(drive: Drive, time: np.ndarray, nodes: Array, steady_state: bool) -> list[np.ndarray]:
-    """Evaluate the responses of the nodes, the baseline functions, and dV/dt over two samples."""
-    step = jnp.asarray((time[-1] - time[0]) / (time.size - 1))
-    functions = _evaluate_basis_functions(drive, pad_samples(time), step, nodes, steady_state)
-    return [np.asarray(values)[..., : time.size] for values in functions]
-
-
 @jit
 def _evaluate_basis_functions(
     drive: Drive, time: Array, step: Array, nodes: Array, steady_state: bool
 ) -> tuple[Array, Array, Array]:
+    """Evaluate the responses of the nodes, the baseline functions, and dV/dt over two samples."""
     u = jax.vmap(lambda tau: highpass(drive, time, tau, steady_state=steady_state))(nodes)
 
     def voltage(time: Array) -> Array:

@@ -66,7 +66,7 @@ def assert_alike(row: dict, other: dict, error: float) -> None:
 
 
 def effective(row: dict, name: str) -> float:
-    """Return a lower bound on the effective number of draws; quantities of every fourth step have a quarter of them."""
+    """Return a lower bound on the effective number of draws; derived quantities of every fourth walker have fewer."""
     return row["ess_min"] / (1.0 if name in (*MEDIANS, "noise") else 4.0)
 
 
