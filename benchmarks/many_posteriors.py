@@ -15,7 +15,7 @@ from batch import SCENE, simulate_records
 from timing import show
 
 import fitact
-from fitact.batch.moves import WALKERS
+from fitact.batch.metropolis import WALKERS
 
 ALONE = 4  # records per round sampled one by one
 ROUNDS = 5

@@ -140,27 +140,7 @@ def _as_argument(leaf: Any) -> np.ndarray | Array:
 
 
 def _signature(leaves: Sequence[Any]) -> tuple[_Shape | _Static, ...]:
-    return tuple(
-        _Shape(leaf.shape, leaf.dtype)
-        if is_array(leaf)
-        else _Static(type(leaf), _Partial.from_partial(leaf) if isinstance(leaf, functools.partial) else leaf)
-        for leaf in leaves
-    )
-
-
-class _Partial(NamedTuple):
-    """A `functools.partial` that equals others of the same function and arguments."""
-
-    function: Callable[..., Any]
-    args: tuple[Any, ...]
-    kwargs: tuple[tuple[str, Any], ...]
-
-    @classmethod
-    def from_partial(cls, partial: "functools.partial[Any]") -> "_Partial":
-        return cls(partial.func, partial.args, tuple(sorted(partial.keywords.items())))
-
-    def __call__(self, *args: Any) -> Any:
-        return self.function(*self.args, *args, **dict(self.kwargs))
+    return tuple(_Shape(leaf.shape, leaf.dtype) if is_array(leaf) else _Static(type(leaf), leaf) for leaf in leaves)
 
 
 @functools.lru_cache(maxsize=2048)
@@ -287,8 +267,6 @@ def _describe(value: Any) -> str:
         parts = [f"{key!r}:{_describe(item)}" for key, item in value.items()]
     elif isinstance(value, tuple | list):
         parts = list(map(_describe, value))
-    elif isinstance(value, functools.partial):
-        parts = [_describe(value.func), _describe(value.args), _describe(value.keywords)]
     elif isinstance(value, eqx.Module):
         parts = [_describe(getattr(value, name)) for name in value.__dataclass_fields__]
     else:

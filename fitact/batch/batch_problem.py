@@ -114,25 +114,23 @@ class BatchProblem(abc.ABC):
         """Cached `prior_factor` of the likelihood."""
         return self.likelihood.prior_factor
 
-    @functools.cached_property
-    def _prior_skin_moments(self) -> tuple[np.ndarray, np.ndarray]:
-        return prior_skin_moments(self.likelihood)
-
     def starting_points(
         self, g: Float[np.ndarray, " records"], b: Float[np.ndarray, " records"]
     ) -> Float[np.ndarray, "records parameters"]:
         """Return the most probable parameters with divider `g` and time constant `b` (s)."""
-        theta = np.tile(self._prior_center, (len(g), 1))
-        ridge = most_probable_skin(g, b, *self._prior_skin_moments)
+        center, moments = self._prior_moments
+        theta, ridge = np.tile(center, (len(g), 1)), most_probable_skin(g, b, *moments)
         for name, logs in zip(FINGER_PARAMETERS, ridge.T, strict=True):
             if name in self.names:
                 theta[:, self.names.index(name)] = logs
         return theta
 
     @functools.cached_property
-    def _prior_center(self) -> Float[np.ndarray, " parameters"]:
-        prior = self.likelihood.prior
-        return np.append(prior.log_mean, np.zeros(len(self.names) - len(prior.names)))
+    def _prior_moments(self) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """Center of the prior, and the moments of the skin's parameters."""
+        log_mean = self.likelihood.prior.log_mean
+        center = np.append(log_mean, np.zeros(len(self.names) - log_mean.size))
+        return center, prior_skin_moments(self.likelihood)
 
     def bic_decreases(self, r_squared: Float[np.ndarray, "records candidates"]) -> np.ndarray:
         """Return the decrease of the BIC that each of `CANDIDATES` would cause; -inf for one that is not optional."""

@@ -28,6 +28,7 @@ from fitact.data.readers.read import read
 from fitact.errors import InputError
 from fitact.files import to_json
 from fitact.fitting.fit import fit
+from fitact.progress import track_progress
 from fitact.sampling.ensemble import sample
 from fitact.scene.scene import Scene
 
@@ -184,7 +185,7 @@ def run_campaign(
         keys = _journal_keys(paths, task)
         batches = _pending_batches(keys, paths, journal)
         if batches:
-            _run_batches(task, batches, journal, scheduler, workers, memory, _Progress(len(paths), progress))
+            _run_batches(task, batches, journal, scheduler, workers, memory, progress)
     finally:
         journal.close()
     return Fits(tuple(journal.rows[key] for key in keys))
@@ -221,26 +222,29 @@ def _run_batches(
     scheduler: str | None,
     workers: int | None,
     memory: str,
-    progress: "_Progress",
+    progress: bool,
     patience: float = 60.0,
 ) -> None:
     """Run all batches; wait up to `patience` seconds for a lost scheduler."""
-    progress.done = progress.total - sum(map(len, batches))
+    total, known = sum(map(len, batches)), len(journal.rows)
     deadline = time.monotonic()  # how long to wait for a scheduler, which may return once it was reached
     while batches:
         with _open_client(scheduler, workers, memory, progress, deadline) as client:
             futures: dict[Any, Batch] = {}
             try:
-                for batch, rows in _completed_batches(client, task, batches, futures):
+                done = _completed_batches(client, task, batches, futures)
+                if progress:
+                    done = track_progress(done, "fitting the records", total, lambda: len(journal.rows) - known)
+                for batch, rows in done:
                     journal.add({key: row for (key, _), row in zip(batch, rows, strict=True)})
-                    progress.add(rows)
                 return
             except (CancelledError, OSError) as error:  # the scheduler and its state are lost
                 if scheduler is None:
                     raise
                 batches.extendleft(futures.values())
                 deadline = time.monotonic() + patience
-                progress.print_status(f"lost the scheduler at {scheduler} ({type(error).__name__}); waiting for it")
+                if progress:
+                    print(f"lost the scheduler at {scheduler} ({type(error).__name__}); waiting", file=sys.stderr)
 
 
 def _completed_batches(
@@ -291,7 +295,7 @@ def _import_distributed() -> Any:
 
 @contextlib.contextmanager
 def _open_client(
-    scheduler: str | None, workers: int | None, memory: str, progress: "_Progress", deadline: float
+    scheduler: str | None, workers: int | None, memory: str, progress: bool, deadline: float
 ) -> Iterator["Client"]:
     """Connect to the scheduler at this address, or start one with workers on this machine."""
     distributed = _import_distributed()
@@ -315,7 +319,8 @@ def _open_client(
         ) as cluster,
         distributed.Client(cluster) as client,
     ):
-        progress.print_status(f"{count} workers of at most {memory} each; Dask's dashboard: {cluster.dashboard_link}")
+        if progress:
+            print(f"{count} workers; Dask's dashboard: {cluster.dashboard_link}", file=sys.stderr)
         yield client
 
 
@@ -330,33 +335,3 @@ def _connect_scheduler(scheduler: str, deadline: float) -> "Client":
                     " command again to resume."
                 ) from error
             time.sleep(1.0)
-
-
-class _Progress:
-    """Number of finished and failed records, rate and remaining time, on standard error."""
-
-    def __init__(self, total: int, show: bool, interval: float = 5.0) -> None:
-        """Start with `total` records; `interval` is the time between lines, s."""
-        self.total, self.done, self.failed, self._interval = total, 0, 0, interval
-        self._show, self._timed_records, self._start_time, self._next_report = show, 0, 0.0, 0.0
-
-    def print_status(self, text: str) -> None:
-        if self._show:
-            print(f"campaign: {text}", file=sys.stderr, flush=True)
-
-    def add(self, rows: Sequence[Row]) -> None:
-        self.done += len(rows)
-        self.failed += sum("samples" not in row for row in rows)
-        now = time.monotonic()
-        if not self._start_time:  # workers start and compile before the first batch
-            self._start_time = now
-        else:
-            self._timed_records += len(rows)
-        if now < self._next_report and self.done < self.total:
-            return
-        self._next_report = now + self._interval
-        text = f"{self.done:,} of {self.total:,} done, {self.failed:,} failed"
-        if self._timed_records:
-            rate = self._timed_records / max(now - self._start_time, 1e-3)
-            text += f", {rate:.3g}/s, {(self.total - self.done) / rate:.0f} s left"
-        self.print_status(text)

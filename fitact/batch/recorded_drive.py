@@ -55,7 +55,8 @@ class RecordedDriveProblem(BatchProblem):
         gain_sd: prior sd of log(gain) that the scene states.
         unresolved: whether the drives jump between two samples, for which a gain is free.
         evaluated: samples at which the force is evaluated, of a long record the last ones.
-        repeat: a multiple of the drive's period, in samples; None if the drive does not repeat.
+        repeat: the longest multiple of the drive's period up to two thirds of the record, rounded, in samples; None if
+            the drive does not repeat.
     """
 
     unit = 64
@@ -94,6 +95,7 @@ class RecordedDriveProblem(BatchProblem):
             *(place for name in optional for place in NUISANCES.get(name, ())),
         }
         frequency, begin = record.frequency(), int(np.searchsorted(time, float(fitted.derive.time[0])))
+        period = math.inf if frequency is None else 1.0 / (frequency * shared.time_step)  # samples
         # only the fields that all records share matter
         fields = dict.fromkeys((field.name for field in dataclasses.fields(Compression)), 0.0)
         fields |= {"half_width": HALF_WIDTH, "samples": counted.size, "origin": origin, "time_step": shared.time_step}
@@ -112,7 +114,7 @@ class RecordedDriveProblem(BatchProblem):
             gain_sd=log_sd(fitted.scene.measurement.gain_relative_sd),
             unresolved=has_unresolved_edge(choice.voltage),
             evaluated=slice(begin, begin + np.trim_zeros(np.asarray(fitted.derive.weight), "b").size),
-            repeat=None if frequency is None else _longest_repeat(time.size, 1.0 / (frequency * shared.time_step)),
+            repeat=None if frequency is None else round(max(1, math.floor(2.0 / 3.0 * time.size / period)) * period),
         )
 
     def includes(self, record: Record) -> bool:
@@ -296,11 +298,6 @@ class RecordedDriveProblem(BatchProblem):
             force_slope * (force / total)[:, None],
         ]
         return np.stack(logs, axis=1), np.stack(gradients, axis=1)
-
-
-def _longest_repeat(samples: int, period: float) -> int:
-    """Return the longest multiple of the period (in samples) up to two thirds of the record, rounded."""
-    return round(max(1, math.floor(2.0 / 3.0 * samples / period)) * period)
 
 
 @functools.partial(jit, fast=True)

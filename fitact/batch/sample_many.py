@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple, Self
 
 import jax
@@ -22,19 +22,15 @@ from fitact.batch.fit_many import (
     run_in_threads,
     tabulate_records,
 )
-from fitact.batch.moves import ENSEMBLES, WALKERS, GaussianApproximations, sample_posteriors
-from fitact.batch.shared_basis import RestrictedTables
+from fitact.batch.metropolis import GaussianApproximations, sample_posteriors
 from fitact.batch.stated_drive import StatedDriveProblem
 from fitact.compiled import BatchEvaluator, pad_rows
 from fitact.data.record import Record
 from fitact.fitting import derived
 from fitact.fitting.derived import DerivedQuantities
 from fitact.fitting.fit import fit
-from fitact.likelihood.certificate import table_half_width, table_precision
-from fitact.likelihood.compression import BASELINE_NAMES, Compression
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import scale_information
-from fitact.model.response_table import TABLE_HALF_WIDTH
 from fitact.sampling.convergence import Convergence, diagnose_chain
 from fitact.sampling.ensemble import TRACKED_WALKERS, sample
 from fitact.sampling.posterior import Posterior
@@ -43,7 +39,7 @@ from fitact.scene.scene import Scene
 from fitact.summary import PROBABILITIES
 
 _BLOCK = 32  # records sampled together, padded to this number; 16 MB of draws
-_TRACKED = derived.DERIVED_NAMES[:3]  # g, b, force_mean
+_TRACKED = ("g", "b", "force_mean")
 _CONVERGENCE_COLUMNS = ("converged", "rhat_max", "ess_min", "tau_max", "acceptance", "steps", "walkers", "ensembles")
 
 
@@ -57,16 +53,16 @@ def sample_many(
     seed: int = 0,
     progress: bool = True,
 ) -> Fits:
-    """Fit each of many records separately and sample its posterior by emcee, like `fitact.sample`.
+    """Fit each of many records separately and sample its posterior, like `fitact.sample`.
 
     Rows of `fit_many` are extended by the posterior quantiles of each parameter, each derived quantity and the noise
     (e.g. `Rsc_q05`, `force_mean_q975`), and by `converged`, `rhat_max`, `ess_min`, `tau_max`, `acceptance`, `steps`
     and `walkers` of each ensemble. Rows that have not converged are not `trusted`.
 
-    Records that are fitted in a batch and have a posterior near its Laplace approximation are sampled together, 32 in
-    one run of emcee. The random numbers of each record depend on `seed` and its content only, so that other records
-    hardly affect it. Records that have not converged, and all others, are sampled separately, like `fitact.sample`
-    with this seed.
+    Records that are fitted in a batch and have a posterior near its Laplace approximation are sampled together, 32 at
+    once, by Metropolis-Hastings moves that propose from this approximation. The random numbers of each record depend on
+    `seed` and its content only, so that other records hardly affect it. Records that have not converged, and all
+    others, are sampled separately, like `fitact.sample` with this seed.
 
     Args:
         records: records, or paths of files; consumed one by one.
@@ -88,14 +84,14 @@ class _Targets(NamedTuple):
 
     Attributes:
         members, rows: records, and rows of their fits.
-        likelihood: common likelihood; its compression is replaced by one of `tables`.
+        likelihood: common likelihood; `coordinates` replaces the record in its compression.
     """
 
     members: list[Member]
     rows: list[Row]
     likelihood: Likelihood
     derive: DerivedQuantities
-    tables: RestrictedTables
+    coordinates: Float[np.ndarray, "records coordinates"]
     approximations: GaussianApproximations
 
     def subset(self, indices: Sequence[int]) -> Self:
@@ -103,7 +99,7 @@ class _Targets(NamedTuple):
         return self._replace(
             members=[self.members[i] for i in indices],
             rows=[self.rows[i] for i in indices],
-            tables=RestrictedTables(*(field[chosen] for field in self.tables)),
+            coordinates=self.coordinates[chosen],
             approximations=GaussianApproximations(*(field[chosen] for field in self.approximations)),
         )
 
@@ -137,33 +133,19 @@ def _make_targets(batch: Batch) -> _Targets | None:
     places = [place for place, (number, _) in enumerate(members) if number in rows]
     if not isinstance(problem, StatedDriveProblem) or optima is None or not places:
         return None
-    if not _has_tables(problem.likelihood, optima.theta[0]):
-        return None
     members = [members[place] for place in places]
     theta, sigma, factor = optima.theta[places], optima.sigma[places], optima.covariance_factor[places]
-    b = derived.DERIVED_NAMES.index("b")
-    log_b, gradient, middle = optima.logs[places, b], optima.gradients[places, b], problem.basis.center
-    reach = table_half_width(np.linalg.norm(np.einsum("ki,kij->kj", gradient, factor), axis=1))
-    low = np.maximum(log_b - reach, middle - TABLE_HALF_WIDTH)
-    high = np.minimum(log_b + reach, middle + TABLE_HALF_WIDTH)
     try:
-        tables = problem.basis.restrict(
-            optima.coordinates[places], 0.5 * (low + high), 0.5 * (high - low), table_precision(sigma)
-        )
         approximations = _laplace_approximations(theta, sigma, factor, problem.samples)
         fit_rows = [rows[number] for number, _ in members]
-        targets = _Targets(members, fit_rows, problem.likelihood, problem.derive, tables, approximations)
+        targets = _Targets(
+            members, fit_rows, problem.likelihood, problem.derive, optima.coordinates[places], approximations
+        )
         targets = targets._replace(approximations=approximations.refine(_probe_axes(targets)))
         is_near = np.all(is_normal(_probe_axes(targets)), axis=1)
     except np.linalg.LinAlgError:  # one record may make the joint computation fail
         return None
     return targets.subset(np.flatnonzero(is_near).tolist()) if is_near.any() else None
-
-
-def _has_tables(likelihood: Likelihood, theta: Float[np.ndarray, " parameters"]) -> bool:
-    """Return whether the record has one time constant, so that a table suffices, and there are enough walkers."""
-    taus = likelihood.circuit(jnp.asarray(theta)).channel_terms(likelihood.channels[0].channel).tau
-    return len(taus) == 1 and 2 * (len(theta) + 1) <= WALKERS
 
 
 def _laplace_approximations(
@@ -187,46 +169,30 @@ def _probe_axes(targets: _Targets) -> Float[np.ndarray, "records n probes"]:
 class _LogProbs:
     """Log-posteriors of points of each record; -inf outside its table, which is recorded.
 
-    `chunk_points` of each record are evaluated at once, i.e. half of its walkers, so that one size is compiled.
+    `chunk_points` of each record are evaluated at once, so that one size is compiled.
     """
 
-    def __init__(self, targets: _Targets, chunk_points: int = ENSEMBLES * WALKERS // 2) -> None:
-        self._tables, self._chunk_points = tuple(targets.tables), chunk_points
-        rows = chunk_points * targets.tables.signal.shape[-1]
+    def __init__(self, targets: _Targets, chunk_points: int = 64) -> None:
+        self._coordinates, self._chunk_points = targets.coordinates, chunk_points
+        rows = chunk_points * targets.coordinates.shape[1]
         self._evaluate = BatchEvaluator(_log_probs, targets.likelihood, rows, _BLOCK)
         self.outside_table = np.zeros(len(targets.members), dtype=bool)
 
     def __call__(self, points: Float[np.ndarray, "records any n"]) -> Float[np.ndarray, "records any"]:
         count, size = points.shape[1], self._chunk_points
         chunks = np.split(pad_rows(points, size, axis=1), -(-count // size), axis=1)
-        values = np.concatenate([self._evaluate(*self._tables, chunk) for chunk in chunks], axis=1)[:, :count]
+        values = np.concatenate([self._evaluate(self._coordinates, chunk) for chunk in chunks], axis=1)[:, :count]
         is_outside = np.isnan(values)
         self.outside_table |= is_outside.any(axis=1)
         return np.where(is_outside, -np.inf, values)
 
 
-def _log_probs(
-    likelihood: Likelihood, center: Array, half_width: Array, signal: Array, observed: Array, points: Array
-) -> Float[Array, " points"]:
-    channel, rows = likelihood.channels[0], observed.size
+def _log_probs(likelihood: Likelihood, coordinates: Array, points: Array) -> Float[Array, " points"]:
+    channel = likelihood.channels[0]
     assert channel.compression is not None
-    zeros = jnp.zeros(rows)  # no linear nuisance is in use
-    table = Compression(
-        center=center,
-        half_width=half_width,
-        signal=signal,
-        decay=jnp.zeros((rows, signal.shape[1])),
-        baseline=jnp.zeros((len(BASELINE_NAMES), rows)),
-        rate=zeros,
-        slope=zeros,
-        observed=observed,
-        observed_slope=zeros,
-        samples=channel.compression.samples,
-        steps=jnp.zeros((0, rows)),
-        origin=jnp.zeros(()),
-        time_step=jnp.zeros(()),
-    )
-    return jax.vmap(likelihood.replace_channel(0, dataclasses.replace(channel, compression=table)).log_prob)(points)
+    compression = dataclasses.replace(channel.compression, observed=coordinates)
+    likelihood = likelihood.replace_channel(0, dataclasses.replace(channel, compression=compression))
+    return jax.vmap(likelihood.log_prob)(points)
 
 
 def _sample_block(
@@ -243,44 +209,27 @@ def _sample_block(
     full = targets.subset([*range(len(members)), *[len(members) - 1] * (_BLOCK - len(members))])
     log_probs = _LogProbs(full)
     seeds = [[seed, int(record.fingerprint, 16)] for _, record in full.members]
-    sampled = sample_posteriors(log_probs, full.approximations, steps, seeds, seed)
-    tracked = _evaluate_draws(_derive_tracked, full.derive, sampled.points[:, :, :, :TRACKED_WALKERS])
+    sampled = sample_posteriors(log_probs, full.approximations, steps, seeds)
+    # derived quantities cost more than the draws, so only some draws are used
+    points = sampled.points[:, :, :, :TRACKED_WALKERS]
+    evaluator = BatchEvaluator(_derive, full.derive, full.derive.time.size, batch=1024)
+    derived_draws = evaluator.map_over(points.shape[:-1], points)
     names = (*full.likelihood.names, "sigma")
     rows = {}
     for i, ((number, _), row) in enumerate(zip(members, targets.rows, strict=True)):
-        tracked_draws = dict(zip(_TRACKED, np.moveaxis(tracked[i], -1, 0), strict=True))
-        convergence = diagnose_chain(names, sampled.points[i], sampled.accepted[i], tracked_draws, rhat_draws)
+        quantities = dict(zip(derived.DERIVED_NAMES, np.moveaxis(derived_draws[i], -1, 0), strict=True))
+        tracked = {name: quantities[name] for name in _TRACKED}
+        convergence = diagnose_chain(names, sampled.points[i], sampled.accepted[i], tracked, rhat_draws)
         if convergence.converged and not log_probs.outside_table[i]:
-            draws = _draws_by_name(names, full.derive, sampled.points[i, :, convergence.burn :])
+            draws = dict(zip(names, np.moveaxis(np.exp(sampled.points[i]), -1, 0), strict=True)) | quantities
+            draws = {name: values[:, convergence.burn :] for name, values in draws.items()}
             rows[number] = row | _posterior_columns(row, draws, convergence)
     return rows
 
 
-def _draws_by_name(
-    names: tuple[str, ...],
-    derive: DerivedQuantities,
-    points: Float[np.ndarray, "ensembles steps walkers n"],
-    thin: int = 4,
-) -> dict[str, np.ndarray]:
-    """Return draws by name in SI units; derived quantities, which cost more, from every `thin`-th step only."""
-    derived_draws = _evaluate_draws(_derive_quantities, derive, points[:, ::thin])
-    draws = dict(zip(names, np.moveaxis(np.exp(points), -1, 0), strict=True))
-    return draws | dict(zip(derived.DERIVED_NAMES, np.moveaxis(derived_draws, -1, 0), strict=True))
-
-
-def _evaluate_draws(
-    function: Callable[..., Array], derive: DerivedQuantities, points: Float[np.ndarray, "*shape n"]
-) -> Float[np.ndarray, "*shape some"]:
-    return BatchEvaluator(function, derive, derive.time.size, batch=1024).map_over(points.shape[:-1], points)
-
-
-def _derive_quantities(derive: DerivedQuantities, point: Array) -> Float[Array, " derived"]:
+def _derive(derive: DerivedQuantities, point: Array) -> Float[Array, " derived"]:
     theta, log_sigma = derive.likelihood.split(point)
     return derive(theta, jnp.exp(log_sigma))
-
-
-def _derive_tracked(derive: DerivedQuantities, point: Array) -> Float[Array, " tracked"]:
-    return _derive_quantities(derive, point)[: len(_TRACKED)]
 
 
 def _posterior_columns(row: Row, draws: Mapping[str, np.ndarray], convergence: Convergence) -> Row:

@@ -16,20 +16,7 @@ from fitact.likelihood.compression import Compression
 from fitact.likelihood.projection import RANK_TOLERANCE, baseline_functions
 from fitact.model.drive import Drive
 from fitact.model.response import highpass
-from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, chebyshev, count_terms, round_up_column_count
-
-
-class RestrictedTables(NamedTuple):
-    """Restricted tables of records: signal and record of a `Compression` around the center of each record.
-
-    Attributes:
-        center, half_width: range of each table, in log tau (tau in s).
-    """
-
-    center: Float[np.ndarray, " records"]
-    half_width: Float[np.ndarray, " records"]
-    signal: Float[np.ndarray, "records terms terms"]
-    observed: Float[np.ndarray, "records terms+1"]
+from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, chebyshev, round_up_column_count
 
 
 class SharedBasis(NamedTuple):
@@ -55,8 +42,9 @@ class SharedBasis(NamedTuple):
     ) -> "SharedBasis":
         """Return a basis for time constants within a factor 9 of `tau` (s). Double precision is required."""
         x, to_series = chebyshev(NODES)
-        nodes = jnp.asarray(tau * np.exp(TABLE_HALF_WIDTH * x))
-        u, baseline, slope = _basis_functions(drive, time, nodes, steady_state)
+        nodes, step = tau * np.exp(TABLE_HALF_WIDTH * x), np.asarray((time[-1] - time[0]) / (time.size - 1))
+        padded = _evaluate_basis_functions(drive, pad_samples(time), step, nodes, steady_state)
+        u, baseline, slope = (values[..., : time.size] for values in padded)
         clock = (time - 0.5 * (time[0] + time[-1])) * slope
         _, sizes, spanning = np.linalg.svd(u, full_matrices=False)
         rank = round_up_column_count(np.count_nonzero(sizes > RANK_TOLERANCE * sizes[0]), len(spanning))
@@ -97,39 +85,12 @@ class SharedBasis(NamedTuple):
     def response(self, signal: Float[np.ndarray, "records rank"]) -> Float[np.ndarray, "records samples"]:
         return signal @ self.functions[:, : signal.shape[1]].T
 
-    def restrict(
-        self,
-        coordinates: Float[np.ndarray, "records coordinates+1"],
-        center: Float[np.ndarray, " records"],
-        half_width: Float[np.ndarray, " records"],
-        precision: Float[np.ndarray, " records"],
-    ) -> RestrictedTables:
-        """Return tables for log tau in `center` ± `half_width` of each record, which cost less to evaluate.
-
-        Omitted terms change the response to the drive by at most `precision` (V, root of the sum of squares).
-        """
-        x, to_series = chebyshev(NODES)
-        inside = (center[:, None] + half_width[:, None] * x - self.center) / TABLE_HALF_WIDTH
-        polynomials = np.polynomial.chebyshev.chebvander(inside, NODES - 1)
-        series = self.signal @ np.swapaxes(polynomials, 1, 2) @ to_series.T
-        terms = count_terms(np.linalg.norm(series, axis=1), precision[:, None])
-        others = ((0, 0), (0, coordinates.shape[1] - len(self.signal)), (0, 0))
-        columns = np.concatenate([np.pad(series[..., :terms], others), coordinates[..., None]], axis=2)
-        _, rows = np.linalg.qr(columns)
-        return RestrictedTables(center, half_width, rows[:, :terms, :terms], rows[:, :, terms])
-
-
-def _basis_functions(drive: Drive, time: np.ndarray, nodes: Array, steady_state: bool) -> list[np.ndarray]:
-    """Evaluate the responses of the nodes, the baseline functions, and dV/dt over two samples."""
-    step = jnp.asarray((time[-1] - time[0]) / (time.size - 1))
-    functions = _evaluate_basis_functions(drive, pad_samples(time), step, nodes, steady_state)
-    return [np.asarray(values)[..., : time.size] for values in functions]
-
 
 @jit
 def _evaluate_basis_functions(
     drive: Drive, time: Array, step: Array, nodes: Array, steady_state: bool
 ) -> tuple[Array, Array, Array]:
+    """Evaluate the responses of the nodes, the baseline functions, and dV/dt over two samples."""
     u = jax.vmap(lambda tau: highpass(drive, time, tau, steady_state=steady_state))(nodes)
 
     def voltage(time: Array) -> Array:

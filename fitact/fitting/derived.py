@@ -184,7 +184,7 @@ def nuisance_deviates(
 
 def evaluate_draws(
     function: Callable[..., Array],
-    model: eqx.Module,
+    model: Any,
     rows: int,
     points: Float[np.ndarray, "*draws coordinates"],
     deviates: Float[np.ndarray, "*draws channels nuisances"],

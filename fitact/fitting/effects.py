@@ -53,7 +53,7 @@ def linear_posterior(laplace: Laplace) -> LinearPosterior | None:
     places = [likelihood.names.index(name) for name in circuit]
     gradients = np.concatenate([laplace.log_derived[1], np.eye(laplace.theta.size)[places]])
     names = (*derived.DERIVED_NAMES, *circuit)
-    return LinearPosterior(loop, laplace.theta, likelihood.prior_factor, names, gradients)
+    return LinearPosterior(loop, likelihood, laplace.theta, likelihood.prior_factor, names, gradients)
 
 
 def channel_samples(laplace: Laplace, traces: Sequence[ChannelFit]) -> list[ChannelSamples]:
@@ -115,14 +115,10 @@ def _free_timing(laplace: Laplace, channel: ChannelLikelihood, shift: float) -> 
     return timing
 
 
-def _components(group: str) -> tuple[str, ...]:
-    return (f"{group}_cos", f"{group}_sin") if group.startswith("hum") else (group,)
-
-
 def _added_nuisances(samples: ChannelSamples) -> list[str]:
     """Return the nuisances of a channel that the data asked for; every channel has an offset, which tells nothing."""
-    found = (group for group in NUISANCES if any(name in samples.nuisances for name in _components(group)))
-    linear = [group for group in found if group != "offset"]
+    added = {name.removesuffix("_cos").removesuffix("_sin") for name in samples.nuisances}
+    linear = [group for group in NUISANCES if group in added and group != "offset"]
     return linear + [name for name in TIMING_NUISANCES if name in samples.timing]
 
 

@@ -281,14 +281,10 @@ class Fit(FitResult):
             for name in FINGER_PARAMETERS
             if name in sd
         }
-        return f"{self._describe_records()}, {summary.format_estimates(estimates)}, {self._describe_verdict()}"
-
-    def _describe_records(self) -> str:
-        others = len(self.records) - 1
-        return os.path.basename(self.records[0].source) + (f" and {others} more" if others else "")
-
-    def _describe_verdict(self) -> str:
-        return f"{self.identifiability.verdict}, {'reliable' if self.trusted else f'unreliable ({self.result})'}"
+        first, others = os.path.basename(self.records[0].source), len(self.records) - 1
+        source = f"{first} and {others} more" if others else first
+        state = self.identifiability.verdict, "reliable" if self.trusted else f"unreliable ({self.result})"
+        return ", ".join((source, summary.format_estimates(estimates), *state))
 
     def _rows(self) -> list[tuple[str, ...]]:
         content = {"parameters": self.parameters(), "derived": self.derived(), "force_basis": self.force_basis}

@@ -15,7 +15,6 @@ from fitact import summary
 from fitact.fitting.derived import DERIVED_NAMES
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.force import Geometry, force_constant
-from fitact.model.skin import circuit_parameters
 from fitact.prior.distributions import Distribution, LogNormal
 from fitact.scene.scene import Scene
 
@@ -38,11 +37,8 @@ class Capacitances(NamedTuple):
     @classmethod
     def from_theta(cls, likelihood: Likelihood, theta: Float[np.ndarray, "*shape parameters"]) -> Self:
         """Return the capacitances at points theta, whether free, tied or fixed."""
-        free, known = likelihood.to_physical(theta), circuit_parameters(likelihood.template)
-        values = {name: free.get(name, known.get(name)) for name in cls._fields}
-        for name, other, ratio in likelihood.tied:
-            values[name] = ratio * free.get(other, known[other])
-        return cls(*(values[name] for name in cls._fields))
+        values = likelihood.parameter_values(theta)
+        return cls(*map(values.get, cls._fields))
 
 
 class Contribution(NamedTuple):

@@ -302,6 +302,14 @@ class Likelihood(eqx.Module):
             points[:, self.names.index(name)] = np.log(draws)
         return points
 
+    def parameter_values(self, theta: Float[np.ndarray, "*shape parameters"]) -> dict[str, Any]:
+        """Return all parameters of the circuit and its probe at points theta in SI units; None for absent elements."""
+        values = circuit_parameters(self.template) | probe_parameters(self.template)
+        values |= {name: np.exp(theta[..., i]) for i, name in enumerate(self.prior.names) if name in values}
+        for name, other, ratio in self.tied:
+            values[name] = ratio * values[other]
+        return values
+
     def to_physical(self, theta: Float[np.ndarray, "*shape parameters"]) -> dict[str, Float[np.ndarray, "*shape"]]:
         """Return points in SI units by name; delays and clocks are the totals between channel and drive."""
         values = {name: np.exp(theta[..., i]) for i, name in enumerate(self.prior.names)}

@@ -27,6 +27,7 @@ from fitact.errors import InputError
 from fitact.model.loop_modes import HighpassTerms, Modes, modes_with_resistance, modes_without_resistance
 
 FINGER_PARAMETERS = ("Rsc", "Csc", "Ci")  # of every circuit
+INFINITE_RATIO = 1e15  # of the time constant that represents an infinite one, to the slowest of the circuit
 # Vgap is not recorded, but the force may come from it; Ft is no voltage or current of the circuit
 Channel: TypeAlias = Literal["Vsc", "I", "Vgap", "Ft"]
 
@@ -84,10 +85,6 @@ class Circuit(eqx.Module):
     def admittance(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
         """Return I / V in siemens at the angular frequency `omega` (rad/s, >= 0)."""
         return self.channel_gain("I", omega)
-
-    def gap_transfer_function(self, omega: ArrayLike) -> Complex[Array, "*shape"]:
-        """Return Vgap / V at the angular frequency `omega` (rad/s, >= 0); see `gap_terms`."""
-        return self.channel_gain("Vgap", omega)
 
     def amplitude(self, omega: ArrayLike) -> Float[Array, "*shape"]:
         """Return |Vsc / V| at the angular frequency `omega` (rad/s, >= 0), eq. (25)."""
@@ -273,7 +270,7 @@ class Loop(Circuit):
             return modes.element_terms(len(self.elements()) - 1)
         share, rest = self._gap_fraction(), self._rest_terms(modes)
         # the last is so long that an open gap keeps its charge
-        return HighpassTerms((*(share * jnp.stack(rest.weight)), share), (*rest.tau, 1e15 * rest.tau[0]))
+        return HighpassTerms((*(share * jnp.stack(rest.weight)), share), (*rest.tau, INFINITE_RATIO * rest.tau[0]))
 
     def insulator_terms(self) -> HighpassTerms:
         """Return the terms of the insulator's voltage over V."""

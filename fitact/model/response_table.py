@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.compiled import BatchEvaluator
-from fitact.model.circuit import HighpassTerms
+from fitact.model.circuit import INFINITE_RATIO, HighpassTerms
 from fitact.model.drive import Drive
 from fitact.model.harmonic import mean_voltage
 from fitact.model.response import highpass
@@ -31,7 +31,6 @@ _MAX_HALF_WIDTH = 4.0 * TABLE_HALF_WIDTH  # beyond it, a table costs more than i
 _MAX_NUMBERS = 4_000_000  # responses of all nodes at all times, which bounds the memory
 _PRECISION = 1e-13  # of a `ResponseTable`, relative to the largest response
 _OPEN = 1e6  # a time constant longer than the table's slowest by this factor counts as infinite
-_INFINITE = 1e15  # the time constant that represents an infinite one, over the table's slowest
 
 
 class ResponseTable(eqx.Module):
@@ -70,7 +69,7 @@ class ResponseTable(eqx.Module):
         if count * low.size * time.size > _MAX_NUMBERS:
             return None
         relative, combinations, series = exponential_basis(half_width, count)
-        nodes = np.append(np.outer(np.exp(center), relative), _INFINITE * np.exp(np.max(high)))
+        nodes = np.append(np.outer(np.exp(center), relative), INFINITE_RATIO * np.exp(np.max(high)))
         signal = highpass_responses(drive, time, nodes, steady_state)
         tables = signal[:-1], np.exp(-(time - begin) / nodes[:-1, None])
         rows, decay = (np.hstack([each.T @ combinations for each in np.split(x, low.size)]) for x in tables)
@@ -138,12 +137,11 @@ def highpass_responses(
 ) -> Float[np.ndarray, "n times"]:
     """Return the responses of `highpass` to `drive` at `time` (s) for many time constants (s)."""
     batch = math.ceil(tau.size / math.ceil(tau.size / (NODES + 1)))  # equal batches, at most a whole table
-    respond = functools.partial(_respond, steady_state=steady_state)
-    return BatchEvaluator(respond, (drive, time), time.size, batch, fast=False)(tau)
+    return BatchEvaluator(_respond, (drive, time, steady_state), time.size, batch, fast=False)(tau)
 
 
-def _respond(driven: tuple[Drive, Array], tau: Array, *, steady_state: bool) -> Float[Array, " times"]:
-    drive, time = driven
+def _respond(driven: tuple[Drive, Array, bool], tau: Array) -> Float[Array, " times"]:
+    drive, time, steady_state = driven
     return highpass(drive, time, tau, steady_state=steady_state)
 
 

@@ -12,13 +12,12 @@ import numpy as np
 from jaxtyping import Array, Complex
 
 from fitact.compiled import jit
-from fitact.model.circuit import RC, Channel, DirectGround, FinalCircuit, NaturalGround, Probe
+from fitact.model.circuit import INFINITE_RATIO, RC, Channel, DirectGround, FinalCircuit, NaturalGround, Probe
 from fitact.model.drive import Drive, Multitone, Periodic, Sine
 from fitact.model.harmonic import fourier_coefficients
 from fitact.model.skin import Fractional, SkinModel, WithSkin, high_frequency_basis
 
 ROWS = 128  # circuits in one evaluation; fewer are padded, so that each program is compiled once
-INFINITE = 1e12  # the time constant that represents an infinite one, over the slowest of the circuit
 _BLOCK = 64  # frequencies in one program
 
 _fourier_coefficients = jit(fourier_coefficients)
@@ -108,7 +107,7 @@ def _constant_skin_terms(circuit: Any, channel: Channel) -> tuple[np.ndarray, np
     weight, tau = map(np.asarray, terms)
     if direct is None:
         return weight, tau
-    return np.column_stack([weight, direct]), np.column_stack([tau, INFINITE * tau.max(axis=1)])
+    return np.column_stack([weight, direct]), np.column_stack([tau, INFINITE_RATIO * tau.max(axis=1)])
 
 
 @jit

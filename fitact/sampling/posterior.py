@@ -385,10 +385,10 @@ class Posterior(Display):
         predicted = xr.Dataset(coords={"chain": np.arange(ensembles), "draw": draws})
         for i, (channel, model) in enumerate(zip(self.fit.traces, self.fit.likelihood.channels, strict=True)):
             stride = -(-len(channel.record) // 4000)
-            signal = functools.partial(_predict_signal, i, stride)
+            predicting = self.fit.likelihood, i, stride
             sd = channel.relative_noise_sd[::stride]
             chosen = self.points[:, draws], self._deviates[:, draws]
-            mean = derived.evaluate_draws(signal, self.fit.likelihood, model.time.size, *chosen)[..., : sd.size]
+            mean = derived.evaluate_draws(_predict_signal, predicting, model.time.size, *chosen)[..., : sd.size]
             sigma = np.exp(self.points[:, draws, self.fit.theta.size + i, None])
             noise = draw_noise(rng, model.noise, model.whitening, mean.shape, stride)
             noisy = mean + sigma * sd * noise
@@ -465,7 +465,9 @@ def _draw_linear_nuisances(likelihood: Likelihood, point: Array, deviate: Array)
     return jnp.stack([channel.sample_nuisances(inputs, sigma, each) for (channel, inputs), sigma, each in parts])
 
 
-def _predict_signal(index: int, stride: int, likelihood: Likelihood, point: Array, deviate: Array) -> Array:
+def _predict_signal(predicting: tuple[Likelihood, int, int], point: Array, deviate: Array) -> Array:
+    """Return the signal of a channel by its index, at every `stride`-th sample."""
+    likelihood, index, stride = predicting
     theta, log_sigma = likelihood.split(point)
     channel, inputs = likelihood.channels[index], likelihood.channel_inputs(theta, index)
     beta = channel.sample_nuisances(inputs, jnp.exp(log_sigma[index]), deviate[index])

@@ -10,6 +10,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
+from fitact.likelihood.likelihood import Likelihood
 from fitact.uncertainty.channel_series import ChannelSeries, Rows
 from fitact.uncertainty.loop import ChannelModel, Instrument, LoopModel
 
@@ -28,6 +29,7 @@ class LinearPosterior:
     """Coordinates of a fit, their optimum and prior, and the quantities that are reported."""
 
     loop: LoopModel
+    likelihood: Likelihood  # gives the values of the circuit's parameters
     theta: Float[np.ndarray, " parameters"]
     prior_factor: Float[np.ndarray, "parameters parameters"]
     quantities: tuple[str, ...]
@@ -126,7 +128,7 @@ class LinearModel:
 
     def models(self, theta: Float[np.ndarray, " parameters"]) -> list[ChannelModel]:
         """Return the models of all channels at theta."""
-        values, move = self.posterior.loop.values(theta), theta - self.posterior.theta
+        values, move = self.posterior.likelihood.parameter_values(theta), theta - self.posterior.theta
         models = []
         for i, each in enumerate(self.series):
             timing = {

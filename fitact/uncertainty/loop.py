@@ -7,12 +7,11 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from fitact.instrument.effects import PROBE_TIME_CONSTANT, nonlinearity_shapes
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.circuit import FINGER_PARAMETERS, FinalCircuit, NaturalGround
-from fitact.model.skin import Fractional, WithSkin, circuit_parameters, constant_skin_circuit
+from fitact.model.skin import Fractional, WithSkin, constant_skin_circuit
 from fitact.uncertainty.channel_series import ChannelSeries, Rows, Spectrum
 
 
@@ -51,10 +50,7 @@ class LoopModel(NamedTuple):
     """A circuit as the values of its parameters."""
 
     kind: type  # class of the circuit with constant skins
-    known: dict[str, float | None]  # all parameters of the template
-    probe: tuple[float, float] | None  # the probe's resistance (ohm) and capacitance (F)
-    free: tuple[str, ...]  # parameters whose logarithms are the first coordinates of theta
-    tied: tuple[tuple[str, str, float], ...]
+    is_probed: bool = True  # whether the circuit's probe, if any, is connected
 
     @classmethod
     def from_likelihood(cls, likelihood: Likelihood) -> "LoopModel | None":
@@ -62,32 +58,17 @@ class LoopModel(NamedTuple):
         template = likelihood.template
         if isinstance(template, WithSkin) and not isinstance(template.skin, Fractional):
             return None
-        inner: Any = constant_skin_circuit(template)
-        values = {name: None if x is None else float(np.asarray(x)) for name, x in circuit_parameters(template).items()}
-        probe = getattr(inner, "probe", None)
-        loads = None if probe is None else (float(np.asarray(probe.R)), float(np.asarray(probe.C)))
-        return cls(type(inner), values, loads, likelihood.prior.names, likelihood.tied)
+        return cls(type(constant_skin_circuit(template)))
 
-    def values(self, theta: Float[np.ndarray, " parameters"]) -> dict[str, float | None]:
-        """Return the parameters of the circuit at theta, in SI units."""
-        values = self.known | {name: float(np.exp(x)) for name, x in zip(self.free, theta, strict=False)}
-        for name, other, ratio in self.tied:
-            value = values[other]
-            assert value is not None
-            values[name] = ratio * value
-        return values
-
-    def impedances(self, values: Mapping[str, float | None], s: Spectrum, added: Addition = NOTHING) -> LoopImpedances:
-        """Return the impedances at complex frequencies `s` (rad/s), with what is `added`."""
+    def impedances(self, values: Mapping[str, Any], s: Spectrum, added: Addition = NOTHING) -> LoopImpedances:
+        """Return the impedances for the `Likelihood.parameter_values` at `s` (rad/s, complex), with what is `added`."""
         get = values.get
         R, C, Ci = (float(values[name] or 0.0) for name in FINGER_PARAMETERS)
         alpha = (get("alpha") or 1.0) - added.dispersion
         touching = _skin(R, C, s, alpha, added.layers)
         load = added.probe * (1e-7 + s * 12e-12)
-        if self.probe is not None:
-            loads = zip(("probe_resistance", "probe_capacitance"), self.probe, strict=True)
-            resistance, capacitance = (get(name) or value for name, value in loads)
-            load = load + 1.0 / resistance + s * capacitance
+        if self.is_probed and "probe_resistance" in values:
+            load = load + 1.0 / values["probe_resistance"] + s * values["probe_capacitance"]
         touching = touching / (1.0 + touching * load)
         grounding, R2 = np.zeros_like(s), 0.0
         series: Any = added.resistor + (get("R_H") or 0.0) + (get("series_resistor") or 0.0)
@@ -130,12 +111,12 @@ class ChannelModel:
     """Signal of one channel at one set of parameter values, and with changes of the circuit or the instrument."""
 
     def __init__(
-        self, series: ChannelSeries, loop: LoopModel, values: Mapping[str, float | None], instrument: Instrument
+        self, series: ChannelSeries, loop: LoopModel, values: Mapping[str, Any], instrument: Instrument
     ) -> None:
         """Set the rows, the circuit and its values, and the instrument."""
         self.series, self.values, self.instrument = series, values, instrument
         # an analyser is connected without the probe
-        self.loop = loop._replace(probe=None) if series.samples.channel == "impedance" else loop
+        self.loop = loop._replace(is_probed=series.samples.channel != "impedance")
         self.s = series.frequencies
 
     @functools.cached_property
@@ -162,7 +143,7 @@ class ChannelModel:
         """Return the signal of a circuit with what is `added`, V or A."""
         return self._respond(self.loop.impedances(self.values, self.s, added))
 
-    def signal_at(self, values: Mapping[str, float | None]) -> Rows:
+    def signal_at(self, values: Mapping[str, Any]) -> Rows:
         """Return the signal of the circuit with other values of its parameters, V or A."""
         return self._respond(self.loop.impedances(values, self.s))
 

@@ -10,6 +10,7 @@ import scipy.stats
 
 import fitact
 from fitact.batch import sample_many as module
+from fitact.batch.metropolis import WALKERS
 from fitact.batch.sample_many import sample_many
 from fitact.summary import PROBABILITIES
 from tests import calibration
@@ -65,7 +66,7 @@ def assert_alike(row: dict, other: dict, error: float) -> None:
 
 
 def effective(row: dict, name: str) -> float:
-    """Return a lower bound on the effective number of draws; quantities of every fourth step have a quarter of them."""
+    """Return a lower bound on the effective number of draws; derived quantities of every fourth walker have fewer."""
     return row["ess_min"] / (1.0 if name in (*MEDIANS, "noise") else 4.0)
 
 
@@ -90,7 +91,7 @@ def test_rows_are_those_of_fits_with_quantiles_beside(found, given):
 
 
 def test_alike_records_are_sampled_together_and_others_alone(found):
-    together = [number for number, row in enumerate(found) if row.get("walkers") == module.WALKERS]
+    together = [number for number, row in enumerate(found) if row.get("walkers") == WALKERS]
     assert together == [number for number in range(COUNT) if number not in (OFFSET, BROKEN)]
     assert (found[OFFSET]["freed"], found[OFFSET]["walkers"]) == ("offset", 128)
     assert found[BROKEN]["result"] == "refused"
@@ -209,7 +210,7 @@ def test_what_is_not_near_laplace_is_sampled_alone():
     low = 18e-9 * float(np.exp(0.3 * heights.min()))
     settings["prior"]["Csc"] = {"low": low, "high": 1e-7}
     rows = sample_many([record(n) for n in numbers], fitact.Scene.from_dict(settings), progress=False)
-    assert [row["walkers"] for row in rows] == [128, *[module.WALKERS] * 16]
+    assert [row["walkers"] for row in rows] == [128, *[WALKERS] * 16]
     assert all(row["trusted"] for row in rows)
     assert low < rows[0]["Csc_q025"] < 1.01 * low
 
@@ -282,6 +283,6 @@ def test_calibration(monkeypatch):
     monkeypatch.setattr(module, "_posterior_columns", seen)
     rows = sample_many([record for record, _ in made], scene, seed=1, progress=False)
     assert len(ranks) == len(rows) == 300
-    assert sum(row["walkers"] == module.WALKERS for row in rows) > 150
+    assert sum(row["walkers"] == WALKERS for row in rows) > 150
     judged = calibration.judge(np.array([ranks[str(number)] for number in range(300)]))
     assert judged.passed, judged

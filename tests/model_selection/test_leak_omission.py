@@ -28,7 +28,7 @@ def test_the_linear_model_of_the_loop(gap: dict[str, float]):
     circuit = fitact.DirectGround(160e3, 22e-9, 1.35e-9, R_H=2e4, Ri=3e6, **gap)
     omega = 2.0 * np.pi * np.logspace(-1, 5, 9)
     values = circuit_parameters(circuit)
-    found = LoopModel(fitact.DirectGround, values, None, (), ()).impedances(values, 1j * omega)
+    found = LoopModel(fitact.DirectGround).impedances(values, 1j * omega)
     with jax.enable_x64(True):
         for channel in ("Vsc", "I"):
             np.testing.assert_allclose(found.gain(channel), circuit.channel_gain(channel, omega), rtol=1e-12)
