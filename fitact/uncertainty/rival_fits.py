@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
 from jaxtyping import Float
+from scipy.special import chdtri
 
 from fitact.uncertainty.channel_series import Rows
 from fitact.uncertainty.linear_model import Columns, LinearModel, Nuisance

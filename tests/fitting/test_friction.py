@@ -124,7 +124,7 @@ def test_the_law_of_the_gap_is_preferred_where_it_holds(tmp_path: Path) -> None:
 
 
 def test_current_beside_the_friction_leaves_the_scale_to_the_noise(tmp_path: Path) -> None:
-    """With I, the scale no longer rests on the prior of Ci."""
+    """The contact area follows from I, so that the scale no longer rests on the prior of Ci."""
     form = {"channels": '["Vsc", "I", "Ft"]'}
     record, text = simulate(tmp_path, "[friction]\nforce_scale = 3.0\n", **form)
     fit = fitact.fit(record, load(tmp_path, text))
