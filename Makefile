@@ -29,10 +29,10 @@ test: env
 test-slow: env
 	$(PYTEST) -m slow
 
-# make test-slow-quick   the same with only a part of the thorough ones, another for every change that landed
+# make test-slow-quick   a part of these, another for every change that landed
 LANDED = $(shell git rev-list --first-parent --count HEAD 2>/dev/null || date +%j)
 test-slow-quick: env
-	$(PYTEST) -m slow --rotate $(LANDED)/25
+	$(PYTEST) -m slow --rotate $(LANDED)/12
 
 # make notebooks   run the notebooks; executed copies in out/notebooks
 notebooks: env

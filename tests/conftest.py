@@ -26,7 +26,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--rotate",
         metavar="N/M",
         type=_part,
-        help="of the thorough tests only part N modulo M, and all M parts in M consecutive N",
+        help="of the slow tests only part N modulo M, and all M parts in M consecutive N",
     )
 
 
@@ -37,22 +37,19 @@ def _part(text: str) -> tuple[int, int]:
 
 def pytest_report_header(config: pytest.Config) -> str | None:
     rotate = config.getoption("rotate")
-    return f"thorough tests: part {rotate[0]} of 0 to {rotate[1] - 1}" if rotate else None
+    return f"slow tests: part {rotate[0]} of 0 to {rotate[1] - 1}" if rotate else None
 
 
-@pytest.hookimpl(tryfirst=True)  # runs before the selection by the command line
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark thorough tests as slow, except for the part that a hash of the name selects for this run."""
-    rotate, waiting = config.getoption("rotate"), []
-    for item in items:
-        if item.get_closest_marker("thorough"):
-            item.add_marker("slow")
-            if rotate and zlib.crc32(item.nodeid.encode()) % rotate[1] != rotate[0]:
-                waiting.append(item)
-    if waiting:
+    """Leave out the slow tests but for the part that a hash of their names selects for this run."""
+    if rotate := config.getoption("rotate"):
+        waiting = [
+            item
+            for item in items
+            if item.get_closest_marker("slow") and zlib.crc32(item.nodeid.encode()) % rotate[1] != rotate[0]
+        ]
         config.hook.pytest_deselected(items=waiting)
-        left_out = set(waiting)
-        items[:] = [item for item in items if item not in left_out]
+        items[:] = [item for item in items if item not in set(waiting)]
 
 
 @pytest.fixture(autouse=True)

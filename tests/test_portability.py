@@ -40,6 +40,7 @@ from fitact.tradeoff.tradeoff import describe_machine
 assert compiled.available_cores() == os.cpu_count()
 assert describe_machine()["load"] is None
 assert compiled.processor() == describe_machine.__globals__["platform"].processor() + os.environ["MACHINE"]
+signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background
 try:
     _interrupt(0)
     raise SystemExit("not interrupted")

@@ -194,7 +194,7 @@ def test_workers_are_killed_three_times(few: Study, tmp_path: Path):
     few.assert_done_once(tmp_path)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_everything_is_killed_and_goes_on(many: Study, tmp_path: Path):
     process = many.started(tmp_path, "--workers", "2")
     until(lambda: lines(tmp_path) >= 1, process)
@@ -222,7 +222,7 @@ def cluster(port: int) -> Iterator[subprocess.Popen[bytes]]:
         yield subprocess.Popen([*dask, "worker", address, "--nthreads", "1", "--no-dashboard"], **quiet)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_three_workers_and_the_scheduler_are_killed(many: Study, tmp_path: Path, port: int):
     running = list(cluster(port))
     try:
@@ -268,7 +268,7 @@ def test_compiled_code_is_dropped_once_it_is_much(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("reports", [False, pytest.param(True, marks=pytest.mark.thorough)], ids=["rows", "reports"])
+@pytest.mark.parametrize("reports", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["rows", "reports"])
 def test_rows_of_posteriors_are_those_of_sample_many(reports: bool, tmp_path: Path):
     """The draws of a report are those of a record sampled alone, as they are here."""
     made = square_record(noise=0.1, per_period=500)

@@ -105,7 +105,7 @@ def test_another_length_compiles_nothing_anew(kind: str, caplog: pytest.LogCaptu
     assert compiled_for(kind, caplog) == []
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ("named", "measured")])
 def test_another_length_of_other_kinds_compiles_nothing_anew(kind: str, caplog: pytest.LogCaptureFixture):
     assert compiled_for(kind, caplog) == []
@@ -153,7 +153,7 @@ def test_an_answer_is_that_of_the_recorded_samples_alone(missing: int, tolerance
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "kind", [pytest.param(kind, marks=[pytest.mark.thorough] * (kind not in ("named", "measured"))) for kind in KINDS]
+    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind not in ("named", "measured"))) for kind in KINDS]
 )
 def test_filling_up_changes_no_answer(kind: str, monkeypatch: pytest.MonkeyPatch):
     made, given = record(kind, 33), scene(kind)

@@ -258,7 +258,7 @@ def drawn_from_the_prior(number: int, time: np.ndarray) -> tuple[fitact.Record, 
     return fitact.Record.from_arrays(time, Vsc=vsc, source=str(number)), truth
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_calibration(monkeypatch):
     """Rank 300 truths from the prior among 99 independent draws of each posterior, as `calibration` does."""
     time = np.arange(1000) / (calibration.PER_PERIOD * FREQUENCY)

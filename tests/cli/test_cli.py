@@ -172,7 +172,7 @@ def test_scene_is_printed_as_a_file(fitact_command, tmp_path):
     assert refused.stderr.startswith("fitact: scene.toml, line 3: [drive]")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_tradeoff_is_written_or_ends_without_a_trace(fitact_process, environment, finger_path, tmp_path):
     command = [sys.executable, "-u", "-c", INTERRUPTIBLE, "tradeoff", str(finger_path)]
     running = subprocess.Popen(

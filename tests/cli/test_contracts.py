@@ -79,7 +79,7 @@ def leaves(path: str, value: Any, known: list[Stated]):
         yield path, value
 
 
-OWN = pytest.mark.thorough  # commands that other tests also run
+OWN = pytest.mark.slow  # commands that other tests also run
 CASES = [
     pytest.param("fit", [*FINGER], id="fit"),
     pytest.param("fit", [*FINGER, "--intervals"], id="fit --intervals", marks=OWN),

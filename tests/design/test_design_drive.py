@@ -557,7 +557,7 @@ def eight() -> tuple[fitact.Population, fitact.DriveDesign]:
     return people, fitact.design_drive(stated, people, seed=1)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_people_are_those_of_the_population(eight):
     """Other fingers of the same population samples feel a sine as often, by its closed form."""
     people, design = eight
@@ -622,7 +622,7 @@ def test_an_area_scales_capacitances_up_and_the_resistance_down():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ground", ["direct", pytest.param("natural", marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("ground", ["direct", pytest.param("natural", marks=pytest.mark.slow)])
 def test_each_finger_of_a_prior_needs_what_its_impedances_say(ground: str):
     """A sine, all that the prior frees, holds or ties included."""
     skins = {"Rsc": {"factor": 3}, "Csc": {"factor": 3}, "Ci": {"relative_sd": 0.1}, "sigma": {"factor": 2}}

@@ -219,7 +219,7 @@ def test_what_is_tied_follows():
     np.testing.assert_allclose(predicted(found)[:3], expected[:3], rtol=1e-3)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [("frequency", "series resistor"), ("frequency", "current"), ("two frequencies",)])
 def test_no_random_setting_is_better(names: tuple[str, ...]):
     experiment = experiment_from_scene(scene(**NATURAL))
@@ -373,12 +373,10 @@ def on_two_panels(seed: int) -> np.ndarray:
     ("drawn", "stated", "names", "values"),
     [
         (vsc_alone, SCENE, (), ()),
-        pytest.param(with_resistor, SCENE, ("series resistor",), (166e3,), marks=pytest.mark.thorough),
-        pytest.param(with_current, SCENE, ("current",), (), marks=pytest.mark.thorough),
-        pytest.param(
-            at_two_frequencies, scene(**NATURAL), ("two frequencies",), (10.0, 100.0), marks=pytest.mark.thorough
-        ),
-        pytest.param(on_two_panels, SCENE, ("second panel",), (13.5e-9,), marks=pytest.mark.thorough),
+        pytest.param(with_resistor, SCENE, ("series resistor",), (166e3,), marks=pytest.mark.slow),
+        pytest.param(with_current, SCENE, ("current",), (), marks=pytest.mark.slow),
+        pytest.param(at_two_frequencies, scene(**NATURAL), ("two frequencies",), (10.0, 100.0), marks=pytest.mark.slow),
+        pytest.param(on_two_panels, SCENE, ("second panel",), (13.5e-9,), marks=pytest.mark.slow),
     ],
 )
 def test_posteriors_are_as_wide_as_was_to_be_expected(drawn, stated: fitact.Scene, names, values):

@@ -22,15 +22,8 @@ import fitact.cli
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PROGRAMS = ("fitact", "make", "python", "pytest")
-# marks for pages whose Python samples a posterior, fits often or compiles much; the other pages are quick
-OWN = pytest.mark.thorough  # pages with separate tests of the same functions
-SLOW = {
-    "README.md": pytest.mark.slow,
-    "theory.md": pytest.mark.slow,
-    **dict.fromkeys(("plan.md", "compare.md", "many.md"), OWN),
-}
-# commands that take minutes; separate tests run them with fewer records
-MINUTES = {"population", "design", "tradeoff", "compare", "reproduce"}
+# pages whose Python samples a posterior, fits often or compiles much
+SLOW = ("README.md", "theory.md", "plan.md", "compare.md", "many.md")
 
 
 class Block(NamedTuple):
@@ -139,7 +132,11 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(page, id=by_name(page), marks=SLOW.get(page.name, ())) for page in PAGES if blocks(page, "python")],
+    [
+        pytest.param(page, id=by_name(page), marks=[pytest.mark.slow] * (page.name in SLOW))
+        for page in PAGES
+        if blocks(page, "python")
+    ],
 )
 def test_python_runs(page, folder):
     """Run the blocks of a page in order, as a reader would paste them."""
@@ -159,10 +156,10 @@ def shell_blocks():
         for block in found:
             own = [words for words in commands(block.text) if words[0] == "fitact"] if block.language == "sh" else []
             if own and "[" not in block.text and "FILE" not in block.text:  # other blocks list possible arguments
-                short = page.name == "README.md" and own[0][1] not in MINUTES
-                marks = pytest.mark.slow if short else pytest.mark.thorough
                 printed = next((after.text for after in found if after.begin == block.end + 1), None)
-                yield pytest.param(page, own, printed, id=f"{by_name(page)}-{' '.join(own[0][:3])}", marks=marks)
+                yield pytest.param(
+                    page, own, printed, id=f"{by_name(page)}-{' '.join(own[0][:3])}", marks=pytest.mark.slow
+                )
 
 
 @pytest.mark.parametrize(("page", "lines", "printed"), list(shell_blocks()))

@@ -22,7 +22,7 @@ def fit(number: int, given: fitact.Scene) -> fitact.Fit:
 
 
 @pytest.mark.parametrize("channels", [pytest.param(["I"], marks=pytest.mark.slow), ["Vsc", "I"]], ids="+".join)
-@pytest.mark.parametrize("number", [0, *(pytest.param(n, marks=pytest.mark.thorough) for n in range(1, 8))])
+@pytest.mark.parametrize("number", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in range(1, 8))])
 def test_current_fixes_all_three(number: int, channels: list[str]):
     found, truth = fit(number, scene(channels)), TRUTH[number]
     assert found.result == "successful"
@@ -36,7 +36,7 @@ def test_current_fixes_all_three(number: int, channels: list[str]):
     assert any("38 of 4,000 samples" in note for note in found.notes)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_named_waveform_gives_the_same():
     measured, named = (
         fit(3, scene(["Vsc", "I"], **drive)) for drive in ({}, {"waveform": "trapezoid", "rise_time": 50e-6})
@@ -66,7 +66,7 @@ def test_current_is_taken_where_there_is_no_skin_voltage():
     )
 
 
-@pytest.mark.parametrize(("noise", "trusted"), [(0.05, True), pytest.param(0.4, False, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize(("noise", "trusted"), [(0.05, True), pytest.param(0.4, False, marks=pytest.mark.slow)])
 def test_noise_of_the_drive_is_not_taken_for_that_of_the_current(noise: float, trusted: bool):
     """Noise of V enters the current through dV/dt; if it dominates the noise of the current, the fit is unreliable."""
     record, truth = fitact.read(FINGERS / "finger00.csv.gz"), TRUTH[0]

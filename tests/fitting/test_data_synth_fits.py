@@ -48,7 +48,7 @@ def deviation(summary: dict[str, Any], truth: float) -> float:
     "name",
     [
         *("clean", "low_snr", "clipped", "eight_bit"),
-        *(pytest.param(name, marks=pytest.mark.thorough) for name in ("hum", "late_trigger", "burst", "chirp")),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("hum", "late_trigger", "burst", "chirp")),
     ],
 )
 def test_vsc_alone_gives_g_and_b(name: str):
@@ -76,7 +76,7 @@ def test_a_late_trigger_is_found():
     assert abs(deviation(fitted("late_trigger").parameters()["delay"], -recipe["clock"]["trigger_error"])) < SIGMAS
 
 
-@pytest.mark.parametrize("name", ["natural_ground", pytest.param("fractional", marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("name", ["natural_ground", pytest.param("fractional", marks=pytest.mark.slow)])
 def test_vsc_and_current_give_everything(name: str):
     fit, truth = fitted(name), truths(RECORDS / f"{name}.json")
     assert fit.trusted
@@ -92,7 +92,7 @@ def test_another_skin_than_the_scene_says_is_noticed(name: str):
     assert not fit.trusted
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_people_with_areas():
     """True values of each finger, and medians and log-sds of their population."""
     paths = sorted((RECORDS / "areas").glob("*.json"))

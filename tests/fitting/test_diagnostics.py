@@ -44,9 +44,9 @@ def significance(vsc: np.ndarray) -> float:
 @pytest.mark.parametrize(
     ("R2", "C2"),
     [
-        pytest.param(20e3, 5e-9, marks=pytest.mark.thorough),
+        pytest.param(20e3, 5e-9, marks=pytest.mark.slow),
         (20e3, 0.5e-6),
-        *(pytest.param(*each, marks=pytest.mark.thorough) for each in ((5e3, 50e-9), (15e3, 0.5e-6), (3e3, 0.5e-6))),
+        *(pytest.param(*each, marks=pytest.mark.slow) for each in ((5e3, 50e-9), (15e3, 0.5e-6), (3e3, 0.5e-6))),
     ],
 )
 def test_a_second_skin_layer_is_misfit_wherever_it_shows(R2: float, C2: float):

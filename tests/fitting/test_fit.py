@@ -36,7 +36,7 @@ def test_verdict_on_vsc_alone(finger_fit: fitact.Fit):
     assert "current" in verdict.remedy
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_shipped_record_with_a_trapezoid_that_lacks_the_overshoot(finger_path, finger_truth):
     scene = fitact.Scene.from_dict({"drive": {"waveform": "trapezoid", "rise_time": "20 us"}})
     fit = fitact.fit(fitact.read(finger_path, scene), scene)
@@ -76,7 +76,7 @@ def test_errors_are_those_of_the_linear_theory(finger_fit: fitact.Fit):
     ("made", "freed"),
     [
         ({}, set()),
-        pytest.param({"offset": 0.2}, {"offset"}, marks=pytest.mark.thorough),
+        pytest.param({"offset": 0.2}, {"offset"}, marks=pytest.mark.slow),
         pytest.param({"offset": 0.2, "drift": 2.0}, {"offset", "drift"}, marks=pytest.mark.slow),
         pytest.param({"delay_samples": 2}, {"delay"}, marks=pytest.mark.slow),
     ],
@@ -95,7 +95,7 @@ def test_nuisances_are_freed_by_evidence_and_leave_g_and_b_unbiased(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("frequency", [50.0, pytest.param(60.0, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("frequency", [50.0, pytest.param(60.0, marks=pytest.mark.slow)])
 def test_hum_of_the_mains_is_modelled(frequency: float):
     """Ignoring 1 V of hum in this record would bias g and b by many standard errors."""
     made = square_record(periods=5)
@@ -136,7 +136,7 @@ def test_partial_scene_does_not_replace_a_recorded_drive(finger_path):
     assert any("V_V" in note for note in fit.notes)
 
 
-@pytest.mark.parametrize("waveform", ["square", pytest.param("triangle", marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("waveform", ["square", pytest.param("triangle", marks=pytest.mark.slow)])
 def test_record_that_starts_anywhere_without_V(waveform: str, tmp_path):
     record = square_record()
     scene = SQUARE
@@ -196,9 +196,8 @@ def misfits(record: fitact.Record) -> dict[str, fitact.Record]:
     }
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param("lost", marks=pytest.mark.thorough), pytest.param("saturating", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["lost", "saturating"])
 def test_misfit_is_named(finger_path, name: str):
     fit = fitact.fit(misfits(fitact.read(finger_path))[name])
     assert fit.result == "misfit"
@@ -255,8 +254,8 @@ def trapezoid_record(step: float, edge: float = 20e-6, noise: float = 0.05) -> f
     "step",
     [
         pytest.param(5e-6, marks=pytest.mark.slow),
-        pytest.param(50e-6, marks=pytest.mark.thorough),
-        pytest.param(100e-6, marks=pytest.mark.thorough),
+        pytest.param(50e-6, marks=pytest.mark.slow),
+        pytest.param(100e-6, marks=pytest.mark.slow),
     ],
 )
 def test_edges_faster_than_the_samples_widen_g(step: float):
@@ -266,9 +265,8 @@ def test_edges_faster_than_the_samples_widen_g(step: float):
     assert abs(deviation(fit, "b", 130e3 * 20.7e-9)) < 4.0
 
 
-@pytest.mark.parametrize(
-    "samples", [pytest.param(10, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.thorough)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("samples", [10, 20])
 def test_coarse_samples_of_a_smooth_drive_are_not_trusted(samples: int):
     time = np.arange(5 * samples) * 0.01 / samples
     omega = 2.0 * np.pi * 100.0
@@ -281,7 +279,7 @@ def test_coarse_samples_of_a_smooth_drive_are_not_trusted(samples: int):
 
 @pytest.mark.parametrize(
     "noise",
-    [0.0, *(pytest.param(noise, marks=pytest.mark.thorough) for noise in (1e-8, 1e-6, 1e-4))],
+    [0.0, *(pytest.param(noise, marks=pytest.mark.slow) for noise in (1e-8, 1e-6, 1e-4))],
 )
 def test_a_record_without_noise_is_not_called_identified(noise: float):
     fit = fitact.fit(square_record(noise=noise), SQUARE)
@@ -314,7 +312,7 @@ def test_scene_that_contradicts_the_recorded_drive_is_refused(drive: dict[str, f
     [
         50e-6,
         -4.99e-3,
-        *(pytest.param(shift, marks=pytest.mark.thorough) for shift in (-50e-6, 2e-3)),
+        *(pytest.param(shift, marks=pytest.mark.slow) for shift in (-50e-6, 2e-3)),
     ],
 )
 def test_any_shift_is_found(shift: float):
@@ -341,7 +339,7 @@ def test_from_rest_with_what_was_recorded_before_the_trigger():
     assert abs(deviation(fit, "g", 1.35 / 20.7)) < 4.0
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_huge_offset_is_not_trusted(finger_path):
     record = fitact.read(finger_path)
     assert not fitact.fit(fitact.Record.from_arrays(record.time, V=record["V"], Vsc=record["Vsc"] + 1e6)).trusted
@@ -350,7 +348,7 @@ def test_huge_offset_is_not_trusted(finger_path):
 SWEEP = {"waveform": "chirp", "start_frequency": 20.0, "end_frequency": 500.0, "sweep_time": 0.05}
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("drive", "shift"), [({"waveform": "burst"}, 0.0), (SWEEP, 1.37e-3)], ids=["burst", "shifted chirp"]
 )
@@ -376,8 +374,8 @@ def test_burst_and_chirp_against_scipy(drive: dict[str, object], shift: float):
 @pytest.mark.parametrize(
     ("off", "with_V"),
     [
-        pytest.param(1e-3, True, marks=pytest.mark.thorough),
-        *(pytest.param(off, False, marks=pytest.mark.thorough) for off in (1e-3, 1e-4, 0.0)),
+        pytest.param(1e-3, True, marks=pytest.mark.slow),
+        *(pytest.param(off, False, marks=pytest.mark.slow) for off in (1e-3, 1e-4, 0.0)),
     ],
 )
 def test_a_recorder_whose_clock_is_not_the_generators(off: float, with_V: bool):

@@ -187,7 +187,7 @@ def test_what_does_not_use_the_friction_refuses_it(tmp_path: Path) -> None:
         fitact.track(record, load(tmp_path, replace_drive(text)), window=0.02)
 
 
-@pytest.mark.thorough  # a fit for each of 40 records
+@pytest.mark.slow  # a fit for each of 40 records
 def test_errors_of_mu_and_scale_are_those_stated(tmp_path: Path) -> None:
     """Sums of squared pulls over 40 records stay within the 99.99 % range of chi-squared, for any seeds."""
     found = []

@@ -311,10 +311,8 @@ def test_a_common_gain_of_an_oscilloscope_cancels_in_the_ratio():
 
 
 # 240 fits of simulated sessions; the other set-ups have the same code with more coordinates
-@pytest.mark.parametrize(
-    "setup",
-    [pytest.param(name, marks=pytest.mark.slow if name == "Vsc" else pytest.mark.thorough) for name in session.SETUPS],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("setup", session.SETUPS)
 def test_intervals_contain_the_truth(setup: str):
     """The seeds were not chosen: the first 80 of the run that `make session-calibration` makes."""
     rows = [session.evaluate(setup, 1_000_000 + number, 1) for number in range(80)]

@@ -97,7 +97,7 @@ EARTH = (14.5e6, 100e-12)
 PROBED = (1.0 / (1.0 / SKIN[0] + 1.0 / 10e6), SKIN[1] + 10e-12)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_known_series_resistor_identifies_all_three():
     fit = fitact.fit(record([SKIN, SKIN], 100e3), scene(measurement={"series_resistor": 100e3}))
     assert fit.trusted
@@ -106,7 +106,7 @@ def test_known_series_resistor_identifies_all_three():
     assert np.all(fit.sd < 0.01)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_unequal_skins_by_vsc_and_current():
     sections = {"grounding": GROUNDING, "prior": free(grounding_Rsc=10.0, grounding_Csc=10.0)}
     made = record([SKIN, tuple(GROUNDING.values())])
@@ -116,7 +116,7 @@ def test_unequal_skins_by_vsc_and_current():
     assert_true(fit, **TRUTH, **GROUNDING)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("elements", "R0", "sections"),
     [
@@ -144,7 +144,7 @@ def test_the_papers_circuits(elements, R0: float, sections):
     assert_true(fit, **{name: TRUTH.get(name, nominal[name]) for name in fit.names})
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_parameters_tied_to_others():
     ties = {"grounding_Rsc": {"tied": "Rsc", "ratio": 0.5}, "grounding_Csc": {"tied": "Csc", "ratio": 2.0}}
     made = record([SKIN, (0.5 * SKIN[0], 2.0 * SKIN[1])])
@@ -164,7 +164,7 @@ def alone(first: fitact.Record) -> fitact.Fit:
     return fitact.fit(first, scene())
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_held_insulator_leaves_nothing_to_the_prior(first: fitact.Record):
     fit = fitact.fit(first, scene(prior={"Ci": {"fixed": True}}))
     assert fit.names == ("Rsc", "Csc")

@@ -130,7 +130,7 @@ QUICK = {"Misra1a", "Chwirut2", "Lanczos3", "Gauss1", "MGH09", "Thurber", "BoxBO
 
 @pytest.mark.parametrize("start", [0, 1])
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.thorough) for name in MODELS]
+    "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in MODELS]
 )
 def test_certified_values(name: str, start: int):
     problem, ends = solved(name)

@@ -41,7 +41,7 @@ def brute_force(fit: fitact.Fit, level: float) -> tuple[float, float]:
     return low, high
 
 
-@pytest.mark.parametrize("level", [pytest.param(0.5, marks=pytest.mark.thorough), 0.95])
+@pytest.mark.parametrize("level", [pytest.param(0.5, marks=pytest.mark.slow), 0.95])
 def test_interval_of_b_against_a_brute_force_profile(noisy: fitact.Fit, level: float):
     low, high = brute_force(noisy, level)
     found = noisy.profile("b", level, prior=False)
@@ -60,7 +60,7 @@ def test_along_the_blind_direction_the_profile_is_the_priors_normal(fit: fitact.
             )
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_records_alone_leave_the_contact_area_open(fit: fitact.Fit):
     found = fit.intervals(prior=False)
     for name in ("Rsc", "Csc", "Ci", "force_mean"):
@@ -95,7 +95,7 @@ def test_without_the_prior_vsc_alone_is_rank_deficient(fit: fitact.Fit):
         fitact.sample(alone)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_command_line_adds_them(finger_path, tmp_path):
     record = fitact.read(finger_path)
     few = tmp_path / "few.csv"

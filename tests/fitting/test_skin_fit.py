@@ -180,7 +180,7 @@ def test_an_exponent_just_beyond_one_is_noise(trapezoid: fitact.Fit):
     assert [out(x) for x in (-1.0, 2.0, 6.0)] == [False, False, True]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_sampling_ends_where_the_fit_is(trapezoid: fitact.Fit):
     posterior = fitact.sample(trapezoid, seed=1, progress=False)
     assert posterior.trusted
@@ -202,7 +202,7 @@ def test_summed_samples_give_the_same_fit(trapezoid: fitact.Fit):
     [
         ("multitone", ("I",)),
         *(
-            pytest.param(waveform, seen, marks=pytest.mark.thorough)
+            pytest.param(waveform, seen, marks=pytest.mark.slow)
             for waveform, seen in [
                 ("multitone", ("Vsc",)),
                 ("multitone", ("Vsc", "I")),
@@ -223,7 +223,7 @@ def test_recovery(waveform: str, seen: tuple[str, ...]):
         assert fit.identifiability.verdict == "identified"
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(("waveform", "seen"), [("trapezoid", ("Vsc",)), ("multitone", ("Vsc", "I"))])
 def test_recovery_of_the_papers_dispersion(waveform: str, seen: tuple[str, ...]):
     fit = fitact.fit(record(waveform, paper), scene(waveform, "dispersive", seen=seen))
@@ -243,7 +243,7 @@ def test_recovery_of_the_papers_dispersion(waveform: str, seen: tuple[str, ...])
         assert fit.derived()["force_peak"]["q50"] == pytest.approx(peak, rel=1e-4)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_an_exponent_of_one_is_the_constant_skin():
     made = record("trapezoid", cole(1.0))
     constant = fitact.fit(made, scene("trapezoid", "constant"))
@@ -254,20 +254,20 @@ def test_an_exponent_of_one_is_the_constant_skin():
         assert held.derived()[name]["q50"] == pytest.approx(constant.derived()[name]["q50"], rel=1e-8)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_constant_skin_has_an_exponent_of_one(seed: int):
     assert_recovers(fitact.fit(record("trapezoid", cole(1.0), seed), scene("trapezoid")), **TRUTH | {"alpha": 1.0})
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_constant_skin_does_not_describe_a_fractional_one(trapezoid: fitact.Fit):
     fit = fitact.fit(trapezoid.record, scene("trapezoid", "constant"))
     assert not fit.trusted
     assert fit.figures["chi2_reduced"] > 100.0
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("steady", [True, False], ids=["steady", "from rest"])
 def test_a_measured_drive(steady: bool):
     """The waveform begins after so long a pause that the earlier charge has decayed."""
@@ -293,7 +293,7 @@ def test_a_measured_drive(steady: bool):
     assert fit.compression_error is not None
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_plan_that_leaves_dispersion_out_fits_a_constant_skin():
     held = {"skin": {"level": "fractional", "alpha": 0.99995}, "prior": {}, "tolerance": {"force": 0.002}}
     stated = scene("trapezoid", **held)

@@ -179,7 +179,7 @@ def test_hundred_far_starts_with_the_prior(finger: fitact.Fit):
     assert np.all(successful)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_hundred_far_starts_without_a_prior(finger: fitact.Fit):
     """Vsc alone determines two of three parameters, so no end point is unique."""
     results = names(finger_ends(finger, with_prior=False))

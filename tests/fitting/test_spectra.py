@@ -294,7 +294,7 @@ def test_a_spectrum_alone_needs_a_drive_for_the_force():
         fitact.fit(spectrum(), scene(drive={"waveform": "burst", "frequency": "1 kHz"}))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_posteriors_hold_the_truth_as_often_as_they_say():
     """500 fingers drawn from the prior, noise of 0.1 to 3 % with a floor: coverage within three binomial sd.
 

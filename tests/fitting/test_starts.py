@@ -25,7 +25,7 @@ def test_from_far_starts_beyond_the_table(fit: fitact.Fit, factors: list[float])
     np.testing.assert_allclose(found.theta, fit.theta, atol=1e-3 * fit.sd.min())
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_start_where_the_circuit_gives_no_signal(fit: fitact.Fit):
     """The time constant is far below a sample step, so without the prior no step leads away."""
     start = {"Rsc": 1e-6 * np.exp(fit.theta[0])}
@@ -34,7 +34,7 @@ def test_a_start_where_the_circuit_gives_no_signal(fit: fitact.Fit):
     assert found.derived()["b"]["q50"] == pytest.approx(fit.derived()["b"]["q50"], rel=1e-6)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("prior", [True, False])
 def test_a_hundred_starts_reach_the_optimum(fit: fitact.Fit, prior: bool):
     """Without the prior, the optimum is a line on which g and b are constant."""
@@ -57,7 +57,7 @@ def test_one_optimum_from_many_starts(fit: fitact.Fit):
     np.testing.assert_array_equal(found.theta, fit.theta)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_current_alone_cannot_tell_which_skin_is_which():
     """The admittance does not change if the two skins are exchanged, and their priors are equal."""
     made = record([SKIN, (80e3, 44e-9)], per_period=250)

@@ -33,9 +33,9 @@ def fitted(waveform: str, off: float, periods: int, per_period: int) -> fitact.F
     ("waveform", "off", "periods", "per_period"),
     [
         pytest.param("sine", 1e-5, 50, 400, marks=pytest.mark.slow),
-        pytest.param("square", 3e-5, 50, 400, marks=pytest.mark.thorough),  # no edge has passed a sample
-        pytest.param("square", 3e-4, 5, 2000, marks=pytest.mark.thorough),  # edges have passed samples
-        pytest.param("square", 5e-4, 2, 25_000, marks=pytest.mark.thorough),  # edges have passed many samples
+        pytest.param("square", 3e-5, 50, 400, marks=pytest.mark.slow),  # no edge has passed a sample
+        pytest.param("square", 3e-4, 5, 2000, marks=pytest.mark.slow),  # edges have passed samples
+        pytest.param("square", 5e-4, 2, 25_000, marks=pytest.mark.slow),  # edges have passed many samples
     ],
 )
 def test_a_clock_is_found(waveform: str, off: float, periods: int, per_period: int):
@@ -67,7 +67,7 @@ def test_a_fine_record_is_not_of_another_frequency(samples: int, periods: int):
     assert choice.notes == ()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_clock_is_sampled():
     fit = fitted("sine", 1e-5, 50, 400)
     posterior = fitact.sample(fit, seed=0, progress=False)

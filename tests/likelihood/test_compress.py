@@ -189,7 +189,7 @@ def test_several_time_constants_far_apart():
     np.testing.assert_allclose(found / scale, expected / scale, atol=1e-9)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", [None, SQUARE], ids=["measured drive", "folded square"])
 def test_fit_and_log_probabilities_are_those_of_the_samples(scene):
     record = square_record(offset=0.1, periods=4)
@@ -209,7 +209,7 @@ def test_fit_and_log_probabilities_are_those_of_the_samples(scene):
     assert np.ptp(b) > 10.0
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_cost_does_not_grow_with_the_record():
     rows = [fitact.fit(square_record(periods=n), SQUARE).likelihood.rows for n in (1, 40)]
     assert rows[1] <= rows[0] + 2  # a longer record is more accurate and needs one or two more terms
@@ -293,7 +293,7 @@ def test_a_tolerance_that_is_none_is_refused(tolerance: float):
         fitact.fit(square_record(), SQUARE, tolerance=tolerance)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_force_of_a_long_record_is_that_of_a_short_one():
     """Above 20,000 samples only the last periods are computed, after the charge has decayed."""
     short, long = (fitact.fit(square_record(periods=n, noise=1e-3)).derived() for n in (9, 30))

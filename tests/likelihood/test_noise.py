@@ -92,7 +92,7 @@ def test_burg_finds_a_known_process():
     assert found.innovation_ratio**-2.0 == pytest.approx(variance, rel=0.05)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_outliers_cost_student_little_and_white_much():
     record = square_record(per_period=200)
     rng = np.random.default_rng(5)
@@ -116,7 +116,7 @@ def test_outliers_cost_student_little_and_white_much():
     assert student.sigma == pytest.approx(scale, rel=0.02)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "covers"), [("ar1", True), ("white", False)])
 def test_intervals_cover_under_autoregressive_noise(model: str, covers: bool):
     """Errors in units of their standard deviations have an rms of 1 ± 0.13 for 30 records."""
@@ -152,7 +152,7 @@ def pink(rng: np.random.Generator, size: int) -> np.ndarray:
     return values[:size] / values.std()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("channel", ["Vsc", "I"])
 def test_a_measured_spectrum_widens_what_white_noise_would_make_too_narrow(channel: str):
     """The rms of 12 normalised errors is 1 ± 0.2."""
@@ -188,7 +188,7 @@ def test_a_decay_in_the_quiet_stretch_is_noticed():
     assert fit.figures["rms_residual"] < 0.1 < fit.sigma
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_student_noise_is_as_wide_as_sampled_and_predicted_with_its_tails():
     record, rng = square_record(per_period=200, noise=0.0), np.random.default_rng(3)
     noisy = record["Vsc"] + 0.05 * rng.standard_t(4, len(record))
@@ -213,7 +213,7 @@ def test_autoregressive_noise_is_predicted_with_its_correlation():
     assert noise.std() == pytest.approx(fit.sigma, rel=0.1)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_current_is_predicted_as_noisy_as_its_drive_makes_it():
     """The slope of V over two steps has noise of sd / (sqrt(2) step), which reaches I through Ci Csc / b Rsc."""
     record, rng = burst_record(), np.random.default_rng(3)

@@ -15,7 +15,7 @@ from tests import extremes
     # `make extremes` tests all points over the whole range
     [
         "transfer",
-        *(pytest.param(n, marks=[] if n == "sine" else pytest.mark.thorough) for n in extremes.DRIVES),
+        *(pytest.param(n, marks=[] if n == "sine" else pytest.mark.slow) for n in extremes.DRIVES),
     ],
 )
 def test_accuracy(name: str, kind: type):
@@ -43,7 +43,7 @@ def loops(point: jax.Array) -> dict[str, fitact.DirectGround | fitact.NaturalGro
     }
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["unequal skins", "R_H", "natural"])
 def test_other_circuits(name: str):
     """Results are finite although time constants may differ by 24 decades; |H| against NumPy's complex impedances."""

@@ -183,7 +183,7 @@ SLIDING = {
 }
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_fit_of_vsc_and_current_tells_the_gap_and_its_force():
     elements, R0 = [SKIN, SKIN, (RGAP, CGAP)], 100e3
     measurement = {"channels": ["Vsc", "I"], "series_resistor": R0}
@@ -198,7 +198,7 @@ def test_fit_of_vsc_and_current_tells_the_gap_and_its_force():
     assert "from the voltage across the interface gap" in str(fit)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_fit_of_vsc_alone_says_that_the_prior_speaks():
     fit = fitact.fit(record([SKIN, SKIN, (RGAP, CGAP)]), scene(**SLIDING))
     assert fit.identifiability.verdict == "prior-limited"

@@ -65,7 +65,7 @@ def test_high_coefficients_keep_their_digits():
     [
         *((name, "direct") for name in DRIVES),
         # the drive and the circuit enter as factors, so not every pair must be tested
-        *(pytest.param(n, "natural", marks=[] if n == "trapezoid" else pytest.mark.thorough) for n in DRIVES),
+        *(pytest.param(n, "natural", marks=[] if n == "trapezoid" else pytest.mark.slow) for n in DRIVES),
     ],
 )
 def test_stated_error_is_the_error(name: str, ground: str):
@@ -122,7 +122,7 @@ def test_current_of_a_trapezoid():
     [
         "sine",
         "square",
-        *(pytest.param(n, marks=pytest.mark.thorough) for n in ("trapezoid", "triangle", "sampled")),
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("trapezoid", "triangle", "sampled")),
     ],
 )
 def test_differentiable_in_every_parameter(name: str):

@@ -105,7 +105,7 @@ def test_peaks_are_the_largest_whatever_the_tones():
         assert peak <= brute * (1.0 + 2e-5)  # (pi 39 / 20000)^2 / 2 is the decrease of a peak between two grid points
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_gradients():
     def force(logs: jax.Array) -> jax.Array:
         circuit = fitact.FinalCircuit(*jnp.exp(logs[:3]))

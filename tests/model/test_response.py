@@ -320,7 +320,7 @@ def test_initial_charge_needs_a_start_and_one_value_for_each_time_constant():
 
 @pytest.mark.parametrize(
     "count",
-    [2, 3, 50, *(pytest.param(count, marks=pytest.mark.thorough) for count in (1000, 1001))],
+    [2, 3, 50, *(pytest.param(count, marks=pytest.mark.slow) for count in (1000, 1001))],
 )
 def test_sampled_drive_against_scipy(count: int):
     voltage = np.random.default_rng(1).normal(size=count)
@@ -331,7 +331,7 @@ def test_sampled_drive_against_scipy(count: int):
     np.testing.assert_allclose(fitact.response(CIRCUIT, drive, drive.time, steady_state=False), expected, atol=1e-13)
 
 
-@pytest.mark.parametrize("part", [250, *(pytest.param(part, marks=pytest.mark.thorough) for part in (333, 998, 999))])
+@pytest.mark.parametrize("part", [250, *(pytest.param(part, marks=pytest.mark.slow) for part in (333, 998, 999))])
 def test_long_sampled_drive_is_followed_in_parts(part: int, monkeypatch):
     monkeypatch.setattr("fitact.model.response.knot_values", functools.partial(knot_values, part=part))
     test_sampled_drive_against_scipy(1000)
@@ -406,7 +406,7 @@ QUICK = [("sine", False), ("square", True), ("sampled", False)]
 @pytest.mark.parametrize(
     ("name", "steady_state"),
     [
-        pytest.param(name, steady, marks=[] if (name, steady) in QUICK else pytest.mark.thorough)
+        pytest.param(name, steady, marks=[] if (name, steady) in QUICK else pytest.mark.slow)
         for name in DIFFERENTIABLE
         for steady in (True, False)
         if not (steady and name == "burst")

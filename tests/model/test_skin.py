@@ -127,7 +127,7 @@ def test_zero_frequency_is_the_limit(level: str):
     assert np.all(np.isfinite(jax.grad(size)(jnp.array([R, C, CI]))))
 
 
-# every circuit and channel with one skin, and every skin with one circuit and channel; other pairs are thorough
+# every circuit and channel with one skin, and every skin with one circuit and channel; other pairs are slow
 GROUNDS = ["final", "direct, R_H", "natural"]
 QUICK = {("fractional 0.8", ground, channel) for ground in GROUNDS for channel in ("Vsc", "I")}
 QUICK |= {("dispersive", "direct, R_H", "I"), ("fractional 0.5", "final", "Vsc")}
@@ -136,7 +136,7 @@ QUICK |= {("dispersive", "direct, R_H", "I"), ("fractional 0.5", "final", "Vsc")
 @pytest.mark.parametrize(
     ("level", "ground", "channel"),
     [
-        pytest.param(*case, marks=[] if case in QUICK else pytest.mark.thorough)
+        pytest.param(*case, marks=[] if case in QUICK else pytest.mark.slow)
         for case in itertools.product(LEVELS, GROUNDS, ["Vsc", "I"])
     ],
 )
@@ -198,7 +198,7 @@ def test_more_harmonics_change_no_more_than_the_stated_error():
 
 
 @pytest.mark.parametrize(
-    "skin", [fitact.Dispersive(), pytest.param(fitact.Fractional(0.8, harmonics=8), marks=pytest.mark.thorough)]
+    "skin", [fitact.Dispersive(), pytest.param(fitact.Fractional(0.8, harmonics=8), marks=pytest.mark.slow)]
 )
 @pytest.mark.slow
 def test_differentiable_under_jit_and_vmap(skin: fitact.Dispersive | fitact.Fractional):
@@ -216,7 +216,7 @@ def test_differentiable_under_jit_and_vmap(skin: fitact.Dispersive | fitact.Frac
     np.testing.assert_allclose(both, np.stack([vsc(row, 360.0) for row in rows]), rtol=1e-9)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_exponent_is_differentiable_up_to_one():
     @jax.jit
     def vsc(alpha: jax.Array) -> jax.Array:
@@ -232,7 +232,7 @@ def test_exponent_is_differentiable_up_to_one():
     [
         "dispersive",
         pytest.param("fractional 0.8", marks=pytest.mark.slow),
-        pytest.param("fractional 0.5", marks=pytest.mark.thorough),
+        pytest.param("fractional 0.5", marks=pytest.mark.slow),
     ],
 )
 def test_single_precision(level: str):

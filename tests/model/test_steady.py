@@ -182,7 +182,7 @@ def test_what_does_not_repeat_is_refused():
 
 
 @pytest.mark.parametrize(
-    "name", ["sine", "square", "triangle", pytest.param("trapezoid", marks=pytest.mark.thorough), "sampled"]
+    "name", ["sine", "square", "triangle", pytest.param("trapezoid", marks=pytest.mark.slow), "sampled"]
 )
 @pytest.mark.slow
 def test_differentiable_in_every_parameter(name: str):
@@ -209,7 +209,7 @@ def test_second_derivatives(x: float):
     check_grads(lambda x: jnp.stack([phi(x), psi(x), _rectangle(0.2, x)]), (x,), order=2, rtol=1e-4, atol=1e-7)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_differentiable_with_several_time_constants():
     def figures(logs: jax.Array) -> jax.Array:
         Rsc, Csc, Ci, R_H, grounding_Rsc = jnp.exp(logs)

@@ -171,7 +171,7 @@ RESISTOR = {"channels": ["Vsc", "I"], "series_resistor": 100e3}
 WITH = scene(measurement=RESISTOR, gap={"resistance": RGAP, "capacitance": CGAP}, prior=free(Rgap=100.0, Cgap=100.0))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("gap", [True, False])
 def test_a_gap_is_preferred_where_there_is_one_and_only_there(gap: bool):
     made = record([SKIN, SKIN, *[(RGAP, CGAP)] * gap], 100e3)
@@ -184,7 +184,7 @@ def test_a_gap_is_preferred_where_there_is_one_and_only_there(gap: bool):
         assert found.preferred in ("plain", None)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_nested_models_differ_by_the_chi_square_law():
     """Twice the gain in log-likelihood by one more parameter is chi-square (1 dof); the AIC changes by 2 less that."""
     measured = {"channels": ["Vsc", "I"]}

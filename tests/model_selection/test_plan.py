@@ -272,7 +272,7 @@ def test_ten_random_scenes_against_kirchhoffs_laws():
     assert check_random_scenes(10, seed=5) == 0
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_two_hundred_random_scenes():
     assert check_random_scenes(200, seed=6) == 0
 

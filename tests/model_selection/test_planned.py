@@ -34,7 +34,7 @@ def test_the_planned_model_is_fitted_and_that_is_said():
     assert abs(divider["q50"] - 1.35 / 24.7) < 4.0 * divider["sd"]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_record_that_contradicts_the_plan_gets_the_full_model():
     scene = fitact.Scene.from_dict(UNEQUAL)
     record = simulate(scene, seed=2)
@@ -85,7 +85,7 @@ def test_which_model_is_used(monkeypatch, of_planned: str, of_full: str, used: s
     assert found.plan.left_out == ("R_H",)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_recorded_drive_is_planned_for_as_it_was_recorded():
     drive = {"waveform": "trapezoid", "rise_time": "0.5 ms", "peak_to_peak": "200 V", "frequency": "250 Hz"}
     body = {"grounding": {"R_H": "20 kohm"}}  # acts over 27 us, which samples at 1 us resolve

@@ -95,7 +95,7 @@ def test_log_posterior_of_known_fingers_is_scipys(varies: bool, known_of_each: i
     np.testing.assert_allclose(difference, difference[0], atol=2e-3 if varies else 1e-9)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_integral_over_a_finger_is_that_of_quadrature():
     """A finger from scipy's state space, so noisy that it is known no better than fingers differ; noise integrated."""
     noise = 8.0
@@ -378,7 +378,7 @@ def nuts(fits: list[fitact.Fit], prior: Prior) -> dict[str, np.ndarray]:
     return found
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [3, 6])
 def test_law_is_that_of_nuts_over_all_parameters(count: int):
     """Fingers are known no better than they differ; means agree within four standard errors, widths within 5 %."""
@@ -402,7 +402,7 @@ def test_law_is_that_of_nuts_over_all_parameters(count: int):
         assert wider == pytest.approx(0.0, abs=0.05), name
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_misfit_is_named_and_the_population_stays_trusted():
     simulated = simulate(1, 0, fingers=4)
     first, *others = simulated.records
@@ -456,7 +456,7 @@ def eight(tmp_path_factory) -> dict:
     return json.loads(done.stdout)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_eight_fingers_and_their_panel(eight):
     truth = json.loads((FINGERS / "truth.json").read_text())
     for name in ("Rsc", "Csc"):

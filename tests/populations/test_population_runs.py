@@ -22,7 +22,7 @@ def few() -> Any:
     return simulate(SEED, 0, fingers=6)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_population_goes_on_where_it_stopped(few, tmp_path):
     """To the draws of an undisturbed run; a chain of another seed is refused."""
     undisturbed = fitact.population(few.records, few.scene, seed=1, progress=False)
@@ -58,7 +58,7 @@ class Counted(Sequence[fitact.Record]):
         return record
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_records_are_not_held(few):
     """Two at most, the one at hand and the one before; and none of what is left has as many numbers as a record."""
     records = Counted(simulate(SEED, 0, fingers=6, noise=0.0).records, 10)
@@ -74,7 +74,7 @@ def arrays_of(tree: Any) -> list[np.ndarray]:
     return [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_slopes_of_a_covariate_and_fingers_at_one_are_covered():
     """Log Rsc falls by 0.15 and log Csc rises by 0.05 with each unit of moisture; and stays easy to sample."""
     rng = np.random.default_rng(11)
@@ -98,7 +98,7 @@ def test_slopes_of_a_covariate_and_fingers_at_one_are_covered():
     assert np.mean(np.log(new["Rsc"])) == pytest.approx(expected, abs=0.25)  # 0.45 less than at the mean
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("channels", [("I",), ("Vsc", "I")])
 def test_areas_are_seen_by_the_current(channels: tuple[str, ...]):
     """Ten fingers whose areas differ by a factor of two and more: their spread and Ci, each within its 99 %."""

@@ -80,7 +80,7 @@ def test_deviations_have_the_pooled_covariance_and_their_part_of_the_variance():
     assert intrafinger_variance_fraction(moments) == pytest.approx(0.25, abs=0.015)
 
 
-@pytest.mark.thorough  # eight tracks of 10 s
+@pytest.mark.slow  # eight tracks of 10 s
 def test_population_of_complete_tracks_covers():
     """One population of `tests/within_calibration.py --complete`: all true values within the central 99 %."""
     row = complete_places(0, 1)
@@ -89,7 +89,7 @@ def test_population_of_complete_tracks_covers():
         assert 0.005 < place < 0.995, name
 
 
-@pytest.mark.thorough  # a command for each of four tracks
+@pytest.mark.slow  # a command for each of four tracks
 def test_command_takes_folders_of_tracks_beside_records(tmp_path: Path):
     rng = np.random.default_rng(5)
     law = Law.draw(rng, CHANGE)

@@ -37,7 +37,7 @@ def kept(path: Path) -> tuple[int, np.ndarray]:
         return int(min(steps)), file["ensemble_0"]["chain"][:]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("least", [3, 10])
 def test_kills_lose_nothing_that_was_saved(least: int, finger_path: Path, finger_scene_path: Path, tmp_path: Path):
     path, out = tmp_path / "results" / "chain.h5", tmp_path / "results" / "posterior.nc"

@@ -22,7 +22,7 @@ QUICK = {("Rsc binds", "compressed")}
 SHARES = np.array([0.05, 0.5, 0.95])
 TOLERANCES = {"compressed": certificate.TOLERANCE, "full": 0.0}
 CASES = [
-    pytest.param(*case, marks=[] if case in QUICK else pytest.mark.thorough)
+    pytest.param(*case, marks=[] if case in QUICK else pytest.mark.slow)
     for case in itertools.product(BOXES, TOLERANCES)
 ]
 

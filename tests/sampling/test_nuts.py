@@ -39,7 +39,7 @@ def reference(finger_fit: fitact.Fit) -> fitact.Posterior:
     return fitact.Posterior.from_draws(finger_fit, flat, np.zeros(len(flat)), Convergence(), 0)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(("level", "runs"), [("emcee", 4), ("psis", 6)])
 def test_widths_are_those_of_nuts(level: str, runs: int, finger_fit: fitact.Fit, reference: fitact.Posterior):
     """Accurate to 2 %: for 40,000 effective draws on both sides these are four standard errors, 1 / sqrt(2 n) each."""

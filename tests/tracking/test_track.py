@@ -288,7 +288,7 @@ def test_refuses_a_record_without_v_or_with_another_rate(short, tmp_path: Path):
         fitact.track(changed, SCENE)
 
 
-@pytest.mark.thorough  # 30 records of the model's own law
+@pytest.mark.slow  # 30 records of the model's own law
 def test_bands_hold_what_they_state_for_random_walks():
     inside: dict[str, list[float]] = {}
     for seed in range(30):
@@ -301,7 +301,7 @@ def test_bands_hold_what_they_state_for_random_walks():
         assert 0.93 - margin < np.mean(shares) < 0.97 + margin, name
 
 
-@pytest.mark.thorough  # 6 million samples
+@pytest.mark.slow  # 6 million samples
 def test_slide_of_thirty_seconds_is_within_its_bands():
     change = {"time": (0.0, 30.0), "area": (1.0, 1.3), "Rsc": (1.0, 0.6), "lifted": (17.03, 17.6)}
     record, course = simulate(0, 30.0, 200e3, **change)

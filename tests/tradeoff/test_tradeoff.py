@@ -66,7 +66,7 @@ def responses(fit: fitact.Fit) -> dict[str, timings.BenchmarkResult]:
         return {level.name: level for level in timings.benchmark_responses(fit)}
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_errors_of_responses_against_scipy(fit: fitact.Fit, responses: dict[str, timings.BenchmarkResult]):
     assert responses["exact"].error == 0.0
     assert 1e-8 < responses["float32"].error < 1e-5
@@ -92,7 +92,7 @@ def test_errors_of_responses_against_scipy(fit: fitact.Fit, responses: dict[str,
         assert responses[f"harmonic({n})"].error == pytest.approx(left_out, rel=0.05)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_costs_of_responses_are_told(responses: dict[str, timings.BenchmarkResult]):
     assert all(level.seconds > 0.0 for level in responses.values())
     assert responses["ODE (scipy)"].gradient_seconds is None
@@ -169,7 +169,7 @@ def test_without_vsc_there_is_nothing_to_compare():
         fitact.measure_tradeoff(scene=scene)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_whole(record: fitact.Record, capsys: pytest.CaptureFixture[str]):
     found = fitact.measure_tradeoff(record, fitact.Scene.load("paper"), tolerances=(1e-1, 1e-3), runs=1)
     assert found.trusted
