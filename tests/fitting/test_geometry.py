@@ -275,6 +275,7 @@ def test_a_stated_prior_of_Ci_wins(record: fitact.Record):
     assert set(slopes.values()) == {0.0}
 
 
+@pytest.mark.slow
 def test_the_current_updates_the_thickness():
     """The loop current determines Ci, so ln Ti | data has variance u^2 - u^4 / s^2 + (u^2 / s^2)^2 sd(ln Ci)^2, and its
     mean moves by -u^2 / s^2 (ln Ci - ln Ci nominal), with u of ln Ti and s^2 the sum of the three variances."""

@@ -126,6 +126,7 @@ def test_the_ratio_of_two_fingers_holds_no_gain(fit: fitact.Fit):
     assert ratio.u < 0.4 * fit.budgets["g"].u  # what is left are the priors of two fingers
 
 
+@pytest.mark.slow
 def test_the_current_tells_the_ratio_of_gains(monkeypatch):
     monkeypatch.setitem(session.NOISE, "I", 1e-6)
     record = make("Vsc and I", **{"scope-8bit:A/CH2": {"gain": 0.025}, "scope-8bit:A/CH3": {"gain": -0.02}})
@@ -169,7 +170,7 @@ def test_the_posterior_has_the_limits(fit: fitact.Fit):
     assert math.hypot(*(row["u"] for row in budget["components"])) == pytest.approx(budget["u"], rel=1e-9)
 
 
-@pytest.mark.parametrize("setup", ["Vsc", "Vsc and I"])
+@pytest.mark.parametrize("setup", ["Vsc", pytest.param("Vsc and I", marks=pytest.mark.slow)])
 def test_compression_keeps_the_effects(setup: str):
     wrong = {"probe-10x:P2": {"compensation": 0.015}, "scope-8bit:A/CH2": {"odd": 0.0015, "even": -0.001}}
     record, scene = make(setup, **wrong), session.scene(setup)
@@ -205,6 +206,7 @@ def test_a_certificate_of_nonlinearity_keeps_its_distribution():
     assert float(prior["nonlinearity_V_odd"].log_sd) == pytest.approx(0.5 / 256.0 / math.sqrt(3.0), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_scanning_converter_delays_channels():
     """Up to a sampling interval of 5 us, of which 3 us move b by 0.7 %."""
     fit = fitact.fit(make("DAQ", skew=3e-6), session.scene("DAQ"))
@@ -222,7 +224,7 @@ def test_an_offset_within_the_limits_is_free(fit: fitact.Fit):
     assert "offset" not in fitact.fit(make(), plain()).linear
 
 
-@pytest.mark.parametrize("noise", ["ar1", "student"])
+@pytest.mark.parametrize("noise", ["ar1", pytest.param("student", marks=pytest.mark.slow)])
 def test_effects_under_other_noise(noise: str):
     scene = session.scene("Vsc").model_dump(mode="json", exclude_unset=True)
     scene["measurement"] |= {"noise_model": noise}

@@ -89,6 +89,7 @@ def test_two_optima_that_overlap():
     assert np.mean(np.abs(np.log(first / second)) < 0.05) < 0.25
 
 
+@pytest.mark.slow
 def test_two_optima_far_apart():
     """Test that draws stay at one of them, that several starts find both, and that the fit is then not trusted."""
     fit = fit_two_skins(FAR_APART, 5e-8)

@@ -79,6 +79,7 @@ SQUARES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SQUARES)
 def test_delay_of_an_ideal_square_wave(name: str):
     """Test edges that all pass samples at the same delays, and edges that do so at different delays."""

@@ -69,12 +69,13 @@ def assert_equals_full_sum(
     return ours
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("late", "clock", "names"),
     [
         (2.3, 0.0, {"delay"}),
-        pytest.param(0.0, 3.0, {"clock"}, marks=pytest.mark.slow),
-        pytest.param(2.3, 3.0, {"delay", "clock"}, marks=pytest.mark.slow),
+        (0.0, 3.0, {"clock"}),
+        (2.3, 3.0, {"delay", "clock"}),
     ],
 )
 def test_timing_of_a_stated_drive(late: float, clock: float, names: set[str]):
@@ -120,14 +121,8 @@ def test_an_ideal_edge_between_two_samples():
         assert abs(np.mean(posterior.derived()[name]) - truth) < 4.0 * np.std(posterior.derived()[name])
 
 
-@pytest.mark.parametrize(
-    ("stated", "largest"),
-    [
-        (False, 10.0),
-        pytest.param(True, 10.0, marks=pytest.mark.slow),
-        pytest.param(False, 100.0, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("stated", "largest"), [(False, 10.0), (True, 10.0), (False, 100.0)])
 def test_student_noise_with_outliers(stated: bool, largest: float):
     """Test one sample in twenty with an outlier on one side."""
     rng = np.random.default_rng(4)

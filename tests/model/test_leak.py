@@ -120,7 +120,7 @@ def test_responses_from_rest_against_ngspice(tmp_path: Path):
 
 
 @pytest.mark.parametrize("waveform", ["trapezoid", "triangle", "sine"])
-@pytest.mark.parametrize("name", ["final", "R_H"])
+@pytest.mark.parametrize("name", ["final", pytest.param("R_H", marks=pytest.mark.slow)])
 def test_steady_state_quantities_against_a_fine_grid(name: str, waveform: str):
     keys: dict[str, Any] = {"waveform": waveform, "frequency": 130.0, "offset": -60.0}
     keys |= {"rise_time": 1e-3, "duty": 0.3} if waveform == "trapezoid" else {}

@@ -1,7 +1,6 @@
 """Posterior methods against closed forms, for a prior with bounds along the unidentified direction."""
 
 import functools
-import itertools
 
 import numpy as np
 import pytest
@@ -18,13 +17,8 @@ BOXES = {
     "Ci binds": WIDE | {"Rsc": ("1 kohm", "10 Mohm"), "Ci": ("1.2 nF", "1.5 nF")},
     "Rsc and Csc bind": WIDE | {"Rsc": ("100 kohm", "10 Mohm"), "Csc": ("8.85 nF", "44.25 nF")},
 }
-QUICK = {("Rsc binds", "compressed")}
 SHARES = np.array([0.05, 0.5, 0.95])
 TOLERANCES = {"compressed": certificate.TOLERANCE, "full": 0.0}
-CASES = [
-    pytest.param(*case, marks=[] if case in QUICK else pytest.mark.slow)
-    for case in itertools.product(BOXES, TOLERANCES)
-]
 
 
 @functools.cache
@@ -57,7 +51,9 @@ def deviations(posterior: fitact.Posterior) -> np.ndarray:
     return (found - SHARES) / np.sqrt(SHARES * (1.0 - SHARES) / min(posterior.convergence.ess["Rsc"], Rsc.size))
 
 
-@pytest.mark.parametrize(("box", "likelihood"), CASES)
+@pytest.mark.slow
+@pytest.mark.parametrize("box", BOXES)
+@pytest.mark.parametrize("likelihood", TOLERANCES)
 def test_uniform_priors_give_the_inverse_square_law_along_the_blind_direction(box: str, likelihood: str):
     fit = box_fit(box, likelihood)
     for level in ("emcee", "psis"):

@@ -67,7 +67,7 @@ class Outcome:
     [
         Case("trapezoid", "compensation", 1.0, 1),
         Case("trapezoid", "AC coupling", 1.0, 1),
-        Case("multisine", "dispersion", 1.0, 1),
+        pytest.param(Case("multisine", "dispersion", 1.0, 1), marks=pytest.mark.slow),
         Case("trapezoid", "resistor", 1.0, 1),
         Case("multisine", "hum", -1.0, 1),
         Case("trapezoid", "ADC", 2.0, 1),

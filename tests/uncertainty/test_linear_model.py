@@ -46,7 +46,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in ("current", "natural ground"))) for n in CASES]
+)
 def test_sensitivities_are_those_of_the_likelihood(name: str):
     record, scene = CASES[name]
     fit = fitact.fit(record, fitact.Scene.from_dict(scene))
