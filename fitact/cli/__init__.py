@@ -21,6 +21,8 @@ from fitact.cli import one_finger, records, scenes, page  # noqa: F401
 
 # isort: on
 
+_INTERRUPTED = 130
+
 
 def main() -> None:
     """Run the command line and end the process."""
@@ -52,6 +54,8 @@ def run_command(command: Callable[[], Any]) -> int:
             stream.reconfigure(encoding="utf-8")  # units and JSON, whatever the system's own encoding is
     try:
         result = command()
+        if result == _INTERRUPTED:  # the exit status into which typer turns Ctrl-C
+            raise KeyboardInterrupt
         return result if isinstance(result, int) else 0
     except InputError as error:
         print_stderr(f"fitact: {error}")
@@ -60,8 +64,8 @@ def run_command(command: Callable[[], Any]) -> int:
         error.show()  # type: ignore[attr-defined]
         return 2
     except (KeyboardInterrupt, typer.Abort):
-        print_stderr("fitact: interrupted; run the same command again to resume from the last checkpoint")
-        return 130
+        print_stderr("fitact: interrupted; the same command resumes from the last checkpoint, if there is one")
+        return _INTERRUPTED
     except BrokenPipeError:
         return 0
     except Exception as error:

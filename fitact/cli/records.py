@@ -9,7 +9,7 @@ import fitact
 from fitact import report
 from fitact.cli import internal, options
 from fitact.cli.app import app
-from fitact.cli.terminal import announce, command_line, print_stderr, show
+from fitact.cli.terminal import announce, command_line, show
 from fitact.files import write_json
 
 
@@ -233,11 +233,7 @@ def tradeoff(
     announce("measuring", [record or scene or "the nominal scene"])
     loaded = options.load_scene(scene)
     measured = None if record is None else fitact.read(record, loaded, **options.column_options((channel, scale, rate)))
-    try:
-        costs = fitact.measure_tradeoff(measured, loaded)
-    except KeyboardInterrupt:
-        print_stderr("fitact: interrupted; nothing was written")
-        raise typer.Exit(130) from None
+    costs = fitact.measure_tradeoff(measured, loaded)
     if out is not None:
         report.write_folder(out, costs, command_line(), loaded, [measured] if measured else [])
     show(str(costs), costs.to_dict(), json, costs.trusted)

@@ -11,10 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fitact.cli import main
+from fitact.cli import main, run_command
+from fitact.cli.app import app
 
 FILES = {"fit.json", "summary.json", "posterior.nc", "chain.h5", "report.html"}
 
+
+INTERRUPTED = "fitact: interrupted; the same command resumes from the last checkpoint, if there is one\n"
 
 # a program that can be interrupted even if the test runner passes on an ignored SIGINT
 INTERRUPTIBLE = (
@@ -187,7 +190,7 @@ def test_tradeoff_is_written_or_ends_without_a_trace(fitact_process, environment
         pass
     running.send_signal(signal.SIGINT)
     out, err = running.communicate(timeout=60)
-    assert (running.returncode, out, err) == (130, "", "fitact: interrupted; nothing was written\n")
+    assert (running.returncode, out, err) == (130, "", INTERRUPTED)
     assert not (tmp_path / "cut").exists()
     done = fitact_process("tradeoff", finger_path, "--out", "whole", "--json")
     assert done.returncode == 0
@@ -202,7 +205,8 @@ def test_a_fit_imports_only_what_it_uses(finger_path: Path, finger_scene_path: P
     """Submodules are looked for, since a lazily imported package is in sys.modules before it is loaded."""
     code = """
 import sys
-from fitact.cli import main
+from fitact.cli import main, run_command
+from fitact.cli.app import app
 try:
     main()
 except SystemExit as end:
@@ -304,6 +308,18 @@ def test_help_is_a_page_to_start_from(fitact_process):
     assert fitact_process().stdout.split() == done.stdout.split()
 
 
+def test_ctrl_c_within_a_command_says_how_to_resume(monkeypatch, capsys, finger_path):
+    """An interrupt inside the command-line library, which would end it without a word."""
+
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    monkeypatch.setattr("fitact.cli.one_finger._fit_records", interrupt)
+    assert run_command(lambda: app(["fit", str(finger_path)], standalone_mode=False)) == 130
+    assert capsys.readouterr().err.endswith(INTERRUPTED)
+
+
 def test_an_interrupt_that_python_drops_comes_again(environment):
     """SIGINT within the callback of a weak reference, where Python prints the exception and continues."""
     script = """
@@ -324,7 +340,7 @@ fitact.cli.main()
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment, timeout=50)
     assert done.returncode == 130
-    assert done.stderr == "fitact: interrupted; run the same command again to resume from the last checkpoint\n"
+    assert done.stderr == INTERRUPTED
 
 
 @pytest.mark.slow
