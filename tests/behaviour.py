@@ -246,7 +246,7 @@ def _is_close(path: str, a: Any, b: Any, old: dict[str, Any], estimates: bool) -
     if path.endswith("_p") and abs(a - b) <= 1e-5 * max(a, b):  # of residuals in single precision
         return True
     if path.endswith(".steps"):
-        return max(a, b) <= 2 * min(a, b)
+        return max(a, b) <= 3 * min(a, b)  # where steps end in rounding, versions of XLA differ
     sd = old.get(re.sub(r"\.\w+$", ".sd", path))
     return abs(a - b) <= max(1e-4 * abs(sd) if isinstance(sd, float) else 0.0, 1e-6 * max(abs(a), abs(b)))
 

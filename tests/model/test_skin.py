@@ -162,7 +162,8 @@ def test_constant_phase_of_one_against_scipy():
     circuit = fitact.WithSkin(fitact.FinalCircuit(R, C, CI), fitact.Fractional(1.0))
     ours = np.asarray(fitact.response(circuit, fitact.Square(360.0, 100.0), time))
     error = np.abs(ours - settled) / np.abs(settled).max()
-    assert error[[0, 1000]].max() < 5e-7  # at the jumps, the highest frequencies dominate
+    # at the jumps, the highest frequencies dominate; 4.3e-7 or 5.1e-7, as the libraries round in the rational fit
+    assert error[[0, 1000]].max() < 6e-7
     assert np.delete(error, [0, 1000]).max() < 1e-7
 
 
