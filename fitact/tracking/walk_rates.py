@@ -55,8 +55,8 @@ def estimate_rates(
     parameters: tuple[str, ...],
     *,
     prior_rate: float = 0.1,
-    sweeps: int = 6,
-    points: int = 15,
+    sweeps: int = 5,
+    points: int = 11,
 ) -> WalkRates:
     """Estimate the rates from the windows, with half-normal priors of scale `prior_rate` (1 per root of a second).
 
