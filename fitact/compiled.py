@@ -213,7 +213,7 @@ def _compile(
 
     run_flat.__name__ = run_flat.__qualname__ = function.__name__
     shapes = [jax.ShapeDtypeStruct(*each) for each in signature if isinstance(each, _Shape)]
-    options = _XLA_OPTIONS | ({} if fast else _FAST_COMPILATION) if jax.default_backend() == "cpu" else None
+    options = XLA_OPTIONS | ({} if fast else _FAST_COMPILATION) if jax.default_backend() == "cpu" else None
     with _outside_users_cache():
         lowered = jax.jit(run_flat).lower(*shapes)
         try:
@@ -225,9 +225,9 @@ def _compile(
 
 # Options of XLA for the CPU. Without its newer way to compile loops, programs compile in half the time and run as fast;
 # later versions have only that way.
-_XLA_OPTIONS: dict[str, Any] = {"xla_cpu_parallel_codegen_split_count": 1}
+XLA_OPTIONS: dict[str, Any] = {"xla_cpu_parallel_codegen_split_count": 1}
 if jax.__version_info__ < (0, 11):
-    _XLA_OPTIONS |= {"xla_cpu_use_fusion_emitters": False}
+    XLA_OPTIONS |= {"xla_cpu_use_fusion_emitters": False}
 _FAST_COMPILATION = {"xla_backend_optimization_level": 0}
 
 

@@ -43,13 +43,13 @@ def pytest_report_header(config: pytest.Config) -> str | None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out the slow tests but for the part that a hash of their names selects for this run."""
     if rotate := config.getoption("rotate"):
-        waiting = [
+        waiting = {
             item
             for item in items
             if item.get_closest_marker("slow") and zlib.crc32(item.nodeid.encode()) % rotate[1] != rotate[0]
-        ]
-        config.hook.pytest_deselected(items=waiting)
-        items[:] = [item for item in items if item not in set(waiting)]
+        }
+        config.hook.pytest_deselected(items=list(waiting))
+        items[:] = [item for item in items if item not in waiting]
 
 
 @pytest.fixture(autouse=True)

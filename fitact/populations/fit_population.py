@@ -15,7 +15,7 @@ from jaxtyping import Float
 from fitact.compiled import BatchEvaluator
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.fitting.fit import fit
+from fitact.fitting.fit import Fit, fit
 from fitact.populations.covariates import Covariates
 from fitact.populations.finger import SHARED_PARAMETER, SKIN, Finger
 from fitact.populations.finger_likelihoods import FingerLikelihoods
@@ -178,11 +178,7 @@ def _fit_fingers(
             record = TrackedFinger.from_track(item) if isinstance(item, Track) else item
             twin = fingers.get(record.fingerprint)
             if twin is None and not (isinstance(record, TrackedFinger) and new_finger):
-                if isinstance(record, TrackedFinger):  # the window of a track under its recorded drive
-                    measured = scene.model_copy(update={"drive": DriveSection(waveform="measured")})
-                    fitted = fit(record.window, measured)
-                else:
-                    fitted = fit(record, scene)
+                fitted = _fit_one(record, scene)
         except InputError as error:
             refusals.append(error)
             continue
@@ -200,6 +196,13 @@ def _fit_fingers(
     if refusals or new_finger is None:
         raise _refusal(refusals)
     return tuple(fingers.values()), new_finger, tracks
+
+
+def _fit_one(record: Record | TrackedFinger, scene: Scene) -> Fit:
+    """Fit a record, or the window of a track under its recorded drive."""
+    if isinstance(record, Record):
+        return fit(record, scene)
+    return fit(record.window, scene.model_copy(update={"drive": DriveSection(waveform="measured")}))
 
 
 def _pool_tracks(

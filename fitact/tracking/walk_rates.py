@@ -8,6 +8,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import scipy.ndimage
 from jaxtyping import Float
 
 from fitact.model.circuit import FINGER_PARAMETERS
@@ -78,9 +79,7 @@ def estimate_rates(
         logs = log_likelihood(information, timing, covariances, prior).reshape(size, points + 1)
         rates = np.exp(grid)
         within = logs > np.max(logs, axis=1, keepdims=True) - 1.92  # half of the 95 % quantile of chi-squared
-        bounds = within[:, :-1].copy()  # and the next point on either side
-        bounds[:, 1:] |= within[:, :-2]
-        bounds[:, :-1] |= within[:, 1:-1]
+        bounds = scipy.ndimage.binary_dilation(within[:, :-1], [[1, 1, 1]])  # and the next point on either side
         lower = np.where(within[:, -1], 0.0, np.min(np.where(bounds, rates[:, :-1], np.inf), axis=1))
         upper = np.max(np.where(bounds, rates[:, :-1], 0.0), axis=1)
         posterior = (logs - 0.5 * np.square(rates / prior_rate))[:, :-1] + grid[:, :-1]  # per log(rate)

@@ -67,7 +67,9 @@ def _check_steps(time: np.ndarray, steps: np.ndarray, step: float, source: str, 
         )
     run = 100  # steps of which more than half differ where the rate has changed
     usual = np.median(steps[: steps.size // run * run].reshape(-1, run), axis=1)
-    for place in np.flatnonzero(np.abs(usual / step - 1.0) > max_change)[:1].tolist():
+    changed = np.abs(usual / step - 1.0) > max_change
+    if changed.any():
+        place = int(np.argmax(changed))
         raise InputError(
             f"{source}: the time step changes from {step:.4g} s to {usual[place]:.4g} s near {time[run * place]:.4g} s;"
             " track each part with one rate by itself"

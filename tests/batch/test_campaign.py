@@ -268,7 +268,7 @@ def test_compiled_code_is_dropped_once_it_is_much(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("reports", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["rows", "reports"])
+@pytest.mark.parametrize("reports", [False, True], ids=["rows", "reports"])
 def test_rows_of_posteriors_are_those_of_sample_many(reports: bool, tmp_path: Path):
     """The draws of a report are those of a record sampled alone, as they are here."""
     made = square_record(noise=0.1, per_period=500)

@@ -152,9 +152,7 @@ def test_an_answer_is_that_of_the_recorded_samples_alone(missing: int, tolerance
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind not in ("named", "measured"))) for kind in KINDS]
-)
+@pytest.mark.parametrize("kind", KINDS)
 def test_filling_up_changes_no_answer(kind: str, monkeypatch: pytest.MonkeyPatch):
     made, given = record(kind, 33), scene(kind)
     filled = fitact.fit(made, given)

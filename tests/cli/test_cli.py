@@ -205,8 +205,7 @@ def test_a_fit_imports_only_what_it_uses(finger_path: Path, finger_scene_path: P
     """Submodules are looked for, since a lazily imported package is in sys.modules before it is loaded."""
     code = """
 import sys
-from fitact.cli import main, run_command
-from fitact.cli.app import app
+from fitact.cli import main
 try:
     main()
 except SystemExit as end:

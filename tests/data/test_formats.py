@@ -97,6 +97,13 @@ def test_what_is_written_is_read_again(tmp_path: Path):
         np.testing.assert_allclose(record[name], values, rtol=6e-12)
 
 
+def test_noise_and_frequency_are_judged_without_a_model(finger_path: Path, finger_truth: dict[str, float]):
+    record = fitact.read(finger_path)
+    assert record.noise("V") == pytest.approx(finger_truth["noise_V"], rel=0.05)
+    assert record.noise("Vsc") == pytest.approx(finger_truth["noise_Vsc"], rel=0.05)
+    assert record.frequency() == pytest.approx(100.0, rel=1e-4)
+
+
 @pytest.mark.parametrize("wave", [np.sin, lambda x: np.sign(np.sin(x)), lambda x: np.sin(x) + 0.8 * np.sin(2 * x)])
 @pytest.mark.parametrize("periods", [1.6, 2.0, 3.7, 25.3])
 def test_frequency(wave, periods: float):

@@ -14,6 +14,7 @@ import fitact
 from fitact.cli import main
 from tests.conftest import square_record
 
+SCOPY = Path(__file__).parents[3] / "shared" / "real" / "scopes" / "Lab1_Square_7kHz.csv"
 REMEDY = "state the sampling rate (--rate, or [measurement] sampling_rate in a scene)"
 START = -3e-3  # s, of the records
 
@@ -152,3 +153,18 @@ def test_the_command_line_takes_a_rate_with_a_unit(write, monkeypatch, capsys):
         out, said = capsys.readouterr()
         assert code or json.loads(out)["time_step"] == pytest.approx(1.0 / 48e3, rel=1e-6)
         assert "--rate: 'fast' is not a quantity" in said or stated != "fast"
+
+
+if SCOPY.exists():  # files of other people's instruments, which are not in a clone
+
+    def test_a_real_file_that_is_rounded(tmp_path: Path):
+        """A file of an ADALM2000 at 10 MHz; three decimals of its milliseconds are 10 samples."""
+        names = {"V": "CH1", "Vsc": "CH2"}
+        exact = fitact.read(SCOPY, channels=names)
+        assert fitact.read(SCOPY, channels=names, rate=1e7).fingerprint == exact.fingerprint
+        path = tmp_path / "rounded.csv"
+        rows = zip(exact.time, exact["V"], exact["Vsc"], strict=True)
+        path.write_text("time_ms,V,Vsc\n" + "".join(f"{1e3 * t:.3f},{v},{vsc}\n" for t, v, vsc in rows))
+        with pytest.raises(fitact.InputError, match="--rate"):
+            fitact.read(path)
+        np.testing.assert_allclose(fitact.read(path, rate=1e7).time, exact.time, rtol=0.0, atol=1e-12)

@@ -622,7 +622,7 @@ def test_an_area_scales_capacitances_up_and_the_resistance_down():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ground", ["direct", pytest.param("natural", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("ground", ["direct", "natural"])
 def test_each_finger_of_a_prior_needs_what_its_impedances_say(ground: str):
     """A sine, all that the prior frees, holds or ties included."""
     skins = {"Rsc": {"factor": 3}, "Csc": {"factor": 3}, "Ci": {"relative_sd": 0.1}, "sigma": {"factor": 2}}

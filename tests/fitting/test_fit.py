@@ -95,7 +95,7 @@ def test_nuisances_are_freed_by_evidence_and_leave_g_and_b_unbiased(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("frequency", [50.0, pytest.param(60.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("frequency", [50.0, 60.0])
 def test_hum_of_the_mains_is_modelled(frequency: float):
     """Ignoring 1 V of hum in this record would bias g and b by many standard errors."""
     made = square_record(periods=5)
