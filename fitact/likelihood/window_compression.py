@@ -64,41 +64,39 @@ class WindowCompressor:
     def compress(
         self,
         V: Float[np.ndarray, " samples"],
-        observed: Sequence[Float[np.ndarray, " samples"]],
+        rests: Sequence[Float[np.ndarray, " samples"]],
         rates: Sequence[Float[np.ndarray, " samples"] | None],
         weights: Sequence[Float[np.ndarray, " samples"] | None],
         responses: Float[np.ndarray, "nodes samples"],
         has_charge: bool,
-    ) -> tuple[tuple[Compression, ...], tuple[Float[np.ndarray, " rows"], ...], Float[np.ndarray, " samples"]]:
-        """Compress a window with the drive `V`: each channel's samples, dV/dt where it follows that, and weights.
+    ) -> tuple[tuple[Compression, ...], tuple[Float[np.ndarray, " rows"], ...]]:
+        """Compress a window with the drive `V`: each channel's rest, dV/dt where it follows that, and weights.
 
-        `responses` are those of `respond`. With `has_charge`, the charge at the first sample is unknown. Also returns V
-        in the coordinates of each, and the signal of the first at the circuit of the tables, without its charge.
+        `responses` are those of `respond`, and the rests those of `subtract_expected`. With `has_charge`, the charge at
+        the first sample is unknown. Also returns V in the coordinates of each channel.
         """
         table, step = self.tables[0], self.time[1]
         combined = table.combinations.T @ responses
         ages = MAX_DELAY if any(channel.timing for channel in self.channels) else 0
         steps, zero = drive_steps(V, 0, V.size, ages) / step, np.zeros(V.size)
-        rests = [each - x.expected @ responses for each, x in zip(observed, self.tables, strict=True)]
-        for i, (x, rate) in enumerate(zip(self.tables, rates, strict=True)):
-            if x.expected_rate is not None and rate is not None:
-                rests[i] = rests[i] - x.expected_rate * rate
         followed = [zero if rate is None else rate for rate in rates]
-        shared = self.shared.copy()
-        shared[: len(combined)] *= has_charge
+        known, begin = 0 if has_charge else len(combined), len(combined) + len(self.shared)
         # all channels with the same weights share the products of what they share
-        rows = np.concatenate([combined, shared, steps, [zero, np.gradient(V, step)], followed, rests, [V]])
-        begin = len(combined) + len(self.shared)
+        rows = np.concatenate(
+            [combined, self.shared[known:], steps, [zero, np.gradient(V, step)], followed, rests, [V]]
+        )
+        used = np.delete(np.arange(len(rows) + known), slice(len(combined), len(combined) + known))
         last, products, parts, driven = begin + len(steps), dict[int, np.ndarray](), [], []
         for i, (channel, weight) in enumerate(zip(self.channels, weights, strict=True)):
             if id(weight) not in products:
                 weighted = rows if weight is None else rows * weight
-                products[id(weight)] = weighted @ weighted.T
+                products[id(weight)] = np.zeros((len(rows) + known, len(rows) + known))
+                products[id(weight)][np.ix_(used, used)] = weighted @ weighted.T
             own = steps[: 2 * MAX_DELAY * bool(channel.timing)]
             places = [
                 *range(2 * len(combined)),
                 *[last] * len(channel.effect_sizes),
-                len(rows) - 1,
+                len(rows) + known - 1,
                 *range(begin, begin + len(own)),
             ]
             places += [*range(2 * len(combined), begin), last + 2 + i, last + 1, last + 2 + len(followed) + i]
@@ -109,7 +107,20 @@ class WindowCompressor:
             assert whole.effects is not None
             driven.append(whole.effects[-1])
             parts.append(dataclasses.replace(whole, effects=whole.effects[:-1] if effects else None))
-        return tuple(parts), tuple(driven), observed[0] - rests[0]
+        return tuple(parts), tuple(driven)
+
+    def subtract_expected(
+        self,
+        observed: Sequence[Float[np.ndarray, " samples"]],
+        rates: Sequence[Float[np.ndarray, " samples"] | None],
+        responses: Float[np.ndarray, "nodes samples"],
+    ) -> list[Float[np.ndarray, " samples"]]:
+        """Return each channel's samples less the signal of the tables' circuit, without its charge."""
+        rests = []
+        for x, each, rate in zip(self.tables, observed, rates, strict=True):
+            following = 0.0 if x.expected_rate is None or rate is None else x.expected_rate * rate
+            rests.append(each - x.expected @ responses - following)
+        return rests
 
     def respond(
         self, V: Float[np.ndarray, " samples"], start: float, before: FilterState | None

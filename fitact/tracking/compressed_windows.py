@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -57,9 +57,22 @@ class CompressedWindows:
         lowest, highest = (np.array([getattr(each, name) for each in windows]) for name in ("lowest", "highest"))
         known = np.isfinite(lowest)
         usual = float(np.median(highest[known & (highest > NO_CONTACT)])) if np.any(known) else 1.0
-        contact = ~known | ((lowest > NO_CONTACT * usual) & (lowest > _WHOLE * highest))
+        contact = ~known | is_in_contact(lowest, highest, usual)
         has_data = np.array([each.data is not None for each in windows])
         return cls(np.array([each.start for each in windows]), stack_data(windows), has_data & contact, contact)
+
+
+class WindowResponses(NamedTuple):
+    """A window with what its compression needs; without responses where it has lost samples or no drive."""
+
+    window: Window
+    responses: Float[np.ndarray, "nodes samples"] | None
+    rests: list[np.ndarray]  # of each channel, less what the model's circuit makes expect
+    rates: list[np.ndarray | None]
+    weights: list[np.ndarray | None]
+    has_charge: bool  # whether the charge at the start is unknown
+    lowest: float  # as in CompressedWindow
+    highest: float
 
 
 class WindowModel(NamedTuple):
@@ -72,53 +85,68 @@ class WindowModel(NamedTuple):
     noise: dict[str, float]
     time_constants: Float[np.ndarray, " taus"]  # s
 
-    def compress_windows(
-        self, windows: Iterable[Window], done: Sequence[CompressedWindow] = ()
-    ) -> Iterator[CompressedWindow]:
-        """Compress windows but for the first, if these are `done`; one with lost samples or no drive has no data.
+    def respond(self, windows: Iterable[Window]) -> Iterator[WindowResponses]:
+        """Yield the responses to the V of windows; none in one with lost samples or no drive.
 
         Responses go on from window to window, so that the charge at the start is known, where the finger touched all
         the time.
         """
         step, settled = float(self.compressor.time[1]), _SETTLED * float(np.max(self.time_constants))
         state: FilterState | None = None
-        for number, window in enumerate(windows):
+        for window in windows:
             V = window.channels["V"]
             if not window.is_whole or float(np.std(V)) < _DRIVEN * self.drive_rms:
                 state = None
-                yield CompressedWindow(window.start, None, math.nan, math.nan)
+                yield WindowResponses(window, None, [], [], [], False, math.nan, math.nan)
                 continue
             if state is not None and abs(window.start - state.end) > 0.5 * step:
                 state = None
             has_charge = state is None or state.age < settled
             responses, state = self.compressor.respond(V, window.start, state)
-            each = done[number] if number < len(done) else self._compress(window, responses, has_charge)
-            if not (each.lowest > NO_CONTACT and each.lowest > _WHOLE * each.highest):
+            rates, weights = self._weigh_samples(window)
+            observed = [window.channels[channel.channel] for channel in self.fit.likelihood.channels]
+            rests = self.compressor.subtract_expected(observed, rates, responses)
+            lowest, highest = self._compare_signal(observed[0], observed[0] - rests[0])
+            if not is_in_contact(lowest, highest):
                 state = None
-            yield each
+            yield WindowResponses(window, responses, rests, rates, weights, has_charge, lowest, highest)
 
-    def _compress(self, window: Window, responses: np.ndarray, has_charge: bool) -> CompressedWindow:
-        V = window.channels["V"]
-        observed, rates, weights, step = [], [], [], float(self.compressor.time[1])
+    def compress(self, given: WindowResponses) -> CompressedWindow:
+        """Compress a window; one without responses has no data."""
+        data = None
+        if given.responses is not None:
+            V = given.window.channels["V"]
+            channels = given.rests, given.rates, given.weights
+            data = WindowData(*self.compressor.compress(V, *channels, given.responses, given.has_charge))
+        return CompressedWindow(given.window.start, data, given.lowest, given.highest)
+
+    def _weigh_samples(self, window: Window) -> tuple[list[np.ndarray | None], list[np.ndarray | None]]:
+        """Return dV/dt of each channel that follows it, V/s, and weights of its samples, or None where all are 1."""
+        rates, weights, step = list[np.ndarray | None](), list[np.ndarray | None](), float(self.compressor.time[1])
         for channel in self.fit.likelihood.channels:
-            values = window.channels[channel.channel]
-            observed.append(values)
             rate = weight = None
             if channel.rate is not None:
                 inside = slice(AROUND, -AROUND)
                 rate, used = np.gradient(window.V, step)[inside], ~edge_mask(window.V, self.noise["V"])[inside]
                 spread = self.noise["V"] / (math.sqrt(2.0) * step * self.noise["I"])
-                weight = used * weigh_current_samples(values, rate, spread, used)
+                weight = used * weigh_current_samples(window.channels[channel.channel], rate, spread, used)
                 weight = None if np.all(weight == 1.0) else weight
             rates.append(rate)
             weights.append(weight)
-        compressions, drive, expected = self.compressor.compress(V, observed, rates, weights, responses, has_charge)
-        products = np.array_split(np.stack([observed[0] * expected, expected * expected]), self.parts, axis=1)
+        return rates, weights
+
+    def _compare_signal(self, observed: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
+        """Return the least and largest signal of a window's parts over the expected one."""
+        products = np.array_split(np.stack([observed * expected, expected * expected]), self.parts, axis=1)
         sizes = np.array([part.sum(axis=1) for part in products])
         driven = sizes[:, 1] > 1e-2 * sizes[:, 1].max()
         signal = sizes[driven, 0] / sizes[driven, 1]
-        data = WindowData(compressions, drive)
-        return CompressedWindow(window.start, data, float(signal.min()), float(signal.max()))
+        return float(signal.min()), float(signal.max())
+
+
+def is_in_contact(lowest: Any, highest: Any, usual: float = 1.0) -> Any:
+    """Return whether the finger touches for a whole window, from its signal over the expected and the usual one."""
+    return (lowest > NO_CONTACT * usual) & (lowest > _WHOLE * highest)
 
 
 def stack_data(windows: Sequence[CompressedWindow]) -> WindowData:

@@ -9,10 +9,11 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from fitact.data.readers.stream import Block, stream_record
 from fitact.data.record import Record, fundamental_frequency
@@ -38,6 +39,9 @@ _HEAD_SAMPLES = 65_536  # from which the time step and the period are taken
 _MIN_PERIODS, _MIN_SAMPLES = 5, 4_000  # of a default window
 UPDATE_INTERVAL = 1.0  # s, between tracks of a record that is being followed
 _TRIED = 8  # windows among which one is fitted
+
+
+_Item = TypeVar("_Item")
 
 
 class _Head(NamedTuple):
@@ -88,10 +92,11 @@ def track(
     else:
         blocks = stream_record(record, channels=channels, scale=scale, rate=rate, follow=follow)
         source = os.fspath(record)
-        is_file = os.path.isfile(source)
-        blocks = _read_ahead(blocks) if is_file and follow == 0.0 else blocks
-        total = float(os.path.getsize(source)) if is_file else math.inf
-    return track_blocks(blocks, source, total, scene, window=window, folder=folder, update=update, rates=rates)
+        total = float(os.path.getsize(source)) if os.path.isfile(source) else math.inf
+    waits = follow > 0.0 or math.isinf(total)
+    return track_blocks(
+        blocks, source, total, scene, waits=waits, window=window, folder=folder, update=update, rates=rates
+    )
 
 
 def track_blocks(
@@ -100,12 +105,16 @@ def track_blocks(
     total: float,
     scene: Scene | None = None,
     *,
+    waits: bool = False,
     window: float | None = None,
     folder: str | os.PathLike[str] | None = None,
     update: Callable[[Track], None] | None = None,
     rates: Sequence[float] | None = None,
 ) -> Track:
-    """Follow a finger along blocks of samples, as `track` does; `total` is the last block's position, for progress."""
+    """Follow a finger along blocks of samples, as `track` does.
+
+    `total` is the last block's position, for progress. A block may take long to come if the record `waits` for more.
+    """
     stated = scene or Scene()
     followed = stated.model_copy(update={"drive": DriveSection(waveform="measured")})
     if stated.measurement.noise_model != "white":
@@ -122,11 +131,12 @@ def track_blocks(
     everything = track_progress(
         itertools.chain(begun, windows), f"tracking {source}", max(total, 1.0), lambda: position[0]
     )
-    last = time.monotonic()
+    responses, last = model.respond(everything), time.monotonic()
     try:
-        with jax.enable_x64(True):
-            for each in model.compress_windows(everything, done):
-                compressed.append(each)
+        # the products are small, and a thread reads and filters meanwhile: BLAS leaves it its core
+        with jax.enable_x64(True), threadpool_limits(1):
+            for number, each in enumerate(responses if waits else _read_ahead(responses)):
+                compressed.append(done[number] if number < len(done) else model.compress(each))
                 if update is not None and time.monotonic() - last > UPDATE_INTERVAL:
                     update(_solve(model, compressed, stated, head.notes, rates))
                     last = time.monotonic()
@@ -159,13 +169,13 @@ def _watch(blocks: Iterable[Block], position: list[float]) -> Iterator[Block]:
         yield block
 
 
-def _read_ahead(blocks: Iterator[Block]) -> Iterator[Block]:
-    """Yield blocks; the next one is read while one is used."""
+def _read_ahead(items: Iterator[_Item]) -> Iterator[_Item]:
+    """Yield items; the next one is made in a thread while one is used."""
     with ThreadPoolExecutor(1) as reader:
-        following = reader.submit(next, blocks, None)
-        while (block := following.result()) is not None:
-            following = reader.submit(next, blocks, None)
-            yield block
+        following = reader.submit(next, items, None)
+        while (item := following.result()) is not None:
+            following = reader.submit(next, items, None)
+            yield item
 
 
 def _read_head(blocks: Iterator[Block], scene: Scene, source: str) -> tuple[list[Block], float | None, Iterator[Block]]:
@@ -276,7 +286,8 @@ class _Checkpoint:
                 return []
             with jax.enable_x64(True):
                 whole = next(each for each in begun if each.is_whole)
-                structure = jax.tree.structure(next(self._model.compress_windows([whole])).data)
+                given = next(self._model.respond([whole]))
+                structure = jax.tree.structure(self._model.compress(given).data)
             leaves = [stored[f"leaf{i}"] for i in range(structure.num_leaves)]
             rest = zip(stored["start"], stored["lowest"], stored["highest"], stored["has_data"], strict=True)
             return [

@@ -120,8 +120,9 @@ def refine(
     width = len(model.kept)
     prior, nuisances = model.design[model.rows :, :width], model.design[:, width:]
     start, left = model.signals(origin), residuals
+    sensitivities = model.design[: model.rows, :width]
     for _ in range(steps):
-        columns = np.concatenate([model.sensitivities(theta), _rival_at(model, rival, theta, amplitudes)], axis=1)
+        columns = np.concatenate([sensitivities, _rival_at(model, rival, theta, amplitudes)], axis=1)
         below = np.pad(prior, ((0, 0), (0, rival.amplitudes)))
         design = np.concatenate([np.concatenate([columns, below]), nuisances], axis=1)
         if not np.all(np.isfinite(design)):
@@ -133,12 +134,15 @@ def refine(
         amplitudes = np.clip(amplitudes + step[width : width + rival.amplitudes], low * rival.size, 4.0 * rival.size)
         if not np.all(np.abs(theta - origin) < 3.0 + 10.0 * np.abs(origin)):
             return fitted
-        change = _rival_signals(model, rival, theta, amplitudes) - start
+        change, before = _rival_signals(model, rival, theta, amplitudes) - start, left
         left = residuals - np.concatenate([change, prior @ (theta - origin)[model.kept]])
         if not np.all(np.isfinite(left)):
             return fitted
         if nuisances.shape[1]:  # which take up what they can
             left = left - nuisances @ np.linalg.lstsq(nuisances, left, rcond=1e-12)[0]
+        if np.linalg.norm(left - before) < 0.01:  # of a standard deviation
+            break
+        sensitivities = model.sensitivities(theta)
     variance, reference = model.noise_variance[: model.rows], residuals if reference is None else reference
     delta_chi2 = float(np.sum((reference[: model.rows] ** 2 - left[: model.rows] ** 2) / variance))
     shift = model.posterior.gradients @ (theta - origin)

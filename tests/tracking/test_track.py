@@ -217,7 +217,7 @@ def test_file_and_standard_input_give_the_same_as_arrays(short, monkeypatch):
 def test_interrupted_run_goes_on_to_the_same_result(short, tmp_path: Path, monkeypatch):
     path, _ = short
     whole = fitact.track(path, SCENE)
-    compress, count = track_record.WindowModel._compress, 0
+    compress, count = track_record.WindowModel.compress, 0
 
     def interrupt(*args: Any) -> Any:
         nonlocal count
@@ -226,7 +226,7 @@ def test_interrupted_run_goes_on_to_the_same_result(short, tmp_path: Path, monke
             raise KeyboardInterrupt
         return compress(*args)
 
-    monkeypatch.setattr(track_record.WindowModel, "_compress", interrupt)
+    monkeypatch.setattr(track_record.WindowModel, "compress", interrupt)
     with pytest.raises(KeyboardInterrupt):
         fitact.track(path, SCENE, folder=tmp_path)
     assert (tmp_path / track_record.CHECKPOINT).is_file()
