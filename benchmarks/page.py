@@ -1,38 +1,62 @@
-"""Time until the report of `fitact app`, against `fitact run` on the same file, as whole processes in turn.
+"""Time until the report of `fitact app` in Chromium, against `fitact run` on the same file, as whole processes in turn.
 
-    pip install "fitact[app]"; python benchmarks/page.py [--rounds 3] [--delay 5] [--json]
+    pip install "fitact[app,test]"; python benchmarks/page.py [--rounds 3] [--delay 5] [--json]
 
-A script sends the requests of a browser: it opens the page, uploads the shipped record and its scene, stores the form,
-presses Start, and asks for the progress every 0.2 s, as the page does. All compiled programs are stored. Medians are
-compared; standard error shows them in seconds.
+Chromium is open before. A driver opens the page, chooses the shipped record and its scene, presses Start as soon as the
+page offers it, and waits until the report shows its verdict. All compiled programs are stored. Medians are compared;
+standard error shows them in seconds: `run` until the process ends, `run_seen` until Chromium shows its report.
 
-- `at_once`: from the start of `fitact app` to the report, with no pause, over the time of `fitact run`;
-- `from_start`: from Start to the report, when a person has had the page open for `--delay` seconds before, likewise.
+- `at_once`: from the start of `fitact app` to the report, with no pause, over `run_seen`;
+- `from_start`: from Start to the report, when a person has had the page open for `--delay` seconds before, likewise;
+- `first_page`: from the start of `fitact app` to its first page, s.
 """
 
 import argparse
-import html
-import json
-import re
 import signal
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-import urllib.parse
-import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+from selenium import webdriver
+from selenium.webdriver.support.ui import WebDriverWait
 from timing import process_seconds, program_environment, show
 
 RECORD = Path(__file__).resolve().parent.parent / "data_synth" / "records" / "finger_direct.csv"
 SCENE = RECORD.with_suffix(".toml")
-POLL = 0.2  # s, of the page
+_SEEN = "document.querySelector('.verdict h2') !== null"
 
 
-def page_seconds(fitact: str, folder: Path, cache: Path, delay: float) -> tuple[float, float]:
-    """Return the seconds from opening the page, and from Start, to the report; Start is pressed after `delay`."""
+@contextmanager
+def open_chromium() -> Iterator[webdriver.Chrome]:
+    options = webdriver.ChromeOptions()
+    for option in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1280,900"):
+        options.add_argument(option)
+    driver = webdriver.Chrome(options=options)
+    try:
+        yield driver
+    finally:
+        driver.quit()
+
+
+def wait(driver: webdriver.Chrome, condition: str) -> None:
+    WebDriverWait(driver, 300.0, poll_frequency=0.05).until(lambda _: driver.execute_script(f"return {condition}"))
+
+
+def run_seconds(driver: webdriver.Chrome, command: list[str], folder: Path, cache: Path) -> dict[str, float]:
+    """Return the seconds of `fitact run`, and those until Chromium shows its report."""
+    seconds, opened = process_seconds(command, folder, cache), time.perf_counter()
+    driver.get((folder / command[-1] / "report.html").as_uri())
+    wait(driver, _SEEN)
+    return {"run": seconds, "run_seen": seconds + time.perf_counter() - opened}
+
+
+def page_seconds(driver: webdriver.Chrome, fitact: str, folder: Path, cache: Path, delay: float) -> dict[str, float]:
+    """Return the seconds from opening to the first page and to the report, and from Start, pressed after `delay`."""
     opened = time.perf_counter()
     server = subprocess.Popen(
         [fitact, "app", "--no-browser", "--out", str(folder)],
@@ -40,38 +64,22 @@ def page_seconds(fitact: str, folder: Path, cache: Path, delay: float) -> tuple[
     )  # fmt: skip
     try:
         assert server.stdout is not None
-        address = server.stdout.readline().strip()
-        host = address.rpartition("/")[0].rpartition("/")[0]
-
-        def ask(path: str, body: bytes | None = None) -> str:
-            request = urllib.request.Request(address + path, body, {"Origin": host} if body is not None else {})
-            with urllib.request.urlopen(request) as answer:
-                return str(answer.read().decode())
-
-        ask("")
-        place = "analyses/" + json.loads(ask(f"files?name={RECORD.name}", RECORD.read_bytes()))["analysis"]
-        ask(f"{place}/scene", SCENE.read_bytes())
-        form = read_form(ask(place))
+        driver.get(server.stdout.readline().strip())
+        shown = time.perf_counter()
+        driver.find_element("id", "files").send_keys(f"{RECORD}\n{SCENE}")
+        wait(driver, "document.getElementById('start') !== null")
         time.sleep(max(opened + delay - time.perf_counter(), 0.0))
         started = time.perf_counter()
-        ask(f"{place}/set-up", urllib.parse.urlencode(form).encode())
-        ask(f"{place}/actions/start", b"")
-        while '"finished"' not in ask(f"{place}/progress"):
-            time.sleep(POLL)
-        ask(f"{place}/report")
+        driver.find_element("id", "start").click()
+        wait(driver, "document.body.dataset.state === 'finished'")
+        driver.switch_to.frame(driver.find_element("tag name", "iframe"))
+        wait(driver, _SEEN)
         now = time.perf_counter()
-        return now - opened, now - started
+        driver.switch_to.default_content()
+        return {"first_page": shown - opened, "opened": now - opened, "started": now - started}
     finally:
         server.send_signal(signal.SIGINT)
         server.wait()
-
-
-def read_form(page: str) -> dict[str, str]:
-    """Return what the form of the page holds, as a browser would send it."""
-    stated = re.findall(r'<input [^>]*name="([^"]+)" value="([^"]*)"', page)
-    for name, options in re.findall(r'<select [^>]*name="([^"]+)"[^>]*>(.*?)</select>', page, re.DOTALL):
-        stated += [(name, choice) for choice in re.findall(r"<option selected>([^<]*)<", options)]
-    return {name: html.unescape(value) for name, value in stated}
 
 
 def main() -> None:
@@ -82,19 +90,21 @@ def main() -> None:
     given = parser.parse_args()
     fitact = str(Path(sys.executable).with_name("fitact"))
     command = [fitact, "run", str(RECORD), "--scene", str(SCENE), "--fresh", "--out", "results"]
-    taken: dict[str, list[float]] = {"run": [], "at_once": [], "opened": [], "from_start": []}
-    with tempfile.TemporaryDirectory() as name:
+    taken: dict[str, list[float]] = {name: [] for name in ("run", "run_seen", "at_once", "from_start", "first_page")}
+    with tempfile.TemporaryDirectory() as name, open_chromium() as driver:
         folder, cache = Path(name), Path(name) / "cache"
         process_seconds(command, folder, cache)  # fills the cache
         for _ in range(given.rounds):
-            taken["run"].append(process_seconds(command, folder, cache))
-            taken["at_once"].append(page_seconds(fitact, folder / "page", cache, 0.0)[0])
-            opened, started = page_seconds(fitact, folder / "page", cache, given.delay)
-            taken["opened"].append(opened)
-            taken["from_start"].append(started)
+            for key, seconds in run_seconds(driver, command, folder, cache).items():
+                taken[key].append(seconds)
+            at_once, later = (page_seconds(driver, fitact, folder / "page", cache, each) for each in (0.0, given.delay))
+            taken["at_once"].append(at_once["opened"])
+            taken["from_start"].append(later["started"])
+            taken["first_page"] += [at_once["first_page"], later["first_page"]]
     median = {key: statistics.median(each) for key, each in taken.items()}
     print(", ".join(f"{key} {value:.2f} s" for key, value in median.items()), file=sys.stderr)
-    show({key: median[key] / median["run"] for key in ("at_once", "from_start")}, given.json)
+    ratios = {key: median[key] / median["run_seen"] for key in ("at_once", "from_start")}
+    show(ratios | {"first_page": median["first_page"]}, given.json)
 
 
 if __name__ == "__main__":

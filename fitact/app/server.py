@@ -50,7 +50,7 @@ _STALE_UPLOAD = 86_400.0  # s, after which the uploads of a server that was kill
 _PERCENT = re.compile(r"(\d+)%")
 
 
-def serve(root: Path, port: int, browser: bool) -> None:
+def serve(root: Path, port: int, browser: bool, commands: WarmCommands) -> None:
     """Serve the page on 127.0.0.1 until Ctrl-C, with all analyses in the folder `root`; print its address first.
 
     Raises:
@@ -81,16 +81,16 @@ def serve(root: Path, port: int, browser: bool) -> None:
         threading.Thread(target=webbrowser.open, args=(opener.as_uri(),), daemon=True).start()
     level = "warning" if os.environ.get("FITACT_DEBUG") else "critical"  # of errors, the page shows a sentence
     config = uvicorn.Config(
-        make_app(root, Path(uploads.name), token, port),
+        make_app(root, Path(uploads.name), token, port, commands),
         log_level=level, access_log=False, ws="none", server_header=False, timeout_graceful_shutdown=2,
     )  # fmt: skip
     with uploads, contextlib.suppress(KeyboardInterrupt):
         uvicorn.Server(config).run(sockets=[listener])
 
 
-def make_app(root: Path, uploads: Path, token: str, port: int) -> Starlette:
+def make_app(root: Path, uploads: Path, token: str, port: int, commands: WarmCommands) -> Starlette:
     """Return the application; `uploads` is a folder on the same disk as `root`, for files that are still arriving."""
-    page = Page(root, uploads, token)
+    page = Page(root, uploads, token, commands)
     one = "/analyses/{id}"
     routes = [
         Route("/", page.show_home),
@@ -127,9 +127,8 @@ async def _refuse(_: Request, error: Exception) -> Response:
 class Page:
     """The handlers of all addresses."""
 
-    def __init__(self, root: Path, uploads: Path, token: str) -> None:
-        self._root, self._uploads = root, uploads
-        self._commands = WarmCommands()
+    def __init__(self, root: Path, uploads: Path, token: str, commands: WarmCommands) -> None:
+        self._root, self._uploads, self._commands = root, uploads, commands
         self._inspections: dict[tuple[str, ...], CommandResult] = {}
         self._templates = jinja2.Environment(
             loader=jinja2.PackageLoader("fitact.app"), autoescape=True, undefined=jinja2.StrictUndefined,
@@ -142,8 +141,7 @@ class Page:
 
     @contextlib.asynccontextmanager
     async def live(self, _: Starlette) -> AsyncIterator[None]:
-        """Prepare a process for commands, which ends with the server; remove what a killed server left."""
-        self._commands.prepare()
+        """Remove what a killed server left; end the process for commands with the server."""
         for old in self._root.glob(".upload-*"):
             if time.time() - old.stat().st_mtime > _STALE_UPLOAD:
                 shutil.rmtree(old, ignore_errors=True)

@@ -1,5 +1,6 @@
 """Processes for commands, one of which waits with its slow imports done (`fitact.cli.warm`)."""
 
+import asyncio
 import json
 import subprocess
 import sys
@@ -7,8 +8,6 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
-
-from starlette.concurrency import run_in_threadpool
 
 
 class CommandResult(NamedTuple):
@@ -44,14 +43,14 @@ class WarmCommands:
     async def describe_scenes(self) -> dict[str, Any]:
         """Return `fields`, the keys of a scene (`describe_fields`), and `scenes`, the names of shipped scenes."""
         if not self._scenes:
-            self._scenes = await run_in_threadpool(self._ask, {})
+            self._scenes = await asyncio.to_thread(self._ask, {})
         return self._scenes
 
     async def run(self, folder: Path, *arguments: str) -> CommandResult:
         """Run `fitact ARGUMENTS` in a folder."""
         try:
             question = {"folder": str(folder), "arguments": arguments}
-            return CommandResult(**await run_in_threadpool(self._ask, question))
+            return CommandResult(**await asyncio.to_thread(self._ask, question))
         except (ConnectionError, json.JSONDecodeError):  # killed, e.g. for its memory
             sentence = f"fitact: the process that read {arguments[1]} has died; try the command line"
             return CommandResult(3, "", sentence)

@@ -7,6 +7,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     submodules={"summary"},
     submod_attrs={
         "app.server": ["serve"],
+        "app.warm_commands": ["WarmCommands"],
         "data.readers.read": ["write_csv"],
         "data.simulate": ["simulate"],
         "data.kramers_kronig": ["check_kramers_kronig"],

@@ -25,8 +25,10 @@ def open_app(
 
     Prints the address of the page first; only this machine reaches it, and only with this address. Ctrl-C ends it.
     """
+    commands = internal.WarmCommands()
+    commands.prepare()  # it imports while the server does
     try:
         serve = internal.serve
     except ImportError as error:
         raise InputError(f"fitact app needs Starlette and uvicorn ({error}); pip install 'fitact[app]'") from error
-    serve(out or Path.home() / "fitact-results", port, not no_browser)
+    serve(out or Path.home() / "fitact-results", port, not no_browser, commands)

@@ -19,7 +19,7 @@ import sys
 import threading
 from typing import Any
 
-from fitact.cli import run_command
+from fitact.cli import end_process, run_command
 from fitact.cli.app import app
 from fitact.scene.fields import describe_fields
 from fitact.scene.toml import shipped_scenes
@@ -43,7 +43,7 @@ def main() -> None:
     while line := _next_question():
         question = json.loads(line)
         if question.pop("last", False):
-            raise SystemExit(_run_last(**question))
+            end_process(_run_last(**question))
         answer = _answer(**question) if question else {"fields": describe_fields(), "scenes": sorted(shipped_scenes())}
         print(json.dumps(answer), file=answers, flush=True)
 

@@ -103,7 +103,7 @@ def test_an_upload_that_hides_its_size_ends_at_the_limit_and_leaves_nothing(tmp_
     monkeypatch.setattr(module, "LARGEST_UPLOAD", MEGABYTE)
     (root := tmp_path / "root").mkdir()
     (uploads := tmp_path / "uploads").mkdir()
-    app = module.make_app(root, uploads, "token", 80)
+    app = module.make_app(root, uploads, "token", 80, module.WarmCommands())
     taken, status = [], []
 
     async def receive():
