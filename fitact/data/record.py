@@ -131,7 +131,7 @@ class Record(Display):
         return self._estimates["frequency", channel]
 
     def plot(self) -> Any:
-        """Draw V, Vsc and I on one time axis, and return the axes, one for each channel."""
+        """Draw V, Vsc, I and Ft on one time axis, and return the axes, one for each channel."""
         series = [
             charts.Series(title, CHANNEL_UNITS[name], self[name], clipped=clipping_mask(self[name]))
             for name, title in CHANNEL_TITLES.items()
@@ -140,7 +140,7 @@ class Record(Display):
         return charts.show_plots(charts.time_plot(self.time, series))
 
     def to_dataframe(self) -> Any:
-        """Return a pandas DataFrame with the columns of a record file: time_s, V_V, Vsc_V, I_A."""
+        """Return a pandas DataFrame with the columns of a record file: time_s, V_V, Vsc_V, I_A, Ft_N."""
         import pandas as pd
 
         columns = {f"{name}_{CHANNEL_UNITS[name]}": values for name, values in self.channels.items()}

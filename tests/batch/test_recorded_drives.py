@@ -81,6 +81,7 @@ def skewed() -> list[fitact.Record]:
 UNUSUAL = range(3, 10)
 
 
+@pytest.mark.slow
 def test_clear_records_are_fitted_together_and_unusual_ones_are_not(skewed):
     expected = [number not in UNUSUAL for number in range(20)]
     np.testing.assert_array_equal(accepted(skewed), expected)

@@ -63,7 +63,7 @@ def replace_drive(text: str) -> str:
     return before + MEASURED + "[friction]" + after.split("[friction]")[1]
 
 
-@pytest.mark.parametrize("is_measured", [False, True])
+@pytest.mark.parametrize("is_measured", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_scale_and_sensor_are_recovered(tmp_path: Path, is_measured: bool) -> None:
     """Any seed serves: a pull beyond 4 has a probability below 1e-4."""
     record, text = simulate(tmp_path, "[friction]\nforce_scale = 3.0\n")
@@ -76,6 +76,7 @@ def test_scale_and_sensor_are_recovered(tmp_path: Path, is_measured: bool) -> No
     assert sd["force_scale"] == pytest.approx(0.05, rel=0.05)  # that of Ci, which Vsc does not determine
 
 
+@pytest.mark.slow
 def test_friction_determines_what_the_electrical_channels_do_not(tmp_path: Path) -> None:
     """If the law is known, the size of the force determines the contact area and thus Ci."""
     record, text = simulate(tmp_path)
@@ -104,6 +105,7 @@ def test_tables_say_whether_the_law_holds(tmp_path: Path) -> None:
     assert agreeing.to_dict()["derived"]["friction_mean"]["q50"] == pytest.approx(0.6 * (0.5 + 271e-6), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_crosstalk_of_the_drive_is_freed(tmp_path: Path) -> None:
     record, text = simulate(tmp_path, "[friction]\ncrosstalk = 2e-6\n")
     fit = fitact.fit(record, load(tmp_path, text))

@@ -102,6 +102,7 @@ def test_an_error_that_nobody_states_is_named(change: dict[str, Any]):
     assert str(silent).count("no instrument stated") == 1
 
 
+@pytest.mark.slow
 def test_records_of_a_session_do_not_average_a_gain_away(fit: fitact.Fit):
     gained = {"scope-8bit:A/CH2": {"gain": 0.025}}
     records = [make(seed=seed, **gained) for seed in range(3)]
@@ -110,6 +111,7 @@ def test_records_of_a_session_do_not_average_a_gain_away(fit: fitact.Fit):
     assert [name for name in joint.names if name.startswith("gain")] == ["gain", "gain_V"]
 
 
+@pytest.mark.slow
 def test_gain_relative_sd_is_one_error_of_the_session():
     scene = plain(measurement={"channels": ["Vsc"], "gain_relative_sd": 0.02})
     one, three = (fitact.fit([make(seed=seed) for seed in range(count)], scene) for count in (1, 3))
@@ -197,6 +199,7 @@ def test_nonlinearity_of_V_is_an_error_of_all_channels(setup: str, shape: str):
     assert any(each.source == f"V nonlinearity, {shape} (scope-8bit:A/CH1)" for each in fit.budgets["b"].components)
 
 
+@pytest.mark.slow
 def test_a_certificate_of_nonlinearity_keeps_its_distribution():
     own = {"scope-8bit:A/CH2": {"nonlinearity": {"expanded": "0.2 %", "k": 2}}}
     scene = plain(instrument=INSTRUMENT | {"own": own}, measurement={"channels": ["Vsc"]})
@@ -224,7 +227,8 @@ def test_an_offset_within_the_limits_is_free(fit: fitact.Fit):
     assert "offset" not in fitact.fit(make(), plain()).linear
 
 
-@pytest.mark.parametrize("noise", ["ar1", pytest.param("student", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", ["ar1", "student"])
 def test_effects_under_other_noise(noise: str):
     scene = session.scene("Vsc").model_dump(mode="json", exclude_unset=True)
     scene["measurement"] |= {"noise_model": noise}
@@ -248,6 +252,7 @@ def dummy_scene(folder: Path, wrong: float = 1.0, gain: float = 0.025) -> fitact
     return fitact.Scene.from_dict(stated | {"calibration": [{"record": str(folder / "dummy.csv"), "circuit": parts}]})
 
 
+@pytest.mark.slow
 def test_a_dummy_calibrates_the_gain(tmp_path: Path):
     fit = fitact.fit(make(**{"scope-8bit:A/CH2": {"gain": 0.025}}), dummy_scene(tmp_path))
     assert float(fit.derived()["g"]["u"]) < 0.003
@@ -302,6 +307,7 @@ def test_a_calibration_needs_instruments(tmp_path: Path, record: fitact.Record):
         fitact.fit(record, fitact.Scene.from_dict(stated))
 
 
+@pytest.mark.slow
 def test_a_common_gain_of_an_oscilloscope_cancels_in_the_ratio():
     own = {f"scope-8bit:A/CH{i}": {"gain": {"tolerance": "0.1 %"}} for i in (1, 2)}
     own["scope-8bit:A"] = {"gain_common": {"tolerance": "3 %"}}

@@ -97,6 +97,7 @@ def test_errors_are_those_of_scipy_with_the_same_weights(weighting: str):
 CELLS = Path(__file__).parents[3] / "shared" / "real" / "impedance_py"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not CELLS.exists(), reason="the files of others' instruments are not shipped")
 @pytest.mark.parametrize(
     ("name", "parts"), [("Circuit1", (29.1, 46.7, 10.4e-6)), ("Circuit2", (150.0, 502.0, 31.2e-9))]
@@ -258,6 +259,7 @@ def test_outliers_count_less_with_student_noise():
     assert np.all(student.sd < 0.3 * white.sd)
 
 
+@pytest.mark.slow
 def test_posterior_and_its_files(tmp_path: Path):
     found = fitact.fit([gain_spectrum(), spectrum()])
     posterior = fitact.sample(found, level="psis")

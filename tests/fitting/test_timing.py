@@ -111,6 +111,7 @@ def test_a_skew_of_whole_steps_is_an_optimum_at_a_corner(seed: int):
     assert abs(fit.parameters()["delay"]["q50"] - 2e-5) < 4.0 * fit.parameters()["delay"]["sd"]
 
 
+@pytest.mark.slow
 def test_a_skew_is_found_among_outliers():
     """Under Student's t, the samples at edges that a skew moves look like outliers; an unnoticed skew biases g.
 

@@ -57,7 +57,10 @@ BOUNDS = {
 }
 
 
-@pytest.mark.parametrize("name", BOUNDS)
+FIRST = next(iter(BOUNDS))
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n != FIRST)) for n in BOUNDS])
 def test_a_bound_cuts_what_the_data_determine(name: str):
     """Test that the quantiles are those of the truncated law, and that the fit says if its optimum is forbidden."""
     bounds = BOUNDS[name]
@@ -125,6 +128,7 @@ def heavy_record(samples: int) -> fitact.Record:
     return record(rng.standard_normal(samples) * np.where(rng.uniform(size=samples) < 0.05, 10.0, 1.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "samples", "tolerance"), HEAVY)
 def test_one_sample_in_twenty_is_an_outlier(model: str, samples: int, tolerance: float):
     """Test Student-t noise, whose expansion must hold to ten tolerances, and what normal noise gives."""

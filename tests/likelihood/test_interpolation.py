@@ -87,14 +87,8 @@ def test_timing_of_a_stated_drive(late: float, clock: float, names: set[str]):
         assert abs(delay["q50"] - late * STEP) < 4.0 * delay["sd"]
 
 
-@pytest.mark.parametrize(
-    ("late", "noise_model"),
-    [
-        (2.3, "white"),
-        pytest.param(1.0, "white", marks=pytest.mark.slow),
-        pytest.param(2.3, "ar1", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("late", "noise_model"), [(2.3, "white"), (1.0, "white"), (2.3, "ar1")])
 def test_delay_of_a_measured_drive(late: float, noise_model: str):
     """Test also a delay of whole samples, whose posterior lies on both sides of a corner of the response."""
     noise = np.random.default_rng(2).standard_normal(SAMPLES)

@@ -66,6 +66,7 @@ def test_uniform_priors_give_the_inverse_square_law_along_the_blind_direction(bo
     assert "REFUSED" in str(laplace)
 
 
+@pytest.mark.slow
 def test_autocorrelation_is_short_in_a_box():
     c = fitact.sample(box_fit("Rsc binds", "compressed"), seed=5, progress=False).convergence
     assert c.tau_max < 5.0

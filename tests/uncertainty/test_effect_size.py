@@ -65,10 +65,10 @@ class Outcome:
 @pytest.mark.parametrize(
     "case",
     [
-        Case("trapezoid", "compensation", 1.0, 1),
+        pytest.param(Case("trapezoid", "compensation", 1.0, 1), marks=pytest.mark.slow),
         Case("trapezoid", "AC coupling", 1.0, 1),
         pytest.param(Case("multisine", "dispersion", 1.0, 1), marks=pytest.mark.slow),
-        Case("trapezoid", "resistor", 1.0, 1),
+        pytest.param(Case("trapezoid", "resistor", 1.0, 1), marks=pytest.mark.slow),
         Case("multisine", "hum", -1.0, 1),
         Case("trapezoid", "ADC", 2.0, 1),
     ],

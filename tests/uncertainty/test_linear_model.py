@@ -47,7 +47,7 @@ CASES = {
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in ("current", "natural ground"))) for n in CASES]
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n not in ("delay", "unknown charge"))) for n in CASES]
 )
 def test_sensitivities_are_those_of_the_likelihood(name: str):
     record, scene = CASES[name]
