@@ -18,10 +18,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
+from chromium import open_chromium
 from selenium import webdriver
 from selenium.webdriver.support.ui import WebDriverWait
 from timing import process_seconds, program_environment, show
@@ -29,18 +28,6 @@ from timing import process_seconds, program_environment, show
 RECORD = Path(__file__).resolve().parent.parent / "data_synth" / "records" / "finger_direct.csv"
 SCENE = RECORD.with_suffix(".toml")
 _SEEN = "document.querySelector('.verdict h2') !== null"
-
-
-@contextmanager
-def open_chromium() -> Iterator[webdriver.Chrome]:
-    options = webdriver.ChromeOptions()
-    for option in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1280,900"):
-        options.add_argument(option)
-    driver = webdriver.Chrome(options=options)
-    try:
-        yield driver
-    finally:
-        driver.quit()
 
 
 def wait(driver: webdriver.Chrome, condition: str) -> None:

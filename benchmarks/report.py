@@ -7,14 +7,12 @@ Opening ends when the first screen with its chart is drawn. The response is time
 """
 
 import argparse
-import shutil
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from selenium import webdriver
+from chromium import open_chromium
 from timing import medians, show
 
 import fitact
@@ -40,21 +38,6 @@ def write_pages(folder: Path) -> dict[str, Path]:
     return pages
 
 
-def browser() -> Any:
-    """Yield a headless Chromium."""
-    options = webdriver.ChromeOptions()
-    options.binary_location = shutil.which("chromium")
-    for each in (
-        "--headless=new",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--disable-dev-shm-usage",
-        "--window-size=1280,900",
-    ):
-        options.add_argument(each)
-    return webdriver.Chrome(options, webdriver.ChromeService(shutil.which("chromedriver")))
-
-
 DRAWN = "() => document.querySelector('figure.chart .plot .main-svg') !== null"
 FRAME = "new Promise((done) => requestAnimationFrame(() => setTimeout(done)))"
 WAIT = f"""const done = arguments[arguments.length - 1];
@@ -70,23 +53,19 @@ look();"""
 
 def measure_pages() -> tuple[dict[str, float], dict[str, int]]:
     """Return median seconds, and bytes of each page."""
-    driver = browser()
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            pages = write_pages(Path(folder))
+    with open_chromium() as driver, tempfile.TemporaryDirectory() as folder:
+        pages = write_pages(Path(folder))
 
-            def open_page(name: str) -> None:
-                driver.get(pages[name].as_uri())
-                driver.execute_async_script(WAIT)
+        def open_page(name: str) -> None:
+            driver.get(pages[name].as_uri())
+            driver.execute_async_script(WAIT)
 
-            times = medians({f"{name} opened": lambda name=name: open_page(name) for name in pages}, ROUNDS)
-            for name in pages:
-                open_page(name)
-                driver.execute_async_script(SHOW)
-                times |= medians({f"{name} answered": lambda: driver.execute_async_script(PRESS)}, ROUNDS)
-            return times, {name: page.stat().st_size for name, page in pages.items()}
-    finally:
-        driver.quit()
+        times = medians({f"{name} opened": lambda name=name: open_page(name) for name in pages}, ROUNDS)
+        for name in pages:
+            open_page(name)
+            driver.execute_async_script(SHOW)
+            times |= medians({f"{name} answered": lambda: driver.execute_async_script(PRESS)}, ROUNDS)
+        return times, {name: page.stat().st_size for name, page in pages.items()}
 
 
 def main() -> None:

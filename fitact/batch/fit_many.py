@@ -1,24 +1,22 @@
 """Separate fits of many records, in batches of similar records; a failure does not affect other records."""
 
 import collections
-import contextlib
 import csv
 import dataclasses
 import functools
 import itertools
 import os
-import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from fitact.batch.batch_problem import BatchFit, BatchProblem
 from fitact.batch.recorded_drive import RecordedDriveProblem
 from fitact.batch.stated_drive import StatedDriveProblem
+from fitact.blas import limit_to_one_thread
 from fitact.compiled import available_cores
 from fitact.data.readers.read import read
 from fitact.data.record import Record
@@ -159,7 +157,7 @@ def tabulate_records(
     (scene or Scene()).require_available(fit=True)
     rows: dict[int, Row] = {}
     total = len(records) if isinstance(records, Sequence) else 0
-    with jax.enable_x64(True), _BLAS_THREADS.limit_to_one():
+    with jax.enable_x64(True), limit_to_one_thread():
         numbered_rows = make_rows(_group_records(_read_records(records, scene, columns, rows), scene))
         if progress_title and total:
             numbered_rows = track_progress(numbered_rows, progress_title, total)
@@ -171,31 +169,6 @@ def _fit_rows(batches: Iterable[Batch], scene: Scene | None, whiteness: bool) ->
     for (_, members), (rows, _) in run_in_threads(batches, functools.partial(fit_batch, whiteness=whiteness)):
         for number, record in members:
             yield number, rows[number] if number in rows else _fit_single(record, scene)
-
-
-class _BlasThreadLimit:
-    """Limit of one thread for BLAS, which would otherwise compete with `run_in_threads` for the cores."""
-
-    def __init__(self) -> None:
-        self._lock, self._users = threading.Lock(), 0
-
-    @contextlib.contextmanager
-    def limit_to_one(self) -> Iterator[None]:
-        """Limit the whole process until the last of several simultaneous calls has ended."""
-        with self._lock:
-            self._users += 1
-            if self._users == 1:
-                self._limits = threadpool_limits(1)
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._users -= 1
-                if self._users == 0:
-                    self._limits.restore_original_limits()
-
-
-_BLAS_THREADS = _BlasThreadLimit()
 
 
 def _read_records(

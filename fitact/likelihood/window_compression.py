@@ -80,26 +80,27 @@ class WindowCompressor:
         ages = MAX_DELAY if any(channel.timing for channel in self.channels) else 0
         steps, zero = drive_steps(V, 0, V.size, ages) / step, np.zeros(V.size)
         followed = [zero if rate is None else rate for rate in rates]
-        known, begin = 0 if has_charge else len(combined), len(combined) + len(self.shared)
+        rank = len(combined)
+        shared = self.shared if has_charge else self.shared[rank:]
         # all channels with the same weights share the products of what they share
-        rows = np.concatenate(
-            [combined, self.shared[known:], steps, [zero, np.gradient(V, step)], followed, rests, [V]]
-        )
-        used = np.delete(np.arange(len(rows) + known), slice(len(combined), len(combined) + known))
+        rows = np.concatenate([combined, shared, steps, [zero, np.gradient(V, step)], followed, rests, [V]])
+        begin = rank + len(shared)
         last, products, parts, driven = begin + len(steps), dict[int, np.ndarray](), [], []
+        baseline = begin - (len(self.shared) - rank)
+        decays = range(rank, baseline) if has_charge else [last] * rank  # the row of zeros, if the charge is known
         for i, (channel, weight) in enumerate(zip(self.channels, weights, strict=True)):
             if id(weight) not in products:
                 weighted = rows if weight is None else rows * weight
-                products[id(weight)] = np.zeros((len(rows) + known, len(rows) + known))
-                products[id(weight)][np.ix_(used, used)] = weighted @ weighted.T
+                products[id(weight)] = weighted @ weighted.T
             own = steps[: 2 * MAX_DELAY * bool(channel.timing)]
             places = [
-                *range(2 * len(combined)),
+                *range(rank),
+                *decays,
                 *[last] * len(channel.effect_sizes),
-                len(rows) + known - 1,
+                len(rows) - 1,
                 *range(begin, begin + len(own)),
             ]
-            places += [*range(2 * len(combined), begin), last + 2 + i, last + 1, last + 2 + len(followed) + i]
+            places += [*range(baseline, begin), last + 2 + i, last + 1, last + 2 + len(followed) + i]
             total = products[id(weight)][np.ix_(places, places)]
             count = V.size if weight is None else int(np.count_nonzero(weight))
             effects = len(channel.effect_sizes)

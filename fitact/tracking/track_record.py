@@ -13,8 +13,8 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from fitact.blas import limit_to_one_thread
 from fitact.data.readers.stream import Block, stream_record
 from fitact.data.record import Record, fundamental_frequency
 from fitact.errors import InputError
@@ -134,7 +134,7 @@ def track_blocks(
     responses, last = model.respond(everything), time.monotonic()
     try:
         # the products are small, and a thread reads and filters meanwhile: BLAS leaves it its core
-        with jax.enable_x64(True), threadpool_limits(1):
+        with jax.enable_x64(True), limit_to_one_thread():
             for number, each in enumerate(responses if waits else _read_ahead(responses)):
                 compressed.append(done[number] if number < len(done) else model.compress(each))
                 if update is not None and time.monotonic() - last > UPDATE_INTERVAL:

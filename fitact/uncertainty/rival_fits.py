@@ -121,7 +121,9 @@ def refine(
     prior, nuisances = model.design[model.rows :, :width], model.design[:, width:]
     start, left = model.signals(origin), residuals
     sensitivities = model.design[: model.rows, :width]
-    for _ in range(steps):
+    for number in range(steps):
+        if number > 0:
+            sensitivities = model.sensitivities(theta)
         columns = np.concatenate([sensitivities, _rival_at(model, rival, theta, amplitudes)], axis=1)
         below = np.pad(prior, ((0, 0), (0, rival.amplitudes)))
         design = np.concatenate([np.concatenate([columns, below]), nuisances], axis=1)
@@ -142,7 +144,6 @@ def refine(
             left = left - nuisances @ np.linalg.lstsq(nuisances, left, rcond=1e-12)[0]
         if np.linalg.norm(left - before) < 0.01:  # of a standard deviation
             break
-        sensitivities = model.sensitivities(theta)
     variance, reference = model.noise_variance[: model.rows], residuals if reference is None else reference
     delta_chi2 = float(np.sum((reference[: model.rows] ** 2 - left[: model.rows] ** 2) / variance))
     shift = model.posterior.gradients @ (theta - origin)
