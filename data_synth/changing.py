@@ -19,7 +19,7 @@ _SETTLED = 20.0  # time constants before the record, in which the charge of an e
 _SUBSTEPS = 4  # per step of a curved drive, which is taken as straight within a substep
 _LIFTED = 1e-4  # ratio of Ci of a lifted finger to that in contact
 _LIFT_TIME = 2e-3  # s, in which a finger leaves the panel or returns to it
-_WALK_STEPS = 3_000  # of a random walk over a record
+_WALK_STEP = 2e-3  # s, of a random walk, or a 3,000th of a shorter record; few steps in a window are no walk
 
 
 class Course(NamedTuple):
@@ -61,7 +61,8 @@ def make_course(
     if np.any(np.diff(times) <= 0.0):
         raise RecipeError("[change] time does not increase; sort it")
     lift_times, lift_logs = _lifts(change["lifted"] or ())
-    grid = np.unique(np.concatenate([times, np.linspace(0.0, duration, _WALK_STEPS + 1), lift_times]))
+    count = max(3_000, math.ceil(duration / _WALK_STEP))
+    grid = np.unique(np.concatenate([times, np.linspace(0.0, duration, count + 1), lift_times]))
     found = {name: np.interp(grid, times, each) for name, each in logs.items()}
     steps_between = np.sqrt(np.diff(grid, prepend=grid[0]))
     for name in found:

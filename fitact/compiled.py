@@ -92,7 +92,7 @@ def jit(
 ) -> Callable[_Arguments, _Result]:
     """Return a function that runs `function` as a compiled program, on NumPy arrays.
 
-    Without `fast`, the program compiles faster and runs up to twice as long: for what runs a few times for each record.
+    Without `fast`, the program compiles faster and takes up to five times as long: for what takes milliseconds.
     It computes in double precision or, without `double`, in the current precision of JAX. Arrays are arguments of the
     program; all else in the arguments, Python's floats included, is static. Within another traced function, `function`
     itself is traced.

@@ -5,6 +5,7 @@ finger needs.
 """
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -131,7 +132,7 @@ class _DriveEvaluator(NamedTuple):
             return jax.tree.map(lambda x: np.asarray(x).reshape(*self.people.shape, *x.shape[1:]), effects)
 
 
-@jit
+@functools.partial(jit, fast=True)
 def _map_fingers(
     template: RC,
     geometry: Geometry,
@@ -146,7 +147,7 @@ def _map_fingers(
         felt = None if sensitivity is None else sensation(circuit, drive, contact, sensitivity)
         return period_quantities(circuit, drive, contact), felt
 
-    return jax.lax.map(evaluate_finger, values, batch_size=1024)  # the batch bounds memory
+    return jax.lax.map(evaluate_finger, values, batch_size=64)  # whose responses fit in the processor's cache
 
 
 def _required_amplitudes(

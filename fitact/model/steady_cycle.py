@@ -10,6 +10,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -28,7 +29,9 @@ class PeriodQuantities(NamedTuple):
     force_mean: Array  # N
     force_alternating: Array  # AC amplitude, N: sqrt(2) times the rms about the mean
     force_harmonics: Float[Array, " harmonics"]  # amplitudes at the harmonics of the drive's frequency, N
-    insulator_peak: Array  # maximum voltage across the insulator, V
+    insulator_peak: (
+        Array  # maximum |voltage| across the insulator, edges included, V; without a leak with the mean of V
+    )
     real_power: Array  # mean of V I, dissipated in skins and resistances, W
     apparent_power: Array  # rms V times rms I, VA; infinite, like both currents, if the current has impulses
     current_rms: Array  # through the body, A
@@ -37,8 +40,11 @@ class PeriodQuantities(NamedTuple):
 
 def period_quantities(circuit: RC, drive: Periodic, contact: Contact | AirGap) -> PeriodQuantities:
     """Compute all `PeriodQuantities`; the force acts on `contact`, eqs. (1) and (22)."""
-    period, terms = PeriodGrid.from_drive(drive), circuit.channel_terms(contact.channel)
-    force = electrostatic_force(period.response(terms), contact)
+    period = PeriodGrid.from_drive(drive)
+    acting, insulator, current = period.responses(
+        circuit.channel_terms(contact.channel), circuit.insulator_terms(), circuit.current_terms()
+    )
+    force = electrostatic_force(acting, contact)
     mean = period.weight @ force
     rms = jnp.sqrt(mean_square(circuit, drive, "I"))
     turns = jnp.exp(-2j * np.pi * jnp.arange(1, HARMONICS + 1)[:, None] * period.cycles)
@@ -46,11 +52,11 @@ def period_quantities(circuit: RC, drive: Periodic, contact: Contact | AirGap) -
         force_mean=mean,
         force_alternating=jnp.sqrt(2.0 * (period.weight @ jnp.square(force - mean))),
         force_harmonics=2.0 * jnp.abs(turns @ (period.weight * force)),
-        insulator_peak=insulator_peak(circuit, drive),
+        insulator_peak=period.max_abs(insulator),
         real_power=real_power(circuit, drive),
         apparent_power=jnp.sqrt(period.weight @ jnp.square(period.voltage)) * rms,
         current_rms=rms,
-        current_peak=jnp.where(jnp.isinf(rms), jnp.inf, period.max_abs(period.response(circuit.current_terms()))),
+        current_peak=jnp.where(jnp.isinf(rms), jnp.inf, period.max_abs(current)),
     )
 
 
@@ -64,12 +70,6 @@ def real_power(circuit: RC, drive: Periodic) -> Float[Array, ""]:
     parts = (weight * highpass_mean_square(drive, tau) for weight, tau in zip(terms.weight, terms.tau, strict=True))
     direct = jnp.zeros(()) if terms.direct is None else terms.direct * voltage_mean_square(drive)
     return sum(parts, direct)
-
-
-def insulator_peak(circuit: RC, drive: Periodic) -> Float[Array, ""]:
-    """Return the maximum |voltage| (V) across the insulator, edges included; without a leak it has the mean of V."""
-    period = PeriodGrid.from_drive(drive)
-    return period.max_abs(period.response(circuit.insulator_terms()))
 
 
 class Sensation(NamedTuple):
@@ -111,7 +111,8 @@ def sensation(
 ) -> Sensation:
     """Compute the `Sensation` of the electrostatic force in the steady state; `sensitivity` as in `from_force`."""
     period = PeriodGrid.from_drive(drive, sensitivity.size)
-    force = electrostatic_force(period.response(circuit.channel_terms(contact.channel)), contact)
+    (acting,) = period.responses(circuit.channel_terms(contact.channel))
+    force = electrostatic_force(acting, contact)
     return Sensation.from_force(force, period.weight, period.cycles, sensitivity)
 
 
@@ -150,17 +151,25 @@ class PeriodGrid(eqx.Module):
         if not isinstance(self.drive, PiecewiseLinear):
             return highpass(self.drive, self.local_time[0], tau)
         pieces = self.drive.pieces()
-        decay = steady_knot_values(pieces, tau)[:, None] * jnp.exp(-self.local_time / tau)
-        return (decay + pieces.slopes()[:, None] * self.local_time * phi(self.local_time / tau)).reshape(-1)
+        share = phi(self.local_time / tau)
+        decay = steady_knot_values(pieces, tau)[:, None] * (1.0 - self.local_time / tau * share)
+        return (decay + pieces.slopes()[:, None] * self.local_time * share).reshape(-1)
 
-    def response(self, terms: HighpassTerms) -> Float[Array, " points"]:
-        """Return the response of the terms of a circuit, in their unit."""
-        total = jnp.zeros_like(self.voltage) if terms.rate is None else terms.rate * self.slope
-        if terms.direct is not None:
-            total = total + terms.direct * self.voltage
-        for weight, tau in zip(terms.weight, terms.tau, strict=True):
-            total = total + weight * self.highpass(tau)
-        return total
+    def responses(self, *channels: HighpassTerms) -> list[Float[Array, " points"]]:
+        """Return the responses of channels of one circuit, in their units.
+
+        The channels share their time constants, which one may have more of. Each is evaluated once, in a buffer of its
+        own: fused into each sum over the points it would be evaluated many times.
+        """
+        taus = max((terms.tau for terms in channels), key=len)
+        units = lax.optimization_barrier([self.highpass(tau) for tau in taus])
+        found = []
+        for terms in channels:
+            total = jnp.zeros_like(self.voltage) if terms.rate is None else terms.rate * self.slope
+            if terms.direct is not None:
+                total = total + terms.direct * self.voltage
+            found.append(sum((w * u for w, u in zip(terms.weight, units, strict=False)), total))
+        return found
 
     def max_abs(self, values: Float[Array, " points"]) -> Float[Array, ""]:
         """Return max |values|; exact at ends of linear pieces and for a sine, elsewhere too small by up to 1e-4."""
