@@ -83,7 +83,7 @@ def summarize_normal(name: str, mean: float, sd: float) -> Summary:
 def format_sd(summary: Summary) -> str:
     """Return the standard deviation for people: in per cent of the mean, or in the unit where that exceeds 50 %."""
     mean, sd = float(summary["mean"]), float(summary["sd"])
-    if not sd <= 1e6 * abs(mean) or math.isinf(sd):
+    if not sd <= 10.0 * abs(mean) or math.isinf(sd):  # a factor of nine in the logarithm
         return "undetermined"
     if sd > 0.5 * abs(mean):
         return format_engineering(sd, str(summary["unit"]), 2)
@@ -152,7 +152,7 @@ def quantity_table(content: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def _quantity_row(name: str, summary: Summary, basis: dict[str, Any]) -> tuple[str, ...]:
-    remark = "" if name in PARAMETERS else describe_quantity(name)
+    remark = "" if name in ("Rsc", "Csc", "Ci") else describe_quantity(name)
     friction = [a for a in basis["assumptions"] if a["affects"] == "friction"]
     defaults = [a for a in friction if a["origin"] == "default"]
     if name == "friction_mean" and defaults and not any(a.get("has_distribution") for a in friction):
@@ -191,14 +191,14 @@ def _compare_with_friction(content: dict[str, Any]) -> list[str]:
     if scale is None:
         return []
     ratio, u = float(scale["q50"]), float(scale.get("u", math.inf))
+    if not u < 1.0:
+        return ["The measured friction does not determine how far the computed force is right (force_scale)."]
     sentence = f"The force in the measured friction is {format_estimate(scale)} times the computed one (force_scale"
-    if not math.isfinite(u):
-        sentence += ")."
-    elif abs(math.log(ratio)) <= 2.0 * u:
-        sentence += f", combined u {format_percent(u)}): they agree."
+    sentence += f", combined u {format_percent(u)} of its logarithm): "
+    if abs(math.log(ratio)) <= 2.0 * u:
+        sentence += "they agree."
     else:
-        sentence += f", combined u {format_percent(u)}): they differ, so the law, the contact area, a thickness or"
-        sentence += " the normal force is wrong."
+        sentence += "they differ, so the law, the contact area, a thickness or the normal force is wrong."
     sentence += " This rests on mu, which follows from the mean friction and the normal force."
     if content["identifiability"]["verdict"] != "identified":
         sentence += " The electrical channels do not determine the contact area, whose error force_scale contains."

@@ -29,13 +29,15 @@ Channels = Annotated[
     typer.Option(
         "--channel",
         metavar="NAME=COLUMN",
-        help="Column that holds V, Vsc or I, e.g. Vsc=CH2; in a second file, V=OTHERFILE:CH1. May be repeated.",
+        help="Column that holds V, Vsc, I or Ft, e.g. Vsc=CH2; in a second file, V=OTHERFILE:CH1. May be repeated.",
     ),
 ]
 Scales = Annotated[
     list[str] | None,
     typer.Option(
-        "--scale", metavar="NAME=FACTOR", help="Factor for V, Vsc or I, e.g. Vsc=10 for a 10x probe. May be repeated."
+        "--scale",
+        metavar="NAME=FACTOR",
+        help="Factor for V, Vsc, I or Ft, e.g. Vsc=10 for a 10x probe. May be repeated.",
     ),
 ]
 Rate = Annotated[

@@ -7,6 +7,8 @@ from fitact.model.circuit import RC, HighpassTerms
 from fitact.scene.scene import Scene
 from fitact.units import format_engineering
 
+STRONGEST_FIELD = 1e9  # V/m; parylene of 5 um withstands this: Diaham et al., J. Appl. Phys. 115 (2014) 054102
+
 
 def insulator_voltage(drive_peak: float, current: HighpassTerms, circuit: RC, frequency: float) -> float:
     """Return the peak voltage (V) across the insulator for a drive of this peak (V) and frequency (Hz).
@@ -25,7 +27,7 @@ def check_plausibility(
     insulator_peak: float,
     force_peak: float,
     max_area: float = 5e-4,  # m^2; five times the contact of the reference paper
-    max_field: float = 1e9,  # V/m; parylene of 5 um withstands this: Diaham et al., J. Appl. Phys. 115 (2014) 054102
+    max_field: float = STRONGEST_FIELD,
 ) -> list[str]:
     """Return a warning with the likeliest cause if the scene, or a peak value (V, V, N), is implausible.
 

@@ -89,7 +89,7 @@ class Record(Display):
             have = ", ".join(f"{name}_{CHANNEL_UNITS[name]}" for name in self.channels)
             raise InputError(
                 f"{self.source}: the channel {channel}_{CHANNEL_UNITS[channel]} is missing (found: {have});"
-                " record it or name it in the header"
+                f" record it, name it in the header, or name its column, as --channel {channel}=COLUMN"
             ) from None
 
     def __contains__(self, channel: object) -> bool:
@@ -355,7 +355,7 @@ def _check_shapes(time: np.ndarray, channels: Mapping[str, np.ndarray], source: 
 
 def _check_values(values: np.ndarray, name: str, source: str, where: _RowLabel) -> None:
     for is_bad, digits, meaning, remedy in (
-        (~np.isfinite(values), "", "", "remove those rows or record again"),
+        (~np.isfinite(values), "", "", "remove those rows (of Ft, interpolate) or record again"),
         (np.abs(values) >= OVERFLOW, ".4g", ", an oscilloscope's code for out of range", "record again within range"),
     ):
         bad = np.flatnonzero(is_bad)

@@ -48,8 +48,8 @@ def design_drive(
         seed: the same seed gives the same fingers.
 
     Raises:
-        InputError: the scene states no threshold, or several; its drive is measured or has no steady state; its skin
-            depends on the frequency; `share` is out of range.
+        InputError: the scene states no threshold, or none at a frequency of the force; its drive is measured or has no
+            steady state; its skin depends on the frequency; `share` is out of range.
     """
     require_designable(scene, share)
     unloaded = scene.measurement.model_copy(update={"probe_resistance": None, "probe_capacitance": None})
@@ -62,6 +62,13 @@ def design_drive(
     own, here = scene.drive.waveform, scene.drive.lowest_frequency
     names = [name for name in WAVEFORMS if name != "trapezoid" or scene.drive.rise_time is not None]
     tried = {name: bench.evaluate(name, here) for name in dict.fromkeys([*names, own])}
+    if all(option.outside is not None and option.strongest is None for option, _ in tried.values()):
+        assert scene.perception.thresholds is not None
+        raise InputError(
+            f"scene: [drive] frequency: the force of a drive at {here:g} Hz has no frequency in the table of thresholds"
+            f" ({scene.perception.thresholds.range_text}); a force alternates at multiples of twice the frequency,"
+            " or of the frequency with an offset"
+        )
     frequencies = np.geomspace(10.0, 1000.0, 9).tolist()  # Hz, where touch is sensitive
     ratios = np.geomspace(0.01, 10.0, 13).tolist()  # over the scene's thickness, as in Fig. 12 of the reference paper
     return DriveDesign(
@@ -171,10 +178,9 @@ def require_designable(scene: Scene, share: float) -> None:
     perception, drive = scene.perception, scene.drive
     if not 0.01 <= share <= 0.99:  # beyond, the answer is the assumed tail of the distribution
         raise InputError(f"share = {share:g}: give a fraction of fingers from 0.01 to 0.99, such as 0.95")
-    stated = perception.threshold_force, perception.friction_change, perception.thresholds
-    if sum(each is not None for each in stated) != 1:
+    if all(each is None for each in (perception.threshold_force, perception.friction_change, perception.thresholds)):
         raise InputError(
-            "scene: [perception] must state one threshold, because fitact knows no generally valid one; write"
+            "scene: [perception] must state a threshold, because fitact knows no generally valid one; write"
             " threshold_force = '...' or friction_change = ..., and its source, or thresholds = 'file.csv'"
         )
     if perception.friction_change is not None and scene.friction.normal_force == 0.0:

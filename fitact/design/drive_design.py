@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact import charts
+from fitact.data.plausibility import STRONGEST_FIELD
 from fitact.design.drive_option import ASSURANCE, DriveOption, normalize_drive, quantile
 from fitact.design.drive_people import FingerSample
 from fitact.design.limits import AC_3, ES1, NO_SAFETY_ASSESSMENT, LimitComparison, format_quantity
@@ -213,6 +214,13 @@ class DriveDesign(Display):
             for each in (self.limits if self.recommended_option else ())
             if each.exceeds_published
         ]
+        field = float(self._shown.at_assured.insulator_peak) / self.scene.device.insulator_thickness
+        if self.scene.device.breakdown_field is None and STRONGEST_FIELD < field < math.inf:
+            sentences.append(
+                f"the field in the insulator would be {format_quantity(field, 'V/m')}, above the"
+                f" {format_quantity(STRONGEST_FIELD, 'V/m')} of the strongest thin films; check the unit of the"
+                " threshold and [device] insulator_thickness"
+            )
         thickness = self.scene.thickness_sd()
         if thickness:
             sentences.append(

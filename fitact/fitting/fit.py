@@ -38,7 +38,7 @@ from fitact.fitting.minimum import Optima
 from fitact.fitting.multistart import find_optima, lower_optimum
 from fitact.fitting.problem import Problem, build_problem
 from fitact.fitting.profile import PROFILE_QUANTITIES, Interval, profile_intervals
-from fitact.fitting.residual_statistics import is_undersampled, pooled_statistics
+from fitact.fitting.residual_statistics import is_misfit, is_undersampled, pooled_statistics
 from fitact.fitting.solution import solve_problem
 from fitact.fitting.source import require_record
 from fitact.fitting.verdict import diagnose_fit, misfit_warnings
@@ -487,11 +487,12 @@ def _assemble_fit(
     else:
         identifiability = assess_identifiability(*evidence, experiment)
     result, effects = diagnose_fit(solution, root, traces, problem.sources, optima), None
-    if result == "misfit":
+    poor = [trace for trace in traces if is_misfit(trace.figures)]
+    noisy = any(source.drive_noise_dominates for source in problem.sources)
+    if result == "misfit" and (noisy or any(trace.channel != "Ft" for trace in poor)):
         effects = assess_fit(laplace, traces, has_structure=True)
-        may_move = any(s.drive_noise_dominates for s in problem.sources) or any(
-            is_undersampled(t.figures) for t in traces
-        )
+        # what a poor fit of the friction may move is not assessed
+        may_move = noisy or any(is_undersampled(t.figures) or t.channel == "Ft" for t in poor)
         if effects is not None and not may_move and is_tolerable(effects, laplace, first.scene.tolerance.force):
             result = "structure"
     whole = Fit(
@@ -540,7 +541,7 @@ def _collect_remarks(
     warnings += remarks.parameter_warnings(likelihood, theta)
     stated = [each.name for each in problem.coordinates if each.is_stated]
     spread = np.linalg.norm(laplace.covariance_root, axis=1)
-    warnings += remarks.instrument_warnings(likelihood, theta, spread, stated)
+    warnings += remarks.prior_warnings(likelihood, theta, spread, stated)
     force_peak = math.exp(laplace.log_derived[0][derived.DERIVED_NAMES.index("force_peak")])
     warnings += remarks.plausibility_warnings(first.record, first.scene, first.choice, optimum, force_peak)
     assumed = remarks.describe_assumed_Ci(None if without_scene else first.scene, likelihood, laplace.prior_sets_Ci)

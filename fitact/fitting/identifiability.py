@@ -15,6 +15,7 @@ from fitact.experiment.blind_directions import blind_directions, gain_names, nam
 from fitact.experiment.experiment import DesignOption
 from fitact.experiment.fisher import Experiment
 from fitact.experiment.options import suggest_measurements
+from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.units import format_percent
 
 # smallest fraction of the variance of a parameter from the prior at which the prior counts as an assumption
@@ -75,9 +76,9 @@ class Identifiability:
         figures = [f"{show(option.force_sd, after)} with {option.text}" for option in options]
         remedy = f"{force}. Expected after one change: {', '.join(figures)}."
         if self.verdict == "unidentified":
-            remedy = (
-                f"No prior constrains that direction; state one for Ci and this contact area under [prior]. {remedy}"
-            )
+            most = max(self.blind_direction, key=lambda name: abs(self.blind_direction[name]))
+            what = "Ci and this contact area" if most in FINGER_PARAMETERS else most
+            remedy = f"No prior narrows that direction; state one for {what} under [prior]. {remedy}"
         gains = structure.directions[:, [name in gain_names(structure.channels) for name in structure.names]]
         if np.any(np.abs(gains) > 0.1):  # components of a unit vector above this belong to a direction
             remedy += (

@@ -50,11 +50,12 @@ class Laplace:
 
     @property
     def prior_sets_Ci(self) -> bool:
-        """Whether the prior of Ci was used, and contributes at least `MIN_PRIOR_FRACTION` of its variance."""
+        """Whether the prior of Ci was used, and contributes at least `MIN_PRIOR_FRACTION` of what is known of Ci."""
         if not self.likelihood.use_prior or "Ci" not in self.likelihood.names:
             return False
-        gradient = np.eye(self.theta.size)[[self.likelihood.names.index("Ci")]]
-        return bool(self.variance_from_prior(gradient)[0] >= MIN_PRIOR_FRACTION)
+        place = self.likelihood.names.index("Ci")
+        ratio = float(np.linalg.norm(self.covariance_root[place])) / float(self.likelihood.prior["Ci"].log_sd)
+        return ratio**2 >= MIN_PRIOR_FRACTION
 
     def log_gradient(self, name: str) -> Float[np.ndarray, " parameters"]:
         """Gradient of the logarithm of a derived quantity in theta."""

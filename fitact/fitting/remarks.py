@@ -14,11 +14,11 @@ from fitact.data.spectrum import Spectrum
 from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.residual_statistics import is_undersampled
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
-from fitact.model.circuit import RC
+from fitact.model.circuit import FINGER_PARAMETERS, RC
 from fitact.model.skin import constant_skin_circuit
 from fitact.scene.assumptions import states_Ci
 from fitact.scene.scene import Scene
-from fitact.units import format_engineering, format_percent
+from fitact.units import format_engineering, format_percent, quantity_unit
 
 
 def channel_warnings(record: Record, choice: DriveModel, channel: str, figures: dict[str, float]) -> list[str]:
@@ -90,29 +90,37 @@ def plausibility_warnings(
     return check_plausibility(scene, peak, insulator_peak, force_peak)
 
 
-def instrument_warnings(
+def prior_warnings(
     likelihood: Likelihood,
     theta: Float[np.ndarray, " parameters"],
     sd: Float[np.ndarray, " parameters"],
-    names: Collection[str],
+    instruments: Collection[str],
     max_pull: float = 3.0,
 ) -> list[str]:
-    """Return warnings about errors of instruments, the coordinates `names`, that the data put beyond their limits.
+    """Return warnings about coordinates that the data put far from their prior, such as errors of `instruments`.
 
-    `sd` are the standard errors. A pull is the distance from the middle of the limits over its standard deviation,
-    the root of the difference of prior and posterior variance.
+    The skin's parameters have `parameter_warnings`, and the scale of the force is what is measured. `sd` are the
+    standard errors. A pull is the distance from the middle of the prior over its standard deviation, the root of the
+    difference of prior and posterior variance.
     """
     warnings = []
-    for name in names:
+    others = set(likelihood.prior.names) - {*FINGER_PARAMETERS, "force_scale"} if likelihood.use_prior else set()
+    for name in (each for each in likelihood.names if each in others | set(instruments)):
         place, marginal = likelihood.names.index(name), likelihood.prior[name]
         value, spread = float(theta[place]), float(marginal.log_sd)
         learned = math.sqrt(max(spread**2 - float(sd[place]) ** 2, 1e-4 * spread**2))
         pull = (value - float(marginal.log_mean)) / learned
         if abs(pull) > max_pull:
+            found = format_engineering(math.exp(value), quantity_unit(name))
+            if name in instruments:
+                prior = "what the stated instruments allow"
+                remedy = (
+                    "check the scale of the channels, the attenuation of probes, and the classes under [instrument]"
+                )
+            else:
+                prior, remedy = "its prior", f"check [prior] {name}, and that the circuit and its parts are as stated"
             warnings.append(
-                f"the data put {name} at {math.exp(value):.4g}, {abs(pull):.1f} standard deviations from what the"
-                " stated instruments allow; check the scale of the channels, the attenuation of probes, and the classes"
-                " under [instrument]"
+                f"the data put {name} at {found}, {abs(pull):.1f} standard deviations from {prior}; {remedy}"
             )
     return warnings
 

@@ -1,6 +1,7 @@
 """How far a fitted finger feels the drive above the detection threshold, by the scene's table of thresholds."""
 
 import dataclasses
+import math
 from typing import Any, Self
 
 import equinox as eqx
@@ -80,7 +81,7 @@ class FeltDrive:
         text = f"{table.range_text}; {scene.perception.threshold_source or 'no source stated'}"
         if frequency is None:
             return cls(None, 0.0, 1.0, text, "the drive does not repeat")
-        sensitivity = table.harmonic_sensitivity(frequency, float(scene.friction.coefficient))
+        sensitivity = table.harmonic_sensitivity(frequency, 1.0)
         with jax.enable_x64(True):
             force = ForceSensation.from_fit(
                 derive.tabulate(points[..., : -len(likelihood.channels)].reshape(-1, len(likelihood.names))),
@@ -91,7 +92,8 @@ class FeltDrive:
         rows = force.derive.time.size
         drawn = evaluate_draws(ForceSensation.__call__, force, rows, points, deviates)
         order, outside = np.median(drawn[..., 1]), float(np.median(drawn[..., 2]))
-        return cls(drawn[..., 0] if order else None, float(order * frequency), outside, text)
+        times = drawn[..., 0] * _friction_over_force(likelihood, scene, points)
+        return cls(times if order else None, float(order * frequency), outside, text)
 
     @property
     def sentence(self) -> str:
@@ -119,6 +121,18 @@ class FeltDrive:
             return {"table": self.table, "sentence": self.sentence}
         figures = {"level": _level(self.times_threshold), "frequency": self.frequency, "outside": self.outside}
         return figures | {"table": self.table, "sentence": self.sentence}
+
+
+def _friction_over_force(likelihood: Likelihood, scene: Scene, points: np.ndarray) -> Float[np.ndarray, "*draws"]:
+    """Return the alternating friction over the computed force: mu force_scale, measured where it was fitted."""
+    known = {"mu": float(scene.friction.coefficient), "force_scale": 1.0}
+    known |= {name: value for name, value in scene.fixed_values().items() if name in known}
+    return np.exp(
+        sum(
+            points[..., likelihood.names.index(name)] if name in likelihood.names else math.log(value)
+            for name, value in known.items()
+        )
+    )
 
 
 def _level(times_threshold: Float[np.ndarray, "*shape"]) -> summary.Summary:

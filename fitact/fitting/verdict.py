@@ -78,10 +78,14 @@ def _clip_exponent(likelihood: Likelihood, theta: np.ndarray, covariance_factor:
 
 def misfit_warnings(traces: Sequence[ChannelFit]) -> list[str]:
     """Return a warning for each of several channels with a poor fit."""
+    remedies = {
+        "Ft": "mu, force_scale and what is said of the force law do not hold; check the sign and zero of the force"
+        " sensor, its frequency and damping, mu and the normal force"
+    }
     return [
         f"{channel.record.source}: the common model fits {channel.channel} poorly (residual variance"
-        f" {channel.figures['chi2_reduced']:.3g} times the noise variance); fit it alone to check that it belongs to"
-        " this finger"
+        f" {channel.figures['chi2_reduced']:.3g} times the noise variance);"
+        f" {remedies.get(channel.channel, 'fit it alone to check that it belongs to this finger')}"
         for channel in traces
         if len(traces) > 1 and is_misfit(channel.figures)
     ]

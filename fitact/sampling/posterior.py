@@ -317,23 +317,22 @@ class Posterior(Display):
             {"quantile": list(summary.PROBABILITIES.values()), "time": ("time", instants, {"units": "s"})},
             {"law": self._force_law},
         )
-        observed, constant = xr.Dataset(), xr.Dataset()
+        axes: dict[str, Any] = {}
+        observed: dict[str, Any] = {}
+        constant: dict[str, Any] = {}
         for channel in self.fit.traces:
             if isinstance(channel.record, Spectrum):
-                axis, variables = _spectrum_axis(channel), _spectrum_variables(channel, channel.record.values)
-                observed = observed.merge(xr.Dataset(variables, coords=axis))
-                constant = constant.merge(xr.Dataset(_spectrum_variables(channel, channel.fitted, "_fit"), coords=axis))
+                axes |= _spectrum_axis(channel)
+                observed |= _spectrum_variables(channel, channel.record.values)
+                constant |= _spectrum_variables(channel, channel.fitted, "_fit")
                 continue
             time, name = _time_axis_name(channel), _variable_name(channel)
             unit = {"units": CHANNEL_UNITS[channel.channel]}
-            coords = {time: (time, channel.record.time, {"units": "s"})}
-            values = channel.record[channel.channel]
-            observed = observed.merge(xr.Dataset({name: (time, values, unit)}, coords=coords))
-            fitted = {f"{name}_fit": (time, channel.fitted, unit)}
-            drive = {_variable_name(channel, "V"): (time, channel.choice.voltage, {"units": "V"})}
-            constant = constant.merge(
-                xr.Dataset(fitted | drive | self._unfitted(channel, channel.record, time), coords=coords)
-            )
+            axes[time] = (time, channel.record.time, {"units": "s"})
+            observed[name] = (time, channel.record[channel.channel], unit)
+            constant[f"{name}_fit"] = (time, channel.fitted, unit)
+            constant[_variable_name(channel, "V")] = (time, channel.choice.voltage, {"units": "V"})
+            constant |= self._unfitted(channel, channel.record, time)
         attributes = {
             "inference_library": "fitact",
             "level": self.convergence.level,
@@ -350,8 +349,8 @@ class Posterior(Display):
                 "posterior": dataset(self.parameters() | self.derived()),
                 "sample_stats": statistics,
                 "posterior_predictive": self._posterior_predictive,
-                "observed_data": observed,
-                "constant_data": constant,
+                "observed_data": xr.Dataset(observed, axes),
+                "constant_data": xr.Dataset(constant, axes),
                 "prior": dataset(prior),
                 "force_in_time": in_time,
             }

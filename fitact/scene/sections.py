@@ -246,7 +246,11 @@ class Measurement(Section):
     quiet: tuple[AnySecond, AnySecond] | None = None
 
     @model_validator(mode="after")
-    def _check_quiet(self) -> Self:
+    def _check_keys(self) -> Self:
+        if self.channels == ("Ft",):
+            raise ValueError(
+                "[measurement] channels = ['Ft']: the friction alone does not determine the circuit; add Vsc or I"
+            )
         if (self.noise_model == "spectrum") != (self.quiet is not None):
             raise ValueError(
                 '[measurement] noise_model = \'spectrum\' and quiet = ["0 ms", "5 ms"], the stretch in which the drive'
@@ -291,10 +295,18 @@ class Perception(Section):
     friction_change: Annotated[float, Field(gt=0)] | None = None
     source: str | None = None
 
+    @model_validator(mode="after")
+    def _check_number(self) -> Self:
+        names = "threshold_force", "thresholds", "friction_change"
+        stated = [name for name in names if getattr(self, name) is not None]
+        if len(stated) > 1:
+            raise ValueError(f"[perception] states {' and '.join(stated)}, of which one can hold; leave out the others")
+        return self
+
     @property
     def threshold_source(self) -> str | None:
-        """Where the threshold comes from, as stated here or in its table."""
-        return self.source or (None if self.thresholds is None else self.thresholds.source)
+        """Where the threshold comes from, by its table or, if that does not say so, as stated here."""
+        return (self.thresholds and self.thresholds.source) or self.source
 
 
 class PopulationSection(Section):

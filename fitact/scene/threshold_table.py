@@ -8,13 +8,14 @@ from typing import Any, Self
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from fitact.errors import InputError
 from fitact.scene.section import Hertz, Section, Threshold
 from fitact.units import format_engineering
 
 _COLUMNS = ["frequency_Hz", "force_N"]
+_LARGEST = 2.0  # N, of a threshold: a firm touch
 _FORM = 'write {frequencies = ["10 Hz", "250 Hz"], forces = ["20 mN", "1 mN"]}, or a CSV file with these columns:'
 
 
@@ -27,7 +28,7 @@ class ThresholdTable(Section):
         source: where the values come from.
     """
 
-    frequencies: tuple[Hertz, ...] = Field(min_length=2)
+    frequencies: tuple[Hertz, ...]
     forces: tuple[Threshold, ...]
     source: str | None = None
 
@@ -42,8 +43,14 @@ class ThresholdTable(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        if max(self.forces, default=0.0) > _LARGEST:
+            raise ValueError(
+                f"a threshold of {max(self.forces):g} N is more than a finger is pressed with; check the unit, N"
+            )
         if len(self.forces) != len(self.frequencies):
             raise ValueError(f"{len(self.frequencies)} frequencies and {len(self.forces)} forces; give one for each")
+        if len(self.frequencies) < 2:
+            raise ValueError("the table has fewer than two frequencies; give its two ends at least")
         if any(low >= high for low, high in itertools.pairwise(self.frequencies)):
             raise ValueError("the frequencies must rise from each to the next; sort them, and drop repeated ones")
         return self
@@ -100,10 +107,13 @@ def _read_csv(name: str) -> dict[str, Any]:
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     header, *rows = csv.reader(lines) if lines else [[]]
     if [title.strip() for title in header] != _COLUMNS or any(len(row) != len(_COLUMNS) for row in rows):
-        raise ValueError(f"the file must have the columns {','.join(_COLUMNS)}, with two numbers in each row")
+        raise ValueError(
+            f"the file must have the columns {','.join(_COLUMNS)}, with a frequency in Hz and a force in N in each row,"
+            " as 250,1e-3"
+        )
     try:
         numbers = [[float(cell) for cell in row] for row in rows]
     except ValueError as error:
         raise ValueError(f"{error}; write plain numbers in Hz and N") from error
-    label = f"{Path(name).name}: {comments[0]}" if comments else Path(name).name
+    label = f"{Path(name).name}: {comments[0]}" if comments else None
     return {"frequencies": [row[0] for row in numbers], "forces": [row[1] for row in numbers], "source": label}

@@ -376,7 +376,7 @@ def test_the_mapping_is_asked_for_and_noted():
     ("asked", "words"),
     [
         ({"channels": {"U": "1"}}, "'U' is no channel of fitact"),
-        ({"channels": {"I": "1"}}, r"1 is in V and I in A; give the factor between them, as --scale I="),
+        ({"channels": {"I": "1"}}, r"1 is in V, but I needs A; give the factor between them, as --scale I="),
         ({"channels": SKIN, "scale": {"I": 2.0}}, "I is scaled but not there"),
     ],
 )

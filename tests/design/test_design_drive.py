@@ -502,9 +502,12 @@ def test_no_probe_is_connected_to_what_is_designed(one):
 @pytest.mark.parametrize(
     ("sections", "share", "sentence"),
     [
-        ({"perception": {}}, 0.95, r"\[perception\] must state one threshold, .*; write threshold_force = "),
-        ({"perception": {"threshold_force": 1.0, "friction_change": 0.1}}, 0.95, "one threshold"),
-        ({"perception": {"threshold_force": 1.0, "thresholds": TABLE}}, 0.95, "one threshold"),
+        ({"perception": {}}, 0.95, r"\[perception\] must state a threshold, .*; write threshold_force = "),
+        (
+            {"perception": {"thresholds": TABLE}, "drive": {"frequency": 200.0, "rise_time": None}},
+            0.95,
+            r"200 Hz has no frequency in the table of thresholds \(20 Hz to 250 Hz\)",
+        ),
         ({"perception": {"friction_change": 0.1}, "friction": {"normal_force": 0.0}}, 0.95, "normal_force"),
         (
             {"drive": {"waveform": "measured"}},

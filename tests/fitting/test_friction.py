@@ -12,6 +12,7 @@ from fitact import Fit, Record, Scene
 from fitact.data.simulate import simulate as simulate_scene
 from fitact.design.measurement import experiment_from_scene
 from fitact.errors import InputError
+from fitact.fitting.sensation import FeltDrive
 
 SCENE = """
 [measurement]
@@ -103,6 +104,29 @@ def test_tables_say_whether_the_law_holds(tmp_path: Path) -> None:
     agreeing = fitact.fit(simulate(tmp_path)[0], load(tmp_path, text))
     assert "they agree" in " ".join(agreeing.summary().split())
     assert agreeing.to_dict()["derived"]["friction_mean"]["q50"] == pytest.approx(0.6 * (0.5 + 271e-6), rel=1e-3)
+
+
+def test_friction_that_does_not_fit_makes_the_fit_unreliable(tmp_path: Path) -> None:
+    record, text = simulate(tmp_path)
+    turned = Record.from_arrays(record.time, Vsc=record["Vsc"], Ft=-record["Ft"])
+    fit = fitact.fit(turned, load(tmp_path, text))
+    assert fit.result == "misfit"
+    assert any("the common model fits Ft poorly" in each and "check the sign" in each for each in fit.warnings)
+    assert "they agree" not in " ".join(fit.summary().split())
+
+
+def test_what_is_felt_follows_from_the_measured_friction(tmp_path: Path) -> None:
+    """The friction of data_synth is 0.6 times 3 times the force of eq. (22), of which the scene states neither."""
+    record, text = simulate(tmp_path, "[friction]\nforce_scale = 3.0\n")
+    table = '[perception]\nthresholds = {frequencies = ["150 Hz", "450 Hz"], forces = ["1 mN", "1 mN"]}\n'
+    scene = load(tmp_path, text.replace("coefficient = 0.6", "coefficient = 0.5") + table)
+    fit = fitact.fit(record, scene)
+    felt = FeltDrive.from_draws(fit.derive, fit.likelihood, scene, 100.0, fit.point[None, None], 0)
+    time = np.arange(10_000) / 10_000 / 100.0
+    voltage = np.asarray(fitact.response(fitact.FinalCircuit(160e3, 22e-9, 1.35e-9), scene.drive.make(), time))
+    force = voltage**2 / (2.0 * (1.0 / 1.35e-9 + 1.0 / 22e-9) * 201e-6)
+    harmonics = [2.0 * abs(np.mean(force * np.exp(-2j * np.pi * n * 100.0 * time))) for n in (2, 4)]
+    assert felt.times_threshold.item() == pytest.approx(0.6 * 3.0 * math.hypot(*harmonics) / 1e-3, rel=0.01)
 
 
 @pytest.mark.slow

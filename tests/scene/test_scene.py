@@ -312,6 +312,11 @@ def test_line_of_what_is_wrong(tmp_path: Path, text: str, line: int):
         ('[prior]\nCi = {fixed = true}\nCsc = {above = "Ci"}', ["Ci", "free"]),
         ('[prior]\nR_H = {below = "Rsc"}', ["[prior] R_H", "density"]),
         ('[prior]\nCsc = {above = "Ci"}\nCi = {above = "Csc"}', ["order", "Csc < Ci < Csc"]),
+        ('[measurement]\nchannels = ["Ft"]', ["the friction alone", "add Vsc or I"]),
+        (
+            '[perception]\nthreshold_force = "1 mN"\nfriction_change = 0.1',
+            ["threshold_force and friction_change", "leave out the others"],
+        ),
         ("[prior.correlation]\nRsc-Csc = -1.6", ["correlation", "-1"]),
         ("[prior.correlation]\nRsc-R_H = 0.5", ["[prior]", "R_H", "free"]),
         ("[prior.correlation]\nRsc = 0.5", ["correlation", "Rsc-Csc"]),

@@ -179,8 +179,8 @@ def _check_unit(file_channel: FileChannel, channel: str, scaled: bool, source: s
         )
     if file_channel.unit and file_channel.unit != wanted and not scaled:
         raise InputError(
-            f"{source}{file_channel.location}: {file_channel.name} is in {file_channel.unit} and {channel} in {wanted};"
-            f" give the factor between them, as --scale {channel}=0.001 for {wanted} per {file_channel.unit}"
+            f"{source}{file_channel.location}: {file_channel.name} is in {file_channel.unit}, but {channel} needs"
+            f" {wanted}; give the factor between them, as --scale {channel}=0.001 for {wanted} per {file_channel.unit}"
         )
 
 
