@@ -32,7 +32,7 @@ test-slow: env
 # make test-slow-quick   a part of these, another for every change that landed
 LANDED = $(shell git rev-list --first-parent --count HEAD 2>/dev/null || date +%j)
 test-slow-quick: env
-	$(PYTEST) -m slow --rotate $(LANDED)/16
+	$(PYTEST) -m slow --rotate $(LANDED)/32
 
 # make notebooks   run the notebooks; executed copies in out/notebooks
 notebooks: env

@@ -26,6 +26,20 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         remove_temporary(path)
 
 
+def require_folder(folder: Path | None) -> Path | None:
+    """Return the folder, in which files can be written: before work whose results would be lost.
+
+    Raises:
+        InputError: it, or what is to contain it, is no folder or not writable.
+    """
+    if folder is not None:
+        place = next(each for each in (folder.absolute(), *folder.absolute().parents) if each.exists())
+        if not place.is_dir() or not os.access(place, os.W_OK):
+            reason = "permission denied" if place.is_dir() else f"{place} is no folder"
+            raise InputError(f"{folder}: cannot be written ({reason}); choose another path")
+    return folder
+
+
 def remove_temporary(path: str | os.PathLike[str]) -> None:
     """Remove the temporary file of an `atomic_write(path)` that was killed."""
     with contextlib.suppress(OSError):

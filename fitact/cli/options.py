@@ -9,6 +9,7 @@ import typer
 import fitact
 from fitact.cli import internal
 from fitact.errors import InputError
+from fitact.files import require_folder
 from fitact.units import parse_quantity
 
 RecordFiles = Annotated[
@@ -67,10 +68,20 @@ SceneFiles = Annotated[
     ),
 ]
 Out = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", help="Folder for the results.", show_default="write no files")
+    Path | None,
+    typer.Option(
+        "--out",
+        metavar="DIR",
+        help="Folder for the results.",
+        show_default="write no files",
+        callback=require_folder,
+    ),
 ]
 RecordOut = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", help="Folder for the results.", show_default="RECORD-fitact")
+    Path | None,
+    typer.Option(
+        "--out", metavar="DIR", help="Folder for the results.", show_default="RECORD-fitact", callback=require_folder
+    ),
 ]
 Seed = Annotated[
     int,

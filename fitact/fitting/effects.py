@@ -154,11 +154,16 @@ def is_change_of_finger(effects: EffectSizes, min_part: float = 0.5) -> bool:
     return any(change >= min_part * effects.rivals[0]["delta_chi2"] for change in changes)
 
 
-def _advise_track(effects: EffectSizes) -> str:
-    """Return a sentence on a finger that changes during the record, if that is the best explanation."""
+def _advise_track(effects: EffectSizes, min_explained: float = 0.6) -> str:
+    """Return a sentence on a finger that changes during the record, if that is the best explanation.
+
+    It names what changes, and by how much, if that explains at least `min_explained` of the residuals' power.
+    """
     best = effects.rivals[0] if effects.rivals else None
     if best is None or not best["name"].startswith(CHANGE):
         return ""
+    if best["explained"] < min_explained:
+        return " The finger may change during the record: use track."
     change = math.expm1(2.0 * best["amplitudes"][0])
     what = best["name"].removeprefix(CHANGE)
     direction = "falls" if change < 0.0 else "rises"

@@ -50,13 +50,19 @@ def channel_warnings(record: Record, choice: DriveModel, channel: str, figures: 
             f"[measurement] quiet contains more than noise: {channel} varies by {quiet} rms there, but the residuals"
             f" are {residual} rms, so the stated errors are too large; choose an interval before the drive starts"
         )
-    if figures["outliers"]:
-        warnings.append(
-            f"{figures['outliers']:.0f} samples of {channel} are outliers for Gaussian noise, the first at"
-            f" {format_engineering(figures['first_outlier'], 's')}; [measurement] noise_model = 'student' reduces their"
-            " weight"
-        )
-    return warnings
+    return warnings + outlier_warnings(channel, figures)
+
+
+def outlier_warnings(channel: str, figures: dict[str, float]) -> list[str]:
+    """Return a warning if samples of a channel are outliers."""
+    if not (count := int(figures["outliers"])):
+        return []
+    which = f"1 sample of {channel} is an outlier" if count == 1 else f"{count} samples of {channel} are outliers"
+    return [
+        f"{which} for Gaussian noise, the first at"
+        f" {format_engineering(figures['first_outlier'], 's')}; [measurement] noise_model = 'student' reduces their"
+        " weight"
+    ]
 
 
 def parameter_warnings(likelihood: Likelihood, theta: Float[np.ndarray, " parameters"]) -> list[str]:

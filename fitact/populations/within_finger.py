@@ -130,7 +130,7 @@ class WithinFinger(NamedTuple):
 
     def describe_assumptions(self, fingers: int) -> list[str]:
         """Return sentences on what the variation within a finger contains."""
-        length, scale = (format_engineering(each, "s", 2) for each in (self.duration, self.time_scale))
+        length, scale = (format_engineering(each, "s", 3) for each in (self.duration, self.time_scale))
         sentences = [
             f"changes within a finger are those about its average over a record of {length}, with a time scale of"
             f" {scale}; slower changes count as differences between fingers"

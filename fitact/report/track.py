@@ -26,19 +26,20 @@ def write_track(path: str | os.PathLike[str], track: Track, origin: Provenance) 
         for names in _PAIRS
         if all(name in track.values for name in names)
     ]
-    rows: list[tuple[str, ...]] = [
-        ("", "median at the start", "at the end", "variation (sd of the logarithm)", "alike over")
-    ]
     state = track.to_dict()
+    times = [format_engineering(state[end]["time_s"], "s", 3) if state[end] else "" for end in ("start", "end")]
+    rows: list[tuple[str, ...]] = [
+        ("", f"median at {times[0]}", f"at {times[1]}", "variation (sd of the logarithm)", "alike over")
+    ]
     for name, within in track.within_finger.items():
+        if name not in state["start"] or name not in state["end"]:
+            continue
         unit = quantity_unit(name)
         cells = [
             f"{format_engineering(state[end][name]['median'], unit)} ± {format_percent(state[end][name]['u'])}"
-            if state[end]
-            else ""
             for end in ("start", "end")
         ]
-        scale = format_engineering(within["time_scale_s"], "s", 2)
+        scale = format_engineering(within["time_scale_s"], "s", 3)
         rows.append((describe_quantity(name), *cells, format_percent(within["log_sd"]), scale))
     rates = [("walk", "log-sd after 1 s", "95 % interval")]
     for name, rate in state["rates"].items():
@@ -47,13 +48,15 @@ def write_track(path: str | os.PathLike[str], track: Track, origin: Provenance) 
     write_page(path, "track.html", frame=_frame(track, state), origin=origin, panels=panels, table=rows, rates=rates)
 
 
-def _frame(track: Track, state: dict[str, Any]) -> PageSummary:
+def _frame(track: Track, state: dict[str, Any], max_u: float = 0.5) -> PageSummary:
+    """Return what the page says first; changes of quantities that are known to better than `max_u`."""
     answers, start, end = [], state["start"], state["end"]
     for name in ("contact_area", "Rsc", "force_mean"):
-        if name in start:
+        if name in start and name in end and max(start[name]["u"], end[name]["u"]) < max_u:
             change = 100.0 * (end[name]["median"] / start[name]["median"] - 1.0)
             spread = format_percent(track.within_finger[name]["log_sd"])
-            note = f"from start to end; varies by {spread}"
+            u = format_percent(max(start[name]["u"], end[name]["u"]))
+            note = f"from start to end, each ± {u}; varies by {spread}"
             answers.append(Answer(describe_quantity(name), f"{change:+.3g} %", note))
     findings = {"Identifiability": str(track.fit.identifiability)}
     if track.lifted:

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.fitting.current import edge_mask, weigh_current_samples
@@ -40,6 +41,7 @@ class CompressedWindow(NamedTuple):
     data: WindowData | None
     lowest: float  # least and largest signal of the window's parts over that of the model's circuit; NaN without drive
     highest: float
+    clipped: bool  # whether samples are excluded because they are clipped
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +52,7 @@ class CompressedWindows:
     data: WindowData  # stacked
     has_data: Bool[np.ndarray, " windows"]
     contact: Bool[np.ndarray, " windows"]
+    clipped: Bool[np.ndarray, " windows"]
 
     @classmethod
     def from_windows(cls, windows: Sequence[CompressedWindow]) -> "CompressedWindows":
@@ -59,7 +62,8 @@ class CompressedWindows:
         usual = float(np.median(highest[known & (highest > NO_CONTACT)])) if np.any(known) else 1.0
         contact = ~known | is_in_contact(lowest, highest, usual)
         has_data = np.array([each.data is not None for each in windows])
-        return cls(np.array([each.start for each in windows]), stack_data(windows), has_data & contact, contact)
+        start, clipped = (np.array([getattr(each, name) for each in windows]) for name in ("start", "clipped"))
+        return cls(start, stack_data(windows), has_data & contact, contact, clipped)
 
 
 class WindowResponses(NamedTuple):
@@ -73,6 +77,7 @@ class WindowResponses(NamedTuple):
     has_charge: bool  # whether the charge at the start is unknown
     lowest: float  # as in CompressedWindow
     highest: float
+    clipped: bool = False
 
 
 class WindowModel(NamedTuple):
@@ -103,13 +108,13 @@ class WindowModel(NamedTuple):
                 state = None
             has_charge = state is None or state.age < settled
             responses, state = self.compressor.respond(V, window.start, state)
-            rates, weights = self._weigh_samples(window)
+            rates, weights, clipped = self._weigh_samples(window)
             observed = [window.channels[channel.channel] for channel in self.fit.likelihood.channels]
             rests = self.compressor.subtract_expected(observed, rates, responses)
-            lowest, highest = self._compare_signal(observed[0], observed[0] - rests[0])
+            lowest, highest = self._compare_signal(observed[0], observed[0] - rests[0], weights[0])
             if not is_in_contact(lowest, highest):
                 state = None
-            yield WindowResponses(window, responses, rests, rates, weights, has_charge, lowest, highest)
+            yield WindowResponses(window, responses, rests, rates, weights, has_charge, lowest, highest, clipped)
 
     def compress(self, given: WindowResponses) -> CompressedWindow:
         """Compress a window; one without responses has no data."""
@@ -118,26 +123,36 @@ class WindowModel(NamedTuple):
             V = given.window.channels["V"]
             channels = given.rests, given.rates, given.weights
             data = WindowData(*self.compressor.compress(V, *channels, given.responses, given.has_charge))
-        return CompressedWindow(given.window.start, data, given.lowest, given.highest)
+        return CompressedWindow(given.window.start, data, given.lowest, given.highest, given.clipped)
 
-    def _weigh_samples(self, window: Window) -> tuple[list[np.ndarray | None], list[np.ndarray | None]]:
-        """Return dV/dt of each channel that follows it, V/s, and weights of its samples, or None where all are 1."""
+    def _weigh_samples(self, window: Window) -> tuple[list[np.ndarray | None], list[np.ndarray | None], bool]:
+        """Return dV/dt of each channel that follows it, V/s, and weights of its samples, or None where all are 1.
+
+        Also whether samples are clipped, whose weight is 0.
+        """
         rates, weights, step = list[np.ndarray | None](), list[np.ndarray | None](), float(self.compressor.time[1])
+        is_clipped = False
         for channel in self.fit.likelihood.channels:
             rate = weight = None
+            clipped = clipping_mask(window.channels[channel.channel])
             if channel.rate is not None:
                 inside = slice(AROUND, -AROUND)
                 rate, used = np.gradient(window.V, step)[inside], ~edge_mask(window.V, self.noise["V"])[inside]
                 spread = self.noise["V"] / (math.sqrt(2.0) * step * self.noise["I"])
                 weight = used * weigh_current_samples(window.channels[channel.channel], rate, spread, used)
                 weight = None if np.all(weight == 1.0) else weight
+            if clipped.any():
+                is_clipped, weight = True, np.where(clipped, 0.0, 1.0 if weight is None else weight)
             rates.append(rate)
             weights.append(weight)
-        return rates, weights
+        return rates, weights, is_clipped
 
-    def _compare_signal(self, observed: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
+    def _compare_signal(
+        self, observed: np.ndarray, expected: np.ndarray, weight: np.ndarray | None
+    ) -> tuple[float, float]:
         """Return the least and largest signal of a window's parts over the expected one."""
-        products = np.array_split(np.stack([observed * expected, expected * expected]), self.parts, axis=1)
+        weighted = expected if weight is None else expected * (weight > 0.0)
+        products = np.array_split(np.stack([observed * weighted, expected * weighted]), self.parts, axis=1)
         sizes = np.array([part.sum(axis=1) for part in products])
         driven = sizes[:, 1] > 1e-2 * sizes[:, 1].max()
         signal = sizes[driven, 0] / sizes[driven, 1]

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 
 from fitact.fitting.effects import is_change_of_finger
 from fitact.fitting.identifiability import information_directions, verdicts
+from fitact.fitting.remarks import outlier_warnings
 from fitact.fitting.verdict import misfit_warnings
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.circuit import FINGER_PARAMETERS
@@ -20,8 +21,9 @@ from fitact.tracking.random_walk import SmoothedWalk, WindowInformation, WindowT
 from fitact.tracking.time_average import TimeAverage, average_windows
 from fitact.tracking.track import Track
 from fitact.tracking.walk_rates import WalkRates, estimate_rates, walk_matrix
-from fitact.tracking.window_likelihood import QUANTITIES, evaluate_quantities, linearize
+from fitact.tracking.window_likelihood import QUANTITIES, Linearization, evaluate_quantities, linearize
 
+_AREA_SHARE = 12.0**-0.5  # of a period: sd of the time within it to which a sample belongs
 NEW_CONTACT_VARIANCE = 0.5**2  # of the logarithms, where the finger touches again or a jump is found
 
 
@@ -48,8 +50,8 @@ def solve_windows(
         theta, windows = _fit_alone(likelihood, windows, theta, sigma, prior, order)
         change = np.zeros((windows.start.size, 3))
         for round_number in range(max_rounds):
-            information, squares, _ = _linear_information(likelihood, windows, theta, sigma, order, change)
-            sigma = sigma * np.sqrt(_noise_ratio(windows, squares))
+            information, linear, _ = _linear_information(likelihood, windows, theta, sigma, order, change)
+            sigma = sigma * np.sqrt(_noise_ratio(windows, linear.squares))
             if round_number == 0:
                 jumps = find_jumps(information, windows.has_data, windows.contact, walk_matrix(walking)[1])
             timing = _window_times(windows, length, jumps)
@@ -69,7 +71,8 @@ def solve_windows(
         quantities = evaluate_quantities(fitted.derive.geometry, likelihood, windows.data.compressions, middle, sigma)
     covariance = walk.covariance[:, back][:, :, back]
     average = _average(likelihood, windows, information, walk, order, prior, length)
-    return _make_track(model, windows, (middle, covariance), quantities, sigma, found, jumps, length, average)
+    follows = is_change_of_finger(fitted.effects) or _residuals_vary(linear.residuals[windows.has_data])
+    return _make_track(model, windows, (middle, covariance), quantities, sigma, found, jumps, length, average, follows)
 
 
 def _average(
@@ -115,13 +118,13 @@ def _fit_alone(
     root = np.linalg.cholesky(np.linalg.inv(prior[1])).T
     back, still = np.argsort(order), np.zeros((len(theta), 3))
     for _ in range(rounds):
-        information, squares, finite = _linear_information(likelihood, windows, theta, sigma, order, still)
+        information, linear, finite = _linear_information(likelihood, windows, theta, sigma, order, still)
         factor = np.concatenate([information.factor, np.tile(root, (len(theta), 1, 1))], axis=1)
         target = np.concatenate([information.target, np.tile(root @ prior[0], (len(theta), 1))], axis=1)
         solved = np.einsum("kij,kj->ki", np.linalg.pinv(factor), target)[:, back]
         step = np.clip(solved - theta, -1.0, 1.0)
         theta = np.where((windows.has_data & finite)[:, None], theta + step, theta)
-    ratio = squares / _counts(windows)
+    ratio = linear.squares / _counts(windows)
     usual = np.median(ratio[windows.has_data], axis=0)
     tau, table = likelihood.time_constants(theta), windows.data.compressions[0]
     covered = np.all(np.abs(np.log(tau) - table.center) <= table.half_width, axis=0)
@@ -160,8 +163,8 @@ def _linear_information(
     sigma: np.ndarray,
     order: list[int],
     change: Float[np.ndarray, "windows rates"],
-) -> tuple[WindowInformation, np.ndarray, Bool[np.ndarray, " windows"]]:
-    """Return the information of each window in square-root form, squares of residuals, and whether all is finite."""
+) -> tuple[WindowInformation, Linearization, Bool[np.ndarray, " windows"]]:
+    """Return the information of each window in square-root form, what it comes from, and whether all is finite."""
     linear = linearize(likelihood, windows.data, theta, sigma, change)
     finite = np.isfinite(linear.residuals).all(axis=1) & np.isfinite(linear.jacobian).all(axis=(1, 2))
     used = windows.has_data & finite
@@ -170,7 +173,20 @@ def _linear_information(
     size = theta.shape[1]
     rows: Any = np.linalg.qr(np.concatenate([jacobian[:, :, order], target[:, :, None]], axis=2), mode="r")
     information = WindowInformation(rows[:, :size, :size], rows[:, :size, size] * used[:, None])
-    return information, linear.squares, finite
+    return information, linear, finite
+
+
+def _residuals_vary(residuals: Float[np.ndarray, "windows rows"], max_common: float = 0.1, fewest: int = 8) -> bool:
+    """Return whether windows have little of their residuals in common, as of a finger that wanders within each.
+
+    What the model lacks for a constant finger is in all windows. `max_common` is the largest fraction of the residuals'
+    power in their mean, beyond that of residuals that are independent.
+    """
+    if len(residuals) < fewest:
+        return False
+    power = float(np.sum(np.mean(np.square(residuals), axis=0)))
+    common = float(np.sum(np.square(np.mean(residuals, axis=0)))) / power if power > 0.0 else 1.0
+    return common - 1.0 / len(residuals) < max_common
 
 
 def _noise_ratio(windows: CompressedWindows, squares: np.ndarray) -> Float[np.ndarray, " channels"]:
@@ -188,6 +204,7 @@ def _make_track(
     jumps: np.ndarray,
     length: float,
     average: TimeAverage | None,
+    follows: bool,
 ) -> Track:
     fitted, likelihood, scene = model.fit, model.fit.likelihood, model.fit.scene
     theta, covariance = state
@@ -199,12 +216,13 @@ def _make_track(
     u: dict[str, np.ndarray] = {}
     alone: dict[str, np.ndarray] = {}
     sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
-    found, follows = fitted.effects, is_change_of_finger(fitted.effects)
+    found = fitted.effects
     effects = {**found.structure, **({} if follows else found.effect_size)}
     geometry = fitted.geometry_contributions()
 
-    b = np.exp(logs[:, QUANTITIES.index("b")])
-    trend = _trend_uncertainty(b, windows.has_data, time, length / model.parts)
+    followed = [logs[:, QUANTITIES.index("b")]]
+    followed += [_AREA_SHARE * theta[:, names.index("Ci")]] if "Ci" in names else []
+    trend = math.hypot(*(_trend_uncertainty(each, windows.has_data, time, length / model.parts) for each in followed))
 
     def add(name: str, log: np.ndarray, spread: np.ndarray, shown: np.ndarray) -> None:
         others = [each.relative_sd * each.sensitivity for each in geometry.get(name, ()) if name not in names]
@@ -217,7 +235,7 @@ def _make_track(
         if name in names:
             add(name, theta[:, names.index(name)], sd[:, names.index(name)], contact)
     for i, name in enumerate(QUANTITIES):
-        shown = contact & windows.has_data if name == "force_mean" else contact
+        shown = contact & windows.has_data & ~windows.clipped if name == "force_mean" else contact
         add(name, logs[:, i], np.sqrt(np.maximum(variance[:, i], 0.0)), shown)
     if "Ci" in names:
         i, area = names.index("Ci"), float(scene.device.contact_area)
@@ -236,24 +254,31 @@ def _make_track(
     lost = int(np.count_nonzero(contact & ~reliable))
     if lost:
         notes.append(f"{lost:,} of {time.size:,} windows have no data of their own; their values are bridged")
+    # of one window: what all have is said instead, and a change looks like outliers
     idle = misfit_warnings(fitted.traces) if follows else []
-    warnings = [each for each in fitted.warnings if each not in idle]
+    idle += [text for each in fitted.traces for text in outlier_warnings(each.channel, each.figures)]
+    warnings = [each for each in fitted.warnings if each not in idle and " is clipped: " not in each]
+    if clipped := int(np.count_nonzero(windows.clipped & windows.has_data)):
+        warnings.append(
+            f"clipped samples are excluded from {clipped:,} of {time.size:,} windows, which have no mean force; record"
+            " with a wider range"
+        )
     noise = dict(zip(likelihood.sigma_names, map(float, sigma), strict=True))
     return Track(
         time, values, u, alone, contact, reliable, verdicts(shares, along),
-        tuple(map(float, time[jumps] - 0.5 * length)), rates, length, fitted, constants, noise, average,
+        tuple(map(float, time[jumps] - 0.5 * length)), rates, length, fitted, constants, noise, average, follows,
         tuple(warnings), tuple(dict.fromkeys(notes)),
     )  # fmt: skip
 
 
 def _trend_uncertainty(
-    b: Float[np.ndarray, " windows"], used: Bool[np.ndarray, " windows"], time: np.ndarray, period: float
+    log: Float[np.ndarray, " windows"], used: Bool[np.ndarray, " windows"], time: np.ndarray, period: float
 ) -> float:
-    """Return the relative error that a trend of b leaves in a window: its change over a period of the drive.
+    """Return the relative error that a trend of a quantity leaves in a window: its change over a period of the drive.
 
     Lags of charges are corrected for. What remains is that different samples of a period determine different
     combinations of the values, which then belong to times that differ by a part of a period.
     """
     if np.count_nonzero(used) < 3:
         return 0.0
-    return float(period * abs(np.polyfit(time[used], np.log(b[used]), 1)[0]))
+    return float(period * abs(np.polyfit(time[used], log[used], 1)[0]))

@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float
 
 from fitact import charts, summary
 from fitact.files import write_parquet
-from fitact.fitting.effects import is_change_of_finger
 from fitact.fitting.fit import Fit
 from fitact.tables import Display, align_table, join_lines
 from fitact.tracking.time_average import TimeAverage
@@ -25,7 +24,8 @@ class Track(Display):
 
     Attributes:
         time: middles of the windows, s.
-        values: medians by name, SI: Rsc, Csc, Ci, g, b, force_mean (over the window), contact_area.
+        values: medians by name, SI: Rsc, Csc, Ci, g, b, contact_area, and force_mean (over the window; NaN where
+            samples are clipped).
         u: relative standard uncertainties of `values`, combined.
         sd: the same from the record and the prior alone, without geometry and effects of what the model lacks.
         contact: whether the finger is in contact with the panel during the whole window; without, values are NaN.
@@ -38,6 +38,7 @@ class Track(Display):
         constants: what does not change, by name: (median, relative standard uncertainty).
         noise: sd of each channel's noise, V or A.
         average: averages over time for a population; None means that Rsc, Csc and Ci are not all free.
+        follows_changes: whether what the fit of one constant finger to a window lacks is that the finger changes.
     """
 
     time: Float[np.ndarray, " windows"]
@@ -54,13 +55,14 @@ class Track(Display):
     constants: dict[str, tuple[float, float]]
     noise: dict[str, float]
     average: TimeAverage | None
+    follows_changes: bool
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
     def trusted(self) -> bool:
         """Whether the model fits, beside changes of the finger, and some windows are reliable."""
-        return (self.fit.trusted or is_change_of_finger(self.fit.effects)) and bool(np.any(self.reliable))
+        return (self.fit.trusted or self.follows_changes) and bool(np.any(self.reliable))
 
     def to_parquet(self, path: str | os.PathLike[str]) -> None:
         """Write a row for each window as Parquet; needs `pip install 'fitact[campaign]'`.
@@ -129,12 +131,16 @@ class Track(Display):
         }
 
     def _state(self, place: int) -> dict[str, Any]:
-        """Return the values at the first or last reliable time."""
+        """Return the values at the first or last reliable time; of a window with clipped samples without the force."""
         chosen = np.flatnonzero(self.reliable)
         if not chosen.size:
             return {}
         k = chosen[place]
-        values = {name: {"median": float(v[k]), "u": float(self.u[name][k])} for name, v in self.values.items()}
+        values = {
+            name: {"median": float(each[k]), "u": float(self.u[name][k])}
+            for name, each in self.values.items()
+            if math.isfinite(each[k])
+        }
         return {"time_s": float(self.time[k]), **values, "verdict": str(self.verdict[k])}
 
     @property
@@ -153,6 +159,7 @@ class Track(Display):
             f"{name} {format_engineering(state[name]['median'], quantity_unit(name))}"
             f" ± {format_percent(state[name]['u'])}"
             for name in self.values
+            if name in state
         ]
         return f"{state['time_s']:.4g} s: {', '.join(cells)}" + ("" if self.contact[-1] else "; no contact now")
 
@@ -164,15 +171,18 @@ class Track(Display):
 
     def _rows(self) -> list[tuple[str, ...]]:
         first, last = self._state(0), self._state(-1)
-        rows: list[tuple[str, ...]] = [("", "at the start", "at the end", "variation")]
-        for name in self.values if first else ():
+        rows: list[tuple[str, ...]] = []
+        if first:
+            times = (f"at {format_engineering(each['time_s'], 's', 3)}" for each in (first, last))
+            rows.append(("", *times, "variation"))
+        for name in (each for each in self.values if each in first and each in last):
             unit, within = quantity_unit(name), self.within_finger[name]
             cells = (
                 f"{format_engineering(each[name]['median'], unit)} ± {format_percent(each[name]['u'])}"
                 for each in (first, last)
             )
             rows.append((name, *cells, format_percent(within["log_sd"]) if math.isfinite(within["log_sd"]) else ""))
-        return rows if first else []
+        return rows
 
     def _sentences(self) -> list[str]:
         return [self.fit.message, summary.force_sentences(self.fit.force_basis)[0]]
@@ -188,7 +198,9 @@ class Track(Display):
                 f" (95 %: {format_percent(float(low))} to {format_percent(float(high))})"
             )
         for begin, end in self.lifted:
-            parts.append(f"no contact from {begin:.4g} s to {end:.4g} s")
+            parts.append(
+                f"no contact from {begin:.4g} s to {end:.4g} s, each within {format_engineering(self.window, 's', 3)}"
+            )
         for jump in self.jumps:
             parts.append(f"a jump at {jump:.4g} s")
         parts.append(str(self.fit.identifiability))

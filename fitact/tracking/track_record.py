@@ -18,7 +18,7 @@ from fitact.blas import limit_to_one_thread
 from fitact.data.readers.stream import Block, stream_record
 from fitact.data.record import Record, fundamental_frequency
 from fitact.errors import InputError
-from fitact.files import atomic_write
+from fitact.files import atomic_write, require_folder
 from fitact.progress import track_progress
 from fitact.scene.scene import Scene
 from fitact.scene.sections import DriveSection
@@ -84,7 +84,7 @@ def track(
         rates: standard deviations of the walks' logarithms after 1 s, instead of their estimates; 0 for constants.
 
     Raises:
-        InputError: the record is refused, lacks V, changes its sampling rate, or a window is shorter than a period.
+        InputError: the record is refused, lacks V, changes its sampling rate, or a window is shorter than 1.5 periods.
     """
     if isinstance(record, Record):
         blocks: Iterator[Block] = iter([Block(record.time, record.channels, float(len(record)))])
@@ -92,8 +92,8 @@ def track(
     else:
         blocks = stream_record(record, channels=channels, scale=scale, rate=rate, follow=follow)
         source = os.fspath(record)
-        total = float(os.path.getsize(source)) if os.path.isfile(source) else math.inf
-    waits = follow > 0.0 or math.isinf(total)
+        total = float(os.path.getsize(source)) if os.path.isfile(source) and follow <= 0.0 else math.inf
+    waits = math.isinf(total)
     return track_blocks(
         blocks, source, total, scene, waits=waits, window=window, folder=folder, update=update, rates=rates
     )
@@ -115,6 +115,7 @@ def track_blocks(
 
     `total` is the last block's position, for progress. A block may take long to come if the record `waits` for more.
     """
+    place = require_folder(None if folder is None else Path(folder))
     stated = scene or Scene()
     followed = stated.model_copy(update={"drive": DriveSection(waveform="measured")})
     if stated.measurement.noise_model != "white":
@@ -125,12 +126,12 @@ def track_blocks(
     windows = split_windows(_watch(blocks, position), head.step, head.samples, source)
     model, begun = _find_first_model(windows, followed, head.step, source)
     require_table(model, source)
-    checkpoint = None if folder is None else _Checkpoint(Path(folder) / CHECKPOINT, model, followed)
+    checkpoint = None if place is None else _Checkpoint(place / CHECKPOINT, model, followed)
     done = checkpoint.load(begun) if checkpoint else []
     compressed: list[CompressedWindow] = []
-    everything = track_progress(
-        itertools.chain(begun, windows), f"tracking {source}", max(total, 1.0), lambda: position[0]
-    )
+    everything: Iterable[Window] = itertools.chain(begun, windows)
+    if math.isfinite(total):
+        everything = track_progress(everything, f"tracking {source}", total, lambda: position[0])
     responses, last = model.respond(everything), time.monotonic()
     try:
         # the products are small, and a thread reads and filters meanwhile: BLAS leaves it its core
@@ -229,10 +230,10 @@ def _describe_head(first: list[Block], frequency: float | None, window: float | 
     samples = round(window / step) if 0.0 < window < math.inf else 0
     if samples < 20:
         raise InputError(f"window = {window:g} s holds {samples} samples of {step:.3g} s; give at least 20 samples")
-    if frequency is not None and samples * step < (1.0 - 1e-3) / frequency:
+    if frequency is not None and samples * step < (1.5 + 1e-3) / frequency:
         raise InputError(
-            f"window = {window:g} s is shorter than a period of V_V ({1.0 / frequency:.4g} s); give at least one"
-            f" period, better {_MIN_PERIODS}"
+            f"window = {window:g} s is shorter than one and a half periods of V_V ({1.0 / frequency:.4g} s each); give"
+            f" two periods or more, better {_MIN_PERIODS}"
         )
     return _Head(step, samples, notes)
 
@@ -271,7 +272,7 @@ class _Checkpoint:
             return
         leaves = jax.tree.leaves(stack_data(windows))
         arrays: dict[str, Any] = {f"leaf{i}": leaf for i, leaf in enumerate(leaves)}
-        for name in ("start", "lowest", "highest"):
+        for name in ("start", "lowest", "highest", "clipped"):
             arrays[name] = np.array([getattr(each, name) for each in windows])
         arrays["has_data"] = np.array([each.data is not None for each in windows])
         with atomic_write(self.path) as temporary, temporary.open("wb") as file:
@@ -289,13 +290,15 @@ class _Checkpoint:
                 given = next(self._model.respond([whole]))
                 structure = jax.tree.structure(self._model.compress(given).data)
             leaves = [stored[f"leaf{i}"] for i in range(structure.num_leaves)]
-            rest = zip(stored["start"], stored["lowest"], stored["highest"], stored["has_data"], strict=True)
+            names = "start", "lowest", "highest", "has_data", "clipped"
+            rest = zip(*(stored[name] for name in names), strict=True)
             return [
                 CompressedWindow(
                     float(start),
                     jax.tree.unflatten(structure, [leaf[k] for leaf in leaves]) if has_data else None,
                     float(low),
                     float(high),
+                    bool(clipped),
                 )
-                for k, (start, low, high, has_data) in enumerate(rest)
+                for k, (start, low, high, has_data, clipped) in enumerate(rest)
             ]

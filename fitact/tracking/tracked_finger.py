@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -41,7 +43,7 @@ class TrackedFinger(NamedTuple):
                 f"{track.fit.record.source}: the track has no averages of Rsc, Csc and Ci over time; leave all three"
                 " free in the scene, and record three windows or more"
             )
-        time_scale = track.within_finger["force_mean"]["time_scale_s"]
+        time_scale = _time_scale(track.within_finger)
         message = "" if track.trusted else track.fit.message
         return cls(track.fit.record.source, track.average, time_scale, track.fit.record, message)
 
@@ -56,11 +58,19 @@ class TrackedFinger(NamedTuple):
         try:
             content = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
             average = TimeAverage.from_dict(content["time_average"])
-            time_scale = float(content["within_finger"]["force_mean"]["time_scale_s"])
+            time_scale = _time_scale(content["within_finger"])
             message = "" if content["trusted"] else f"{content['fit']['result']}: see the track's page"
             return cls(folder.name, average, time_scale, read(folder / WINDOW), message)
         except (OSError, ValueError, TypeError, KeyError) as error:
+            missing = isinstance(error, FileNotFoundError) and error.filename
+            reason = f"{Path(missing).name} is missing" if missing else repr(error)
             raise InputError(
-                f"{folder}: holds no complete track of Rsc, Csc and Ci ({error!r}); make it with: fitact track RECORD"
+                f"{folder}: holds no complete track of Rsc, Csc and Ci ({reason}); make it with: fitact track RECORD"
                 f" --out {folder}"
             ) from error
+
+
+def _time_scale(within: Mapping[str, Mapping[str, float | None]]) -> float:
+    """Return the time scale of the force, s; of the area or b if windows have clipped samples and thus no force."""
+    scales = (within.get(name, {}).get("time_scale_s") for name in ("force_mean", "contact_area", "b"))
+    return next((float(scale) for scale in scales if scale is not None and math.isfinite(scale)), math.nan)

@@ -22,8 +22,8 @@ class Window(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether all samples are numbers."""
-        return all(bool(np.isfinite(values).all()) for values in self.channels.values())
+        """Whether all samples are numbers, and the neighbours of V."""
+        return all(bool(np.isfinite(values).all()) for values in (self.V, *self.channels.values()))
 
 
 def split_windows(

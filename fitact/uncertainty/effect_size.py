@@ -212,6 +212,7 @@ def describe_rivals(
                 "name": each.rival.name,
                 "group": leader.rival.name,
                 "delta_chi2": each.delta_chi2,
+                "explained": 1.0 - float(np.sum(each.left**2) / np.sum((each.left + each.explained) ** 2)),
                 "shift": dict(zip(quantities, each.shift.tolist(), strict=True)),
                 "visible": each.visible,
                 "amplitudes": each.amplitudes.tolist(),

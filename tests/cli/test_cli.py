@@ -95,6 +95,16 @@ def test_run_leaves_everything_and_says_what_to_open(results):
     assert summary["convergence"]["converged"] is True
 
 
+@pytest.mark.parametrize("command", ["run", "fit", "track"])
+def test_a_folder_that_cannot_be_written_is_refused_before_the_work(fitact_command, finger_path, tmp_path, command):
+    (tmp_path / "file").touch()
+    done = fitact_command(command, finger_path, "--out", tmp_path / "file" / "results")
+    assert done.returncode == 2
+    assert done.stderr.strip().endswith(f"cannot be written ({tmp_path / 'file'} is no folder); choose another path")
+    assert done.stdout == ""
+    assert "fitting" not in done.stderr + done.stdout
+
+
 @pytest.mark.slow
 def test_run_again_goes_on_from_the_chain_and_json_stands_alone(
     results, fitact_process, finger_path, finger_scene_path
