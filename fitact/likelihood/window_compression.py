@@ -26,6 +26,7 @@ from fitact.likelihood.projection import (
 
 REACH = 4.0  # factor by which b may change
 REACH_NODES = 29  # of the table, whose series then ends at 1e-12
+TREND_RANK = 8  # combinations of responses that represent a small trend, to 1e-5
 
 
 class FilterState(NamedTuple):
@@ -35,6 +36,14 @@ class FilterState(NamedTuple):
     voltage: float  # last V
     memory: Float[np.ndarray, "nodes 1"]  # of the filters
     age: float  # time since the drive was first known, s
+
+
+class TrendInputs(NamedTuple):
+    """What a trend within a window adds to a channel, in its coordinates, by the time from the window's middle (s)."""
+
+    signal: Float[np.ndarray, "rows terms"]  # time times the response to the drive, as `Compression.signal`
+    rate: Float[np.ndarray, " rows"]  # time times dV/dt
+    voltage: Float[np.ndarray, " rows"]  # V itself
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,11 +78,11 @@ class WindowCompressor:
         weights: Sequence[Float[np.ndarray, " samples"] | None],
         responses: Float[np.ndarray, "nodes samples"],
         has_charge: bool,
-    ) -> tuple[tuple[Compression, ...], tuple[Float[np.ndarray, " rows"], ...]]:
+    ) -> tuple[tuple[Compression, ...], tuple[TrendInputs, ...]]:
         """Compress a window with the drive `V`: each channel's rest, dV/dt where it follows that, and weights.
 
         `responses` are those of `respond`, and the rests those of `subtract_expected`. With `has_charge`, the charge at
-        the first sample is unknown. Also returns V in the coordinates of each channel.
+        the first sample is unknown. Also returns what a trend within the window needs.
         """
         table, step = self.tables[0], self.time[1]
         combined = table.combinations.T @ responses
@@ -81,11 +90,14 @@ class WindowCompressor:
         steps, zero = drive_steps(V, 0, V.size, ages) / step, np.zeros(V.size)
         followed = [zero if rate is None else rate for rate in rates]
         rank = len(combined)
+        late = self.time - 0.5 * self.time[-1]
+        trends = [*(late * combined[:TREND_RANK]), *(late * each for each in followed)]
         shared = self.shared if has_charge else self.shared[rank:]
         # all channels with the same weights share the products of what they share
-        rows = np.concatenate([combined, shared, steps, [zero, np.gradient(V, step)], followed, rests, [V]])
+        rows = np.concatenate([combined, shared, steps, [zero, np.gradient(V, step)], followed, rests, trends, [V]])
         begin = rank + len(shared)
-        last, products, parts, driven = begin + len(steps), dict[int, np.ndarray](), [], []
+        last, products, parts, inputs = begin + len(steps), dict[int, np.ndarray](), [], []
+        first_trend, count_trends = len(rows) - 1 - len(trends), len(trends) - len(followed)
         baseline = begin - (len(self.shared) - rank)
         decays = range(rank, baseline) if has_charge else [last] * rank  # the row of zeros, if the charge is known
         for i, (channel, weight) in enumerate(zip(self.channels, weights, strict=True)):
@@ -97,6 +109,8 @@ class WindowCompressor:
                 *range(rank),
                 *decays,
                 *[last] * len(channel.effect_sizes),
+                *range(first_trend, first_trend + count_trends),
+                first_trend + count_trends + i,
                 len(rows) - 1,
                 *range(begin, begin + len(own)),
             ]
@@ -104,11 +118,13 @@ class WindowCompressor:
             total = products[id(weight)][np.ix_(places, places)]
             count = V.size if weight is None else int(np.count_nonzero(weight))
             effects = len(channel.effect_sizes)
-            whole = assemble_compression(self.tables[i], total, True, len(own), effects + 1, count)
+            whole = assemble_compression(self.tables[i], total, True, len(own), effects + count_trends + 2, count)
             assert whole.effects is not None
-            driven.append(whole.effects[-1])
-            parts.append(dataclasses.replace(whole, effects=whole.effects[:-1] if effects else None))
-        return tuple(parts), tuple(driven)
+            *late_parts, late_rate, voltage = whole.effects[effects:]
+            late_signal = np.transpose(late_parts) @ self.tables[i].series[:count_trends]
+            inputs.append(TrendInputs(late_signal, late_rate, voltage))
+            parts.append(dataclasses.replace(whole, effects=whole.effects[:effects] if effects else None))
+        return tuple(parts), tuple(inputs)
 
     def subtract_expected(
         self,

@@ -16,7 +16,7 @@ from fitact.fitting.current import edge_mask, weigh_current_samples
 from fitact.fitting.fit import Fit, fit
 from fitact.likelihood.certificate import TOLERANCE, reason_against_table
 from fitact.likelihood.compression import Compression
-from fitact.likelihood.window_compression import FilterState, WindowCompressor
+from fitact.likelihood.window_compression import FilterState, TrendInputs, WindowCompressor
 from fitact.model.circuit import passes_direct_current
 from fitact.scene.scene import Scene
 from fitact.tracking.windows import AROUND, Window
@@ -31,7 +31,7 @@ class WindowData(NamedTuple):
     """Each channel of a window, or of windows with a leading dimension, in its coordinates."""
 
     compressions: tuple[Compression, ...]
-    drive: tuple[Float[np.ndarray, "*windows rows"], ...]  # V
+    trends: tuple[TrendInputs, ...]  # of each channel
 
 
 class CompressedWindow(NamedTuple):

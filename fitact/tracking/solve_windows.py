@@ -23,7 +23,6 @@ from fitact.tracking.track import Track
 from fitact.tracking.walk_rates import WalkRates, estimate_rates, walk_matrix
 from fitact.tracking.window_likelihood import QUANTITIES, Linearization, evaluate_quantities, linearize
 
-_AREA_SHARE = 12.0**-0.5  # of a period: sd of the time within it to which a sample belongs
 NEW_CONTACT_VARIANCE = 0.5**2  # of the logarithms, where the finger touches again or a jump is found
 
 
@@ -220,13 +219,8 @@ def _make_track(
     effects = {**found.structure, **({} if follows else found.effect_size)}
     geometry = fitted.geometry_contributions()
 
-    followed = [logs[:, QUANTITIES.index("b")]]
-    followed += [_AREA_SHARE * theta[:, names.index("Ci")]] if "Ci" in names else []
-    trend = math.hypot(*(_trend_uncertainty(each, windows.has_data, time, length / model.parts) for each in followed))
-
     def add(name: str, log: np.ndarray, spread: np.ndarray, shown: np.ndarray) -> None:
         others = [each.relative_sd * each.sensitivity for each in geometry.get(name, ()) if name not in names]
-        spread = np.hypot(spread, trend)
         whole = np.sqrt(np.square(spread) + sum(x**2 for x in (*others, effects.get(name, 0.0))))
         values[name], u[name] = np.where(shown, np.exp(log), np.nan), np.where(shown, whole, np.nan)
         alone[name] = np.where(shown, spread, np.nan)
@@ -269,16 +263,3 @@ def _make_track(
         tuple(map(float, time[jumps] - 0.5 * length)), rates, length, fitted, constants, noise, average, follows,
         tuple(warnings), tuple(dict.fromkeys(notes)),
     )  # fmt: skip
-
-
-def _trend_uncertainty(
-    log: Float[np.ndarray, " windows"], used: Bool[np.ndarray, " windows"], time: np.ndarray, period: float
-) -> float:
-    """Return the relative error that a trend of a quantity leaves in a window: its change over a period of the drive.
-
-    Lags of charges are corrected for. What remains is that different samples of a period determine different
-    combinations of the values, which then belong to times that differ by a part of a period.
-    """
-    if np.count_nonzero(used) < 3:
-        return 0.0
-    return float(period * abs(np.polyfit(time[used], log[used], 1)[0]))

@@ -13,6 +13,7 @@ from fitact.compiled import jit, pad_rows
 from fitact.likelihood.channel import CHARGES
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
+from fitact.likelihood.window_compression import TrendInputs
 from fitact.model.circuit import FinalCircuit, HighpassTerms
 from fitact.model.force import Geometry, force_constant
 from fitact.tracking.compressed_windows import WindowData
@@ -69,8 +70,8 @@ def _insert(likelihood: Likelihood, compressions: tuple[Compression, ...]) -> Li
 @jit
 def _linearize_batch(likelihood: Likelihood, windows: Any, theta: Array, sigma: Array) -> tuple[Array, Array, Array]:
     def one(window: Any, theta: Array) -> tuple[Array, Array, Array]:
-        (compressions, drive), change = window
-        model = _insert(likelihood, _subtract_lags(_insert(likelihood, compressions), drive, change, theta))
+        (compressions, trends), change = window
+        model = _insert(likelihood, _subtract_changes(_insert(likelihood, compressions), trends, change, theta))
 
         def residuals(theta: Array) -> tuple[Array, tuple[Array, Array]]:
             parts = model.residuals(theta, sigma)
@@ -83,14 +84,17 @@ def _linearize_batch(likelihood: Likelihood, windows: Any, theta: Array, sigma: 
     return jax.vmap(one)(windows, theta)
 
 
-def _subtract_lags(model: Likelihood, drive: tuple[Array, ...], change: Array, theta: Array) -> tuple[Any, ...]:
+def _subtract_changes(
+    model: Likelihood, trends: tuple[TrendInputs, ...], change: Array, theta: Array
+) -> tuple[Any, ...]:
     """Return the compressions without what a changing finger adds, to first order, in the final circuit.
 
-    Charges lag behind values that change, and i = d(C v)/dt. With a = Ci'/Ci, r = b'/b, u the response to V, u1 and u2
-    its derivatives in log b, the voltage v exceeds g u by b g (a (V - u - u1) - r (u1 + u2) / 2).
+    Values change within the window, charges lag behind them, and i = d(C v)/dt. With a = Ci'/Ci, r = b'/b, u the
+    response to V, u1 and u2 its derivatives in log b, the lag is b g (a (V - u - u1) - r (u1 + u2) / 2) of v = g u.
     """
     found = []
-    for channel, V in zip(model.channels, drive, strict=True):
+    for channel, trend in zip(model.channels, trends, strict=True):
+        V = trend.voltage
         compression, inputs = channel.compression, model.make_inputs(model.circuit(theta), theta, channel)
         circuit = inputs.circuit
         if not (isinstance(circuit, FinalCircuit) and isinstance(compression, Compression)):
@@ -112,6 +116,17 @@ def _subtract_lags(model: Likelihood, drive: tuple[Array, ...], change: Array, t
         else:
             slope = g * ((a - whole) * u + r * u1 + a * u1 - 0.5 * r * (u1 - u2))  # of v, beyond that of g u
             added = -2.0 * Ci * slope + a * Ci * (V - 2.0 * g * u)
+        late = dataclasses.replace(
+            compression, signal=trend.signal, rate=trend.rate, steps=jnp.zeros((0, compression.observed.size))
+        )
+
+        def respond_late(logs: Array, late: Compression = late, circuit: Any = circuit, name: Any = channel.channel):
+            moved = [
+                getattr(circuit, part) * jnp.exp(log) for part, log in zip(("Rsc", "Csc", "Ci"), logs, strict=True)
+            ]
+            return late.response(FinalCircuit(*moved).channel_terms(name))
+
+        added = added + jax.jvp(respond_late, (jnp.zeros(3),), (change[::-1],))[1]
         observed = compression.observed - inputs.gain * added
         found.append(dataclasses.replace(compression, observed=lax.stop_gradient(observed)))
     return tuple(found)

@@ -64,8 +64,9 @@ def test_slide_is_followed_within_its_bands(slide):
     for name, z in errors(track, course).items():
         assert np.mean(np.abs(z) < 1.96) >= 0.93, name
     assert track.trusted
-    # values are of use: far narrower than the change
+    # values are of use: far narrower than the change, and g, which does not change, is known as well as the noise allows
     assert np.nanmedian(track.u["contact_area"]) < 4e-3 < 0.1 < track.within_finger["Rsc"]["log_sd"]
+    assert np.nanmedian(track.u["g"]) < 1e-4
     assert set(track.verdict[track.reliable]) == {"identified"}
 
 
@@ -338,13 +339,18 @@ def test_bands_hold_what_they_state_for_random_walks():
         assert 0.93 - margin < np.mean(shares) < 0.97 + margin, name
 
 
-@pytest.mark.slow  # 6 million samples
-def test_slide_of_thirty_seconds_is_within_its_bands():
+@pytest.mark.slow  # 6 million samples, six times
+def test_slides_of_thirty_seconds_are_within_their_bands():
+    """Errors of g are alike along a record, in which it does not change; so that one record tells little."""
     change = {"time": (0.0, 30.0), "area": (1.0, 1.3), "Rsc": (1.0, 0.6), "lifted": (17.03, 17.6)}
-    record, course = simulate(0, 30.0, 200e3, **change)
-    track = fitact.track(record, SCENE)
-    for name, z in errors(track, course).items():
-        assert np.mean(np.abs(z) < 1.96) >= 0.93, name
-    ((begin, end),) = track.lifted
-    assert 0.0 <= 17.03 - begin <= track.window
-    assert 0.0 <= end - 17.602 <= track.window
+    inside: dict[str, list[float]] = {}
+    for seed in range(6):
+        record, course = simulate(seed, 30.0, 200e3, **change)
+        track = fitact.track(record, SCENE)
+        for name, z in errors(track, course).items():
+            inside.setdefault(name, []).append(float(np.mean(np.abs(z) < 1.96)))
+        ((begin, end),) = track.lifted
+        assert 0.0 <= 17.03 - begin <= track.window
+        assert 0.0 <= end - 17.602 <= track.window
+        assert track.noise == pytest.approx({"sigma": 0.1, "sigma_I": 20e-9}, rel=0.03)
+    assert min(map(np.mean, inside.values())) >= 0.93, inside
