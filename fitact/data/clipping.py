@@ -15,9 +15,10 @@ def clipping_mask(values: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " s
     railed = np.zeros(values.size, dtype=bool)
     for upward in (values, -values):
         is_extreme = upward == upward.max()
-        others = upward[~is_extreme]
-        if longest_run(is_extreme) >= min_run and others.size:
-            railed |= is_extreme & (is_extreme.sum() > min_count_ratio * np.count_nonzero(others == others.max()))
+        count = np.count_nonzero(is_extreme)
+        if min_run <= count < values.size and longest_run(is_extreme) >= min_run:
+            others = upward[~is_extreme]
+            railed |= is_extreme & (count > min_count_ratio * np.count_nonzero(others == others.max()))
     if not railed.any():
         return railed
     return np.convolve(railed, np.ones(2 * margin + 1), mode="same") > 0.5

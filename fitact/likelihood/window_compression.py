@@ -26,7 +26,7 @@ from fitact.likelihood.projection import (
 
 REACH = 4.0  # factor by which b may change
 REACH_NODES = 29  # of the table, whose series then ends at 1e-12
-TREND_RANK = 8  # combinations of responses that represent a small trend, to 1e-5
+TREND_RANK = 6  # combinations of responses that represent those to a small trend, to 0.3 %
 
 
 class FilterState(NamedTuple):

@@ -64,7 +64,7 @@ def test_slide_is_followed_within_its_bands(slide):
     for name, z in errors(track, course).items():
         assert np.mean(np.abs(z) < 1.96) >= 0.93, name
     assert track.trusted
-    # values are of use: far narrower than the change, and g, which does not change, is known as well as the noise allows
+    # values are of use: far narrower than the change, and g, which does not change, as well as the noise allows
     assert np.nanmedian(track.u["contact_area"]) < 4e-3 < 0.1 < track.within_finger["Rsc"]["log_sd"]
     assert np.nanmedian(track.u["g"]) < 1e-4
     assert set(track.verdict[track.reliable]) == {"identified"}
