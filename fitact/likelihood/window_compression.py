@@ -39,7 +39,7 @@ class FilterState(NamedTuple):
 
 
 class TrendInputs(NamedTuple):
-    """What a trend within a window adds to a channel, in its coordinates, by the time from the window's middle (s)."""
+    """Inputs of what a trend within a window adds to a channel, in its coordinates; times are from its middle, s."""
 
     signal: Float[np.ndarray, "rows terms"]  # time times the response to the drive, as `Compression.signal`
     rate: Float[np.ndarray, " rows"]  # time times dV/dt

@@ -120,7 +120,9 @@ def _subtract_changes(
             compression, signal=trend.signal, rate=trend.rate, steps=jnp.zeros((0, compression.observed.size))
         )
 
-        def respond_late(logs: Array, late: Compression = late, circuit: Any = circuit, name: Any = channel.channel):
+        def respond_late(
+            logs: Array, late: Compression = late, circuit: Any = circuit, name: Any = channel.channel
+        ) -> Array:
             moved = [
                 getattr(circuit, part) * jnp.exp(log) for part, log in zip(("Rsc", "Csc", "Ci"), logs, strict=True)
             ]
