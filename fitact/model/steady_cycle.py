@@ -29,9 +29,7 @@ class PeriodQuantities(NamedTuple):
     force_mean: Array  # N
     force_alternating: Array  # AC amplitude, N: sqrt(2) times the rms about the mean
     force_harmonics: Float[Array, " harmonics"]  # amplitudes at the harmonics of the drive's frequency, N
-    insulator_peak: (
-        Array  # maximum |voltage| across the insulator, edges included, V; without a leak with the mean of V
-    )
+    insulator_peak: Array  # maximum |voltage| across the insulator, V; without a leak it has the mean of V
     real_power: Array  # mean of V I, dissipated in skins and resistances, W
     apparent_power: Array  # rms V times rms I, VA; infinite, like both currents, if the current has impulses
     current_rms: Array  # through the body, A

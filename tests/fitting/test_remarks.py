@@ -1,9 +1,13 @@
 """Warnings of a channel from its figures of merit: each if it applies, and only then."""
 
+import math
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 
 import fitact
-from fitact.fitting.remarks import channel_warnings
+from fitact.fitting.remarks import channel_warnings, prior_warnings
 from fitact.fitting.starting_point import DriveModel
 from tests.conftest import square_record
 
@@ -46,3 +50,17 @@ def test_each_figure_has_its_remark(figures: dict[str, float], words: list[str])
 
 def test_what_lies_within_the_noise_has_none():
     assert remarks(square_record(), quiet_noise=0.29, interpolation_error=1e-3) == []
+
+
+@pytest.mark.parametrize(("distance", "is_warned"), [(2.9, False), (3.1, True), (-3.1, True)])
+def test_data_far_from_the_prior_of_a_part(distance: float, is_warned: bool):
+    """The pull of a parameter that the data determine is its distance over the prior's standard deviation."""
+    prior = fitact.Prior.of(
+        Rsc=fitact.LogNormal(1e5, 10.0), Ri=fitact.LogNormal(5e6, 4.0), force_scale=fitact.LogNormal(1.0, 2.0)
+    )
+    sd = float(prior["Ri"].log_sd)
+    likelihood = SimpleNamespace(names=prior.names, prior=prior, use_prior=True)
+    theta = np.log([1e9, 5e6 * math.exp(distance * sd), 1e6])  # far out, but neither is a part with a value
+    found = prior_warnings(likelihood, theta, np.full(3, 1e-3), [])
+    assert [each.split(" at ")[0] for each in found] == ["the data put Ri"] * is_warned
+    assert all("3.1 standard deviations from its prior; check [prior] Ri" in each for each in found)
