@@ -78,7 +78,7 @@ GEOMETRY = {  # what force and friction rest on beside the circuit
 }
 DERIVED = {
     "g": ("1", "divider g = Ci / (2 Ci + Csc)"),
-    "b": ("s", "time constant b = Rsc (2 Ci + Csc), over 1 + 2 Rsc / Ri with a leak"),
+    "b": ("s", "time constant b = Rsc (2 Ci + Csc); a leak shortens it"),
     "force_mean": ("N", "electrostatic force, mean"),
     "force_peak": ("N", "electrostatic force, peak"),
     "force_rms": ("N", "electrostatic force, rms"),
