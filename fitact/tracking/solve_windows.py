@@ -139,16 +139,15 @@ def _fit_alone(
 def _change_rates(
     windows: CompressedWindows, theta: np.ndarray, names: Sequence[str], jumps: Bool[np.ndarray, " windows"]
 ) -> Float[np.ndarray, "windows rates"]:
-    """Return the rates of log(Ci), log(Csc) and log(Rsc), 1/s, from window to window; 0 beside lift-offs and jumps."""
-    broken = ~windows.contact | jumps
-    beside = broken | np.append(broken[1:], False) | np.append(False, broken[:-1])
-    rates = [
-        np.gradient(theta[:, names.index(name)], windows.start)
-        if name in names and len(theta) > 1
-        else np.zeros(len(theta))
-        for name in ("Ci", "Csc", "Rsc")
-    ]
-    return np.where(beside[:, None], 0.0, np.stack(rates, axis=1))
+    """Return the rates of log(Ci), log(Csc) and log(Rsc), 1/s, within each stretch between lift-offs and jumps."""
+    absent = np.zeros(len(theta))
+    logs = [theta[:, names.index(name)] if name in names else absent for name in ("Ci", "Csc", "Rsc")]
+    values, rates = np.stack(logs, axis=1), np.zeros((len(theta), 3))
+    ends = np.flatnonzero(jumps | (windows.contact != np.append(windows.contact[:1], windows.contact[:-1])))
+    for stretch in np.split(np.arange(len(theta)), ends):
+        if len(stretch) > 1 and windows.contact[stretch[0]]:
+            rates[stretch] = np.gradient(values[stretch], windows.start[stretch], axis=0)
+    return rates
 
 
 def _counts(windows: CompressedWindows) -> Float[np.ndarray, "windows channels"]:
