@@ -41,7 +41,7 @@ def track(finger_fit: fitact.Fit) -> fitact.Track:
     verdict = np.full(3, "prior-limited")
     times = np.array([0.5, 1.5, 2.5])
     shared = (2.0,), rates, 1.0, finger_fit, {}, {"Vsc": 0.1}
-    return fitact.Track(times, values, u, u, there, there, verdict, *shared, average=None)
+    return fitact.Track(times, values, u, u, there, there, verdict, *shared, average=None, follows_changes=False)
 
 
 @pytest.fixture(scope="module")
