@@ -24,6 +24,14 @@ def clipping_mask(values: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " s
     return np.convolve(railed, np.ones(2 * margin + 1), mode="same") > 0.5
 
 
+def describe_clipping(channel: str, clipped: Bool[np.ndarray, " samples"]) -> str:
+    """Return the sentence on the samples of a channel in a `clipping_mask`, which are excluded."""
+    return (
+        f"{channel} is clipped: {np.count_nonzero(clipped):,} of {clipped.size:,} samples (at an extreme, or within two"
+        " samples of one) are excluded; record with a wider range"
+    )
+
+
 def longest_run(mask: Bool[np.ndarray, " n"]) -> int:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
     return int(np.max(edges[1::2] - edges[::2], initial=0))

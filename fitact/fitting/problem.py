@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.compiled import MAX_PADDED_LENGTH, as_arrays, pad_samples, pad_weight
-from fitact.data.clipping import clipping_mask
+from fitact.data.clipping import clipping_mask, describe_clipping
 from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
 from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
@@ -285,11 +285,7 @@ def _weight(record: Record, channel: str, samples: CurrentSamples | None) -> tup
     clipped, weight = clipping_mask(record[channel]), None if samples is None else samples.weight
     if not clipped.any():
         return weight, ()
-    note = (
-        f"{channel} is clipped: {np.count_nonzero(clipped):,} of {clipped.size:,} samples (at an extreme, or within two"
-        " samples of one) are excluded; record with a wider range"
-    )
-    return np.where(clipped, 0.0, 1.0 if weight is None else weight), (note,)
+    return np.where(clipped, 0.0, 1.0 if weight is None else weight), (describe_clipping(channel, clipped),)
 
 
 def _noise(record: Record, channel: str, scene: Scene) -> tuple[Autoregression | None, float]:

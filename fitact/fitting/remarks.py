@@ -110,8 +110,9 @@ def prior_warnings(
     difference of prior and posterior variance.
     """
     warnings = []
-    others = set(likelihood.prior.names) - {*FINGER_PARAMETERS, "force_scale"} if likelihood.use_prior else set()
-    for name in (each for each in likelihood.names if each in others | set(instruments)):
+    parts = set(likelihood.prior.names) - {*FINGER_PARAMETERS, "force_scale"} if likelihood.use_prior else set()
+    checked = parts.union(instruments)
+    for name in (each for each in likelihood.names if each in checked):
         place, marginal = likelihood.names.index(name), likelihood.prior[name]
         value, spread = float(theta[place]), float(marginal.log_sd)
         learned = math.sqrt(max(spread**2 - float(sd[place]) ** 2, 1e-4 * spread**2))

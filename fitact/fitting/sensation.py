@@ -1,7 +1,6 @@
 """How far a fitted finger feels the drive above the detection threshold, by the scene's table of thresholds."""
 
 import dataclasses
-import math
 from typing import Any, Self
 
 import equinox as eqx
@@ -125,14 +124,9 @@ class FeltDrive:
 
 def _friction_over_force(likelihood: Likelihood, scene: Scene, points: np.ndarray) -> Float[np.ndarray, "*draws"]:
     """Return the alternating friction over the computed force: mu force_scale, measured where it was fitted."""
-    known = {"mu": float(scene.friction.coefficient), "force_scale": 1.0}
-    known |= {name: value for name, value in scene.fixed_values().items() if name in known}
-    return np.exp(
-        sum(
-            points[..., likelihood.names.index(name)] if name in likelihood.names else math.log(value)
-            for name, value in known.items()
-        )
-    )
+    stated = {"mu": float(scene.friction.coefficient), "force_scale": 1.0} | scene.fixed_values()
+    values = stated | likelihood.friction_parameters(np.moveaxis(points, -1, 0))
+    return np.asarray(values["mu"] * values["force_scale"])
 
 
 def _level(times_threshold: Float[np.ndarray, "*shape"]) -> summary.Summary:

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from fitact.data.clipping import clipping_mask, describe_clipping
 from fitact.fitting.effects import is_change_of_finger
 from fitact.fitting.identifiability import information_directions, verdicts
 from fitact.fitting.remarks import outlier_warnings
@@ -249,11 +250,13 @@ def _make_track(
         notes.append(f"{lost:,} of {time.size:,} windows have no data of their own; their values are bridged")
     # of one window: what all have is said instead, and a change looks like outliers
     idle = misfit_warnings(fitted.traces) if follows else []
-    idle += [text for each in fitted.traces for text in outlier_warnings(each.channel, each.figures)]
-    warnings = [each for each in fitted.warnings if each not in idle and " is clipped: " not in each]
-    if clipped := int(np.count_nonzero(windows.clipped & windows.has_data)):
+    for each in fitted.traces:
+        clipped = clipping_mask(fitted.record[each.channel])
+        idle += [*outlier_warnings(each.channel, each.figures), describe_clipping(each.channel, clipped)]
+    warnings = [text for text in fitted.warnings if text not in idle]
+    if count := int(np.count_nonzero(windows.clipped & windows.has_data)):
         warnings.append(
-            f"clipped samples are excluded from {clipped:,} of {time.size:,} windows, which have no mean force; record"
+            f"clipped samples are excluded from {count:,} of {time.size:,} windows, which have no mean force; record"
             " with a wider range"
         )
     noise = dict(zip(likelihood.sigma_names, map(float, sigma), strict=True))

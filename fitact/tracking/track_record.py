@@ -93,10 +93,7 @@ def track(
         blocks = stream_record(record, channels=channels, scale=scale, rate=rate, follow=follow)
         source = os.fspath(record)
         total = float(os.path.getsize(source)) if os.path.isfile(source) and follow <= 0.0 else math.inf
-    waits = math.isinf(total)
-    return track_blocks(
-        blocks, source, total, scene, waits=waits, window=window, folder=folder, update=update, rates=rates
-    )
+    return track_blocks(blocks, source, total, scene, window=window, folder=folder, update=update, rates=rates)
 
 
 def track_blocks(
@@ -105,7 +102,6 @@ def track_blocks(
     total: float,
     scene: Scene | None = None,
     *,
-    waits: bool = False,
     window: float | None = None,
     folder: str | os.PathLike[str] | None = None,
     update: Callable[[Track], None] | None = None,
@@ -113,7 +109,7 @@ def track_blocks(
 ) -> Track:
     """Follow a finger along blocks of samples, as `track` does.
 
-    `total` is the last block's position, for progress. A block may take long to come if the record `waits` for more.
+    `total` is the last block's position, for progress; infinite if more may follow, so that a block may take long.
     """
     place = require_folder(None if folder is None else Path(folder))
     stated = scene or Scene()
@@ -130,7 +126,8 @@ def track_blocks(
     done = checkpoint.load(begun) if checkpoint else []
     compressed: list[CompressedWindow] = []
     everything: Iterable[Window] = itertools.chain(begun, windows)
-    if math.isfinite(total):
+    waits = math.isinf(total)
+    if not waits:
         everything = track_progress(everything, f"tracking {source}", total, lambda: position[0])
     responses, last = model.respond(everything), time.monotonic()
     try:

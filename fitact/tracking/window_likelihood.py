@@ -123,12 +123,11 @@ def _subtract_changes(
         def respond_late(
             logs: Array, late: Compression = late, circuit: Any = circuit, name: Any = channel.channel
         ) -> Array:
-            moved = [
-                getattr(circuit, part) * jnp.exp(log) for part, log in zip(("Rsc", "Csc", "Ci"), logs, strict=True)
-            ]
-            return late.response(FinalCircuit(*moved).channel_terms(name))
+            parts = zip(("Ci", "Csc", "Rsc"), logs, strict=True)
+            moved = FinalCircuit(**{part: getattr(circuit, part) * jnp.exp(log) for part, log in parts})
+            return late.response(moved.channel_terms(name))
 
-        added = added + jax.jvp(respond_late, (jnp.zeros(3),), (change[::-1],))[1]
+        added = added + jax.jvp(respond_late, (jnp.zeros(3),), (change,))[1]
         observed = compression.observed - inputs.gain * added
         found.append(dataclasses.replace(compression, observed=lax.stop_gradient(observed)))
     return tuple(found)
