@@ -11,11 +11,12 @@ from jaxtyping import Array, Bool, Float
 from fitact.compiled import jit
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
+from fitact.fitting.current import flatten_rows
 from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.residual_statistics import channel_statistics, outliers
 from fitact.fitting.source import Source
 from fitact.fitting.spectra import spectrum_statistics
-from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
+from fitact.likelihood.channel import SKEW, ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import STUDENT_DOF, student_weight
 from fitact.likelihood.spectrum_channel import join_complex
@@ -78,15 +79,18 @@ class ChannelFit:
         residuals, weight = residuals[unpadded], None if channel.equally_weighted else channel.weights[unpadded]
         names = [channel.qualified_name(channel.linear_names[column]) for column in channel.columns]
         linear = dict(zip(names, (beta * np.asarray(channel.linear_sd)[list(channel.columns)]).tolist(), strict=True))
+        if (delay := channel.qualified_name(SKEW)) in linear:
+            linear[delay] += float(channel.shift)
         counted = (channel.weights if channel.whitening is None else np.asarray(channel.whitening.mask))[unpadded] > 0.0
         white = white[unpadded][counted]
         n_fitted = theta.size * white.size / float(likelihood.count) + len(linear)
         if isinstance(source.record, Spectrum):
             figures = spectrum_statistics(white, n_fitted)
         else:
-            noise = (
-                sigma if channel.noise == "ar1" else source.noise
-            )  # AR(1) noise is estimated only from the residuals
+            # AR(1) noise is estimated only from the residuals
+            noise = sigma if channel.noise == "ar1" else source.noise
+            if channel.charges is not None:
+                white = flatten_rows(white, channel, inputs, source.in_time)
             whole = white, source.record.time[counted], noise, n_fitted, _gain(optimum, channel)
             figures = channel_statistics(*whole, source.record, channel.channel, source.choice)
             figures |= _weighted_statistics(channel, residuals, weight, counted, source.record.time, source.noise)
@@ -130,7 +134,7 @@ def _weighted_statistics(
 
 def _gain(optimum: CircuitValues, channel: ChannelLikelihood) -> float:
     """Return the factor by which noise of a measured drive enters the channel."""
-    if channel.channel == "Ft":  # whose sensor hardly follows noise
+    if channel.channel == "Ft" or channel.charges is not None:  # whose sensor hardly follows noise; which contain it
         return 0.0
     if isinstance(optimum.circuit, WithSkin):  # the gain falls with frequency, and most of the noise is fast
         return float(np.abs(_channel_gain(optimum.circuit, channel.channel, 1.0 / channel.time_step)))
@@ -151,6 +155,10 @@ def _log_likelihood(
         if channel.noise == "student":
             return _student_log_likelihood(residuals, weights, sigma)
         return gaussian_log_likelihood(residuals, weights)
+    if channel.charges is not None:
+        gain = np.asarray(channel.charges.gain)[: residuals.size]
+        used = gain > 0.0
+        return gaussian_log_likelihood(white_residuals, None) + float(np.sum(np.log(gain[used])))
     used = np.asarray(channel.whitening.mask) > 0.0
     innovations = white_residuals / float(channel.whitening.taps[0])
     return gaussian_log_likelihood(innovations, None) + float(np.sum(np.log(channel.weights[used])))
@@ -182,11 +190,10 @@ def _student_log_likelihood(residuals: Samples, weight: Samples, scale: float) -
 @jit
 def sample_residuals(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: Array) -> tuple[Array, Array, Array]:
     """Return the residuals, the whitened residuals, and the linear nuisances in units of their prior sd."""
-    residuals, beta, _ = channel.fit_nuisances(inputs, sigma)
-    if channel.weight is not None or channel.whitening is not None:
-        residuals, shapes = dataclasses.replace(channel, weight=None, whitening=None).residuals_and_shapes(inputs)
-        residuals = residuals - beta @ (channel.linear_sd[np.array(channel.columns, dtype=int), None] * shapes)
-    white = channel.apply_whitening(residuals)
+    white, beta, _ = channel.fit_nuisances(inputs, sigma)
+    columns = np.array(channel.columns, dtype=int)
+    residuals = channel.observed - channel.signal(inputs)
+    residuals = residuals - beta @ (channel.linear_sd[columns, None] * channel.shapes(inputs)[columns])
     if channel.noise == "student":
         white = white * jnp.sqrt(student_weight(white / sigma))
     return residuals, white, beta

@@ -1,109 +1,384 @@
-"""Loop current I: selection of the samples that a model can predict, and estimates of the circuit before any fit.
+"""Loop current I: rows of charge where V was recorded, the noise of V in them, and estimates before any fit.
 
-If no resistance limits it, I follows dV/dt. I jumps at an edge of the drive, so a sample there carries little
-information. Elsewhere, differentiating a recorded V amplifies its noise.
+The noise of a recorded V is part of the likelihood of I (errors in variables). At given parameters, the residuals tell
+how much of V is noise; the estimate of the drive that remains, with its covariance left in that of the rows, gives
+estimates without bias, unlike the recorded V (`fitact.likelihood.charge_rows`).
 """
 
+import dataclasses
 import math
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
 
-from fitact.data.record import Record
+from fitact.compiled import jit, pad_samples
+from fitact.data.clipping import clipping_mask
+from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
 from fitact.fitting.drive_choice import DriveModel, drive_slope, unit_response
-from fitact.units import format_percent
+from fitact.fitting.least_squares import LeastSquaresResult
+from fitact.fitting.source import Source
+from fitact.fitting.starting_point import CurrentEstimate
+from fitact.likelihood.channel import LINEAR_NUISANCES, SKEW, ChannelInputs, ChannelLikelihood
+from fitact.likelihood.charge_rows import (
+    LAG,
+    MAX_STEPS,
+    ChargeRows,
+    RowCovariance,
+    step_means,
+    whiten_rows,
+)
+from fitact.likelihood.likelihood import Likelihood
+from fitact.model.circuit import HighpassTerms, gain_at
+from fitact.model.drive import Sampled
+
+Rows = Float[np.ndarray, " samples"]
+_SKEW = LINEAR_NUISANCES.index(SKEW)
+# rms error of the mean over a step, up to six steps from a jump, relative to its height
+_JUMP_ERRORS = np.array([3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.29, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4])
+_FEW = 4  # equal values in a row that are usual where noise exceeds the rounding
+_ROW_NOISE = 0.6285  # variance of a row over that of a sample of white noise; with those of neighbours, the sum is 1
 
 
-class CurrentSamples(NamedTuple):
-    """Samples of a current that follows dV/dt, as a likelihood uses them."""
+class Current(NamedTuple):
+    """A modelled current: what its noise of V and its delay depend on."""
 
-    weight: Float[np.ndarray, " samples"]  # relative inverse noise sd, 0 at edges; see `ChannelLikelihood`
-    rate: Float[np.ndarray, " samples"]  # dV/dt, V/s
-    drive_noise_dominates: bool  # whether V's noise, differentiated, takes too much off what follows dV/dt
-    notes: tuple[str, ...]  # sentences for information
-    warnings: tuple[str, ...]  # sentences on what may change the result
+    capacitance: float  # that follows dV/dt, with the stray one, F
+    conductance: float  # of what does not follow it, S
+    delay: float  # against V, in time steps
 
 
-def select_current_samples(record: Record, choice: DriveModel) -> CurrentSamples:
-    """Exclude the samples at edges, and weight the others by their noise, including that of dV/dt."""
-    max_attenuation = 1e-3  # largest acceptable relative bias of the capacitive current due to noise of V
-    noise = record.noise("V") if choice.name == "measured" else 0.0
-    used = ~edge_mask(choice.voltage, noise)
-    if choice.name != "measured":
-        slope = drive_slope(choice, record.time)
-        used &= np.isfinite(slope)  # a record may begin at a jump
-    note = f"I: {np.count_nonzero(~used):,} of {used.size:,} samples lie at an edge of the drive and are excluded"
-    if choice.name != "measured":
-        return CurrentSamples(used.astype(float), np.where(used, slope, 0.0), False, (note,), ())
-    rate = np.gradient(choice.voltage) / np.gradient(record.time)  # over two steps, which halves the noise
-    spread = noise / (math.sqrt(2.0) * record.time_step)
-    weight = used * weigh_current_samples(record["I"], rate, spread / record.noise("I"), used)
-    # what noise in a regressor takes off its coefficient
-    spread = spread * (rate != 0.0)
-    attenuation = float(np.sum((weight * spread) ** 2) / max(float(np.sum((weight * rate) ** 2)), 1e-300))
-    if attenuation <= max_attenuation:
-        return CurrentSamples(weight, rate, False, (note,), ())
-    warning = (
-        "noise of V_V, amplified by differentiation, lowers the estimated capacitive part of I by"
-        f" {format_percent(attenuation)}; name the waveform in the scene, or record V with less noise"
-    )
-    return CurrentSamples(weight, rate, True, (note,), (warning,))
+@dataclasses.dataclass(frozen=True)
+class RecordedCurrent:
+    """V and I of a record, and what is known of their noise before a fit."""
+
+    V: Rows
+    I: Rows  # noqa: E741
+    step: float  # s
+    variance_V: Rows  # of the noise and the rounding of each sample of V, V^2
+    noise_I: float  # A
+    uncertain: Rows  # variance of the mean current over the step after a sample, because of kinks and rounding, A^2
+    excluded: Bool[np.ndarray, " samples"]  # samples of I that are clipped
+
+    @classmethod
+    def from_record(cls, record: Record) -> "RecordedCurrent":
+        """Estimate the noise of a record's V and I."""
+        V, current = record["V"], record["I"]
+        noise, rounding = estimate_noise(current), rounding_noise_sd(current)
+        runs = run_lengths(current)
+        # a run of equal values shares one error, so that its mean has the variance of one
+        uncertain = _kink_variance(current, noise) + np.where(runs > _FEW, rounding**2 * runs, 0.0)
+        return cls(V, current, record.time_step, drive_variance(V), noise, uncertain, clipping_mask(current))
+
+    def covariance(self, modelled: Current) -> RowCovariance:
+        """Return the covariance of the rows."""
+        driven = np.roll((modelled.capacitance / self.step) ** 2 * self.variance_V, LAG)
+        floor = max(self.noise_I, 1e-12 * float(np.ptp(self.I))) ** 2
+        level = _ROW_NOISE * floor + driven + np.roll(driven, -1) + modelled.conductance**2 * np.mean(self.variance_V)
+        shift = LAG - round(modelled.delay)
+        variance = level + np.roll(self.uncertain, shift)
+        neighbours = 0.5 * (1.0 - _ROW_NOISE) * floor - driven
+        reach = np.arange(-LAG, LAG)
+        clipped = np.convolve(self.excluded, np.ones(reach.size), "same") > 0.5
+        excluded = np.roll(clipped, shift)
+        excluded[: 2 * LAG] = True
+        return RowCovariance(variance, neighbours, excluded)
+
+    def flatten(self, white: Rows, modelled: Current) -> Rows:
+        """Return whitened rows without the spectrum that a tridiagonal covariance leaves in the noise of I."""
+        impulse = np.zeros(64)
+        impulse[32 - LAG] = 1.0
+        turns = 2.0 * math.pi * np.fft.rfftfreq(white.size)
+        taps = np.flatnonzero(own := step_means(impulse, modelled.delay))
+        gain = np.abs(np.exp(-1j * np.outer(turns, taps)) @ own[taps]) ** 2
+        driven = (modelled.capacitance / self.step) ** 2 * float(np.median(self.variance_V))
+        floor, others = self.noise_I**2, 2.0 * driven * (1.0 - np.cos(turns))
+        assumed = floor * (_ROW_NOISE + (1.0 - _ROW_NOISE) * np.cos(turns)) + others
+        lines = np.fft.rfft(white) * np.sqrt(assumed / np.maximum(floor * gain + others, 0.05 * assumed))
+        return np.fft.irfft(lines, white.size)
+
+    def rise(self, V: Rows) -> Rows:
+        """Return the rise of a drive over each step, V/s, stored as rows are."""
+        return np.concatenate([np.zeros(LAG), np.diff(V)[: 1 - LAG] / self.step])
+
+    def make_rows(
+        self, modelled: Current, respond: Callable[[Rows], Rows], nuisances: ArrayLike = 0.0
+    ) -> tuple[ChargeRows, Rows]:
+        """Return the rows of charge and the estimate of V, given the modelled rows of a drive and of nuisances."""
+        covariance = self.covariance(modelled)
+        means, from_V = step_means(self.I, modelled.delay), respond(self.V)
+        scaled = np.append(covariance.solve(means - from_V - nuisances)[LAG:], np.zeros(LAG))
+        # covariance of the noise of V with that of the rows
+        share = -modelled.capacitance / self.step * self.variance_V
+        noise = share * (np.append(0.0, scaled[:-1]) - scaled)
+        V = self.V - noise
+        signal = respond(V)
+        slope = np.where(covariance.used, -np.gradient(signal) / self.step, 0.0)
+        gain, decay = covariance.recursion(self.noise_I or 1e-12 * float(np.ptp(self.I)))
+        return ChargeRows(means + signal - from_V, self.rise(V), slope, gain, decay), V
 
 
-def weigh_current_samples(
-    current: Float[np.ndarray, " samples"],
-    rate: Float[np.ndarray, " samples"],
-    spread: float,
-    used: Bool[np.ndarray, " samples"],
-) -> Float[np.ndarray, " samples"]:
-    """Return the weights of samples of I whose dV/dt has noise; `spread` is its sd (V/s) over the sd of I's noise."""
-    capacitance = abs(float(current[used] @ rate[used]) / max(float(rate[used] @ rate[used]), 1e-300))
-    # a V that stays at one level has no noise there that a derivative could see
-    return 1.0 / np.hypot(1.0, capacitance * spread * (rate != 0.0))
+def estimate_noise(values: Rows) -> float:
+    """Return the sd of white noise and rounding: that of third differences, or of the highest frequencies if lower.
+
+    Edges hardly change the first, and fast smooth signals the second.
+    """
+    lines = np.fft.rfft((values - values.mean()) * np.hanning(values.size))[int(0.4 * values.size) :]
+    fastest = math.sqrt(float(np.median(np.abs(lines) ** 2)) / math.log(2.0) / (0.375 * values.size))
+    return math.hypot(min(white_noise_sd(values), fastest), rounding_noise_sd(values))
 
 
-def edge_mask(voltage: Float[np.ndarray, " samples"], noise: float) -> Bool[np.ndarray, " samples"]:
-    """Return which samples lie within `margin` steps of a sudden change of the drive's slope."""
-    margin = 2
-    # a change is sudden if it exceeds so many times the median over a block of samples, or the effect of noise
-    threshold, block = 8.0, 64
+def _kink_variance(current: Rows, noise: float, threshold: float = 4.0, smooth: float = 8.0, block: int = 64) -> Rows:
+    """Return the variance of the mean current over the step after each sample, if the current jumps within the step.
+
+    A jump somewhere within a step changes the mean by its height times a uniform number in +-1/2, and the polynomials
+    of `step_means` around it by the `_JUMP_ERRORS`. Sixth differences are ten times a jump; they count above `threshold` times the effect of noise, and `smooth` times what is usual in a
+    `block` of samples.
+    """
+    jump = np.pad(np.abs(np.diff(current, 6)) / 10.0, 3)
+    padded = np.pad(jump, (0, -jump.size % block), mode="edge").reshape(-1, block)
+    usual = np.repeat(np.median(padded, axis=1), block)[: jump.size]
+    least = np.maximum(threshold * math.sqrt(924.0) / 10.0 * noise, smooth * usual)
+    around = np.max([np.roll(jump, k) for k in (-2, -1, 1, 2)], axis=0)
+    jump = np.where((jump > np.maximum(least, 1e-9 * np.ptp(current))) & (jump >= around), jump, 0.0)
+    height = np.maximum(jump, np.append(jump[1:], 0.0))
+    return np.convolve(np.square(height), np.square(_JUMP_ERRORS), "same")
+
+
+def drive_variance(V: Rows) -> Rows:
+    """Return the variance of each sample of V; within a run of equal values, rounding is no noise, but an offset."""
+    white, rounding, alike = math.sqrt(max(estimate_noise(V) ** 2 - rounding_noise_sd(V) ** 2, 0.0)), rounding_noise_sd(V), np.diff(V) == 0.0
+    within = np.append(False, alike) & np.append(alike, False)
+    return white**2 + np.where(within, 0.0, rounding**2)
+
+
+def run_lengths(values: Rows) -> Rows:
+    """Return for each sample the number of equal values in a row."""
+    ends = np.append(np.flatnonzero(np.diff(values)), values.size - 1)
+    lengths = np.diff(ends, prepend=-1)
+    return np.repeat(lengths, lengths).astype(float)
+
+
+def describe_terms(terms: HighpassTerms, stray: ArrayLike | None, delay: float, step: float) -> Current:
+    """Return what the noise of the drive in a current depends on; `delay` is in time steps of `step` s.
+
+    If a resistance limits the current, its capacitance is that whose rows have the same variance.
+    """
+    stray = 0.0 if stray is None else float(stray)
+    if terms.rate is not None:
+        return Current(float(terms.rate) + stray, float(abs(np.sum(terms.weight))), delay)
+    omega = math.pi / step * (np.arange(64) + 0.5) / 64.0
+    gain = np.asarray(gain_at(terms, omega)) + 1j * omega * stray
+    mean_square = float(np.mean(np.abs(gain * np.sinc(0.5 * omega * step / math.pi)) ** 2))
+    return Current(math.sqrt(0.5 * mean_square) * step, 0.0, delay)
+
+
+# ---- estimates before a fit ----------------------------------------------------------------------------------------
+
+
+def select_samples(record: Record, choice: DriveModel) -> tuple[Bool[np.ndarray, " samples"], Rows]:
+    """Return the samples of I that a stated drive predicts, and its dV/dt (V/s), which is 0 at others."""
+    slope = drive_slope(choice, record.time)
+    used = ~edge_mask(choice.voltage) & np.isfinite(slope)  # a record may begin at a jump
+    return used, np.where(used, slope, 0.0)
+
+
+def edge_mask(voltage: Rows, margin: int = 2, threshold: float = 8.0, block: int = 64) -> Bool[np.ndarray, " samples"]:
+    """Return which samples lie within `margin` steps of a sudden change of a stated drive's slope.
+
+    A change is sudden if it exceeds `threshold` times the median over a `block` of samples.
+    """
     bend = np.abs(np.diff(voltage, 2, prepend=voltage[0], append=voltage[-1]))
     blocks = np.pad(bend, (0, -bend.size % block), mode="edge").reshape(-1, block)
     median = np.repeat(np.median(blocks, axis=1), block)[: bend.size]
-    floor = math.sqrt(6.0) * noise + 1e-9 * float(np.ptp(voltage))
-    edges = bend > threshold * np.maximum(median, floor)
+    edges = bend > threshold * np.maximum(median, 1e-9 * float(np.ptp(voltage)))
     return np.convolve(edges, np.ones(2 * margin + 1), mode="same") > 0.5
 
 
-class CurrentEstimate(NamedTuple):
-    """Coefficients of I = weight s b / (1 + s b) V + capacitance dV/dt from linear fits."""
-
-    weight: float  # S
-    b: float  # s
-    capacitance: float  # F
-
-
-def estimate_from_current(record: Record, choice: DriveModel, samples: CurrentSamples) -> CurrentEstimate:
-    """Estimate the coefficients of I by linear fits on a grid of time constants."""
-    weight, rate = samples.weight, samples.rate
+def estimate_from_current(
+    record: Record, choice: DriveModel, used: Bool[np.ndarray, " samples"], slope: Rows
+) -> CurrentEstimate:
+    """Estimate the coefficients of I for a stated drive with dV/dt `slope`, on a grid of time constants."""
     span = float(record.time[-1] - record.time[0])
-    taus = np.geomspace(2.0 * record.time_step, 10.0 * span, 60)
 
     def fit_at_tau(tau: float) -> tuple[float, float, float]:
-        columns = [unit_response(choice, record.time, tau), rate, np.ones_like(rate)]
-        if choice.unknown_charge:
-            columns.append(np.exp(-(record.time - record.time[0]) / tau))
-        design = np.stack(columns, axis=1) * weight[:, None]
-        sizes = np.linalg.norm(design, axis=0)
-        sizes = np.where(sizes > 0.0, sizes, 1.0)
-        amplitudes = np.linalg.lstsq(design / sizes, record["I"] * weight, rcond=None)[0] / sizes
-        residuals = record["I"] * weight - design @ amplitudes
-        return float(residuals @ residuals), float(amplitudes[0]), float(amplitudes[1])
+        columns = [unit_response(choice, record.time, tau), slope, np.ones_like(slope)]
+        residual, amplitudes = _solve(np.stack(columns) * used, record["I"] * used)
+        return residual, *amplitudes[:2]
 
-    best = min(range(taus.size), key=lambda k: fit_at_tau(float(taus[k]))[0])
-    if 0 < best < taus.size - 1:
+    return _scan(fit_at_tau, np.geomspace(2.0 * record.time_step, 10.0 * span, 60))
+
+
+def _scan(fit_at_tau: Callable[[float], tuple[float, float, float]], taus: np.ndarray) -> CurrentEstimate:
+    """Return the coefficients at the best of the time constants, refined between its neighbours."""
+    for _ in range(2):
+        found = [fit_at_tau(float(tau)) for tau in taus]
+        # no circuit has a negative coefficient
+        best = min(range(taus.size), key=lambda k: (not min(found[k][1:]) > 0.0, found[k][0]))
+        estimate = CurrentEstimate(found[best][1], float(taus[best]), found[best][2])
+        if not 0 < best < taus.size - 1:
+            break
         taus = np.geomspace(taus[best - 1], taus[best + 1], 17)
-        best = min(range(taus.size), key=lambda k: fit_at_tau(float(taus[k]))[0])
-    _, g, capacitance = fit_at_tau(taus[best])
-    return CurrentEstimate(g, float(taus[best]), capacitance)
+    return estimate
+
+
+def _solve(columns: np.ndarray, observed: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the residual sum of squares and the coefficients of a linear fit."""
+    sizes = np.linalg.norm(columns, axis=1)
+    sizes = np.where(sizes > 0.0, sizes, 1.0)
+    amplitudes = np.linalg.lstsq((columns / sizes[:, None]).T, observed, rcond=1e-12)[0] / sizes
+    residuals = observed - amplitudes @ columns
+    return float(residuals @ residuals), amplitudes
+
+
+def _first_order(V: Rows, step: float, tau: float) -> Rows:
+    """Return the response of s tau / (1 + s tau) to V, linear between samples, from 0."""
+    x = step / tau
+    decay = np.full(V.size, math.exp(-x))
+    return whiten_rows(np.full(V.size, -math.expm1(-x) / x), decay, np.diff(V, prepend=V[0]))
+
+
+def estimate_recorded(
+    current: RecordedCurrent, stray: float, hum: Sequence[float], most: int = 8192
+) -> tuple[CurrentEstimate, Rows]:
+    """Estimate the coefficients of I for a recorded V by a scan of b, and return the rows of nuisances.
+
+    Given b, I is linear in the other coefficients, so that the scan finds the global optimum. Charges of several steps
+    add up, so that at most `most` rows serve. `hum` has frequencies (Hz) at which I may have a part of its own.
+    """
+    rise = current.rise(current.V)
+    C = abs(float(current.I[LAG:-LAG] @ np.gradient(current.V, current.step)[LAG:-LAG]))
+    C /= max(float(np.sum(np.gradient(current.V, current.step)[LAG:-LAG] ** 2)), 1e-300)
+    several = math.ceil((current.I.size - 3 * LAG) / most)
+    first, count = 2 * LAG, (current.I.size - 2 * LAG) // several
+    step = current.step * several
+
+    def thin(rows: np.ndarray) -> np.ndarray:
+        return rows[..., first : first + several * count].reshape(*rows.shape[:-1], count, several).mean(axis=-1)
+
+    covariance = current.covariance(Current(C, 0.0, 0.0))
+    own = np.where(covariance.used, np.roll(current.uncertain, LAG), np.inf)
+    extra = np.minimum(thin(np.where(np.isfinite(own), own, 0.0)) / several, np.inf)
+    extra = np.where(thin(np.isinf(own) * 1.0) > 0.0, np.inf, extra)
+    driven = (C / step) ** 2 * float(np.mean(current.variance_V))
+    lost = np.isinf(extra)
+    variance = current.noise_I**2 / several + 2.0 * driven + np.where(lost, 0.0, extra) + 1e-24 * np.ptp(current.I) ** 2
+    gain, decay = RowCovariance(variance, np.full(count, -driven), lost).recursion(1.0)
+    V = current.V[first - LAG :: several][: count + 1]
+    V = np.pad(V, (0, count + 1 - V.size), mode="edge")
+    time = step * np.arange(count)
+    waves = [wave(2.0 * np.pi * f * time) for f in hum for wave in (np.cos, np.sin)]
+    observed = whiten_rows(gain, decay, thin(step_means(current.I) - stray * rise))
+    fixed = whiten_rows(gain, decay, np.stack([np.diff(V) / step, np.ones(count), *waves]))
+
+    def columns(tau: float) -> np.ndarray:
+        u = _first_order(V, step, tau)
+        mean = tau * (np.diff(V) - np.diff(u)) / step  # over a step, exactly
+        return np.concatenate([whiten_rows(gain, decay, np.stack([mean, np.exp(-time / tau)])), fixed])
+
+    def fit_at_tau(tau: float) -> tuple[float, float, float]:
+        residual, amplitudes = _solve(columns(tau), observed)
+        return residual, float(amplitudes[0]), float(amplitudes[2])
+
+    taus = np.geomspace(max(2.0 * step, 1e-4), max(10.0 * step * count, 4e-4), 48)
+    estimate = _scan(fit_at_tau, taus)
+    amplitudes = _solve(columns(estimate.b), observed)[1]
+    time = current.step * (np.arange(current.I.size) - first)
+    waves = [wave(2.0 * np.pi * f * time) for f in hum for wave in (np.cos, np.sin)]
+    decays = np.exp(-np.maximum(time, -step) / estimate.b)
+    return estimate, amplitudes[1] * decays + amplitudes[3:] @ np.stack([np.ones_like(time), *waves])
+
+
+def respond_to(current: RecordedCurrent, estimate: CurrentEstimate, stray: float) -> Callable[[Rows], Rows]:
+    """Return the function from a drive to the rows of the estimated current."""
+
+    def respond(V: Rows) -> Rows:
+        filtered = step_means(_first_order(V, current.step, estimate.b))
+        return (estimate.capacitance + stray) * current.rise(V) + estimate.weight * filtered
+
+    return respond
+
+
+# ---- after a fit ---------------------------------------------------------------------------------------------------
+
+
+def update_rows(
+    likelihood: Likelihood, solution: LeastSquaresResult, sources: Sequence[Source]
+) -> tuple[Likelihood, float]:
+    """Return the likelihood with rows of charge for the drive, noise and delay at a solution, and the largest skew.
+
+    The skew is how much later than its rows a current is, in time steps.
+    """
+    largest, optimum = 0.0, solution.likelihood.evaluate_circuit(solution.theta)
+    for i, (channel, solved) in enumerate(zip(likelihood.channels, solution.likelihood.channels, strict=True)):
+        if channel.charges is not None:
+            inputs = solution.likelihood.make_inputs(optimum.circuit, solution.theta, solved)
+            rows, V, delay, skew = _rows_at(solved, inputs, solution.sigma[i], sources[i].in_time)
+            likelihood = likelihood.replace_channel(i, set_rows(channel, rows, V, delay))
+            largest = max(largest, abs(skew))
+    return likelihood, largest
+
+
+def flatten_rows(
+    white: Rows, channel: ChannelLikelihood, inputs: ChannelInputs, record: Record
+) -> Rows:
+    """Return the whitened rows of a channel of charges without the spectrum of their own; see `RecordedCurrent`."""
+    terms, current = inputs.circuit.channel_terms(channel.channel), RecordedCurrent.from_record(record)
+    delay = float(channel.shift) / current.step
+    return current.flatten(white, describe_terms(terms, inputs.stray, delay, current.step))
+
+
+def _rows_at(
+    channel: ChannelLikelihood, inputs: ChannelInputs, sigma: ArrayLike, record: Record
+) -> tuple[ChargeRows, Rows, float, float]:
+    """Return rows and drive of a channel at its optimum, the delay (s), and the skew (time steps)."""
+    current, size = RecordedCurrent.from_record(record), len(record)
+    beta = np.asarray(_fit_nuisances(channel, inputs, np.asarray(sigma))[1])
+    full = channel.without_compression()
+    sizes = beta * np.asarray(full.linear_sd)[list(full.columns)]
+    is_skew = np.array(full.columns) == _SKEW
+    skew = float(sizes[is_skew].sum()) / current.step
+    delay = float(full.shift) / current.step + float(np.clip(skew, -0.5, 0.5))
+    delay = float(np.clip(delay, 0.5 - MAX_STEPS, MAX_STEPS - 0.5))
+
+    def respond(V: Rows) -> Rows:
+        return np.asarray(_modelled_rows(_with_drive(full, current, V), inputs))[:size]
+
+    nuisances = _nuisance_rows(_with_drive(full, current, current.V), inputs, np.where(is_skew, 0.0, sizes))
+    terms = inputs.circuit.channel_terms(channel.channel)
+    modelled = describe_terms(terms, inputs.stray, delay, current.step)
+    return *current.make_rows(modelled, respond, np.asarray(nuisances)[:size]), delay * current.step, skew
+
+
+def set_rows(channel: ChannelLikelihood, rows: ChargeRows, V: Rows, delay: float) -> ChannelLikelihood:
+    """Return the channel with rows of charge, an estimate of the drive, and the delay (s) at which they are taken."""
+    length = np.shape(channel.time)[0]
+    arrays = {field.name: getattr(rows, field.name) for field in dataclasses.fields(rows)}
+    padded = ChargeRows(**{name: np.pad(x, (0, length - x.size)) for name, x in arrays.items()})
+    assert isinstance(channel.drive, Sampled)
+    drive = Sampled(channel.drive.time, pad_samples(V))
+    return dataclasses.replace(channel, drive=drive, whitening=padded, shift=np.asarray(delay, dtype=float))
+
+
+def _with_drive(channel: ChannelLikelihood, current: RecordedCurrent, V: Rows) -> ChannelLikelihood:
+    """Return the channel of a current that is 0, with another drive."""
+    assert channel.charges is not None and isinstance(channel.drive, Sampled)
+    length = np.shape(channel.time)[0]
+    rise = np.pad(current.rise(V), (0, length - V.size))
+    charges = dataclasses.replace(channel.charges, observed=np.zeros(length), rate=rise)
+    return dataclasses.replace(channel, drive=Sampled(channel.drive.time, pad_samples(V)), whitening=charges)
+
+
+@jit
+def _modelled_rows(channel: ChannelLikelihood, inputs: ChannelInputs) -> Array:
+    return -channel.rows_and_shapes(inputs)[0]
+
+
+@jit
+def _nuisance_rows(channel: ChannelLikelihood, inputs: ChannelInputs, sizes: Array) -> Array:
+    return sizes @ channel.rows_and_shapes(inputs)[1]
+
+
+_fit_nuisances = jit(ChannelLikelihood.fit_nuisances)

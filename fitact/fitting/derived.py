@@ -16,7 +16,7 @@ from fitact.compiled import BatchEvaluator, as_arrays, jit, pad_samples, pad_wei
 from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.fitting.drive_choice import DriveModel, has_ideal_edges, whole_periods
-from fitact.likelihood.channel import CHARGES, LINEAR_NUISANCES, ChannelInputs, ChannelLikelihood
+from fitact.likelihood.channel import CHARGES, FIRST_CHARGE, LINEAR_NUISANCES, ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.circuit import Circuit
 from fitact.model.drive import Drive, Multitone, Periodic, PiecewiseLinear, Sampled, Sine
@@ -104,7 +104,7 @@ class DerivedQuantities(eqx.Module):
         A charge that stays on a gap is not included, because no channel shows it.
         """
         first = None if deviate is None else deviate[0]
-        sizes = (channel.sample_nuisances(inputs, sigma, first) * channel.linear_sd)[-len(CHARGES) :]
+        sizes = (channel.sample_nuisances(inputs, sigma, first) * channel.linear_sd)[FIRST_CHARGE : FIRST_CHARGE + len(CHARGES)]
         # the effect of a charge scales between channels like the response to a drive
         names = self.geometry.contact(inputs.circuit).channel, channel.channel
         acting, recorded = (inputs.circuit.channel_terms(name).weight for name in names)

@@ -29,7 +29,7 @@ def assess_fit(
 ) -> EffectSizes | None:
     """Return the effect sizes of a fit; None if they cannot be computed. By default all known rivals are considered."""
     posterior, channels = linear_posterior(laplace), channel_samples(laplace, traces)
-    if posterior is None:
+    if posterior is None or not channels:
         return None
     added: dict[tuple[str, str], list[int]] = {}
     for i, each in enumerate(channels):
@@ -61,7 +61,7 @@ def channel_samples(laplace: Laplace, traces: Sequence[ChannelFit]) -> list[Chan
     with jax.enable_x64(True):
         taus = np.asarray(laplace.likelihood.evaluate_circuit(laplace.theta).tau)
     pairs = zip(laplace.likelihood.channels, traces, strict=True)
-    electrical = [(channel, fitted) for channel, fitted in pairs if fitted.channel != "Ft"]
+    electrical = [(channel, fitted) for channel, fitted in pairs if fitted.channel != "Ft" and channel.charges is None]
     return [_channel_samples(laplace, channel, fitted, taus) for channel, fitted in electrical]
 
 

@@ -486,13 +486,12 @@ def _assemble_fit(
         identifiability = assess_parameters(*evidence, free, channels)
     else:
         identifiability = assess_identifiability(*evidence, experiment)
-    result, effects = diagnose_fit(solution, root, traces, problem.sources, optima), None
+    result, effects = diagnose_fit(solution, root, traces, optima), None
     poor = [trace for trace in traces if is_misfit(trace.figures)]
-    noisy = any(source.drive_noise_dominates for source in problem.sources)
-    if result == "misfit" and (noisy or any(trace.channel != "Ft" for trace in poor)):
+    if result == "misfit" and any(trace.channel != "Ft" for trace in poor):
         effects = assess_fit(laplace, traces, has_structure=True)
         # what a poor fit of the friction may move is not assessed
-        may_move = noisy or any(is_undersampled(t.figures) or t.channel == "Ft" for t in poor)
+        may_move = any(is_undersampled(t.figures) or t.channel == "Ft" for t in poor)
         if effects is not None and not may_move and is_tolerable(effects, laplace, first.scene.tolerance.force):
             result = "structure"
     whole = Fit(

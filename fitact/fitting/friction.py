@@ -11,7 +11,7 @@ from fitact.errors import InputError
 from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.starting_point import estimate_from_vsc
 from fitact.likelihood import certificate
-from fitact.likelihood.channel import CHARGES, LINEAR_NUISANCES, ChannelLikelihood
+from fitact.likelihood.channel import FIRST_CHARGE, LINEAR_NUISANCES, ChannelLikelihood
 from fitact.likelihood.friction_channel import FrictionChannel
 from fitact.model.force import FRICTION_PARAMETERS
 from fitact.scene.scene import Scene
@@ -36,8 +36,7 @@ def make_friction_channel(
     constants = {name: np.asarray(known[name]) for name in FRICTION_PARAMETERS if known[name] is not None}
     linear_sd = np.zeros(len(LINEAR_NUISANCES))
     ringing = sum(name in constants for name in ("sensor_frequency", "sensor_damping"))
-    first = len(LINEAR_NUISANCES) - len(CHARGES)
-    linear_sd[first : first + ringing] = 10.0 * float(np.ptp(record["Ft"]))  # wide
+    linear_sd[FIRST_CHARGE : FIRST_CHARGE + ringing] = 10.0 * float(np.ptp(record["Ft"]))  # wide
     channel = dataclasses.replace(channel, linear_sd=linear_sd)
     if choice.unknown_charge:
         if "Vsc" in record and math.isfinite(b := estimate_from_vsc(record, choice, 1.0).b):

@@ -16,13 +16,19 @@ from fitact.experiment.fisher import covariance_factor
 from fitact.fitting.minimum import minimise, result_name
 from fitact.fitting.timing import clock_r_squared, free_timing, orthonormal_basis
 from fitact.likelihood.certificate import can_interpolate, expand_student, interpolate_channel, recompress
-from fitact.likelihood.channel import TIMING_NUISANCES, ChannelLikelihood
+from fitact.likelihood.channel import FIRST_CHARGE, TIMING_NUISANCES, ChannelLikelihood
+from fitact.likelihood.compression import HUM_FREQUENCIES
 from fitact.likelihood.interpolation import Interpolation
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import NoiseModel, fit_ar1, student_curvature, student_weight
 
 # columns of `LINEAR_NUISANCES` that a fit may add as free parameters, by name; it may also add `TIMING_NUISANCES`
-NUISANCES = {"offset": (0,), "drift": (1,), "hum_50Hz": (2, 3), "hum_60Hz": (4, 5), "crosstalk": (8, 9)}
+NUISANCES = {
+    "offset": (0,),
+    "drift": (1,),
+    **{f"hum_{frequency:.0f}Hz": (2 * i + 2, 2 * i + 3) for i, frequency in enumerate(HUM_FREQUENCIES)},
+    "crosstalk": (FIRST_CHARGE + 2, FIRST_CHARGE + 3),
+}
 MIN_BIC_DECREASE = 10.0  # least decrease of the BIC for which a nuisance is added as a free parameter
 
 

@@ -16,7 +16,15 @@ from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
 from fitact.experiment.blind_directions import gain_names
 from fitact.experiment.fisher import Experiment
-from fitact.fitting.current import CurrentSamples, estimate_from_current, select_current_samples
+from fitact.fitting.current import (
+    Current,
+    RecordedCurrent,
+    estimate_from_current,
+    estimate_recorded,
+    respond_to,
+    select_samples,
+    set_rows,
+)
 from fitact.fitting.drive_choice import DriveModel, choose_drive, frequency_error, has_ideal_edges, has_unresolved_edge
 from fitact.fitting.friction import make_friction_channel
 from fitact.fitting.instrument_errors import (
@@ -29,14 +37,16 @@ from fitact.fitting.instrument_errors import (
 from fitact.fitting.skin_model import apply_skin_model, count_harmonics, exclude_jumps, require_skin_response
 from fitact.fitting.source import Source
 from fitact.fitting.spectra import build_spectrum_channel
-from fitact.fitting.starting_point import Estimate, VscEstimate, estimate_from_vsc, start_from_estimates
+from fitact.fitting.starting_point import CurrentEstimate, Estimate, VscEstimate, estimate_from_vsc, start_from_estimates
 from fitact.instrument.classes import typical_gain_u
 from fitact.instrument.effects import INPUT_RANGE
 from fitact.likelihood import certificate
-from fitact.likelihood.channel import CHARGES, LINEAR_NUISANCES, ChannelLikelihood
-from fitact.likelihood.likelihood import Likelihood
+from fitact.likelihood.channel import FIRST_CHARGE, LINEAR_NUISANCES, SKEW, ChannelLikelihood
+from fitact.likelihood.compression import HUM_FREQUENCIES
+from fitact.likelihood.likelihood import STRAY, Likelihood
 from fitact.likelihood.noise import Autoregression, estimate_quiet_noise, require_uniform
 from fitact.model.circuit import RC, Channel, Circuit, FinalCircuit, passes_direct_current
+from fitact.model.drive import Sampled
 from fitact.model.skin import WithSkin, circuit_parameters, constant_skin_circuit, limits_current
 from fitact.prior.distributions import Distribution, LogNormal
 from fitact.prior.prior import Prior
@@ -128,7 +138,8 @@ def build_problem(
             continue
         choice = drive or choose_drive(record, scene)
         for name in _channels(record, scene):
-            channel, source, edge_sd = _build_channel(record, stated, choice, name, suffix, likelihood.template, taus)
+            template, names = likelihood.template, likelihood.prior.names
+            channel, source, edge_sd = _build_channel(record, stated, choice, name, suffix, template, taus, names)
             sources.append(source)
             members.append(Member(channel, number, stated, edge_sd))
     coordinates = collect_coordinates(members)
@@ -201,6 +212,7 @@ def _build_channel(
     number: str,
     template: RC | WithSkin,
     taus: Float[np.ndarray, " time_constants"],
+    prior_names: tuple[str, ...],
 ) -> tuple[ChannelLikelihood, Source, float]:
     """Return the likelihood of a channel over its samples, its source, and the sd of log(gain) for unresolved edges.
 
@@ -211,9 +223,10 @@ def _build_channel(
     label = "_".join(filter(None, ("" if channel == "Vsc" else channel, number)))
     notes, warnings = (*record.notes, *choice.notes), (*record.warnings, *choice.warnings)
     # an offset of the friction would be mistaken for the normal force
-    optional = ("drift", *_hum(record, choice), "crosstalk" if channel == "Ft" else "offset")
+    optional = ("drift", *_hum(record, choice, channel), "crosstalk" if channel == "Ft" else "offset")
     start: Estimate | None = None
-    samples: CurrentSamples | None = None
+    used: np.ndarray | None = None
+    slope: np.ndarray | None = None
     edge_sd = 0.0
     if channel == "Vsc":
         optional = (*optional, "delay")
@@ -225,12 +238,11 @@ def _build_channel(
             leaks = passes_direct_current(plain)
             start = estimate_from_vsc(record, choice, max_divider * largest_gain(scene), has_leak=leaks)
             edge_sd = _unresolved_gain_sd(record, choice, start)
-    elif channel == "I" and not limits_current(template):
-        samples = select_current_samples(record, choice)
+    elif channel == "I" and choice.name != "measured" and not limits_current(template):
+        used, slope = select_samples(record, choice)
         # the estimate knows no leak; without it, the start comes from Vsc or from draws of the prior
-        start = None if passes_direct_current(template) else estimate_from_current(record, choice, samples)
-        notes, warnings = (*notes, *samples.notes), (*warnings, *samples.warnings)
-    weight, clipped = _weight(record, channel, samples)
+        start = None if passes_direct_current(template) else estimate_from_current(record, choice, used, slope)
+    weight, clipped = _weight(record, channel, used)
     weight, at_jumps = exclude_jumps(template, record, choice, weight)
     if weight is None and len(record) <= MAX_PADDED_LENGTH:
         weight = np.ones(len(record))
@@ -239,13 +251,15 @@ def _build_channel(
     nuisances = _prior_of_nuisances(record, choice, scene, channel, len(taus) if choice.unknown_charge else 0)
     # edges of a shifted drive are known only to within a step, which affects g; samples of I there are excluded
     timing = ("delay",) if channel == "Vsc" and (choice.shift != 0.0 or _has_skew(record, scene)) else ()
+    has_stray = channel == "I" and (scene.stray_capacitance() > 0.0 or STRAY in prior_names)
     likelihood = ChannelLikelihood(
         **nuisances,
+        stray=np.asarray(scene.stray_capacitance()) if has_stray else None,
         time=pad_samples(record.time),
         observed=pad_samples(record[channel]),
         weight=weight,
         whitening=colour and colour.whitening(np.ones(len(record), bool) if weight is None else weight > 0.0),
-        rate=None if samples is None else pad_samples(samples.rate),
+        rate=None if slope is None else pad_samples(slope),
         drive=choice.drive,
         shift=np.asarray(choice.shift, dtype=float),
         clock=np.zeros(()),
@@ -263,9 +277,27 @@ def _build_channel(
         likelihood = make_friction_channel(likelihood, record, scene, choice, float(taus[0]))
     if timing:
         likelihood = likelihood.exclude_unknown_drive()
-    dominates = samples is not None and samples.drive_noise_dominates
+    if channel == "I" and choice.name == "measured":
+        likelihood, start, noise = _make_charge_rows(likelihood, record, scene, choice, template)
     remarks = (*notes, *at_jumps), (*warnings, *clipped)
-    return likelihood, Source(record, scene, choice, noise, optional, start, *remarks, dominates), edge_sd
+    return likelihood, Source(record, scene, choice, noise, optional, start, *remarks), edge_sd
+
+
+def _make_charge_rows(
+    channel: ChannelLikelihood, record: Record, scene: Scene, choice: DriveModel, template: RC | WithSkin
+) -> tuple[ChannelLikelihood, CurrentEstimate | None, float]:
+    """Return the channel of a current with a recorded drive in rows of charge, an estimate of its circuit, and noise."""
+    current, stray = RecordedCurrent.from_record(record), scene.stray_capacitance()
+    fixed = [float(name[4:-2]) for name in _hum(record, choice, "I")]
+    estimate, nuisances = estimate_recorded(current, stray, fixed)
+    modelled = Current(estimate.capacitance + stray, abs(estimate.weight), 0.0)
+    rows, V = current.make_rows(modelled, respond_to(current, estimate, stray), nuisances)
+    linear_sd = channel.linear_sd.copy()
+    linear_sd[LINEAR_NUISANCES.index(SKEW)] = max(record.time_step, scene.skew_limit("I", record.time_step))
+    drive = Sampled(channel.time, pad_samples(V))
+    channel = dataclasses.replace(channel, drive=drive, steady_state=False, linear_sd=linear_sd)
+    usable = estimate.weight > 0.0 and not limits_current(template) and not passes_direct_current(template)
+    return set_rows(channel, rows, V, 0.0), estimate if usable else None, current.noise_I
 
 
 def _require_whole_drive(record: Record, choice: DriveModel) -> None:
@@ -280,9 +312,9 @@ def _require_whole_drive(record: Record, choice: DriveModel) -> None:
         )
 
 
-def _weight(record: Record, channel: str, samples: CurrentSamples | None) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """Return the weights of the samples, 0 where they are clipped, and a sentence on these."""
-    clipped, weight = clipping_mask(record[channel]), None if samples is None else samples.weight
+def _weight(record: Record, channel: str, used: np.ndarray | None) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """Return the weights of the samples, 0 where they are clipped or not `used`, and a sentence on the clipped ones."""
+    clipped, weight = clipping_mask(record[channel]), None if used is None else used.astype(float)
     if not clipped.any():
         return weight, ()
     return np.where(clipped, 0.0, 1.0 if weight is None else weight), (describe_clipping(channel, clipped),)
@@ -310,8 +342,7 @@ def _prior_of_nuisances(
     """Return the noise floor and the prior sds of linear nuisances, delay and clock, by their field in a channel."""
     peak_to_peak = float(np.ptp(record[channel]))
     linear_sd = np.zeros(len(LINEAR_NUISANCES))
-    first_charge = len(LINEAR_NUISANCES) - len(CHARGES)
-    linear_sd[first_charge : first_charge + n_charges] = 10.0 * peak_to_peak  # wide
+    linear_sd[FIRST_CHARGE : FIRST_CHARGE + n_charges] = 10.0 * peak_to_peak  # wide
     # a fraction of a period cannot determine an offset, so its prior is the accuracy of an oscilloscope (2 %)
     linear_sd[0] = 0.02 * peak_to_peak if record.frequency() is None and choice.periodic else 0.0
     linear_sd[0] = max(linear_sd[0], INPUT_RANGE * peak_to_peak * scene.offset_limit(channel) / math.sqrt(3.0))
@@ -331,8 +362,11 @@ def _prior_of_nuisances(
     }
 
 
-def _hum(record: Record, choice: DriveModel) -> list[str]:
-    """Return the mains hums that are distinguishable from harmonics of the drive, or from a fraction of its period."""
+def _hum(record: Record, choice: DriveModel, channel: str) -> list[str]:
+    """Return the mains hums that are distinguishable from harmonics of the drive, or from a fraction of its period.
+
+    Hum of a small current has harmonics.
+    """
     span, frequency = float(record.time[-1] - record.time[0]), record.frequency()
 
     def is_distinguishable(hum: float) -> bool:
@@ -340,7 +374,8 @@ def _hum(record: Record, choice: DriveModel) -> list[str]:
             return not choice.periodic and hum * span > 2.0
         return abs(hum - frequency * round(hum / frequency)) * span > 0.5
 
-    return [f"hum_{hum:.0f}Hz" for hum in (50.0, 60.0) if is_distinguishable(hum) and hum * record.time_step < 0.5]
+    frequencies = HUM_FREQUENCIES if channel == "I" else HUM_FREQUENCIES[:2]
+    return [f"hum_{hum:.0f}Hz" for hum in frequencies if is_distinguishable(hum) and hum * record.time_step < 0.5]
 
 
 def _unresolved_gain_sd(record: Record, choice: DriveModel, start: VscEstimate) -> float:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from fitact.fitting.current import update_rows
 from fitact.fitting.instrument_effects import effects_would_change, fill_effects
 from fitact.fitting.least_squares import LeastSquaresResult, solve
 from fitact.fitting.multistart import choose_start
@@ -13,23 +14,35 @@ from fitact.likelihood import certificate
 
 
 def solve_problem(
-    problem: Problem, tolerance: float, start: Mapping[str, float] | None, max_rounds: int = 8, max_change: float = 0.3
+    problem: Problem,
+    tolerance: float,
+    start: Mapping[str, float] | None,
+    max_rounds: int = 8,
+    max_change: float = 0.3,
+    max_skew: float = 0.05,
 ) -> tuple[LeastSquaresResult, certificate.CertifiedLikelihood, np.ndarray]:
     """Fit, and fit again while effects of instruments for the new optimum would differ by more than `max_change`.
 
-    Also while weights of spectra change by more than a thousandth.
+    Also while weights of spectra change by more than a thousandth, or a current with a recorded drive by more than
+    `max_skew` time steps, or the parameters with the estimate of its drive by more than `max_change` standard errors.
     """
     noise, theta = [source.noise for source in problem.sources], choose_start(problem, start)
     likelihood, end = problem.likelihood, None
-    for _ in range(max_rounds):
+    has_rows = any(channel.charges is not None for channel in likelihood.channels)
+    for round_number in range(max_rounds):
         before, likelihood = theta, fill_effects(likelihood, theta, noise, problem.sources)
         end = _solve_with_effects(problem._replace(likelihood=likelihood), tolerance, theta)
-        places = dict(zip(end[0].likelihood.names, end[0].theta, strict=True))
-        theta = np.array([places[name] for name in likelihood.names])
+        places = [end[0].likelihood.names.index(name) for name in likelihood.names]
+        theta = end[0].theta[places]
         if effects_would_change(likelihood, before, theta, end[0].sigma) > max_change:
             continue
         influences = [jacobian @ end[2] for jacobian in end[0].jacobian]
         likelihood, change = update_weights(likelihood, theta, problem.sources, influences)
+        if has_rows:
+            likelihood, skew = update_rows(likelihood, end[0], problem.sources)
+            moved = np.abs(theta - before) / np.linalg.norm(end[2][places], axis=1)
+            if round_number == 0 or skew > max_skew or not np.max(moved) <= max_change:
+                continue
         if change <= 1e-3:
             break
     assert end is not None

@@ -21,7 +21,6 @@ class Source(NamedTuple):
     start: Estimate | None  # estimate from a linear fit, or None
     notes: tuple[str, ...]  # sentences for information
     warnings: tuple[str, ...]  # sentences on what may change the result
-    drive_noise_dominates: bool  # whether noise of the drive dominates the channel and biases the fit
 
     @property
     def in_time(self) -> Record:

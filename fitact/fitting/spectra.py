@@ -55,7 +55,7 @@ def build_spectrum_channel(spectrum: Spectrum, scene: Scene, number: str) -> tup
         omega=pad_samples(omega, 2 * omega.size)[: pad_samples(parts).size // 2],
     ).with_noise_sd(np.abs(values))
     start = _estimate_skin(omega, values) if channel.is_impedance else _estimate_divider(omega, values)
-    return channel, Source(spectrum, scene, choice, noise, (), start, spectrum.notes, spectrum.warnings, False)
+    return channel, Source(spectrum, scene, choice, noise, (), start, spectrum.notes, spectrum.warnings)
 
 
 def _stated_drive(scene: Scene) -> DriveModel:

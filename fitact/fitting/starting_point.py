@@ -11,7 +11,6 @@ from jaxtyping import Float
 from fitact.compiled import BatchEvaluator
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.fitting.current import CurrentEstimate
 from fitact.fitting.drive_choice import DriveModel, has_ideal_edges
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.circuit import FINGER_PARAMETERS
@@ -24,6 +23,14 @@ class VscEstimate(NamedTuple):
     g: float
     b: float
     direct: float = 0.0
+
+
+class CurrentEstimate(NamedTuple):
+    """Coefficients of I = weight s b / (1 + s b) V + capacitance dV/dt from linear fits."""
+
+    weight: float  # S
+    b: float  # s
+    capacitance: float  # F
 
 
 class SkinEstimate(NamedTuple):

@@ -11,7 +11,6 @@ from fitact.fitting.channel_fit import ChannelFit
 from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.fitting.minimum import Optima
 from fitact.fitting.residual_statistics import is_misfit
-from fitact.fitting.source import Source
 from fitact.likelihood.likelihood import Likelihood
 from fitact.prior.distributions import Bounded
 from fitact.prior.product import Product
@@ -21,7 +20,6 @@ def diagnose_fit(
     solution: LeastSquaresResult,
     covariance_factor: Float[np.ndarray, "parameters parameters"],
     traces: Sequence[ChannelFit],
-    sources: Sequence[Source],
     optima: Optima | None,
 ) -> str:
     """Return the name of the first of the `RESULTS` that makes the fit unreliable; "successful" if none does."""
@@ -31,8 +29,7 @@ def diagnose_fit(
         return "on_bound"
     if optima is not None and optima.result == "several_optima":
         return "several_optima"
-    noisy = any(source.drive_noise_dominates for source in sources)
-    return "misfit" if noisy or any(is_misfit(channel.figures) for channel in traces) else "successful"
+    return "misfit" if any(is_misfit(channel.figures) for channel in traces) else "successful"
 
 
 def is_out_of_bounds(

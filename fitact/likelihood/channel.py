@@ -20,6 +20,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from fitact.compiled import array_module, pad_samples, pad_weight
+from fitact.likelihood.charge_rows import ChargeRows
 from fitact.likelihood.compression import BASELINE_NAMES, Compression
 from fitact.likelihood.compression_on_grid import GridCompression
 from fitact.likelihood.interpolation import Interpolation
@@ -32,13 +33,15 @@ from fitact.likelihood.noise import (
     student_weight,
 )
 from fitact.likelihood.projection import MAX_DELAY, baseline_functions
-from fitact.model.circuit import Channel, Circuit
+from fitact.model.circuit import Channel, Circuit, HighpassTerms
 from fitact.model.drive import Drive, Sampled
 from fitact.model.response import response_and_rate
 from fitact.model.skin import WithSkin
 
 CHARGES = ("charge", "charge_2", "charge_3", "charge_4")  # one for each time constant, the slowest first
-LINEAR_NUISANCES = (*BASELINE_NAMES, *CHARGES)
+SKEW = "delay"  # of a current in rows of charges, to first order, s
+LINEAR_NUISANCES = (*BASELINE_NAMES, *CHARGES, SKEW)
+FIRST_CHARGE = len(BASELINE_NAMES)
 TIMING_NUISANCES = ("delay", "clock")
 
 
@@ -53,6 +56,7 @@ class ChannelInputs(eqx.Module):
     effects: Float[Array, " effects"] | None = None  # sizes of the channel's `effects`
     friction: dict[str, ArrayLike] | None = None  # free parameters of a `FrictionChannel`, SI
     drive_gain: ArrayLike = 1.0  # ratio between indicated and true V, where it does not act through `gain`
+    stray: ArrayLike | None = None  # capacitance from the lead to ground, whose current I contains, F
 
 
 class ChannelLikelihood(eqx.Module):
@@ -62,13 +66,13 @@ class ChannelLikelihood(eqx.Module):
     observed: Float[Array, " samples"]  # V or A
     # inverse noise sd of each sample, relative to the channel's; 0 excludes a sample, None means equal weights
     weight: Float[Array, " samples"] | None
-    whitening: Whitening | None  # filter for coloured noise; None means white noise
+    whitening: Whitening | ChargeRows | None  # for coloured noise, or for noise of V in I; None means white noise
     noise_floor: ArrayLike  # lower bound of the noise sd, in the channel's unit
     rate: Float[Array, " samples"] | None  # dV/dt at the samples, V/s, if the current follows it
     drive: Drive  # V(t)
     # prior standard deviations of the `LINEAR_NUISANCES`, in the channel's unit (drift: over half the record);
     # 0 excludes a nuisance
-    linear_sd: Float[Array, " 10"]
+    linear_sd: Float[Array, " nuisances"]
     shift: ArrayLike  # start of the drive after the record's t = 0, s
     clock: ArrayLike  # relative error of the drive's frequency
     time_step: ArrayLike  # s
@@ -93,6 +97,8 @@ class ChannelLikelihood(eqx.Module):
     # times of the first period (padded, s) and its number of samples, if the signal need be computed only there
     phases: Float[Array, " phases"] | None = None
     period: ArrayLike | None = None
+    # stray capacitance whose current I contains, F, unless it is a free parameter; None means none
+    stray: ArrayLike | None = None
 
     @property
     def linear_names(self) -> tuple[str, ...]:
@@ -123,6 +129,11 @@ class ChannelLikelihood(eqx.Module):
     def follows_samples(self) -> bool:
         """Whether the response follows a measured drive from sample to sample."""
         return isinstance(self.drive, Sampled) and not self.steady_state
+
+    @property
+    def charges(self) -> ChargeRows | None:
+        """Rows of a current whose drive was recorded, or None."""
+        return self.whitening if isinstance(self.whitening, ChargeRows) else None
 
     @property
     def is_student(self) -> bool:
@@ -160,7 +171,8 @@ class ChannelLikelihood(eqx.Module):
     def exclude_samples(self, excluded: Bool[np.ndarray, " samples"]) -> "ChannelLikelihood":
         """Return the channel without some of its samples; a compression must be made anew."""
         weight, whitening = np.where(excluded, 0.0, self.weights), self.whitening
-        return dataclasses.replace(self, weight=weight, whitening=whitening and whitening.exclude(excluded))
+        whitening = whitening.exclude(excluded) if isinstance(whitening, Whitening) else whitening
+        return dataclasses.replace(self, weight=weight, whitening=whitening)
 
     def exclude_unknown_drive(self) -> "ChannelLikelihood":
         """Return the channel without the samples at the ends that may follow, by a delay, a V beyond the record."""
@@ -232,21 +244,36 @@ class ChannelLikelihood(eqx.Module):
             time = self.drive.time  # identical to the samples of V, so that `highpass` needs no search
         else:
             time = self.drive_time(inputs.delay + extra_delay, inputs.clock)
-        how: dict[str, Any] = {"steady_state": self.steady_state, "channel": self.channel}
-        total, rate = response_and_rate(inputs.circuit, self.drive, time, **how)
-        if rate is not None and self.rate is not None:
+        total, rate = self._response_and_rate(inputs, time)
+        if rate is not None and self.charges is not None:
+            total = jnp.interp(self.time - self.shift, self.time, total + rate * self.charges.sample_rate())
+        elif rate is not None and self.rate is not None:
             total = total + rate * self.rate
         return inputs.gain * total
+
+    def _response_and_rate(self, inputs: ChannelInputs, time: Array) -> tuple[Array, ArrayLike | None]:
+        """Return the response without what follows dV/dt, and the capacitance that does (F), or None."""
+        how: dict[str, Any] = {"steady_state": self.steady_state, "channel": self.channel}
+        total, rate = response_and_rate(inputs.circuit, self.drive, time, **how)
+        return total, rate if inputs.stray is None else (0.0 if rate is None else rate) + inputs.stray
+
+    def terms(self, inputs: ChannelInputs) -> HighpassTerms:
+        """Return the terms of the channel over V, with the stray capacitance."""
+        terms = inputs.circuit.channel_terms(self.channel)
+        if inputs.stray is None:
+            return terms
+        return terms._replace(rate=(0.0 if terms.rate is None else terms.rate) + inputs.stray)
 
     def drive_time(self, delay: ArrayLike, clock: ArrayLike) -> Float[Array, " samples"]:
         """Return the times of the samples on the drive's clock, s."""
         time = self.time - (self.shift + delay)
         return time * (1.0 + self.clock + clock) if "clock" in self.timing else time
 
-    def shapes(self, inputs: ChannelInputs) -> Float[Array, "10 samples"]:
+    def shapes(self, inputs: ChannelInputs) -> Float[Array, "nuisances samples"]:
         """Return the shapes in time of the linear nuisances, each of height 1."""
         middle, half = 0.5 * (self.time[0] + self.time[-1]), 0.5 * (self.time[-1] - self.time[0])
-        return jnp.concatenate([baseline_functions(self.time, middle, half), self.linear_shapes(inputs)])
+        shapes = [baseline_functions(self.time, middle, half), self.linear_shapes(inputs)]
+        return jnp.pad(jnp.concatenate(shapes), ((0, 1), (0, 0)))  # the skew, which acts on rows
 
     def linear_shapes(self, inputs: ChannelInputs) -> Float[Array, "4 samples"]:
         """Return the shapes that follow those of the baseline."""
@@ -266,6 +293,9 @@ class ChannelLikelihood(eqx.Module):
 
     def residuals_and_shapes(self, inputs: ChannelInputs) -> tuple[Float[Array, " rows"], Float[Array, "columns rows"]]:
         """Return channel minus signal, and the shapes of the `columns`, both whitened, over samples or coordinates."""
+        if self.compression is None and self.charges is not None:
+            remainder, shapes = self.rows_and_shapes(inputs)
+            return self.charges.whiten(remainder), self.charges.whiten(shapes)
         if self.compression is None:
             remainder, shapes = self.observed - self.signal(inputs), self.shapes(inputs)[self._column_indices]
             return self.apply_whitening(remainder), self.apply_whitening(shapes)
@@ -274,9 +304,22 @@ class ChannelLikelihood(eqx.Module):
         if isinstance(self.compression, Compression) and not isinstance(self.compression, GridCompression):
             taus = inputs.circuit.channel_terms(self.channel).tau
             shapes += [self.compression.decays(tau, index)[None] for index, tau in enumerate(taus)]
-        missing = len(LINEAR_NUISANCES) - sum(map(len, shapes))
-        shapes.append(jnp.zeros((missing, remainder.size)))
+        missing = len(LINEAR_NUISANCES) - 1 - sum(map(len, shapes))
+        shapes += [jnp.zeros((missing, remainder.size)), self.compression.slope[None]]
         return remainder, jnp.concatenate(shapes)[self._column_indices]
+
+    def rows_and_shapes(self, inputs: ChannelInputs) -> tuple[Float[Array, " samples"], Float[Array, "columns samples"]]:
+        """Return rows minus those of the signal, and the rows of the shapes of the `columns`, before whitening."""
+        charges = self.charges
+        assert charges is not None and isinstance(self.drive, Sampled)
+        total, rate = self._response_and_rate(inputs, self.drive.time)
+        if inputs.effects is not None:
+            total = total + inputs.effects @ self.effects / inputs.gain
+        functions = jnp.concatenate([total[None], self.shapes(inputs)])
+        signal, *shapes = charges.means(jnp.pad(functions, ((0, 0), (charges.reach, 0))))
+        signal = signal if rate is None else signal + rate * charges.rate
+        shapes = jnp.stack([*shapes[:-1], charges.slope])[self._column_indices]
+        return charges.observed - inputs.gain * signal, shapes
 
     def _compressed_signal(self, inputs: ChannelInputs) -> tuple[Float[Array, " rows"], Array]:
         """Return the signal in the coordinates of the compression, and whether the compression holds there."""
@@ -287,7 +330,7 @@ class ChannelLikelihood(eqx.Module):
             points = dataclasses.replace(self, phases=None, **at_points)
             signal, timing = points.signal(inputs), jnp.stack([jnp.asarray(inputs.delay), jnp.asarray(inputs.clock)])
             return compression.to_rows @ signal, compression.holds(signal, timing)
-        terms, delay = inputs.circuit.channel_terms(self.channel), self.shift + inputs.delay
+        terms, delay = self.terms(inputs), self.shift + inputs.delay
         covered = compression.covers(jnp.stack(jnp.broadcast_arrays(*terms.tau)), delay)
         response = inputs.gain * compression.response(terms, delay)
         if inputs.effects is not None:
@@ -301,6 +344,8 @@ class ChannelLikelihood(eqx.Module):
 
     def whitened_observed(self) -> Float[Array, " rows"]:
         """Return the record, over samples or coordinates, in units of independent noise of equal sd."""
+        if self.compression is None and self.charges is not None:
+            return self.charges.whiten(self.charges.observed)
         return self.apply_whitening(self.observed) if self.compression is None else self.compression.observed
 
     def mean(self, values: Float[Array, " samples"]) -> Float[Array, ""]:
@@ -313,6 +358,8 @@ class ChannelLikelihood(eqx.Module):
 
     def whitened_delay_derivative(self, inputs: ChannelInputs) -> Float[Array, " rows"]:
         """Return the whitened `delay_derivative`, over samples or coordinates."""
+        if self.charges is not None:  # the skew is among the linear nuisances
+            return jnp.zeros(self.rows)
         if self.compression is None:
             return self.apply_whitening(self.delay_derivative(inputs))
         if isinstance(self.compression, Interpolation | GridCompression):
@@ -363,11 +410,11 @@ class ChannelLikelihood(eqx.Module):
         return remainder, beta, jnp.linalg.cholesky(one + curvature * A @ A.T / sigma**2)
 
     def sample_nuisances(
-        self, inputs: ChannelInputs, sigma: ArrayLike, deviate: Float[Array, " 10"] | None = None
-    ) -> Float[Array, " 10"]:
+        self, inputs: ChannelInputs, sigma: ArrayLike, deviate: Float[Array, " nuisances"] | None = None
+    ) -> Float[Array, " nuisances"]:
         """Return posterior draws of the nuisance coefficients, in prior standard deviations.
 
-        `deviate` holds ten standard normal numbers; None gives the posterior mean.
+        `deviate` holds standard normal numbers; None gives the posterior mean.
         """
         _, beta, factor = self.fit_nuisances(inputs, sigma)
         if deviate is not None:

@@ -23,7 +23,12 @@ from fitact.model.response_table import (
     node_count,
 )
 
-BASELINE_NAMES = ("offset", "drift", "hum_50Hz_cos", "hum_50Hz_sin", "hum_60Hz_cos", "hum_60Hz_sin")
+HUM_FREQUENCIES = (50.0, 60.0, 150.0, 180.0)  # Hz: mains, and the third harmonics, which are the strongest
+BASELINE_NAMES = (
+    "offset",
+    "drift",
+    *(f"hum_{frequency:.0f}Hz_{part}" for frequency in HUM_FREQUENCIES for part in ("cos", "sin")),
+)
 
 # indices of the last functions of the inner products
 RATE_FUNCTION, SLOPE_FUNCTION, OBSERVED_FUNCTION = -3, -2, -1

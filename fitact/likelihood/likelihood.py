@@ -34,6 +34,7 @@ from fitact.model.skin import (
 from fitact.prior.distributions import Distribution
 from fitact.prior.prior import Prior
 
+STRAY = "stray_capacitance"  # name of the parameter, F
 UNCONSTRAINED_SD = math.log(1e6)  # in a log-parameter; a larger sd counts as no constraint
 
 
@@ -196,7 +197,9 @@ class Likelihood(eqx.Module):
 
         gain = xp.exp(log_product(channel.gains)) if channel.gains else 1.0
         sizes = [xp.expm1(xp.asarray(log_product(coordinates), float)) for _, coordinates in channel.effect_sizes]
-        inputs = ChannelInputs(circuit, gain, **timing, effects=xp.stack(sizes) if sizes else None)
+        inputs = ChannelInputs(circuit, gain, **timing, effects=xp.stack(sizes) if sizes else None, stray=channel.stray)
+        if channel.stray is not None and STRAY in places:
+            inputs = dataclasses.replace(inputs, stray=xp.exp(theta[places[STRAY]]))
         if not isinstance(channel, FrictionChannel):
             return inputs
         drive_gain = xp.exp(log_product(channel.drive_gains))

@@ -23,9 +23,11 @@ from jaxtyping import Array, Float
 
 from fitact.compiled import jit, pad_samples, pad_weight
 from fitact.data.record import is_uniform
+from fitact.likelihood.charge_rows import ChargeRows
 from fitact.likelihood.compression import (
     BASELINE_FUNCTIONS,
     BASELINE_NAMES,
+    HUM_FREQUENCIES,
     OBSERVED_FUNCTION,
     Compression,
     split_last_functions,
@@ -47,6 +49,7 @@ from fitact.progress import track_progress
 
 RANK_TOLERANCE = 1e-13  # relative size of the singular values that are omitted
 MANY_SAMPLES = 65_536  # samples above which a faster program saves more than its compilation takes
+ROW_FUNCTIONS = 3  # the last functions of the inner products: rate, slope and record, which for charges are rows
 MAX_DELAY = 6  # time steps by which the response to a measured drive may be shifted
 
 
@@ -58,7 +61,7 @@ def compress(
     steady_state: bool,
     expected_terms: HighpassTerms,
     weight: Float[np.ndarray, " samples"] | None = None,
-    whitening: Whitening | None = None,
+    whitening: Whitening | ChargeRows | None = None,
     rate: Float[np.ndarray, " samples"] | None = None,
     delayed: bool = False,
     slope: Float[np.ndarray, " samples"] | None = None,
@@ -88,10 +91,21 @@ def compress(
         effects = voltage if effects is None else np.concatenate([effects, voltage])
     one = np.ones(time.size) if weight is None else np.asarray(weight)
     mask = one if whitening is None else np.asarray(whitening.mask)[: time.size]
+    charges = whitening if isinstance(whitening, ChargeRows) else None
+    if charges is not None:
+        observed, rate, slope = charges.observed, charges.rate, charges.slope
     samples = Samples(
-        time, observed, one, np.broadcast_to(0.0 if rate is None else rate, time.size), mask, slope, student, effects
+        time,
+        observed,
+        one,
+        np.broadcast_to(0.0 if rate is None else rate, time.size),
+        mask,
+        slope,
+        student,
+        effects,
+        charges,
     )
-    taps = None if whitening is None else np.asarray(whitening.taps)
+    taps = None if whitening is None or charges is not None else np.asarray(whitening.taps)
     measured = isinstance(drive, Sampled) and not steady_state
     if isinstance(drive, Sampled) and measured:
         parts = _accumulate_measured(table, drive, samples, taps, MAX_DELAY if delayed else 0)
@@ -171,15 +185,15 @@ class TableNodes(eqx.Module):
         )
 
 
-def baseline_functions(time: Float[Array, " n"], middle: Array, half: Array) -> Float[Array, "6 n"]:
+def baseline_functions(time: Float[Array, " n"], middle: Array, half: Array) -> Float[Array, "shapes n"]:
     """Return the shapes of `BASELINE_NAMES` in time: 1, a line from -1 to 1 over the record, and hum."""
     since = time - middle
     turns = 2.0 * np.pi * since
-    waves = [wave(frequency * turns) for frequency in (50.0, 60.0) for wave in (jnp.cos, jnp.sin)]
+    waves = [wave(frequency * turns) for frequency in HUM_FREQUENCIES for wave in (jnp.cos, jnp.sin)]
     return jnp.stack([jnp.ones_like(since), since / half, *waves])
 
 
-def evaluate_baseline(time: np.ndarray, middle: ArrayLike, half: ArrayLike) -> Float[np.ndarray, "6 n"]:
+def evaluate_baseline(time: np.ndarray, middle: ArrayLike, half: ArrayLike) -> Float[np.ndarray, "shapes n"]:
     """Return `baseline_functions` at any number of times without compilation."""
     return _baseline_functions(pad_samples(time), np.asarray(middle), np.asarray(half))[:, : time.size]
 
@@ -212,6 +226,7 @@ class Samples(NamedTuple):
     slope: np.ndarray | None = None  # dV/dt over two samples, or what replaces it; None: computed from the drive
     student: np.ndarray | None = None  # as in `compress`
     effects: np.ndarray | None = None  # likewise
+    charges: ChargeRows | None = None  # of a current; `observed`, `rate` and `slope` are then rows
 
     @property
     def n_effects(self) -> int:
@@ -229,7 +244,7 @@ def chunks(samples: Samples, length: int) -> Iterator[Samples]:
 
     for first in range(0, samples.time.size, length):
         time = np.asarray(samples.time[first : first + length])
-        others = (part(values, first) for values in samples[1:])
+        others = (jax.tree.map(lambda values, first=first: part(values, first), values) for values in samples[1:])
         yield Samples(np.pad(time, (0, length - time.size), mode="edge"), *others)
 
 
@@ -253,11 +268,16 @@ def _accumulate_directly(
 class WhiteningState(NamedTuple):
     """Whitening filter during the pass."""
 
-    taps: np.ndarray
+    taps: np.ndarray | None  # None for the rows of charges
     last: Float[np.ndarray, "functions reach"]  # values before the chunk
+    whitened: Float[np.ndarray, " functions"] | None = None  # last whitened row of each function, of charges
 
     @classmethod
-    def start(cls, taps: np.ndarray | None, functions: int) -> "WhiteningState | None":
+    def start(
+        cls, taps: np.ndarray | None, functions: int, charges: ChargeRows | None = None
+    ) -> "WhiteningState | None":
+        if charges is not None:
+            return cls(None, np.zeros((functions - ROW_FUNCTIONS + 1, charges.reach)), np.zeros(functions))
         return None if taps is None else cls(taps, np.zeros((functions, taps.size - 1)))
 
 
@@ -295,16 +315,29 @@ def _inner_products(
     filtering: WhiteningState | None,
 ) -> tuple[Array, WhiteningState | None]:
     """Return the inner products of the responses (and charge decays) at the nodes, other functions and the record."""
-    rest = chunk.observed - table.expected @ responses[0]
-    if table.expected_rate is not None:
-        rest = rest - table.expected_rate * chunk.rate
+    expected = table.expected @ responses[0]
     if table.expected_direct is not None and chunk.effects is not None:
-        rest = rest - table.expected_direct * chunk.effects[-1]
+        expected = expected + table.expected_direct * chunk.effects[-1]
+    following = 0.0 if table.expected_rate is None else table.expected_rate * chunk.rate
     parts = [table.combinations.T @ response for response in responses]
     slope = slope if chunk.slope is None else chunk.slope
     before = [] if chunk.effects is None else [chunk.effects]
-    rows = jnp.concatenate([*parts, *before, others, chunk.rate[None], slope[None], rest[None]])
-    return whitened_products(rows, chunk, filtering)
+    functions = jnp.concatenate([*parts, *before, others])
+    if chunk.charges is not None:
+        return _charge_products(chunk.charges, functions, expected, following, filtering)
+    rest = chunk.observed - expected - following
+    return whitened_products(jnp.concatenate([functions, chunk.rate[None], slope[None], rest[None]]), chunk, filtering)
+
+
+def _charge_products(
+    charges: ChargeRows, functions: Float[Array, "functions n"], expected: Array, following: ArrayLike, filtering: Any
+) -> tuple[Array, WhiteningState]:
+    """Return the inner products of whitened rows: of functions of time, then rate, slope and what is not expected."""
+    around = jnp.concatenate([filtering.last, jnp.concatenate([functions, expected[None]])], axis=1)
+    *means, expected = charges.means(around)
+    last = charges.rate, charges.slope, charges.observed - expected - following
+    rows = charges.continue_whitening(jnp.stack([*means, *last]), filtering.whitened)
+    return rows @ rows.T, WhiteningState(None, around[:, functions.shape[1] :], rows[:, -1])
 
 
 def whitened_products(
@@ -384,8 +417,8 @@ def _accumulate_measured(
         last = first * np.exp(x), np.asarray(time[0] - step), np.asarray(first)
     tables = 1 if table.is_grid else 2
     functions = tables * table.series.shape[0] + samples.n_effects + 2 * ages + len(BASELINE_NAMES) + 3
-    filtering = WhiteningState.start(taps, functions)
-    voltages = chunks(samples._replace(observed=voltage, effects=None), length)
+    filtering = WhiteningState.start(taps, functions, samples.charges)
+    voltages = chunks(samples._replace(observed=voltage, effects=None, charges=None), length)
     advance = jit(_advance_chunk, fast=time.size > MANY_SAMPLES)
     for number, (chunk, driven) in enumerate(zip(chunks(samples, length), voltages, strict=True)):
         steps = drive_steps(voltage, number * length, length, ages) / step

@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from fitact.compiled import jit, pad_rows
-from fitact.likelihood.channel import CHARGES
+from fitact.likelihood.channel import FIRST_CHARGE
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.window_compression import TrendInputs
@@ -166,11 +166,10 @@ def _mean_square(model: Likelihood, circuit: Any, theta: Array, sigma: Array, ac
     # the effect of a charge scales between channels like the response to the drive
     _, beta, _ = channel.fit_nuisances(inputs, sigma[0])
     sizes = dict(zip(channel.columns, beta * channel.linear_sd[np.array(channel.columns, dtype=int)], strict=True))
-    first = len(channel.linear_sd) - len(CHARGES)
     recorded = circuit.channel_terms(channel.channel)
     for index, (weight, other, tau) in enumerate(zip(terms.weight, recorded.weight, recorded.tau, strict=False)):
-        if first + index in sizes:
-            size = sizes[first + index] / inputs.gain * weight / jnp.where(other == 0.0, 1.0, other)
+        if FIRST_CHARGE + index in sizes:
+            size = sizes[FIRST_CHARGE + index] / inputs.gain * weight / jnp.where(other == 0.0, 1.0, other)
             voltage = voltage + size * compression.decays(tau, index)
     names, gains = model.names, channel.drive_gains
     scale = jnp.exp(sum((power * theta[names.index(name)] for name, power in gains), jnp.zeros(())))

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Complex, Float
 
 from fitact.data.record import is_uniform
 from fitact.likelihood.channel import CHARGES
+from fitact.likelihood.compression import HUM_FREQUENCIES
 
 Rows = Float[np.ndarray, " rows"]
 Spectrum = Complex[np.ndarray, " lines"]
@@ -133,9 +134,9 @@ class ChannelSeries:
         all_shapes["offset"] = np.ones_like(since)
         if self.kind != "period":
             all_shapes["drift"] = since / half
-            for mains in (50, 60):
-                turns = 2.0 * math.pi * mains * since
-                all_shapes |= {f"hum_{mains}Hz_cos": np.cos(turns), f"hum_{mains}Hz_sin": np.sin(turns)}
+            for frequency in HUM_FREQUENCIES:
+                turns, name = 2.0 * math.pi * frequency * since, f"hum_{frequency:.0f}Hz"
+                all_shapes |= {f"{name}_cos": np.cos(turns), f"{name}_sin": np.sin(turns)}
             for name, tau in zip(CHARGES, self.samples.taus, strict=False):
                 all_shapes[name] = np.exp(-(self.time - self.time[0]) / tau)
         return {name: shape for name, shape in all_shapes.items() if name in self.samples.nuisances}

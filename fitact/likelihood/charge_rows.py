@@ -1,0 +1,129 @@
+"""Rows of a current that follows dV/dt: its mean over each step between samples, whitened for the noise of V and I.
+
+Over a step of length h, the current of a capacitance C is C (V[k + 1] - V[k]) / h, whatever V does in between, so that
+no derivative of a sampled V is needed. Noise of V adds C (n[k + 1] - n[k]) / h: its spectrum grows with the frequency,
+and neighbouring rows share a sample of V. The covariance of the rows is therefore tridiagonal, also where single rows
+are less certain or excluded, and its Cholesky factor whitens them by a recursion over the samples.
+Errors in variables: Levin, IEEE Trans. Autom. Control 9 (1964) 229; Pintelon and Schoukens, System Identification
+(2012), chapter 9.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from jaxtyping import Array, Bool, Float
+
+from fitact.model.response import recurrence
+
+# mean of a smooth function over the middle step of six samples, by the polynomial through them
+_MEAN_OF_STEP = np.array([11.0, -93.0, 802.0, 802.0, -93.0, 11.0]) / 1440.0
+_BEFORE = 2  # of these samples, those before the first of the step
+MAX_STEPS = 3  # largest delay of the current against V, in time steps
+# the row of a step from sample k to k + 1 is stored at k + LAG, when all samples that it needs are there
+LAG = 6 + MAX_STEPS
+_INTERPOLATED = np.arange(-2, 4)  # samples between which a delayed one is interpolated, those around it being 0 and 1
+
+
+def step_means(values: Float[np.ndarray, "*n samples"], delay: float = 0.0) -> Float[np.ndarray, "*n samples"]:
+    """Return the means of samples over each step, stored `LAG` later; those of the first `LAG` + 5 are not valid.
+
+    The step is taken `delay` time steps later, at most `MAX_STEPS` in either direction.
+    """
+    whole = int(np.floor(delay))
+    part = delay - whole
+    others = _INTERPOLATED[:, None] != _INTERPOLATED
+    factors = np.where(others, part - _INTERPOLATED, 1.0) / np.where(others, np.subtract.outer(_INTERPOLATED, _INTERPOLATED), 1.0)
+    taps = np.convolve(np.prod(factors, axis=1), _MEAN_OF_STEP)  # from the sample k + whole - 4 on
+    result = np.zeros_like(values)
+    for j, tap in enumerate(taps):
+        shift = LAG - (whole + j - 2 - _BEFORE)  # the row k + LAG takes the sample k + whole + j - 4
+        result[..., shift:] += tap * values[..., : values.shape[-1] - shift]
+    return result
+
+
+class ChargeRows(eqx.Module):
+    """A current in rows of one step each, and the recursion that whitens rows.
+
+    Whitened rows have the standard deviation of the noise of I. The arrays are padded with 0.
+    """
+
+    observed: Float[Array, " samples"]  # mean current over each step, on the clock of V, A
+    rate: Float[Array, " samples"]  # rise of V over each step, divided by its length, V/s
+    slope: Float[Array, " samples"]  # derivative of the modelled rows with respect to a delay of I, A/s
+    # whitened row k = gain[k] (row k) + decay[k] (whitened row k - 1); a gain of 0 excludes a row
+    gain: Float[Array, " samples"]
+    decay: Float[Array, " samples"]
+
+    @property
+    def mask(self) -> Float[Array, " samples"]:
+        """1 for rows that count, 0 for others."""
+        return (self.gain > 0.0) * 1.0
+
+    @property
+    def reach(self) -> int:
+        """Number of samples before its own that a row needs."""
+        return LAG + _BEFORE
+
+    def __call__(self, values: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
+        """Return the whitened rows of functions of time, on the clock of V."""
+        return self.whiten(self.means(jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(self.reach, 0)])))
+
+    def means(self, values: Float[Array, "*shape reach+samples"]) -> Float[Array, "*shape samples"]:
+        """Return the rows of functions of time, given from `reach` samples before the first row on."""
+        size = values.shape[-1] - self.reach
+        parts = [tap * values[..., j : j + size] for j, tap in enumerate(_MEAN_OF_STEP)]
+        return sum(parts[1:], parts[0])
+
+    def whiten(self, rows: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
+        """Return whitened rows."""
+        return self.continue_whitening(rows, jnp.zeros(rows.shape[:-1]))
+
+    def continue_whitening(
+        self, rows: Float[Array, "*shape samples"], before: Float[Array, "*shape"]
+    ) -> Float[Array, "*shape samples"]:
+        """Return whitened rows, where the whitened ones `before` the first are given."""
+        if rows.ndim > 1:
+            return jax.vmap(self.continue_whitening)(rows, before)
+        return recurrence(self.decay, self.gain * rows, before)
+
+    def sample_rate(self) -> Float[Array, " samples"]:
+        """Return dV/dt at the samples, over two steps, V/s."""
+        return 0.5 * (jnp.roll(self.rate, -LAG) + jnp.roll(self.rate, 1 - LAG))
+
+    def restrict(self, samples: slice) -> "ChargeRows":
+        """Return some of the rows."""
+        return jax.tree.map(lambda leaf: leaf[samples], self)
+
+
+class RowCovariance:
+    """Covariance of the rows, tridiagonal; excluded rows are not correlated with others."""
+
+    def __init__(
+        self,
+        variance: Float[np.ndarray, " rows"],
+        neighbours: Float[np.ndarray, " rows"],
+        excluded: Bool[np.ndarray, " rows"],
+    ) -> None:
+        """Factorise; `neighbours` are the covariances of each row with the one before."""
+        self.used = ~excluded
+        apart = excluded | np.append(True, excluded[:-1])
+        bands = np.stack([np.where(apart, 0.0, neighbours), np.where(excluded, 1.0, variance)])
+        self._factor = scipy.linalg.cholesky_banded(bands)
+
+    def recursion(self, unit: float) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
+        """Return gain and decay of `ChargeRows`, with which whitened rows have the standard deviation `unit`."""
+        above, diagonal = self._factor
+        return np.where(self.used, unit / diagonal, 0.0), np.where(self.used, -above / diagonal, 0.0)
+
+    def solve(self, rows: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
+        """Return the inverse of the covariance times rows; 0 for excluded ones."""
+        return self.used * scipy.linalg.cho_solve_banded((self._factor, False), np.where(self.used, rows, 0.0))
+
+
+def whiten_rows(gain: np.ndarray, decay: np.ndarray, rows: Float[np.ndarray, "*n rows"]) -> Float[np.ndarray, "*n rows"]:
+    """Return whitened rows as `ChargeRows.whiten`, without JAX."""
+    bands = np.stack([np.ones_like(decay), -np.append(decay[1:], 0.0)])
+    return scipy.linalg.solve_banded((1, 0), bands, np.moveaxis(gain * rows, -1, 0)).T.reshape(np.shape(rows))
+
