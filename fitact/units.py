@@ -46,6 +46,7 @@ NUISANCES = {  # quantities of the measurement; {}: the channel
     "nonlinearity_V_odd": ("1", "1 + odd non-linearity of V, relative to the range"),
     "probe_resistance": ("ohm", "input resistance that loads the skin"),
     "probe_capacitance": ("F", "input capacitance that loads the skin"),
+    "stray_capacitance": ("F", "stray capacitance of panel and cable"),
     "delay": ("s", "delay of {} against V"),
     "clock": ("1", "relative deviation of the drive frequency from the stated one"),
     "sigma": ("V", "noise of {}, standard deviation"),

@@ -19,7 +19,12 @@ _EVERYTHING = Scene.from_dict(
     {
         "device": {"Ri": "50 Mohm"},
         "gap": {"resistance": "1 Mohm", "thickness": "2 um"},
-        "measurement": {"series_resistor": "100 kohm", "probe_resistance": "10 Mohm", "probe_capacitance": "10 pF"},
+        "measurement": {
+            "series_resistor": "100 kohm",
+            "probe_resistance": "10 Mohm",
+            "probe_capacitance": "10 pF",
+            "stray_capacitance": "100 pF",
+        },
     }
 )
 DRAWINGS: dict[str, Callable[[], str]] = {

@@ -14,11 +14,13 @@ import lazy_loader
 schemdraw = lazy_loader.load("schemdraw")  # not loaded by `import fitact`
 
 Grounding: TypeAlias = Literal["direct", "natural"]
+Lead: TypeAlias = Literal["drive", "ground"]
 Point: TypeAlias = tuple[float, float]
 
 _PIXELS = 36.0  # of one unit of length
 _FONT, _SMALL = 13.0, 11.0  # px, at the drawing's own width
 _SOURCE, _CAPTION, _COLUMN, _LEFT, _RIGHT = 0.0, 0.6, 4.75, 4.1, 5.4  # x of what stands above each other
+_STRAY = -0.3  # x of a stray capacitance; the source is further to the left then
 
 
 class Diagram:
@@ -81,19 +83,26 @@ class Diagram:
         )
 
 
-def lay_out_circuit(values: Mapping[str, str], grounding: Grounding = "direct", current: bool = False) -> Diagram:
+def lay_out_circuit(
+    values: Mapping[str, str], grounding: Grounding = "direct", current_lead: Lead | None = None
+) -> Diagram:
     """Lay out the elements of a circuit, with a text for each part by its name in a scene.
 
     A part without a value is left out. The grounding skin is equal to the touching one where its own values are absent.
-    If the `current` is recorded, there is a shunt.
+    A shunt is in the lead in which the current is recorded.
     """
-    diagram = Diagram()
+    diagram, has_stray = Diagram(), "stray_capacitance" in values
     bottom = _add_column(diagram, values, grounding)
-    source = (_SOURCE, bottom / 2 - 0.6), (_SOURCE, bottom / 2 + 0.6)
+    x = _STRAY - 3.5 if has_stray else _SOURCE
+    source = (x, bottom / 2 - 0.6), (x, bottom / 2 + 0.6)
     diagram.part("source", schemdraw.elements.SourceV(), *source)
-    diagram.text("V", (_SOURCE - 0.6, bottom / 2), "left")
-    diagram.wire(source[1], (_SOURCE, 0.0), (1.1, 0.0))
-    in_lead = current and grounding == "natural"  # the mains earth would bypass a shunt in the way back
+    diagram.text("V", (x - 0.6, bottom / 2), "left")
+    diagram.wire(source[1], (x, 0.0))
+    in_lead = current_lead == "drive"
+    if has_stray:
+        _add_stray(diagram, values["stray_capacitance"], x, bottom - 0.3, in_lead)
+        x, in_lead = _STRAY, False
+    diagram.wire((x, 0.0), (1.1, 0.0))
     measured = "\nI = its voltage / R" if in_lead else ""
     if "series_resistor" in values:
         label = f"series resistor\n{values['series_resistor']}{measured}"
@@ -103,10 +112,31 @@ def lay_out_circuit(values: Mapping[str, str], grounding: Grounding = "direct", 
     else:
         diagram.wire((1.1, 0.0), (2.9, 0.0))
     diagram.wire((2.9, 0.0), (_COLUMN, 0.0))
-    diagram.add(schemdraw.elements.Arrowhead(headwidth=0.26, headlength=0.3).at((4.3, 0.0)).theta(0))
-    diagram.text("I", (4.2, 0.2), "top")
-    _add_return(diagram, bottom, grounding, current)
+    if not (has_stray and current_lead == "drive"):
+        _add_current(diagram, 4.3)
+    _add_return(diagram, bottom, grounding, source[0], current_lead == "ground")
     return diagram
+
+
+def _add_current(diagram: Diagram, x: float) -> None:
+    """Draw the arrow of I in the drive lead."""
+    diagram.add(schemdraw.elements.Arrowhead(headwidth=0.26, headlength=0.3).at((x, 0.0)).theta(0))
+    diagram.text("I", (x - 0.1, 0.2), "top")
+
+
+def _add_stray(diagram: Diagram, value: str, x: float, base: float, current: bool) -> None:
+    """Draw the stray capacitance from the drive lead down to `base`, with the shunt between source (at `x`) and it."""
+    if current:
+        shunt = (x + 0.5, 0.0), (x + 2.3, 0.0)
+        diagram.wire((x, 0.0), shunt[0])
+        label = "shunt R\nI = its voltage / R"
+        diagram.part("shunt", schemdraw.elements.ResistorIEC(), *shunt, label, "top")
+        diagram.wire(shunt[1], (_STRAY, 0.0))
+        _add_current(diagram, _STRAY - 0.4)
+    else:
+        diagram.wire((x, 0.0), (_STRAY, 0.0))
+    label = f"stray\n{value}".strip()
+    diagram.part("stray_capacitance", schemdraw.elements.Capacitor(), (_STRAY, 0.0), (_STRAY, base), label, "left")
 
 
 def _add_column(diagram: Diagram, values: Mapping[str, str], grounding: Grounding) -> float:
@@ -186,30 +216,33 @@ def _add_touching_skin(diagram: Diagram, values: Mapping[str, str], y: float) ->
     return below
 
 
-def _add_return(diagram: Diagram, bottom: float, grounding: Grounding, current: bool) -> None:
-    """Draw the way from the column's end back to the source, with the shunt in it."""
+def _add_return(diagram: Diagram, bottom: float, grounding: Grounding, source: Point, current: bool) -> None:
+    """Draw the way from the column's end back to the source, with the shunt if the `current` is recorded there."""
     base = bottom - 0.3
     diagram.wire((_COLUMN, bottom), (_COLUMN, base), (3.4, base))
-    if current and grounding == "direct":
+    if current:
         diagram.part("shunt", schemdraw.elements.ResistorIEC(), (3.4, base), (1.6, base), "shunt R", "top")
         diagram.text("I = its voltage / R", (2.5, base - 0.4), "bottom", _SMALL)
     else:
         diagram.wire((3.4, base), (1.6, base))
-    diagram.wire((1.6, base), (_SOURCE, base), (_SOURCE, bottom / 2 - 0.6))
-    ground = (_COLUMN, "earth") if grounding == "natural" else (_SOURCE, "ground electrode")
+    diagram.wire((1.6, base), (source[0], base), source)
+    ground = (_COLUMN, "earth") if grounding == "natural" else (source[0], "ground electrode")
     diagram.add(schemdraw.elements.Ground().at((ground[0], base)))
     diagram.text(ground[1], (_COLUMN + 0.35, base - (0.3 if grounding == "natural" else 0.0)), size=_SMALL)
 
 
 def lay_out_wiring(
-    grounding: Grounding, channels: Collection[str] = ("Vsc", "I"), series_resistor: bool = False
+    grounding: Grounding,
+    channels: Collection[str] = ("Vsc", "I"),
+    series_resistor: bool = False,
+    current_lead: Lead | None = None,
 ) -> Diagram:
     """Lay out the wiring of a bench: oscilloscope channel 1 on V, 2 on Vsc, and 3 on the current.
 
-    `channels` are recorded besides V; `series_resistor`: whether a known resistor is in the lead to the electrode.
+    `channels` are recorded besides V; `series_resistor`: whether a known resistor is in the lead to the electrode;
+    `current_lead`: the lead in which the current is recorded, if it is.
     """
     diagram, elements, direct = Diagram(), schemdraw.elements, grounding == "direct"
-    current = "I" in channels
     for (x, y), (width, height), text in (
         ((0.0, -2.4), (2.0, 2.6), "amplifier"),
         ((5.6, -0.8), (3.8, 0.55), "electrode"),
@@ -222,7 +255,7 @@ def lay_out_wiring(
         diagram.text(text, (x + width / 2, y + height / 2), "center")
     diagram.wire((8.8, 0.9), (9.9, 0.9), (9.9, -2.5), (9.4, -2.5))
     diagram.text("body", (10.0, -0.8))
-    in_lead = "series\nresistor" if series_resistor else "" if direct or not current else "shunt"
+    in_lead = "series\nresistor" if series_resistor else "shunt" if current_lead == "drive" else ""
     start, end = (2.9, -0.5), (4.9, -0.5)
     diagram.wire((2.0, -0.5), start)
     if in_lead:
@@ -231,7 +264,7 @@ def lay_out_wiring(
         diagram.wire(start, end)
     diagram.wire(end, (5.6, -0.5))
     start, end = (5.8, -3.15), (3.8, -3.15)
-    if direct and current:
+    if current_lead == "ground":
         diagram.part("shunt", elements.ResistorIEC(), start, end, "shunt", "top")
     else:
         diagram.wire(start, end)
@@ -239,9 +272,9 @@ def lay_out_wiring(
     diagram.add(elements.Ground().at((2.9, -3.15)))
     diagram.text("common\nground", (2.55, -3.6), "left")
     taps = [((2.55, -0.5), 1.2, "1: V")]
-    if current and direct:
+    if current_lead == "ground":
         taps += [((5.45, -3.15), -0.8, "3: I × shunt")]
-    elif current:
+    elif current_lead == "drive":
         taps += [((2.55, -0.5), -0.7, "3 +"), ((5.2, -0.5), -0.7, "3 −: I × resistance")]
     for (x, y), length, text in taps:
         _add_tap(diagram, (x, y), (x, y + length), text, "top" if length > 0.0 else "bottom")

@@ -20,24 +20,30 @@ from fitact.scene.scene import Scene
 
 
 def simulate(scene: Scene, seed: int = 0) -> Record:
-    """Return a simulated record of V and the measured channels, with noise, by the scene's [measurement]."""
+    """Return a simulated record of V and the measured channels, with noise, by the scene's [measurement].
+
+    I includes the current of a stray capacitance. V has a random stream of its own.
+    """
     circuit, drive, measured, time = scene.make_circuit(), scene.make_drive(), scene.measurement, sample_times(scene)
     rng = np.random.default_rng(seed)
     with jax.enable_x64(True):
-        channels: dict[str, Any] = {"V": np.asarray(drive.value(time))}
+        steady_state, stray = scene.drive.steady_state, scene.stray_capacitance()
+        noise_V = scene.noise_V() * np.random.default_rng([seed, 1]).standard_normal(time.size)
+        channels: dict[str, Any] = {"V": np.asarray(drive.value(time)) + noise_V}
         for channel in measured.channels:
             if channel == "Ft":
                 clean = _simulate_friction(scene, circuit, drive, time)
             else:
-                steady_state = scene.drive.steady_state
                 clean = np.asarray(response(circuit, drive, time, steady_state=steady_state, channel=channel))
+            if channel == "I" and stray:
+                clean = clean + stray * np.asarray(drive.slope(time, steady_state=steady_state))
             noise = {"Vsc": measured.noise_Vsc, "I": measured.noise_I, "Ft": measured.noise_Ft}[channel]
             channels[channel] = clean + noise * rng.standard_normal(time.size)
         doubts = _check_scene(scene, circuit, drive, time)
     if not np.all(np.isfinite(channels.get("I", 0.0))):
         raise InputError(
             "scene: the current has an impulse at each ideal jump of the drive; give the drive a rise time"
-            " (waveform = 'trapezoid'), or the scene an R_H or a series_resistor"
+            " (waveform = 'trapezoid')" + ("" if stray else ", or the scene an R_H or a series_resistor")
         )
     return Record.from_arrays(time, **channels, source="simulation", warnings=tuple(doubts))
 

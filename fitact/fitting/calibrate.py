@@ -40,6 +40,11 @@ def calibrate(scene: Scene | None, names: tuple[str, ...], fit_records: FitRecor
         return CalibratedInstruments()
     if not scene.instrument.is_stated:
         raise InputError("scene: [[calibration]] calibrates the pieces of [instrument]; state these too")
+    if any(each.circuit == "open" for each in scene.calibration):
+        raise InputError(
+            "scene: [[calibration]] circuit = 'open', a record without the finger, is not fitted in this version; leave"
+            " it out, and state what it tells as [prior] stray_capacitance"
+        )
     contents = tuple(read(each.record).fingerprint for each in scene.calibration)
     return _calibrate(scene.to_json(), names, fit_records, contents)
 

@@ -1,7 +1,7 @@
 """Circuit and wiring diagrams of a scene, with the values of its elements."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from markupsafe import Markup
 
@@ -18,16 +18,26 @@ _NOT_PARTS = {"sigma", "sigma_I", "sigma_Ft", *FRICTION_PARAMETERS}
 
 def scene_circuit(scene: "Scene", values: Mapping[str, Summary] | None = None, *, is_file: bool = False) -> Markup:
     """Draw a scene's circuit as an SVG element, or as a file; `values`, by name, replace the scene's."""
-    grounding, current = scene.grounding.connection, "I" in scene.measurement.channels
-    diagram = lay_out_circuit(describe_parts(scene, values or {}), grounding, current)
+    grounding = scene.grounding.connection
+    diagram = lay_out_circuit(describe_parts(scene, values or {}), grounding, find_current_lead(scene))
     return Markup(diagram.svg(f"The circuit with {grounding} ground", is_file=is_file))
 
 
 def scene_wiring(scene: "Scene", *, is_file: bool = False) -> Markup:
     """Draw how a scene's record is measured, as an SVG element, or as a file."""
     measured, grounding = scene.measurement, scene.grounding.connection
-    diagram = lay_out_wiring(grounding, measured.channels, measured.series_resistor > 0.0)
+    diagram = lay_out_wiring(grounding, measured.channels, measured.series_resistor > 0.0, find_current_lead(scene))
     return Markup(diagram.svg(f"The wiring with {grounding} ground", is_file=is_file))
+
+
+def find_current_lead(scene: "Scene") -> Literal["drive", "ground"] | None:
+    """Return the lead in which I is recorded, or None without I; where it makes no difference, the usual one."""
+    measured = scene.measurement
+    if "I" not in measured.channels:
+        return None
+    if "current_lead" in measured.model_fields_set or scene.states_stray_capacitance():
+        return measured.current_lead
+    return "drive" if scene.grounding.connection == "natural" else "ground"  # the mains earth would bypass the other
 
 
 def describe_parts(scene: "Scene", values: Mapping[str, Summary]) -> dict[str, str]:

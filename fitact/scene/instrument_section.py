@@ -5,7 +5,7 @@ Certificates replace what the class of a piece of equipment says. A dummy is a c
 
 import dataclasses
 import difflib
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -156,10 +156,10 @@ class DummyCircuit(Section):
 
 
 class CalibrationSection(Section):
-    """A record of a dummy circuit, made with the instruments of the scene."""
+    """A record of a dummy circuit, or "open", without any finger, made with the instruments of the scene."""
 
     record: str
-    circuit: DummyCircuit
+    circuit: DummyCircuit | Literal["open"]
 
     @model_validator(mode="before")
     @classmethod

@@ -49,6 +49,7 @@ class PriorSection(Section):
     Rgap: OhmPriorSpec | None = None
     Cgap: FaradPriorSpec | None = None
     alpha: PlainPriorSpec | None = None
+    stray_capacitance: FaradPriorSpec | None = None
     sigma: VoltPriorSpec | None = None
     sigma_I: AmperePriorSpec | None = None
     sigma_Ft: NewtonPriorSpec | None = None
@@ -69,6 +70,11 @@ class PriorSection(Section):
                 )
             if name == "alpha" and belief.upper_bound > 1.0:
                 raise ValueError("[prior] alpha is an exponent of at most 1; add high = 1 or less")
+            if "stray_capacitance" in (name, belief.tied) and not belief.is_free:
+                raise ValueError(
+                    f"[prior] {name}: a stray capacitance is not in the loop, so it cannot be fixed or tied here; state"
+                    " its value as [measurement] stray_capacitance"
+                )
             for key in ("tied", "above", "below"):
                 other = getattr(belief, key)
                 if other is not None:

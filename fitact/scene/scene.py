@@ -46,6 +46,7 @@ _GEOMETRY_KEYS = {  # what force and friction rest on beside the circuit: quanti
     "contact_area": ("device", "contact_area"),
     "friction_coefficient": ("friction", "coefficient"),
 }
+_NO_KEYS = ("function-before", "constrained-float", "DummyCircuit", "literal['open']")  # pydantic's words in a place
 PLATES = {  # eq. (3): capacitance -> the powers of the quantities that it follows from
     "Ci": {"insulator_permittivity": 1.0, "contact_area": 1.0, "insulator_thickness": -1.0},
     "Csc": {"skin_permittivity": 1.0, "contact_area": 1.0, "skin_thickness": -1.0},
@@ -169,6 +170,7 @@ class Scene(Section, Display):
             "Z": ground.Z or None,  # 0 means that the body is at earth
             "series_resistor": measured.series_resistor or None,
             "alpha": self.skin.alpha if self.skin.level == "fractional" else None,
+            "stray_capacitance": float(measured.stray_capacitance or 0.0) or None,
             "Rgap": self.gap.resistance,
             "Cgap": self._gap_capacitance(),
             "sigma": measured.noise_Vsc or None,
@@ -273,6 +275,27 @@ class Scene(Section, Display):
             return FinalCircuit(*skin, Ri=Ri)
         return DirectGround(*skin, **extras, Ri=Ri)
 
+    def noise_V(self) -> float:
+        """Return the rms noise of the recorded V, V; unless stated, the rounding of 12 bits over the drive's swing."""
+        stated = self.measurement.noise_V
+        return self.drive.swing / 4096 / math.sqrt(12.0) if stated is None else stated
+
+    def states_stray_capacitance(self) -> bool:
+        """Return whether [measurement] or [prior] states a stray capacitance, also one of 0."""
+        return self.measurement.stray_capacitance is not None or self.prior.stray_capacitance is not None
+
+    def stray_capacitance(self) -> float:
+        """Return the capacitance (F) of panel and cable whose current I includes, or 0.
+
+        It is the stated value, or else the median of [prior]. I in the ground lead does not include it.
+        """
+        if self.measurement.current_lead == "ground":
+            return 0.0
+        stated, belief = self.measurement.stray_capacitance, self.prior.stray_capacitance
+        if stated is None and belief is not None:
+            return math.exp(self.make_prior()["stray_capacitance"].log_mean)
+        return float(stated or 0.0)
+
     def find_load(self) -> Piece | None:
         """Return the piece of [instrument] Vsc that loads the skin, or None."""
         return find_load(self.instrument.pieces("Vsc"))
@@ -320,6 +343,9 @@ class Scene(Section, Display):
         default = FRICTION_PRIORS if "Ft" in self.measurement.channels else {}
         nominal, beliefs = self.nominal_values(), (default | self.prior.specs()).items()
         marginals = {name: b.distribution(name, nominal[name], layer) for name, b in beliefs if b.is_free}
+        stray = self.measurement.stray_capacitance
+        if isinstance(stray, UncertainValue) and "stray_capacitance" not in self._unmeasured():
+            marginals.setdefault("stray_capacitance", stray.distribution())
         correlations, stated = self.prior.correlations(), self.geometry_distributions()
         plates = self.plates()
         for name, (powers, factor) in plates.items():
@@ -366,10 +392,7 @@ class Scene(Section, Display):
             absent = dict.fromkeys(_NATURAL_GROUND_KEYS, "[grounding] connection = 'natural'")
         if self.skin.level != "fractional":
             absent["alpha"] = "[skin] level = 'fractional'"
-        of_channels = {"sigma": "Vsc", "sigma_I": "I"} | dict.fromkeys(("sigma_Ft", *self._friction_values()), "Ft")
-        for name, channel in of_channels.items():
-            if channel not in self.measurement.channels:
-                absent[name] = f"'{channel}' among [measurement] channels"
+        absent |= self._unmeasured()
         for name in self.prior.specs():
             if name in absent:
                 raise InputError(f"[prior] {name} needs {absent[name]}; leave it out of [prior] otherwise")
@@ -398,6 +421,16 @@ class Scene(Section, Display):
         self.fixed_values()
         return self
 
+    def _unmeasured(self) -> dict[str, str]:
+        """Return parameters that no recorded channel depends on, with what they need."""
+        channels = {"sigma": "Vsc", "sigma_I": "I", "stray_capacitance": "I"}
+        channels |= dict.fromkeys(("sigma_Ft", *self._friction_values()), "Ft")
+        missing = {name: each for name, each in channels.items() if each not in self.measurement.channels}
+        absent = {name: f"'{each}' among [measurement] channels" for name, each in missing.items()}
+        if self.measurement.current_lead == "ground":
+            absent.setdefault("stray_capacitance", "[measurement] current_lead = 'drive'")
+        return absent
+
     def _check_friction(self) -> None:
         """Raise InputError if the friction is measured and what it needs is not stated."""
         if "Ft" not in self.measurement.channels:
@@ -417,7 +450,7 @@ class Scene(Section, Display):
 
 def _sentence(error: Any) -> str:
     """Return a pydantic error as one sentence with place and remedy."""
-    where = [str(part) for part in error["loc"] if part not in ("function-before", "constrained-float")]
+    where = [str(part) for part in error["loc"] if part not in _NO_KEYS]
     place = f"[{where[0]}] {'.'.join(where[1:])}".strip() if where else "the scene"
     if error["type"] == "extra_forbidden":
         model: type[Section] = Scene

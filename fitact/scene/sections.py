@@ -4,6 +4,7 @@ import math
 from fractions import Fraction
 from typing import Annotated, Literal, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from fitact.errors import InputError
@@ -34,6 +35,7 @@ from fitact.scene.section import (
 from fitact.scene.threshold_table import ThresholdTable
 from fitact.scene.uncertain_value import (
     UncertainCoefficient,
+    UncertainFarad,
     UncertainMeter,
     UncertainPermittivity,
     UncertainSquareMeter,
@@ -199,6 +201,14 @@ class DriveSection(Section):
             return math.gcd(*(int(tone * whole) for tone in tones)) / whole
         return min(self.start_frequency or self.frequency, self.end_frequency or self.frequency)
 
+    @property
+    def swing(self) -> float:
+        """Difference between the largest and the smallest voltage, V."""
+        if self.waveform != "multitone":
+            return self.peak_to_peak
+        samples = 64 * Multitone.max_order  # of a period; 64 of the fastest tone are within 0.1 % of its peak
+        return float(np.ptp(self.make().value(np.arange(samples) / samples / self.lowest_frequency)))
+
     def make(self) -> Drive:
         """Make the drive; refused if the waveform is 'measured', which only a record has."""
         if self.waveform == "chirp":
@@ -226,14 +236,17 @@ class DriveSection(Section):
 
 
 class Measurement(Section):
-    """Recorded channels, their noise and gain errors, series resistor and probe."""
+    """Recorded channels, their noise and gain errors, the lead of I, series resistor, probe and stray capacitance."""
 
     channels: tuple[Literal["Vsc", "I", "Ft"], ...] = Field(default=("Vsc",), min_length=1)
     series_resistor: AnyOhm = 0.0
     probe_resistance: Ohm | None = None
     probe_capacitance: Farad | None = None
+    stray_capacitance: UncertainFarad | None = None
+    current_lead: Literal["drive", "ground"] = "drive"
     sampling_rate: Hertz = 200e3
     duration: Second = 20e-3
+    noise_V: NoiseVolt | None = None
     noise_Vsc: NoiseVolt = 0.1
     noise_I: NoiseAmpere = 20e-9
     noise_Ft: Newton = 2e-3

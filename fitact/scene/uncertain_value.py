@@ -70,4 +70,5 @@ def _to_stated_form(value: float) -> float | dict[str, Any]:
 UncertainMeter = Annotated[float, Field(gt=0), UncertainUnit("m")]
 UncertainSquareMeter = Annotated[float, Field(gt=0), UncertainUnit("m^2")]
 UncertainPermittivity = Annotated[float, Field(ge=1), UncertainUnit("")]
+UncertainFarad = Annotated[float, Field(ge=0), UncertainUnit("F")]
 UncertainCoefficient = Annotated[float, Field(gt=0), UncertainUnit("")]

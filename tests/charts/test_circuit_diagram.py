@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from fitact.charts.circuit_diagram import Diagram, lay_out_circuit
-from fitact.scene.diagrams import describe_parts, scene_circuit, scene_wiring
+from fitact.scene.diagrams import describe_parts, find_current_lead, scene_circuit, scene_wiring
 from fitact.scene.scene import Scene
 from fitact.summary import summarize_log_normal
 
 ROOT = Path(__file__).parents[2]
 DRAWINGS = runpy.run_path(str(ROOT / "tools" / "draw_circuits.py"))["DRAWINGS"]
 MEASURED = {"series_resistor": "100 kohm", "probe_resistance": "10 Mohm", "probe_capacitance": "10 pF"}
+STRAY = 90e-12  # F
 SCENES = {
     "final": {},
     "unequal": {"grounding": {"R_H": 500.0, "grounding_Rsc": "80 kohm", "grounding_Csc": "44 nF"}},
@@ -31,13 +32,20 @@ SCENES = {
         "gap": {"resistance": "1.2 Mohm", "thickness": "2 um"},
         "measurement": MEASURED,
     },
+    "stray": {"measurement": {"channels": ["Vsc", "I"], "stray_capacitance": STRAY}},
+    "stray, all": {
+        "grounding": {"connection": "natural", "Z": "14.5 Mohm"},
+        "measurement": MEASURED | {"channels": ["I"], "stray_capacitance": {"median": STRAY, "relative_sd": 0.1}},
+    },
+    "stray, I in the ground lead": {
+        "measurement": {"channels": ["I"], "stray_capacitance": STRAY, "current_lead": "ground"},
+    },
 }
 SHUNT = 1e-2  # ohm, so small that it changes nothing
 
 
 def lay_out(scene: Scene) -> Diagram:
-    current = "I" in scene.measurement.channels
-    return lay_out_circuit(describe_parts(scene, {}), scene.grounding.connection, current)
+    return lay_out_circuit(describe_parts(scene, {}), scene.grounding.connection, find_current_lead(scene))
 
 
 def texts(svg: str) -> list[str]:
@@ -71,7 +79,7 @@ def find_nodes(diagram: Diagram) -> dict[tuple[float, float], int]:
 
 
 def solve(diagram: Diagram, of: dict[str, complex]) -> tuple[complex, complex]:
-    """Return Vsc / V and I / V of what is drawn, by nodal analysis."""
+    """Return Vsc / V and I / V of what is drawn, by nodal analysis; I is that of the shunt, if there is one."""
     node = find_nodes(diagram)
     numbers = sorted(set(node.values()))
     ends = {name: [numbers.index(node[p]) for p in pair] for name, pair in diagram.parts.items()}
@@ -84,8 +92,11 @@ def solve(diagram: Diagram, of: dict[str, complex]) -> tuple[complex, complex]:
     matrix[-1, high], matrix[-1, low] = 1.0, -1.0
     matrix[low, low] += 1.0  # where the ground is
     solution = np.linalg.solve(matrix, np.eye(len(matrix))[-1])
+    current = solution[-1]
+    if "shunt" in ends:
+        current = of["shunt"] * np.subtract(*solution[ends["shunt"]])
     plus, minus = (solution[numbers.index(node[diagram.terminals[name]])] for name in ("Vsc+", "Vsc-"))
-    return plus - minus, solution[-1]
+    return plus - minus, current
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -96,7 +107,8 @@ def test_drawing_is_the_circuit_that_is_fitted(name: str):
         omega = 2 * np.pi * frequency
         Vsc, current = solve(diagram, admittances(scene, omega))
         assert np.isclose(Vsc, complex(circuit.transfer_function(omega)), rtol=1e-5)
-        assert np.isclose(current, complex(circuit.admittance(omega)), rtol=1e-5)
+        stray = 1j * omega * scene.stray_capacitance()
+        assert np.isclose(current, complex(circuit.admittance(omega)) + stray, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -132,6 +144,7 @@ def test_parts_have_their_values_and_no_others_are_drawn(name: str):
         "series resistor\n100 kΩ": scene.measurement.series_resistor > 0.0,
         "probe\n10 MΩ\n10 pF": scene.measurement.probe_resistance is not None,
         "shunt": "I" in scene.measurement.channels,
+        "stray\n90 pF": scene.states_stray_capacitance(),
     }.items():
         assert (part in everything) == present, part
 

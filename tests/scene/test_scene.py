@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 import fitact
 from fitact import units
 from fitact.data.simulate import simulate
+from fitact.scene.prior_predictive import prior_predictive
 from fitact.scene.section import field_unit
 from fitact.scene.toml import shipped_scenes, value_text
 
@@ -188,6 +189,76 @@ def test_circuit_at_other_values(tmp_path: Path):
     scene = fitact.Scene()
     assert scene.make_circuit({"Rsc": 1e5}) == fitact.FinalCircuit(1e5, 22e-9, 1.35e-9)
     assert scene.make_circuit({"R_H": 500.0}) == fitact.DirectGround(160e3, 22e-9, 1.35e-9, 500.0)
+
+
+def measuring(**measurement: object) -> fitact.Scene:
+    return fitact.Scene.from_dict({"measurement": {"channels": ["Vsc", "I"]} | measurement})
+
+
+STRAY_SPEC = {"median": "100 pF", "relative_sd": 0.1}
+
+
+def test_noise_of_V_is_stated_or_that_of_12_bits_over_the_swing():
+    assert measuring(noise_V="50 mV").noise_V() == 0.05
+    assert measuring(noise_V=0.0).noise_V() == 0.0
+    for drive in ({"offset": "50 V"}, {"waveform": "measured"}, {"waveform": "burst", "shape": "sine"}):
+        scene = fitact.Scene.from_dict({"drive": drive | {"peak_to_peak": "300 V"}})
+        assert scene.noise_V() == pytest.approx(300.0 / 4096 / math.sqrt(12.0), rel=1e-12)
+    tones = {"waveform": "multitone", "frequencies": [100.0, 300.0], "amplitudes": [90.0, 10.0], "offset": 20.0}
+    swing = 2.0 * np.max(90.0 * np.sin(t := np.linspace(0.0, 2.0 * np.pi, 100_001)) + 10.0 * np.sin(3.0 * t))
+    found = fitact.Scene.from_dict({"drive": tones}).noise_V()
+    assert found == pytest.approx(swing / 4096 / math.sqrt(12.0), rel=1e-5)
+
+
+def test_stray_capacitance_is_a_value_a_distribution_or_absent():
+    absent, zero, known = measuring(), measuring(stray_capacitance=0.0), measuring(stray_capacitance="100 pF")
+    assert [each.stray_capacitance() for each in (absent, zero, known)] == [0.0, 0.0, 1e-10]
+    assert [each.states_stray_capacitance() for each in (absent, zero, known)] == [False, True, True]
+    assert "stray_capacitance" not in known.make_prior().names
+    uncertain = measuring(stray_capacitance=STRAY_SPEC)
+    assert uncertain.stray_capacitance() == 1e-10
+    assert uncertain.make_prior()["stray_capacitance"] == fitact.LogNormal.with_relative_sd(1e-10, 0.1)
+    for other in ({"current_lead": "ground"}, {"channels": ["Vsc"]}):
+        assert "stray_capacitance" not in measuring(stray_capacitance=STRAY_SPEC, **other).make_prior().names
+    assert measuring(stray_capacitance="100 pF", current_lead="ground").stray_capacitance() == 0.0
+    assert fitact.Scene.from_json(uncertain.to_json()) == uncertain
+
+
+def test_prior_of_the_stray_capacitance_overrules_the_distribution_that_is_simulated():
+    content = {"measurement": {"channels": ["I"], "stray_capacitance": STRAY_SPEC}}
+    scene = fitact.Scene.from_dict(content | {"prior": {"stray_capacitance": {"median": "80 pF", "factor": 2}}})
+    assert scene.make_prior()["stray_capacitance"] == fitact.LogNormal.within_factor(80e-12, 2.0)
+    assert scene.stray_capacitance() == 1e-10
+    around = fitact.Scene.from_dict(content | {"prior": {"stray_capacitance": {"relative_sd": 0.3}}})
+    assert around.make_prior()["stray_capacitance"] == fitact.LogNormal.with_relative_sd(1e-10, 0.3)
+    only = {"measurement": {"channels": ["I"]}, "prior": {"stray_capacitance": {"median": "80 pF", "factor": 2}}}
+    assert fitact.Scene.from_dict(only).stray_capacitance() == pytest.approx(80e-12)
+    # the loop, its prior predictive and its designs are those without it
+    assert prior_predictive(scene, 20).parameters["stray_capacitance"].shape == (20,)
+    assert scene.make_circuit() == fitact.Scene().make_circuit()
+
+
+@pytest.mark.parametrize(
+    ("measurement", "spec", "message"),
+    [
+        ({}, STRAY_SPEC, "needs 'I' among [measurement] channels"),
+        ({"channels": ["I"], "current_lead": "ground"}, STRAY_SPEC, "needs [measurement] current_lead = 'drive'"),
+        ({"channels": ["I"]}, {"fixed": "100 pF"}, "state its value as [measurement] stray_capacitance"),
+        ({"channels": ["I"]}, {"factor": 2}, "needs a median"),
+    ],
+)
+def test_prior_of_a_stray_capacitance_that_no_channel_contains(measurement, spec, message):
+    with pytest.raises(fitact.InputError, match=re.escape(message)):
+        fitact.Scene.from_dict({"measurement": measurement, "prior": {"stray_capacitance": spec}})
+
+
+def test_calibration_record_without_the_finger():
+    scene = fitact.Scene.from_dict({"calibration": [{"record": "open.csv", "circuit": "open"}]})
+    assert scene.calibration[0].circuit == "open"
+    assert fitact.Scene.from_json(scene.to_json()) == scene
+    for circuit in ("closed", {"Rsc": {"nominal": 1.0, "tolerance": 0.1}}):
+        with pytest.raises(fitact.InputError, match="circuit lacks"):
+            fitact.Scene.from_dict({"calibration": [{"record": "open.csv", "circuit": circuit}]})
 
 
 def test_Ci_from_the_layer_only_where_it_is_absent(tmp_path: Path):
