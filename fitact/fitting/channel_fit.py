@@ -16,7 +16,7 @@ from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.residual_statistics import channel_statistics, outliers
 from fitact.fitting.source import Source
 from fitact.fitting.spectra import spectrum_statistics
-from fitact.likelihood.channel import SKEW, ChannelInputs, ChannelLikelihood
+from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import STUDENT_DOF, student_weight
 from fitact.likelihood.spectrum_channel import join_complex
@@ -79,8 +79,6 @@ class ChannelFit:
         residuals, weight = residuals[unpadded], None if channel.equally_weighted else channel.weights[unpadded]
         names = [channel.qualified_name(channel.linear_names[column]) for column in channel.columns]
         linear = dict(zip(names, (beta * np.asarray(channel.linear_sd)[list(channel.columns)]).tolist(), strict=True))
-        if (delay := channel.qualified_name(SKEW)) in linear:
-            linear[delay] += float(channel.shift)
         counted = (channel.weights if channel.whitening is None else np.asarray(channel.whitening.mask))[unpadded] > 0.0
         white = white[unpadded][counted]
         n_fitted = theta.size * white.size / float(likelihood.count) + len(linear)

@@ -21,7 +21,7 @@ from fitact.fitting.drive_choice import DriveModel, drive_slope, unit_response
 from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.fitting.source import Source
 from fitact.fitting.starting_point import CurrentEstimate
-from fitact.likelihood.channel import LINEAR_NUISANCES, SKEW, ChannelInputs, ChannelLikelihood
+from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.charge_rows import (
     LAG,
     MAX_STEPS,
@@ -35,7 +35,6 @@ from fitact.model.circuit import HighpassTerms, gain_at
 from fitact.model.drive import Sampled
 
 Rows = Float[np.ndarray, " samples"]
-_SKEW = LINEAR_NUISANCES.index(SKEW)
 # rms error of the mean over a step, up to six steps from a jump, relative to its height
 _JUMP_ERRORS = np.array([3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.29, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4])
 _FEW = 4  # equal values in a row that are usual where noise exceeds the rounding
@@ -338,15 +337,14 @@ def _rows_at(
     beta = np.asarray(_fit_nuisances(channel, inputs, np.asarray(sigma))[1])
     full = channel.without_compression()
     sizes = beta * np.asarray(full.linear_sd)[list(full.columns)]
-    is_skew = np.array(full.columns) == _SKEW
-    skew = float(sizes[is_skew].sum()) / current.step
+    skew, inputs = float(inputs.delay) / current.step, dataclasses.replace(inputs, delay=np.zeros(()))
     delay = float(full.shift) / current.step + float(np.clip(skew, -0.5, 0.5))
     delay = float(np.clip(delay, 0.5 - MAX_STEPS, MAX_STEPS - 0.5))
 
     def respond(V: Rows) -> Rows:
         return np.asarray(_modelled_rows(_with_drive(full, current, V), inputs))[:size]
 
-    nuisances = _nuisance_rows(_with_drive(full, current, current.V), inputs, np.where(is_skew, 0.0, sizes))
+    nuisances = _nuisance_rows(_with_drive(full, current, current.V), inputs, sizes)
     terms = inputs.circuit.channel_terms(channel.channel)
     modelled = describe_terms(terms, inputs.stray, delay, current.step)
     return *current.make_rows(modelled, respond, np.asarray(nuisances)[:size]), delay * current.step, skew

@@ -41,7 +41,7 @@ from fitact.fitting.starting_point import CurrentEstimate, Estimate, VscEstimate
 from fitact.instrument.classes import typical_gain_u
 from fitact.instrument.effects import INPUT_RANGE
 from fitact.likelihood import certificate
-from fitact.likelihood.channel import FIRST_CHARGE, LINEAR_NUISANCES, SKEW, ChannelLikelihood
+from fitact.likelihood.channel import FIRST_CHARGE, LINEAR_NUISANCES, ChannelLikelihood
 from fitact.likelihood.compression import HUM_FREQUENCIES
 from fitact.likelihood.likelihood import STRAY, Likelihood
 from fitact.likelihood.noise import Autoregression, estimate_quiet_noise, require_uniform
@@ -292,10 +292,15 @@ def _make_charge_rows(
     estimate, nuisances = estimate_recorded(current, stray, fixed)
     modelled = Current(estimate.capacitance + stray, abs(estimate.weight), 0.0)
     rows, V = current.make_rows(modelled, respond_to(current, estimate, stray), nuisances)
-    linear_sd = channel.linear_sd.copy()
-    linear_sd[LINEAR_NUISANCES.index(SKEW)] = max(record.time_step, scene.skew_limit("I", record.time_step))
-    drive = Sampled(channel.time, pad_samples(V))
-    channel = dataclasses.replace(channel, drive=drive, steady_state=False, linear_sd=linear_sd)
+    # converters take channels in turn, and probes delay them
+    delay_sd = max(1.0, scene.skew_limit("I", record.time_step) / record.time_step)
+    channel = dataclasses.replace(
+        channel,
+        drive=Sampled(channel.time, pad_samples(V)),
+        steady_state=False,
+        timing=("delay",),
+        timing_sd=np.array([delay_sd, channel.timing_sd[1]]),
+    )
     usable = estimate.weight > 0.0 and not limits_current(template) and not passes_direct_current(template)
     return set_rows(channel, rows, V, 0.0), estimate if usable else None, current.noise_I
 

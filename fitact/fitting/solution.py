@@ -40,7 +40,8 @@ def solve_problem(
         likelihood, change = update_weights(likelihood, theta, problem.sources, influences)
         if has_rows:
             likelihood, skew = update_rows(likelihood, end[0], problem.sources)
-            moved = np.abs(theta - before) / np.linalg.norm(end[2][places], axis=1)
+            theta = np.where(likelihood.follows_rows, 0.0, theta)  # their delays have moved into the rows
+            moved = np.abs(end[0].theta[places] - before) / np.linalg.norm(end[2][places], axis=1)
             if round_number == 0 or skew > max_skew or not np.max(moved) <= max_change:
                 continue
         if change <= 1e-3:

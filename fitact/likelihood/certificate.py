@@ -70,8 +70,13 @@ def compress_channel(
         fields = {field.name: getattr(compression, field.name) for field in dataclasses.fields(compression)}
         compression = GridCompression(**fields)
     else:
-        compression = compress(*arrays, expected_terms=terms, delayed=bool(channel.timing), **how)
+        compression = compress(*arrays, expected_terms=terms, delayed=_shifts_response(channel), **how)
     return dataclasses.replace(channel, compression=compression), ""
+
+
+def _shifts_response(channel: ChannelLikelihood) -> bool:
+    """Return whether a delay or clock error shifts the response; rows of charges are shifted to first order."""
+    return bool(channel.timing) and channel.charges is None
 
 
 _signal = jit(ChannelLikelihood.signal)
@@ -111,13 +116,13 @@ def reason_against_table(
     if reason := reason_against_compression(channel, tolerance):
         return reason
     if isinstance(start.circuit, WithSkin):
-        if channel.timing:
+        if _shifts_response(channel):
             return _TIMING_REASON
         if channel.channel == "I" and not channel.follows_samples:  # inner products would lose digits of large weights
             return "the current of a fractional skin is not tabulated"
         return "a dispersive skin has no time constants" if start.circuit.grid is None else ""
     is_direct = start.terms[channel.channel].direct is not None  # its table has V, which is not delayed
-    if channel.timing and (is_direct or not can_delay(channel, start.tau)):
+    if _shifts_response(channel) and (is_direct or not can_delay(channel, start.tau)):
         return _TIMING_REASON
     if table_multiple(start.tau) > max_multiple:
         return "the time constants of the circuit are too far apart"

@@ -39,8 +39,7 @@ from fitact.model.response import response_and_rate
 from fitact.model.skin import WithSkin
 
 CHARGES = ("charge", "charge_2", "charge_3", "charge_4")  # one for each time constant, the slowest first
-SKEW = "delay"  # of a current in rows of charges, to first order, s
-LINEAR_NUISANCES = (*BASELINE_NAMES, *CHARGES, SKEW)
+LINEAR_NUISANCES = (*BASELINE_NAMES, *CHARGES)
 FIRST_CHARGE = len(BASELINE_NAMES)
 TIMING_NUISANCES = ("delay", "clock")
 
@@ -117,6 +116,10 @@ class ChannelLikelihood(eqx.Module):
     def timing_unit(self, name: str) -> ArrayLike:
         """Return the unit of a coordinate of `TIMING_NUISANCES`: in s for a delay, relative for a clock."""
         return self.time_step if name == "delay" else 2.0 * self.time_step / (self.time[-1] - self.time[0])
+
+    def timing_mean(self, name: str) -> ArrayLike:
+        """Return the prior mean of a coordinate of `TIMING_NUISANCES`: a current is not late, wherever its rows are."""
+        return 0.0 if self.charges is None else -self.shift / self.timing_unit(name)
 
     def without_compression(self) -> "ChannelLikelihood":
         return dataclasses.replace(self, compression=None, expansion=None)
@@ -239,14 +242,14 @@ class ChannelLikelihood(eqx.Module):
         if self.phases is not None and "clock" not in self.timing:
             folded = dataclasses.replace(self, time=self.phases, phases=None)
             return folded._response(inputs, extra_delay)[jnp.arange(self.time.size) % self.period]
-        undelayed = not self.timing and isinstance(extra_delay, float) and extra_delay == 0.0
+        undelayed = self.charges is not None or not self.timing and isinstance(extra_delay, float) and extra_delay == 0.0
         if undelayed and isinstance(self.drive, Sampled) and self.drive.period is None:
             time = self.drive.time  # identical to the samples of V, so that `highpass` needs no search
         else:
             time = self.drive_time(inputs.delay + extra_delay, inputs.clock)
         total, rate = self._response_and_rate(inputs, time)
         if rate is not None and self.charges is not None:
-            total = jnp.interp(self.time - self.shift, self.time, total + rate * self.charges.sample_rate())
+            total = jnp.interp(self.time - (self.shift + inputs.delay), self.time, total + rate * self.charges.sample_rate())
         elif rate is not None and self.rate is not None:
             total = total + rate * self.rate
         return inputs.gain * total
@@ -272,8 +275,7 @@ class ChannelLikelihood(eqx.Module):
     def shapes(self, inputs: ChannelInputs) -> Float[Array, "nuisances samples"]:
         """Return the shapes in time of the linear nuisances, each of height 1."""
         middle, half = 0.5 * (self.time[0] + self.time[-1]), 0.5 * (self.time[-1] - self.time[0])
-        shapes = [baseline_functions(self.time, middle, half), self.linear_shapes(inputs)]
-        return jnp.pad(jnp.concatenate(shapes), ((0, 1), (0, 0)))  # the skew, which acts on rows
+        return jnp.concatenate([baseline_functions(self.time, middle, half), self.linear_shapes(inputs)])
 
     def linear_shapes(self, inputs: ChannelInputs) -> Float[Array, "4 samples"]:
         """Return the shapes that follow those of the baseline."""
@@ -304,8 +306,8 @@ class ChannelLikelihood(eqx.Module):
         if isinstance(self.compression, Compression) and not isinstance(self.compression, GridCompression):
             taus = inputs.circuit.channel_terms(self.channel).tau
             shapes += [self.compression.decays(tau, index)[None] for index, tau in enumerate(taus)]
-        missing = len(LINEAR_NUISANCES) - 1 - sum(map(len, shapes))
-        shapes += [jnp.zeros((missing, remainder.size)), self.compression.slope[None]]
+        missing = len(LINEAR_NUISANCES) - sum(map(len, shapes))
+        shapes.append(jnp.zeros((missing, remainder.size)))
         return remainder, jnp.concatenate(shapes)[self._column_indices]
 
     def rows_and_shapes(self, inputs: ChannelInputs) -> tuple[Float[Array, " samples"], Float[Array, "columns samples"]]:
@@ -318,8 +320,8 @@ class ChannelLikelihood(eqx.Module):
         functions = jnp.concatenate([total[None], self.shapes(inputs)])
         signal, *shapes = charges.means(jnp.pad(functions, ((0, 0), (charges.reach, 0))))
         signal = signal if rate is None else signal + rate * charges.rate
-        shapes = jnp.stack([*shapes[:-1], charges.slope])[self._column_indices]
-        return charges.observed - inputs.gain * signal, shapes
+        remainder = charges.observed - inputs.gain * signal - inputs.delay * charges.slope
+        return remainder, jnp.stack(shapes)[self._column_indices]
 
     def _compressed_signal(self, inputs: ChannelInputs) -> tuple[Float[Array, " rows"], Array]:
         """Return the signal in the coordinates of the compression, and whether the compression holds there."""
@@ -335,6 +337,8 @@ class ChannelLikelihood(eqx.Module):
         response = inputs.gain * compression.response(terms, delay)
         if inputs.effects is not None:
             response = response + inputs.effects @ compression.effects
+        if self.charges is not None:
+            response = response + inputs.delay * compression.slope
         return response, jnp.all(covered)
 
     def apply_whitening(self, values: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
@@ -358,7 +362,7 @@ class ChannelLikelihood(eqx.Module):
 
     def whitened_delay_derivative(self, inputs: ChannelInputs) -> Float[Array, " rows"]:
         """Return the whitened `delay_derivative`, over samples or coordinates."""
-        if self.charges is not None:  # the skew is among the linear nuisances
+        if self.charges is not None:  # whose delay is no optional nuisance
             return jnp.zeros(self.rows)
         if self.compression is None:
             return self.apply_whitening(self.delay_derivative(inputs))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from fitact.likelihood.channel import SKEW, ChannelInputs, ChannelLikelihood
+from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.compression import BASELINE_NAMES
 from fitact.model.force import Geometry, electrostatic_force, friction
 from fitact.model.force_sensor import ForceSensor, StepForce, square_over_steps
@@ -32,7 +32,7 @@ class FrictionChannel(ChannelLikelihood):
 
     @property
     def linear_names(self) -> tuple[str, ...]:
-        return (*BASELINE_NAMES, *_NUISANCES, SKEW)
+        return (*BASELINE_NAMES, *_NUISANCES)
 
     def _values(self, inputs: ChannelInputs) -> dict[str, ArrayLike]:
         return self.constants | (inputs.friction or {})

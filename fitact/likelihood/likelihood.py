@@ -80,6 +80,17 @@ class Likelihood(eqx.Module):
         return [channel.timing_sd[TIMING_NUISANCES.index(name)] for channel, name in self._timing]
 
     @property
+    def follows_rows(self) -> Bool[np.ndarray, " parameters"]:
+        """Mask of the coordinates that are delays of rows of charge."""
+        rows = [channel.charges is not None for channel, _ in self._timing]
+        return np.array([*[False] * len(self.prior.names), *rows])
+
+    @property
+    def timing_mean(self) -> list[ArrayLike]:
+        """Prior means of free delays and clocks."""
+        return [jnp.asarray(channel.timing_mean(name), dtype=float) for channel, name in self._timing]
+
+    @property
     def timing(self) -> dict[str, tuple[float, float]]:
         """Origin and unit of the coordinate of each free delay (s) and clock (relative), by name."""
         with jax.enable_x64(True):
@@ -229,7 +240,8 @@ class Likelihood(eqx.Module):
         size = len(self.prior.names)
         scaled = self.prior.residuals(theta[:size])
         if self._timing:
-            scaled = jnp.concatenate([scaled, theta[size:] / jnp.asarray(self.timing_sd)])
+            off = theta[size:] - jnp.asarray(self.timing_mean)
+            scaled = jnp.concatenate([scaled, off / jnp.asarray(self.timing_sd)])
         scaled = scaled if self.use_prior else jnp.where(self._circuit_mask, 0.0, scaled)
         if self.calibration is None:
             return scaled
@@ -260,8 +272,8 @@ class Likelihood(eqx.Module):
         theta, log_sigma = self.split(point)
         size = len(self.prior.names)
         value = self.prior.log_density(theta[:size])
-        for off, sd in zip(theta[size:], self.timing_sd, strict=True):
-            value = value - 0.5 * jnp.square(off / sd)
+        for off, mean, sd in zip(theta[size:], self.timing_mean, self.timing_sd, strict=True):
+            value = value - 0.5 * jnp.square((off - mean) / sd)
         for prior, log in zip(self.sigma_prior, log_sigma, strict=True):
             value = value if prior is None else value + prior.log_density(log)
         if self.calibration is not None:
