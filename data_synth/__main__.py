@@ -30,7 +30,8 @@ def main() -> int:
         if chosen.command == "committed":
             for path in sorted(RECORDS.glob("*.recipe.toml")):
                 if _is_route_available(path):
-                    _make(path, chosen.out, "csv.gz", None, None)
+                    plain = path.with_name(path.name.replace(".recipe.toml", ".csv")).exists()
+                    _make(path, chosen.out, "csv" if plain else "csv.gz", None, None)
             return 0
         for path in chosen.recipe:
             _make(path, chosen.out, chosen.format, chosen.seed, chosen.route)

@@ -82,10 +82,12 @@ def _lifts(ends: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
     return np.ravel([[end, end + _LIFT_TIME] for end in ends]), np.ravel(levels)
 
 
-def changing_response(course: Course, drive: Drive, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def changing_response(
+    course: Course, drive: Drive, time: np.ndarray, stray: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return V, Vsc (V) and I (A) at `time` (s, any order): settled periodic drives, others from rest.
 
-    At an ideal jump I is NaN.
+    I includes the current of the capacitance `stray` (F) from drive to ground. At an ideal jump I is NaN.
     """
     first, fine = float(time.min()), 1 if drive.degree == 1 else _SUBSTEPS
     before = np.empty(0)
@@ -110,7 +112,7 @@ def changing_response(course: Course, drive: Drive, time: np.ndarray) -> tuple[n
     Vsc = (y + Ci * V) / total
     slope, (_, Csc_rate, Ci_rate) = taylor[:, 1] / length, course.rates(grid[:-1])
     change = (-Vsc / Rsc + Ci * (slope + Ci_rate * V) - (Csc * Csc_rate + 2.0 * Ci * Ci_rate) * Vsc) / total
-    current = Vsc / Rsc + Csc * (change + Csc_rate * Vsc)
+    current = Vsc / Rsc + Csc * (change + Csc_rate * Vsc) + stray * slope
     if drive.jumps:
         jumped = np.abs(V - np.append(V[:1], V_end[:-1])) > 1e-5 * np.ptp(V)
         current = np.where(jumped, np.nan, current)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from data_synth.bench import IDEAL, Bench
 from data_synth.drive import Drive, end_values
 from data_synth.errors import RecipeError
 from data_synth.network import Branch, Network, gains, plain_admittance, state_space
@@ -20,7 +21,12 @@ _CAPACITANCE = np.array([44.25, 22.0, 8.85]) / 22.0
 
 
 def harmonic_response(
-    circuit: Network, skin: Mapping[str, Any], drive: Drive, time: np.ndarray, count: int = HARMONICS
+    circuit: Network,
+    skin: Mapping[str, Any],
+    drive: Drive,
+    time: np.ndarray,
+    count: int = HARMONICS,
+    bench: Bench = IDEAL,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return V, Vsc and I at `time` in the steady state, with dispersive or fractional outer skin layers.
 
@@ -49,16 +55,15 @@ def harmonic_response(
         return branch._replace(value=1.0 / top.real if branch.kind == "R" else top.imag / omega[-1])
 
     above = circuit._replace(branches=tuple(map(high_frequency_branch, circuit.branches)))
-    voltage, Vsc, current = response(state_space(above), drive, time)
+    found = np.array(response(bench.extend(state_space(above)), drive, time))
     heights = 2.0 * fourier_coefficients(drive, count)
-    whole, part = gains(circuit, omega, admittance), gains(above, omega, plain_admittance)
-    missing = heights[:, None] * np.column_stack([whole[0] - part[0], whole[1] - part[1]])
+    difference = gains(circuit, omega, admittance) - gains(above, omega, plain_admittance)
+    missing = (heights * bench.gains(omega) * difference).T
     there = np.flatnonzero(np.any(np.abs(missing) > _NOTHING * np.max(np.abs(missing), axis=0), axis=1))
     for first in range(0, there.size, _BLOCK):
         some = there[first : first + _BLOCK]
-        added = (np.exp(1j * np.outer(time, omega[some])) @ missing[some]).real
-        Vsc, current = Vsc + added[:, 0], current + added[:, 1]
-    return voltage, Vsc, current
+        found += (np.exp(1j * np.outer(time, omega[some])) @ missing[some]).real.T
+    return found[0], found[1], found[2]
 
 
 def _layer_admittance(R: float, C: float, skin: Mapping[str, Any], omega: np.ndarray) -> np.ndarray:

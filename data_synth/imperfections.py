@@ -14,6 +14,7 @@ from data_synth.recipe import UNITS
 # append only: the index seeds the random numbers
 _STREAMS = ("population", "clock", "hum", "pink", "white", "missing", "change")
 _CHANNELS = tuple(UNITS)
+_HEADROOM = 1.3  # end of a converter's automatic range over the largest value
 
 
 def generator(seed: int, finger: int, kind: str, channel: str = "V") -> np.random.Generator:
@@ -45,8 +46,10 @@ def add_imperfections(
         values = values + parts["white"][channel] * generator(seed, finger, "white", channel).standard_normal(time.size)
     if parts["clip"][channel]:
         values = np.clip(values, -parts["clip"][channel], parts["clip"][channel])
-    if parts["converter"][channel]:
-        values = quantize(values, parts["converter"][channel], parts["converter"]["bits"])
+    converter = parts["converter"]
+    span = converter[channel] or (2.0 * _HEADROOM * float(np.max(np.abs(values))) if converter["auto"] else None)
+    if span:
+        values = quantize(values, span, converter[f"bits_{channel}"] or converter["bits"])
     return values
 
 

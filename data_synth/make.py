@@ -1,5 +1,6 @@
 """Records from recipes, by scipy or ngspice, with their true values."""
 
+import functools
 import math
 import platform
 from collections.abc import Mapping
@@ -8,15 +9,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from data_synth import imperfections
+from data_synth.bench import IDEAL, Bench
 from data_synth.changing import Course, changing_response, make_course
 from data_synth.drive import Drive, make_drive
 from data_synth.errors import RecipeError
 from data_synth.friction import friction
 from data_synth.keys import default_value
 from data_synth.network import Network, network, state_space
-from data_synth.recipe import AS_IT_IS, KEYS, UNITS, Recipe
+from data_synth.recipe import AS_IT_IS, CIRCUIT_CHANNELS, KEYS, UNITS, Recipe
 from data_synth.scene import KEYS as SCENE
 from data_synth.scene import Scene
+
+Signals = tuple[np.ndarray, np.ndarray, np.ndarray]  # V, Vsc and I at times
 
 _MOST_SAMPLES = 10_000_000
 _VALUES = {  # name -> section of the scene, key, unit
@@ -33,6 +37,7 @@ _VALUES = {  # name -> section of the scene, key, unit
     "series_resistor": ("measurement", "series_resistor", "ohm"),
     "probe_resistance": ("measurement", "probe_resistance", "ohm"),
     "probe_capacitance": ("measurement", "probe_capacitance", "F"),
+    "stray_capacitance": ("measurement", "stray_capacitance", "F"),
     "mu": ("friction", "coefficient", "1"),
     "fN": ("friction", "normal_force", "N"),
     "sensor_frequency": ("friction", "sensor_frequency", "Hz"),
@@ -97,17 +102,22 @@ def _record(recipe: Recipe, scene: Scene, finger: int) -> Synthetic:
         course = make_course(parts["change"], values, measured["duration"], rng)
     skin = _scale_second_layer(parts["skin"], area)
 
-    def waves(times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return simulate_response(scene, times, skin, recipe.route, course)
+    amplified = Bench(parts["amplifier"]["bandwidth"])
+    whole = amplified._replace(bandwidth=parts["bandwidth"], behind=parts["shunt"]["V"] == "behind")
 
-    found = dict(zip(("V", "Vsc", "I"), waves(taken), strict=True))
+    def waves(times: np.ndarray, bench: Bench = amplified) -> Signals:
+        return simulate_response(scene, times, skin, recipe.route, course, bench)
+
+    delay = parts["delay"]
+    recorded = functools.cache(lambda late: dict(zip(CIRCUIT_CHANNELS, waves(taken - late, whole), strict=True)))
     wanted = [name for name in UNITS if name == "V" or name in measured["channels"]]
+    found = {name: recorded(delay[name])[name] for name in wanted if name in CIRCUIT_CHANNELS}
     if "Ft" in wanted:
-        found["Ft"] = friction(scene, waves, taken, parts["friction"])
+        found["Ft"] = friction(scene, waves, taken - delay["Ft"], parts["friction"])
     if "I" in wanted and not np.all(np.isfinite(found["I"])):
         raise RecipeError(
-            f"{recipe.name}: the current has an impulse at each ideal jump of the drive; give the drive a rise time, or"
-            " the circuit R_H or a series_resistor"
+            f"{recipe.name}: the current has an impulse at each ideal jump of the drive; give the drive a rise time,"
+            " state an [amplifier], or give a circuit without stray capacitance R_H or a series_resistor"
         )
     channels = {n: imperfections.add_imperfections(found[n], n, time, parts, recipe.seed, finger) for n in wanted}
     there = imperfections.sample_mask(count, parts["missing"]["share"], recipe.seed, finger)
@@ -132,7 +142,7 @@ def _scale_second_layer(skin: Mapping[str, Any], area: float) -> Mapping[str, An
 def _resolve_noise(recipe: Recipe) -> dict[str, dict[str, Any]]:
     """Return the recipe's sections, with the scene's white noise if the recipe states none."""
     measured, white = recipe.scene["measurement"], recipe.parts["white"]
-    stated = {"V": 0.0, "Vsc": measured["noise_Vsc"], "I": measured["noise_I"], "Ft": measured["noise_Ft"]}
+    stated = {name: measured[f"noise_{name}"] or 0.0 for name in UNITS}
     return {**recipe.parts, "white": {n: stated[n] if white[n] is None else white[n] for n in UNITS}}
 
 
@@ -142,45 +152,56 @@ def simulate_response(
     skin: Mapping[str, Any] | None = None,
     route: str = "scipy",
     course: Course | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    bench: Bench = IDEAL,
+) -> Signals:
     """Return V, Vsc (V) and I (A) at `time` (s) without imperfections; `skin` is the recipe's section [skin].
 
-    A `course` gives the values of a changing finger.
+    A `course` gives the values of a changing finger, which supports no bandwidths in `bench`.
 
     Raises:
-        RecipeError: the route does not support this skin, or ngspice is not installed.
+        RecipeError: the route does not support this skin or bench, or ngspice is not installed.
     """
     skin = skin or {"model": AS_IT_IS}
     second = (skin["Rsc_2"], skin["Csc_2"]) if skin["model"] == "two layers" else None
-    circuit, drive = network(scene, second), make_drive(scene["drive"])
+    circuit, drive = network(scene, second, bench.behind), make_drive(scene["drive"])
     law = skin if skin["model"] in ("nonlinear", "electroporated") else None
-    level = scene["skin"]["level"]
+    level, measured = scene["skin"]["level"], scene["measurement"]
+    stray = (measured["stray_capacitance"] or 0.0) if measured["current_lead"] == "drive" else 0.0
     if route == "ngspice":
         from data_synth.spice import spice_response
 
         if level != "constant":
             raise RecipeError(f"[skin] level = '{level}' is not available with ngspice; use route = 'scipy'")
+        if bench.filters:
+            raise RecipeError("[amplifier] and [bandwidth] are not available with ngspice; use route = 'scipy'")
+        if course is not None and stray:
+            raise RecipeError("[change] with stray capacitance is not available with ngspice; use route = 'scipy'")
         return spice_response(circuit, law, drive, time, course)
     if course is not None:
-        return changing_response(course, drive, time)
-    return _scipy_response(circuit, law, scene["skin"], drive, time)
+        return changing_response(course, drive, time, stray)
+    return _scipy_response(circuit, law, scene["skin"], drive, time, bench)
 
 
 def _scipy_response(
-    circuit: Network, law: Mapping[str, Any] | None, skin: Mapping[str, Any], drive: Drive, time: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    circuit: Network,
+    law: Mapping[str, Any] | None,
+    skin: Mapping[str, Any],
+    drive: Drive,
+    time: np.ndarray,
+    bench: Bench,
+) -> Signals:
     # imported here, because each loads another part of scipy
     if law is not None:
         from data_synth.nonlinear import nonlinear_response
 
-        return nonlinear_response(circuit, law, drive, time)
+        return nonlinear_response(circuit, law, drive, time, bench)
     if skin["level"] != "constant":
         from data_synth.harmonics import harmonic_response
 
-        return harmonic_response(circuit, skin, drive, time)
+        return harmonic_response(circuit, skin, drive, time, bench=bench)
     from data_synth.response import response
 
-    return response(state_space(circuit), drive, time)
+    return response(bench.extend(state_space(circuit)), drive, time)
 
 
 def _truth(recipe: Recipe, scene: Scene, parts: dict[str, dict[str, Any]]) -> dict[str, Any]:
@@ -191,7 +212,8 @@ def _truth(recipe: Recipe, scene: Scene, parts: dict[str, dict[str, Any]]) -> di
         values = {name: value for name, value in values.items() if _VALUES[name][0] != "friction"}
     else:
         values["force_scale"] = parts["friction"]["force_scale"], "1"
-    values |= {f"noise_{name}": (parts["white"][name], UNITS[name]) for name in scene["measurement"]["channels"]}
+    recorded = ("V", *scene["measurement"]["channels"])
+    values |= {f"noise_{name}": (parts["white"][name], UNITS[name]) for name in recorded}
     stated = {key: value for key, value in scene["drive"].items() if value != default_value(SCENE["drive"][key])}
     added = {name: parts[name] for name in KEYS if name in recipe.given}
     return {

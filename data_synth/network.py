@@ -21,17 +21,19 @@ class Branch(NamedTuple):
 
 
 class Network(NamedTuple):
-    """Branches, the two nodes of Vsc, and for each outer skin layer its nodes, R (ohm) and C (F)."""
+    """Branches, the two nodes of Vsc, for each outer skin layer its nodes, R (ohm) and C (F), and the node of V."""
 
     branches: tuple[Branch, ...]
     skin: tuple[int, int]
     layers: tuple[tuple[int, int, float, float], ...]
+    voltage: int = 1
 
 
 class StateSpace(NamedTuple):
     """State space x' = A x + B u, y = C x + D u + E dV/dt.
 
-    u: V (V), and the nonlinear current of each outer layer (A). y: Vsc (V), I (A), the voltage of each outer layer (V).
+    u: V of the drive (V), and the nonlinear current of each outer layer (A).
+    y: V, Vsc (V) and I (A) as recorded, the voltage of each outer layer (V).
     """
 
     A: np.ndarray
@@ -41,8 +43,13 @@ class StateSpace(NamedTuple):
     E: np.ndarray
 
 
-def network(scene: Mapping[str, Mapping[str, Any]], second: tuple[float, float] | None = None) -> Network:
-    """Return the scene's circuit from drive to ground; `second` is R (ohm) and C (F) of a deeper layer in each skin."""
+def network(
+    scene: Mapping[str, Mapping[str, Any]], second: tuple[float, float] | None = None, behind: bool = False
+) -> Network:
+    """Return the scene's circuit from drive to ground; `second` is R (ohm) and C (F) of a deeper layer in each skin.
+
+    behind: whether V is recorded behind the series resistor, where the rest of the loop begins.
+    """
     skin, measured = scene["skin"], scene["measurement"]
     touching = [(skin["Rsc"], skin["Csc"], "outer"), *([(*second, "")] if second else [])]
     before = [
@@ -62,9 +69,11 @@ def network(scene: Mapping[str, Mapping[str, Any]], second: tuple[float, float] 
     last = first + len(touching) if after else 0
     probe = (("R", measured["probe_resistance"]), ("C", measured["probe_capacitance"]))
     branches += [Branch(kind, first, last, value) for kind, value in probe if value]
+    if measured["stray_capacitance"] and measured["current_lead"] == "drive":
+        branches.append(Branch("C", 1, 0, measured["stray_capacitance"]))
     outer = [(R, C) for R, C in itertools.pairwise(branches) if R.layer and R.kind == "R"]
     layers = tuple((R.start, R.end, R.value, C.value) for R, C in outer)
-    return Network(tuple(branches), (first, last), layers)
+    return Network(tuple(branches), (first, last), layers, 2 if behind else 1)
 
 
 def _has_impedance(part: tuple[float | None, float | None, str]) -> bool:
@@ -129,22 +138,24 @@ def state_space(circuit: Network) -> StateSpace:
     A, B = -P.T @ g[1:, 1:] @ rest @ P, -P.T @ (g[1:, 1:] @ follow + np.eye(size - 1)) @ source
     nodes_x, nodes_u = rest @ P, follow @ source
     nodes_u[:, 0] -= at_once
-    of_skin = _incidence([circuit.skin, *((start, end) for start, end, *_ in circuit.layers)], size)
-    C = np.vstack([of_skin[1:].T @ nodes_x, c[0, 1:] @ nodes_x @ A + g[0, 1:] @ nodes_x])
-    D = np.vstack([of_skin[1:].T @ nodes_u, c[0, 1:] @ nodes_x @ B + g[0, 1:] @ nodes_u])
-    D[:-1, 0] += of_skin[0]
+    across = [(circuit.voltage, 0), circuit.skin, *((start, end) for start, end, *_ in circuit.layers)]
+    voltages = _incidence(across, size)
+    C = np.vstack([voltages[1:].T @ nodes_x, c[0, 1:] @ nodes_x @ A + g[0, 1:] @ nodes_x])
+    D = np.vstack([voltages[1:].T @ nodes_u, c[0, 1:] @ nodes_x @ B + g[0, 1:] @ nodes_u])
+    D[:-1, 0] += voltages[0]
     D[-1] += np.append(g[0, 0], extra[0])
     E = np.zeros(len(D))
     E[-1] = c[0, 1:] @ nodes_u[:, 0] + c[0, 0]
     E[np.abs(E) < _EMPTY * values[-1]] = 0.0
-    order = [0, len(D) - 1, *range(1, len(D) - 1)]
+    order = [0, 1, len(D) - 1, *range(2, len(D) - 1)]
     return StateSpace(A, B, C[order], D[order], E[order])
 
 
-def gains(
-    circuit: Network, omega: np.ndarray, admittance: Callable[[Branch, np.ndarray], np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return Vsc / V and I / V (S) at angular frequencies `omega` (rad/s), with the admittance (S) of each branch."""
+def gains(circuit: Network, omega: np.ndarray, admittance: Callable[[Branch, np.ndarray], np.ndarray]) -> np.ndarray:
+    """Return V, Vsc (1) and I (S) per volt of the drive, (3, frequencies), with the admittance (S) of each branch.
+
+    omega: angular frequencies, rad/s.
+    """
     size = _size(circuit)
     Y = np.zeros((omega.size, size, size), dtype=complex)
     for each in circuit.branches:
@@ -152,7 +163,8 @@ def gains(
         Y += admittance(each, omega)[:, None, None] * (ends @ ends.T)
     free = np.linalg.solve(Y[:, 1:, 1:], -Y[:, 1:, :1])[..., 0]
     nodes = np.concatenate([np.ones((omega.size, 1)), free], axis=1)
-    return nodes @ _incidence([circuit.skin], size)[:, 0], np.einsum("ni,ni->n", Y[:, 0], nodes)
+    voltages = nodes @ _incidence([(circuit.voltage, 0), circuit.skin], size)
+    return np.vstack([voltages.T, np.einsum("ni,ni->n", Y[:, 0], nodes)])
 
 
 def plain_admittance(branch: Branch, omega: np.ndarray) -> np.ndarray:

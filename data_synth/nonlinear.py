@@ -8,6 +8,7 @@ import numpy as np
 import scipy.integrate
 from scipy.special import expit
 
+from data_synth.bench import IDEAL, Bench
 from data_synth.drive import Drive
 from data_synth.errors import RecipeError
 from data_synth.network import Network, StateSpace, state_space
@@ -39,7 +40,7 @@ class NonlinearSkin(NamedTuple):
     def extra(self, states: np.ndarray, voltage: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the current of each layer beyond v / R (A), and its voltage (V)."""
         size = len(self.system.A)
-        v = self.system.C[2:] @ states[:size] + np.multiply.outer(self.system.D[2:, 0], voltage)
+        v = self.system.C[3:] @ states[:size] + np.multiply.outer(self.system.D[3:, 0], voltage)
         more = (self.law["factor"] - 1.0) * states[size:] if self.remembers else (v / self.law["half_voltage"]) ** 2
         return more * (v.T / self.R).T, v
 
@@ -55,14 +56,14 @@ class NonlinearSkin(NamedTuple):
 
 
 def nonlinear_response(
-    circuit: Network, law: Mapping[str, Any], drive: Drive, time: np.ndarray
+    circuit: Network, law: Mapping[str, Any], drive: Drive, time: np.ndarray, bench: Bench = IDEAL
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return V, Vsc (V) and I (A) at `time` (s): periodic drives in the steady state, others from rest.
 
     Raises:
         RecipeError: no steady state after many periods.
     """
-    system = state_space(circuit)
+    system = bench.extend(state_space(circuit))
     skin = NonlinearSkin(system, np.array([layer[2] for layer in circuit.layers]), law)
     size = len(system.A)
     grid, place = steps(drive, time)
@@ -73,10 +74,10 @@ def nonlinear_response(
     taylor = polynomials(drive, grid)
     voltage, slope = taylor[:, 0], taylor[:, 1] / np.diff(grid)
     inputs = np.vstack([voltage, skin.extra(states, voltage)[0]])
-    out = system.C[:2] @ states[:size] + system.D[:2] @ inputs + np.outer(system.E[:2], slope)
-    if drive.jumps and system.E[1] != 0.0:
-        out[1] = np.nan
-    return voltage[place], out[0, place], out[1, place]
+    out = system.C[:3] @ states[:size] + system.D[:3] @ inputs + np.outer(system.E[:3], slope)
+    if drive.jumps and system.E[2] != 0.0:
+        out[2] = np.nan
+    return out[0, place], out[1, place], out[2, place]
 
 
 def _states(skin: NonlinearSkin, drive: Drive, state: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from data_synth.scene import KEYS as SCENE
 from data_synth.scene import Scene, make_scene
 
 UNITS = {"V": "V", "Vsc": "V", "I": "A", "Ft": "N"}
+CIRCUIT_CHANNELS = ("V", "Vsc", "I")
 AS_IT_IS = "as the scene says"  # skin model of a recipe that states none
 _SUFFIX = ".recipe"
 
@@ -49,7 +50,12 @@ KEYS: Table = {
     # electrostatic force over the computed one, and cross-talk of the drive in the friction, N/V
     "friction": {"force_scale": Quantity("", 1.0), "crosstalk": Quantity("N/V", 0.0, -math.inf)},
     # in the order in which they act
+    "amplifier": {"bandwidth": Quantity("Hz")},
+    "stray": {"capacitance": Quantity("F")},
+    "shunt": {"V": Choice(("before", "behind"))},
+    "bandwidth": dict.fromkeys(CIRCUIT_CHANNELS, Quantity("Hz")),
     "clock": {"jitter": Quantity("s", 0.0, least=True), "trigger_error": Quantity("s", 0.0, -math.inf)},
+    "delay": dict.fromkeys(UNITS, Quantity("s", 0.0, -math.inf)),
     "gain": dict.fromkeys(UNITS, Quantity("", 1.0, -math.inf)),
     "offset": _channel_quantities(-math.inf),
     "drift": _channel_quantities(-math.inf),
@@ -61,7 +67,12 @@ KEYS: Table = {
     "pink": {**_channel_quantities(), "exponent": Quantity("", 1.0), "corner": Quantity("Hz")},
     "white": _channel_quantities(),
     "clip": {name: Quantity(unit) for name, unit in UNITS.items()},
-    "converter": {"bits": WholeNumber(12, 2), **{name: Quantity(unit) for name, unit in UNITS.items()}},
+    "converter": {
+        "bits": WholeNumber(12, 2),
+        **{f"bits_{name}": WholeNumber(None, 2) for name in UNITS},
+        "auto": Choice((False, True)),
+        **{name: Quantity(unit) for name, unit in UNITS.items()},
+    },
     "missing": {"share": Quantity("", 0.0, least=True)},
 }
 _MODELS = {
@@ -112,6 +123,8 @@ def load(path: Path) -> Recipe:
         "recipe"
     ]
     _check(parts, scene, tuple(rest), str(path))
+    if parts["stray"]["capacitance"]:
+        scene["measurement"]["stray_capacitance"] = parts["stray"]["capacitance"]
     name = path.name.removesuffix(".toml").removesuffix(_SUFFIX)
     return Recipe(name, scene_path.name, scene, parts, tuple(rest), top["seed"], top["route"])
 
@@ -134,6 +147,15 @@ def _check(parts: dict[str, dict[str, Any]], scene: Scene, given: tuple[str, ...
     others = scene["skin"]["level"] != "constant" or scene["grounding"]["connection"] != "direct" or needed
     if "change" in given and (others or any(added) or any(loads)):
         raise RecipeError(f"{place}: [change] needs two equal skins in series with Ci; leave out all other elements")
+    if "change" in given and {"amplifier", "bandwidth"} & set(given):
+        raise RecipeError(f"{place}: [change] excludes [amplifier] and [bandwidth]; leave them out")
+    measured = scene["measurement"]
+    if parts["stray"]["capacitance"] and measured["stray_capacitance"] is not None:
+        raise RecipeError(f"{place}: [stray] repeats the scene's stray_capacitance; put it under [truth.measurement]")
+    if parts["stray"]["capacitance"] and measured["current_lead"] == "ground":
+        raise RecipeError(f"{place}: [stray] has no effect on I in the ground lead; leave it out")
+    if parts["shunt"]["V"] == "behind" and not measured["series_resistor"]:
+        raise RecipeError(f"{place}: [shunt] V = 'behind' needs a [measurement] series_resistor in the scene; state it")
     if not -1.0 < parts["population"]["correlation"] < 1.0:
         raise RecipeError(f"{place}: [population] correlation must lie between -1 and 1")
     if parts["missing"]["share"] > 0.9:

@@ -28,19 +28,19 @@ def response(system: StateSpace, drive: Drive, time: np.ndarray) -> tuple[np.nda
     states = _states(system, grid, taylor, charge)[:-1]
     voltage, slope = taylor[:, 0], taylor[:, 1] / np.diff(grid)
     out = states @ system.C.T + np.outer(voltage, system.D[:, 0])
-    current = out[:, 1] + system.E[1] * slope
-    if drive.jumps and system.E[1] != 0.0:
+    current = out[:, 2] + system.E[2] * slope
+    if drive.jumps and system.E[2] != 0.0:
         ended = np.sum(taylor / _factorials(drive.degree), axis=1)
         before = np.append(drive.value(grid[:1] - 1e-6 * drive.longest), ended[:-1])
         current = np.where(np.abs(voltage - before) > 1e-5 * np.ptp(voltage), np.nan, current)
-    return voltage[place], out[place, 0], current[place]
+    return out[place, 0], out[place, 1], current[place]
 
 
-def frequency_response(system: StateSpace, omega: float) -> tuple[complex, complex]:
-    """Return Vsc / V and I / V (S) at the angular frequency `omega` (rad/s)."""
+def frequency_response(system: StateSpace, omega: float) -> tuple[complex, complex, complex]:
+    """Return V, Vsc (1) and I (S) per volt of the drive at the angular frequency `omega` (rad/s)."""
     x = np.linalg.solve(1j * omega * np.eye(len(system.A)) - system.A, system.B[:, 0])
-    Vsc, current = system.C[:2] @ x + system.D[:2, 0] + 1j * omega * system.E[:2]
-    return complex(Vsc), complex(current)
+    V, Vsc, current = system.C[:3] @ x + system.D[:3, 0] + 1j * omega * system.E[:3]
+    return complex(V), complex(Vsc), complex(current)
 
 
 def steps(drive: Drive, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ Scene = dict[str, dict[str, Any]]
 
 _ANY = -math.inf
 _PRIORS = """Rsc Csc Ci R_H grounding_Rsc grounding_Csc Z Z_capacitance series_resistor Ri Rgap Cgap alpha sigma
-sigma_I sigma_Ft mu fN force_scale sensor_frequency sensor_damping correlation"""
+sigma_I sigma_Ft mu fN force_scale sensor_frequency sensor_damping correlation stray_capacitance"""
 KEYS: Table = {
     "device": {
         "Ci": Quantity("F", 1.35e-9),
@@ -63,8 +63,11 @@ KEYS: Table = {
         "series_resistor": Quantity("ohm", 0.0, least=True),
         "probe_resistance": Quantity("ohm"),
         "probe_capacitance": Quantity("F"),
+        "stray_capacitance": Quantity("F", least=True),  # from drive to ground, beside the loop
+        "current_lead": Choice(("drive", "ground")),
         "sampling_rate": Quantity("Hz", 200e3),
         "duration": Quantity("s", 20e-3),
+        "noise_V": Quantity("V", least=True),
         "noise_Vsc": Quantity("V", 0.1, least=True),
         "noise_I": Quantity("A", 20e-9, least=True),
         "noise_Ft": Quantity("N", 2e-3, least=True),

@@ -63,7 +63,7 @@ def spice_response(
     deck += [".options reltol=1e-6 abstol=1e-15 vntol=1e-9 trtol=1 method=gear", ".control"]
     deck += ["set wr_vecnames", "set wr_singlescale", "set numdgt=12"]
     deck += [f"tran {step:.12g} {end - begin:.15g} {kept:.15g} {step:.12g} uic"]
-    deck += [f"wrdata out.txt v(1) v({skin}) i(Vmeter)"]
+    deck += [f"wrdata out.txt v({circuit.voltage}) v({skin}) i(Vmeter)"]
     table = _run_ngspice([*deck, "quit", ".endc", ".end"], end - begin)
     # at a jump the record holds the value after it
     wanted = time - begin + (2.0 * _JUMP if drive.jumps else 0.0)

@@ -11,6 +11,8 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.fft
+import scipy.signal
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
@@ -20,7 +22,7 @@ from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
 from fitact.fitting.drive_choice import DriveModel, drive_slope, unit_response
 from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.fitting.source import Source
-from fitact.fitting.starting_point import CurrentEstimate
+from fitact.fitting.starting_point import CurrentEstimate, skin_from_estimates
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.charge_rows import (
     LAG,
@@ -35,6 +37,7 @@ from fitact.model.circuit import HighpassTerms, gain_at
 from fitact.model.drive import Sampled
 
 Rows = Float[np.ndarray, " samples"]
+Belief = tuple[np.ndarray, np.ndarray]  # prior means and sds of log Rsc, log Csc and log Ci
 # rms error of the mean over a step, up to six steps from a jump, relative to its height
 _JUMP_ERRORS = np.array([3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.29, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4])
 _FEW = 4  # equal values in a row that are usual where noise exceeds the rounding
@@ -65,8 +68,8 @@ class RecordedCurrent:
     def from_record(cls, record: Record) -> "RecordedCurrent":
         """Estimate the noise of a record's V and I."""
         V, current = record["V"], record["I"]
-        noise, rounding = estimate_noise(current), rounding_noise_sd(current)
-        runs = run_lengths(current)
+        rounding, runs = _least_step(current) / math.sqrt(12.0), run_lengths(current)
+        noise = max(estimate_noise(current), rounding)
         # a run of equal values shares one error, so that its mean has the variance of one
         uncertain = _kink_variance(current, noise) + np.where(runs > _FEW, rounding**2 * runs, 0.0)
         return cls(V, current, record.time_step, drive_variance(V), noise, uncertain, clipping_mask(current))
@@ -124,7 +127,7 @@ def estimate_noise(values: Rows) -> float:
 
     Edges hardly change the first, and fast smooth signals the second.
     """
-    lines = np.fft.rfft((values - values.mean()) * np.hanning(values.size))[int(0.4 * values.size) :]
+    lines = scipy.fft.rfft((values - values.mean()) * np.hanning(values.size))[int(0.4 * values.size) :]
     fastest = math.sqrt(float(np.median(np.abs(lines) ** 2)) / math.log(2.0) / (0.375 * values.size))
     return math.hypot(min(white_noise_sd(values), fastest), rounding_noise_sd(values))
 
@@ -151,6 +154,12 @@ def drive_variance(V: Rows) -> Rows:
     white, rounding, alike = math.sqrt(max(estimate_noise(V) ** 2 - rounding_noise_sd(V) ** 2, 0.0)), rounding_noise_sd(V), np.diff(V) == 0.0
     within = np.append(False, alike) & np.append(alike, False)
     return white**2 + np.where(within, 0.0, rounding**2)
+
+
+def _least_step(current: Rows, max_part: float = 0.25) -> float:
+    """Return the least step between the values of a channel, or 0 if more than `max_part` of its values differ."""
+    levels = np.unique(current)
+    return float(np.diff(levels).min()) if 1 < levels.size <= max_part * current.size else 0.0
 
 
 def run_lengths(values: Rows) -> Rows:
@@ -197,7 +206,7 @@ def edge_mask(voltage: Rows, margin: int = 2, threshold: float = 8.0, block: int
 
 
 def estimate_from_current(
-    record: Record, choice: DriveModel, used: Bool[np.ndarray, " samples"], slope: Rows
+    record: Record, choice: DriveModel, used: Bool[np.ndarray, " samples"], slope: Rows, belief: Belief
 ) -> CurrentEstimate:
     """Estimate the coefficients of I for a stated drive with dV/dt `slope`, on a grid of time constants."""
     span = float(record.time[-1] - record.time[0])
@@ -207,20 +216,30 @@ def estimate_from_current(
         residual, amplitudes = _solve(np.stack(columns) * used, record["I"] * used)
         return residual, *amplitudes[:2]
 
-    return _scan(fit_at_tau, np.geomspace(2.0 * record.time_step, 10.0 * span, 60))
+    return _scan(fit_at_tau, np.geomspace(2.0 * record.time_step, 10.0 * span, 60), record.noise("I"), belief)
 
 
-def _scan(fit_at_tau: Callable[[float], tuple[float, float, float]], taus: np.ndarray) -> CurrentEstimate:
-    """Return the coefficients at the best of the time constants, refined between its neighbours."""
+def _scan(
+    fit_at_tau: Callable[[float], tuple[float, float, float]], taus: np.ndarray, noise: float, belief: Belief
+) -> CurrentEstimate:
+    """Return the most probable coefficients for any of the time constants, refined between its neighbours.
+
+    `noise` is the standard deviation of the residuals.
+    """
+    mean, sd = belief
     for _ in range(2):
-        found = [fit_at_tau(float(tau)) for tau in taus]
-        # no circuit has a negative coefficient
-        best = min(range(taus.size), key=lambda k: (not min(found[k][1:]) > 0.0, found[k][0]))
-        estimate = CurrentEstimate(found[best][1], float(taus[best]), found[best][2])
+        costs, estimates = [], []
+        for tau in taus:
+            square, weight, capacitance = fit_at_tau(float(tau))
+            estimates.append(CurrentEstimate(weight, float(tau), capacitance))
+            skin = skin_from_estimates(None, estimates[-1])  # None if a coefficient is negative
+            surprise = math.inf if skin is None else float(np.sum(np.square((np.log(skin) - mean) / sd)))
+            costs.append((surprise == math.inf, square / noise**2 + (0.0 if skin is None else surprise)))
+        best = min(range(taus.size), key=costs.__getitem__)
         if not 0 < best < taus.size - 1:
             break
         taus = np.geomspace(taus[best - 1], taus[best + 1], 17)
-    return estimate
+    return estimates[best]
 
 
 def _solve(columns: np.ndarray, observed: np.ndarray) -> tuple[float, np.ndarray]:
@@ -240,16 +259,29 @@ def _first_order(V: Rows, step: float, tau: float) -> Rows:
 
 
 def estimate_recorded(
-    current: RecordedCurrent, stray: float, hum: Sequence[float], most: int = 8192
+    current: RecordedCurrent, stray: float, hum: Sequence[float], belief: Belief, most: int = 8192
 ) -> tuple[CurrentEstimate, Rows]:
     """Estimate the coefficients of I for a recorded V by a scan of b, and return the rows of nuisances.
 
     Given b, I is linear in the other coefficients, so that the scan finds the global optimum. Charges of several steps
     add up, so that at most `most` rows serve. `hum` has frequencies (Hz) at which I may have a part of its own.
     """
+    charge, V = scipy.signal.detrend(np.cumsum(current.I) * current.step), scipy.signal.detrend(current.V)
+    C = abs(float(charge @ V)) / float(V @ V)  # between those of low and of high frequencies
+    for _ in range(3):
+        before = C
+        estimate, nuisances = _scan_recorded(current, C, stray, hum, belief, most)
+        C = abs(estimate.capacitance + stray)
+        if abs(C - before) < 0.1 * before:
+            break
+    return estimate, nuisances
+
+
+def _scan_recorded(
+    current: RecordedCurrent, C: float, stray: float, hum: Sequence[float], belief: Belief, most: int
+) -> tuple[CurrentEstimate, Rows]:
+    """Return the estimate and the nuisances where noise of V acts through the capacitance `C` (F)."""
     rise = current.rise(current.V)
-    C = abs(float(current.I[LAG:-LAG] @ np.gradient(current.V, current.step)[LAG:-LAG]))
-    C /= max(float(np.sum(np.gradient(current.V, current.step)[LAG:-LAG] ** 2)), 1e-300)
     several = math.ceil((current.I.size - 3 * LAG) / most)
     first, count = 2 * LAG, (current.I.size - 2 * LAG) // several
     step = current.step * several
@@ -282,7 +314,7 @@ def estimate_recorded(
         return residual, float(amplitudes[0]), float(amplitudes[2])
 
     taus = np.geomspace(max(2.0 * step, 1e-4), max(10.0 * step * count, 4e-4), 48)
-    estimate = _scan(fit_at_tau, taus)
+    estimate = _scan(fit_at_tau, taus, 1.0, belief)
     amplitudes = _solve(columns(estimate.b), observed)[1]
     time = current.step * (np.arange(current.I.size) - first)
     waves = [wave(2.0 * np.pi * f * time) for f in hum for wave in (np.cos, np.sin)]

@@ -37,7 +37,14 @@ from fitact.fitting.instrument_errors import (
 from fitact.fitting.skin_model import apply_skin_model, count_harmonics, exclude_jumps, require_skin_response
 from fitact.fitting.source import Source
 from fitact.fitting.spectra import build_spectrum_channel
-from fitact.fitting.starting_point import CurrentEstimate, Estimate, VscEstimate, estimate_from_vsc, start_from_estimates
+from fitact.fitting.starting_point import (
+    CurrentEstimate,
+    Estimate,
+    VscEstimate,
+    estimate_from_vsc,
+    prior_skin_moments,
+    start_from_estimates,
+)
 from fitact.instrument.classes import typical_gain_u
 from fitact.instrument.effects import INPUT_RANGE
 from fitact.likelihood import certificate
@@ -138,8 +145,7 @@ def build_problem(
             continue
         choice = drive or choose_drive(record, scene)
         for name in _channels(record, scene):
-            template, names = likelihood.template, likelihood.prior.names
-            channel, source, edge_sd = _build_channel(record, stated, choice, name, suffix, template, taus, names)
+            channel, source, edge_sd = _build_channel(record, stated, choice, name, suffix, likelihood, taus)
             sources.append(source)
             members.append(Member(channel, number, stated, edge_sd))
     coordinates = collect_coordinates(members)
@@ -210,14 +216,14 @@ def _build_channel(
     choice: DriveModel,
     channel: Channel,
     number: str,
-    template: RC | WithSkin,
+    bare: Likelihood,
     taus: Float[np.ndarray, " time_constants"],
-    prior_names: tuple[str, ...],
 ) -> tuple[ChannelLikelihood, Source, float]:
     """Return the likelihood of a channel over its samples, its source, and the sd of log(gain) for unresolved edges.
 
-    `taus` are the time constants (s) of the `template`.
+    `bare` has no channels yet, and `taus` are the time constants (s) of its circuit.
     """
+    template = bare.template
     _require_whole_drive(record, choice)
     require_skin_response(template, record, choice)
     label = "_".join(filter(None, ("" if channel == "Vsc" else channel, number)))
@@ -241,7 +247,9 @@ def _build_channel(
     elif channel == "I" and choice.name != "measured" and not limits_current(template):
         used, slope = select_samples(record, choice)
         # the estimate knows no leak; without it, the start comes from Vsc or from draws of the prior
-        start = None if passes_direct_current(template) else estimate_from_current(record, choice, used, slope)
+        start = None if passes_direct_current(template) else estimate_from_current(
+            record, choice, used, slope, prior_skin_moments(bare)
+        )
     weight, clipped = _weight(record, channel, used)
     weight, at_jumps = exclude_jumps(template, record, choice, weight)
     if weight is None and len(record) <= MAX_PADDED_LENGTH:
@@ -251,7 +259,7 @@ def _build_channel(
     nuisances = _prior_of_nuisances(record, choice, scene, channel, len(taus) if choice.unknown_charge else 0)
     # edges of a shifted drive are known only to within a step, which affects g; samples of I there are excluded
     timing = ("delay",) if channel == "Vsc" and (choice.shift != 0.0 or _has_skew(record, scene)) else ()
-    has_stray = channel == "I" and (scene.stray_capacitance() > 0.0 or STRAY in prior_names)
+    has_stray = channel == "I" and (scene.stray_capacitance() > 0.0 or STRAY in bare.prior.names)
     likelihood = ChannelLikelihood(
         **nuisances,
         stray=np.asarray(scene.stray_capacitance()) if has_stray else None,
@@ -278,18 +286,18 @@ def _build_channel(
     if timing:
         likelihood = likelihood.exclude_unknown_drive()
     if channel == "I" and choice.name == "measured":
-        likelihood, start, noise = _make_charge_rows(likelihood, record, scene, choice, template)
+        likelihood, start, noise = _make_charge_rows(likelihood, record, scene, choice, bare)
     remarks = (*notes, *at_jumps), (*warnings, *clipped)
     return likelihood, Source(record, scene, choice, noise, optional, start, *remarks), edge_sd
 
 
 def _make_charge_rows(
-    channel: ChannelLikelihood, record: Record, scene: Scene, choice: DriveModel, template: RC | WithSkin
+    channel: ChannelLikelihood, record: Record, scene: Scene, choice: DriveModel, bare: Likelihood
 ) -> tuple[ChannelLikelihood, CurrentEstimate | None, float]:
     """Return the channel of a current with a recorded drive in rows of charge, an estimate of its circuit, and noise."""
     current, stray = RecordedCurrent.from_record(record), scene.stray_capacitance()
     fixed = [float(name[4:-2]) for name in _hum(record, choice, "I")]
-    estimate, nuisances = estimate_recorded(current, stray, fixed)
+    estimate, nuisances = estimate_recorded(current, stray, fixed, prior_skin_moments(bare))
     modelled = Current(estimate.capacitance + stray, abs(estimate.weight), 0.0)
     rows, V = current.make_rows(modelled, respond_to(current, estimate, stray), nuisances)
     # converters take channels in turn, and probes delay them
@@ -301,7 +309,7 @@ def _make_charge_rows(
         timing=("delay",),
         timing_sd=np.array([delay_sd, channel.timing_sd[1]]),
     )
-    usable = estimate.weight > 0.0 and not limits_current(template) and not passes_direct_current(template)
+    usable = not limits_current(bare.template) and not passes_direct_current(bare.template)
     return set_rows(channel, rows, V, 0.0), estimate if usable else None, current.noise_I
 
 

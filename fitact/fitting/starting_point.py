@@ -109,7 +109,7 @@ def start_from_estimates(
     if vsc is not None and 0.0 < vsc.direct < 0.5:
         ratio = vsc.direct / (1.0 - 2.0 * vsc.direct)
         vsc = vsc._replace(b=vsc.b * (1.0 + 2.0 * ratio))  # without the leak
-    skin, logs = known or _estimate_skin(vsc, current), mean
+    skin, logs = known or skin_from_estimates(vsc, current), mean
     if skin is not None:
         logs = np.log(skin)
     elif vsc is not None:
@@ -122,7 +122,9 @@ def start_from_estimates(
     return theta
 
 
-def _estimate_skin(vsc: VscEstimate | None, current: CurrentEstimate | None) -> tuple[float, float, float] | None:
+def skin_from_estimates(
+    vsc: VscEstimate | None, current: CurrentEstimate | None
+) -> tuple[float, float, float] | None:
     """Return Rsc, Csc and Ci of the circuit from the estimates of Vsc and I, or None if these do not determine them."""
     if current is None or not current.weight > 0.0:
         return None

