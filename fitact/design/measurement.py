@@ -13,7 +13,7 @@ from fitact import charts
 from fitact.data.record import Record
 from fitact.data.simulate import sample_times
 from fitact.errors import InputError
-from fitact.experiment.blind_directions import GAIN_CHANNELS, gain_names
+from fitact.experiment.blind_directions import GAIN_CHANNELS, STRAY, gain_names
 from fitact.experiment.experiment import CandidateDesign, DesignOption, Gradient, evaluate_design, optimise
 from fitact.experiment.fisher import Experiment, force_gradient, signal_spans
 from fitact.experiment.options import Change, changes
@@ -130,7 +130,8 @@ def design_measurement(scene: Scene, records: Record | Sequence[Record] = ()) ->
 
     The force is always the one of the scene's circuit and drive; the changes apply to the measurement only. Continuous
     settings are optimized. Uncertainties come from the Laplace approximation, with no unknown offset, drift, delay or
-    initial charge.
+    initial charge. The drive is exact unless the scene states the noise of V; with this noise, V is what a fit knows of
+    the drive.
 
     Args:
         scene: measurement as it stands.
@@ -180,13 +181,16 @@ def experiment_from_scene(scene: Scene) -> Experiment:
     tied = tuple((name, other, ratio) for name, (other, ratio) in scene.prior.ties().items())
     values |= {name: ratio * float(values.get(other) or nominal[other] or 0.0) for name, other, ratio in tied}
     noise = {"Vsc": measured.noise_Vsc, "I": measured.noise_I}
+    if measured.noise_V is not None:  # then the record of V is what a fit knows of the drive
+        noise["V"] = measured.noise_V
     silent = [channel for channel in measured.channels if noise[channel] == 0.0]
     if silent:
         raise InputError(f"scene: [measurement] noise_{silent[0]} is 0, so the data would be exact; state the noise")
     if not prior.names:
         raise InputError("scene: [prior] frees no parameter, so there is nothing to estimate; give a parameter a prior")
     circuit = count_harmonics(scene.make_circuit(values), scene.drive.lowest_frequency)
-    prior = prior.drop_marginals(*(name for name in prior.names if name not in circuit_parameters(circuit)))
+    counted = {*circuit_parameters(circuit), STRAY}
+    prior = prior.drop_marginals(*(name for name in prior.names if name not in counted))
     anonymous = {"gain": measured.gain_relative_sd, "gain_I": measured.gain_I_relative_sd}
     gain_sd = {name: math.hypot(anonymous[name], scene.gain_u(channel)) for name, channel in GAIN_CHANNELS.items()}
     gains = [name for name in gain_names(measured.channels) if gain_sd[name] > 0.0]
@@ -202,8 +206,17 @@ def experiment_from_scene(scene: Scene) -> Experiment:
         steady_state=scene.drive.steady_state,
         geometry=scene.geometry(),
         ties=tied,
+        stray_capacitance=scene.stray_capacitance(),
+        new_stray_sd=_stray_sd(scene),
         new_gain_sd={c: scene.gain_u(c) or typical_gain_u(c) for c in ("Vsc", "I") if scene.instrument.is_stated},
     )
+
+
+def _stray_sd(scene: Scene) -> float:
+    """Return the standard deviation of log(stray capacitance) in I, if its distribution is stated; else 0."""
+    measured = scene.measurement.model_copy(update={"channels": ("I",)})
+    prior = scene.model_copy(update={"measurement": measured}).make_prior()
+    return float(prior[STRAY].log_sd) if STRAY in prior.names else 0.0
 
 
 def _rank_options(

@@ -21,6 +21,7 @@ from fitact.model.circuit import Channel, Circuit, passes_direct_current
 from fitact.model.skin import circuit_parameters, constant_skin_circuit, with_values
 
 GAIN_CHANNELS: dict[str, Channel] = {"gain": "Vsc", "gain_I": "I"}  # channels by the names of their gains
+STRAY = "stray_capacitance"  # name of the parameter of panel and cable, whose current I includes
 _MIN_SINE = 1e-6  # sine of the angle between directions below which they count as equal
 
 
@@ -53,19 +54,21 @@ class StructuralIdentifiability(NamedTuple):
         return f"No record of {channels}{' alone' * (len(self.channels) == 1)} can determine {what}{here}."
 
 
-def blind_directions(circuit: Circuit, free: Sequence[str], channels: Sequence[Channel]) -> StructuralIdentifiability:
+def blind_directions(
+    circuit: Circuit, free: Sequence[str], channels: Sequence[Channel], stray_capacitance: float = 0.0
+) -> StructuralIdentifiability:
     """Find the directions in the logarithms of `free` that no record of `channels` determines.
 
-    `free` names fields of the circuit, "gain" (of the channel Vsc) and "gain_I"; all else is known. The circuit's
-    values may be special (two equal skins). A direction therefore counts only if it is unidentified there and at
-    `points` random values around them, each up to a factor of 10 away.
+    `free` names fields of the circuit, "gain" (of the channel Vsc), "gain_I" and "stray_capacitance", which has this
+    value (F); all else is known. The circuit's values may be special (two equal skins). A direction therefore counts
+    only if it is unidentified there and at `points` random values around them, each up to a factor of 10 away.
     """
     free, channels, points = tuple(free), tuple(channels), 8
     spread = np.array([0.1 if name == "alpha" else math.log(10.0) for name in free])  # alpha is at most 1
     offsets = spread * np.random.default_rng(0).uniform(-1.0, 1.0, (points, len(free)))  # any other points would serve
-    thetas = log_values(circuit, free, channels) + np.vstack([np.zeros(len(free)), offsets])
+    thetas = log_values(circuit, free, channels, stray_capacitance) + np.vstack([np.zeros(len(free)), offsets])
     with jax.enable_x64(True):
-        slopes = _log_gain_slopes(as_arrays(circuit), thetas, free, channels)
+        slopes = _log_gain_slopes(as_arrays(circuit), thetas, free, channels, np.asarray(stray_capacitance))
     null_spaces = [_null_space(np.concatenate([slope.real, slope.imag])) for slope in slopes]
     dimension = min(len(directions) for directions in null_spaces)
     generic = [directions for directions in null_spaces if len(directions) == dimension]
@@ -82,11 +85,11 @@ def gain_names(channels: Sequence[Channel]) -> dict[str, Channel]:
 
 
 def log_values(
-    circuit: Circuit, free: Sequence[str], channels: Sequence[Channel]
+    circuit: Circuit, free: Sequence[str], channels: Sequence[Channel], stray_capacitance: float = 0.0
 ) -> Float[np.ndarray, " circuit_parameters"]:
-    """Return the logarithms of the parameters `free`: of the circuit, and of the channels' gains, which are 1."""
-    gains = dict.fromkeys(gain_names(channels), 1.0)
-    known = gains | {name: float(value) for name, value in circuit_parameters(circuit).items() if value is not None}
+    """Return the logarithms of `free`: parameters of the circuit, the channels' gains, which are 1, and the stray."""
+    known = dict.fromkeys(gain_names(channels), 1.0) | ({STRAY: stray_capacitance} if "I" in channels else {})
+    known |= {name: float(value) for name, value in circuit_parameters(circuit).items() if value is not None}
     for name in free:
         if not known.get(name, 0.0) > 0.0:
             raise InputError(
@@ -97,13 +100,26 @@ def log_values(
 
 
 def with_parameters(
-    circuit: Circuit, free: Sequence[str], channels: Sequence[Channel], theta: Float[Array, " circuit_parameters"]
-) -> tuple[Circuit, list[ArrayLike]]:
-    """Return the circuit and the gain of each channel for logarithms `theta` of the parameters `free`."""
+    circuit: Circuit,
+    free: Sequence[str],
+    channels: Sequence[Channel],
+    theta: Float[Array, " circuit_parameters"],
+    stray_capacitance: ArrayLike = 0.0,
+) -> tuple[Circuit, list[ArrayLike], list[ArrayLike]]:
+    """Return the circuit, and of each channel the gain and the stray capacitance (F), for logarithms of `free`."""
     values = dict(zip(free, jnp.exp(theta), strict=True))
     named = gain_names(channels)
+    stray = values.pop(STRAY, stray_capacitance)
     gains = {named[name]: values.pop(name) for name in free if name in named}
-    return with_values(circuit, values), [gains.get(channel, 1.0) for channel in channels]
+    gain = [gains.get(channel, 1.0) for channel in channels]
+    return with_values(circuit, values), gain, [stray if channel == "I" else 0.0 for channel in channels]
+
+
+def recorded_gain(
+    circuit: Circuit, channel: Channel, gain: ArrayLike, stray_capacitance: ArrayLike, omega: ArrayLike
+) -> Complex[Array, "*shape"]:
+    """Return a recorded channel over V at angular frequencies (rad/s)."""
+    return gain * (circuit.channel_gain(channel, omega) + 1j * omega * jnp.asarray(stray_capacitance))
 
 
 def name_direction(direction: dict[str, float]) -> str:
@@ -124,7 +140,11 @@ def _area_power(name: str) -> float:
 
 @jit
 def _log_gain_slopes(
-    circuit: Circuit, thetas: Float[Array, "n parameters"], free: tuple[str, ...], channels: tuple[Channel, ...]
+    circuit: Circuit,
+    thetas: Float[Array, "n parameters"],
+    free: tuple[str, ...],
+    channels: tuple[Channel, ...],
+    stray_capacitance: ArrayLike,
 ) -> Complex[Array, "n rows parameters"]:
     """Return derivatives of the log gains, at frequencies up to `margin` times beyond the circuit's at both ends."""
     frequencies, margin = 128, 100.0
@@ -137,8 +157,8 @@ def _log_gain_slopes(
             omega = jnp.append(0.0, omega)
 
         def gain(theta: Array) -> tuple[Array, Array]:
-            there, gains = with_parameters(circuit, free, channels, theta)
-            parts = [g * there.channel_gain(channel, omega) for g, channel in zip(gains, channels, strict=True)]
+            there, gains, strays = with_parameters(circuit, free, channels, theta, stray_capacitance)
+            parts = [recorded_gain(there, *each, omega) for each in zip(channels, gains, strays, strict=True)]
             return jnp.concatenate(parts), jnp.concatenate(parts)
 
         slope, value = jax.jacfwd(gain, has_aux=True)(theta)

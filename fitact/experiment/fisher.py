@@ -2,6 +2,10 @@
 
 They come from the Fisher information of the channels and the prior, in the same Laplace approximation as a fit. No
 offset, drift, delay or initial charge is taken to be unknown.
+
+A recorded drive has noise, too. A fit that knows the drive from its record alone then has the residuals e = x - h V
+with the covariance diag(s^2) + s_V^2 h h^H at each frequency, where h are the channels' gains over V (errors in
+variables: Pintelon and Schoukens, System Identification: A Frequency Domain Approach, chapter 9).
 """
 
 import dataclasses
@@ -14,10 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from fitact.compiled import as_arrays, jit
-from fitact.experiment.blind_directions import log_values, with_parameters
+from fitact.experiment.blind_directions import log_values, recorded_gain, with_parameters
 from fitact.model.circuit import Channel, Circuit
 from fitact.model.drive import Drive, Periodic, Sampled
 from fitact.model.force import Geometry, force_constant
@@ -32,19 +36,21 @@ class Experiment:
     """A measurement, made or planned."""
 
     circuit: Circuit  # at the expected values
-    free: tuple[str, ...]  # unknown parameters: fields of the circuit, "gain" (of Vsc) and "gain_I"
+    free: tuple[str, ...]  # unknown parameters: fields of the circuit, "gain" (of Vsc), "gain_I", "stray_capacitance"
     prior_factor: Float[np.ndarray, "parameters parameters"]  # root of the prior covariance of the log-parameters
     drive: Drive
     time: Float[np.ndarray, " samples"]  # s, on the drive's time axis
     channels: tuple[Channel, ...]  # recorded in addition to V
-    noise: Mapping[str, float]  # standard deviation of each channel, V and A
+    noise: Mapping[str, float]  # sd of each channel, V and A; that of "V" is absent or 0 where the drive is stated
     steady_state: bool = True  # False means from rest
     records: float = 1.0  # number of such records
     geometry: Geometry = Geometry()  # noqa: RUF009  (a frozen Module; areas are factors only)
     own_parameters: tuple[str, ...] = ()  # parameters in `free` that no other experiment shares
     ties: Ties = ()  # between fields of the circuit
+    stray_capacitance: float = 0.0  # F, of panel and cable, whose current I includes
     # relative sd of the gain that a channel would have if it was also recorded; a channel without one is exact
     new_gain_sd: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    new_stray_sd: float = 0.0  # sd of log(stray_capacitance) that I would add if it was also recorded
 
 
 def force_gradient(experiment: Experiment) -> Float[np.ndarray, " circuit_parameters"]:
@@ -59,15 +65,95 @@ def force_gradient(experiment: Experiment) -> Float[np.ndarray, " circuit_parame
 
 def jacobian(experiment: Experiment) -> Float[np.ndarray, "rows parameters"]:
     """Return the Jacobian of the signals in units of their noise, in the logarithms of the free parameters."""
+    has_noise = experiment.noise.get("V", 0.0) > 0.0
+    experiment = _represent_by_uniform_samples(experiment) if has_noise else experiment
     with jax.enable_x64(True):
         sampling, model = _sampling(experiment), _Model.from_experiment(experiment)
         signals = _derivatives(model, sampling, slice(-1))
+        if has_noise:
+            return _whiten(experiment, model, sampling, [slope for _, slope in signals])
     blocks = []
     for channel, (_, slope) in zip(experiment.channels, signals, strict=True):
-        follows_slope = channel == "I" and not limits_current(experiment.circuit)
-        weight = sampling.off_edge_weight if follows_slope else sampling.sample_weight
+        weight = sampling.off_edge_weight if _follows_slope(experiment, channel) else sampling.sample_weight
         blocks.append(slope * (weight / experiment.noise[channel])[:, None])
     return np.concatenate(blocks)
+
+
+def _follows_slope(e: Experiment, channel: Channel) -> bool:
+    """Return whether a channel follows dV/dt, so that its samples at edges are not used."""
+    return channel == "I" and (not limits_current(e.circuit) or e.stray_capacitance > 0.0)
+
+
+def _represent_by_uniform_samples(e: Experiment, max_samples: int = 4096) -> Experiment:
+    """Return at most `max_samples` samples, evenly over a period or a record, of a drive without its noise.
+
+    They are repeated until the information is that of all samples.
+    """
+    time, drive = np.asarray(e.time, dtype=float), e.drive
+    step, period = float(np.median(np.diff(time))), getattr(drive, "period", None)
+    if isinstance(drive, Sampled):
+        time = time[: time.size if period is not None else 2 * max_samples]  # whose beginning represents a long record
+        drive = _remove_noise(drive, time.size, e.noise["V"])
+    if e.steady_state and period is not None:
+        length, count = float(period), max(round(float(period) / step), 8)
+    else:
+        length, count = float(time[-1] - time[0]) + step, time.size
+    count = min(count, max_samples)
+    grid = time[0] + length / count * np.arange(count)
+    return dataclasses.replace(e, drive=drive, time=grid, records=e.records * np.size(e.time) / count)
+
+
+def _remove_noise(drive: Sampled, count: int, noise: float, min_ratio: float = 10.0) -> Sampled:
+    """Return a measured drive with those of its lines whose power is more than `min_ratio` times that of the noise.
+
+    The noise would pass for a known drive otherwise. The first `count` samples are used, or those of its period.
+    """
+    time, samples = np.asarray(drive.time)[:count], np.asarray(drive.samples)[:count]
+    if drive.period is not None:  # samples that fill an array up follow
+        count = int(np.searchsorted(time, time[0] + float(drive.period) - 0.5 * (time[1] - time[0])))
+        time, samples = time[:count], samples[:count]
+    trend = np.zeros_like(samples) if drive.period is not None else np.linspace(samples[0], samples[-1], count)
+    lines = np.fft.rfft(samples - trend)
+    lines[np.abs(lines) ** 2 < min_ratio * count * noise**2] = 0.0
+    clean = np.fft.irfft(lines, count) + trend
+    return dataclasses.replace(drive, time=time, samples=clean)
+
+
+def _whiten(
+    e: Experiment, model: "_Model", sampling: "_Sampling", slopes: list[np.ndarray]
+) -> Float[np.ndarray, "rows parameters"]:
+    """Return the derivatives of uniform samples in units of the noise of channels and V, by frequency.
+
+    Samples that are not used have an error of their own each, whose direction is removed.
+    """
+    count, step = e.time.size, float(e.time[1] - e.time[0])
+    omega = 2.0 * np.pi * np.fft.rfftfreq(count, step)
+    padded = np.pad(omega, (0, len(sampling.time) - omega.size), mode="edge")  # one length, so one program
+    scale = 1.0 / np.array([e.noise[channel] for channel in e.channels])
+    gain = scale * np.asarray(_channel_gains(model, padded))[: omega.size]
+    covariance = np.eye(scale.size) + e.noise["V"] ** 2 * gain[:, :, None] * gain[:, None, :].conj()
+    root = np.linalg.cholesky(covariance)
+    multiplicity = np.where((omega == 0.0) | (2 * np.arange(omega.size) == count), 1.0, 2.0)  # of lines in a spectrum
+
+    def whiten(signals: Float[np.ndarray, "samples channels n"]) -> Float[np.ndarray, "rows n"]:
+        lines = np.fft.rfft(signals * scale[:, None], axis=0) * np.sqrt(multiplicity / count)[:, None, None]
+        white = np.linalg.solve(root, lines).reshape(-1, signals.shape[2])
+        return np.concatenate([white.real, white.imag])
+
+    rows = whiten(np.stack([slope[:count] for slope in slopes], axis=1))
+    unused = [
+        (sample, number)
+        for number, channel in enumerate(e.channels)
+        for sample in np.flatnonzero(sampling.off_edge_weight[:count] == 0.0)
+        if _follows_slope(e, channel)
+    ]
+    if unused:
+        impulses = np.zeros((count, scale.size, len(unused)))
+        for column, (sample, number) in enumerate(unused):
+            impulses[sample, number, column] = 1.0 / scale[number]
+        basis = np.linalg.qr(whiten(impulses))[0]
+        rows -= basis @ (basis.T @ rows)
+    return sampling.sample_weight[0] * rows
 
 
 def signal_spans(experiment: Experiment) -> dict[Channel, float]:
@@ -98,22 +184,24 @@ class _Model(eqx.Module):
 
     circuit: Circuit
     theta: Float[Array, " parameters"]  # present values
+    stray: Float[Array, ""]  # stray capacitance where it is not free, F
     names: tuple[str, ...] = eqx.field(static=True)  # parameters
     channels: tuple[Channel, ...] = eqx.field(static=True)  # recorded channels, then the voltage that causes the force
     ties: Ties = eqx.field(static=True)
 
     @classmethod
     def from_experiment(cls, e: Experiment) -> "_Model":
-        theta = log_values(e.circuit, e.free, e.channels)
+        theta = log_values(e.circuit, e.free, e.channels, e.stray_capacitance)
         circuit = as_arrays(e.circuit)  # plain numbers would become constants of the compiled program
         channels: tuple[Channel, ...] = (*e.channels, "Vsc" if e.geometry.model == "paper" else "Vgap")
-        return cls(circuit, theta, e.free, channels, e.ties)
+        return cls(circuit, theta, np.asarray(e.stray_capacitance, dtype=float), e.free, channels, e.ties)
 
-    def circuit_and_gains(self, theta: Array) -> tuple[Circuit, list[ArrayLike]]:
-        """Return the circuit and the gain of each channel at `theta`."""
-        circuit, gains = with_parameters(self.circuit, self.names, self.channels[:-1], theta)
+    def circuit_and_gains(self, theta: Array) -> tuple[Circuit, list[ArrayLike], list[ArrayLike]]:
+        """Return the circuit, and the gain and the stray capacitance of each channel, at `theta`."""
+        circuit, gains, strays = with_parameters(self.circuit, self.names, self.channels[:-1], theta, self.stray)
         known = circuit_parameters(circuit)
-        return with_values(circuit, {name: ratio * known[other] for name, other, ratio in self.ties}), [*gains, 1.0]
+        circuit = with_values(circuit, {name: ratio * known[other] for name, other, ratio in self.ties})
+        return circuit, [*gains, 1.0], [*strays, 0.0]
 
 
 def _derivatives(model: _Model, sampling: "_Sampling", selection: slice) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -139,15 +227,24 @@ def _term_derivatives(model: _Model) -> tuple[list[_LogTauTerms], list[_LogTauTe
     """Return the terms of each channel, and their derivatives in the parameters."""
 
     def terms(theta: Array) -> list[_LogTauTerms]:
-        circuit, gains = model.circuit_and_gains(theta)
+        circuit, gains, strays = model.circuit_and_gains(theta)
         of_channels = []
-        for gain, channel in zip(gains, model.channels, strict=True):
+        for gain, stray, channel in zip(gains, strays, model.channels, strict=True):
             weight, tau, *others = circuit.channel_terms(channel)
             rate, direct = (gain * jnp.asarray(0.0 if each is None else each) for each in others)
+            rate = rate + gain * stray
             of_channels.append(_LogTauTerms(gain * jnp.stack(weight), jnp.log(jnp.stack(tau)), rate, direct))
         return of_channels
 
     return terms(model.theta), jax.jacfwd(terms)(model.theta)
+
+
+@jit
+def _channel_gains(model: _Model, omega: Float[Array, " lines"]) -> Complex[Array, "lines channels"]:
+    """Return the recorded channels over V at angular frequencies (rad/s)."""
+    circuit, gains, strays = model.circuit_and_gains(model.theta)
+    channels = list(zip(model.channels, gains, strays, strict=True))[:-1]
+    return jnp.stack([recorded_gain(circuit, *each, omega) for each in channels], axis=1)
 
 
 @jit
@@ -177,13 +274,14 @@ def _sampling(e: Experiment, max_samples: int = 4096, period_times: int = 1024, 
     """Choose at most `max_samples` samples that represent a record, and `period_times` times for the mean force.
 
     A step of V above `edge_ratio` times the mean step is an edge; the largest step of a sine is 1.6 times the mean.
+    If V is recorded with a known noise, edges of four steps or more are resolved, and their samples are used.
     """
     padded, time = _pad_drive(e.drive, np.asarray(e.time, dtype=float))
     drive: Any = as_arrays(padded)
     k, used = np.arange(max_samples), min(time.size, max_samples)
     # the golden ratio spreads the chosen samples evenly and out of step with any period
     spread = (time.size * (0.5 * (math.sqrt(5.0) - 1.0) * k % 1.0)).astype(int)
-    chosen = np.minimum(k, used - 1) if used < max_samples else spread
+    chosen = np.minimum(k, used - 1) if time.size <= max_samples else spread
     represented = np.where(k < used, math.sqrt(e.records * np.size(e.time) / used), 0.0)
     periodic = e.steady_state and isinstance(drive, Periodic)
     phases = (np.arange(period_times) + 0.5) / period_times
@@ -192,14 +290,16 @@ def _sampling(e: Experiment, max_samples: int = 4096, period_times: int = 1024, 
     # two samples on either side of an edge carry no information on a current that follows dV/dt; the quarter step keeps
     # rounding from deciding where edges coincide with samples
     around = time[chosen][:, None] + (np.arange(-2, 3) + 0.25) * float(np.median(np.diff(time)))
-    if isinstance(drive, Sampled):
+    has_noise = e.noise.get("V", 0.0) > 0.0
+    if isinstance(drive, Sampled) and not has_noise:
         # by NumPy, which is faster; the slope is mostly noise, so a signal that follows it counts as uninformative
         near, voltage = (np.interp(each, drive.time, drive.samples, period=drive.period) for each in (around, times))
         slope = np.zeros_like(times)
     else:
         near, slope, voltage = _evaluate_drive(drive, around, times, e.steady_state)
     step = np.abs(np.diff(near, axis=1))
-    off_edge = step.max(axis=1) <= edge_ratio * step[:used].mean()
+    largest = 0.25 * np.ptp(near[:used]) if has_noise else edge_ratio * step[:used].mean()
+    off_edge = step.max(axis=1) <= largest
     outside = np.zeros(period_times)
     return _Sampling(
         drive,
@@ -246,11 +346,12 @@ def _predicted_signals(
     model: _Model, drive: Drive, time: Array, drive_slope: Array, steady_state: bool
 ) -> tuple[list[Array], list[Array]]:
     def signals(theta: Array) -> tuple[list[Array], list[Array]]:
-        circuit, gains = model.circuit_and_gains(theta)
+        circuit, gains, strays = model.circuit_and_gains(theta)
         of_channels = []
-        for gain, channel in zip(gains, model.channels, strict=True):
+        for gain, stray, channel in zip(gains, strays, model.channels, strict=True):
             value, rate = response_and_rate(circuit, drive, time, steady_state=steady_state, channel=channel)
-            of_channels.append(gain * (value if rate is None else value + rate * drive_slope))
+            rate = (0.0 if rate is None else rate) + stray
+            of_channels.append(gain * (value + rate * drive_slope))
         return of_channels, of_channels
 
     slopes, values = jax.jacfwd(signals, has_aux=True)(model.theta)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from fitact.experiment.blind_directions import gain_names
+from fitact.experiment.blind_directions import STRAY, gain_names
 from fitact.experiment.experiment import FREQUENCY, CandidateDesign, DesignOption, Gradient, Setting, evaluate_design
 from fitact.experiment.fisher import Experiment
 from fitact.model.circuit import RC, Channel, FinalCircuit, Probe
@@ -52,6 +52,7 @@ def changes(adc_steps: Mapping[Channel, float] | None = None) -> tuple[Change, .
         Change("better Ci", "Ci", 3.0, _better_Ci),
         Change("current", "current", 3.0, lambda d: _add_channel(d, "I", "the loop current I", 20e-9)),
         Change("skin voltage", "skin voltage", 3.0, lambda d: _add_channel(d, "Vsc", "the skin voltage Vsc", 0.1)),
+        Change("quieter V", "noise of V", 4.0, _quieter_drive),
         Change("finer converter", "converter", 4.0, lambda d: _higher_adc_resolution(d, adc_steps or {})),
         Change("second panel", "panel", 5.0, _second_panel),
     )
@@ -176,15 +177,23 @@ def _add_channel(design: CandidateDesign, channel: Channel, what: str, default_n
 
     def record_channel(e: Experiment) -> Experiment:
         recorded = dataclasses.replace(e, channels=(*e.channels, channel), noise={**e.noise, channel: noise})
-        gain_sd = e.new_gain_sd.get(channel, 0.0)
-        if not gain_sd:
-            return recorded
-        (name,) = (name for name, gained in gain_names((channel,)).items() if gained == channel)
-        prior_factor = scipy.linalg.block_diag(e.prior_factor, gain_sd)
-        return dataclasses.replace(recorded, free=(*e.free, name), prior_factor=prior_factor)
+        new = {name: e.new_gain_sd.get(channel, 0.0) for name in gain_names((channel,))}
+        new |= {STRAY: e.new_stray_sd} if channel == "I" else {}
+        new = {name: sd for name, sd in new.items() if sd}
+        prior_factor = scipy.linalg.block_diag(e.prior_factor, *new.values())
+        return dataclasses.replace(recorded, free=(*e.free, *new), prior_factor=prior_factor)
 
     shown = format_engineering(noise, _UNITS[channel])
     return _apply_to_all(design, f"{what} also recorded ({shown} rms noise)", record_channel)
+
+
+def _quieter_drive(design: CandidateDesign) -> CandidateDesign | None:
+    """Record the drive with half its noise, or return None if the drive is stated."""
+    noise = 0.5 * design.experiments[0].noise.get("V", 0.0)
+    if noise == 0.0:
+        return None
+    text = f"V recorded with half the noise ({format_engineering(noise, 'V')} rms)"
+    return _apply_to_all(design, text, lambda e: dataclasses.replace(e, noise={**e.noise, "V": 0.5 * e.noise["V"]}))
 
 
 def _higher_adc_resolution(design: CandidateDesign, adc_steps: Mapping[Channel, float]) -> CandidateDesign | None:

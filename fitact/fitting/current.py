@@ -72,7 +72,11 @@ class RecordedCurrent:
         noise = max(estimate_noise(current), rounding)
         # a run of equal values shares one error, so that its mean has the variance of one
         uncertain = _kink_variance(current, noise) + np.where(runs > _FEW, rounding**2 * runs, 0.0)
-        return cls(V, current, record.time_step, drive_variance(V), noise, uncertain, clipping_mask(current))
+        # the flat top of a pulse that is coarsely rounded looks clipped, but lies within the range of the converter
+        codes = np.log2(np.maximum(np.abs([current.min(), current.max()]) / (math.sqrt(12.0) * rounding or 1.0), 1.0))
+        is_coarse = rounding > white_noise_sd(current) and np.max(np.abs(codes - np.round(codes))) > 0.02
+        excluded = np.zeros(V.size, bool) if is_coarse else clipping_mask(current)
+        return cls(V, current, record.time_step, drive_variance(V), noise, uncertain, excluded)
 
     def covariance(self, modelled: Current) -> RowCovariance:
         """Return the covariance of the rows."""
@@ -259,7 +263,7 @@ def _first_order(V: Rows, step: float, tau: float) -> Rows:
 
 
 def estimate_recorded(
-    current: RecordedCurrent, stray: float, hum: Sequence[float], belief: Belief, most: int = 8192
+    current: RecordedCurrent, stray: float, hum: Sequence[float], belief: Belief, most: int = 4096
 ) -> tuple[CurrentEstimate, Rows]:
     """Estimate the coefficients of I for a recorded V by a scan of b, and return the rows of nuisances.
 
@@ -290,32 +294,40 @@ def _scan_recorded(
         return rows[..., first : first + several * count].reshape(*rows.shape[:-1], count, several).mean(axis=-1)
 
     covariance = current.covariance(Current(C, 0.0, 0.0))
-    own = np.where(covariance.used, np.roll(current.uncertain, LAG), np.inf)
-    extra = np.minimum(thin(np.where(np.isfinite(own), own, 0.0)) / several, np.inf)
-    extra = np.where(thin(np.isinf(own) * 1.0) > 0.0, np.inf, extra)
-    driven = (C / step) ** 2 * float(np.mean(current.variance_V))
-    lost = np.isinf(extra)
-    variance = current.noise_I**2 / several + 2.0 * driven + np.where(lost, 0.0, extra) + 1e-24 * np.ptp(current.I) ** 2
-    gain, decay = RowCovariance(variance, np.full(count, -driven), lost).recursion(1.0)
+    lost = thin(~covariance.used * 1.0) > 0.0
+    own = current.noise_I**2 / several + thin(np.roll(current.uncertain, LAG)) / several
+    own += 1e-24 * float(np.ptp(current.I)) ** 2
+    noise_V = float(np.mean(current.variance_V))
+
+    def recursion(capacitance: float) -> tuple[Rows, Rows]:
+        driven = (capacitance / step) ** 2 * noise_V
+        return RowCovariance(own + 2.0 * driven, np.full(count, -driven), lost).recursion(1.0)
+
     V = current.V[first - LAG :: several][: count + 1]
     V = np.pad(V, (0, count + 1 - V.size), mode="edge")
     time = step * np.arange(count)
     waves = [wave(2.0 * np.pi * f * time) for f in hum for wave in (np.cos, np.sin)]
-    observed = whiten_rows(gain, decay, thin(step_means(current.I) - stray * rise))
-    fixed = whiten_rows(gain, decay, np.stack([np.diff(V) / step, np.ones(count), *waves]))
+    observed = thin(step_means(current.I) - stray * rise)
+    fixed = np.stack([np.diff(V) / step, np.ones(count), *waves])
 
-    def columns(tau: float) -> np.ndarray:
+    def fit(tau: float) -> tuple[float, np.ndarray]:
         u = _first_order(V, step, tau)
         mean = tau * (np.diff(V) - np.diff(u)) / step  # over a step, exactly
-        return np.concatenate([whiten_rows(gain, decay, np.stack([mean, np.exp(-time / tau)])), fixed])
+        rows = np.concatenate([[mean, np.exp(-time / tau)], fixed, observed[None]])
+        capacitance = C
+        for _ in range(2):  # a low-pass is no better for passing less noise of V
+            *columns, data = whiten_rows(*recursion(capacitance), rows)
+            square, amplitudes = _solve(np.stack(columns), data)
+            capacitance = abs(amplitudes[2] + stray)
+        return square, amplitudes
 
     def fit_at_tau(tau: float) -> tuple[float, float, float]:
-        residual, amplitudes = _solve(columns(tau), observed)
-        return residual, float(amplitudes[0]), float(amplitudes[2])
+        square, amplitudes = fit(tau)
+        return square, float(amplitudes[0]), float(amplitudes[2])
 
     taus = np.geomspace(max(2.0 * step, 1e-4), max(10.0 * step * count, 4e-4), 48)
     estimate = _scan(fit_at_tau, taus, 1.0, belief)
-    amplitudes = _solve(columns(estimate.b), observed)[1]
+    amplitudes = fit(estimate.b)[1]
     time = current.step * (np.arange(current.I.size) - first)
     waves = [wave(2.0 * np.pi * f * time) for f in hum for wave in (np.cos, np.sin)]
     decays = np.exp(-np.maximum(time, -step) / estimate.b)

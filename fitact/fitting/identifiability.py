@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from fitact.experiment.blind_directions import blind_directions, gain_names, name_direction
+from fitact.experiment.blind_directions import STRAY, blind_directions, gain_names, name_direction
 from fitact.experiment.experiment import DesignOption
 from fitact.experiment.fisher import Experiment
 from fitact.experiment.options import suggest_measurements
@@ -71,7 +71,8 @@ class Identifiability:
                 return NextMeasurement(True, f"{force}; measure the impedance, or record the current I beside Vsc.")
             return NextMeasurement(remedy=f"{force}; measure from below the corner frequency of the skin to above it.")
         with jax.enable_x64(True):
-            structure = blind_directions(experiment.circuit, experiment.free, experiment.channels)
+            stray = experiment.stray_capacitance
+            structure = blind_directions(experiment.circuit, experiment.free, experiment.channels, stray)
             options = suggest_measurements(experiment, self.force_gradient)
         figures = [f"{show(option.force_sd, after)} with {option.text}" for option in options]
         remedy = f"{force}. Expected after one change: {', '.join(figures)}."
@@ -144,10 +145,11 @@ def assess_identifiability(
 ) -> Identifiability:
     """Assess the identifiability of a fit, from factors of its covariance and of the prior covariance.
 
-    `names` are the coordinates of theta. The free parameters of `experiment` are assessed, except gains, which are
-    nuisances with priors of their own. `force_gradient`: gradient of the log mean force in theta.
+    `names` are the coordinates of theta. The free parameters of `experiment` are assessed, except gains and a stray
+    capacitance, which are nuisances with priors of their own. `force_gradient`: gradient of the log mean force in
+    theta.
     """
-    free = [name for name in experiment.free if name not in gain_names(experiment.channels)]
+    free = [name for name in experiment.free if name not in (*gain_names(experiment.channels), STRAY)]
     judgement = assess_parameters(names, covariance_factor, prior_factor, force_gradient, free, experiment.channels)
     rows = [list(names).index(name) for name in experiment.free]
     return dataclasses.replace(judgement, experiment=experiment, force_gradient=force_gradient[rows])

@@ -277,6 +277,25 @@ def test_what_cannot_be_asked():
         fitact.design_measurement(fitact.Scene.from_dict({"measurement": {"noise_Vsc": 0.0}}))
 
 
+def test_stated_noise_of_V_and_an_uncertain_stray_capacitance_are_counted():
+    content = {"drive": {"waveform": "trapezoid", "rise_time": "400 us"}}
+    current = {"channels": ["I"], "stray_capacitance": {"median": "100 pF", "relative_sd": 0.1}}
+    experiment = experiment_from_scene(fitact.Scene.from_dict(content | {"measurement": current | {"noise_V": 0.5}}))
+    assert experiment.noise["V"] == 0.5
+    assert experiment.free == (*VALUES, "stray_capacitance")
+    assert np.linalg.norm(experiment.prior_factor[3]) == pytest.approx(math.sqrt(math.log1p(0.01)))
+    assert "V" not in experiment_from_scene(fitact.Scene.from_dict(content | {"measurement": current})).noise
+    gradient = force_gradient(experiment)
+    assert gradient[3] == 0.0
+    # I that is added brings the unknown with it
+    skin = experiment_from_scene(fitact.Scene.from_dict(content | {"measurement": current | {"channels": ["Vsc"]}}))
+    assert skin.free == tuple(VALUES)
+    (added,) = trial_of(skin, "current").experiments
+    assert added.free == experiment.free
+    sd = evaluate_design(trial_of(skin, "current"), (), gradient[:3]).sd["stray_capacitance"]
+    assert sd < 0.1
+
+
 def test_command_line(design: fitact.MeasurementDesign, tmp_path: Path, monkeypatch, capsys):
     (tmp_path / "scene.toml").write_text(str(SCENE))
     monkeypatch.setattr("fitact.design.measurement.design_measurement", lambda scene, records: design)
