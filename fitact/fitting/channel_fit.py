@@ -89,8 +89,12 @@ class ChannelFit:
             noise = sigma if channel.noise == "ar1" else source.noise
             if channel.charges is not None:
                 white = flatten_rows(white, channel, inputs, source.in_time)
+            # a delayed response lies between the samples of V
+            b = 0.0 if "delay" in channel.timing and channel.charges is None else float(optimum.b)
             whole = white, source.record.time[counted], noise, n_fitted, _gain(optimum, channel)
-            figures = channel_statistics(*whole, source.record, channel.channel, source.choice)
+            figures = channel_statistics(*whole, source.record, channel.channel, source.choice, b)
+            if channel.charges is not None:  # signs of rounded noise are not independent; the covariance knows rounding
+                figures |= {"runs_z": 0.0, "rounding_noise": 0.0}
             figures |= _weighted_statistics(channel, residuals, weight, counted, source.record.time, source.noise)
         return cls(
             label=channel.label,

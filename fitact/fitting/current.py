@@ -78,6 +78,11 @@ class RecordedCurrent:
         excluded = np.zeros(V.size, bool) if is_coarse else clipping_mask(current)
         return cls(V, current, record.time_step, drive_variance(V), noise, uncertain, excluded)
 
+    @property
+    def is_coarse(self) -> bool:
+        """Whether I has long runs of equal values, whose rounding is no noise."""
+        return float(np.mean(run_lengths(self.I) > _FEW)) > 0.1
+
     def covariance(self, modelled: Current) -> RowCovariance:
         """Return the covariance of the rows."""
         driven = np.roll((modelled.capacitance / self.step) ** 2 * self.variance_V, LAG)
@@ -246,11 +251,18 @@ def _scan(
     return estimates[best]
 
 
-def _solve(columns: np.ndarray, observed: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the residual sum of squares and the coefficients of a linear fit."""
+def _solve(columns: np.ndarray, observed: np.ndarray, noisy: tuple[int, float] = (0, 0.0)) -> tuple[float, np.ndarray]:
+    """Return the residual sum of squares and the coefficients of a linear fit.
+
+    `noisy` is the index of a column, and the sum of squares of its noise, which is taken off, but for a tenth.
+    """
+    place, square = noisy
     sizes = np.linalg.norm(columns, axis=1)
     sizes = np.where(sizes > 0.0, sizes, 1.0)
-    amplitudes = np.linalg.lstsq((columns / sizes[:, None]).T, observed, rcond=1e-12)[0] / sizes
+    scaled = columns / sizes[:, None]
+    gram = scaled @ scaled.T
+    gram[place, place] -= min(square / sizes[place] ** 2, 0.9)
+    amplitudes = np.linalg.lstsq(gram, scaled @ observed, rcond=1e-13)[0] / sizes
     residuals = observed - amplitudes @ columns
     return float(residuals @ residuals), amplitudes
 
@@ -316,8 +328,12 @@ def _scan_recorded(
         rows = np.concatenate([[mean, np.exp(-time / tau)], fixed, observed[None]])
         capacitance = C
         for _ in range(2):  # a low-pass is no better for passing less noise of V
-            *columns, data = whiten_rows(*recursion(capacitance), rows)
-            square, amplitudes = _solve(np.stack(columns), data)
+            gain, decay = recursion(capacitance)
+            *columns, data = whiten_rows(gain, decay, rows)
+            # the noise of V in dV/dt, which would lower the coefficient of a weak drive
+            part = 1.0 - own / (own + 2.0 * (capacitance / step) ** 2 * noise_V)
+            taken = float(np.sum(part[~lost])) / max(capacitance, 1e-15) ** 2
+            square, amplitudes = _solve(np.stack(columns), data, (2, taken))
             capacitance = abs(amplitudes[2] + stray)
         return square, amplitudes
 

@@ -490,8 +490,9 @@ def _assemble_fit(
     poor = [trace for trace in traces if is_misfit(trace.figures)]
     if result == "misfit" and any(trace.channel != "Ft" for trace in poor):
         effects = assess_fit(laplace, traces, has_structure=True)
-        # what a poor fit of the friction may move is not assessed
-        may_move = any(is_undersampled(t.figures) or t.channel == "Ft" for t in poor)
+        # what a poor fit of the friction, or of a current with a recorded drive, may move is not assessed
+        assessed = {each.label for each in likelihood.channels if each.charges is None and each.channel != "Ft"}
+        may_move = any(is_undersampled(trace.figures) or trace.label not in assessed for trace in poor)
         if effects is not None and not may_move and is_tolerable(effects, laplace, first.scene.tolerance.force):
             result = "structure"
     whole = Fit(

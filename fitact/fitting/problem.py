@@ -308,6 +308,8 @@ def _make_charge_rows(
         steady_state=False,
         timing=("delay",),
         timing_sd=np.array([delay_sd, channel.timing_sd[1]]),
+        # residuals of runs of equal values are no measure of the noise
+        noise_floor=np.asarray(current.noise_I * (1.0 if current.is_coarse else 0.5)),
     )
     usable = not limits_current(bare.template) and not passes_direct_current(bare.template)
     return set_rows(channel, rows, V, 0.0), estimate if usable else None, current.noise_I

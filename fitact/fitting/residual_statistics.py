@@ -25,11 +25,13 @@ def channel_statistics(
     record: Record,
     channel: str,
     choice: DriveModel,
+    b: float,
 ) -> dict[str, float]:
     """Return figures of merit of the weighted residuals of a channel (in its unit) after fitting `n_fitted` parameters.
 
     `noise` is the model-free noise estimate of the channel. The noise of a measured drive adds to it, multiplied by
-    `gain` (unit of the channel per V).
+    `gain` (unit of the channel per V). `b` is the slowest time constant (s). At the samples of V, the response follows V
+    but for a low-pass of it, whose interpolation is all that may be wrong, unless `b` is 0.
     """
     measured, V = choice.name == "measured", choice.voltage
     expected = math.hypot(noise, gain * record.noise("V") if measured else 0.0)
@@ -39,9 +41,11 @@ def channel_statistics(
     # single precision suffices for the tests
     structure = ResidualTestStatistics.from_residuals((residuals / unit).astype(np.float32), bins)
     figures = residual_statistics(square, count, structure, np.asarray(expected), count - n_fitted, bins)
+    interpolated = float(interpolation_errors(V, white_noise_sds(V)))
+    delayed = float(np.median(np.abs(np.diff(V)))) * record.time_step / (8.0 * b) if b else math.inf
     return {name: float(value) for name, value in figures.items()} | {
         "rounding_noise": rounding_noise_sd(record[channel]),
-        "interpolation_error": gain * float(interpolation_errors(V, white_noise_sds(V))) if measured else 0.0,
+        "interpolation_error": gain * min(interpolated, delayed) if measured else 0.0,
         "samples": count,
     }
 
