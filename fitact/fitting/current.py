@@ -364,17 +364,23 @@ def _scan_recorded(
 
 
 def hum_likeness(current: RecordedCurrent, frequency: float, most: int = 4096) -> float:
-    """Return the fraction of a hum's power that the response of a circuit may explain; 1 below a period."""
+    """Return the fraction of a hum's power that a change of the circuit may explain; 1 below a period.
+
+    It is the largest of circuits with a time constant of a fingertip.
+    """
     several = math.ceil(current.I.size / most)
     step, V = current.step * several, current.V[: current.I.size // several * several].reshape(-1, several).mean(axis=1)
     if frequency * step * V.size < 1.0 or frequency * step > 0.5:
         return 1.0
-    taus = np.geomspace(2.0 * step, step * V.size, 8)
-    rows = np.stack([np.ones_like(V), np.gradient(V), *(_first_order(V, step, tau) for tau in taus)])
-    basis, sizes, _ = np.linalg.svd((rows / np.linalg.norm(rows, axis=1, keepdims=True)).T, full_matrices=False)
-    turns = 2.0 * math.pi * frequency * step * np.arange(V.size)
-    parts = basis[:, sizes > 1e-6 * sizes[0]].T @ np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    return float(np.sum(parts**2) / V.size)
+    turns, largest = 2.0 * math.pi * frequency * step * np.arange(V.size), 0.0
+    for b in (1e-3, 4e-3, 16e-3):
+        u, later = (_first_order(V, step, tau) for tau in (b, 1.01 * b))
+        decay = np.exp(-step * np.arange(V.size) / b)
+        rows = np.stack([np.ones_like(V), decay, np.gradient(V), u, later - u])
+        basis, _ = np.linalg.qr(rows.T / np.linalg.norm(rows, axis=1))
+        parts = basis.T @ np.stack([np.cos(turns), np.sin(turns)], axis=1)
+        largest = max(largest, float(np.sum(parts**2) / V.size))
+    return largest
 
 
 def respond_to(current: RecordedCurrent, estimate: CurrentEstimate, stray: float) -> Callable[[Rows], Rows]:

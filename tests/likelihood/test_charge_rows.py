@@ -1,0 +1,56 @@
+"""Rows of charge against exact integrals, dense covariances, and simulated noise of V and I."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fitact.likelihood.charge_rows import LAG, ChargeRows, RowCovariance, step_means, whiten_rows
+
+STEP = 1e-5
+
+
+def tone(time: np.ndarray) -> np.ndarray:
+    return np.sin(2.0 * np.pi * 3e3 * time + 0.3) + 0.2 * np.cos(2.0 * np.pi * 7e3 * time)
+
+
+def integral(time: np.ndarray) -> np.ndarray:
+    return -np.cos(2.0 * np.pi * 3e3 * time + 0.3) / (2.0 * np.pi * 3e3) + 0.2 * np.sin(2.0 * np.pi * 7e3 * time) / (
+        2.0 * np.pi * 7e3
+    )
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.37, -1.6, 2.4])
+def test_means_are_those_of_the_integral(delay: float):
+    samples = np.arange(60, 90)
+    begin, end = (samples + delay) * STEP, (samples + 1 + delay) * STEP
+    exact = (integral(end) - integral(begin)) / STEP
+    means = step_means(tone(STEP * np.arange(150)), delay)[samples + LAG]
+    np.testing.assert_allclose(means, exact, atol=2e-5)
+
+
+def test_compiled_means_are_the_same():
+    values = tone(STEP * np.arange(100))
+    rows = ChargeRows(*np.zeros((5, 100)))
+    with jax.enable_x64(True):
+        means = rows.means(jnp.pad(jnp.asarray(values), (rows.reach, 0)))
+    np.testing.assert_allclose(means[2 * LAG :], step_means(values)[2 * LAG :], rtol=1e-12, atol=1e-14)
+
+
+def test_whitening_is_that_of_the_dense_covariance():
+    rng = np.random.default_rng(1)
+    variance, neighbours = rng.uniform(3.0, 5.0, 40), rng.uniform(-1.5, 0.5, 40)
+    excluded = np.isin(np.arange(40), [0, 1, 17, 18, 30])
+    covariance = RowCovariance(variance, neighbours, excluded)
+    used = np.flatnonzero(~excluded)
+    dense = np.diag(variance) + np.diag(neighbours[1:], 1) + np.diag(neighbours[1:], -1)
+    dense = dense[np.ix_(used, used)]
+    rows = rng.standard_normal((3, 40))
+    expected = np.linalg.solve(np.linalg.cholesky(dense), rows[:, used].T).T
+    gain, decay = covariance.recursion(2.0)
+    np.testing.assert_allclose(whiten_rows(gain, decay, rows)[:, used], 2.0 * expected, rtol=1e-12)
+    assert np.all(whiten_rows(gain, decay, rows)[:, excluded] == 0.0)
+    with jax.enable_x64(True):
+        compiled = ChargeRows(*np.zeros((3, 40)), gain, decay).whiten(jnp.asarray(rows))
+    np.testing.assert_allclose(compiled[:, used], 2.0 * expected, rtol=1e-12)
+    np.testing.assert_allclose(covariance.solve(rows[0])[used], np.linalg.solve(dense, rows[0, used]), rtol=1e-12)
