@@ -143,11 +143,15 @@ class RecordedCurrent:
 def estimate_noise(values: Rows) -> float:
     """Return the sd of white noise and rounding: that of third differences, or of the highest frequencies if lower.
 
-    Edges hardly change the first, and fast smooth signals the second.
+    Edges hardly change the first, and fast smooth signals the second. Third differences of few levels have few values,
+    so that their median needs a dither, whose variance is taken off.
     """
     lines = scipy.fft.rfft((values - values.mean()) * np.hanning(values.size))[int(0.4 * values.size) :]
     fastest = math.sqrt(float(np.median(np.abs(lines) ** 2)) / math.log(2.0) / (0.375 * values.size))
-    return math.hypot(min(white_noise_sd(values), fastest), rounding_noise_sd(values))
+    step = _least_step(values)
+    dithered = values + step * np.random.default_rng(0).uniform(-0.5, 0.5, values.size) if step else values
+    white = math.sqrt(max(white_noise_sd(dithered) ** 2 - step**2 / 12.0, 0.0))
+    return max(min(white, fastest), rounding_noise_sd(values))
 
 
 def _kink_variance(current: Rows, noise: float, threshold: float = 4.0, smooth: float = 8.0, block: int = 64) -> Rows:
