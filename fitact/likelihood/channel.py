@@ -201,7 +201,8 @@ class ChannelLikelihood(eqx.Module):
         rate = None if self.rate is None else np.zeros(2)
         effects = None if self.effects is None else np.zeros((len(self.effects), 2))
         shortened = dataclasses.replace(self, time=ends, observed=extremes, drive=drive, rate=rate, effects=effects)
-        return dataclasses.replace(shortened, weight=None, whitening=None, phases=None)
+        rows = self.charges and self.charges.restrict(slice(2))  # with which the channel follows its delay
+        return dataclasses.replace(shortened, weight=None, whitening=rows, phases=None)
 
     def thin(self, count: int) -> "ChannelLikelihood":
         """Return the channel with `count` of its samples, the ends among them, and white noise."""

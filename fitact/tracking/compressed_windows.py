@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.fitting.current import edge_mask, weigh_current_samples
+from fitact.fitting.current import edge_mask
 from fitact.fitting.fit import Fit, fit
 from fitact.likelihood.certificate import TOLERANCE, reason_against_table
 from fitact.likelihood.compression import Compression
@@ -139,7 +139,7 @@ class WindowModel(NamedTuple):
                 inside = slice(AROUND, -AROUND)
                 rate, used = np.gradient(window.V, step)[inside], ~edge_mask(window.V, self.noise["V"])[inside]
                 spread = self.noise["V"] / (math.sqrt(2.0) * step * self.noise["I"])
-                weight = used * weigh_current_samples(window.channels[channel.channel], rate, spread, used)
+                weight = used * (window.channels[channel.channel], rate, spread, used)
                 weight = None if np.all(weight == 1.0) else weight
             if clipped.any():
                 is_clipped, weight = True, np.where(clipped, 0.0, 1.0 if weight is None else weight)
