@@ -60,6 +60,7 @@ class RecordedCurrent:
     I: Rows  # noqa: E741
     step: float  # s
     variance_V: Rows  # of the noise and the rounding of each sample of V, V^2
+    noise_V: tuple[float, float]  # white noise and rounding, V
     noise_I: float  # A
     uncertain: Rows  # variance of the mean current over the step after a sample, because of kinks and rounding, A^2
     excluded: Bool[np.ndarray, " samples"]  # samples of I that are clipped
@@ -68,15 +69,27 @@ class RecordedCurrent:
     def from_record(cls, record: Record) -> "RecordedCurrent":
         """Estimate the noise of a record's V and I."""
         V, current = record["V"], record["I"]
+        noise_V = math.sqrt(max(estimate_noise(V) ** 2 - rounding_noise_sd(V) ** 2, 0.0)), rounding_noise_sd(V)
+        noise_I = max(estimate_noise(current), _least_step(current) / math.sqrt(12.0))
+        return cls.from_samples(V, current, record.time_step, noise_V, noise_I)
+
+    @classmethod
+    def from_samples(
+        cls, V: Rows, current: Rows, step: float, noise_V: tuple[float, float], noise: float
+    ) -> "RecordedCurrent":
+        """Estimate which samples are less certain than the noise of V and I (A) makes them."""
         rounding, runs = _least_step(current) / math.sqrt(12.0), run_lengths(current)
-        noise = max(estimate_noise(current), rounding)
         # a run of equal values shares one error, so that its mean has the variance of one
         uncertain = _kink_variance(current, noise) + np.where(runs > _FEW, rounding**2 * runs, 0.0)
         # the flat top of a pulse that is coarsely rounded looks clipped, but lies within the range of the converter
         codes = np.log2(np.maximum(np.abs([current.min(), current.max()]) / (math.sqrt(12.0) * rounding or 1.0), 1.0))
         is_coarse = rounding > white_noise_sd(current) and np.max(np.abs(codes - np.round(codes))) > 0.02
         excluded = np.zeros(V.size, bool) if is_coarse else clipping_mask(current)
-        return cls(V, current, record.time_step, drive_variance(V), noise, uncertain, excluded)
+        return cls(V, current, step, drive_variance(V, *noise_V), noise_V, noise, uncertain, excluded)
+
+    def continue_with(self, V: Rows, current: Rows) -> "RecordedCurrent":
+        """Return other samples of V and I, with the same noise."""
+        return self.from_samples(V, current, self.step, self.noise_V, self.noise_I)
 
     @property
     def is_coarse(self) -> bool:
@@ -92,8 +105,10 @@ class RecordedCurrent:
         variance = level + np.roll(self.uncertain, shift)
         neighbours = 0.5 * (1.0 - _ROW_NOISE) * floor - driven
         reach = np.arange(-LAG, LAG)
-        clipped = np.convolve(self.excluded, np.ones(reach.size), "same") > 0.5
-        excluded = np.roll(clipped, shift)
+        clipped = self.excluded
+        if clipped.any():
+            clipped = np.roll(np.convolve(clipped, np.ones(reach.size), "same") > 0.5, shift)
+        excluded = clipped.copy()
         excluded[: 2 * LAG] = True
         return RowCovariance(variance, neighbours, excluded)
 
@@ -130,6 +145,35 @@ class RecordedCurrent:
         gain, decay = covariance.recursion(self.noise_I or 1e-12 * float(np.ptp(self.I)))
         return ChargeRows(means + signal - from_V, self.rise(V), slope, gain, decay), V
 
+    def fit_rows(
+        self, modelled: Current, follows: bool, functions: Float[np.ndarray, "functions samples"], blocks: int
+    ) -> ChargeRows:
+        """Return the rows of charge, where the signal is any combination of rows of functions and, if it `follows`, dV/dt.
+
+        The circuit of the residuals is thus not needed, which tell the noise of the drive. The combination is that of
+        charges over `blocks` of steps, in which noise of V hardly matters.
+        """
+        rise, several = self.rise(self.V), max(1, (self.V.size - 2 * LAG) // blocks)
+        following = np.stack([rise, np.linspace(-1.0, 1.0, rise.size) * rise])
+        columns = np.concatenate([following, functions]) if follows else functions
+        with np.errstate(divide="ignore"):  # excluded rows
+            weight = 1.0 / np.sqrt(_thin(self.covariance(modelled).recursion(1.0)[0] ** -2.0, several))
+        noise = 2.0 * float(np.mean(self.variance_V)) / (several * self.step) ** 2 * float(np.sum(np.square(weight)))
+        data = _thin(step_means(self.I, modelled.delay), several)
+        sizes = _solve(_thin(columns, several) * weight, data * weight, (0, noise if follows else 0.0))[1]
+        if not follows:
+            signal = sizes @ columns
+            return self.make_rows(modelled, lambda _: signal)[0]
+        rest = sizes[1:] @ columns[1:]
+        modelled = modelled._replace(capacitance=abs(float(sizes[0])))
+        return self.make_rows(modelled, lambda V: sizes[0] * self.rise(V) + rest)[0]
+
+
+def _thin(rows: np.ndarray, several: int) -> np.ndarray:
+    """Return means over `several` rows each, without the first ones, which are not valid."""
+    count = (rows.shape[-1] - 2 * LAG) // several
+    return rows[..., 2 * LAG : 2 * LAG + several * count].reshape(*rows.shape[:-1], count, several).mean(axis=-1)
+
 
 def estimate_noise(values: Rows) -> float:
     """Return the sd of white noise and rounding: that of third differences, or of the highest frequencies if lower.
@@ -158,9 +202,9 @@ def _kink_variance(current: Rows, noise: float, threshold: float = 4.0, smooth: 
     return np.convolve(np.square(height), np.square(_JUMP_ERRORS), "same")
 
 
-def drive_variance(V: Rows) -> Rows:
+def drive_variance(V: Rows, white: float, rounding: float) -> Rows:
     """Return the variance of each sample of V; within a run of equal values, rounding is no noise, but an offset."""
-    white, rounding, alike = math.sqrt(max(estimate_noise(V) ** 2 - rounding_noise_sd(V) ** 2, 0.0)), rounding_noise_sd(V), np.diff(V) == 0.0
+    alike = np.diff(V) == 0.0
     within = np.append(False, alike) & np.append(alike, False)
     return white**2 + np.where(within, 0.0, rounding**2)
 
