@@ -98,19 +98,20 @@ class RecordedCurrent:
 
     def covariance(self, modelled: Current) -> RowCovariance:
         """Return the covariance of the rows."""
+        variance, driven, excluded = self._variance(modelled)
+        floor = max(self.noise_I, 1e-12 * float(np.ptp(self.I))) ** 2
+        return RowCovariance(variance, 0.5 * (1.0 - _ROW_NOISE) * floor - driven, excluded)
+
+    def _variance(self, modelled: Current) -> tuple[Rows, Rows, Bool[np.ndarray, " samples"]]:
+        """Return the variance of the rows, that by the noise of a sample of V, and which rows are excluded."""
         driven = np.roll((modelled.capacitance / self.step) ** 2 * self.variance_V, LAG)
         floor = max(self.noise_I, 1e-12 * float(np.ptp(self.I))) ** 2
         level = _ROW_NOISE * floor + driven + np.roll(driven, -1) + modelled.conductance**2 * np.mean(self.variance_V)
-        shift = LAG - round(modelled.delay)
-        variance = level + np.roll(self.uncertain, shift)
-        neighbours = 0.5 * (1.0 - _ROW_NOISE) * floor - driven
-        reach = np.arange(-LAG, LAG)
-        clipped = self.excluded
-        if clipped.any():
-            clipped = np.roll(np.convolve(clipped, np.ones(reach.size), "same") > 0.5, shift)
-        excluded = clipped.copy()
+        shift, excluded = LAG - round(modelled.delay), self.excluded.copy()
+        if excluded.any():
+            excluded = np.roll(np.convolve(excluded, np.ones(2 * LAG), "same") > 0.5, shift)
         excluded[: 2 * LAG] = True
-        return RowCovariance(variance, neighbours, excluded)
+        return level + np.roll(self.uncertain, shift), driven, excluded
 
     def flatten(self, white: Rows, modelled: Current) -> Rows:
         """Return whitened rows without the spectrum that a tridiagonal covariance leaves in the noise of I."""
@@ -146,27 +147,32 @@ class RecordedCurrent:
         return ChargeRows(means + signal - from_V, self.rise(V), slope, gain, decay), V
 
     def fit_rows(
-        self, modelled: Current, follows: bool, functions: Float[np.ndarray, "functions samples"], blocks: int
+        self,
+        modelled: Current,
+        follows: bool,
+        functions: Sequence[Float[np.ndarray, "functions samples"]],
+        blocks: int,
     ) -> ChargeRows:
-        """Return the rows of charge, where the signal is any combination of rows of functions and, if it `follows`, dV/dt.
+        """Return the rows of charge, if the signal is any combination of rows of functions and, if it `follows`, dV/dt.
 
-        The circuit of the residuals is thus not needed, which tell the noise of the drive. The combination is that of
-        charges over `blocks` of steps, in which noise of V hardly matters.
+        The residuals, which tell the noise of the drive, thus need no circuit. The combination is that of charges over
+        `blocks` of steps, in which noise of V hardly matters.
         """
         rise, several = self.rise(self.V), max(1, (self.V.size - 2 * LAG) // blocks)
-        following = np.stack([rise, np.linspace(-1.0, 1.0, rise.size) * rise])
-        columns = np.concatenate([following, functions]) if follows else functions
-        with np.errstate(divide="ignore"):  # excluded rows
-            weight = 1.0 / np.sqrt(_thin(self.covariance(modelled).recursion(1.0)[0] ** -2.0, several))
-        noise = 2.0 * float(np.mean(self.variance_V)) / (several * self.step) ** 2 * float(np.sum(np.square(weight)))
-        data = _thin(step_means(self.I, modelled.delay), several)
-        sizes = _solve(_thin(columns, several) * weight, data * weight, (0, noise if follows else 0.0))[1]
-        if not follows:
-            signal = sizes @ columns
-            return self.make_rows(modelled, lambda _: signal)[0]
-        rest = sizes[1:] @ columns[1:]
-        modelled = modelled._replace(capacitance=abs(float(sizes[0])))
-        return self.make_rows(modelled, lambda V: sizes[0] * self.rise(V) + rest)[0]
+        variance, _, excluded = self._variance(modelled)
+        weight = 1.0 / np.sqrt(_thin(np.where(excluded, np.inf, variance), several))
+        changing = np.linspace(-1.0, 1.0, rise.size) * rise
+        parts = [np.stack([rise, changing])[: 2 * follows], *functions]
+        columns = np.concatenate([_thin(part, several) for part in parts]) * weight
+        noise = 2.0 * float(np.mean(self.variance_V)) * float(np.sum(weight**2)) / (several * self.step) ** 2
+        observed = _thin(step_means(self.I, modelled.delay), several) * weight
+        sizes = _solve(columns, observed, (0, noise * follows))[1]
+        capacitance, begin = float(sizes[0]) * follows, 2 * follows
+        rest = sizes[1] * changing if follows else np.zeros(rise.size)
+        for part in functions:
+            rest += sizes[begin : (begin := begin + len(part))] @ part
+        noisy = modelled._replace(capacitance=abs(capacitance)) if follows else modelled
+        return self.make_rows(noisy, lambda V: capacitance * self.rise(V) + rest)[0]
 
 
 def _thin(rows: np.ndarray, several: int) -> np.ndarray:

@@ -26,8 +26,8 @@ from fitact.likelihood.projection import (
 )
 
 REACH = 4.0  # factor by which b may change
-REACH_NODES = 29  # of the table, whose series then ends at 1e-12
-RANK = 16  # combinations of responses that represent those of the table, to 1e-8
+REACH_NODES = 21  # of the table, whose series then ends at 1e-8
+RANK = 14  # combinations of responses that represent those of the table, to 2e-7
 TREND_RANK = 6  # combinations of responses that represent those to a small trend, to 0.3 %
 
 
@@ -50,7 +50,7 @@ class TrendInputs(NamedTuple):
 
 Samples = Float[np.ndarray, " samples"]
 # makes the rows of charge of a current from those of the functions that it consists of, beside dV/dt
-MakeRows = Callable[[Float[np.ndarray, "functions samples"]], ChargeRows]
+MakeRows = Callable[[Sequence[Float[np.ndarray, "functions samples"]]], ChargeRows]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,9 +76,8 @@ class WindowCompressor:
             if reach is not None:
                 kept = slice(RANK)
                 table = dataclasses.replace(table, combinations=table.combinations[:, kept], series=table.series[kept])
-            decays = table.combinations.T @ np.exp(-time / table.nodes[:, None])
             baseline = evaluate_baseline(time, table.middle, table.half)[_baseline_columns(each)]
-            functions = np.concatenate([decays, baseline])
+            functions = np.concatenate([_decays(table, time), baseline])
             tables.append(table)
             shared.append(functions if each.charges is None else step_means(functions))
         return cls(tuple(channels), tuple(tables), time, tuple(shared))
@@ -96,18 +95,18 @@ class WindowCompressor:
         `responses` are those of `respond`. With `has_charge`, the charge at the first sample is unknown. Also returns
         what a trend within the window needs, and the samples of the responses if the first channel has rows instead.
         """
-        step, late = float(self.time[1]), self.time - 0.5 * self.time[-1]
-        combined = self.tables[0].combinations.T @ responses
-        functions = np.concatenate([combined, late * combined[:TREND_RANK], V[None]])
-        found = [
-            self._compress_channel(i, V, late, functions, self.tables[i].expected @ responses, *pair, has_charge)
-            for i, pair in enumerate(zip(given, weights, strict=True))
-        ]
+        late, rank = self.time - 0.5 * self.time[-1], len(self.tables[0].series)
+        functions = np.empty((rank + TREND_RANK + 2, V.size))
+        combined = np.matmul(self.tables[0].combinations.T, responses, out=functions[:rank])
+        np.multiply(late, combined[:TREND_RANK], out=functions[rank:-2])
+        functions[-2], found = V, []
+        for i, pair in enumerate(zip(given, weights, strict=True)):
+            functions[-1] = self.tables[i].expected @ responses
+            found.append(self._compress_channel(i, late, functions, *pair, has_charge))
         parts, inputs = zip(*found, strict=True)
         if self.channels[0].charges is None:
             return parts, inputs, None
-        rank, nodes = len(combined), self.tables[0].nodes
-        decays = self.tables[0].combinations.T @ np.exp(-self.time / nodes[:, None]) if has_charge else combined[:0]
+        decays = _decays(self.tables[0], self.time)[: rank * has_charge]
         rows = np.concatenate([combined, decays])
         total = np.zeros(2 * [2 * rank + len(BASELINE_NAMES) + 3])
         total[: len(rows), : len(rows)] = rows @ rows.T
@@ -116,43 +115,38 @@ class WindowCompressor:
     def _compress_channel(
         self,
         index: int,
-        V: Samples,
         late: Samples,
         functions: Float[np.ndarray, "functions samples"],
-        expected: Samples,
         given: Samples | MakeRows,
         weight: Samples | None,
         has_charge: bool,
     ) -> tuple[Compression, TrendInputs]:
-        """Compress a channel, in which the `functions` are the responses, those of trends, and V."""
+        """Compress a channel; the `functions` are the responses, those of trends, V, and what the tables expect."""
         channel, table, step = self.channels[index], self.tables[index], float(self.time[1])
-        rank, effects = len(table.series), len(channel.effect_sizes)
-        shared = self.shared[index][0 if has_charge else rank :]
-        steps = np.empty((0, V.size))
+        rank, effects, charged = len(table.series), len(channel.effect_sizes), has_charge * len(table.series)
+        shared, steps = self.shared[index][rank - charged :], np.empty((0, late.size))
+        rows = None
         if callable(given):
-            *means, expected = step_means(np.concatenate([functions, expected[None]]))
-            functions = np.stack(means)
-            rows = given(np.concatenate([functions[:-1], shared]))
+            functions = step_means(functions)
+            rows = given([functions[:-2], shared])
             rate, slope, observed = rows.rate, rows.slope, rows.observed
             late, count = late - (LAG - 0.5) * step, int(np.count_nonzero(rows.gain))
         else:
-            rate, slope, observed = np.zeros(V.size), np.gradient(V, step), given
-            count = V.size if weight is None else int(np.count_nonzero(weight))
+            rate, slope, observed = np.zeros(late.size), np.gradient(functions[-2], step), given
+            count = late.size if weight is None else int(np.count_nonzero(weight))
             if channel.timing:
-                steps = drive_steps(V, 0, V.size, MAX_DELAY) / step
-        rest = observed - expected - (0.0 if table.expected_rate is None else table.expected_rate * rate)
-        decays, baseline = shared[: rank * has_charge], shared[rank * has_charge :]
-        late_rate = [late * rate, functions[-1]]
-        own = [functions[:rank], decays, functions[rank:-1], late_rate, steps, baseline, [rate, slope, rest]]
-        products = np.concatenate(own)
-        if callable(given):
+                steps = drive_steps(functions[-2], 0, late.size, MAX_DELAY) / step
+        rest = observed - functions[-1] - (0.0 if table.expected_rate is None else table.expected_rate * rate)
+        own = functions[:rank], shared[:charged], functions[rank:-2], [late * rate, functions[-2]], steps
+        products = np.concatenate([*own, shared[charged:], [rate, slope, rest]])
+        if rows is not None:
             products = whiten_rows(rows.gain, rows.decay, products)
         elif weight is not None:
             products = products * weight
         # functions that are absent are 0
         first = 2 * rank + effects
         begin = first + TREND_RANK + 2 + len(steps)
-        places = [*range(rank + rank * has_charge), *range(first, begin)]
+        places = [*range(rank + charged), *range(first, begin)]
         places += [begin + column for column in _baseline_columns(channel)]
         end = begin + len(BASELINE_NAMES)
         places += range(end, end + 3)
@@ -188,6 +182,10 @@ class WindowCompressor:
         length = step * V.size
         age = length + (0.0 if before is None else before.age)
         return responses, FilterState(start + length, float(V[-1]), left, age)
+
+
+def _decays(table: TableNodes, time: Samples) -> Float[np.ndarray, "rank samples"]:
+    return table.combinations.T @ np.exp(-time / table.nodes[:, None])
 
 
 def _baseline_columns(channel: ChannelLikelihood) -> list[int]:
