@@ -50,6 +50,7 @@ class Current(NamedTuple):
     capacitance: float  # that follows dV/dt, with the stray one, F
     conductance: float  # of what does not follow it, S
     delay: float  # against V, in time steps
+    follows: bool = True  # whether it follows dV/dt, which no resistance limits
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,19 +148,15 @@ class RecordedCurrent:
         return ChargeRows(means + signal - from_V, self.rise(V), slope, gain, decay), V
 
     def fit_rows(
-        self,
-        modelled: Current,
-        follows: bool,
-        functions: Sequence[Float[np.ndarray, "functions samples"]],
-        blocks: int,
+        self, modelled: Current, blocks: int, functions: Sequence[Float[np.ndarray, "functions samples"]]
     ) -> ChargeRows:
-        """Return the rows of charge, if the signal is any combination of rows of functions and, if it `follows`, dV/dt.
+        """Return the rows of charge, if the signal is any combination of dV/dt, which may drift, and rows of functions.
 
         The residuals, which tell the noise of the drive, thus need no circuit. The combination is that of charges over
         `blocks` of steps, in which noise of V hardly matters.
         """
         rise, several = self.rise(self.V), max(1, (self.V.size - 2 * LAG) // blocks)
-        variance, _, excluded = self._variance(modelled)
+        (variance, _, excluded), follows = self._variance(modelled), modelled.follows
         weight = 1.0 / np.sqrt(_thin(np.where(excluded, np.inf, variance), several))
         changing = np.linspace(-1.0, 1.0, rise.size) * rise
         parts = [np.stack([rise, changing])[: 2 * follows], *functions]
@@ -239,7 +236,7 @@ def describe_terms(terms: HighpassTerms, stray: ArrayLike | None, delay: float, 
     omega = math.pi / step * (np.arange(64) + 0.5) / 64.0
     gain = np.asarray(gain_at(terms, omega)) + 1j * omega * stray
     mean_square = float(np.mean(np.abs(gain * np.sinc(0.5 * omega * step / math.pi)) ** 2))
-    return Current(math.sqrt(0.5 * mean_square) * step, 0.0, delay)
+    return Current(math.sqrt(0.5 * mean_square) * step, 0.0, delay, follows=False)
 
 
 # ---- estimates before a fit ----------------------------------------------------------------------------------------

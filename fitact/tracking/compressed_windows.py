@@ -1,6 +1,7 @@
 """Windows of a record, compressed: a fit to a first window in contact gives the model, which all others share."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -73,7 +74,8 @@ class WindowResponses(NamedTuple):
 
     window: Window
     responses: Float[np.ndarray, "nodes samples"] | None
-    weights: list[np.ndarray | None]
+    recorded: list[np.ndarray | MakeRows]  # of each channel
+    weights: list[np.ndarray | None]  # of its samples, or None where all are 1
     has_charge: bool  # whether the charge at the start is unknown
     lowest: float  # as in CompressedWindow
     highest: float
@@ -102,46 +104,39 @@ class WindowModel(NamedTuple):
             V = window.channels["V"]
             if not window.is_whole or float(np.std(V)) < _DRIVEN * self.drive_rms:
                 state = None
-                yield WindowResponses(window, None, [], False, math.nan, math.nan)
+                yield WindowResponses(window, None, [], [], False, math.nan, math.nan)
                 continue
             if state is not None and abs(window.start - state.end) > 0.5 * step:
                 state = None
             has_charge = state is None or state.age < settled
             responses, state = self.compressor.respond(V, window.start, state)
-            recorded = [window.channels[channel.channel] for channel in self.fit.likelihood.channels]
-            clipped = [clipping_mask(values) for values in recorded]
+            channels = self.fit.likelihood.channels
+            samples = [window.channels[channel.channel] for channel in channels]
+            clipped = [clipping_mask(values) for values in samples]
             weights = [np.where(each, 0.0, 1.0) if each.any() else None for each in clipped]
-            expected = self.compressor.expect(V, responses)
-            lowest, highest = self._compare_signal(recorded[0], expected, weights[0])
+            lowest, highest = self._compare_signal(samples[0], self.compressor.expect(V, responses), weights[0])
+            pairs = zip(channels, samples, strict=True)
+            recorded = [values if channel.charges is None else self._make_rows(window) for channel, values in pairs]
             if not is_in_contact(lowest, highest):
                 state = None
             is_clipped = any(each is not None for each in weights)
-            yield WindowResponses(window, responses, weights, has_charge, lowest, highest, is_clipped)
+            yield WindowResponses(window, responses, recorded, weights, has_charge, lowest, highest, is_clipped)
 
     def compress(self, given: WindowResponses) -> CompressedWindow:
         """Compress a window; one without responses has no data."""
         data = None
         if given.responses is not None:
-            channels = given.window.channels
-            data = WindowData(
-                *self.compressor.compress(
-                    channels["V"],
-                    [channels[each.channel] if each.charges is None else self._rows_maker(given.window)
-                    for each in self.fit.likelihood.channels],
-                    given.weights,
-                    given.responses,
-                    given.has_charge,
-                )
-            )
+            V = given.window.channels["V"]
+            channels = given.recorded, given.weights
+            data = WindowData(*self.compressor.compress(V, *channels, given.responses, given.has_charge))
         return CompressedWindow(given.window.start, data, given.lowest, given.highest, given.clipped)
 
-    def _rows_maker(self, window: Window) -> MakeRows:
+    def _make_rows(self, window: Window) -> MakeRows:
         """Return the function that makes the rows of charge of a window."""
         assert self.current is not None
         current, modelled = self.current
         recorded, blocks = current.continue_with(window.channels["V"], window.channels["I"]), max(400, 16 * self.parts)
-        follows = next(x.expected_rate is not None for x, each in zip(self.compressor.tables, self.compressor.channels) if each.channel == "I")
-        return lambda functions: recorded.fit_rows(modelled, follows, functions, blocks)
+        return functools.partial(recorded.fit_rows, modelled, blocks)
 
     def _compare_signal(
         self, observed: np.ndarray, expected: np.ndarray, weight: np.ndarray | None
