@@ -79,7 +79,9 @@ class ChannelFit:
         residuals, weight = residuals[unpadded], None if channel.equally_weighted else channel.weights[unpadded]
         names = [channel.qualified_name(channel.linear_names[column]) for column in channel.columns]
         linear = dict(zip(names, (beta * np.asarray(channel.linear_sd)[list(channel.columns)]).tolist(), strict=True))
-        counted = (channel.weights if channel.whitening is None else np.asarray(channel.whitening.mask))[unpadded] > 0.0
+        mask = channel.weights if channel.whitening is None else np.asarray(channel.whitening.mask)
+        mask = mask if channel.charges is None else np.asarray(channel.charges.gain)
+        counted = mask[unpadded] > 0.0
         white = white[unpadded][counted]
         n_fitted = theta.size * white.size / float(likelihood.count) + len(linear)
         if isinstance(source.record, Spectrum):
@@ -152,15 +154,14 @@ def _log_likelihood(
     channel: ChannelLikelihood, residuals: np.ndarray, white_residuals: np.ndarray, sigma: float
 ) -> float:
     """Return the log-likelihood at its maximum over the noise sd; under Student's t, at scale `sigma`."""
+    if channel.charges is not None:
+        gain = np.asarray(channel.charges.gain)[: residuals.size]
+        return gaussian_log_likelihood(white_residuals, None) + float(np.sum(np.log(gain[gain > 0.0])))
     if channel.whitening is None:
         weights = channel.weights[: residuals.size]
         if channel.noise == "student":
             return _student_log_likelihood(residuals, weights, sigma)
         return gaussian_log_likelihood(residuals, weights)
-    if channel.charges is not None:
-        gain = np.asarray(channel.charges.gain)[: residuals.size]
-        used = gain > 0.0
-        return gaussian_log_likelihood(white_residuals, None) + float(np.sum(np.log(gain[used])))
     used = np.asarray(channel.whitening.mask) > 0.0
     innovations = white_residuals / float(channel.whitening.taps[0])
     return gaussian_log_likelihood(innovations, None) + float(np.sum(np.log(channel.weights[used])))

@@ -97,16 +97,20 @@ class RecordedCurrent:
         """Whether I has long runs of equal values, whose rounding is no noise."""
         return float(np.mean(run_lengths(self.I) > _FEW)) > 0.1
 
+    @property
+    def _floor(self) -> float:
+        """Noise of I, at least of rounding errors, A."""
+        return max(self.noise_I, 1e-12 * float(np.ptp(self.I)))
+
     def covariance(self, modelled: Current) -> RowCovariance:
         """Return the covariance of the rows."""
         variance, driven, excluded = self._variance(modelled)
-        floor = max(self.noise_I, 1e-12 * float(np.ptp(self.I))) ** 2
-        return RowCovariance(variance, 0.5 * (1.0 - _ROW_NOISE) * floor - driven, excluded)
+        return RowCovariance(variance, 0.5 * (1.0 - _ROW_NOISE) * self._floor**2 - driven, excluded)
 
     def _variance(self, modelled: Current) -> tuple[Rows, Rows, Bool[np.ndarray, " samples"]]:
         """Return the variance of the rows, that by the noise of a sample of V, and which rows are excluded."""
         driven = np.roll((modelled.capacitance / self.step) ** 2 * self.variance_V, LAG)
-        floor = max(self.noise_I, 1e-12 * float(np.ptp(self.I))) ** 2
+        floor = self._floor**2
         level = _ROW_NOISE * floor + driven + np.roll(driven, -1) + modelled.conductance**2 * np.mean(self.variance_V)
         shift, excluded = LAG - round(modelled.delay), self.excluded.copy()
         if excluded.any():
@@ -116,16 +120,19 @@ class RecordedCurrent:
 
     def flatten(self, white: Rows, modelled: Current) -> Rows:
         """Return whitened rows without the spectrum that a tridiagonal covariance leaves in the noise of I."""
-        impulse = np.zeros(64)
+        power = self._noise_power(np.fft.rfftfreq(white.size), modelled)
+        lines = scipy.fft.rfft(white) / np.sqrt(np.maximum(power / np.mean(power), 0.05))
+        return scipy.fft.irfft(lines, white.size)
+
+    def _noise_power(self, cycles: Rows, modelled: Current) -> Rows:
+        """Return the power of the noise of rows over the assumed one, at frequencies in cycles per step."""
+        impulse, turns = np.zeros(64), 2.0 * math.pi * cycles
         impulse[32 - LAG] = 1.0
-        turns = 2.0 * math.pi * np.fft.rfftfreq(white.size)
         taps = np.flatnonzero(own := step_means(impulse, modelled.delay))
-        gain = np.abs(np.exp(-1j * np.outer(turns, taps)) @ own[taps]) ** 2
         driven = (modelled.capacitance / self.step) ** 2 * float(np.median(self.variance_V))
-        floor, others = self.noise_I**2, 2.0 * driven * (1.0 - np.cos(turns))
+        floor, others = self._floor**2, 2.0 * driven * (1.0 - np.cos(turns))
         assumed = floor * (_ROW_NOISE + (1.0 - _ROW_NOISE) * np.cos(turns)) + others
-        lines = np.fft.rfft(white) * np.sqrt(assumed / np.maximum(floor * gain + others, 0.05 * assumed))
-        return np.fft.irfft(lines, white.size)
+        return (floor * np.abs(np.exp(-1j * np.outer(turns, taps)) @ own[taps]) ** 2 + others) / assumed
 
     def rise(self, V: Rows) -> Rows:
         """Return the rise of a drive over each step, V/s, stored as rows are."""
@@ -144,7 +151,8 @@ class RecordedCurrent:
         V = self.V - noise
         signal = respond(V)
         slope = np.where(covariance.used, -np.gradient(signal) / self.step, 0.0)
-        gain, decay = covariance.recursion(self.noise_I or 1e-12 * float(np.ptp(self.I)))
+        power = np.mean(self._noise_power(np.linspace(0.0, 0.5, 129), modelled))
+        gain, decay = covariance.recursion(self._floor / math.sqrt(float(power)))
         return ChargeRows(means + signal - from_V, self.rise(V), slope, gain, decay), V
 
     def fit_rows(
@@ -192,8 +200,8 @@ def _kink_variance(current: Rows, noise: float, threshold: float = 4.0, smooth: 
     """Return the variance of the mean current over the step after each sample, if the current jumps within the step.
 
     A jump somewhere within a step changes the mean by its height times a uniform number in +-1/2, and the polynomials
-    of `step_means` around it by the `_JUMP_ERRORS`. Sixth differences are ten times a jump; they count above `threshold` times the effect of noise, and `smooth` times what is usual in a
-    `block` of samples.
+    of `step_means` around it by the `_JUMP_ERRORS`. Sixth differences are ten times a jump; they count above
+    `threshold` times the effect of noise, and `smooth` times what is usual in a `block` of samples.
     """
     jump = np.pad(np.abs(np.diff(current, 6)) / 10.0, 3)
     padded = np.pad(jump, (0, -jump.size % block), mode="edge").reshape(-1, block)
@@ -427,9 +435,7 @@ def update_rows(
     return likelihood, largest
 
 
-def flatten_rows(
-    white: Rows, channel: ChannelLikelihood, inputs: ChannelInputs, record: Record
-) -> Rows:
+def flatten_rows(white: Rows, channel: ChannelLikelihood, inputs: ChannelInputs, record: Record) -> Rows:
     """Return the whitened rows of a channel of charges without the spectrum of their own; see `RecordedCurrent`."""
     terms, current = inputs.circuit.channel_terms(channel.channel), RecordedCurrent.from_record(record)
     delay = float(channel.shift) / current.step
@@ -464,16 +470,17 @@ def set_rows(channel: ChannelLikelihood, rows: ChargeRows, V: Rows, delay: float
     padded = ChargeRows(**{name: np.pad(x, (0, length - x.size)) for name, x in arrays.items()})
     assert isinstance(channel.drive, Sampled)
     drive = Sampled(channel.drive.time, pad_samples(V))
-    return dataclasses.replace(channel, drive=drive, whitening=padded, shift=np.asarray(delay, dtype=float))
+    return dataclasses.replace(channel, drive=drive, charges=padded, shift=np.asarray(delay, dtype=float))
 
 
 def _with_drive(channel: ChannelLikelihood, current: RecordedCurrent, V: Rows) -> ChannelLikelihood:
     """Return the channel of a current that is 0, with another drive."""
-    assert channel.charges is not None and isinstance(channel.drive, Sampled)
+    assert channel.charges is not None
+    assert isinstance(channel.drive, Sampled)
     length = np.shape(channel.time)[0]
     rise = np.pad(current.rise(V), (0, length - V.size))
     charges = dataclasses.replace(channel.charges, observed=np.zeros(length), rate=rise)
-    return dataclasses.replace(channel, drive=Sampled(channel.drive.time, pad_samples(V)), whitening=charges)
+    return dataclasses.replace(channel, drive=Sampled(channel.drive.time, pad_samples(V)), charges=charges)
 
 
 @jit

@@ -104,7 +104,9 @@ class DerivedQuantities(eqx.Module):
         A charge that stays on a gap is not included, because no channel shows it.
         """
         first = None if deviate is None else deviate[0]
-        sizes = (channel.sample_nuisances(inputs, sigma, first) * channel.linear_sd)[FIRST_CHARGE : FIRST_CHARGE + len(CHARGES)]
+        sizes = (channel.sample_nuisances(inputs, sigma, first) * channel.linear_sd)[
+            FIRST_CHARGE : FIRST_CHARGE + len(CHARGES)
+        ]
         # the effect of a charge scales between channels like the response to a drive
         names = self.geometry.contact(inputs.circuit).channel, channel.channel
         acting, recorded = (inputs.circuit.channel_terms(name).weight for name in names)

@@ -13,13 +13,14 @@ from jaxtyping import Float
 
 from fitact import charts, summary
 from fitact.data.kramers_kronig import KramersKronig, check_kramers_kronig
-from fitact.data.record import Record
+from fitact.data.record import Record, rounding_noise_sd
 from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
 from fitact.experiment.fisher import Experiment
 from fitact.fitting import derived, remarks
 from fitact.fitting.calibrate import calibrate
 from fitact.fitting.channel_fit import ChannelFit, information_criteria
+from fitact.fitting.current import estimate_noise
 from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.effects import assess_fit, describe_alternatives, describe_structure, is_tolerable
 from fitact.fitting.error_sources import (
@@ -336,8 +337,24 @@ class Fit(FitResult):
         return content | {"notes": [*self.notes, *self.effect_notes]}
 
     def validity(self) -> dict[str, Any]:
-        """Return `kramers_kronig` of fit.json, for spectra only."""
-        return {} if self.kramers_kronig is None else {"kramers_kronig": self.kramers_kronig.to_dict()}
+        """Return `kramers_kronig` of fit.json, for spectra only, and `noise`, for records."""
+        validity: dict[str, Any] = {"noise": self.noise()}
+        return validity | ({} if self.kramers_kronig is None else {"kramers_kronig": self.kramers_kronig.to_dict()})
+
+    def noise(self) -> dict[str, dict[str, Any]]:
+        """Return the noise of each recorded channel, V among them: `sd`, `rounding` (rms, SI units) and `source`."""
+        found = {}
+        for trace in self.traces:
+            if isinstance(trace.record, Record):
+                number = trace.label.rpartition("_")[2]
+                suffix = f"_{number}" if number.isdigit() else ""
+                known = {trace.channel: trace.sigma}
+                if "V" in trace.record:
+                    known = {"V": estimate_noise(trace.record["V"])} | known
+                for name, sd in known.items():
+                    rounding = rounding_noise_sd(trace.record[name])
+                    found[name + suffix] = {"sd": sd, "rounding": rounding, "source": "estimated"}
+        return found
 
     def _nuisances(self) -> dict[str, float]:
         return dict(zip(self.likelihood.sigma_names, self.laplace.sigmas.tolist(), strict=True)) | self.linear
@@ -478,7 +495,7 @@ def _assemble_fit(
         figures |= {"optima": len(optima.start_counts), "starts_failed": optima.n_failed}
     said = _collect_remarks(problem, laplace, traces, optimum, without_scene)
     tests = [check_kramers_kronig(each.record) for each in traces if isinstance(each.record, Spectrum)]
-    experiment = problem.experiment(likelihood, optimum.circuit, sigma)
+    experiment = problem.experiment(likelihood, optimum.circuit, theta, sigma)
     evidence = likelihood.names, root, likelihood.prior_factor, laplace.log_gradient("force_mean")
     if experiment is None:
         free = [name for name in likelihood.names if name in circuit_parameters(likelihood.template)]
@@ -544,6 +561,7 @@ def _collect_remarks(
     warnings += remarks.prior_warnings(likelihood, theta, spread, stated)
     force_peak = math.exp(laplace.log_derived[0][derived.DERIVED_NAMES.index("force_peak")])
     warnings += remarks.plausibility_warnings(first.record, first.scene, first.choice, optimum, force_peak)
+    notes += remarks.stray_notes(problem.sources, traces, optimum)
     assumed = remarks.describe_assumed_Ci(None if without_scene else first.scene, likelihood, laplace.prior_sets_Ci)
     notes += assumed.notes
     notes += UncertainGeometry.from_scene(first.scene, laplace.derive.geometry).notes(first.scene, likelihood, theta)

@@ -14,12 +14,13 @@ from fitact.data.clipping import clipping_mask, describe_clipping
 from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
 from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
-from fitact.experiment.blind_directions import gain_names
+from fitact.experiment.blind_directions import STRAY, gain_names
 from fitact.experiment.fisher import Experiment
 from fitact.fitting.current import (
     Current,
     RecordedCurrent,
     estimate_from_current,
+    estimate_noise,
     estimate_recorded,
     respond_to,
     select_samples,
@@ -50,11 +51,11 @@ from fitact.instrument.effects import INPUT_RANGE
 from fitact.likelihood import certificate
 from fitact.likelihood.channel import FIRST_CHARGE, LINEAR_NUISANCES, ChannelLikelihood
 from fitact.likelihood.compression import HUM_FREQUENCIES
-from fitact.likelihood.likelihood import STRAY, Likelihood
+from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import Autoregression, estimate_quiet_noise, require_uniform
-from fitact.model.circuit import RC, Channel, Circuit, FinalCircuit, passes_direct_current
+from fitact.model.circuit import Channel, Circuit, FinalCircuit, passes_direct_current
 from fitact.model.drive import Sampled
-from fitact.model.skin import WithSkin, circuit_parameters, constant_skin_circuit, limits_current
+from fitact.model.skin import circuit_parameters, constant_skin_circuit, limits_current
 from fitact.prior.distributions import Distribution, LogNormal
 from fitact.prior.prior import Prior
 from fitact.prior.product import multiply
@@ -79,10 +80,12 @@ class Problem(NamedTuple):
         channels, reasons = zip(*pairs, strict=True)
         return dataclasses.replace(self.likelihood, channels=channels), reasons
 
-    def experiment(self, likelihood: Likelihood, circuit: Circuit, sigma: np.ndarray) -> Experiment | None:
-        """Return the measurement at `circuit` as an experiment; several records are repetitions of the first.
+    def experiment(
+        self, likelihood: Likelihood, circuit: Circuit, theta: np.ndarray, sigma: np.ndarray
+    ) -> Experiment | None:
+        """Return the measurement at theta, where the circuit is `circuit`, as an experiment.
 
-        None with a spectrum, whose information no experiment in time has.
+        Several records are repetitions of the first. None with a spectrum, whose information no experiment in time has.
         """
         source, record = self.sources[0], self.sources[0].record
         if isinstance(record, Spectrum) or isinstance(self.sources[-1].record, Spectrum):
@@ -93,10 +96,15 @@ class Problem(NamedTuple):
         channels = tuple(each.channel for each in electrical)
         fields = circuit_parameters(likelihood.template)
         gains = gain_names(channels)
-        free = tuple(name for name in likelihood.prior.names if name in fields or name in gains)
+        free = tuple(name for name in likelihood.prior.names if name in fields or name in gains or name == STRAY)
         rows = [likelihood.prior.names.index(name) for name in free]
         factor, measurement = likelihood.prior_factor, source.scene.measurement
         noise = {"Vsc": measurement.noise_Vsc, "I": measurement.noise_I}
+        if source.choice.name == "measured":
+            noise["V"] = estimate_noise(record["V"])
+        stray = source.scene.stray_capacitance()
+        if STRAY in free:
+            stray = math.exp(theta[likelihood.prior.names.index(STRAY)])
         return Experiment(
             circuit=likelihood.finger(circuit),
             free=free,
@@ -108,6 +116,7 @@ class Problem(NamedTuple):
             steady_state=source.choice.steady_state,
             records=float(records),
             geometry=source.scene.geometry(),
+            stray_capacitance=stray,
             ties=likelihood.tied,
             new_gain_sd={name: source.scene.gain_u(name) or typical_gain_u(name) for name in ("Vsc", "I")},
         )
@@ -247,8 +256,10 @@ def _build_channel(
     elif channel == "I" and choice.name != "measured" and not limits_current(template):
         used, slope = select_samples(record, choice)
         # the estimate knows no leak; without it, the start comes from Vsc or from draws of the prior
-        start = None if passes_direct_current(template) else estimate_from_current(
-            record, choice, used, slope, prior_skin_moments(bare)
+        start = (
+            None
+            if passes_direct_current(template)
+            else estimate_from_current(record, choice, used, slope, prior_skin_moments(bare))
         )
     weight, clipped = _weight(record, channel, used)
     weight, at_jumps = exclude_jumps(template, record, choice, weight)
@@ -294,7 +305,7 @@ def _build_channel(
 def _make_charge_rows(
     channel: ChannelLikelihood, record: Record, scene: Scene, choice: DriveModel, bare: Likelihood
 ) -> tuple[ChannelLikelihood, CurrentEstimate | None, float]:
-    """Return the channel of a current with a recorded drive in rows of charge, an estimate of its circuit, and noise."""
+    """Return the channel of a current with a recorded drive, an estimate of its circuit, and the noise of I (A)."""
     current, stray = RecordedCurrent.from_record(record), scene.stray_capacitance()
     fixed = [float(name[4:-2]) for name in _hum(record, choice, "I")]
     estimate, nuisances = estimate_recorded(current, stray, fixed, prior_skin_moments(bare))

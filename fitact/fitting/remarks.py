@@ -1,7 +1,7 @@
 """Warnings and notes about a fit that is otherwise reliable, in sentences."""
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -11,8 +11,11 @@ from fitact.data.inspection import check_divider
 from fitact.data.plausibility import check_plausibility, insulator_voltage
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.data.spectrum import Spectrum
+from fitact.fitting.channel_fit import ChannelFit
 from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.residual_statistics import is_undersampled
+from fitact.fitting.source import Source
+from fitact.fitting.starting_point import CurrentEstimate, skin_from_estimates
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.model.circuit import FINGER_PARAMETERS, RC
 from fitact.model.skin import constant_skin_circuit
@@ -146,6 +149,34 @@ def unfitted_channel_notes(record: Record, fitted: Collection[str]) -> list[str]
         for name in record.channels
         if name not in ("V", *fitted)
     ]
+
+
+def stray_notes(
+    sources: Sequence[Source], traces: Sequence[ChannelFit], optimum: CircuitValues, usual: float = 100e-12
+) -> list[str]:
+    """Return a note on a current in the drive lead whose stray capacitance nobody stated; `usual` is in F."""
+    terms = optimum.terms.get("I")
+    for source, trace in zip(sources, traces, strict=True):
+        measurement = source.scene.measurement
+        if trace.channel != "I" or source.scene.states_stray_capacitance() or measurement.current_lead == "ground":
+            continue
+        shift = ""
+        if terms is not None and terms.rate is not None and len(terms.tau) == 1 and terms.direct is None:
+            parts = float(terms.weight[0]), float(terms.tau[0])
+            pair = (skin_from_estimates(None, CurrentEstimate(*parts, float(terms.rate) - C)) for C in (0.0, usual))
+            now, then = pair
+            if now is not None and then is not None:
+                changes = (
+                    f"{name} by {100.0 * (b / a - 1.0):+.2g} %"
+                    for name, a, b in zip(FINGER_PARAMETERS, now, then, strict=True)
+                )
+                shift = f"; with V and I alone, {format_engineering(usual, 'F')} would change {', '.join(changes)}"
+        return [
+            "I in the drive lead contains the current of the stray capacitance of panel and cable, which the scene does"
+            f" not state{shift}; state [measurement] stray_capacitance, or take I in the ground lead (current_lead ="
+            " 'ground')"
+        ]
+    return []
 
 
 def describe_assumed_Ci(scene: Scene | None, likelihood: Likelihood, prior_sets_Ci: bool) -> Remarks:

@@ -30,8 +30,8 @@ def channel_statistics(
     """Return figures of merit of the weighted residuals of a channel (in its unit) after fitting `n_fitted` parameters.
 
     `noise` is the model-free noise estimate of the channel. The noise of a measured drive adds to it, multiplied by
-    `gain` (unit of the channel per V). `b` is the slowest time constant (s). At the samples of V, the response follows V
-    but for a low-pass of it, whose interpolation is all that may be wrong, unless `b` is 0.
+    `gain` (unit of the channel per V). At the samples of V, the response follows V but for a low-pass of it with the
+    time constant `b` (s), whose interpolation is all that may be wrong, unless `b` is 0.
     """
     measured, V = choice.name == "measured", choice.voltage
     expected = math.hypot(noise, gain * record.noise("V") if measured else 0.0)

@@ -122,9 +122,7 @@ def start_from_estimates(
     return theta
 
 
-def skin_from_estimates(
-    vsc: VscEstimate | None, current: CurrentEstimate | None
-) -> tuple[float, float, float] | None:
+def skin_from_estimates(vsc: VscEstimate | None, current: CurrentEstimate | None) -> tuple[float, float, float] | None:
     """Return Rsc, Csc and Ci of the circuit from the estimates of Vsc and I, or None if these do not determine them."""
     if current is None or not current.weight > 0.0:
         return None

@@ -57,6 +57,7 @@ def compress_channel(
         "steady_state": channel.steady_state,
         "weight": None if channel.equally_weighted else channel.weights[samples],
         "whitening": channel.whitening and channel.whitening.restrict(samples),
+        "charges": channel.charges and channel.charges.restrict(samples),
         "rate": None if channel.rate is None else np.asarray(channel.rate)[samples],
         "effects": None if channel.effects is None else np.asarray(channel.effects)[:, samples],
     }

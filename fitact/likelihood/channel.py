@@ -12,6 +12,7 @@ import dataclasses
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -65,7 +66,7 @@ class ChannelLikelihood(eqx.Module):
     observed: Float[Array, " samples"]  # V or A
     # inverse noise sd of each sample, relative to the channel's; 0 excludes a sample, None means equal weights
     weight: Float[Array, " samples"] | None
-    whitening: Whitening | ChargeRows | None  # for coloured noise, or for noise of V in I; None means white noise
+    whitening: Whitening | None  # filter for coloured noise; None means white noise
     noise_floor: ArrayLike  # lower bound of the noise sd, in the channel's unit
     rate: Float[Array, " samples"] | None  # dV/dt at the samples, V/s, if the current follows it
     drive: Drive  # V(t)
@@ -98,6 +99,8 @@ class ChannelLikelihood(eqx.Module):
     period: ArrayLike | None = None
     # stray capacitance whose current I contains, F, unless it is a free parameter; None means none
     stray: ArrayLike | None = None
+    # rows of a current whose drive was recorded, with its noise; `drive` is then an estimate of the drive
+    charges: ChargeRows | None = None
 
     @property
     def linear_names(self) -> tuple[str, ...]:
@@ -134,11 +137,6 @@ class ChannelLikelihood(eqx.Module):
         return isinstance(self.drive, Sampled) and not self.steady_state
 
     @property
-    def charges(self) -> ChargeRows | None:
-        """Rows of a current whose drive was recorded, or None."""
-        return self.whitening if isinstance(self.whitening, ChargeRows) else None
-
-    @property
     def is_student(self) -> bool:
         """Whether residuals have a Student-t distribution, and not its expansion."""
         return self.noise == "student" and self.expansion is None
@@ -147,6 +145,8 @@ class ChannelLikelihood(eqx.Module):
     def count(self) -> ArrayLike:
         if self.compression is not None:
             return self.compression.samples
+        if self.charges is not None:
+            return array_module(self.charges.gain).count_nonzero(self.charges.gain)
         if self.whitening is not None:
             return array_module(self.whitening.mask).count_nonzero(self.whitening.mask)
         return self.time.size if self.weight is None else array_module(self.weight).count_nonzero(self.weight)
@@ -174,8 +174,7 @@ class ChannelLikelihood(eqx.Module):
     def exclude_samples(self, excluded: Bool[np.ndarray, " samples"]) -> "ChannelLikelihood":
         """Return the channel without some of its samples; a compression must be made anew."""
         weight, whitening = np.where(excluded, 0.0, self.weights), self.whitening
-        whitening = whitening.exclude(excluded) if isinstance(whitening, Whitening) else whitening
-        return dataclasses.replace(self, weight=weight, whitening=whitening)
+        return dataclasses.replace(self, weight=weight, whitening=whitening and whitening.exclude(excluded))
 
     def exclude_unknown_drive(self) -> "ChannelLikelihood":
         """Return the channel without the samples at the ends that may follow, by a delay, a V beyond the record."""
@@ -201,8 +200,8 @@ class ChannelLikelihood(eqx.Module):
         rate = None if self.rate is None else np.zeros(2)
         effects = None if self.effects is None else np.zeros((len(self.effects), 2))
         shortened = dataclasses.replace(self, time=ends, observed=extremes, drive=drive, rate=rate, effects=effects)
-        rows = self.charges and self.charges.restrict(slice(2))  # with which the channel follows its delay
-        return dataclasses.replace(shortened, weight=None, whitening=rows, phases=None)
+        charges = None if self.charges is None else jax.tree.map(lambda _: np.zeros(2), self.charges)
+        return dataclasses.replace(shortened, weight=None, whitening=None, charges=charges, phases=None)
 
     def thin(self, count: int) -> "ChannelLikelihood":
         """Return the channel with `count` of its samples, the ends among them, and white noise."""
@@ -243,14 +242,18 @@ class ChannelLikelihood(eqx.Module):
         if self.phases is not None and "clock" not in self.timing:
             folded = dataclasses.replace(self, time=self.phases, phases=None)
             return folded._response(inputs, extra_delay)[jnp.arange(self.time.size) % self.period]
-        undelayed = self.charges is not None or not self.timing and isinstance(extra_delay, float) and extra_delay == 0.0
+        undelayed = self.charges is not None or (
+            not self.timing and isinstance(extra_delay, float) and extra_delay == 0.0
+        )
         if undelayed and isinstance(self.drive, Sampled) and self.drive.period is None:
             time = self.drive.time  # identical to the samples of V, so that `highpass` needs no search
         else:
             time = self.drive_time(inputs.delay + extra_delay, inputs.clock)
         total, rate = self._response_and_rate(inputs, time)
         if rate is not None and self.charges is not None:
-            total = jnp.interp(self.time - (self.shift + inputs.delay), self.time, total + rate * self.charges.sample_rate())
+            total = jnp.interp(
+                self.time - (self.shift + inputs.delay), self.time, total + rate * self.charges.sample_rate()
+            )
         elif rate is not None and self.rate is not None:
             total = total + rate * self.rate
         return inputs.gain * total
@@ -311,10 +314,13 @@ class ChannelLikelihood(eqx.Module):
         shapes.append(jnp.zeros((missing, remainder.size)))
         return remainder, jnp.concatenate(shapes)[self._column_indices]
 
-    def rows_and_shapes(self, inputs: ChannelInputs) -> tuple[Float[Array, " samples"], Float[Array, "columns samples"]]:
+    def rows_and_shapes(
+        self, inputs: ChannelInputs
+    ) -> tuple[Float[Array, " samples"], Float[Array, "columns samples"]]:
         """Return rows minus those of the signal, and the rows of the shapes of the `columns`, before whitening."""
         charges = self.charges
-        assert charges is not None and isinstance(self.drive, Sampled)
+        assert charges is not None
+        assert isinstance(self.drive, Sampled)
         total, rate = self._response_and_rate(inputs, self.drive.time)
         if inputs.effects is not None:
             total = total + inputs.effects @ self.effects / inputs.gain

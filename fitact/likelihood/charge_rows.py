@@ -35,7 +35,9 @@ def step_means(values: Float[np.ndarray, "*n samples"], delay: float = 0.0) -> F
     whole = int(np.floor(delay))
     part = delay - whole
     others = _INTERPOLATED[:, None] != _INTERPOLATED
-    factors = np.where(others, part - _INTERPOLATED, 1.0) / np.where(others, np.subtract.outer(_INTERPOLATED, _INTERPOLATED), 1.0)
+    factors = np.where(others, part - _INTERPOLATED, 1.0) / np.where(
+        others, np.subtract.outer(_INTERPOLATED, _INTERPOLATED), 1.0
+    )
     taps = np.convolve(np.prod(factors, axis=1), _MEAN_OF_STEP)
     used = np.flatnonzero(taps)[[0, -1]]
     shift = LAG + 2 + _BEFORE - whole - int(used[1])  # the row k + LAG takes the samples from k + whole - 4 on
@@ -59,18 +61,9 @@ class ChargeRows(eqx.Module):
     decay: Float[Array, " samples"]
 
     @property
-    def mask(self) -> Float[Array, " samples"]:
-        """1 for rows that count, 0 for others."""
-        return (self.gain > 0.0) * 1.0
-
-    @property
     def reach(self) -> int:
         """Number of samples before its own that a row needs."""
         return LAG + _BEFORE
-
-    def __call__(self, values: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
-        """Return the whitened rows of functions of time, on the clock of V."""
-        return self.whiten(self.means(jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(self.reach, 0)])))
 
     def means(self, values: Float[Array, "*shape reach+samples"]) -> Float[Array, "*shape samples"]:
         """Return the rows of functions of time, given from `reach` samples before the first row on."""
@@ -124,9 +117,11 @@ class RowCovariance:
         return self.used * scipy.linalg.cho_solve_banded((self._factor, False), np.where(self.used, rows, 0.0))
 
 
-def whiten_rows(gain: np.ndarray, decay: np.ndarray, rows: Float[np.ndarray, "*n rows"]) -> Float[np.ndarray, "*n rows"]:
+def whiten_rows(
+    gain: np.ndarray, decay: np.ndarray, rows: Float[np.ndarray, "*n rows"]
+) -> Float[np.ndarray, "*n rows"]:
     """Return whitened rows as `ChargeRows.whiten`, without JAX."""
     bands = np.stack([np.ones_like(decay), -np.append(decay[1:], 0.0)])
     scaled = np.reshape(gain * rows, (-1, decay.size))
-    return scipy.linalg.lapack.dtbtrs(bands, scaled.T, uplo="L", diag="U", overwrite_b=True)[0].T.reshape(np.shape(rows))
-
+    whitened, _ = scipy.linalg.lapack.dtbtrs(bands, scaled.T, uplo="L", diag="U", overwrite_b=True)
+    return whitened.T.reshape(np.shape(rows))

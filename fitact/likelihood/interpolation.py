@@ -12,7 +12,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -104,7 +104,7 @@ def interpolate(
         return None
     basis, triangle = np.linalg.qr(signals[chosen].T)
     selected, coefficients, surplus = _choose_points(basis)
-    without_kept = {
+    without_kept: dict[str, Any] = {
         "mask" if channel.whitening else "weight": np.where(np.isin(np.arange(size), kept), 0.0, samples.mask)
     }
     training = jax.tree.map(lambda leaf: leaf[np.append(chosen, 0)], inputs)

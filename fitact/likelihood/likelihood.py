@@ -17,6 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from fitact.compiled import BatchEvaluator, array_module, jit
+from fitact.experiment.blind_directions import STRAY
 from fitact.likelihood.calibration import Calibration
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
 from fitact.likelihood.friction_channel import FrictionChannel
@@ -34,7 +35,6 @@ from fitact.model.skin import (
 from fitact.prior.distributions import Distribution
 from fitact.prior.prior import Prior
 
-STRAY = "stray_capacitance"  # name of the parameter, F
 UNCONSTRAINED_SD = math.log(1e6)  # in a log-parameter; a larger sd counts as no constraint
 
 

@@ -61,7 +61,8 @@ def compress(
     steady_state: bool,
     expected_terms: HighpassTerms,
     weight: Float[np.ndarray, " samples"] | None = None,
-    whitening: Whitening | ChargeRows | None = None,
+    whitening: Whitening | None = None,
+    charges: ChargeRows | None = None,
     rate: Float[np.ndarray, " samples"] | None = None,
     delayed: bool = False,
     slope: Float[np.ndarray, " samples"] | None = None,
@@ -80,7 +81,8 @@ def compress(
     to a measured drive on a uniform grid can be shifted by up to `MAX_DELAY` steps; V is then taken as constant before
     the first and after the last sample. `slope` replaces dV/dt in the field of that name. `student`
     holds weights of the squares, and two functions to be projected instead of the record; `observed` and its slope are
-    then without the model at which they were computed. `effects` are further functions of the model.
+    then without the model at which they were computed. `charges` are rows that take the place of `observed`, `rate` and
+    `slope`, and of the filter. `effects` are further functions of the model.
 
     Terms of a grid of time constants have arrays of weights and time constants; the table then holds the responses of
     the grid instead of series.
@@ -91,9 +93,8 @@ def compress(
         effects = voltage if effects is None else np.concatenate([effects, voltage])
     one = np.ones(time.size) if weight is None else np.asarray(weight)
     mask = one if whitening is None else np.asarray(whitening.mask)[: time.size]
-    charges = whitening if isinstance(whitening, ChargeRows) else None
     if charges is not None:
-        observed, rate, slope = charges.observed, charges.rate, charges.slope
+        observed, rate, slope, mask = charges.observed, charges.rate, charges.slope, charges.gain
     samples = Samples(
         time,
         observed,
@@ -105,7 +106,7 @@ def compress(
         effects,
         charges,
     )
-    taps = None if whitening is None or charges is not None else np.asarray(whitening.taps)
+    taps = None if whitening is None else np.asarray(whitening.taps)
     measured = isinstance(drive, Sampled) and not steady_state
     if isinstance(drive, Sampled) and measured:
         parts = _accumulate_measured(table, drive, samples, taps, MAX_DELAY if delayed else 0)

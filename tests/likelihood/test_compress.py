@@ -49,7 +49,7 @@ def check(compression, u: np.ndarray, decay: np.ndarray | None, slow: np.ndarray
 
 def slow(time: np.ndarray) -> np.ndarray:
     since = time - 0.5 * (time[0] + time[-1])
-    angles = [2.0 * np.pi * f * since for f in (50.0, 60.0)]
+    angles = [2.0 * np.pi * f * since for f in (50.0, 60.0, 150.0, 180.0)]
     waves = [wave(angle) for angle in angles for wave in (np.cos, np.sin)]
     return np.stack([np.ones_like(time), since / since[-1], *waves])
 
