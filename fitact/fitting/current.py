@@ -38,8 +38,9 @@ from fitact.model.drive import Sampled
 
 Rows = Float[np.ndarray, " samples"]
 Belief = tuple[np.ndarray, np.ndarray]  # prior means and sds of log Rsc, log Csc and log Ci
-# rms error of the mean over a step, up to six steps from a jump, relative to its height
-_JUMP_ERRORS = np.array([3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.29, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4])
+# rms error of the mean over a step, up to six steps from a jump, relative to its height; beside the step of the jump,
+# where the error is 0.06 to 0.1 at all jumps alike and would bias a delay, three times as large
+_JUMP_ERRORS = np.array([3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.3, 0.29, 0.3, 0.03, 0.01, 3e-3, 1e-3, 3e-4])
 _FEW = 4  # equal values in a row that are usual where noise exceeds the rounding
 _ROW_NOISE = 0.6285  # variance of a row over that of a sample of white noise; with those of neighbours, the sum is 1
 
