@@ -17,8 +17,8 @@ from fitact.tracking import track_record
 from fitact.tracking.solve_windows import _residuals_vary
 
 RATE, DURATION, WINDOW = 50e3, 3.0, 0.08
-# corners lie anywhere between samples, which otherwise would all have the same error
-DRIVE = {"waveform": "trapezoid", "rise_time": "200 us", "frequency": "63 Hz"}
+# corners in the middle between samples; on samples, the time of all jumps of I would have the same error of half a step
+DRIVE = {"waveform": "trapezoid", "rise_time": "200 us", "phase": "0.36 deg"}
 START = (160e3, 22e-9, 1.35e-9)
 SCENE = fitact.Scene.from_dict({"drive": {"waveform": "measured"}, "measurement": {"channels": ["Vsc", "I"]}})
 ALONE = fitact.Scene.from_dict({"drive": {"waveform": "measured"}})
@@ -38,7 +38,8 @@ def simulate(
     course = make_course(STILL | change, START, duration, rng)
     time = np.arange(round(duration * rate)) / rate
     V, Vsc, current = simulate_response(scene, time, None, "scipy", course)
-    Vsc, current = Vsc + 0.1 * rng.standard_normal(time.size), current + 20e-9 * rng.standard_normal(time.size)
+    V, Vsc = (values + 0.1 * rng.standard_normal(time.size) for values in (V, Vsc))
+    current = current + 20e-9 * rng.standard_normal(time.size)
     return fitact.Record.from_arrays(time, V=V, Vsc=Vsc, I=current), course
 
 
@@ -130,7 +131,7 @@ def test_fit_of_a_constant_finger_names_the_change(slide):
 def test_stationary_record_gives_the_answer_of_a_fit():
     record, course = simulate(duration=1.0)
     fitted, found = fitact.fit(record, SCENE), fitact.track(record, SCENE)
-    for i, name in enumerate(fitted.names):
+    for i, name in enumerate(each for each in fitted.names if each in found.values):
         # the walk's rate is not exactly zero, so that the bands are a little wider
         assert np.max(np.abs(np.log(found.values[name]) - fitted.theta[i])) < 2.0 * np.max(found.sd[name])
         assert np.max(found.sd[name]) < 2.0 * fitted.sd[i]
@@ -143,9 +144,9 @@ def test_walk_fixed_at_zero_gives_the_answer_of_a_fit():
     record, _ = simulate(duration=0.96)  # a whole number of windows
     fitted = fitact.fit(record, SCENE)
     found = fitact.track(record, SCENE, rates=(0.0, 0.0, 0.0))
-    for i, name in enumerate(fitted.names):
-        # the first windows have a few samples at edges more or less than the whole record
-        assert np.log(found.values[name]) == pytest.approx(fitted.theta[i], abs=0.05 * fitted.sd[i])
+    for i, name in enumerate(each for each in fitted.names if each in found.values):
+        # the first steps of each window have no row, and each window has an estimate of the drive of its own
+        assert np.log(found.values[name]) == pytest.approx(fitted.theta[i], abs=0.2 * fitted.sd[i])
         assert found.sd[name] == pytest.approx(fitted.sd[i], rel=0.02)
 
 
