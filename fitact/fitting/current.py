@@ -41,7 +41,7 @@ Belief = tuple[np.ndarray, np.ndarray]  # prior means and sds of log Rsc, log Cs
 # rms error of the mean over a step, up to six steps from a jump, relative to its height; beside the step of the jump,
 # where the error is 0.06 to 0.1 at all jumps alike and would bias a delay, three times as large
 _JUMP_ERRORS = np.array([3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.3, 0.29, 0.3, 0.03, 0.01, 3e-3, 1e-3, 3e-4])
-_FEW = 4  # equal values in a row that are usual where noise exceeds the rounding
+FEW = 4  # equal values in a row that are usual where noise exceeds the rounding
 _ROW_NOISE = 0.6285  # variance of a row over that of a sample of white noise; with those of neighbours, the sum is 1
 
 
@@ -82,7 +82,7 @@ class RecordedCurrent:
         """Estimate which samples are less certain than the noise of V and I (A) makes them."""
         rounding, runs = _least_step(current) / math.sqrt(12.0), run_lengths(current)
         # a run of equal values shares one error, so that its mean has the variance of one
-        uncertain = _kink_variance(current, noise) + np.where(runs > _FEW, rounding**2 * runs, 0.0)
+        uncertain = _kink_variance(current, noise) + np.where(runs > FEW, rounding**2 * runs, 0.0)
         # the flat top of a pulse that is coarsely rounded looks clipped, but lies within the range of the converter
         codes = np.log2(np.maximum(np.abs([current.min(), current.max()]) / (math.sqrt(12.0) * rounding or 1.0), 1.0))
         is_coarse = rounding > white_noise_sd(current) and np.max(np.abs(codes - np.round(codes))) > 0.02
@@ -96,7 +96,7 @@ class RecordedCurrent:
     @property
     def is_coarse(self) -> bool:
         """Whether I has long runs of equal values, whose rounding is no noise."""
-        return float(np.mean(run_lengths(self.I) > _FEW)) > 0.1
+        return float(np.mean(run_lengths(self.I) > FEW)) > 0.1
 
     @property
     def _floor(self) -> float:
@@ -404,6 +404,20 @@ def _scan_recorded(
     waves = [wave(2.0 * np.pi * f * time) for f in hum for wave in (np.cos, np.sin)]
     decays = np.exp(-np.maximum(time, -step) / estimate.b)
     return estimate, amplitudes[1] * decays + amplitudes[3:] @ np.stack([np.ones_like(time), *waves])
+
+
+def hum_likeness(current: RecordedCurrent, frequency: float, most: int = 4096) -> float:
+    """Return the fraction of a hum's power that the response of a circuit may explain; 1 below a period."""
+    several = math.ceil(current.I.size / most)
+    step, V = current.step * several, current.V[: current.I.size // several * several].reshape(-1, several).mean(axis=1)
+    if frequency * step * V.size < 1.0 or frequency * step > 0.5:
+        return 1.0
+    taus = np.geomspace(2.0 * step, step * V.size, 8)
+    rows = np.stack([np.ones_like(V), np.gradient(V), *(_first_order(V, step, tau) for tau in taus)])
+    basis, sizes, _ = np.linalg.svd((rows / np.linalg.norm(rows, axis=1, keepdims=True)).T, full_matrices=False)
+    turns = 2.0 * math.pi * frequency * step * np.arange(V.size)
+    parts = basis[:, sizes > 1e-6 * sizes[0]].T @ np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    return float(np.sum(parts**2) / V.size)
 
 
 def respond_to(current: RecordedCurrent, estimate: CurrentEstimate, stray: float) -> Callable[[Rows], Rows]:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from fitact import summary
 from fitact.fitting.geometry import Contribution
-from fitact.fitting.instrument_errors import UNRESOLVED_EDGES, ErrorCoordinate, InstrumentError
+from fitact.fitting.instrument_errors import UNRESOLVED_V, ErrorCoordinate, InstrumentError
 from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.skin import probe_parameters
@@ -73,7 +73,7 @@ def structure_components(effects: EffectSizes, quantity: str) -> tuple[Component
 
 
 def _instrument_source(error: InstrumentError) -> ErrorSource:
-    is_own = error.source.startswith(UNRESOLVED_EDGES)
+    is_own = error.source.startswith(UNRESOLVED_V)
     return ErrorSource(error.source, error.distribution, _CALIBRATE, error.power, is_shared=not is_own)
 
 

@@ -462,10 +462,12 @@ def fit_records(
                 warnings=(*calibrated.warnings, *fitted.warnings),
                 notes=(*calibrated.notes, *fitted.notes),
             )
-        except np.linalg.LinAlgError as error:
+        except InputError:
+            raise
+        except Exception as error:  # whatever it is, other records are to go on
             raise InputError(
-                f"{records[0].source}: the channels cannot be computed with ({error}); check for a huge offset or a"
-                " wrong unit"
+                f"{records[0].source}: the channels cannot be computed with ({type(error).__name__}: {error}); check"
+                " for a huge offset, a wrong unit, or a channel without a signal"
             ) from error
 
 

@@ -16,7 +16,7 @@ from fitact.prior.product import multiply
 from fitact.scene.scene import Scene
 
 GAIN = "gain"
-UNRESOLVED_EDGES = "edges of V between two samples"
+UNRESOLVED_V = "V between two samples or two levels of its converter"
 # small errors in proportion to a function of time; those of V reach the channels through the circuit
 V_NONLINEARITY = ("nonlinearity_V_even", "nonlinearity_V_odd")
 EFFECTS = ("compensation", "nonlinearity_even", "nonlinearity_odd", *V_NONLINEARITY)
@@ -52,7 +52,7 @@ class ErrorCoordinate:
     @property
     def is_stated(self) -> bool:
         """Whether the scene states an instrument's error, and it does not only stand for unresolved edges."""
-        return any(not error.source.startswith(UNRESOLVED_EDGES) for error in self.errors)
+        return any(not error.source.startswith(UNRESOLVED_V) for error in self.errors)
 
     def distribution(self) -> Distribution:
         return multiply([(error.distribution, error.power) for error in self.errors])
@@ -149,7 +149,7 @@ def _channel_errors(member: Member, kind: str) -> Iterable[tuple[str, Distributi
         key = "gain_relative_sd" if name == "Vsc" else "gain_I_relative_sd"
         yield f"{name} gain ([measurement] {key} = {stated:g})", LogNormal(1.0, log_sd(stated)), 1.0, 0.0
     if member.edge_sd > 0.0:
-        label = member.channel.qualified_name(UNRESOLVED_EDGES)
+        label = member.channel.qualified_name(UNRESOLVED_V)
         yield label, LogNormal(1.0, member.edge_sd), 1.0, 0.0
 
 

@@ -313,6 +313,8 @@ def _bic_decreases(
     """Return the decrease of the BIC that adding each nuisance would cause, to first order."""
     likelihood, sigma = solution.likelihood, solution.sigma
     residuals = [x / s for x, s in zip(solution.residuals, sigma, strict=True)]
+    if not all(np.isfinite(x).all() for x in (*residuals, *solution.jacobian)):
+        return {}
     starts = np.cumsum([0, *(x.size for x in residuals)])
     columns = [np.concatenate([j[: x.size] for j, x in zip(solution.jacobian, residuals, strict=True)])]
 

@@ -17,12 +17,15 @@ from fitact.errors import InputError
 from fitact.experiment.blind_directions import STRAY, gain_names
 from fitact.experiment.fisher import Experiment
 from fitact.fitting.current import (
+    FEW,
     Current,
     RecordedCurrent,
     estimate_from_current,
     estimate_noise,
     estimate_recorded,
+    hum_likeness,
     respond_to,
+    run_lengths,
     select_samples,
     set_rows,
 )
@@ -238,11 +241,11 @@ def _build_channel(
     label = "_".join(filter(None, ("" if channel == "Vsc" else channel, number)))
     notes, warnings = (*record.notes, *choice.notes), (*record.warnings, *choice.warnings)
     # an offset of the friction would be mistaken for the normal force
-    optional = ("drift", *_hum(record, choice, channel), "crosstalk" if channel == "Ft" else "offset")
+    optional = ("drift", *_hum(record, choice), "crosstalk" if channel == "Ft" else "offset")
     start: Estimate | None = None
     used: np.ndarray | None = None
     slope: np.ndarray | None = None
-    edge_sd = 0.0
+    edge_sd = 0.0 if choice.name != "measured" or channel == "Ft" else rounded_gain_sd(record["V"])
     if channel == "Vsc":
         optional = (*optional, "delay")
         if choice.periodic and choice.steady_state and choice.name != "measured":
@@ -252,15 +255,13 @@ def _build_channel(
             max_divider = 0.5 if isinstance(plain, FinalCircuit) else 1.0
             leaks = passes_direct_current(plain)
             start = estimate_from_vsc(record, choice, max_divider * largest_gain(scene), has_leak=leaks)
-            edge_sd = _unresolved_gain_sd(record, choice, start)
+            edge_sd = math.hypot(edge_sd, _unresolved_gain_sd(record, choice, start))
     elif channel == "I" and choice.name != "measured" and not limits_current(template):
         used, slope = select_samples(record, choice)
         # the estimate knows no leak; without it, the start comes from Vsc or from draws of the prior
-        start = (
-            None
-            if passes_direct_current(template)
-            else estimate_from_current(record, choice, used, slope, prior_skin_moments(bare))
-        )
+        belief = prior_skin_moments(bare)
+        if not passes_direct_current(template):
+            start = estimate_from_current(record, choice, used, slope, belief)
     weight, clipped = _weight(record, channel, used)
     weight, at_jumps = exclude_jumps(template, record, choice, weight)
     if weight is None and len(record) <= MAX_PADDED_LENGTH:
@@ -297,18 +298,28 @@ def _build_channel(
     if timing:
         likelihood = likelihood.exclude_unknown_drive()
     if channel == "I" and choice.name == "measured":
-        likelihood, start, noise = _make_charge_rows(likelihood, record, scene, choice, bare)
+        likelihood, start, noise, hum = _make_charge_rows(likelihood, record, scene, bare)
+        optional = ("drift", "offset", *(f"hum_{frequency:.0f}Hz" for frequency in hum))
     remarks = (*notes, *at_jumps), (*warnings, *clipped)
     return likelihood, Source(record, scene, choice, noise, optional, start, *remarks), edge_sd
 
 
 def _make_charge_rows(
-    channel: ChannelLikelihood, record: Record, scene: Scene, choice: DriveModel, bare: Likelihood
-) -> tuple[ChannelLikelihood, CurrentEstimate | None, float]:
-    """Return the channel of a current with a recorded drive, an estimate of its circuit, and the noise of I (A)."""
+    channel: ChannelLikelihood, record: Record, scene: Scene, bare: Likelihood, usual_hum: float = 10.0
+) -> tuple[ChannelLikelihood, CurrentEstimate | None, float, list[float]]:
+    """Return the channel of a current with a recorded drive, and an estimate of its circuit.
+
+    Also the noise of I (A), and the frequencies (Hz) of hum that the record shows if it is there. Hum that a circuit
+    may explain has a prior of `usual_hum` times the noise.
+    """
     current, stray = RecordedCurrent.from_record(record), scene.stray_capacitance()
-    fixed = [float(name[4:-2]) for name in _hum(record, choice, "I")]
-    estimate, nuisances = estimate_recorded(current, stray, fixed, prior_skin_moments(bare))
+    likeness = {frequency: hum_likeness(current, frequency) for frequency in HUM_FREQUENCIES}
+    hum = [frequency for frequency, part in likeness.items() if part < 0.7]
+    estimate, nuisances = estimate_recorded(current, stray, hum, prior_skin_moments(bare))
+    linear_sd = channel.linear_sd.copy()
+    for i, frequency in enumerate(HUM_FREQUENCIES):
+        if not likeness[frequency] < 0.7:
+            linear_sd[2 * i + 2 : 2 * i + 4] = usual_hum * current.noise_I
     modelled = Current(estimate.capacitance + stray, abs(estimate.weight), 0.0)
     rows, V = current.make_rows(modelled, respond_to(current, estimate, stray), nuisances)
     # converters take channels in turn, and probes delay them
@@ -317,13 +328,14 @@ def _make_charge_rows(
         channel,
         drive=Sampled(channel.time, pad_samples(V)),
         steady_state=False,
+        linear_sd=linear_sd,
         timing=("delay",),
         timing_sd=np.array([delay_sd, channel.timing_sd[1]]),
         # residuals of runs of equal values are no measure of the noise
         noise_floor=np.asarray(current.noise_I * (1.0 if current.is_coarse else 0.5)),
     )
     usable = not limits_current(bare.template) and not passes_direct_current(bare.template)
-    return set_rows(channel, rows, V, 0.0), estimate if usable else None, current.noise_I
+    return set_rows(channel, rows, V, 0.0), estimate if usable else None, current.noise_I, hum
 
 
 def _require_whole_drive(record: Record, choice: DriveModel) -> None:
@@ -388,11 +400,8 @@ def _prior_of_nuisances(
     }
 
 
-def _hum(record: Record, choice: DriveModel, channel: str) -> list[str]:
-    """Return the mains hums that are distinguishable from harmonics of the drive, or from a fraction of its period.
-
-    Hum of a small current has harmonics.
-    """
+def _hum(record: Record, choice: DriveModel) -> list[str]:
+    """Return the mains hums that are distinguishable from harmonics of the drive, or from a fraction of its period."""
     span, frequency = float(record.time[-1] - record.time[0]), record.frequency()
 
     def is_distinguishable(hum: float) -> bool:
@@ -400,7 +409,7 @@ def _hum(record: Record, choice: DriveModel, channel: str) -> list[str]:
             return not choice.periodic and hum * span > 2.0
         return abs(hum - frequency * round(hum / frequency)) * span > 0.5
 
-    frequencies = HUM_FREQUENCIES if channel == "I" else HUM_FREQUENCIES[:2]
+    frequencies = HUM_FREQUENCIES[:2]
     return [f"hum_{hum:.0f}Hz" for hum in frequencies if is_distinguishable(hum) and hum * record.time_step < 0.5]
 
 
@@ -409,6 +418,16 @@ def _unresolved_gain_sd(record: Record, choice: DriveModel, start: VscEstimate) 
     if choice.name != "measured" or not has_unresolved_edge(choice.voltage) or not math.isfinite(start.b):
         return 0.0
     return edge_gain_sd(record.time_step, start.b)
+
+
+def rounded_gain_sd(voltage: np.ndarray, min_part: float = 0.1, least: float = 2e-4) -> float:
+    """Return the sd of log(gain) that stands for the rounding of flat levels, which their samples share.
+
+    It is 0 if less than `min_part` of the samples have the same value as those around them, and below `least`, which
+    is that of 11 bits.
+    """
+    sd = math.sqrt(2.0) * rounding_noise_sd(voltage) / float(np.ptp(voltage))
+    return sd if sd > least and np.mean(run_lengths(voltage) > FEW) > min_part else 0.0
 
 
 def edge_gain_sd(time_step: float, b: Any) -> Any:

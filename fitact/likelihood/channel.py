@@ -324,11 +324,11 @@ class ChannelLikelihood(eqx.Module):
         total, rate = self._response_and_rate(inputs, self.drive.time)
         if inputs.effects is not None:
             total = total + inputs.effects @ self.effects / inputs.gain
-        functions = jnp.concatenate([total[None], self.shapes(inputs)])
+        functions = jnp.concatenate([total[None], self.shapes(inputs)[self._column_indices]])
         signal, *shapes = charges.means(jnp.pad(functions, ((0, 0), (charges.reach, 0))))
         signal = signal if rate is None else signal + rate * charges.rate
         remainder = charges.observed - inputs.gain * signal - inputs.delay * charges.slope
-        return remainder, jnp.stack(shapes)[self._column_indices]
+        return remainder, jnp.reshape(jnp.asarray(shapes), (len(self.columns), remainder.size))
 
     def _compressed_signal(self, inputs: ChannelInputs) -> tuple[Float[Array, " rows"], Array]:
         """Return the signal in the coordinates of the compression, and whether the compression holds there."""

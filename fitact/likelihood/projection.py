@@ -87,7 +87,12 @@ def compress(
     Terms of a grid of time constants have arrays of weights and time constants; the table then holds the responses of
     the grid instead of series.
     """
-    table = TableNodes.from_terms(expected_terms, time, narrow=student is not None)
+    reach = None
+    if charges is not None and time.size <= MANY_SAMPLES and isinstance(expected_terms.tau, tuple):
+        # I with a noisy V may leave b uncertain by more than a usual table covers
+        multiple = 1 + table_multiple(np.array(expected_terms.tau))
+        reach = multiple * TABLE_HALF_WIDTH, node_count(multiple * TABLE_HALF_WIDTH)
+    table = TableNodes.from_terms(expected_terms, time, narrow=student is not None, reach=reach)
     if table.expected_direct is not None:  # V is one more function, the last of the effects
         voltage = evaluate_voltage(drive, time, steady_state)[None]
         effects = voltage if effects is None else np.concatenate([effects, voltage])
