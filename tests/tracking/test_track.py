@@ -18,8 +18,7 @@ from fitact.tracking import track_record
 from fitact.tracking.solve_windows import _residuals_vary
 
 RATE, DURATION, WINDOW = 50e3, 3.0, 0.08
-# corners in the middle between samples; on samples, the time of all jumps of I would have the same error of half a step
-DRIVE = {"waveform": "trapezoid", "rise_time": "200 us", "phase": "0.36 deg"}
+DRIVE = {"waveform": "trapezoid", "rise_time": "200 us", "frequency": "100 Hz"}
 START = (160e3, 22e-9, 1.35e-9)
 SCENE = fitact.Scene.from_dict({"drive": {"waveform": "measured"}, "measurement": {"channels": ["Vsc", "I"]}})
 ALONE = fitact.Scene.from_dict({"drive": {"waveform": "measured"}})
@@ -34,7 +33,9 @@ def simulate(
     seed: int = 0, duration: float = DURATION, rate: float = RATE, **change: Any
 ) -> tuple[fitact.Record, Course]:
     """Return a record of a finger that changes, with noise of 0.1 V and 20 nA, and its course."""
-    scene = make_scene({"drive": DRIVE, "measurement": {"channels": ["Vsc", "I"]}}, {}, "scene")
+    # corners lie half-way between samples; if all lay on samples, the jumps of I would tell a wrong delay
+    drive = DRIVE | {"phase": f"{180.0 * 100.0 / rate} deg"}
+    scene = make_scene({"drive": drive, "measurement": {"channels": ["Vsc", "I"]}}, {}, "scene")
     rng = np.random.default_rng(seed)
     course = make_course(STILL | change, START, duration, rng)
     time = np.arange(round(duration * rate)) / rate
