@@ -38,8 +38,9 @@ from fitact.model.drive import Sampled
 
 Rows = Float[np.ndarray, " samples"]
 Belief = tuple[np.ndarray, np.ndarray]  # prior means and sds of log Rsc, log Csc and log Ci
-# rms error of the mean over a step, up to six steps from a jump, relative to its height
-_JUMP_ERRORS = np.array([3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.29, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4])
+# rms error of the mean over a step, up to six steps from a jump, relative to its height; beside the step of the jump,
+# where the error is 0.06 to 0.1 at all jumps alike and would bias a delay, three times as large
+_JUMP_ERRORS = np.array([3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.3, 0.29, 0.3, 0.03, 0.01, 3e-3, 1e-3, 3e-4])
 FEW = 4  # equal values in a row that are usual where noise exceeds the rounding
 _ROW_NOISE = 0.6285  # variance of a row over that of a sample of white noise; with those of neighbours, the sum is 1
 
@@ -50,6 +51,7 @@ class Current(NamedTuple):
     capacitance: float  # that follows dV/dt, with the stray one, F
     conductance: float  # of what does not follow it, S
     delay: float  # against V, in time steps
+    follows: bool = True  # whether it follows dV/dt, which no resistance limits
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,6 +62,7 @@ class RecordedCurrent:
     I: Rows  # noqa: E741
     step: float  # s
     variance_V: Rows  # of the noise and the rounding of each sample of V, V^2
+    noise_V: tuple[float, float]  # white noise and rounding, V
     noise_I: float  # A
     uncertain: Rows  # variance of the mean current over the step after a sample, because of kinks and rounding, A^2
     excluded: Bool[np.ndarray, " samples"]  # samples of I that are clipped
@@ -68,15 +71,27 @@ class RecordedCurrent:
     def from_record(cls, record: Record) -> "RecordedCurrent":
         """Estimate the noise of a record's V and I."""
         V, current = record["V"], record["I"]
+        noise_V = math.sqrt(max(estimate_noise(V) ** 2 - rounding_noise_sd(V) ** 2, 0.0)), rounding_noise_sd(V)
+        noise_I = max(estimate_noise(current), _least_step(current) / math.sqrt(12.0))
+        return cls.from_samples(V, current, record.time_step, noise_V, noise_I)
+
+    @classmethod
+    def from_samples(
+        cls, V: Rows, current: Rows, step: float, noise_V: tuple[float, float], noise: float
+    ) -> "RecordedCurrent":
+        """Estimate which samples are less certain than the noise of V and I (A) makes them."""
         rounding, runs = _least_step(current) / math.sqrt(12.0), run_lengths(current)
-        noise = max(estimate_noise(current), rounding)
         # a run of equal values shares one error, so that its mean has the variance of one
         uncertain = _kink_variance(current, noise) + np.where(runs > FEW, rounding**2 * runs, 0.0)
         # the flat top of a pulse that is coarsely rounded looks clipped, but lies within the range of the converter
         codes = np.log2(np.maximum(np.abs([current.min(), current.max()]) / (math.sqrt(12.0) * rounding or 1.0), 1.0))
         is_coarse = rounding > white_noise_sd(current) and np.max(np.abs(codes - np.round(codes))) > 0.02
         excluded = np.zeros(V.size, bool) if is_coarse else clipping_mask(current)
-        return cls(V, current, record.time_step, drive_variance(V), noise, uncertain, excluded)
+        return cls(V, current, step, drive_variance(V, *noise_V), noise_V, noise, uncertain, excluded)
+
+    def continue_with(self, V: Rows, current: Rows) -> "RecordedCurrent":
+        """Return other samples of V and I, with the same noise."""
+        return self.from_samples(V, current, self.step, self.noise_V, self.noise_I)
 
     @property
     def is_coarse(self) -> bool:
@@ -90,17 +105,19 @@ class RecordedCurrent:
 
     def covariance(self, modelled: Current) -> RowCovariance:
         """Return the covariance of the rows."""
+        variance, driven, excluded = self._variance(modelled)
+        return RowCovariance(variance, 0.5 * (1.0 - _ROW_NOISE) * self._floor**2 - driven, excluded)
+
+    def _variance(self, modelled: Current) -> tuple[Rows, Rows, Bool[np.ndarray, " samples"]]:
+        """Return the variance of the rows, that by the noise of a sample of V, and which rows are excluded."""
         driven = np.roll((modelled.capacitance / self.step) ** 2 * self.variance_V, LAG)
         floor = self._floor**2
         level = _ROW_NOISE * floor + driven + np.roll(driven, -1) + modelled.conductance**2 * np.mean(self.variance_V)
-        shift = LAG - round(modelled.delay)
-        variance = level + np.roll(self.uncertain, shift)
-        neighbours = 0.5 * (1.0 - _ROW_NOISE) * floor - driven
-        reach = np.arange(-LAG, LAG)
-        clipped = np.convolve(self.excluded, np.ones(reach.size), "same") > 0.5
-        excluded = np.roll(clipped, shift)
+        shift, excluded = LAG - round(modelled.delay), self.excluded.copy()
+        if excluded.any():
+            excluded = np.roll(np.convolve(excluded, np.ones(2 * LAG), "same") > 0.5, shift)
         excluded[: 2 * LAG] = True
-        return RowCovariance(variance, neighbours, excluded)
+        return level + np.roll(self.uncertain, shift), driven, excluded
 
     def flatten(self, white: Rows, modelled: Current) -> Rows:
         """Return whitened rows without the spectrum that a tridiagonal covariance leaves in the noise of I."""
@@ -139,6 +156,36 @@ class RecordedCurrent:
         gain, decay = covariance.recursion(self._floor / math.sqrt(float(power)))
         return ChargeRows(means + signal - from_V, self.rise(V), slope, gain, decay), V
 
+    def fit_rows(
+        self, modelled: Current, blocks: int, functions: Sequence[Float[np.ndarray, "functions samples"]]
+    ) -> ChargeRows:
+        """Return the rows of charge, if the signal is any combination of dV/dt, which may drift, and rows of functions.
+
+        The residuals, which tell the noise of the drive, thus need no circuit. The combination is that of charges over
+        `blocks` of steps, in which noise of V hardly matters.
+        """
+        rise, several = self.rise(self.V), max(1, (self.V.size - 2 * LAG) // blocks)
+        (variance, _, excluded), follows = self._variance(modelled), modelled.follows
+        weight = 1.0 / np.sqrt(_thin(np.where(excluded, np.inf, variance), several))
+        changing = np.linspace(-1.0, 1.0, rise.size) * rise
+        parts = [np.stack([rise, changing])[: 2 * follows], *functions]
+        columns = np.concatenate([_thin(part, several) for part in parts]) * weight
+        noise = 2.0 * float(np.mean(self.variance_V)) * float(np.sum(weight**2)) / (several * self.step) ** 2
+        observed = _thin(step_means(self.I, modelled.delay), several) * weight
+        sizes = _solve(columns, observed, (0, noise * follows))[1]
+        capacitance, begin = float(sizes[0]) * follows, 2 * follows
+        rest = sizes[1] * changing if follows else np.zeros(rise.size)
+        for part in functions:
+            rest += sizes[begin : (begin := begin + len(part))] @ part
+        noisy = modelled._replace(capacitance=abs(capacitance)) if follows else modelled
+        return self.make_rows(noisy, lambda V: capacitance * self.rise(V) + rest)[0]
+
+
+def _thin(rows: np.ndarray, several: int) -> np.ndarray:
+    """Return means over `several` rows each, without the first ones, which are not valid."""
+    count = (rows.shape[-1] - 2 * LAG) // several
+    return rows[..., 2 * LAG : 2 * LAG + several * count].reshape(*rows.shape[:-1], count, several).mean(axis=-1)
+
 
 def estimate_noise(values: Rows) -> float:
     """Return the sd of white noise and rounding: that of third differences, or of the highest frequencies if lower.
@@ -171,13 +218,9 @@ def _kink_variance(current: Rows, noise: float, threshold: float = 4.0, smooth: 
     return np.convolve(np.square(height), np.square(_JUMP_ERRORS), "same")
 
 
-def drive_variance(V: Rows) -> Rows:
+def drive_variance(V: Rows, white: float, rounding: float) -> Rows:
     """Return the variance of each sample of V; within a run of equal values, rounding is no noise, but an offset."""
-    white, rounding, alike = (
-        math.sqrt(max(estimate_noise(V) ** 2 - rounding_noise_sd(V) ** 2, 0.0)),
-        rounding_noise_sd(V),
-        np.diff(V) == 0.0,
-    )
+    alike = np.diff(V) == 0.0
     within = np.append(False, alike) & np.append(alike, False)
     return white**2 + np.where(within, 0.0, rounding**2)
 
@@ -206,7 +249,7 @@ def describe_terms(terms: HighpassTerms, stray: ArrayLike | None, delay: float, 
     omega = math.pi / step * (np.arange(64) + 0.5) / 64.0
     gain = np.asarray(gain_at(terms, omega)) + 1j * omega * stray
     mean_square = float(np.mean(np.abs(gain * np.sinc(0.5 * omega * step / math.pi)) ** 2))
-    return Current(math.sqrt(0.5 * mean_square) * step, 0.0, delay)
+    return Current(math.sqrt(0.5 * mean_square) * step, 0.0, delay, follows=False)
 
 
 # ---- estimates before a fit ----------------------------------------------------------------------------------------
