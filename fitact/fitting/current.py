@@ -14,7 +14,7 @@ import numpy as np
 import scipy.fft
 import scipy.signal
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from fitact.compiled import jit, pad_samples
 from fitact.data.clipping import clipping_mask
@@ -97,6 +97,12 @@ class RecordedCurrent:
     def is_coarse(self) -> bool:
         """Whether I has long runs of equal values, whose rounding is no noise."""
         return float(np.mean(run_lengths(self.I) > FEW)) > 0.1
+
+    @property
+    def is_within_steps(self) -> bool:
+        """Whether I spends half of the time within two steps of its converter, and so tells little."""
+        half = np.quantile(np.abs(self.I - np.median(self.I)), 0.5)
+        return self.is_coarse and bool(half <= 2.0 * _least_step(self.I))
 
     @property
     def _floor(self) -> float:
@@ -215,7 +221,22 @@ def _kink_variance(current: Rows, noise: float, threshold: float = 4.0, smooth: 
     around = np.max([np.roll(jump, k) for k in (-2, -1, 1, 2)], axis=0)
     jump = np.where((jump > np.maximum(least, 1e-9 * np.ptp(current))) & (jump >= around), jump, 0.0)
     height = np.maximum(jump, np.append(jump[1:], 0.0))
-    return np.convolve(np.square(height), np.square(_JUMP_ERRORS), "same")
+    return _shared_jumps(np.flatnonzero(height)) * np.convolve(np.square(height), np.square(_JUMP_ERRORS), "same")
+
+
+def _shared_jumps(places: Int[np.ndarray, " n"]) -> float:
+    """Return how many jumps lie at the same part of a step, and so have the same error.
+
+    These are half of all if the drive repeats after a whole number of steps, to one over the record.
+    """
+    first = places[np.diff(places, prepend=-9) > 3]
+    for jumps in (2, 4):  # in a period, of a triangle and a trapezoid
+        periods = (first.size - 1) // jumps
+        if periods:
+            period = (first[periods * jumps] - first[0]) / periods
+            if abs(period - round(period)) * periods <= 1.0:
+                return max(0.5 * first.size, 1.0)
+    return 1.0
 
 
 def drive_variance(V: Rows, white: float, rounding: float) -> Rows:
@@ -460,11 +481,22 @@ def update_rows(
     return likelihood, largest
 
 
-def flatten_rows(white: Rows, channel: ChannelLikelihood, inputs: ChannelInputs, record: Record) -> Rows:
-    """Return the whitened rows of a channel of charges without the spectrum of their own; see `RecordedCurrent`."""
+def row_figures(
+    white: Rows, channel: ChannelLikelihood, inputs: ChannelInputs, record: Record
+) -> tuple[Rows, dict[str, float]]:
+    """Return whitened rows without the spectrum of their own (`RecordedCurrent.flatten`), and figures of merit.
+
+    Signs of rounded noise are not independent, and the covariance knows the rounding.
+    """
     terms, current = inputs.circuit.channel_terms(channel.channel), RecordedCurrent.from_record(record)
     delay = float(channel.shift) / current.step
-    return current.flatten(white, describe_terms(terms, inputs.stray, delay, current.step))
+    figures = {
+        "runs_z": 0.0,
+        "rounding_noise": 0.0,
+        "false_alarm": 1e-4,
+        "within_steps": float(current.is_within_steps),
+    }
+    return current.flatten(white, describe_terms(terms, inputs.stray, delay, current.step)), figures
 
 
 def _rows_at(
