@@ -96,6 +96,8 @@ class ChannelFit:
             if channel.charges is not None:  # signs of rounded noise are not independent; the covariance knows rounding
                 figures |= {"runs_z": 0.0, "rounding_noise": 0.0}
             figures |= _weighted_statistics(channel, residuals, weight, counted, source.record.time, source.noise)
+            if channel.charges is not None:  # at edges and ends, samples of dV/dt are wrong, and rows are not
+                figures |= {"outliers": 0} | outliers(white, source.record.time[counted], source.noise)
         return cls(
             label=channel.label,
             channel=channel.channel,
