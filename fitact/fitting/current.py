@@ -131,14 +131,19 @@ class RecordedCurrent:
         return ChargeRows(means + signal - from_V, self.rise(V), slope, gain, decay), V
 
 
-def estimate_noise(values: Rows) -> float:
-    """Return the sd of white noise and rounding: that of third differences, or of the highest frequencies if lower.
+def estimate_noise(values: Rows, block: int = 16, max_ratio: float = 0.7) -> float:
+    """Return the sd of white noise and rounding: that of sixth differences, or of the highest frequencies if far lower.
 
-    Edges hardly change the first, and fast smooth signals the second.
+    Fast smooth signals hardly change the second, which is less accurate. The median over blocks is robust to edges, and
+    the mean square within a block counts rounding, with which a median of differences takes few values.
     """
+    squares = np.diff(values, 6) ** 2 / 924.0
+    means = squares[: squares.size // block * block].reshape(-1, block).mean(axis=1)
+    # median over mean of the mean squares of white noise in blocks of 16, from simulations
+    differences = math.sqrt(float(np.median(means)) / 0.8677) if means.size else white_noise_sd(values)
     lines = scipy.fft.rfft((values - values.mean()) * np.hanning(values.size))[int(0.4 * values.size) :]
     fastest = math.sqrt(float(np.median(np.abs(lines) ** 2)) / math.log(2.0) / (0.375 * values.size))
-    return math.hypot(min(white_noise_sd(values), fastest), rounding_noise_sd(values))
+    return max(fastest if fastest < max_ratio * differences else differences, rounding_noise_sd(values))
 
 
 def _kink_variance(current: Rows, noise: float, threshold: float = 4.0, smooth: float = 8.0, block: int = 64) -> Rows:
