@@ -377,6 +377,9 @@ def update_rows(
     """
     largest, optimum = 0.0, solution.likelihood.evaluate_circuit(solution.theta)
     for i, (channel, solved) in enumerate(zip(likelihood.channels, solution.likelihood.channels, strict=True)):
+        # nuisances that were added stay: without them, the next fit leaves the optimum, and returns by hundreds of steps
+        channel = dataclasses.replace(channel, linear_sd=solved.linear_sd)
+        likelihood = likelihood.replace_channel(i, channel)
         if channel.charges is not None:
             inputs = solution.likelihood.make_inputs(optimum.circuit, solution.theta, solved)
             rows, V, delay, skew = _rows_at(solved, inputs, solution.sigma[i], sources[i].in_time)
