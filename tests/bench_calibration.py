@@ -147,12 +147,15 @@ def simulate(seed: int, number: int) -> Simulated:
         each: math.hypot(instrument.noise[each], 2.6 * peak / 2**instrument.bits / math.sqrt(12.0))
         for each, peak in peaks.items()
     }
+    thin = 2 ** math.ceil(
+        math.log2(max(FINE * frequency / rate, 1.0))
+    )  # the expected information takes no more samples than the record has
     free = tuple(finger) + ("stray_capacitance",) * bool(nominal)
     experiment = Experiment(
         circuit=fitact.FinalCircuit(**finger),
         free=free,
         prior_factor=np.diag([log_sd(FINGER.get(each, {"relative_sd": STRAY_SD})) for each in free]),
-        drive=Sampled(period, V, 1.0 / frequency),
+        drive=Sampled(period[::thin], V[::thin], 1.0 / frequency),
         time=made.time,
         channels=channels,
         noise=noise,
