@@ -382,10 +382,29 @@ def update_rows(
         likelihood = likelihood.replace_channel(i, channel)
         if channel.charges is not None:
             inputs = solution.likelihood.make_inputs(optimum.circuit, solution.theta, solved)
+            channel = dataclasses.replace(channel, linear_sd=_expect_harmonics(solved, inputs, solution.sigma[i]))
             rows, V, delay, skew = _rows_at(solved, inputs, solution.sigma[i], sources[i].in_time)
             likelihood = likelihood.replace_channel(i, set_rows(channel, rows, V, delay))
             largest = max(largest, abs(skew))
     return likelihood, largest
+
+
+def _expect_harmonics(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: ArrayLike) -> np.ndarray:
+    """Return the prior sds of the linear nuisances, with a third harmonic of the size of each hum that was found.
+
+    A harmonic beside one of the drive cannot be told from it, but its amplitude is about known.
+    """
+    linear_sd = np.array(channel.linear_sd, dtype=float)
+    sizes = np.zeros(linear_sd.size)
+    sizes[list(channel.columns)] = np.asarray(_fit_nuisances(channel, inputs, np.asarray(sigma))[1])
+    sizes *= linear_sd
+    names = list(channel.linear_names)
+    for mains in (50, 60):
+        first, third = (
+            [names.index(f"hum_{frequency}Hz_{part}") for part in ("cos", "sin")] for frequency in (mains, 3 * mains)
+        )
+        linear_sd[third] = np.maximum(linear_sd[third], math.hypot(*sizes[first]))
+    return linear_sd
 
 
 def flatten_rows(
