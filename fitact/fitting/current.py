@@ -377,7 +377,7 @@ def update_rows(
     """
     largest, optimum = 0.0, solution.likelihood.evaluate_circuit(solution.theta)
     for i, (channel, solved) in enumerate(zip(likelihood.channels, solution.likelihood.channels, strict=True)):
-        # nuisances that were added stay: without them, the next fit leaves the optimum, and returns by hundreds of steps
+        # nuisances that were added stay: without them, the next fit leaves the optimum and returns by hundreds of steps
         channel = dataclasses.replace(channel, linear_sd=solved.linear_sd)
         likelihood = likelihood.replace_channel(i, channel)
         if channel.charges is not None:
