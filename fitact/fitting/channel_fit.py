@@ -98,6 +98,8 @@ class ChannelFit:
             figures = channel_statistics(*whole, source.record, channel.channel, source.choice, b)
             figures |= of_rows
             figures |= _weighted_statistics(channel, residuals, weight, counted, source.record.time, source.noise)
+            if channel.charges is not None:  # at edges and ends, samples of dV/dt are wrong, and rows are not
+                figures |= {"outliers": 0} | outliers(white, source.record.time[counted], source.noise)
         return cls(
             label=channel.label,
             channel=channel.channel,

@@ -193,18 +193,19 @@ def _thin(rows: np.ndarray, several: int) -> np.ndarray:
     return rows[..., 2 * LAG : 2 * LAG + several * count].reshape(*rows.shape[:-1], count, several).mean(axis=-1)
 
 
-def estimate_noise(values: Rows) -> float:
-    """Return the sd of white noise and rounding: that of third differences, or of the highest frequencies if lower.
+def estimate_noise(values: Rows, block: int = 16, max_ratio: float = 0.7) -> float:
+    """Return the sd of white noise and rounding: that of sixth differences, or of the highest frequencies if far lower.
 
-    Edges hardly change the first, and fast smooth signals the second. Third differences of few levels have few values,
-    so that their median needs a dither, whose variance is taken off.
+    Fast smooth signals hardly change the second, which is less accurate. The median over blocks is robust to edges, and
+    the mean square within a block counts rounding, with which a median of differences takes few values.
     """
+    squares = np.diff(values, 6) ** 2 / 924.0
+    means = squares[: squares.size // block * block].reshape(-1, block).mean(axis=1)
+    # median over mean of the mean squares of white noise in blocks of 16, from simulations
+    differences = math.sqrt(float(np.median(means)) / 0.8677) if means.size else white_noise_sd(values)
     lines = scipy.fft.rfft((values - values.mean()) * np.hanning(values.size))[int(0.4 * values.size) :]
     fastest = math.sqrt(float(np.median(np.abs(lines) ** 2)) / math.log(2.0) / (0.375 * values.size))
-    step = _least_step(values)
-    dithered = values + step * np.random.default_rng(0).uniform(-0.5, 0.5, values.size) if step else values
-    white = math.sqrt(max(white_noise_sd(dithered) ** 2 - step**2 / 12.0, 0.0))
-    return max(min(white, fastest), rounding_noise_sd(values))
+    return max(fastest if fastest < max_ratio * differences else differences, rounding_noise_sd(values))
 
 
 def _kink_variance(current: Rows, noise: float, threshold: float = 4.0, smooth: float = 8.0, block: int = 64) -> Rows:
@@ -232,7 +233,7 @@ def _shared_jumps(places: Int[np.ndarray, " n"]) -> float:
     first = places[np.diff(places, prepend=-9) > 3]
     for jumps in (2, 4):  # in a period, of a triangle and a trapezoid
         periods = (first.size - 1) // jumps
-        if periods:
+        if periods > 0:
             period = (first[periods * jumps] - first[0]) / periods
             if abs(period - round(period)) * periods <= 1.0:
                 return max(0.5 * first.size, 1.0)
@@ -473,12 +474,34 @@ def update_rows(
     """
     largest, optimum = 0.0, solution.likelihood.evaluate_circuit(solution.theta)
     for i, (channel, solved) in enumerate(zip(likelihood.channels, solution.likelihood.channels, strict=True)):
+        # nuisances that were added stay: without them, the next fit leaves the optimum and returns by hundreds of steps
+        channel = dataclasses.replace(channel, linear_sd=solved.linear_sd)
+        likelihood = likelihood.replace_channel(i, channel)
         if channel.charges is not None:
             inputs = solution.likelihood.make_inputs(optimum.circuit, solution.theta, solved)
+            channel = dataclasses.replace(channel, linear_sd=_expect_harmonics(solved, inputs, solution.sigma[i]))
             rows, V, delay, skew = _rows_at(solved, inputs, solution.sigma[i], sources[i].in_time)
             likelihood = likelihood.replace_channel(i, set_rows(channel, rows, V, delay))
             largest = max(largest, abs(skew))
     return likelihood, largest
+
+
+def _expect_harmonics(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: ArrayLike) -> np.ndarray:
+    """Return the prior sds of the linear nuisances, with a third harmonic of the size of each hum that was found.
+
+    A harmonic beside one of the drive cannot be told from it, but its amplitude is about known.
+    """
+    linear_sd = np.array(channel.linear_sd, dtype=float)
+    sizes = np.zeros(linear_sd.size)
+    sizes[list(channel.columns)] = np.asarray(_fit_nuisances(channel, inputs, np.asarray(sigma))[1])
+    sizes *= linear_sd
+    names = list(channel.linear_names)
+    for mains in (50, 60):
+        first, third = (
+            [names.index(f"hum_{frequency}Hz_{part}") for part in ("cos", "sin")] for frequency in (mains, 3 * mains)
+        )
+        linear_sd[third] = np.maximum(linear_sd[third], math.hypot(*sizes[first]))
+    return linear_sd
 
 
 def row_figures(
