@@ -6,6 +6,7 @@ estimates without bias, unlike the recorded V (`fitact.likelihood.charge_rows`).
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -69,7 +70,13 @@ class RecordedCurrent:
 
     @classmethod
     def from_record(cls, record: Record) -> "RecordedCurrent":
-        """Estimate the noise of a record's V and I."""
+        """Estimate the noise of a record's V and I, once."""
+        if (key := ("noise", "rows of I")) not in record._estimates:
+            record._estimates[key] = cls._estimate(record)
+        return record._estimates[key]
+
+    @classmethod
+    def _estimate(cls, record: Record) -> "RecordedCurrent":
         V, current = record["V"], record["I"]
         noise_V = math.sqrt(max(estimate_noise(V) ** 2 - rounding_noise_sd(V) ** 2, 0.0)), rounding_noise_sd(V)
         noise_I = max(estimate_noise(current), _least_step(current) / math.sqrt(12.0))
@@ -127,7 +134,8 @@ class RecordedCurrent:
 
     def flatten(self, white: Rows, modelled: Current) -> Rows:
         """Return whitened rows without the spectrum that a tridiagonal covariance leaves in the noise of I."""
-        power = self._noise_power(np.fft.rfftfreq(white.size), modelled)
+        cycles = np.linspace(0.0, 0.5, 257)
+        power = np.interp(np.fft.rfftfreq(white.size), cycles, self._noise_power(cycles, modelled))
         lines = scipy.fft.rfft(white) / np.sqrt(np.maximum(power / np.mean(power), 0.05))
         return scipy.fft.irfft(lines, white.size)
 
@@ -465,36 +473,30 @@ def respond_to(current: RecordedCurrent, estimate: CurrentEstimate, stray: float
 # ---- after a fit ---------------------------------------------------------------------------------------------------
 
 
-def update_rows(
-    likelihood: Likelihood, solution: LeastSquaresResult, sources: Sequence[Source]
-) -> tuple[Likelihood, float]:
-    """Return the likelihood with rows of charge for the drive, noise and delay at a solution, and the largest skew.
-
-    The skew is how much later than its rows a current is, in time steps.
-    """
-    largest, optimum = 0.0, solution.likelihood.evaluate_circuit(solution.theta)
+def update_rows(likelihood: Likelihood, solution: LeastSquaresResult, sources: Sequence[Source]) -> Likelihood:
+    """Return the likelihood with rows of charge for the drive, noise and delay at a solution."""
+    optimum = solution.likelihood.evaluate_circuit(solution.theta)
     for i, (channel, solved) in enumerate(zip(likelihood.channels, solution.likelihood.channels, strict=True)):
         # nuisances that were added stay: without them, the next fit leaves the optimum and returns by hundreds of steps
         channel = dataclasses.replace(channel, linear_sd=solved.linear_sd)
-        likelihood = likelihood.replace_channel(i, channel)
         if channel.charges is not None:
             inputs = solution.likelihood.make_inputs(optimum.circuit, solution.theta, solved)
-            channel = dataclasses.replace(channel, linear_sd=_expect_harmonics(solved, inputs, solution.sigma[i]))
-            rows, V, delay, skew = _rows_at(solved, inputs, solution.sigma[i], sources[i].in_time)
-            likelihood = likelihood.replace_channel(i, set_rows(channel, rows, V, delay))
-            largest = max(largest, abs(skew))
-    return likelihood, largest
+            beta = np.asarray(_fit_nuisances(solved, inputs, np.asarray(solution.sigma[i]))[1])
+            sizes = beta * np.asarray(solved.linear_sd)[list(solved.columns)]
+            channel = dataclasses.replace(channel, linear_sd=_expect_harmonics(solved, sizes))
+            channel = set_rows(channel, *_rows_at(solved, inputs, sizes, sources[i].in_time))
+        likelihood = likelihood.replace_channel(i, channel)
+    return likelihood
 
 
-def _expect_harmonics(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: ArrayLike) -> np.ndarray:
-    """Return the prior sds of the linear nuisances, with a third harmonic of the size of each hum that was found.
+def _expect_harmonics(channel: ChannelLikelihood, fitted: Float[np.ndarray, " columns"]) -> np.ndarray:
+    """Return the prior sds of the linear nuisances, with a third harmonic of the size of each hum that was `fitted`.
 
     A harmonic beside one of the drive cannot be told from it, but its amplitude is about known.
     """
     linear_sd = np.array(channel.linear_sd, dtype=float)
     sizes = np.zeros(linear_sd.size)
-    sizes[list(channel.columns)] = np.asarray(_fit_nuisances(channel, inputs, np.asarray(sigma))[1])
-    sizes *= linear_sd
+    sizes[list(channel.columns)] = fitted
     names = list(channel.linear_names)
     for mains in (50, 60):
         first, third = (
@@ -523,24 +525,26 @@ def row_figures(
 
 
 def _rows_at(
-    channel: ChannelLikelihood, inputs: ChannelInputs, sigma: ArrayLike, record: Record
-) -> tuple[ChargeRows, Rows, float, float]:
-    """Return rows and drive of a channel at its optimum, the delay (s), and the skew (time steps)."""
+    channel: ChannelLikelihood, inputs: ChannelInputs, sizes: Float[np.ndarray, " columns"], record: Record
+) -> tuple[ChargeRows, Rows, float]:
+    """Return rows and drive of a channel at its optimum, with nuisances of these `sizes`, and the delay (s)."""
     current, size = RecordedCurrent.from_record(record), len(record)
-    beta = np.asarray(_fit_nuisances(channel, inputs, np.asarray(sigma))[1])
     full = channel.without_compression()
-    sizes = beta * np.asarray(full.linear_sd)[list(full.columns)]
     skew, inputs = float(inputs.delay) / current.step, dataclasses.replace(inputs, delay=np.zeros(()))
     delay = float(full.shift) / current.step + float(np.clip(skew, -0.5, 0.5))
     delay = float(np.clip(delay, 0.5 - MAX_STEPS, MAX_STEPS - 0.5))
 
-    def respond(V: Rows) -> Rows:
-        return np.asarray(_modelled_rows(_with_drive(full, current, V), inputs))[:size]
+    @functools.lru_cache(maxsize=1)
+    def respond_to_V() -> tuple[np.ndarray, np.ndarray]:
+        return _modelled_rows(_with_drive(full, current, current.V), inputs, sizes)
 
-    nuisances = _nuisance_rows(_with_drive(full, current, current.V), inputs, sizes)
+    def respond(V: Rows) -> Rows:
+        pair = respond_to_V() if V is current.V else _modelled_rows(_with_drive(full, current, V), inputs, sizes)
+        return np.asarray(pair[0])[:size]
+
     terms = inputs.circuit.channel_terms(channel.channel)
     modelled = describe_terms(terms, inputs.stray, delay, current.step)
-    return *current.make_rows(modelled, respond, np.asarray(nuisances)[:size]), delay * current.step, skew
+    return *current.make_rows(modelled, respond, np.asarray(respond_to_V()[1])[:size]), delay * current.step
 
 
 def set_rows(channel: ChannelLikelihood, rows: ChargeRows, V: Rows, delay: float) -> ChannelLikelihood:
@@ -550,6 +554,7 @@ def set_rows(channel: ChannelLikelihood, rows: ChargeRows, V: Rows, delay: float
     padded = ChargeRows(**{name: np.pad(x, (0, length - x.size)) for name, x in arrays.items()})
     assert isinstance(channel.drive, Sampled)
     drive = Sampled(channel.drive.time, pad_samples(V))
+    channel = channel.without_compression()
     return dataclasses.replace(channel, drive=drive, charges=padded, shift=np.asarray(delay, dtype=float))
 
 
@@ -564,13 +569,10 @@ def _with_drive(channel: ChannelLikelihood, current: RecordedCurrent, V: Rows) -
 
 
 @jit
-def _modelled_rows(channel: ChannelLikelihood, inputs: ChannelInputs) -> Array:
-    return -channel.rows_and_shapes(inputs)[0]
-
-
-@jit
-def _nuisance_rows(channel: ChannelLikelihood, inputs: ChannelInputs, sizes: Array) -> Array:
-    return sizes @ channel.rows_and_shapes(inputs)[1]
+def _modelled_rows(channel: ChannelLikelihood, inputs: ChannelInputs, sizes: Array) -> tuple[Array, Array]:
+    """Return the rows of the signal of a channel that observed 0, and those of nuisances of these sizes."""
+    rows, shapes = channel.rows_and_shapes(inputs)
+    return -rows, sizes @ shapes
 
 
 _fit_nuisances = jit(ChannelLikelihood.fit_nuisances)
