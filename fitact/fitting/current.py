@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import jax
 import numpy as np
 import scipy.fft
 import scipy.signal
@@ -20,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from fitact.compiled import jit, pad_samples
 from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
+from fitact.errors import InputError
 from fitact.fitting.drive_choice import DriveModel, drive_slope, unit_response
 from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.fitting.source import Source
@@ -71,6 +73,11 @@ class RecordedCurrent:
     @classmethod
     def from_record(cls, record: Record) -> "RecordedCurrent":
         """Estimate the noise of a record's V and I, once."""
+        if len(record) < 6 * LAG:
+            raise InputError(
+                f"{record.source}: {len(record)} samples are too few to fit I with a recorded V; record at least"
+                f" {6 * LAG}, better two periods"
+            )
         if (key := ("noise", "rows of I")) not in record._estimates:
             record._estimates[key] = cls._estimate(record)
         return record._estimates[key]
@@ -391,13 +398,9 @@ def _scan_recorded(
     several = math.ceil((current.I.size - 3 * LAG) / most)
     first, count = 2 * LAG, (current.I.size - 2 * LAG) // several
     step = current.step * several
-
-    def thin(rows: np.ndarray) -> np.ndarray:
-        return rows[..., first : first + several * count].reshape(*rows.shape[:-1], count, several).mean(axis=-1)
-
     covariance = current.covariance(Current(C, 0.0, 0.0))
-    lost = thin(~covariance.used * 1.0) > 0.0
-    own = current.noise_I**2 / several + thin(np.roll(current.uncertain, LAG)) / several
+    lost = _thin(~covariance.used * 1.0, several) > 0.0
+    own = current.noise_I**2 / several + _thin(np.roll(current.uncertain, LAG), several) / several
     own += 1e-24 * float(np.ptp(current.I)) ** 2
     noise_V = float(np.mean(current.variance_V))
 
@@ -409,7 +412,7 @@ def _scan_recorded(
     V = np.pad(V, (0, count + 1 - V.size), mode="edge")
     time = step * np.arange(count)
     waves = [wave(2.0 * np.pi * f * time) for f in hum for wave in (np.cos, np.sin)]
-    observed = thin(step_means(current.I) - stray * rise)
+    observed = _thin(step_means(current.I) - stray * rise, several)
     fixed = np.stack([np.diff(V) / step, np.ones(count), *waves])
 
     def fit(tau: float) -> tuple[float, np.ndarray]:
@@ -550,8 +553,7 @@ def _rows_at(
 def set_rows(channel: ChannelLikelihood, rows: ChargeRows, V: Rows, delay: float) -> ChannelLikelihood:
     """Return the channel with rows of charge, an estimate of the drive, and the delay (s) at which they are taken."""
     length = np.shape(channel.time)[0]
-    arrays = {field.name: getattr(rows, field.name) for field in dataclasses.fields(rows)}
-    padded = ChargeRows(**{name: np.pad(x, (0, length - x.size)) for name, x in arrays.items()})
+    padded = jax.tree.map(lambda x: np.pad(x, (0, length - x.size)), rows)
     assert isinstance(channel.drive, Sampled)
     drive = Sampled(channel.drive.time, pad_samples(V))
     channel = channel.without_compression()

@@ -302,6 +302,11 @@ def _build_channel(
         likelihood = likelihood.exclude_unknown_drive()
     if channel == "I" and choice.name == "measured":
         likelihood, start, noise, hum = _make_charge_rows(likelihood, record, scene, bare)
+        if scene.measurement.noise_model != "white":
+            warnings = (
+                *warnings,
+                "noise_model is that of Vsc; the noise of I with a recorded V is white, and that of V",
+            )
         optional = ("drift", "offset", *(f"hum_{frequency:.0f}Hz" for frequency in hum))
     remarks = (*notes, *at_jumps), (*warnings, *clipped)
     return likelihood, Source(record, scene, choice, noise, optional, start, *remarks), edge_sd
@@ -331,6 +336,8 @@ def _make_charge_rows(
         channel,
         drive=Sampled(channel.time, pad_samples(V)),
         steady_state=False,
+        noise="white",
+        whitening=None,
         linear_sd=linear_sd,
         timing=("delay",),
         timing_sd=np.array([delay_sd, channel.timing_sd[1]]),

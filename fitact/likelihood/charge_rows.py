@@ -59,6 +59,7 @@ class ChargeRows(eqx.Module):
     # whitened row k = gain[k] (row k) + decay[k] (whitened row k - 1); a gain of 0 excludes a row
     gain: Float[Array, " samples"]
     decay: Float[Array, " samples"]
+    weight: Float[Array, " samples"] | None = None  # of whitened rows, 0 leaves one out; None means 1
 
     @property
     def reach(self) -> int:
@@ -72,8 +73,9 @@ class ChargeRows(eqx.Module):
         return sum(parts[1:], parts[0])
 
     def whiten(self, rows: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
-        """Return whitened rows."""
-        return self.continue_whitening(rows, jnp.zeros(rows.shape[:-1]))
+        """Return whitened rows, with their weight."""
+        whitened = self.continue_whitening(rows, jnp.zeros(rows.shape[:-1]))
+        return whitened if self.weight is None else whitened * self.weight
 
     def continue_whitening(
         self, rows: Float[Array, "*shape samples"], before: Float[Array, "*shape"]

@@ -51,7 +51,9 @@ def block_indices(record: Record | Spectrum) -> Int[np.ndarray, " samples"]:
 
 
 def likelihood_mask(trace: ChannelLikelihood) -> Bool[np.ndarray, " samples"]:
-    """Return a mask of the samples that enter the likelihood."""
+    """Return a mask of the samples, or rows of charge, that enter the likelihood."""
+    if trace.charges is not None:
+        return np.asarray(trace.charges.gain) > 0.0
     return trace.weights > 0.0 if trace.whitening is None else np.asarray(trace.whitening.mask) > 0.0
 
 
@@ -83,7 +85,9 @@ def cross_validate(fit: Fit, folds: int = 10) -> CrossValidation:
 def _mask_samples(likelihood: Likelihood, masks: list[np.ndarray]) -> Likelihood:
     """Return the likelihood of the masked samples of each channel only."""
     for i, (trace, mask) in enumerate(zip(likelihood.channels, masks, strict=True)):
-        if trace.whitening is None:
+        if trace.charges is not None:  # likewise the recursion
+            trace = dataclasses.replace(trace, charges=dataclasses.replace(trace.charges, weight=mask * 1.0))
+        elif trace.whitening is None:
             trace = dataclasses.replace(trace, weight=trace.weights * mask)
         else:  # the whitening filter still runs over all samples
             whitening = dataclasses.replace(trace.whitening, mask=trace.whitening.mask * mask)
@@ -120,8 +124,9 @@ class _LinearisedModel(NamedTuple):
             slope = np.hstack([np.asarray(slopes[i]) @ full.prior_factor, by_nuisances]) / sigma[i]
             counts, is_student = likelihood_mask(trace), trace.noise == "student"
             first = 1.0 if trace.whitening is None else abs(float(trace.whitening.taps[0]))
+            scale = trace.weights * first if trace.charges is None else np.asarray(trace.charges.gain)
             with np.errstate(divide="ignore"):
-                log_scale = np.where(counts, np.log(trace.weights * first / sigma[i]), -np.inf)
+                log_scale = np.where(counts, np.log(scale / sigma[i]), -np.inf)
             channels.append(_LinearisedChannel(np.asarray(residuals[i]) / sigma[i], slope, log_scale, is_student))
             rows = slope[mask & counts]
             # Fisher information of a sample on its location, in units of the scale
