@@ -11,7 +11,7 @@ TEST_XLA_FLAGS = $(shell $(PY) -c 'from fitact.compiled import XLA_OPTIONS as o;
   --xla_backend_optimization_level=0
 PYTEST = XLA_FLAGS="$(TEST_XLA_FLAGS)" $(PY) -m pytest -n auto
 .DEFAULT_GOAL = help
-.PHONY: help env demo test test-slow test-slow-quick notebooks peers docs wheel extremes calibration calibration-quick session-calibration fuzz check lock plotly axe clean
+.PHONY: help env demo test test-slow test-slow-quick notebooks peers docs wheel extremes calibration calibration-quick session-calibration bench-calibration fuzz check lock plotly axe clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -67,6 +67,10 @@ calibration: env
 # make session-calibration   1,000 simulated sessions with errors of instruments: are the stated uncertainties right?
 session-calibration: env
 	$(PY) -m tests.session_calibration --sessions 1000 --out out/session_calibration
+
+# make bench-calibration   500 simulated benches with noise of V, delays, hum: are the stated uncertainties right?
+bench-calibration: env
+	$(PY) -m tests.bench_calibration --records 500 --out out/bench_calibration
 
 # make calibration-quick   the same with the first 100 of them
 calibration-quick: env

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from fitact.compiled import jit
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
-from fitact.fitting.current import flatten_rows
+from fitact.fitting.current import row_figures
 from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.residual_statistics import channel_statistics, outliers
 from fitact.fitting.source import Source
@@ -89,15 +89,17 @@ class ChannelFit:
         else:
             # AR(1) noise is estimated only from the residuals
             noise = sigma if channel.noise == "ar1" else source.noise
+            of_rows: dict[str, float] = {}
             if channel.charges is not None:
-                white = flatten_rows(white, channel, inputs, source.in_time)
+                white, of_rows = row_figures(white, channel, inputs, source.in_time)
             # a delayed response lies between the samples of V
             b = 0.0 if "delay" in channel.timing and channel.charges is None else float(optimum.b)
             whole = white, source.record.time[counted], noise, n_fitted, _gain(optimum, channel)
             figures = channel_statistics(*whole, source.record, channel.channel, source.choice, b)
-            if channel.charges is not None:  # signs of rounded noise are not independent; the covariance knows rounding
-                figures |= {"runs_z": 0.0, "rounding_noise": 0.0}
+            figures |= of_rows
             figures |= _weighted_statistics(channel, residuals, weight, counted, source.record.time, source.noise)
+            if channel.charges is not None:  # at edges and ends, samples of dV/dt are wrong, and rows are not
+                figures |= {"outliers": 0} | outliers(white, source.record.time[counted], source.noise)
         return cls(
             label=channel.label,
             channel=channel.channel,

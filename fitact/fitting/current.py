@@ -6,6 +6,7 @@ estimates without bias, unlike the recorded V (`fitact.likelihood.charge_rows`).
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -14,7 +15,7 @@ import numpy as np
 import scipy.fft
 import scipy.signal
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from fitact.compiled import jit, pad_samples
 from fitact.data.clipping import clipping_mask
@@ -38,8 +39,9 @@ from fitact.model.drive import Sampled
 
 Rows = Float[np.ndarray, " samples"]
 Belief = tuple[np.ndarray, np.ndarray]  # prior means and sds of log Rsc, log Csc and log Ci
-# rms error of the mean over a step, up to six steps from a jump, relative to its height
-_JUMP_ERRORS = np.array([3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.29, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4])
+# rms error of the mean over a step, up to six steps from a jump, relative to its height; beside the step of the jump,
+# where the error is 0.06 to 0.1 at all jumps alike and would bias a delay, three times as large
+_JUMP_ERRORS = np.array([3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.3, 0.29, 0.3, 0.03, 0.01, 3e-3, 1e-3, 3e-4])
 FEW = 4  # equal values in a row that are usual where noise exceeds the rounding
 _ROW_NOISE = 0.6285  # variance of a row over that of a sample of white noise; with those of neighbours, the sum is 1
 
@@ -50,6 +52,7 @@ class Current(NamedTuple):
     capacitance: float  # that follows dV/dt, with the stray one, F
     conductance: float  # of what does not follow it, S
     delay: float  # against V, in time steps
+    follows: bool = True  # whether it follows dV/dt, which no resistance limits
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,28 +63,53 @@ class RecordedCurrent:
     I: Rows  # noqa: E741
     step: float  # s
     variance_V: Rows  # of the noise and the rounding of each sample of V, V^2
+    noise_V: tuple[float, float]  # white noise and rounding, V
     noise_I: float  # A
     uncertain: Rows  # variance of the mean current over the step after a sample, because of kinks and rounding, A^2
     excluded: Bool[np.ndarray, " samples"]  # samples of I that are clipped
 
     @classmethod
     def from_record(cls, record: Record) -> "RecordedCurrent":
-        """Estimate the noise of a record's V and I."""
+        """Estimate the noise of a record's V and I, once."""
+        if (key := ("noise", "rows of I")) not in record._estimates:
+            record._estimates[key] = cls._estimate(record)
+        return record._estimates[key]
+
+    @classmethod
+    def _estimate(cls, record: Record) -> "RecordedCurrent":
         V, current = record["V"], record["I"]
+        noise_V = math.sqrt(max(estimate_noise(V) ** 2 - rounding_noise_sd(V) ** 2, 0.0)), rounding_noise_sd(V)
+        noise_I = max(estimate_noise(current), _least_step(current) / math.sqrt(12.0))
+        return cls.from_samples(V, current, record.time_step, noise_V, noise_I)
+
+    @classmethod
+    def from_samples(
+        cls, V: Rows, current: Rows, step: float, noise_V: tuple[float, float], noise: float
+    ) -> "RecordedCurrent":
+        """Estimate which samples are less certain than the noise of V and I (A) makes them."""
         rounding, runs = _least_step(current) / math.sqrt(12.0), run_lengths(current)
-        noise = max(estimate_noise(current), rounding)
         # a run of equal values shares one error, so that its mean has the variance of one
         uncertain = _kink_variance(current, noise) + np.where(runs > FEW, rounding**2 * runs, 0.0)
         # the flat top of a pulse that is coarsely rounded looks clipped, but lies within the range of the converter
         codes = np.log2(np.maximum(np.abs([current.min(), current.max()]) / (math.sqrt(12.0) * rounding or 1.0), 1.0))
         is_coarse = rounding > white_noise_sd(current) and np.max(np.abs(codes - np.round(codes))) > 0.02
         excluded = np.zeros(V.size, bool) if is_coarse else clipping_mask(current)
-        return cls(V, current, record.time_step, drive_variance(V), noise, uncertain, excluded)
+        return cls(V, current, step, drive_variance(V, *noise_V), noise_V, noise, uncertain, excluded)
+
+    def continue_with(self, V: Rows, current: Rows) -> "RecordedCurrent":
+        """Return other samples of V and I, with the same noise."""
+        return self.from_samples(V, current, self.step, self.noise_V, self.noise_I)
 
     @property
     def is_coarse(self) -> bool:
         """Whether I has long runs of equal values, whose rounding is no noise."""
         return float(np.mean(run_lengths(self.I) > FEW)) > 0.1
+
+    @property
+    def is_within_steps(self) -> bool:
+        """Whether I spends half of the time within two steps of its converter, and so tells little."""
+        half = np.quantile(np.abs(self.I - np.median(self.I)), 0.5)
+        return self.is_coarse and bool(half <= 2.0 * _least_step(self.I))
 
     @property
     def _floor(self) -> float:
@@ -90,21 +118,24 @@ class RecordedCurrent:
 
     def covariance(self, modelled: Current) -> RowCovariance:
         """Return the covariance of the rows."""
+        variance, driven, excluded = self._variance(modelled)
+        return RowCovariance(variance, 0.5 * (1.0 - _ROW_NOISE) * self._floor**2 - driven, excluded)
+
+    def _variance(self, modelled: Current) -> tuple[Rows, Rows, Bool[np.ndarray, " samples"]]:
+        """Return the variance of the rows, that by the noise of a sample of V, and which rows are excluded."""
         driven = np.roll((modelled.capacitance / self.step) ** 2 * self.variance_V, LAG)
         floor = self._floor**2
         level = _ROW_NOISE * floor + driven + np.roll(driven, -1) + modelled.conductance**2 * np.mean(self.variance_V)
-        shift = LAG - round(modelled.delay)
-        variance = level + np.roll(self.uncertain, shift)
-        neighbours = 0.5 * (1.0 - _ROW_NOISE) * floor - driven
-        reach = np.arange(-LAG, LAG)
-        clipped = np.convolve(self.excluded, np.ones(reach.size), "same") > 0.5
-        excluded = np.roll(clipped, shift)
+        shift, excluded = LAG - round(modelled.delay), self.excluded.copy()
+        if excluded.any():
+            excluded = np.roll(np.convolve(excluded, np.ones(2 * LAG), "same") > 0.5, shift)
         excluded[: 2 * LAG] = True
-        return RowCovariance(variance, neighbours, excluded)
+        return level + np.roll(self.uncertain, shift), driven, excluded
 
     def flatten(self, white: Rows, modelled: Current) -> Rows:
         """Return whitened rows without the spectrum that a tridiagonal covariance leaves in the noise of I."""
-        power = self._noise_power(np.fft.rfftfreq(white.size), modelled)
+        cycles = np.linspace(0.0, 0.5, 257)
+        power = np.interp(np.fft.rfftfreq(white.size), cycles, self._noise_power(cycles, modelled))
         lines = scipy.fft.rfft(white) / np.sqrt(np.maximum(power / np.mean(power), 0.05))
         return scipy.fft.irfft(lines, white.size)
 
@@ -139,15 +170,50 @@ class RecordedCurrent:
         gain, decay = covariance.recursion(self._floor / math.sqrt(float(power)))
         return ChargeRows(means + signal - from_V, self.rise(V), slope, gain, decay), V
 
+    def fit_rows(
+        self, modelled: Current, blocks: int, functions: Sequence[Float[np.ndarray, "functions samples"]]
+    ) -> ChargeRows:
+        """Return the rows of charge, if the signal is any combination of dV/dt, which may drift, and rows of functions.
 
-def estimate_noise(values: Rows) -> float:
-    """Return the sd of white noise and rounding: that of third differences, or of the highest frequencies if lower.
+        The residuals, which tell the noise of the drive, thus need no circuit. The combination is that of charges over
+        `blocks` of steps, in which noise of V hardly matters.
+        """
+        rise, several = self.rise(self.V), max(1, (self.V.size - 2 * LAG) // blocks)
+        (variance, _, excluded), follows = self._variance(modelled), modelled.follows
+        weight = 1.0 / np.sqrt(_thin(np.where(excluded, np.inf, variance), several))
+        changing = np.linspace(-1.0, 1.0, rise.size) * rise
+        parts = [np.stack([rise, changing])[: 2 * follows], *functions]
+        columns = np.concatenate([_thin(part, several) for part in parts]) * weight
+        noise = 2.0 * float(np.mean(self.variance_V)) * float(np.sum(weight**2)) / (several * self.step) ** 2
+        observed = _thin(step_means(self.I, modelled.delay), several) * weight
+        sizes = _solve(columns, observed, (0, noise * follows))[1]
+        capacitance, begin = float(sizes[0]) * follows, 2 * follows
+        rest = sizes[1] * changing if follows else np.zeros(rise.size)
+        for part in functions:
+            rest += sizes[begin : (begin := begin + len(part))] @ part
+        noisy = modelled._replace(capacitance=abs(capacitance)) if follows else modelled
+        return self.make_rows(noisy, lambda V: capacitance * self.rise(V) + rest)[0]
 
-    Edges hardly change the first, and fast smooth signals the second.
+
+def _thin(rows: np.ndarray, several: int) -> np.ndarray:
+    """Return means over `several` rows each, without the first ones, which are not valid."""
+    count = (rows.shape[-1] - 2 * LAG) // several
+    return rows[..., 2 * LAG : 2 * LAG + several * count].reshape(*rows.shape[:-1], count, several).mean(axis=-1)
+
+
+def estimate_noise(values: Rows, block: int = 16, max_ratio: float = 0.7) -> float:
+    """Return the sd of white noise and rounding: that of sixth differences, or of the highest frequencies if far lower.
+
+    Fast smooth signals hardly change the second, which is less accurate. The median over blocks is robust to edges, and
+    the mean square within a block counts rounding, with which a median of differences takes few values.
     """
+    squares = np.diff(values, 6) ** 2 / 924.0
+    means = squares[: squares.size // block * block].reshape(-1, block).mean(axis=1)
+    # median over mean of the mean squares of white noise in blocks of 16, from simulations
+    differences = math.sqrt(float(np.median(means)) / 0.8677) if means.size else white_noise_sd(values)
     lines = scipy.fft.rfft((values - values.mean()) * np.hanning(values.size))[int(0.4 * values.size) :]
     fastest = math.sqrt(float(np.median(np.abs(lines) ** 2)) / math.log(2.0) / (0.375 * values.size))
-    return math.hypot(min(white_noise_sd(values), fastest), rounding_noise_sd(values))
+    return max(fastest if fastest < max_ratio * differences else differences, rounding_noise_sd(values))
 
 
 def _kink_variance(current: Rows, noise: float, threshold: float = 4.0, smooth: float = 8.0, block: int = 64) -> Rows:
@@ -164,16 +230,27 @@ def _kink_variance(current: Rows, noise: float, threshold: float = 4.0, smooth: 
     around = np.max([np.roll(jump, k) for k in (-2, -1, 1, 2)], axis=0)
     jump = np.where((jump > np.maximum(least, 1e-9 * np.ptp(current))) & (jump >= around), jump, 0.0)
     height = np.maximum(jump, np.append(jump[1:], 0.0))
-    return np.convolve(np.square(height), np.square(_JUMP_ERRORS), "same")
+    return _shared_jumps(np.flatnonzero(height)) * np.convolve(np.square(height), np.square(_JUMP_ERRORS), "same")
 
 
-def drive_variance(V: Rows) -> Rows:
+def _shared_jumps(places: Int[np.ndarray, " n"]) -> float:
+    """Return how many jumps lie at the same part of a step, and so have the same error.
+
+    These are half of all if the drive repeats after a whole number of steps, to one over the record.
+    """
+    first = places[np.diff(places, prepend=-9) > 3]
+    for jumps in (2, 4):  # in a period, of a triangle and a trapezoid
+        periods = (first.size - 1) // jumps
+        if periods > 0:
+            period = (first[periods * jumps] - first[0]) / periods
+            if abs(period - round(period)) * periods <= 1.0:
+                return max(0.5 * first.size, 1.0)
+    return 1.0
+
+
+def drive_variance(V: Rows, white: float, rounding: float) -> Rows:
     """Return the variance of each sample of V; within a run of equal values, rounding is no noise, but an offset."""
-    white, rounding, alike = (
-        math.sqrt(max(estimate_noise(V) ** 2 - rounding_noise_sd(V) ** 2, 0.0)),
-        rounding_noise_sd(V),
-        np.diff(V) == 0.0,
-    )
+    alike = np.diff(V) == 0.0
     within = np.append(False, alike) & np.append(alike, False)
     return white**2 + np.where(within, 0.0, rounding**2)
 
@@ -202,7 +279,7 @@ def describe_terms(terms: HighpassTerms, stray: ArrayLike | None, delay: float, 
     omega = math.pi / step * (np.arange(64) + 0.5) / 64.0
     gain = np.asarray(gain_at(terms, omega)) + 1j * omega * stray
     mean_square = float(np.mean(np.abs(gain * np.sinc(0.5 * omega * step / math.pi)) ** 2))
-    return Current(math.sqrt(0.5 * mean_square) * step, 0.0, delay)
+    return Current(math.sqrt(0.5 * mean_square) * step, 0.0, delay, follows=False)
 
 
 # ---- estimates before a fit ----------------------------------------------------------------------------------------
@@ -396,49 +473,78 @@ def respond_to(current: RecordedCurrent, estimate: CurrentEstimate, stray: float
 # ---- after a fit ---------------------------------------------------------------------------------------------------
 
 
-def update_rows(
-    likelihood: Likelihood, solution: LeastSquaresResult, sources: Sequence[Source]
-) -> tuple[Likelihood, float]:
-    """Return the likelihood with rows of charge for the drive, noise and delay at a solution, and the largest skew.
-
-    The skew is how much later than its rows a current is, in time steps.
-    """
-    largest, optimum = 0.0, solution.likelihood.evaluate_circuit(solution.theta)
+def update_rows(likelihood: Likelihood, solution: LeastSquaresResult, sources: Sequence[Source]) -> Likelihood:
+    """Return the likelihood with rows of charge for the drive, noise and delay at a solution."""
+    optimum = solution.likelihood.evaluate_circuit(solution.theta)
     for i, (channel, solved) in enumerate(zip(likelihood.channels, solution.likelihood.channels, strict=True)):
+        # nuisances that were added stay: without them, the next fit leaves the optimum and returns by hundreds of steps
+        channel = dataclasses.replace(channel, linear_sd=solved.linear_sd)
         if channel.charges is not None:
             inputs = solution.likelihood.make_inputs(optimum.circuit, solution.theta, solved)
-            rows, V, delay, skew = _rows_at(solved, inputs, solution.sigma[i], sources[i].in_time)
-            likelihood = likelihood.replace_channel(i, set_rows(channel, rows, V, delay))
-            largest = max(largest, abs(skew))
-    return likelihood, largest
+            beta = np.asarray(_fit_nuisances(solved, inputs, np.asarray(solution.sigma[i]))[1])
+            sizes = beta * np.asarray(solved.linear_sd)[list(solved.columns)]
+            channel = dataclasses.replace(channel, linear_sd=_expect_harmonics(solved, sizes))
+            channel = set_rows(channel, *_rows_at(solved, inputs, sizes, sources[i].in_time))
+        likelihood = likelihood.replace_channel(i, channel)
+    return likelihood
 
 
-def flatten_rows(white: Rows, channel: ChannelLikelihood, inputs: ChannelInputs, record: Record) -> Rows:
-    """Return the whitened rows of a channel of charges without the spectrum of their own; see `RecordedCurrent`."""
+def _expect_harmonics(channel: ChannelLikelihood, fitted: Float[np.ndarray, " columns"]) -> np.ndarray:
+    """Return the prior sds of the linear nuisances, with a third harmonic of the size of each hum that was `fitted`.
+
+    A harmonic beside one of the drive cannot be told from it, but its amplitude is about known.
+    """
+    linear_sd = np.array(channel.linear_sd, dtype=float)
+    sizes = np.zeros(linear_sd.size)
+    sizes[list(channel.columns)] = fitted
+    names = list(channel.linear_names)
+    for mains in (50, 60):
+        first, third = (
+            [names.index(f"hum_{frequency}Hz_{part}") for part in ("cos", "sin")] for frequency in (mains, 3 * mains)
+        )
+        linear_sd[third] = np.maximum(linear_sd[third], math.hypot(*sizes[first]))
+    return linear_sd
+
+
+def row_figures(
+    white: Rows, channel: ChannelLikelihood, inputs: ChannelInputs, record: Record
+) -> tuple[Rows, dict[str, float]]:
+    """Return whitened rows without the spectrum of their own (`RecordedCurrent.flatten`), and figures of merit.
+
+    Signs of rounded noise are not independent, and the covariance knows the rounding.
+    """
     terms, current = inputs.circuit.channel_terms(channel.channel), RecordedCurrent.from_record(record)
     delay = float(channel.shift) / current.step
-    return current.flatten(white, describe_terms(terms, inputs.stray, delay, current.step))
+    figures = {
+        "runs_z": 0.0,
+        "rounding_noise": 0.0,
+        "false_alarm": 1e-4,
+        "within_steps": float(current.is_within_steps),
+    }
+    return current.flatten(white, describe_terms(terms, inputs.stray, delay, current.step)), figures
 
 
 def _rows_at(
-    channel: ChannelLikelihood, inputs: ChannelInputs, sigma: ArrayLike, record: Record
-) -> tuple[ChargeRows, Rows, float, float]:
-    """Return rows and drive of a channel at its optimum, the delay (s), and the skew (time steps)."""
+    channel: ChannelLikelihood, inputs: ChannelInputs, sizes: Float[np.ndarray, " columns"], record: Record
+) -> tuple[ChargeRows, Rows, float]:
+    """Return rows and drive of a channel at its optimum, with nuisances of these `sizes`, and the delay (s)."""
     current, size = RecordedCurrent.from_record(record), len(record)
-    beta = np.asarray(_fit_nuisances(channel, inputs, np.asarray(sigma))[1])
     full = channel.without_compression()
-    sizes = beta * np.asarray(full.linear_sd)[list(full.columns)]
     skew, inputs = float(inputs.delay) / current.step, dataclasses.replace(inputs, delay=np.zeros(()))
     delay = float(full.shift) / current.step + float(np.clip(skew, -0.5, 0.5))
     delay = float(np.clip(delay, 0.5 - MAX_STEPS, MAX_STEPS - 0.5))
 
-    def respond(V: Rows) -> Rows:
-        return np.asarray(_modelled_rows(_with_drive(full, current, V), inputs))[:size]
+    @functools.lru_cache(maxsize=1)
+    def respond_to_V() -> tuple[np.ndarray, np.ndarray]:
+        return _modelled_rows(_with_drive(full, current, current.V), inputs, sizes)
 
-    nuisances = _nuisance_rows(_with_drive(full, current, current.V), inputs, sizes)
+    def respond(V: Rows) -> Rows:
+        pair = respond_to_V() if V is current.V else _modelled_rows(_with_drive(full, current, V), inputs, sizes)
+        return np.asarray(pair[0])[:size]
+
     terms = inputs.circuit.channel_terms(channel.channel)
     modelled = describe_terms(terms, inputs.stray, delay, current.step)
-    return *current.make_rows(modelled, respond, np.asarray(nuisances)[:size]), delay * current.step, skew
+    return *current.make_rows(modelled, respond, np.asarray(respond_to_V()[1])[:size]), delay * current.step
 
 
 def set_rows(channel: ChannelLikelihood, rows: ChargeRows, V: Rows, delay: float) -> ChannelLikelihood:
@@ -448,6 +554,7 @@ def set_rows(channel: ChannelLikelihood, rows: ChargeRows, V: Rows, delay: float
     padded = ChargeRows(**{name: np.pad(x, (0, length - x.size)) for name, x in arrays.items()})
     assert isinstance(channel.drive, Sampled)
     drive = Sampled(channel.drive.time, pad_samples(V))
+    channel = channel.without_compression()
     return dataclasses.replace(channel, drive=drive, charges=padded, shift=np.asarray(delay, dtype=float))
 
 
@@ -462,13 +569,10 @@ def _with_drive(channel: ChannelLikelihood, current: RecordedCurrent, V: Rows) -
 
 
 @jit
-def _modelled_rows(channel: ChannelLikelihood, inputs: ChannelInputs) -> Array:
-    return -channel.rows_and_shapes(inputs)[0]
-
-
-@jit
-def _nuisance_rows(channel: ChannelLikelihood, inputs: ChannelInputs, sizes: Array) -> Array:
-    return sizes @ channel.rows_and_shapes(inputs)[1]
+def _modelled_rows(channel: ChannelLikelihood, inputs: ChannelInputs, sizes: Array) -> tuple[Array, Array]:
+    """Return the rows of the signal of a channel that observed 0, and those of nuisances of these sizes."""
+    rows, shapes = channel.rows_and_shapes(inputs)
+    return -rows, sizes @ shapes
 
 
 _fit_nuisances = jit(ChannelLikelihood.fit_nuisances)

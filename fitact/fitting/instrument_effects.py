@@ -23,13 +23,13 @@ from fitact.model.drive import Sampled
 def fill_effects(
     likelihood: Likelihood, theta: np.ndarray, noise: Sequence[float], sources: Sequence[Source]
 ) -> Likelihood:
-    """Return the likelihood without compression, and with effects of instruments for the signals at `theta`.
+    """Return the likelihood with effects of instruments for the signals at `theta`, and without their compression.
 
     `noise` is the noise sd of each channel, V or A.
     """
-    likelihood = likelihood.without_compression()
     for i, (channel, source, sigma) in enumerate(zip(likelihood.channels, sources, noise, strict=True)):
         if channel.effects is not None:
+            channel = channel.without_compression()
             inputs = likelihood.make_inputs(likelihood.evaluate_circuit(theta).circuit, theta, channel)
             if isinstance(channel, SpectrumChannel):
                 likelihood = likelihood.replace_channel(i, channel.with_compensation(inputs))

@@ -77,9 +77,12 @@ class Problem(NamedTuple):
     coordinates: tuple[ErrorCoordinate, ...]  # of the errors of instruments
 
     def compress_likelihood(self, tolerance: float) -> tuple[Likelihood, tuple[str, ...]]:
-        """Return the likelihood with compressed channels, and for each channel the reason if it is not compressed."""
+        """Return the likelihood with compressed channels, and why each of the others is not compressed, or ""."""
         at_start = self.likelihood.evaluate_circuit(self.start)
-        pairs = [certificate.compress_channel(each, at_start, tolerance) for each in self.likelihood.channels]
+        pairs = [
+            (each, "") if each.compression is not None else certificate.compress_channel(each, at_start, tolerance)
+            for each in self.likelihood.channels
+        ]
         channels, reasons = zip(*pairs, strict=True)
         return dataclasses.replace(self.likelihood, channels=channels), reasons
 

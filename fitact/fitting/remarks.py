@@ -41,6 +41,11 @@ def channel_warnings(record: Record, choice: DriveModel, channel: str, figures: 
             f" {format_engineering(figures['interpolation_error'], 'V')}); record faster, or state the waveform in a"
             " scene"
         )
+    if figures.get("within_steps", 0.0) > 0.0:
+        warnings.append(
+            "I spends half of the time within two steps of its converter, so the record does not determine what it is"
+            " between edges; amplify it (its edges may then be clipped), or make the edges of V slower"
+        )
     if figures["rounding_noise"] > 0.0:
         warnings.append(
             f"{channel} is rounded to steps larger than its noise, so the rounding errors are correlated and the stated"

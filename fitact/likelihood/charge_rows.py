@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
+import scipy.signal
 from jaxtyping import Array, Bool, Float
 
 from fitact.model.response import recurrence
@@ -37,11 +38,12 @@ def step_means(values: Float[np.ndarray, "*n samples"], delay: float = 0.0) -> F
     factors = np.where(others, part - _INTERPOLATED, 1.0) / np.where(
         others, np.subtract.outer(_INTERPOLATED, _INTERPOLATED), 1.0
     )
-    taps = np.convolve(np.prod(factors, axis=1), _MEAN_OF_STEP)  # from the sample k + whole - 4 on
+    taps = np.convolve(np.prod(factors, axis=1), _MEAN_OF_STEP)
+    used = np.flatnonzero(taps)[[0, -1]]
+    shift = LAG + 2 + _BEFORE - whole - int(used[1])  # the row k + LAG takes the samples from k + whole - 4 on
     result = np.zeros_like(values)
-    for j, tap in enumerate(taps):
-        shift = LAG - (whole + j - 2 - _BEFORE)  # the row k + LAG takes the sample k + whole + j - 4
-        result[..., shift:] += tap * values[..., : values.shape[-1] - shift]
+    last = taps[used[1] : used[0] - 1 if used[0] else None : -1]
+    result[..., shift:] = scipy.signal.lfilter(last, [1.0], values[..., : values.shape[-1] - shift])
     return result
 
 
@@ -120,4 +122,6 @@ def whiten_rows(
 ) -> Float[np.ndarray, "*n rows"]:
     """Return whitened rows as `ChargeRows.whiten`, without JAX."""
     bands = np.stack([np.ones_like(decay), -np.append(decay[1:], 0.0)])
-    return scipy.linalg.solve_banded((1, 0), bands, np.moveaxis(gain * rows, -1, 0)).T.reshape(np.shape(rows))
+    scaled = np.reshape(gain * rows, (-1, decay.size))
+    whitened, _ = scipy.linalg.lapack.dtbtrs(bands, scaled.T, uplo="L", diag="U", overwrite_b=True)
+    return whitened.T.reshape(np.shape(rows))

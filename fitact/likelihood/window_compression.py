@@ -6,7 +6,7 @@ all. The responses to the recorded drive are first-order recursive filters, whos
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -14,7 +14,8 @@ import scipy.signal
 from jaxtyping import Float
 
 from fitact.likelihood.channel import ChannelLikelihood
-from fitact.likelihood.compression import Compression
+from fitact.likelihood.charge_rows import LAG, ChargeRows, step_means, whiten_rows
+from fitact.likelihood.compression import BASELINE_NAMES, Compression
 from fitact.likelihood.likelihood import CircuitValues
 from fitact.likelihood.projection import (
     MAX_DELAY,
@@ -25,7 +26,8 @@ from fitact.likelihood.projection import (
 )
 
 REACH = 4.0  # factor by which b may change
-REACH_NODES = 29  # of the table, whose series then ends at 1e-12
+REACH_NODES = 21  # of the table, whose series then ends at 1e-8
+RANK = 14  # combinations of responses that represent those of the table, to 2e-7
 TREND_RANK = 6  # combinations of responses that represent those to a small trend, to 0.3 %
 
 
@@ -46,6 +48,11 @@ class TrendInputs(NamedTuple):
     voltage: Float[np.ndarray, " rows"]  # V itself
 
 
+Samples = Float[np.ndarray, " samples"]
+# makes the rows of charge of a current from those of the functions that it consists of, beside dV/dt
+MakeRows = Callable[[Sequence[Float[np.ndarray, "functions samples"]]], ChargeRows]
+
+
 @dataclasses.dataclass(frozen=True)
 class WindowCompressor:
     """Compresses windows of `time.size` samples; `channels` are those of a fit to one of them."""
@@ -53,7 +60,8 @@ class WindowCompressor:
     channels: tuple[ChannelLikelihood, ...]
     tables: tuple[TableNodes, ...]  # of the channels
     time: Float[np.ndarray, " samples"]  # from the start of a window, s
-    shared: Float[np.ndarray, "functions samples"]  # decays in the combinations of the table, and slow shapes
+    # decays in the combinations of the table, and the baseline that each channel has; rows of a current
+    shared: tuple[Float[np.ndarray, "functions samples"], ...]
 
     @classmethod
     def from_channels(
@@ -62,82 +70,100 @@ class WindowCompressor:
         """Make the tables around the time constants of a circuit, a factor `REACH` either way."""
         time = step * np.arange(samples)
         reach = (math.log(REACH), REACH_NODES) if len(circuit.tau) == 1 else None
-        tables = [
-            TableNodes.from_terms(circuit.terms[each.channel], time, narrow=False, reach=reach) for each in channels
-        ]
-        first = tables[0]
-        decays = first.combinations.T @ np.exp(-time / first.nodes[:, None])
-        baseline = evaluate_baseline(time, first.middle, first.half)
-        return cls(tuple(channels), tuple(tables), time, np.concatenate([decays, baseline]))
+        tables, shared = [], []
+        for each in channels:
+            table = TableNodes.from_terms(circuit.terms[each.channel], time, narrow=False, reach=reach)
+            if reach is not None:
+                kept = slice(RANK)
+                table = dataclasses.replace(table, combinations=table.combinations[:, kept], series=table.series[kept])
+            baseline = evaluate_baseline(time, table.middle, table.half)[_baseline_columns(each)]
+            functions = np.concatenate([_decays(table, time), baseline])
+            tables.append(table)
+            shared.append(functions if each.charges is None else step_means(functions))
+        return cls(tuple(channels), tuple(tables), time, tuple(shared))
 
     def compress(
         self,
-        V: Float[np.ndarray, " samples"],
-        rests: Sequence[Float[np.ndarray, " samples"]],
-        rates: Sequence[Float[np.ndarray, " samples"] | None],
-        weights: Sequence[Float[np.ndarray, " samples"] | None],
+        V: Samples,
+        given: Sequence[Samples | MakeRows],
+        weights: Sequence[Samples | None],
         responses: Float[np.ndarray, "nodes samples"],
         has_charge: bool,
-    ) -> tuple[tuple[Compression, ...], tuple[TrendInputs, ...]]:
-        """Compress a window with the drive `V`: each channel's rest, dV/dt where it follows that, and weights.
+    ) -> tuple[tuple[Compression, ...], tuple[TrendInputs, ...], Compression | None]:
+        """Compress a window with the drive `V`: each channel's samples and weights, or rows of charge.
 
-        `responses` are those of `respond`, and the rests those of `subtract_expected`. With `has_charge`, the charge at
-        the first sample is unknown. Also returns what a trend within the window needs.
+        `responses` are those of `respond`. With `has_charge`, the charge at the first sample is unknown. Also returns
+        what a trend within the window needs, and the samples of the responses if the first channel has rows instead.
         """
-        table, step = self.tables[0], self.time[1]
-        combined = table.combinations.T @ responses
-        ages = MAX_DELAY if any(channel.timing for channel in self.channels) else 0
-        steps, zero = drive_steps(V, 0, V.size, ages) / step, np.zeros(V.size)
-        followed = [zero if rate is None else rate for rate in rates]
-        rank = len(combined)
-        late = self.time - 0.5 * self.time[-1]
-        trends = [*(late * combined[:TREND_RANK]), *(late * each for each in followed)]
-        shared = self.shared if has_charge else self.shared[rank:]
-        # all channels with the same weights share the products of what they share
-        rows = np.concatenate([combined, shared, steps, [zero, np.gradient(V, step)], followed, rests, trends, [V]])
-        begin = rank + len(shared)
-        last, products, parts, inputs = begin + len(steps), dict[int, np.ndarray](), [], []
-        first_trend, count_trends = len(rows) - 1 - len(trends), len(trends) - len(followed)
-        baseline = begin - (len(self.shared) - rank)
-        decays = range(rank, baseline) if has_charge else [last] * rank  # the row of zeros, if the charge is known
-        for i, (channel, weight) in enumerate(zip(self.channels, weights, strict=True)):
-            if id(weight) not in products:
-                weighted = rows if weight is None else rows * weight
-                products[id(weight)] = weighted @ weighted.T
-            own = steps[: 2 * MAX_DELAY * bool(channel.timing)]
-            places = [
-                *range(rank),
-                *decays,
-                *[last] * len(channel.effect_sizes),
-                *range(first_trend, first_trend + count_trends),
-                first_trend + count_trends + i,
-                len(rows) - 1,
-                *range(begin, begin + len(own)),
-            ]
-            places += [*range(baseline, begin), last + 2 + i, last + 1, last + 2 + len(followed) + i]
-            total = products[id(weight)][np.ix_(places, places)]
-            count = V.size if weight is None else int(np.count_nonzero(weight))
-            effects = len(channel.effect_sizes)
-            whole = assemble_compression(self.tables[i], total, True, len(own), effects + count_trends + 2, count)
-            assert whole.effects is not None
-            *late_parts, late_rate, voltage = whole.effects[effects:]
-            late_signal = np.transpose(late_parts) @ self.tables[i].series[:count_trends]
-            inputs.append(TrendInputs(late_signal, late_rate, voltage))
-            parts.append(dataclasses.replace(whole, effects=whole.effects[:effects] if effects else None))
-        return tuple(parts), tuple(inputs)
+        late, rank = self.time - 0.5 * self.time[-1], len(self.tables[0].series)
+        functions = np.empty((rank + TREND_RANK + 2, V.size))
+        combined = np.matmul(self.tables[0].combinations.T, responses, out=functions[:rank])
+        np.multiply(late, combined[:TREND_RANK], out=functions[rank:-2])
+        functions[-2], found = V, []
+        for i, pair in enumerate(zip(given, weights, strict=True)):
+            functions[-1] = self.tables[i].expected @ responses
+            found.append(self._compress_channel(i, late, functions, *pair, has_charge))
+        parts, inputs = zip(*found, strict=True)
+        if self.channels[0].charges is None:
+            return parts, inputs, None
+        decays = _decays(self.tables[0], self.time)[: rank * has_charge]
+        rows = np.concatenate([combined, decays])
+        total = np.zeros(2 * [2 * rank + len(BASELINE_NAMES) + 3])
+        total[: len(rows), : len(rows)] = rows @ rows.T
+        return parts, inputs, assemble_compression(self.tables[0], total, True, 0, 0, V.size)
 
-    def subtract_expected(
+    def _compress_channel(
         self,
-        observed: Sequence[Float[np.ndarray, " samples"]],
-        rates: Sequence[Float[np.ndarray, " samples"] | None],
-        responses: Float[np.ndarray, "nodes samples"],
-    ) -> list[Float[np.ndarray, " samples"]]:
-        """Return each channel's samples less the signal of the tables' circuit, without its charge."""
-        rests = []
-        for x, each, rate in zip(self.tables, observed, rates, strict=True):
-            following = 0.0 if x.expected_rate is None or rate is None else x.expected_rate * rate
-            rests.append(each - x.expected @ responses - following)
-        return rests
+        index: int,
+        late: Samples,
+        functions: Float[np.ndarray, "functions samples"],
+        given: Samples | MakeRows,
+        weight: Samples | None,
+        has_charge: bool,
+    ) -> tuple[Compression, TrendInputs]:
+        """Compress a channel; the `functions` are the responses, those of trends, V, and what the tables expect."""
+        channel, table, step = self.channels[index], self.tables[index], float(self.time[1])
+        rank, effects, charged = len(table.series), len(channel.effect_sizes), has_charge * len(table.series)
+        shared, steps = self.shared[index][rank - charged :], np.empty((0, late.size))
+        rows = None
+        if callable(given):
+            functions = step_means(functions)
+            rows = given([functions[:-2], shared])
+            rate, slope, observed = rows.rate, rows.slope, rows.observed
+            late, count = late - (LAG - 0.5) * step, int(np.count_nonzero(rows.gain))
+        else:
+            rate, slope, observed = np.zeros(late.size), np.gradient(functions[-2], step), given
+            count = late.size if weight is None else int(np.count_nonzero(weight))
+            if channel.timing:
+                steps = drive_steps(functions[-2], 0, late.size, MAX_DELAY) / step
+        rest = observed - functions[-1] - (0.0 if table.expected_rate is None else table.expected_rate * rate)
+        own = functions[:rank], shared[:charged], functions[rank:-2], [late * rate, functions[-2]], steps
+        products = np.concatenate([*own, shared[charged:], [rate, slope, rest]])
+        if rows is not None:
+            products = whiten_rows(rows.gain, rows.decay, products)
+        elif weight is not None:
+            products = products * weight
+        # functions that are absent are 0
+        first = 2 * rank + effects
+        begin = first + TREND_RANK + 2 + len(steps)
+        places = [*range(rank + charged), *range(first, begin)]
+        places += [begin + column for column in _baseline_columns(channel)]
+        end = begin + len(BASELINE_NAMES)
+        places += range(end, end + 3)
+        total = np.zeros((end + 3, end + 3))
+        total[np.ix_(places, places)] = products @ products.T
+        whole = assemble_compression(table, total, True, len(steps), effects + TREND_RANK + 2, count)
+        assert whole.effects is not None
+        *late_parts, late_rate, voltage = whole.effects[effects:]
+        late_signal = np.transpose(late_parts) @ table.series[:TREND_RANK]
+        whole = dataclasses.replace(whole, effects=whole.effects[:effects] if effects else None)
+        return whole, TrendInputs(late_signal, late_rate, voltage)
+
+    def expect(self, V: Samples, responses: Float[np.ndarray, "nodes samples"]) -> Samples:
+        """Return the samples of the first channel with the tables' circuit, without its charge."""
+        table = self.tables[0]
+        signal = table.expected @ responses
+        return signal if table.expected_rate is None else signal + table.expected_rate * np.gradient(V, self.time[1])
 
     def respond(
         self, V: Float[np.ndarray, " samples"], start: float, before: FilterState | None
@@ -156,3 +182,11 @@ class WindowCompressor:
         length = step * V.size
         age = length + (0.0 if before is None else before.age)
         return responses, FilterState(start + length, float(V[-1]), left, age)
+
+
+def _decays(table: TableNodes, time: Samples) -> Float[np.ndarray, "rank samples"]:
+    return table.combinations.T @ np.exp(-time / table.nodes[:, None])
+
+
+def _baseline_columns(channel: ChannelLikelihood) -> list[int]:
+    return [column for column in channel.columns if column < len(BASELINE_NAMES)]

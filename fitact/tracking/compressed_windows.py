@@ -1,6 +1,7 @@
 """Windows of a record, compressed: a fit to a first window in contact gives the model, which all others share."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -12,14 +13,15 @@ from jaxtyping import Bool, Float
 from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.fitting.current import edge_mask, weigh_current_samples
+from fitact.fitting.current import Current, RecordedCurrent, describe_terms
 from fitact.fitting.fit import Fit, fit
 from fitact.likelihood.certificate import TOLERANCE, reason_against_table
 from fitact.likelihood.compression import Compression
-from fitact.likelihood.window_compression import FilterState, TrendInputs, WindowCompressor
+from fitact.likelihood.likelihood import CircuitValues
+from fitact.likelihood.window_compression import FilterState, MakeRows, TrendInputs, WindowCompressor
 from fitact.model.circuit import passes_direct_current
 from fitact.scene.scene import Scene
-from fitact.tracking.windows import AROUND, Window
+from fitact.tracking.windows import Window
 
 NO_CONTACT = 0.1  # part of the usual signal below which the finger is not in contact
 _WHOLE = 0.5  # least signal of a part of a window over its largest; otherwise contact was made or lost within it
@@ -32,6 +34,7 @@ class WindowData(NamedTuple):
 
     compressions: tuple[Compression, ...]
     trends: tuple[TrendInputs, ...]  # of each channel
+    samples: Compression | None  # of the responses, if the first channel is compressed in rows of charge
 
 
 class CompressedWindow(NamedTuple):
@@ -71,9 +74,8 @@ class WindowResponses(NamedTuple):
 
     window: Window
     responses: Float[np.ndarray, "nodes samples"] | None
-    rests: list[np.ndarray]  # of each channel, less what the model's circuit makes expect
-    rates: list[np.ndarray | None]
-    weights: list[np.ndarray | None]
+    recorded: list[np.ndarray | MakeRows]  # of each channel
+    weights: list[np.ndarray | None]  # of its samples, or None where all are 1
     has_charge: bool  # whether the charge at the start is unknown
     lowest: float  # as in CompressedWindow
     highest: float
@@ -87,7 +89,7 @@ class WindowModel(NamedTuple):
     compressor: WindowCompressor
     parts: int  # parts of a window in which the signal is compared
     drive_rms: float  # V
-    noise: dict[str, float]
+    current: tuple[RecordedCurrent, Current] | None  # noise of the fitted V and I, and the modelled current
     time_constants: Float[np.ndarray, " taus"]  # s
 
     def respond(self, windows: Iterable[Window]) -> Iterator[WindowResponses]:
@@ -102,50 +104,39 @@ class WindowModel(NamedTuple):
             V = window.channels["V"]
             if not window.is_whole or float(np.std(V)) < _DRIVEN * self.drive_rms:
                 state = None
-                yield WindowResponses(window, None, [], [], [], False, math.nan, math.nan)
+                yield WindowResponses(window, None, [], [], False, math.nan, math.nan)
                 continue
             if state is not None and abs(window.start - state.end) > 0.5 * step:
                 state = None
             has_charge = state is None or state.age < settled
             responses, state = self.compressor.respond(V, window.start, state)
-            rates, weights, clipped = self._weigh_samples(window)
-            observed = [window.channels[channel.channel] for channel in self.fit.likelihood.channels]
-            rests = self.compressor.subtract_expected(observed, rates, responses)
-            lowest, highest = self._compare_signal(observed[0], observed[0] - rests[0], weights[0])
+            channels = self.fit.likelihood.channels
+            samples = [window.channels[channel.channel] for channel in channels]
+            clipped = [clipping_mask(values) for values in samples]
+            weights = [np.where(each, 0.0, 1.0) if each.any() else None for each in clipped]
+            lowest, highest = self._compare_signal(samples[0], self.compressor.expect(V, responses), weights[0])
+            pairs = zip(channels, samples, strict=True)
+            recorded = [values if channel.charges is None else self._make_rows(window) for channel, values in pairs]
             if not is_in_contact(lowest, highest):
                 state = None
-            yield WindowResponses(window, responses, rests, rates, weights, has_charge, lowest, highest, clipped)
+            is_clipped = any(each is not None for each in weights)
+            yield WindowResponses(window, responses, recorded, weights, has_charge, lowest, highest, is_clipped)
 
     def compress(self, given: WindowResponses) -> CompressedWindow:
         """Compress a window; one without responses has no data."""
         data = None
         if given.responses is not None:
             V = given.window.channels["V"]
-            channels = given.rests, given.rates, given.weights
+            channels = given.recorded, given.weights
             data = WindowData(*self.compressor.compress(V, *channels, given.responses, given.has_charge))
         return CompressedWindow(given.window.start, data, given.lowest, given.highest, given.clipped)
 
-    def _weigh_samples(self, window: Window) -> tuple[list[np.ndarray | None], list[np.ndarray | None], bool]:
-        """Return dV/dt of each channel that follows it, V/s, and weights of its samples, or None where all are 1.
-
-        Also whether samples are clipped, whose weight is 0.
-        """
-        rates, weights, step = list[np.ndarray | None](), list[np.ndarray | None](), float(self.compressor.time[1])
-        is_clipped = False
-        for channel in self.fit.likelihood.channels:
-            rate = weight = None
-            clipped = clipping_mask(window.channels[channel.channel])
-            if channel.rate is not None:
-                inside = slice(AROUND, -AROUND)
-                rate, used = np.gradient(window.V, step)[inside], ~edge_mask(window.V, self.noise["V"])[inside]
-                spread = self.noise["V"] / (math.sqrt(2.0) * step * self.noise["I"])
-                weight = used * weigh_current_samples(window.channels[channel.channel], rate, spread, used)
-                weight = None if np.all(weight == 1.0) else weight
-            if clipped.any():
-                is_clipped, weight = True, np.where(clipped, 0.0, 1.0 if weight is None else weight)
-            rates.append(rate)
-            weights.append(weight)
-        return rates, weights, is_clipped
+    def _make_rows(self, window: Window) -> MakeRows:
+        """Return the function that makes the rows of charge of a window."""
+        assert self.current is not None
+        current, modelled = self.current
+        recorded, blocks = current.continue_with(window.channels["V"], window.channels["I"]), max(400, 16 * self.parts)
+        return functools.partial(recorded.fit_rows, modelled, blocks)
 
     def _compare_signal(
         self, observed: np.ndarray, expected: np.ndarray, weight: np.ndarray | None
@@ -209,9 +200,20 @@ def find_model(windows: Sequence[Window], scene: Scene, step: float, source: str
     with jax.enable_x64(True):
         circuit = fitted.likelihood.evaluate_circuit(fitted.theta)
         compressor = WindowCompressor.from_channels(fitted.likelihood.channels, circuit, time.size, step)
-    noise = {name: record.noise(name) for name in record.channels}
     parts = max(1, math.floor((time[-1] + step) * frequency))
-    return WindowModel(fitted, compressor, parts, float(np.std(first.channels["V"])), noise, circuit.tau)
+    current = _describe_current(fitted, record, circuit)
+    return WindowModel(fitted, compressor, parts, float(np.std(first.channels["V"])), current, circuit.tau)
+
+
+def _describe_current(fitted: Fit, record: Record, circuit: CircuitValues) -> tuple[RecordedCurrent, Current] | None:
+    """Return the noise of a record's V and I, and what is modelled of I; None without I."""
+    for channel in fitted.likelihood.channels:
+        if channel.charges is not None:
+            inputs = fitted.likelihood.make_inputs(circuit.circuit, fitted.theta, channel)
+            delay = float(channel.shift) / record.time_step
+            modelled = describe_terms(circuit.terms["I"], inputs.stray, delay, record.time_step)
+            return RecordedCurrent.from_record(record), modelled
+    return None
 
 
 def require_table(model: WindowModel, source: str) -> None:

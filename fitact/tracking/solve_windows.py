@@ -36,7 +36,7 @@ def solve_windows(
     walking = tuple(name for name in names if name in FINGER_PARAMETERS)
     order = [names.index(name) for name in (*walking, *(name for name in names if name not in walking))]
     factor = likelihood.prior_factor[order]
-    mean = np.append(likelihood.prior.log_mean, np.zeros(len(likelihood.timing)))[order]
+    mean = np.append(likelihood.prior.log_mean, likelihood.timing_mean)[order]
     prior = mean, factor @ factor.T
     length = float(model.compressor.time[-1] + model.compressor.time[1])
     sigma = np.array(fitted.laplace.sigmas)
@@ -68,7 +68,7 @@ def solve_windows(
         assert walk is not None
         assert found is not None
         middle = walk.middle[:, back]
-        quantities = evaluate_quantities(fitted.derive.geometry, likelihood, windows.data.compressions, middle, sigma)
+        quantities = evaluate_quantities(fitted.derive.geometry, likelihood, windows.data, middle, sigma)
     covariance = walk.covariance[:, back][:, :, back]
     average = _average(likelihood, windows, information, walk, order, prior, length)
     follows = is_change_of_finger(fitted.effects) or _residuals_vary(linear.residuals[windows.has_data])

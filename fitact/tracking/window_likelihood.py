@@ -44,7 +44,7 @@ def linearize(
 def evaluate_quantities(
     geometry: Geometry,
     likelihood: Likelihood,
-    windows: tuple[Compression, ...],
+    windows: WindowData,
     theta: Float[np.ndarray, "windows parameters"],
     sigma: Float[np.ndarray, " channels"],
     batch: int = 64,
@@ -70,7 +70,7 @@ def _insert(likelihood: Likelihood, compressions: tuple[Compression, ...]) -> Li
 @jit
 def _linearize_batch(likelihood: Likelihood, windows: Any, theta: Array, sigma: Array) -> tuple[Array, Array, Array]:
     def one(window: Any, theta: Array) -> tuple[Array, Array, Array]:
-        (compressions, trends), change = window
+        (compressions, trends, _), change = window
         model = _insert(likelihood, _subtract_changes(_insert(likelihood, compressions), trends, change, theta))
 
         def residuals(theta: Array) -> tuple[Array, tuple[Array, Array]]:
@@ -139,14 +139,14 @@ def _quantities_batch(
 ) -> tuple[Array, Array]:
     likelihood, geometry = model_and_geometry
 
-    def one(compressions: tuple[Compression, ...], theta: Array) -> tuple[Array, Array]:
-        model = _insert(likelihood, compressions)
+    def one(window: WindowData, theta: Array) -> tuple[Array, Array]:
+        model = _insert(likelihood, window.compressions)
 
         def logs(theta: Array) -> tuple[Array, Array]:
             circuit = model.circuit(theta)
             finger = model.finger(circuit)
             contact = geometry.contact(finger)
-            square = _mean_square(model, circuit, theta, sigma, contact.channel)
+            square = _mean_square(model, window.samples, circuit, theta, sigma, contact.channel)
             values = jnp.stack([finger.g, finger.b, force_constant(contact) * square])
             return jnp.log(values), jnp.log(values)
 
@@ -156,10 +156,12 @@ def _quantities_batch(
     return jax.vmap(one)(windows, theta)
 
 
-def _mean_square(model: Likelihood, circuit: Any, theta: Array, sigma: Array, acting: Any) -> Array:
+def _mean_square(
+    model: Likelihood, samples: Compression | None, circuit: Any, theta: Array, sigma: Array, acting: Any
+) -> Array:
     """Return the mean square of the voltage that generates the force, V^2, from inner products over the window."""
     channel = model.channels[0]
-    compression, inputs = channel.compression, model.make_inputs(circuit, theta, channel)
+    compression, inputs = samples or channel.compression, model.make_inputs(circuit, theta, channel)
     assert isinstance(compression, Compression)
     terms = model.finger(circuit).channel_terms(acting)
     voltage = compression.response(terms)
@@ -173,5 +175,4 @@ def _mean_square(model: Likelihood, circuit: Any, theta: Array, sigma: Array, ac
             voltage = voltage + size * compression.decays(tau, index)
     names, gains = model.names, channel.drive_gains
     scale = jnp.exp(sum((power * theta[names.index(name)] for name, power in gains), jnp.zeros(())))
-    ones = compression.baseline[0]
-    return jnp.sum(jnp.square(voltage)) / jnp.sum(jnp.square(ones)) / jnp.square(scale)
+    return jnp.sum(jnp.square(voltage)) / compression.samples / jnp.square(scale)

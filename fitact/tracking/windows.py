@@ -10,20 +10,17 @@ from jaxtyping import Float
 from fitact.data.readers.stream import Block
 from fitact.errors import InputError
 
-AROUND = 3  # samples of V that a window has on either side, for its slope and edges
-
 
 class Window(NamedTuple):
     """Consecutive samples of all channels."""
 
     start: float  # time of the first sample, s
     channels: Mapping[str, Float[np.ndarray, " samples"]]
-    V: Float[np.ndarray, " samples+around"]  # with its neighbours; after lost samples, the first or last is repeated
 
     @property
     def is_whole(self) -> bool:
-        """Whether all samples are numbers, and the neighbours of V."""
-        return all(bool(np.isfinite(values).all()) for values in (self.V, *self.channels.values()))
+        """Whether all samples are numbers."""
+        return all(bool(np.isfinite(values).all()) for values in self.channels.values())
 
 
 def split_windows(
@@ -35,27 +32,19 @@ def split_windows(
         InputError: times that do not increase, or steps that differ from `step` by more than `max_change`.
     """
     time, channels = np.empty(0), dict[str, np.ndarray]()
-    done = 0  # samples at the beginning that are in windows, and are kept as neighbours of the next one
     for block in itertools.chain(blocks, [None]):
         if block is not None:
             time = np.concatenate([time, block.time])
             channels = {n: np.concatenate([channels.get(n, np.empty(0)), v]) for n, v in block.channels.items()}
         steps = np.diff(time)
         _check_steps(time, steps, step, source, max_change)
-        begin, first = done, 0
+        begin = 0
         for end in [*(np.flatnonzero(steps > 1.5 * step) + 1).tolist(), time.size]:
-            is_open = end == time.size and block is not None  # more samples may follow
-            while end - begin >= samples + AROUND * is_open:
-                last = begin + samples
-                V = channels["V"][max(first, begin - AROUND) : min(end, last + AROUND)]
-                around = (AROUND - min(AROUND, begin - first), AROUND - min(AROUND, end - last))
-                values = {name: each[begin:last] for name, each in channels.items()}
-                yield Window(float(time[begin]), values, np.pad(V, around, mode="edge"))
-                begin = last
-            if end < time.size:
-                begin = first = end
-        kept = max(first, begin - AROUND)
-        time, channels, done = time[kept:], {name: each[kept:] for name, each in channels.items()}, begin - kept
+            for first in range(begin, end - samples + 1, samples):
+                begin = first + samples
+                yield Window(float(time[first]), {name: each[first:begin] for name, each in channels.items()})
+            begin = begin if end == time.size else end
+        time, channels = time[begin:], {name: each[begin:] for name, each in channels.items()}
 
 
 def _check_steps(time: np.ndarray, steps: np.ndarray, step: float, source: str, max_change: float) -> None:

