@@ -16,8 +16,8 @@ app = typer.Typer(
     help="""
 Estimate the circuit of a finger on an electrovibration display, and the electrostatic force, from recorded voltages.
 
-Start with a CSV file whose header reads `time_s,V_V,Vsc_V` (time in s, drive and skin voltage in V). Describe the
-panel, the finger and the drive in a scene file:
+Start with a CSV file whose header reads `time_s,V_V,I_A` (time in s, drive in V, loop current in A) or
+`time_s,V_V,Vsc_V` (skin voltage in V). Describe the panel, the finger and the drive in a scene file:
 
     fitact scene > scene.toml
     fitact run finger.csv --scene scene.toml --out results

@@ -395,9 +395,10 @@ def fit(
 
     The scene of the first record (or spectrum, without records) gives the circuit, the prior and the device. The drive
     is the recorded V if there is no scene or its waveform is "measured", otherwise the waveform of the record's scene.
-    Each channel has its own noise. Offset, drift, mains hum and (for Vsc) delay and clock error are added as free
-    parameters if the BIC favours them; a gain is free only with a prior in the scene. The start is estimated from the
-    records. Computes in double precision and leaves the setting of JAX unchanged.
+    Each channel has its own noise; that of a recorded V is part of the likelihood of I, whose delay is then free.
+    Offset, drift, mains hum and (for Vsc) delay and clock error are added as free parameters if the BIC favours them;
+    a gain is free with a prior in the scene, or where V is coarsely rounded. The start is estimated from the records.
+    Computes in double precision and leaves the setting of JAX unchanged.
 
     Args:
         record: record or spectrum, or several. A record has the channels of the scene; V too, unless the scene states

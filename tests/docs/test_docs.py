@@ -110,11 +110,12 @@ def names_files(arguments: list[str]) -> None:
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """Return a folder with the project's data and with the files that pages name."""
+def folder(page, tmp_path, monkeypatch):
+    """Return a folder with the project's data and with the files that the page names."""
     records = ROOT / "data_synth" / "records"
     (tmp_path / "data_synth").symlink_to(ROOT / "data_synth")
-    shutil.copy(records / "finger_direct.csv", tmp_path / "finger.csv")
+    shown = "finger_bench.csv" if page.name == "README.md" else "finger_direct.csv"
+    shutil.copy(records / shown, tmp_path / "finger.csv")
     for number in (0, 1):
         packed = (records / "fingers" / f"finger0{number}.csv.gz").read_bytes()
         (tmp_path / f"finger0{number}.csv").write_bytes(gzip.decompress(packed))
