@@ -91,12 +91,15 @@ class RecordedCurrent:
 
     @classmethod
     def from_samples(
-        cls, V: Rows, current: Rows, step: float, noise_V: tuple[float, float], noise: float
+        cls, V: Rows, current: Rows, step: float, noise_V: tuple[float, float], noise: float, is_whole: bool = True
     ) -> "RecordedCurrent":
-        """Estimate which samples are less certain than the noise of V and I (A) makes them."""
+        """Estimate which samples are less certain than the noise of V and I (A) makes them.
+
+        `is_whole`: whether they are a whole record, and not a window of one, whose delay others determine.
+        """
         rounding, runs = _least_step(current) / math.sqrt(12.0), run_lengths(current)
         # a run of equal values shares one error, so that its mean has the variance of one
-        uncertain = _kink_variance(current, noise) + np.where(runs > FEW, rounding**2 * runs, 0.0)
+        uncertain = _kink_variance(current, noise, is_whole) + np.where(runs > FEW, rounding**2 * runs, 0.0)
         # the flat top of a pulse that is coarsely rounded looks clipped, but lies within the range of the converter
         codes = np.log2(np.maximum(np.abs([current.min(), current.max()]) / (math.sqrt(12.0) * rounding or 1.0), 1.0))
         is_coarse = rounding > white_noise_sd(current) and np.max(np.abs(codes - np.round(codes))) > 0.02
@@ -105,7 +108,7 @@ class RecordedCurrent:
 
     def continue_with(self, V: Rows, current: Rows) -> "RecordedCurrent":
         """Return other samples of V and I, with the same noise."""
-        return self.from_samples(V, current, self.step, self.noise_V, self.noise_I)
+        return self.from_samples(V, current, self.step, self.noise_V, self.noise_I, is_whole=False)
 
     @property
     def is_coarse(self) -> bool:
@@ -114,9 +117,9 @@ class RecordedCurrent:
 
     @property
     def is_within_steps(self) -> bool:
-        """Whether I spends half of the time within two steps of its converter, and so tells little."""
+        """Whether I spends half of the time within a step of its converter, and so tells little."""
         half = np.quantile(np.abs(self.I - np.median(self.I)), 0.5)
-        return self.is_coarse and bool(half <= 2.0 * _least_step(self.I))
+        return self.is_coarse and bool(half <= 1.01 * _least_step(self.I))
 
     @property
     def _floor(self) -> float:
@@ -223,7 +226,9 @@ def estimate_noise(values: Rows, block: int = 16, max_ratio: float = 0.7) -> flo
     return max(fastest if fastest < max_ratio * differences else differences, rounding_noise_sd(values))
 
 
-def _kink_variance(current: Rows, noise: float, threshold: float = 4.0, smooth: float = 8.0, block: int = 64) -> Rows:
+def _kink_variance(
+    current: Rows, noise: float, is_whole: bool, threshold: float = 4.0, smooth: float = 8.0, block: int = 64
+) -> Rows:
     """Return the variance of the mean current over the step after each sample, if the current jumps within the step.
 
     A jump somewhere within a step changes the mean by its height times a uniform number in +-1/2, and the polynomials
@@ -237,13 +242,15 @@ def _kink_variance(current: Rows, noise: float, threshold: float = 4.0, smooth: 
     around = np.max([np.roll(jump, k) for k in (-2, -1, 1, 2)], axis=0)
     jump = np.where((jump > np.maximum(least, 1e-9 * np.ptp(current))) & (jump >= around), jump, 0.0)
     height = np.maximum(jump, np.append(jump[1:], 0.0))
-    return _shared_jumps(np.flatnonzero(height)) * np.convolve(np.square(height), np.square(_JUMP_ERRORS), "same")
+    shared = _shared_jumps(np.flatnonzero(height)) if is_whole else 1.0
+    return shared * np.convolve(np.square(height), np.square(_JUMP_ERRORS), "same")
 
 
-def _shared_jumps(places: Int[np.ndarray, " n"]) -> float:
-    """Return how many jumps lie at the same part of a step, and so have the same error.
+def _shared_jumps(places: Int[np.ndarray, " n"], most: float = 4.0) -> float:
+    """Return how many jumps lie at the same part of a step and so have the same error, `most` at most.
 
-    These are half of all if the drive repeats after a whole number of steps, to one over the record.
+    These are half of all if the drive repeats after a whole number of steps, to one over the record. With more of them,
+    the delay of a long record would be known to a part of a step only, which is too cautious for its other parameters.
     """
     first = places[np.diff(places, prepend=-9) > 3]
     for jumps in (2, 4):  # in a period, of a triangle and a trapezoid
@@ -251,7 +258,7 @@ def _shared_jumps(places: Int[np.ndarray, " n"]) -> float:
         if periods > 0:
             period = (first[periods * jumps] - first[0]) / periods
             if abs(period - round(period)) * periods <= 1.0:
-                return max(0.5 * first.size, 1.0)
+                return min(max(0.5 * first.size, 1.0), most)
     return 1.0
 
 

@@ -52,7 +52,7 @@ from fitact.fitting.starting_point import (
 from fitact.instrument.classes import typical_gain_u
 from fitact.instrument.effects import INPUT_RANGE
 from fitact.likelihood import certificate
-from fitact.likelihood.channel import FIRST_CHARGE, LINEAR_NUISANCES, ChannelLikelihood
+from fitact.likelihood.channel import CHARGES, FIRST_CHARGE, LINEAR_NUISANCES, ChannelLikelihood
 from fitact.likelihood.compression import HUM_FREQUENCIES
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import Autoregression, estimate_quiet_noise, require_uniform
@@ -219,8 +219,8 @@ def _prior_as_arrays(prior: Prior) -> Prior:
 
 
 def _channels(record: Record, scene: Scene | None) -> tuple[Channel, ...]:
-    """Return the channels to fit: those of the scene; without a scene Vsc, or I if there is no Vsc."""
-    if scene is None:
+    """Return the channels to fit: those of the scene; if none are stated Vsc, or I if there is no Vsc."""
+    if scene is None or "channels" not in scene.measurement.model_fields_set:
         return ("I",) if "I" in record and "Vsc" not in record else ("Vsc",)
     return tuple(channel for channel in ("Vsc", "I", "Ft") if channel in scene.measurement.channels)
 
@@ -301,7 +301,7 @@ def _build_channel(
     if timing:
         likelihood = likelihood.exclude_unknown_drive()
     if channel == "I" and choice.name == "measured":
-        likelihood, start, noise, hum = _make_charge_rows(likelihood, record, scene, bare)
+        likelihood, start, noise, hum = _make_charge_rows(likelihood, record, scene, bare, taus)
         if scene.measurement.noise_model != "white":
             warnings = (
                 *warnings,
@@ -313,7 +313,12 @@ def _build_channel(
 
 
 def _make_charge_rows(
-    channel: ChannelLikelihood, record: Record, scene: Scene, bare: Likelihood, usual_hum: float = 10.0
+    channel: ChannelLikelihood,
+    record: Record,
+    scene: Scene,
+    bare: Likelihood,
+    taus: Float[np.ndarray, " time_constants"],
+    usual_hum: float = 10.0,
 ) -> tuple[ChannelLikelihood, CurrentEstimate | None, float, list[float]]:
     """Return the channel of a current with a recorded drive, and an estimate of its circuit.
 
@@ -325,6 +330,8 @@ def _make_charge_rows(
     hum = [frequency for frequency, part in likeness.items() if part < 0.7]
     estimate, nuisances = estimate_recorded(current, stray, hum, prior_skin_moments(bare))
     linear_sd = channel.linear_sd.copy()
+    # a charge that has decayed before the first row is not determined, and must not act on the force
+    linear_sd[FIRST_CHARGE : FIRST_CHARGE + taus.size][taus[: len(CHARGES)] < 5.0 * record.time_step] = 0.0
     for i, frequency in enumerate(HUM_FREQUENCIES):
         if not likeness[frequency] < 0.7:
             linear_sd[2 * i + 2 : 2 * i + 4] = usual_hum * current.noise_I
