@@ -110,7 +110,14 @@ class DerivedQuantities(eqx.Module):
         # the effect of a charge scales between channels like the response to a drive
         names = self.geometry.contact(inputs.circuit).channel, channel.channel
         acting, recorded = (inputs.circuit.channel_terms(name).weight for name in names)
-        ratios = jnp.stack([v / jnp.where(w == 0.0, 1.0, w) for v, w in zip(acting, recorded, strict=False)])
+        # a charge that the channel does not show, such as a difference of equal skins in I, has no known effect
+        largest = jnp.max(jnp.abs(jnp.stack(recorded)))
+        ratios = jnp.stack(
+            [
+                jnp.where(jnp.abs(w) > 1e-9 * largest, v / jnp.where(w == 0.0, 1.0, w), 0.0)
+                for v, w in zip(acting, recorded, strict=False)
+            ]
+        )
         sizes = sizes[: ratios.size] * ratios / inputs.gain
         if isinstance(self.drive, ResponseTable):
             return self.drive.decays(inputs.circuit.terms().tau, sizes)
