@@ -18,7 +18,7 @@ from fitact.errors import InputError
 from fitact.fitting.drive_choice import DriveModel, has_ideal_edges, whole_periods
 from fitact.likelihood.channel import CHARGES, FIRST_CHARGE, LINEAR_NUISANCES, ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
-from fitact.model.circuit import Circuit
+from fitact.model.circuit import Circuit, charge_ratios
 from fitact.model.drive import Drive, Multitone, Periodic, PiecewiseLinear, Sampled, Sine
 from fitact.model.force import Geometry, electrostatic_force, friction, mean_force, peak_force, summarize
 from fitact.model.response import response
@@ -107,17 +107,9 @@ class DerivedQuantities(eqx.Module):
         sizes = (channel.sample_nuisances(inputs, sigma, first) * channel.linear_sd)[
             FIRST_CHARGE : FIRST_CHARGE + len(CHARGES)
         ]
-        # the effect of a charge scales between channels like the response to a drive
-        names = self.geometry.contact(inputs.circuit).channel, channel.channel
-        acting, recorded = (inputs.circuit.channel_terms(name).weight for name in names)
-        # a charge that the channel does not show, such as a difference of equal skins in I, has no known effect
-        largest = jnp.max(jnp.abs(jnp.stack(recorded)))
-        ratios = jnp.stack(
-            [
-                jnp.where(jnp.abs(w) > 1e-9 * largest, v / jnp.where(w == 0.0, 1.0, w), 0.0)
-                for v, w in zip(acting, recorded, strict=False)
-            ]
-        )
+        acting = self.geometry.contact(inputs.circuit).channel
+        terms = (inputs.circuit.channel_terms(name) for name in (acting, channel.channel))
+        ratios = jnp.stack(charge_ratios(*terms))
         sizes = sizes[: ratios.size] * ratios / inputs.gain
         if isinstance(self.drive, ResponseTable):
             return self.drive.decays(inputs.circuit.terms().tau, sizes)

@@ -392,6 +392,19 @@ def _series_resistance(*resistances: ArrayLike | None) -> ArrayLike | None:
     return sum(stated[1:], stated[0]) if stated else None
 
 
+def charge_ratios(acting: HighpassTerms, recorded: HighpassTerms) -> list[Array]:
+    """Return, term by term, the effect of a charge on one channel over its effect on the recorded one.
+
+    The effect of a charge scales between channels like the response to a drive. A charge that the recorded channel does
+    not show, such as a difference of equal skins in I, has no known effect: 0.
+    """
+    largest = jnp.max(jnp.abs(jnp.stack(recorded.weight)))
+    return [
+        jnp.where(jnp.abs(known) > 1e-9 * largest, weight / jnp.where(known == 0.0, 1.0, known), 0.0)
+        for weight, known in zip(acting.weight, recorded.weight, strict=False)
+    ]
+
+
 def gain_at(terms: HighpassTerms, omega: ArrayLike) -> Complex[Array, "*shape"]:
     """Return the sum of `terms` at s = j omega (rad/s, >= 0)."""
     omega = jnp.asarray(omega)

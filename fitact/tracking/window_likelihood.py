@@ -14,7 +14,7 @@ from fitact.likelihood.channel import FIRST_CHARGE
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.window_compression import TrendInputs
-from fitact.model.circuit import FinalCircuit, HighpassTerms
+from fitact.model.circuit import FinalCircuit, HighpassTerms, charge_ratios
 from fitact.model.force import Geometry, force_constant
 from fitact.tracking.compressed_windows import WindowData
 
@@ -165,14 +165,12 @@ def _mean_square(
     assert isinstance(compression, Compression)
     terms = model.finger(circuit).channel_terms(acting)
     voltage = compression.response(terms)
-    # the effect of a charge scales between channels like the response to the drive
     _, beta, _ = channel.fit_nuisances(inputs, sigma[0])
     sizes = dict(zip(channel.columns, beta * channel.linear_sd[np.array(channel.columns, dtype=int)], strict=True))
     recorded = circuit.channel_terms(channel.channel)
-    for index, (weight, other, tau) in enumerate(zip(terms.weight, recorded.weight, recorded.tau, strict=False)):
+    for index, (ratio, tau) in enumerate(zip(charge_ratios(terms, recorded), recorded.tau, strict=False)):
         if FIRST_CHARGE + index in sizes:
-            size = sizes[FIRST_CHARGE + index] / inputs.gain * weight / jnp.where(other == 0.0, 1.0, other)
-            voltage = voltage + size * compression.decays(tau, index)
+            voltage = voltage + sizes[FIRST_CHARGE + index] / inputs.gain * ratio * compression.decays(tau, index)
     names, gains = model.names, channel.drive_gains
     scale = jnp.exp(sum((power * theta[names.index(name)] for name, power in gains), jnp.zeros(())))
     return jnp.sum(jnp.square(voltage)) / compression.samples / jnp.square(scale)
