@@ -56,6 +56,10 @@ class Current(NamedTuple):
     delay: float  # against V, in time steps
     follows: bool = True  # whether it follows dV/dt, which no resistance limits
 
+    def sample_gains(self, step: float) -> tuple[float, float]:
+        """Return the gains (S) of the noise of V, at the first and last sample of a step (s), in the mean current."""
+        return 0.5 * self.conductance - self.capacitance / step, 0.5 * self.conductance + self.capacitance / step
+
 
 @dataclasses.dataclass(frozen=True)
 class RecordedCurrent:
@@ -128,19 +132,19 @@ class RecordedCurrent:
 
     def covariance(self, modelled: Current) -> RowCovariance:
         """Return the covariance of the rows."""
-        variance, driven, excluded = self._variance(modelled)
-        return RowCovariance(variance, 0.5 * (1.0 - _ROW_NOISE) * self._floor**2 - driven, excluded)
+        variance, shared, excluded = self._variance(modelled)
+        return RowCovariance(variance, 0.5 * (1.0 - _ROW_NOISE) * self._floor**2 + shared, excluded)
 
     def _variance(self, modelled: Current) -> tuple[Rows, Rows, Bool[np.ndarray, " samples"]]:
-        """Return the variance of the rows, that by the noise of a sample of V, and which rows are excluded."""
-        driven = np.roll((modelled.capacitance / self.step) ** 2 * self.variance_V, LAG)
-        floor = self._floor**2
-        level = _ROW_NOISE * floor + driven + np.roll(driven, -1) + modelled.conductance**2 * np.mean(self.variance_V)
+        """Return the variance of the rows, their covariance by the sample of V they share, and which are excluded."""
+        early, late = modelled.sample_gains(self.step)
+        driven = np.roll(self.variance_V, LAG)
+        level = _ROW_NOISE * self._floor**2 + early**2 * driven + late**2 * np.roll(driven, -1)
         shift, excluded = LAG - round(modelled.delay), self.excluded.copy()
         if excluded.any():
             excluded = np.roll(np.convolve(excluded, np.ones(2 * LAG), "same") > 0.5, shift)
         excluded[: 2 * LAG] = True
-        return level + np.roll(self.uncertain, shift), driven, excluded
+        return level + np.roll(self.uncertain, shift), early * late * driven, excluded
 
     def flatten(self, white: Rows, modelled: Current) -> Rows:
         """Return whitened rows without the spectrum that a tridiagonal covariance leaves in the noise of I."""
@@ -171,9 +175,8 @@ class RecordedCurrent:
         means, from_V = step_means(self.I, modelled.delay), respond(self.V)
         scaled = np.append(covariance.solve(means - from_V - nuisances)[LAG:], np.zeros(LAG))
         # covariance of the noise of V with that of the rows
-        share = -modelled.capacitance / self.step * self.variance_V
-        noise = share * (np.append(0.0, scaled[:-1]) - scaled)
-        V = self.V - noise
+        early, late = modelled.sample_gains(self.step)
+        V = self.V + self.variance_V * (early * scaled + late * np.append(0.0, scaled[:-1]))
         signal = respond(V)
         slope = np.where(covariance.used, -np.gradient(signal) / self.step, 0.0)
         power = np.mean(self._noise_power(np.linspace(0.0, 0.5, 129), modelled))
@@ -289,7 +292,7 @@ def describe_terms(terms: HighpassTerms, stray: ArrayLike | None, delay: float, 
     """
     stray = 0.0 if stray is None else float(stray)
     if terms.rate is not None:
-        return Current(float(terms.rate) + stray, float(abs(np.sum(terms.weight))), delay)
+        return Current(float(terms.rate) + stray, float(np.sum(terms.weight)), delay)
     omega = math.pi / step * (np.arange(64) + 0.5) / 64.0
     gain = np.asarray(gain_at(terms, omega)) + 1j * omega * stray
     mean_square = float(np.mean(np.abs(gain * np.sinc(0.5 * omega * step / math.pi)) ** 2))

@@ -335,7 +335,7 @@ def _make_charge_rows(
     for i, frequency in enumerate(HUM_FREQUENCIES):
         if not likeness[frequency] < 0.7:
             linear_sd[2 * i + 2 : 2 * i + 4] = usual_hum * current.noise_I
-    modelled = Current(estimate.capacitance + stray, abs(estimate.weight), 0.0)
+    modelled = Current(estimate.capacitance + stray, estimate.weight, 0.0)
     rows, V = current.make_rows(modelled, respond_to(current, estimate, stray), nuisances)
     # converters take channels in turn, and probes delay them
     delay_sd = max(1.0, scene.skew_limit("I", record.time_step) / record.time_step)
