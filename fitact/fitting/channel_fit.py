@@ -80,7 +80,7 @@ class ChannelFit:
         names = [channel.qualified_name(channel.linear_names[column]) for column in channel.columns]
         linear = dict(zip(names, (beta * np.asarray(channel.linear_sd)[list(channel.columns)]).tolist(), strict=True))
         mask = channel.weights if channel.whitening is None else np.asarray(channel.whitening.mask)
-        mask = mask if channel.charges is None else np.asarray(channel.charges.gain)
+        mask = mask if channel.charges is None else np.asarray(channel.charges.used)
         counted = mask[unpadded] > 0.0
         white = white[unpadded][counted]
         n_fitted = theta.size * white.size / float(likelihood.count) + len(linear)
@@ -157,8 +157,8 @@ def _log_likelihood(
 ) -> float:
     """Return the log-likelihood at its maximum over the noise sd; under Student's t, at scale `sigma`."""
     if channel.charges is not None:
-        gain = np.asarray(channel.charges.gain)[: residuals.size]
-        return gaussian_log_likelihood(white_residuals, None) + float(np.sum(np.log(gain[gain > 0.0])))
+        gain = np.asarray(channel.charges.gain)[np.asarray(channel.charges.used) > 0.0]
+        return gaussian_log_likelihood(white_residuals, None) + float(np.sum(np.log(gain)))
     if channel.whitening is None:
         weights = channel.weights[: residuals.size]
         if channel.noise == "student":

@@ -71,7 +71,10 @@ class RecordedCurrent:
     variance_V: Rows  # of the noise and the rounding of each sample of V, V^2
     noise_V: tuple[float, float]  # white noise and rounding, V
     noise_I: float  # A
-    uncertain: Rows  # variance of the mean current over the step after a sample, because of kinks and rounding, A^2
+    uncertain: Rows  # variance of the mean current over the step after a sample, because of kinks, A^2
+    shared: float  # number of kinks that have the same error
+    rounded: Rows  # variance of the rounding error that the steps of a run of equal values of I have in common, A^2
+    alike: Rows  # number of runs that have the same rounding error
     excluded: Bool[np.ndarray, " samples"]  # samples of I that are clipped
 
     @classmethod
@@ -101,14 +104,15 @@ class RecordedCurrent:
 
         `is_whole`: whether they are a whole record, and not a window of one, whose delay others determine.
         """
-        rounding, runs = _least_step(current) / math.sqrt(12.0), run_lengths(current)
-        # a run of equal values shares one error, so that its mean has the variance of one
-        uncertain = _kink_variance(current, noise, is_whole) + np.where(runs > FEW, rounding**2 * runs, 0.0)
+        rounding, alike = _least_step(current) / math.sqrt(12.0), _count_runs(current)
+        uncertain, shared = _kink_variance(current, noise, is_whole)
         # the flat top of a pulse that is coarsely rounded looks clipped, but lies within the range of the converter
         codes = np.log2(np.maximum(np.abs([current.min(), current.max()]) / (math.sqrt(12.0) * rounding or 1.0), 1.0))
         is_coarse = rounding > white_noise_sd(current) and np.max(np.abs(codes - np.round(codes))) > 0.02
         excluded = np.zeros(V.size, bool) if is_coarse else clipping_mask(current)
-        return cls(V, current, step, drive_variance(V, *noise_V), noise_V, noise, uncertain, excluded)
+        rounded = np.where(alike > 0.0, rounding**2, 0.0)
+        variance_V = drive_variance(V, *noise_V)
+        return cls(V, current, step, variance_V, noise_V, noise, uncertain, shared, rounded, alike, excluded)
 
     def continue_with(self, V: Rows, current: Rows) -> "RecordedCurrent":
         """Return other samples of V and I, with the same noise."""
@@ -130,12 +134,17 @@ class RecordedCurrent:
         """Noise of I, at least of rounding errors, A."""
         return max(self.noise_I, 1e-12 * float(np.ptp(self.I)))
 
-    def covariance(self, modelled: Current) -> RowCovariance:
-        """Return the covariance of the rows."""
-        variance, shared, excluded = self._variance(modelled)
-        return RowCovariance(variance, 0.5 * (1.0 - _ROW_NOISE) * self._floor**2 + shared, excluded)
+    def covariance(self, modelled: Current, is_shared: bool = True) -> RowCovariance:
+        """Return the covariance of the rows.
 
-    def _variance(self, modelled: Current) -> tuple[Rows, Rows, Bool[np.ndarray, " samples"]]:
+        Errors that several kinks or runs have in common, which a tridiagonal matrix cannot express, have their sum if
+        `is_shared`; else they are independent.
+        """
+        variance, neighbours, excluded = self._variance(modelled, is_shared)
+        common = np.roll(self.rounded * (self.alike if is_shared else 1.0), LAG - round(modelled.delay))
+        return RowCovariance(variance, 0.5 * (1.0 - _ROW_NOISE) * self._floor**2 + neighbours, excluded, common)
+
+    def _variance(self, modelled: Current, is_shared: bool = True) -> tuple[Rows, Rows, Bool[np.ndarray, " samples"]]:
         """Return the variance of the rows, their covariance by the sample of V they share, and which are excluded."""
         early, late = modelled.sample_gains(self.step)
         driven = np.roll(self.variance_V, LAG)
@@ -144,7 +153,8 @@ class RecordedCurrent:
         if excluded.any():
             excluded = np.roll(np.convolve(excluded, np.ones(2 * LAG), "same") > 0.5, shift)
         excluded[: 2 * LAG] = True
-        return level + np.roll(self.uncertain, shift), early * late * driven, excluded
+        uncertain = np.roll(self.uncertain, shift) * (self.shared if is_shared else 1.0)
+        return level + uncertain, early * late * driven, excluded
 
     def flatten(self, white: Rows, modelled: Current) -> Rows:
         """Return whitened rows without the spectrum that a tridiagonal covariance leaves in the noise of I."""
@@ -173,15 +183,16 @@ class RecordedCurrent:
         """Return the rows of charge and the estimate of V, given the modelled rows of a drive and of nuisances."""
         covariance = self.covariance(modelled)
         means, from_V = step_means(self.I, modelled.delay), respond(self.V)
-        scaled = np.append(covariance.solve(means - from_V - nuisances)[LAG:], np.zeros(LAG))
+        independent = self.covariance(modelled, is_shared=False)
+        scaled = np.append(independent.solve(means - from_V - nuisances)[LAG:], np.zeros(LAG))
         # covariance of the noise of V with that of the rows
         early, late = modelled.sample_gains(self.step)
         V = self.V + self.variance_V * (early * scaled + late * np.append(0.0, scaled[:-1]))
         signal = respond(V)
-        slope = np.where(covariance.used, -np.gradient(signal) / self.step, 0.0)
         power = np.mean(self._noise_power(np.linspace(0.0, 0.5, 129), modelled))
         gain, decay = covariance.recursion(self._floor / math.sqrt(float(power)))
-        return ChargeRows(means + signal - from_V, self.rise(V), slope, gain, decay), V
+        slope = np.where(gain > 0.0, -np.gradient(signal) / self.step, 0.0)
+        return ChargeRows(means + signal - from_V, self.rise(V), slope, gain, decay, covariance.used * 1.0), V
 
     def fit_rows(
         self, modelled: Current, blocks: int, functions: Sequence[Float[np.ndarray, "functions samples"]]
@@ -231,8 +242,10 @@ def estimate_noise(values: Rows, block: int = 16, max_ratio: float = 0.7) -> flo
 
 def _kink_variance(
     current: Rows, noise: float, is_whole: bool, threshold: float = 4.0, smooth: float = 8.0, block: int = 64
-) -> Rows:
+) -> tuple[Rows, float]:
     """Return the variance of the mean current over the step after each sample, if the current jumps within the step.
+
+    Also how many jumps have the same error.
 
     A jump somewhere within a step changes the mean by its height times a uniform number in +-1/2, and the polynomials
     of `step_means` around it by the `_JUMP_ERRORS`. Sixth differences are ten times a jump; they count above
@@ -246,7 +259,7 @@ def _kink_variance(
     jump = np.where((jump > np.maximum(least, 1e-9 * np.ptp(current))) & (jump >= around), jump, 0.0)
     height = np.maximum(jump, np.append(jump[1:], 0.0))
     shared = _shared_jumps(np.flatnonzero(height)) if is_whole else 1.0
-    return shared * np.convolve(np.square(height), np.square(_JUMP_ERRORS), "same")
+    return np.convolve(np.square(height), np.square(_JUMP_ERRORS), "same"), shared
 
 
 def _shared_jumps(places: Int[np.ndarray, " n"], most: float = 4.0) -> float:
@@ -283,6 +296,21 @@ def run_lengths(values: Rows) -> Rows:
     ends = np.append(np.flatnonzero(np.diff(values)), values.size - 1)
     lengths = np.diff(ends, prepend=-1)
     return np.repeat(lengths, lengths).astype(float)
+
+
+def _count_runs(values: Rows) -> Rows:
+    """Return for each sample in a run of equal values, and not its last one, how many runs have such a value.
+
+    It is 0 for other samples. The opposite value counts, whose rounding error is the opposite one.
+    """
+    lengths = run_lengths(values)
+    within = (lengths > FEW) & np.append(np.diff(values) == 0.0, False)
+    begins = within & ~np.append(False, within[:-1])
+    sizes, counts = np.unique(np.abs(values[begins]), return_counts=True)
+    result = np.zeros(values.size)
+    if sizes.size:
+        result[within] = counts[np.searchsorted(sizes, np.abs(values[within]))]
+    return result
 
 
 def describe_terms(terms: HighpassTerms, stray: ArrayLike | None, delay: float, step: float) -> Current:
@@ -409,8 +437,9 @@ def _scan_recorded(
     first, count = 2 * LAG, (current.I.size - 2 * LAG) // several
     step = current.step * several
     covariance = current.covariance(Current(C, 0.0, 0.0))
-    lost = _thin(~covariance.used * 1.0, several) > 0.0
-    own = current.noise_I**2 / several + _thin(np.roll(current.uncertain, LAG), several) / several
+    lost = _thin((covariance.recursion(1.0)[0] == 0.0) * 1.0, several) > 0.0
+    uncertain = current.uncertain * current.shared + current.rounded * current.alike * run_lengths(current.I)
+    own = current.noise_I**2 / several + _thin(np.roll(uncertain, LAG), several) / several
     own += 1e-24 * float(np.ptp(current.I)) ** 2
     noise_V = float(np.mean(current.variance_V))
 
@@ -531,7 +560,6 @@ def row_figures(
     figures = {
         "runs_z": 0.0,
         "rounding_noise": 0.0,
-        "false_alarm": 1e-4,
         "within_steps": float(current.is_within_steps),
     }
     return current.flatten(white, describe_terms(terms, inputs.stray, delay, current.step)), figures

@@ -43,8 +43,8 @@ def channel_warnings(record: Record, choice: DriveModel, channel: str, figures: 
         )
     if figures.get("within_steps", 0.0) > 0.0:
         warnings.append(
-            "I spends half of the time within a step of its converter, so the record does not determine what it is"
-            " between edges; amplify it (its edges may then be clipped), or make the edges of V slower"
+            "I spends half of the time within a step of its converter, which tells little of it between edges; amplify"
+            " it (its edges may then be clipped), or make the edges of V slower"
         )
     if figures["rounding_noise"] > 0.0:
         warnings.append(

@@ -113,17 +113,15 @@ def is_misfit(figures: Mapping[str, ArrayLike], max_excess: float = 0.1) -> Bool
     # rounding correlates the residuals and makes the noise estimate less accurate
     rounded = np.asarray(figures["rounding_noise"]) > 0.0
     excess = np.asarray(figures["chi2_reduced"]) > 1.0 + np.maximum(np.where(rounded, 1.0, max_excess), significant)
-    lost = np.asarray(figures.get("within_steps", 0.0)) > 0.0
-    return excess | (is_structured(figures) & ~rounded) | is_undersampled(figures) | lost
+    return excess | (is_structured(figures) & ~rounded) | is_undersampled(figures)
 
 
 def is_structured(figures: Mapping[str, ArrayLike], min_runs_z: float = -6.0) -> Bool[np.ndarray, "*records"]:
     """Return whether any test rejects white noise; False for residuals that were not tested."""
     if "runs_z" not in figures:
         return np.zeros(np.shape(figures["chi2_reduced"]), bool)
-    alarm = np.asarray(figures.get("false_alarm", _FALSE_ALARM))
     least = np.minimum.reduce([np.asarray(figures[name]) for name in _P_VALUES])
-    return (np.asarray(figures["runs_z"]) < min_runs_z) | (least < alarm / N_TESTS)
+    return (np.asarray(figures["runs_z"]) < min_runs_z) | (least < _FALSE_ALARM / N_TESTS)
 
 
 def is_undersampled(figures: Mapping[str, ArrayLike]) -> Bool[np.ndarray, "*records"]:

@@ -4,6 +4,8 @@ Over a step of length h, the current of a capacitance C is C (V[k + 1] - V[k]) /
 no derivative of a sampled V is needed. Noise of V adds C (n[k + 1] - n[k]) / h: its spectrum grows with the frequency,
 and neighbouring rows share a sample of V. The covariance of the rows is therefore tridiagonal, also where single rows
 are less certain or excluded, and its Cholesky factor whitens them by a recursion over the samples.
+Where a converter returns the same value for several samples, these share one rounding error. Their rows are one, the
+mean current over the whole run, which is whitened at its last step.
 Errors in variables: Levin, IEEE Trans. Autom. Control 9 (1964) 229; Pintelon and Schoukens, System Identification
 (2012), chapter 9.
 """
@@ -56,10 +58,10 @@ class ChargeRows(eqx.Module):
     observed: Float[Array, " samples"]  # mean current over each step, on the clock of V, A
     rate: Float[Array, " samples"]  # rise of V over each step, divided by its length, V/s
     slope: Float[Array, " samples"]  # derivative of the modelled rows with respect to a delay of I, A/s
-    # whitened row k = gain[k] (row k) + decay[k] (whitened row k - 1); a gain of 0 excludes a row
+    # whitened row k = gain[k] (row k) + decay[k] (whitened row k - 1)
     gain: Float[Array, " samples"]
     decay: Float[Array, " samples"]
-    weight: Float[Array, " samples"] | None = None  # of whitened rows, 0 leaves one out; None means 1
+    used: Float[Array, " samples"]  # 1 for the rows that count, which are the last ones of runs, and 0 for others
 
     @property
     def reach(self) -> int:
@@ -73,9 +75,8 @@ class ChargeRows(eqx.Module):
         return sum(parts[1:], parts[0])
 
     def whiten(self, rows: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
-        """Return whitened rows, with their weight."""
-        whitened = self.continue_whitening(rows, jnp.zeros(rows.shape[:-1]))
-        return whitened if self.weight is None else whitened * self.weight
+        """Return whitened rows, 0 where they do not count."""
+        return self.continue_whitening(rows, jnp.zeros(rows.shape[:-1])) * self.used
 
     def continue_whitening(
         self, rows: Float[Array, "*shape samples"], before: Float[Array, "*shape"]
@@ -95,28 +96,46 @@ class ChargeRows(eqx.Module):
 
 
 class RowCovariance:
-    """Covariance of the rows, tridiagonal; excluded rows are not correlated with others."""
+    """Covariance of the rows, those of a run taken together: tridiagonal, and excluded rows are not correlated."""
 
     def __init__(
         self,
         variance: Float[np.ndarray, " rows"],
         neighbours: Float[np.ndarray, " rows"],
         excluded: Bool[np.ndarray, " rows"],
+        common: Float[np.ndarray, " rows"] | None = None,
     ) -> None:
-        """Factorise; `neighbours` are the covariances of each row with the one before."""
-        self.used = ~excluded
-        apart = excluded | np.append(True, excluded[:-1])
-        bands = np.stack([np.where(apart, 0.0, neighbours), np.where(excluded, 1.0, variance)])
-        self._factor = scipy.linalg.cholesky_banded(bands)
+        """Factorise; `neighbours` are the covariances of each row with the one before.
+
+        Rows with a variance in `common` that is not 0 continue the run of the row before, if that has one as well.
+        """
+        in_run = np.zeros(variance.size, bool) if common is None else (common > 0.0) & ~excluded
+        self._begins = np.flatnonzero(~(in_run & np.append(False, in_run[:-1])))
+        self._lengths = np.diff(self._begins, append=variance.size)
+        self.used = np.zeros(variance.size, bool)
+        self.used[np.append(self._begins[1:], variance.size) - 1] = True
+        self.used &= ~excluded
+        lost = excluded[self._begins]
+        apart = lost | np.append(True, lost[:-1])
+        first = neighbours[self._begins]
+        whole = np.add.reduceat(variance + 2.0 * neighbours, self._begins) - 2.0 * first
+        diagonal = whole / self._lengths**2 + (0.0 if common is None else common[self._begins])
+        beside = first / (self._lengths * np.append(1, self._lengths[:-1]))
+        self._factor = scipy.linalg.cholesky_banded(np.stack([np.where(apart, 0.0, beside), np.where(lost, 1.0, diagonal)]))
+        self._lost = lost
 
     def recursion(self, unit: float) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
         """Return gain and decay of `ChargeRows`, with which whitened rows have the standard deviation `unit`."""
         above, diagonal = self._factor
-        return np.where(self.used, unit / diagonal, 0.0), np.where(self.used, -above / diagonal, 0.0)
+        decay = np.ones(self.used.size)  # within a run, rows add up
+        decay[self._begins] = np.where(self._lost, 0.0, -above / diagonal)
+        return np.repeat(np.where(self._lost, 0.0, unit / diagonal / self._lengths), self._lengths), decay
 
     def solve(self, rows: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
-        """Return the inverse of the covariance times rows; 0 for excluded ones."""
-        return self.used * scipy.linalg.cho_solve_banded((self._factor, False), np.where(self.used, rows, 0.0))
+        """Return the inverse of the covariance times rows, for the rows of runs an equal part each."""
+        means = np.where(self._lost, 0.0, np.add.reduceat(rows, self._begins) / self._lengths)
+        scaled = scipy.linalg.cho_solve_banded((self._factor, False), means) * ~self._lost
+        return np.repeat(scaled / self._lengths, self._lengths)
 
 
 def whiten_rows(

@@ -99,7 +99,7 @@ def compress(
     one = np.ones(time.size) if weight is None else np.asarray(weight)
     mask = one if whitening is None else np.asarray(whitening.mask)[: time.size]
     if charges is not None:
-        observed, rate, slope, mask = charges.observed, charges.rate, charges.slope, charges.gain
+        observed, rate, slope, mask = charges.observed, charges.rate, charges.slope, charges.used
     samples = Samples(
         time,
         observed,
@@ -343,7 +343,8 @@ def _charge_products(
     *means, expected = charges.means(around)
     last = charges.rate, charges.slope, charges.observed - expected - following
     rows = charges.continue_whitening(jnp.stack([*means, *last]), filtering.whitened)
-    return rows @ rows.T, WhiteningState(None, around[:, functions.shape[1] :], rows[:, -1])
+    used = rows * charges.used
+    return used @ used.T, WhiteningState(None, around[:, functions.shape[1] :], rows[:, -1])
 
 
 def whitened_products(

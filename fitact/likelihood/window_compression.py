@@ -130,7 +130,7 @@ class WindowCompressor:
             functions = step_means(functions)
             rows = given([functions[:-2], shared])
             rate, slope, observed = rows.rate, rows.slope, rows.observed
-            late, count = late - (LAG - 0.5) * step, int(np.count_nonzero(rows.gain))
+            late, count = late - (LAG - 0.5) * step, int(np.count_nonzero(rows.used))
         else:
             rate, slope, observed = np.zeros(late.size), np.gradient(functions[-2], step), given
             count = late.size if weight is None else int(np.count_nonzero(weight))
@@ -140,7 +140,7 @@ class WindowCompressor:
         own = functions[:rank], shared[:charged], functions[rank:-2], [late * rate, functions[-2]], steps
         products = np.concatenate([*own, shared[charged:], [rate, slope, rest]])
         if rows is not None:
-            products = whiten_rows(rows.gain, rows.decay, products)
+            products = whiten_rows(rows.gain, rows.decay, products) * rows.used
         elif weight is not None:
             products = products * weight
         # functions that are absent are 0

@@ -53,7 +53,7 @@ def block_indices(record: Record | Spectrum) -> Int[np.ndarray, " samples"]:
 def likelihood_mask(trace: ChannelLikelihood) -> Bool[np.ndarray, " samples"]:
     """Return a mask of the samples, or rows of charge, that enter the likelihood."""
     if trace.charges is not None:
-        return np.asarray(trace.charges.gain) > 0.0
+        return np.asarray(trace.charges.used) > 0.0
     return trace.weights > 0.0 if trace.whitening is None else np.asarray(trace.whitening.mask) > 0.0
 
 
@@ -86,7 +86,7 @@ def _mask_samples(likelihood: Likelihood, masks: list[np.ndarray]) -> Likelihood
     """Return the likelihood of the masked samples of each channel only."""
     for i, (trace, mask) in enumerate(zip(likelihood.channels, masks, strict=True)):
         if trace.charges is not None:  # likewise the recursion
-            trace = dataclasses.replace(trace, charges=dataclasses.replace(trace.charges, weight=mask * 1.0))
+            trace = dataclasses.replace(trace, charges=dataclasses.replace(trace.charges, used=trace.charges.used * mask))
         elif trace.whitening is None:
             trace = dataclasses.replace(trace, weight=trace.weights * mask)
         else:  # the whitening filter still runs over all samples

@@ -31,7 +31,7 @@ def test_means_are_those_of_the_integral(delay: float):
 
 def test_compiled_means_are_the_same():
     values = tone(STEP * np.arange(100))
-    rows = ChargeRows(*np.zeros((5, 100)))
+    rows = ChargeRows(*np.zeros((6, 100)))
     with jax.enable_x64(True):
         means = rows.means(jnp.pad(jnp.asarray(values), (rows.reach, 0)))
     np.testing.assert_allclose(means[2 * LAG :], step_means(values)[2 * LAG :], rtol=1e-12, atol=1e-14)
@@ -51,6 +51,29 @@ def test_whitening_is_that_of_the_dense_covariance():
     np.testing.assert_allclose(whiten_rows(gain, decay, rows)[:, used], 2.0 * expected, rtol=1e-12)
     assert np.all(whiten_rows(gain, decay, rows)[:, excluded] == 0.0)
     with jax.enable_x64(True):
-        compiled = ChargeRows(*np.zeros((3, 40)), gain, decay).whiten(jnp.asarray(rows))
+        compiled = ChargeRows(*np.zeros((3, 40)), gain, decay, covariance.used * 1.0).whiten(jnp.asarray(rows))
     np.testing.assert_allclose(compiled[:, used], 2.0 * expected, rtol=1e-12)
     np.testing.assert_allclose(covariance.solve(rows[0])[used], np.linalg.solve(dense, rows[0, used]), rtol=1e-12)
+
+
+def test_rows_of_a_run_count_as_their_mean():
+    rng = np.random.default_rng(2)
+    variance, neighbours = rng.uniform(3.0, 5.0, 30), rng.uniform(-1.5, 0.5, 30)
+    excluded, common = np.isin(np.arange(30), [0, 1, 20]), np.zeros(30)
+    common[5:12], common[18:23] = 0.7, 0.2
+    covariance = RowCovariance(variance, neighbours, excluded, common)
+    groups = [[k] for k in range(2, 5)] + [list(range(5, 12))] + [[k] for k in range(12, 18)]
+    groups += [[18, 19], [21, 22]] + [[k] for k in range(23, 30)]
+    mean = np.zeros((len(groups), 30))
+    for i, group in enumerate(groups):
+        mean[i, group] = 1.0 / len(group)
+    dense = np.diag(variance) + np.diag(neighbours[1:], 1) + np.diag(neighbours[1:], -1)
+    dense[20], dense[:, 20] = 0.0, 0.0
+    dense = mean @ dense @ mean.T + np.diag([common[group[0]] for group in groups])
+    rows, last = rng.standard_normal((3, 30)), [group[-1] for group in groups]
+    assert np.flatnonzero(covariance.used).tolist() == last
+    gain, decay = covariance.recursion(2.0)
+    expected = np.linalg.solve(np.linalg.cholesky(dense), mean @ rows.T).T
+    np.testing.assert_allclose(whiten_rows(gain, decay, rows)[:, last], 2.0 * expected, rtol=1e-12)
+    solved = mean.T @ np.linalg.solve(dense, mean @ rows[0])
+    np.testing.assert_allclose(covariance.solve(rows[0]), solved, rtol=1e-12, atol=1e-15)
