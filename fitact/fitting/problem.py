@@ -333,7 +333,8 @@ def _make_charge_rows(
     # a charge that has decayed before the first row is not determined, and must not act on the force
     linear_sd[FIRST_CHARGE : FIRST_CHARGE + taus.size][taus[: len(CHARGES)] < 5.0 * record.time_step] = 0.0
     for i, frequency in enumerate(HUM_FREQUENCIES):
-        if not likeness[frequency] < 0.7:
+        # a record too short to show one hum cannot tell that of 60 Hz from that of 50 Hz either
+        if frequency % 50.0 == 0.0 and not likeness[frequency] < 0.7:
             linear_sd[2 * i + 2 : 2 * i + 4] = usual_hum * current.noise_I
     modelled = Current(estimate.capacitance + stray, estimate.weight, 0.0)
     rows, V = current.make_rows(modelled, respond_to(current, estimate, stray), nuisances)
