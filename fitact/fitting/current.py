@@ -279,8 +279,11 @@ def _shared_jumps(places: Int[np.ndarray, " n"], most: float = 4.0) -> float:
 
 
 def drive_variance(V: Rows, white: float, rounding: float) -> Rows:
-    """Return the variance of each sample of V; within a run of equal values, rounding is no noise, but an offset."""
-    alike = np.diff(V) == 0.0
+    """Return the variance of each sample of V.
+
+    Within a run of equal values, rounding is no noise, but an offset, unless noise of a seventh of a step changes it.
+    """
+    alike = (np.diff(V) == 0.0) & (white < 0.5 * rounding)
     within = np.append(False, alike) & np.append(alike, False)
     return white**2 + np.where(within, 0.0, rounding**2)
 
@@ -425,6 +428,10 @@ def estimate_recorded(
         C = abs(estimate.capacitance + stray)
         if abs(C - before) < 0.1 * before:
             break
+    # noise of V draws a capacitance that the record does not determine to 0, from where no fit returns
+    Ci, usual = estimate.capacitance + estimate.weight * estimate.b, math.exp(belief[0][2])
+    if Ci < 0.3 * usual:
+        estimate = estimate._replace(capacitance=estimate.capacitance + usual - Ci)
     return estimate, nuisances
 
 
@@ -466,13 +473,16 @@ def _scan_recorded(
             part = 1.0 - own / (own + 2.0 * (capacitance / step) ** 2 * noise_V)
             taken = float(np.sum(part[~lost])) / max(capacitance, 1e-15) ** 2
             square, amplitudes = _solve(np.stack(columns), data, (2, taken))
-            capacitance = abs(amplitudes[2] + stray)
+            # noise of V draws to 0 what the record does not determine
+            has_drive = amplitudes[0] * tau + amplitudes[2] > 0.3 * usual
+            capacitance = abs(amplitudes[2] + stray) if has_drive else usual
         return square, amplitudes
 
     def fit_at_tau(tau: float) -> tuple[float, float, float]:
         square, amplitudes = fit(tau)
         return square, float(amplitudes[0]), float(amplitudes[2])
 
+    usual = math.exp(belief[0][2])
     taus = np.geomspace(max(2.0 * step, 1e-4), max(10.0 * step * count, 4e-4), 48)
     estimate = _scan(fit_at_tau, taus, 1.0, belief)
     amplitudes = fit(estimate.b)[1]

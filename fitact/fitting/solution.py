@@ -39,20 +39,21 @@ def solve_problem(
         end = _solve_with_effects(problem._replace(likelihood=likelihood), reasons, tolerance, theta, checked)
         places = [end[0].likelihood.names.index(name) for name in likelihood.names]
         theta = end[0].theta[places]
-        if effects_would_change(likelihood, before, theta, end[0].sigma) > max_change:
-            continue
-        influences = [jacobian @ end[2] for jacobian in end[0].jacobian]
-        likelihood, change = update_weights(likelihood, theta, problem.sources, influences)
+        is_settled = effects_would_change(likelihood, before, theta, end[0].sigma) <= max_change
+        if is_settled:
+            influences = [jacobian @ end[2] for jacobian in end[0].jacobian]
+            likelihood, change = update_weights(likelihood, theta, problem.sources, influences)
+            is_settled = change <= 1e-3
         if has_rows:
             moved = np.abs(theta - before) / np.linalg.norm(end[2][places], axis=1)
             skew = np.max(np.abs(theta), where=likelihood.follows_rows, initial=0.0)
             others = np.max(moved, where=~likelihood.follows_rows, initial=0.0)
-            is_settled = (skew <= max_skew and np.max(moved) <= max_change) or (skew <= 0.5 and others <= 0.05)
-            if not (checked and is_settled):
+            is_still = (skew <= max_skew and np.max(moved) <= max_change) or (skew <= 0.5 and others <= 0.05)
+            is_settled = is_settled and checked and is_still
+            if not is_settled:
                 likelihood = update_rows(likelihood, end[0], problem.sources)
                 theta = np.where(likelihood.follows_rows, 0.0, theta)  # their delays have moved into the rows
-                continue
-        if change <= 1e-3:
+        if is_settled:
             break
     assert end is not None
     return end
