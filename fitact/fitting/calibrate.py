@@ -10,8 +10,10 @@ import numpy as np
 
 from fitact.data.readers.read import read
 from fitact.errors import InputError
+from fitact.experiment.blind_directions import STRAY
 from fitact.likelihood.calibration import Calibration
 from fitact.model.circuit import FINGER_PARAMETERS
+from fitact.scene.instrument_section import CalibrationSection, DummyCircuit
 from fitact.scene.prior_section import PriorSection
 from fitact.scene.scene import Scene
 from fitact.units import format_engineering, format_percent, quantity_unit
@@ -20,6 +22,12 @@ if TYPE_CHECKING:
     from fitact.fitting.fit import Fit
 
 FitRecords = Callable[..., "Fit"]  # `fitact.fitting.fit.fit_records`
+
+
+# so small an insulator passes no current
+_NO_FINGER = DummyCircuit.model_validate(
+    {"Rsc": {"fixed": 1e6}, "Csc": {"fixed": 1e-9}, "Ci": {"nominal": 1e-18, "tolerance": 0.01}}
+)
 
 
 class CalibratedInstruments(NamedTuple):
@@ -38,14 +46,16 @@ def calibrate(scene: Scene | None, names: tuple[str, ...], fit_records: FitRecor
     """
     if scene is None or not scene.calibration:
         return CalibratedInstruments()
-    if not scene.instrument.is_stated:
-        raise InputError("scene: [[calibration]] calibrates the pieces of [instrument]; state these too")
-    if any(each.circuit == "open" for each in scene.calibration):
+    has_open = any(each.circuit == "open" for each in scene.calibration)
+    if has_open and STRAY not in names:
         raise InputError(
-            "scene: [[calibration]] circuit = 'open', a record without the finger, is not fitted in this version; leave"
-            " it out, and state what it tells as [prior] stray_capacitance"
+            "scene: [[calibration]] circuit = 'open', a record without the finger, determines the stray capacitance;"
+            ' state what is known of it before, [measurement] stray_capacitance = {median = "100 pF", relative_sd ='
+            " 1.0}, with I in the drive lead"
         )
-    contents = tuple(read(each.record).fingerprint for each in scene.calibration)
+    if not scene.instrument.is_stated and not all(each.circuit == "open" for each in scene.calibration):
+        raise InputError("scene: [[calibration]] calibrates the pieces of [instrument]; state these too")
+    contents = tuple(read(each.record, _dummy_scene(scene, each)).fingerprint for each in scene.calibration)
     return _calibrate(scene.to_json(), names, fit_records, contents)
 
 
@@ -56,10 +66,8 @@ def _calibrate(
     stated = Scene.from_json(scene)
     parts, notes, warnings = [], [], []
     for each in stated.calibration:
-        record = read(each.record)
-        prior = PriorSection(**{name: getattr(each.circuit, name) for name in FINGER_PARAMETERS})
-        dummy = Scene(drive=stated.drive, measurement=stated.measurement, instrument=stated.instrument, prior=prior)
-        fitted = fit_records((record,), (dummy,))
+        dummy = _dummy_scene(stated, each)
+        fitted = fit_records((read(each.record, dummy),), (dummy,))
         parts.append(_marginal_calibration(fitted, names))
         warnings += [f"calibration {os.path.basename(each.record)}: {text}" for text in _dummy_warnings(fitted)]
         known = ", ".join(
@@ -67,6 +75,16 @@ def _calibrate(
         )
         notes.append(f"calibration {os.path.basename(each.record)}: uncertainties are now {known}")
     return CalibratedInstruments(_join_calibrations(parts), tuple(notes), tuple(warnings))
+
+
+def _dummy_scene(scene: Scene, stated: CalibrationSection) -> Scene:
+    """Return the scene of a calibration record: that of the finger with the parts of the dummy, or with none."""
+    measurement, parts = scene.measurement, stated.circuit
+    if parts == "open":
+        measurement, parts = measurement.model_copy(update={"channels": ("I",)}), _NO_FINGER
+    own = {name: getattr(parts, name) for name in FINGER_PARAMETERS}
+    prior = PriorSection(stray_capacitance=scene.prior.stray_capacitance, **own)
+    return Scene(drive=scene.drive, measurement=measurement, instrument=scene.instrument, prior=prior)
 
 
 def _dummy_warnings(fitted: "Fit", max_pull: float = 3.0) -> list[str]:

@@ -571,6 +571,7 @@ def row_figures(
         "runs_z": 0.0,
         "rounding_noise": 0.0,
         "within_steps": float(current.is_within_steps),
+        "rounding_V": current.noise_V[1] if current.noise_V[0] < current.noise_V[1] else 0.0,
     }
     return current.flatten(white, describe_terms(terms, inputs.stray, delay, current.step)), figures
 

@@ -46,6 +46,11 @@ def channel_warnings(record: Record, choice: DriveModel, channel: str, figures: 
             "I spends half of the time within a step of its converter, which tells little of it between edges; amplify"
             " it (its edges may then be clipped), or make the edges of V slower"
         )
+    if figures.get("rounding_V", 0.0) > 0.0:
+        warnings.append(
+            "V_V is rounded to steps larger than its noise; if the fit of I is poor, this is the likely cause: record V"
+            " with a smaller range or more bits"
+        )
     if figures["rounding_noise"] > 0.0:
         warnings.append(
             f"{channel} is rounded to steps larger than its noise, so the rounding errors are correlated and the stated"

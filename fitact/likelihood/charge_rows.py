@@ -121,7 +121,9 @@ class RowCovariance:
         whole = np.add.reduceat(variance + 2.0 * neighbours, self._begins) - 2.0 * first
         diagonal = whole / self._lengths**2 + (0.0 if common is None else common[self._begins])
         beside = first / (self._lengths * np.append(1, self._lengths[:-1]))
-        self._factor = scipy.linalg.cholesky_banded(np.stack([np.where(apart, 0.0, beside), np.where(lost, 1.0, diagonal)]))
+        self._factor = scipy.linalg.cholesky_banded(
+            np.stack([np.where(apart, 0.0, beside), np.where(lost, 1.0, diagonal)])
+        )
         self._lost = lost
 
     def recursion(self, unit: float) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:

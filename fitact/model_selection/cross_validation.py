@@ -86,7 +86,9 @@ def _mask_samples(likelihood: Likelihood, masks: list[np.ndarray]) -> Likelihood
     """Return the likelihood of the masked samples of each channel only."""
     for i, (trace, mask) in enumerate(zip(likelihood.channels, masks, strict=True)):
         if trace.charges is not None:  # likewise the recursion
-            trace = dataclasses.replace(trace, charges=dataclasses.replace(trace.charges, used=trace.charges.used * mask))
+            trace = dataclasses.replace(
+                trace, charges=dataclasses.replace(trace.charges, used=trace.charges.used * mask)
+            )
         elif trace.whitening is None:
             trace = dataclasses.replace(trace, weight=trace.weights * mask)
         else:  # the whitening filter still runs over all samples

@@ -2,8 +2,11 @@
 
 import dataclasses
 import json
+import math
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import fitact
@@ -106,6 +109,46 @@ def test_unstated_stray_capacitance_is_a_note():
     Ci = rate + weight * b
     Rsc = 2.0 * (weight * b / (2.0 * Ci)) ** 2 / weight
     assert f"Rsc by {100.0 * (Rsc / truth['Rsc'] - 1.0):+.2g} %" in note
+
+
+def open_record(path: Path, stray: float) -> None:
+    """Write a record without a finger: the current of a stray capacitance (F), with noise and rounding."""
+    rng, time = np.random.default_rng(4), 5e-6 * np.arange(12_000)
+    turns = 2.0 * np.pi * np.array([[70.0], [910.0]])
+    V = np.array([120.0, 25.0]) @ np.sin(turns * time)
+    current = stray * (np.array([120.0, 25.0]) @ (turns * np.cos(turns * (time - 1.2e-6))))
+    columns = {"time_s": time}
+    for name, values, noise in (("V_V", V, 0.1), ("I_A", current, 30e-9)):
+        step = np.ptp(values) / 4000.0
+        columns[name] = step * np.round((values + noise * rng.standard_normal(time.size)) / step)
+    pd.DataFrame(columns).to_csv(path, index=False)
+
+
+def test_a_record_without_the_finger_determines_the_stray_capacitance(tmp_path: Path):
+    content = json.loads((RECORDS / "bench_multisine.json").read_text())["truth"]
+    stray = content["stray_capacitance"]["value"]
+    stated = fitact.Scene.load(RECORDS / "bench_multisine.toml").model_dump(mode="json", exclude_unset=True)
+    stated["prior"]["stray_capacitance"] = {"median": 0.7 * stray, "relative_sd": 0.5}
+    open_record(tmp_path / "open.csv", stray)
+    calibration = {"calibration": [{"record": str(tmp_path / "open.csv"), "circuit": "open"}]}
+    record = fitact.read(RECORDS / "bench_multisine.csv.gz", fitact.Scene.from_dict(stated))
+    wide, known = (fitact.fit(record, fitact.Scene.from_dict(stated | each)) for each in ({}, calibration))
+    assert known.trusted
+    assert known.parameters()["stray_capacitance"]["u"] < 2e-3
+    for name in ("Rsc", "Csc", "Ci", "stray_capacitance"):
+        found = known.parameters()[name]
+        assert abs(math.log(found["q50"] / content[name]["value"])) < 4.0 * found["u"]
+    assert known.parameters()["Rsc"]["u"] < 0.5 * wide.parameters()["Rsc"]["u"]
+
+
+def test_an_open_record_needs_a_stray_capacitance_to_determine(tmp_path: Path):
+    open_record(tmp_path / "open.csv", 1e-10)
+    stated = {
+        "measurement": {"channels": ["I"]},
+        "calibration": [{"record": str(tmp_path / "open.csv"), "circuit": "open"}],
+    }
+    with pytest.raises(fitact.InputError, match=r"state what is known of it before"):
+        fit(0, fitact.Scene.from_dict(stated))
 
 
 def test_current_without_a_recorded_or_known_drive_is_refused():
