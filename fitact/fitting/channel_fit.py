@@ -11,8 +11,8 @@ from jaxtyping import Array, Bool, Float
 from fitact.compiled import jit
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
-from fitact.fitting.current import row_figures
 from fitact.fitting.drive_choice import DriveModel
+from fitact.fitting.recorded_current import row_figures
 from fitact.fitting.residual_statistics import channel_statistics, outliers
 from fitact.fitting.source import Source
 from fitact.fitting.spectra import spectrum_statistics

@@ -20,7 +20,6 @@ from fitact.experiment.fisher import Experiment
 from fitact.fitting import derived, remarks
 from fitact.fitting.calibrate import calibrate
 from fitact.fitting.channel_fit import ChannelFit, information_criteria
-from fitact.fitting.current import estimate_noise
 from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.effects import assess_fit, describe_alternatives, describe_structure, is_tolerable
 from fitact.fitting.error_sources import (
@@ -39,6 +38,7 @@ from fitact.fitting.minimum import Optima
 from fitact.fitting.multistart import find_optima, lower_optimum
 from fitact.fitting.problem import Problem, build_problem
 from fitact.fitting.profile import PROFILE_QUANTITIES, Interval, profile_intervals
+from fitact.fitting.recorded_current import estimate_noise
 from fitact.fitting.residual_statistics import is_misfit, is_undersampled, pooled_statistics
 from fitact.fitting.solution import solve_problem
 from fitact.fitting.source import require_record

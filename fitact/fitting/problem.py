@@ -17,17 +17,11 @@ from fitact.errors import InputError
 from fitact.experiment.blind_directions import STRAY, gain_names
 from fitact.experiment.fisher import Experiment
 from fitact.fitting.current import (
-    FEW,
-    Current,
-    RecordedCurrent,
     estimate_from_current,
-    estimate_noise,
     estimate_recorded,
     hum_likeness,
     respond_to,
-    run_lengths,
     select_samples,
-    set_rows,
 )
 from fitact.fitting.drive_choice import DriveModel, choose_drive, frequency_error, has_ideal_edges, has_unresolved_edge
 from fitact.fitting.friction import make_friction_channel
@@ -38,6 +32,8 @@ from fitact.fitting.instrument_errors import (
     collect_coordinates,
     largest_gain,
 )
+from fitact.fitting.recorded_current import FEW, Current, RecordedCurrent, estimate_noise, run_lengths
+from fitact.fitting.row_updates import set_rows
 from fitact.fitting.skin_model import apply_skin_model, count_harmonics, exclude_jumps, require_skin_response
 from fitact.fitting.source import Source
 from fitact.fitting.spectra import build_spectrum_channel

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.fitting.current import Current, RecordedCurrent, describe_terms
 from fitact.fitting.fit import Fit, fit
+from fitact.fitting.recorded_current import Current, RecordedCurrent
 from fitact.likelihood.certificate import TOLERANCE, reason_against_table
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import CircuitValues
@@ -210,9 +210,7 @@ def _describe_current(fitted: Fit, record: Record, circuit: CircuitValues) -> tu
     for channel in fitted.likelihood.channels:
         if channel.charges is not None:
             inputs = fitted.likelihood.make_inputs(circuit.circuit, fitted.theta, channel)
-            delay = float(channel.shift) / record.time_step
-            modelled = describe_terms(circuit.terms["I"], inputs.stray, delay, record.time_step)
-            return RecordedCurrent.from_record(record), modelled
+            return RecordedCurrent.from_record(record), Current.from_channel(channel, inputs)
     return None
 
 

@@ -10,7 +10,8 @@ import pandas as pd
 import pytest
 
 import fitact
-from fitact.fitting.current import RecordedCurrent, estimate_noise, hum_likeness
+from fitact.fitting.current import hum_likeness
+from fitact.fitting.recorded_current import RecordedCurrent, estimate_noise
 from tests.conftest import RECORDS
 
 FINGERS = RECORDS / "fingers"

@@ -14,7 +14,7 @@ from data_synth.changing import Course, make_course
 from data_synth.make import make, simulate_response
 from data_synth.recipe import load
 from data_synth.scene import make_scene
-from fitact.fitting import current
+from fitact.fitting import recorded_current
 from fitact.tracking import track_record
 from fitact.tracking.solve_windows import _residuals_vary
 
@@ -150,7 +150,7 @@ def test_stationary_record_gives_the_answer_of_a_fit():
 
 def test_walk_fixed_at_zero_gives_the_answer_of_a_fit(monkeypatch):
     # windows take the errors at jumps of I as independent
-    monkeypatch.setattr(current, "_shared_jumps", lambda places: 1.0)
+    monkeypatch.setattr(recorded_current, "_shared_jumps", lambda places: 1.0)
     record, _ = simulate(duration=0.96)  # a whole number of windows
     fitted = fitact.fit(record, SCENE)
     found = fitact.track(record, SCENE, rates=(0.0, 0.0, 0.0))

@@ -1,0 +1,357 @@
+"""V and I of a record: their noise before any fit, and the rows of charge of a current with a recorded V.
+
+The noise of a recorded V is part of the likelihood of I (errors in variables). At given parameters, the residuals tell
+how much of V is noise; the estimate of the drive that remains, with its covariance left in that of the rows, gives
+estimates without bias, unlike the recorded V (`fitact.likelihood.charge_rows`).
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Self
+
+import numpy as np
+import scipy.fft
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float, Int
+
+from fitact.data.clipping import clipping_mask
+from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
+from fitact.errors import InputError
+from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
+from fitact.likelihood.charge_rows import LAG, ChargeRows, RowCovariance, step_means
+from fitact.model.circuit import gain_at
+
+Rows = Float[np.ndarray, " samples"]
+# rms error of the mean over a step, up to six steps from a jump, relative to its height; beside the step of the jump,
+# where the error is 0.06 to 0.1 at all jumps alike and would bias a delay, three times as large
+_JUMP_ERRORS = np.array([3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.3, 0.29, 0.3, 0.03, 0.01, 3e-3, 1e-3, 3e-4])
+FEW = 4  # equal values in a row that are usual where noise exceeds the rounding
+_ROW_NOISE = 0.6285  # variance of a row over that of a sample of white noise; with those of neighbours, the sum is 1
+
+
+class Current(NamedTuple):
+    """A modelled current: what its noise of V and its delay depend on."""
+
+    capacitance: float  # that follows dV/dt, with the stray one, F
+    conductance: float  # of what does not follow it, S
+    delay: float  # against V, in time steps
+    follows: bool = True  # whether it follows dV/dt, which no resistance limits
+
+    @classmethod
+    def from_channel(cls, channel: ChannelLikelihood, inputs: ChannelInputs, delay: float | None = None) -> Self:
+        """Return what a channel models, with its delay or another one (time steps).
+
+        If a resistance limits the current, its capacitance is that whose rows have the same variance.
+        """
+        terms, step = inputs.circuit.channel_terms(channel.channel), float(channel.time_step)
+        stray = 0.0 if inputs.stray is None else float(inputs.stray)
+        delay = float(channel.shift) / step if delay is None else delay
+        if terms.rate is not None:
+            return cls(float(terms.rate) + stray, float(np.sum(terms.weight)), delay)
+        omega = math.pi / step * (np.arange(64) + 0.5) / 64.0
+        gain = np.asarray(gain_at(terms, omega)) + 1j * omega * stray
+        mean_square = float(np.mean(np.abs(gain * np.sinc(0.5 * omega * step / math.pi)) ** 2))
+        return cls(math.sqrt(0.5 * mean_square) * step, 0.0, delay, follows=False)
+
+    def sample_gains(self, step: float) -> tuple[float, float]:
+        """Return the gains (S) of the noise of V, at the first and last sample of a step (s), in the mean current."""
+        return 0.5 * self.conductance - self.capacitance / step, 0.5 * self.conductance + self.capacitance / step
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordedCurrent:
+    """V and I of a record, and what is known of their noise before a fit."""
+
+    V: Rows
+    I: Rows  # noqa: E741
+    step: float  # s
+    variance_V: Rows  # of the noise and the rounding of each sample of V, V^2
+    noise_V: tuple[float, float]  # white noise and rounding, V
+    noise_I: float  # A
+    uncertain: Rows  # variance of the mean current over the step after a sample, because of kinks, A^2
+    shared: float  # number of kinks that have the same error
+    rounded: Rows  # variance of the rounding error that the steps of a run of equal values of I have in common, A^2
+    alike: Rows  # number of runs that have the same rounding error
+    excluded: Bool[np.ndarray, " samples"]  # samples of I that are clipped
+
+    @classmethod
+    def from_record(cls, record: Record) -> "RecordedCurrent":
+        """Estimate the noise of a record's V and I, once."""
+        if len(record) < 6 * LAG:
+            raise InputError(
+                f"{record.source}: {len(record)} samples are too few to fit I with a recorded V; record at least"
+                f" {6 * LAG}, better two periods"
+            )
+        if (key := ("noise", "rows of I")) not in record._estimates:
+            record._estimates[key] = cls._estimate(record)
+        return record._estimates[key]
+
+    @classmethod
+    def _estimate(cls, record: Record) -> "RecordedCurrent":
+        V, current = record["V"], record["I"]
+        noise_V = math.sqrt(max(estimate_noise(V) ** 2 - rounding_noise_sd(V) ** 2, 0.0)), rounding_noise_sd(V)
+        noise_I = max(estimate_noise(current), _least_step(current) / math.sqrt(12.0))
+        return cls.from_samples(V, current, record.time_step, noise_V, noise_I)
+
+    @classmethod
+    def from_samples(
+        cls, V: Rows, current: Rows, step: float, noise_V: tuple[float, float], noise: float, is_whole: bool = True
+    ) -> "RecordedCurrent":
+        """Estimate which samples are less certain than the noise of V and I (A) makes them.
+
+        `is_whole`: whether they are a whole record, and not a window of one, whose delay others determine.
+        """
+        rounding = _least_step(current) / math.sqrt(12.0)
+        rounded, alike = _round_runs(current, math.sqrt(12.0) * rounding)
+        uncertain, shared = _kink_variance(current, noise, is_whole)
+        # the flat top of a pulse that is coarsely rounded looks clipped, but lies within the range of the converter
+        codes = np.log2(np.maximum(np.abs([current.min(), current.max()]) / (math.sqrt(12.0) * rounding or 1.0), 1.0))
+        is_coarse = rounding > white_noise_sd(current) and np.max(np.abs(codes - np.round(codes))) > 0.02
+        excluded = np.zeros(V.size, bool) if is_coarse else clipping_mask(current)
+        variance_V = drive_variance(V, *noise_V)
+        return cls(V, current, step, variance_V, noise_V, noise, uncertain, shared, rounded, alike, excluded)
+
+    def continue_with(self, V: Rows, current: Rows) -> "RecordedCurrent":
+        """Return other samples of V and I, with the same noise."""
+        return self.from_samples(V, current, self.step, self.noise_V, self.noise_I, is_whole=False)
+
+    @property
+    def is_coarse(self) -> bool:
+        """Whether I has long runs of equal values, whose rounding is no noise."""
+        return float(np.mean(run_lengths(self.I) > FEW)) > 0.1
+
+    @property
+    def is_within_steps(self) -> bool:
+        """Whether I spends half of the time within a step of its converter, and so tells little."""
+        half = np.quantile(np.abs(self.I - np.median(self.I)), 0.5)
+        return self.is_coarse and bool(half <= 1.01 * _least_step(self.I))
+
+    @property
+    def _floor(self) -> float:
+        """Noise of I, at least of rounding errors, A."""
+        return max(self.noise_I, 1e-12 * float(np.ptp(self.I)))
+
+    def covariance(self, modelled: Current, is_shared: bool = True) -> RowCovariance:
+        """Return the covariance of the rows.
+
+        Errors that several kinks or runs have in common, which a tridiagonal matrix cannot express, have their sum if
+        `is_shared`; else they are independent.
+        """
+        variance, neighbours, excluded = self._variance(modelled, is_shared)
+        common = np.roll(self.rounded * (self.alike if is_shared else 1.0), LAG - round(modelled.delay))
+        return RowCovariance(variance, 0.5 * (1.0 - _ROW_NOISE) * self._floor**2 + neighbours, excluded, common)
+
+    def _variance(self, modelled: Current, is_shared: bool = True) -> tuple[Rows, Rows, Bool[np.ndarray, " samples"]]:
+        """Return the variance of the rows, their covariance by the sample of V they share, and which are excluded."""
+        early, late = modelled.sample_gains(self.step)
+        driven = np.roll(self.variance_V, LAG)
+        level = _ROW_NOISE * self._floor**2 + early**2 * driven + late**2 * np.roll(driven, -1)
+        shift, excluded = LAG - round(modelled.delay), self.excluded.copy()
+        if excluded.any():
+            excluded = np.roll(np.convolve(excluded, np.ones(2 * LAG), "same") > 0.5, shift)
+        excluded[: 2 * LAG] = True
+        uncertain = np.roll(self.uncertain, shift) * (self.shared if is_shared else 1.0)
+        return level + uncertain, early * late * driven, excluded
+
+    def flatten(self, white: Rows, modelled: Current) -> Rows:
+        """Return whitened rows without the spectrum that a tridiagonal covariance leaves in the noise of I."""
+        cycles = np.linspace(0.0, 0.5, 257)
+        power = np.interp(np.fft.rfftfreq(white.size), cycles, self._noise_power(cycles, modelled))
+        lines = scipy.fft.rfft(white) / np.sqrt(np.maximum(power / np.mean(power), 0.05))
+        return scipy.fft.irfft(lines, white.size)
+
+    def _noise_power(self, cycles: Rows, modelled: Current) -> Rows:
+        """Return the power of the noise of rows over the assumed one, at frequencies in cycles per step."""
+        impulse, turns = np.zeros(64), 2.0 * math.pi * cycles
+        impulse[32 - LAG] = 1.0
+        taps = np.flatnonzero(own := step_means(impulse, modelled.delay))
+        driven = (modelled.capacitance / self.step) ** 2 * float(np.median(self.variance_V))
+        floor, others = self._floor**2, 2.0 * driven * (1.0 - np.cos(turns))
+        assumed = floor * (_ROW_NOISE + (1.0 - _ROW_NOISE) * np.cos(turns)) + others
+        return (floor * np.abs(np.exp(-1j * np.outer(turns, taps)) @ own[taps]) ** 2 + others) / assumed
+
+    def rise(self, V: Rows) -> Rows:
+        """Return the rise of a drive over each step, V/s, stored as rows are."""
+        return np.concatenate([np.zeros(LAG), np.diff(V)[: 1 - LAG] / self.step])
+
+    def make_rows(
+        self, modelled: Current, respond: Callable[[Rows], Rows], nuisances: ArrayLike = 0.0
+    ) -> tuple[ChargeRows, Rows]:
+        """Return the rows of charge and the estimate of V, given the modelled rows of a drive and of nuisances."""
+        covariance = self.covariance(modelled)
+        means, from_V = step_means(self.I, modelled.delay), respond(self.V)
+        independent = self.covariance(modelled, is_shared=False)
+        scaled = np.append(independent.solve(means - from_V - nuisances)[LAG:], np.zeros(LAG))
+        # covariance of the noise of V with that of the rows
+        early, late = modelled.sample_gains(self.step)
+        V = self.V + self.variance_V * (early * scaled + late * np.append(0.0, scaled[:-1]))
+        signal = respond(V)
+        power = np.mean(self._noise_power(np.linspace(0.0, 0.5, 129), modelled))
+        gain, decay = covariance.recursion(self._floor / math.sqrt(float(power)))
+        slope = np.where(gain > 0.0, -np.gradient(signal) / self.step, 0.0)
+        return ChargeRows(means + signal - from_V, self.rise(V), slope, gain, decay, covariance.used * 1.0), V
+
+    def fit_rows(
+        self, modelled: Current, blocks: int, functions: Sequence[Float[np.ndarray, "functions samples"]]
+    ) -> ChargeRows:
+        """Return the rows of charge, if the signal is any combination of dV/dt, which may drift, and rows of functions.
+
+        The residuals, which tell the noise of the drive, thus need no circuit. The combination is that of charges over
+        `blocks` of steps, in which noise of V hardly matters.
+        """
+        rise, several = self.rise(self.V), max(1, (self.V.size - 2 * LAG) // blocks)
+        (variance, _, excluded), follows = self._variance(modelled), modelled.follows
+        weight = 1.0 / np.sqrt(thin_rows(np.where(excluded, np.inf, variance), several))
+        changing = np.linspace(-1.0, 1.0, rise.size) * rise
+        parts = [np.stack([rise, changing])[: 2 * follows], *functions]
+        columns = np.concatenate([thin_rows(part, several) for part in parts]) * weight
+        noise = 2.0 * float(np.mean(self.variance_V)) * float(np.sum(weight**2)) / (several * self.step) ** 2
+        observed = thin_rows(step_means(self.I, modelled.delay), several) * weight
+        sizes = solve_linear(columns, observed, (0, noise * follows))[1]
+        capacitance, begin = float(sizes[0]) * follows, 2 * follows
+        rest = sizes[1] * changing if follows else np.zeros(rise.size)
+        for part in functions:
+            rest += sizes[begin : (begin := begin + len(part))] @ part
+        noisy = modelled._replace(capacitance=abs(capacitance)) if follows else modelled
+        return self.make_rows(noisy, lambda V: capacitance * self.rise(V) + rest)[0]
+
+
+def thin_rows(rows: np.ndarray, several: int) -> np.ndarray:
+    """Return means over `several` rows each, without the first ones, which are not valid."""
+    count = (rows.shape[-1] - 2 * LAG) // several
+    return rows[..., 2 * LAG : 2 * LAG + several * count].reshape(*rows.shape[:-1], count, several).mean(axis=-1)
+
+
+def estimate_noise(values: Rows, block: int = 16, max_ratio: float = 0.7) -> float:
+    """Return the sd of white noise and rounding: that of sixth differences, or of the highest frequencies if far lower.
+
+    Fast smooth signals hardly change the second, which is less accurate. The median over blocks is robust to edges, and
+    the mean square within a block counts rounding, with which a median of differences takes few values.
+    """
+    squares = np.diff(values, 6) ** 2 / 924.0
+    means = squares[: squares.size // block * block].reshape(-1, block).mean(axis=1)
+    # median over mean of the mean squares of white noise in blocks of 16, from simulations
+    differences = math.sqrt(float(np.median(means)) / 0.8677) if means.size else white_noise_sd(values)
+    lines = scipy.fft.rfft((values - values.mean()) * np.hanning(values.size))[int(0.4 * values.size) :]
+    fastest = math.sqrt(float(np.median(np.abs(lines) ** 2)) / math.log(2.0) / (0.375 * values.size))
+    return max(fastest if fastest < max_ratio * differences else differences, rounding_noise_sd(values))
+
+
+def _kink_variance(
+    current: Rows, noise: float, is_whole: bool, threshold: float = 4.0, smooth: float = 8.0, block: int = 64
+) -> tuple[Rows, float]:
+    """Return the variance of the mean current over the step after each sample, if the current jumps within the step.
+
+    Also how many jumps have the same error.
+
+    A jump somewhere within a step changes the mean by its height times a uniform number in +-1/2, and the polynomials
+    of `step_means` around it by the `_JUMP_ERRORS`. Sixth differences are ten times a jump; they count above
+    `threshold` times the effect of noise, and `smooth` times what is usual in a `block` of samples.
+    """
+    jump = np.pad(np.abs(np.diff(current, 6)) / 10.0, 3)
+    padded = np.pad(jump, (0, -jump.size % block), mode="edge").reshape(-1, block)
+    usual = np.repeat(np.median(padded, axis=1), block)[: jump.size]
+    least = np.maximum(threshold * math.sqrt(924.0) / 10.0 * noise, smooth * usual)
+    around = np.max([np.roll(jump, k) for k in (-2, -1, 1, 2)], axis=0)
+    jump = np.where((jump > np.maximum(least, 1e-9 * np.ptp(current))) & (jump >= around), jump, 0.0)
+    height = np.maximum(jump, np.append(jump[1:], 0.0))
+    shared = _shared_jumps(np.flatnonzero(height)) if is_whole else 1.0
+    return np.convolve(np.square(height), np.square(_JUMP_ERRORS), "same"), shared
+
+
+def _shared_jumps(places: Int[np.ndarray, " n"], most: float = 4.0) -> float:
+    """Return how many jumps lie at the same part of a step and so have the same error, `most` at most.
+
+    These are half of all if the drive repeats after a whole number of steps, to one over the record. With more of them,
+    the delay of a long record would be known to a part of a step only, which is too cautious for its other parameters.
+    """
+    first = places[np.diff(places, prepend=-9) > 3]
+    for jumps in (2, 4):  # in a period, of a triangle and a trapezoid
+        periods = (first.size - 1) // jumps
+        if periods > 0:
+            period = (first[periods * jumps] - first[0]) / periods
+            if abs(period - round(period)) * periods <= 1.0:
+                return min(max(0.5 * first.size, 1.0), most)
+    return 1.0
+
+
+def drive_variance(V: Rows, white: float, rounding: float) -> Rows:
+    """Return the variance of each sample of V.
+
+    Within a run of equal values, rounding is no noise, but an offset, unless noise of a seventh of a step changes it.
+    """
+    alike = (np.diff(V) == 0.0) & (white < 0.5 * rounding)
+    within = np.append(False, alike) & np.append(alike, False)
+    return white**2 + np.where(within, 0.0, rounding**2)
+
+
+def _least_step(current: Rows, max_part: float = 0.25) -> float:
+    """Return the least step between the values of a channel, or 0 if more than `max_part` of its values differ."""
+    levels = np.unique(current)
+    return float(np.diff(levels).min()) if 1 < levels.size <= max_part * current.size else 0.0
+
+
+def run_lengths(values: Rows) -> Rows:
+    """Return for each sample the number of equal values in a row."""
+    ends = np.append(np.flatnonzero(np.diff(values)), values.size - 1)
+    lengths = np.diff(ends, prepend=-1)
+    return np.repeat(lengths, lengths).astype(float)
+
+
+def _round_runs(values: Rows, step: float) -> tuple[Rows, Rows]:
+    """Return the variance of the rounding error that the samples of a run have in common, and how many runs have it.
+
+    `step` is that of the converter. Both are 0 outside of runs and at their last sample. A run of the opposite value
+    has the opposite error. Values that pass through a run from one step below to one above, or down, are known at its
+    ends, and their mean but for the bend that the lengths of the runs around it show.
+    """
+    lengths = run_lengths(values)
+    within = (lengths > FEW) & np.append(np.diff(values) == 0.0, False)
+    begins = np.flatnonzero(within & ~np.append(False, within[:-1]))
+    variance, alike = np.zeros(values.size), np.zeros(values.size)
+    if begins.size:
+        runs, levels = lengths[begins].astype(int) - 1, values[begins]
+        before, after = np.diff(levels, prepend=np.inf) / step, np.diff(levels, append=np.inf) / step
+        passed = (np.abs(np.abs(before) - 1.0) < 0.1) & (np.abs(after - before) < 0.1)
+        bend = np.abs(np.log(np.append(runs[1:], 1) / np.append(1, runs[:-1])))
+        parts = np.where(passed, np.minimum(0.02 + bend / 24.0, 0.28), 1.0 / math.sqrt(12.0))
+        _, places, counts = np.unique(np.abs(levels), return_inverse=True, return_counts=True)
+        variance[within] = np.repeat((step * parts) ** 2, runs)
+        alike[within] = np.repeat(counts[places], runs)
+    return variance, alike
+
+
+def row_figures(
+    white: Rows, channel: ChannelLikelihood, inputs: ChannelInputs, record: Record
+) -> tuple[Rows, dict[str, float]]:
+    """Return whitened rows without the spectrum of their own (`RecordedCurrent.flatten`), and figures of merit.
+
+    Signs of rounded noise are not independent, and the covariance knows the rounding.
+    """
+    current = RecordedCurrent.from_record(record)
+    figures = {
+        "runs_z": 0.0,
+        "rounding_noise": 0.0,
+        "within_steps": float(current.is_within_steps),
+        "rounding_V": current.noise_V[1] if current.noise_V[0] < current.noise_V[1] else 0.0,
+    }
+    return current.flatten(white, Current.from_channel(channel, inputs)), figures
+
+
+def solve_linear(
+    columns: np.ndarray, observed: np.ndarray, noisy: tuple[int, float] = (0, 0.0)
+) -> tuple[float, np.ndarray]:
+    """Return the residual sum of squares and the coefficients of a linear fit.
+
+    `noisy` is the index of a column, and the sum of squares of its noise, which is taken off, but for a tenth.
+    """
+    place, square = noisy
+    sizes = np.linalg.norm(columns, axis=1)
+    sizes = np.where(sizes > 0.0, sizes, 1.0)
+    scaled = columns / sizes[:, None]
+    gram = scaled @ scaled.T
+    gram[place, place] -= min(square / sizes[place] ** 2, 0.9)
+    amplitudes = np.linalg.lstsq(gram, scaled @ observed, rcond=1e-13)[0] / sizes
+    residuals = observed - amplitudes @ columns
+    return float(residuals @ residuals), amplitudes

@@ -1,0 +1,106 @@
+"""Rows of charge at the optimum of a fit: with its circuit, nuisances and delay, and the drive estimated there."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitact.compiled import jit, pad_samples
+from fitact.data.record import Record
+from fitact.fitting.least_squares import LeastSquaresResult
+from fitact.fitting.recorded_current import Current, RecordedCurrent, Rows
+from fitact.fitting.source import Source
+from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
+from fitact.likelihood.charge_rows import MAX_STEPS, ChargeRows
+from fitact.likelihood.compression import HUM_FREQUENCIES
+from fitact.likelihood.likelihood import Likelihood
+from fitact.model.drive import Sampled
+
+
+def update_rows(likelihood: Likelihood, solution: LeastSquaresResult, sources: Sequence[Source]) -> Likelihood:
+    """Return the likelihood with rows of charge for the drive, noise and delay at a solution."""
+    optimum = solution.likelihood.evaluate_circuit(solution.theta)
+    for i, (channel, solved) in enumerate(zip(likelihood.channels, solution.likelihood.channels, strict=True)):
+        # nuisances that were added stay: without them, the next fit leaves the optimum and returns by hundreds of steps
+        channel = dataclasses.replace(channel, linear_sd=solved.linear_sd)
+        if channel.charges is not None:
+            inputs = solution.likelihood.make_inputs(optimum.circuit, solution.theta, solved)
+            beta = np.asarray(_fit_nuisances(solved, inputs, np.asarray(solution.sigma[i]))[1])
+            sizes = beta * np.asarray(solved.linear_sd)[list(solved.columns)]
+            channel = dataclasses.replace(channel, linear_sd=_expect_harmonics(solved, sizes))
+            channel = set_rows(channel, *_rows_at(solved, inputs, sizes, sources[i].in_time))
+        likelihood = likelihood.replace_channel(i, channel)
+    return likelihood
+
+
+def _expect_harmonics(channel: ChannelLikelihood, fitted: Float[np.ndarray, " columns"]) -> np.ndarray:
+    """Return the prior sds of the linear nuisances, with a third harmonic of the size of each hum that was `fitted`.
+
+    A harmonic beside one of the drive cannot be told from it, but its amplitude is about known.
+    """
+    linear_sd = np.array(channel.linear_sd, dtype=float)
+    sizes = np.zeros(linear_sd.size)
+    sizes[list(channel.columns)] = fitted
+    names = list(channel.linear_names)
+    for mains in HUM_FREQUENCIES[:2]:
+        first, third = (
+            [names.index(f"hum_{order * mains:.0f}Hz_{part}") for part in ("cos", "sin")] for order in (1, 3)
+        )
+        linear_sd[third] = np.maximum(linear_sd[third], math.hypot(*sizes[first]))
+    return linear_sd
+
+
+def _rows_at(
+    channel: ChannelLikelihood, inputs: ChannelInputs, sizes: Float[np.ndarray, " columns"], record: Record
+) -> tuple[ChargeRows, Rows, float]:
+    """Return rows and drive of a channel at its optimum, with nuisances of these `sizes`, and the delay (s)."""
+    current, size = RecordedCurrent.from_record(record), len(record)
+    full = channel.without_compression()
+    skew, inputs = float(inputs.delay) / current.step, dataclasses.replace(inputs, delay=np.zeros(()))
+    delay = float(full.shift) / current.step + float(np.clip(skew, -0.5, 0.5))
+    delay = float(np.clip(delay, 0.5 - MAX_STEPS, MAX_STEPS - 0.5))
+
+    @functools.lru_cache(maxsize=1)
+    def respond_to_V() -> tuple[np.ndarray, np.ndarray]:
+        return _modelled_rows(_with_drive(full, current, current.V), inputs, sizes)
+
+    def respond(V: Rows) -> Rows:
+        pair = respond_to_V() if V is current.V else _modelled_rows(_with_drive(full, current, V), inputs, sizes)
+        return np.asarray(pair[0])[:size]
+
+    modelled = Current.from_channel(channel, inputs, delay)
+    return *current.make_rows(modelled, respond, np.asarray(respond_to_V()[1])[:size]), delay * current.step
+
+
+def set_rows(channel: ChannelLikelihood, rows: ChargeRows, V: Rows, delay: float) -> ChannelLikelihood:
+    """Return the channel with rows of charge, an estimate of the drive, and the delay (s) at which they are taken."""
+    length = np.shape(channel.time)[0]
+    padded = jax.tree.map(lambda x: np.pad(x, (0, length - x.size)), rows)
+    assert isinstance(channel.drive, Sampled)
+    drive = Sampled(channel.drive.time, pad_samples(V))
+    channel = channel.without_compression()
+    return dataclasses.replace(channel, drive=drive, charges=padded, shift=np.asarray(delay, dtype=float))
+
+
+def _with_drive(channel: ChannelLikelihood, current: RecordedCurrent, V: Rows) -> ChannelLikelihood:
+    """Return the channel of a current that is 0, with another drive."""
+    assert channel.charges is not None
+    assert isinstance(channel.drive, Sampled)
+    length = np.shape(channel.time)[0]
+    rise = np.pad(current.rise(V), (0, length - V.size))
+    charges = dataclasses.replace(channel.charges, observed=np.zeros(length), rate=rise)
+    return dataclasses.replace(channel, drive=Sampled(channel.drive.time, pad_samples(V)), charges=charges)
+
+
+@jit
+def _modelled_rows(channel: ChannelLikelihood, inputs: ChannelInputs, sizes: Array) -> tuple[Array, Array]:
+    """Return the rows of the signal of a channel that observed 0, and those of nuisances of these sizes."""
+    rows, shapes = channel.rows_and_shapes(inputs)
+    return -rows, sizes @ shapes
+
+
+_fit_nuisances = jit(ChannelLikelihood.fit_nuisances)
