@@ -310,12 +310,13 @@ def _round_runs(values: Rows, step: float) -> tuple[Rows, Rows]:
     within = (lengths > FEW) & np.append(np.diff(values) == 0.0, False)
     begins = np.flatnonzero(within & ~np.append(False, within[:-1]))
     variance, alike = np.zeros(values.size), np.zeros(values.size)
-    if begins.size:
+    if begins.size and step > 0.0:
         runs, levels = lengths[begins].astype(int) - 1, values[begins]
         before, after = np.diff(levels, prepend=np.inf) / step, np.diff(levels, append=np.inf) / step
         passed = (np.abs(np.abs(before) - 1.0) < 0.1) & (np.abs(after - before) < 0.1)
-        bend = np.abs(np.log(np.append(runs[1:], 1) / np.append(1, runs[:-1])))
-        parts = np.where(passed, np.minimum(0.02 + bend / 24.0, 0.28), 1.0 / math.sqrt(12.0))
+        growth = np.abs(np.diff(np.log(runs)))
+        bend = np.maximum(np.append(growth, 0.0), np.append(0.0, growth))  # of the mean, in twelfths of a step
+        parts = np.where(passed, np.minimum(0.02 + bend / 12.0, 0.28), 1.0 / math.sqrt(12.0))
         _, places, counts = np.unique(np.abs(levels), return_inverse=True, return_counts=True)
         variance[within] = np.repeat((step * parts) ** 2, runs)
         alike[within] = np.repeat(counts[places], runs)

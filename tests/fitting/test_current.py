@@ -9,9 +9,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import data_synth.make
+import data_synth.recipe
+import data_synth.scene
 import fitact
+from data_synth.keys import validate_sections
 from fitact.fitting.current import hum_likeness
-from fitact.fitting.recorded_current import RecordedCurrent, estimate_noise
+from fitact.fitting.recorded_current import RecordedCurrent, _round_runs, estimate_noise
 from tests.conftest import RECORDS
 
 FINGERS = RECORDS / "fingers"
@@ -110,6 +114,86 @@ def test_unstated_stray_capacitance_is_a_note():
     Ci = rate + weight * b
     Rsc = 2.0 * (weight * b / (2.0 * Ci)) ** 2 / weight
     assert f"Rsc by {100.0 * (Rsc / truth['Rsc'] - 1.0):+.2g} %" in note
+
+
+FINGER = {"Rsc": 180e3, "Csc": 18e-9, "Ci": 0.7e-9}
+
+
+def simulate_bench(drive: dict[str, object], bits: int, rate: float, noise: dict[str, float]) -> fitact.Record:
+    """Simulate 60 ms of V, Vsc and I of the `FINGER`, I a quarter of a step late, as converters write them."""
+    own = {
+        "device": {"Ci": FINGER["Ci"]},
+        "skin": {"Rsc": FINGER["Rsc"], "Csc": FINGER["Csc"]},
+        "drive": drive,
+        "measurement": {"channels": ["Vsc", "I"], "sampling_rate": rate, "duration": 0.06},
+    }
+    parts = {"delay": {"I": 0.25 / rate}, "white": noise, "converter": {"bits": bits, "auto": True}}
+    checked = validate_sections(parts, data_synth.recipe.KEYS, "bench")
+    scene = data_synth.scene.make_scene(own, {}, "bench")
+    recipe = data_synth.recipe.Recipe("bench", "", scene, checked, tuple(parts), 3, "scipy")
+    made = data_synth.make.make(recipe)["bench"]
+    return fitact.Record.from_arrays(made.time, **made.channels, source="bench")
+
+
+def errors(found: fitact.Fit) -> np.ndarray:
+    """Return the errors of Rsc, Csc and Ci in standard uncertainties."""
+    parameters = found.parameters()
+    return np.array([math.log(parameters[name]["q50"] / FINGER[name]) / parameters[name]["u"] for name in FINGER])
+
+
+def bench_scene(channels: list[str]) -> fitact.Scene:
+    content = {"channels": channels, "current_lead": "ground"}
+    prior = {"Ci": {"median": 0.9e-9, "relative_sd": 0.5}}
+    return fitact.Scene.from_dict({"measurement": content, "drive": {"waveform": "measured"}, "prior": prior})
+
+
+def test_edges_that_set_the_range_of_I_leave_its_plateaus_to_few_steps():
+    """Rounding of a plateau is one error, and no noise, from which Vsc and I still determine all three to 5 %."""
+    square = {"waveform": "trapezoid", "peak_to_peak": 200.0, "frequency": 80.0, "rise_time": 20e-6}
+    record = simulate_bench(square, 12, 500e3, {"V": 0.1, "Vsc": 0.05, "I": 50e-9})
+    alone, both = (fitact.fit(record, bench_scene(channels)) for channels in (["I"], ["Vsc", "I"]))
+    for found in (alone, both):
+        assert found.trusted
+        assert np.max(np.abs(errors(found))) < 4.0
+        assert any("within a step of its converter" in warning for warning in found.warnings)
+    assert alone.parameters()["Rsc"]["u"] > 0.1
+    assert both.parameters()["Rsc"]["u"] < 0.05
+
+
+def test_hum_does_not_stand_in_for_a_tone_of_the_drive():
+    """A tone at the frequency of the mains, and one other, which alone does not determine three parameters."""
+    tones = {"waveform": "multitone", "frequencies": [50.0, 350.0], "amplitudes": [75.0, 75.0], "phases": [1.0, 0.3]}
+    record = simulate_bench(tones, 14, 200e3, {"V": 0.5, "Vsc": 0.05, "I": 30e-9})
+    found = fitact.fit(record, bench_scene(["I"]))
+    assert found.trusted
+    assert np.max(np.abs(errors(found))) < 4.0
+    assert found.parameters()["Rsc"]["u"] < 0.05
+    assert not any("hum" in name for name in found.linear)
+
+
+def test_rows_follow_a_fit_with_stated_instruments():
+    """The estimate before the fit is off; with an oscilloscope of 8 bits the rows are made anew as well."""
+    triangle = {"waveform": "triangle", "peak_to_peak": 240.0, "frequency": 70.0}
+    record = simulate_bench(triangle, 8, 250e3, {"V": 0.3, "Vsc": 0.05, "I": 30e-9})
+    stated = bench_scene(["I"]).model_dump(mode="json", exclude_unset=True)
+    stated["instrument"] = {"V": ["scope-8bit:A/CH1"], "I": ["scope-8bit:A/CH2", "shunt-1%:S"]}
+    found = fitact.fit(record, fitact.Scene.from_dict(stated))
+    assert found.trusted
+    assert np.max(np.abs(errors(found))) < 4.0
+    assert found.parameters()["Rsc"]["u"] < 0.6
+
+
+def test_values_that_pass_through_a_run_are_known_but_for_its_bend():
+    time = np.arange(20_000)
+    current = 9.3 * np.exp(-time / 6000.0)
+    rounded = np.round(current)
+    variance, alike = _round_runs(rounded, 1.0)
+    ends = np.flatnonzero(np.diff(np.append(rounded, np.nan)))
+    for begin, end in zip(ends[:-1] + 1, ends[1:], strict=True):
+        error = np.mean(current[begin:end] - rounded[begin:end])
+        assert abs(error) < 3.0 * math.sqrt(variance[begin])
+        assert alike[begin] == 1.0
+    assert math.sqrt(variance[ends[2] + 1]) < 0.1 < math.sqrt(variance[0])
 
 
 def open_record(path: Path, stray: float) -> None:
