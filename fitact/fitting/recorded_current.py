@@ -226,13 +226,15 @@ def thin_rows(rows: np.ndarray, several: int) -> np.ndarray:
 def estimate_noise(values: Rows, block: int = 16, max_ratio: float = 0.7) -> float:
     """Return the sd of white noise and rounding: that of sixth differences, or of the highest frequencies if far lower.
 
-    Fast smooth signals hardly change the second, which is less accurate. The median over blocks is robust to edges, and
-    the mean square within a block counts rounding, with which a median of differences takes few values.
+    Fast smooth signals hardly change the second, which is less accurate. Blocks with edges, above 2.5 times the median,
+    are left out, and the mean square within a block counts rounding, with which a median of differences takes few
+    values.
     """
     squares = np.diff(values, 6) ** 2 / 924.0
     means = squares[: squares.size // block * block].reshape(-1, block).mean(axis=1)
-    # median over mean of the mean squares of white noise in blocks of 16, from simulations
-    differences = math.sqrt(float(np.median(means)) / 0.8677) if means.size else white_noise_sd(values)
+    # mean square of white noise in blocks of 16 up to 2.5 times their median, over that of all, from simulations
+    kept = means[means <= 2.5 * np.median(means)] if means.size else means
+    differences = math.sqrt(float(np.mean(kept)) / 0.9099) if kept.size else white_noise_sd(values)
     lines = scipy.fft.rfft((values - values.mean()) * np.hanning(values.size))[int(0.4 * values.size) :]
     fastest = math.sqrt(float(np.median(np.abs(lines) ** 2)) / math.log(2.0) / (0.375 * values.size))
     return max(fastest if fastest < max_ratio * differences else differences, rounding_noise_sd(values))
