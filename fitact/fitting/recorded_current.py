@@ -19,7 +19,7 @@ from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
 from fitact.errors import InputError
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
-from fitact.likelihood.charge_rows import LAG, ChargeRows, RowCovariance, step_means
+from fitact.likelihood.charge_rows import LAG, ChargeRows, RowCovariance, step_means, whiten_rows
 from fitact.model.circuit import gain_at
 
 Rows = Float[np.ndarray, " samples"]
@@ -193,7 +193,11 @@ class RecordedCurrent:
         return ChargeRows(means + signal - from_V, self.rise(V), slope, gain, decay, covariance.used * 1.0), V
 
     def fit_rows(
-        self, modelled: Current, blocks: int, functions: Sequence[Float[np.ndarray, "functions samples"]]
+        self,
+        modelled: Current,
+        blocks: int,
+        functions: Sequence[Float[np.ndarray, "functions samples"]],
+        slow: int = 16,
     ) -> ChargeRows:
         """Return the rows of charge, if the signal is any combination of dV/dt, which may drift, and rows of functions.
 
@@ -214,7 +218,12 @@ class RecordedCurrent:
         for part in functions:
             rest += sizes[begin : (begin := begin + len(part))] @ part
         noisy = modelled._replace(capacitance=abs(capacitance)) if follows else modelled
-        return self.make_rows(noisy, lambda V: capacitance * self.rise(V) + rest)[0]
+        rows, _ = self.make_rows(noisy, lambda V: capacitance * self.rise(V) + rest)
+        # what changes within the window is slow, and hidden by the noise of V at high frequencies
+        residuals = step_means(self.I, modelled.delay) - capacitance * rise - rest
+        power = np.abs(scipy.fft.rfft(whiten_rows(rows.gain, rows.decay, residuals) * rows.used)) ** 2
+        alike = max(1.0, float(np.median(power[: power.size // slow]) / np.median(power)))
+        return dataclasses.replace(rows, used=rows.used / math.sqrt(alike))
 
 
 def thin_rows(rows: np.ndarray, several: int) -> np.ndarray:

@@ -61,7 +61,9 @@ class ChargeRows(eqx.Module):
     # whitened row k = gain[k] (row k) + decay[k] (whitened row k - 1)
     gain: Float[Array, " samples"]
     decay: Float[Array, " samples"]
-    used: Float[Array, " samples"]  # 1 for the rows that count, which are the last ones of runs, and 0 for others
+    # weight of whitened rows: 0 for those that do not count, as all but the last of a run, else 1, or less where the
+    # residuals of many rows are alike
+    used: Float[Array, " samples"]
 
     @property
     def reach(self) -> int:
