@@ -428,5 +428,7 @@ def test_slides_of_thirty_seconds_are_within_their_bands():
         ((begin, end),) = track.lifted
         assert 0.0 <= 17.03 - begin <= track.window
         assert 0.0 <= end - 17.602 <= track.window
-        assert track.noise == pytest.approx({"sigma": 0.1, "sigma_I": 20e-9}, rel=0.03)
+        # the rows of I hold the noise of V and kinks, too, which are estimated to some per cent
+        assert track.noise["sigma"] == pytest.approx(0.1, rel=0.03)
+        assert track.noise["sigma_I"] == pytest.approx(20e-9, rel=0.05)
     assert min(map(np.mean, inside.values())) >= 0.93, inside
