@@ -221,7 +221,8 @@ class RecordedCurrent:
         rows, _ = self.make_rows(noisy, lambda V: capacitance * self.rise(V) + rest)
         # what changes within the window is slow, and hidden by the noise of V at high frequencies
         residuals = step_means(self.I, modelled.delay) - capacitance * rise - rest
-        power = np.abs(scipy.fft.rfft(whiten_rows(rows.gain, rows.decay, residuals) * rows.used)) ** 2
+        white = whiten_rows(rows.gain, rows.decay, residuals) * rows.used
+        power = np.abs(scipy.fft.rfft(white * np.hanning(white.size))) ** 2
         alike = max(1.0, float(np.median(power[: power.size // slow]) / np.median(power)))
         return dataclasses.replace(rows, used=rows.used / math.sqrt(alike))
 

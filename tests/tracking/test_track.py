@@ -157,7 +157,8 @@ def test_walk_fixed_at_zero_gives_the_answer_of_a_fit(monkeypatch):
     for i, name in enumerate(each for each in fitted.names if each in found.values):
         # the first steps of each window have no row, and each window has an estimate of the drive of its own
         assert np.log(found.values[name]) == pytest.approx(fitted.theta[i], abs=0.5 * fitted.sd[i])
-        assert found.sd[name] == pytest.approx(fitted.sd[i], rel=0.02)
+        # windows count residuals that are alike as fewer, of which noise alone leaves some
+        assert np.all((found.sd[name] > 0.98 * fitted.sd[i]) & (found.sd[name] < 1.15 * fitted.sd[i]))
 
 
 def test_vsc_alone_leaves_the_area_to_the_prior():
