@@ -91,8 +91,9 @@ class RecordedCurrent:
     def _estimate(cls, record: Record) -> "RecordedCurrent":
         V, current = record["V"], record["I"]
         rounding = rounding_noise_sd(V)
-        # within runs of a coarse V, less noise than this is not known
-        noise_V = math.sqrt(max(estimate_noise(V) ** 2 - rounding**2, (0.1 * rounding) ** 2)), rounding
+        # within runs of a coarse V, of ten bits or fewer, less noise than this is not known
+        least = 0.1 * rounding if rounding > 5e-4 * float(np.ptp(V)) else 0.0
+        noise_V = math.sqrt(max(estimate_noise(V) ** 2 - rounding**2, least**2)), rounding
         noise_I = max(estimate_noise(current), _least_step(current) / math.sqrt(12.0))
         return cls.from_samples(V, current, record.time_step, noise_V, noise_I)
 
