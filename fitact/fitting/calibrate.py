@@ -46,14 +46,13 @@ def calibrate(scene: Scene | None, names: tuple[str, ...], fit_records: FitRecor
     """
     if scene is None or not scene.calibration:
         return CalibratedInstruments()
-    has_open = any(each.circuit == "open" for each in scene.calibration)
-    if has_open and STRAY not in names:
+    if STRAY not in names and any(each.circuit == "open" for each in scene.calibration):
         raise InputError(
             "scene: [[calibration]] circuit = 'open', a record without the finger, determines the stray capacitance;"
             ' state what is known of it before, [measurement] stray_capacitance = {median = "100 pF", relative_sd ='
             " 1.0}, with I in the drive lead"
         )
-    if not scene.instrument.is_stated and not all(each.circuit == "open" for each in scene.calibration):
+    if not scene.instrument.is_stated and any(each.circuit != "open" for each in scene.calibration):
         raise InputError("scene: [[calibration]] calibrates the pieces of [instrument]; state these too")
     contents = tuple(read(each.record, _dummy_scene(scene, each)).fingerprint for each in scene.calibration)
     return _calibrate(scene.to_json(), names, fit_records, contents)

@@ -9,7 +9,7 @@ from jaxtyping import Bool
 
 from fitact.data.record import Record
 from fitact.fitting.drive_choice import DriveModel, drive_slope, unit_response
-from fitact.fitting.recorded_current import Current, RecordedCurrent, Rows, run_lengths, solve_linear, thin_rows
+from fitact.fitting.recorded_current import RecordedCurrent, Rows, run_lengths, solve_linear, thin_rows
 from fitact.fitting.starting_point import CurrentEstimate, skin_from_estimates
 from fitact.likelihood.charge_rows import LAG, RowCovariance, step_means, whiten_rows
 
@@ -95,11 +95,15 @@ def estimate_recorded(
         C = abs(estimate.capacitance + stray)
         if abs(C - before) < 0.1 * before:
             break
-    # noise of V draws a capacitance that the record does not determine to 0, from where no fit returns
-    Ci, usual = estimate.capacitance + estimate.weight * estimate.b, math.exp(belief[0][2])
-    if Ci < 0.3 * usual:
-        estimate = estimate._replace(capacitance=estimate.capacitance + usual - Ci)
+    if _lacks_capacitance(estimate, belief):  # from where no fit returns
+        usual = math.exp(belief[0][2]) - estimate.weight * estimate.b
+        estimate = estimate._replace(capacitance=usual)
     return estimate, nuisances
+
+
+def _lacks_capacitance(estimate: CurrentEstimate, belief: Belief, least: float = 0.3) -> bool:
+    """Return whether Ci is below `least` of its prior median: noise of V draws an undetermined one to 0."""
+    return estimate.capacitance + estimate.weight * estimate.b < least * math.exp(belief[0][2])
 
 
 def _scan_recorded(
@@ -110,8 +114,7 @@ def _scan_recorded(
     several = math.ceil((current.I.size - 3 * LAG) / most)
     first, count = 2 * LAG, (current.I.size - 2 * LAG) // several
     step = current.step * several
-    covariance = current.covariance(Current(C, 0.0, 0.0))
-    lost = thin_rows((covariance.recursion(1.0)[0] == 0.0) * 1.0, several) > 0.0
+    lost = thin_rows(current.excluded_rows(0.0) * 1.0, several) > 0.0
     uncertain = current.uncertain * current.shared + current.rounded * current.alike * run_lengths(current.I)
     own = current.noise_I**2 / several + thin_rows(np.roll(uncertain, LAG), several) / several
     own += 1e-24 * float(np.ptp(current.I)) ** 2
@@ -139,16 +142,14 @@ def _scan_recorded(
             part = 1.0 - own / (own + 2.0 * (capacitance / step) ** 2 * noise_V)
             taken = float(np.sum(part[~lost])) / max(capacitance, 1e-15) ** 2
             square, amplitudes = solve_linear(np.stack(columns), data, (2, taken))
-            # noise of V draws to 0 what the record does not determine
-            has_drive = amplitudes[0] * tau + amplitudes[2] > 0.3 * usual
-            capacitance = abs(amplitudes[2] + stray) if has_drive else usual
+            lacks = _lacks_capacitance(CurrentEstimate(amplitudes[0], tau, amplitudes[2]), belief)
+            capacitance = math.exp(belief[0][2]) if lacks else abs(amplitudes[2] + stray)
         return square, amplitudes
 
     def fit_at_tau(tau: float) -> tuple[float, float, float]:
         square, amplitudes = fit(tau)
         return square, float(amplitudes[0]), float(amplitudes[2])
 
-    usual = math.exp(belief[0][2])
     taus = np.geomspace(max(2.0 * step, 1e-4), max(10.0 * step * count, 4e-4), 48)
     estimate = _scan(fit_at_tau, taus, 1.0, belief)
     amplitudes = fit(estimate.b)[1]

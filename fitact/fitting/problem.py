@@ -322,15 +322,14 @@ def _make_charge_rows(
     may explain has a prior of `usual_hum` times the noise.
     """
     current, stray = RecordedCurrent.from_record(record), scene.stray_capacitance()
-    likeness = {frequency: hum_likeness(current, frequency) for frequency in HUM_FREQUENCIES}
-    hum = [frequency for frequency, part in likeness.items() if part < 0.3]
+    hum = [frequency for frequency in HUM_FREQUENCIES if hum_likeness(current, frequency) < 0.3]
     estimate, nuisances = estimate_recorded(current, stray, hum, prior_skin_moments(bare))
     linear_sd = channel.linear_sd.copy()
     # a charge that has decayed before the first row is not determined, and must not act on the force
     linear_sd[FIRST_CHARGE : FIRST_CHARGE + taus.size][taus[: len(CHARGES)] < 5.0 * record.time_step] = 0.0
     for i, frequency in enumerate(HUM_FREQUENCIES):
         # a record too short to show one hum cannot tell that of 60 Hz from that of 50 Hz either
-        if frequency % 50.0 == 0.0 and not likeness[frequency] < 0.3:
+        if frequency % 50.0 == 0.0 and frequency not in hum:
             linear_sd[2 * i + 2 : 2 * i + 4] = usual_hum * current.noise_I
     modelled = Current(estimate.capacitance + stray, estimate.weight, 0.0)
     rows, V = current.make_rows(modelled, respond_to(current, estimate, stray), nuisances)

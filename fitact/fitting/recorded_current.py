@@ -110,8 +110,8 @@ class RecordedCurrent:
         uncertain, shared = _kink_variance(current, noise, is_whole)
         # the flat top of a pulse that is coarsely rounded looks clipped, but lies within the range of the converter
         codes = np.log2(np.maximum(np.abs([current.min(), current.max()]) / (math.sqrt(12.0) * rounding or 1.0), 1.0))
-        is_coarse = rounding > white_noise_sd(current) and np.max(np.abs(codes - np.round(codes))) > 0.02
-        excluded = np.zeros(V.size, bool) if is_coarse else clipping_mask(current)
+        is_rounded = rounding > white_noise_sd(current) and np.max(np.abs(codes - np.round(codes))) > 0.02
+        excluded = np.zeros(V.size, bool) if is_rounded else clipping_mask(current)
         variance_V = drive_variance(V, *noise_V)
         return cls(V, current, step, variance_V, noise_V, noise, uncertain, shared, rounded, alike, excluded)
 
@@ -141,21 +141,26 @@ class RecordedCurrent:
         Errors that several kinks or runs have in common, which a tridiagonal matrix cannot express, have their sum if
         `is_shared`; else they are independent.
         """
-        variance, neighbours, excluded = self._variance(modelled, is_shared)
+        variance, neighbours = self._variance(modelled, is_shared)
+        excluded = self.excluded_rows(modelled.delay)
         common = np.roll(self.rounded * (self.alike if is_shared else 1.0), LAG - round(modelled.delay))
         return RowCovariance(variance, 0.5 * (1.0 - _ROW_NOISE) * self._floor**2 + neighbours, excluded, common)
 
-    def _variance(self, modelled: Current, is_shared: bool = True) -> tuple[Rows, Rows, Bool[np.ndarray, " samples"]]:
-        """Return the variance of the rows, their covariance by the sample of V they share, and which are excluded."""
+    def excluded_rows(self, delay: float) -> Bool[np.ndarray, " samples"]:
+        """Return which rows are not valid or need a clipped sample, where I is `delay` time steps late."""
+        excluded = self.excluded.copy()
+        if excluded.any():
+            excluded = np.roll(np.convolve(excluded, np.ones(2 * LAG), "same") > 0.5, LAG - round(delay))
+        excluded[: 2 * LAG] = True
+        return excluded
+
+    def _variance(self, modelled: Current, is_shared: bool = True) -> tuple[Rows, Rows]:
+        """Return the variance of the rows, and their covariance by the sample of V that they share."""
         early, late = modelled.sample_gains(self.step)
         driven = np.roll(self.variance_V, LAG)
         level = _ROW_NOISE * self._floor**2 + early**2 * driven + late**2 * np.roll(driven, -1)
-        shift, excluded = LAG - round(modelled.delay), self.excluded.copy()
-        if excluded.any():
-            excluded = np.roll(np.convolve(excluded, np.ones(2 * LAG), "same") > 0.5, shift)
-        excluded[: 2 * LAG] = True
-        uncertain = np.roll(self.uncertain, shift) * (self.shared if is_shared else 1.0)
-        return level + uncertain, early * late * driven, excluded
+        uncertain = np.roll(self.uncertain, LAG - round(modelled.delay)) * (self.shared if is_shared else 1.0)
+        return level + uncertain, early * late * driven
 
     def flatten(self, white: Rows, modelled: Current) -> Rows:
         """Return whitened rows without the spectrum that a tridiagonal covariance leaves in the noise of I."""
@@ -169,8 +174,9 @@ class RecordedCurrent:
         impulse, turns = np.zeros(64), 2.0 * math.pi * cycles
         impulse[32 - LAG] = 1.0
         taps = np.flatnonzero(own := step_means(impulse, modelled.delay))
-        driven = (modelled.capacitance / self.step) ** 2 * float(np.median(self.variance_V))
-        floor, others = self._floor**2, 2.0 * driven * (1.0 - np.cos(turns))
+        early, late = modelled.sample_gains(self.step)
+        driven = float(np.median(self.variance_V))
+        floor, others = self._floor**2, driven * (early**2 + late**2 + 2.0 * early * late * np.cos(turns))
         assumed = floor * (_ROW_NOISE + (1.0 - _ROW_NOISE) * np.cos(turns)) + others
         return (floor * np.abs(np.exp(-1j * np.outer(turns, taps)) @ own[taps]) ** 2 + others) / assumed
 
@@ -184,7 +190,8 @@ class RecordedCurrent:
         """Return the rows of charge and the estimate of V, given the modelled rows of a drive and of nuisances."""
         covariance = self.covariance(modelled)
         means, from_V = step_means(self.I, modelled.delay), respond(self.V)
-        independent = self.covariance(modelled, is_shared=False)
+        is_shared = self.shared > 1.0 or bool(np.any(self.alike > 1.0))
+        independent = self.covariance(modelled, is_shared=False) if is_shared else covariance
         scaled = np.append(independent.solve(means - from_V - nuisances)[LAG:], np.zeros(LAG))
         # covariance of the noise of V with that of the rows
         early, late = modelled.sample_gains(self.step)
@@ -208,14 +215,14 @@ class RecordedCurrent:
         `blocks` of steps, in which noise of V hardly matters.
         """
         rise, several = self.rise(self.V), max(1, (self.V.size - 2 * LAG) // blocks)
-        (variance, _, excluded), follows = self._variance(modelled), modelled.follows
-        weight = 1.0 / np.sqrt(thin_rows(np.where(excluded, np.inf, variance), several))
+        means, follows = step_means(self.I, modelled.delay), modelled.follows
+        variance = np.where(self.excluded_rows(modelled.delay), np.inf, self._variance(modelled)[0])
+        weight = 1.0 / np.sqrt(thin_rows(variance, several))
         changing = np.linspace(-1.0, 1.0, rise.size) * rise
         parts = [np.stack([rise, changing])[: 2 * follows], *functions]
         columns = np.concatenate([thin_rows(part, several) for part in parts]) * weight
         noise = 2.0 * float(np.mean(self.variance_V)) * float(np.sum(weight**2)) / (several * self.step) ** 2
-        observed = thin_rows(step_means(self.I, modelled.delay), several) * weight
-        sizes = solve_linear(columns, observed, (0, noise * follows))[1]
+        sizes = solve_linear(columns, thin_rows(means, several) * weight, (0, noise * follows))[1]
         capacitance, begin = float(sizes[0]) * follows, 2 * follows
         rest = sizes[1] * changing if follows else np.zeros(rise.size)
         for part in functions:
@@ -223,8 +230,7 @@ class RecordedCurrent:
         noisy = modelled._replace(capacitance=abs(capacitance)) if follows else modelled
         rows, _ = self.make_rows(noisy, lambda V: capacitance * self.rise(V) + rest)
         # what changes within the window is slow, and hidden by the noise of V at high frequencies
-        residuals = step_means(self.I, modelled.delay) - capacitance * rise - rest
-        white = whiten_rows(rows.gain, rows.decay, residuals) * rows.used
+        white = whiten_rows(rows.gain, rows.decay, means - capacitance * rise - rest) * rows.used
         power = np.abs(scipy.fft.rfft(white * np.hanning(white.size))) ** 2
         alike = max(1.0, float(np.median(power[: power.size // slow]) / np.median(power)))
         return dataclasses.replace(rows, used=rows.used / math.sqrt(alike))
@@ -258,11 +264,10 @@ def _kink_variance(
 ) -> tuple[Rows, float]:
     """Return the variance of the mean current over the step after each sample, if the current jumps within the step.
 
-    Also how many jumps have the same error.
-
-    A jump somewhere within a step changes the mean by its height times a uniform number in +-1/2, and the polynomials
-    of `step_means` around it by the `_JUMP_ERRORS`. Sixth differences are ten times a jump; they count above
-    `threshold` times the effect of noise, and `smooth` times what is usual in a `block` of samples.
+    Also how many jumps have the same error. A jump somewhere within a step changes the mean by its height times a
+    uniform number in +-1/2, and the polynomials of `step_means` around it by the `_JUMP_ERRORS`. Sixth differences are
+    ten times a jump; they count above `threshold` times the effect of noise, and `smooth` times what is usual in a
+    `block` of samples.
     """
     jump = np.pad(np.abs(np.diff(current, 6)) / 10.0, 3)
     padded = np.pad(jump, (0, -jump.size % block), mode="edge").reshape(-1, block)

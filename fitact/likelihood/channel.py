@@ -146,7 +146,7 @@ class ChannelLikelihood(eqx.Module):
         if self.compression is not None:
             return self.compression.samples
         if self.charges is not None:
-            return array_module(self.charges.used).count_nonzero(self.charges.used)
+            return self.charges.count
         if self.whitening is not None:
             return array_module(self.whitening.mask).count_nonzero(self.whitening.mask)
         return self.time.size if self.weight is None else array_module(self.weight).count_nonzero(self.weight)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.signal
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from fitact.model.response import recurrence
@@ -66,6 +67,11 @@ class ChargeRows(eqx.Module):
     used: Float[Array, " samples"]
 
     @property
+    def count(self) -> ArrayLike:
+        """Number of rows that count, by the square of their weights."""
+        return self.used @ self.used
+
+    @property
     def reach(self) -> int:
         """Number of samples before its own that a row needs."""
         return LAG + _BEFORE
@@ -111,22 +117,22 @@ class RowCovariance:
 
         Rows with a variance in `common` that is not 0 continue the run of the row before, if that has one as well.
         """
-        in_run = np.zeros(variance.size, bool) if common is None else (common > 0.0) & ~excluded
+        common = np.zeros(variance.size) if common is None else common
+        in_run = (common > 0.0) & ~excluded
         self._begins = np.flatnonzero(~(in_run & np.append(False, in_run[:-1])))
         self._lengths = np.diff(self._begins, append=variance.size)
         self.used = np.zeros(variance.size, bool)
         self.used[np.append(self._begins[1:], variance.size) - 1] = True
         self.used &= ~excluded
-        lost = excluded[self._begins]
+        self._lost = lost = excluded[self._begins]
         apart = lost | np.append(True, lost[:-1])
         first = neighbours[self._begins]
         whole = np.add.reduceat(variance + 2.0 * neighbours, self._begins) - 2.0 * first
-        diagonal = whole / self._lengths**2 + (0.0 if common is None else common[self._begins])
+        diagonal = whole / self._lengths**2 + common[self._begins]
         beside = first / (self._lengths * np.append(1, self._lengths[:-1]))
         self._factor = scipy.linalg.cholesky_banded(
             np.stack([np.where(apart, 0.0, beside), np.where(lost, 1.0, diagonal)])
         )
-        self._lost = lost
 
     def recursion(self, unit: float) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
         """Return gain and decay of `ChargeRows`, with which whitened rows have the standard deviation `unit`."""

@@ -130,7 +130,7 @@ class WindowCompressor:
             functions = step_means(functions)
             rows = given([functions[:-2], shared])
             rate, slope, observed = rows.rate, rows.slope, rows.observed
-            late, count = late - (LAG - 0.5) * step, max(round(float(rows.used @ rows.used)), 1)
+            late, count = late - (LAG - 0.5) * step, max(round(float(rows.count)), 1)
         else:
             rate, slope, observed = np.zeros(late.size), np.gradient(functions[-2], step), given
             count = late.size if weight is None else int(np.count_nonzero(weight))
