@@ -115,8 +115,9 @@ def _scan_recorded(
     first, count = 2 * LAG, (current.I.size - 2 * LAG) // several
     step = current.step * several
     lost = thin_rows(current.excluded_rows(0.0) * 1.0, several) > 0.0
-    uncertain = current.uncertain * current.shared + current.rounded * current.alike * run_lengths(current.I)
-    own = current.noise_I**2 / several + thin_rows(np.roll(uncertain, LAG), several) / several
+    means, uncertain = current.step_means(0.0)
+    rounded = np.roll(current.rounded * current.alike * run_lengths(current.I), LAG)
+    own = current.noise_I**2 / several + thin_rows(uncertain * current.jumps.alike + rounded, several) / several
     own += 1e-24 * float(np.ptp(current.I)) ** 2
     noise_V = float(np.mean(current.variance_V))
 
@@ -127,7 +128,7 @@ def _scan_recorded(
     V = current.V[first - LAG :: several][: count + 1]
     V = np.pad(V, (0, count + 1 - V.size), mode="edge")
     time = step * np.arange(count)
-    observed = thin_rows(step_means(current.I) - stray * rise, several)
+    observed = thin_rows(means - stray * rise, several)
     fixed = np.stack([np.diff(V) / step, np.ones(count), *_waves(hum, time)])
 
     def fit(tau: float) -> tuple[float, np.ndarray]:

@@ -13,19 +13,17 @@ from typing import NamedTuple, Self
 import numpy as np
 import scipy.fft
 from jax.typing import ArrayLike
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
 from fitact.errors import InputError
+from fitact.fitting.jumps import Jumps
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.charge_rows import LAG, ChargeRows, RowCovariance, step_means, whiten_rows
 from fitact.model.circuit import gain_at
 
 Rows = Float[np.ndarray, " samples"]
-# rms error of the mean over a step, up to six steps from a jump, relative to its height; beside the step of the jump,
-# where the error is 0.06 to 0.1 at all jumps alike and would bias a delay, three times as large
-_JUMP_ERRORS = np.array([3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.3, 0.29, 0.3, 0.03, 0.01, 3e-3, 1e-3, 3e-4])
 FEW = 4  # equal values in a row that are usual where noise exceeds the rounding
 _ROW_NOISE = 0.6285  # variance of a row over that of a sample of white noise; with those of neighbours, the sum is 1
 
@@ -69,8 +67,7 @@ class RecordedCurrent:
     variance_V: Rows  # of the noise and the rounding of each sample of V, V^2
     noise_V: tuple[float, float]  # white noise and rounding, V
     noise_I: float  # A
-    uncertain: Rows  # variance of the mean current over the step after a sample, because of kinks, A^2
-    shared: float  # number of kinks that have the same error
+    jumps: Jumps  # of I
     rounded: Rows  # variance of the rounding error that the steps of a run of equal values of I have in common, A^2
     alike: Rows  # number of runs that have the same rounding error
     excluded: Bool[np.ndarray, " samples"]  # samples of I that are clipped
@@ -107,13 +104,13 @@ class RecordedCurrent:
         """
         rounding = _least_step(current) / math.sqrt(12.0)
         rounded, alike = _round_runs(current, math.sqrt(12.0) * rounding)
-        uncertain, shared = _kink_variance(current, noise, is_whole)
+        jumps = Jumps.from_samples(V, current, (math.hypot(*noise_V), noise), is_whole)
         # the flat top of a pulse that is coarsely rounded looks clipped, but lies within the range of the converter
         codes = np.log2(np.maximum(np.abs([current.min(), current.max()]) / (math.sqrt(12.0) * rounding or 1.0), 1.0))
         is_rounded = rounding > white_noise_sd(current) and np.max(np.abs(codes - np.round(codes))) > 0.02
         excluded = np.zeros(V.size, bool) if is_rounded else clipping_mask(current)
         variance_V = drive_variance(V, *noise_V)
-        return cls(V, current, step, variance_V, noise_V, noise, uncertain, shared, rounded, alike, excluded)
+        return cls(V, current, step, variance_V, noise_V, noise, jumps, rounded, alike, excluded)
 
     def continue_with(self, V: Rows, current: Rows) -> "RecordedCurrent":
         """Return other samples of V and I, with the same noise."""
@@ -159,7 +156,7 @@ class RecordedCurrent:
         early, late = modelled.sample_gains(self.step)
         driven = np.roll(self.variance_V, LAG)
         level = _ROW_NOISE * self._floor**2 + early**2 * driven + late**2 * np.roll(driven, -1)
-        uncertain = np.roll(self.uncertain, LAG - round(modelled.delay)) * (self.shared if is_shared else 1.0)
+        uncertain = self.step_means(modelled.delay)[1] * (self.jumps.alike if is_shared else 1.0)
         return level + uncertain, early * late * driven
 
     def flatten(self, white: Rows, modelled: Current) -> Rows:
@@ -180,6 +177,10 @@ class RecordedCurrent:
         assumed = floor * (_ROW_NOISE + (1.0 - _ROW_NOISE) * np.cos(turns)) + others
         return (floor * np.abs(np.exp(-1j * np.outer(turns, taps)) @ own[taps]) ** 2 + others) / assumed
 
+    def step_means(self, delay: float) -> tuple[Rows, Rows]:
+        """Return the rows of the mean current over each step, and their variance beyond that of noise, A^2."""
+        return self.jumps.step_means(self.I, delay, self.noise_I)
+
     def rise(self, V: Rows) -> Rows:
         """Return the rise of a drive over each step, V/s, stored as rows are."""
         return np.concatenate([np.zeros(LAG), np.diff(V)[: 1 - LAG] / self.step])
@@ -189,8 +190,8 @@ class RecordedCurrent:
     ) -> tuple[ChargeRows, Rows]:
         """Return the rows of charge and the estimate of V, given the modelled rows of a drive and of nuisances."""
         covariance = self.covariance(modelled)
-        means, from_V = step_means(self.I, modelled.delay), respond(self.V)
-        is_shared = self.shared > 1.0 or bool(np.any(self.alike > 1.0))
+        means, from_V = self.step_means(modelled.delay)[0], respond(self.V)
+        is_shared = self.jumps.alike > 1.0 or bool(np.any(self.alike > 1.0))
         independent = self.covariance(modelled, is_shared=False) if is_shared else covariance
         scaled = np.append(independent.solve(means - from_V - nuisances)[LAG:], np.zeros(LAG))
         # covariance of the noise of V with that of the rows
@@ -199,7 +200,7 @@ class RecordedCurrent:
         signal = respond(V)
         power = np.mean(self._noise_power(np.linspace(0.0, 0.5, 129), modelled))
         gain, decay = covariance.recursion(self._floor / math.sqrt(float(power)))
-        slope = np.where(gain > 0.0, -np.gradient(signal) / self.step, 0.0)
+        slope = np.where(gain > 0.0, -self.jumps.slope(signal) / self.step, 0.0)
         return ChargeRows(means + signal - from_V, self.rise(V), slope, gain, decay, covariance.used * 1.0), V
 
     def fit_rows(
@@ -215,7 +216,7 @@ class RecordedCurrent:
         `blocks` of steps, in which noise of V hardly matters.
         """
         rise, several = self.rise(self.V), max(1, (self.V.size - 2 * LAG) // blocks)
-        means, follows = step_means(self.I, modelled.delay), modelled.follows
+        means, follows = self.step_means(modelled.delay)[0], modelled.follows
         variance = np.where(self.excluded_rows(modelled.delay), np.inf, self._variance(modelled)[0])
         weight = 1.0 / np.sqrt(thin_rows(variance, several))
         changing = np.linspace(-1.0, 1.0, rise.size) * rise
@@ -257,43 +258,6 @@ def estimate_noise(values: Rows, block: int = 16, max_ratio: float = 0.7) -> flo
     lines = scipy.fft.rfft((values - values.mean()) * np.hanning(values.size))[int(0.4 * values.size) :]
     fastest = math.sqrt(float(np.median(np.abs(lines) ** 2)) / math.log(2.0) / (0.375 * values.size))
     return max(fastest if fastest < max_ratio * differences else differences, rounding_noise_sd(values))
-
-
-def _kink_variance(
-    current: Rows, noise: float, is_whole: bool, threshold: float = 4.0, smooth: float = 8.0, block: int = 64
-) -> tuple[Rows, float]:
-    """Return the variance of the mean current over the step after each sample, if the current jumps within the step.
-
-    Also how many jumps have the same error. A jump somewhere within a step changes the mean by its height times a
-    uniform number in +-1/2, and the polynomials of `step_means` around it by the `_JUMP_ERRORS`. Sixth differences are
-    ten times a jump; they count above `threshold` times the effect of noise, and `smooth` times what is usual in a
-    `block` of samples.
-    """
-    jump = np.pad(np.abs(np.diff(current, 6)) / 10.0, 3)
-    padded = np.pad(jump, (0, -jump.size % block), mode="edge").reshape(-1, block)
-    usual = np.repeat(np.median(padded, axis=1), block)[: jump.size]
-    least = np.maximum(threshold * math.sqrt(924.0) / 10.0 * noise, smooth * usual)
-    around = np.max([np.roll(jump, k) for k in (-2, -1, 1, 2)], axis=0)
-    jump = np.where((jump > np.maximum(least, 1e-9 * np.ptp(current))) & (jump >= around), jump, 0.0)
-    height = np.maximum(jump, np.append(jump[1:], 0.0))
-    shared = _shared_jumps(np.flatnonzero(height)) if is_whole else 1.0
-    return np.convolve(np.square(height), np.square(_JUMP_ERRORS), "same"), shared
-
-
-def _shared_jumps(places: Int[np.ndarray, " n"], most: float = 4.0) -> float:
-    """Return how many jumps lie at the same part of a step and so have the same error, `most` at most.
-
-    These are half of all if the drive repeats after a whole number of steps, to one over the record. With more of them,
-    the delay of a long record would be known to a part of a step only, which is too cautious for its other parameters.
-    """
-    first = places[np.diff(places, prepend=-9) > 3]
-    for jumps in (2, 4):  # in a period, of a triangle and a trapezoid
-        periods = (first.size - 1) // jumps
-        if periods > 0:
-            period = (first[periods * jumps] - first[0]) / periods
-            if abs(period - round(period)) * periods <= 1.0:
-                return min(max(0.5 * first.size, 1.0), most)
-    return 1.0
 
 
 def drive_variance(V: Rows, white: float, rounding: float) -> Rows:

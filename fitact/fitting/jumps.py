@@ -1,0 +1,125 @@
+"""Jumps of a current at the corners of a drive, and its mean over steps beside them.
+
+Between jumps a current is smooth, so that a step beside one has the mean of a polynomial through samples on its own
+side, as in essentially non-oscillatory schemes (Harten et al., J. Comput. Phys. 71 (1987) 231). V tells which step
+holds the corner: that in which its slope changes most. Only this one has an unknown mean.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import scipy.ndimage
+from jaxtyping import Float, Int
+
+from fitact.likelihood.charge_rows import LAG, MAX_STEPS, step_means
+
+Rows = Float[np.ndarray, " samples"]
+_REACH = 6 + MAX_STEPS  # steps beside a jump whose polynomial of `step_means` may pass it
+
+
+class Jumps(NamedTuple):
+    """Jumps of a current, in order."""
+
+    last: Int[np.ndarray, " jumps"]  # the last sample of I before each
+    corner: Int[np.ndarray, " jumps"]  # the step of V, by its first sample, that holds the corner
+    spread: Int[np.ndarray, " jumps"]  # steps beside it that may hold it as well
+    height: Float[np.ndarray, " jumps"]  # A
+    alike: float  # how many have the same error
+
+    @classmethod
+    def from_samples(cls, V: Rows, current: Rows, noise: tuple[float, float], is_whole: bool = True) -> "Jumps":
+        """Find the jumps in samples with `noise` (V, A).
+
+        `is_whole`: whether they are a whole record, and not a window of one, whose delay others determine.
+        """
+        change = np.diff(current)
+        last = _find_jumps(current, noise[1])
+        last = last[(last > _REACH) & (last < current.size - _REACH - 2)]
+        height = change[np.clip(last[:, None] + np.arange(-1, 2), 0, change.size - 1)].sum(axis=1)
+        # the step in which the slope of V changes most, if noise of V shows it
+        rises = np.diff(V)
+        candidates = last[:, None] + np.arange(-1, 2)
+        bends = (rises[candidates + 1] - rises[candidates - 1]) * np.sign(change[last])[:, None]
+        best = np.argmax(bends, axis=1)
+        is_seen = bends[np.arange(last.size), best] > 8.0 * math.sqrt(2.0) * noise[0]
+        corner = np.where(is_seen, last - 1 + best, last)
+        return cls(last, corner, np.where(is_seen, 0, 1), np.abs(height), _count_alike(last) if is_whole else 1.0)
+
+    def step_means(self, current: Rows, delay: float, noise: float) -> tuple[Rows, Rows]:
+        """Return the rows of the mean current over each step, and their variance beyond that of white noise, A^2.
+
+        The current is `delay` steps late, and has the `noise` (A).
+        """
+        means, variance = step_means(current, delay), np.zeros(current.size)
+        if not self.last.size:
+            return means, variance
+        steps = (self.corner[:, None] + np.arange(-_REACH, _REACH + 1)).ravel()
+        steps = np.unique(steps[(steps > 0) & (steps < current.size - LAG)])
+        side = np.searchsorted(self.corner, steps, side="left")  # jumps before the step
+        first = np.append(0, self.last + 1)[side]
+        final = np.append(self.last, current.size - 1)[side]
+        count = np.minimum(3, final - first + 1)
+        start = np.clip(np.round(steps + delay - 0.5 * (count - 2.0)).astype(int), first, final - count + 1)
+        offset = steps + delay - start  # of the step, from the first of its samples
+        value, rise, bend = (np.zeros(steps.size) for _ in range(3))
+        value = current[start]
+        rise = np.where(count > 1, current[np.minimum(start + 1, final)] - value, 0.0)
+        bend = np.where(count > 2, current[np.minimum(start + 2, final)] - value - 2.0 * rise, 0.0)
+        curved = np.where(count > 2, 0.5 * (offset**2 - 1.0 / 6.0), 0.0)
+        ramp = np.where(count > 1, offset + 0.5, 0.0)
+        means[steps + LAG] = value + ramp * rise + curved * bend
+        error = np.where(count > 2, np.maximum(np.abs(curved), 1.0 / 12.0) * np.abs(bend), np.abs(rise) / 6.0)
+        weights = np.stack([1.0 - ramp + curved, ramp - 2.0 * curved, curved])
+        variance[steps + LAG] = error**2 + noise**2 * np.maximum(np.sum(weights**2, axis=0) - 0.6285, 0.0)
+        lone = count < 2
+        variance[steps[lone] + LAG] = (np.max(self.height) / math.sqrt(12.0)) ** 2
+        for k in (0, -1, 1):
+            held = self.spread >= abs(k)
+            variance[self.corner[held] + k + LAG] = self.height[held] ** 2 / 12.0
+        return means, variance
+
+    def slope(self, signal: Rows) -> Rows:
+        """Return the differences of modelled rows per step, on their own side of each jump."""
+        change, known = np.diff(signal), np.ones(signal.size - 1, bool)
+        for k in (-1, 0):
+            known[np.clip(self.corner + k + LAG, 0, known.size - 1)] = False
+        change = np.where(known, change, 0.0)
+        count = np.append(known, False).astype(int) + np.append(False, known)
+        return (np.append(change, 0.0) + np.append(0.0, change)) / np.maximum(count, 1)
+
+
+def _find_jumps(
+    current: Rows, noise: float, threshold: float = 4.0, smooth: float = 8.0, block: int = 64, part: float = 0.2
+) -> Int[np.ndarray, " jumps"]:
+    """Return the last sample before each jump.
+
+    Sixth differences are ten times a jump; they count above `threshold` times the effect of noise, and `smooth` times
+    what is usual in a `block` of samples. Near them, each largest rise and fall above a `part` of the others is a jump.
+    """
+    jump = np.pad(np.abs(np.diff(current, 6)) / 10.0, 3)
+    padded = np.pad(jump, (0, -jump.size % block), mode="edge").reshape(-1, block)
+    usual = np.repeat(np.median(padded, axis=1), block)[: jump.size]
+    least = np.maximum(threshold * math.sqrt(924.0) / 10.0 * noise, smooth * usual)
+    sudden = jump > np.maximum(least, 1e-9 * np.ptp(current))
+    sudden = np.convolve(sudden, np.ones(7), "same")[1:] > 0.5
+    change = np.diff(current)
+    size, before, after = np.abs(change), np.roll(change, 1), np.roll(change, -1)
+    largest = (np.sign(change) * before <= size) & (np.sign(change) * after < size)
+    return np.flatnonzero(sudden & largest & (size > part * scipy.ndimage.maximum_filter1d(size, 13)))
+
+
+def _count_alike(places: Int[np.ndarray, " n"], most: float = 4.0) -> float:
+    """Return how many jumps lie at the same part of a step and so have the same error, `most` at most.
+
+    These are half of all if the drive repeats after a whole number of steps, to one over the record. With more of them,
+    the delay of a long record would be known to a part of a step only, which is too cautious for its other parameters.
+    """
+    first = places[np.diff(places, prepend=-9) > 3]
+    for jumps in (2, 4):  # in a period, of a triangle and a trapezoid
+        periods = (first.size - 1) // jumps
+        if periods > 0:
+            period = (first[periods * jumps] - first[0]) / periods
+            if abs(period - round(period)) * periods <= 1.0:
+                return min(max(0.5 * first.size, 1.0), most)
+    return 1.0
