@@ -32,8 +32,9 @@ from fitact.fitting.instrument_errors import (
     collect_coordinates,
     largest_gain,
 )
-from fitact.fitting.recorded_current import FEW, Current, RecordedCurrent, estimate_noise, run_lengths
+from fitact.fitting.recorded_current import Current, RecordedCurrent, estimate_noise
 from fitact.fitting.row_updates import set_rows
+from fitact.fitting.runs import FEW, run_lengths
 from fitact.fitting.skin_model import apply_skin_model, count_harmonics, exclude_jumps, require_skin_response
 from fitact.fitting.source import Source
 from fitact.fitting.spectra import build_spectrum_channel

@@ -19,12 +19,12 @@ from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
 from fitact.errors import InputError
 from fitact.fitting.jumps import Jumps
+from fitact.fitting.runs import FEW, RoundedSteps, least_step, run_lengths
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.charge_rows import LAG, ChargeRows, RowCovariance, step_means, whiten_rows
 from fitact.model.circuit import gain_at
 
 Rows = Float[np.ndarray, " samples"]
-FEW = 4  # equal values in a row that are usual where noise exceeds the rounding
 _ROW_NOISE = 0.6285  # variance of a row over that of a sample of white noise; with those of neighbours, the sum is 1
 
 
@@ -68,8 +68,7 @@ class RecordedCurrent:
     noise_V: tuple[float, float]  # white noise and rounding, V
     noise_I: float  # A
     jumps: Jumps  # of I
-    rounded: Rows  # variance of the rounding error that the steps of a run of equal values of I have in common, A^2
-    alike: Rows  # number of runs that have the same rounding error
+    rounded: RoundedSteps  # of I
     excluded: Bool[np.ndarray, " samples"]  # samples of I that are clipped
 
     @classmethod
@@ -91,7 +90,7 @@ class RecordedCurrent:
         # within runs of a coarse V, of ten bits or fewer, less noise than this is not known
         least = 0.1 * rounding if rounding > 5e-4 * float(np.ptp(V)) else 0.0
         noise_V = math.sqrt(max(estimate_noise(V) ** 2 - rounding**2, least**2)), rounding
-        noise_I = max(estimate_noise(current), _least_step(current) / math.sqrt(12.0))
+        noise_I = max(estimate_noise(current), least_step(current) / math.sqrt(12.0))
         return cls.from_samples(V, current, record.time_step, noise_V, noise_I)
 
     @classmethod
@@ -102,15 +101,15 @@ class RecordedCurrent:
 
         `is_whole`: whether they are a whole record, and not a window of one, whose delay others determine.
         """
-        rounding = _least_step(current) / math.sqrt(12.0)
-        rounded, alike = _round_runs(current, math.sqrt(12.0) * rounding)
+        rounding = least_step(current) / math.sqrt(12.0)
+        rounded = RoundedSteps.from_samples(current, math.sqrt(12.0) * rounding)
         jumps = Jumps.from_samples(V, current, (math.hypot(*noise_V), noise), is_whole)
         # the flat top of a pulse that is coarsely rounded looks clipped, but lies within the range of the converter
         codes = np.log2(np.maximum(np.abs([current.min(), current.max()]) / (math.sqrt(12.0) * rounding or 1.0), 1.0))
         is_rounded = rounding > white_noise_sd(current) and np.max(np.abs(codes - np.round(codes))) > 0.02
         excluded = np.zeros(V.size, bool) if is_rounded else clipping_mask(current)
         variance_V = drive_variance(V, *noise_V)
-        return cls(V, current, step, variance_V, noise_V, noise, jumps, rounded, alike, excluded)
+        return cls(V, current, step, variance_V, noise_V, noise, jumps, rounded, excluded)
 
     def continue_with(self, V: Rows, current: Rows) -> "RecordedCurrent":
         """Return other samples of V and I, with the same noise."""
@@ -125,7 +124,7 @@ class RecordedCurrent:
     def is_within_steps(self) -> bool:
         """Whether I spends half of the time within a step of its converter, and so tells little."""
         half = np.quantile(np.abs(self.I - np.median(self.I)), 0.5)
-        return self.is_coarse and bool(half <= 1.01 * _least_step(self.I))
+        return self.is_coarse and bool(half <= 1.01 * least_step(self.I))
 
     @property
     def _floor(self) -> float:
@@ -140,8 +139,10 @@ class RecordedCurrent:
         """
         variance, neighbours = self._variance(modelled, is_shared)
         excluded = self.excluded_rows(modelled.delay)
-        common = np.roll(self.rounded * (self.alike if is_shared else 1.0), LAG - round(modelled.delay))
-        return RowCovariance(variance, 0.5 * (1.0 - _ROW_NOISE) * self._floor**2 + neighbours, excluded, common)
+        common = self.rounded.variance * (self.rounded.alike if is_shared else 1.0)
+        group, common = (np.roll(x, LAG - round(modelled.delay)) for x in (self.rounded.group, common))
+        neighbours += 0.5 * (1.0 - _ROW_NOISE) * self._floor**2
+        return RowCovariance(variance, neighbours, excluded, group, common)
 
     def excluded_rows(self, delay: float) -> Bool[np.ndarray, " samples"]:
         """Return which rows are not valid or need a clipped sample, where I is `delay` time steps late."""
@@ -191,7 +192,7 @@ class RecordedCurrent:
         """Return the rows of charge and the estimate of V, given the modelled rows of a drive and of nuisances."""
         covariance = self.covariance(modelled)
         means, from_V = self.step_means(modelled.delay)[0], respond(self.V)
-        is_shared = self.jumps.alike > 1.0 or bool(np.any(self.alike > 1.0))
+        is_shared = self.jumps.alike > 1.0 or bool(np.any(self.rounded.alike > 1.0))
         independent = self.covariance(modelled, is_shared=False) if is_shared else covariance
         scaled = np.append(independent.solve(means - from_V - nuisances)[LAG:], np.zeros(LAG))
         # covariance of the noise of V with that of the rows
@@ -268,43 +269,6 @@ def drive_variance(V: Rows, white: float, rounding: float) -> Rows:
     alike = (np.diff(V) == 0.0) & (white < 0.5 * rounding)
     within = np.append(False, alike) & np.append(alike, False)
     return white**2 + np.where(within, 0.0, rounding**2)
-
-
-def _least_step(current: Rows, max_part: float = 0.25) -> float:
-    """Return the least step between the values of a channel, or 0 if more than `max_part` of its values differ."""
-    levels = np.unique(current)
-    return float(np.diff(levels).min()) if 1 < levels.size <= max_part * current.size else 0.0
-
-
-def run_lengths(values: Rows) -> Rows:
-    """Return for each sample the number of equal values in a row."""
-    ends = np.append(np.flatnonzero(np.diff(values)), values.size - 1)
-    lengths = np.diff(ends, prepend=-1)
-    return np.repeat(lengths, lengths).astype(float)
-
-
-def _round_runs(values: Rows, step: float) -> tuple[Rows, Rows]:
-    """Return the variance of the rounding error that the samples of a run have in common, and how many runs have it.
-
-    `step` is that of the converter. Both are 0 outside of runs and at their last sample. A run of the opposite value
-    has the opposite error. Values that pass through a run from one step below to one above, or down, are known at its
-    ends, and their mean but for the bend that the lengths of the runs around it show.
-    """
-    lengths = run_lengths(values)
-    within = (lengths > FEW) & np.append(np.diff(values) == 0.0, False)
-    begins = np.flatnonzero(within & ~np.append(False, within[:-1]))
-    variance, alike = np.zeros(values.size), np.zeros(values.size)
-    if begins.size and step > 0.0:
-        runs, levels = lengths[begins].astype(int) - 1, values[begins]
-        before, after = np.diff(levels, prepend=np.inf) / step, np.diff(levels, append=np.inf) / step
-        passed = (np.abs(np.abs(before) - 1.0) < 0.1) & (np.abs(after - before) < 0.1)
-        growth = np.abs(np.diff(np.log(runs)))
-        bend = np.maximum(np.append(growth, 0.0), np.append(0.0, growth))  # of the mean, in twelfths of a step
-        parts = np.where(passed, np.minimum(0.02 + bend / 12.0, 0.28), 1.0 / math.sqrt(12.0))
-        _, places, counts = np.unique(np.abs(levels), return_inverse=True, return_counts=True)
-        variance[within] = np.repeat((step * parts) ** 2, runs)
-        alike[within] = np.repeat(counts[places], runs)
-    return variance, alike
 
 
 def row_figures(

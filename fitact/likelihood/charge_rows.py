@@ -17,7 +17,7 @@ import numpy as np
 import scipy.linalg
 import scipy.signal
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from fitact.model.response import recurrence
 
@@ -111,15 +111,15 @@ class RowCovariance:
         variance: Float[np.ndarray, " rows"],
         neighbours: Float[np.ndarray, " rows"],
         excluded: Bool[np.ndarray, " rows"],
-        common: Float[np.ndarray, " rows"] | None = None,
+        group: Int[np.ndarray, " rows"] | None = None,
+        common: ArrayLike = 0.0,
     ) -> None:
         """Factorise; `neighbours` are the covariances of each row with the one before.
 
-        Rows with a variance in `common` that is not 0 continue the run of the row before, if that has one as well.
+        Rows of the same `group`, if that is not 0, are one, whose error has the variance `common` besides.
         """
-        common = np.zeros(variance.size) if common is None else common
-        in_run = (common > 0.0) & ~excluded
-        self._begins = np.flatnonzero(~(in_run & np.append(False, in_run[:-1])))
+        group = np.zeros(variance.size, int) if group is None else np.where(excluded, 0, group)
+        self._begins = np.flatnonzero((group == 0) | (np.diff(group, prepend=0) != 0))
         self._lengths = np.diff(self._begins, append=variance.size)
         self.used = np.zeros(variance.size, bool)
         self.used[np.append(self._begins[1:], variance.size) - 1] = True
@@ -128,7 +128,7 @@ class RowCovariance:
         apart = lost | np.append(True, lost[:-1])
         first = neighbours[self._begins]
         whole = np.add.reduceat(variance + 2.0 * neighbours, self._begins) - 2.0 * first
-        diagonal = whole / self._lengths**2 + common[self._begins]
+        diagonal = whole / self._lengths**2 + np.broadcast_to(common, variance.shape)[self._begins]
         beside = first / (self._lengths * np.append(1, self._lengths[:-1]))
         self._factor = scipy.linalg.cholesky_banded(
             np.stack([np.where(apart, 0.0, beside), np.where(lost, 1.0, diagonal)])
