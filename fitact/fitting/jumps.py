@@ -25,6 +25,7 @@ class Jumps(NamedTuple):
     corner: Int[np.ndarray, " jumps"]  # the step of V, by its first sample, that holds the corner
     spread: Int[np.ndarray, " jumps"]  # steps beside it that may hold it as well
     height: Float[np.ndarray, " jumps"]  # A
+    early: Float[np.ndarray, " jumps"]  # part of it in the mean over the step before, of a corner that is not sharp
     alike: float  # how many have the same error
 
     @classmethod
@@ -42,9 +43,16 @@ class Jumps(NamedTuple):
         candidates = last[:, None] + np.arange(-1, 2)
         bends = (rises[candidates + 1] - rises[candidates - 1]) * np.sign(change[last])[:, None]
         best = np.argmax(bends, axis=1)
-        is_seen = bends[np.arange(last.size), best] > 8.0 * math.sqrt(2.0) * noise[0]
+        bend = bends[np.arange(last.size), best]
+        is_seen = bend > 8.0 * math.sqrt(2.0) * noise[0]
         corner = np.where(is_seen, last - 1 + best, last)
-        return cls(last, corner, np.where(is_seen, 0, 1), np.abs(height), _count_alike(last) if is_whole else 1.0)
+        squares = np.square(rises[corner - 1] - rises[corner - 2]) - 6.0 * noise[0] ** 2
+        early = np.sqrt(np.maximum(squares, 0.0)) / np.where(is_seen, bend, math.inf)
+        is_alone = np.diff(corner, prepend=-9) > 2  # else the step before holds another corner, or lies beside it
+        early = np.where(is_alone, early, np.median(early[is_alone]) if np.any(is_alone) else 0.0)
+        return cls(
+            last, corner, np.where(is_seen, 0, 1), np.abs(height), early, _count_alike(last) if is_whole else 1.0
+        )
 
     def step_means(self, current: Rows, delay: float, noise: float) -> tuple[Rows, Rows]:
         """Return the rows of the mean current over each step, and their variance beyond that of white noise, A^2.
@@ -74,6 +82,7 @@ class Jumps(NamedTuple):
         variance[steps + LAG] = error**2 + noise**2 * np.maximum(np.sum(weights**2, axis=0) - 0.6285, 0.0)
         lone = count < 2
         variance[steps[lone] + LAG] = (np.max(self.height) / math.sqrt(12.0)) ** 2
+        variance[self.corner - 1 + LAG] += (self.early * self.height) ** 2
         for k in (0, -1, 1):
             held = self.spread >= abs(k)
             variance[self.corner[held] + k + LAG] = self.height[held] ** 2 / 12.0

@@ -315,12 +315,12 @@ def _make_charge_rows(
     scene: Scene,
     bare: Likelihood,
     taus: Float[np.ndarray, " time_constants"],
-    usual_hum: float = 10.0,
+    usual_hum: float = 3e-7,  # A: 230 V through 4 pF
 ) -> tuple[ChannelLikelihood, CurrentEstimate | None, float, list[float]]:
     """Return the channel of a current with a recorded drive, and an estimate of its circuit.
 
     Also the noise of I (A), and the frequencies (Hz) of hum that the record shows if it is there. Hum that a circuit
-    may explain has a prior of `usual_hum` times the noise.
+    may explain has a prior of ten times the noise, `usual_hum` at most.
     """
     current, stray = RecordedCurrent.from_record(record), scene.stray_capacitance()
     hum = [frequency for frequency in HUM_FREQUENCIES if hum_likeness(current, frequency) < 0.3]
@@ -331,7 +331,7 @@ def _make_charge_rows(
     for i, frequency in enumerate(HUM_FREQUENCIES):
         # a record too short to show one hum cannot tell that of 60 Hz from that of 50 Hz either
         if frequency % 50.0 == 0.0 and frequency not in hum:
-            linear_sd[2 * i + 2 : 2 * i + 4] = usual_hum * current.noise_I
+            linear_sd[2 * i + 2 : 2 * i + 4] = min(10.0 * current.noise_I, usual_hum)
     modelled = Current(estimate.capacitance + stray, estimate.weight, 0.0)
     rows, V = current.make_rows(modelled, respond_to(current, estimate, stray), nuisances)
     # converters take channels in turn, and probes delay them

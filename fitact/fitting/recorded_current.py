@@ -67,6 +67,7 @@ class RecordedCurrent:
     variance_V: Rows  # of the noise and the rounding of each sample of V, V^2
     noise_V: tuple[float, float]  # white noise and rounding, V
     noise_I: float  # A
+    step_I: float  # of the converter, or 0 if it does not show, A
     jumps: Jumps  # of I
     rounded: RoundedSteps  # of I
     excluded: Bool[np.ndarray, " samples"]  # samples of I that are clipped
@@ -101,15 +102,17 @@ class RecordedCurrent:
 
         `is_whole`: whether they are a whole record, and not a window of one, whose delay others determine.
         """
-        rounding = least_step(current) / math.sqrt(12.0)
-        rounded = RoundedSteps.from_samples(current, math.sqrt(12.0) * rounding)
+        step_I = least_step(current)
+        rounded = RoundedSteps.from_samples(current, step_I)
         jumps = Jumps.from_samples(V, current, (math.hypot(*noise_V), noise), is_whole)
         # the flat top of a pulse that is coarsely rounded looks clipped, but lies within the range of the converter
-        codes = np.log2(np.maximum(np.abs([current.min(), current.max()]) / (math.sqrt(12.0) * rounding or 1.0), 1.0))
-        is_rounded = rounding > white_noise_sd(current) and np.max(np.abs(codes - np.round(codes))) > 0.02
+        codes = np.log2(np.maximum(np.abs([current.min(), current.max()]) / (step_I or 1.0), 1.0))
+        is_rounded = (
+            step_I > math.sqrt(12.0) * white_noise_sd(current) and np.max(np.abs(codes - np.round(codes))) > 0.02
+        )
         excluded = np.zeros(V.size, bool) if is_rounded else clipping_mask(current)
         variance_V = drive_variance(V, *noise_V)
-        return cls(V, current, step, variance_V, noise_V, noise, jumps, rounded, excluded)
+        return cls(V, rounded.values, step, variance_V, noise_V, noise, step_I, jumps, rounded, excluded)
 
     def continue_with(self, V: Rows, current: Rows) -> "RecordedCurrent":
         """Return other samples of V and I, with the same noise."""
@@ -124,7 +127,7 @@ class RecordedCurrent:
     def is_within_steps(self) -> bool:
         """Whether I spends half of the time within a step of its converter, and so tells little."""
         half = np.quantile(np.abs(self.I - np.median(self.I)), 0.5)
-        return self.is_coarse and bool(half <= 1.01 * least_step(self.I))
+        return self.is_coarse and bool(half <= 1.01 * self.step_I)
 
     @property
     def _floor(self) -> float:
