@@ -77,7 +77,11 @@ class Jumps(NamedTuple):
         curved = np.where(count > 2, 0.5 * (offset**2 - 1.0 / 6.0), 0.0)
         ramp = np.where(count > 1, offset + 0.5, 0.0)
         means[steps + LAG] = value + ramp * rise + curved * bend
-        error = np.where(count > 2, np.maximum(np.abs(curved), 1.0 / 12.0) * np.abs(bend), np.abs(rise) / 6.0)
+        error = np.where(
+            count > 2,
+            np.maximum(np.abs(curved), 1.0 / 12.0) * np.abs(bend),
+            np.maximum(np.abs(ramp), 1.0 / 6.0) * np.abs(rise),
+        )
         weights = np.stack([1.0 - ramp + curved, ramp - 2.0 * curved, curved])
         variance[steps + LAG] = error**2 + noise**2 * np.maximum(np.sum(weights**2, axis=0) - 0.6285, 0.0)
         lone = count < 2
@@ -88,14 +92,13 @@ class Jumps(NamedTuple):
             variance[self.corner[held] + k + LAG] = self.height[held] ** 2 / 12.0
         return means, variance
 
-    def slope(self, signal: Rows) -> Rows:
-        """Return the differences of modelled rows per step, on their own side of each jump."""
-        change, known = np.diff(signal), np.ones(signal.size - 1, bool)
-        for k in (-1, 0):
-            known[np.clip(self.corner + k + LAG, 0, known.size - 1)] = False
-        change = np.where(known, change, 0.0)
-        count = np.append(known, False).astype(int) + np.append(False, known)
-        return (np.append(change, 0.0) + np.append(0.0, change)) / np.maximum(count, 1)
+    def differentiate(self, rows: Rows) -> Rows:
+        """Return derivatives of rows per step, from differences on their own side of each jump."""
+        change, known = np.diff(rows, prepend=0.0, append=0.0), np.ones(rows.size + 1)
+        known[self.corner + LAG], known[self.corner + 1 + LAG] = 0.0, 0.0
+        known[[2 * LAG, -1]] = 0.0  # first and last rows
+        change *= known
+        return (change[:-1] + change[1:]) / np.maximum(known[:-1] + known[1:], 1.0)
 
 
 def _find_jumps(

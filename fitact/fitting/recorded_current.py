@@ -134,18 +134,16 @@ class RecordedCurrent:
         """Noise of I, at least of rounding errors, A."""
         return max(self.noise_I, 1e-12 * float(np.ptp(self.I)))
 
-    def covariance(self, modelled: Current, is_shared: bool = True) -> RowCovariance:
-        """Return the covariance of the rows.
+    def covariance(self, modelled: Current, uncertain: Rows, is_shared: bool = True) -> RowCovariance:
+        """Return the covariance of the rows, which have the variance `uncertain` beside that of noise (A^2).
 
-        Errors that several kinks or runs have in common, which a tridiagonal matrix cannot express, have their sum if
+        Errors that several jumps or runs have in common, which a tridiagonal matrix cannot express, have their sum if
         `is_shared`; else they are independent.
         """
-        variance, neighbours = self._variance(modelled, is_shared)
-        excluded = self.excluded_rows(modelled.delay)
+        variance, neighbours = self._variance(modelled, uncertain * (self.jumps.alike if is_shared else 1.0))
         common = self.rounded.variance * (self.rounded.alike if is_shared else 1.0)
-        group, common = (np.roll(x, LAG - round(modelled.delay)) for x in (self.rounded.group, common))
-        neighbours += 0.5 * (1.0 - _ROW_NOISE) * self._floor**2
-        return RowCovariance(variance, neighbours, excluded, group, common)
+        groups = (np.roll(x, LAG - round(modelled.delay)) for x in (self.rounded.group, common))
+        return RowCovariance(variance, neighbours, self.excluded_rows(modelled.delay), *groups)
 
     def excluded_rows(self, delay: float) -> Bool[np.ndarray, " samples"]:
         """Return which rows are not valid or need a clipped sample, where I is `delay` time steps late."""
@@ -155,13 +153,12 @@ class RecordedCurrent:
         excluded[: 2 * LAG] = True
         return excluded
 
-    def _variance(self, modelled: Current, is_shared: bool = True) -> tuple[Rows, Rows]:
-        """Return the variance of the rows, and their covariance by the sample of V that they share."""
+    def _variance(self, modelled: Current, uncertain: Rows) -> tuple[Rows, Rows]:
+        """Return the variance of the rows, and their covariance with the rows before."""
         early, late = modelled.sample_gains(self.step)
         driven = np.roll(self.variance_V, LAG)
-        level = _ROW_NOISE * self._floor**2 + early**2 * driven + late**2 * np.roll(driven, -1)
-        uncertain = self.step_means(modelled.delay)[1] * (self.jumps.alike if is_shared else 1.0)
-        return level + uncertain, early * late * driven
+        variance = _ROW_NOISE * self._floor**2 + early**2 * driven + late**2 * np.roll(driven, -1) + uncertain
+        return variance, 0.5 * (1.0 - _ROW_NOISE) * self._floor**2 + early * late * driven
 
     def flatten(self, white: Rows, modelled: Current) -> Rows:
         """Return whitened rows without the spectrum that a tridiagonal covariance leaves in the noise of I."""
@@ -193,19 +190,27 @@ class RecordedCurrent:
         self, modelled: Current, respond: Callable[[Rows], Rows], nuisances: ArrayLike = 0.0
     ) -> tuple[ChargeRows, Rows]:
         """Return the rows of charge and the estimate of V, given the modelled rows of a drive and of nuisances."""
-        covariance = self.covariance(modelled)
-        means, from_V = self.step_means(modelled.delay)[0], respond(self.V)
+        means, uncertain = self.step_means(modelled.delay)
+        covariance, from_V = self.covariance(modelled, uncertain), respond(self.V)
         is_shared = self.jumps.alike > 1.0 or bool(np.any(self.rounded.alike > 1.0))
-        independent = self.covariance(modelled, is_shared=False) if is_shared else covariance
-        scaled = np.append(independent.solve(means - from_V - nuisances)[LAG:], np.zeros(LAG))
-        # covariance of the noise of V with that of the rows
-        early, late = modelled.sample_gains(self.step)
-        V = self.V + self.variance_V * (early * scaled + late * np.append(0.0, scaled[:-1]))
-        signal = respond(V)
+        independent = self.covariance(modelled, uncertain, is_shared=False) if is_shared else covariance
+        residuals = means - from_V - nuisances
+        V = smooth = self._estimate_drive(independent, residuals, modelled)
+        if self.rounded.group.any():  # noise of V within a group does not change its mean, but derivatives
+            alone = RowCovariance(*self._variance(modelled, uncertain), self.excluded_rows(modelled.delay))
+            smooth = self._estimate_drive(alone, residuals, modelled)
+        bend = self.jumps.differentiate(self.rise(smooth)) / self.step
+        observed = means + respond(V) - from_V
         power = np.mean(self._noise_power(np.linspace(0.0, 0.5, 129), modelled))
         gain, decay = covariance.recursion(self._floor / math.sqrt(float(power)))
-        slope = np.where(gain > 0.0, -self.jumps.slope(signal) / self.step, 0.0)
-        return ChargeRows(means + signal - from_V, self.rise(V), slope, gain, decay, covariance.used * 1.0), V
+        return ChargeRows(observed, self.rise(V), bend, gain, decay, covariance.used * 1.0), V
+
+    def _estimate_drive(self, covariance: RowCovariance, residuals: Rows, modelled: Current) -> Rows:
+        """Return V without the noise that the residuals of the rows tell."""
+        scaled = np.append(covariance.solve(residuals)[LAG:], np.zeros(LAG))
+        # covariance of the noise of V with that of the rows
+        early, late = modelled.sample_gains(self.step)
+        return self.V + self.variance_V * (early * scaled + late * np.append(0.0, scaled[:-1]))
 
     def fit_rows(
         self,
@@ -220,8 +225,9 @@ class RecordedCurrent:
         `blocks` of steps, in which noise of V hardly matters.
         """
         rise, several = self.rise(self.V), max(1, (self.V.size - 2 * LAG) // blocks)
-        means, follows = self.step_means(modelled.delay)[0], modelled.follows
-        variance = np.where(self.excluded_rows(modelled.delay), np.inf, self._variance(modelled)[0])
+        (means, uncertain), follows = self.step_means(modelled.delay), modelled.follows
+        variance = self._variance(modelled, uncertain * self.jumps.alike)[0]
+        variance = np.where(self.excluded_rows(modelled.delay), np.inf, variance)
         weight = 1.0 / np.sqrt(thin_rows(variance, several))
         changing = np.linspace(-1.0, 1.0, rise.size) * rise
         parts = [np.stack([rise, changing])[: 2 * follows], *functions]

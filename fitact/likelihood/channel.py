@@ -326,8 +326,10 @@ class ChannelLikelihood(eqx.Module):
             total = total + inputs.effects @ self.effects / inputs.gain
         functions = jnp.concatenate([total[None], self.shapes(inputs)[self._column_indices]])
         signal, *shapes = charges.means(jnp.pad(functions, ((0, 0), (charges.reach, 0))))
-        signal = signal if rate is None else signal + rate * charges.rate
-        remainder = charges.observed - inputs.gain * signal - inputs.delay * charges.slope
+        later = signal - inputs.delay * jnp.diff(signal, prepend=signal[:1]) / self.time_step  # a smooth signal
+        if rate is not None:
+            later = later + rate * (charges.rate - inputs.delay * charges.bend)
+        remainder = charges.observed - inputs.gain * later
         return remainder, jnp.reshape(jnp.asarray(shapes), (len(self.columns), remainder.size))
 
     def _compressed_signal(self, inputs: ChannelInputs) -> tuple[Float[Array, " rows"], Array]:
@@ -342,10 +344,10 @@ class ChannelLikelihood(eqx.Module):
         terms, delay = self.terms(inputs), self.shift + inputs.delay
         covered = compression.covers(jnp.stack(jnp.broadcast_arrays(*terms.tau)), delay)
         response = inputs.gain * compression.response(terms, delay)
+        if self.charges is not None:
+            response = response + inputs.gain * inputs.delay * compression.rows_delay_derivative(terms)
         if inputs.effects is not None:
             response = response + inputs.effects @ compression.effects
-        if self.charges is not None:
-            response = response + inputs.delay * compression.slope
         return response, jnp.all(covered)
 
     def apply_whitening(self, values: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:

@@ -58,7 +58,7 @@ class ChargeRows(eqx.Module):
 
     observed: Float[Array, " samples"]  # mean current over each step, on the clock of V, A
     rate: Float[Array, " samples"]  # rise of V over each step, divided by its length, V/s
-    slope: Float[Array, " samples"]  # derivative of the modelled rows with respect to a delay of I, A/s
+    bend: Float[Array, " samples"]  # derivative of `rate` in time, V/s^2
     # whitened row k = gain[k] (row k) + decay[k] (whitened row k - 1)
     gain: Float[Array, " samples"]
     decay: Float[Array, " samples"]

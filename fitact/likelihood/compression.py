@@ -50,7 +50,9 @@ class Compression(eqx.Module):
     decay: Float[Array, "rows terms"]  # the same for the decay of an unknown charge from 1 V
     baseline: Float[Array, "shapes rows"]  # the shapes of `BASELINE_NAMES`, of height 1
     rate: Float[Array, " rows"]  # dV/dt, V/s, if the channel follows it, else 0
-    slope: Float[Array, " rows"]  # dV/dt, V/s, over two samples, so that a jump appears on both sides
+    slope: Float[
+        Array, " rows"
+    ]  # dV/dt over two samples, so that a jump appears on both sides; of rows of charge, that of `rate`
     observed: Float[Array, " rows"]  # the record, V or A
     observed_slope: Float[Array, " rows"]  # derivative of `observed` in log sigma, 0 but for `StudentExpansion`
     samples: Float[Array, ""]  # number of samples
@@ -107,9 +109,17 @@ class Compression(eqx.Module):
 
     def delay_derivative(self, terms: HighpassTerms) -> Float[Array, " rows"]:
         """Return the derivative of the response with respect to a delay (per s): u / tau - V' for each term."""
+        return self._falling_response(terms, self.slope)
+
+    def rows_delay_derivative(self, terms: HighpassTerms) -> Float[Array, " rows"]:
+        """Return the same of rows of charge, whose `slope` is the derivative of `rate`."""
+        change = self._falling_response(terms, self.rate)
+        return change if terms.rate is None else change - terms.rate * self.slope
+
+    def _falling_response(self, terms: HighpassTerms, drive_slope: Float[Array, " rows"]) -> Float[Array, " rows"]:
         falling = HighpassTerms(tuple(w / t for w, t in zip(terms.weight, terms.tau, strict=True)), terms.tau)
         jump = sum(terms.weight) + (0.0 if terms.direct is None else terms.direct)
-        return self.response(falling) - jump * self.slope
+        return self.response(falling) - jump * drive_slope
 
     def decays(self, tau: Array, index: int = 0) -> Float[Array, " rows"]:
         """Return e^{-(t - t0) / tau}, where t0 is the first sample; `index` is that of the time constant."""

@@ -99,7 +99,7 @@ def compress(
     one = np.ones(time.size) if weight is None else np.asarray(weight)
     mask = one if whitening is None else np.asarray(whitening.mask)[: time.size]
     if charges is not None:
-        observed, rate, slope, mask = charges.observed, charges.rate, charges.slope, charges.used
+        observed, rate, slope, mask = charges.observed, charges.rate, charges.bend, charges.used
     samples = Samples(
         time,
         observed,
@@ -341,7 +341,7 @@ def _charge_products(
     """Return the inner products of whitened rows: of functions of time, then rate, slope and what is not expected."""
     around = jnp.concatenate([filtering.last, jnp.concatenate([functions, expected[None]])], axis=1)
     *means, expected = charges.means(around)
-    last = charges.rate, charges.slope, charges.observed - expected - following
+    last = charges.rate, charges.bend, charges.observed - expected - following
     rows = charges.continue_whitening(jnp.stack([*means, *last]), filtering.whitened)
     used = rows * charges.used
     return used @ used.T, WhiteningState(None, around[:, functions.shape[1] :], rows[:, -1])

@@ -129,7 +129,7 @@ class WindowCompressor:
         if callable(given):
             functions = step_means(functions)
             rows = given([functions[:-2], shared])
-            rate, slope, observed = rows.rate, rows.slope, rows.observed
+            rate, slope, observed = rows.rate, rows.bend, rows.observed
             late, count = late - (LAG - 0.5) * step, max(round(float(rows.count)), 1)
         else:
             rate, slope, observed = np.zeros(late.size), np.gradient(functions[-2], step), given
