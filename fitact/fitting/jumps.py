@@ -63,7 +63,7 @@ class Jumps(NamedTuple):
         if not self.last.size:
             return means, variance
         steps = (self.corner[:, None] + np.arange(-_REACH, _REACH + 1)).ravel()
-        steps = np.unique(steps[(steps > 0) & (steps < current.size - LAG)])
+        steps = np.setdiff1d(steps[(steps > 0) & (steps < current.size - LAG)], self.corner)
         side = np.searchsorted(self.corner, steps, side="left")  # jumps before the step
         first = np.append(0, self.last + 1)[side]
         final = np.append(self.last, current.size - 1)[side]
@@ -86,6 +86,8 @@ class Jumps(NamedTuple):
         variance[steps + LAG] = error**2 + noise**2 * np.maximum(np.sum(weights**2, axis=0) - 0.6285, 0.0)
         lone = count < 2
         variance[steps[lone] + LAG] = (np.max(self.height) / math.sqrt(12.0)) ** 2
+        own, after = self.corner + LAG, self.corner + delay + 0.5 - self.last  # part of the step after the jump
+        means[own] = (1.0 - after) * means[own - 1] + after * means[own + 1]
         variance[self.corner - 1 + LAG] += (self.early * self.height) ** 2
         for k in (0, -1, 1):
             held = self.spread >= abs(k)
@@ -93,12 +95,15 @@ class Jumps(NamedTuple):
         return means, variance
 
     def differentiate(self, rows: Rows) -> Rows:
-        """Return derivatives of rows per step, from differences on their own side of each jump."""
+        """Return derivatives of rows per step: differences on their own side of each jump, and across its own row."""
         change, known = np.diff(rows, prepend=0.0, append=0.0), np.ones(rows.size + 1)
-        known[self.corner + LAG], known[self.corner + 1 + LAG] = 0.0, 0.0
+        own = self.corner + LAG
+        known[own], known[own + 1] = 0.0, 0.0
         known[[2 * LAG, -1]] = 0.0  # first and last rows
-        change *= known
-        return (change[:-1] + change[1:]) / np.maximum(known[:-1] + known[1:], 1.0)
+        across, change = change[own] + change[own + 1], change * known
+        result = (change[:-1] + change[1:]) / np.maximum(known[:-1] + known[1:], 1.0)
+        result[own] = across
+        return result
 
 
 def _find_jumps(

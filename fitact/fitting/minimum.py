@@ -46,7 +46,7 @@ class Minimum(eqx.Module):
 def minimise(
     residuals: Callable[[Float[Array, " parameters"]], PyTree[Float[Array, "..."]]],
     start: Float[Array, " parameters"],
-    max_steps: int = 1000,
+    max_steps: int = 300,
     damping: ArrayLike = 1e-2,
 ) -> Minimum:
     """Find the least-squares optimum nearest to `start`; pure, for use within jit and vmap, in double precision.

@@ -20,16 +20,18 @@ def solve_problem(
     max_rounds: int = 8,
     max_change: float = 0.3,
     max_skew: float = 0.05,
+    max_steps: int = 500,
 ) -> tuple[LeastSquaresResult, certificate.CertifiedLikelihood, np.ndarray]:
     """Fit, and fit again while effects of instruments for the new optimum would differ by more than `max_change`.
 
     Also while weights of spectra change by more than a thousandth, or a current with a recorded drive by more than
     `max_skew` time steps, or the parameters with the estimate of its drive by more than `max_change` standard errors.
+    It does not go on after `max_steps` of the search, of which a model that is wrong may need many.
     A delay that is known to a tenth of a step may change without end, by up to half a step, if the other parameters
     follow it by less than a twentieth of a standard error.
     """
     noise, theta = [source.noise for source in problem.sources], choose_start(problem, start)
-    likelihood, end = problem.likelihood, None
+    likelihood, end, steps = problem.likelihood, None, 0
     has_rows = any(channel.charges is not None for channel in likelihood.channels)
     for round_number in range(max_rounds):
         before, likelihood = theta, fill_effects(likelihood, theta, noise, problem.sources)
@@ -38,7 +40,7 @@ def solve_problem(
         likelihood, reasons = problem.compress_likelihood(tolerance)  # what does not change stays compressed
         end = _solve_with_effects(problem._replace(likelihood=likelihood), reasons, tolerance, theta, checked)
         places = [end[0].likelihood.names.index(name) for name in likelihood.names]
-        theta = end[0].theta[places]
+        theta, steps = end[0].theta[places], steps + end[0].steps
         is_settled = effects_would_change(likelihood, before, theta, end[0].sigma) <= max_change
         if is_settled:
             influences = [jacobian @ end[2] for jacobian in end[0].jacobian]
@@ -53,7 +55,7 @@ def solve_problem(
             if not is_settled:
                 likelihood = update_rows(likelihood, end[0], problem.sources)
                 theta = np.where(likelihood.follows_rows, 0.0, theta)  # their delays have moved into the rows
-        if is_settled:
+        if is_settled or (checked and steps > max_steps):
             break
     assert end is not None
     return end

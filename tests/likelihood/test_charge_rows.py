@@ -59,10 +59,11 @@ def test_whitening_is_that_of_the_dense_covariance():
 def test_rows_of_a_run_count_as_their_mean():
     rng = np.random.default_rng(2)
     variance, neighbours = rng.uniform(3.0, 5.0, 30), rng.uniform(-1.5, 0.5, 30)
-    excluded, common = np.isin(np.arange(30), [0, 1, 20]), np.zeros(30)
-    common[5:12], common[18:23] = 0.7, 0.2
-    covariance = RowCovariance(variance, neighbours, excluded, common)
-    groups = [[k] for k in range(2, 5)] + [list(range(5, 12))] + [[k] for k in range(12, 18)]
+    excluded, common, numbers = np.isin(np.arange(30), [0, 1, 20]), np.zeros(30), np.zeros(30, int)
+    common[5:12], common[12:15], common[18:23] = 0.7, 0.4, 0.2
+    numbers[5:12], numbers[12:15], numbers[18:23] = 1, 2, 3
+    covariance = RowCovariance(variance, neighbours, excluded, numbers, common)
+    groups = [[k] for k in range(2, 5)] + [list(range(5, 12)), list(range(12, 15))] + [[k] for k in range(15, 18)]
     groups += [[18, 19], [21, 22]] + [[k] for k in range(23, 30)]
     mean = np.zeros((len(groups), 30))
     for i, group in enumerate(groups):
