@@ -9,7 +9,7 @@ from jaxtyping import Bool
 
 from fitact.data.record import Record
 from fitact.fitting.drive_choice import DriveModel, drive_slope, unit_response
-from fitact.fitting.recorded_current import RecordedCurrent, Rows, solve_linear, thin_rows
+from fitact.fitting.recorded_current import Current, RecordedCurrent, Rows, solve_linear, thin_rows
 from fitact.fitting.runs import run_lengths
 from fitact.fitting.starting_point import CurrentEstimate, skin_from_estimates
 from fitact.likelihood.charge_rows import LAG, RowCovariance, step_means, whiten_rows
@@ -116,7 +116,7 @@ def _scan_recorded(
     first, count = 2 * LAG, (current.I.size - 2 * LAG) // several
     step = current.step * several
     lost = thin_rows(current.excluded_rows(0.0) * 1.0, several) > 0.0
-    (means, uncertain), rounded = current.step_means(0.0), current.rounded
+    (means, uncertain), rounded = current.step_means(Current(C, 0.0, 0.0)), current.rounded
     common = np.roll(rounded.variance * rounded.alike * run_lengths(rounded.group), LAG)
     own = current.noise_I**2 / several + thin_rows(uncertain * current.jumps.alike + common, several) / several
     own += 1e-24 * float(np.ptp(current.I)) ** 2

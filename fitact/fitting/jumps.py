@@ -36,16 +36,16 @@ class Jumps(NamedTuple):
         """
         change = np.diff(current)
         last = _find_jumps(current, noise[1])
-        last = last[(last > _REACH) & (last < current.size - _REACH - 2)]
+        last = last[(last > MAX_STEPS + 1) & (last < current.size - MAX_STEPS - 3)]
         height = change[np.clip(last[:, None] + np.arange(-1, 2), 0, change.size - 1)].sum(axis=1)
         # the step in which the slope of V changes most, if noise of V shows it
         rises = np.diff(V)
-        candidates = last[:, None] + np.arange(-1, 2)
+        candidates = last[:, None] + np.arange(-MAX_STEPS - 1, MAX_STEPS + 2)
         bends = (rises[candidates + 1] - rises[candidates - 1]) * np.sign(change[last])[:, None]
         best = np.argmax(bends, axis=1)
         bend = bends[np.arange(last.size), best]
         is_seen = bend > 8.0 * math.sqrt(2.0) * noise[0]
-        corner = np.where(is_seen, last - 1 + best, last)
+        corner = np.where(is_seen, last - MAX_STEPS - 1 + best, last)
         squares = np.square(rises[corner - 1] - rises[corner - 2]) - 6.0 * noise[0] ** 2
         early = np.sqrt(np.maximum(squares, 0.0)) / np.where(is_seen, bend, math.inf)
         is_alone = np.diff(corner, prepend=-9) > 2  # else the step before holds another corner, or lies beside it
@@ -86,18 +86,34 @@ class Jumps(NamedTuple):
         variance[steps + LAG] = error**2 + noise**2 * np.maximum(np.sum(weights**2, axis=0) - 0.6285, 0.0)
         lone = count < 2
         variance[steps[lone] + LAG] = (np.max(self.height) / math.sqrt(12.0)) ** 2
-        own, after = self.corner + LAG, self.corner + delay + 0.5 - self.last  # part of the step after the jump
-        means[own] = (1.0 - after) * means[own - 1] + after * means[own + 1]
-        variance[self.corner - 1 + LAG] += (self.early * self.height) ** 2
+        after = self.corner + delay + 0.5 - self.last  # part of the step after the jump
+        early, own, late = (self._rows(k, current.size) for k in (-1, 0, 1))
+        means[own] = (1.0 - after) * means[early] + after * means[late]
+        variance[self._rows(-1, current.size)] += (self.early * self.height) ** 2
         for k in (0, -1, 1):
             held = self.spread >= abs(k)
-            variance[self.corner[held] + k + LAG] = self.height[held] ** 2 / 12.0
+            variance[self._rows(k, current.size)[held]] = self.height[held] ** 2 / 12.0
         return means, variance
+
+    def kink_variance(self, size: int) -> Rows:
+        """Return the variance of the means of a modelled current that has kinks where this one has jumps, A^2.
+
+        Its slope changes by these heights per step, and polynomials of `step_means` that pass a kink are off by these
+        parts of it, all alike at worst.
+        """
+        variance = np.zeros(size)
+        for k, part in ((-2, 0.005), (-1, 0.025), (1, 0.025), (2, 0.005)):
+            variance[self._rows(k, size)] += (part * self.height) ** 2
+        return variance * self.last.size
+
+    def _rows(self, beside: int, size: int) -> Int[np.ndarray, " jumps"]:
+        """Return the rows of the steps `beside` those of corners."""
+        return np.minimum(self.corner + beside + LAG, size - 1)
 
     def differentiate(self, rows: Rows) -> Rows:
         """Return derivatives of rows per step: differences on their own side of each jump, and across its own row."""
         change, known = np.diff(rows, prepend=0.0, append=0.0), np.ones(rows.size + 1)
-        own = self.corner + LAG
+        own = self._rows(0, rows.size)
         known[own], known[own + 1] = 0.0, 0.0
         known[[2 * LAG, -1]] = 0.0  # first and last rows
         across, change = change[own] + change[own + 1], change * known

@@ -178,9 +178,11 @@ class RecordedCurrent:
         assumed = floor * (_ROW_NOISE + (1.0 - _ROW_NOISE) * np.cos(turns)) + others
         return (floor * np.abs(np.exp(-1j * np.outer(turns, taps)) @ own[taps]) ** 2 + others) / assumed
 
-    def step_means(self, delay: float) -> tuple[Rows, Rows]:
+    def step_means(self, modelled: Current) -> tuple[Rows, Rows]:
         """Return the rows of the mean current over each step, and their variance beyond that of noise, A^2."""
-        return self.jumps.step_means(self.I, delay, self.noise_I)
+        means, variance = self.jumps.step_means(self.I, modelled.delay, self.noise_I)
+        kink = modelled.conductance * self.step / max(modelled.capacitance, 1e-15)  # of what does not follow dV/dt
+        return means, variance + self.jumps.kink_variance(self.I.size) * kink**2
 
     def rise(self, V: Rows) -> Rows:
         """Return the rise of a drive over each step, V/s, stored as rows are."""
@@ -190,7 +192,7 @@ class RecordedCurrent:
         self, modelled: Current, respond: Callable[[Rows], Rows], nuisances: ArrayLike = 0.0
     ) -> tuple[ChargeRows, Rows]:
         """Return the rows of charge and the estimate of V, given the modelled rows of a drive and of nuisances."""
-        means, uncertain = self.step_means(modelled.delay)
+        means, uncertain = self.step_means(modelled)
         covariance, from_V = self.covariance(modelled, uncertain), respond(self.V)
         is_shared = self.jumps.alike > 1.0 or bool(np.any(self.rounded.alike > 1.0))
         independent = self.covariance(modelled, uncertain, is_shared=False) if is_shared else covariance
@@ -225,7 +227,7 @@ class RecordedCurrent:
         `blocks` of steps, in which noise of V hardly matters.
         """
         rise, several = self.rise(self.V), max(1, (self.V.size - 2 * LAG) // blocks)
-        (means, uncertain), follows = self.step_means(modelled.delay), modelled.follows
+        (means, uncertain), follows = self.step_means(modelled), modelled.follows
         variance = self._variance(modelled, uncertain * self.jumps.alike)[0]
         variance = np.where(self.excluded_rows(modelled.delay), np.inf, variance)
         weight = 1.0 / np.sqrt(thin_rows(variance, several))

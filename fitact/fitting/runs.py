@@ -8,9 +8,10 @@ from jaxtyping import Float, Int
 
 Rows = Float[np.ndarray, " samples"]
 FEW = 4  # equal values in a row that are usual where noise exceeds the rounding
-# sd of errors in steps of a converter: of a threshold between two values; of the mean of a run that is passed from one
-# side to the other, of one that is no more than entered or left, and may remain near the threshold, and of others
-_THRESHOLD_ERROR, _RUN_ERRORS = 0.05, (0.1, 0.5, 0.29)
+# sd of errors in steps of a converter: of a threshold that values pass, and of one beside which they alternate; of the
+# mean of a run that is passed from one side to the other, of one that is no more than entered or left, and may remain
+# near the threshold, and of others
+_THRESHOLD_ERRORS, _RUN_ERRORS = (0.05, 0.2), (0.1, 0.5, 0.29)
 _DITHER = 0.25  # noise, in steps, with which rounding is noise as well
 
 
@@ -68,7 +69,7 @@ class RoundedSteps(NamedTuple):
         threshold = 0.5 * (values[ends[first]] + values[ends[first] + 1])
         inner = _ranges(begin + before, end - begin + 1 - before - after)
         result.values[inner] = np.repeat(threshold, end - begin + 1 - before - after)
-        error = np.where(both, _THRESHOLD_ERROR, np.maximum(_THRESHOLD_ERROR, 2.0 * noise))
+        error = np.where(both, _THRESHOLD_ERRORS[0], max(_THRESHOLD_ERRORS[1], 2.0 * noise))
         passages = begin - half, end + half, error, np.where(both, 1.0, _count_equal(np.abs(threshold)))
         # the rest of long runs
         entered, left = np.zeros(lengths.size), np.zeros(lengths.size)

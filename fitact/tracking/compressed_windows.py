@@ -135,7 +135,7 @@ class WindowModel(NamedTuple):
         """Return the function that makes the rows of charge of a window."""
         assert self.current is not None
         current, modelled = self.current
-        recorded, blocks = current.continue_with(window.channels["V"], window.channels["I"]), max(400, 16 * self.parts)
+        recorded, blocks = current.continue_with(window.channels["V"], window.channels["I"]), max(2000, 16 * self.parts)
         return functools.partial(recorded.fit_rows, modelled, blocks)
 
     def _compare_signal(

@@ -15,7 +15,7 @@ import data_synth.scene
 import fitact
 from data_synth.keys import validate_sections
 from fitact.fitting.current import hum_likeness
-from fitact.fitting.recorded_current import RecordedCurrent, _round_runs, estimate_noise
+from fitact.fitting.recorded_current import RecordedCurrent, estimate_noise
 from tests.conftest import RECORDS
 
 FINGERS = RECORDS / "fingers"
@@ -181,19 +181,6 @@ def test_rows_follow_a_fit_with_stated_instruments():
     assert found.trusted
     assert np.max(np.abs(errors(found))) < 4.0
     assert found.parameters()["Rsc"]["u"] < 0.6
-
-
-def test_values_that_pass_through_a_run_are_known_but_for_its_bend():
-    time = np.arange(20_000)
-    current = 9.3 * np.exp(-time / 6000.0)
-    rounded = np.round(current)
-    variance, alike = _round_runs(rounded, 1.0)
-    ends = np.flatnonzero(np.diff(np.append(rounded, np.nan)))
-    for begin, end in zip(ends[:-1] + 1, ends[1:], strict=True):
-        error = np.mean(current[begin:end] - rounded[begin:end])
-        assert abs(error) < 3.0 * math.sqrt(variance[begin])
-        assert alike[begin] == 1.0
-    assert math.sqrt(variance[ends[2] + 1]) < 0.1 < math.sqrt(variance[0])
 
 
 def open_record(path: Path, stray: float) -> None:
