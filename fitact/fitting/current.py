@@ -1,5 +1,6 @@
 """Estimates of the circuit from the loop current before any fit, by a scan of its time constant."""
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 
@@ -122,28 +123,32 @@ def _scan_recorded(
     own += 1e-24 * float(np.ptp(current.I)) ** 2
     noise_V = float(np.mean(current.variance_V))
 
-    def recursion(capacitance: float) -> tuple[Rows, Rows]:
-        driven = (capacitance / step) ** 2 * noise_V
-        return RowCovariance(own + 2.0 * driven, np.full(count, -driven), lost).recursion(1.0)
-
     V = current.V[first - LAG :: several][: count + 1]
     V = np.pad(V, (0, count + 1 - V.size), mode="edge")
     time = step * np.arange(count)
     observed = thin_rows(means - stray * rise, several)
-    fixed = np.stack([np.diff(V) / step, np.ones(count), *_waves(hum, time)])
+    fixed = np.stack([np.diff(V) / step, np.ones(count), *_waves(hum, time), observed])
+
+    @functools.lru_cache
+    def whiten_fixed(twentieths: int) -> tuple[Rows, Rows, np.ndarray, float]:
+        """Return gain, decay and whitened rows where the logarithm of the capacitance has these twentieths.
+
+        Also the sum of squares of the noise in dV/dt, which would lower the coefficient of a weak drive.
+        """
+        capacitance = math.exp(0.05 * twentieths)
+        driven = (capacitance / step) ** 2 * noise_V
+        gain, decay = RowCovariance(own + 2.0 * driven, np.full(count, -driven), lost).recursion(1.0)
+        taken = float(np.sum((1.0 - own / (own + 2.0 * driven))[~lost])) / capacitance**2
+        return gain, decay, whiten_rows(gain, decay, fixed), taken
 
     def fit(tau: float) -> tuple[float, np.ndarray]:
         u = _first_order(V, step, tau)
         mean = tau * (np.diff(V) - np.diff(u)) / step  # over a step, exactly
-        rows = np.concatenate([[mean, np.exp(-time / tau)], fixed, observed[None]])
-        capacitance = C
+        rows, capacitance = np.stack([mean, np.exp(-time / tau)]), C
         for _ in range(2):  # a low-pass is no better for passing less noise of V
-            gain, decay = recursion(capacitance)
-            *columns, data = whiten_rows(gain, decay, rows)
-            # the noise of V in dV/dt, which would lower the coefficient of a weak drive
-            part = 1.0 - own / (own + 2.0 * (capacitance / step) ** 2 * noise_V)
-            taken = float(np.sum(part[~lost])) / max(capacitance, 1e-15) ** 2
-            square, amplitudes = solve_linear(np.stack(columns), data, (2, taken))
+            gain, decay, (*others, data), taken = whiten_fixed(round(20.0 * math.log(max(capacitance, 1e-15))))
+            columns = np.stack([*whiten_rows(gain, decay, rows), *others])
+            square, amplitudes = solve_linear(columns, data, (2, taken))
             lacks = _lacks_capacitance(CurrentEstimate(amplitudes[0], tau, amplitudes[2]), belief)
             capacitance = math.exp(belief[0][2]) if lacks else abs(amplitudes[2] + stray)
         return square, amplitudes

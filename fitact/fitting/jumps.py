@@ -50,9 +50,9 @@ class Jumps(NamedTuple):
         early = np.sqrt(np.maximum(squares, 0.0)) / np.where(is_seen, bend, math.inf)
         is_alone = np.diff(corner, prepend=-9) > 2  # else the step before holds another corner, or lies beside it
         early = np.where(is_alone, early, np.median(early[is_alone]) if np.any(is_alone) else 0.0)
-        return cls(
-            last, corner, np.where(is_seen, 0, 1), np.abs(height), early, _count_alike(last) if is_whole else 1.0
-        )
+        within = (rises[corner + 1] - rises[corner]) / np.where(is_seen, bend * np.sign(change[last]), math.inf)
+        alike = _count_alike(within) if is_whole else 1.0
+        return cls(last, corner, np.where(is_seen, 0, 1), np.abs(height), early, alike)
 
     def step_means(self, current: Rows, delay: float, noise: float) -> tuple[Rows, Rows]:
         """Return the rows of the mean current over each step, and their variance beyond that of white noise, A^2.
@@ -142,17 +142,15 @@ def _find_jumps(
     return np.flatnonzero(sudden & largest & (size > part * scipy.ndimage.maximum_filter1d(size, 13)))
 
 
-def _count_alike(places: Int[np.ndarray, " n"], most: float = 4.0) -> float:
-    """Return how many jumps lie at the same part of a step and so have the same error, `most` at most.
+def _count_alike(within: Float[np.ndarray, " n"], width: float = 0.1, most: float = 4.0) -> float:
+    """Return how many jumps lie `within` their steps at the same part and so have the same error, `most` at most.
 
-    These are half of all if the drive repeats after a whole number of steps, to one over the record. With more of them,
-    the delay of a long record would be known to a part of a step only, which is too cautious for its other parameters.
+    It is the mean number that lies in a `width` around each, beyond those of any positions. With more of them, the
+    delay of a long record would be known to a part of a step only, which is too cautious for its other parameters.
     """
-    first = places[np.diff(places, prepend=-9) > 3]
-    for jumps in (2, 4):  # in a period, of a triangle and a trapezoid
-        periods = (first.size - 1) // jumps
-        if periods > 0:
-            period = (first[periods * jumps] - first[0]) / periods
-            if abs(period - round(period)) * periods <= 1.0:
-                return min(max(0.5 * first.size, 1.0), most)
-    return 1.0
+    if not within.size:
+        return 1.0
+    places = np.sort(np.mod(within, 1.0))
+    around = np.concatenate([places - 1.0, places, places + 1.0])
+    near = np.searchsorted(around, places + 0.5 * width, "right") - np.searchsorted(around, places - 0.5 * width)
+    return float(np.clip(np.mean(near) - width * (within.size - 1), 1.0, most))

@@ -39,6 +39,7 @@ class LeastSquaresResult:
     likelihood: Likelihood  # likelihood with the selected nuisances
     theta: Float[np.ndarray, " parameters"]  # the optimum
     sigma: Float[np.ndarray, " channels"]  # noise sd of each channel, from its residuals
+    log_density: float  # of the posterior, up to a constant, before the last change of sigma
     result: str  # name of a member of `RESULTS`
     steps: int  # total number of trial steps
     jacobian: tuple[Float[np.ndarray, "rows parameters"], ...]  # Jacobian of the whitened residuals
@@ -59,6 +60,7 @@ class _Round(NamedTuple):
 
     theta: Array
     sigma: Array
+    log_density: Array
     result: Array  # index in `RESULT_NAMES`
     steps: Array
     jacobian: tuple[Array, ...]
@@ -84,6 +86,7 @@ def least_squares(
         if not change > noise_tolerance:
             break
     end = solved._asdict() | {"steps": steps, "result": result_name(solved.result)}
+    end["log_density"] = float(solved.log_density)
     return LeastSquaresResult(likelihood, **end)
 
 
@@ -108,7 +111,9 @@ def _solve_round(likelihood: Likelihood, start: Array, sigma: Array, damping: Ar
     else:
         sizes = [channel.rows + len(channel.columns) for channel in likelihood.channels]
         jacobians = tuple(jnp.split(minimum.jacobian, np.cumsum(sizes))[:-1])
-    return _Round(theta, jnp.stack(noise), minimum.result, minimum.steps, jacobians, *weighted)
+    counts = jnp.stack([jnp.asarray(channel.count, dtype=float) for channel in likelihood.channels])
+    log_density = -minimum.cost - counts @ jnp.log(sigma)
+    return _Round(theta, jnp.stack(noise), log_density, minimum.result, minimum.steps, jacobians, *weighted)
 
 
 def _information_jacobian(

@@ -50,7 +50,8 @@ def _expect_harmonics(channel: ChannelLikelihood, fitted: Float[np.ndarray, " co
         first, third = (
             [names.index(f"hum_{order * mains:.0f}Hz_{part}") for part in ("cos", "sin")] for order in (1, 3)
         )
-        linear_sd[third] = np.maximum(linear_sd[third], math.hypot(*sizes[first]))
+        expected = math.hypot(*np.minimum(np.abs(sizes[first]), linear_sd[first]))
+        linear_sd[third] = np.maximum(linear_sd[third], expected)
     return linear_sd
 
 

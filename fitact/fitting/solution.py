@@ -20,18 +20,19 @@ def solve_problem(
     max_rounds: int = 8,
     max_change: float = 0.3,
     max_skew: float = 0.05,
-    max_steps: int = 500,
+    max_steps: int = 1500,
 ) -> tuple[LeastSquaresResult, certificate.CertifiedLikelihood, np.ndarray]:
     """Fit, and fit again while effects of instruments for the new optimum would differ by more than `max_change`.
 
     Also while weights of spectra change by more than a thousandth, or a current with a recorded drive by more than
     `max_skew` time steps, or the parameters with the estimate of its drive by more than `max_change` standard errors.
-    It does not go on after `max_steps` of the search, of which a model that is wrong may need many.
+    It does not go on after `max_steps` of the search, of which a model that is wrong may need many; what has not
+    settled ends with the most probable fit.
     A delay that is known to a tenth of a step may change without end, by up to half a step, if the other parameters
     follow it by less than a twentieth of a standard error.
     """
     noise, theta = [source.noise for source in problem.sources], choose_start(problem, start)
-    likelihood, end, steps = problem.likelihood, None, 0
+    likelihood, end, best, steps = problem.likelihood, None, None, 0
     has_rows = any(channel.charges is not None for channel in likelihood.channels)
     for round_number in range(max_rounds):
         before, likelihood = theta, fill_effects(likelihood, theta, noise, problem.sources)
@@ -41,6 +42,8 @@ def solve_problem(
         end = _solve_with_effects(problem._replace(likelihood=likelihood), reasons, tolerance, theta, checked)
         places = [end[0].likelihood.names.index(name) for name in likelihood.names]
         theta, steps = end[0].theta[places], steps + end[0].steps
+        if checked and (best is None or end[0].log_density > best[0].log_density):
+            best = end
         is_settled = effects_would_change(likelihood, before, theta, end[0].sigma) <= max_change
         if is_settled:
             influences = [jacobian @ end[2] for jacobian in end[0].jacobian]
@@ -58,7 +61,7 @@ def solve_problem(
         if is_settled or (checked and steps > max_steps):
             break
     assert end is not None
-    return end
+    return end if is_settled or best is None else best
 
 
 def _solve_with_effects(
