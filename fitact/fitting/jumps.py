@@ -12,7 +12,7 @@ import numpy as np
 import scipy.ndimage
 from jaxtyping import Float, Int
 
-from fitact.likelihood.charge_rows import LAG, MAX_STEPS, step_means
+from fitact.likelihood.charge_rows import LAG, MAX_STEPS, ROW_NOISE, step_means
 
 Rows = Float[np.ndarray, " samples"]
 _REACH = 6 + MAX_STEPS  # steps beside a jump whose polynomial of `step_means` may pass it
@@ -45,7 +45,7 @@ class Jumps(NamedTuple):
         best = np.argmax(bends, axis=1)
         bend = bends[np.arange(last.size), best]
         is_seen = bend > 8.0 * math.sqrt(2.0) * noise[0]
-        corner = np.where(is_seen, last - MAX_STEPS - 1 + best, last)
+        corner = np.maximum.accumulate(np.where(is_seen, last - MAX_STEPS - 1 + best, last))
         squares = np.square(rises[corner - 1] - rises[corner - 2]) - 6.0 * noise[0] ** 2
         early = np.sqrt(np.maximum(squares, 0.0)) / np.where(is_seen, bend, math.inf)
         is_alone = np.diff(corner, prepend=-9) > 2  # else the step before holds another corner, or lies beside it
@@ -64,28 +64,12 @@ class Jumps(NamedTuple):
             return means, variance
         steps = (self.corner[:, None] + np.arange(-_REACH, _REACH + 1)).ravel()
         steps = np.setdiff1d(steps[(steps > 0) & (steps < current.size - LAG)], self.corner)
-        side = np.searchsorted(self.corner, steps, side="left")  # jumps before the step
-        first = np.append(0, self.last + 1)[side]
-        final = np.append(self.last, current.size - 1)[side]
-        count = np.minimum(3, final - first + 1)
-        start = np.clip(np.round(steps + delay - 0.5 * (count - 2.0)).astype(int), first, final - count + 1)
-        offset = steps + delay - start  # of the step, from the first of its samples
-        value, rise, bend = (np.zeros(steps.size) for _ in range(3))
-        value = current[start]
-        rise = np.where(count > 1, current[np.minimum(start + 1, final)] - value, 0.0)
-        bend = np.where(count > 2, current[np.minimum(start + 2, final)] - value - 2.0 * rise, 0.0)
-        curved = np.where(count > 2, 0.5 * (offset**2 - 1.0 / 6.0), 0.0)
-        ramp = np.where(count > 1, offset + 0.5, 0.0)
-        means[steps + LAG] = value + ramp * rise + curved * bend
-        error = np.where(
-            count > 2,
-            np.maximum(np.abs(curved), 1.0 / 12.0) * np.abs(bend),
-            np.maximum(np.abs(ramp), 1.0 / 6.0) * np.abs(rise),
-        )
-        weights = np.stack([1.0 - ramp + curved, ramp - 2.0 * curved, curved])
-        variance[steps + LAG] = error**2 + noise**2 * np.maximum(np.sum(weights**2, axis=0) - 0.6285, 0.0)
-        lone = count < 2
-        variance[steps[lone] + LAG] = (np.max(self.height) / math.sqrt(12.0)) ** 2
+        side = np.searchsorted(self.corner, steps)  # jumps before the step
+        first, final = np.append(0, self.last + 1)[side], np.append(self.last, current.size - 1)[side]
+        means[steps + LAG], error, weight = _fit_parabolas(current, steps + delay, first, final)
+        lone = np.max(self.height) / math.sqrt(12.0)
+        error = np.where(np.isfinite(error), error, lone)
+        variance[steps + LAG] = error**2 + noise**2 * np.maximum(weight - ROW_NOISE, 0.0)
         after = self.corner + delay + 0.5 - self.last  # part of the step after the jump
         early, own, late = (self._rows(k, current.size) for k in (-1, 0, 1))
         means[own] = (1.0 - after) * means[early] + after * means[late]
@@ -120,6 +104,26 @@ class Jumps(NamedTuple):
         result = (change[:-1] + change[1:]) / np.maximum(known[:-1] + known[1:], 1.0)
         result[own] = across
         return result
+
+
+def _fit_parabolas(
+    current: Rows, begin: Float[np.ndarray, " n"], first: Int[np.ndarray, " n"], final: Int[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return the means of steps that `begin` between samples, by those from the `first` to the `final` one.
+
+    Also their errors, as much as the last power that is used, infinite with a single sample; and the sums of squares of
+    the weights of the samples.
+    """
+    count = np.minimum(3, final - first + 1)
+    start = np.clip(np.round(begin - 0.5 * (count - 2.0)).astype(int), first, final - count + 1)
+    offset, value = begin - start, current[start]
+    rise = np.where(count > 1, current[np.minimum(start + 1, final)] - value, 0.0)
+    bend = np.where(count > 2, current[np.minimum(start + 2, final)] - value - 2.0 * rise, 0.0)
+    ramp, curved = np.where(count > 1, offset + 0.5, 0.0), np.where(count > 2, 0.5 * (offset**2 - 1.0 / 6.0), 0.0)
+    linear, square = np.maximum(np.abs(ramp), 1.0 / 6.0) * np.abs(rise), np.maximum(np.abs(curved), 1.0 / 12.0)
+    error = np.select([count > 2, count > 1], [square * np.abs(bend), linear], math.inf)
+    weight = np.square(1.0 - ramp + curved) + np.square(ramp - 2.0 * curved) + np.square(curved)
+    return value + ramp * rise + curved * bend, error, weight
 
 
 def _find_jumps(

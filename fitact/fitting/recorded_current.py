@@ -21,11 +21,10 @@ from fitact.errors import InputError
 from fitact.fitting.jumps import Jumps
 from fitact.fitting.runs import FEW, RoundedSteps, least_step, run_lengths
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
-from fitact.likelihood.charge_rows import LAG, ChargeRows, RowCovariance, step_means, whiten_rows
+from fitact.likelihood.charge_rows import LAG, ROW_NOISE, ChargeRows, RowCovariance, step_means, whiten_rows
 from fitact.model.circuit import gain_at
 
 Rows = Float[np.ndarray, " samples"]
-_ROW_NOISE = 0.6285  # variance of a row over that of a sample of white noise; with those of neighbours, the sum is 1
 
 
 class Current(NamedTuple):
@@ -157,8 +156,8 @@ class RecordedCurrent:
         """Return the variance of the rows, and their covariance with the rows before."""
         early, late = modelled.sample_gains(self.step)
         driven = np.roll(self.variance_V, LAG)
-        variance = _ROW_NOISE * self._floor**2 + early**2 * driven + late**2 * np.roll(driven, -1) + uncertain
-        return variance, 0.5 * (1.0 - _ROW_NOISE) * self._floor**2 + early * late * driven
+        variance = ROW_NOISE * self._floor**2 + early**2 * driven + late**2 * np.roll(driven, -1) + uncertain
+        return variance, 0.5 * (1.0 - ROW_NOISE) * self._floor**2 + early * late * driven
 
     def flatten(self, white: Rows, modelled: Current) -> Rows:
         """Return whitened rows without the spectrum that a tridiagonal covariance leaves in the noise of I."""
@@ -175,7 +174,7 @@ class RecordedCurrent:
         early, late = modelled.sample_gains(self.step)
         driven = float(np.median(self.variance_V))
         floor, others = self._floor**2, driven * (early**2 + late**2 + 2.0 * early * late * np.cos(turns))
-        assumed = floor * (_ROW_NOISE + (1.0 - _ROW_NOISE) * np.cos(turns)) + others
+        assumed = floor * (ROW_NOISE + (1.0 - ROW_NOISE) * np.cos(turns)) + others
         return (floor * np.abs(np.exp(-1j * np.outer(turns, taps)) @ own[taps]) ** 2 + others) / assumed
 
     def step_means(self, modelled: Current) -> tuple[Rows, Rows]:

@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 Rows = Float[np.ndarray, " samples"]
 FEW = 4  # equal values in a row that are usual where noise exceeds the rounding
@@ -47,49 +47,86 @@ class RoundedSteps(NamedTuple):
         result = cls(values.copy(), np.zeros(values.size, int), np.zeros(values.size), np.zeros(values.size))
         ends = np.append(np.flatnonzero(np.diff(values)), values.size - 1)
         lengths = np.diff(ends, prepend=-1)
-        if step <= 0.0 or np.max(lengths) <= FEW:
+        # of a constant signal with this noise (steps) and any rounding error, values change at this rate
+        noise = 0.5 * math.sqrt(math.pi) * (ends.size - 1) / values.size
+        if step <= 0.0 or np.max(lengths) <= FEW or noise > _DITHER:
             return result
-        changes, starts = np.diff(values[ends]) / step, ends - lengths + 1
-        is_unit = np.abs(np.abs(changes) - 1.0) < 0.1
-        # of a constant signal with this noise and any rounding error, values change at this rate
-        noise = 0.5 * math.sqrt(math.pi) * changes.size / values.size
-        if noise > _DITHER:
-            return result
-        stretch = np.append(0, np.cumsum(~(is_unit[1:] & (np.abs(changes[1:] + changes[:-1]) < 0.1))))[: changes.size]
-        is_long = (lengths > FEW) & (4 * lengths >= _usual_lengths(lengths, stretch))
-        # passages: changes of a stretch between long runs, or beside one
-        first = np.flatnonzero((np.diff(stretch, prepend=-1) != 0) | is_long[: changes.size])
-        last = np.append(first[1:], changes.size) - 1
-        before, after = is_long[first], is_long[last + 1]
-        is_used = is_unit[first] & ((before & after) | (last - first > 2))
-        first, last, before, after = (x[is_used] for x in (first, last, before, after))
-        both = before & after & (changes[first] * changes[last] > 0.0)
-        half = np.where(both, (np.minimum(lengths[first], lengths[last + 1]) - 1) // 2, 0)
-        begin, end = np.where(before, ends[first], starts[first]), np.where(after, starts[last + 1], ends[last + 1])
-        threshold = 0.5 * (values[ends[first]] + values[ends[first] + 1])
-        inner = _ranges(begin + before, end - begin + 1 - before - after)
-        result.values[inner] = np.repeat(threshold, end - begin + 1 - before - after)
-        error = np.where(both, _THRESHOLD_ERRORS[0], max(_THRESHOLD_ERRORS[1], 2.0 * noise))
-        passages = begin - half, end + half, error, np.where(both, 1.0, _count_equal(np.abs(threshold)))
-        # the rest of long runs
-        entered, left = np.zeros(lengths.size), np.zeros(lengths.size)
-        rest, until = starts.copy(), ends.copy()
-        left[first[before]], entered[last[after] + 1] = changes[first[before]], changes[last[after]]
-        until[first[both]] -= half[both]
-        rest[last[both] + 1] += half[both]
-        error = np.select([entered * left > 0.0, (entered != 0.0) | (left != 0.0)], _RUN_ERRORS[:2], _RUN_ERRORS[2])
-        runs = (x[is_long] for x in (rest, until, error))
-        begin, end, error, alike = (
-            np.append(x, y) for x, y in zip(passages, (*runs, _count_equal(np.abs(values[ends[is_long]]))), strict=True)
-        )
+        runs = _Runs(values[ends], ends - lengths + 1, ends)
+        passages, is_long = _find_passages(runs, step)
+        inner = passages.begin + passages.is_bounded[0], passages.end - passages.is_bounded[1]
+        size = inner[1] - inner[0] + 1
+        result.values[_ranges(inner[0], size)] = np.repeat(passages.threshold, size)
+        groups = np.hstack([passages.groups(noise), _rest_of_runs(runs, passages, is_long)])
+        begin, end = groups[:2].astype(int)
         order = np.argsort(begin, kind="stable")
         order = order[(end > begin)[order]]
         size = (end - begin)[order]
         steps = _ranges(begin[order], size)
         result.group[steps] = np.repeat(np.arange(1, order.size + 1), size)
-        result.variance[steps] = np.repeat((step * error[order]) ** 2, size)
-        result.alike[steps] = np.repeat(alike[order], size)
+        result.variance[steps] = np.repeat((step * groups[2, order]) ** 2, size)
+        result.alike[steps] = np.repeat(groups[3, order], size)
         return result
+
+
+class _Runs(NamedTuple):
+    """Runs of equal values, one after the other."""
+
+    levels: Float[np.ndarray, " runs"]
+    starts: Int[np.ndarray, " runs"]  # first and last samples
+    ends: Int[np.ndarray, " runs"]
+
+
+class _Passages(NamedTuple):
+    """Changes between two values of a converter, one or more, between long runs or beside one."""
+
+    first: Int[np.ndarray, " n"]  # number of the run before the first change
+    last: Int[np.ndarray, " n"]  # and before the last one
+    is_bounded: tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]  # whether the run before, and after it, is long
+    is_through: Bool[np.ndarray, " n"]  # from a long run to one on the other side
+    half: Int[np.ndarray, " n"]  # steps within the runs around it for which the threshold is the mean
+    begin: Int[np.ndarray, " n"]  # last sample of the long run before it, or first of its own
+    end: Int[np.ndarray, " n"]  # likewise
+    threshold: Float[np.ndarray, " n"]
+
+    def groups(self, noise: float) -> Float[np.ndarray, "4 n"]:
+        """Return first and last samples, the error of the mean (steps), and how many have it; the noise is in steps."""
+        error = np.where(self.is_through, _THRESHOLD_ERRORS[0], max(_THRESHOLD_ERRORS[1], 2.0 * noise))
+        alike = np.where(self.is_through, 1.0, _count_equal(np.abs(self.threshold)))
+        return np.stack([self.begin - self.half, self.end + self.half, error, alike])
+
+
+def _find_passages(runs: _Runs, step: float) -> tuple[_Passages, Bool[np.ndarray, " runs"]]:
+    """Return the passages, and which runs are long."""
+    changes, lengths = np.diff(runs.levels) / step, runs.ends - runs.starts + 1
+    is_unit = np.abs(np.abs(changes) - 1.0) < 0.1
+    continues = is_unit[1:] & (np.abs(changes[1:] + changes[:-1]) < 0.1)
+    stretch = np.append(0, np.cumsum(~continues))[: changes.size]  # in which values alternate
+    is_long = (lengths > FEW) & (4 * lengths >= _usual_lengths(lengths, stretch))
+    first = np.flatnonzero((np.diff(stretch, prepend=-1) != 0) | is_long[:-1])
+    last = np.append(first[1:], changes.size) - 1
+    is_used = is_unit[first] & ((is_long[first] & is_long[last + 1]) | (last - first > 2))
+    first, last = first[is_used], last[is_used]
+    before, after = is_long[first], is_long[last + 1]
+    is_through = before & after & (changes[first] * changes[last] > 0.0)
+    half = np.where(is_through, (np.minimum(lengths[first], lengths[last + 1]) - 1) // 2, 0)
+    begin = np.where(before, runs.ends[first], runs.starts[first])
+    end = np.where(after, runs.starts[last + 1], runs.ends[last + 1])
+    threshold = 0.5 * (runs.levels[first] + runs.levels[first + 1])
+    return _Passages(first, last, (before, after), is_through, half, begin, end, threshold), is_long
+
+
+def _rest_of_runs(runs: _Runs, passages: _Passages, is_long: Bool[np.ndarray, " runs"]) -> Float[np.ndarray, "4 long"]:
+    """Return the groups of what passages leave of long runs, as `_Passages.groups`."""
+    changes, (before, after) = np.sign(np.diff(runs.levels)), passages.is_bounded
+    entered, left, begin, end = np.zeros(is_long.size), np.zeros(is_long.size), runs.starts.copy(), runs.ends.copy()
+    left[passages.first[before]] = changes[passages.first[before]]
+    entered[passages.last[after] + 1] = changes[passages.last[after]]
+    through, half = passages.is_through, passages.half
+    end[passages.first[through]] -= half[through]
+    begin[passages.last[through] + 1] += half[through]
+    error = np.select([entered * left > 0.0, (entered != 0.0) | (left != 0.0)], _RUN_ERRORS[:2], _RUN_ERRORS[2])
+    alike = _count_equal(np.abs(runs.levels[is_long]))
+    return np.stack([begin[is_long], end[is_long], error[is_long], alike])
 
 
 def _ranges(begin: Int[np.ndarray, " n"], size: Int[np.ndarray, " n"]) -> Int[np.ndarray, " all"]:

@@ -23,6 +23,7 @@ from fitact.model.response import recurrence
 
 # mean of a smooth function over the middle step of six samples, by the polynomial through them
 _MEAN_OF_STEP = np.array([11.0, -93.0, 802.0, 802.0, -93.0, 11.0]) / 1440.0
+ROW_NOISE = 0.6285  # variance of a row over that of a sample of white noise; with those of neighbours, the sum is 1
 _BEFORE = 2  # of these samples, those before the first of the step
 MAX_STEPS = 3  # largest delay of the current against V, in time steps
 # the row of a step from sample k to k + 1 is stored at k + LAG, when all samples that it needs are there

@@ -42,7 +42,7 @@ def test_values_that_alternate_until_the_end_do_not_tell_the_mean():
 
 
 def test_a_step_between_two_plateaus_is_no_passage():
-    """From 0 over 700 to 1: both plateaus lie beside each other in value, but not in time."""
+    """Plateaus at 0 and 1, with 700 between them, lie beside each other in value, but not in time."""
     current = np.concatenate([np.full(500, 0.3), [250.0, 700.0, 400.0], np.full(500, 0.8)])
     _, stated, found = group_errors(current, 0.0)
     np.testing.assert_allclose(stated, 0.29)
