@@ -47,8 +47,9 @@ class RoundedSteps(NamedTuple):
         result = cls(values.copy(), np.zeros(values.size, int), np.zeros(values.size), np.zeros(values.size))
         ends = np.append(np.flatnonzero(np.diff(values)), values.size - 1)
         lengths = np.diff(ends, prepend=-1)
-        # of a constant signal with this noise (steps) and any rounding error, values change at this rate
-        noise = 0.5 * math.sqrt(math.pi) * (ends.size - 1) / values.size
+        # a constant signal with this noise (steps) and any rounding error changes to and fro at this rate
+        changes = np.diff(values[ends])
+        noise = 0.5 * math.sqrt(math.pi) * np.count_nonzero(changes[1:] * changes[:-1] < 0.0) / values.size
         if step <= 0.0 or np.max(lengths) <= FEW or noise > _DITHER:
             return result
         runs = _Runs(values[ends], ends - lengths + 1, ends)
