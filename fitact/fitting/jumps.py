@@ -22,6 +22,7 @@ class Jumps(NamedTuple):
     """Jumps of a current, in order."""
 
     last: Int[np.ndarray, " jumps"]  # the last sample of I before each
+    middle: Float[np.ndarray, " jumps"]  # its place between samples of I, to half a step
     corner: Int[np.ndarray, " jumps"]  # the step of V, by its first sample, that holds the corner
     spread: Int[np.ndarray, " jumps"]  # steps beside it that may hold it as well
     height: Float[np.ndarray, " jumps"]  # A
@@ -37,7 +38,10 @@ class Jumps(NamedTuple):
         change = np.diff(current)
         last = _find_jumps(current, noise[1])
         last = last[(last > MAX_STEPS + 1) & (last < current.size - MAX_STEPS - 3)]
-        height = change[np.clip(last[:, None] + np.arange(-1, 2), 0, change.size - 1)].sum(axis=1)
+        around = change[last[:, None] + np.arange(-1, 2)]
+        around = np.where(around * around[:, 1:2] > 0.0, around, 0.0)
+        height = around.sum(axis=1)
+        middle = last + 0.5 + (around[:, 2] - around[:, 0]) / height
         # the step in which the slope of V changes most, if noise of V shows it
         rises = np.diff(V)
         candidates = last[:, None] + np.arange(-MAX_STEPS - 1, MAX_STEPS + 2)
@@ -52,7 +56,7 @@ class Jumps(NamedTuple):
         early = np.where(is_alone, early, np.median(early[is_alone]) if np.any(is_alone) else 0.0)
         within = (rises[corner + 1] - rises[corner]) / np.where(is_seen, bend * np.sign(change[last]), math.inf)
         alike = _count_alike(within) if is_whole else 1.0
-        return cls(last, corner, np.where(is_seen, 0, 1), np.abs(height), early, alike)
+        return cls(last, middle, corner, np.where(is_seen, 0, 1), np.abs(height), early, alike)
 
     def step_means(self, current: Rows, delay: float, noise: float) -> tuple[Rows, Rows]:
         """Return the rows of the mean current over each step, and their variance beyond that of white noise, A^2.
@@ -70,7 +74,7 @@ class Jumps(NamedTuple):
         lone = np.max(self.height) / math.sqrt(12.0)
         error = np.where(np.isfinite(error), error, lone)
         variance[steps + LAG] = error**2 + noise**2 * np.maximum(weight - ROW_NOISE, 0.0)
-        after = self.corner + delay + 0.5 - self.last  # part of the step after the jump
+        after = self.corner + delay + 1.0 - self.middle  # part of the step after the jump
         early, own, late = (self._rows(k, current.size) for k in (-1, 0, 1))
         means[own] = (1.0 - after) * means[early] + after * means[late]
         variance[self._rows(-1, current.size)] += (self.early * self.height) ** 2
@@ -82,11 +86,11 @@ class Jumps(NamedTuple):
     def kink_variance(self, size: int) -> Rows:
         """Return the variance of the means of a modelled current that has kinks where this one has jumps, A^2.
 
-        Its slope changes by these heights per step, and polynomials of `step_means` that pass a kink are off by these
-        parts of it, all alike at worst.
+        Its slope changes by these heights per step, and the delay decides which step holds the kink: it is off by such
+        parts of it at most, all alike.
         """
         variance = np.zeros(size)
-        for k, part in ((-2, 0.005), (-1, 0.025), (1, 0.025), (2, 0.005)):
+        for k, part in ((-2, 0.05), (-1, 0.25), (1, 0.25), (2, 0.05)):
             variance[self._rows(k, size)] += (part * self.height) ** 2
         return variance * self.last.size
 
@@ -146,15 +150,14 @@ def _find_jumps(
     return np.flatnonzero(sudden & largest & (size > part * scipy.ndimage.maximum_filter1d(size, 13)))
 
 
-def _count_alike(within: Float[np.ndarray, " n"], width: float = 0.1, most: float = 4.0) -> float:
-    """Return how many jumps lie `within` their steps at the same part and so have the same error, `most` at most.
+def _count_alike(within: Float[np.ndarray, " n"], width: float = 0.1) -> float:
+    """Return how many jumps lie `within` their steps at the same part and so have the same error.
 
-    It is the mean number that lies in a `width` around each, beyond those of any positions. With more of them, the
-    delay of a long record would be known to a part of a step only, which is too cautious for its other parameters.
+    It is the mean number that lies in a `width` around each, beyond those of any positions.
     """
     if not within.size:
         return 1.0
     places = np.sort(np.mod(within, 1.0))
     around = np.concatenate([places - 1.0, places, places + 1.0])
     near = np.searchsorted(around, places + 0.5 * width, "right") - np.searchsorted(around, places - 0.5 * width)
-    return float(np.clip(np.mean(near) - width * (within.size - 1), 1.0, most))
+    return max(float(np.mean(near)) - width * (within.size - 1), 1.0)
