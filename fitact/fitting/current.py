@@ -10,8 +10,9 @@ from jaxtyping import Bool
 
 from fitact.data.record import Record
 from fitact.fitting.drive_choice import DriveModel, drive_slope, unit_response
-from fitact.fitting.recorded_current import Current, RecordedCurrent, Rows, solve_linear, thin_rows
-from fitact.fitting.runs import run_lengths
+from fitact.fitting.jumps import block_medians
+from fitact.fitting.recorded_current import Current, RecordedCurrent, solve_linear, thin_rows
+from fitact.fitting.runs import Rows, run_lengths
 from fitact.fitting.starting_point import CurrentEstimate, skin_from_estimates
 from fitact.likelihood.charge_rows import LAG, RowCovariance, step_means, whiten_rows
 
@@ -31,9 +32,7 @@ def edge_mask(voltage: Rows, margin: int = 2, threshold: float = 8.0, block: int
     A change is sudden if it exceeds `threshold` times the median over a `block` of samples.
     """
     bend = np.abs(np.diff(voltage, 2, prepend=voltage[0], append=voltage[-1]))
-    blocks = np.pad(bend, (0, -bend.size % block), mode="edge").reshape(-1, block)
-    median = np.repeat(np.median(blocks, axis=1), block)[: bend.size]
-    edges = bend > threshold * np.maximum(median, 1e-9 * float(np.ptp(voltage)))
+    edges = bend > threshold * np.maximum(block_medians(bend, block), 1e-9 * float(np.ptp(voltage)))
     return np.convolve(edges, np.ones(2 * margin + 1), mode="same") > 0.5
 
 

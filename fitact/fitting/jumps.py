@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.ndimage
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
+from fitact.fitting.runs import Rows
 from fitact.likelihood.charge_rows import LAG, MAX_STEPS, ROW_NOISE, step_means
 
-Rows = Float[np.ndarray, " samples"]
 _REACH = 6 + MAX_STEPS  # steps beside a jump whose polynomial of `step_means` may pass it
 
 
@@ -24,7 +24,7 @@ class Jumps(NamedTuple):
     last: Int[np.ndarray, " jumps"]  # the last sample of I before each
     middle: Float[np.ndarray, " jumps"]  # its place between samples of I, to half a step
     corner: Int[np.ndarray, " jumps"]  # the step of V, by its first sample, that holds the corner
-    spread: Int[np.ndarray, " jumps"]  # steps beside it that may hold it as well
+    is_seen: Bool[np.ndarray, " jumps"]  # else the steps beside it may hold it as well
     height: Float[np.ndarray, " jumps"]  # A
     early: Float[np.ndarray, " jumps"]  # part of it in the mean over the step before, of a corner that is not sharp
     alike: float  # how many have the same error
@@ -56,7 +56,7 @@ class Jumps(NamedTuple):
         early = np.where(is_alone, early, np.median(early[is_alone]) if np.any(is_alone) else 0.0)
         within = (rises[corner + 1] - rises[corner]) / np.where(is_seen, bend * np.sign(change[last]), math.inf)
         alike = _count_alike(within) if is_whole else 1.0
-        return cls(last, middle, corner, np.where(is_seen, 0, 1), np.abs(height), early, alike)
+        return cls(last, middle, corner, is_seen, np.abs(height), early, alike)
 
     def step_means(self, current: Rows, delay: float, noise: float) -> tuple[Rows, Rows]:
         """Return the rows of the mean current over each step, and their variance beyond that of white noise, A^2.
@@ -70,17 +70,17 @@ class Jumps(NamedTuple):
         steps = np.setdiff1d(steps[(steps > 0) & (steps < current.size - LAG)], self.corner)
         side = np.searchsorted(self.corner, steps)  # jumps before the step
         first, final = np.append(0, self.last + 1)[side], np.append(self.last, current.size - 1)[side]
-        means[steps + LAG], error, weight = _fit_parabolas(current, steps + delay, first, final)
         lone = np.max(self.height) / math.sqrt(12.0)
-        error = np.where(np.isfinite(error), error, lone)
+        means[steps + LAG], error, weight = _fit_parabolas(current, steps + delay, first, final, lone)
         variance[steps + LAG] = error**2 + noise**2 * np.maximum(weight - ROW_NOISE, 0.0)
         after = self.corner + delay + 1.0 - self.middle  # part of the step after the jump
         early, own, late = (self._rows(k, current.size) for k in (-1, 0, 1))
         means[own] = (1.0 - after) * means[early] + after * means[late]
-        variance[self._rows(-1, current.size)] += (self.early * self.height) ** 2
-        for k in (0, -1, 1):
-            held = self.spread >= abs(k)
-            variance[self._rows(k, current.size)[held]] = self.height[held] ** 2 / 12.0
+        variance[early] += (self.early * self.height) ** 2
+        unknown = self.height**2 / 12.0
+        variance[own] = unknown
+        for beside in (early, late):
+            variance[beside[~self.is_seen]] = unknown[~self.is_seen]
         return means, variance
 
     def kink_variance(self, size: int) -> Rows:
@@ -111,12 +111,16 @@ class Jumps(NamedTuple):
 
 
 def _fit_parabolas(
-    current: Rows, begin: Float[np.ndarray, " n"], first: Int[np.ndarray, " n"], final: Int[np.ndarray, " n"]
+    current: Rows,
+    begin: Float[np.ndarray, " n"],
+    first: Int[np.ndarray, " n"],
+    final: Int[np.ndarray, " n"],
+    lone: float,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return the means of steps that `begin` between samples, by those from the `first` to the `final` one.
 
-    Also their errors, as much as the last power that is used, infinite with a single sample; and the sums of squares of
-    the weights of the samples.
+    Also their errors, as much as the last power that is used, and `lone` with a single sample; and the sums of squares
+    of the weights of the samples.
     """
     count = np.minimum(3, final - first + 1)
     start = np.clip(np.round(begin - 0.5 * (count - 2.0)).astype(int), first, final - count + 1)
@@ -125,9 +129,15 @@ def _fit_parabolas(
     bend = np.where(count > 2, current[np.minimum(start + 2, final)] - value - 2.0 * rise, 0.0)
     ramp, curved = np.where(count > 1, offset + 0.5, 0.0), np.where(count > 2, 0.5 * (offset**2 - 1.0 / 6.0), 0.0)
     linear, square = np.maximum(np.abs(ramp), 1.0 / 6.0) * np.abs(rise), np.maximum(np.abs(curved), 1.0 / 12.0)
-    error = np.select([count > 2, count > 1], [square * np.abs(bend), linear], math.inf)
+    error = np.select([count > 2, count > 1], [square * np.abs(bend), linear], lone)
     weight = np.square(1.0 - ramp + curved) + np.square(ramp - 2.0 * curved) + np.square(curved)
     return value + ramp * rise + curved * bend, error, weight
+
+
+def block_medians(values: Rows, block: int) -> Rows:
+    """Return for each value the median of its block."""
+    padded = np.pad(values, (0, -values.size % block), mode="edge").reshape(-1, block)
+    return np.repeat(np.median(padded, axis=1), block)[: values.size]
 
 
 def _find_jumps(
@@ -139,9 +149,7 @@ def _find_jumps(
     what is usual in a `block` of samples. Near them, each largest rise and fall above a `part` of the others is a jump.
     """
     jump = np.pad(np.abs(np.diff(current, 6)) / 10.0, 3)
-    padded = np.pad(jump, (0, -jump.size % block), mode="edge").reshape(-1, block)
-    usual = np.repeat(np.median(padded, axis=1), block)[: jump.size]
-    least = np.maximum(threshold * math.sqrt(924.0) / 10.0 * noise, smooth * usual)
+    least = np.maximum(threshold * math.sqrt(924.0) / 10.0 * noise, smooth * block_medians(jump, block))
     sudden = jump > np.maximum(least, 1e-9 * np.ptp(current))
     sudden = np.convolve(sudden, np.ones(7), "same")[1:] > 0.5
     change = np.diff(current)

@@ -34,7 +34,7 @@ from fitact.fitting.instrument_errors import (
 )
 from fitact.fitting.recorded_current import Current, RecordedCurrent, estimate_noise
 from fitact.fitting.row_updates import set_rows
-from fitact.fitting.runs import FEW, run_lengths
+from fitact.fitting.runs import long_run_share
 from fitact.fitting.skin_model import apply_skin_model, count_harmonics, exclude_jumps, require_skin_response
 from fitact.fitting.source import Source
 from fitact.fitting.spectra import build_spectrum_channel
@@ -441,7 +441,7 @@ def rounded_gain_sd(voltage: np.ndarray, min_part: float = 0.1, least: float = 2
     is that of 11 bits.
     """
     sd = math.sqrt(2.0) * rounding_noise_sd(voltage) / float(np.ptp(voltage))
-    return sd if sd > least and np.mean(run_lengths(voltage) > FEW) > min_part else 0.0
+    return sd if sd > least and long_run_share(voltage) > min_part else 0.0
 
 
 def edge_gain_sd(time_step: float, b: Any) -> Any:

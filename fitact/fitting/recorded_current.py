@@ -19,12 +19,10 @@ from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
 from fitact.errors import InputError
 from fitact.fitting.jumps import Jumps
-from fitact.fitting.runs import FEW, RoundedSteps, least_step, run_lengths
+from fitact.fitting.runs import RoundedSteps, Rows, least_step, long_run_share
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.charge_rows import LAG, ROW_NOISE, ChargeRows, RowCovariance, step_means, whiten_rows
 from fitact.model.circuit import gain_at
-
-Rows = Float[np.ndarray, " samples"]
 
 
 class Current(NamedTuple):
@@ -90,18 +88,25 @@ class RecordedCurrent:
         # within runs of a coarse V, of ten bits or fewer, less noise than this is not known
         least = 0.1 * rounding if rounding > 5e-4 * float(np.ptp(V)) else 0.0
         noise_V = math.sqrt(max(estimate_noise(V) ** 2 - rounding**2, least**2)), rounding
-        noise_I = max(estimate_noise(current), least_step(current) / math.sqrt(12.0))
-        return cls.from_samples(V, current, record.time_step, noise_V, noise_I)
+        step_I = least_step(current)
+        noise_I = max(estimate_noise(current), step_I / math.sqrt(12.0))
+        return cls.from_samples(V, current, record.time_step, noise_V, noise_I, step_I)
 
     @classmethod
     def from_samples(
-        cls, V: Rows, current: Rows, step: float, noise_V: tuple[float, float], noise: float, is_whole: bool = True
+        cls,
+        V: Rows,
+        current: Rows,
+        step: float,
+        noise_V: tuple[float, float],
+        noise: float,
+        step_I: float,
+        is_whole: bool = True,
     ) -> "RecordedCurrent":
-        """Estimate which samples are less certain than the noise of V and I (A) makes them.
+        """Estimate which samples are less certain than the noise (V, A) and the step of the converter of I make them.
 
         `is_whole`: whether they are a whole record, and not a window of one, whose delay others determine.
         """
-        step_I = least_step(current)
         rounded = RoundedSteps.from_samples(current, step_I)
         jumps = Jumps.from_samples(V, current, (math.hypot(*noise_V), noise), is_whole)
         # the flat top of a pulse that is coarsely rounded looks clipped, but lies within the range of the converter
@@ -115,12 +120,13 @@ class RecordedCurrent:
 
     def continue_with(self, V: Rows, current: Rows) -> "RecordedCurrent":
         """Return other samples of V and I, with the same noise."""
-        return self.from_samples(V, current, self.step, self.noise_V, self.noise_I, is_whole=False)
+        noise = self.noise_V, self.noise_I, least_step(current)
+        return self.from_samples(V, current, self.step, *noise, is_whole=False)
 
     @property
     def is_coarse(self) -> bool:
         """Whether I has long runs of equal values, whose rounding is no noise."""
-        return float(np.mean(run_lengths(self.I) > FEW)) > 0.1
+        return long_run_share(self.I) > 0.1
 
     @property
     def is_within_steps(self) -> bool:
@@ -223,7 +229,7 @@ class RecordedCurrent:
         """Return the rows of charge, if the signal is any combination of dV/dt, which may drift, and rows of functions.
 
         The residuals, which tell the noise of the drive, thus need no circuit. The combination is that of charges over
-        `blocks` of steps, in which noise of V hardly matters.
+        `blocks` of steps, of which those that hold a jump hardly count.
         """
         rise, several = self.rise(self.V), max(1, (self.V.size - 2 * LAG) // blocks)
         (means, uncertain), follows = self.step_means(modelled), modelled.follows

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 from fitact.compiled import jit, pad_samples
 from fitact.data.record import Record
 from fitact.fitting.least_squares import LeastSquaresResult
-from fitact.fitting.recorded_current import Current, RecordedCurrent, Rows
+from fitact.fitting.recorded_current import Current, RecordedCurrent
+from fitact.fitting.runs import Rows
 from fitact.fitting.source import Source
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.charge_rows import MAX_STEPS, ChargeRows

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 Rows = Float[np.ndarray, " samples"]
-FEW = 4  # equal values in a row that are usual where noise exceeds the rounding
+_FEW = 4  # equal values in a row that are usual where noise exceeds the rounding
 # sd of errors in steps of a converter: of a threshold that values pass, and of one beside which they alternate; of the
 # mean of a run that is passed from one side to the other, of one that is no more than entered or left, and may remain
 # near the threshold, and of others
@@ -17,9 +17,13 @@ _DITHER = 0.25  # noise, in steps, with which rounding is noise as well
 
 def run_lengths(values: Rows) -> Rows:
     """Return for each sample the number of equal values in a row."""
-    ends = np.append(np.flatnonzero(np.diff(values)), values.size - 1)
-    lengths = np.diff(ends, prepend=-1)
+    lengths = _Runs.from_values(values).lengths
     return np.repeat(lengths, lengths).astype(float)
+
+
+def long_run_share(values: Rows) -> float:
+    """Return the share of samples in runs longer than noise above the rounding leaves."""
+    return float(np.mean(run_lengths(values) > _FEW))
 
 
 def least_step(values: Rows, max_part: float = 0.25) -> float:
@@ -45,14 +49,12 @@ class RoundedSteps(NamedTuple):
         a run has its value, with the error of rounding; a run of the opposite value has the opposite error.
         """
         result = cls(values.copy(), np.zeros(values.size, int), np.zeros(values.size), np.zeros(values.size))
-        ends = np.append(np.flatnonzero(np.diff(values)), values.size - 1)
-        lengths = np.diff(ends, prepend=-1)
+        runs = _Runs.from_values(values)
         # a constant signal with this noise (steps) and any rounding error changes to and fro at this rate
-        changes = np.diff(values[ends])
+        changes = np.diff(runs.levels)
         noise = 0.5 * math.sqrt(math.pi) * np.count_nonzero(changes[1:] * changes[:-1] < 0.0) / values.size
-        if step <= 0.0 or np.max(lengths) <= FEW or noise > _DITHER:
+        if step <= 0.0 or np.max(runs.lengths) <= _FEW or noise > _DITHER:
             return result
-        runs = _Runs(values[ends], ends - lengths + 1, ends)
         passages, is_long = _find_passages(runs, step)
         inner = passages.begin + passages.is_bounded[0], passages.end - passages.is_bounded[1]
         size = inner[1] - inner[0] + 1
@@ -76,6 +78,15 @@ class _Runs(NamedTuple):
     starts: Int[np.ndarray, " runs"]  # first and last samples
     ends: Int[np.ndarray, " runs"]
 
+    @classmethod
+    def from_values(cls, values: Rows) -> "_Runs":
+        ends = np.append(np.flatnonzero(np.diff(values)), values.size - 1)
+        return cls(values[ends], np.append(0, ends[:-1] + 1), ends)
+
+    @property
+    def lengths(self) -> Int[np.ndarray, " runs"]:
+        return self.ends - self.starts + 1
+
 
 class _Passages(NamedTuple):
     """Changes between two values of a converter, one or more, between long runs or beside one."""
@@ -98,11 +109,11 @@ class _Passages(NamedTuple):
 
 def _find_passages(runs: _Runs, step: float) -> tuple[_Passages, Bool[np.ndarray, " runs"]]:
     """Return the passages, and which runs are long."""
-    changes, lengths = np.diff(runs.levels) / step, runs.ends - runs.starts + 1
+    changes, lengths = np.diff(runs.levels) / step, runs.lengths
     is_unit = np.abs(np.abs(changes) - 1.0) < 0.1
     continues = is_unit[1:] & (np.abs(changes[1:] + changes[:-1]) < 0.1)
     stretch = np.append(0, np.cumsum(~continues))[: changes.size]  # in which values alternate
-    is_long = (lengths > FEW) & (4 * lengths >= _usual_lengths(lengths, stretch))
+    is_long = (lengths > _FEW) & (4 * lengths >= _usual_lengths(lengths, stretch))
     first = np.flatnonzero((np.diff(stretch, prepend=-1) != 0) | is_long[:-1])
     last = np.append(first[1:], changes.size) - 1
     is_used = is_unit[first] & ((is_long[first] & is_long[last + 1]) | (last - first > 2))

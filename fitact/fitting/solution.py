@@ -26,8 +26,8 @@ def solve_problem(
 
     Also while weights of spectra change by more than a thousandth, or a current with a recorded drive by more than
     `max_skew` time steps, or the parameters with the estimate of its drive by more than `max_change` standard errors.
-    It does not go on after `max_steps` of the search, of which a model that is wrong may need many; what has not
-    settled ends with the most probable fit.
+    It does not go on after `max_steps` of the search, of which a model that is wrong may need many. A current with a
+    recorded drive that has not settled ends with its most probable fit.
     A delay that is known to a tenth of a step may change without end, by up to half a step, if the other parameters
     follow it by less than a twentieth of a standard error.
     """
@@ -42,7 +42,7 @@ def solve_problem(
         end = _solve_with_effects(problem._replace(likelihood=likelihood), reasons, tolerance, theta, checked)
         places = [end[0].likelihood.names.index(name) for name in likelihood.names]
         theta, steps = end[0].theta[places], steps + end[0].steps
-        if checked and (best is None or end[0].log_density > best[0].log_density):
+        if has_rows and checked and (best is None or end[0].log_density > best[0].log_density):
             best = end
         is_settled = effects_would_change(likelihood, before, theta, end[0].sigma) <= max_change
         if is_settled:

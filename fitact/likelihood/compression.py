@@ -50,9 +50,8 @@ class Compression(eqx.Module):
     decay: Float[Array, "rows terms"]  # the same for the decay of an unknown charge from 1 V
     baseline: Float[Array, "shapes rows"]  # the shapes of `BASELINE_NAMES`, of height 1
     rate: Float[Array, " rows"]  # dV/dt, V/s, if the channel follows it, else 0
-    slope: Float[
-        Array, " rows"
-    ]  # dV/dt over two samples, so that a jump appears on both sides; of rows of charge, that of `rate`
+    # dV/dt, V/s, over two samples, so that a jump appears on both sides; of rows of charge, the derivative of `rate`
+    slope: Float[Array, " rows"]
     observed: Float[Array, " rows"]  # the record, V or A
     observed_slope: Float[Array, " rows"]  # derivative of `observed` in log sigma, 0 but for `StudentExpansion`
     samples: Float[Array, ""]  # number of samples
