@@ -32,7 +32,11 @@ def current_record() -> fitact.Record:
     return fitact.Record.from_arrays(TIME, V=V, Vsc=vsc + 0.1 * noise[0], I=current + 2e-8 * noise[1])
 
 
-RESISTOR = {"measurement": {"channels": ["Vsc", "I"], "series_resistor": "20 kohm"}}
+# the effects of what a model lacks are taken from the current of a stated drive only
+RESISTOR = {
+    "measurement": {"channels": ["Vsc", "I"], "series_resistor": "20 kohm"},
+    "drive": {"waveform": "trapezoid", "peak_to_peak": 360.0, "frequency": 100.0, "rise_time": "100 us"},
+}
 CASES = {
     "steady": (Case("trapezoid", "none", 0.0, 1).record(), SCENE),
     "delay": (Case("trapezoid", "delay", 1.0, 1).record(), SCENE),
