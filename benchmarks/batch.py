@@ -27,7 +27,7 @@ from timing import show
 
 import fitact
 from fitact.batch.stated_drive import StatedDriveProblem
-from fitact.fitting.problem import build_problem
+from fitact.problem.build import build_problem
 
 V0, FREQUENCY, NOISE = 180.0, 100.0, 0.1  # V, Hz, V
 NAMES = ("Rsc", "Csc", "Ci")

@@ -20,9 +20,9 @@ from fitact.data.record import Record, white_noise_sds
 from fitact.fitting.derived import DerivedQuantities
 from fitact.fitting.least_squares import NUISANCES, bic_decrease
 from fitact.fitting.residual_tests import PhaseBins, count_true
-from fitact.fitting.starting_point import most_probable_skin, prior_skin_moments
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.circuit import FINGER_PARAMETERS
+from fitact.problem.starting_point import most_probable_skin, prior_skin_moments
 
 
 class BatchFit(NamedTuple):

@@ -26,8 +26,8 @@ from fitact.fitting import derived
 from fitact.fitting.fit import Fit, fit
 from fitact.fitting.identifiability import information_directions, prior_variance_fraction, verdicts
 from fitact.fitting.laplace import SUCCESS_MESSAGE
-from fitact.fitting.problem import build_problem
 from fitact.model.skin import circuit_parameters
+from fitact.problem.build import build_problem
 from fitact.progress import track_progress
 from fitact.scene.scene import Scene
 

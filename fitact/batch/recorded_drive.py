@@ -18,11 +18,8 @@ from fitact.batch.recorded_tables import AGES, HALF_WIDTH, TABLE_NODES, SharedFu
 from fitact.compiled import jit
 from fitact.data.record import Record, rounding_noise_sd
 from fitact.fitting.derived import DerivedQuantities
-from fitact.fitting.drive_choice import has_unresolved_edge, has_unresolved_edges
 from fitact.fitting.fit import Fit
-from fitact.fitting.instrument_errors import log_sd
 from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES, bic_decrease_from_z
-from fitact.fitting.problem import MIN_RELATIVE_NOISE, Problem, edge_gain_sd
 from fitact.fitting.residual_statistics import interpolation_errors, is_misfit, residual_statistics
 from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics
 from fitact.likelihood.channel import LINEAR_NUISANCES
@@ -33,6 +30,9 @@ from fitact.model.circuit import passes_direct_current
 from fitact.model.force import force_constant
 from fitact.model.response_table import TABLE_HALF_WIDTH
 from fitact.model.skin import WithSkin
+from fitact.problem.build import MIN_RELATIVE_NOISE, Problem, edge_gain_sd
+from fitact.problem.drive_choice import has_unresolved_edge, has_unresolved_edges
+from fitact.problem.instrument_errors import log_sd
 
 
 class ModelCoefficients(NamedTuple):

@@ -18,15 +18,15 @@ from fitact.data.record import Record
 from fitact.fitting import derived
 from fitact.fitting.derived import DerivedQuantities, log_derivatives
 from fitact.fitting.least_squares import MIN_BIC_DECREASE
-from fitact.fitting.problem import MIN_RELATIVE_NOISE, Problem
 from fitact.fitting.residual_statistics import is_misfit, residual_statistics
 from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics
-from fitact.fitting.starting_point import VscEstimate
 from fitact.likelihood.channel import LINEAR_NUISANCES
 from fitact.model.chirp import Chirp
 from fitact.model.circuit import passes_direct_current
 from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, chebyshev
 from fitact.model.skin import WithSkin
+from fitact.problem.build import MIN_RELATIVE_NOISE, Problem
+from fitact.problem.starting_point import VscEstimate
 
 _CHUNK = 48  # records whose samples are processed together, so that they stay in the processor's cache
 

@@ -18,10 +18,10 @@ from fitact.experiment.experiment import CandidateDesign, DesignOption, Gradient
 from fitact.experiment.fisher import Experiment, force_gradient, signal_spans
 from fitact.experiment.options import Change, changes
 from fitact.fitting.fit import fit
-from fitact.fitting.skin_model import count_harmonics
 from fitact.instrument.classes import typical_gain_u
 from fitact.model.skin import circuit_parameters
 from fitact.prior.distributions import LogNormal
+from fitact.problem.skin_model import count_harmonics
 from fitact.scene.scene import Scene
 from fitact.tables import Display, align_row, join_lines
 from fitact.units import format_percent

@@ -11,17 +11,17 @@ from jaxtyping import Array, Bool, Float
 from fitact.compiled import jit
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
-from fitact.fitting.drive_choice import DriveModel
-from fitact.fitting.recorded_current import row_figures
 from fitact.fitting.residual_statistics import channel_statistics, outliers
-from fitact.fitting.source import Source
-from fitact.fitting.spectra import spectrum_statistics
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import STUDENT_DOF, student_weight
 from fitact.likelihood.spectrum_channel import join_complex
 from fitact.model.circuit import Channel, Circuit
 from fitact.model.skin import WithSkin
+from fitact.problem.drive_choice import DriveModel
+from fitact.problem.recorded_current import row_figures
+from fitact.problem.source import Source
+from fitact.problem.spectra import spectrum_statistics
 
 Samples = Float[np.ndarray, " samples"]
 

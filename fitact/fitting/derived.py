@@ -15,7 +15,6 @@ from jaxtyping import Array, Float
 from fitact.compiled import BatchEvaluator, as_arrays, jit, pad_samples, pad_weight
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.fitting.drive_choice import DriveModel, has_ideal_edges, whole_periods
 from fitact.likelihood.channel import CHARGES, FIRST_CHARGE, LINEAR_NUISANCES, ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.circuit import Circuit, charge_ratios
@@ -24,6 +23,7 @@ from fitact.model.force import Geometry, electrostatic_force, friction, mean_for
 from fitact.model.response import response
 from fitact.model.response_table import ResponseTable
 from fitact.model.skin import WithSkin
+from fitact.problem.drive_choice import DriveModel, has_ideal_edges, whole_periods
 from fitact.scene.scene import Scene
 
 DERIVED_NAMES = ("g", "b", "force_mean", "force_peak", "force_rms", "friction_mean")

@@ -7,11 +7,11 @@ from jaxtyping import Float
 
 from fitact import summary
 from fitact.fitting.geometry import Contribution
-from fitact.fitting.instrument_errors import UNRESOLVED_V, ErrorCoordinate, InstrumentError
 from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.skin import probe_parameters
 from fitact.prior.distributions import LogNormal
+from fitact.problem.instrument_errors import UNRESOLVED_V, ErrorCoordinate, InstrumentError
 from fitact.scene.scene import Scene
 from fitact.uncertainty.budget import Component, ErrorSource
 from fitact.uncertainty.effect_size import EffectSizes

@@ -20,7 +20,6 @@ from fitact.experiment.fisher import Experiment
 from fitact.fitting import derived, remarks
 from fitact.fitting.calibrate import calibrate
 from fitact.fitting.channel_fit import ChannelFit, information_criteria
-from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.effects import assess_fit, describe_alternatives, describe_structure, is_tolerable
 from fitact.fitting.error_sources import (
     gain_shifts,
@@ -36,12 +35,9 @@ from fitact.fitting.laplace import FitResult, Laplace
 from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.fitting.minimum import Optima
 from fitact.fitting.multistart import find_optima, lower_optimum
-from fitact.fitting.problem import Problem, build_problem
 from fitact.fitting.profile import PROFILE_QUANTITIES, Interval, profile_intervals
-from fitact.fitting.recorded_current import estimate_noise
 from fitact.fitting.residual_statistics import is_misfit, is_undersampled, pooled_statistics
 from fitact.fitting.solution import solve_problem
-from fitact.fitting.source import require_record
 from fitact.fitting.verdict import diagnose_fit, misfit_warnings
 from fitact.instrument.classes import TYPICAL, typical_gain_u
 from fitact.likelihood import certificate
@@ -49,6 +45,10 @@ from fitact.likelihood.likelihood import CircuitValues
 from fitact.likelihood.noise import scale_information
 from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.model.skin import circuit_parameters, constant_skin_circuit
+from fitact.problem.build import Problem, build_problem
+from fitact.problem.drive_choice import DriveModel
+from fitact.problem.recorded_current import estimate_noise
+from fitact.problem.source import require_record
 from fitact.scene.scene import Scene
 from fitact.tables import join_lines
 from fitact.uncertainty.budget import Budget, ErrorSource, laplace_components

@@ -11,13 +11,13 @@ from jaxtyping import Array, Float
 
 from fitact.compiled import jit, pad_samples
 from fitact.fitting.channel_fit import sample_residuals
-from fitact.fitting.instrument_errors import EFFECTS, V_NONLINEARITY
-from fitact.fitting.source import Source
 from fitact.instrument.effects import PROBE_TIME_CONSTANT, nonlinearity_shapes, nonlinearity_slopes
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.spectrum_channel import SpectrumChannel
 from fitact.model.drive import Sampled
+from fitact.problem.instrument_errors import EFFECTS, V_NONLINEARITY
+from fitact.problem.source import Source
 
 
 def fill_effects(

@@ -10,9 +10,9 @@ from jaxtyping import Array, Float
 from fitact.errors import InputError
 from fitact.fitting.least_squares import LeastSquaresResult, solve
 from fitact.fitting.minimum import Optima, minimise_many
-from fitact.fitting.problem import Problem
-from fitact.fitting.starting_point import residual_objective
 from fitact.likelihood.likelihood import Likelihood
+from fitact.problem.build import Problem
+from fitact.problem.starting_point import residual_objective
 
 
 def choose_start(problem: Problem, start: Mapping[str, float] | None) -> Float[np.ndarray, " parameters"]:

@@ -12,13 +12,13 @@ from fitact.data.plausibility import check_plausibility, insulator_voltage
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.data.spectrum import Spectrum
 from fitact.fitting.channel_fit import ChannelFit
-from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.residual_statistics import is_undersampled
-from fitact.fitting.source import Source
-from fitact.fitting.starting_point import CurrentEstimate, skin_from_estimates
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.model.circuit import FINGER_PARAMETERS, RC
 from fitact.model.skin import constant_skin_circuit
+from fitact.problem.drive_choice import DriveModel
+from fitact.problem.source import Source
+from fitact.problem.starting_point import CurrentEstimate, skin_from_estimates
 from fitact.scene.assumptions import states_Ci
 from fitact.scene.scene import Scene
 from fitact.units import format_engineering, format_percent, quantity_unit

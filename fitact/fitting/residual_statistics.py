@@ -9,8 +9,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
 from fitact.data.record import Record, rounding_noise_sd, row_medians, white_noise_sds
-from fitact.fitting.drive_choice import DriveModel
 from fitact.fitting.residual_tests import N_TESTS, PhaseBins, ResidualTestStatistics, p_values, runs_z
+from fitact.problem.drive_choice import DriveModel
 
 _FALSE_ALARM = 1e-6  # false-alarm probability of all residual tests of a channel together, for pure noise
 _P_VALUES = ("folded_p", "spectrum_p", "line_p")

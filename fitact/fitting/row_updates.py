@@ -5,21 +5,20 @@ import functools
 import math
 from collections.abc import Sequence
 
-import jax
 import numpy as np
 from jaxtyping import Array, Float
 
 from fitact.compiled import jit, pad_samples
 from fitact.data.record import Record
 from fitact.fitting.least_squares import LeastSquaresResult
-from fitact.fitting.recorded_current import Current, RecordedCurrent
-from fitact.fitting.runs import Rows
-from fitact.fitting.source import Source
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.charge_rows import MAX_STEPS, ChargeRows
 from fitact.likelihood.compression import HUM_FREQUENCIES
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.drive import Sampled
+from fitact.problem.recorded_current import Current, RecordedCurrent, set_rows
+from fitact.problem.runs import Rows
+from fitact.problem.source import Source
 
 
 def update_rows(likelihood: Likelihood, solution: LeastSquaresResult, sources: Sequence[Source]) -> Likelihood:
@@ -76,16 +75,6 @@ def _rows_at(
 
     modelled = Current.from_channel(channel, inputs, delay)
     return *current.make_rows(modelled, respond, np.asarray(respond_to_V()[1])[:size]), delay * current.step
-
-
-def set_rows(channel: ChannelLikelihood, rows: ChargeRows, V: Rows, delay: float) -> ChannelLikelihood:
-    """Return the channel with rows of charge, an estimate of the drive, and the delay (s) at which they are taken."""
-    length = np.shape(channel.time)[0]
-    padded = jax.tree.map(lambda x: np.pad(x, (0, length - x.size)), rows)
-    assert isinstance(channel.drive, Sampled)
-    drive = Sampled(channel.drive.time, pad_samples(V))
-    channel = channel.without_compression()
-    return dataclasses.replace(channel, drive=drive, charges=padded, shift=np.asarray(delay, dtype=float))
 
 
 def _with_drive(channel: ChannelLikelihood, current: RecordedCurrent, V: Rows) -> ChannelLikelihood:

@@ -7,10 +7,10 @@ import numpy as np
 from fitact.fitting.instrument_effects import effects_would_change, fill_effects
 from fitact.fitting.least_squares import LeastSquaresResult, solve
 from fitact.fitting.multistart import choose_start
-from fitact.fitting.problem import Problem
 from fitact.fitting.row_updates import update_rows
-from fitact.fitting.spectra import update_weights
 from fitact.likelihood import certificate
+from fitact.problem.build import Problem
+from fitact.problem.spectra import update_weights
 
 
 def solve_problem(

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitact.compiled import jit, pad_rows
-from fitact.fitting.drive_choice import has_ideal_edges, ideal_edge_mask
 from fitact.likelihood.certificate import recompress
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
 from fitact.likelihood.likelihood import CircuitValues
 from fitact.likelihood.noise import student_weight
 from fitact.model.response import highpass
 from fitact.model.skin import constant_skin_circuit
+from fitact.problem.drive_choice import has_ideal_edges, ideal_edge_mask
 
 
 def free_timing(

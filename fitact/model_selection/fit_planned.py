@@ -7,11 +7,11 @@ from typing import Any, Literal, TypeAlias
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
-from fitact.fitting.drive_choice import DriveModel, choose_drive, whole_periods
 from fitact.fitting.fit import Fit, fit_records
 from fitact.model.drive import Sampled
 from fitact.model_selection.omissions import applicable_omissions, reduce_scene
 from fitact.model_selection.plan import Plan, plan
+from fitact.problem.drive_choice import DriveModel, choose_drive, whole_periods
 from fitact.scene.scene import Scene
 
 Model: TypeAlias = Literal["planned", "full"]

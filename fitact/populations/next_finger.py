@@ -12,11 +12,11 @@ from jaxtyping import Array, Float
 
 from fitact.compiled import BatchEvaluator, array_module
 from fitact.fitting import derived
-from fitact.fitting.drive_choice import whole_periods
 from fitact.fitting.fit import Fit
 from fitact.model.drive import Periodic, Sampled
 from fitact.populations.finger import SHARED_PARAMETER, SKIN
 from fitact.populations.finger_likelihoods import PopulationParameters
+from fitact.problem.drive_choice import whole_periods
 
 AREA = "contact_area"
 THICKNESSES = ("skin_thickness", "insulator_thickness")

@@ -14,12 +14,12 @@ from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.fitting.fit import Fit, fit
-from fitact.fitting.recorded_current import Current, RecordedCurrent
 from fitact.likelihood.certificate import TOLERANCE, reason_against_table
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import CircuitValues
 from fitact.likelihood.window_compression import FilterState, MakeRows, TrendInputs, WindowCompressor
 from fitact.model.circuit import passes_direct_current
+from fitact.problem.recorded_current import Current, RecordedCurrent
 from fitact.scene.scene import Scene
 from fitact.tracking.windows import Window
 

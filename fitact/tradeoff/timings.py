@@ -22,7 +22,6 @@ from jaxtyping import Array, Float
 
 from fitact.compiled import BatchEvaluator, is_array
 from fitact.data.record import Record
-from fitact.fitting.drive_choice import whole_periods
 from fitact.fitting.fit import Fit
 from fitact.fitting.fit import fit as fit_record
 from fitact.likelihood.likelihood import Likelihood
@@ -30,6 +29,7 @@ from fitact.model.circuit import RC
 from fitact.model.drive import Drive, Sampled
 from fitact.model.harmonic import harmonic_response
 from fitact.model.response import highpass, response
+from fitact.problem.drive_choice import whole_periods
 from fitact.sampling.ensemble import Level, sample
 from fitact.sampling.posterior import Posterior
 from fitact.scene.scene import Scene

@@ -9,9 +9,9 @@ import pytest
 import fitact
 from data_synth.make import simulate_response
 from data_synth.scene import make_scene
-from fitact.fitting.problem import build_problem
 from fitact.likelihood.certificate import compress_channel
 from fitact.model.circuit import FinalCircuit
+from fitact.problem.build import build_problem
 from fitact.tracking.compressed_windows import find_model
 
 TRUTH = {"Rsc": 130e3, "Csc": 18e-9, "Ci": 1.35e-9, "Ri": 2e6}

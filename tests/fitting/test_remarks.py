@@ -8,7 +8,7 @@ import pytest
 
 import fitact
 from fitact.fitting.remarks import channel_warnings, prior_warnings
-from fitact.fitting.starting_point import DriveModel
+from fitact.problem.starting_point import DriveModel
 from tests.conftest import square_record
 
 QUIET = {"interpolation_error": 0.0, "rms_residual": 0.1, "rounding_noise": 0.0, "outliers": 0}

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import fitact
-from fitact.fitting.drive_choice import choose_drive
+from fitact.problem.drive_choice import choose_drive
 
 RSC, CSC, CI = 130e3, 18e-9, 1.35e-9
 G, B = CI / (2.0 * CI + CSC), RSC * (2.0 * CI + CSC)

@@ -14,7 +14,7 @@ from data_synth.changing import Course, make_course
 from data_synth.make import make, simulate_response
 from data_synth.recipe import load
 from data_synth.scene import make_scene
-from fitact.fitting import jumps
+from fitact.problem import jumps
 from fitact.tracking import track_record
 from fitact.tracking.solve_windows import _residuals_vary
 

@@ -14,8 +14,8 @@ import data_synth.recipe
 import data_synth.scene
 import fitact
 from data_synth.keys import validate_sections
-from fitact.fitting.current import hum_likeness
-from fitact.fitting.recorded_current import RecordedCurrent, estimate_noise
+from fitact.problem.current import hum_likeness
+from fitact.problem.recorded_current import RecordedCurrent, estimate_noise
 from tests.conftest import RECORDS
 
 FINGERS = RECORDS / "fingers"

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from fitact.fitting.runs import RoundedSteps, least_step, run_lengths
+from fitact.problem.runs import RoundedSteps, least_step, run_lengths
 
 
 def group_errors(current: np.ndarray, noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray, RoundedSteps]:

@@ -10,19 +10,22 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Self
 
+import jax
 import numpy as np
 import scipy.fft
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
+from fitact.compiled import pad_samples
 from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
 from fitact.errors import InputError
-from fitact.fitting.jumps import Jumps
-from fitact.fitting.runs import RoundedSteps, Rows, least_step, long_run_share
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.charge_rows import LAG, ROW_NOISE, ChargeRows, RowCovariance, step_means, whiten_rows
 from fitact.model.circuit import gain_at
+from fitact.model.drive import Sampled
+from fitact.problem.jumps import Jumps
+from fitact.problem.runs import RoundedSteps, Rows, least_step, long_run_share
 
 
 class Current(NamedTuple):
@@ -320,3 +323,13 @@ def solve_linear(
     amplitudes = np.linalg.lstsq(gram, scaled @ observed, rcond=1e-13)[0] / sizes
     residuals = observed - amplitudes @ columns
     return float(residuals @ residuals), amplitudes
+
+
+def set_rows(channel: ChannelLikelihood, rows: ChargeRows, V: Rows, delay: float) -> ChannelLikelihood:
+    """Return the channel with rows of charge, an estimate of the drive, and the delay (s) at which they are taken."""
+    length = np.shape(channel.time)[0]
+    padded = jax.tree.map(lambda x: np.pad(x, (0, length - x.size)), rows)
+    assert isinstance(channel.drive, Sampled)
+    drive = Sampled(channel.drive.time, pad_samples(V))
+    channel = channel.without_compression()
+    return dataclasses.replace(channel, drive=drive, charges=padded, shift=np.asarray(delay, dtype=float))

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from fitact.fitting.jumps import Jumps
 from fitact.likelihood.charge_rows import LAG
+from fitact.problem.jumps import Jumps
 
 STEP, CAPACITANCE, RATE, RISE, PERIOD = 1e-5, 1e-9, 2e-6, 5.3, 101.7  # the last two in steps
 

@@ -5,8 +5,8 @@ from typing import NamedTuple
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
-from fitact.fitting.drive_choice import DriveModel
-from fitact.fitting.starting_point import Estimate
+from fitact.problem.drive_choice import DriveModel
+from fitact.problem.starting_point import Estimate
 from fitact.scene.scene import Scene
 
 

@@ -8,12 +8,12 @@ import numpy as np
 from fitact.compiled import as_arrays
 from fitact.data.record import Record, is_uniform
 from fitact.errors import InputError
-from fitact.fitting.drive_choice import DriveModel
-from fitact.fitting.starting_point import estimate_from_vsc
 from fitact.likelihood import certificate
 from fitact.likelihood.channel import FIRST_CHARGE, LINEAR_NUISANCES, ChannelLikelihood
 from fitact.likelihood.friction_channel import FrictionChannel
 from fitact.model.force import FRICTION_PARAMETERS
+from fitact.problem.drive_choice import DriveModel
+from fitact.problem.starting_point import estimate_from_vsc
 from fitact.scene.scene import Scene
 
 

@@ -10,14 +10,14 @@ from jaxtyping import Complex, Float
 
 from fitact.compiled import as_arrays, jit, pad_samples
 from fitact.data.spectrum import Spectrum
-from fitact.fitting.drive_choice import DriveModel
-from fitact.fitting.source import Source
-from fitact.fitting.starting_point import Estimate, SkinEstimate, VscEstimate
 from fitact.likelihood.channel import LINEAR_NUISANCES
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.spectrum_channel import SpectrumChannel, join_complex
 from fitact.model.circuit import Channel
 from fitact.model.drive import Sine
+from fitact.problem.drive_choice import DriveModel
+from fitact.problem.source import Source
+from fitact.problem.starting_point import Estimate, SkinEstimate, VscEstimate
 from fitact.scene.scene import Scene
 from fitact.scene.sections import Measurement
 

@@ -16,36 +16,6 @@ from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
 from fitact.experiment.blind_directions import STRAY, gain_names
 from fitact.experiment.fisher import Experiment
-from fitact.fitting.current import (
-    estimate_from_current,
-    estimate_recorded,
-    hum_likeness,
-    respond_to,
-    select_samples,
-)
-from fitact.fitting.drive_choice import DriveModel, choose_drive, frequency_error, has_ideal_edges, has_unresolved_edge
-from fitact.fitting.friction import make_friction_channel
-from fitact.fitting.instrument_errors import (
-    ErrorCoordinate,
-    Member,
-    apply_coordinates,
-    collect_coordinates,
-    largest_gain,
-)
-from fitact.fitting.recorded_current import Current, RecordedCurrent, estimate_noise
-from fitact.fitting.row_updates import set_rows
-from fitact.fitting.runs import long_run_share
-from fitact.fitting.skin_model import apply_skin_model, count_harmonics, exclude_jumps, require_skin_response
-from fitact.fitting.source import Source
-from fitact.fitting.spectra import build_spectrum_channel
-from fitact.fitting.starting_point import (
-    CurrentEstimate,
-    Estimate,
-    VscEstimate,
-    estimate_from_vsc,
-    prior_skin_moments,
-    start_from_estimates,
-)
 from fitact.instrument.classes import typical_gain_u
 from fitact.instrument.effects import INPUT_RANGE
 from fitact.likelihood import certificate
@@ -59,6 +29,35 @@ from fitact.model.skin import circuit_parameters, constant_skin_circuit, limits_
 from fitact.prior.distributions import Distribution, LogNormal
 from fitact.prior.prior import Prior
 from fitact.prior.product import multiply
+from fitact.problem.current import (
+    estimate_from_current,
+    estimate_recorded,
+    hum_likeness,
+    respond_to,
+    select_samples,
+)
+from fitact.problem.drive_choice import DriveModel, choose_drive, frequency_error, has_ideal_edges, has_unresolved_edge
+from fitact.problem.friction import make_friction_channel
+from fitact.problem.instrument_errors import (
+    ErrorCoordinate,
+    Member,
+    apply_coordinates,
+    collect_coordinates,
+    largest_gain,
+)
+from fitact.problem.recorded_current import Current, RecordedCurrent, estimate_noise, set_rows
+from fitact.problem.runs import long_run_share
+from fitact.problem.skin_model import apply_skin_model, count_harmonics, exclude_jumps, require_skin_response
+from fitact.problem.source import Source
+from fitact.problem.spectra import build_spectrum_channel
+from fitact.problem.starting_point import (
+    CurrentEstimate,
+    Estimate,
+    VscEstimate,
+    estimate_from_vsc,
+    prior_skin_moments,
+    start_from_estimates,
+)
 from fitact.scene.scene import Scene
 
 NOISE_PRIORS = ("sigma", "sigma_I", "sigma_Ft")

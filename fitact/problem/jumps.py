@@ -12,8 +12,8 @@ import numpy as np
 import scipy.ndimage
 from jaxtyping import Bool, Float, Int
 
-from fitact.fitting.runs import Rows
 from fitact.likelihood.charge_rows import LAG, MAX_STEPS, ROW_NOISE, step_means
+from fitact.problem.runs import Rows
 
 _REACH = 6 + MAX_STEPS  # steps beside a jump whose polynomial of `step_means` may pass it
 

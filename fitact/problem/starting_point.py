@@ -11,10 +11,10 @@ from jaxtyping import Float
 from fitact.compiled import BatchEvaluator
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.fitting.drive_choice import DriveModel, has_ideal_edges
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.model.skin import WithSkin, circuit_parameters
+from fitact.problem.drive_choice import DriveModel, has_ideal_edges
 
 
 class VscEstimate(NamedTuple):

@@ -9,10 +9,10 @@ from jaxtyping import Float
 
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.fitting.drive_choice import DriveModel, has_ideal_edges, ideal_edge_mask
 from fitact.model.circuit import RC, Circuit
 from fitact.model.drive import Periodic
 from fitact.model.skin import MAX_DISPERSION_FREQUENCY, Dispersive, Fractional, TimeConstantGrid, WithSkin
+from fitact.problem.drive_choice import DriveModel, has_ideal_edges, ideal_edge_mask
 from fitact.scene.scene import Scene
 
 

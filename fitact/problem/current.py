@@ -9,12 +9,12 @@ import scipy.signal
 from jaxtyping import Bool
 
 from fitact.data.record import Record
-from fitact.fitting.drive_choice import DriveModel, drive_slope, unit_response
-from fitact.fitting.jumps import block_medians
-from fitact.fitting.recorded_current import Current, RecordedCurrent, solve_linear, thin_rows
-from fitact.fitting.runs import Rows, run_lengths
-from fitact.fitting.starting_point import CurrentEstimate, skin_from_estimates
 from fitact.likelihood.charge_rows import LAG, RowCovariance, step_means, whiten_rows
+from fitact.problem.drive_choice import DriveModel, drive_slope, unit_response
+from fitact.problem.jumps import block_medians
+from fitact.problem.recorded_current import Current, RecordedCurrent, solve_linear, thin_rows
+from fitact.problem.runs import Rows, run_lengths
+from fitact.problem.starting_point import CurrentEstimate, skin_from_estimates
 
 Belief = tuple[np.ndarray, np.ndarray]  # prior means and sds of log Rsc, log Csc and log Ci
 
