@@ -10,8 +10,9 @@ from .design.drive import design_drive
 from .design.drive_design import DriveDesign
 from .design.measurement import MeasurementDesign, design_measurement
 from .errors import InputError
-from .fitting.fit import Fit, fit
+from .fitting.fit import fit
 from .fitting.levenberg_marquardt import RESULTS
+from .fitting.result import Fit
 from .model.chirp import Chirp
 from .model.circuit import DirectGround, FinalCircuit, NaturalGround, Probe
 from .model.drive import Burst, Multitone, Polyline, Sampled, Sine, Square, Trapezoid, Triangle

@@ -23,9 +23,10 @@ from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.files import atomic_write, write_parquet
 from fitact.fitting import derived
-from fitact.fitting.fit import Fit, fit
+from fitact.fitting.fit import fit
 from fitact.fitting.identifiability import information_directions, prior_variance_fraction, verdicts
-from fitact.fitting.laplace import SUCCESS_MESSAGE
+from fitact.fitting.outcome import RESULT_MESSAGES
+from fitact.fitting.result import Fit
 from fitact.model.skin import circuit_parameters
 from fitact.problem.build import build_problem
 from fitact.progress import track_progress
@@ -284,7 +285,7 @@ def fit_batch(batch: Batch, whiteness: bool = True) -> tuple[dict[int, Row], Bat
     try:
         optima = problem.fit(padded, whiteness)
         columns = {"record": [os.path.basename(record.source) for record in padded]}
-        columns |= _fit_columns(problem, optima, SUCCESS_MESSAGE if whiteness else _UNTESTED_MESSAGE)
+        columns |= _fit_columns(problem, optima, RESULT_MESSAGES["successful"] if whiteness else _UNTESTED_MESSAGE)
     except np.linalg.LinAlgError:  # one record may make the joint computation fail
         return {}, None
     rows = {
@@ -339,7 +340,7 @@ def row_from_fit(fit: Fit) -> Row:
     )
     row = {"record": os.path.basename(fit.record.source)} | dict(zip(_FIT_COLUMNS, values, strict=True))
     row |= _median_columns([fit.names[i] for i in free], np.exp(fit.theta[free]), fit.sd[free])
-    logs, log_sds, _ = fit.derived_moments()
+    logs, log_sds, _ = fit.laplace.derived_moments()
     row |= _median_columns(derived.DERIVED_NAMES, np.exp(logs), log_sds)
     return {name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()}
 

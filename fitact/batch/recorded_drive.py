@@ -18,10 +18,10 @@ from fitact.batch.recorded_tables import AGES, HALF_WIDTH, TABLE_NODES, SharedFu
 from fitact.compiled import jit
 from fitact.data.record import Record, rounding_noise_sd
 from fitact.fitting.derived import DerivedQuantities
-from fitact.fitting.fit import Fit
 from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES, bic_decrease_from_z
 from fitact.fitting.residual_statistics import interpolation_errors, is_misfit, residual_statistics
 from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics
+from fitact.fitting.result import Fit
 from fitact.likelihood.channel import LINEAR_NUISANCES
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood

@@ -4,13 +4,14 @@ import functools
 import math
 import os
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from fitact.data.readers.read import read
 from fitact.errors import InputError
 from fitact.experiment.blind_directions import STRAY
+from fitact.fitting.result import Fit
 from fitact.likelihood.calibration import Calibration
 from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.scene.instrument_section import CalibrationSection, DummyCircuit
@@ -18,10 +19,7 @@ from fitact.scene.prior_section import PriorSection
 from fitact.scene.scene import Scene
 from fitact.units import format_engineering, format_percent, quantity_unit
 
-if TYPE_CHECKING:
-    from fitact.fitting.fit import Fit
-
-FitRecords = Callable[..., "Fit"]  # `fitact.fitting.fit.fit_records`
+FitRecords = Callable[..., Fit]  # `fitact.fitting.fit.fit_records`
 
 
 # so small an insulator passes no current
@@ -86,7 +84,7 @@ def _dummy_scene(scene: Scene, stated: CalibrationSection) -> Scene:
     return Scene(drive=scene.drive, measurement=measurement, instrument=scene.instrument, prior=prior)
 
 
-def _dummy_warnings(fitted: "Fit", max_pull: float = 3.0) -> list[str]:
+def _dummy_warnings(fitted: Fit, max_pull: float = 3.0) -> list[str]:
     """Return warnings about a record that does not fit its dummy circuit, or parts that are not as stated."""
     warnings = [] if fitted.trusted else [fitted.message]
     for name in FINGER_PARAMETERS:
@@ -103,7 +101,7 @@ def _dummy_warnings(fitted: "Fit", max_pull: float = 3.0) -> list[str]:
     return warnings
 
 
-def _marginal_calibration(fitted: "Fit", names: tuple[str, ...]) -> Calibration:
+def _marginal_calibration(fitted: Fit, names: tuple[str, ...]) -> Calibration:
     """Return what a fit tells about those of the coordinates `names` that it has, whatever its other parameters are."""
     names = tuple(name for name in fitted.likelihood.prior.names if name in names and name not in FINGER_PARAMETERS)
     shared = [fitted.names.index(name) for name in names]

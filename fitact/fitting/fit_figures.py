@@ -1,21 +1,20 @@
 """Figures of a fit: data with fit and residuals, and what the data determine."""
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from fitact import charts
-from fitact.data.record import CHANNEL_TITLES, CHANNEL_UNITS
+from fitact.data.record import CHANNEL_TITLES, CHANNEL_UNITS, Record
 from fitact.data.spectrum import Spectrum
+from fitact.fitting.channel_fit import ChannelFit
+from fitact.fitting.laplace import Laplace
 
-if TYPE_CHECKING:
-    from fitact.fitting.fit import Fit
 
-
-def plot_fit(fit: "Fit", number: int = 0) -> Any:
-    """Draw the channels of a record of a fit, or a spectrum, and return the axes; see `Fit.plot`."""
-    record = fit.records[number]
-    traces = {trace.channel: trace for trace in fit.traces if trace.record is record}
+def plot_fit(record: Record | Spectrum, channels: Sequence[ChannelFit]) -> Any:
+    """Draw a record or spectrum with those of the fitted channels that are its own, and return the axes."""
+    traces = {trace.channel: trace for trace in channels if trace.record is record}
     if isinstance(record, Spectrum):
         return charts.show_plots(
             charts.spectrum_plot(record.frequency, *record.symbol, record.values, traces[record.channel].fitted)
@@ -31,18 +30,17 @@ def plot_fit(fit: "Fit", number: int = 0) -> Any:
     return charts.show_plots(charts.time_plot(record.time, series))
 
 
-def plot_identifiability(fit: "Fit", ax: Any = None) -> Any:
-    """Draw the 95 % regions of two parameters, and return the axes; see `Fit.plot_identifiability`."""
-    direction = fit.identifiability.blind_direction
+def plot_identifiability(laplace: Laplace, direction: Mapping[str, float], ax: Any = None) -> Any:
+    """Draw the 95 % regions of the two parameters that change most in a `direction`, and return the axes."""
     largest = sorted(direction, key=lambda name: -abs(direction[name]))[:2]
     first, second = sorted(largest, key=list(direction).index)
-    rows = [fit.names.index(name) for name in (first, second)]
-    prior = fit.likelihood.prior
+    rows = [laplace.likelihood.names.index(name) for name in (first, second)]
+    prior = laplace.likelihood.prior
     laws = {
         name: (mean[rows], (root @ root.T)[np.ix_(rows, rows)])
         for name, mean, root in (
-            ("posterior", fit.theta, fit.covariance_root),
-            ("prior", np.asarray(prior.log_mean), fit.likelihood.prior_factor),
+            ("posterior", laplace.theta, laplace.covariance_root),
+            ("prior", np.asarray(prior.log_mean), laplace.likelihood.prior_factor),
         )
     }
     moves = np.array([direction[first], direction[second]])

@@ -48,22 +48,22 @@ class Identifiability:
     experiment: Experiment | None = dataclasses.field(default=None, repr=False, compare=False)
     # gradient of the logarithm of the mean force in the free parameters of `experiment`
     force_gradient: Float[np.ndarray, " free"] | None = dataclasses.field(default=None, repr=False, compare=False)
-    # standard uncertainty of the log mean force from what no suggested measurement changes, now and after one
-    unchanged_u: tuple[float, float] = (0.0, 0.0)
-    unchanged_sources: str = ""  # names of these sources
+    # standard uncertainty of the log mean force from what no suggested measurement changes, now and after one, and the
+    # names of the sources
+    unchanged: tuple[float, float, str] = (0.0, 0.0, "")
 
     @functools.cached_property
     def next_measurement(self) -> NextMeasurement:
         """Suggested next measurement, computed on first access."""
         if self.verdict == "identified":
             return NextMeasurement()
-        now, after = self.unchanged_u
+        now, after, sources = self.unchanged
 
         def show(circuit: float, others: float) -> str:
             alone = f" ({format_percent(circuit)})" if others > 0.0 else ""
             return f"± {format_percent(math.hypot(circuit, others))}{alone}"
 
-        brackets = f", in brackets without {self.unchanged_sources}" if after > 0.0 else ""
+        brackets = f", in brackets without {sources}" if after > 0.0 else ""
         force = f"Uncertainty of the mean force{brackets}: {show(self.force_sd, now)} now"
         experiment = self.experiment
         if experiment is None or self.force_gradient is None:
@@ -142,15 +142,17 @@ def assess_identifiability(
     prior_factor: Float[np.ndarray, "parameters parameters"],
     force_gradient: Float[np.ndarray, " parameters"],
     experiment: Experiment,
+    unchanged: tuple[float, float, str] = (0.0, 0.0, ""),
 ) -> Identifiability:
     """Assess the identifiability of a fit, from factors of its covariance and of the prior covariance.
 
     `names` are the coordinates of theta. The free parameters of `experiment` are assessed, except gains and a stray
     capacitance, which are nuisances with priors of their own. `force_gradient`: gradient of the log mean force in
-    theta.
+    theta. `unchanged` is that of the result.
     """
     free = [name for name in experiment.free if name not in (*gain_names(experiment.channels), STRAY)]
-    judgement = assess_parameters(names, covariance_factor, prior_factor, force_gradient, free, experiment.channels)
+    factors = covariance_factor, prior_factor
+    judgement = assess_parameters(names, *factors, force_gradient, free, experiment.channels, unchanged)
     rows = [list(names).index(name) for name in experiment.free]
     return dataclasses.replace(judgement, experiment=experiment, force_gradient=force_gradient[rows])
 
@@ -162,6 +164,7 @@ def assess_parameters(
     force_gradient: Float[np.ndarray, " parameters"],
     free: Sequence[str],
     channels: tuple[str, ...],
+    unchanged: tuple[float, float, str] = (0.0, 0.0, ""),
 ) -> Identifiability:
     """Assess the parameters `free` among `names`, without suggested measurements."""
     shares, blind, along = information_directions(names, covariance_factor, prior_factor, free)
@@ -177,6 +180,7 @@ def assess_parameters(
         force_sd=force_sd,
         force_contraction=1.0 - force_sd / float(np.linalg.norm(prior_factor.T @ force_gradient)),
         channels=channels,
+        unchanged=unchanged,
     )
 
 

@@ -12,33 +12,19 @@ from jax.flatten_util import ravel_pytree
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PyTree
 
-from fitact.fitting.minimum import RESULT_NAMES, Minimum
+from fitact.fitting.outcome import RESULT_MESSAGES, RESULT_NAMES, Minimum
 
 
 class RESULTS(optx.RESULTS):
     """Reasons why a fit ended: those of optimistix, and others that make a fit unreliable."""
 
-    did_not_move = (
-        "The optimiser did not move from its starting point, which is not a minimum; check the units of the record."
-    )
-    not_at_optimum = (
-        "The optimiser stopped before it reached a minimum; check the units of the record, or state a narrower prior."
-    )
-    rank_deficient = (
-        "The data do not determine all parameters, and many values fit equally well; state a prior, or record another"
-        " channel."
-    )
-    on_bound = (
-        "The best fit violates a bound or an order that the prior states; check the units of the record, or widen it."
-    )
-    several_optima = (
-        "The fit has several optima that are almost equally good; state a narrower prior, or sample the posterior."
-    )
-    misfit = (
-        "Poor fit: the residuals are larger than the noise or correlated. Inspect them in the report, then fit with the"
-        " measured drive or add the missing circuit element (a gap, R_H, …) to the scene."
-    )
-    structure = "The residuals are more than noise, but can hardly move the results."
+    did_not_move = RESULT_MESSAGES["did_not_move"]
+    not_at_optimum = RESULT_MESSAGES["not_at_optimum"]
+    rank_deficient = RESULT_MESSAGES["rank_deficient"]
+    on_bound = RESULT_MESSAGES["on_bound"]
+    several_optima = RESULT_MESSAGES["several_optima"]
+    misfit = RESULT_MESSAGES["misfit"]
+    structure = RESULT_MESSAGES["structure"]
 
 
 def _result_index(result: Any) -> Int[Array, ""]:

@@ -1,4 +1,4 @@
-"""Minima of sums of squares, from one start or many, and the names of the reasons why a search ended.
+"""Minima of sums of squares, from one start or many.
 
 The solver itself is in `fitact.fitting.levenberg_marquardt`. It is imported only where a program is traced, because a
 program from the disk does without optimistix.
@@ -7,40 +7,13 @@ program from the disk does without optimistix.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PyTree
 
 from fitact.compiled import jit
-
-RESULT_NAMES = (
-    "successful", "did_not_move", "not_at_optimum", "rank_deficient", "on_bound", "several_optima", "misfit",
-    "structure", "nonfinite", "nonlinear_max_steps_reached", "nonlinear_divergence",
-)  # fmt: skip
-
-
-def result_name(index: Int[ArrayLike, ""]) -> str:
-    """Return the name of a result in `RESULT_NAMES`."""
-    return RESULT_NAMES[int(index)]
-
-
-def result_message(name: str) -> str:
-    """Return the sentence of a member of `RESULTS`."""
-    from fitact.fitting.levenberg_marquardt import RESULTS
-
-    return str(RESULTS[getattr(RESULTS, name)])  # type: ignore[misc]  # equinox's enumerations look up by item
-
-
-class Minimum(eqx.Module):
-    """Point at which Levenberg-Marquardt ended."""
-
-    theta: Float[Array, " parameters"]
-    cost: Float[Array, ""]  # half of the sum of squared residuals
-    jacobian: Float[Array, "rows parameters"]  # Jacobian of the residuals, in the order of their pytree
-    steps: Array  # trial steps taken
-    result: Int[Array, ""]  # index in `RESULT_NAMES`
+from fitact.fitting.outcome import RESULT_NAMES, Minimum, result_name
 
 
 def minimise(

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from fitact.compiled import jit
 from fitact.errors import InputError
 from fitact.fitting.derived import DERIVED_NAMES, DerivedQuantities
-from fitact.fitting.laplace import FitResult
+from fitact.fitting.laplace import Laplace
 from fitact.fitting.minimum import minimise
 from fitact.likelihood.likelihood import UNCONSTRAINED_SD, Likelihood
 from fitact.summary import format_range
@@ -85,24 +85,25 @@ def _fit_constrained(
     return jax.lax.map(lambda row: fit_row(*row), (indices, goal, weight, start))
 
 
-def profile_intervals(fit: FitResult, names: Sequence[str], level: float, prior: bool) -> dict[str, Interval]:
+def profile_intervals(laplace: Laplace, names: Sequence[str], level: float, prior: bool) -> dict[str, Interval]:
     """Return profile-likelihood intervals of the quantities `names`, at the noise of the fit; see `Fit.profile`."""
     if not 0.0 < level < 1.0:
         raise InputError(f"level = {level}: give a probability between 0 and 1, such as 0.95")
-    likelihood, timing = fit.likelihood, fit.likelihood.timing
+    likelihood, timing = laplace.likelihood, laplace.likelihood.timing
     for name in names:
         if name not in (available := (*likelihood.names, *PROFILE_QUANTITIES)):
             raise InputError(f"no interval is available for {name}; choose from {', '.join(available)}")
-    derived_sd = fit.laplace.derived_log_sd[[DERIVED_NAMES.index(name) for name in PROFILE_QUANTITIES]]
+    derived_sd = laplace.derived_log_sd[[DERIVED_NAMES.index(name) for name in PROFILE_QUANTITIES]]
     intervals = {}
     with jax.enable_x64(True):
         likelihood = dataclasses.replace(likelihood.without_samples(), use_prior=prior and likelihood.use_prior)
-        for kind, sd, derive in ((likelihood.names, fit.sd, None), (PROFILE_QUANTITIES, derived_sd, fit.derive)):
+        sd = np.linalg.norm(laplace.covariance_root, axis=1)
+        for kind, errors, derive in ((likelihood.names, sd, None), (PROFILE_QUANTITIES, derived_sd, laplace.derive)):
             chosen = [name for name in names if name in kind]
             if not chosen:
                 continue
-            model = ConstrainedFit(likelihood, jnp.asarray(fit.laplace.sigmas), derive)
-            sides = interval_bounds(model, fit.theta, sd, [kind.index(name) for name in chosen], level)
+            model = ConstrainedFit(likelihood, jnp.asarray(laplace.sigmas), derive)
+            sides = interval_bounds(model, laplace.theta, errors, [kind.index(name) for name in chosen], level)
             for name, side in zip(chosen, sides, strict=True):
                 low, high = timing[name][0] + side * timing[name][1] if name in timing else np.exp(side)
                 intervals[name] = Interval(float(low), float(high), level, likelihood.use_prior)

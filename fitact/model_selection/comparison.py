@@ -11,7 +11,8 @@ from jaxtyping import Float
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
-from fitact.fitting.fit import Fit, fit
+from fitact.fitting.fit import fit
+from fitact.fitting.result import Fit
 from fitact.model_selection.cross_validation import CrossValidation, cross_validate, likelihood_mask
 from fitact.scene.scene import Scene
 from fitact.summary import round_to_sd

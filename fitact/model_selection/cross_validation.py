@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float, Int
 from fitact.compiled import jit, pad_samples
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
-from fitact.fitting.fit import Fit
 from fitact.fitting.least_squares import least_squares
+from fitact.fitting.result import Fit
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import STUDENT_DOF, student_curvature, student_weight

@@ -7,7 +7,8 @@ from typing import Any, Literal, TypeAlias
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
-from fitact.fitting.fit import Fit, fit_records
+from fitact.fitting.fit import fit_records
+from fitact.fitting.result import Fit
 from fitact.model.drive import Sampled
 from fitact.model_selection.omissions import applicable_omissions, reduce_scene
 from fitact.model_selection.plan import Plan, plan

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from fitact import summary
 from fitact.compiled import jit
-from fitact.fitting.fit import Fit
+from fitact.fitting.result import Fit
 from fitact.likelihood.likelihood import Likelihood
 from fitact.prior.distributions import LogNormal
 from fitact.prior.prior import Prior

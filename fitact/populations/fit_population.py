@@ -15,7 +15,8 @@ from jaxtyping import Float
 from fitact.compiled import BatchEvaluator
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.fitting.fit import Fit, fit
+from fitact.fitting.fit import fit
+from fitact.fitting.result import Fit
 from fitact.populations.covariates import Covariates
 from fitact.populations.finger import SHARED_PARAMETER, SKIN, Finger
 from fitact.populations.finger_likelihoods import FingerLikelihoods

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from fitact.compiled import BatchEvaluator, array_module
 from fitact.fitting import derived
-from fitact.fitting.fit import Fit
+from fitact.fitting.result import Fit
 from fitact.model.drive import Periodic, Sampled
 from fitact.populations.finger import SHARED_PARAMETER, SKIN
 from fitact.populations.finger_likelihoods import PopulationParameters

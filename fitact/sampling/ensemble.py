@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from fitact.errors import InputError
 from fitact.files import remove_temporary
-from fitact.fitting.fit import Fit
+from fitact.fitting.result import Fit
 from fitact.likelihood import certificate
 from fitact.progress import open_bar
 from fitact.sampling import importance

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.fitting import derived
-from fitact.fitting.fit import Fit
+from fitact.fitting.result import Fit
 from fitact.sampling.convergence import diagnose_weights, pareto_smooth
 from fitact.sampling.posterior import Posterior
 from fitact.sampling.proposal import LogProb, Proposal

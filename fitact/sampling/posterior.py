@@ -19,8 +19,8 @@ from fitact.errors import InputError
 from fitact.files import atomic_write
 from fitact.fitting import derived
 from fitact.fitting.channel_fit import ChannelFit
-from fitact.fitting.fit import Fit
 from fitact.fitting.geometry import Capacitances
+from fitact.fitting.result import Fit
 from fitact.fitting.sensation import FeltDrive
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import draw_noise
@@ -136,12 +136,12 @@ class Posterior(Display):
     def _derived_draws(self) -> np.ndarray:
         if not self._geometry_logs:
             return self._nominal_draws
-        return self.fit.geometry.change_derived(self._capacitances, self._geometry_logs, self._nominal_draws)
+        return self.fit.laplace.geometry.change_derived(self._capacitances, self._geometry_logs, self._nominal_draws)
 
     @functools.cached_property
     def _geometry_logs(self) -> dict[str, np.ndarray]:
         """Draws of the logarithms of what force and friction rest on beside the circuit, as far as stated."""
-        return self.fit.geometry.draw_logs(self._capacitances, self.points.shape[:-1], self.seed)
+        return self.fit.laplace.geometry.draw_logs(self._capacitances, self.points.shape[:-1], self.seed)
 
     @property
     def _capacitances(self) -> Capacitances:
@@ -183,7 +183,7 @@ class Posterior(Display):
             summaries[name]["u"] = relative if budget is None else budget.u
         for name, prior_sd in zip(prior.names, prior.log_sd, strict=True):
             summaries[name]["contraction"] = float(1.0 - np.std(np.log(drawn[name]), ddof=1) / prior_sd)
-        for name, law in self.fit.geometry.stated.items():
+        for name, law in self.fit.laplace.geometry.stated.items():
             summaries[name]["contraction"] = float(1.0 - np.std(np.log(drawn[name]), ddof=1) / law.log_sd)
         return {
             "parameters": {name: summaries[name] for name in drawn},

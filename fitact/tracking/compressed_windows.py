@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float
 from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.fitting.fit import Fit, fit
+from fitact.fitting.fit import fit
+from fitact.fitting.result import Fit
 from fitact.likelihood.certificate import TOLERANCE, reason_against_table
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import CircuitValues

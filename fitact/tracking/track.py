@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from fitact import charts, summary
 from fitact.files import write_parquet
-from fitact.fitting.fit import Fit
+from fitact.fitting.result import Fit
 from fitact.tables import Display, align_table, join_lines
 from fitact.tracking.time_average import TimeAverage
 from fitact.tracking.walk_rates import WalkRates

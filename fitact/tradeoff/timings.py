@@ -22,8 +22,8 @@ from jaxtyping import Array, Float
 
 from fitact.compiled import BatchEvaluator, is_array
 from fitact.data.record import Record
-from fitact.fitting.fit import Fit
 from fitact.fitting.fit import fit as fit_record
+from fitact.fitting.result import Fit
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.circuit import RC
 from fitact.model.drive import Drive, Sampled

@@ -14,7 +14,8 @@ from fitact.compiled import available_cores, processor
 from fitact.data.record import Record
 from fitact.data.simulate import simulate
 from fitact.errors import InputError
-from fitact.fitting.fit import Fit, fit
+from fitact.fitting.fit import fit
+from fitact.fitting.result import Fit
 from fitact.scene.scene import Scene
 from fitact.tables import align_row
 from fitact.tradeoff import timings
