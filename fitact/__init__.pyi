@@ -11,7 +11,7 @@ from .design.drive_design import DriveDesign
 from .design.measurement import MeasurementDesign, design_measurement
 from .errors import InputError
 from .fitting.fit import fit
-from .fitting.levenberg_marquardt import RESULTS
+from .fitting.outcome import RESULTS
 from .fitting.result import Fit
 from .model.chirp import Chirp
 from .model.circuit import DirectGround, FinalCircuit, NaturalGround, Probe

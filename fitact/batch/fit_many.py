@@ -25,7 +25,7 @@ from fitact.files import atomic_write, write_parquet
 from fitact.fitting import derived
 from fitact.fitting.fit import fit
 from fitact.fitting.identifiability import information_directions, prior_variance_fraction, verdicts
-from fitact.fitting.outcome import RESULT_MESSAGES
+from fitact.fitting.outcome import RESULTS
 from fitact.fitting.result import Fit
 from fitact.model.skin import circuit_parameters
 from fitact.problem.build import build_problem
@@ -285,7 +285,7 @@ def fit_batch(batch: Batch, whiteness: bool = True) -> tuple[dict[int, Row], Bat
     try:
         optima = problem.fit(padded, whiteness)
         columns = {"record": [os.path.basename(record.source) for record in padded]}
-        columns |= _fit_columns(problem, optima, RESULT_MESSAGES["successful"] if whiteness else _UNTESTED_MESSAGE)
+        columns |= _fit_columns(problem, optima, RESULTS["successful"] if whiteness else _UNTESTED_MESSAGE)
     except np.linalg.LinAlgError:  # one record may make the joint computation fail
         return {}, None
     rows = {

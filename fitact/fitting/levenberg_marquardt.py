@@ -12,27 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PyTree
 
-from fitact.fitting.outcome import RESULT_MESSAGES, RESULT_NAMES, Minimum
-
-
-class RESULTS(optx.RESULTS):
-    """Reasons why a fit ended: those of optimistix, and others that make a fit unreliable."""
-
-    did_not_move = RESULT_MESSAGES["did_not_move"]
-    not_at_optimum = RESULT_MESSAGES["not_at_optimum"]
-    rank_deficient = RESULT_MESSAGES["rank_deficient"]
-    on_bound = RESULT_MESSAGES["on_bound"]
-    several_optima = RESULT_MESSAGES["several_optima"]
-    misfit = RESULT_MESSAGES["misfit"]
-    structure = RESULT_MESSAGES["structure"]
-
-
-def _result_index(result: Any) -> Int[Array, ""]:
-    """Return the index of a member of `RESULTS` in `RESULT_NAMES`; a failure of the linear solver is "nonfinite"."""
-    index: Any = RESULT_NAMES.index("nonfinite")
-    for i, name in enumerate(RESULT_NAMES):
-        index = jnp.where(result == getattr(RESULTS, name), i, index)
-    return index
+from fitact.fitting.outcome import RESULT_NAMES, Minimum
 
 
 def find_minimum(
@@ -61,7 +41,7 @@ def find_minimum(
         cost=0.5 * jnp.sum(jnp.square(end.residuals)),
         jacobian=end.jacobian,
         steps=solution.stats["num_steps"],
-        result=_result_index(solver.final_result(end, start, RESULTS.promote(solution.result))),
+        result=solver.final_result(end, start, solution.result),
     )
 
 
@@ -140,12 +120,15 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         there |= (local.offset < self.offset_tolerance) & (state.num_steps_since_acceptance > self.max_rejections)
         return there | state.terminate | (state.search_state.step_size < self.min_step), state.result
 
-    def final_result(self, end: _LinearProblem, start: Array, result: Any) -> Any:
-        """Return the first reason why the result is unreliable, or success."""
-        failed = RESULTS.where(result == RESULTS.successful, RESULTS.not_at_optimum, result)
-        failed = RESULTS.where(jnp.all(end.theta == start), RESULTS.did_not_move, failed)
-        name = RESULTS.where(end.rank < end.theta.size, RESULTS.rank_deficient, RESULTS.successful)
-        is_optimum = end.offset < jnp.where(result == RESULTS.successful, self.corner_tolerance, self.offset_tolerance)
-        name = RESULTS.where(is_optimum, name, failed)
+    def final_result(self, end: _LinearProblem, start: Array, result: Any) -> Int[Array, ""]:
+        """Return the index in `RESULT_NAMES` of the first reason why the result is unreliable, or of success."""
+        index = RESULT_NAMES.index
+        has_ended = result == optx.RESULTS.successful
+        failed = jnp.where(has_ended, index("not_at_optimum"), index("nonfinite"))  # by the linear solver
+        for name in ("nonlinear_max_steps_reached", "nonlinear_divergence"):
+            failed = jnp.where(result == getattr(optx.RESULTS, name), index(name), failed)
+        failed = jnp.where(jnp.all(end.theta == start), index("did_not_move"), failed)
+        found = jnp.where(end.rank < end.theta.size, index("rank_deficient"), index("successful"))
+        is_optimum = end.offset < jnp.where(has_ended, self.corner_tolerance, self.offset_tolerance)
         finite = jnp.all(jnp.isfinite(end.residuals)) & jnp.all(jnp.isfinite(end.jacobian))
-        return RESULTS.where(finite, name, RESULTS.nonfinite)
+        return jnp.where(finite, jnp.where(is_optimum, found, failed), index("nonfinite"))

@@ -7,8 +7,7 @@ import equinox as eqx
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-# reasons why a fit ended: those of optimistix, and others that make a fit unreliable
-RESULT_MESSAGES = {
+RESULTS = {
     "successful": "The fit converged, and the residuals are consistent with the noise.",
     "did_not_move": (
         "The optimiser did not move from its starting point, which is not a minimum; check the units of the record."
@@ -37,7 +36,8 @@ RESULT_MESSAGES = {
     ),
     "nonlinear_divergence": "The search diverged; state a narrower prior, or start elsewhere.",
 }
-RESULT_NAMES = tuple(RESULT_MESSAGES)
+"""Sentence for each reason why a fit ended: those of optimistix, and others that make a fit unreliable."""
+RESULT_NAMES = tuple(RESULTS)
 
 
 def result_name(index: Int[ArrayLike, ""]) -> str:

@@ -22,7 +22,7 @@ from fitact.fitting.fit_figures import plot_fit, plot_identifiability
 from fitact.fitting.geometry import Contribution
 from fitact.fitting.identifiability import Identifiability, assess_identifiability, assess_parameters
 from fitact.fitting.laplace import Laplace
-from fitact.fitting.outcome import RESULT_MESSAGES
+from fitact.fitting.outcome import RESULTS
 from fitact.fitting.profile import PROFILE_QUANTITIES, Interval, profile_intervals
 from fitact.instrument.classes import TYPICAL, typical_gain_u
 from fitact.likelihood.likelihood import Likelihood
@@ -370,7 +370,7 @@ class Fit(Display):
     @property
     def message(self) -> str:
         """Sentence for the result, and what the residuals look like."""
-        message = RESULT_MESSAGES[self.result]
+        message = RESULTS[self.result]
         if self.result not in ("misfit", "structure"):
             return message
         return describe_structure(self.result, message, self.effects)

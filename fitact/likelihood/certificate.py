@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
@@ -272,8 +273,8 @@ def certify(
     is_local = any(channel.expansion is not None for channel in likelihood.channels)
     points = around if is_local else np.vstack([around, _prior_points(light, theta, check_points - 1)])  # fills a batch
     narrow = dataclasses.replace(likelihood, channels=restricted).without_samples()
-    exact, compressed, tabulated = (
-        _evaluate_log_likelihoods(model, points, sigma) for model in (likelihood.without_compression(), narrow, light)
+    exact, compressed, tabulated = _evaluate_log_likelihoods(
+        (likelihood.without_compression(), narrow, light), points, sigma
     )
     # a constant error of an expansion, in the integral over nuisances, does not change the posterior
     is_expanded = np.array([channel.expansion is not None for channel in likelihood.channels])
@@ -319,28 +320,28 @@ def _compression_failure(error: float, excess: float, tolerance: float) -> str:
 
 def _prior_points(likelihood: Likelihood, theta: np.ndarray, count: int) -> Float[np.ndarray, "n parameters"]:
     """Return draws from the prior that the tables cover, `count` if there are so many."""
-    draws = likelihood.sample_prior(theta, 256)  # a batch of time constants
-    tau = likelihood.time_constants(draws)
-    covered = [channel.compression.covers(tau) for channel in likelihood.channels if channel.compression is not None]
-    return draws[np.all(covered, axis=(0, 1))][:count]
+    tables, found = [channel.compression for channel in likelihood.channels], list[np.ndarray]()
+    for draw in likelihood.sample_prior(theta, 256):
+        tau = np.asarray(likelihood.evaluate_circuit(draw).tau)
+        if all(table is None or np.all(table.covers(tau)) for table in tables):
+            found.append(draw)
+        if len(found) == count:
+            break
+    return np.reshape(found, (-1, theta.size))
 
 
 def _evaluate_log_likelihoods(
-    likelihood: Likelihood, theta: Float[np.ndarray, "n parameters"], sigma: np.ndarray
-) -> np.ndarray:
-    """Return the log-likelihood of each channel at points with common sigma, (n, channels)."""
+    models: tuple[Likelihood, ...], theta: Float[np.ndarray, "n parameters"], sigma: np.ndarray
+) -> Float[np.ndarray, "models n channels"]:
+    """Return the log-likelihood of each channel in several models at points with common sigma, by one program."""
     points = np.column_stack([theta, np.tile(np.log(sigma), (len(theta), 1))])
-    few, many = likelihood.rows <= FEW_ROWS, likelihood.rows > MANY_SAMPLES
-    evaluate = batch_log_prob_parts(likelihood, 128 if few else 16, fast=many)
-    return evaluate(points, description="checking the compression")[:, :-1]
+    rows = max(model.rows for model in models)
+    evaluate = BatchEvaluator(_log_likelihoods, models, rows, 16, max_numbers=65_536, fast=rows > MANY_SAMPLES)
+    return evaluate(points, description="checking the compression").swapaxes(0, 1)
 
 
-def batch_log_prob_parts(likelihood: Likelihood, batch: int = 128, *, fast: bool = False) -> BatchEvaluator:
-    """Return the evaluation of `Likelihood.log_prob_parts` at many points; `fast` as in `compiled.jit`.
-
-    Batches of a sum over samples are so small that intermediate arrays stay in the processor's cache.
-    """
-    return BatchEvaluator(Likelihood.log_prob_parts, likelihood, likelihood.rows, batch, max_numbers=65_536, fast=fast)
+def _log_likelihoods(models: tuple[Likelihood, ...], point: Array) -> Float[Array, "models channels"]:
+    return jnp.stack([model.log_likelihoods(point) for model in models])
 
 
 def batched_log_prob(likelihood: Likelihood, walkers: int) -> Callable[[np.ndarray], np.ndarray]:
@@ -351,7 +352,11 @@ def batched_log_prob(likelihood: Likelihood, walkers: int) -> Callable[[np.ndarr
     # pad halves where this costs nothing, so that only one size is compiled
     batch = walkers if likelihood.rows <= FEW_ROWS else walkers // 2
     light, full = likelihood.without_samples(), likelihood.without_compression()
-    tabulated, summed = batch_log_prob_parts(light, batch, fast=True), batch_log_prob_parts(full, 1, fast=True)
+    tabulated, summed = (
+        # of a sum over samples so few at once that intermediate arrays stay in the processor's cache
+        BatchEvaluator(Likelihood.log_prob_parts, model, model.rows, size, max_numbers=65_536)
+        for model, size in ((light, batch), (full, 1))
+    )
     # bound once, because Equinox takes longer to bind a method than the evaluation takes
     combine_tabulated, combine_summed = light.combine_log_prob, full.combine_log_prob
 
@@ -405,5 +410,7 @@ def _log_tau_slopes(
 ) -> Float[np.ndarray, "taus parameters"]:
     """Return the gradients of the logarithms of the time constants, from differences."""
     steps = step * np.eye(theta.size)
-    later, earlier = np.split(np.log(likelihood.time_constants(theta + np.vstack([steps, -steps]))), 2, axis=1)
-    return (later - earlier) / (2.0 * step)
+    later, earlier = (
+        np.log([likelihood.evaluate_circuit(theta + sign * change).tau for change in steps]) for sign in (1.0, -1.0)
+    )
+    return (later - earlier).T / (2.0 * step)
