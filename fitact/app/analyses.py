@@ -97,7 +97,7 @@ class Analysis:
         """Move an uploaded file into the folder under a name of our own, which it returns."""
         own = re.sub(r"[^A-Za-z0-9._-]+", "_", re.split(r"[/\\]", name)[-1])[-_NAME_LENGTH:].lstrip("._-") or "file"
         taken = {each.casefold() for each in self.files}
-        own = next(each for each in _numbered(own) if each.casefold() not in taken)
+        own = next(each for each in _name_candidates(own) if each.casefold() not in taken)
         os.replace(temporary, self.folder / "records" / own)
         self.files[own] = "".join(character if character.isprintable() else "�" for character in name)[:200]
         self.save()
@@ -176,7 +176,7 @@ class Analysis:
                 archive.write(each, Path(self.name) / each.relative_to(self.folder))
 
 
-def _numbered(name: str) -> Iterator[str]:
+def _name_candidates(name: str) -> Iterator[str]:
     yield name
     number = 2
     while True:

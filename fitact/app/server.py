@@ -237,7 +237,7 @@ class Page:
 
     async def send_picture(self, request: Request) -> Response:
         """Send a picture that `fitact inspect` drew of a file."""
-        return _send_one_of((self._find(request).folder / "pictures").glob("*.png"), request)
+        return _send_by_name((self._find(request).folder / "pictures").glob("*.png"), request)
 
     async def send_report(self, request: Request) -> Response:
         """Send the report, sandboxed."""
@@ -248,7 +248,7 @@ class Page:
 
     async def send_result(self, request: Request) -> Response:
         """Send a result file, the scene or the command, for download."""
-        return _send_one_of(self._find(request).result_files(), request, is_download=True)
+        return _send_by_name(self._find(request).result_files(), request, is_download=True)
 
     async def send_archive(self, request: Request) -> Response:
         """Send everything as one file."""
@@ -320,7 +320,7 @@ def _mark_code(text: str) -> Markup:
     return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", html.escape(text)))
 
 
-def _send_one_of(paths: Iterable[Path], request: Request, is_download: bool = False) -> Response:
+def _send_by_name(paths: Iterable[Path], request: Request, is_download: bool = False) -> Response:
     """Send the file whose name is asked for, so that a name is never used as a path."""
     for path in paths:
         if path.name == request.path_params["file"]:

@@ -103,7 +103,7 @@ def write_tradeoff_page(path: str | os.PathLike[str], tradeoff: Tradeoff, origin
             kind: [(*COLUMNS, "dominated by"), *((*each.cells, each.dominated_by) for each in tradeoff.methods(kind))]
             for kind in KINDS
         },
-        resolved=tradeoff.resolved,
+        resolved=tradeoff.resolution_note,
         machine=tradeoff.machine,
     )
 

@@ -324,15 +324,15 @@ class Posterior(Display):
             if isinstance(channel.record, Spectrum):
                 axes |= _spectrum_axis(channel)
                 observed |= _spectrum_variables(channel, channel.record.values)
-                constant |= _spectrum_variables(channel, channel.fitted, "_fit")
+                constant |= _spectrum_variables(channel, channel.prediction, "_fit")
                 continue
             time, name = _time_axis_name(channel), _variable_name(channel)
             unit = {"units": CHANNEL_UNITS[channel.channel]}
             axes[time] = (time, channel.record.time, {"units": "s"})
             observed[name] = (time, channel.record[channel.channel], unit)
-            constant[f"{name}_fit"] = (time, channel.fitted, unit)
+            constant[f"{name}_fit"] = (time, channel.prediction, unit)
             constant[_variable_name(channel, "V")] = (time, channel.choice.voltage, {"units": "V"})
-            constant |= self._unfitted(channel, channel.record, time)
+            constant |= self._unfitted_channels(channel, channel.record, time)
         attributes = {
             "inference_library": "fitact",
             "level": self.convergence.level,
@@ -356,7 +356,7 @@ class Posterior(Display):
             }
         )
 
-    def _unfitted(self, trace: ChannelFit, record: Record, time: str) -> dict[str, Any]:
+    def _unfitted_channels(self, trace: ChannelFit, record: Record, time: str) -> dict[str, Any]:
         """Return the channels of a fitted channel's record that were recorded but not fitted, as variables."""
         fitted = {each.channel for each in self.fit.traces if each.record is record}
         others = [name for name in record.channels if name not in fitted]

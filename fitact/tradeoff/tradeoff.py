@@ -103,10 +103,10 @@ class Tradeoff:
         rows = [f"{self.record}; {self.machine['cpu']}, {self.machine['cores']} cores", ""]
         for kind, title in KINDS.items():
             rows += [f"{kind}: {title}", align_row(COLUMNS, _WIDTHS), *map(str, self.methods(kind)), ""]
-        return "\n".join([*rows, self.resolved, *self.notes])
+        return "\n".join([*rows, self.resolution_note, *self.notes])
 
     @property
-    def resolved(self) -> str:
+    def resolution_note(self) -> str:
         """Smallest significant error of an uncertainty, as text."""
         return f"errors of uncertainty below {self.resolution:.2g} are not significant"
 
