@@ -30,7 +30,7 @@ from fitact.model.drive import Periodic
 from fitact.model_selection.plan import Plan
 from fitact.sampling.chain import Chain
 from fitact.sampling.convergence import Convergence
-from fitact.tables import Display
+from fitact.tables import Display, to_dataframe, to_dataset, to_datatree
 from fitact.uncertainty.budget import Budget
 from fitact.units import quantity_unit
 
@@ -274,11 +274,9 @@ class Posterior(Display):
 
         The index holds the chain (independent ensemble) and the draw.
         """
-        import pandas as pd
-
-        index = pd.MultiIndex.from_product(map(range, self.points.shape[:2]), names=["chain", "draw"])
+        ensembles, count = self.points.shape[:2]
         columns = {name: values.ravel() for name, values in (self.parameters() | self.derived()).items()}
-        return pd.DataFrame(columns, index=index)
+        return to_dataframe(columns, levels={"chain": range(ensembles), "draw": range(count)})
 
     def to_arviz(self) -> Any:
         """Return ArviZ's object: an `InferenceData`, or from ArviZ 1 on the `xarray.DataTree` itself.
@@ -303,16 +301,15 @@ class Posterior(Display):
 
     def to_datatree(self) -> Any:
         """Return an `xarray.DataTree` in ArviZ's groups; chain: the independent ensembles."""
-        import xarray as xr
 
-        def dataset(draws: dict[str, np.ndarray]) -> xr.Dataset:
+        def dataset(draws: dict[str, np.ndarray]) -> Any:
             dims, coords = ("chain", "draw"), {"chain": np.arange(ensembles), "draw": np.arange(count)}
             variables = {name: (dims, values, {"units": quantity_unit(name)}) for name, values in draws.items()}
-            return xr.Dataset(variables, coords=coords)
+            return to_dataset(variables, coords)
 
         ensembles, count = self.points.shape[:2]
         prior, (instants, force) = self._prior_draws, self.force_in_time
-        in_time = xr.Dataset(
+        in_time = to_dataset(
             {"force": (("quantile", "time"), force, {"units": "N"})},
             {"quantile": list(summary.PROBABILITIES.values()), "time": ("time", instants, {"units": "s"})},
             {"law": self._force_law},
@@ -342,15 +339,15 @@ class Posterior(Display):
             "scene": self.fit.scene.to_json(),
             "seed": self.seed,
         }
-        statistics = xr.Dataset({"lp": (("chain", "draw"), self.log_prob)}, coords=dataset(prior).coords)
-        return xr.DataTree.from_dict(
+        statistics = to_dataset({"lp": (("chain", "draw"), self.log_prob)}, dataset(prior).coords)
+        return to_datatree(
             {
-                "/": xr.Dataset(attrs=attributes),
+                "/": to_dataset({}, attributes=attributes),
                 "posterior": dataset(self.parameters() | self.derived()),
                 "sample_stats": statistics,
                 "posterior_predictive": self._posterior_predictive,
-                "observed_data": xr.Dataset(observed, axes),
-                "constant_data": xr.Dataset(constant, axes),
+                "observed_data": to_dataset(observed, axes),
+                "constant_data": to_dataset(constant, axes),
                 "prior": dataset(prior),
                 "force_in_time": in_time,
             }
@@ -376,12 +373,10 @@ class Posterior(Display):
     @functools.cached_property
     def _posterior_predictive(self) -> Any:
         """Posterior predictive records with noise: 50 of each ensemble, each of about 4000 samples at most."""
-        import xarray as xr
-
         ensembles, count = self.points.shape[:2]
         draws = np.linspace(0, count - 1, min(50, count)).astype(int)
         rng = np.random.default_rng([self.seed, 3])
-        predicted = xr.Dataset(coords={"chain": np.arange(ensembles), "draw": draws})
+        predicted = to_dataset({}, {"chain": np.arange(ensembles), "draw": draws})
         for i, (channel, model) in enumerate(zip(self.fit.traces, self.fit.likelihood.channels, strict=True)):
             stride = -(-len(channel.record) // 4000)
             predicting = self.fit.likelihood, i, stride
