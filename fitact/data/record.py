@@ -20,6 +20,7 @@ from fitact.units import format_engineering
 MINIMUM_SAMPLES = 20
 OVERFLOW = 9e36  # oscilloscopes write 9.9E+37 or more for a value out of range
 CHANNEL_UNITS = {"V": "V", "Vsc": "V", "I": "A", "Ft": "N"}
+LARGEST_VALUES = {"V": 5e3, "A": 0.1}  # on a touch display, by unit
 CHANNEL_TITLES = {"V": "drive V", "Vsc": "skin voltage Vsc", "I": "loop current I", "Ft": "friction Ft"}
 
 # times of existing records, so that records on the same grid share one array

@@ -6,7 +6,7 @@ import functools
 import importlib.metadata
 import math
 import os
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,12 +27,22 @@ from fitact.likelihood.noise import draw_noise
 from fitact.likelihood.spectrum_channel import join_complex
 from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.model.drive import Periodic
-from fitact.model_selection.plan import Plan
 from fitact.sampling.chain import Chain
 from fitact.sampling.convergence import Convergence
 from fitact.tables import Display, to_dataframe, to_dataset, to_datatree
 from fitact.uncertainty.budget import Budget
 from fitact.units import quantity_unit
+
+
+class ReducedModel(Protocol):
+    """Model without the elements of the scene that can be neglected, as a report states it; `Plan` is one."""
+
+    @property
+    def sentence(self) -> str:
+        """Neglected elements and the resulting errors, in a sentence."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the omissions as a JSON object."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -405,7 +415,7 @@ class Posterior(Display):
         with atomic_write(path) as temporary:
             tree.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
 
-    def report(self, path: str | os.PathLike[str], plan: Plan | None = None) -> None:
+    def report(self, path: str | os.PathLike[str], plan: ReducedModel | None = None) -> None:
         """Write the report as one self-contained HTML page; `plan` adds the simplifications of the fitted scene."""
         from fitact.report import write_report
 
