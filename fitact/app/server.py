@@ -46,7 +46,6 @@ _TOO_LARGE = (
     f"too large for the page, which takes files up to {LARGEST_UPLOAD // 10**6} MB and scenes up to"
     f" {_LARGEST_FORM // 10**6} MB; use `fitact run` on the command line"
 )
-_STALE_UPLOAD = 86_400.0  # s, after which the uploads of a server that was killed are removed
 _PERCENT = re.compile(r"(\d+)%")
 
 
@@ -140,10 +139,10 @@ class Page:
         self._templates.filters |= {"field_name": scene_form.field_name, "display_value": scene_form.display_value}
 
     @contextlib.asynccontextmanager
-    async def live(self, _: Starlette) -> AsyncIterator[None]:
-        """Remove what a killed server left; end the process for commands with the server."""
+    async def live(self, _: Starlette, stale_age: float = 86_400.0) -> AsyncIterator[None]:
+        """Remove uploads of killed servers, older than `stale_age` (s); in the end, end the process for commands."""
         for old in self._root.glob(".upload-*"):
-            if time.time() - old.stat().st_mtime > _STALE_UPLOAD:
+            if time.time() - old.stat().st_mtime > stale_age:
                 shutil.rmtree(old, ignore_errors=True)
         yield
         self._commands.stop()
