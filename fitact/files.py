@@ -1,4 +1,4 @@
-"""Atomic writing of files, JSON, and errors of reading."""
+"""Atomic writing of files, JSON, Parquet, NetCDF, and errors of reading."""
 
 import contextlib
 import json
@@ -69,6 +69,14 @@ def write_parquet(path: str | os.PathLike[str], columns: Mapping[str, Any]) -> N
         raise InputError(f"{path}: Parquet needs pyarrow; pip install 'fitact[campaign]', or write CSV") from error
     with atomic_write(path) as temporary:
         pq.write_table(pa.table(columns), temporary)
+
+
+def read_datatree(path: str | os.PathLike[str]) -> Any:
+    """Return the `xarray.DataTree` of a NetCDF file; raise what xarray does."""
+    import xarray as xr  # slow to import, and few commands read NetCDF
+
+    with xr.open_datatree(path, engine="h5netcdf") as tree:
+        return tree.load()
 
 
 def read_head(path: str | os.PathLike[str], size: int = 4096) -> bytes:

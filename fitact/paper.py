@@ -20,21 +20,46 @@ from fitact.model.steady import mean_square, peak
 
 Value = float | dict[str, float]
 
-RSC, CSC = 160e3, 22e-9  # ohm, F; one layer at 100 Hz
-R_H, Z = 500.0, 14.5e6  # ohm
-AREA, INSULATOR, SKIN, PERMITTIVITY = 1e-4, 1e-6, 200e-6, 3.9  # m^2, m, m, 1
-FREQUENCY, PEAK_TO_PEAK = 100.0, 360.0  # Hz, V
-GROUNDING_RSC = (80e3, 110e3, 140e3, 170e3, 200e3)  # ohm, Fig. 5
-GROUNDING_CSC = (8.85e-9, 17.7e-9, 26.5e-9, 35.4e-9, 44.2e-9)  # F, Fig. 6
-SKIN_AT = {"10Hz": (1e4, 1e5), "100Hz": (5e3, 8e4), "1kHz": (2e3, 4e4)}  # permittivity, resistivity (ohm m)
 TEXT_CI, CI = "1.35 nF", 1.35e-9  # F
-_OMEGA = 2.0 * math.pi * FREQUENCY
+
+
+class PaperValues(NamedTuple):
+    """Values of the reference paper in SI units, and its circuits with them."""
+
+    Rsc: float = 160e3  # of one layer at 100 Hz
+    Csc: float = 22e-9  # likewise
+    R_H: float = 500.0
+    Z: float = 14.5e6
+    contact_area: float = 1e-4
+    insulator_thickness: float = 1e-6
+    insulator_permittivity: float = 3.9
+    skin_thickness: float = 200e-6
+    frequency: float = 100.0
+    peak_to_peak: float = 360.0
+    grounding_Rsc: tuple[float, ...] = (80e3, 110e3, 140e3, 170e3, 200e3)  # Fig. 5
+    grounding_Csc: tuple[float, ...] = (8.85e-9, 17.7e-9, 26.5e-9, 35.4e-9, 44.2e-9)  # Fig. 6
+
+    def final_circuit(self, Ci: float = CI) -> FinalCircuit:
+        """Return the circuit of Fig. 11."""
+        return FinalCircuit(self.Rsc, self.Csc, Ci)
+
+    def direct_ground(self, Ci: float = CI, **others: Any) -> DirectGround:
+        """Return the circuit of Fig. 3a, with `others` of its fields."""
+        return DirectGround(self.Rsc, self.Csc, Ci, **{"R_H": self.R_H} | others)
+
+    def natural_ground(self, Ci: float = CI) -> NaturalGround:
+        """Return the circuit of Fig. 3b."""
+        return NaturalGround(self.Rsc, self.Csc, Ci, self.Z)
+
+
+VALUES = PaperValues()
+_OMEGA = 2.0 * math.pi * VALUES.frequency
 INSULATORS = {
     TEXT_CI: CI,
-    "3.45 nF": float(plate_capacitance(PERMITTIVITY, AREA, INSULATOR)),
+    "3.45 nF": float(plate_capacitance(VALUES.insulator_permittivity, VALUES.contact_area, VALUES.insulator_thickness)),
     "0.69 nF": 1.0 / (_OMEGA * 2.3e6),
 }  # F; from the text, from eq. (3), and from |Z_Ci| = 2.3 Mohm
-_SQUARE = Square(peak_to_peak=PEAK_TO_PEAK, frequency=FREQUENCY)
+_SQUARE = Square(peak_to_peak=VALUES.peak_to_peak, frequency=VALUES.frequency)
 
 
 class Claim(NamedTuple):
@@ -87,25 +112,27 @@ def _element_claims() -> Iterator[Claim]:
     )  # fmt: skip
     end = "the end of the range that the paper gives"
     middle = "the paper states no value for 100 Hz; this one, within its range, gives the paper's result"
-    for frequency, Csc, Rsc, why in (
-        ("10 Hz", 44.25e-9, 200e3, end), ("100 Hz", 22e-9, 160e3, middle), ("1 kHz", 8.85e-9, 80e3, end)
-    ):  # fmt: skip
+    area, thickness = VALUES.contact_area, VALUES.skin_thickness
+    for frequency, permittivity, resistivity, Csc, Rsc, why in (  # resistivity in ohm m
+        ("10 Hz", 1e4, 1e5, 44.25e-9, 200e3, end),
+        ("100 Hz", 5e3, 8e4, 22e-9, 160e3, middle),
+        ("1 kHz", 2e3, 4e4, 8.85e-9, 80e3, end),
+    ):
         suffix = frequency.replace(" ", "")
-        permittivity, resistivity = SKIN_AT[suffix]
         yield _make_claim(
-            f"eq3_Csc_{suffix}", f"Csc at {frequency}", Csc, float(plate_capacitance(permittivity, AREA, SKIN)), "F",
-            f"permittivity {permittivity:g}: {why}", 0.01,
+            f"eq3_Csc_{suffix}", f"Csc at {frequency}", Csc, float(plate_capacitance(permittivity, area, thickness)),
+            "F", f"permittivity {permittivity:g}: {why}", 0.01,
         )  # fmt: skip
         yield _make_claim(
-            f"eq4_Rsc_{suffix}", f"Rsc at {frequency}", Rsc, float(plate_resistance(resistivity, AREA, SKIN)), "ohm",
-            f"resistivity {resistivity:g} ohm m: {why}",
+            f"eq4_Rsc_{suffix}", f"Rsc at {frequency}", Rsc, float(plate_resistance(resistivity, area, thickness)),
+            "ohm", f"resistivity {resistivity:g} ohm m: {why}",
         )  # fmt: skip
     yield _make_claim(
         "eq7_ZCi_100Hz", "|1 / (j w Ci)| at 100 Hz is 2.3 Mohm", 2.3e6, _map_insulators(lambda Ci: 1.0 / (_OMEGA * Ci)),
         "ohm", "1.35 nF gives 1.18 Mohm; 2.3 Mohm corresponds to 0.69 nF",
     )  # fmt: skip
     yield _make_claim(
-        "eq8_Zsc_100Hz", "|Zsc| at 100 Hz is 65.7 kohm", 65.7e3, abs(RSC / (1.0 + 1j * _OMEGA * RSC * CSC)), "ohm",
+        "eq8_Zsc_100Hz", "|Zsc| at 100 Hz is 65.7 kohm", 65.7e3, abs(_skin_impedance(_OMEGA)), "ohm",
         "65.9 kohm with 22 nF; 65.7 kohm corresponds to 22.1 nF",
     )  # fmt: skip
 
@@ -113,7 +140,7 @@ def _element_claims() -> Iterator[Claim]:
 def _grounding_claims() -> Iterator[Claim]:
     def ratio(measure: Callable[[Circuit], Any], Ci: float = CI) -> float:
         """Return the measure under direct ground over the measure under natural ground."""
-        return float(measure(DirectGround(RSC, CSC, Ci, R_H=R_H)) / measure(NaturalGround(RSC, CSC, Ci, Z)))
+        return float(measure(VALUES.direct_ground(Ci)) / measure(VALUES.natural_ground(Ci)))
 
     def gain(circuit: Circuit) -> Any:
         return jnp.abs(circuit.transfer_function(_OMEGA))
@@ -133,14 +160,14 @@ def _grounding_claims() -> Iterator[Claim]:
 
 def peaks_over_grounding(Ci: float, name: str, values: tuple[float, ...]) -> np.ndarray:
     """Return peaks of Vsc (V) for the square of Figs. 5 and 6, varying Rsc or Csc of the grounding finger."""
-    skin: dict[str, Any] = {"grounding_Rsc": RSC, "grounding_Csc": CSC}
-    circuits = [DirectGround(RSC, CSC, Ci, R_H=R_H, **(skin | {name: value})) for value in values]
+    skin = {"grounding_Rsc": VALUES.Rsc, "grounding_Csc": VALUES.Csc}
+    circuits = [VALUES.direct_ground(Ci, **skin | {name: value}) for value in values]
     return np.array([float(peak(circuit, _SQUARE)) for circuit in circuits])
 
 
 def _grounding_finger_claims() -> Iterator[Claim]:
     def spread(Ci: float) -> float:
-        peaks = peaks_over_grounding(Ci, "grounding_Rsc", GROUNDING_RSC)
+        peaks = peaks_over_grounding(Ci, "grounding_Rsc", VALUES.grounding_Rsc)
         return float(np.ptp(peaks) / peaks.mean())
 
     yield _make_claim(
@@ -159,8 +186,8 @@ def _grounding_finger_claims() -> Iterator[Claim]:
 
 
 def _equivalent_claims() -> Iterator[Claim]:
-    series = series_equivalent(RSC, CSC, FREQUENCY)
-    with_body, without = (float(quality_factor(RSC, CSC, FREQUENCY, R)) for R in (R_H, 0.0))
+    series = series_equivalent(VALUES.Rsc, VALUES.Csc, VALUES.frequency)
+    with_body, without = (float(quality_factor(VALUES.Rsc, VALUES.Csc, VALUES.frequency, R)) for R in (VALUES.R_H, 0.0))
     yield _make_claim("eq11_Rx", "Rx at 100 Hz", 27.16e3, float(series.Rx), "ohm", "to the paper's digits")
     yield _make_claim("eq13_Cx", "Cx at 100 Hz", 26.5e-9, float(series.Cx), "F", "to the paper's digits")
     yield _make_claim("eq14_Rx2", "Rx' of both skins", 54.32e3, 2.0 * float(series.Rx), "ohm", "to the paper's digits")
@@ -173,7 +200,7 @@ def _equivalent_claims() -> Iterator[Claim]:
     )  # fmt: skip
 
     def relative_change(Ci: float) -> Any:
-        return 1.0 - peak(DirectGround(RSC, CSC, Ci, R_H=R_H), _SQUARE) / peak(FinalCircuit(RSC, CSC, Ci), _SQUARE)
+        return 1.0 - peak(VALUES.direct_ground(Ci), _SQUARE) / peak(VALUES.final_circuit(Ci), _SQUARE)
 
     yield _make_claim(
         "fig10_RH", "R_H changes Vsc too little to have an effect (of the peak)", 0.0,
@@ -184,21 +211,24 @@ def _equivalent_claims() -> Iterator[Claim]:
 
 def force_over(permittivity: float, thickness: float) -> float:
     """Return the mean force (N) of Fig. 12 for a 360 Vpp square, with Ci from the insulator by eq. (3)."""
-    Ci = plate_capacitance(permittivity, AREA, thickness)
-    contact = Contact(AREA, thickness, permittivity, SKIN, float(CSC * SKIN / plate_capacitance(1.0, AREA, 1.0)))
-    return float(mean_force(FinalCircuit(RSC, CSC, Ci), _SQUARE, contact))
+    area, skin_thickness = VALUES.contact_area, VALUES.skin_thickness
+    skin_permittivity = float(VALUES.Csc * skin_thickness / plate_capacitance(1.0, area, 1.0))
+    contact = Contact(area, thickness, permittivity, skin_thickness, skin_permittivity)
+    circuit = VALUES.final_circuit(plate_capacitance(permittivity, area, thickness))
+    return float(mean_force(circuit, _SQUARE, contact))
 
 
 def _insulator_claims() -> Iterator[Claim]:
     values = np.linspace(1.0, 10.0, 19)
-    forces = [force_over(eps, INSULATOR) for eps in values]
+    forces = [force_over(eps, VALUES.insulator_thickness) for eps in values]
     exponent = float(np.polyfit(np.log(values), np.log(forces), 1)[0])
     yield _make_claim(
         "fig12_eps", "the force grows about linearly with the permittivity (its exponent, 1 to 10)", 1.0, exponent, "1",
         "it grows faster, since Vsc grows with Ci, too; at a fixed voltage across the finger eq. (1) is nearly linear",
         0.1,
     )  # fmt: skip
-    remainder = force_over(PERMITTIVITY, 0.2e-6) / force_over(PERMITTIVITY, 0.01e-6)
+    thick, thin = (force_over(VALUES.insulator_permittivity, thickness) for thickness in (0.2e-6, 0.01e-6))
+    remainder = thick / thin
     yield _make_claim(
         "fig12_T", "the force falls with the thickness, to almost nothing at 0.2 um (of that at 0.01 um)", 0.0,
         remainder, "1",
@@ -208,7 +238,7 @@ def _insulator_claims() -> Iterator[Claim]:
 
 
 def _frequency_claims() -> Iterator[Claim]:
-    corner = _map_insulators(lambda Ci: 1.0 / (2.0 * math.pi * FinalCircuit(RSC, CSC, Ci).b))
+    corner = _map_insulators(lambda Ci: 1.0 / (2.0 * math.pi * VALUES.final_circuit(Ci).b))
     steady = {name: frequency * 0.99 / math.sqrt(1.0 - 0.99**2) for name, frequency in corner.items()}
     for id, claim, frequency, ours, reason, tolerance in (
         ("amplitude_knee", "the amplitude's knee is at about 40 Hz", 40.0, corner,
@@ -227,14 +257,14 @@ def _frequency_claims() -> Iterator[Claim]:
 def waveforms(peak_to_peak: float) -> dict[str, Drive]:
     """Return the three drives of Fig. 15, by name."""
     kinds = {"sine": Sine, "triangle": Triangle, "square": Square}
-    return {name: kind(peak_to_peak=peak_to_peak, frequency=FREQUENCY) for name, kind in kinds.items()}
+    return {name: kind(peak_to_peak=peak_to_peak, frequency=VALUES.frequency) for name, kind in kinds.items()}
 
 
 def _waveform_claims() -> Iterator[Claim]:
     def peak_to_peak(drive: Drive) -> dict[str, float]:
-        return _map_insulators(lambda Ci: 2.0 * peak(FinalCircuit(RSC, CSC, Ci), drive))
+        return _map_insulators(lambda Ci: 2.0 * peak(VALUES.final_circuit(Ci), drive))
 
-    larger = waveforms(PEAK_TO_PEAK)
+    larger = waveforms(VALUES.peak_to_peak)
     for name, drive in waveforms(30.0).items():
         printed = 30.0 if name == "square" else 15.0
         yield _make_claim(
@@ -249,23 +279,22 @@ def _equation_claims() -> Iterator[Claim]:
     """Yield the formulas without a number: as printed in the paper, in complex arithmetic, against fitact."""
     frequency = np.geomspace(10.0, 1000.0, 41)
     w = 2.0 * np.pi * frequency
-    final, direct, natural = (
-        FinalCircuit(RSC, CSC, CI), DirectGround(RSC, CSC, CI, R_H=R_H), NaturalGround(RSC, CSC, CI, Z)
-    )  # fmt: skip
-    skin, insulator, X = RSC / (1.0 + 1j * w * RSC * CSC), 1.0 / (1j * w * CI), 1.0 / (w * CSC)
-    series = series_equivalent(RSC, CSC, frequency)
+    Rsc, Csc, R_H, Z = VALUES.Rsc, VALUES.Csc, VALUES.R_H, VALUES.Z
+    final, direct, natural = VALUES.final_circuit(), VALUES.direct_ground(), VALUES.natural_ground()
+    skin, insulator, X = _skin_impedance(w), 1.0 / (1j * w * CI), 1.0 / (w * Csc)
+    series = series_equivalent(Rsc, Csc, frequency)
     both = np.asarray(series.Rx) + 1j / (w * np.asarray(series.Cx))
-    a, b = RSC * CI, 2.0 * RSC * CI + RSC * CSC
+    a, b = Rsc * CI, 2.0 * Rsc * CI + Rsc * Csc
     H, admittance = final.transfer_function(w), final.admittance(w)
     same = "equal within rounding"
     for id, claim, printed, ours, reason in (
         ("eq5", "Vsc under direct ground", skin / (2 * skin + insulator + R_H), direct.transfer_function(w), same),
         ("eq6", "Vsc under natural ground", skin / (skin + insulator + Z), natural.transfer_function(w), same),
         ("eq10", "the series equivalent, resistance and reactance",
-         (RSC * (1j * X) ** 2 + 1j * RSC**2 * X) / (RSC**2 + X**2), both,
+         (Rsc * (1j * X) ** 2 + 1j * Rsc**2 * X) / (Rsc**2 + X**2), both,
          "as printed, its real part is negative, since (jX)^2 = -X^2; the subsequent eqs. (11) to (13) are right"),
-        ("eq12", "Xx", w * CSC * RSC**2 / (1 + (w * CSC * RSC) ** 2), both.imag, same),
-        ("eq15", "Q, series and parallel", RSC / X, both.imag / both.real, same),
+        ("eq12", "Xx", w * Csc * Rsc**2 / (1 + (w * Csc * Rsc) ** 2), both.imag, same),
+        ("eq15", "Q, series and parallel", Rsc / X, both.imag / both.real, same),
         ("eq18", "V over I", 2 * skin + insulator, 1 / admittance, same),
         ("eq19", "Vsc over I", skin, H / admittance, same),
         ("eq21", "H, eqs. (20) and (21)", 1j * w * a / (1j * w * b + 1.0), H, same),
@@ -280,9 +309,16 @@ def _equation_claims() -> Iterator[Claim]:
         yield _make_claim(id, f"{claim} (largest relative difference, 10 to 1000 Hz)", 0.0, off, "1", reason, 1e-9)
 
 
+def _skin_impedance(omega: Any) -> Any:
+    """Return the impedance (ohm) of one skin layer, eq. (8), as printed."""
+    return VALUES.Rsc / (1.0 + 1j * omega * VALUES.Rsc * VALUES.Csc)
+
+
 def _force_law() -> tuple[float, float]:
     """Return eq. (22) as printed, and the mean force over the mean square of Vsc (eq. (1) with v = Vsc)."""
-    contact = Contact(AREA, INSULATOR, PERMITTIVITY, SKIN, 5e3)
-    circuit = FinalCircuit(RSC, CSC, CI)
-    printed = 8.85e-12 * AREA / (2 * (INSULATOR / PERMITTIVITY + SKIN / 5e3) * (INSULATOR + SKIN))
+    A, Ti, Tsc, epsilon_i, epsilon_sc = (
+        VALUES.contact_area, VALUES.insulator_thickness, VALUES.skin_thickness, VALUES.insulator_permittivity, 5e3
+    )  # fmt: skip
+    contact, circuit = Contact(A, Ti, epsilon_i, Tsc, epsilon_sc), VALUES.final_circuit()
+    printed = 8.85e-12 * A / (2 * (Ti / epsilon_i + Tsc / epsilon_sc) * (Ti + Tsc))
     return printed, float(mean_force(circuit, _SQUARE, contact) / mean_square(circuit, _SQUARE))

@@ -16,9 +16,6 @@ import time
 from pathlib import Path
 
 _SUFFIX = ".program"
-_SIZE_LIMIT = 256 << 20  # bytes in the folder, above which the programs that were not used for longest are removed
-_STALE_AGE = 3600.0  # s; a temporary file this old was left by a process that was killed
-_STORES_PER_CLEANUP = 50
 _stores = itertools.count()
 
 
@@ -42,8 +39,12 @@ def load(key: str) -> bytes | None:
     return content
 
 
-def store(key: str, content: bytes) -> None:
-    """Store `content` under `key`; a process that is killed leaves no incomplete entry."""
+def store(key: str, content: bytes, size_limit: int = 256 << 20, stores_per_cleanup: int = 50) -> None:
+    """Store `content` under `key`; a process that is killed leaves no incomplete entry.
+
+    Once in `stores_per_cleanup` times, the programs that were not used for longest are removed above `size_limit`
+    bytes in the folder.
+    """
     folder = cache_folder()
     if folder is None:
         return
@@ -56,8 +57,8 @@ def store(key: str, content: bytes) -> None:
         except BaseException:
             os.unlink(temporary)
             raise
-        if next(_stores) % _STORES_PER_CLEANUP == 0:
-            _clean_up(folder)
+        if next(_stores) % stores_per_cleanup == 0:
+            _clean_up(folder, size_limit)
     except OSError as error:
         _note(f"compiled programs cannot be stored in {folder} ({error.strerror or error})")
 
@@ -103,19 +104,22 @@ def _note(reason: str) -> None:
     )
 
 
-def _clean_up(folder: Path) -> None:
-    """Remove what killed processes left, and the programs that were not used for longest if the folder is too large."""
+def _clean_up(folder: Path, size_limit: int, stale_age: float = 3600.0) -> None:
+    """Remove what killed processes left, and the programs that were not used for longest if the folder is too large.
+
+    A temporary file older than `stale_age` (s) was left by a process that was killed.
+    """
     entries = []
     for entry in os.scandir(folder):
         with contextlib.suppress(OSError):  # another process may have removed it
             found = entry.stat()
             if entry.name.endswith(_SUFFIX):
                 entries.append((found.st_mtime, found.st_size, entry.path))
-            elif entry.name.endswith(".tmp") and found.st_mtime < time.time() - _STALE_AGE:
+            elif entry.name.endswith(".tmp") and found.st_mtime < time.time() - stale_age:
                 os.unlink(entry.path)
     total = sum(size for _, size, _ in entries)
     for _, size, path in sorted(entries):
-        if total <= _SIZE_LIMIT:
+        if total <= size_limit:
             break
         with contextlib.suppress(OSError):
             os.unlink(path)

@@ -1,7 +1,8 @@
-"""Rows of text as aligned columns or as HTML, and how a result looks in a notebook; knows no result class."""
+"""Tables as text, HTML, pandas and xarray objects, and how a result looks in a notebook; knows no result class."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
+from typing import Any, Literal
 
 
 def align_row(cells: Sequence[str], widths: Sequence[int]) -> str:
@@ -45,6 +46,39 @@ def html_table(rows: Sequence[Sequence[str]]) -> str:
         )
         lines.append(f"<tr>{''.join(cells)}</tr>")
     return f'<table style="color:inherit">{"".join(lines)}</table>'
+
+
+def to_dataframe(
+    content: Mapping[str, Any],
+    orient: Literal["columns", "index"] = "columns",
+    levels: Mapping[str, Iterable[Any]] | None = None,
+) -> Any:
+    """Return a pandas DataFrame of columns, or of rows by name if `orient` is "index".
+
+    `levels`: labels of each level of the index; each combination has a row, those of the last level in turn.
+    """
+    import pandas as pd  # slow to import, and most results are never a DataFrame
+
+    frame = pd.DataFrame.from_dict(content, orient=orient)
+    return frame if levels is None else frame.set_axis(pd.MultiIndex.from_product(levels.values(), names=list(levels)))
+
+
+def to_dataset(
+    variables: Mapping[str, Any],
+    coordinates: Mapping[Any, Any] | None = None,
+    attributes: Mapping[str, Any] | None = None,
+) -> Any:
+    """Return an `xarray.Dataset`; a variable is a tuple of its dimension or dimensions, values and attributes."""
+    import xarray as xr  # slow to import, and only files and ArviZ need it
+
+    return xr.Dataset(variables, coordinates, attributes)
+
+
+def to_datatree(datasets: Mapping[str, Any]) -> Any:
+    """Return an `xarray.DataTree` of datasets by the paths of their groups."""
+    import xarray as xr
+
+    return xr.DataTree.from_dict(datasets)
 
 
 class Display:

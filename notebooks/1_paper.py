@@ -32,7 +32,7 @@ from fitact import paper
 
 jax.config.update("jax_enable_x64", True)
 plt.style.use("style.mplstyle")
-Rsc, Csc = paper.RSC, paper.CSC  # 160 kohm, 22 nF: of one layer at 100 Hz
+Rsc, Csc = paper.VALUES.Rsc, paper.VALUES.Csc  # 160 kohm, 22 nF: of one layer at 100 Hz
 circuit = fitact.FinalCircuit(Rsc=Rsc, Csc=Csc, Ci=1.35e-9)
 
 # %% [markdown]
@@ -118,8 +118,8 @@ for name, of in {"direct": direct, "natural": natural}.items():
     axes[0].plot(1e3 * time, fitact.response(of, square, time), label=name)
 peaks = {}
 for here, values, name, unit, scale in (
-    (axes[1], paper.GROUNDING_RSC, "grounding_Rsc", "kΩ", 1e-3),
-    (axes[2], paper.GROUNDING_CSC, "grounding_Csc", "nF", 1e9),
+    (axes[1], paper.VALUES.grounding_Rsc, "grounding_Rsc", "kΩ", 1e-3),
+    (axes[2], paper.VALUES.grounding_Csc, "grounding_Csc", "nF", 1e9),
 ):
     shown = np.linspace(0.0, 2.5e-3, 300)[1:]
     for value in values:

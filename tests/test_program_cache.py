@@ -56,12 +56,10 @@ def test_the_folder_follows_xdg_and_can_be_turned_off(tmp_path, monkeypatch):
     assert program_cache.load(KEY) is None
 
 
-def test_programs_unused_for_longest_go_first(folder, monkeypatch):
-    monkeypatch.setattr(program_cache, "_SIZE_LIMIT", 2500)
-    monkeypatch.setattr(program_cache, "_STORES_PER_CLEANUP", 1)
+def test_programs_unused_for_longest_go_first(folder):
     keys = [str(i) * 64 for i in range(3)]
     for age, key in zip((300.0, 200.0, 100.0), keys, strict=True):
-        program_cache.store(key, bytes(1000))
+        program_cache.store(key, bytes(1000), size_limit=2500, stores_per_cleanup=1)
         if key == keys[2]:
             break
         os.utime(folder / f"{key}.program", (time.time() - age,) * 2)
@@ -98,6 +96,6 @@ def test_a_process_killed_while_it_writes_leaves_whole_entries_only(folder):
     for path in folder.glob(".*.tmp"):
         os.utime(path, (0.0, 0.0))
     program_cache.store(KEY, b"program")
-    program_cache._clean_up(folder)
+    program_cache._clean_up(folder, size_limit=1 << 20)
     assert program_cache.load(KEY) == b"program"
     assert not list(folder.glob(".*.tmp"))

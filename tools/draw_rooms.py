@@ -5,6 +5,7 @@ Names and order come from pyproject.toml, and each package's task from its docst
 
 import ast
 import re
+import textwrap
 import tomllib
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from matplotlib.patches import FancyBboxPatch
 
 ROOT = Path(__file__).parents[1]
 # packages on the path of a parameter to the force
-STREET = ("scene", "prior", "model", "data", "likelihood", "fitting", "sampling")
+STREET = ("scene", "prior", "model", "data", "likelihood", "problem", "fitting", "sampling")
 
 
 def read_layers() -> list[list[str]]:
@@ -32,21 +33,39 @@ def read_task(name: str) -> str:
     return re.split(r"[:;.]", first)[0]
 
 
-def draw(layers: list[list[str]]) -> Figure:
-    """Return the figure, with a storey per layer and the rooms of `STREET` in colour."""
-    height, width = 0.5, 8.0
-    figure = Figure(figsize=(width, height * len(layers)), layout="constrained")
-    axes = figure.add_subplot(xlim=(0.0, width), ylim=(-len(layers), 0.0))
-    axes.axis("off")
-    for storey, names in enumerate(layers):
+def draw(
+    layers: list[list[str]], width: float = 8.0, gap: float = 0.04, margin: float = 0.09, letter: float = 0.056
+) -> Figure:
+    """Return the figure, with a storey per layer and the rooms of `STREET` in colour.
+
+    Each storey is as tall as its longest task needs; `letter` is the mean width of one, as all lengths in inches.
+    """
+    name_height, line_height = 0.22, 0.145
+    storeys = []
+    for names in layers:
         room = width / len(names)
-        for place, name in enumerate(names):
-            x, y = place * room + 0.05, -storey - 0.92
+        columns = int((room - 2.0 * (gap + margin)) / letter)
+        storeys.append([(name, textwrap.wrap(read_task(name), columns)) for name in names])
+    heights = [
+        2.0 * (gap + margin) + name_height + line_height * max(len(task) for _, task in rooms) for rooms in storeys
+    ]
+    total = sum(heights)
+    figure = Figure(figsize=(width, total))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0.0, width), ylim=(-total, 0.0))
+    axes.axis("off")
+    top = 0.0
+    for rooms, height in zip(storeys, heights, strict=True):
+        room = width / len(rooms)
+        for place, (name, task) in enumerate(rooms):
+            x, y = place * room + gap, top - height + gap
             colour = "#d7e8f4" if name in STREET else "#f1f1f1"
-            box = FancyBboxPatch((x, y), room - 0.1, 0.84, "round,pad=0,rounding_size=0.08", fc=colour, ec="#777777")
-            axes.add_patch(box)
-            axes.text(x + 0.12, y + 0.6, name, va="center", weight="bold", size=10)
-            axes.text(x + 0.12, y + 0.24, read_task(name), va="center", size=7.5)
+            size = room - 2.0 * gap, height - 2.0 * gap
+            axes.add_patch(FancyBboxPatch((x, y), *size, "round,pad=0,rounding_size=0.08", fc=colour, ec="#777777"))
+            axes.text(x + margin, top - gap - margin, name, va="top", weight="bold", size=10)
+            for number, line in enumerate(task):
+                below = gap + margin + name_height + number * line_height
+                axes.text(x + margin, top - below, line, va="top", size=7.5)
+        top -= height
     return figure
 
 

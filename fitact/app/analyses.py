@@ -18,7 +18,6 @@ from fitact.files import write_json
 
 CHANNELS = {"V": "drive voltage", "Vsc": "voltage across the skin", "I": "loop current", "Ft": "friction"}
 _OPTIONS = ("rate", "spectrum", "shunt", "band")
-_NAME_LENGTH = 80  # characters of a file name on disk, below the limits of all file systems
 _processes: dict[Path, subprocess.Popen[bytes]] = {}  # that this server started, by the analysis's folder
 
 
@@ -93,11 +92,14 @@ class Analysis:
         if self.state != "set-up":
             raise InputError("this analysis has results or is running; start another one with the same files")
 
-    def add_file(self, temporary: Path, name: str) -> str:
-        """Move an uploaded file into the folder under a name of our own, which it returns."""
-        own = re.sub(r"[^A-Za-z0-9._-]+", "_", re.split(r"[/\\]", name)[-1])[-_NAME_LENGTH:].lstrip("._-") or "file"
+    def add_file(self, temporary: Path, name: str, max_length: int = 80) -> str:
+        """Move an uploaded file into the folder under a name of our own, which it returns.
+
+        The name has at most `max_length` characters, which is below the limits of all file systems.
+        """
+        own = re.sub(r"[^A-Za-z0-9._-]+", "_", re.split(r"[/\\]", name)[-1])[-max_length:].lstrip("._-") or "file"
         taken = {each.casefold() for each in self.files}
-        own = next(each for each in _numbered(own) if each.casefold() not in taken)
+        own = next(each for each in _name_candidates(own) if each.casefold() not in taken)
         os.replace(temporary, self.folder / "records" / own)
         self.files[own] = "".join(character if character.isprintable() else "�" for character in name)[:200]
         self.save()
@@ -176,7 +178,7 @@ class Analysis:
                 archive.write(each, Path(self.name) / each.relative_to(self.folder))
 
 
-def _numbered(name: str) -> Iterator[str]:
+def _name_candidates(name: str) -> Iterator[str]:
     yield name
     number = 2
     while True:

@@ -46,7 +46,6 @@ _TOO_LARGE = (
     f"too large for the page, which takes files up to {LARGEST_UPLOAD // 10**6} MB and scenes up to"
     f" {_LARGEST_FORM // 10**6} MB; use `fitact run` on the command line"
 )
-_STALE_UPLOAD = 86_400.0  # s, after which the uploads of a server that was killed are removed
 _PERCENT = re.compile(r"(\d+)%")
 
 
@@ -140,10 +139,10 @@ class Page:
         self._templates.filters |= {"field_name": scene_form.field_name, "display_value": scene_form.display_value}
 
     @contextlib.asynccontextmanager
-    async def live(self, _: Starlette) -> AsyncIterator[None]:
-        """Remove what a killed server left; end the process for commands with the server."""
+    async def live(self, _: Starlette, stale_age: float = 86_400.0) -> AsyncIterator[None]:
+        """Remove uploads of killed servers, older than `stale_age` (s); in the end, end the process for commands."""
         for old in self._root.glob(".upload-*"):
-            if time.time() - old.stat().st_mtime > _STALE_UPLOAD:
+            if time.time() - old.stat().st_mtime > stale_age:
                 shutil.rmtree(old, ignore_errors=True)
         yield
         self._commands.stop()
@@ -237,7 +236,7 @@ class Page:
 
     async def send_picture(self, request: Request) -> Response:
         """Send a picture that `fitact inspect` drew of a file."""
-        return _send_one_of((self._find(request).folder / "pictures").glob("*.png"), request)
+        return _send_by_name((self._find(request).folder / "pictures").glob("*.png"), request)
 
     async def send_report(self, request: Request) -> Response:
         """Send the report, sandboxed."""
@@ -248,7 +247,7 @@ class Page:
 
     async def send_result(self, request: Request) -> Response:
         """Send a result file, the scene or the command, for download."""
-        return _send_one_of(self._find(request).result_files(), request, is_download=True)
+        return _send_by_name(self._find(request).result_files(), request, is_download=True)
 
     async def send_archive(self, request: Request) -> Response:
         """Send everything as one file."""
@@ -320,7 +319,7 @@ def _mark_code(text: str) -> Markup:
     return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", html.escape(text)))
 
 
-def _send_one_of(paths: Iterable[Path], request: Request, is_download: bool = False) -> Response:
+def _send_by_name(paths: Iterable[Path], request: Request, is_download: bool = False) -> Response:
     """Send the file whose name is asked for, so that a name is never used as a path."""
     for path in paths:
         if path.name == request.path_params["file"]:

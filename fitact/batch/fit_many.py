@@ -74,7 +74,7 @@ class Fits(Sequence[Row]):
         return tuple(row for row in self.rows if "samples" not in row)
 
     @property
-    def answered(self) -> "Fits":
+    def results(self) -> "Fits":
         """Rows of records with a result."""
         return Fits(tuple(row for row in self.rows if "samples" in row))
 

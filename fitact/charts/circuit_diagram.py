@@ -7,7 +7,7 @@ with a value are drawn.
 import itertools
 from collections.abc import Collection, Mapping
 from html import escape
-from typing import Any, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import lazy_loader
 
@@ -17,20 +17,39 @@ Grounding: TypeAlias = Literal["direct", "natural"]
 Lead: TypeAlias = Literal["drive", "ground"]
 Point: TypeAlias = tuple[float, float]
 
-_PIXELS = 36.0  # of one unit of length
-_FONT, _SMALL = 13.0, 11.0  # px, at the drawing's own width
-_SOURCE, _CAPTION, _COLUMN, _LEFT, _RIGHT = 0.0, 0.6, 4.75, 4.1, 5.4  # x of what stands above each other
-_STRAY = -0.3  # x of a stray capacitance; the source is further to the left then
+
+class _Columns(NamedTuple):
+    """The x of what stands above each other, in units of length."""
+
+    source: float = 0.0
+    stray: float = -0.3  # a stray capacitance; the source is further to the left then
+    caption: float = 0.6
+    left: float = 4.1  # of two elements in parallel
+    middle: float = 4.75  # of a single element
+    right: float = 5.4
+
+
+_X = _Columns()
 
 
 class Diagram:
     """Diagram and its connections."""
 
+    pixels: ClassVar[float] = 36.0  # of one unit of length
+    font: ClassVar[float] = 13.0  # px, at the drawing's own width
+    small_font: ClassVar[float] = 11.0
+
     def __init__(self) -> None:
         self.parts: dict[str, tuple[Point, Point]] = {}  # both ends of each element, by its name in a scene
         self.wires: list[tuple[Point, Point]] = []  # both ends of each straight wire
         self.terminals: dict[str, Point] = {}  # points between which Vsc is measured, "Vsc+" and "Vsc-"
-        style = {"color": "currentColor", "lw": 1.5, "fontsize": _FONT, "margin": 0.25, "inches_per_unit": _PIXELS / 72}
+        style = {
+            "color": "currentColor",
+            "lw": 1.5,
+            "fontsize": self.font,
+            "margin": 0.25,
+            "inches_per_unit": self.pixels / 72,
+        }
         self._drawing: Any = schemdraw.Drawing(canvas="svg", show=False, font="inherit")
         self._drawing.config(**style)
 
@@ -51,11 +70,12 @@ class Diagram:
             self.add(schemdraw.elements.Line().endpoints(start, end))
             self.wires.append((start, end))
 
-    def text(self, text: str, at: Point, side: str = "right", size: float = _FONT) -> None:
+    def text(self, text: str, at: Point, side: str = "right", is_small: bool = False) -> None:
         """Write `text`, which may have several lines, to one side of a point, or over it (side "center")."""
         across = {"right": "left", "left": "right"}.get(side, "center")
         along = {"top": "bottom", "bottom": "top"}.get(side, "center")
         if text:
+            size = self.small_font if is_small else self.font
             element = schemdraw.elements.Element().at(at).theta(0)  # it would turn with what was drawn before
             element.segments.append(schemdraw.SegmentText((0, 0), text, align=(across, along), fontsize=size))
             self.add(element)
@@ -70,7 +90,7 @@ class Diagram:
         finally:
             schemdraw.svgconfig.text = mode
         body = content[content.index(">", content.index("<svg")) + 1 :].replace("stroke-dasharray:-;", "")
-        left, top = figure.bbox.xmin * _PIXELS, -figure.bbox.ymax * _PIXELS
+        left, top = figure.bbox.xmin * self.pixels, -figure.bbox.ymax * self.pixels
         width, height = figure.pxwidth, figure.pxheight
         if is_file:
             look = f'width="{width:.0f}" height="{height:.0f}" color="#1c2733" font-family="system-ui, sans-serif"'
@@ -93,7 +113,7 @@ def lay_out_circuit(
     """
     diagram, has_stray = Diagram(), "stray_capacitance" in values
     bottom = _add_column(diagram, values, grounding)
-    x = _STRAY - 3.5 if has_stray else _SOURCE
+    x = _X.stray - 3.5 if has_stray else _X.source
     source = (x, bottom / 2 - 0.6), (x, bottom / 2 + 0.6)
     diagram.part("source", schemdraw.elements.SourceV(), *source)
     diagram.text("V", (x - 0.6, bottom / 2), "left")
@@ -101,7 +121,7 @@ def lay_out_circuit(
     in_lead = current_lead == "drive"
     if has_stray:
         _add_stray(diagram, values["stray_capacitance"], x, bottom - 0.3, in_lead)
-        x, in_lead = _STRAY, False
+        x, in_lead = _X.stray, False
     diagram.wire((x, 0.0), (1.1, 0.0))
     measured = "\nI = its voltage / R" if in_lead else ""
     if "series_resistor" in values:
@@ -111,7 +131,7 @@ def lay_out_circuit(
         diagram.part("shunt", schemdraw.elements.ResistorIEC(), (1.1, 0.0), (2.9, 0.0), f"shunt R{measured}", "top")
     else:
         diagram.wire((1.1, 0.0), (2.9, 0.0))
-    diagram.wire((2.9, 0.0), (_COLUMN, 0.0))
+    diagram.wire((2.9, 0.0), (_X.middle, 0.0))
     if not (has_stray and current_lead == "drive"):
         _add_current(diagram, 4.3)
     _add_return(diagram, bottom, grounding, source[0], current_lead == "ground")
@@ -131,18 +151,18 @@ def _add_stray(diagram: Diagram, value: str, x: float, base: float, current: boo
         diagram.wire((x, 0.0), shunt[0])
         label = "shunt R\nI = its voltage / R"
         diagram.part("shunt", schemdraw.elements.ResistorIEC(), *shunt, label, "top")
-        diagram.wire(shunt[1], (_STRAY, 0.0))
-        _add_current(diagram, _STRAY - 0.4)
+        diagram.wire(shunt[1], (_X.stray, 0.0))
+        _add_current(diagram, _X.stray - 0.4)
     else:
-        diagram.wire((x, 0.0), (_STRAY, 0.0))
+        diagram.wire((x, 0.0), (_X.stray, 0.0))
     label = f"stray\n{value}".strip()
-    diagram.part("stray_capacitance", schemdraw.elements.Capacitor(), (_STRAY, 0.0), (_STRAY, base), label, "left")
+    diagram.part("stray_capacitance", schemdraw.elements.Capacitor(), (_X.stray, 0.0), (_X.stray, base), label, "left")
 
 
 def _add_column(diagram: Diagram, values: Mapping[str, str], grounding: Grounding) -> float:
     """Draw from the insulator down to the body's last part; return the height at which the column ends."""
     if "Ri" in values:
-        diagram.wire((_COLUMN, 0.0), (_COLUMN, -0.5))
+        diagram.wire((_X.middle, 0.0), (_X.middle, -0.5))
         y = _add_layer(diagram, ("Ri", "Ci"), values, -0.5, "insulator")
     else:
         y = _add_single(diagram, "Ci", schemdraw.elements.Capacitor(), values, 0.0, "insulator")
@@ -164,8 +184,8 @@ def _add_column(diagram: Diagram, values: Mapping[str, str], grounding: Groundin
 def _add_single(diagram: Diagram, name: str, kind: Any, values: Mapping[str, str], y: float, caption: str) -> float:
     """Draw a part alone in the column from the height `y` on; return the height at which it ends."""
     end = y - 1.7
-    diagram.part(name, kind, (_COLUMN, y), (_COLUMN, end), f"{name} {values[name]}".strip())
-    diagram.text(caption, (_CAPTION, (y + end) / 2), size=_SMALL)
+    diagram.part(name, kind, (_X.middle, y), (_X.middle, end), f"{name} {values[name]}".strip())
+    diagram.text(caption, (_X.caption, (y + end) / 2), is_small=True)
     return end
 
 
@@ -177,17 +197,17 @@ def _add_layer(
     present = [name for name in names if name in values]
     for name in present:
         left = name == names[0]
-        x = _COLUMN if len(present) == 1 else _LEFT if left else _RIGHT
+        x = _X.middle if len(present) == 1 else _X.left if left else _X.right
         short = {"Z_capacitance": "C"}.get(name, name.removeprefix("grounding_"))
         separator = " " if len(present) == 1 else "\n"
         side = "left" if left and len(present) == 2 else "right"
         kind = schemdraw.elements.ResistorIEC() if left else schemdraw.elements.Capacitor()
         diagram.part(name, kind, (x, y), (x, end), f"{short}{separator}{values[name]}".strip(), side)
     if len(present) == 2:
-        diagram.wire((_LEFT, y), (_COLUMN, y), (_RIGHT, y))
-        diagram.wire((_LEFT, end), (_COLUMN, end), (_RIGHT, end))
-    diagram.text(caption, (_CAPTION, (y + end) / 2), size=_SMALL)
-    diagram.wire((_COLUMN, end), (_COLUMN, end - 0.5))
+        diagram.wire((_X.left, y), (_X.middle, y), (_X.right, y))
+        diagram.wire((_X.left, end), (_X.middle, end), (_X.right, end))
+    diagram.text(caption, (_X.caption, (y + end) / 2), is_small=True)
+    diagram.wire((_X.middle, end), (_X.middle, end - 0.5))
     return end - 0.5
 
 
@@ -207,11 +227,11 @@ def _add_touching_skin(diagram: Diagram, values: Mapping[str, str], y: float) ->
         diagram.text("\n".join(["probe", *(values[name] for name in probe)]), (x - 0.4, (y + end) / 2))
         x += 1.1
     for name, at, place, side in (("Vsc+", y, "skin's surface", "top"), ("Vsc-", end, "inside the finger", "bottom")):
-        diagram.wire((_RIGHT, at), (x, at))
+        diagram.wire((_X.right, at), (x, at))
         diagram.add(schemdraw.elements.Dot(open=True, radius=0.09).at((x, at)))
         diagram.terminals[name] = x, at
         diagram.text("+" if name == "Vsc+" else "−", (x + 0.2, at))
-        diagram.text(place, ((_RIGHT + 7.2) / 2 + 0.1, at + (0.12 if side == "top" else -0.12)), side, _SMALL)
+        diagram.text(place, ((_X.right + 7.2) / 2 + 0.1, at + (0.12 if side == "top" else -0.12)), side, is_small=True)
     diagram.text("Vsc", (x + 0.1, (y + end) / 2))
     return below
 
@@ -219,16 +239,16 @@ def _add_touching_skin(diagram: Diagram, values: Mapping[str, str], y: float) ->
 def _add_return(diagram: Diagram, bottom: float, grounding: Grounding, source: Point, current: bool) -> None:
     """Draw the way from the column's end back to the source, with the shunt if the `current` is recorded there."""
     base = bottom - 0.3
-    diagram.wire((_COLUMN, bottom), (_COLUMN, base), (3.4, base))
+    diagram.wire((_X.middle, bottom), (_X.middle, base), (3.4, base))
     if current:
         diagram.part("shunt", schemdraw.elements.ResistorIEC(), (3.4, base), (1.6, base), "shunt R", "top")
-        diagram.text("I = its voltage / R", (2.5, base - 0.4), "bottom", _SMALL)
+        diagram.text("I = its voltage / R", (2.5, base - 0.4), "bottom", is_small=True)
     else:
         diagram.wire((3.4, base), (1.6, base))
     diagram.wire((1.6, base), (source[0], base), source)
-    ground = (_COLUMN, "earth") if grounding == "natural" else (source[0], "ground electrode")
+    ground = (_X.middle, "earth") if grounding == "natural" else (source[0], "ground electrode")
     diagram.add(schemdraw.elements.Ground().at((ground[0], base)))
-    diagram.text(ground[1], (_COLUMN + 0.35, base - (0.3 if grounding == "natural" else 0.0)), size=_SMALL)
+    diagram.text(ground[1], (_X.middle + 0.35, base - (0.3 if grounding == "natural" else 0.0)), is_small=True)
 
 
 def lay_out_wiring(

@@ -8,7 +8,7 @@ import base64
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,10 +25,6 @@ _AXIS = {
     "showline": True, "linecolor": "#51606f", "ticks": "outside", "tickcolor": "#51606f", "gridcolor": "#e3e7eb",
     "zeroline": False, "automargin": True, "exponentformat": "SI",
 }  # fmt: skip
-_LINEAR_TICKS = 6
-# plotly.js labels powers of ten if there are fewer ticks than 1.4 for each decade, and otherwise 1, 2, 5 or all digits,
-# which overlap
-_LOG_TICKS = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +38,10 @@ class Axis:
     limits: tuple[float, float] | None = None  # initial limits, SI; None means all data
     hides_numbers: bool = False  # whether the axis starts at 0 and has no numbers
     has_tick_prefixes: bool = False  # whether each tick has its own prefix (for many decades)
-    log_ticks: int = _LOG_TICKS
+    # plotly.js labels powers of ten if there are fewer ticks than 1.4 for each decade, and otherwise 1, 2, 5 or all
+    # digits, which overlap
+    log_ticks: int = 3
+    linear_ticks: ClassVar[int] = 6
 
     @classmethod
     def from_values(
@@ -56,7 +55,7 @@ class Axis:
         wide = decades > 4.0
         middle = float(np.sqrt(sizes.min() * sizes.max()) if log else sizes.max()) if sizes.size and not wide else 0.0
         size, symbol = choose_prefixed_unit(middle, unit)
-        ticks = min(max(_LOG_TICKS, math.ceil(decades)), _LINEAR_TICKS)
+        ticks = min(max(cls.log_ticks, math.ceil(decades)), cls.linear_ticks)
         return cls(title, symbol, size, log, limits, has_tick_prefixes=wide, log_ticks=ticks)
 
     def encode(self, values: ArrayLike, dtype: str = "f4") -> dict[str, str]:
@@ -68,7 +67,7 @@ class Axis:
         """Return the axis layout for plotly.js."""
         title = f"{self.title} / {self.symbol}" if self.symbol else self.title
         layout = _AXIS | {"title": {"text": title, "standoff": 6}, "type": "log" if self.log else "linear"}
-        layout["nticks"] = self.log_ticks if self.log else _LINEAR_TICKS
+        layout["nticks"] = self.log_ticks if self.log else self.linear_ticks
         if self.has_tick_prefixes:
             layout["tickformat"] = "~s"
         if self.hides_numbers:
@@ -224,12 +223,12 @@ def _axis_type_update(plot: Plot, axes: str, kind: str) -> dict[str, Any]:
     layout = plot["layout"]
     names = [name for name in layout if name[:5] in [f"{letter}axis" for letter in axes]]
     traces = [i for i, trace in enumerate(plot["data"]) if "x" in axes and "meta" in trace]
-    ticks = {name: layout[name]["nticks"] if layout[name]["type"] == "log" else _LOG_TICKS for name in names}
+    ticks = {name: layout[name]["nticks"] if layout[name]["type"] == "log" else Axis.log_ticks for name in names}
     return {
         "traces": traces,
         "restyle": {"y": [plot["data"][i]["meta"][kind] for i in traces]} if traces else {},
         "relayout": {f"{name}.type": kind for name in names}
-        | {f"{name}.nticks": ticks[name] if kind == "log" else _LINEAR_TICKS for name in names},
+        | {f"{name}.nticks": ticks[name] if kind == "log" else Axis.linear_ticks for name in names},
     }
 
 

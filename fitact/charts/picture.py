@@ -13,8 +13,6 @@ from fitact.charts.figure import MODEL, log_ticks, pyplot_figure
 from fitact.charts.interactive import Chart, Plot, PlotlyTrace
 
 _DASHES = {"solid": "-", "dash": "--", "dot": ":"}
-_POINTS_PER_PIXEL = 0.75
-_MARGINS = 0.8, 0.15, 0.6, 0.4  # left, right, bottom and top of the axes, inches
 
 
 def draw_chart(chart: Chart) -> Figure:
@@ -44,8 +42,13 @@ def _line_heights(plots: Sequence[Plot]) -> list[float]:
     return [max(sizes[first : first + 3]) for first in range(0, len(sizes), 3)]
 
 
-def draw_plots(figure: FigureBase, plots: Sequence[Plot]) -> None:
-    """Draw plots side by side, three in a line."""
+def draw_plots(
+    figure: FigureBase, plots: Sequence[Plot], margins: tuple[float, float, float, float] = (0.8, 0.15, 0.6, 0.4)
+) -> None:
+    """Draw plots side by side, three in a line.
+
+    `margins`: left, right, below and above the axes (inches), where no layout engine finds them.
+    """
     heights = _line_heights(plots)
     parts = figure.subfigures(len(heights), min(len(plots), 3), squeeze=False, height_ratios=heights).flat
     for part, plot in zip(parts, plots, strict=False):
@@ -53,7 +56,7 @@ def draw_plots(figure: FigureBase, plots: Sequence[Plot]) -> None:
         rows = part.subplots(len(domains), 1, sharex=True, squeeze=False, height_ratios=domains)[:, 0]
         draw_plot(plot, *rows)
         if part.get_layout_engine() is None:
-            left, right, bottom, top = _MARGINS
+            left, right, bottom, top = margins
             width, height = part.bbox.width / part.dpi, part.bbox.height / part.dpi
             ends = {"left": left / width, "right": 1.0 - right / width}
             part.subplots_adjust(**ends, bottom=bottom / height, top=1.0 - top / height, hspace=0.15)
@@ -87,7 +90,7 @@ def draw_plot(plot: Plot, *rows: Axes) -> None:
         rows[0].set_title(plot["title"], fontsize=10.0)
 
 
-def _draw_trace(axes: Axes, trace: PlotlyTrace, below: np.ndarray) -> np.ndarray:
+def _draw_trace(axes: Axes, trace: PlotlyTrace, below: np.ndarray, points_per_pixel: float = 0.75) -> np.ndarray:
     """Draw a trace, if requested filled down to the previous trace `below`, and return its values."""
     x, y = (np.frombuffer(base64.b64decode(trace[k]["bdata"]), f"<{trace[k]['dtype']}") for k in ("x", "y"))
     line, marker = trace.get("line", {}), trace.get("marker", {})
@@ -101,11 +104,11 @@ def _draw_trace(axes: Axes, trace: PlotlyTrace, below: np.ndarray) -> np.ndarray
         x,
         y,
         color=color,
-        lw=_POINTS_PER_PIXEL * line.get("width", 0.0) * ("lines" in trace["mode"]),
+        lw=points_per_pixel * line.get("width", 0.0) * ("lines" in trace["mode"]),
         ls=_DASHES[line.get("dash", "solid")],
         drawstyle="steps-post" if is_step else "default",
         marker="o" if marker else "",
-        ms=_POINTS_PER_PIXEL * marker.get("size", 0.0),
+        ms=points_per_pixel * marker.get("size", 0.0),
         mfc="none" if marker.get("symbol") == "circle-open" else color,
         alpha=marker.get("opacity"),
         rasterized=x.size > 500,

@@ -12,7 +12,6 @@ from fitact.units import quantity_unit
 
 _FORCES = {"force_mean": "mean force", "force_rms": "rms force", "force_peak": "peak force"}
 _DENSITY = Axis("density", hides_numbers=True)  # each density is scaled to its own maximum
-_RADIUS_95 = 2.4477  # of the ellipse that holds 95 % of a normal distribution in two dimensions, sqrt(-2 ln 0.05)
 
 Draws = Mapping[str, np.ndarray]
 
@@ -73,16 +72,16 @@ def ellipse_plot(
     x, y = (
         Axis.from_values(n, quantity_unit(n), np.exp(laws["posterior"][0][i]), log=True) for i, n in enumerate(names)
     )
-    circle = np.linspace(0.0, 2.0 * np.pi, 181)
+    radius, circle = 2.4477, np.linspace(0.0, 2.0 * np.pi, 181)  # 95 % of a normal distribution: sqrt(-2 ln 0.05)
     traces = []
     for name, color in (("prior", PRIOR), ("posterior", MODEL)):
         mean, covariance = laws[name]
         values, vectors = np.linalg.eigh(covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
-        edge = np.exp(mean[:, None] + _RADIUS_95 * root @ np.stack([np.cos(circle), np.sin(circle)]))
+        edge = np.exp(mean[:, None] + radius * root @ np.stack([np.cos(circle), np.sin(circle)]))
         traces.append(interactive.line(x, y, edge[0], edge[1], f"{name}, 95 %", color))
     mean, covariance = laws["posterior"]
-    reach = 1.5 * _RADIUS_95 * np.sqrt(np.trace(covariance)) * np.array([-1.0, 1.0])
+    reach = 1.5 * radius * np.sqrt(np.trace(covariance)) * np.array([-1.0, 1.0])
     along = np.exp(mean[:, None] + direction[:, None] / np.linalg.norm(direction) * reach)
     traces.append(interactive.line(x, y, along[0], along[1], "least constrained direction", ALERT, dash="dash"))
     return interactive.plot(x, (y, traces), size=400)

@@ -11,8 +11,6 @@ from fitact.charts.interactive import Axis, Chart, Plot, PlotlyTrace
 from fitact.summary import describe_quantity
 from fitact.units import quantity_unit
 
-_PIXELS = 145  # height of a row of height 1
-_MAX_POINTS = 4_000  # of a curve
 _EDGES = ("5 % predictive", "95 % predictive", "90 % predictive interval")
 
 
@@ -43,8 +41,13 @@ def time_chart(time: np.ndarray, series: Sequence[Series], columns: int = 2000) 
     )
 
 
-def time_plot(time: np.ndarray, series: Sequence[Series], columns: int = 2000, title: str = "") -> Plot:
-    """Draw channels (time in s) one below the other, each with its fit and, below, the residuals."""
+def time_plot(
+    time: np.ndarray, series: Sequence[Series], columns: int = 2000, title: str = "", row_pixels: int = 145
+) -> Plot:
+    """Draw channels (time in s) one below the other, each with its fit and, below, the residuals.
+
+    A row without a fit is `row_pixels` high.
+    """
     x, rows, heights = Axis.from_values("time", "s", time, limits=(time[0], time[-1])), [], []
     names: set[str] = set()  # each has one entry in the legend
 
@@ -80,7 +83,7 @@ def time_plot(time: np.ndarray, series: Sequence[Series], columns: int = 2000, t
             below = draw_extremes(rest, kept, values - fitted, "data − fit", ALERT) | {"showlegend": False}
             rows.append((rest, [below]))
             heights.append(1.0)
-    size = int(_PIXELS * sum(heights)) + 80  # legend and labels
+    size = int(row_pixels * sum(heights)) + 80  # legend and labels
     legend = len(names) > 1
     return interactive.plot(x, *rows, heights=heights, title=title, size=size, legend=legend, unified_hover=True)
 
@@ -142,10 +145,10 @@ def track_plot(columns: Mapping[str, np.ndarray], name: str, jumps: Sequence[flo
     return interactive.plot(x, (y, traces), legend=False)
 
 
-def _stretches(shown: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the places of each stretch without a gap, at most `_MAX_POINTS` of all."""
+def _stretches(shown: np.ndarray, max_points: int = 4_000) -> Iterator[np.ndarray]:
+    """Yield the places of each stretch without a gap, at most `max_points` of all."""
     places = np.flatnonzero(shown)
-    stride = -(-places.size // _MAX_POINTS)
+    stride = -(-places.size // max_points)
     for part in np.split(places, np.flatnonzero(np.diff(places) > 1) + 1):
         if part.size:
             yield part[::stride]

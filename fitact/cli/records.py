@@ -209,7 +209,7 @@ def campaign(
         reports=reports, seed=seed,
     )  # fmt: skip
     page = report.write_campaign(out, fits, report.Provenance.from_inputs(command_line(), loaded))
-    counts = {"records": len(fits), "answers": len(fits.answered), "failures": len(fits.failures)}
+    counts = {"records": len(fits), "answers": len(fits.results), "failures": len(fits.failures)}
     show(f"{fits}\nopen {page}", counts | {"page": str(page)}, json)
 
 

@@ -14,6 +14,7 @@ from fitact.data.readers.capture import Capture, FileChannel, has_standard_names
 from fitact.data.readers.read import merge_other_files, read_capture
 from fitact.data.record import (
     CHANNEL_UNITS,
+    LARGEST_VALUES,
     MINIMUM_SAMPLES,
     OVERFLOW,
     STATE_RATE,
@@ -28,8 +29,6 @@ from fitact.tables import join_lines
 from fitact.units import format_engineering
 
 Samples = Float[np.ndarray, " samples"]
-
-LARGEST_VALUES = {"V": 5e3, "A": 0.1}  # on a touch display, by unit
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,7 +17,6 @@ from fitact.data.spectrum import MINIMUM_POINTS, Spectrum
 from fitact.units import format_engineering, format_percent
 
 Points = Float[np.ndarray, " points"]
-_FALSE_ALARM = 1e-4  # of each of the two tests, for pure noise
 
 
 class KramersKronig(NamedTuple):
@@ -58,11 +57,15 @@ def check_kramers_kronig(spectrum: Spectrum) -> KramersKronig:
 
 
 def _test(
-    frequency: Points, values: Complex[np.ndarray, " points"], is_impedance: bool, negligible: float = 5e-3
+    frequency: Points,
+    values: Complex[np.ndarray, " points"],
+    is_impedance: bool,
+    negligible: float = 5e-3,
+    false_alarm: float = 1e-4,
 ) -> tuple[Complex[np.ndarray, " points"], Bool[np.ndarray, " points"]]:
     """Return the relative residuals of the best fit, and which points fail (all if the residuals have structure).
 
-    Residuals below `negligible` pass.
+    Residuals below `negligible` pass. `false_alarm`: probability that pure noise fails, of each of the two tests.
     """
     fits = (
         _fit_elements(frequency, values, count, is_impedance) for count in range(1, max(2, min(values.size - 3, 40)))
@@ -71,13 +74,13 @@ def _test(
     n, size = values.size, np.abs(residuals) / np.sqrt(1.0 - leverage)
     sigma = max(float(np.median(size)) / math.sqrt(2.0 * math.log(2.0)), 1e-7)  # of real and imaginary part
     # sigma may be a fifth too small
-    bad = size > max(1.2 * sigma * math.sqrt(2.0 * math.log(n / _FALSE_ALARM)), negligible)
+    bad = size > max(1.2 * sigma * math.sqrt(2.0 * math.log(n / false_alarm)), negligible)
     square = float(np.mean(np.abs(residuals[~bad]) ** 2)) if not bad.all() else 0.0
     successive = float(np.mean(np.abs(np.diff(residuals[~bad])) ** 2)) if np.count_nonzero(~bad) > 2 else 2.0 * square
     z = (
         (1.0 - 0.5 * successive / square) * math.sqrt(2.0 * n) if square > (0.5 * negligible) ** 2 else 0.0
     )  # von Neumann
-    return residuals, np.ones(n, bool) if 0.5 * math.erfc(z / math.sqrt(2.0)) < _FALSE_ALARM else bad
+    return residuals, np.ones(n, bool) if 0.5 * math.erfc(z / math.sqrt(2.0)) < false_alarm else bad
 
 
 def _fit_elements(

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fitact.data.inspection import LARGEST_VALUES
+from fitact.data.record import LARGEST_VALUES
 from fitact.model.circuit import RC, HighpassTerms
 from fitact.scene.scene import Scene
 from fitact.units import format_engineering

@@ -14,12 +14,13 @@ from jaxtyping import Float
 from fitact import charts
 from fitact.data.clipping import clipping_mask
 from fitact.errors import InputError
-from fitact.tables import Display
+from fitact.tables import Display, to_dataframe
 from fitact.units import format_engineering
 
 MINIMUM_SAMPLES = 20
 OVERFLOW = 9e36  # oscilloscopes write 9.9E+37 or more for a value out of range
 CHANNEL_UNITS = {"V": "V", "Vsc": "V", "I": "A", "Ft": "N"}
+LARGEST_VALUES = {"V": 5e3, "A": 0.1}  # on a touch display, by unit
 CHANNEL_TITLES = {"V": "drive V", "Vsc": "skin voltage Vsc", "I": "loop current I", "Ft": "friction Ft"}
 
 # times of existing records, so that records on the same grid share one array
@@ -141,10 +142,8 @@ class Record(Display):
 
     def to_dataframe(self) -> Any:
         """Return a pandas DataFrame with the columns of a record file: time_s, V_V, Vsc_V, I_A, Ft_N."""
-        import pandas as pd
-
         columns = {f"{name}_{CHANNEL_UNITS[name]}": values for name, values in self.channels.items()}
-        return pd.DataFrame({"time_s": self.time} | columns)
+        return to_dataframe({"time_s": self.time} | columns)
 
     @property
     def _headline(self) -> str:

@@ -9,7 +9,7 @@ from jaxtyping import Complex, Float
 
 from fitact import charts
 from fitact.errors import InputError
-from fitact.tables import Display, join_lines
+from fitact.tables import Display, join_lines, to_dataframe
 from fitact.units import format_engineering
 
 MINIMUM_POINTS = 5
@@ -127,9 +127,7 @@ class Spectrum(Display):
 
     def to_dataframe(self) -> Any:
         """Return a pandas DataFrame with a row a frequency: frequency_Hz, real, imag (ohm, or 1 for a gain)."""
-        import pandas as pd
-
-        return pd.DataFrame({"frequency_Hz": self.frequency, "real": self.values.real, "imag": self.values.imag})
+        return to_dataframe({"frequency_Hz": self.frequency, "real": self.values.real, "imag": self.values.imag})
 
     @property
     def _headline(self) -> str:

@@ -26,8 +26,6 @@ from fitact.scene.scene import Scene
 from fitact.tables import Display, align_row, join_lines
 from fitact.units import format_percent
 
-_MIN_GAIN = math.log(1.01)  # smallest gain that counts as an improvement
-
 
 @dataclasses.dataclass(frozen=True)
 class SettingCurve:
@@ -66,7 +64,7 @@ class MeasurementDesign(Display):
 
     @property
     def _informative_options(self) -> tuple[DesignOption, ...]:
-        return tuple(option for option in self.options if option.gain > _MIN_GAIN)
+        return tuple(option for option in self.options if option.gain > option.min_gain)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of design.json."""
@@ -231,10 +229,10 @@ def _rank_options(
     curves = tuple(curve for _, curve in evaluated.values() if curve is not None)
     options = [option for option, _ in evaluated.values()]
     by_name, by_force_sd = {change.name: change for change in candidates}, operator.attrgetter("force_sd")
-    best = [by_name[option.name] for option in sorted(options, key=by_force_sd) if option.gain > _MIN_GAIN]
+    best = [by_name[option.name] for option in sorted(options, key=by_force_sd) if option.gain > option.min_gain]
     partner = next((change for change in best[1:] if change.group != best[0].group), None)
     together = partner and _evaluate_best_settings(_combine_changes(trial, best[0], partner), gradient, baseline)
-    if together and together[0].gain > max(option.gain for option in options) + _MIN_GAIN:
+    if together and together[0].gain > max(option.gain for option in options) + DesignOption.min_gain:
         options.append(together[0])
     return tuple(sorted(options, key=by_force_sd)), curves
 

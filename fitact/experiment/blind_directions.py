@@ -22,7 +22,6 @@ from fitact.model.skin import circuit_parameters, constant_skin_circuit, with_va
 
 GAIN_CHANNELS: dict[str, Channel] = {"gain": "Vsc", "gain_I": "I"}  # channels by the names of their gains
 STRAY = "stray_capacitance"  # name of the parameter of panel and cable, whose current I includes
-_MIN_SINE = 1e-6  # sine of the angle between directions below which they count as equal
 
 
 class StructuralIdentifiability(NamedTuple):
@@ -55,13 +54,18 @@ class StructuralIdentifiability(NamedTuple):
 
 
 def blind_directions(
-    circuit: Circuit, free: Sequence[str], channels: Sequence[Channel], stray_capacitance: float = 0.0
+    circuit: Circuit,
+    free: Sequence[str],
+    channels: Sequence[Channel],
+    stray_capacitance: float = 0.0,
+    min_sine: float = 1e-6,
 ) -> StructuralIdentifiability:
     """Find the directions in the logarithms of `free` that no record of `channels` determines.
 
     `free` names fields of the circuit, "gain" (of the channel Vsc), "gain_I" and "stray_capacitance", which has this
     value (F); all else is known. The circuit's values may be special (two equal skins). A direction therefore counts
     only if it is unidentified there and at `points` random values around them, each up to a factor of 10 away.
+    Directions count as equal if the sine of the angle between them is below `min_sine`.
     """
     free, channels, points = tuple(free), tuple(channels), 8
     spread = np.array([0.1 if name == "alpha" else math.log(10.0) for name in free])  # alpha is at most 1
@@ -72,10 +76,10 @@ def blind_directions(
     null_spaces = [_null_space(np.concatenate([slope.real, slope.imag])) for slope in slopes]
     dimension = min(len(directions) for directions in null_spaces)
     generic = [directions for directions in null_spaces if len(directions) == dimension]
-    constant = dimension == 0 or all(_subspace_distance(generic[0], other) < _MIN_SINE for other in generic)
+    constant = dimension == 0 or all(_subspace_distance(generic[0], other) < min_sine for other in generic)
     directions = _sparse_basis(generic[0])
     if "Ci" in free:
-        directions[directions[:, free.index("Ci")] < -_MIN_SINE] *= -1.0
+        directions[directions[:, free.index("Ci")] < -min_sine] *= -1.0
     return StructuralIdentifiability(free, channels, directions, constant)
 
 

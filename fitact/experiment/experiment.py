@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 import scipy.linalg
@@ -79,6 +79,8 @@ class DesignOption:
     sd: dict[str, float]  # standard deviations of the log-parameters
     contractions: dict[str, float]  # 1 - sd / prior sd of the log-parameters
     gain: float  # ln(present force_sd / this force_sd)
+
+    min_gain: ClassVar[float] = math.log(1.01)  # smallest that counts as an improvement
 
     @property
     def gain_per_effort(self) -> float:

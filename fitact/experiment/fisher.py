@@ -71,7 +71,7 @@ def jacobian(experiment: Experiment) -> Float[np.ndarray, "rows parameters"]:
         sampling, model = _sampling(experiment), _Model.from_experiment(experiment)
         signals = _derivatives(model, sampling, slice(-1))
         if has_noise:
-            return _whiten(experiment, model, sampling, [slope for _, slope in signals])
+            return _whitened_derivatives(experiment, model, sampling, [slope for _, slope in signals])
     blocks = []
     for channel, (_, slope) in zip(experiment.channels, signals, strict=True):
         weight = sampling.off_edge_weight if _follows_slope(experiment, channel) else sampling.sample_weight
@@ -119,7 +119,7 @@ def _remove_noise(drive: Sampled, count: int, noise: float, min_ratio: float = 1
     return dataclasses.replace(drive, time=time, samples=clean)
 
 
-def _whiten(
+def _whitened_derivatives(
     e: Experiment, model: "_Model", sampling: "_Sampling", slopes: list[np.ndarray]
 ) -> Float[np.ndarray, "rows parameters"]:
     """Return the derivatives of uniform samples in units of the noise of channels and V, by frequency.

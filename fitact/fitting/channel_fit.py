@@ -52,7 +52,7 @@ class ChannelFit:
         return np.where(counts, 1.0 / np.where(counts, self.weight, 1.0), np.nan)
 
     @property
-    def fitted(self) -> np.ndarray:
+    def prediction(self) -> np.ndarray:
         """Data minus residuals, V or A, or complex for a spectrum; NaN where a sample was excluded."""
         if isinstance(self.record, Spectrum):
             return self.record.values - join_complex(self.residuals)

@@ -17,13 +17,13 @@ def plot_fit(record: Record | Spectrum, channels: Sequence[ChannelFit]) -> Any:
     traces = {trace.channel: trace for trace in channels if trace.record is record}
     if isinstance(record, Spectrum):
         return charts.show_plots(
-            charts.spectrum_plot(record.frequency, *record.symbol, record.values, traces[record.channel].fitted)
+            charts.spectrum_plot(record.frequency, *record.symbol, record.values, traces[record.channel].prediction)
         )
     voltage, series = next(iter(traces.values())).choice.voltage, []
     for name, title in CHANNEL_TITLES.items():
         if name in record:
             stated = voltage if name == "V" and not np.array_equal(voltage, record["V"]) else None
-            fitted = traces[name].fitted if name in traces else stated
+            fitted = traces[name].prediction if name in traces else stated
             series.append(charts.Series(title, CHANNEL_UNITS[name], record[name], fitted, has_residuals=name in traces))
         elif name == "V":
             series.append(charts.Series(f"{title}, stated", "V", voltage))

@@ -35,7 +35,7 @@ from fitact.problem.recorded_current import estimate_noise
 from fitact.problem.source import require_record
 from fitact.scene.assumptions import list_assumptions
 from fitact.scene.scene import Scene
-from fitact.tables import Display, join_lines
+from fitact.tables import Display, join_lines, to_dataframe
 from fitact.uncertainty.budget import Budget, ErrorSource, laplace_components
 from fitact.uncertainty.effect_size import NO_EFFECTS, EffectSizes
 from fitact.units import quantity_unit
@@ -417,9 +417,7 @@ class Fit(Display):
 
         Columns are those of `parameters()`: unit, mean, sd, quantiles, u, contraction and from_prior.
         """
-        import pandas as pd
-
-        return pd.DataFrame.from_dict(self.parameters() | self.derived(), orient="index")
+        return to_dataframe(self.parameters() | self.derived(), orient="index")
 
     @property
     def _headline(self) -> str:

@@ -15,8 +15,6 @@ from fitact.populations.finger import Finger
 from fitact.prior.distributions import Distribution
 from fitact.units import format_percent
 
-MAX_P_VALUE = 0.01  # below which the fingers' own estimates disagree
-
 
 class ContactAreaTest(NamedTuple):
     """Result of a chi-square test that all fingers have the same Ci, and so the same contact area."""
@@ -27,6 +25,7 @@ class ContactAreaTest(NamedTuple):
     p_value: float  # probability of a larger one if all have the same Ci; NaN for fewer than two such fingers
     log_sd: float  # standard deviation of log Ci between fingers beyond the standard errors (Hedges & Olkin 1985)
     tolerance: float  # log_sd that changes the force by no more than `[tolerance] force`
+    max_p_value: float = 0.01  # below which the fingers' own estimates disagree
 
     @classmethod
     def from_fingers(
@@ -57,7 +56,7 @@ class ContactAreaTest(NamedTuple):
         return (
             self.assumption == "common"
             and self.is_tested
-            and self.p_value < MAX_P_VALUE
+            and self.p_value < self.max_p_value
             and self.log_sd > self.tolerance
         )
 

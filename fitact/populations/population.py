@@ -33,7 +33,7 @@ from fitact.populations.within_finger import WithinFinger
 from fitact.sampling.convergence import Convergence
 from fitact.sampling.posterior import convert_to_arviz
 from fitact.scene.scene import Scene
-from fitact.tables import Display, align_table, join_lines
+from fitact.tables import Display, align_table, join_lines, to_dataframe, to_dataset, to_datatree
 from fitact.units import choose_prefixed_unit, format_engineering, format_percent, quantity_unit
 
 QUANTILES = tuple(summary.PROBABILITIES.values())  # of the force in time
@@ -292,11 +292,10 @@ class Population(Display):
 
         It also holds the force of fingers from the prior, `prior_new_fingers`, and of new fingers, `force_in_time`.
         """
-        import xarray as xr
 
-        def dataset(draws: dict[str, np.ndarray], dims: tuple[str, str]) -> xr.Dataset:
+        def dataset(draws: dict[str, np.ndarray], dims: tuple[str, str]) -> Any:
             units = {name: "1" if name.startswith(("log_sd", "slope")) else quantity_unit(name) for name in draws}
-            return xr.Dataset({name: (dims, values, {"units": units[name]}) for name, values in draws.items()})
+            return to_dataset({name: (dims, values, {"units": units[name]}) for name, values in draws.items()})
 
         new_fingers = dataset(self.new_fingers(), ("law", "finger"))
         new_fingers["log_factors"] = ("law", "finger", "factor"), self.factors
@@ -307,7 +306,7 @@ class Population(Display):
             "normal_force": float(self.finger.derive.normal_force),
             "periodic": int(self.finger.frequency is not None),
         }
-        in_time = xr.Dataset(
+        in_time = to_dataset(
             {"force": (("quantile", "time"), force, {"units": "N"})},
             {"quantile": list(QUANTILES), "time": ("time", time, {"units": "s"})},
             friction,
@@ -318,9 +317,9 @@ class Population(Display):
             "scene": self.scene.to_json(),
             "seed": self.seed,
         }
-        return xr.DataTree.from_dict(
+        return to_datatree(
             {
-                "/": xr.Dataset(attrs=about),
+                "/": to_dataset({}, attributes=about),
                 "posterior": dataset(self.parameters(), ("chain", "draw")),
                 "new_fingers": new_fingers.assign_coords(factor=list(self.finger.factors)),
                 "prior_new_fingers": dataset(prior, ("law", "finger")),
@@ -338,15 +337,13 @@ class Population(Display):
         The index is the record; columns are the result, and for Rsc, Csc and Ci the median (SI) and, with the ending
         _sd, the standard deviation.
         """
-        import pandas as pd
-
         rows = {}
         for finger in self.fingers:
             estimates = {name: finger.parameters[name] for name in (*SKIN, SHARED_PARAMETER)}
             columns = [(name, each["q50"], each["sd"]) for name, each in estimates.items()]
             values = {key: x for name, median, sd in columns for key, x in ((name, median), (f"{name}_sd", sd))}
             rows[finger.source] = {"result": finger.result, **values}
-        return pd.DataFrame.from_dict(rows, orient="index")
+        return to_dataframe(rows, orient="index")
 
     def plot(self) -> Any:
         """Draw the fingers, the force on the next one and over time, and the sources of variance; return the axes."""

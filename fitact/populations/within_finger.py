@@ -17,13 +17,7 @@ from fitact.populations.next_finger import NewFingerModel
 from fitact.tracking.tracked_finger import TrackedFinger
 from fitact.units import format_engineering
 
-LOG_SD_SCALE = 0.5  # of the half-normal prior of the standard deviation, as for the one between fingers
 FORCES = ("force_mean", "force_peak")
-_FREEDOM = np.geomspace(0.5, 30.0, 13)  # degrees of freedom of a finger's variance, of equal prior probability each
-_GRID = 241  # standard deviations between nothing and `_LARGEST`, and as many true variances of a finger
-_LARGEST = 3.0  # standard deviation of a logarithm
-_NEGLIGIBLE = 0.01  # least standard deviation on the grid, in units of the largest finger's or its error
-_CHI_SQUARE_95 = 3.84  # 95 % quantile with one degree of freedom
 
 
 class PooledVariance(NamedTuple):
@@ -40,27 +34,38 @@ def pool_variances(
     windows: Float[np.ndarray, " fingers"],
     random: np.random.Generator,
     draws: int,
+    *,
+    log_sd_scale: float = 0.5,
+    largest: float = 3.0,
+    negligible: float = 0.01,
+    grid_size: int = 241,
 ) -> PooledVariance:
-    """Pool the fingers' variances `found` without bias from `windows` values with errors of variance `noise`."""
+    """Pool the fingers' variances `found` without bias from `windows` values with errors of variance `noise`.
+
+    The standard deviation of a logarithm has a half-normal prior of scale `log_sd_scale`, as the one between fingers.
+    It is one of `grid_size` values up to `largest`, from `negligible` times the largest finger's or its error.
+    """
+    degrees = np.geomspace(0.5, 30.0, 13)  # of freedom of a finger's variance, of equal prior probability each
     top = float(np.max(np.maximum(found, 0.0) + noise / np.sqrt(windows)))
-    log_sd = np.linspace(np.log(_NEGLIGIBLE) + 0.5 * np.log(top), np.log(_LARGEST), _GRID)
-    true = 2.0 * np.linspace(log_sd[0] - 4.0, log_sd[-1], 4 * _GRID)  # logarithm of a finger's variance
+    log_sd = np.linspace(np.log(negligible) + 0.5 * np.log(top), np.log(largest), grid_size)
+    true = 2.0 * np.linspace(log_sd[0] - 4.0, log_sd[-1], 4 * grid_size)  # logarithm of a finger's variance
     # variance of the estimate given the true one; where it is finer than the grid, that of the grid's step
     error = np.sqrt((2.0 * noise[:, None] ** 2 + 4.0 * noise[:, None] * np.exp(true)) / windows[:, None])
     error = np.hypot(error, (true[1] - true[0]) * np.exp(true))
     measured = np.exp(-0.5 * np.square((found[:, None] - np.exp(true)) / error)) / error
-    shape = 0.5 * _FREEDOM[:, None, None]
+    shape = 0.5 * degrees[:, None, None]
     ratio = true - 2.0 * log_sd[:, None]
     gamma = np.exp(shape * (np.log(shape) + ratio - np.exp(ratio)) - scipy.special.gammaln(shape))
     likelihood = np.einsum("nsv,fv->nsf", gamma, measured) / np.maximum(gamma.sum(axis=-1), 1e-300)[..., None]
     logs = np.sum(np.log(np.maximum(likelihood, 1e-300)), axis=-1)
-    may_be_zero = bool(2.0 * (np.max(logs) - np.max(logs[:, 0])) < _CHI_SQUARE_95)
-    posterior = logs + log_sd - 0.5 * np.square(np.exp(log_sd) / LOG_SD_SCALE)
+    chi_square_95 = 3.84  # 95 % quantile with one degree of freedom
+    may_be_zero = bool(2.0 * (np.max(logs) - np.max(logs[:, 0])) < chi_square_95)
+    posterior = logs + log_sd - 0.5 * np.square(np.exp(log_sd) / log_sd_scale)
     weight = np.exp(posterior - np.max(posterior)).ravel()
     chosen = random.choice(weight.size, size=draws, p=weight / weight.sum())
     freedom, place = np.unravel_index(chosen, posterior.shape)
     blurred = log_sd[place] + (log_sd[1] - log_sd[0]) * (random.random(draws) - 0.5)
-    return PooledVariance(np.exp(2.0 * blurred), _FREEDOM[freedom], may_be_zero)
+    return PooledVariance(np.exp(2.0 * blurred), degrees[freedom], may_be_zero)
 
 
 class WithinFinger(NamedTuple):

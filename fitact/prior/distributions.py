@@ -20,8 +20,6 @@ from jaxtyping import Array, Float
 from fitact.compiled import array_module
 from fitact.errors import InputError
 
-_Z95 = 1.959963984540054  # half-width, in standard deviations, of a central 95 % interval
-
 
 class Distribution(eqx.Module):
     """Prior for one positive parameter."""
@@ -79,7 +77,7 @@ class LogNormal(Distribution):
         """Return the log-normal with 95 % probability between median / `factor` and median * `factor` (> 1)."""
         if not factor > 1.0:
             raise InputError(f"factor = {factor:g} must be above 1: 95 % of the prior lies within this factor")
-        return cls(median, math.log(factor) / _Z95)
+        return cls(median, math.log(factor) / float(scipy.special.ndtri(0.975)))
 
     @classmethod
     def with_relative_sd(cls, median: float, relative_sd: float) -> "LogNormal":

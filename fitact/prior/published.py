@@ -8,7 +8,6 @@ from fitact.prior.distributions import Distribution, LogNormal, Uniform
 
 PublishedTable: TypeAlias = Literal["gabriel-dry", "gabriel-wet", "paper"]
 
-_HIGH_FREQUENCY = 4.0  # relative permittivity
 # S. Gabriel, R. W. Lau, C. Gabriel, Phys. Med. Biol. 41 (1996) 2271, table 1:
 # conductivity (S/m) and dispersions (strength, time constant in s, Cole-Cole exponent alpha)
 _GABRIEL = {
@@ -18,7 +17,6 @@ _GABRIEL = {
         ((39.0, 7.958e-12, 0.1), (280.0, 79.577e-9, 0.0), (3e4, 1.592e-6, 0.16), (3e4, 1.592e-3, 0.2)),
     ),
 }
-_PAPER_RESISTIVITY, _PAPER_PERMITTIVITY = (4e4, 1e5), (2e3, 1e4)  # ohm m, 1; ranges from 10 to 1000 Hz
 
 
 class Layer(NamedTuple):
@@ -38,7 +36,7 @@ def published_prior(table: PublishedTable, name: str, layer: Layer, factor: floa
     is_resistance = name.endswith("Rsc")
     plate = plate_resistance if is_resistance else plate_capacitance
     if table == "paper":
-        ends = _PAPER_RESISTIVITY if is_resistance else _PAPER_PERMITTIVITY
+        ends = (4e4, 1e5) if is_resistance else (2e3, 1e4)  # resistivity (ohm m), permittivity; from 10 to 1000 Hz
         return Uniform(*(plate(end, layer.area, layer.thickness) for end in ends))
     permittivity = skin_permittivity(table, layer.frequency)
     resistivity = -1.0 / (permittivity.imag * EPSILON_0 * 2.0 * math.pi * layer.frequency)
@@ -46,12 +44,17 @@ def published_prior(table: PublishedTable, name: str, layer: Layer, factor: floa
     return LogNormal.within_factor(plate(middle, layer.area, layer.thickness), factor)
 
 
-def skin_permittivity(table: Literal["gabriel-dry", "gabriel-wet"], frequency: float) -> complex:
-    """Return the relative complex permittivity of skin at `frequency` (Hz) (Cole-Cole), conduction included."""
+def skin_permittivity(
+    table: Literal["gabriel-dry", "gabriel-wet"], frequency: float, high_frequency: float = 4.0
+) -> complex:
+    """Return the relative complex permittivity of skin at `frequency` (Hz) (Cole-Cole), conduction included.
+
+    `high_frequency`: the relative permittivity above all dispersions.
+    """
     conductivity, dispersions = _GABRIEL[table]
     s = 2j * math.pi * frequency
     return (
-        _HIGH_FREQUENCY
+        high_frequency
         + sum(height / (1.0 + (s * tau) ** (1.0 - alpha)) for height, tau, alpha in dispersions)
         + (conductivity / (s * EPSILON_0))
     )

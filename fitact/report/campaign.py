@@ -9,8 +9,8 @@ from fitact.report.frame import Answer, PageSummary, Provenance, write_page
 
 def write_campaign(folder: str | os.PathLike[str], fits: Fits, origin: Provenance, max_rows: int = 2000) -> Path:
     """Write results.parquet, failures.csv and index.html (at most `max_rows` of each), and return the page."""
-    out, answered, failures = Path(folder), fits.answered, Fits(fits.failures)
-    answered.to_parquet(out / "results.parquet")
+    out, results, failures = Path(folder), fits.results, Fits(fits.failures)
+    results.to_parquet(out / "results.parquet")
     failures.to_csv(out / "failures.csv", ("record", "result", "message"))
     trusted = sum(bool(row["trusted"]) for row in fits)
     frame = PageSummary(
@@ -21,7 +21,7 @@ def write_campaign(folder: str | os.PathLike[str], fits: Fits, origin: Provenanc
         findings={},
         answers=(
             Answer("reliable", f"{trusted:,}", "fits"),
-            Answer("unreliable", f"{len(answered) - trusted:,}", "fits; see the column result"),
+            Answer("unreliable", f"{len(results) - trusted:,}", "fits; see the column result"),
             Answer("failed", f"{len(failures):,}", "records; failures.csv states the reasons"),
         ),
         warnings=(),
@@ -32,8 +32,8 @@ def write_campaign(folder: str | os.PathLike[str], fits: Fits, origin: Provenanc
         "campaign.html",
         frame=frame,
         origin=origin,
-        answers=answered[:max_rows],
+        answers=results[:max_rows],
         failures=[(row["record"], row["result"], row["message"]) for row in failures[:max_rows]],
-        count=len(answered),
+        count=len(results),
     )
     return out / "index.html"

@@ -12,6 +12,7 @@ from markupsafe import Markup
 
 from fitact.charts.bars import draw_budgets
 from fitact.errors import InputError
+from fitact.files import read_datatree
 from fitact.report.frame import image, write_page
 from fitact.report.posterior import make_charts
 from fitact.scene.diagrams import scene_circuit, scene_wiring
@@ -76,12 +77,9 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
 
 def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]]:
     """Read what `write_report` needs from a folder of results; raise InputError if it is incomplete."""
-    import xarray as xr
-
     content = load(directory)
     try:
-        with xr.open_datatree(Path(directory) / "posterior.nc", engine="h5netcdf") as tree:
-            return tree.load(), content
+        return read_datatree(Path(directory) / "posterior.nc"), content
     except (OSError, ValueError, TypeError) as error:
         raise InputError(
             f"{directory}: holds no complete results ({error}); make them with: fitact sample RECORD --out {directory}"

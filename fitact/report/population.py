@@ -20,6 +20,7 @@ from fitact.charts.population import (
     skin_chart,
 )
 from fitact.errors import InputError
+from fitact.files import read_datatree
 from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.populations.population import (
     MAX_INTEGRATION_ERROR,
@@ -77,14 +78,11 @@ def write_population_page(path: str | os.PathLike[str], tree: Any, content: dict
 
 def read_population(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]]:
     """Read what `write_population_page` needs from a folder of results; raise InputError if it is incomplete."""
-    import xarray as xr
-
     try:
         content = json.loads((Path(directory) / "population.json").read_text(encoding="utf-8"))
         if not (isinstance(content, dict) and "trusted" in content):
             raise ValueError("population.json is not this version's")
-        with xr.open_datatree(Path(directory) / "population.nc", engine="h5netcdf") as tree:
-            return tree.load(), content
+        return read_datatree(Path(directory) / "population.nc"), content
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise InputError(
             f"{directory}: holds no complete population ({error}); make it with: fitact population RECORD..."

@@ -5,7 +5,6 @@ import functools
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +14,7 @@ from fitact import paper
 from fitact.charts.figure import DATA, MODEL, PRIOR
 from fitact.charts.interactive import Axis, Chart, chart, line, log_axis_button, mark_position, plot, points
 from fitact.files import write_json
-from fitact.model.circuit import Circuit, DirectGround, FinalCircuit, NaturalGround
+from fitact.model.circuit import Circuit
 from fitact.model.drive import Drive, Square
 from fitact.model.response import response
 from fitact.report.frame import write_page
@@ -23,9 +22,9 @@ from fitact.units import format_engineering
 
 _COLORS = ("#D55E00", "#009E73", "#CC79A7", "#8C564B", "#222222")  # in the order of the figures in the reference paper
 _CI_COLORS = (MODEL, PRIOR, "#555555")
-_TIME = Axis.from_values("time", "s", 2.0 / paper.FREQUENCY)
-_FINAL = FinalCircuit(paper.RSC, paper.CSC, paper.CI)
-_DIRECT = DirectGround(paper.RSC, paper.CSC, paper.CI, R_H=paper.R_H)
+_TIME = Axis.from_values("time", "s", 2.0 / paper.VALUES.frequency)
+_FINAL = paper.VALUES.final_circuit()
+_DIRECT = paper.VALUES.direct_ground()
 
 
 def write_reproduction(directory: str | os.PathLike[str], claims: tuple[paper.Claim, ...]) -> Path:
@@ -48,7 +47,7 @@ def _format_value(value: float | None, unit: str) -> str:
 
 def _two_periods() -> np.ndarray:
     """Return times (s) over two periods, including both sides of each jump of a square."""
-    period = 1.0 / paper.FREQUENCY
+    period = 1.0 / paper.VALUES.frequency
     edges = np.arange(4) * 0.5 * period
     inside = np.linspace(0.0, 2.0 * period, 2001)[:-1]
     return np.union1d(inside, np.append(edges, edges[1:] - 1e-9 * period))  # just before each jump
@@ -59,7 +58,7 @@ def _compute_vsc(circuit: Circuit, drive: Drive) -> np.ndarray:
 
 
 def _vsc_chart(circuits: dict[str, Circuit], shows_peak: bool = False) -> Chart:
-    y, drive = Axis("Vsc1", "V"), Square(peak_to_peak=paper.PEAK_TO_PEAK, frequency=paper.FREQUENCY)
+    y, drive = Axis("Vsc1", "V"), Square(peak_to_peak=paper.VALUES.peak_to_peak, frequency=paper.VALUES.frequency)
     traces = [
         line(_TIME, y, _two_periods(), _compute_vsc(circuit, drive), name, color)
         for (name, circuit), color in zip(circuits.items(), _COLORS, strict=False)
@@ -72,12 +71,10 @@ def _vsc_chart(circuits: dict[str, Circuit], shows_peak: bool = False) -> Chart:
 
 
 def _grounding_chart(name: str, values: Sequence[float], unit: str) -> Chart:
-    nominal: dict[str, Any] = {"R_H": paper.R_H, "grounding_Rsc": paper.RSC, "grounding_Csc": paper.CSC}
+    equal = {"grounding_Rsc": paper.VALUES.Rsc, "grounding_Csc": paper.VALUES.Csc}
     symbol = f"{name.removeprefix('grounding_')}1"
     circuits: dict[str, Circuit] = {
-        f"{symbol} = {format_engineering(value, unit, 3)}": DirectGround(
-            paper.RSC, paper.CSC, paper.CI, **nominal | {name: value}
-        )
+        f"{symbol} = {format_engineering(value, unit, 3)}": paper.VALUES.direct_ground(**equal | {name: value})
         for value in values
     }
     return _vsc_chart(circuits, shows_peak=True)
@@ -86,12 +83,12 @@ def _grounding_chart(name: str, values: Sequence[float], unit: str) -> Chart:
 def _insulator_chart() -> Chart:
     """Return a chart of the mean force, scaled to a maximum of 1, over each property of the insulator."""
     permittivities, thicknesses = np.linspace(1.0, 10.0, 37), 1e-6 * np.geomspace(0.01, 10.0, 46)
-    nominal, y, plots = paper.force_over(paper.PERMITTIVITY, paper.INSULATOR), Axis("mean force, normalised"), []
+    permittivity, thickness = paper.VALUES.insulator_permittivity, paper.VALUES.insulator_thickness
+    nominal, y, plots = paper.force_over(permittivity, thickness), Axis("mean force, normalised"), []
     for title, unit, here, values, forces in (
-        ("relative permittivity", "1", paper.PERMITTIVITY, permittivities,
-         [paper.force_over(e, paper.INSULATOR) for e in permittivities]),
-        ("thickness", "m", paper.INSULATOR, thicknesses,
-         [paper.force_over(paper.PERMITTIVITY, t) for t in thicknesses]),
+        ("relative permittivity", "1", permittivity, permittivities,
+         [paper.force_over(e, thickness) for e in permittivities]),
+        ("thickness", "m", thickness, thicknesses, [paper.force_over(permittivity, t) for t in thicknesses]),
     ):  # fmt: skip
         x = Axis.from_values(title, unit, here)
         curve = line(x, y, values, np.array(forces) / max(forces), "mean force", MODEL)
@@ -104,7 +101,7 @@ def _frequencies_chart(low: float, high: float, marks_corners: bool) -> Chart:
     """Return a chart of amplitude and phase between two frequencies (Hz) for each Ci."""
     frequency = np.geomspace(low, high, 400)
     omega, x = jnp.asarray(2.0 * np.pi * frequency), Axis("frequency", "Hz", log=True, has_tick_prefixes=True)
-    circuits = {f"Ci = {name}": FinalCircuit(paper.RSC, paper.CSC, Ci) for name, Ci in paper.INSULATORS.items()}
+    circuits = {f"Ci = {name}": paper.VALUES.final_circuit(Ci) for name, Ci in paper.INSULATORS.items()}
     plots = []
     for y, corners, evaluate in (
         (Axis("|H|"), (40.0, 300.0), lambda circuit: circuit.amplitude(omega)),
@@ -133,13 +130,13 @@ def _waveforms_chart() -> Chart:
     return chart(*plots)
 
 
-_NATURAL = NaturalGround(paper.RSC, paper.CSC, paper.CI, paper.Z)
+_NATURAL = paper.VALUES.natural_ground()
 _FIGURES = (
     ("Fig. 4: direct and natural ground", lambda: _vsc_chart({"direct": _DIRECT, "natural": _NATURAL}),
      "Vsc over two periods: large for direct ground, a tenth as large for natural ground."),
-    ("Fig. 5: the grounding finger's Rsc", lambda: _grounding_chart("grounding_Rsc", paper.GROUNDING_RSC, "ohm"),
+    ("Fig. 5: the grounding finger's Rsc", lambda: _grounding_chart("grounding_Rsc", paper.VALUES.grounding_Rsc, "ohm"),
      "Five curves with different decays and almost equal peaks."),
-    ("Fig. 6: the grounding finger's Csc", lambda: _grounding_chart("grounding_Csc", paper.GROUNDING_CSC, "F"),
+    ("Fig. 6: the grounding finger's Csc", lambda: _grounding_chart("grounding_Csc", paper.VALUES.grounding_Csc, "F"),
      "Five curves whose peaks rise from 13.7 V to 15.9 V with the capacitance."),
     ("Fig. 10: with and without R_H", lambda: _vsc_chart({"without R_H": _FINAL, "with R_H": _DIRECT}),
      "Two curves that coincide."),

@@ -22,7 +22,6 @@ _TITLES: dict[Kind, tuple[str, str, str]] = {
     "likelihood": ("likelihood", "one evaluation in a batch", "error of the log-likelihood"),
     "uncertainty": ("uncertainty", "one effective draw", "error in posterior standard deviations"),
 }
-_ZERO_RATIO = 30.0  # an error of 0 is drawn at the smallest error over this ratio
 
 
 def draw_tradeoff(tradeoff: Tradeoff, kinds: Sequence[Kind] = tuple(_TITLES)) -> Figure:
@@ -34,9 +33,9 @@ def draw_tradeoff(tradeoff: Tradeoff, kinds: Sequence[Kind] = tuple(_TITLES)) ->
     return figure
 
 
-def _heights(levels: Sequence[BenchmarkedMethod]) -> dict[str, float]:
-    """Return the positions of errors on the logarithmic axis; an error of 0 is drawn below all others."""
-    zero = min((level.error for level in levels if level.error > 0.0), default=1.0) / _ZERO_RATIO
+def _heights(levels: Sequence[BenchmarkedMethod], zero_ratio: float = 30.0) -> dict[str, float]:
+    """Return the positions of errors on the logarithmic axis; 0 is drawn at the smallest other over `zero_ratio`."""
+    zero = min((level.error for level in levels if level.error > 0.0), default=1.0) / zero_ratio
     return {level.name: level.error or zero for level in levels}
 
 
@@ -103,7 +102,7 @@ def write_tradeoff_page(path: str | os.PathLike[str], tradeoff: Tradeoff, origin
             kind: [(*COLUMNS, "dominated by"), *((*each.cells, each.dominated_by) for each in tradeoff.methods(kind))]
             for kind in KINDS
         },
-        resolved=tradeoff.resolved,
+        resolved=tradeoff.resolution_note,
         machine=tradeoff.machine,
     )
 

@@ -29,7 +29,7 @@ from fitact.sampling import importance
 from fitact.sampling.chain import Chain
 from fitact.sampling.convergence import Convergence, diagnose_chain
 from fitact.sampling.posterior import Posterior
-from fitact.sampling.proposal import OVERDISPERSION, SHARES, LogProb, Proposal
+from fitact.sampling.proposal import OVERDISPERSION, LogProb, Proposal
 
 Level = Literal["emcee", "psis", "laplace"]
 
@@ -126,9 +126,9 @@ def run_ensembles(
     return run.chain, convergence
 
 
-def make_moves(proposal: Proposal) -> list[tuple[emcee.moves.Move, float]]:
-    """Return emcee's moves with their weights."""
-    return list(zip((emcee.moves.MHMove(proposal.move), emcee.moves.StretchMove()), SHARES, strict=True))
+def make_moves(proposal: Proposal, independent: float = 0.7) -> list[tuple[emcee.moves.Move, float]]:
+    """Return emcee's moves with their weights: a fraction `independent` draws from the proposal, others stretch."""
+    return [(emcee.moves.MHMove(proposal.move), independent), (emcee.moves.StretchMove(), 1.0 - independent)]
 
 
 def reject_nonfinite(log_prob: LogProb) -> LogProb:

@@ -6,7 +6,7 @@ import functools
 import importlib.metadata
 import math
 import os
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,12 +27,22 @@ from fitact.likelihood.noise import draw_noise
 from fitact.likelihood.spectrum_channel import join_complex
 from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.model.drive import Periodic
-from fitact.model_selection.plan import Plan
 from fitact.sampling.chain import Chain
 from fitact.sampling.convergence import Convergence
-from fitact.tables import Display
+from fitact.tables import Display, to_dataframe, to_dataset, to_datatree
 from fitact.uncertainty.budget import Budget
 from fitact.units import quantity_unit
+
+
+class ReducedModel(Protocol):
+    """Model without the elements of the scene that can be neglected, as a report states it; `Plan` is one."""
+
+    @property
+    def sentence(self) -> str:
+        """Neglected elements and the resulting errors, in a sentence."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the omissions as a JSON object."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -274,11 +284,9 @@ class Posterior(Display):
 
         The index holds the chain (independent ensemble) and the draw.
         """
-        import pandas as pd
-
-        index = pd.MultiIndex.from_product(map(range, self.points.shape[:2]), names=["chain", "draw"])
+        ensembles, count = self.points.shape[:2]
         columns = {name: values.ravel() for name, values in (self.parameters() | self.derived()).items()}
-        return pd.DataFrame(columns, index=index)
+        return to_dataframe(columns, levels={"chain": range(ensembles), "draw": range(count)})
 
     def to_arviz(self) -> Any:
         """Return ArviZ's object: an `InferenceData`, or from ArviZ 1 on the `xarray.DataTree` itself.
@@ -303,16 +311,15 @@ class Posterior(Display):
 
     def to_datatree(self) -> Any:
         """Return an `xarray.DataTree` in ArviZ's groups; chain: the independent ensembles."""
-        import xarray as xr
 
-        def dataset(draws: dict[str, np.ndarray]) -> xr.Dataset:
+        def dataset(draws: dict[str, np.ndarray]) -> Any:
             dims, coords = ("chain", "draw"), {"chain": np.arange(ensembles), "draw": np.arange(count)}
             variables = {name: (dims, values, {"units": quantity_unit(name)}) for name, values in draws.items()}
-            return xr.Dataset(variables, coords=coords)
+            return to_dataset(variables, coords)
 
         ensembles, count = self.points.shape[:2]
         prior, (instants, force) = self._prior_draws, self.force_in_time
-        in_time = xr.Dataset(
+        in_time = to_dataset(
             {"force": (("quantile", "time"), force, {"units": "N"})},
             {"quantile": list(summary.PROBABILITIES.values()), "time": ("time", instants, {"units": "s"})},
             {"law": self._force_law},
@@ -324,15 +331,15 @@ class Posterior(Display):
             if isinstance(channel.record, Spectrum):
                 axes |= _spectrum_axis(channel)
                 observed |= _spectrum_variables(channel, channel.record.values)
-                constant |= _spectrum_variables(channel, channel.fitted, "_fit")
+                constant |= _spectrum_variables(channel, channel.prediction, "_fit")
                 continue
             time, name = _time_axis_name(channel), _variable_name(channel)
             unit = {"units": CHANNEL_UNITS[channel.channel]}
             axes[time] = (time, channel.record.time, {"units": "s"})
             observed[name] = (time, channel.record[channel.channel], unit)
-            constant[f"{name}_fit"] = (time, channel.fitted, unit)
+            constant[f"{name}_fit"] = (time, channel.prediction, unit)
             constant[_variable_name(channel, "V")] = (time, channel.choice.voltage, {"units": "V"})
-            constant |= self._unfitted(channel, channel.record, time)
+            constant |= self._unfitted_channels(channel, channel.record, time)
         attributes = {
             "inference_library": "fitact",
             "level": self.convergence.level,
@@ -342,21 +349,21 @@ class Posterior(Display):
             "scene": self.fit.scene.to_json(),
             "seed": self.seed,
         }
-        statistics = xr.Dataset({"lp": (("chain", "draw"), self.log_prob)}, coords=dataset(prior).coords)
-        return xr.DataTree.from_dict(
+        statistics = to_dataset({"lp": (("chain", "draw"), self.log_prob)}, dataset(prior).coords)
+        return to_datatree(
             {
-                "/": xr.Dataset(attrs=attributes),
+                "/": to_dataset({}, attributes=attributes),
                 "posterior": dataset(self.parameters() | self.derived()),
                 "sample_stats": statistics,
                 "posterior_predictive": self._posterior_predictive,
-                "observed_data": xr.Dataset(observed, axes),
-                "constant_data": xr.Dataset(constant, axes),
+                "observed_data": to_dataset(observed, axes),
+                "constant_data": to_dataset(constant, axes),
                 "prior": dataset(prior),
                 "force_in_time": in_time,
             }
         )
 
-    def _unfitted(self, trace: ChannelFit, record: Record, time: str) -> dict[str, Any]:
+    def _unfitted_channels(self, trace: ChannelFit, record: Record, time: str) -> dict[str, Any]:
         """Return the channels of a fitted channel's record that were recorded but not fitted, as variables."""
         fitted = {each.channel for each in self.fit.traces if each.record is record}
         others = [name for name in record.channels if name not in fitted]
@@ -376,12 +383,10 @@ class Posterior(Display):
     @functools.cached_property
     def _posterior_predictive(self) -> Any:
         """Posterior predictive records with noise: 50 of each ensemble, each of about 4000 samples at most."""
-        import xarray as xr
-
         ensembles, count = self.points.shape[:2]
         draws = np.linspace(0, count - 1, min(50, count)).astype(int)
         rng = np.random.default_rng([self.seed, 3])
-        predicted = xr.Dataset(coords={"chain": np.arange(ensembles), "draw": draws})
+        predicted = to_dataset({}, {"chain": np.arange(ensembles), "draw": draws})
         for i, (channel, model) in enumerate(zip(self.fit.traces, self.fit.likelihood.channels, strict=True)):
             stride = -(-len(channel.record) // 4000)
             predicting = self.fit.likelihood, i, stride
@@ -410,7 +415,7 @@ class Posterior(Display):
         with atomic_write(path) as temporary:
             tree.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
 
-    def report(self, path: str | os.PathLike[str], plan: Plan | None = None) -> None:
+    def report(self, path: str | os.PathLike[str], plan: ReducedModel | None = None) -> None:
         """Write the report as one self-contained HTML page; `plan` adds the simplifications of the fitted scene."""
         from fitact.report import write_report
 

@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float
 LogProb = Callable[[np.ndarray], np.ndarray]
 Random = np.random.RandomState | np.random.Generator
 
-SHARES = (0.7, 0.3)  # fractions of moves that draw from the proposal, and of stretch moves
 OVERDISPERSION = 1.5  # factor on the width of the starting points: ensembles must agree in spite of it
 DEGREES_OF_FREEDOM = 8.0  # Student-t with heavier tails than any posterior met so far
 PROBES = np.array([-2.5, -1.0, 0.0, 1.0, 2.5])  # points along an axis, in sd, at which normality is tested

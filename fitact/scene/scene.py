@@ -344,7 +344,7 @@ class Scene(Section, Display):
         nominal, beliefs = self.nominal_values(), (default | self.prior.specs()).items()
         marginals = {name: b.distribution(name, nominal[name], layer) for name, b in beliefs if b.is_free}
         stray = self.measurement.stray_capacitance
-        if isinstance(stray, UncertainValue) and "stray_capacitance" not in self._unmeasured():
+        if isinstance(stray, UncertainValue) and "stray_capacitance" not in self._unmeasured_parameters():
             marginals.setdefault("stray_capacitance", stray.distribution())
         correlations, stated = self.prior.correlations(), self.geometry_distributions()
         plates = self.plates()
@@ -392,7 +392,7 @@ class Scene(Section, Display):
             absent = dict.fromkeys(_NATURAL_GROUND_KEYS, "[grounding] connection = 'natural'")
         if self.skin.level != "fractional":
             absent["alpha"] = "[skin] level = 'fractional'"
-        absent |= self._unmeasured()
+        absent |= self._unmeasured_parameters()
         for name in self.prior.specs():
             if name in absent:
                 raise InputError(f"[prior] {name} needs {absent[name]}; leave it out of [prior] otherwise")
@@ -421,7 +421,7 @@ class Scene(Section, Display):
         self.fixed_values()
         return self
 
-    def _unmeasured(self) -> dict[str, str]:
+    def _unmeasured_parameters(self) -> dict[str, str]:
         """Return parameters that no recorded channel depends on, with what they need."""
         channels = {"sigma": "Vsc", "sigma_I": "I", "stray_capacitance": "I"}
         channels |= dict.fromkeys(("sigma_Ft", *self._friction_values()), "Ft")

@@ -15,7 +15,6 @@ from fitact.scene.section import Hertz, Section, Threshold
 from fitact.units import format_engineering
 
 _COLUMNS = ["frequency_Hz", "force_N"]
-_LARGEST = 2.0  # N, of a threshold: a firm touch
 _FORM = 'write {frequencies = ["10 Hz", "250 Hz"], forces = ["20 mN", "1 mN"]}, or a CSV file with these columns:'
 
 
@@ -43,7 +42,8 @@ class ThresholdTable(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if max(self.forces, default=0.0) > _LARGEST:
+        firm_touch = 2.0  # N
+        if max(self.forces, default=0.0) > firm_touch:
             raise ValueError(
                 f"a threshold of {max(self.forces):g} N is more than a finger is pressed with; check the unit, N"
             )

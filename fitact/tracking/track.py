@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from fitact import charts, summary
 from fitact.files import write_parquet
 from fitact.fitting.result import Fit
-from fitact.tables import Display, align_table, join_lines
+from fitact.tables import Display, align_table, join_lines, to_dataframe
 from fitact.tracking.time_average import TimeAverage
 from fitact.tracking.walk_rates import WalkRates
 from fitact.units import format_engineering, format_percent, quantity_unit
@@ -81,9 +81,7 @@ class Track(Display):
 
     def to_dataframe(self) -> Any:
         """Return a pandas DataFrame with the columns of track.parquet, a row for each window."""
-        import pandas as pd
-
-        return pd.DataFrame(self.to_columns())
+        return to_dataframe(self.to_columns())
 
     def plot(self, *names: str, ax: Any = None) -> Any:
         """Draw quantities over time with their 95 % bands, all of `values` by default; return the axes.

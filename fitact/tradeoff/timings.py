@@ -234,9 +234,6 @@ def _likelihood_job(model: Likelihood, points: Float[np.ndarray, "batch coordina
     return _compile_job(log_probs, gradients, (dynamic, points), len(points))
 
 
-_FORCE_QUANTILES = (0.5, 0.05, 0.95)
-
-
 class UncertaintyBenchmark(NamedTuple):
     """Benchmarks of the posterior methods, resolution of their errors, and convergence of the reference."""
 
@@ -334,13 +331,14 @@ def benchmark_answers(
     """
     fit_seconds = statistics.median(timeit.repeat(lambda: fit_record(record, scene), number=1, repeat=3))
     fitted = fit_record(record, scene).derived()["force_mean"]
-    reference = np.quantile(np.concatenate(draws.force["emcee, full"]), _FORCE_QUANTILES)
+    probabilities = (0.5, 0.05, 0.95)
+    reference = np.quantile(np.concatenate(draws.force["emcee, full"]), probabilities)
     stated = [np.array([fitted["q50"], fitted["q05"], fitted["q95"]], dtype=float)]
     sampling_seconds = {level.name: level.details["seconds"] for level in draws.levels}
     results = []
     for level in (None, "laplace", "psis", "emcee"):
         report(f"first answer by {level or 'least squares'} in a new process")
-        quantiles = [np.quantile(force, _FORCE_QUANTILES) for force in draws.force[level]] if level else stated
+        quantiles = [np.quantile(force, probabilities) for force in draws.force[level]] if level else stated
         errors = [np.max(np.abs(each - reference)) / reference[0] for each in quantiles]
         sampling = 0.0 if level is None else sampling_seconds[level]
         cold = _time_first_answer(record, scene, level)

@@ -6,7 +6,7 @@ import platform
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
-from typing import Any, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, TypeAlias
 
 import jax
 
@@ -24,8 +24,6 @@ from fitact.units import format_engineering
 
 Kind: TypeAlias = Literal["answer", "response", "likelihood", "uncertainty"]
 
-_DEFAULT_TOLERANCE = 1e-3  # default of `fitact.fit`; the posterior methods use this fit
-_WIDTHS = [24, 10, 11, 9, 11, 10, 11]
 COLUMNS = ("method", "error", "time", "ratio", "gradient", "compile", "memory")
 KINDS: dict[Kind, str] = {
     "answer": "error of the force and its 90 % interval, relative; wall time from the record to the force, compiled",
@@ -38,6 +36,8 @@ KINDS: dict[Kind, str] = {
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BenchmarkedMethod(BenchmarkResult):
     """Error and cost of one method, compared with the others of its kind."""
+
+    column_widths: ClassVar[tuple[int, ...]] = (24, 10, 11, 9, 11, 10, 11)  # of `COLUMNS` in a printed table
 
     kind: Kind
     ratio: float  # `seconds` over the time of the exact method
@@ -57,8 +57,8 @@ class BenchmarkedMethod(BenchmarkResult):
         )
 
     def __str__(self) -> str:
-        row = align_row(self.cells, _WIDTHS)
-        return f"{row:{sum(_WIDTHS)}}  dominated by {self.dominated_by}" if self.dominated_by else row
+        row = align_row(self.cells, self.column_widths)
+        return f"{row:{sum(self.column_widths)}}  dominated by {self.dominated_by}" if self.dominated_by else row
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,11 +103,16 @@ class Tradeoff:
     def __str__(self) -> str:
         rows = [f"{self.record}; {self.machine['cpu']}, {self.machine['cores']} cores", ""]
         for kind, title in KINDS.items():
-            rows += [f"{kind}: {title}", align_row(COLUMNS, _WIDTHS), *map(str, self.methods(kind)), ""]
-        return "\n".join([*rows, self.resolved, *self.notes])
+            rows += [
+                f"{kind}: {title}",
+                align_row(COLUMNS, BenchmarkedMethod.column_widths),
+                *map(str, self.methods(kind)),
+                "",
+            ]
+        return "\n".join([*rows, self.resolution_note, *self.notes])
 
     @property
-    def resolved(self) -> str:
+    def resolution_note(self) -> str:
         """Smallest significant error of an uncertainty, as text."""
         return f"errors of uncertainty below {self.resolution:.2g} are not significant"
 
@@ -157,7 +162,8 @@ def measure_tradeoff(
         say("likelihoods")
         likelihoods = timings.benchmark_likelihoods(full, fits)
     say("uncertainties")
-    uncertainties = timings.benchmark_uncertainties(full, fits[_DEFAULT_TOLERANCE], say, runs)
+    default = fits[1e-3]  # by the default tolerance of `fitact.fit`
+    uncertainties = timings.benchmark_uncertainties(full, default, say, runs)
     answers = timings.benchmark_answers(measured, scene if record else used_scene, uncertainties, say)
     resolution, converged = uncertainties.resolution, uncertainties.converged
     return Tradeoff(

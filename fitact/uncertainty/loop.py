@@ -147,7 +147,7 @@ class ChannelModel:
         """Return the signal of the circuit with other values of its parameters, V or A."""
         return self._respond(self.loop.impedances(values, self.s))
 
-    def filtered(self, gain: Callable[[Spectrum], Spectrum]) -> Rows:
+    def signal_filtered(self, gain: Callable[[Spectrum], Spectrum]) -> Rows:
         """Return the signal behind a filter, V or A."""
         return self._respond(self.parts, gain(self.s))
 

@@ -86,7 +86,7 @@ def _circuit(field: str) -> Effect:
 
 def _filter(gain: Callable[[Spectrum, float, ChannelSeries], Spectrum]) -> Effect:
     def effect(model: ChannelModel, a: Amplitudes) -> Rows:
-        return model.filtered(lambda s: gain(s, float(a[0]), model.series))
+        return model.signal_filtered(lambda s: gain(s, float(a[0]), model.series))
 
     return effect
 

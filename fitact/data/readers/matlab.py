@@ -13,8 +13,6 @@ _MATRIX, _COMPRESSED = 14, 15
 _NUMBERS = {
     1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8", 16: "u1", 17: "u2",
 }  # fmt: skip
-_CHAR, _CLASSES = 4, range(6, 16)  # classes of arrays: strings; double, single and integers
-_COMPLEX = 0x0800
 
 
 def read_mat(content: bytes, max_bytes: int) -> Iterator[tuple[str, np.ndarray]]:
@@ -62,17 +60,19 @@ def _read_matrix(data: bytes, order: str) -> Iterator[tuple[str, np.ndarray]]:
     if len(parts) < 4 or len(parts[0][1]) < 8:
         return  # an empty array, or an object
     flags = struct.unpack_from(order + "I", parts[0][1])[0]
+    is_complex, kind = flags & 0x0800, flags & 0xFF
+    string, numbers = 4, range(6, 16)  # kinds of arrays; numbers are double, single and integers
     name = parts[2][1].decode("ascii", errors="replace")
     values = [
-        np.frombuffer(raw, order + _NUMBERS[kind])
-        for kind, raw in parts[3 : 5 if flags & _COMPLEX else 4]
-        if kind in _NUMBERS and len(raw) % int(_NUMBERS[kind][1]) == 0
+        np.frombuffer(raw, order + _NUMBERS[code])
+        for code, raw in parts[3 : 5 if is_complex else 4]
+        if code in _NUMBERS and len(raw) % int(_NUMBERS[code][1]) == 0
     ]
     shape = np.frombuffer(parts[1][1], order + "i4").astype(int)
     if not values or np.prod(shape.astype(float)) != values[0].size:
         return  # a cell or a structure, whose parts are not numbers
-    if flags & 0xFF == _CHAR:
+    if kind == string:
         yield name, np.array("".join(map(chr, values[0])))
-    elif flags & 0xFF in _CLASSES:
+    elif kind in numbers:
         array = values[0] if len(values) == 1 else values[0] + 1j * values[1]
         yield name, array.reshape(shape, order="F")

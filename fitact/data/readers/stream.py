@@ -13,11 +13,8 @@ from jaxtyping import Float
 from fitact.data.readers.binary import is_known_binary
 from fitact.data.readers.capture import channel_arrays, resolve_channels
 from fitact.data.readers.read import read
-from fitact.data.readers.text import is_binary, read_sidecar, stream_text
+from fitact.data.readers.text import BLOCK_BYTES, is_binary, read_sidecar, stream_text
 from fitact.files import read_error, read_head
-
-_BLOCK = 8_388_608  # bytes
-_SAMPLES = 262_144  # in a block of a record that was read at once
 
 
 class Block(NamedTuple):
@@ -48,8 +45,9 @@ def stream_record(
     source, channels, scale = os.fspath(path), channels or {}, scale or {}
     if source != "-" and not _is_plain_text(Path(path)):
         record = read(path, channels=channels, scale=scale, rate=rate)
-        for first in range(0, len(record), _SAMPLES):
-            part = slice(first, first + _SAMPLES)
+        size = 262_144  # samples in a block
+        for first in range(0, len(record), size):
+            part = slice(first, first + size)
             values = {name: each[part] for name, each in record.channels.items()}
             yield Block(record.time[part], values, float(first), record.notes)
         return
@@ -88,7 +86,7 @@ def _chunks(file: IO[bytes], follow: float, pause: float = 0.1) -> Iterator[byte
     read_some = getattr(file, "read1", file.read)
     waited = 0.0
     while True:
-        chunk = read_some(_BLOCK)
+        chunk = read_some(BLOCK_BYTES)
         if chunk:
             waited = 0.0
             yield chunk

@@ -23,19 +23,20 @@ from fitact.files import read_error
 from fitact.progress import track_progress
 
 _HEAD_BYTES = 32_768  # bytes; enough for any header and some rows
-_BLOCK = 8_388_608  # bytes parsed in one block
-_LARGE = 1_048_576  # bytes of a block from which it is parsed by pandas
-_MAX_BYTES = 4_294_967_296  # bytes; more text indicates a damaged gzip file
+BLOCK_BYTES = 8_388_608  # parsed in one block
 
 
-def read_text(path: Path, source: str, pick: Pick) -> Capture:
-    """Return the columns of a text file (plain or gzip) that `pick` selects, in SI units."""
+def read_text(path: Path, source: str, pick: Pick, max_bytes: int = 4_294_967_296) -> Capture:
+    """Return the columns of a text file (plain or gzip) that `pick` selects, in SI units.
+
+    Text of more than `max_bytes` is refused; it indicates a damaged gzip file.
+    """
     try:
-        with _open_text(path) as (stream, file):
+        with _open_text(path, max_bytes) as (stream, file):
             head = stream.read(_HEAD_BYTES)
             stream.seek(0)
             table = _TableParser.from_head(head, source, pick, read_sidecar(path))
-            blocks = _blocks(iter(lambda: stream.read(_BLOCK), b""), source, _MAX_BYTES)
+            blocks = _blocks(iter(lambda: stream.read(BLOCK_BYTES), b""), source, max_bytes)
             for block in track_progress(blocks, f"reading {source}", path.stat().st_size, file.tell):
                 table.add(block)
     except (OSError, EOFError, zlib.error) as error:
@@ -79,8 +80,11 @@ def _is_utf16(head: bytes) -> bool:
 
 
 @contextlib.contextmanager
-def _open_text(path: Path) -> Iterator[tuple[IO[bytes], IO[bytes]]]:
-    """Open a text file and yield its bytes (UTF-8 or a superset of ASCII, lines ending in a line feed) and the file."""
+def _open_text(path: Path, max_bytes: int) -> Iterator[tuple[IO[bytes], IO[bytes]]]:
+    """Open a text file and yield its bytes (UTF-8 or a superset of ASCII, lines ending in a line feed) and the file.
+
+    Of other text, which is converted, at most `max_bytes` are read.
+    """
     with path.open("rb") as file:
         packed = file.read(2) == b"\x1f\x8b"
         file.seek(0)
@@ -89,7 +93,7 @@ def _open_text(path: Path) -> Iterator[tuple[IO[bytes], IO[bytes]]]:
         stream.seek(0)
         old = b"\r" in head and b"\n" not in head
         if old or _is_utf16(head):
-            text = stream.read(_MAX_BYTES).decode("utf-16" if _is_utf16(head) else "latin-1", errors="replace")
+            text = stream.read(max_bytes).decode("utf-16" if _is_utf16(head) else "latin-1", errors="replace")
             stream = io.BytesIO((text.replace("\r", "\n") if old else text).encode())
         yield stream, file
 
@@ -124,7 +128,7 @@ def _blocks(parts: Iterator[bytes], source: str, max_bytes: float) -> Iterator[b
         whole, newline, rest = (rest + part).rpartition(b"\n")
         if newline:
             yield whole
-        elif len(rest) > _BLOCK:
+        elif len(rest) > BLOCK_BYTES:
             raise InputError(f"{source}: has a line of {len(rest):,} bytes; export the record as CSV")
     if rest:
         yield rest
@@ -170,8 +174,8 @@ class _TableParser:
             self._lines.append(lines or range(first, first + len(numbers)))
             self._starts.append(self._starts[-1] + len(numbers))
 
-    def _parse_fast(self, block: bytes) -> np.ndarray | None:
-        """Return the rows, parsed by NumPy, or None if a line has another form."""
+    def _parse_fast(self, block: bytes, large: int = 1_048_576) -> np.ndarray | None:
+        """Return the rows, parsed by NumPy or above `large` bytes by pandas, or None if a line has another form."""
         delimiter = self._header.delimiter
         if b"#" in block or not block:
             return None
@@ -184,7 +188,7 @@ class _TableParser:
             return None
         if self._header.decimal_comma:
             block = block.replace(b",", b".")
-        if len(block) > _LARGE:
+        if len(block) > large:
             return self._parse_large(block)
         try:
             return np.loadtxt(
