@@ -7,6 +7,7 @@ coordinates are Chebyshev series. `fitact.likelihood.projection` computes them.
 
 import dataclasses
 import math
+from collections.abc import Mapping
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -30,9 +31,27 @@ BASELINE_NAMES = (
     *(f"hum_{frequency:.0f}Hz_{part}" for frequency in HUM_FREQUENCIES for part in ("cos", "sin")),
 )
 
-# indices of the last functions of the inner products
-RATE_FUNCTION, SLOPE_FUNCTION, OBSERVED_FUNCTION = -3, -2, -1
-BASELINE_FUNCTIONS = slice(RATE_FUNCTION - len(BASELINE_NAMES), RATE_FUNCTION)
+Columns = Float[np.ndarray, "rows functions"]
+
+
+def function_sizes(rank: int, *, decays: bool, effects: int = 0, ages: int = 0) -> dict[str, int]:
+    """Return the functions of a record in the order of their inner products, each name with its number of functions.
+
+    They are named like the fields of `Compression`, and by `BASELINE_NAMES`.
+    """
+    sizes = {"signal": rank, "decay": rank * decays, "effects": effects, "steps": ages}
+    return sizes | dict.fromkeys((*BASELINE_NAMES, "rate", "slope", "observed"), 1)
+
+
+def split_functions(columns: Columns, sizes: Mapping[str, int]) -> dict[str, Columns]:
+    """Return columns by the name of the functions to which they belong."""
+    return dict(zip(sizes, np.split(columns, np.cumsum(list(sizes.values()))[:-1], axis=1), strict=True))
+
+
+def orthogonal_coordinates(functions: Mapping[str, Columns]) -> dict[str, Columns]:
+    """Return functions in coordinates of as many orthonormal ones, with the same inner products."""
+    _, rows = np.linalg.qr(np.hstack(list(functions.values())))
+    return split_functions(rows, {name: each.shape[1] for name, each in functions.items()})
 
 
 class Compression(eqx.Module):
@@ -153,17 +172,25 @@ class Compression(eqx.Module):
         terms = count_terms(np.linalg.norm(signal, axis=0) + charge * np.linalg.norm(decay, axis=0), precision)
         basis, series = _significant_modes(signal[..., :terms].reshape(len(signal), -1), precision)
         charges, charge_series = _significant_modes(charge * decay[..., :terms].reshape(len(decay), -1), precision)
-        last = self.baseline.T, *(x[:, None] for x in (self.rate, self.slope, self.observed))
-        observed_slope = np.asarray(self.observed_slope)[:, None]
+        columns = {name: np.asarray(getattr(self, name))[:, None] for name in ("observed_slope", "rate", "slope")}
         functions = [*([] if self.effects is None else self.effects), *([] if self.voltage is None else [self.voltage])]
-        effects = np.reshape(functions, (-1, len(observed_slope)))
-        _, rows = np.linalg.qr(np.hstack([basis, steps.T, charges, observed_slope, effects.T, *last]))
-        sizes = len(series), len(steps), len(charge_series), 1, len(effects)
-        basis, shifted, charges, observed_slope, moved, _ = np.split(rows, np.cumsum(sizes), axis=1)
-        table = center, half_width, basis[: len(series)] @ series, charges @ charge_series / (charge or 1.0)
-        record = *split_last_functions(rows), observed_slope[:, 0], self.samples
-        changed = Compression(*map(np.asarray, (*table, *record, shifted.T, origin, self.time_step)))
-        return changed.with_functions(moved.T, self.voltage is not None)
+        effects = np.reshape(functions, (-1, self.observed.size))
+        found = orthogonal_coordinates(
+            {"signal": basis, "steps": steps.T, "decay": charges, "effects": effects.T}
+            | {"baseline": np.asarray(self.baseline).T, **columns, "observed": np.asarray(self.observed)[:, None]}
+        )
+        changed = dataclasses.replace(
+            self,
+            center=np.asarray(center),
+            half_width=np.asarray(half_width),
+            signal=found["signal"][: len(series)] @ series,
+            decay=found["decay"] @ charge_series / (charge or 1.0),
+            baseline=found["baseline"].T,
+            steps=found["steps"].T,
+            origin=np.asarray(origin),
+            **{name: found[name][:, 0] for name in (*columns, "observed")},
+        )
+        return changed.with_functions(found["effects"].T, self.voltage is not None)
 
     def with_functions(self, rows: Float[np.ndarray, "functions rows"], has_voltage: bool) -> "Compression":
         """Return the compression with the coordinates of effects, and of V as the last of these functions."""
@@ -196,8 +223,3 @@ def _significant_modes(
     modes, sizes, series = np.linalg.svd(coefficients, full_matrices=False)
     rank = count_terms(sizes, precision) if sizes[0] > 0.0 else 0
     return modes[:, :rank] * sizes[:rank], series[:rank]
-
-
-def split_last_functions(rows: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the last columns, in the order of the fields of `Compression`."""
-    return rows[:, BASELINE_FUNCTIONS].T, rows[:, RATE_FUNCTION], rows[:, SLOPE_FUNCTION], rows[:, OBSERVED_FUNCTION]

@@ -22,7 +22,7 @@ import scipy.linalg
 from jaxtyping import Array, Bool, Float
 
 from fitact.compiled import jit
-from fitact.likelihood.compression import BASELINE_NAMES
+from fitact.likelihood.compression import BASELINE_NAMES, split_functions
 from fitact.likelihood.projection import (
     Samples,
     WhiteningState,
@@ -111,7 +111,8 @@ def interpolate(
     parts = _accumulate(channel, training, np.linalg.inv(triangle), samples._replace(**without_kept), taps)
     parts = track_progress(parts, "compressing the record", math.ceil(size / chunk_length(size)))
     rows, _ = factor_products(sum(parts, np.zeros(())))
-    functions, baseline, last = np.split(rows.T, np.cumsum([len(chosen), len(BASELINE_NAMES)]))
+    sizes = {"signal": len(chosen), "baseline": len(BASELINE_NAMES), "slope": 1, "observed": 1}
+    functions, baseline, slope, observed = (each.T for each in split_functions(rows, sizes).values())
     needed, filtering = _kept_rows(kept, taps, samples)
     middle, half = 0.5 * (samples.time[0] + samples.time[-1]), 0.5 * (samples.time[-1] - samples.time[0])
     optimum = jax.tree.map(lambda leaf: leaf[0], inputs)
@@ -125,9 +126,9 @@ def interpolate(
         highest=highest,
         baseline=np.hstack([baseline, evaluate_baseline(samples.time[needed], middle, half) @ filtering.T]),
         slope=np.append(
-            last[0], filtering @ _slope(channel.select(needed, np.ones(needed.size)), optimum)[: needed.size]
+            slope[0], filtering @ _slope(channel.select(needed, np.ones(needed.size)), optimum)[: needed.size]
         ),
-        observed=np.append(last[1] + functions.T @ (basis.T @ signals[0]), filtering @ samples.observed[needed]),
+        observed=np.append(observed[0] + functions.T @ (basis.T @ signals[0]), filtering @ samples.observed[needed]),
         samples=np.asarray(float(np.count_nonzero(samples.mask))),
         effects=None if samples.effects is None else samples.effects[:, points],
     )

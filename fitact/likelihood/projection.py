@@ -9,7 +9,7 @@ Coloured noise is whitened by a linear filter, which is applied to all functions
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from typing import Any, NamedTuple
 
@@ -25,12 +25,12 @@ from fitact.compiled import jit, pad_samples, pad_weight
 from fitact.data.record import is_uniform
 from fitact.likelihood.charge_rows import ChargeRows
 from fitact.likelihood.compression import (
-    BASELINE_FUNCTIONS,
     BASELINE_NAMES,
     HUM_FREQUENCIES,
-    OBSERVED_FUNCTION,
+    Columns,
     Compression,
-    split_last_functions,
+    function_sizes,
+    split_functions,
 )
 from fitact.likelihood.noise import Whitening
 from fitact.model.chirp import Chirp
@@ -49,7 +49,6 @@ from fitact.progress import track_progress
 
 RANK_TOLERANCE = 1e-13  # relative size of the singular values that are omitted
 MANY_SAMPLES = 65_536  # samples above which a faster program saves more than its compilation takes
-ROW_FUNCTIONS = 3  # the last functions of the inner products: rate, slope and record, which for charges are rows
 MAX_DELAY = 6  # time steps by which the response to a measured drive may be shifted
 
 
@@ -113,8 +112,15 @@ def compress(
     )
     taps = None if whitening is None else np.asarray(whitening.taps)
     measured = isinstance(drive, Sampled) and not steady_state
+    sizes = function_sizes(
+        len(table.series),
+        decays=measured and not table.is_grid,
+        effects=samples.n_effects,
+        ages=2 * MAX_DELAY if measured and delayed else 0,
+    )
+    filtering = WhiteningState.start(taps, sum(sizes.values()), charges)
     if isinstance(drive, Sampled) and measured:
-        parts = _accumulate_measured(table, drive, samples, taps, MAX_DELAY if delayed else 0)
+        parts = _accumulate_measured(table, drive, samples, filtering, MAX_DELAY if delayed else 0)
     else:
         is_simple = steady_state and taps is None and student is None
         period = samples_per_period(drive, time) if is_simple else None
@@ -122,14 +128,13 @@ def compress(
         if period and not np.allclose(samples.rate[period:], samples.rate[:-period], rtol=0.0, atol=rounding):
             period = None
         if period is None:
-            parts = _accumulate_directly(table, drive, samples, steady_state, taps)
+            parts = _accumulate_directly(table, drive, samples, steady_state, filtering)
         else:
             parts = _accumulate_folded(table, drive, samples, period)
     parts = track_progress(parts, "compressing the record", math.ceil(time.size / chunk_length(time.size)))
-    ages = 2 * MAX_DELAY if measured and delayed else 0
-    count = int(np.count_nonzero(mask))
-    n_effects = 0 if effects is None else len(effects)
-    return assemble_compression(table, sum(parts, np.zeros(())), measured and not table.is_grid, ages, n_effects, count)
+    rows, projected = factor_products(sum(parts, np.zeros(())))
+    functions, count = split_functions(rows, sizes), int(np.count_nonzero(mask))
+    return assemble_compression(table, functions, count, projected.T if projected.size else None)
 
 
 def table_multiple(tau: Float[np.ndarray, " terms"]) -> int:
@@ -260,11 +265,10 @@ def chunk_length(samples: int, longest: int = 8_192) -> int:
 
 
 def _accumulate_directly(
-    table: TableNodes, drive: Drive, samples: Samples, steady_state: bool, taps: np.ndarray | None
+    table: TableNodes, drive: Drive, samples: Samples, steady_state: bool, filtering: "WhiteningState | None"
 ) -> Iterator[np.ndarray]:
     size = samples.time.size
     length = chunk_length(size, 65_536) if isinstance(drive, Chirp) else chunk_length(size)  # of few chirps
-    filtering = WhiteningState.start(taps, table.series.shape[0] + samples.n_effects + len(BASELINE_NAMES) + 3)
     multiply = jit(_chunk_products, fast=size > MANY_SAMPLES)
     for chunk in chunks(samples, length):
         total, filtering = multiply(table, drive, chunk, None, steady_state, filtering)
@@ -282,8 +286,8 @@ class WhiteningState(NamedTuple):
     def start(
         cls, taps: np.ndarray | None, functions: int, charges: ChargeRows | None = None
     ) -> "WhiteningState | None":
-        if charges is not None:
-            return cls(None, np.zeros((functions - ROW_FUNCTIONS + 1, charges.reach)), np.zeros(functions))
+        if charges is not None:  # rate, slope and record are rows; the expected signal is a function of time, too
+            return cls(None, np.zeros((functions - 2, charges.reach)), np.zeros(functions))
         return None if taps is None else cls(taps, np.zeros((functions, taps.size - 1)))
 
 
@@ -386,8 +390,8 @@ def _accumulate_folded(table: TableNodes, drive: Drive, samples: Samples, period
     effects = None if samples.effects is None else pad_samples(samples.effects[:, :period])
     folded = Samples(time, mean, weight, rate, weight, slope, None, effects)
     total = np.array(jit(_chunk_products)(table, drive, folded, baseline, True, None)[0])
-    # scatter of the samples of one phase about their mean
-    kept = np.r_[BASELINE_FUNCTIONS, OBSERVED_FUNCTION]
+    # scatter of the samples of one phase about their mean; rate and slope stand between
+    kept = np.r_[-len(BASELINE_NAMES) - 3 : -3, -1]
     total[np.ix_(kept, kept)] += squares - means @ sums.T
     yield total
 
@@ -413,7 +417,7 @@ def is_exactly_uniform(time: np.ndarray, tolerance: float = 1e-9) -> bool:
 
 
 def _accumulate_measured(
-    table: TableNodes, drive: Sampled, samples: Samples, taps: np.ndarray | None, ages: int
+    table: TableNodes, drive: Sampled, samples: Samples, filtering: WhiteningState | None, ages: int
 ) -> Iterator[np.ndarray]:
     """Yield the inner products of each chunk for a measured drive; `ages` steps before and after a sample."""
     time, voltage = samples.time, np.asarray(drive.samples)[: samples.time.size]
@@ -422,9 +426,6 @@ def _accumulate_measured(
     last = np.zeros(table.nodes.size), np.asarray(time[0]), np.zeros(())  # the first sample is a jump from 0
     if x is not None:
         last = first * np.exp(x), np.asarray(time[0] - step), np.asarray(first)
-    tables = 1 if table.is_grid else 2
-    functions = tables * table.series.shape[0] + samples.n_effects + 2 * ages + len(BASELINE_NAMES) + 3
-    filtering = WhiteningState.start(taps, functions, samples.charges)
     voltages = chunks(samples._replace(observed=voltage, effects=None, charges=None), length)
     advance = jit(_advance_chunk, fast=time.size > MANY_SAMPLES)
     for number, (chunk, driven) in enumerate(zip(chunks(samples, length), voltages, strict=True)):
@@ -489,24 +490,33 @@ def uniform_recurrence(
 
 
 def assemble_compression(
-    table: TableNodes, total: np.ndarray, decays: bool, ages: int, n_effects: int, samples: int
+    table: TableNodes, functions: Mapping[str, Columns], samples: int, projected: np.ndarray | None = None
 ) -> Compression:
-    """Return coordinates that have the accumulated inner products."""
-    rows, projected = factor_products(total)
-    size, (rank, terms) = len(rows), table.series.shape
-    signal = rows[:, :rank] @ table.series
-    decay = rows[:, rank : 2 * rank] @ table.series if decays else np.zeros((size, terms))
-    first = (1 + decays) * rank + n_effects
-    effects, steps = rows[:, first - n_effects : first].T, rows[:, first : first + ages].T
-    baseline, rate, slope, remainder = split_last_functions(rows)
+    """Return a record from coordinates of its functions, and those of functions `projected` in its place."""
+    rate, slope, remainder = (functions[name][:, 0] for name in ("rate", "slope", "observed"))
+    signal, effects, series = functions["signal"] @ table.series, functions["effects"].T, table.series
+    decay = functions["decay"] @ (series if functions["decay"].size else series[:0])
     following = 0.0 if table.expected_rate is None else table.expected_rate * rate
     if table.expected_direct is not None:
         following = following + table.expected_direct * effects[-1]
-    observed, observed_slope = remainder + signal @ table.expected_series + following, np.zeros(size)
-    if projected.size:
-        observed, observed_slope = projected.T
-    arrays = table.center, table.half_width, signal[:rank], decay, baseline, rate, slope, observed, observed_slope
-    compression = Compression(*map(np.asarray, (*arrays, float(samples), steps, 0.0, table.step)))
+    observed, observed_slope = remainder + signal @ table.expected_series + following, np.zeros(rate.size)
+    if projected is not None:
+        observed, observed_slope = projected
+    compression = Compression(
+        center=table.center,
+        half_width=table.half_width,
+        signal=signal[: len(series)],
+        decay=decay,
+        baseline=np.stack([functions[name][:, 0] for name in BASELINE_NAMES]),
+        rate=rate,
+        slope=slope,
+        observed=observed,
+        observed_slope=observed_slope,
+        samples=np.asarray(float(samples)),
+        steps=functions["steps"].T,
+        origin=np.zeros(()),
+        time_step=table.step,
+    )
     return compression.with_functions(effects, table.expected_direct is not None)
 
 

@@ -6,7 +6,7 @@ all. The responses to the recorded drive are first-order recursive filters, whos
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.charge_rows import LAG, ChargeRows, step_means, whiten_rows
-from fitact.likelihood.compression import BASELINE_NAMES, Compression
+from fitact.likelihood.compression import BASELINE_NAMES, Columns, Compression, function_sizes, split_functions
 from fitact.likelihood.likelihood import CircuitValues
 from fitact.likelihood.projection import (
     MAX_DELAY,
@@ -23,6 +23,7 @@ from fitact.likelihood.projection import (
     assemble_compression,
     drive_steps,
     evaluate_baseline,
+    factor_products,
 )
 
 REACH = 4.0  # factor by which b may change
@@ -76,8 +77,8 @@ class WindowCompressor:
             if reach is not None:
                 kept = slice(RANK)
                 table = dataclasses.replace(table, combinations=table.combinations[:, kept], series=table.series[kept])
-            baseline = evaluate_baseline(time, table.middle, table.half)[_baseline_columns(each)]
-            functions = np.concatenate([_decays(table, time), baseline])
+            baseline = dict(zip(BASELINE_NAMES, evaluate_baseline(time, table.middle, table.half), strict=True))
+            functions = np.vstack([_decays(table, time), *(baseline[name] for name in _baseline_names(each))])
             tables.append(table)
             shared.append(functions if each.charges is None else step_means(functions))
         return cls(tuple(channels), tuple(tables), time, tuple(shared))
@@ -107,10 +108,9 @@ class WindowCompressor:
         if self.channels[0].charges is None:
             return parts, inputs, None
         decays = _decays(self.tables[0], self.time)[: rank * has_charge]
-        rows = np.concatenate([combined, decays])
-        total = np.zeros(2 * [2 * rank + len(BASELINE_NAMES) + 3])
-        total[: len(rows), : len(rows)] = rows @ rows.T
-        return parts, inputs, assemble_compression(self.tables[0], total, True, 0, 0, V.size)
+        sizes = function_sizes(rank, decays=True)
+        sampled = _find_coordinates({"signal": combined, "decay": decays}, sizes)
+        return parts, inputs, assemble_compression(self.tables[0], sampled, V.size)
 
     def _compress_channel(
         self,
@@ -123,7 +123,7 @@ class WindowCompressor:
     ) -> tuple[Compression, TrendInputs]:
         """Compress a channel; the `functions` are the responses, those of trends, V, and what the tables expect."""
         channel, table, step = self.channels[index], self.tables[index], float(self.time[1])
-        rank, effects, charged = len(table.series), len(channel.effect_sizes), has_charge * len(table.series)
+        rank, charged = len(table.series), has_charge * len(table.series)
         shared, steps = self.shared[index][rank - charged :], np.empty((0, late.size))
         rows = None
         if callable(given):
@@ -137,27 +137,15 @@ class WindowCompressor:
             if channel.timing:
                 steps = drive_steps(functions[-2], 0, late.size, MAX_DELAY) / step
         rest = observed - functions[-1] - (0.0 if table.expected_rate is None else table.expected_rate * rate)
-        own = functions[:rank], shared[:charged], functions[rank:-2], [late * rate, functions[-2]], steps
-        products = np.concatenate([*own, shared[charged:], [rate, slope, rest]])
-        if rows is not None:
-            products = whiten_rows(rows.gain, rows.decay, products) * rows.used
-        elif weight is not None:
-            products = products * weight
-        # functions that are absent are 0
-        first = 2 * rank + effects
-        begin = first + TREND_RANK + 2 + len(steps)
-        places = [*range(rank + charged), *range(first, begin)]
-        places += [begin + column for column in _baseline_columns(channel)]
-        end = begin + len(BASELINE_NAMES)
-        places += range(end, end + 3)
-        total = np.zeros((end + 3, end + 3))
-        total[np.ix_(places, places)] = products @ products.T
-        whole = assemble_compression(table, total, True, len(steps), effects + TREND_RANK + 2, count)
-        assert whole.effects is not None
-        *late_parts, late_rate, voltage = whole.effects[effects:]
-        late_signal = np.transpose(late_parts) @ table.series[:TREND_RANK]
-        whole = dataclasses.replace(whole, effects=whole.effects[:effects] if effects else None)
-        return whole, TrendInputs(late_signal, late_rate, voltage)
+        own = {"signal": functions[:rank], "decay": shared[:charged], "steps": steps}
+        own |= zip(_baseline_names(channel), shared[charged:, None], strict=True)
+        own |= {"rate": rate[None], "slope": slope[None], "observed": rest[None]}
+        own |= {"late": functions[rank:-2], "late_rate": (late * rate)[None], "voltage": functions[-2:-1]}
+        sizes = function_sizes(rank, decays=True, effects=len(channel.effect_sizes), ages=len(steps))
+        found = _find_coordinates(own, sizes | {"late": TREND_RANK, "late_rate": 1, "voltage": 1}, weight, rows)
+        late_signal = found["late"] @ table.series[:TREND_RANK]
+        trend = TrendInputs(late_signal, found["late_rate"][:, 0], found["voltage"][:, 0])
+        return assemble_compression(table, found, count), trend
 
     def expect(self, V: Samples, responses: Float[np.ndarray, "nodes samples"]) -> Samples:
         """Return the samples of the first channel with the tables' circuit, without its charge."""
@@ -184,9 +172,30 @@ class WindowCompressor:
         return responses, FilterState(start + length, float(V[-1]), left, age)
 
 
+def _find_coordinates(
+    functions: Mapping[str, Float[np.ndarray, "some samples"]],
+    sizes: Mapping[str, int],
+    weight: Samples | None = None,
+    charges: ChargeRows | None = None,
+) -> dict[str, Columns]:
+    """Return coordinates of functions, 0 for those of `sizes` that are absent, so that windows have equal shapes.
+
+    Functions over the samples have a `weight`; rows are whitened like `charges`.
+    """
+    starts = dict(zip(sizes, np.cumsum([0, *sizes.values()]), strict=False))
+    kept = np.concatenate([starts[name] + np.arange(len(each)) for name, each in functions.items()])
+    rows, total = np.concatenate(list(functions.values())), np.zeros(2 * [sum(sizes.values())])
+    if charges is not None:
+        rows = whiten_rows(charges.gain, charges.decay, rows) * charges.used
+    elif weight is not None:
+        rows = rows * weight
+    total[np.ix_(kept, kept)] = rows @ rows.T
+    return split_functions(factor_products(total)[0], sizes)
+
+
 def _decays(table: TableNodes, time: Samples) -> Float[np.ndarray, "rank samples"]:
     return table.combinations.T @ np.exp(-time / table.nodes[:, None])
 
 
-def _baseline_columns(channel: ChannelLikelihood) -> list[int]:
-    return [column for column in channel.columns if column < len(BASELINE_NAMES)]
+def _baseline_names(channel: ChannelLikelihood) -> list[str]:
+    return [BASELINE_NAMES[column] for column in channel.columns if column < len(BASELINE_NAMES)]
