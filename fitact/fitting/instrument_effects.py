@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
-import scipy.linalg
 from jaxtyping import Array, Float
 
 from fitact.compiled import jit, pad_samples
 from fitact.fitting.channel_fit import sample_residuals
 from fitact.instrument.effects import PROBE_TIME_CONSTANT, nonlinearity_shapes, nonlinearity_slopes
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
+from fitact.likelihood.charge_rows import filter_highpass
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.spectrum_channel import SpectrumChannel
 from fitact.model.drive import Sampled
@@ -111,9 +111,5 @@ def _highpass(
     uniform = np.interp(time[0] + step * np.arange(time.size), time, signal)
     period = 0 if frequency is None else round(1.0 / (frequency * step))
     before = uniform[:period] if 0 < period <= time.size else np.full(1, uniform[0] if settled else 0.0)
-    x = step / PROBE_TIME_CONSTANT
-    gain = -np.expm1(-x) / x
-    rise = np.diff(np.append(before, uniform), prepend=before[0])
-    # filtered[k] - exp(-x) filtered[k - 1] = gain rise[k]
-    filtered = scipy.linalg.solve_banded((1, 0), np.outer([1.0, -np.exp(-x)], np.ones(rise.size)), gain * rise)
+    filtered, _ = filter_highpass(np.diff(np.append(before, uniform), prepend=before[0]), step / PROBE_TIME_CONSTANT)
     return np.interp(time, time[0] + step * np.arange(time.size), filtered[before.size :])

@@ -157,3 +157,11 @@ def whiten_rows(
     scaled = np.reshape(gain * rows, (-1, decay.size))
     whitened, _ = scipy.linalg.lapack.dtbtrs(bands, scaled.T, uplo="L", diag="U", overwrite_b=True)
     return whitened.T.reshape(np.shape(rows))
+
+
+def filter_highpass(
+    rise: Float[np.ndarray, " n"], x: float, memory: Float[np.ndarray, "1"] | None = None
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "1"]]:
+    """Return u[k] = e^{-x} u[k - 1] + phi(x) rise[k] without JAX, and the `memory` with which it goes on; from 0."""
+    before = np.zeros(1) if memory is None else memory
+    return scipy.signal.lfilter([-np.expm1(-x) / x], [1.0, -np.exp(-x)], rise, zi=before)

@@ -10,11 +10,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
-import scipy.signal
 from jaxtyping import Float
 
 from fitact.likelihood.channel import ChannelLikelihood
-from fitact.likelihood.charge_rows import LAG, ChargeRows, step_means, whiten_rows
+from fitact.likelihood.charge_rows import LAG, ChargeRows, filter_highpass, step_means, whiten_rows
 from fitact.likelihood.compression import BASELINE_NAMES, Columns, Compression, function_sizes, split_functions
 from fitact.likelihood.likelihood import CircuitValues
 from fitact.likelihood.projection import (
@@ -166,7 +165,7 @@ class WindowCompressor:
         memory = np.zeros((nodes.size, 1)) if before is None else before.memory
         responses, left = np.empty((nodes.size, V.size)), np.empty((nodes.size, 1))
         for i, x in enumerate(step / nodes):
-            responses[i], left[i] = scipy.signal.lfilter([-np.expm1(-x) / x], [1.0, -np.exp(-x)], rise, zi=memory[i])
+            responses[i], left[i] = filter_highpass(rise, x, memory[i])
         length = step * V.size
         age = length + (0.0 if before is None else before.age)
         return responses, FilterState(start + length, float(V[-1]), left, age)

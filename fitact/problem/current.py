@@ -9,7 +9,7 @@ import scipy.signal
 from jaxtyping import Bool
 
 from fitact.data.record import Record
-from fitact.likelihood.charge_rows import LAG, RowCovariance, step_means, whiten_rows
+from fitact.likelihood.charge_rows import LAG, RowCovariance, filter_highpass, step_means, whiten_rows
 from fitact.problem.drive_choice import DriveModel, drive_slope, unit_response
 from fitact.problem.jumps import block_medians
 from fitact.problem.recorded_current import Current, RecordedCurrent, solve_linear, thin_rows
@@ -73,13 +73,6 @@ def _scan(
     return estimates[best]
 
 
-def _first_order(V: Rows, step: float, tau: float) -> Rows:
-    """Return the response of s tau / (1 + s tau) to V, linear between samples, from 0."""
-    x = step / tau
-    decay = np.full(V.size, math.exp(-x))
-    return whiten_rows(np.full(V.size, -math.expm1(-x) / x), decay, np.diff(V, prepend=V[0]))
-
-
 def estimate_recorded(
     current: RecordedCurrent, stray: float, hum: Sequence[float], belief: Belief, most: int = 4096
 ) -> tuple[CurrentEstimate, Rows]:
@@ -141,7 +134,7 @@ def _scan_recorded(
         return gain, decay, whiten_rows(gain, decay, fixed), taken
 
     def fit(tau: float) -> tuple[float, np.ndarray]:
-        u = _first_order(V, step, tau)
+        u = filter_highpass(np.diff(V, prepend=V[0]), step / tau)[0]
         mean = tau * (np.diff(V) - np.diff(u)) / step  # over a step, exactly
         rows, capacitance = np.stack([mean, np.exp(-time / tau)]), C
         for _ in range(2):  # a low-pass is no better for passing less noise of V
@@ -179,7 +172,7 @@ def hum_likeness(current: RecordedCurrent, frequency: float, most: int = 4096) -
         return 1.0
     time, largest = step * np.arange(V.size), 0.0
     for b in (1e-3, 4e-3, 16e-3):
-        u, later = (_first_order(V, step, tau) for tau in (b, 1.01 * b))
+        u, later = (filter_highpass(np.diff(V, prepend=V[0]), step / tau)[0] for tau in (b, 1.01 * b))
         rows = np.stack([np.ones_like(V), np.exp(-time / b), np.gradient(V), u, later - u])
         basis, _ = np.linalg.qr(rows.T / np.linalg.norm(rows, axis=1))
         parts = basis.T @ np.stack(_waves([frequency], time), axis=1)
@@ -191,7 +184,7 @@ def respond_to(current: RecordedCurrent, estimate: CurrentEstimate, stray: float
     """Return the function from a drive to the rows of the estimated current."""
 
     def respond(V: Rows) -> Rows:
-        filtered = step_means(_first_order(V, current.step, estimate.b))
+        filtered = step_means(filter_highpass(np.diff(V, prepend=V[0]), current.step / estimate.b)[0])
         return (estimate.capacitance + stray) * current.rise(V) + estimate.weight * filtered
 
     return respond
