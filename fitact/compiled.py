@@ -30,6 +30,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from jaxtyping import Array
 
 from fitact import program_cache
+from fitact.errors import InputError
 from fitact.progress import track_progress
 
 _Module = TypeVar("_Module", bound=eqx.Module)
@@ -87,6 +88,33 @@ def is_array(leaf: Any) -> bool:
     return isinstance(leaf, np.ndarray | jax.Array | np.generic)
 
 
+@functools.cache
+def find_device() -> jax.Device:
+    """Return the device on which fitact computes: the first CPU, or that of the environment variable FITACT_DEVICE.
+
+    Its value is a platform of JAX, with a number where there are several devices: "gpu", "gpu:1".
+
+    Raises:
+        InputError: JAX finds no such device.
+    """
+    wanted = os.environ.get("FITACT_DEVICE", "")
+    platform, _, number = (wanted or "cpu").partition(":")
+    try:
+        return jax.devices(platform)[int(number or 0)]
+    except (RuntimeError, ValueError, IndexError):
+        if not wanted:
+            return jax.devices()[0]  # JAX_PLATFORMS leaves out the CPU
+        found = ", ".join(f"{each.platform}:{each.id}" for each in jax.devices())
+        raise InputError(f"FITACT_DEVICE = {wanted}: JAX finds {found} only; give one of these") from None
+
+
+@contextlib.contextmanager
+def double_precision() -> Iterator[None]:
+    """Compute in double precision, on the device of fitact, with the block or the function that is decorated."""
+    with jax.enable_x64(True), jax.default_device(find_device()):
+        yield
+
+
 def jit(
     function: Callable[_Arguments, _Result], *, fast: bool = False, double: bool = True
 ) -> Callable[_Arguments, _Result]:
@@ -136,7 +164,8 @@ class _Static(NamedTuple):
 
 
 def _as_argument(leaf: Any) -> np.ndarray | Array:
-    return leaf if isinstance(leaf, np.ndarray | jax.Array) else np.asarray(leaf)
+    is_there = isinstance(leaf, np.ndarray) or (isinstance(leaf, jax.Array) and leaf.devices() == {find_device()})
+    return leaf if is_there else np.asarray(leaf)
 
 
 def _signature(leaves: Sequence[Any]) -> tuple[_Shape | _Static, ...]:
@@ -148,7 +177,7 @@ def _find_program(
     function: Callable[..., Any], fast: bool, x64: bool, structure: Any, signature: tuple[_Shape | _Static, ...]
 ) -> _Program:
     """Load the program from the disk, or compile it and store it there; `x64` is the current setting of JAX."""
-    if jax.default_backend() != "cpu" or jax.config.jax_default_device is not None:
+    if find_device().platform != "cpu":
         return _compile(function, fast, structure, signature)[0]
     try:
         described = _describe(function), _describe(jax.tree.unflatten(structure, signature))
@@ -185,7 +214,7 @@ def _load_program(content: bytes) -> _Program:
     _initialize_lapack()
     result = jax.tree.structure(skeleton)
     trees = jax.tree.structure(((0,) * n_arguments, {})), jax.tree.structure([0] * result.num_leaves)
-    device = jax.devices()[0]
+    device = find_device()
     loaded = serialize_executable.deserialize_and_load(executable, *trees, device.client, [device])
     return _Program(loaded, result)
 
@@ -213,8 +242,8 @@ def _compile(
 
     run_flat.__name__ = run_flat.__qualname__ = function.__name__
     shapes = [jax.ShapeDtypeStruct(*each) for each in signature if isinstance(each, _Shape)]
-    options = XLA_OPTIONS | ({} if fast else _FAST_COMPILATION) if jax.default_backend() == "cpu" else None
-    with _outside_users_cache():
+    options = XLA_OPTIONS | ({} if fast else _FAST_COMPILATION) if find_device().platform == "cpu" else None
+    with _outside_users_cache(), jax.default_device(find_device()):
         lowered = jax.jit(run_flat).lower(*shapes)
         try:
             compiled = lowered.compile(compiler_options=options)
@@ -342,9 +371,9 @@ class BatchEvaluator:
         count, batch = len(arrays[0]), self._batch
         arrays = tuple(pad_rows(a, batch) for a in arrays)
         starts = range(0, count, batch)
-        with jax.enable_x64(True):
+        with double_precision():
             if (self._programs or len(starts) > 1) and not self._is_copied:
-                self._arrays, self._is_copied = jax.device_put(self._arrays), True
+                self._arrays, self._is_copied = jax.device_put(self._arrays, find_device()), True
             program = self._find_program(*(a[:batch] for a in arrays))
             parts = [
                 program(*self._arrays, *(a[i : i + batch] for a in arrays))

@@ -8,10 +8,10 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fitact.compiled import double_precision
 from fitact.model.circuit import Circuit, DirectGround, FinalCircuit, NaturalGround
 from fitact.model.drive import Drive, Sine, Square, Triangle
 from fitact.model.force import Contact, mean_force, plate_capacitance, plate_resistance
@@ -84,7 +84,7 @@ def reproduce() -> tuple[Claim, ...]:
         _element_claims, _grounding_claims, _grounding_finger_claims, _equivalent_claims, _insulator_claims,
         _frequency_claims, _waveform_claims, _equation_claims,
     )  # fmt: skip
-    with jax.enable_x64(True):
+    with double_precision():
         return tuple(claim for part in parts for claim in part())
 
 

@@ -10,14 +10,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
-import jax
 import numpy as np
 
 from fitact.batch.batch_problem import BatchFit, BatchProblem
 from fitact.batch.recorded_drive import RecordedDriveProblem
 from fitact.batch.stated_drive import StatedDriveProblem
 from fitact.blas import limit_to_one_thread
-from fitact.compiled import available_cores
+from fitact.compiled import available_cores, double_precision
 from fitact.data.readers.read import read
 from fitact.data.record import Record
 from fitact.errors import InputError
@@ -158,7 +157,7 @@ def tabulate_records(
     (scene or Scene()).require_available(fit=True)
     rows: dict[int, Row] = {}
     total = len(records) if isinstance(records, Sequence) else 0
-    with jax.enable_x64(True), limit_to_one_thread():
+    with double_precision(), limit_to_one_thread():
         numbered_rows = make_rows(_group_records(_read_records(records, scene, columns, rows), scene))
         if progress_title and total:
             numbered_rows = track_progress(numbered_rows, progress_title, total)
@@ -195,7 +194,7 @@ def run_in_threads(
     under_way: collections.deque[tuple[_Job, Future[_Done]]] = collections.deque()
 
     def run_job(job: _Job) -> _Done:
-        with jax.enable_x64(True):  # x64 is a setting of each thread
+        with double_precision():  # x64 is a setting of each thread
             return work(job)
 
     with ThreadPoolExecutor(cores) as pool:

@@ -27,6 +27,8 @@ _INTERRUPTED = 130
 
 def main() -> None:
     """Run the command line and end the process."""
+    if os.environ.get("FITACT_DEVICE", "cpu").startswith("cpu"):
+        os.environ.setdefault("JAX_PLATFORMS", "cpu")  # to start a GPU takes longer than a fit
     end_process(run_command(lambda: app(standalone_mode=False)))
 
 

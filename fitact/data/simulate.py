@@ -3,11 +3,11 @@
 import math
 from typing import Any
 
-import jax
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from fitact.compiled import double_precision
 from fitact.data.plausibility import check_plausibility, insulator_voltage
 from fitact.data.record import MINIMUM_SAMPLES, Record
 from fitact.errors import InputError
@@ -26,7 +26,7 @@ def simulate(scene: Scene, seed: int = 0) -> Record:
     """
     circuit, drive, measured, time = scene.make_circuit(), scene.make_drive(), scene.measurement, sample_times(scene)
     rng = np.random.default_rng(seed)
-    with jax.enable_x64(True):
+    with double_precision():
         steady_state, stray = scene.drive.steady_state, scene.stray_capacitance()
         noise_V = scene.noise_V() * np.random.default_rng([seed, 1]).standard_normal(time.size)
         channels: dict[str, Any] = {"V": np.asarray(drive.value(time)) + noise_V}

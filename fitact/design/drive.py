@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitact.compiled import jit
+from fitact.compiled import double_precision, jit
 from fitact.design.drive_design import DriveDesign
 from fitact.design.drive_option import DriveOption, normalize_drive
 from fitact.design.drive_people import FingerSample
@@ -134,7 +134,7 @@ class _DriveEvaluator(NamedTuple):
         geometry = dataclasses.replace(self.scene.geometry(), insulator_thickness=thickness)
         table, coefficient = self.scene.perception.thresholds, float(self.scene.friction.coefficient)
         sensitivity = table and table.harmonic_sensitivity(float(np.asarray(drive.frequency)), coefficient)
-        with jax.enable_x64(True):
+        with double_precision():
             effects = _map_fingers(*jax.tree.map(jnp.asarray, (template, geometry, drive, flat, sensitivity)))
             return jax.tree.map(lambda x: np.asarray(x).reshape(*self.people.shape, *x.shape[1:]), effects)
 

@@ -4,11 +4,11 @@ import dataclasses
 import math
 from typing import Any, ClassVar, Self
 
-import jax
 import numpy as np
 import scipy.stats
 from jaxtyping import Float
 
+from fitact.compiled import double_precision
 from fitact.design.limits import LimitComparison, compare_with_limits, format_quantity
 from fitact.model.steady_cycle import PeriodQuantities, Sensation
 from fitact.scene.sections import Device, DriveSection
@@ -152,7 +152,7 @@ def normalize_drive(drive: DriveSection) -> DriveSection:
     height = drive.peak_to_peak
     if drive.amplitudes is not None:  # at least 65 points of the fastest cycle
         time = np.linspace(0.0, 1.0 / drive.lowest_frequency, 16_384, endpoint=False)
-        with jax.enable_x64(True):
+        with double_precision():
             height = float(np.ptp(drive.make().value(time)))
     amplitudes = drive.amplitudes and tuple(amplitude / height for amplitude in drive.amplitudes)
     scaled = {"peak_to_peak": 1.0, "offset": drive.offset / height, "amplitudes": amplitudes}

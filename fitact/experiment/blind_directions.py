@@ -15,7 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
-from fitact.compiled import as_arrays, jit
+from fitact.compiled import as_arrays, double_precision, jit
 from fitact.errors import InputError
 from fitact.model.circuit import Channel, Circuit, passes_direct_current
 from fitact.model.skin import circuit_parameters, constant_skin_circuit, with_values
@@ -71,7 +71,7 @@ def blind_directions(
     spread = np.array([0.1 if name == "alpha" else math.log(10.0) for name in free])  # alpha is at most 1
     offsets = spread * np.random.default_rng(0).uniform(-1.0, 1.0, (points, len(free)))  # any other points would serve
     thetas = log_values(circuit, free, channels, stray_capacitance) + np.vstack([np.zeros(len(free)), offsets])
-    with jax.enable_x64(True):
+    with double_precision():
         slopes = _log_gain_slopes(as_arrays(circuit), thetas, free, channels, np.asarray(stray_capacitance))
     null_spaces = [_null_space(np.concatenate([slope.real, slope.imag])) for slope in slopes]
     dimension = min(len(directions) for directions in null_spaces)

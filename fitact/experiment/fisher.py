@@ -20,7 +20,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
-from fitact.compiled import as_arrays, jit
+from fitact.compiled import as_arrays, double_precision, jit
 from fitact.experiment.blind_directions import log_values, recorded_gain, with_parameters
 from fitact.model.circuit import Channel, Circuit
 from fitact.model.drive import Drive, Periodic, Sampled
@@ -55,7 +55,7 @@ class Experiment:
 
 def force_gradient(experiment: Experiment) -> Float[np.ndarray, " circuit_parameters"]:
     """Return the gradient of the log mean force of an experiment in its log-parameters."""
-    with jax.enable_x64(True):
+    with double_precision():
         sampling, model = _sampling(experiment), _Model.from_experiment(experiment)
         ((voltage, slope),) = _derivatives(model, sampling, slice(-1, None))
         constant = _force_constant_slope(model, as_arrays(experiment.geometry))
@@ -67,7 +67,7 @@ def jacobian(experiment: Experiment) -> Float[np.ndarray, "rows parameters"]:
     """Return the Jacobian of the signals in units of their noise, in the logarithms of the free parameters."""
     has_noise = experiment.noise.get("V", 0.0) > 0.0
     experiment = _represent_by_uniform_samples(experiment) if has_noise else experiment
-    with jax.enable_x64(True):
+    with double_precision():
         sampling, model = _sampling(experiment), _Model.from_experiment(experiment)
         signals = _derivatives(model, sampling, slice(-1))
         if has_noise:
@@ -158,7 +158,7 @@ def _whitened_derivatives(
 
 def signal_spans(experiment: Experiment) -> dict[Channel, float]:
     """Return the range of each channel's samples, V and A, without a current's samples at edges."""
-    with jax.enable_x64(True):
+    with double_precision():
         sampling, model = _sampling(experiment), _Model.from_experiment(experiment)
         signals = _derivatives(model, sampling, slice(-1))
     kept, channels = sampling.off_edge_weight > 0.0, experiment.channels

@@ -12,7 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from fitact.compiled import BatchEvaluator, as_arrays, jit, pad_samples, pad_weight
+from fitact.compiled import BatchEvaluator, as_arrays, double_precision, jit, pad_samples, pad_weight
 from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.likelihood.channel import CHARGES, FIRST_CHARGE, LINEAR_NUISANCES, ChannelInputs, ChannelLikelihood
@@ -183,6 +183,7 @@ def nuisance_deviates(
     return np.random.default_rng([seed, 1]).standard_normal(shape)
 
 
+@double_precision()
 def evaluate_draws(
     function: Callable[..., Array],
     model: Any,
@@ -191,8 +192,7 @@ def evaluate_draws(
     deviates: Float[np.ndarray, "*draws channels nuisances"],
 ) -> np.ndarray:
     """Evaluate `function(model, point, deviate)` for each draw; one evaluation processes `rows` numbers."""
-    with jax.enable_x64(True):
-        return BatchEvaluator(function, model, rows).map_over(points.shape[:-1], points, deviates)
+    return BatchEvaluator(function, model, rows).map_over(points.shape[:-1], points, deviates)
 
 
 def _derive_draw(derive: DerivedQuantities, point: Array, deviate: Array) -> Array:

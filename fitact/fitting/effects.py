@@ -4,10 +4,10 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
+from fitact.compiled import double_precision
 from fitact.data.spectrum import Spectrum
 from fitact.fitting import derived
 from fitact.fitting.channel_fit import ChannelFit
@@ -58,7 +58,7 @@ def linear_posterior(laplace: Laplace) -> LinearPosterior | None:
 
 def channel_samples(laplace: Laplace, traces: Sequence[ChannelFit]) -> list[ChannelSamples]:
     """Return the residuals of all channels, with what is known of their noise and nuisances."""
-    with jax.enable_x64(True):
+    with double_precision():
         taus = np.asarray(laplace.likelihood.evaluate_circuit(laplace.theta).tau)
     pairs = zip(laplace.likelihood.channels, traces, strict=True)
     electrical = [(channel, fitted) for channel, fitted in pairs if fitted.channel != "Ft" and channel.charges is None]

@@ -4,10 +4,10 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
+from fitact.compiled import double_precision
 from fitact.data.kramers_kronig import check_kramers_kronig
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
@@ -100,7 +100,7 @@ def fit_records(
         (scene or Scene()).require_available(fit=True)
     pairs = sorted(zip(records, scenes, strict=True), key=lambda pair: isinstance(pair[0], Spectrum))  # records first
     records, scenes = (tuple(each) for each in zip(*pairs, strict=True))
-    with jax.enable_x64(True):
+    with double_precision():
         try:
             problem = build_problem(records, scenes, prior, drives)
             calibrated = calibrate(scenes[0], problem.likelihood.prior.names, fit_records)

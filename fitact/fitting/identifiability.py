@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from statistics import NormalDist
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
+from fitact.compiled import double_precision
 from fitact.experiment.blind_directions import STRAY, blind_directions, gain_names, name_direction
 from fitact.experiment.experiment import DesignOption
 from fitact.experiment.fisher import Experiment
@@ -70,7 +70,7 @@ class Identifiability:
             if self.channels == ("Vsc",):
                 return NextMeasurement(True, f"{force}; measure the impedance, or record the current I beside Vsc.")
             return NextMeasurement(remedy=f"{force}; measure from below the corner frequency of the skin to above it.")
-        with jax.enable_x64(True):
+        with double_precision():
             stray = experiment.stray_capacitance
             structure = blind_directions(experiment.circuit, experiment.free, experiment.channels, stray)
             options = suggest_measurements(experiment, self.force_gradient)

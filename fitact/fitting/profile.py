@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitact.compiled import jit
+from fitact.compiled import double_precision, jit
 from fitact.errors import InputError
 from fitact.fitting.derived import DERIVED_NAMES, DerivedQuantities
 from fitact.fitting.laplace import Laplace
@@ -95,7 +95,7 @@ def profile_intervals(laplace: Laplace, names: Sequence[str], level: float, prio
             raise InputError(f"no interval is available for {name}; choose from {', '.join(available)}")
     derived_sd = laplace.derived_log_sd[[DERIVED_NAMES.index(name) for name in PROFILE_QUANTITIES]]
     intervals = {}
-    with jax.enable_x64(True):
+    with double_precision():
         likelihood = dataclasses.replace(likelihood.without_samples(), use_prior=prior and likelihood.use_prior)
         sd = np.linalg.norm(laplace.covariance_root, axis=1)
         for kind, errors, derive in ((likelihood.names, sd, None), (PROFILE_QUANTITIES, derived_sd, laplace.derive)):

@@ -4,12 +4,12 @@ import dataclasses
 from typing import Any, Self
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from fitact import summary
+from fitact.compiled import double_precision
 from fitact.fitting.derived import DerivedQuantities, evaluate_draws, nuisance_deviates
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.drive import Periodic
@@ -81,7 +81,7 @@ class FeltDrive:
         if frequency is None:
             return cls(None, 0.0, 1.0, text, "the drive does not repeat")
         sensitivity = table.harmonic_sensitivity(frequency, 1.0)
-        with jax.enable_x64(True):
+        with double_precision():
             force = ForceSensation.from_fit(
                 derive.tabulate(points[..., : -len(likelihood.channels)].reshape(-1, len(likelihood.names))),
                 frequency,

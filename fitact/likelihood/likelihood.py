@@ -16,7 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from fitact.compiled import BatchEvaluator, array_module, jit
+from fitact.compiled import BatchEvaluator, array_module, double_precision, jit
 from fitact.experiment.blind_directions import STRAY
 from fitact.likelihood.calibration import Calibration
 from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
@@ -91,13 +91,11 @@ class Likelihood(eqx.Module):
         return [jnp.asarray(channel.timing_mean(name), dtype=float) for channel, name in self._timing]
 
     @property
+    @double_precision()
     def timing(self) -> dict[str, tuple[float, float]]:
         """Origin and unit of the coordinate of each free delay (s) and clock (relative), by name."""
-        with jax.enable_x64(True):
-            pairs = [
-                (channel, name, channel.shift if name == "delay" else channel.clock) for channel, name in self._timing
-            ]
-            return {t.qualified_name(name): (float(base), float(t.timing_unit(name))) for t, name, base in pairs}
+        pairs = [(channel, name, channel.shift if name == "delay" else channel.clock) for channel, name in self._timing]
+        return {t.qualified_name(name): (float(base), float(t.timing_unit(name))) for t, name, base in pairs}
 
     @property
     def sigma_names(self) -> tuple[str, ...]:
@@ -107,7 +105,7 @@ class Likelihood(eqx.Module):
     @property
     def prior_factor(self) -> Float[np.ndarray, "parameters parameters"]:
         """Factor of the prior covariance of theta; `UNCONSTRAINED_SD` in each direction without a prior."""
-        with jax.enable_x64(True):
+        with double_precision():
             sd = np.append(self.prior.log_sd, np.array(self.timing_sd))
         size, root = len(self.prior.names), np.diag(sd)
         root[:size, :size] = np.linalg.cholesky(self.prior.covariance)

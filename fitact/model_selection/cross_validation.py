@@ -16,7 +16,7 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Array, Bool, Float, Int
 
-from fitact.compiled import jit, pad_samples
+from fitact.compiled import double_precision, jit, pad_samples
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
 from fitact.fitting.least_squares import least_squares
@@ -68,7 +68,7 @@ def cross_validate(fit: Fit, folds: int = 10) -> CrossValidation:
     folds = min(folds, total)
     fold = np.random.default_rng(0).permutation(total) % folds
     log_density, failed = np.zeros(total), 0
-    with jax.enable_x64(True):
+    with double_precision():
         likelihood = fit.likelihood.without_compression()
         sigma = np.array([trace.sigma for trace in fit.traces])
         for number in range(folds):

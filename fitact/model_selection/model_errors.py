@@ -16,7 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from fitact.compiled import jit, pad_rows
+from fitact.compiled import double_precision, jit, pad_rows
 from fitact.model.chirp import Chirp
 from fitact.model.circuit import Channel, passes_direct_current
 from fitact.model.drive import Burst, Drive, LinearPieces, Multitone, Periodic, PiecewiseLinear, Sampled, Sine
@@ -149,7 +149,7 @@ class CircuitResponses(NamedTuple):
     def _transient_response(self, cycle: np.ndarray, elapsed: np.ndarray) -> np.ndarray:
         begin = np.full((1, 1), _phase_offset(self.wave), dtype=cycle.dtype)
         tau, since = self.tau[..., None], elapsed[:, None, :]
-        with jax.enable_x64(True):
+        with double_precision():
             initial = float(self.wave.value(0.0))
         difference = initial - self._steady_state_response(begin)
         u = self._steady_state_response(cycle) + difference * np.exp(-since / tau)
@@ -209,7 +209,7 @@ class ReferenceModel:
         vsc = acting = _voltages(self.grid, CircuitResponses.from_scene(scene, drive, values, precision, "Vsc"))
         if scene.force.model != "paper":
             acting = _voltages(self.grid, CircuitResponses.from_scene(scene, drive, values, precision, "Vgap"))
-        with jax.enable_x64(True):  # for any precision of the voltages
+        with double_precision():  # for any precision of the voltages
             contact = scene.geometry().contact(scene.make_rc_circuit(dict(values)))
             return vsc, acting, np.broadcast_to(np.asarray(force_constant(contact)), len(vsc[0]))
 
@@ -284,7 +284,7 @@ def _corner_times(wave: Periodic) -> np.ndarray:
 
 def _period_segments(wave: PiecewiseLinear | Sampled) -> LinearPieces:
     """Return one period, padded to 4 pieces with pieces of zero length, so that one compiled program serves."""
-    with jax.enable_x64(True):
+    with double_precision():
         knots, start, end = (np.asarray(x) for x in wave.pieces())
     missing = np.zeros(max(4 - start.size, 0))
     return LinearPieces(*(np.append(x, missing + y[-1]) for x, y in ((knots, knots), (start, end), (end, end))))

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex
 
-from fitact.compiled import jit
+from fitact.compiled import double_precision, jit
 from fitact.model.circuit import INFINITE_RATIO, RC, Channel, DirectGround, FinalCircuit, NaturalGround, Probe
 from fitact.model.drive import Drive, Multitone, Periodic, Sine
 from fitact.model.harmonic import fourier_coefficients
@@ -65,7 +65,7 @@ def partial_fractions(
     else:
         count = max(1, skin.harmonic_count(frequency))
     omega = 2.0 * np.pi * frequency * np.arange(1, count + 1)
-    with jax.enable_x64(True):  # the drive needs double precision in any case
+    with double_precision():  # the drive needs double precision in any case
         amplitude = np.asarray(_fourier_coefficients(jax.tree.map(np.asarray, drive), count + -count % _BLOCK))[:count]
     gain = _transfer_function(circuit, skin, omega, channel)
     if smooth:
@@ -86,7 +86,7 @@ def _transfer_function(
 ) -> np.ndarray:
     """Return Vsc / V, or Vgap / V, of circuits with a skin model."""
     blocks = np.pad(omega, (0, -omega.size % _BLOCK), mode="edge").reshape(-1, _BLOCK)
-    with jax.enable_x64(True):  # in double precision for any result, so that one program serves
+    with double_precision():  # in double precision for any result, so that one program serves
         circuits = jax.tree.map(np.float64, WithSkin(circuit, skin))
         parts = [np.asarray(_channel_gain(circuits, block, channel)) for block in blocks]
     return np.concatenate(parts, axis=1)[:, : omega.size]

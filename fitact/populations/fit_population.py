@@ -8,11 +8,10 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
-from fitact.compiled import BatchEvaluator
+from fitact.compiled import BatchEvaluator, double_precision
 from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.fitting.fit import fit
@@ -101,7 +100,7 @@ def population(
     make_tables = functools.partial(
         FingerLikelihoods.from_fingers, averages, medians[SHARED_PARAMETER], area_varies=area_varies
     )
-    with jax.enable_x64(True):
+    with double_precision():
 
         def hierarchy(draws: int, terms: int, purpose: int) -> Hierarchy:
             tables = make_tables(draws=draws, terms=terms, seed=[seed, purpose])
@@ -187,7 +186,7 @@ def _fit_fingers(
             raise InputError(
                 f"{record.source} holds the same record as {twin.source}, whose finger would count twice; drop one"
             )
-        with jax.enable_x64(True):
+        with double_precision():
             new_finger = new_finger or NewFingerModel.from_fit(fitted, factors)
             if isinstance(record, TrackedFinger):
                 tracks[record.fingerprint] = record

@@ -5,12 +5,11 @@ import math
 from typing import Self
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitact.compiled import BatchEvaluator, array_module
+from fitact.compiled import BatchEvaluator, array_module, double_precision
 from fitact.fitting import derived
 from fitact.fitting.result import Fit
 from fitact.model.drive import Periodic, Sampled
@@ -93,12 +92,12 @@ class NewFingerModel(eqx.Module):
             parts += [tones, derive.coefficient * tones]
         return jnp.concatenate(parts)
 
+    @double_precision()
     def evaluate(self, factors: Float[np.ndarray, "*shape factors"]) -> Float[np.ndarray, "*shape names"]:
         """Compute the quantities `names` of many fingers."""
-        with jax.enable_x64(True):
-            model = self._tabulate(factors)
-            evaluator = BatchEvaluator(NewFingerModel.__call__, model, model.derive.time.size, batch=512)
-            return evaluator.map_over(factors.shape[:-1], factors)
+        model = self._tabulate(factors)
+        evaluator = BatchEvaluator(NewFingerModel.__call__, model, model.derive.time.size, batch=512)
+        return evaluator.map_over(factors.shape[:-1], factors)
 
     def _tabulate(self, factors: Float[np.ndarray, "*shape factors"]) -> Self:
         points = self._theta(factors).reshape(-1, self.theta.size)
@@ -108,7 +107,7 @@ class NewFingerModel(eqx.Module):
         self, factors: Float[np.ndarray, "fingers factors"], count: int
     ) -> tuple[Float[np.ndarray, " count"], Float[np.ndarray, "fingers count"]]:
         """Compute times (s) and force (N) of many fingers over the last period, or over a whole aperiodic drive."""
-        with jax.enable_x64(True):
+        with double_precision():
             first, last = float(np.min(self.derive.time)), float(np.max(self.derive.time))
             span = last - first if self.frequency is None else 1.0 / self.frequency
             time = span * np.arange(count) / count

@@ -9,7 +9,6 @@ import math
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
@@ -17,7 +16,7 @@ from jax.scipy.special import ndtr, ndtri
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from fitact.compiled import array_module
+from fitact.compiled import array_module, double_precision
 from fitact.errors import InputError
 
 
@@ -54,10 +53,10 @@ class Distribution(eqx.Module):
         """Return (u - mean) / standard deviation."""
         return (jnp.asarray(u) - self.log_mean) / self.log_sd
 
+    @double_precision()
     def sample(self, rng: np.random.Generator, size: int) -> Float[np.ndarray, " size"]:
         """Return draws of x."""
-        with jax.enable_x64(True):
-            return np.exp(np.asarray(self.from_standard_normal(rng.standard_normal(size))))
+        return np.exp(np.asarray(self.from_standard_normal(rng.standard_normal(size))))
 
 
 class LogNormal(Distribution):

@@ -13,6 +13,7 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
+from fitact.compiled import double_precision
 from fitact.errors import InputError
 from fitact.prior.distributions import Distribution
 
@@ -121,7 +122,7 @@ class Prior(eqx.Module):
         powers = np.arange(1, 24)
         polynomials = np.polynomial.hermite_e.hermevander(z, powers[-1])[:, 1:]
         polynomials = polynomials / np.sqrt(np.cumprod(powers, dtype=float))
-        with jax.ensure_compile_time_eval(), jax.enable_x64(True):
+        with jax.ensure_compile_time_eval(), double_precision():
             logs = np.array([marginal.from_standard_normal(z) for marginal in self.marginals])
         coefficients = logs @ (polynomials * (weight / math.sqrt(2.0 * math.pi))[:, None])
         joint = np.einsum("ik,jk,ijk->ij", coefficients, coefficients, self.correlation[..., None] ** powers)
@@ -177,7 +178,7 @@ class Prior(eqx.Module):
         kept, root = {name: np.zeros(0) for name in self.names}, np.linalg.cholesky(self.correlation)
         for _ in range(1 + max_rounds):
             pairs = zip(self.names, self.marginals, root @ scores(), strict=True)
-            with jax.enable_x64(True):
+            with double_precision():
                 draws = {name: np.exp(np.asarray(marginal.from_standard_normal(z))) for name, marginal, z in pairs}
             in_order = np.ones(size, dtype=bool)
             for low, high in self.order_constraints:

@@ -6,13 +6,13 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from fitact import paper
 from fitact.charts.figure import DATA, MODEL, PRIOR
 from fitact.charts.interactive import Axis, Chart, chart, line, log_axis_button, mark_position, plot, points
+from fitact.compiled import double_precision
 from fitact.files import write_json
 from fitact.model.circuit import Circuit
 from fitact.model.drive import Drive, Square
@@ -31,7 +31,7 @@ def write_reproduction(directory: str | os.PathLike[str], claims: tuple[paper.Cl
     """Write reproduction.json and reproduction.html, with the figures, into `directory`, and return the page."""
     directory = Path(directory)
     page = directory / "reproduction.html"
-    with jax.enable_x64(True):
+    with double_precision():
         figures = [(title, make_chart(), alt) for title, make_chart, alt in _FIGURES]
     counts = {verdict: sum(claim.verdict == verdict for claim in claims) for verdict in ("agrees", "differs")}
     write_json(directory / "reproduction.json", [claim.to_dict() for claim in claims])

@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 import emcee
-import jax
 import numpy as np
 from jaxtyping import Float
 
+from fitact.compiled import double_precision
 from fitact.errors import InputError
 from fitact.files import remove_temporary
 from fitact.fitting.result import Fit
@@ -92,7 +92,7 @@ def sample(
             " least 2 ensembles"
         )
     start_time = time.perf_counter()
-    with jax.enable_x64(True):
+    with double_precision():
         log_prob = reject_nonfinite(certificate.batched_log_prob(fit.likelihood, walkers))
         if level != "emcee":
             posterior = importance.draw_around_fit(fit, level, log_prob, seed)

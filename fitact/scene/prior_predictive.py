@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitact import summary
-from fitact.compiled import jit
+from fitact.compiled import double_precision, jit
 from fitact.model.circuit import FinalCircuit
 from fitact.model.drive import Drive, Periodic, PiecewiseLinear
 from fitact.model.force import electrostatic_force, mean_force, peak_force
@@ -51,7 +51,7 @@ def prior_predictive(scene: Scene, draws: int = 2000, seed: int = 0) -> PriorPre
     parameters = sample_prior(scene, np.random.default_rng(seed), draws)
     drive = scene.make_drive()
     repeats = isinstance(drive, Periodic) and scene.drive.steady_state
-    with jax.enable_x64(True):
+    with double_precision():
         time = jnp.asarray(_times(drive, scene.measurement.duration, repeats))
         circuits = {name: jnp.asarray(x) for name, x in parameters.items() if name not in ("sigma", "sigma_I")}
         vsc, derived = _predict_draws(scene.to_json(), drive, repeats, time, circuits)

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from fitact.compiled import double_precision
 from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record
 from fitact.errors import InputError
@@ -198,7 +199,7 @@ def find_model(windows: Sequence[Window], scene: Scene, step: float, source: str
             f" --window {10.0 * time[-1]:.2g}s, and a drive that repeats"
         )
     fitted = fit(record, scene)
-    with jax.enable_x64(True):
+    with double_precision():
         circuit = fitted.likelihood.evaluate_circuit(fitted.theta)
         compressor = WindowCompressor.from_channels(fitted.likelihood.channels, circuit, time.size, step)
     parts = max(1, math.floor((time[-1] + step) * frequency))

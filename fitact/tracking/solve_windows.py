@@ -5,10 +5,10 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from fitact.compiled import double_precision
 from fitact.data.clipping import clipping_mask, describe_clipping
 from fitact.fitting.effects import is_change_of_finger
 from fitact.fitting.identifiability import information_directions, verdicts
@@ -46,7 +46,7 @@ def solve_windows(
     walk: SmoothedWalk | None = None
     fixed = None if rates is None else np.asarray(rates, dtype=float)
     found = None if fixed is None else WalkRates(*walk_matrix(walking), fixed, fixed, fixed)
-    with jax.enable_x64(True):
+    with double_precision():
         theta, windows = _fit_alone(likelihood, windows, theta, sigma, prior, order)
         change = np.zeros((windows.start.size, 3))
         for round_number in range(max_rounds):

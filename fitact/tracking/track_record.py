@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from fitact.blas import limit_to_one_thread
+from fitact.compiled import double_precision
 from fitact.data.readers.stream import Block, stream_record
 from fitact.data.record import Record, fundamental_frequency
 from fitact.errors import InputError
@@ -132,7 +133,7 @@ def track_blocks(
     responses, last = model.respond(everything), time.monotonic()
     try:
         # the products are small, and a thread reads and filters meanwhile: BLAS leaves it its core
-        with jax.enable_x64(True), limit_to_one_thread():
+        with double_precision(), limit_to_one_thread():
             for number, each in enumerate(responses if waits else _read_ahead(responses)):
                 compressed.append(done[number] if number < len(done) else model.compress(each))
                 if update is not None and time.monotonic() - last > UPDATE_INTERVAL:
@@ -282,7 +283,7 @@ class _Checkpoint:
         with np.load(self.path, allow_pickle=False) as stored:
             if str(stored["key"]) != self._key():
                 return []
-            with jax.enable_x64(True):
+            with double_precision():
                 whole = next(each for each in begun if each.is_whole)
                 given = next(self._model.respond([whole]))
                 structure = jax.tree.structure(self._model.compress(given).data)

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, TypeAlias
 
 import jax
 
-from fitact.compiled import available_cores, processor
+from fitact.compiled import available_cores, double_precision, processor
 from fitact.data.record import Record
 from fitact.data.simulate import simulate
 from fitact.errors import InputError
@@ -156,7 +156,7 @@ def measure_tradeoff(
     say(f"fitting {measured.source} at {len(tolerances)} tolerances and without compression")
     fits = {tolerance: fit(measured, scene if record else used_scene, tolerance=tolerance) for tolerance in tolerances}
     full = fit(measured, scene if record else used_scene, tolerance=0.0)
-    with jax.enable_x64(True):
+    with double_precision():
         say("responses")
         responses = timings.benchmark_responses(full)
         say("likelihoods")
