@@ -17,8 +17,7 @@ from fitact.fitting.minimum import minimise, result_name
 from fitact.fitting.timing import clock_r_squared, free_timing, orthonormal_basis
 from fitact.likelihood.certificate import can_interpolate, expand_student, interpolate_channel, recompress
 from fitact.likelihood.channel import FIRST_CHARGE, TIMING_NUISANCES, ChannelLikelihood
-from fitact.likelihood.compression import HUM_FREQUENCIES
-from fitact.likelihood.interpolation import Interpolation
+from fitact.likelihood.compression import HUM_FREQUENCIES, Interpolation
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import NoiseModel, fit_ar1, student_curvature, student_weight
 

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from fitact.compiled import BatchEvaluator, jit, pad_samples
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
-from fitact.likelihood.compression import BASELINE_NAMES, Compression
-from fitact.likelihood.compression_on_grid import GridCompression
+from fitact.likelihood.compression import BASELINE_NAMES, Compression, GridCompression
 from fitact.likelihood.friction_channel import FrictionChannel
 from fitact.likelihood.interpolation import interpolate
 from fitact.likelihood.likelihood import CircuitValues, Likelihood

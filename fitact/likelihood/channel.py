@@ -22,9 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from fitact.compiled import array_module, pad_samples, pad_weight
 from fitact.likelihood.charge_rows import ChargeRows
-from fitact.likelihood.compression import BASELINE_NAMES, Compression
-from fitact.likelihood.compression_on_grid import GridCompression
-from fitact.likelihood.interpolation import Interpolation
+from fitact.likelihood.compression import BASELINE_NAMES, Compression, GridCompression, Interpolation
 from fitact.likelihood.noise import (
     NoiseModel,
     StudentExpansion,

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from fitact.compiled import array_module
 from fitact.model.circuit import HighpassTerms
@@ -223,3 +223,50 @@ def _significant_modes(
     modes, sizes, series = np.linalg.svd(coefficients, full_matrices=False)
     rank = count_terms(sizes, precision) if sizes[0] > 0.0 else 0
     return modes[:, :rank] * sizes[:rank], series[:rank]
+
+
+class GridCompression(Compression):
+    """A record in coordinates of the responses of a grid, which are the columns of `signal`.
+
+    The model is linear in the weights of the grid. `slope` is the derivative of the signal with respect to a delay.
+    """
+
+    def covers(self, tau: Array, delay: ArrayLike = 0.0) -> Bool[Array, "*shape"]:
+        """Return True, since the grid belongs to the circuit."""
+        return np.ones(np.shape(tau), dtype=bool)
+
+    def response(self, terms: HighpassTerms, delay: ArrayLike = 0.0) -> Float[Array, " rows"]:
+        """Return the response of a circuit, undelayed; compare `fitact.response`."""
+        if terms.direct is not None:
+            raise TypeError("a compression on a grid holds no V, which a leak of the insulator needs")
+        total = self.signal @ jnp.asarray(terms.weight)
+        total = jnp.pad(total, (0, self.observed.size - total.size))
+        return total if terms.rate is None else total + terms.rate * self.rate
+
+
+class Interpolation(eqx.Module):
+    """A record in coordinates of a basis of its model's signals; compare `Compression`.
+
+    The model is evaluated at a few samples, the points.
+    """
+
+    time: Float[Array, " points"]  # s
+    rate: Float[Array, " points"] | None  # dV/dt at the points, V/s, if the channel follows it
+    to_rows: Float[Array, "rows points"]  # coordinates from the signal at the points
+    surplus: Float[Array, "checks points"]  # root of its mean square is 1 if the interpolation is barely accurate
+    lowest: Float[Array, "2"]  # delay (s) and clock error from which on the kept samples suffice
+    highest: Float[Array, "2"]
+    baseline: Float[Array, "shapes rows"]  # the shapes of `BASELINE_NAMES`, of height 1
+    slope: Float[Array, " rows"]  # derivative of the signal with respect to a delay at the optimum, per s
+    observed: Float[Array, " rows"]  # the record, V or A
+    samples: Float[Array, ""]  # number of samples
+    effects: Float[Array, "effects points"] | None = None  # `ChannelLikelihood.effects` at the points
+
+    def covers(self, tau: Array) -> Bool[Array, "*shape"]:
+        """Return False, since the interpolation holds only where `holds` says so."""
+        return np.zeros(np.shape(tau), dtype=bool)
+
+    def holds(self, signal: Float[Array, " points"], timing: Float[Array, "2"]) -> Array:
+        """Return whether the signal at the points is interpolated accurately, for this delay (s) and clock error."""
+        within = jnp.all((timing >= self.lowest) & (timing <= self.highest))
+        return within & (jnp.mean(jnp.square(self.surplus @ signal)) <= 1.0)

@@ -12,9 +12,8 @@ import dataclasses
 import functools
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,7 +21,8 @@ import scipy.linalg
 from jaxtyping import Array, Bool, Float
 
 from fitact.compiled import jit
-from fitact.likelihood.compression import BASELINE_NAMES, split_functions
+from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
+from fitact.likelihood.compression import BASELINE_NAMES, Interpolation, split_functions
 from fitact.likelihood.projection import (
     Samples,
     WhiteningState,
@@ -37,41 +37,10 @@ from fitact.model.chirp import Chirp
 from fitact.model.drive import Burst, InterpolatedDrive, PiecewiseLinear
 from fitact.progress import track_progress
 
-if TYPE_CHECKING:
-    from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
-
-
-class Interpolation(eqx.Module):
-    """A record in coordinates of a basis of its model's signals; compare `Compression`.
-
-    The model is evaluated at a few samples, the points.
-    """
-
-    time: Float[Array, " points"]  # s
-    rate: Float[Array, " points"] | None  # dV/dt at the points, V/s, if the channel follows it
-    to_rows: Float[Array, "rows points"]  # coordinates from the signal at the points
-    surplus: Float[Array, "checks points"]  # root of its mean square is 1 if the interpolation is barely accurate
-    lowest: Float[Array, "2"]  # delay (s) and clock error from which on the kept samples suffice
-    highest: Float[Array, "2"]
-    baseline: Float[Array, "shapes rows"]  # the shapes of `BASELINE_NAMES`, of height 1
-    slope: Float[Array, " rows"]  # derivative of the signal with respect to a delay at the optimum, per s
-    observed: Float[Array, " rows"]  # the record, V or A
-    samples: Float[Array, ""]  # number of samples
-    effects: Float[Array, "effects points"] | None = None  # `ChannelLikelihood.effects` at the points
-
-    def covers(self, tau: Array) -> Bool[Array, "*shape"]:
-        """Return False, since the interpolation holds only where `holds` says so."""
-        return np.zeros(np.shape(tau), dtype=bool)
-
-    def holds(self, signal: Float[Array, " points"], timing: Float[Array, "2"]) -> Array:
-        """Return whether the signal at the points is interpolated accurately, for this delay (s) and clock error."""
-        within = jnp.all((timing >= self.lowest) & (timing <= self.highest))
-        return within & (jnp.mean(jnp.square(self.surplus @ signal)) <= 1.0)
-
 
 def interpolate(
-    channel: "ChannelLikelihood",
-    inputs: "ChannelInputs",
+    channel: ChannelLikelihood,
+    inputs: ChannelInputs,
     precision: float,
     max_functions: int = 40,
     max_kept: int = 2048,
@@ -134,7 +103,7 @@ def interpolate(
     )
 
 
-def _samples(channel: "ChannelLikelihood") -> Samples:
+def _samples(channel: ChannelLikelihood) -> Samples:
     part = slice(channel.n_samples)
     time, observed, weight = (np.asarray(x)[part] for x in (channel.time, channel.observed, channel.weights))
     rate = np.zeros(time.size) if channel.rate is None else np.asarray(channel.rate)[part]
@@ -143,9 +112,7 @@ def _samples(channel: "ChannelLikelihood") -> Samples:
     return Samples(time, observed, weight, rate, mask, effects=effects)
 
 
-def _passes_corner(
-    channel: "ChannelLikelihood", lowest: np.ndarray, highest: np.ndarray
-) -> Bool[np.ndarray, " samples"]:
+def _passes_corner(channel: ChannelLikelihood, lowest: np.ndarray, highest: np.ndarray) -> Bool[np.ndarray, " samples"]:
     """Return which samples lie on different pieces of the drive for some delays and clock errors in a range."""
     ends = np.stack(np.meshgrid(*np.stack([lowest, highest]).T, indexing="ij")).reshape(2, -1)
     pieces = _pieces(channel, *ends)
@@ -153,7 +120,7 @@ def _passes_corner(
 
 
 @jit
-def _pieces(channel: "ChannelLikelihood", delays: Array, clocks: Array) -> Float[Array, "n samples"]:
+def _pieces(channel: ChannelLikelihood, delays: Array, clocks: Array) -> Float[Array, "n samples"]:
     """Return numbers of the pieces of the drive on which the samples lie."""
     drive = channel.drive
     wave = drive.wave if isinstance(drive, Burst) else drive
@@ -169,18 +136,18 @@ def _pieces(channel: "ChannelLikelihood", delays: Array, clocks: Array) -> Float
 
 
 def _evaluate(
-    channel: "ChannelLikelihood", inputs: "ChannelInputs", indices: np.ndarray
+    channel: ChannelLikelihood, inputs: ChannelInputs, indices: np.ndarray
 ) -> Float[np.ndarray, "inputs points"]:
     return _signals(channel.select(indices, np.ones(indices.size)), inputs)[:, : indices.size]
 
 
 @jit
-def _signals(channel: "ChannelLikelihood", inputs: "ChannelInputs") -> Float[Array, "inputs samples"]:
+def _signals(channel: ChannelLikelihood, inputs: ChannelInputs) -> Float[Array, "inputs samples"]:
     return jax.vmap(channel.signal)(inputs)
 
 
 @jit
-def _slope(channel: "ChannelLikelihood", inputs: "ChannelInputs") -> Float[Array, " samples"]:
+def _slope(channel: ChannelLikelihood, inputs: ChannelInputs) -> Float[Array, " samples"]:
     """Return the derivative with respect to a delay, or 0 if it is a parameter."""
     return jnp.zeros_like(channel.time) if "delay" in channel.timing else channel.delay_derivative(inputs)
 
@@ -206,8 +173,8 @@ def _choose_points(basis: Float[np.ndarray, "samples rank"]) -> tuple[np.ndarray
 
 
 def _accumulate(
-    channel: "ChannelLikelihood",
-    training: "ChannelInputs",
+    channel: ChannelLikelihood,
+    training: ChannelInputs,
     combinations: Float[np.ndarray, "signals functions"],
     samples: Samples,
     taps: np.ndarray | None,
@@ -222,8 +189,8 @@ def _accumulate(
 
 @functools.partial(jit, fast=True)
 def _chunk_products(
-    channel: "ChannelLikelihood",
-    training: "ChannelInputs",
+    channel: ChannelLikelihood,
+    training: ChannelInputs,
     combinations: Array,
     chunk: Samples,
     ends: tuple[Array, Array],

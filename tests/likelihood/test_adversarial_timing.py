@@ -7,8 +7,7 @@ import pytest
 import scipy.signal
 
 import fitact
-from fitact.likelihood.compression import Compression
-from fitact.likelihood.interpolation import Interpolation
+from fitact.likelihood.compression import Compression, Interpolation
 from tests.likelihood.quadrature import (
     CI,
     CSC,

@@ -8,7 +8,7 @@ import scipy.stats
 
 import fitact
 from fitact.likelihood import certificate
-from fitact.likelihood.interpolation import Interpolation
+from fitact.likelihood.compression import Interpolation
 from fitact.likelihood.noise import fit_student_scale
 
 STEP, SAMPLES, NOISE = 5e-6, 12_000, 0.06
