@@ -25,7 +25,6 @@ from fitact.model.skin import WithSkin
 
 TOLERANCE = 1e-3  # error of the log-likelihood
 _TIMING_REASON = "a delay or a clock error is a free parameter"
-_TRAINING = 63  # points around an optimum whose signals an interpolation represents
 FEW_ROWS = 200  # numbers per evaluation, below which the overhead of the call dominates
 
 
@@ -192,16 +191,18 @@ def interpolate_channel(
     covariance_factor: np.ndarray,
     sigma: float,
     reach: float,
+    training: int = 63,
 ) -> ChannelLikelihood:
     """Return a channel with an interpolation around theta, or without a compression if that is not possible.
 
-    It extends `reach` standard deviations in all directions that the record determines, less in others.
+    It extends `reach` standard deviations in all directions that the record determines, less in others, and represents
+    the signals of `training` points there.
     """
     channel = likelihood.channels[index]
     directions, sd, _ = np.linalg.svd(covariance_factor)
     widths = np.minimum(reach * sd, 6.0 * sd + 1.0)
-    deviates = np.random.default_rng(0).standard_normal((_TRAINING, theta.size))  # any reproducible points serve
-    deviates *= np.random.default_rng(1).uniform(0.2, 1.0, (_TRAINING, 1)) / np.linalg.norm(deviates, axis=1)[:, None]
+    deviates = np.random.default_rng(0).standard_normal((training, theta.size))  # any reproducible points serve
+    deviates *= np.random.default_rng(1).uniform(0.2, 1.0, (training, 1)) / np.linalg.norm(deviates, axis=1)[:, None]
     points = theta + np.vstack([np.zeros(theta.size), deviates * widths @ directions.T])
     light = dataclasses.replace(likelihood, channels=tuple(each.shorten() for each in likelihood.channels))
     inputs = _inputs(light, points)[index]

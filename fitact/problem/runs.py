@@ -12,7 +12,6 @@ _FEW = 4  # equal values in a row that are usual where noise exceeds the roundin
 # mean of a run that is passed from one side to the other, of one that is no more than entered or left, and may remain
 # near the threshold, and of others
 _THRESHOLD_ERRORS, _RUN_ERRORS = (0.05, 0.2), (0.1, 0.5, 0.29)
-_DITHER = 0.25  # noise, in steps, with which rounding is noise as well
 
 
 def run_lengths(values: Rows) -> Rows:
@@ -53,7 +52,7 @@ class RoundedSteps(NamedTuple):
         # a constant signal with this noise (steps) and any rounding error changes to and fro at this rate
         changes = np.diff(runs.levels)
         noise = 0.5 * math.sqrt(math.pi) * np.count_nonzero(changes[1:] * changes[:-1] < 0.0) / values.size
-        if step <= 0.0 or np.max(runs.lengths) <= _FEW or noise > _DITHER:
+        if step <= 0.0 or np.max(runs.lengths) <= _FEW or noise > 0.25:  # with it, rounding is noise as well
             return result
         passages, is_long = _find_passages(runs, step)
         inner = passages.begin + passages.is_bounded[0], passages.end - passages.is_bounded[1]

@@ -26,9 +26,6 @@ from fitact.scene.scene import Scene
 from fitact.tracking.windows import Window
 
 NO_CONTACT = 0.1  # part of the usual signal below which the finger is not in contact
-_WHOLE = 0.5  # least signal of a part of a window over its largest; otherwise contact was made or lost within it
-_SETTLED = 12.0  # time constants after which an unknown charge has decayed to 6e-6
-_DRIVEN = 1e-3  # least rms of V over its usual one
 
 
 class WindowData(NamedTuple):
@@ -100,11 +97,13 @@ class WindowModel(NamedTuple):
         Responses go on from window to window, so that the charge at the start is known, where the finger touched all
         the time.
         """
-        step, settled = float(self.compressor.time[1]), _SETTLED * float(np.max(self.time_constants))
+        step = float(self.compressor.time[1])
+        settled = 12.0 * float(np.max(self.time_constants))  # an unknown charge has decayed to 6e-6
+        least_rms = 1e-3 * self.drive_rms  # of V
         state: FilterState | None = None
         for window in windows:
             V = window.channels["V"]
-            if not window.is_whole or float(np.std(V)) < _DRIVEN * self.drive_rms:
+            if not window.is_whole or float(np.std(V)) < least_rms:
                 state = None
                 yield WindowResponses(window, None, [], [], False, math.nan, math.nan)
                 continue
@@ -152,9 +151,12 @@ class WindowModel(NamedTuple):
         return float(signal.min()), float(signal.max())
 
 
-def is_in_contact(lowest: Any, highest: Any, usual: float = 1.0) -> Any:
-    """Return whether the finger touches for a whole window, from its signal over the expected and the usual one."""
-    return (lowest > NO_CONTACT * usual) & (lowest > _WHOLE * highest)
+def is_in_contact(lowest: Any, highest: Any, usual: float = 1.0, min_ratio: float = 0.5) -> Any:
+    """Return whether the finger touches for a whole window, from its signal over the expected and the usual one.
+
+    If the least signal of its parts is below `min_ratio` of the largest, contact was made or lost within it.
+    """
+    return (lowest > NO_CONTACT * usual) & (lowest > min_ratio * highest)
 
 
 def stack_data(windows: Sequence[CompressedWindow]) -> WindowData:

@@ -24,8 +24,6 @@ from fitact.tracking.track import Track
 from fitact.tracking.walk_rates import WalkRates, estimate_rates, walk_matrix
 from fitact.tracking.window_likelihood import QUANTITIES, Linearization, evaluate_quantities, linearize
 
-NEW_CONTACT_VARIANCE = 0.5**2  # of the logarithms, where the finger touches again or a jump is found
-
 
 def solve_windows(
     model: WindowModel, windows: CompressedWindows, *, rates: Sequence[float] | None = None, max_rounds: int = 10
@@ -94,11 +92,12 @@ def _average(
 
 def _window_times(windows: CompressedWindows, length: float, jumps: Bool[np.ndarray, " windows"]) -> WindowTimes:
     """Return lengths, gaps, and where the walk may jump: at `jumps`, and when the finger touches again."""
+    jump_variance = 0.5**2  # of the logarithms
     touched = windows.contact & ~np.append(True, windows.contact[:-1])
     gaps = np.maximum(np.diff(windows.start, prepend=windows.start[0] - length) - length, 0.0)
     gaps = np.where(gaps > 1e-6 * length, gaps, 0.0)
     lengths = np.full(windows.start.size, length)
-    return WindowTimes(lengths, gaps, NEW_CONTACT_VARIANCE * (jumps | touched))
+    return WindowTimes(lengths, gaps, jump_variance * (jumps | touched))
 
 
 def _fit_alone(

@@ -39,7 +39,6 @@ CHECKPOINT = "windows.npz"
 _HEAD_SAMPLES = 65_536  # from which the time step and the period are taken
 _MIN_PERIODS, _MIN_SAMPLES = 5, 4_000  # of a default window
 UPDATE_INTERVAL = 1.0  # s, between tracks of a record that is being followed
-_TRIED = 8  # windows among which one is fitted
 
 
 _Item = TypeVar("_Item")
@@ -237,12 +236,12 @@ def _describe_head(first: list[Block], frequency: float | None, window: float | 
 
 
 def _find_first_model(
-    windows: Iterator[Window], scene: Scene, step: float, source: str, rounds: int = 250
+    windows: Iterator[Window], scene: Scene, step: float, source: str, rounds: int = 250, tried: int = 8
 ) -> tuple[WindowModel, list[Window]]:
-    """Return the model of the first windows that can be fitted, and all windows read for that."""
+    """Return the model of the first windows, `tried` at a time, that can be fitted, and all windows read for that."""
     begun: list[Window] = []
     for number in range(rounds):
-        part = list(itertools.islice(windows, _TRIED))
+        part = list(itertools.islice(windows, tried))
         begun += part
         if not part:
             if number == 0:
