@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from fitact.compiled import jit
 from fitact.experiment.fisher import covariance_factor
 from fitact.fitting.minimum import minimise, result_name
-from fitact.fitting.timing import clock_r_squared, free_timing, orthonormal_basis
+from fitact.fitting.timing import clock_r_squared, explained_square, free_timing, orthonormal_basis
 from fitact.likelihood.certificate import can_interpolate, expand_student, interpolate_channel, recompress
 from fitact.likelihood.channel import FIRST_CHARGE, TIMING_NUISANCES, ChannelLikelihood
 from fitact.likelihood.compression import HUM_FREQUENCIES, Interpolation
@@ -342,9 +342,7 @@ def _bic_decreases(
     basis = orthonormal_basis(np.concatenate(columns, axis=1))
     all_residuals = np.concatenate(residuals)
     for (i, name), added in candidates.items():
-        modes, sizes, _ = np.linalg.svd(added - basis @ (basis.T @ added), full_matrices=False)
-        modes = modes[:, sizes > 1e-9 * max(float(np.linalg.norm(added)), 1e-300)]
-        fraction = float(np.sum((modes.T @ all_residuals) ** 2)) / float(residuals[i] @ residuals[i])
+        fraction = explained_square(basis, added, all_residuals) / float(residuals[i] @ residuals[i])
         gains[i, name] = bic_decrease(fraction, float(likelihood.channels[i].count), added.shape[1])
     return gains
 

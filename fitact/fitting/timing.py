@@ -122,6 +122,15 @@ def orthonormal_basis(columns: Float[np.ndarray, "rows n"]) -> Float[np.ndarray,
     return q @ modes[:, sizes > 1e-9 * np.max(sizes, initial=0.0)]
 
 
+def explained_square(
+    basis: Float[np.ndarray, "rows rank"], added: Float[np.ndarray, "rows n"], residuals: Float[np.ndarray, " rows"]
+) -> float:
+    """Return the sum of squares of residuals that added columns explain, beside a `basis` of what is fitted."""
+    modes, sizes, _ = np.linalg.svd(added - basis @ (basis.T @ added), full_matrices=False)
+    kept = sizes > 1e-9 * max(float(np.linalg.norm(added)), 1e-300)
+    return float(np.sum(np.square(modes[:, kept].T @ residuals)))
+
+
 def clock_r_squared(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: float) -> float:
     """Return the fraction of the residual sum of squares that a free clock error would explain, to first order.
 
@@ -136,8 +145,8 @@ def clock_r_squared(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: fl
 
 def _r_squared(rows: np.ndarray) -> float:
     basis = orthonormal_basis(rows[2:].T)
-    clock, residuals = (x - basis @ (basis.T @ x) for x in rows[:2])
-    return float((clock @ residuals) ** 2 / max((clock @ clock) * (residuals @ residuals), 1e-300))
+    residuals = rows[1] - basis @ (basis.T @ rows[1])
+    return explained_square(basis, rows[:1].T, residuals) / max(float(residuals @ residuals), 1e-300)
 
 
 @functools.partial(jit, fast=True)
