@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from fitact.compiled import MAX_PADDED_LENGTH, as_arrays, pad_samples, pad_weight
 from fitact.data.clipping import clipping_mask, describe_clipping
@@ -239,29 +239,8 @@ def _build_channel(
     require_skin_response(template, record, choice)
     label = "_".join(filter(None, ("" if channel == "Vsc" else channel, number)))
     notes, warnings = (*record.notes, *choice.notes), (*record.warnings, *choice.warnings)
-    # an offset of the friction would be mistaken for the normal force
-    optional = ("drift", *_hum(record, choice), "crosstalk" if channel == "Ft" else "offset")
-    start: Estimate | None = None
-    used: np.ndarray | None = None
-    slope: np.ndarray | None = None
-    edge_sd = 0.0 if choice.name != "measured" or channel == "Ft" else rounded_gain_sd(record["V"])
-    if channel == "Vsc":
-        optional = (*optional, "delay")
-        if choice.periodic and choice.steady_state and choice.name != "measured":
-            optional = (*optional, "clock")
-        plain = constant_skin_circuit(template)
-        if not limits_current(template) or taus[-1] < record.time_step:  # Vsc jumps with V
-            max_divider = 0.5 if isinstance(plain, FinalCircuit) else 1.0
-            leaks = passes_direct_current(plain)
-            start = estimate_from_vsc(record, choice, max_divider * largest_gain(scene), has_leak=leaks)
-            edge_sd = math.hypot(edge_sd, _unresolved_gain_sd(record, choice, start))
-    elif channel == "I" and choice.name != "measured" and not limits_current(template):
-        used, slope = select_samples(record, choice)
-        # the estimate knows no leak; without it, the start comes from Vsc or from draws of the prior
-        belief = prior_skin_moments(bare)
-        if not passes_direct_current(template):
-            start = estimate_from_current(record, choice, used, slope, belief)
-    weight, clipped = _weight(record, channel, used)
+    begun = _estimate_channel(record, scene, choice, channel, bare, taus)
+    weight, clipped = _weight(record, channel, begun.used)
     weight, at_jumps = exclude_jumps(template, record, choice, weight)
     if weight is None and len(record) <= MAX_PADDED_LENGTH:
         weight = np.ones(len(record))
@@ -278,7 +257,7 @@ def _build_channel(
         observed=pad_samples(record[channel]),
         weight=weight,
         whitening=colour and colour.whitening(np.ones(len(record), bool) if weight is None else weight > 0.0),
-        rate=None if slope is None else pad_samples(slope),
+        rate=None if begun.slope is None else pad_samples(begun.slope),
         drive=choice.drive,
         shift=np.asarray(choice.shift, dtype=float),
         clock=np.zeros(()),
@@ -296,6 +275,12 @@ def _build_channel(
         likelihood = make_friction_channel(likelihood, record, scene, choice, float(taus[0]))
     if timing:
         likelihood = likelihood.exclude_unknown_drive()
+    # an offset of the friction would be mistaken for the normal force
+    optional = ("drift", *_hum(record, choice), "crosstalk" if channel == "Ft" else "offset")
+    if channel == "Vsc":
+        may_have_clock = choice.periodic and choice.steady_state and choice.name != "measured"
+        optional = (*optional, "delay", *["clock"] * may_have_clock)
+    start = begun.start
     if channel == "I" and choice.name == "measured":
         likelihood, start, noise, hum = _make_charge_rows(likelihood, record, scene, bare, taus)
         if scene.measurement.noise_model != "white":
@@ -305,7 +290,41 @@ def _build_channel(
             )
         optional = ("drift", "offset", *(f"hum_{frequency:.0f}Hz" for frequency in hum))
     remarks = (*notes, *at_jumps), (*warnings, *clipped)
-    return likelihood, Source(record, scene, choice, noise, optional, start, *remarks), edge_sd
+    return likelihood, Source(record, scene, choice, noise, optional, start, *remarks), begun.edge_sd
+
+
+class _ChannelStart(NamedTuple):
+    """What is known of a channel before its likelihood."""
+
+    start: Estimate | None = None
+    used: Bool[np.ndarray, " samples"] | None = None  # samples of I that a stated drive predicts
+    slope: Float[np.ndarray, " samples"] | None = None  # its dV/dt there, V/s
+    edge_sd: float = 0.0  # of log(gain), for rounded V and unresolved edges
+
+
+def _estimate_channel(
+    record: Record,
+    scene: Scene,
+    choice: DriveModel,
+    channel: Channel,
+    bare: Likelihood,
+    taus: Float[np.ndarray, " time_constants"],
+) -> _ChannelStart:
+    """Estimate the circuit from a channel, unless its estimate comes with rows of charge."""
+    template = bare.template
+    edge_sd = 0.0 if choice.name != "measured" or channel == "Ft" else rounded_gain_sd(record["V"])
+    if channel == "Vsc" and (not limits_current(template) or taus[-1] < record.time_step):  # Vsc jumps with V
+        plain = constant_skin_circuit(template)
+        highest = (0.5 if isinstance(plain, FinalCircuit) else 1.0) * largest_gain(scene)
+        start = estimate_from_vsc(record, choice, highest, has_leak=passes_direct_current(plain))
+        return _ChannelStart(start, edge_sd=math.hypot(edge_sd, _unresolved_gain_sd(record, choice, start)))
+    if channel == "I" and choice.name != "measured" and not limits_current(template):
+        used, slope = select_samples(record, choice)
+        if passes_direct_current(template):  # the start comes from Vsc or from draws of the prior
+            return _ChannelStart(None, used, slope, edge_sd)
+        estimate = estimate_from_current(record, choice, used, slope, prior_skin_moments(bare))
+        return _ChannelStart(estimate, used, slope, edge_sd)
+    return _ChannelStart(edge_sd=edge_sd)
 
 
 def _make_charge_rows(
