@@ -62,11 +62,7 @@ def compare(
     for model in models.values():
         model.require_available(fit=True)
     first, columns = next(iter(models.values())), options.column_options((channel, scale, rate))
-    measured = [
-        fitact.read_spectrum(path) if internal.is_spectrum(path) else fitact.read(path, first, **columns)
-        for path in records
-    ]
-    comparison = fitact.compare(measured, models)
+    comparison = fitact.compare([internal.read_any(path, first, **columns) for path in records], models)
     show(str(comparison), comparison.to_dict(), json, comparison.trusted)
 
 

@@ -94,8 +94,9 @@ def test_what_knows_no_leak_refuses_it():
     record, scene = leaky_record(MEAN, TRUTH["Ri"]), leaky_scene(MEAN, 2e6)
     with pytest.raises(fitact.InputError, match="a track has no leak"):
         find_model([], scene, 5e-6, "record")
-    with pytest.raises(fitact.InputError, match="a population has no leak"):
-        fitact.population([record, record], scene)
+    varies = scene.model_dump(exclude_unset=True) | {"population": {"contact_area": "varies"}}
+    with pytest.raises(fitact.InputError, match="excludes a leak"):
+        fitact.population([record, record], fitact.Scene.from_dict(varies))
     with pytest.raises(fitact.InputError, match=r"\[device\] Ri, a leak, is not modelled with \[skin\] level"):
         fitact.Scene.from_dict({"device": {"Ri": 2e6}, "skin": {"level": "fractional"}})
     assert isinstance(scene.make_rc_circuit(), FinalCircuit)
