@@ -17,6 +17,7 @@ from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.charge_rows import LAG, ChargeRows, step_means, whiten_rows
 from fitact.likelihood.compression import BASELINE_NAMES, Compression
 from fitact.likelihood.likelihood import CircuitValues
+from fitact.likelihood.noise import Whitening
 from fitact.likelihood.projection import (
     MAX_DELAY,
     TableNodes,
@@ -93,7 +94,7 @@ class WindowCompressor:
         """Compress a window with the drive `V`: each channel's samples and weights, or rows of charge.
 
         `responses` are those of `respond`. With `has_charge`, the charge at the first sample is unknown. Also returns
-        what a trend within the window needs, and the samples of the responses if the first channel has rows instead.
+        what a trend within the window needs, and the samples of the responses if the first channel is whitened.
         """
         late, rank = self.time - 0.5 * self.time[-1], len(self.tables[0].series)
         functions = np.empty((rank + TREND_RANK + 2, V.size))
@@ -104,7 +105,7 @@ class WindowCompressor:
             functions[-1] = self.tables[i].expected @ responses
             found.append(self._compress_channel(i, late, functions, *pair, has_charge))
         parts, inputs = zip(*found, strict=True)
-        if self.channels[0].charges is None:
+        if self.channels[0].charges is None and self.channels[0].whitening is None:
             return parts, inputs, None
         decays = _decays(self.tables[0], self.time)[: rank * has_charge]
         rows = np.concatenate([combined, decays])
@@ -133,7 +134,9 @@ class WindowCompressor:
             late, count = late - (LAG - 0.5) * step, max(round(float(rows.count)), 1)
         else:
             rate, slope, observed = np.zeros(late.size), np.gradient(functions[-2], step), given
-            count = late.size if weight is None else int(np.count_nonzero(weight))
+            whitening = None if channel.whitening is None else _make_filter(channel.whitening, weight, late.size)
+            used = weight if whitening is None else whitening.mask
+            count = late.size if used is None else int(np.count_nonzero(used))
             if channel.timing:
                 steps = drive_steps(functions[-2], 0, late.size, MAX_DELAY) / step
         rest = observed - functions[-1] - (0.0 if table.expected_rate is None else table.expected_rate * rate)
@@ -141,6 +144,8 @@ class WindowCompressor:
         products = np.concatenate([*own, shared[charged:], [rate, slope, rest]])
         if rows is not None:
             products = whiten_rows(rows.gain, rows.decay, products) * rows.used
+        elif whitening is not None:
+            products = whitening.filter(np.pad(products, [(0, 0), (whitening.taps.size - 1, 0)]))
         elif weight is not None:
             products = products * weight
         # functions that are absent are 0
@@ -182,6 +187,13 @@ class WindowCompressor:
         length = step * V.size
         age = length + (0.0 if before is None else before.age)
         return responses, FilterState(start + length, float(V[-1]), left, age)
+
+
+def _make_filter(fitted: Whitening, weight: Samples | None, samples: int) -> Whitening:
+    """Return the filter of the fitted window for another one, which begins without the samples before it."""
+    taps = np.asarray(fitted.taps)
+    whitening = Whitening(taps, np.where(np.arange(samples) < taps.size - 1, 0.0, 1.0))
+    return whitening if weight is None else whitening.exclude(weight == 0.0)
 
 
 def _decays(table: TableNodes, time: Samples) -> Float[np.ndarray, "rank samples"]:
