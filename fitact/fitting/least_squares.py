@@ -1,6 +1,7 @@
 """Least-squares fit of one or several channels, and the selection of nuisance parameters by the BIC."""
 
 import dataclasses
+import functools
 import math
 from typing import Any, NamedTuple
 
@@ -312,20 +313,31 @@ def _add_nuisance(solution: LeastSquaresResult, index: int, name: str) -> tuple[
     return likelihood.replace_channel(index, channel), theta
 
 
+@functools.partial(jit, fast=True)
+def _prior_rows(likelihood: Likelihood, theta: Array) -> tuple[Array, Array]:
+    return likelihood.prior_residuals(theta), jax.jacfwd(likelihood.prior_residuals)(theta)
+
+
 def _bic_decreases(
     solution: LeastSquaresResult, optional_nuisances: tuple[tuple[str, ...], ...]
 ) -> dict[tuple[int, str], float]:
-    """Return the decrease of the BIC that adding each nuisance would cause, to first order."""
+    """Return the decrease of the BIC that adding each nuisance would cause, to first order.
+
+    The rows of the prior follow those of the data, since a parameter stands for a nuisance only as far as its prior
+    lets it: a fast time constant of a known circuit acts as a delay.
+    """
     likelihood, sigma = solution.likelihood, solution.sigma
     residuals = [x / s for x, s in zip(solution.residuals, sigma, strict=True)]
     if not all(np.isfinite(x).all() for x in (*residuals, *solution.jacobian)):
         return {}
     starts = np.cumsum([0, *(x.size for x in residuals)])
-    columns = [np.concatenate([j[: x.size] for j, x in zip(solution.jacobian, residuals, strict=True)])]
+    off_prior, prior_jacobian = _prior_rows(likelihood.without_samples(), solution.theta)
+    parts = [j[: x.size] for j, x in zip(solution.jacobian, residuals, strict=True)]
+    columns = [np.concatenate([*parts, prior_jacobian])]
 
     def pad_columns(index: int, shapes: np.ndarray) -> np.ndarray:
         """Return the columns of one channel, padded with zeros for the others."""
-        around = (starts[index], starts[-1] - starts[index + 1])
+        around = (starts[index], starts[-1] - starts[index + 1] + off_prior.size)
         return np.pad(np.atleast_2d(shapes) / sigma[index], ((0, 0), around)).T
 
     candidates, gains = {}, {}
@@ -341,7 +353,7 @@ def _bic_decreases(
             elif name in NUISANCES and not free[NUISANCES[name][0]]:
                 candidates[i, name] = pad_columns(i, shapes[list(NUISANCES[name])])
     basis = orthonormal_basis(np.concatenate(columns, axis=1))
-    all_residuals = np.concatenate(residuals)
+    all_residuals = np.concatenate([*residuals, off_prior])
     for (i, name), added in candidates.items():
         modes, sizes, _ = np.linalg.svd(added - basis @ (basis.T @ added), full_matrices=False)
         modes = modes[:, sizes > 1e-9 * max(float(np.linalg.norm(added)), 1e-300)]
