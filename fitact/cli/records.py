@@ -71,7 +71,8 @@ def population(
     records: Annotated[
         list[Path],
         typer.Argument(
-            metavar="RECORD...", help="Records on one panel, one per finger, or folders that fitact track left."
+            metavar="RECORD...",
+            help="Records or spectra on one panel, one per finger, or folders that fitact track left.",
         ),
     ],
     scene: options.CommonScene = None,
@@ -168,7 +169,9 @@ def track(
 
 @app.command()
 def campaign(
-    records: Annotated[list[Path], typer.Argument(metavar="RECORD...", help="Records, each fitted independently.")],
+    records: Annotated[
+        list[Path], typer.Argument(metavar="RECORD...", help="Records or spectra, each fitted independently.")
+    ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results, also to resume.")],
     scene: options.CommonScene = None,
     channel: options.Channels = None,
