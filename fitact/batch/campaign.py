@@ -21,10 +21,9 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 
-from fitact.batch.fit_many import Fits, Row, fit_many
+from fitact.batch.fit_many import Fits, Row, failure_row, fit_many, list_sources, read_finger
 from fitact.batch.sample_many import add_posterior, sample_many
 from fitact.compiled import available_cores
-from fitact.data.readers.read import read
 from fitact.errors import InputError
 from fitact.files import to_json
 from fitact.fitting.fit import fit
@@ -45,7 +44,8 @@ _ONE_THREAD = {
 }
 JOURNAL = "journal.jsonl"
 
-Batch = tuple[tuple[str, str], ...]  # (key of the journal, path) of each record
+Paths = str | tuple[str, ...]  # of a record, or of records that are fitted jointly
+Batch = tuple[tuple[str, Paths], ...]  # (key of the journal, paths) of each row
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Task:
         settings = [importlib.metadata.version("fitact"), self.scene, self.columns, *sampled]
         return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
 
-    def rows(self, paths: Sequence[str]) -> list[Row]:
+    def rows(self, paths: Sequence[Paths]) -> list[Row]:
         """Compute the rows of a batch; runs on a worker."""
         scene = None if self.scene is None else Scene.from_json(self.scene)
         self._clear_large_caches()
@@ -81,14 +81,16 @@ class Task:
                 row |= self._write_record_report(Path(self.reports), path, scene, row)
         return rows
 
-    def _fit_or_sample(self, paths: Sequence[str], scene: Scene | None) -> Fits:
+    def _fit_or_sample(self, paths: Sequence[Paths], scene: Scene | None) -> Fits:
         if self.posteriors and self.reports is None:  # reports sample each record separately
             return sample_many(paths, scene, **self.columns, seed=self.seed, progress=False)
         return fit_many(paths, scene, **self.columns, progress=False)
 
-    def _write_record_report(self, reports: Path, path: str, scene: Scene | None, row: Row) -> Row:
-        place = reports / f"{Path(path).stem}-{hashlib.sha256(path.encode()).hexdigest()[:8]}"
-        posterior = sample(fit(read(path, scene, **self.columns), scene), seed=self.seed, progress=False)
+    def _write_record_report(self, reports: Path, paths: Paths, scene: Scene | None, row: Row) -> Row:
+        first, *others = list_sources(paths)
+        place = reports / f"{Path(first).stem}-{hashlib.sha256(chr(0).join([first, *others]).encode()).hexdigest()[:8]}"
+        fitted = fit(read_finger(paths, scene, self.columns), scene)
+        posterior = sample(fitted, seed=self.seed, progress=False)
         posterior.to_netcdf(place / "posterior.nc")
         posterior.report(place / "report.html")
         row = add_posterior(row, posterior) if self.posteriors else row
@@ -130,7 +132,7 @@ class Journal:
 
 
 def run_campaign(
-    records: Sequence[str | os.PathLike[str]],
+    records: Sequence[str | os.PathLike[str] | Sequence[str | os.PathLike[str]]],
     folder: str | os.PathLike[str],
     scene: Scene | None = None,
     *,
@@ -152,7 +154,8 @@ def run_campaign(
     workers, it is split until the offending record is isolated; this record is reported as failed.
 
     Args:
-        records: paths, which must be accessible to workers on other machines.
+        records: paths, which must be accessible to workers on other machines. Paths in a sequence are fitted jointly,
+            as the records of one finger.
         folder: folder for the results.
         scene: scene of all records.
         channels, scale, rate: channels and sampling rate of the files, as in `fitact.read`.
@@ -169,8 +172,8 @@ def run_campaign(
             cannot be reached.
     """
     (scene or Scene()).require_available(fit=True)
-    paths = [os.path.abspath(path) for path in records]
-    for path, count in Counter(paths).most_common(1):
+    paths = [_make_absolute(each) for each in records]
+    for path, count in Counter(path for each in paths for path in list_sources(each)).most_common(1):
         if count > 1:
             raise InputError(f"{path}: is given twice; give each record once")
     out = Path(folder)
@@ -191,23 +194,32 @@ def run_campaign(
     return Fits(tuple(journal.rows[key] for key in keys))
 
 
-def _journal_keys(paths: Sequence[str], task: Task) -> list[str]:
-    """Return the key of each row in the journal, a hash of settings, name and content."""
+def _make_absolute(given: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> Paths:
+    if isinstance(given, (str, os.PathLike)):
+        return os.path.abspath(given)
+    return tuple(os.path.abspath(path) for path in given)
+
+
+def _journal_keys(paths: Sequence[Paths], task: Task) -> list[str]:
+    """Return the key of each row in the journal, a hash of settings, names and contents."""
     settings = task.fingerprint
 
-    def key(path: str) -> str:
+    def digest(path: str) -> str:
         try:
             with open(path, "rb") as file:
-                content = hashlib.file_digest(file, "sha256").hexdigest()
+                return hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:
-            content = f"unreadable: {error}"
-        return hashlib.sha256("\0".join([settings, path, content]).encode()).hexdigest()
+            return f"unreadable: {error}"
+
+    def key(given: Paths) -> str:
+        parts = [part for path in list_sources(given) for part in (path, digest(path))]
+        return hashlib.sha256("\0".join([settings, *parts]).encode()).hexdigest()
 
     with ThreadPoolExecutor() as pool:
         return list(pool.map(key, paths))
 
 
-def _pending_batches(keys: Sequence[str], paths: Sequence[str], journal: Journal) -> deque[Batch]:
+def _pending_batches(keys: Sequence[str], paths: Sequence[Paths], journal: Journal) -> deque[Batch]:
     """Return the batches of pending records, identical after any interruption."""
     pairs = list(zip(keys, paths, strict=True))
     parts = (pairs[first : first + BATCH] for first in range(0, len(pairs), BATCH))
@@ -278,11 +290,10 @@ def _completed_batches(
         submit()
 
 
-def _crash_row(path: str, error: BaseException) -> Row:
-    reason = f"{type(error).__name__}: {error}"
+def _crash_row(paths: Paths, error: BaseException) -> Row:
     if isinstance(error, _import_distributed().scheduler.KilledWorker):
-        reason = f"killed {error.allowed_failures + 1} workers"
-    return {"record": os.path.basename(path), "result": "crashed", "trusted": False, "message": f"{path}: {reason}"}
+        return failure_row(paths, error, f"killed {error.allowed_failures + 1} workers")
+    return failure_row(paths, error)
 
 
 def _import_distributed() -> Any:

@@ -17,8 +17,9 @@ from fitact.batch.recorded_drive import RecordedDriveProblem
 from fitact.batch.stated_drive import StatedDriveProblem
 from fitact.blas import limit_to_one_thread
 from fitact.compiled import available_cores, double_precision
-from fitact.data.readers.read import read
+from fitact.data.readers.read import read_any
 from fitact.data.record import Record
+from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
 from fitact.files import atomic_write, write_parquet
 from fitact.fitting import derived
@@ -40,9 +41,11 @@ _FIT_COLUMNS = (
     *("force_from_prior", "freed"),
 )
 
-Input = Record | str | os.PathLike[str]
+_Item = Record | Spectrum | str | os.PathLike[str]
+Input = _Item | Sequence[_Item]  # a sequence is fitted jointly
+Finger = Record | Spectrum | tuple[Record | Spectrum, ...]
 Row = dict[str, Any]
-Member = tuple[int, Record]
+Member = tuple[int, Any]  # number, and what `fit` takes of a finger: a record in a batch
 Batch = tuple[BatchProblem | None, list[Member]]
 _Job = TypeVar("_Job")
 _Done = TypeVar("_Done")
@@ -131,7 +134,8 @@ def fit_many(
     record that is refused or fails does not affect the others, and its row states the reason.
 
     Args:
-        records: records, or paths of files; consumed one by one.
+        records: records, spectra, or paths of files; consumed one by one. A sequence of them is fitted jointly, as the
+            records of one finger.
         scene: scene of all records.
         channels, scale, rate: channels and sampling rate of the files, as in `fitact.read`.
         whiteness: whether to test the residuals of batches for structure. Without this test, a record is trusted if
@@ -177,9 +181,18 @@ def _read_records(
     """Yield numbered records; add failure rows for files that cannot be read."""
     for number, record in enumerate(records):
         try:
-            yield number, record if isinstance(record, Record) else read(record, scene, **columns)
+            yield number, read_finger(record, scene, columns)
         except Exception as error:
-            rows[number] = failure_row(str(record), error)
+            rows[number] = failure_row(record, error)
+
+
+def read_finger(given: Input, scene: Scene | None, columns: Mapping[str, Any]) -> Finger:
+    """Return what `fit` takes of one finger; `columns` as in `read`."""
+    if isinstance(given, (Record, Spectrum)):
+        return given
+    if isinstance(given, (str, os.PathLike)):
+        return read_any(given, scene, **columns)
+    return tuple(each if isinstance(each, (Record, Spectrum)) else read_any(each, scene, **columns) for each in given)
 
 
 def run_in_threads(
@@ -240,6 +253,9 @@ def _group_records(records: Iterable[Member], scene: Scene | None) -> Iterator[B
     """Yield batches of records to fit together, or single records."""
     groups: dict[tuple[float, ...], RecordGroup] = {}
     for number, record in records:
+        if not isinstance(record, Record):
+            yield None, [(number, record)]
+            continue
         time = record.time
         key = time.size, time[0], time[1], time[-1]
         group = groups[key] = groups.get(key) or RecordGroup(time)
@@ -323,11 +339,11 @@ def _median_columns(names: Sequence[str], medians: np.ndarray, log_sds: np.ndarr
     }
 
 
-def _fit_single(record: Record, scene: Scene | None) -> Row:
+def _fit_single(record: Finger, scene: Scene | None) -> Row:
     try:
         return row_from_fit(fit(record, scene))
     except Exception as error:
-        return failure_row(record.source, error)
+        return failure_row(record, error)
 
 
 def row_from_fit(fit: Fit) -> Row:
@@ -337,15 +353,30 @@ def row_from_fit(fit: Fit) -> Row:
         *(fit.figures["rms_residual"], fit.identifiability.verdict, fit.identifiability.force_from_prior),
         ", ".join(fit.model()["freed"]),
     )
-    row = {"record": os.path.basename(fit.record.source)} | dict(zip(_FIT_COLUMNS, values, strict=True))
+    row = {"record": name_row(fit.records)} | dict(zip(_FIT_COLUMNS, values, strict=True))
     row |= _median_columns([fit.names[i] for i in free], np.exp(fit.theta[free]), fit.sd[free])
     logs, log_sds, _ = fit.laplace.derived_moments()
     row |= _median_columns(derived.DERIVED_NAMES, np.exp(logs), log_sds)
     return {name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()}
 
 
-def failure_row(source: str, error: Exception) -> Row:
-    result, message = "crashed", f"{source}: {type(error).__name__}: {error}"
-    if isinstance(error, InputError):
-        result, message = "refused", str(error)
-    return {"record": os.path.basename(source), "result": result, "trusted": False, "message": message}
+def failure_row(given: Input, error: BaseException, reason: str = "") -> Row:
+    """Return the row of records without a result; `reason` in place of that of a crash."""
+    result, message = "refused", str(error)
+    if not isinstance(error, InputError):
+        result, message = "crashed", f"{list_sources(given)[0]}: {reason or f'{type(error).__name__}: {error}'}"
+    return {"record": name_row(given), "result": result, "trusted": False, "message": message}
+
+
+def name_row(given: Input) -> str:
+    """Return the names of the files, without folders."""
+    return ", ".join(os.path.basename(source) for source in list_sources(given))
+
+
+def list_sources(given: Input) -> list[str]:
+    """Return the names of records, or their paths as given."""
+    if isinstance(given, (Record, Spectrum)):
+        return [given.source]
+    if isinstance(given, (str, os.PathLike)):
+        return [os.fspath(given)]
+    return [source for each in given for source in list_sources(each)]

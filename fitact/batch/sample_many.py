@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from fitact.batch.fit_many import (
     Batch,
+    Finger,
     Fits,
     Input,
     Member,
@@ -25,7 +26,6 @@ from fitact.batch.fit_many import (
 from fitact.batch.metropolis import GaussianApproximations, sample_posteriors
 from fitact.batch.stated_drive import StatedDriveProblem
 from fitact.compiled import BatchEvaluator, pad_rows
-from fitact.data.record import Record
 from fitact.fitting import derived
 from fitact.fitting.derived import DerivedQuantities
 from fitact.fitting.fit import fit
@@ -65,7 +65,7 @@ def sample_many(
     others, are sampled separately, like `fitact.sample` with this seed.
 
     Args:
-        records: records, or paths of files; consumed one by one.
+        records: records, spectra, paths of files, or sequences of them, as in `fit_many`.
         scene: scene of all records.
         channels, scale, rate: channels and sampling rate of the files, as in `fitact.read`.
         seed: seed of the random numbers; the same seed gives the same rows.
@@ -243,18 +243,18 @@ def _posterior_columns(row: Row, draws: Mapping[str, np.ndarray], convergence: C
     return columns | {name: getattr(convergence, name) for name in _CONVERGENCE_COLUMNS}
 
 
-def _alone(record: Record, scene: Scene | None, seed: int) -> Row:
+def _alone(record: Finger, scene: Scene | None, seed: int) -> Row:
     """Sample a record separately; return the row of its fit if the sampler fails."""
     try:
         fitted = fit(record, scene)
         row = row_from_fit(fitted)
     except Exception as error:
-        return failure_row(record.source, error)
+        return failure_row(record, error)
     try:
         posterior = sample(fitted, seed=seed, progress=False)
         row = add_posterior(row, posterior)
     except Exception as error:
-        return row | {"trusted": False, "converged": False, "message": failure_row(record.source, error)["message"]}
+        return row | {"trusted": False, "converged": False, "message": failure_row(record, error)["message"]}
     if posterior.convergence.interrupted:
         raise KeyboardInterrupt
     return row

@@ -8,7 +8,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "app.server": ["serve"],
         "app.warm_commands": ["WarmCommands"],
-        "data.readers.read": ["write_csv"],
+        "data.readers.read": ["read_any", "write_csv"],
         "data.simulate": ["simulate"],
         "data.kramers_kronig": ["check_kramers_kronig"],
         "data.readers.spectrum": ["is_spectrum"],

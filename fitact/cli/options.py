@@ -118,8 +118,8 @@ Results = Annotated[Path, typer.Argument(metavar="DIR", help="Folder with the re
 Fresh = Annotated[bool, typer.Option("--fresh", help="Start a new chain instead of resuming the one in DIR.")]
 
 
-class LazyRecords(Sequence["fitact.Record"]):
-    """Records of one scene, each read on access, with the columns and times of --channel, --scale and --rate.
+class LazyRecords(Sequence[Any]):
+    """Records and spectra of a scene, each read on access, with the columns and times of --channel, --scale and --rate.
 
     A folder stands for the track that `fitact track` left there, and so do its files.
     """
@@ -134,7 +134,7 @@ class LazyRecords(Sequence["fitact.Record"]):
         path = self._paths[index]
         if path.is_dir() or path.name in ("track.parquet", "summary.json"):
             return internal.TrackedFinger.from_folder(path)
-        return fitact.read(path, self._scene, **self._columns)
+        return internal.read_any(path, self._scene, **self._columns)
 
 
 def load_scene(path: Path | str | None) -> "fitact.Scene | None":

@@ -62,11 +62,7 @@ def compare(
     for model in models.values():
         model.require_available(fit=True)
     first, columns = next(iter(models.values())), options.column_options((channel, scale, rate))
-    measured = [
-        fitact.read_spectrum(path) if internal.is_spectrum(path) else fitact.read(path, first, **columns)
-        for path in records
-    ]
-    comparison = fitact.compare(measured, models)
+    comparison = fitact.compare([internal.read_any(path, first, **columns) for path in records], models)
     show(str(comparison), comparison.to_dict(), json, comparison.trusted)
 
 
@@ -75,7 +71,8 @@ def population(
     records: Annotated[
         list[Path],
         typer.Argument(
-            metavar="RECORD...", help="Records on one panel, one per finger, or folders that fitact track left."
+            metavar="RECORD...",
+            help="Records or spectra on one panel, one per finger, or folders that fitact track left.",
         ),
     ],
     scene: options.CommonScene = None,
@@ -172,7 +169,9 @@ def track(
 
 @app.command()
 def campaign(
-    records: Annotated[list[Path], typer.Argument(metavar="RECORD...", help="Records, each fitted independently.")],
+    records: Annotated[
+        list[Path], typer.Argument(metavar="RECORD...", help="Records or spectra, each fitted independently.")
+    ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results, also to resume.")],
     scene: options.CommonScene = None,
     channel: options.Channels = None,

@@ -135,7 +135,8 @@ def measurement(
     """
     announce("ranking measurements for", [scene])
     stated = fitact.Scene.load(scene)
-    measured = list(LazyRecords(record, stated, (channel, scale, rate)))  # refuses bad records before the slow imports
+    columns = column_options((channel, scale, rate))
+    measured = [fitact.read(path, stated, **columns) for path in record or ()]  # refused before the slow imports
     options = fitact.design_measurement(stated, measured)
     if out is not None:
         report.write_folder(out, options, command_line(), stated, measured)

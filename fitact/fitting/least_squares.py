@@ -41,6 +41,7 @@ class LeastSquaresResult:
     log_density: float  # of the posterior, up to a constant, before the last change of sigma
     result: str  # name of a member of `RESULTS`
     steps: int  # total number of trial steps
+    prior: tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows parameters"]]  # its residuals and their Jacobian
     jacobian: tuple[Float[np.ndarray, "rows parameters"], ...]  # Jacobian of the whitened residuals
     # under Student's t, all of these are reweighted
     residuals: tuple[Float[np.ndarray, " rows"], ...]
@@ -62,6 +63,7 @@ class _Round(NamedTuple):
     log_density: Array
     result: Array  # index in `RESULT_NAMES`
     steps: Array
+    prior: tuple[Array, Array]
     jacobian: tuple[Array, ...]
     residuals: tuple[Array, ...]
     shapes: tuple[Array, ...]
@@ -112,7 +114,9 @@ def _solve_round(likelihood: Likelihood, start: Array, sigma: Array, damping: Ar
         jacobians = tuple(jnp.split(minimum.jacobian, np.cumsum(sizes))[:-1])
     counts = jnp.stack([jnp.asarray(channel.count, dtype=float) for channel in likelihood.channels])
     log_density = -minimum.cost - counts @ jnp.log(sigma)
-    return _Round(theta, jnp.stack(noise), log_density, minimum.result, minimum.steps, jacobians, *weighted)
+    off_prior = likelihood.prior_residuals(theta)
+    prior = off_prior, minimum.jacobian[len(minimum.jacobian) - off_prior.size :]
+    return _Round(theta, jnp.stack(noise), log_density, minimum.result, minimum.steps, prior, jacobians, *weighted)
 
 
 def _information_jacobian(
@@ -314,17 +318,23 @@ def _add_nuisance(solution: LeastSquaresResult, index: int, name: str) -> tuple[
 def _bic_decreases(
     solution: LeastSquaresResult, optional_nuisances: tuple[tuple[str, ...], ...]
 ) -> dict[tuple[int, str], float]:
-    """Return the decrease of the BIC that adding each nuisance would cause, to first order."""
+    """Return the decrease of the BIC that adding each nuisance would cause, to first order.
+
+    The rows of the prior follow those of the data, since a parameter stands for a nuisance only as far as its prior
+    lets it: a fast time constant of a known circuit acts as a delay.
+    """
     likelihood, sigma = solution.likelihood, solution.sigma
     residuals = [x / s for x, s in zip(solution.residuals, sigma, strict=True)]
     if not all(np.isfinite(x).all() for x in (*residuals, *solution.jacobian)):
         return {}
     starts = np.cumsum([0, *(x.size for x in residuals)])
-    columns = [np.concatenate([j[: x.size] for j, x in zip(solution.jacobian, residuals, strict=True)])]
+    off_prior, prior_jacobian = solution.prior
+    parts = [j[: x.size] for j, x in zip(solution.jacobian, residuals, strict=True)]
+    columns = [np.concatenate([*parts, prior_jacobian])]
 
     def pad_columns(index: int, shapes: np.ndarray) -> np.ndarray:
         """Return the columns of one channel, padded with zeros for the others."""
-        around = (starts[index], starts[-1] - starts[index + 1])
+        around = (starts[index], starts[-1] - starts[index + 1] + off_prior.size)
         return np.pad(np.atleast_2d(shapes) / sigma[index], ((0, 0), around)).T
 
     candidates, gains = {}, {}
@@ -340,7 +350,7 @@ def _bic_decreases(
             elif name in NUISANCES and not free[NUISANCES[name][0]]:
                 candidates[i, name] = pad_columns(i, shapes[list(NUISANCES[name])])
     basis = orthonormal_basis(np.concatenate(columns, axis=1))
-    all_residuals = np.concatenate(residuals)
+    all_residuals = np.concatenate([*residuals, off_prior])
     for (i, name), added in candidates.items():
         fraction = explained_square(basis, added, all_residuals) / float(residuals[i] @ residuals[i])
         gains[i, name] = bic_decrease(fraction, float(likelihood.channels[i].count), added.shape[1])

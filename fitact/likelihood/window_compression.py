@@ -16,6 +16,7 @@ from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.charge_rows import LAG, ChargeRows, filter_highpass, step_means, whiten_rows
 from fitact.likelihood.compression import BASELINE_NAMES, Columns, Compression, function_sizes, split_functions
 from fitact.likelihood.likelihood import CircuitValues
+from fitact.likelihood.noise import Whitening
 from fitact.likelihood.projection import (
     MAX_DELAY,
     TableNodes,
@@ -93,7 +94,7 @@ class WindowCompressor:
         """Compress a window with the drive `V`: each channel's samples and weights, or rows of charge.
 
         `responses` are those of `respond`. With `has_charge`, the charge at the first sample is unknown. Also returns
-        what a trend within the window needs, and the samples of the responses if the first channel has rows instead.
+        what a trend within the window needs, and the samples of the responses if the first channel is whitened.
         """
         late, rank = self.time - 0.5 * self.time[-1], len(self.tables[0].series)
         functions = np.empty((rank + TREND_RANK + 2, V.size))
@@ -104,7 +105,7 @@ class WindowCompressor:
             functions[-1] = self.tables[i].expected @ responses
             found.append(self._compress_channel(i, late, functions, *pair, has_charge))
         parts, inputs = zip(*found, strict=True)
-        if self.channels[0].charges is None:
+        if self.channels[0].charges is None and self.channels[0].whitening is None:
             return parts, inputs, None
         decays = _decays(self.tables[0], self.time)[: rank * has_charge]
         sizes = function_sizes(rank, decays=True)
@@ -124,7 +125,7 @@ class WindowCompressor:
         channel, table, step = self.channels[index], self.tables[index], float(self.time[1])
         rank, charged = len(table.series), has_charge * len(table.series)
         shared, steps = self.shared[index][rank - charged :], np.empty((0, late.size))
-        rows = None
+        rows, whitening = None, None
         if callable(given):
             functions = step_means(functions)
             rows = given([functions[:-2], shared])
@@ -132,7 +133,9 @@ class WindowCompressor:
             late, count = late - (LAG - 0.5) * step, max(round(float(rows.count)), 1)
         else:
             rate, slope, observed = np.zeros(late.size), np.gradient(functions[-2], step), given
-            count = late.size if weight is None else int(np.count_nonzero(weight))
+            whitening = None if channel.whitening is None else _make_filter(channel.whitening, weight, late.size)
+            used = weight if whitening is None else whitening.mask
+            count = late.size if used is None else int(np.count_nonzero(used))
             if channel.timing:
                 steps = drive_steps(functions[-2], 0, late.size, MAX_DELAY) / step
         rest = observed - functions[-1] - (0.0 if table.expected_rate is None else table.expected_rate * rate)
@@ -141,7 +144,9 @@ class WindowCompressor:
         own |= {"rate": rate[None], "slope": slope[None], "observed": rest[None]}
         own |= {"late": functions[rank:-2], "late_rate": (late * rate)[None], "voltage": functions[-2:-1]}
         sizes = function_sizes(rank, decays=True, effects=len(channel.effect_sizes), ages=len(steps))
-        found = _find_coordinates(own, sizes | {"late": TREND_RANK, "late_rate": 1, "voltage": 1}, weight, rows)
+        found = _find_coordinates(
+            own, sizes | {"late": TREND_RANK, "late_rate": 1, "voltage": 1}, weight, rows, whitening
+        )
         late_signal = found["late"] @ table.series[:TREND_RANK]
         trend = TrendInputs(late_signal, found["late_rate"][:, 0], found["voltage"][:, 0])
         return assemble_compression(table, found, count), trend
@@ -176,20 +181,30 @@ def _find_coordinates(
     sizes: Mapping[str, int],
     weight: Samples | None = None,
     charges: ChargeRows | None = None,
+    whitening: Whitening | None = None,
 ) -> dict[str, Columns]:
     """Return coordinates of functions, 0 for those of `sizes` that are absent, so that windows have equal shapes.
 
-    Functions over the samples have a `weight`; rows are whitened like `charges`.
+    Functions over the samples have a `weight` or a filter; rows are whitened like `charges`.
     """
     starts = dict(zip(sizes, np.cumsum([0, *sizes.values()]), strict=False))
     kept = np.concatenate([starts[name] + np.arange(len(each)) for name, each in functions.items()])
     rows, total = np.concatenate(list(functions.values())), np.zeros(2 * [sum(sizes.values())])
     if charges is not None:
         rows = whiten_rows(charges.gain, charges.decay, rows) * charges.used
+    elif whitening is not None:
+        rows = whitening.filter(np.pad(rows, [(0, 0), (whitening.taps.size - 1, 0)]))
     elif weight is not None:
         rows = rows * weight
     total[np.ix_(kept, kept)] = rows @ rows.T
     return split_functions(factor_products(total)[0], sizes)
+
+
+def _make_filter(fitted: Whitening, weight: Samples | None, samples: int) -> Whitening:
+    """Return the filter of the fitted window for another one, which begins without the samples before it."""
+    taps = np.asarray(fitted.taps)
+    whitening = Whitening(taps, np.where(np.arange(samples) < taps.size - 1, 0.0, 1.0))
+    return whitening if weight is None else whitening.exclude(weight == 0.0)
 
 
 def _decays(table: TableNodes, time: Samples) -> Float[np.ndarray, "rank samples"]:

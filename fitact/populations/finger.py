@@ -27,7 +27,7 @@ SHARED_PARAMETER = "Ci"
 class Finger:
     """Fitted record with its likelihood around the optimum, normal in the finger's own coordinates given log Ci."""
 
-    source: str  # name of the record
+    source: str  # names of the records
     fingerprint: str  # hash of its numbers
     result: str  # of the separate fit, as the next two, see `Fit`
     message: str
@@ -55,8 +55,8 @@ class Finger:
         n, noise = len(own), np.diag(fit.point_root)[size:]
         root = np.linalg.inv(R[:n, :n])
         return cls(
-            source=os.path.basename(fit.record.source),
-            fingerprint=fit.record.fingerprint,
+            source=", ".join(os.path.basename(each.source) for each in fit.records),
+            fingerprint="-".join(each.fingerprint for each in fit.records),
             result=fit.result,
             message=fit.message,
             parameters=fit.parameters(),

@@ -7,12 +7,14 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 
 from fitact.compiled import BatchEvaluator, double_precision
 from fitact.data.record import Record
+from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
 from fitact.fitting.fit import fit
 from fitact.fitting.result import Fit
@@ -37,8 +39,12 @@ from fitact.tracking.tracked_finger import TrackedFinger
 _CHAIN_FILES = {64: "chain.h5", 1024: "chain_1024.h5"}
 
 
+# what is given of one finger: a track, or what `fit` takes
+FingerData: TypeAlias = Record | Spectrum | Sequence[Record | Spectrum] | Track | TrackedFinger
+
+
 def population(
-    records: Sequence[Record | Track | TrackedFinger],
+    records: Sequence[FingerData],
     scene: Scene | None = None,
     *,
     covariates: Mapping[str, Sequence[float]] | None = None,
@@ -56,8 +62,9 @@ def population(
     r has the density 3/4 (1 - r^2). Each finger's own parameters are integrated out.
 
     Args:
-        records: one record or track of each finger, on one panel; they are read one after the other and not kept. A
-            finger of a track is its average over time; the tracks together give the variation within fingers.
+        records: one record, spectrum or track of each finger, on one panel, or a sequence of records that are fitted
+            jointly; they are read one after the other and not kept. A finger of a track is its average over time; the
+            tracks together give the variation within fingers.
         scene: scene of all records; its prior of Rsc and Csc is the prior of their medians.
         covariates: one number per finger under each name, such as skin moisture; the medians of log Rsc and log Csc
             change linearly with each, with a normal prior of scale 0.5 per standard deviation of the covariate.
@@ -75,19 +82,14 @@ def population(
     """
     scene = scene or Scene()
     medians = _prior(scene)
-    if "Ri" in scene.prior.specs() or scene.device.Ri is not None:
+    area_varies = scene.population.contact_area == "varies"
+    if area_varies and ("Ri" in scene.prior.specs() or scene.device.Ri is not None):
         raise InputError(
-            "scene: a population has no leak of the insulator yet, whose Ri goes as 1 / area; leave [device] Ri and"
-            " [prior] Ri out, or fit the fingers one by one"
-        )
-    if "Ft" in scene.measurement.channels:
-        raise InputError(
-            "scene: a population does not use the friction yet; leave 'Ft' out of [measurement] channels, or fit the"
-            " fingers one by one"
+            "scene: [population] contact_area = 'varies' excludes a leak of the insulator, whose Ri would vary, too;"
+            " leave [device] Ri and [prior] Ri out, or state contact_area = 'common'"
         )
     standardized = Covariates.from_values(covariates or {}, len(records))
     next_at = standardized.standardize(at or {})
-    area_varies = scene.population.contact_area == "varies"
     factors = (*SKIN, SHARED_PARAMETER, *((AREA,) if area_varies else ()), *scene.thickness_sd())
     # errors of the instruments are the same for all fingers, so that they do not make these differ
     exact = scene.without_instrument_errors()
@@ -158,7 +160,7 @@ def _prior(scene: Scene) -> Prior:
 
 
 def _fit_fingers(
-    records: Sequence[Record | Track | TrackedFinger],
+    records: Sequence[FingerData],
     scene: Scene,
     prior: Prior,
     factors: tuple[str, ...],
@@ -176,31 +178,31 @@ def _fit_fingers(
         try:
             item = records[number]
             record = TrackedFinger.from_track(item) if isinstance(item, Track) else item
-            twin = fingers.get(record.fingerprint)
-            if twin is None and not (isinstance(record, TrackedFinger) and new_finger):
+            if not (isinstance(record, TrackedFinger) and new_finger):
                 fitted = _fit_one(record, scene)
         except InputError as error:
             refusals.append(error)
             continue
-        if twin is not None:
-            raise InputError(
-                f"{record.source} holds the same record as {twin.source}, whose finger would count twice; drop one"
-            )
         with double_precision():
             new_finger = new_finger or NewFingerModel.from_fit(fitted, factors)
-            if isinstance(record, TrackedFinger):
-                tracks[record.fingerprint] = record
-                fingers[record.fingerprint] = Finger.from_track(record, prior)
-            else:
-                fingers[record.fingerprint] = Finger.from_fit(fitted)
+            tracked = record if isinstance(record, TrackedFinger) else None
+            finger = Finger.from_fit(fitted) if tracked is None else Finger.from_track(tracked, prior)
+        twin = fingers.get(finger.fingerprint)
+        if twin is not None:
+            raise InputError(
+                f"{finger.source} holds the same record as {twin.source}, whose finger would count twice; drop one"
+            )
+        fingers[finger.fingerprint] = finger
+        if tracked is not None:
+            tracks[finger.fingerprint] = tracked
     if refusals or new_finger is None:
         raise _refusal(refusals)
     return tuple(fingers.values()), new_finger, tracks
 
 
-def _fit_one(record: Record | TrackedFinger, scene: Scene) -> Fit:
-    """Fit a record, or the window of a track under its recorded drive."""
-    if isinstance(record, Record):
+def _fit_one(record: Any, scene: Scene) -> Fit:
+    """Fit records, or the window of a track under its recorded drive."""
+    if not isinstance(record, TrackedFinger):
         return fit(record, scene)
     return fit(record.window, scene.model_copy(update={"drive": DriveSection(waveform="measured")}))
 

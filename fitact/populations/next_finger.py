@@ -20,6 +20,7 @@ from fitact.problem.drive_choice import whole_periods
 AREA = "contact_area"
 THICKNESSES = ("skin_thickness", "insulator_thickness")
 FACTORS = (*SKIN, SHARED_PARAMETER, AREA, *THICKNESSES)  # the first three are at the median area and thickness
+FRICTION = ("mu", "fN", "force_scale")  # parameters of a measured friction on which the computed one depends
 NAMES = (*SKIN, *derived.DERIVED_NAMES)
 HARMONICS = ("force_at_f", "force_at_2f", "friction_at_f", "friction_at_2f")
 
@@ -35,7 +36,11 @@ class NewFingerModel(eqx.Module):
 
     @classmethod
     def from_fit(cls, fit: Fit, factors: tuple[str, ...]) -> Self:
-        """Make the model from a fit; a measured drive that repeats is continued periodically."""
+        """Make the model from a fit; a measured drive that repeats is continued periodically.
+
+        Friction is computed with the scene's coefficient and normal force, since those that were fitted are one
+        finger's.
+        """
         derive = fit.derive
         if derive.charge:
             samples, period = whole_periods(fit.record)
@@ -48,7 +53,11 @@ class NewFingerModel(eqx.Module):
             frequency = float(derive.drive.frequency)
         elif isinstance(derive.drive, Sampled) and whole_periods(fit.record)[1] is not None:
             frequency = float(fit.record.frequency() or math.nan)
-        return cls(derive, fit.theta, np.array([trace.sigma for trace in fit.traces]), factors, frequency)
+        theta, stated = fit.theta.copy(), fit.scene.nominal_values()
+        for name in FRICTION:
+            if name in fit.names:
+                theta[fit.names.index(name)] = math.log(float(stated[name] or 1.0))
+        return cls(derive, theta, np.array([trace.sigma for trace in fit.traces]), factors, frequency)
 
     @property
     def names(self) -> tuple[str, ...]:

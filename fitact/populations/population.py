@@ -96,9 +96,10 @@ class Population(Display):
                 f"the integrals over the fingers may shift means by {self.off:.2g} standard deviations; leave out the"
                 " records that constrain Rsc and Csc least"
             )
-        if self.hierarchy.area_varies and "I" not in self.scene.measurement.channels:
+        if self.hierarchy.area_varies and not self.contact_area.is_tested:
             sentences.append(
-                "Vsc alone does not determine the contact area, so its standard deviation is the prior's; record I, too"
+                "these records do not determine the contact area, so its standard deviation is the prior's; record I,"
+                " too, or an impedance"
             )
         if self.contact_area.disagrees:
             sentences.append(self.contact_area.sentence)

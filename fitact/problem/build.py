@@ -294,7 +294,7 @@ def _build_channel(
 
 
 class _ChannelStart(NamedTuple):
-    """What is known of a channel before its likelihood."""
+    """Estimates from a channel before its likelihood is made."""
 
     start: Estimate | None = None
     used: Bool[np.ndarray, " samples"] | None = None  # samples of I that a stated drive predicts

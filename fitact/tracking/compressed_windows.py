@@ -172,16 +172,6 @@ def find_model(windows: Sequence[Window], scene: Scene, step: float, source: str
         InputError: no window can be fitted, or the drive does not repeat.
     """
     channels = scene.measurement.channels
-    if passes_direct_current(scene.make_rc_circuit()) or "Ri" in scene.prior.specs():
-        raise InputError(
-            f"{source}: a track has no leak of the insulator; leave [device] Ri and [prior] Ri out of the scene, or fit"
-            " each part of the record on its own"
-        )
-    if "Ft" in channels:
-        raise InputError(
-            f"{source}: a track does not use the friction; leave 'Ft' out of [measurement] channels, or fit each part"
-            " of the record on its own"
-        )
     whole = [each for each in windows if each.is_whole and np.ptp(each.channels["V"]) > 0.0]
     if not whole:
         raise InputError(f"{source}: there is no window with a drive and all samples; record V_V beside {channels[0]}")
@@ -216,6 +206,21 @@ def _describe_current(fitted: Fit, record: Record, circuit: CircuitValues) -> tu
             inputs = fitted.likelihood.make_inputs(circuit.circuit, fitted.theta, channel)
             return RecordedCurrent.from_record(record), Current.from_channel(channel, inputs)
     return None
+
+
+def require_compressible(scene: Scene, source: str) -> None:
+    """Refuse a scene whose model windows of a few numbers do not represent."""
+    noise, level = scene.measurement.noise_model, scene.skin.level
+    reasons = {
+        "has no leak of the insulator; leave [device] Ri and [prior] Ri out of the scene": (
+            passes_direct_current(scene.make_rc_circuit()) or "Ri" in scene.prior.specs()
+        ),
+        "does not use the friction; leave 'Ft' out of [measurement] channels": "Ft" in scene.measurement.channels,
+        f"has no [measurement] noise_model = '{noise}'; state 'white' or 'ar1'": noise not in ("white", "ar1"),
+        f"has no [skin] level = '{level}'; state 'constant'": level != "constant",
+    }
+    if reason := next((reason for reason, applies in reasons.items() if applies), ""):
+        raise InputError(f"{source}: a track {reason}, or fit each part of the record on its own")
 
 
 def require_table(model: WindowModel, source: str) -> None:

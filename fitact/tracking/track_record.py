@@ -16,10 +16,13 @@ import numpy as np
 
 from fitact.blas import limit_to_one_thread
 from fitact.compiled import double_precision
+from fitact.data.readers.spectrum import is_spectrum, read_spectrum
 from fitact.data.readers.stream import Block, stream_record
 from fitact.data.record import Record, fundamental_frequency
+from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
 from fitact.files import atomic_write, require_folder
+from fitact.problem.source import require_record
 from fitact.progress import track_progress
 from fitact.scene.scene import Scene
 from fitact.scene.sections import DriveSection
@@ -28,6 +31,7 @@ from fitact.tracking.compressed_windows import (
     CompressedWindows,
     WindowModel,
     find_model,
+    require_compressible,
     require_table,
     stack_data,
 )
@@ -86,7 +90,12 @@ def track(
     Raises:
         InputError: the record is refused, lacks V, changes its sampling rate, or a window is shorter than 1.5 periods.
     """
-    if isinstance(record, Record):
+    if isinstance(record, Sequence) and not isinstance(record, str):
+        raise InputError(f"{len(record)} records: a track follows one record; track each by itself")
+    if isinstance(record, (str, os.PathLike)) and os.path.isfile(record) and is_spectrum(record):
+        require_record(read_spectrum(record))
+    if isinstance(record, (Record, Spectrum)):
+        record = require_record(record)
         blocks: Iterator[Block] = iter([Block(record.time, record.channels, float(len(record)))])
         source, total = record.source, float(len(record))
     else:
@@ -114,8 +123,7 @@ def track_blocks(
     place = require_folder(None if folder is None else Path(folder))
     stated = scene or Scene()
     followed = stated.model_copy(update={"drive": DriveSection(waveform="measured")})
-    if stated.measurement.noise_model != "white":
-        raise InputError("scene: [measurement] noise_model: a track needs white noise; leave the key out")
+    require_compressible(stated, source)
     first, frequency, blocks = _read_head(blocks, followed, source)
     head = _describe_head(first, frequency, window, source)
     position = [0.0]

@@ -197,9 +197,6 @@ def test_records_that_cannot_serve_are_refused(tmp_path: Path) -> None:
 def test_what_does_not_use_the_friction_refuses_it(tmp_path: Path) -> None:
     record, text = simulate(tmp_path)
     scene = load(tmp_path, text)
-    other = Record.from_arrays(record.time, **{name: 1.01 * record[name] for name in record.channels})
-    with pytest.raises(InputError, match="a population does not use the friction"):
-        fitact.population([record, other], scene)
     with pytest.raises(InputError, match="a design does not count the friction"):
         experiment_from_scene(scene)
     with pytest.raises(InputError, match="a track does not use the friction"):

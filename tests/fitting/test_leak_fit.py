@@ -12,7 +12,6 @@ from data_synth.scene import make_scene
 from fitact.likelihood.certificate import compress_channel
 from fitact.model.circuit import FinalCircuit
 from fitact.problem.build import build_problem
-from fitact.tracking.compressed_windows import find_model
 
 TRUTH = {"Rsc": 130e3, "Csc": 18e-9, "Ci": 1.35e-9, "Ri": 2e6}
 MEAN = {"waveform": "trapezoid", "rise_time": 40e-6, "frequency": 100.0, "offset": 60.0}
@@ -93,9 +92,10 @@ def test_posterior_of_a_leaky_panel_holds_the_truth():
 def test_what_knows_no_leak_refuses_it():
     record, scene = leaky_record(MEAN, TRUTH["Ri"]), leaky_scene(MEAN, 2e6)
     with pytest.raises(fitact.InputError, match="a track has no leak"):
-        find_model([], scene, 5e-6, "record")
-    with pytest.raises(fitact.InputError, match="a population has no leak"):
-        fitact.population([record, record], scene)
+        fitact.track(record, scene)
+    varies = scene.model_dump(exclude_unset=True) | {"population": {"contact_area": "varies"}}
+    with pytest.raises(fitact.InputError, match="excludes a leak"):
+        fitact.population([record, record], fitact.Scene.from_dict(varies))
     with pytest.raises(fitact.InputError, match=r"\[device\] Ri, a leak, is not modelled with \[skin\] level"):
         fitact.Scene.from_dict({"device": {"Ri": 2e6}, "skin": {"level": "fractional"}})
     assert isinstance(scene.make_rc_circuit(), FinalCircuit)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas
 import pytest
+import scipy.signal
 
 import fitact
 from data_synth.changing import Course, make_course
@@ -31,9 +32,12 @@ SLIDE = {"time": (0.0, 3.0), "area": (1.0, 1.3), "Rsc": (1.0, 0.6), "lifted": (1
 
 
 def simulate(
-    seed: int = 0, duration: float = DURATION, rate: float = RATE, **change: Any
+    seed: int = 0, duration: float = DURATION, rate: float = RATE, coloured: float = 0.0, **change: Any
 ) -> tuple[fitact.Record, Course]:
-    """Return a record of a finger that changes, with noise of 0.1 V and 20 nA, and its course."""
+    """Return a record of a finger that changes, and its course.
+
+    The noise is 0.1 V and 20 nA; that of Vsc is an AR(1) with these innovations and the coefficient `coloured`.
+    """
     # corners lie half-way between samples; if all lay on samples, the jumps of I would tell a wrong delay
     drive = DRIVE | {"phase": f"{180.0 * 100.0 / rate} deg"}
     scene = make_scene({"drive": drive, "measurement": {"channels": ["Vsc", "I"]}}, {}, "scene")
@@ -41,7 +45,8 @@ def simulate(
     course = make_course(STILL | change, START, duration, rng)
     time = np.arange(round(duration * rate)) / rate
     V, Vsc, current = simulate_response(scene, time, None, "scipy", course)
-    V, Vsc = (values + 0.1 * rng.standard_normal(time.size) for values in (V, Vsc))
+    V = V + 0.1 * rng.standard_normal(time.size)
+    Vsc = Vsc + 0.1 * scipy.signal.lfilter([1.0], [1.0, -coloured], rng.standard_normal(time.size))
     current = current + 20e-9 * rng.standard_normal(time.size)
     return fitact.Record.from_arrays(time, V=V, Vsc=Vsc, I=current), course
 
@@ -159,6 +164,19 @@ def test_walk_fixed_at_zero_gives_the_answer_of_a_fit(monkeypatch):
         assert np.log(found.values[name]) == pytest.approx(fitted.theta[i], abs=0.5 * fitted.sd[i])
         # windows count residuals that are alike as fewer, of which noise alone leaves some
         assert np.all((found.sd[name] > 0.98 * fitted.sd[i]) & (found.sd[name] < 1.15 * fitted.sd[i]))
+
+
+def test_windows_with_coloured_noise_give_the_answer_of_a_fit():
+    record, _ = simulate(duration=0.96, coloured=0.9)
+    scene = fitact.Scene.from_dict({"drive": {"waveform": "measured"}, "measurement": {"noise_model": "ar1"}})
+    fitted = fitact.fit(record, scene)
+    found = fitact.track(record, scene, rates=(0.0, 0.0, 0.0))
+    logs, sds, _ = fitted.derived_moments()
+    for name, log, sd in zip(("g", "b", "force_mean"), logs, sds, strict=False):
+        assert np.log(found.values[name]) == pytest.approx(log, abs=max(0.5 * sd, 1e-3 * (name == "force_mean")))
+        # the filter is that of one window, whose coefficient is known to 0.01
+        assert np.all((found.sd[name] > 0.8 * sd) & (found.sd[name] < 1.2 * sd))
+    assert found.noise["sigma"] == pytest.approx(fitted.sigma, rel=0.1)
 
 
 def test_vsc_alone_leaves_the_area_to_the_prior():
@@ -327,7 +345,8 @@ def test_file_that_is_still_written_is_followed(short, tmp_path: Path):
     [
         ({"window": 0.005}, "shorter than one and a half periods"),
         ({"window": 1e-4}, "at least 20 samples"),
-        ({"scene": {"measurement": {"noise_model": "student"}}}, "white noise"),
+        ({"scene": {"measurement": {"noise_model": "student"}}}, "state 'white' or 'ar1'"),
+        ({"scene": {"skin": {"level": "fractional"}}}, "state 'constant'"),
     ],
 )
 def test_refusals(short, change, sentence):

@@ -4,7 +4,7 @@ import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,14 +18,31 @@ from fitact.data.readers.capture import (
     to_record,
 )
 from fitact.data.readers.layouts import is_same_grid
-from fitact.data.readers.spectrum import is_spectrum
+from fitact.data.readers.spectrum import is_spectrum, read_spectrum
 from fitact.data.readers.text import is_binary, read_text
 from fitact.data.record import CHANNEL_UNITS, Record
+from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
 from fitact.files import atomic_write, read_head
 
 if TYPE_CHECKING:
     from fitact.scene.scene import Scene  # would import JAX
+
+
+class SpectrumFileError(InputError):
+    """The file holds a spectrum in place of a record."""
+
+
+def read_any(path: str | os.PathLike[str], scene: "Scene | None" = None, **columns: Any) -> Record | Spectrum:
+    """Read a record with the `columns` of `read`, or the spectrum that the file holds.
+
+    Raises:
+        InputError: as `read` and `read_spectrum`.
+    """
+    try:
+        return read(path, scene, **columns)
+    except SpectrumFileError:
+        return read_spectrum(path)
 
 
 def read(
@@ -77,7 +94,7 @@ def read_capture(path: str | os.PathLike[str], pick: Pick = lambda names, place:
     if is_binary(head) or is_known_binary(head, path.suffix):
         return read_binary(path, source, head, pick)
     if is_spectrum(path):
-        raise InputError(f"{source}: is a spectrum, without time; give it to fitact run, fit or inspect")
+        raise SpectrumFileError(f"{source}: is a spectrum, without time, and this needs a record in time")
     return read_text(path, source, pick)
 
 
