@@ -32,24 +32,28 @@ class GaussNewton:
         max_samples: record length above which a separate fit costs no more.
         max_steps: maximum number of steps of each record.
         max_log_change: maximum step in a log-parameter.
-        loop_tolerance: distance to the optimum before the last step, in standard errors, which this step squares;
-            also the relative change of sigma in the last step.
+        loop_tolerance, first_tolerance: `tolerance` of `find_optima`, also while the nuisances are still chosen; the
+            R^2 of a nuisance hardly depends on theta, since it is orthogonal to the derivatives in theta.
         tolerance: distance to the optimum after the last step, in standard errors.
         max_rounding_loss: maximum relative error of the residual sum of squares in the coordinates (very low noise).
         clock_bic_error: error of the BIC difference for a clock error, whose regressor is only approximate here.
         adc_samples: number of samples used to decide whether noise exceeds the LSB of the ADC.
         max_rail_samples: number of samples at an extreme from which saturation is suspected.
+        block: number of records that a program computes at once, so few that XLA does not split its loops among
+            threads, which compute other batches.
     """
 
     max_samples: int = 65_536
     max_steps: int = 20
     max_log_change: float = 1.0
     loop_tolerance: float = 1e-4
+    first_tolerance: float = 0.3
     tolerance: float = 1e-6
     max_rounding_loss: float = 1e-3
     clock_bic_error: float = 3.0
     adc_samples: int = 512
     max_rail_samples: int = 3
+    block: int = 64
 
 
 class RecordInputs(NamedTuple):
@@ -103,14 +107,31 @@ class GaussNewtonResult(NamedTuple):
 
 @functools.partial(jit, fast=True)
 def find_optima(
-    likelihood: Likelihood, settings: GaussNewton, clock: Array, records: RecordInputs, start: Array, noise: Array
+    likelihood: Likelihood,
+    settings: GaussNewton,
+    clock: Array,
+    tolerance: ArrayLike,
+    records: RecordInputs,
+    start: Array,
+    noise: Array,
 ) -> GaussNewtonResult:
-    """Solve the least squares of many records; `clock`: effect of a clock error in the coordinates."""
-    return jax.vmap(functools.partial(_find_optimum, likelihood, settings, clock))(records, start, noise)
+    """Solve the least squares of many records; `clock`: effect of a clock error in the coordinates.
+
+    `tolerance` is the distance to the optimum before the last step, in standard errors, which this step squares, and
+    the relative change of sigma in the last step.
+    """
+    find = functools.partial(_find_optimum, likelihood, settings, clock, tolerance)
+    return lax.map(lambda each: find(*each), (records, start, noise), batch_size=settings.block)
 
 
 def _find_optimum(
-    likelihood: Likelihood, settings: GaussNewton, clock: Array, record: RecordInputs, start: Array, noise: Array
+    likelihood: Likelihood,
+    settings: GaussNewton,
+    clock: Array,
+    tolerance: ArrayLike,
+    record: RecordInputs,
+    start: Array,
+    noise: Array,
 ) -> GaussNewtonResult:
     """Find the optimum by Gauss-Newton steps from a nearby start, with sigma estimated from the residuals."""
     model = record.model(likelihood)
@@ -138,7 +159,7 @@ def _find_optimum(
         return theta + move, rms, distance, steps + 1
 
     def should_continue(state: tuple[Array, ...]) -> Array:
-        return (state[2] > settings.loop_tolerance) & (state[3] < settings.max_steps)
+        return (state[2] > tolerance) & (state[3] < settings.max_steps)
 
     theta, sigma, _, _ = lax.while_loop(should_continue, step, (start, noise, jnp.array(jnp.inf), jnp.array(0)))
     whitened, jacobian = linearise(theta, sigma)
