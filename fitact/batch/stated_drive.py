@@ -28,7 +28,7 @@ from fitact.model.skin import WithSkin
 from fitact.problem.build import MIN_RELATIVE_NOISE, Problem
 from fitact.problem.starting_point import VscEstimate
 
-_CHUNK = 48  # records whose samples are processed together, so that they stay in the processor's cache
+_CHUNK = 64  # records whose samples are processed together, so that they stay in the processor's cache
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,11 +90,11 @@ class StatedDriveProblem(BatchProblem):
         noise, height, fine, railed, coordinates = map(np.concatenate, zip(*screened, strict=True))
         optima, accepted = self.find_optima(coordinates, noise, MIN_RELATIVE_NOISE * height)
         logs, gradients = _log_derived(self.derive, optima.theta, optima.sigma)
+        square, tests = optima.sum_of_squares, None
         if whiteness:
-            square, tests = self._residual_statistics(parts, optima.fitted[:, : len(self.basis.signal)])
-            loss = np.abs(optima.sum_of_squares - square)
+            from_samples, tests = self._residual_statistics(parts, optima.fitted[:, : len(self.basis.signal)])
+            loss = np.abs(square - from_samples)
         else:
-            square, tests = optima.sum_of_squares, None
             # relative to the square of the record; 12 eps was observed
             loss = 32.0 * np.finfo(float).eps * np.vecdot(coordinates, coordinates)
         freedom = self.samples - optima.theta.shape[1]
@@ -112,11 +112,12 @@ class StatedDriveProblem(BatchProblem):
         self, parts: Sequence[np.ndarray], signal: Float[np.ndarray, "records rank"]
     ) -> tuple[Float[np.ndarray, " records"], ResidualTestStatistics]:
         """Return the residual sums of squares over the samples, and statistics of the residual tests."""
-        statistics = []
-        for number, part in enumerate(parts):
-            residuals = self.basis.response(signal[number * _CHUNK : (number + 1) * _CHUNK])
-            np.subtract(part, residuals, out=residuals)
-            tests = ResidualTestStatistics.from_residuals(residuals.astype(np.float32), self.phases)
+        statistics, single = [], np.float32  # which suffices for the tests, and to notice a loss of digits in `fit`
+        functions = self.basis.functions[:, : signal.shape[1]].astype(single).T
+        for part, coefficients in zip(parts, split_rows(signal.astype(single), _CHUNK), strict=True):
+            residuals = coefficients @ functions
+            np.subtract(part.astype(single), residuals, out=residuals)
+            tests = ResidualTestStatistics.from_residuals(residuals, self.phases)
             statistics.append((np.vecdot(residuals, residuals), *tests))
         square, *others = map(np.concatenate, zip(*statistics, strict=True))
         return square, ResidualTestStatistics(*others)
