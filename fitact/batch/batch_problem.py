@@ -8,8 +8,8 @@ import abc
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator, Sequence
-from typing import ClassVar, NamedTuple
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -23,6 +23,8 @@ from fitact.fitting.residual_tests import PhaseBins, count_true
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.problem.starting_point import most_probable_skin, prior_skin_moments
+
+_Rows = TypeVar("_Rows", np.ndarray, list[Any])
 
 
 class BatchFit(NamedTuple):
@@ -85,7 +87,7 @@ class BatchProblem(abc.ABC):
         phases: phase bins of the samples in the drive's period, or None if there are too few periods.
         samples: number of samples of each record that are fitted.
         optional_nuisances: nuisances that a record may need.
-        unit: number of records for which programs are compiled; `fit` takes multiples of it.
+        unit: number of records in a batch, for which programs are compiled.
     """
 
     likelihood: Likelihood
@@ -102,7 +104,7 @@ class BatchProblem(abc.ABC):
 
     @abc.abstractmethod
     def fit(self, records: Sequence[Record], whiteness: bool = True) -> BatchFit:
-        """Fit records, and optionally test the residuals for structure (`whiteness`), in double precision."""
+        """Fit `unit` records, and optionally test the residuals for structure (`whiteness`), in double precision."""
 
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
@@ -142,8 +144,11 @@ class BatchProblem(abc.ABC):
         return gains
 
 
-def stack_channel(records: Sequence[Record], channel: str, size: int) -> Iterator[Float[np.ndarray, "some samples"]]:
-    """Yield a channel of `size` records at once, whose samples fit into the processor cache."""
-    for first in range(0, len(records), size):
-        part = [record[channel] for record in records[first : first + size]]
-        yield np.concatenate(part).reshape(len(part), -1)  # faster than `np.stack`
+def stack_channel(records: Sequence[Record], channel: str) -> Float[np.ndarray, "records samples"]:
+    """Return a channel of all records; one large array, since many smaller ones take new memory again and again."""
+    return np.concatenate([record[channel] for record in records]).reshape(len(records), -1)  # faster than `np.stack`
+
+
+def split_rows(rows: _Rows, size: int) -> list[_Rows]:
+    """Return parts of `size` rows, of an array or a list."""
+    return [rows[first : first + size] for first in range(0, len(rows), size)]

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from fitact.batch.batch_problem import BatchFit, BatchProblem
+from fitact.batch.batch_problem import BatchFit, BatchProblem, split_rows
 from fitact.batch.recorded_drive import RecordedDriveProblem
 from fitact.batch.stated_drive import StatedDriveProblem
 from fitact.blas import limit_to_one_thread
@@ -32,7 +32,7 @@ from fitact.problem.build import build_problem
 from fitact.progress import track_progress
 from fitact.scene.scene import Scene
 
-_BATCH_RECORDS = 256  # most records in a batch
+_GROUP_RECORDS = 256  # records that are collected for batches
 _UNTESTED_MESSAGE = (
     "The fit converged, and the residuals are no larger than the noise; they were not tested for structure."
 )
@@ -263,7 +263,7 @@ def _group_records(records: Iterable[Member], scene: Scene | None) -> Iterator[B
             yield None, [(number, record)]
             continue
         group.members.append((number, record))
-        if len(group.members) == _BATCH_RECORDS:
+        if len(group.members) == _GROUP_RECORDS:
             yield from _split_group(group, scene)
     for group in groups.values():
         yield from _split_group(group, scene)
@@ -273,7 +273,8 @@ def _split_group(group: RecordGroup, scene: Scene | None) -> Iterator[Batch]:
     if group.is_batchable(scene):
         assert group.batch_problem is not None
         alike = [group.batch_problem.includes(record) for _, record in group.members]
-        yield group.batch_problem, list(itertools.compress(group.members, alike))
+        for members in split_rows(list(itertools.compress(group.members, alike)), group.batch_problem.unit):
+            yield group.batch_problem, members
         group.members = [member for member, same in zip(group.members, alike, strict=True) if not same]
     yield None, group.members
     group.members = []
@@ -296,7 +297,7 @@ def fit_batch(batch: Batch, whiteness: bool = True) -> tuple[dict[int, Row], Bat
     problem, members = batch
     if problem is None or not members:
         return {}, None
-    padded = [record for _, record in [*members, *members[-1:] * (-len(members) % problem.unit)]]
+    padded = [record for _, record in [*members, *members[-1:] * (problem.unit - len(members))]]
     try:
         optima = problem.fit(padded, whiteness)
         columns = {"record": [os.path.basename(record.source) for record in padded]}

@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+import itertools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -9,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from fitact.compiled import jit
@@ -18,6 +21,7 @@ from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
 
 CANDIDATES = (*NUISANCES, "delay", "clock")  # nuisances that a record may need
+_TOLERANCE = 1e-9  # fraction of a column within rounding, if that is all that remains beside others
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,24 +32,28 @@ class GaussNewton:
         max_samples: record length above which a separate fit costs no more.
         max_steps: maximum number of steps of each record.
         max_log_change: maximum step in a log-parameter.
-        loop_tolerance: distance to the optimum before the last step, in standard errors, which this step squares;
-            also the relative change of sigma in the last step.
+        loop_tolerance, first_tolerance: `tolerance` of `find_optima`, also while the nuisances are still chosen; the
+            R^2 of a nuisance hardly depends on theta, since it is orthogonal to the derivatives in theta.
         tolerance: distance to the optimum after the last step, in standard errors.
         max_rounding_loss: maximum relative error of the residual sum of squares in the coordinates (very low noise).
         clock_bic_error: error of the BIC difference for a clock error, whose regressor is only approximate here.
         adc_samples: number of samples used to decide whether noise exceeds the LSB of the ADC.
         max_rail_samples: number of samples at an extreme from which saturation is suspected.
+        block: number of records that a program computes at once, so few that XLA does not split its loops among
+            threads, which compute other batches.
     """
 
     max_samples: int = 65_536
     max_steps: int = 20
     max_log_change: float = 1.0
     loop_tolerance: float = 1e-4
+    first_tolerance: float = 0.3
     tolerance: float = 1e-6
     max_rounding_loss: float = 1e-3
     clock_bic_error: float = 3.0
     adc_samples: int = 512
     max_rail_samples: int = 3
+    block: int = 64
 
 
 class RecordInputs(NamedTuple):
@@ -99,14 +107,31 @@ class GaussNewtonResult(NamedTuple):
 
 @functools.partial(jit, fast=True)
 def find_optima(
-    likelihood: Likelihood, settings: GaussNewton, clock: Array, records: RecordInputs, start: Array, noise: Array
+    likelihood: Likelihood,
+    settings: GaussNewton,
+    clock: Array,
+    tolerance: ArrayLike,
+    records: RecordInputs,
+    start: Array,
+    noise: Array,
 ) -> GaussNewtonResult:
-    """Solve the least squares of many records; `clock`: effect of a clock error in the coordinates."""
-    return jax.vmap(functools.partial(_find_optimum, likelihood, settings, clock))(records, start, noise)
+    """Solve the least squares of many records; `clock`: effect of a clock error in the coordinates.
+
+    `tolerance` is the distance to the optimum before the last step, in standard errors, which this step squares, and
+    the relative change of sigma in the last step.
+    """
+    find = functools.partial(_find_optimum, likelihood, settings, clock, tolerance)
+    return lax.map(lambda each: find(*each), (records, start, noise), batch_size=settings.block)
 
 
 def _find_optimum(
-    likelihood: Likelihood, settings: GaussNewton, clock: Array, record: RecordInputs, start: Array, noise: Array
+    likelihood: Likelihood,
+    settings: GaussNewton,
+    clock: Array,
+    tolerance: ArrayLike,
+    record: RecordInputs,
+    start: Array,
+    noise: Array,
 ) -> GaussNewtonResult:
     """Find the optimum by Gauss-Newton steps from a nearby start, with sigma estimated from the residuals."""
     model = record.model(likelihood)
@@ -126,14 +151,15 @@ def _find_optimum(
         r_factor, projections = _qr_decompose(jacobian, residuals)
         move = -_back_substitute(r_factor, projections)
         move = move * jnp.minimum(1.0, settings.max_log_change / jnp.max(jnp.abs(move)))
-        rms = sigma * jnp.linalg.norm(residuals[:rows]) / jnp.sqrt(channel.count - size)
+        # of the residuals after this step, if the model is linear
+        rms = sigma * jnp.linalg.norm((residuals + jacobian @ move)[:rows]) / jnp.sqrt(channel.count - size)
         rms = jnp.maximum(rms, record.noise_floor)
-        # the optimum depends on sigma, which lags behind theta by a step
+        # the optimum depends on sigma
         distance = jnp.maximum(jnp.linalg.norm(projections), jnp.abs(rms / sigma - 1.0))
         return theta + move, rms, distance, steps + 1
 
     def should_continue(state: tuple[Array, ...]) -> Array:
-        return (state[2] > settings.loop_tolerance) & (state[3] < settings.max_steps)
+        return (state[2] > tolerance) & (state[3] < settings.max_steps)
 
     theta, sigma, _, _ = lax.while_loop(should_continue, step, (start, noise, jnp.array(jnp.inf), jnp.array(0)))
     whitened, jacobian = linearise(theta, sigma)
@@ -150,32 +176,36 @@ def _r_squared(
     """Return the fraction of the residual sum of squares that each of `CANDIDATES` explains, beside what is fitted."""
     table = channel.compression
     assert isinstance(table, Compression)
-    candidates = [[table.baseline[place] for place in places] for places in NUISANCES.values()]
-    candidates += [[channel.whitened_delay_derivative(inputs)], [clock]]
+    places = list(itertools.chain(*NUISANCES.values()))
+    candidates = jnp.stack([*(table.baseline[i] for i in places), channel.whitened_delay_derivative(inputs), clock])
     shapes = channel.residuals_and_shapes(inputs)[1] * (channel.linear_sd[np.array(channel.columns, int), None] > 0.0)
-    fitted = _orthonormalise([*jacobian.T, *shapes], [])
-    explained = [sum(jnp.square(q @ residuals) for q in _orthonormalise(columns, fitted)) for columns in candidates]
+    columns = [*jacobian.T, *shapes]
+    fitted = jnp.stack(_orthonormalise(columns, [_TOLERANCE * jnp.linalg.norm(column) for column in columns]))
+    rest, min_lengths = candidates, _TOLERANCE * jnp.linalg.norm(candidates, axis=1)
+    for _ in range(2):
+        rest = rest - (rest @ fitted.T) @ fitted
+    starts = np.cumsum([0, *map(len, NUISANCES.values()), 1, 1])
+    groups = [slice(*ends) for ends in itertools.pairwise(starts.tolist())]
+    bases = [_orthonormalise(list(rest[group]), list(min_lengths[group])) for group in groups]
+    explained = [sum(jnp.square(q @ residuals) for q in basis) for basis in bases]
     return jnp.stack(explained) / (residuals @ residuals)
 
 
-def _orthonormalise(columns: list[Array], others: list[Array], tolerance: float = 1e-9) -> list[Array]:
-    """Make columns orthonormal to `others` and to each other, by Gram-Schmidt, applied twice.
-
-    A column becomes 0 if at most `tolerance` of its length remains, i.e. if it is linearly dependent within rounding.
-    """
-    basis = jnp.stack(others) if others else jnp.zeros((0, columns[0].size))
-    for column in columns:
+def _orthonormalise(columns: list[Array], min_lengths: Sequence[ArrayLike]) -> list[Array]:
+    """Make columns orthonormal by Gram-Schmidt, applied twice; a column becomes 0 if only its `min_lengths` remains."""
+    basis = jnp.zeros((0, columns[0].size))
+    for column, min_length in zip(columns, min_lengths, strict=True):
         rest = column
         for _ in range(2):
             rest = rest - jnp.sum(jnp.sum(basis * rest, axis=1, keepdims=True) * basis, axis=0)
         length = jnp.linalg.norm(rest)
-        basis = jnp.vstack([basis, jnp.where(length > tolerance * jnp.linalg.norm(column), rest / length, 0.0)])
-    return list(basis[len(others) :])
+        basis = jnp.vstack([basis, jnp.where(length > min_length, rest / length, 0.0)])
+    return list(basis)
 
 
 def _qr_decompose(jacobian: Float[Array, "rows n"], residuals: Array) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
     """Return R and Q^T residuals of a QR decomposition; it vectorises over many small matrices, unlike LAPACK."""
-    q = jnp.stack(_orthonormalise(list(jacobian.T), [], tolerance=0.0))
+    q = jnp.stack(_orthonormalise(list(jacobian.T), [0.0] * jacobian.shape[1]))
     return jnp.triu(q @ jacobian), q @ residuals
 
 

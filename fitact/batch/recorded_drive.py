@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fitact.batch.batch_problem import BatchFit, BatchProblem, Screening, stack_channel
-from fitact.batch.gauss_newton import GaussNewtonResult, RecordInputs, find_optima
+from fitact.batch.gauss_newton import GaussNewton, GaussNewtonResult, RecordInputs, find_optima
 from fitact.batch.recorded_tables import AGES, HALF_WIDTH, TABLE_NODES, SharedFunctions, Tables, to_response_table
 from fitact.compiled import jit
 from fitact.data.record import Record, rounding_noise_sd
@@ -59,7 +59,7 @@ class RecordedDriveProblem(BatchProblem):
             the drive does not repeat.
     """
 
-    unit = 64
+    unit, settings = 64, GaussNewton(block=32)
     shared: SharedFunctions
     linear_sd: Float[np.ndarray, " nuisances"]
     gain_sd: float
@@ -122,14 +122,8 @@ class RecordedDriveProblem(BatchProblem):
         return "V" in record and "Vsc" in record
 
     def fit(self, records: Sequence[Record], whiteness: bool = True) -> BatchFit:
-        """Fit records, and optionally test the residuals for structure (`whiteness`), in double precision."""
-        channels = (stack_channel(records, name, self.unit) for name in ("V", "Vsc"))
-        parts = [self._fit_chunk(V, Vsc, whiteness) for V, Vsc in zip(*channels, strict=True)]
-        return jax.tree.map(lambda *each: np.concatenate(each), *parts)
-
-    def _fit_chunk(
-        self, V: Float[np.ndarray, "records samples"], Vsc: Float[np.ndarray, "records samples"], whiteness: bool
-    ) -> BatchFit:
+        """Fit `unit` records, and optionally test the residuals for structure (`whiteness`), in double precision."""
+        V, Vsc = stack_channel(records, "V"), stack_channel(records, "Vsc")
         driven, screened = Screening.from_values(V, self.settings), Screening.from_values(Vsc, self.settings)
         g, b, accepted = self._estimate_start(V, Vsc)
         tables = Tables.from_records(self.shared, V, Vsc, b)
@@ -227,17 +221,19 @@ class RecordedDriveProblem(BatchProblem):
         wide, floor = 10.0 * screened.height, MIN_RELATIVE_NOISE * screened.height  # as for a single record
         linear_sd, noise = self.linear_sd * screened.height[:, None], np.maximum(screened.noise, floor)
         fields, clock = self._select(tables.fields()), np.zeros(tables.observed.shape[1])
+        tolerance = self.settings.first_tolerance
         while True:
             inputs = RecordInputs(fields, linear_sd, floor, gain_sd)
-            optima = find_optima(self.likelihood, self.settings, clock, inputs, start, noise)
+            optima = find_optima(self.likelihood, self.settings, clock, np.asarray(tolerance), inputs, start, noise)
             gains, linear_sd = self.bic_decreases(optima.r_squared), linear_sd.copy()
             largest = np.max(gains, axis=1)
             for name, gain in zip(NUISANCES, gains.T, strict=False):  # delays and clocks, which follow, are not added
                 rows = np.flatnonzero((gain == largest) & (largest > MIN_BIC_DECREASE))
                 linear_sd[np.ix_(rows, np.array(NUISANCES[name]))] = wide[rows, None]
-            if np.array_equal(linear_sd, inputs.linear_sd):
+            if np.array_equal(linear_sd, inputs.linear_sd) and tolerance == self.settings.loop_tolerance:
                 return inputs, optima
             start, noise = optima.theta, optima.sigma  # near the next optimum
+            tolerance = self.settings.loop_tolerance
 
     def _select(self, fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the fields of compressions, without steps if no delay is fitted."""

@@ -82,9 +82,6 @@ class SharedBasis(NamedTuple):
         square = np.vecdot(observed, observed) - np.vecdot(inside, inside)
         return np.column_stack([inside, np.sqrt(np.maximum(square, 0.0))])
 
-    def response(self, signal: Float[np.ndarray, "records rank"]) -> Float[np.ndarray, "records samples"]:
-        return signal @ self.functions[:, : signal.shape[1]].T
-
 
 @jit
 def _evaluate_basis_functions(

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fitact.batch.batch_problem import BatchFit, BatchProblem, Screening, stack_channel
+from fitact.batch.batch_problem import BatchFit, BatchProblem, Screening, split_rows, stack_channel
 from fitact.batch.gauss_newton import GaussNewtonResult, RecordInputs, find_optima
 from fitact.batch.shared_basis import SharedBasis
 from fitact.compiled import jit
@@ -23,12 +23,12 @@ from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics
 from fitact.likelihood.channel import LINEAR_NUISANCES
 from fitact.model.chirp import Chirp
 from fitact.model.circuit import passes_direct_current
-from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, chebyshev
+from fitact.model.response_table import NODES, TABLE_HALF_WIDTH
 from fitact.model.skin import WithSkin
 from fitact.problem.build import MIN_RELATIVE_NOISE, Problem
 from fitact.problem.starting_point import VscEstimate
 
-_CHUNK = 48  # records whose samples are processed together, so that they stay in the processor's cache
+_CHUNK = 64  # records whose samples are processed together, so that they stay in the processor's cache
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,17 +84,17 @@ class StatedDriveProblem(BatchProblem):
         return bool(difference @ difference <= tolerance**2 * (self.voltage @ self.voltage))
 
     def fit(self, records: Sequence[Record], whiteness: bool = True) -> BatchFit:
-        """Fit records, and optionally test the residuals for structure (`whiteness`), in double precision."""
-        parts = list(stack_channel(records, "Vsc", _CHUNK))
+        """Fit `unit` records, and optionally test the residuals for structure (`whiteness`), in double precision."""
+        parts = split_rows(stack_channel(records, "Vsc"), _CHUNK)
         screened = [(*Screening.from_values(part, self.settings), self.basis.project(part)) for part in parts]
         noise, height, fine, railed, coordinates = map(np.concatenate, zip(*screened, strict=True))
         optima, accepted = self.find_optima(coordinates, noise, MIN_RELATIVE_NOISE * height)
         logs, gradients = _log_derived(self.derive, optima.theta, optima.sigma)
+        square, tests = optima.sum_of_squares, None
         if whiteness:
-            square, tests = self._residual_statistics(parts, optima.fitted[:, : len(self.basis.signal)])
-            loss = np.abs(optima.sum_of_squares - square)
+            from_samples, tests = self._residual_statistics(parts, optima.fitted[:, : len(self.basis.signal)])
+            loss = np.abs(square - from_samples)
         else:
-            square, tests = optima.sum_of_squares, None
             # relative to the square of the record; 12 eps was observed
             loss = 32.0 * np.finfo(float).eps * np.vecdot(coordinates, coordinates)
         freedom = self.samples - optima.theta.shape[1]
@@ -112,11 +112,12 @@ class StatedDriveProblem(BatchProblem):
         self, parts: Sequence[np.ndarray], signal: Float[np.ndarray, "records rank"]
     ) -> tuple[Float[np.ndarray, " records"], ResidualTestStatistics]:
         """Return the residual sums of squares over the samples, and statistics of the residual tests."""
-        statistics = []
-        for number, part in enumerate(parts):
-            residuals = self.basis.response(signal[number * _CHUNK : (number + 1) * _CHUNK])
-            np.subtract(part, residuals, out=residuals)
-            tests = ResidualTestStatistics.from_residuals(residuals.astype(np.float32), self.phases)
+        statistics, single = [], np.float32  # which suffices for the tests, and to notice a loss of digits in `fit`
+        functions = self.basis.functions[:, : signal.shape[1]].astype(single).T
+        for part, coefficients in zip(parts, split_rows(signal.astype(single), _CHUNK), strict=True):
+            residuals = coefficients @ functions
+            np.subtract(part.astype(single), residuals, out=residuals)
+            tests = ResidualTestStatistics.from_residuals(residuals, self.phases)
             statistics.append((np.vecdot(residuals, residuals), *tests))
         square, *others = map(np.concatenate, zip(*statistics, strict=True))
         return square, ResidualTestStatistics(*others)
@@ -135,17 +136,17 @@ class StatedDriveProblem(BatchProblem):
         products = coordinates[:, : len(signal)] @ signal
         best = np.argmax(np.where(products > 0.0, products**2 / size, -1.0), axis=1)
         highest = products[np.arange(len(best)), best]
-        in_table = (best > 0) & (best < NODES - 1) & (highest > 0.0)
+        in_table = (best > 0) & (best < len(tau) - 1) & (highest > 0.0)
         start = self.starting_points(highest / size[best], tau[best])
         records = RecordInputs({"observed": coordinates}, np.zeros((len(best), len(LINEAR_NUISANCES))), noise_floor)
-        clock = np.append(self.basis.clock, 0.0)
+        clock, tolerance = np.append(self.basis.clock, 0.0), np.asarray(self.settings.loop_tolerance)
         noise = np.maximum(noise, noise_floor)
-        return find_optima(self.likelihood, self.settings, clock, records, start, noise), in_table
+        return find_optima(self.likelihood, self.settings, clock, tolerance, records, start, noise), in_table
 
     @functools.cached_property
     def _table_responses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Time constants of the nodes (s), their responses to the drive (in columns), and the squared responses."""
-        x, _ = chebyshev(NODES)
+        """Time constants across the table (s), their responses to the drive (in columns), and the squared responses."""
+        x = np.linspace(-1.0, 1.0, 257)
         signal = self.basis.signal @ np.polynomial.chebyshev.chebvander(x, NODES - 1).T
         return np.exp(self.basis.center + TABLE_HALF_WIDTH * x), signal, np.einsum("ij,ij->j", signal, signal)
 
