@@ -171,7 +171,7 @@ def test_windows_with_coloured_noise_give_the_answer_of_a_fit():
     scene = fitact.Scene.from_dict({"drive": {"waveform": "measured"}, "measurement": {"noise_model": "ar1"}})
     fitted = fitact.fit(record, scene)
     found = fitact.track(record, scene, rates=(0.0, 0.0, 0.0))
-    logs, sds, _ = fitted.derived_moments()
+    logs, sds, _ = fitted.laplace.derived_moments()
     for name, log, sd in zip(("g", "b", "force_mean"), logs, sds, strict=False):
         assert np.log(found.values[name]) == pytest.approx(log, abs=max(0.5 * sd, 1e-3 * (name == "force_mean")))
         # the filter is that of one window, whose coefficient is known to 0.01
