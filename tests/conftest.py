@@ -9,6 +9,7 @@ import json
 import zlib
 from pathlib import Path
 
+import hypothesis
 import jax
 import numpy as np
 import pytest
@@ -61,6 +62,9 @@ def _room_for_programs():
         jax.clear_caches()
         compiled._find_program.cache_clear()
 
+
+hypothesis.settings.register_profile("fitact", max_examples=25, deadline=None, derandomize=True)
+hypothesis.settings.load_profile("fitact")
 
 RECORDS = Path(__file__).parents[1] / "data_synth" / "records"
 

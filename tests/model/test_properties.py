@@ -16,9 +16,6 @@ from hypothesis import strategies as st
 
 import fitact
 
-settings.register_profile("fitact", max_examples=25, deadline=None, derandomize=True)
-settings.load_profile("fitact")
-
 PERIOD = 0.01
 TIME = (np.arange(64) + 0.5) * (PERIOD / 64)
 

@@ -10,6 +10,7 @@ import pytest
 
 import fitact
 from fitact.files import to_json
+from fitact.fitting.geometry import UncertainGeometry
 from fitact.fitting.sensation import FeltDrive
 from fitact.summary import format_sd, summarize_log_normal
 
@@ -38,12 +39,18 @@ def test_force_of_a_draw_by_hand(finger_posterior: fitact.Posterior):
         assert force["friction_mean"][1, draw] == pytest.approx(0.5 * (fe.mean() + 0.5), rel=1e-9)
 
 
+def with_scene(fit: fitact.Fit, scene: fitact.Scene) -> fitact.Fit:
+    """Return the fit with the friction and the perception of another scene."""
+    geometry = UncertainGeometry.from_scene(scene, fit.derive.geometry)
+    return dataclasses.replace(fit, scene=scene, laplace=dataclasses.replace(fit.laplace, geometry=geometry))
+
+
 def test_a_table_of_thresholds_gives_the_sensation_of_each_draw(finger_posterior: fitact.Posterior):
     """The Fourier sum of mu fe over the record, at the multiples of its frequency that the table has."""
     table = {"frequencies": [90.0, 500.0], "forces": [2e-3, 1e-3], "source": "test"}
     content = {"perception": {"thresholds": table}, "friction": {"coefficient": {"median": 0.4, "relative_sd": 0.2}}}
     scene = fitact.Scene.from_dict(finger_posterior.fit.scene.model_dump(exclude_unset=True) | content)
-    felt = dataclasses.replace(finger_posterior, fit=dataclasses.replace(finger_posterior.fit, scene=scene))
+    felt = dataclasses.replace(finger_posterior, fit=with_scene(finger_posterior.fit, scene))
     draws, record, frequency = felt.parameters(), felt.fit.record, felt.fit.record.frequency()
     for draw in (0, 1000):
         Rsc, Csc, Ci, charge, mu = (
@@ -75,7 +82,7 @@ def test_a_table_of_thresholds_gives_the_sensation_of_each_draw(finger_posterior
 def test_no_sensation_is_stated_without_a_frequency_in_the_table(finger_posterior: fitact.Posterior):
     fit, table = finger_posterior.fit, {"frequencies": [1.0, 50.0], "forces": [2e-3, 1e-3]}
     scene = fitact.Scene.from_dict({"perception": {"thresholds": table}})
-    felt = dataclasses.replace(finger_posterior, fit=dataclasses.replace(fit, scene=scene))
+    felt = dataclasses.replace(finger_posterior, fit=with_scene(fit, scene))
     assert felt.sensation.sentence == (
         "Felt: no detection is stated, because the force has no frequency in the table of thresholds (1 Hz to 50 Hz;"
         " no source stated)."
