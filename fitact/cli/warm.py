@@ -26,7 +26,7 @@ from fitact.scene.toml import shipped_scenes
 
 # in the order in which a page needs them: pictures, `fitact run`, `fitact population`
 _SLOW_IMPORTS = (
-    "fitact.report.record", "scipy.stats", "optimistix", "fitact.fitting.fit",
+    "fitact.report.record", "scipy.signal", "optimistix", "fitact.fitting.fit",
     "fitact.model_selection.fit_planned", "xarray", "fitact.sampling.ensemble", "fitact.report.page", "h5netcdf",
     "fitact.populations.fit_population",
 )  # fmt: skip

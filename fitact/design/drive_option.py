@@ -5,7 +5,7 @@ import math
 from typing import Any, ClassVar, Self
 
 import numpy as np
-import scipy.stats
+import scipy
 from jaxtyping import Float
 
 from fitact.compiled import double_precision

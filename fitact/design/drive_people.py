@@ -4,8 +4,7 @@ import dataclasses
 from typing import Any, Self
 
 import numpy as np
-import scipy.special
-import scipy.stats
+import scipy
 from jaxtyping import Float
 
 from fitact.populations.finger import SHARED_PARAMETER, SKIN

@@ -7,9 +7,7 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
-import scipy.linalg
-import scipy.ndimage
-import scipy.optimize
+import scipy
 from jaxtyping import Float
 
 from fitact.experiment.fisher import Experiment, covariance_factor, jacobian

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from fitact.experiment.blind_directions import STRAY, gain_names
 from fitact.experiment.experiment import FREQUENCY, CandidateDesign, DesignOption, Gradient, Setting, evaluate_design

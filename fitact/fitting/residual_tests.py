@@ -4,9 +4,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import scipy.fft
-import scipy.sparse
-import scipy.special
+import scipy
 from jaxtyping import Bool, Float, Int
 
 _PHASES = (8, 32, 128, 512)  # numbers of parts of a period; few reveal slow structure, many brief structure

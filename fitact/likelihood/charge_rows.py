@@ -14,8 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
-import scipy.signal
+import scipy
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 

@@ -6,7 +6,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
+import scipy
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-import scipy.stats
+import scipy
 from jaxtyping import Array, Bool, Float, Int
 
 from fitact.compiled import double_precision, jit, pad_samples

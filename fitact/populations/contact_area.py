@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.stats
+import scipy
 
 from fitact.populations.finger import Finger
 from fitact.prior.distributions import Distribution

@@ -8,7 +8,7 @@ from typing import Self
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
+import scipy
 from jaxtyping import Array, Float
 
 from fitact import summary

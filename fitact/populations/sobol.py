@@ -7,9 +7,8 @@ from collections.abc import Callable
 from typing import NamedTuple, Self
 
 import numpy as np
-import scipy.stats
+import scipy
 from jaxtyping import Float, Int
-from scipy.special import ndtri
 
 from fitact.populations.next_finger import NewFingerModel
 
@@ -66,7 +65,7 @@ class Surrogate(NamedTuple):
 
 
 def _to_normal(uniform: np.ndarray) -> np.ndarray:
-    return ndtri(np.clip(uniform, 1e-12, 1.0 - 1e-12))  # it is infinite at 0 and 1
+    return scipy.special.ndtri(np.clip(uniform, 1e-12, 1.0 - 1e-12))  # it is infinite at 0 and 1
 
 
 def _least_squares(terms: Terms, logs: Quantities) -> np.ndarray:

@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import scipy.signal
+import scipy
 from jaxtyping import Bool
 
 from fitact.data.record import Record

@@ -9,7 +9,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import scipy.ndimage
+import scipy
 from jaxtyping import Bool, Float, Int
 
 from fitact.likelihood.charge_rows import LAG, MAX_STEPS, ROW_NOISE, step_means

@@ -12,7 +12,7 @@ from typing import NamedTuple, Self
 
 import jax
 import numpy as np
-import scipy.fft
+import scipy
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
-import scipy.optimize
+import scipy
 from jaxtyping import Complex, Float
 
 from fitact.compiled import as_arrays, jit, pad_samples

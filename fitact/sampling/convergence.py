@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import emcee
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
-from scipy.special import ndtri
 
 from fitact.units import format_percent
 
@@ -168,7 +168,7 @@ def _split_rhat(values: Float[np.ndarray, "ensembles steps walkers"], rhat_draws
 def _normal_score_rhat(draws: Float[np.ndarray, "chains draws"]) -> float:
     rank = np.empty(draws.size)
     rank[np.argsort(draws, axis=None, kind="stable")] = np.arange(1, draws.size + 1)
-    scores = ndtri((rank - 0.375) / (draws.size + 0.25)).reshape(draws.shape)
+    scores = scipy.special.ndtri((rank - 0.375) / (draws.size + 0.25)).reshape(draws.shape)
     between, within = np.var(scores.mean(axis=1), ddof=1), np.mean(np.var(scores, axis=1, ddof=1))
     return float(np.sqrt(between / within + 1.0 - 1.0 / draws.shape[1]))
 

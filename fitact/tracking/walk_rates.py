@@ -8,7 +8,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import scipy.ndimage
+import scipy
 from jaxtyping import Float
 
 from fitact.model.circuit import FINGER_PARAMETERS

@@ -17,7 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.integrate
+import scipy
 from jaxtyping import Array, Float
 
 from fitact.compiled import BatchEvaluator, is_array

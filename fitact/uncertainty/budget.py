@@ -12,9 +12,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
-import scipy.sparse.csgraph
+import scipy
 from jaxtyping import Float
-from scipy.special import ndtri
 
 from fitact.prior.distributions import Distribution, LogNormal
 from fitact.prior.product import multiply
@@ -101,7 +100,7 @@ class Budget:
 
     def quantiles(self, probabilities: Iterable[float], *, only_posterior: bool = False) -> Float[np.ndarray, " n"]:
         """Return quantiles of the quantity over its estimate, from the convolution of all components."""
-        z = ndtri(np.array(list(probabilities)))
+        z = scipy.special.ndtri(np.array(list(probabilities)))
         product = self._posterior_factor if only_posterior else self._factor
         return np.exp(np.asarray(product.from_standard_normal(z)) - product.log_mean)
 

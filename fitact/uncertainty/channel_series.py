@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 import numpy as np
-import scipy.fft
+import scipy
 from jaxtyping import Bool, Complex, Float
 
 from fitact.data.record import is_uniform

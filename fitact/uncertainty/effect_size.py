@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-import scipy.fft
+import scipy
 from jaxtyping import Bool
 
 from fitact.uncertainty.channel_series import ChannelSamples, ChannelSeries, Rows, channel_series

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.special import chdtri
 
 from fitact.uncertainty.channel_series import Rows
 from fitact.uncertainty.linear_model import Columns, LinearModel, Nuisance
@@ -97,7 +97,7 @@ def fit_rival(model: LinearModel, residuals: Rows, each: RivalColumns) -> RivalF
 
 def is_significant(fitted: RivalFit) -> bool:
     """Return whether a rival explains more than three standard deviations of noise would."""
-    return fitted.delta_chi2 > float(chdtri(fitted.amplitudes.size, 2.7e-3))
+    return fitted.delta_chi2 > float(scipy.special.chdtri(fitted.amplitudes.size, 2.7e-3))
 
 
 def is_possible(fitted: RivalFit, excess: float = 2.0) -> bool:
