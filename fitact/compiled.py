@@ -25,8 +25,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
+from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from fitact import program_cache
@@ -137,6 +139,14 @@ def jit(
             return program(*map(_as_argument, filter(is_array, leaves)))
 
     return run
+
+
+def solve_lower(factor: ArrayLike, values: Array, *, transposed: bool = False) -> Array:
+    """Return the solution of a lower triangular system; `jax.scipy.linalg` takes 0.05 s to import."""
+    columns = values if values.ndim > 1 else values[:, None]
+    root = jnp.asarray(factor, dtype=values.dtype)
+    solution = lax.linalg.triangular_solve(root, columns, left_side=True, lower=True, transpose_a=transposed)
+    return solution.reshape(values.shape)
 
 
 class _Program(NamedTuple):

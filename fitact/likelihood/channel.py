@@ -16,11 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.scipy.linalg import cho_solve, solve_triangular
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from fitact.compiled import array_module, pad_samples, pad_weight
+from fitact.compiled import array_module, pad_samples, pad_weight, solve_lower
 from fitact.likelihood.charge_rows import ChargeRows
 from fitact.likelihood.compression import BASELINE_NAMES, Compression, GridCompression, Interpolation
 from fitact.likelihood.noise import (
@@ -394,9 +393,12 @@ class ChannelLikelihood(eqx.Module):
         remainder, A = lax.optimization_barrier((remainder, A))
         precision = jnp.eye(len(A)) + A @ A.T / sigma**2
         factor = jnp.linalg.cholesky(precision)
-        fixed = lax.stop_gradient(factor), True  # the derivative of a solution does not need that of the factor
+        fixed = lax.stop_gradient(factor)  # the derivative of a solution does not need that of the factor
         beta = lax.custom_linear_solve(
-            lambda x: precision @ x, A @ remainder / sigma**2, lambda _, y: cho_solve(fixed, y), symmetric=True
+            lambda x: precision @ x,
+            A @ remainder / sigma**2,
+            lambda _, y: solve_lower(fixed, solve_lower(fixed, y), transposed=True),
+            symmetric=True,
         )
         if not self.is_student:
             return remainder - beta @ A, beta, factor
@@ -429,7 +431,7 @@ class ChannelLikelihood(eqx.Module):
         """
         _, beta, factor = self.fit_nuisances(inputs, sigma)
         if deviate is not None:
-            beta = beta + solve_triangular(factor.T, deviate[self._column_indices])
+            beta = beta + solve_lower(factor, deviate[self._column_indices], transposed=True)
         return jnp.zeros(len(LINEAR_NUISANCES)).at[self._column_indices].set(beta)
 
     def residuals(self, inputs: ChannelInputs, sigma: ArrayLike) -> Float[Array, " rows+columns"]:

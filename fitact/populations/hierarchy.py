@@ -7,7 +7,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from fitact.compiled import array_module, jit
+from fitact.compiled import array_module, jit, solve_lower
 from fitact.populations.finger import SHARED_PARAMETER, SKIN
 from fitact.populations.finger_likelihoods import TABLE_HALF_WIDTH, FingerLikelihoods, PopulationParameters
 from fitact.prior.prior import Prior
@@ -54,7 +54,7 @@ class Hierarchy(eqx.Module):
         second = correlation * shifts[:, 0] + jnp.sqrt(1.0 - correlation**2) * shifts[:, 1]
         errors = log_sd * jnp.column_stack([shifts[:, 0], second])
         root = jnp.linalg.cholesky(self._design.T @ self._design)
-        coefficients = self._regress_skin(point[2]) + jax.scipy.linalg.solve_triangular(root.T, errors)
+        coefficients = self._regress_skin(point[2]) + solve_lower(root, errors, transposed=True)
         area = jnp.exp(point[6]) if self.area_varies else None
         slopes = coefficients[1:] if self.covariates.size else None
         return PopulationParameters(coefficients[0], log_sd, correlation, point[2], area, slopes)

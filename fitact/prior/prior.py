@@ -10,10 +10,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
-from fitact.compiled import double_precision
+from fitact.compiled import double_precision, solve_lower
 from fitact.errors import InputError
 from fitact.prior.distributions import Distribution
 
@@ -137,7 +136,7 @@ class Prior(eqx.Module):
             return value
         z = jnp.stack([marginal.to_standard_normal(u[i]) for i, marginal in enumerate(self.marginals)])
         root = np.linalg.cholesky(self.correlation)
-        whitened = solve_triangular(root, z, lower=True)
+        whitened = solve_lower(root, z)
         return value - 0.5 * (whitened @ whitened - z @ z) - np.log(np.diag(root)).sum()
 
     def residuals(self, u: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
@@ -150,7 +149,7 @@ class Prior(eqx.Module):
         places = np.array([place for place, name in enumerate(self.names) if name in names])
         correlated = Prior(tuple(self.names[i] for i in places), tuple(self.marginals[i] for i in places), self.pairs)
         root = np.linalg.cholesky(correlated.covariance)
-        return scaled.at[places].set(solve_triangular(root, u[places] - correlated.log_mean, lower=True))
+        return scaled.at[places].set(solve_lower(root, u[places] - correlated.log_mean))
 
     def sample(self, rng: np.random.Generator, size: int) -> dict[str, Float[np.ndarray, " size"]]:
         """Return draws of the parameters by name; raise InputError if almost none satisfy the order constraints."""
