@@ -13,7 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from fitact.compiled import array_module
 from fitact.model.circuit import HighpassTerms
@@ -43,9 +43,15 @@ def function_sizes(rank: int, *, decays: bool, effects: int = 0, ages: int = 0) 
     return sizes | dict.fromkeys((*BASELINE_NAMES, "rate", "slope", "observed"), 1)
 
 
+def place_functions(sizes: Mapping[str, int]) -> dict[str, Int[np.ndarray, " functions"]]:
+    """Return the places of the functions among all, by name."""
+    counts = list(sizes.values())
+    return dict(zip(sizes, np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1]), strict=True))
+
+
 def split_functions(columns: Columns, sizes: Mapping[str, int]) -> dict[str, Columns]:
     """Return columns by the name of the functions to which they belong."""
-    return dict(zip(sizes, np.split(columns, np.cumsum(list(sizes.values()))[:-1], axis=1), strict=True))
+    return {name: columns[:, place] for name, place in place_functions(sizes).items()}
 
 
 def orthogonal_coordinates(functions: Mapping[str, Columns]) -> dict[str, Columns]:

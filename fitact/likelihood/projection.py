@@ -30,6 +30,7 @@ from fitact.likelihood.compression import (
     Columns,
     Compression,
     function_sizes,
+    place_functions,
     split_functions,
 )
 from fitact.likelihood.noise import Whitening
@@ -130,7 +131,7 @@ def compress(
         if period is None:
             parts = _accumulate_directly(table, drive, samples, steady_state, filtering)
         else:
-            parts = _accumulate_folded(table, drive, samples, period)
+            parts = _accumulate_folded(table, drive, samples, period, sizes)
     parts = track_progress(parts, "compressing the record", math.ceil(time.size / chunk_length(time.size)))
     rows, projected = factor_products(sum(parts, np.zeros(())))
     functions, count = split_functions(rows, sizes), int(np.count_nonzero(mask))
@@ -368,7 +369,9 @@ def whitened_products(
     return rows @ rows.T, filtering
 
 
-def _accumulate_folded(table: TableNodes, drive: Drive, samples: Samples, period: int) -> Iterator[np.ndarray]:
+def _accumulate_folded(
+    table: TableNodes, drive: Drive, samples: Samples, period: int, sizes: Mapping[str, int]
+) -> Iterator[np.ndarray]:
     """Yield the inner products from folded periods; the response is computed for one period only."""
     periods = max(1, chunk_length(samples.time.size) // period)
     reference = np.asarray(samples.observed[:period])
@@ -390,8 +393,9 @@ def _accumulate_folded(table: TableNodes, drive: Drive, samples: Samples, period
     effects = None if samples.effects is None else pad_samples(samples.effects[:, :period])
     folded = Samples(time, mean, weight, rate, weight, slope, None, effects)
     total = np.array(jit(_chunk_products)(table, drive, folded, baseline, True, None)[0])
-    # scatter of the samples of one phase about their mean; rate and slope stand between
-    kept = np.r_[-len(BASELINE_NAMES) - 3 : -3, -1]
+    # scatter of the samples of one phase about their mean
+    places = place_functions(sizes)
+    kept = np.concatenate([places[name] for name in (*BASELINE_NAMES, "observed")])
     total[np.ix_(kept, kept)] += squares - means @ sums.T
     yield total
 

@@ -14,7 +14,14 @@ from jaxtyping import Float
 
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.charge_rows import LAG, ChargeRows, filter_highpass, step_means, whiten_rows
-from fitact.likelihood.compression import BASELINE_NAMES, Columns, Compression, function_sizes, split_functions
+from fitact.likelihood.compression import (
+    BASELINE_NAMES,
+    Columns,
+    Compression,
+    function_sizes,
+    place_functions,
+    split_functions,
+)
 from fitact.likelihood.likelihood import CircuitValues
 from fitact.likelihood.noise import Whitening
 from fitact.likelihood.projection import (
@@ -187,8 +194,8 @@ def _find_coordinates(
 
     Functions over the samples have a `weight` or a filter; rows are whitened like `charges`.
     """
-    starts = dict(zip(sizes, np.cumsum([0, *sizes.values()]), strict=False))
-    kept = np.concatenate([starts[name] + np.arange(len(each)) for name, each in functions.items()])
+    places = place_functions(sizes)
+    kept = np.concatenate([places[name][: len(each)] for name, each in functions.items()])
     rows, total = np.concatenate(list(functions.values())), np.zeros(2 * [sum(sizes.values())])
     if charges is not None:
         rows = whiten_rows(charges.gain, charges.decay, rows) * charges.used
